@@ -108,27 +108,25 @@ class TrainingImages:
     def patches(self, image: NDArray[np.int64], origin: NDArray[np.int64], size: int, margin: int) -> Patches:
         """Patches of `size` × `size` samples of images (items,) with the first sample at `origin` (items, 2),
         row and column."""
+        chosen = torch.from_numpy(image).to(self.u.device)
+        at = self._index(image, origin, np.arange(size))
+        if self.extent is None:
+            u = self.u.view(-1, 2)[self._index(image, origin, np.arange(-margin, size + margin))]
+        else:
+            u = self._grid(chosen, self.extent[image], origin, size, margin)
+        return Patches(
+            u, self.sigma[chosen], self.omega_i[chosen], self.omega_o[chosen], self.value.view(-1, 3)[at]
+        )
+
+    def _index(self, image: NDArray[np.int64], origin: NDArray[np.int64], steps: NDArray[np.int64]) -> Tensor:
+        """Numbers (items, steps, steps) of the queries of images, so many samples from `origin`."""
         rows, columns = self.u.shape[1:3]
-        steps = np.arange(-margin, size + margin)
         row, column = (
             (origin[:, axis, None] + self.stride[image, axis, None] * steps) % extent
             for axis, extent in enumerate((rows, columns))
         )
         index = (image[:, None] * rows + row)[:, :, None] * columns + column[:, None, :]
-        at = torch.from_numpy(index).to(self.u.device)
-        inner = at[:, margin : margin + size, margin : margin + size]
-        chosen = torch.from_numpy(image).to(self.u.device)
-        if self.extent is None:
-            u = self.u.view(-1, 2)[at]
-        else:
-            u = self._grid(chosen, self.extent[image], origin, size, margin)
-        return Patches(
-            u,
-            self.sigma[chosen],
-            self.omega_i[chosen],
-            self.omega_o[chosen],
-            self.value.view(-1, 3)[inner],
-        )
+        return torch.from_numpy(index).to(self.u.device)
 
     def _grid(
         self, chosen: Tensor, extent: NDArray[np.int64], origin: NDArray[np.int64], size: int, margin: int
@@ -137,10 +135,10 @@ class TrainingImages:
         steps = np.arange(-margin, size + margin)
         down, across = ((origin[:, k, None] + steps) / extent[:, k, None] for k in (0, 1))
         first = self.u[chosen, 0, 0].cpu().numpy().astype(np.float64)
-        u, v = first[:, :1] + across, first[:, 1:] - down
-        shape = (len(u), len(steps), len(steps))
-        grid = np.stack([np.broadcast_to(u[:, None], shape), np.broadcast_to(v[:, :, None], shape)], -1)
-        return torch.from_numpy(grid % 1.0).to(self.u)
+        grid = np.empty((len(first), len(steps), len(steps), 2), np.float32)
+        grid[..., 0] = ((first[:, :1] + across) % 1.0)[:, None]
+        grid[..., 1] = ((first[:, 1:] - down) % 1.0)[:, :, None]
+        return torch.from_numpy(grid).to(self.u)
 
     def batches(self, size: int, seed: int, step: int, margin: int) -> Iterator[Patches]:
         """Endless batches of at most about `size` queries from a step on; every epoch visits each image

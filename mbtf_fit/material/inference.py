@@ -76,7 +76,8 @@ def _predict_patches(found: Kernel, model: NeuralMaterial, *arrays: ArrayLike) -
         part = (a[start:stop] for a in inputs)
         return evaluate_in_chunks(partial(evaluate_hierarchical, native), device, 3, *part, chunk=chunk)
 
-    device, chunk = torch.device("cpu"), max(1, _CHUNK // model.positions)
+    # Positions take less memory than PyTorch's activations.
+    device, chunk = torch.device("cpu"), max(1, 8 * _CHUNK // model.positions)
     count = max(1, min(torch.get_num_threads(), n // chunk))
     edges = [n * k // count for k in range(count + 1)]
     with ThreadPoolExecutor(count) as pool:

@@ -120,8 +120,8 @@ EXPORT int64_t mbtf_scratch_floats(void) { return 2 * MAX_WIDTH * BLOCK; }
 
 /* Weights (outputs, inputs, taps), element (o, i, t) at w[o·down + i·across + t], into tiles of at most `most`
  * outputs. */
-static float *pack_matrix(const float *w, int64_t down, int64_t across, int taps, const float *bias, int outputs,
-                          int inputs, int most, float *to) {
+static float *pack_matrix(const float *w, int64_t down, int64_t across, int taps, const float *bias,
+                          int outputs, int inputs, int most, float *to) {
     const int tiles = (outputs + most - 1) / most;
     for (int t = 0, o = 0; t < tiles; t++) {
         const int R = outputs / tiles + (t < outputs % tiles);
@@ -225,8 +225,10 @@ EXPORT void mbtf_pack_inception(int32_t variant, const mbtf_inception *d, const 
         const convolution *c = &list[k];
         const int taps = c->size * c->size;
         const float *w = parameters[2 * k];
-        pack_matrix(w, columns_of(c), taps, taps, parameters[2 * k + 1], c->outputs, c->inputs, most, packed + c->packed);
-        pack_matrix(w, taps, columns_of(c), taps, NULL, c->inputs, c->outputs, most, packed + c->transposed);
+        const int64_t columns = columns_of(c);
+        float *to = packed + c->packed, *transposed = packed + c->transposed;
+        pack_matrix(w, columns, taps, taps, parameters[2 * k + 1], c->outputs, c->inputs, most, to);
+        pack_matrix(w, taps, columns, taps, NULL, c->inputs, c->outputs, most, transposed);
     }
 }
 
@@ -253,7 +255,7 @@ EXPORT void mbtf_patch_forward(int32_t variant, const mbtf_model *m, const mbtf_
 
 /* Gradients after a forward that kept its state; those by `inputs` (items, m->inputs) where there are modules. */
 EXPORT void mbtf_patch_backward(int32_t variant, const mbtf_model *m, const mbtf_patches *p, int64_t group,
-                                const float *state, const float *by_value, float *by_inputs, float *scratch,
+                                float *state, const float *by_value, float *by_inputs, float *scratch,
                                 const mbtf_gradients *to) {
     const int64_t floats = mbtf_patch_state_floats(m, p->rows, p->columns, group);
     for (int64_t first = 0; first < p->items; first += group, state += floats) {
@@ -269,15 +271,17 @@ EXPORT double mbtf_patch_learn(int32_t variant, const mbtf_model *m, const mbtf_
                                float *out, float *by_inputs, float *scratch, const mbtf_gradients *to) {
     const int64_t values = values_of(m, p);
     double sum = 0.0;
+    const mbtf_variant *v = VARIANTS[variant];
     for (int64_t first = 0; first < p->items; first += group) {
         const mbtf_patches part = part_of(m, p, first, group);
+        const float *target = targets + first * values;
         float *by_value = out + group * values;
-        VARIANTS[variant]->patch_forward(m, &part, 0, 1, state, out);
+        v->patch_forward(m, &part, 0, 1, state, out);
         for (int64_t at = 0; at < part.items * values; at += 3 * BLOCK) {
             const int64_t left = part.items * values - at, n = left < 3 * BLOCK ? left : 3 * BLOCK;
-            sum += VARIANTS[variant]->loss(loss, out + at, targets + first * values + at, n, share, by_value + at);
+            sum += v->loss(loss, out + at, target + at, n, share, by_value + at);
         }
-        VARIANTS[variant]->patch_backward(m, &part, state, by_value, by_inputs + first * m->inputs, scratch, to);
+        v->patch_backward(m, &part, state, by_value, by_inputs + first * m->inputs, scratch, to);
     }
     return sum;
 }

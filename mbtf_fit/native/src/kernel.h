@@ -36,15 +36,16 @@ typedef struct {
     const float *table;
 } mbtf_textures;
 
-/* An Inception decoder behind its first layer: modules, channels between them, and those of their branches, the rest
- * of which is that of the maximum. Packed by mbtf_pack_inception. */
+/* An Inception decoder behind its first layer: modules, channels between them, and channels of the branches; the
+ * maximum has the rest. Packed by mbtf_pack_inception. */
 typedef struct {
     int32_t modules, width, one, before3, three, before5, five;
     const float *packed;
 } mbtf_inception;
 
 /* neumip, neumip-baseline where offset.layers is 0, or relief where depth_weights (a number per level) are
- * given. Where height_scale is not 0, the offset texture holds learned heights over height_scale, in one channel. The decoder sees so many coordinates of light and of view: 2 (x, y) or 3; then, where they are not 0,
+ * given. Where height_scale is not 0, the offset texture holds learned heights over height_scale, in one
+ * channel. The decoder sees so many coordinates of light and of view: 2 (x, y) or 3; then, where they are not 0,
  * half vector and difference vector, hints, light and view about the known normal. With `gate`, its last output
  * is that of the gate. */
 typedef struct {
@@ -57,9 +58,10 @@ typedef struct {
     int32_t fourth_root, bands, inputs;
 } mbtf_model;
 
-/* Patches of positions that share footprint and view: u (items, rows, columns, 2), sigma (items), omega_o (items, 3);
- * factors of the position's encoding (items, 2 bands). `inputs` (items, m->inputs) are those of the decoder that an
- * item's positions share: with modules what light and view add to its first layer, else light and view encoded. */
+/* Patches of positions that share footprint and view: u (items, rows, columns, 2), sigma (items), omega_o
+ * (items, 3), factors of the position's encoding (items, 2 bands). `inputs` (items, m->inputs) are those of the
+ * decoder that an item's positions share: with modules what light and view add to its first layer, else light
+ * and view encoded. */
 typedef struct {
     int64_t items;
     int32_t rows, columns;

@@ -7,14 +7,14 @@
 /* Rows and columns that a module crops at every border. */
 #define REACH 2
 #define MAX_MODULES (MAX_LAYERS - 2)
-/* Rows of a block's state before the decoder's: u', v', level, weight of the finer level, 3 slopes of the value. */
+/* Rows of a block's state before the decoder's: u', v', level, weight of the finer level, 3 slopes. */
 #define PATCH_ROWS 7
 
 /* Convolutions of a module. */
 enum { ONE, BEFORE3, THREE, BEFORE5, FIVE, POOLED, BRANCHES };
 #define MAX_CONVOLUTIONS (MAX_MODULES * BRANCHES + 1)
 
-/* Where a convolution's weights, their transpose, and their gradients begin. */
+/* Where a convolution's packed weights, their transpose, and their gradients begin. */
 typedef struct {
     int32_t inputs, outputs, size;
     int64_t packed, transposed, sums;
@@ -45,15 +45,24 @@ static int convolutions(const mbtf_inception *d, convolution *list) {
     return count;
 }
 
-/* Where the weights of a module's convolutions lie, and their gradients. */
+/* Rows that a module computes: before the two larger convolutions, the maxima, the outputs. Gradients have the
+ * first three in the same order. */
 typedef struct {
-    const float *forward[BRANCHES], *backward[BRANCHES];
-    int64_t sums[BRANCHES];
-} module_weights;
+    float *before3, *before5, *most, *y;
+} module_buffers;
 
-/* Memory of a group of patches. Their positions are numbered one after the other; flat activations have `pitch`
- * floats a row, those of the gradients of a single patch `wide` floats, of which `lead` are before its first number.
- */
+static inline module_buffers buffers_of(const mbtf_inception *d, float *rows, int64_t pitch) {
+    module_buffers r;
+    r.before3 = rows;
+    r.before5 = r.before3 + d->before3 * pitch;
+    r.most = r.before5 + d->before5 * pitch;
+    r.y = r.most + d->width * pitch;
+    return r;
+}
+
+/* Memory of a group of patches. Their positions are numbered one after the other. Flat activations have rows of
+ * `pitch` floats, gradients of a single patch rows of `wide` floats, of which `lead` come before its first
+ * number. */
 typedef struct {
     int64_t area, positions, blocks, pitch, flat_floats, block_floats, lead, wide, scratch_floats;
     int32_t features, module_rows, patch_rows;
@@ -72,7 +81,8 @@ static patch_layout layout_of(const mbtf_model *m, int64_t rows, int64_t columns
     l.module_rows = d->before3 + d->before5 + 2 * d->width;
     const int64_t flat_rows = d->modules ? d->width + (int64_t)d->modules * l.module_rows + 6 : 0;
     l.flat_floats = flat_rows * l.pitch;
-    l.block_floats = BLOCK * (PATCH_ROWS + network_rows(&m->decoder) + (m->offset.layers ? network_rows(&m->offset) : 0));
+    const int64_t offset_rows = m->offset.layers ? network_rows(&m->offset) : 0;
+    l.block_floats = BLOCK * (PATCH_ROWS + network_rows(&m->decoder) + offset_rows);
     l.lead = behind;
     l.wide = l.lead + (l.area + 15) / 16 * 16 + behind;
     /* Two modules' gradients in turn, those within a module, and the positions of the maxima. */
