@@ -15,7 +15,7 @@ def export(
     file: Path,
     /,
     *,
-    format: Literal["neumip", "neuralbtf"] = "neumip",
+    program: Literal["neumip", "neuralbtf"] = "neumip",
     overwrite: Overwrite = False,
     console: Console = CONSOLE,
 ) -> None:
@@ -27,7 +27,7 @@ def export(
         Folder of shards.
     file
         HDF5 file to write.
-    format
+    program
         The program that reads it: NeuMIP (shuffled layout) or NeuralBTF (slices layout).
     """
     from mbtf_gen.dataset.exported import export_neumip, export_neural_btf
@@ -36,7 +36,7 @@ def export(
     if file.exists() and not overwrite:
         raise UsageError("exists", where=file, hint="choose another name, or --overwrite")
     data = Dataset.open(shards)
-    count = (export_neumip if format == "neumip" else export_neural_btf)(data, file)
+    count = (export_neumip if program == "neumip" else export_neural_btf)(data, file)
     total = int(data.manifest["splits"]["train"]["queries"])
     left = f"; {total - count} that do not fill an image are left out" if count < total else ""
-    console.report({"file": file, "format": format, "values": count}, f"{file}: {count} values{left}")
+    console.report({"file": file, "program": program, "values": count}, f"{file}: {count} values{left}")

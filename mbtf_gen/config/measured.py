@@ -19,16 +19,16 @@ class MeasuredQueriesSection(Settings):
     """Which values of a measured BTF become queries."""
 
     train: Annotated[Count, Flag("--queries", "N|N/texel")] = Field(
-        "400/texel", description="training queries, in total or per texel, drawn at random from the images"
+        "400/texel", description="training queries, in total or per texel of the finest level"
     )
     test: Annotated[Count, Flag("--test-queries", "N|N/texel")] = Field(
-        "8192", description="test queries, in total or per texel; of pairs of light and view of their own"
+        "8192", description="test queries, in total or per texel of the finest level"
     )
     min_cos: Annotated[float, Flag("--min-cos")] = Field(
         0.1,
         gt=0,
         lt=1,
-        description="smallest cosine of both directions to the normal; lower ones are left out",
+        description="smallest cosine of light and view directions to the normal",
     )
 
 
@@ -48,7 +48,7 @@ class ImportConfig(Settings):
     )
     output: OutputSection = OutputSection()
     seed: Annotated[int, Flag("--seed")] = Field(
-        0, ge=0, lt=1 << 63, description="root seed of the random choice"
+        0, ge=0, lt=1 << 63, description="root seed of all random numbers"
     )
 
     def hash(self, inputs: dict[str, str]) -> str:

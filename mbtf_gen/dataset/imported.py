@@ -117,7 +117,7 @@ class Import:
 
     @property
     def texels(self) -> int:
-        """Texels of an image, or of the finest level."""
+        """Texels of an image; of the finest level where there are no images."""
         source = self.source
         return source.rows * source.columns if has_images(source) else self.lattice.texels()
 
@@ -153,13 +153,14 @@ class Import:
         return included
 
     def count(self, split: Split) -> int:
-        """Queries of a split."""
+        """Queries of a split. A list of queries is imported whole."""
         queries = self.config.queries
-        asked = count_queries(queries.train if split == "train" else queries.test, self.texels)
+        texels = self.lattice.texels()
+        asked = count_queries(queries.train if split == "train" else queries.test, texels)
         if has_images(self.source):
             assert self.pairs is not None
             return min(asked, self.texels * len(self.pairs[SPLITS.index(split)]))
-        test = min(count_queries(queries.test, self.texels), self.usable // 2)
+        test = min(count_queries(queries.test, texels), self.usable // 2)
         return test if split == "test" else self.usable - test
 
     def entries(self, split: Split) -> list[ShardEntry]:

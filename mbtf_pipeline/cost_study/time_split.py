@@ -126,7 +126,7 @@ class TimedRun:
         first = recipes[names[0]]
         if any(layout_of(fit) != "shuffled" for fit in first.fit.values()):
             problem = "only models of the shuffled layout can share a time"
-            raise UsageError(problem, where="--time", hint="leave out the fits of 'hierarchical'")
+            raise UsageError(problem, where="--time", hint="leave out the fits of models with another layout")
         self.folder = first.folder if folder is None else folder
         options = [
             r.model_dump(mode="json", include={"generate", "fit", "compare"}) for r in recipes.values()

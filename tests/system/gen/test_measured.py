@@ -25,9 +25,9 @@ LINES = {
     "slices": f"wool {SMALL} --queries 81/texel --layout slices -o slices",
     "to neumip": "export shuffled shuffled.hdf5",
     "from neumip": "import shuffled.hdf5 --test-queries 32 -o neumip",
-    "to neuralbtf": "export slices slices.hdf5 --format neuralbtf",
+    "to neuralbtf": "export slices slices.hdf5 --program neuralbtf",
     "from neuralbtf": "import slices.hdf5 --cosine excluded --queries 60/texel -o neuralbtf",
-    "wrong layout": "export shuffled other.hdf5 --format neuralbtf",
+    "wrong layout": "export shuffled other.hdf5 --program neuralbtf",
     "exists": "export shuffled shuffled.hdf5",
 }
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.measured_data import Images, Listed, known
+from support.paths import ROOT
 
 from mbtf_core.errors import InputError
 from mbtf_fit import fit
@@ -48,7 +49,7 @@ def test_values_are_those_of_the_reference_plane(opened: Open, tmp_path: Path) -
     data = Dataset.open(tmp_path / "shards")
     assert (data.lattice.finest, data.lattice.aspect, data.estimates) == (4, 0.5, 1)
     assert data.geometry() is None
-    for split, count in (("train", 20 * 72), ("test", 150)):
+    for split, count in (("train", 20 * 128), ("test", 150)):
         arrays = data.load(split)
         assert set(arrays) == {"u", "sigma", "omega_i", "omega_o", "value_a"}
         assert len(arrays["sigma"]) == count
@@ -58,6 +59,8 @@ def test_values_are_those_of_the_reference_plane(opened: Open, tmp_path: Path) -
         np.testing.assert_allclose(arrays["sigma"], 0.5 / 12)
         assert min(arrays["omega_i"][:, 2].min(), arrays["omega_o"][:, 2].min()) >= 0.2
     measured = data.manifest["measured"]
+    page = (ROOT / "docs/reference/data-format.md").read_text()
+    assert all(f"`{key}`" in page for key in measured)
     assert measured["divided_by_cosine"]
     assert measured["left_out"] + sum(map(len, job.pairs or ())) == 64 + 3
 
