@@ -114,7 +114,7 @@ def _ratios(runs: Sequence[FinishedRun]) -> Table:
         METHOD,
         Column("relative to", "relative_to"),
         Column("MSE ratio, measured here", "measured"),
-        Column("MSE ratio, published for another material with the same name", "published"),
+        Column("MSE ratio, published for another material of the same name or kind", "published"),
         Column("source", "source"),
     ]
     rows: list[list[Cell]] = []
@@ -124,7 +124,7 @@ def _ratios(runs: Sequence[FinishedRun]) -> Table:
             rows.append([run.title, fit, base, ratio_of(run.mse(fit), run.mse(base)), *published])
     text = (
         "A ratio below 1 means that the method is better than the one it is divided by. Published numbers "
-        "belong to other data: another material with the same name, other light, other training. The "
+        "belong to other data: another material of the same name or kind, other light, other training. The "
         "errors of the two MSEs are taken as independent, which overestimates the error bars."
     )
     return Table("ratios", "MSE ratios beside published ones", text, columns, rows)
