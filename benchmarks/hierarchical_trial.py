@@ -160,7 +160,7 @@ def main() -> int:
     parser.add_argument("--material", default="twisted_wool", help="a folder of assets/")
     parser.add_argument("--resolution", type=int, default=64)
     parser.add_argument("--queries", default="1600/texel")
-    parser.add_argument("--patch-size", type=int, default=8, help="texels along each side of an image")
+    parser.add_argument("--patch-size", type=int, default=16, help="texels along each side of an image")
     parser.add_argument("--steps", type=int, nargs="*", default=[300, 1000, 3000])
     parser.add_argument("--only", nargs="*", choices=list(FITS), default=list(FITS))
     parser.add_argument("--curve", action="store_true", help="print validation errors during the fits")

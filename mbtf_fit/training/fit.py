@@ -317,8 +317,8 @@ def _light_width(data: Dataset) -> float:
 def _initialize_from(model: NeuralMaterial, folder: str | Path) -> None:
     """Copy textures and offset of a material into a model of like levels, channels, width and offset.
 
-    A step of the hierarchical model takes a hundred times as long per query as a step of ``neumip``. Both
-    share textures and offset, which ``neumip`` learns sooner.
+    A step of the hierarchical model takes several times as long as a step of ``neumip``. Both share textures
+    and offset, which ``neumip`` learns sooner.
     """
     source = Material.load(folder).model
     given, mine = source.weights(), model.weights()
