@@ -48,6 +48,8 @@ def import_measured(
             f"{job.left_out} of {job.left_out + sum(map(len, job.pairs))} pairs of light and view are "
             "left out: too low"
         )
+    elif job.left_out:
+        console.note(f"{job.left_out} of {job.left_out + job.usable} queries are left out: too low, or NaN")
     check_space(output, size, "reduce --queries, or choose another folder with -o")
     keep_on_interruption(f"the shards that are finished are kept in {output}")
     with console.progress(total=total, label="importing", unit="queries") as bar:

@@ -45,6 +45,19 @@ from mbtf_gen.sampling.rng import Purpose, numpy_generator
 # Arrays of measured data.
 MEASURED = ("u", "sigma", "omega_i", "omega_o", "value_a")
 MEASURED_BYTES = 48
+# What differs from rendered data.
+MEASURED_MEANINGS = {
+    "sigma": "half the width of a texel, or as the file states",
+    "value_a": "the only value of the query (linear Rec.709 RGB)",
+}
+MEASURED_CONVENTIONS = {
+    "heights": "unknown",
+    "light": "as measured; its width is unknown",
+    "value": "as measured, converted to radiance in 1/sr leaving towards omega_o per irradiance on the "
+    "reference plane; no cosine, no clamp, no log; a Lambert plane gives albedo/pi",
+    "halves": "value_a is the only value of a query; its noise is unknown",
+    "holes": "unknown",
+}
 # Share of the pairs of light and view whose values are test queries alone.
 TEST_PAIRS = 0.05
 # Queries whose values are read at once: images of a folder are decoded once per so many.
@@ -68,7 +81,7 @@ class Import:
     config : options
     source : its reader
     digests : role → SHA-256 of the files
-    usable : number of usable queries in a list; finest : level of its finest footprint
+    usable : number of usable queries in a list; finest : level of its finest footprint among these
     """
 
     path: Path
@@ -89,9 +102,13 @@ class Import:
         source, digests = open_measured(path), {"measured": _digest(path)}
         if not has_images(source):
             assert not hasattr(source, "light")
-            usable, sigma = _scan(source)
+            usable, sigma = _scan(source, config.queries.min_cos)
             if usable < 2:
-                raise InputError("has no usable queries", where=path, hint="check that the file is complete")
+                raise InputError(
+                    f"has {usable} usable queries of {source.count:,}",
+                    where=path,
+                    hint="lower --min-cos, or check that the file is complete",
+                )
             # Rounding of a footprint must not add a level.
             finest = max(0, math.ceil(float(level_of_sigma(np.float64(sigma))) - 1e-3))
             return cls(path, config, source, digests, usable, finest)
@@ -135,25 +152,25 @@ class Import:
 
     @property
     def left_out(self) -> int:
-        """Pairs of light and view that are too low."""
+        """Pairs of light and view that are too low; queries of a list that are too low or not numbers."""
         source, pairs = self.source, self.pairs
-        if not has_images(source) or pairs is None:
-            return 0
-        return len(source.light) + source.left_out - sum(map(len, pairs))
+        if has_images(source) and pairs is not None:
+            return len(source.light) + source.left_out - sum(map(len, pairs))
+        return cast(MeasuredQueries, source).count - self.usable
 
     @property
     def divides_by_cosine(self) -> bool:
         """Whether stored values include the cosine of the light; an InputError where nobody says."""
-        if not has_images(self.source):
-            return False
-        included = {"auto": self.source.cosine, "included": True, "excluded": False}[self.config.cosine]
+        # Lists are of NeuMIP, which divides by it.
+        said = self.source.cosine if has_images(self.source) else False
+        included = {"auto": said, "included": True, "excluded": False}[self.config.cosine]
         if included is None:
             hint = "state it: --cosine included, or --cosine excluded"
             raise InputError("does not say whether values include the cosine", where=self.path, hint=hint)
         return included
 
     def count(self, split: Split) -> int:
-        """Queries of a split. A list of queries is imported whole."""
+        """Queries of a split, at most those of the file."""
         queries = self.config.queries
         texels = self.lattice.texels()
         asked = count_queries(queries.train if split == "train" else queries.test, texels)
@@ -161,7 +178,7 @@ class Import:
             assert self.pairs is not None
             return min(asked, self.texels * len(self.pairs[SPLITS.index(split)]))
         test = min(count_queries(queries.test, texels), self.usable // 2)
-        return test if split == "test" else self.usable - test
+        return test if split == "test" else min(asked, self.usable - test)
 
     def entries(self, split: Split) -> list[ShardEntry]:
         """Shards of a split."""
@@ -175,18 +192,20 @@ class Import:
         return [entry for split in SPLITS for entry in self.entries(split)]
 
 
-def _blocks(source: MeasuredQueries) -> Iterator[Queries]:
-    """The usable queries of a list, block by block."""
+def _blocks(source: MeasuredQueries, min_cos: float) -> Iterator[tuple[Queries, NDArray[np.int64]]]:
+    """The queries of a list, block by block, and the rows of those that are not too low."""
     for start in range(0, source.count, _AT_ONCE // 2):
-        yield source.read(start, min(start + _AT_ONCE // 2, source.count))
+        block = source.read(start, min(start + _AT_ONCE // 2, source.count))
+        lowest = np.minimum(block["omega_i"][:, 2], block["omega_o"][:, 2])
+        yield block, np.flatnonzero(lowest >= min_cos)
 
 
-def _scan(source: MeasuredQueries) -> tuple[int, float]:
+def _scan(source: MeasuredQueries, min_cos: float) -> tuple[int, float]:
     """Number of usable queries, and their smallest footprint."""
     usable, sigma = 0, 0.5
-    for block in _blocks(source):
-        usable += len(block["sigma"])
-        sigma = min(sigma, float(block["sigma"].min(initial=0.5)))
+    for block, rows in _blocks(source, min_cos):
+        usable += len(rows)
+        sigma = min(sigma, float(block["sigma"][rows].min(initial=0.5)))
     return usable, sigma
 
 
@@ -200,20 +219,23 @@ def _digest(path: Path) -> str:
 
 def _manifest(job: Import) -> dict[str, Any]:
     config, lattice, source = job.config.model_dump(mode="json"), job.lattice, job.source
-    conventions = CONVENTIONS | {
-        "halves": "value_a is the only value of a query; its noise is unknown",
-        "light": "as measured; its width is unknown",
+    conventions = CONVENTIONS | MEASURED_CONVENTIONS
+    read: dict[str, Any] = {
+        "format": type(source).__name__,
+        "file": job.path.name,
+        "left_out": job.left_out,
+        "divided_by_cosine": job.divides_by_cosine,
+        "light_width": None,
     }
-    read: dict[str, Any] = {"format": type(source).__name__, "file": job.path.name}
     if has_images(source):
         assert job.pairs is not None
         read |= {
             "images": [source.rows, source.columns],
             "pairs": len(source.light) + source.left_out,
-            "left_out": job.left_out,
             "test_pairs": len(job.pairs[1]),
-            "divided_by_cosine": job.divides_by_cosine,
         }
+    else:
+        read["queries"] = cast(MeasuredQueries, source).count
     return {
         "format": FORMAT_NAME,
         "schema": SCHEMA_VERSION,
@@ -236,7 +258,11 @@ def _manifest(job: Import) -> dict[str, Any]:
         "estimates": 1,
         "array_format": job.config.output.format,
         "arrays": {
-            a.name: {"shape": [*LEADING_AXES["shuffled"], *a.trailing], "unit": a.unit, "meaning": a.meaning}
+            a.name: {
+                "shape": [*LEADING_AXES["shuffled"], *a.trailing],
+                "unit": a.unit,
+                "meaning": MEASURED_MEANINGS.get(a.name, a.meaning),
+            }
             for a in ARRAYS
             if a.name in MEASURED
         },
@@ -364,26 +390,29 @@ def _draw(
 
 
 def _of_list(job: Import, source: MeasuredQueries) -> Iterator[tuple[ShardEntry, Arrays | None]]:
-    """Shards and arrays, in random order within blocks of the file. Test queries are spread over it."""
-    test = job.count("test")
-    random = numpy_generator(job.config.seed, "test", 0, Purpose.CHOICE)
-    chosen = ((np.arange(test) + random.random(test)) * (job.usable / max(test, 1))).astype(np.int64)
+    """Shards and arrays, in random order within blocks of the file. Every block gives its share of the test
+    queries and of the training queries."""
+    test, train = job.count("test"), job.count("train")
     left: Arrays = {}
     kept: list[Arrays] = []
     waiting = iter(job.entries("train"))
     entry = next(waiting, None)
     read = 0
-    for number, block in enumerate(_blocks(source)):
+    for number, (block, usable) in enumerate(_blocks(source, job.config.queries.min_cos)):
         found: Arrays = {name: block[name] for name in MEASURED[:-1]}  # type: ignore[literal-required]
         found["value_a"] = block["value"] * np.float32(job.config.scale)
-        count = len(found["sigma"])
-        mine = chosen[(chosen >= read) & (chosen < read + count)] - read
-        read += count
-        kept.append({name: a[mine] for name, a in found.items()})
-        training = np.ones(count, bool)
-        training[mine] = False
+        if job.divides_by_cosine:
+            found["value_a"] /= found["omega_i"][:, 2:]
+        # Counts are differences of cumulative ones, so that their sums are exact.
+        ends = (read, read + len(usable))
+        tested = [n * test // job.usable for n in ends]
+        trained = [(n - t) * train // (job.usable - test) for n, t in zip(ends, tested, strict=True)]
+        read = ends[1]
         random = numpy_generator(job.config.seed, "train", number, Purpose.QUERIES)
-        rows = random.permutation(np.flatnonzero(training))
+        rows = random.permutation(usable)
+        count = tested[1] - tested[0]
+        kept.append({name: a[rows[:count]] for name, a in found.items()})
+        rows = rows[count : count + trained[1] - trained[0]]
         parts = {name: a[rows] for name, a in found.items()}
         left = {n: np.concatenate([left[n], a]) for n, a in parts.items()} if left else parts
         begin = 0
@@ -422,7 +451,7 @@ def _store(job: Import, folder: Path, plan: str, entry: ShardEntry, arrays: Arra
         "statistics": {
             "mean_value": arrays["value_a"].mean(axis=0, dtype=np.float64).tolist(),
             # Unknown: a query has a single value.
-            "mean_variance": [0.0, 0.0, 0.0],
+            "mean_variance": None,
         },
     }
     write_checksummed(sidecar_of(path), record)
