@@ -33,7 +33,8 @@ def import_measured(
         File of a BTF (.btf, .hdf5), or folder or zip archive of images.
     """
     from mbtf_core.folders import check_space
-    from mbtf_gen.dataset.imported import MEASURED_BYTES, Import
+    from mbtf_gen.dataset.import_job import Import
+    from mbtf_gen.dataset.imported import MEASURED_BYTES
     from mbtf_gen.dataset.imported import import_measured as run
 
     job = Import.prepare(Path(measured), options.resolve())

@@ -23,6 +23,8 @@ HORIZON = 1e-4
 # Most pairs of light and view, and most texels of an image.
 MOST_PAIRS = 10_000_000
 MOST_TEXELS = 1 << 26
+# Values to read at once from images that are decoded as a whole.
+MANY = 1 << 24
 
 
 class MeasuredBtf(Protocol):
@@ -51,6 +53,10 @@ class MeasuredBtf(Protocol):
     @property
     def cosine(self) -> bool | None:
         """Do the values include the cosine of the light? None: the file does not say."""
+
+    @property
+    def at_once(self) -> int:
+        """Number of values that one call should read: many where each image is decoded as a whole."""
 
     def values(self, pair: NDArray[np.integer[Any]], texel: NDArray[np.integer[Any]]) -> F32:
         """Values at texels (n,), row-major, of pairs (n,).

@@ -107,6 +107,8 @@ class _Cursor:
 class Ubo2014:
     """An opened DFMF file; see :class:`~mbtf_gen.measured.interface.MeasuredBtf`."""
 
+    at_once = 1 << 20
+
     def __init__(
         self, path: Path, header: _Header, pairs: list[NDArray[Any]], texels: list[NDArray[Any]]
     ) -> None:

@@ -21,8 +21,9 @@ from mbtf_fit.formatting import describe_coverage, summarize_errors
 from mbtf_fit.training.fit import prepare_trainer
 from mbtf_gen.cli.generate import describe
 from mbtf_gen.config.measured import ImportConfig
-from mbtf_gen.dataset import imported
-from mbtf_gen.dataset.imported import Import, import_measured
+from mbtf_gen.dataset import import_job
+from mbtf_gen.dataset.import_job import Import
+from mbtf_gen.dataset.imported import import_measured
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.dataset.verify import verify
 from mbtf_gen.repairs import Corruption
@@ -39,7 +40,7 @@ def opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Open:
     file.write_bytes(b"measured")
 
     def open_(source: Any, **options: Any) -> Import:
-        monkeypatch.setattr(imported, "open_measured", lambda path: source)
+        monkeypatch.setattr(import_job, "open_measured", lambda path: source)
         options["output"] = {"shard_queries": 300, **options.get("output", {})}
         return Import.prepare(file, ImportConfig.model_validate(options))
 
@@ -141,7 +142,7 @@ def test_no_noise_is_claimed(opened: Open, tmp_path: Path) -> None:
 def test_blocks_of_a_list_keep_every_query_once(
     opened: Open, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, test: int
 ) -> None:
-    monkeypatch.setattr(imported, "_AT_ONCE", 512)
+    monkeypatch.setattr(import_job, "_BLOCK", 256)
     source = Listed()
     import_measured(opened(source, queries={"test": str(test)}), tmp_path / "shards")
     data = Dataset.open(tmp_path / "shards")
@@ -165,7 +166,7 @@ def test_blocks_of_a_list_keep_every_query_once(
 
 
 def test_options_select_from_a_list(opened: Open, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(imported, "_AT_ONCE", 512)
+    monkeypatch.setattr(import_job, "_BLOCK", 256)
     source = Listed()
     queries = {"train": "123", "test": "45", "min_cos": 0.6}
     job = opened(source, queries=queries, cosine="included", scale=2.0)
