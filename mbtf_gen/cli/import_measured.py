@@ -50,7 +50,10 @@ def import_measured(
             "left out: too low"
         )
     elif job.left_out:
-        console.note(f"{job.left_out} of {job.left_out + job.usable} queries are left out: too low, or NaN")
+        console.note(
+            f"{job.left_out} of {job.left_out + job.usable} queries are left out: too low, NaN, or of a "
+            "footprint that is no level's"
+        )
     check_space(output, size, "reduce --queries, or choose another folder with -o")
     keep_on_interruption(f"the shards that are finished are kept in {output}")
     with console.progress(total=total, label="importing", unit="queries") as bar:

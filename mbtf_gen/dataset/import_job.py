@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mbtf_core.digest import data_sha256, file_sha256
 from mbtf_core.errors import InputError
-from mbtf_core.lattice import Lattice, level_of_sigma
+from mbtf_core.lattice import MAX_LEVEL, Lattice, level_of_sigma, sigma_of_level
 from mbtf_core.shard_schema import SPLITS, ShardEntry, Split
 from mbtf_gen.config.generator import count_queries
 from mbtf_gen.config.measured import ImportConfig
@@ -71,7 +71,7 @@ class Import:
                     hint="lower --min-cos, or check that the file is complete",
                 )
             # Rounding of a footprint must not add a level.
-            finest = max(0, math.ceil(float(level_of_sigma(np.float64(sigma))) - 1e-3))
+            finest = max(0, math.ceil(float(level_of_sigma(np.float64(sigma))) - 2e-3))
             return cls(path, config, source, digests, usable, finest)
         found = cls(path, config, source, digests)
         if found.pairs is not None and len(found.pairs[0]) == 0:
@@ -113,7 +113,7 @@ class Import:
 
     @property
     def left_out(self) -> int:
-        """Pairs of light and view that are too low; queries of a list that are too low or not numbers."""
+        """Pairs of light and view that are too low; queries of a list that are unusable."""
         source, pairs = self.source, self.pairs
         if has_images(source) and pairs is not None:
             return len(source.light) + source.left_out - sum(map(len, pairs))
@@ -154,11 +154,15 @@ class Import:
 
 
 def usable_blocks(source: MeasuredQueries, min_cos: float) -> Iterator[tuple[Queries, NDArray[np.int64]]]:
-    """The queries of a list, block by block, and the rows of those that are not too low."""
+    """The queries of a list, block by block, and the rows of the usable ones: not too low, and with the
+    footprint of one of the levels that data can have."""
+    least, most = (float(sigma_of_level(level)) for level in (MAX_LEVEL, 0))
     for start in range(0, source.count, _BLOCK):
         block = source.read(start, min(start + _BLOCK, source.count))
         lowest = np.minimum(block["omega_i"][:, 2], block["omega_o"][:, 2])
-        yield block, np.flatnonzero(lowest >= min_cos)
+        # Footprints of half precision are rounded.
+        sigma = (block["sigma"] >= least * (1 - 1e-3)) & (block["sigma"] <= most * (1 + 1e-3))
+        yield block, np.flatnonzero((lowest >= min_cos) & sigma)
 
 
 def _scan(source: MeasuredQueries, min_cos: float) -> tuple[int, float]:

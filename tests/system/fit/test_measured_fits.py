@@ -25,10 +25,10 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_from_data_to_pictures(work: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(work)
-    fit = call("mbtf-fit felt -o material --steps 30 --batch 500 --json".split())
+    fit = call(["mbtf-fit", "felt", "-o", "material", "--steps", "30", "--batch", "500", "--json"])
     assert fit.code == 0, fit.err
     assert "felt -> material: neumip+" in fit.err
-    evaluated = call("mbtf-fit evaluate material felt --json".split())
+    evaluated = call(["mbtf-fit", "evaluate", "material", "felt", "--json"])
     errors = json.loads(evaluated.out)["errors"]
     assert {"test", "held_out_queries", "training"} <= errors.keys()
     assert all(split["includes_noise"] for split in errors.values())

@@ -192,6 +192,15 @@ def test_options_select_from_a_list(opened: Open, tmp_path: Path, monkeypatch: p
         opened(Listed(), queries={"min_cos": 0.999})
 
 
+def test_footprints_of_a_list_are_those_of_levels(opened: Open, tmp_path: Path) -> None:
+    source = Listed()
+    source.arrays["sigma"][::10], source.arrays["sigma"][5::10] = 1e-20, 7.0
+    job = opened(source, queries={"test": "100"})
+    assert (job.usable, job.left_out, job.finest) == (800, 200, 4)
+    import_measured(job, tmp_path / "shards")
+    assert (Dataset.open(tmp_path / "shards").load("train")["sigma"] == np.float32(0.5 / 16)).all()
+
+
 def test_errors_of_a_fit_include_the_noise(opened: Open, tmp_path: Path) -> None:
     class Noisy(Images):
         def values(self, pair: Any, texel: Any) -> Any:
