@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 FORMAT_NAME = "mbtf-shards"
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 MANIFEST_NAME = "manifest.json"
 CONFIG_NAME = "config.yaml"
 GEOMETRY_NAME = "geometry.exr"

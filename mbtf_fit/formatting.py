@@ -148,9 +148,16 @@ def format_estimate(estimate: dict[str, Any]) -> str:
 
 
 def describe_coverage(coverage: dict[str, float]) -> str:
-    """One line: levels whose texels have received gradients."""
-    partly = [f"{share:.1%} of level {level}" for level, share in coverage.items() if share < 1]
-    return f"gradients reached only {', '.join(partly)}" if partly else "gradients reached every texel"
+    """One line: levels whose texels have received gradients. Those that are coarser than all data have none:
+    their texels are averages."""
+    left = list(coverage.items())
+    while len(left) > 1 and left[0][1] == 0:
+        del left[0]
+    partly = [f"{share:.1%} of level {level}" for level, share in left if share < 1]
+    found = f"gradients reached only {', '.join(partly)}" if partly else "gradients reached every texel"
+    if len(left) == len(coverage):
+        return found
+    return f"{found}; levels coarser than {left[0][0]} have no data and are averages of it"
 
 
 def report_errors(

@@ -58,7 +58,9 @@ def open_data(folder: str | Path, layout: Layout, model: str) -> Dataset:
         raise InputError(
             f"the data set has the {data.layout} layout, but {model} needs the {layout} layout",
             where=folder,
-            hint=f"generate them with: mbtf-gen ... --layout {layout}",
+            hint=f"generate them with: mbtf-gen ... --layout {layout}"
+            if data.estimates == 2
+            else "measured data have no other layout; choose another model: --model neumip+",
         )
     return data
 

@@ -265,7 +265,10 @@ def prepare_trainer(config: FitConfig, data: Dataset, partition: Partition, devi
     model.initialize(torch.Generator().manual_seed(config.seed), unit)
     if config.init_from is not None:
         _initialize_from(model, config.init_from)
-    noise = NoiseModel.of(partition.sample, data.lattice, unit)
+    noise = NoiseModel.silent(unit, data.lattice)
+    # A single value does not tell its noise; none is assumed.
+    if data.estimates == 2:
+        noise = NoiseModel.of(partition.sample, data.lattice, unit)
     training: TrainingData = partition.training.to(device)
     if isinstance(model, Rainer2019):
         assert isinstance(training, TrainingSlices)

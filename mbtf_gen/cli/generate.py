@@ -126,6 +126,12 @@ def describe(summary: Summary, *, ran: bool = True) -> str:
     state = "complete" if summary.complete else "unfinished: run the other slices, then mbtf-gen merge"
     counts = " + ".join(f"{n} {'training' if k == 'train' else k}" for k, n in summary.splits.items())
     lines = [f"{summary.folder}: {counts} queries, {state}"]
+    if summary.measured or summary.relative_error is None:
+        # Measured values are not traced.
+        lines.append(
+            f"  mean value {sum(summary.mean_value) / 3:.4g} 1/sr; one value per query: its noise is unknown"
+        )
+        return "\n".join(lines)
     if ran and summary.paths:
         lines.append(
             f"  this run: {summary.paths} paths in {clock(summary.seconds)} "
@@ -134,11 +140,6 @@ def describe(summary: Summary, *, ran: bool = True) -> str:
         )
     elif ran:
         lines.append("  this run: nothing left to do")
-    if summary.measured:
-        lines.append(
-            f"  mean value {sum(summary.mean_value) / 3:.4g} 1/sr; one value per query: its noise is unknown"
-        )
-        return "\n".join(lines)
     noise = f"pooled noise of a training query {summary.relative_error:.1%} of the mean"
     if summary.complete and summary.relative_error > 0:
         # The variance of every value falls at least like one over the number of paths.

@@ -33,7 +33,8 @@ def import_measured(
         File of a BTF (.btf, .hdf5), or folder or zip archive of images.
     """
     from mbtf_core.folders import check_space
-    from mbtf_gen.dataset.imported import MEASURED_BYTES, Import
+    from mbtf_gen.dataset.import_job import Import
+    from mbtf_gen.dataset.imported import MEASURED_BYTES
     from mbtf_gen.dataset.imported import import_measured as run
 
     job = Import.prepare(Path(measured), options.resolve())
@@ -47,6 +48,11 @@ def import_measured(
         console.note(
             f"{job.left_out} of {job.left_out + sum(map(len, job.pairs))} pairs of light and view are "
             "left out: too low"
+        )
+    elif job.left_out:
+        console.note(
+            f"{job.left_out} of {job.left_out + job.usable} queries are left out: too low, NaN, or of a "
+            "footprint that is no level's"
         )
     check_space(output, size, "reduce --queries, or choose another folder with -o")
     keep_on_interruption(f"the shards that are finished are kept in {output}")

@@ -131,7 +131,8 @@ def render_shards(
             total.add(done)
         if progress is not None:
             rate = result.paths / max(time.perf_counter() - start, 1e-9)
-            error = f", noise {total.relative_error():.2%}" if total.train else ""
+            noise = total.relative_error() if total.train else None
+            error = "" if noise is None else f", noise {noise:.2%}"
             left = expected.paths(pending.values())
             total_paths = None if left is None else result.paths + left
             progress(result.paths, f"{rate / 1e6:.2f} M paths/s{error}", total_paths)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, PositiveInt
 
 from mbtf_core.atomic import write_checksummed
@@ -53,8 +54,9 @@ class Summary:
         Time that rendering waited for the writer.
     shard_seconds : float
         Rendering time of all finished shards, over all runs.
-    relative_error : float
-        Pooled relative standard error of the training values, √(mean variance) / mean value.
+    relative_error : float or None
+        Pooled relative standard error of the training values, √(mean variance) / mean value; None where
+        their noise is unknown.
     mean_value : list of float
         Mean training value per channel, 1/sr.
     lost, capped, nonfinite : int
@@ -79,7 +81,7 @@ class Summary:
     writing_seconds: float
     waiting_seconds: float
     shard_seconds: float
-    relative_error: float
+    relative_error: float | None
     mean_value: list[float]
     lost: int
     capped: int
@@ -106,7 +108,7 @@ class ShardStatistics:
         self.counts = dict.fromkeys(("nonfinite_samples", "lost_rays", "capped_rays"), 0)
         self.located: list[str] = []
         self._value = np.zeros(3)
-        self._variance = np.zeros(3)
+        self._variance: NDArray[np.float64] | None = np.zeros(3)
         self._targeted = self._missed = 0
         self._worst = self._square = 0.0
 
@@ -124,7 +126,11 @@ class ShardStatistics:
             self._square += target["queries"] * target["square"]
         if record["split"] == "train":
             self._value += record["queries"] * np.asarray(record["statistics"]["mean_value"])
-            self._variance += record["queries"] * np.asarray(record["statistics"]["mean_variance"])
+            variance = record["statistics"]["mean_variance"]
+            if variance is None or self._variance is None:
+                self._variance = None
+            else:
+                self._variance = self._variance + record["queries"] * np.asarray(variance)
 
     def add_quarantined(self, file: str, quarantined: Mapping[str, Any]) -> None:
         """Add a shard's quarantined samples alone."""
@@ -154,8 +160,11 @@ class ShardStatistics:
             "worst": self._worst,
         }
 
-    def relative_error(self) -> float:
-        """Pooled relative standard error of the training values, √(mean variance) / mean value."""
+    def relative_error(self) -> float | None:
+        """Pooled relative standard error of the training values, √(mean variance) / mean value; None of
+        measured data, whose noise is unknown."""
+        if self._variance is None:
+            return None
         mean = float(self._value.mean()) / max(self.train, 1)
         variance = float(self._variance.mean()) / max(self.train, 1)
         return float(np.sqrt(variance)) / mean if mean > 0 else 0.0
@@ -175,7 +184,7 @@ def refuse_nonfinite(totals: ShardStatistics, paths: int, folder: Path) -> None:
 
 class _Statistics(BaseModel, allow_inf_nan=False):
     mean_value: tuple[float, float, float]
-    mean_variance: tuple[float, float, float]
+    mean_variance: tuple[float, float, float] | None
 
 
 class _Quarantined(BaseModel):

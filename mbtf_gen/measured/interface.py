@@ -14,15 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
+from mbtf_core.lattice import MAX_LEVEL
 
 F32 = NDArray[np.float32]
 I64 = NDArray[np.int64]
 
 # Directions that are lower than this above the reference plane count as below it.
 HORIZON = 1e-4
-# Most pairs of light and view, and most texels of an image.
+# Most pairs of light and view; most texels of an image, and along one of its sides.
 MOST_PAIRS = 10_000_000
 MOST_TEXELS = 1 << 26
+MOST_ACROSS = 1 << MAX_LEVEL
+# Values to read at once from images that are decoded as a whole.
+MANY = 1 << 24
 
 
 class MeasuredBtf(Protocol):
@@ -51,6 +55,10 @@ class MeasuredBtf(Protocol):
     @property
     def cosine(self) -> bool | None:
         """Do the values include the cosine of the light? None: the file does not say."""
+
+    @property
+    def at_once(self) -> int:
+        """Number of values that one call should read: many where each image is decoded as a whole."""
 
     def values(self, pair: NDArray[np.integer[Any]], texel: NDArray[np.integer[Any]]) -> F32:
         """Values at texels (n,), row-major, of pairs (n,).
@@ -130,6 +138,10 @@ def check_texels(rows: int, columns: int, path: Path) -> None:
     """Refuse images without texels, and images that are too large."""
     if rows < 1 or columns < 1:
         raise InputError(f"claims images of {columns} x {rows} texels", where=path)
+    if max(rows, columns) > MOST_ACROSS:
+        raise InputError(
+            f"claims {columns} x {rows} texels; at most {MOST_ACROSS:,} across are read", where=path
+        )
     if rows * columns > MOST_TEXELS:
         raise InputError(f"claims {columns} x {rows} texels; at most {MOST_TEXELS:,} are read", where=path)
 

@@ -23,6 +23,7 @@ from mbtf_gen.measured.hdf5 import data_set, floats, opened
 from mbtf_gen.measured.interface import (
     F32,
     HORIZON,
+    MANY,
     MOST_PAIRS,
     check_finite,
     check_indices,
@@ -37,6 +38,7 @@ class NeuralBtf:
     """An opened capture; see :class:`~mbtf_gen.measured.interface.MeasuredBtf`."""
 
     cosine = None
+    at_once = MANY
 
     def __init__(self, path: Path, shape: tuple[int, int, int], light: F32, view: F32) -> None:
         self.path = path

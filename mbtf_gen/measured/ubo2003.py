@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError, reason
 from mbtf_core.suggest import refuse_special
-from mbtf_gen.measured.interface import F32, HORIZON, check_indices, check_texels, from_angles
+from mbtf_gen.measured.interface import F32, HORIZON, MANY, check_indices, check_texels, from_angles
 
 SUFFIXES = (".jpg", ".jpeg", ".png")
 _ANGLES = tuple(
@@ -45,6 +45,7 @@ class Ubo2003:
     """
 
     cosine = None
+    at_once = MANY
 
     def __init__(
         self, path: Path, names: list[str], angles: NDArray[np.float64], content: Callable[[str], bytes]

@@ -34,7 +34,6 @@ from mbtf_core.errors import InputError
 from mbtf_gen.measured.interface import (
     F32,
     HORIZON,
-    I64,
     MOST_PAIRS,
     check_finite,
     check_indices,
@@ -47,8 +46,8 @@ _COMPLETE = "check that the file is complete"
 _TEXTS = 3 * 80
 _TYPES = {2: "<f2", 4: "<f4", 8: "<f8"}
 _MOST_COMPONENTS = 65_536
-# Values computed at a time.
-_BLOCK = 16_384
+# Values computed at a time, and numbers of their factors; numbers that are converted as a whole.
+_BLOCK, _MOST_NUMBERS, _MOST_WIDENED = 16_384, 1 << 24, 1 << 28
 # Added before the logarithm; the files do not have it, the readers agree on it.
 _EPSILON = 1e-5
 # Rows: red, green and blue of Y, U and V; of Y, Co and Cg.
@@ -107,6 +106,8 @@ class _Cursor:
 class Ubo2014:
     """An opened DFMF file; see :class:`~mbtf_gen.measured.interface.MeasuredBtf`."""
 
+    at_once = 1 << 20
+
     def __init__(
         self, path: Path, header: _Header, pairs: list[NDArray[Any]], texels: list[NDArray[Any]]
     ) -> None:
@@ -123,20 +124,28 @@ class Ubo2014:
         """Values (n, 3); of no image more than these texels is computed."""
         pair, texel = check_indices(pair, texel, len(self._number), self.rows * self.columns)
         number = self._number[pair]
-        out = np.empty((len(pair), 3), np.float32)
-        for start in range(0, len(pair), _BLOCK):
-            part = slice(start, start + _BLOCK)
-            out[part] = self._block(number[part], texel[part])
+        channels = np.empty((len(pair), 3), np.float32)
+        with np.errstate(over="ignore", invalid="ignore"):
+            for c, factors in enumerate(zip(self._pairs, self._texels, strict=True)):
+                of_pairs, of_texels = (_widened(f, len(pair)) for f in factors)
+                size = max(1, min(_BLOCK, _MOST_NUMBERS // of_pairs.shape[1]))
+                for start in range(0, len(pair), size):
+                    part = slice(start, start + size)
+                    left = of_pairs[number[part]].astype(np.float32, copy=False)
+                    right = of_texels[texel[part]].astype(np.float32, copy=False)
+                    channels[part, c] = np.linalg.vecdot(left, right)
+            out = np.empty_like(channels)
+            for start in range(0, len(pair), _BLOCK):
+                part = slice(start, start + _BLOCK)
+                out[part] = _rgb(channels[part].astype(np.float64), self._header)
         return check_finite(out, self.path)
 
-    def _block(self, number: I64, texel: I64) -> NDArray[np.float64]:
-        channels = []
-        with np.errstate(over="ignore", invalid="ignore"):
-            for of_pairs, of_texels in zip(self._pairs, self._texels, strict=True):
-                left = of_pairs[number].astype(np.float32)
-                right = of_texels[texel].astype(np.float32)
-                channels.append(np.einsum("nk,nk->n", left, right, dtype=np.float64))
-            return _rgb(np.stack(channels, axis=-1), self._header)
+
+def _widened(factors: NDArray[Any], values: int) -> NDArray[Any]:
+    """Factors in single precision, where most rows are used several times and they fit into memory."""
+    if values < 2 * len(factors) or factors.size > _MOST_WIDENED:
+        return factors
+    return factors.astype(np.float32)
 
 
 def read_ubo2014(path: str | Path) -> Ubo2014:

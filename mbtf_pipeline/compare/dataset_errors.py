@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +18,8 @@ def dataset_errors(materials: Mapping[str, Material], data: Dataset) -> dict[str
     """Errors of every fit on the test split of one data set, and on the splits held out in its own training.
 
     All fits but the first also have ``mse_minus_first``: their MSE minus that of the first fit on the same
-    test queries, overall and by level. Returns plain data by name of the fit.
+    test queries, overall and by level. Of measured data, which have one value per query, errors include the
+    noise and say so (``includes_noise``); differences do not. Returns plain data by name of the fit.
 
     Raises
     ------
@@ -34,6 +36,8 @@ def dataset_errors(materials: Mapping[str, Material], data: Dataset) -> dict[str
     for name, material in materials.items():
         value = material.predict(test)
         found = split_errors(partial(_stored, value), test, data.lattice)
+        if found is not None:
+            found = replace(found, includes_noise=data.estimates == 1)
         own = material.description["training"]["errors"]
         splits = {split: errors for split, errors in own.items() if split != "test"}
         record = {

@@ -21,6 +21,8 @@ def known(u: NDArray[np.floating], omega_i: F32, omega_o: F32) -> F32:
 class Images:
     """Images of :func:`known`, times the cosine of the light."""
 
+    at_once = 700
+
     def __init__(self, rows: int = 6, columns: int = 12, lights: int = 8, lowest: float = 0.05) -> None:
         self.rows, self.columns = rows, columns
         self.light, self.view = direction_pairs(slice_directions("spiral", lights, lowest))

@@ -76,6 +76,25 @@ def btf(
     rotations: int = 1,
 ) -> bytes:
     """A DFMF file of the known function."""
+    # Channels have numbers of components of their own.
+    used = (12, 11, 11)
+    return factorized(grid(), LIGHTS, VIEWS, model, width, transposed, version, cosine, rotations, used)
+
+
+def factorized(
+    values: F64,
+    lights: Any,
+    views: Any,
+    model: int = 0,
+    width: int = 4,
+    transposed: bool = False,
+    version: int = 4,
+    cosine: int = 1,
+    rotations: int = 0,
+    components: tuple[int, int, int] | None = None,
+) -> bytes:
+    """A DFMF file of values (views, lights, rows, columns, 3) at polar angles and azimuths in degrees."""
+    count, each, height, across = values.shape[:4]
     meta = b"a dome".ljust(80, b"\0") + b"a sensor".ljust(80, b"\0") + b"a lamp".ljust(80, b"\0")
     meta += struct.pack("<4f", 10.0, 2.0, 3.0, 4.0)
     if version > 1:
@@ -85,19 +104,20 @@ def btf(
     if version > 3:
         meta += struct.pack("<I", 3) + b"".join(struct.pack("<I", 1) + c for c in (b"R", b"G", b"B"))
     out = b"!DFMF08FCR" + struct.pack("<II", 8 + len(meta), version) + meta
-    out += struct.pack("<I", len(VIEWS))
-    for angles in VIEWS:
-        out += np.deg2rad(angles).astype("<f4").tobytes() + struct.pack("<I", len(LIGHTS))
-        out += np.deg2rad(LIGHTS).astype("<f4").tobytes()
-    out += struct.pack("<II", COLUMNS, ROWS)
+    out += struct.pack("<I", count)
+    for angles in views:
+        out += np.deg2rad(angles).astype("<f4").tobytes() + struct.pack("<I", each)
+        out += np.deg2rad(lights).astype("<f4").tobytes()
+    out += struct.pack("<II", across, height)
     out += struct.pack("<I", rotations) + rotations * np.eye(3, dtype="<f4").tobytes()
-    matrices = decorrelated(grid(), model).reshape(len(VIEWS) * len(LIGHTS), ROWS * COLUMNS, 3)
-    out += struct.pack("<Ii", 12, model) + PCA_MEAN.astype("<f4").tobytes()
+    matrices = decorrelated(values, model).reshape(count * each, height * across, 3)
+    most = min(matrices.shape[:2])
+    out += struct.pack("<Ii", most, model) + PCA_MEAN.astype("<f4").tobytes()
     out += PCA_MATRIX.astype("<f4").tobytes()
     for channel in range(3):
         matrix = matrices[..., channel].T if transposed else matrices[..., channel]
         u, s, v = np.linalg.svd(matrix, full_matrices=False)
-        used = 12 if channel == 0 else 11
+        used = most if components is None else components[channel]
         kind = f"<f{width}"
         out += struct.pack("<BIII", width, used, *matrix.shape)
         out += s[:used].astype(kind).tobytes() + u[:, :used].astype(kind).tobytes()

@@ -8,21 +8,27 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from support.measured_data import Images, Listed, known
 from support.paths import ROOT
 
 from mbtf_core.errors import InputError
+from mbtf_core.shard_schema import CONVENTIONS
 from mbtf_fit import fit
 from mbtf_fit.config import FitConfig
-from mbtf_fit.data.loader import load_training
-from mbtf_fit.formatting import summarize_errors
+from mbtf_fit.data.loader import load_split, load_training
+from mbtf_fit.formatting import describe_coverage, summarize_errors
+from mbtf_fit.training.fit import prepare_trainer
+from mbtf_gen.cli.generate import describe
 from mbtf_gen.config.measured import ImportConfig
-from mbtf_gen.dataset import imported
-from mbtf_gen.dataset.imported import Import, import_measured
+from mbtf_gen.dataset import import_job
+from mbtf_gen.dataset.import_job import Import
+from mbtf_gen.dataset.imported import import_measured
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.dataset.verify import verify
 from mbtf_gen.repairs import Corruption
 from mbtf_gen.sampling.slice_directions import slice_directions
+from mbtf_pipeline.compare.dataset_errors import dataset_errors
 
 Open = Callable[..., Import]
 
@@ -34,7 +40,7 @@ def opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Open:
     file.write_bytes(b"measured")
 
     def open_(source: Any, **options: Any) -> Import:
-        monkeypatch.setattr(imported, "open_measured", lambda path: source)
+        monkeypatch.setattr(import_job, "open_measured", lambda path: source)
         options["output"] = {"shard_queries": 300, **options.get("output", {})}
         return Import.prepare(file, ImportConfig.model_validate(options))
 
@@ -114,15 +120,34 @@ def test_an_interrupted_import_resumes_with_the_same_bytes(opened: Open, tmp_pat
         Corruption(tmp_path / "part")
 
 
+def test_no_noise_is_claimed(opened: Open, tmp_path: Path) -> None:
+    summary = import_measured(opened(Images(), queries={"train": "300", "test": "9"}), tmp_path / "shards")
+    assert summary.relative_error is None
+    assert "nothing left to do" not in describe(summary)
+    assert "its noise is unknown" in describe(summary)
+    data = Dataset.open(tmp_path / "shards")
+    (shard,) = data.shards("train")
+    assert shard.sidecar["statistics"]["mean_variance"] is None
+    assert data.manifest["summary"]["relative_error"] is None
+    assert data.manifest["measured"]["light_width"] is None
+    assert "only value" in data.manifest["arrays"]["value_a"]["meaning"]
+    assert data.manifest["conventions"].keys() == CONVENTIONS.keys()
+    config = FitConfig.model_validate({"model": "neumip-baseline"})
+    partition = load_training(data, config.held_out, 0)
+    trainer = prepare_trainer(config, data, partition, torch.device("cpu"))
+    assert trainer.weight_decay.weights == 0
+
+
+@pytest.mark.parametrize("test", [100, 300, 499])
 def test_blocks_of_a_list_keep_every_query_once(
-    opened: Open, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    opened: Open, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, test: int
 ) -> None:
-    monkeypatch.setattr(imported, "_AT_ONCE", 512)
+    monkeypatch.setattr(import_job, "_BLOCK", 256)
     source = Listed()
-    import_measured(opened(source, queries={"test": "100"}), tmp_path / "shards")
+    import_measured(opened(source, queries={"test": str(test)}), tmp_path / "shards")
     data = Dataset.open(tmp_path / "shards")
     parts = [data.load(split) for split in ("train", "test")]
-    assert [len(p["sigma"]) for p in parts] == [900, 100]
+    assert [len(p["sigma"]) for p in parts] == [1000 - test, test]
 
     def rows(*arrays: Any) -> list[tuple[float, ...]]:
         return sorted(map(tuple, np.concatenate(arrays, 1).tolist()))
@@ -140,6 +165,42 @@ def test_blocks_of_a_list_keep_every_query_once(
     assert max(at) > 950
 
 
+def test_options_select_from_a_list(opened: Open, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(import_job, "_BLOCK", 256)
+    source = Listed()
+    queries = {"train": "123", "test": "45", "min_cos": 0.6}
+    job = opened(source, queries=queries, cosine="included", scale=2.0)
+    import_measured(job, tmp_path / "shards")
+    data = Dataset.open(tmp_path / "shards")
+    parts = [data.load(split) for split in ("train", "test")]
+    assert [len(p["sigma"]) for p in parts] == [123, 45]
+    lowest = np.minimum(source.arrays["omega_i"][:, 2], source.arrays["omega_o"][:, 2])
+    assert data.manifest["measured"]["queries"] == 1000
+    assert data.manifest["measured"]["left_out"] == (lowest < 0.6).sum() == job.left_out
+    assert data.manifest["measured"]["divided_by_cosine"]
+    found = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
+    assert len(np.unique(found["u"], axis=0)) == 168
+    assert min(found["omega_i"][:, 2].min(), found["omega_o"][:, 2].min()) >= 0.6
+    expected = 2.0 * known(found["u"], found["omega_i"], found["omega_o"]) / found["omega_i"][:, 2:]
+    np.testing.assert_allclose(found["value_a"], expected, rtol=1e-5)
+    # From the whole list: its first and its last blocks.
+    order = {tuple(u): k for k, u in enumerate(source.arrays["u"].tolist())}
+    at = np.array([order[tuple(u)] for u in found["u"].tolist()])
+    counts = np.histogram(at, bins=4, range=(0, 1000))[0]
+    assert counts.min() > 25
+    with pytest.raises(InputError, match="has 0 usable queries of 1,000"):
+        opened(Listed(), queries={"min_cos": 0.999})
+
+
+def test_footprints_of_a_list_are_those_of_levels(opened: Open, tmp_path: Path) -> None:
+    source = Listed()
+    source.arrays["sigma"][::10], source.arrays["sigma"][5::10] = 1e-20, 7.0
+    job = opened(source, queries={"test": "100"})
+    assert (job.usable, job.left_out, job.finest) == (800, 200, 4)
+    import_measured(job, tmp_path / "shards")
+    assert (Dataset.open(tmp_path / "shards").load("train")["sigma"] == np.float32(0.5 / 16)).all()
+
+
 def test_errors_of_a_fit_include_the_noise(opened: Open, tmp_path: Path) -> None:
     class Noisy(Images):
         def values(self, pair: Any, texel: Any) -> Any:
@@ -155,6 +216,12 @@ def test_errors_of_a_fit_include_the_noise(opened: Open, tmp_path: Path) -> None
     assert test["mse"]["value"] == pytest.approx(0.05**2, rel=0.15)
     assert result.material.description["training"]["noise_variance"] is None
     assert any("include the noise of the data" in line for line in summarize_errors(result.errors))
+    compared = dataset_errors({"a": result.material}, Dataset.open(tmp_path / "shards"))
+    assert compared["a"]["splits"]["test"]["includes_noise"]
+    # Error bars are the scatter of squared errors over queries.
+    held = load_split(Dataset.open(tmp_path / "shards"), "test")
+    squares = ((result.material.predict(held) - held.value_a).astype(np.float64) ** 2).mean(axis=1)
+    assert test["mse"]["error"] == pytest.approx(squares.std(ddof=1) / np.sqrt(len(squares)), rel=1e-3)
     streamed = load_training(Dataset.open(tmp_path / "shards"), config.held_out, 0, memory=None).training
     kept = load_training(Dataset.open(tmp_path / "shards"), config.held_out, 0).training
     assert (streamed.slice(5, 50).value == kept.slice(5, 50).value).all()  # type: ignore[union-attr]
@@ -165,6 +232,8 @@ def test_levels_without_data_are_averages(opened: Open, tmp_path: Path) -> None:
     import_measured(opened(Images(lights=16), queries=queries), tmp_path / "shards")
     config = FitConfig.model_validate({"model": "neumip-baseline", "training": {"steps": 400, "batch": 4096}})
     material = fit(config, tmp_path / "shards", tmp_path / "fit").material
+    line = describe_coverage(material.description["training"]["coverage"])
+    assert line.endswith("levels coarser than 3 have no data and are averages of it")
     pyramid = material.model.pyramid.export()
     np.testing.assert_allclose(pyramid["0"][0, 0], pyramid["3"].mean((0, 1)), atol=1e-5)
     omega = slice_directions("spiral", 40, 0.3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -102,6 +103,7 @@ def broken() -> dict[str, bytes]:
         "NaN or infinite numbers in its directions": patched(good, views + 4, struct.pack("<f", np.nan)),
         "polar angles": patched(good, views + 4, struct.pack("<f", -1.0)),
         "claims 1000000000 x 5 texels": patched(good, size, huge),
+        "at most 16,384 across": patched(good, size, struct.pack("<I", 16_385)),
         "claims images of 0 x 5": patched(good, size, bytes(4)),
         "ends within the rotations": patched(good, size + 8, huge),
         "the color model 2": patched(good, model, struct.pack("<i", 2)),
@@ -126,6 +128,22 @@ def test_nan_factors_are_refused_where_they_are_used(tmp_path: Path) -> None:
     btf.values(np.array([0]), np.array([0]))
     with pytest.raises(InputError, match="NaN or infinite"):
         btf.values(np.array([0, 1]), np.array([TEXELS - 1, 0]))
+
+
+def test_many_components_take_little_memory(tmp_path: Path) -> None:
+    """A value of 65 536 components takes half a megabyte while it is computed."""
+    values = np.ones((1, 1, 4, 4, 3))
+    content = files.factorized(values, [(10, 20)], [(30, 40)], version=1, width=2)
+    head = content[: content.index(struct.pack("<BIII", 2, 1, 1, 16))]
+    head = head[:-56] + struct.pack("<I", 65_536) + head[-52:]
+    channel = struct.pack("<BIII", 2, 65_536, 1, 16) + np.full(18 * 65_536, 1 / 256, "<f2").tobytes()
+    btf = opened(tmp_path, head + 3 * channel)
+    tracemalloc.start()
+    found = btf.values(np.zeros(4000, int), np.zeros(4000, int))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    np.testing.assert_allclose(found, 1.0)
+    assert peak < 400e6
 
 
 def test_indices_out_of_range(tmp_path: Path) -> None:

@@ -1,0 +1,62 @@
+"""Fits to measured data, as a user runs them: they say what is unknown, and refuse what needs more."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from support.commands import run_all
+from support.invalid_inputs import call
+from support.measured_files import photographs, zipped
+
+SMALL = "--sheet-only --size 64 --spp 1 --view 60,0 --light 60,0 --tiles-across 1"
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("measured")
+    (folder / "felt.zip").write_bytes(zipped(photographs()))
+    command = "import felt.zip --cosine included --scale 0.3183 --queries 20/texel -o felt"
+    (done,) = run_all([command.split()], folder)
+    assert done.code == 0, done.err
+    return folder
+
+
+def test_from_data_to_pictures(work: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(work)
+    fit = call(["mbtf-fit", "felt", "-o", "material", "--steps", "30", "--batch", "500", "--json"])
+    assert fit.code == 0, fit.err
+    assert "felt -> material: neumip+" in fit.err
+    evaluated = call(["mbtf-fit", "evaluate", "material", "felt", "--json"])
+    errors = json.loads(evaluated.out)["errors"]
+    assert {"test", "held_out_queries", "training"} <= errors.keys()
+    assert all(split["includes_noise"] for split in errors.values())
+    for words in (["info", "material"], ["evaluate", "material", "felt", "--verbose"]):
+        done = call(["mbtf-fit", *words])
+        assert done.code == 0, done.err
+        assert "these errors include the noise of the data" in done.out
+    drawn = call(f"mbtf-fit preview material -o pictures {SMALL}".split())
+    assert drawn.code == 0, drawn.err
+    assert (work / "pictures/sheet.png").is_file()
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("mbtf-fit felt -o other --model relief --steps 1", "--model neumip+"),
+        ("mbtf-fit felt -o other --model hierarchical --steps 1", "measured data have no other layout"),
+        ("mbtf-fit felt -o other --model rainer2019 --steps 1", "measured data have no other layout"),
+        ("mbtf-gen repair felt", "cannot be generated again"),
+        ("mbtf-gen preview felt -o other", "whose surface is unknown"),
+        ("mbtf-gen export felt other.hdf5 --program neuralbtf", "under fixed lights and views"),
+    ],
+)
+def test_what_does_not_apply_is_refused(
+    work: Path, monkeypatch: pytest.MonkeyPatch, line: str, message: str
+) -> None:
+    monkeypatch.chdir(work)
+    done = call(line.split())
+    assert done.code == 3
+    assert message in done.err
+    assert len([text for text in done.err.splitlines() if text.startswith("error:")]) == 1
