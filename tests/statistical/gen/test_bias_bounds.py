@@ -16,6 +16,7 @@ from mbtf_gen.planning import effects_plan as planning
 from mbtf_gen.planning.bounds import displacement_bounds
 from mbtf_gen.planning.effects import Effect, EffectsPlan, without
 from mbtf_gen.planning.effects_plan import plan_effects
+from mbtf_gen.planning.surface_effects import analyze
 from mbtf_gen.planning.pilot import Change, pilot_queries, relative_change
 from mbtf_gen.planning.simulation import build_estimator, normal_map_slopes
 from mbtf_gen.render.estimates import Estimates, Stream
@@ -236,6 +237,6 @@ def test_the_bounce_bound_is_above_that_of_grooves(slope: float, share: float) -
     base[:, : round(share * columns)] = 0.9
     stuff = replace(lambert(z, 1.0), base_color=base)
     job = job_of(stuff, queries={"min_cos": 0.99}, light={"width": 0.0}, geometry={"mesh": columns})
-    bound = planning._bounce_bound(planning._analysis(job, False))
+    bound = planning._bounce_bound(analyze(job, False))
     seen = 0.9 * (1 - np.cos(np.arctan(slope)))
     assert bound > seen / np.sqrt(share)

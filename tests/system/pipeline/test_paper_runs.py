@@ -73,7 +73,7 @@ def test_tables_contain_the_measured_numbers(made: Path) -> None:
     assert list(record["skipped"]) == ["elsewhere"]
     methods = table(made, "methods")
     assert [r["method"] for r in methods[:3]] == ["neumip-baseline", "neumip", "hierarchical"]
-    assert [r["unexplained"] for r in methods[3:]] == ["not implemented"] * 2
+    assert len(methods) == 3
     run_folder = made / "out" / "runs" / "bumps"
     comparison = json.loads((run_folder / "compare" / "comparison.json").read_text())
     for row in methods[:3]:

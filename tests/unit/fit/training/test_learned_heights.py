@@ -99,7 +99,9 @@ def test_pytorch_fits_as_the_kernel_does(
         library.reload()
     described = [r.material.description["training"] for r in (compiled, plain)]
     assert [d["backend"].split()[0] for d in described] == ["kernel", "pytorch"]
-    assert described[1]["loss"] == pytest.approx(described[0]["loss"], rel=1e-3)
+    # Not the loss: it is the mean since the last report, which a busy machine sends after fewer steps.
+    found = [r.errors["test"]["mse"]["value"] for r in (compiled, plain)]
+    assert found[1] == pytest.approx(found[0], rel=2e-3)
 
 
 def test_a_depth_is_learned(tmp_path: Path) -> None:
