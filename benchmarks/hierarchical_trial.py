@@ -160,9 +160,10 @@ def main() -> int:
     parser.add_argument("--material", default="twisted_wool", help="a folder of assets/")
     parser.add_argument("--resolution", type=int, default=64)
     parser.add_argument("--queries", default="1600/texel")
-    parser.add_argument("--patch-size", type=int, default=8, help="texels along each side of an image")
+    parser.add_argument("--patch-size", type=int, default=16, help="texels along each side of an image")
     parser.add_argument("--steps", type=int, nargs="*", default=[300, 1000, 3000])
     parser.add_argument("--only", nargs="*", choices=list(FITS), default=list(FITS))
+    parser.add_argument("--threads", type=int, default=1, help="of the fits; steps are timed on one")
     parser.add_argument("--curve", action="store_true", help="print validation errors during the fits")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
@@ -174,6 +175,7 @@ def main() -> int:
         folders = {name: shards[MODELS[FITS[name]["model"]].layout] for name in FITS}
         found: dict[str, Any] = json.loads(record.read_text()) if record.exists() else {}
         seconds = {name: step_seconds(name, folders[name]) for name in {*arguments.only, "hierarchical"}}
+        torch.set_num_threads(arguments.threads)
         for name, each in seconds.items():
             print(f"{name}: {1e3 * each:.1f} ms per step", file=sys.stderr)
         runs: list[tuple[str, int, bool]] = []

@@ -355,6 +355,8 @@ class FitConfig(Settings):
             raise ValueError(
                 f"{self.model} has no offset, oversampling, blending, encoding or output options"
             )
+        if self.model in SLICE_MODELS and self.init_from is not None:
+            raise ValueError(f"{self.model} encodes its textures: it cannot be initialized from a material")
         shared = self.training.materials, self.training.own_material
         if self.model != "rainer2020" and shared != ((), True):
             raise ValueError("training.materials and training.own_material are options of rainer2020")

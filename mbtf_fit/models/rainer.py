@@ -140,7 +140,9 @@ class Rainer2019(NeuralMaterial):
     def normalized(self, values: Tensor, omega_i: Tensor) -> tuple[Tensor, Tensor]:
         """Logarithms (items, D, 3) of slices with mean 0 and variance 1 per item and color, and both (items,
         6)."""
-        apparent = (values * omega_i[:, 2:]).clamp_min(0.0) / self.unit
+        # Black data have no unit.
+        unit = torch.where(self.unit > 0, self.unit, torch.ones_like(self.unit))
+        apparent = (values * omega_i[:, 2:]).clamp_min(0.0) / unit
         logarithm = torch.log1p(apparent)
         mean = logarithm.mean(1, keepdim=True)
         deviation = logarithm.std(1, unbiased=False, keepdim=True).clamp_min(LEAST_DEVIATION)

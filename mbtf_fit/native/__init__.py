@@ -1,4 +1,4 @@
-"""The compiled kernel: forward and backward of the NeuMIP models, blur and Adam on CPUs.
+"""The compiled kernel: forward and backward of all models, blur and Adam on CPUs.
 
 Written in C, compiled when the package is installed (``setup.py``), called through ctypes. Without it
 everything runs in PyTorch; the tests compare both.

@@ -18,6 +18,7 @@ from mbtf_core.atomic import write_text
 from mbtf_core.errors import EngineError, InputError
 from mbtf_core.folders import owned
 from mbtf_core.interruption import stop_on_interruption
+from mbtf_core.lattice import level_of_sigma
 from mbtf_core.stats import pooled_variance
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import Partition, load_training, open_data
@@ -220,7 +221,7 @@ def _fit(
     subset = validation_subset(trainer.model.positions, queries)
     del queries
     _train(trainer, subset, out, progress)
-    trainer.fill_levels()
+    trainer.fill_levels(float(level_of_sigma(partition.sample.sigma.max())))
     trainer.calibrate()
     errors = evaluate_splits(trainer.predict, data, partition)
     variance = errors["training"].overall.variance.value
@@ -320,8 +321,8 @@ def _light_width(data: Dataset) -> float:
 def _initialize_from(model: NeuralMaterial, folder: str | Path) -> None:
     """Copy textures and offset of a material into a model of like levels, channels, width and offset.
 
-    A step of the hierarchical model takes a hundred times as long per query as a step of ``neumip``. Both
-    share textures and offset, which ``neumip`` learns sooner.
+    A step of the hierarchical model takes several times as long as a step of ``neumip``. Both share textures
+    and offset, which ``neumip`` learns sooner.
     """
     source = Material.load(folder).model
     given, mine = source.weights(), model.weights()

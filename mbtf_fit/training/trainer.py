@@ -45,6 +45,8 @@ BETAS = (0.8, 0.95)
 # Widest blur, in tile widths. A blur of half a tile made training unstable on textures of 16 × 16 texels: the
 # offsets of three of eight fits diverged before the textures became sharp.
 WIDEST_BLUR = 0.125
+# Difference of fractional levels that rounding explains.
+_SAME_LEVEL = 1e-4
 
 
 def learning_rate_factor(training: TrainingSection, step: int, fraction: float) -> float:
@@ -280,12 +282,11 @@ class Trainer:
         )
         model.calibration = torch.from_numpy(found).to(self.device)
 
-    def fill_levels(self) -> None:
-        """Give levels of the pyramid that are coarser than all data the averages of the coarsest level with
-        data. Measured BTFs have one footprint: their coarser levels would keep their initial noise."""
-        reached = [level for level, share in self.coverage().items() if share > 0]
-        if reached:
-            self.model.pyramid.average_coarser(min(reached))
+    def fill_levels(self, coarsest: float) -> None:
+        """Give levels of the pyramid below the fractional level of the data's largest footprint the averages
+        of the next finer one. Measured BTFs have one footprint: their coarser levels would keep their initial
+        noise."""
+        self.model.pyramid.average_coarser(math.floor(coarsest + _SAME_LEVEL))
 
     def coverage(self) -> dict[int, float]:
         """Level → fraction of the pyramid's texels that have received gradients."""

@@ -40,10 +40,12 @@ def write_slices(
     noise: float = 0.0,
     seed: int = 0,
     rows: int = 40,
+    through: Callable[[F32], F32] | None = None,
     change: Callable[[dict[str, F32]], None] | None = None,
 ) -> Path:
     """Write a data set of `lights` lights and views per texel with independent noise in both halves; returns
-    its folder. `change` alters the arrays of the first shard."""
+    its folder. `through`: the transmittance at u, of a material with holes; `change` alters the arrays of the
+    first shard."""
     folder.mkdir(parents=True)
     lattice = Lattice(finest, aspect)
     directions = slice_directions("spiral", lights, 0.2)
@@ -62,6 +64,8 @@ def write_slices(
                 noisy = value + noise * random.standard_normal(value.shape)
                 arrays[f"value_{half}"] = noisy.reshape(*lead, 3).astype(np.float32)
             arrays["spp"] = np.full(lead, 2, np.float32)
+            if through is not None:
+                arrays["transmittance"] = through(queries.u)
             if change is not None and (split, index) == ("train", 0):
                 change(arrays)
             name = f"{split}-{index:05d}.npz"
@@ -69,7 +73,7 @@ def write_slices(
             write_sidecar(folder / name, split, index, config_hash)
             entries.append({"file": name, "rows": lead[0]})
         splits[split] = {"queries": total, "shards": entries}
-    manifest = {
+    manifest: dict[str, Any] = {
         "format": FORMAT_NAME,
         "schema": SCHEMA_VERSION,
         "config_hash": config_hash,
@@ -80,5 +84,7 @@ def write_slices(
         "geometry": None,
         "splits": splits,
     }
+    if through is not None:
+        manifest["arrays"] = {"transmittance": {}}
     (folder / MANIFEST_NAME).write_bytes(checksummed(manifest))
     return folder

@@ -5,8 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from support.fit_data import constant
 from support.slice_data import spots, write_slices
 
 from mbtf_core.errors import InputError, UsageError
@@ -165,7 +167,31 @@ def test_the_network_learns_others_in_units_of_its_own_material(tmp_path: Path) 
         assert 0.5 < level < 2.0
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_black_data_stay_black(name: str, tmp_path: Path) -> None:
+    shards = write_slices(tmp_path / "data", constant(0.0))
+    material = fit(config(name, steps=3), shards, tmp_path / "fit").material
+    omega = slice_directions("spiral", 9, 0.2)
+    assert (material.evaluate(np.zeros((9, 2)), np.full(9, 0.1), omega, omega) == 0.0).all()
+
+
+def test_slices_of_cloth_have_a_transmittance(tmp_path: Path) -> None:
+    """The transmittance is fitted to all texels, with the finest footprint."""
+
+    shards = write_slices(
+        tmp_path / "data", through=lambda u: np.where(u[..., 0] < 0.5, 0.8, 0.2).astype(np.float32)
+    )
+    material = fit(config("rainer2019", steps=3), shards, tmp_path / "fit").material
+    assert material.transmittance is not None
+    u = np.array([[0.25, 0.5], [0.75, 0.5]])
+    omega = slice_directions("spiral", 2, 0.5)
+    found = material.transmittance.evaluate(u, np.full(2, 1 / 16), omega)
+    np.testing.assert_allclose(found, (0.8, 0.2), atol=0.1)
+
+
 def test_options_of_other_models_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="cannot be initialized from a material"):
+        FitConfig.model_validate({"model": "rainer2019", "init_from": "material"})
     with pytest.raises(ValueError, match=r"training\.materials and training\.own_material are options"):
         config("rainer2019", materials=["x"])
     with pytest.raises(ValueError, match="has no offset, oversampling"):

@@ -31,7 +31,7 @@ def arrays(lead: tuple[int, ...], holes: bool = False) -> dict[str, NDArray[np.f
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
-@pytest.mark.parametrize("lead", [SHUFFLED, IMAGE, (1,), (1024,), (1, 1, 1), (2, 5, 3)])
+@pytest.mark.parametrize("lead", [SHUFFLED, IMAGE, (1,), (1024,), (1, 1, 1), (2, 5, 3), (5, 9), (7, 1)])
 @pytest.mark.parametrize("holes", [False, True])
 def test_arrays_round_trip(tmp_path: Path, suffix: str, lead: tuple[int, ...], holes: bool) -> None:
     path = tmp_path / f"train-00000.{suffix}"
