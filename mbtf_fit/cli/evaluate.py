@@ -14,6 +14,8 @@ def evaluate(
 ) -> None:
     """Measure the errors of a material on a data set, without the noise of the data.
 
+    Measured data have one value per query: errors on them include their noise, and say so.
+
     Errors are those of the test split, of held-out queries and directions, and of training queries; with
     --verbose also by level of detail and by elevation.
 

@@ -24,7 +24,7 @@ from mbtf_gen.sampling.rng import Purpose, numpy_generator
 # Share of the pairs of light and view whose values are test queries alone.
 TEST_PAIRS = 0.05
 # Queries of a list that are read at once.
-_BLOCK = 1 << 23
+_BLOCK = 1 << 22
 
 
 def has_images(source: MeasuredBtf | MeasuredQueries) -> TypeGuard[MeasuredBtf]:

@@ -36,7 +36,8 @@ def test_from_data_to_pictures(work: Path, monkeypatch: pytest.MonkeyPatch) -> N
         done = call(["mbtf-fit", *words])
         assert done.code == 0, done.err
         assert "these errors include the noise of the data" in done.out
-    drawn = call(f"mbtf-fit preview material -o pictures {SMALL}".split())
+    # Mitsuba looks for relative paths in the folder where it was first loaded.
+    drawn = call(["mbtf-fit", "preview", str(work / "material"), "-o", "pictures", *SMALL.split()])
     assert drawn.code == 0, drawn.err
     assert (work / "pictures/sheet.png").is_file()
 
