@@ -16,9 +16,9 @@ from mbtf_gen.planning import effects_plan as planning
 from mbtf_gen.planning.bounds import displacement_bounds
 from mbtf_gen.planning.effects import Effect, EffectsPlan, without
 from mbtf_gen.planning.effects_plan import plan_effects
-from mbtf_gen.planning.surface_effects import analyze
 from mbtf_gen.planning.pilot import Change, pilot_queries, relative_change
 from mbtf_gen.planning.simulation import build_estimator, normal_map_slopes
+from mbtf_gen.planning.surface_effects import analyze
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.sampling.light_kernel import LightKernel
 
