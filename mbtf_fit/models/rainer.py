@@ -35,8 +35,8 @@ from mbtf_fit.models.mlp import Mlp, initialize_layers
 
 # Least standard deviation of a slice's logarithms.
 LEAST_DEVIATION = 1e-3
-# Texels that are encoded at once when the texture is written.
-_AT_ONCE = 1024
+# Samples that are encoded at once when the texture is written.
+_AT_ONCE = 1 << 19
 
 
 def stereographic(omega: Tensor) -> Tensor:
@@ -169,9 +169,10 @@ class Rainer2019(NeuralMaterial):
     def write_textures(self, slices: TrainingSlices) -> None:
         """Encode all slices, and average them for the coarser levels."""
         with torch.no_grad():
+            step = max(1, _AT_ONCE // slices.values.shape[1])
             parts = [
-                self.encode(slices.values[a : a + _AT_ONCE], slices.omega_i, slices.omega_o)
-                for a in range(0, len(slices.values), _AT_ONCE)
+                self.encode(slices.values[a : a + step], slices.omega_i, slices.omega_o)
+                for a in range(0, len(slices.values), step)
             ]
             finest = torch.cat(parts)
             self.pyramid.texels[-len(finest) :] = finest

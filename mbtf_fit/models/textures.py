@@ -66,7 +66,7 @@ class FeatureTextures(nn.Module):
     def average_coarser(self, first: int) -> None:
         """Replace all levels coarser than `first` by averages of that level."""
         starts, shapes = self.packing.starts, self.packing.shapes
-        if first == 0:
+        if first <= 0:
             return
         with torch.no_grad():
             finer = self.texels[starts[first] : starts[first + 1]].t().view(1, -1, *shapes[first])

@@ -173,7 +173,7 @@ class Trainer:
     def _health(self) -> Tensor:
         """A number that is finite if all network weights are."""
         with torch.no_grad():
-            return torch.stack([p.sum() for p in self.model.parameter_groups()[1]]).sum()
+            return torch.stack([p.sum() for p in self.model.trained()[1]]).sum()
 
     def _stop_diverged(self, first: int, losses: list[Tensor], health: list[Tensor]) -> NoReturn:
         """Report the first bad batch of the steps since `first`."""

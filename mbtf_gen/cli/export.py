@@ -33,6 +33,10 @@ def export(
     from mbtf_gen.dataset.exported import export_neumip, export_neural_btf
     from mbtf_gen.dataset.reader import Dataset
 
+    if file.is_dir() or shards.resolve() in file.resolve().parents:
+        raise UsageError("is a folder, or inside the data set", where=file, hint="choose another name")
+    if not file.resolve().parent.is_dir():
+        raise UsageError("the folder does not exist", where=file.parent)
     if file.exists() and not overwrite:
         raise UsageError("exists", where=file, hint="choose another name, or --overwrite")
     data = Dataset.open(shards)

@@ -6,6 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from mbtf_core.console import CONSOLE, Console
+from mbtf_core.errors import UsageError
 from mbtf_core.interruption import keep_on_interruption
 from mbtf_core.options import Options, Output, Overwrite, PathText, takes_options
 from mbtf_core.units import size_text
@@ -37,6 +38,8 @@ def import_measured(
     from mbtf_gen.dataset.imported import MEASURED_BYTES
     from mbtf_gen.dataset.imported import import_measured as run
 
+    if Path(measured).is_dir() and Path(measured).resolve() in (output / "x").resolve().parents:
+        raise UsageError("is inside the measured folder", where=f"-o {output}", hint="choose another folder")
     job = Import.prepare(Path(measured), options.resolve())
     total = job.count("train") + job.count("test")
     size = total * MEASURED_BYTES

@@ -38,6 +38,12 @@ def export_neumip(data: Dataset, path: Path) -> int:
             where=data.folder,
             hint="generate it with --layout shuffled",
         )
+    if data.lattice.aspect != 1.0:
+        raise InputError(
+            f"has the aspect {data.lattice.aspect:g}, but NeuMIP's tiles are square",
+            where=data.folder,
+            hint="generate it from a square tile",
+        )
     side = _LARGEST
     while side > 1 and side * side > count:
         side //= 2

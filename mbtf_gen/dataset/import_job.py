@@ -162,6 +162,7 @@ def usable_blocks(source: MeasuredQueries, min_cos: float) -> Iterator[tuple[Que
         lowest = np.minimum(block["omega_i"][:, 2], block["omega_o"][:, 2])
         # Footprints of half precision are rounded.
         sigma = (block["sigma"] >= least * (1 - 1e-3)) & (block["sigma"] <= most * (1 + 1e-3))
+        block["sigma"] = np.clip(block["sigma"], np.float32(least), np.float32(most))
         yield block, np.flatnonzero((lowest >= min_cos) & sigma)
 
 

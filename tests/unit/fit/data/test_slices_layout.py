@@ -45,6 +45,8 @@ def test_held_out_pairs_are_not_trained_on(tmp_path: Path) -> None:
     for held in (found.held_out_queries, found.held_out_directions):
         assert len(held) > 100
         assert not pairs & {tuple(p) for p in np.concatenate([held.omega_i, held.omega_o], 1).tolist()}
+    for omega in (slices.omega_i, slices.omega_o):
+        assert ((omega[:, :2] - torch.tensor([0.45, 0.3])).square().sum(1) >= 0.2**2).all()
     sampled = np.concatenate([found.sample.omega_i, found.sample.omega_o], 1).tolist()
     assert {tuple(p) for p in sampled} <= pairs
     assert len(pairs) < 100
@@ -62,10 +64,8 @@ def test_a_batch_decodes_pairs_of_whole_slices(tmp_path: Path) -> None:
     k = batch.chosen.shape[1]
     assert torch.equal(queries.value[k + 2], batch.values[1, batch.chosen[1, 2]])
     assert torch.equal(queries.omega_o[k + 2], batch.omega_o[batch.chosen[1, 2]])
-    numbers = [r.start for r in slices.batch_ranges(640, 1, 5)]
-    assert {tuple(v) for v in slices.values[numbers][:, 0].tolist()} == {
-        tuple(v) for v in batch.values[:, 0].tolist()
-    }
+    # Other steps have other texels.
+    assert not torch.equal(batch.values, next(slices.batches(640, 1, 6)).values)
     shared = SharedSlices(slices, [slices.scaled(2.0), slices])
     assert len(shared) == 2 * len(slices)
     assert torch.equal(next(shared.batches(640, 1, 4)).values, 2 * next(slices.batches(640, 1, 4)).values)

@@ -242,3 +242,13 @@ def test_levels_without_data_are_averages(opened: Open, tmp_path: Path) -> None:
     grid = (np.stack(np.mgrid[:12, :12], -1).reshape(-1, 2) + 0.5) / 12
     mean = np.mean([known(np.repeat(u[None], 20, 0), light, view) for u in grid], axis=0)
     assert np.abs(found - mean).mean() < 0.1 * mean.mean()
+
+
+def test_rounded_footprints_of_the_whole_tile_are_fitted(opened: Open, tmp_path: Path) -> None:
+    """Half precision rounds 0.5 up; the fit must not look for a level before the first."""
+    source = Listed()
+    source.arrays["sigma"][:] = 0.5003
+    import_measured(opened(source, queries={"test": "100"}), tmp_path / "shards")
+    assert Dataset.open(tmp_path / "shards").load("train")["sigma"].max() == 0.5
+    config = FitConfig.model_validate({"model": "neumip-baseline", "training": {"steps": 3, "batch": 500}})
+    assert fit(config, tmp_path / "shards", tmp_path / "fit").errors["test"]["n"] == 100
