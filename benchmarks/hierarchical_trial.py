@@ -113,14 +113,14 @@ def step_seconds(name: str, shards: Path) -> float:
     return float(0.25 * first + 0.75 * later)
 
 
-def train(name: str, steps: int, shards: Path, judge: Dataset, out: Path) -> dict[str, Any]:
+def train(name: str, steps: int, shards: Path, shuffled: Dataset, out: Path) -> dict[str, Any]:
     """Errors of one fit, on the shuffled test queries."""
 
     def progress(share: float, note: str) -> None:
         print(f"{name} {steps} {share:4.0%} {note}", file=sys.stderr)
 
     result = fit(config_of(name, steps), shards, out / f"{name}-{steps}", progress=progress)
-    found = split_errors(Material.load(result.folder).predict, load_split(judge, "test"), judge.lattice)
+    found = split_errors(Material.load(result.folder).predict, load_split(shuffled, "test"), shuffled.lattice)
     assert found is not None
     errors = found.as_dict()
     return {
@@ -171,7 +171,7 @@ def main() -> int:
     record = out / "trial.json"
     try:
         shards = {layout: make_data(out / layout, layout, arguments) for layout in ("shuffled", "image")}
-        judge = Dataset.open(shards["shuffled"])
+        shuffled = Dataset.open(shards["shuffled"])
         folders = {name: shards[MODELS[FITS[name]["model"]].layout] for name in FITS}
         found: dict[str, Any] = json.loads(record.read_text()) if record.exists() else {}
         seconds = {name: step_seconds(name, folders[name]) for name in {*arguments.only, "hierarchical"}}
@@ -187,7 +187,7 @@ def main() -> int:
         for name, steps, equal_time in runs:
             key = f"{name} {steps}"
             if key not in found:
-                found[key] = train(name, steps, folders[name], judge, out)
+                found[key] = train(name, steps, folders[name], shuffled, out)
                 found[key] |= {"seconds": steps * seconds[name], "equal_time": equal_time}
                 record.write_text(json.dumps(found))
     except MbtfError as error:

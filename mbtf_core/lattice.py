@@ -9,6 +9,7 @@ level ``l = -log2(2σ)``.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -101,6 +102,13 @@ class Lattice:
         """Number of texels of a level; of the finest level by default."""
         rows, columns = self.shape(level)
         return rows * columns
+
+    def texel_of(self, u: NDArray[np.floating[Any]]) -> NDArray[np.int64]:
+        """Numbers (n,) of the finest level's texels, row by row from the side v → 1, at uv positions (n, 2)
+        in [0, 1)."""
+        rows, columns = self.shape()
+        column, above = np.floor(u.astype(np.float64) * (columns, rows)).astype(np.int64).T
+        return np.asarray((rows - 1 - above) * columns + column)
 
     @property
     def sigma_range(self) -> tuple[float, float]:

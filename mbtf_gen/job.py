@@ -138,6 +138,12 @@ class Job:
         return self.grid.displacement_range if shape is None else shape.thickness
 
     @cached_property
+    def slice_directions(self) -> F32 | None:
+        """Directions (n, 3) of the slices layout, lights and views alike; None in other layouts. A UsageError
+        if the number of training queries does not suit them."""
+        return _slice_directions(self)
+
+    @cached_property
     def query_plan(self) -> QueryPlan:
         """Samples the queries of any shard; a UsageError if all weights of the mixture are zero."""
         queries = self.config.queries
@@ -153,7 +159,7 @@ class Job:
             self.config.seed,
             _shard_rows(self),
             queries.patch_size,
-            slice_of(self),
+            self.slice_directions,
         )
 
     @cached_property
@@ -197,7 +203,7 @@ def limit_resolution(job: Job) -> Job:
     return replace(job, config=job.config.model_copy(update={"queries": queries}))
 
 
-def slice_of(job: Job) -> F32 | None:
+def _slice_directions(job: Job) -> F32 | None:
     """Directions (n, 3) of the slices layout, lights and views alike; None in other layouts.
 
     Raises
@@ -225,7 +231,7 @@ def row_queries(job: Job, split: Split) -> int:
     queries = job.config.queries
     if queries.layout == "image":
         return job.lattice.texels() if queries.patch_size is None else queries.patch_size**2
-    directions = slice_of(job)
+    directions = job.slice_directions
     return 1 if directions is None or split == "test" else len(directions) ** 2
 
 

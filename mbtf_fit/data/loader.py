@@ -239,8 +239,7 @@ def _load_slices(data: Dataset, shards: list[Shard], held_out: HeldOutSection, s
     kept = np.flatnonzero(labels == TRAINING)
     if len(kept) == 0:
         raise _all_held_out(data, f"{len(labels)} pairs of light and view")
-    rows, columns = data.lattice.shape()
-    value = np.full((rows * columns, len(kept), 3), np.nan, np.float32)
+    value = np.full((data.lattice.texels(), len(kept), 3), np.nan, np.float32)
     kept_out: tuple[list[ShardQueries], list[ShardQueries]] = ([], [])
     sample: list[ShardQueries] = []
     selection = Selection()
@@ -254,11 +253,7 @@ def _load_slices(data: Dataset, shards: list[Shard], held_out: HeldOutSection, s
             )
         sample.append(_pairs(slices, labels == TRAINING, SAMPLE * len(slices) // value.shape[0] + 1, random))
         selection.add(shard.path, np.ones(len(slices), bool))
-        place = slices.u[:, 0].astype(np.float64) * (columns, rows)
-        texel = (rows - 1 - np.floor(place[:, 1]).astype(np.int64)) * columns + np.floor(place[:, 0]).astype(
-            np.int64
-        )
-        value[texel] = mean_value(slices.value_a, slices.value_b)[:, kept]
+        value[data.lattice.texel_of(slices.u[:, 0])] = mean_value(slices.value_a, slices.value_b)[:, kept]
     if np.isnan(value).any():
         raise InputError("lacks slices of some texels", where=data.folder, hint="generate the data set again")
     mean, omega_i, omega_o = (

@@ -126,11 +126,6 @@ class SharedSlices:
     def __len__(self) -> int:
         return sum(map(len, self.learned))
 
-    @property
-    def omega_i(self) -> Tensor:
-        """Lights of the fitted material's slices."""
-        return self.own.omega_i
-
     def batches(self, size: int, seed: int, step: int, margin: int = 0) -> Iterator[SliceBatch]:
         """Endless batches from a step on; `margin` is unused."""
         while True:

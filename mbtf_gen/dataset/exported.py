@@ -66,9 +66,7 @@ def export_neural_btf(data: Dataset, path: Path) -> int:
         )
     rows, columns = data.lattice.shape()
     whole = data.load("train")
-    place = whole["u"][:, 0].astype(np.float64) * (columns, rows)
-    texel = (rows - 1 - np.floor(place[:, 1]).astype(np.int64)) * columns + np.floor(place[:, 0]).astype(int)
-    values = mean_of(whole)[np.argsort(texel)].reshape(rows, columns, -1, 3)
+    values = mean_of(whole)[np.argsort(data.lattice.texel_of(whole["u"][:, 0]))].reshape(rows, columns, -1, 3)
 
     def images() -> Iterator[NDArray[np.float32]]:
         for pair in range(values.shape[2]):

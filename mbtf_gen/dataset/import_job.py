@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TypeGuard, cast
 
@@ -62,7 +63,7 @@ class Import:
         """
         source, digests = open_measured(path), {"measured": _digest(path)}
         if not has_images(source):
-            assert not hasattr(source, "light")
+            source = cast(MeasuredQueries, source)
             usable, sigma = _scan(source, config.queries.min_cos)
             if usable < 2:
                 raise InputError(
@@ -99,7 +100,7 @@ class Import:
         source = self.source
         return source.rows * source.columns if has_images(source) else self.lattice.texels()
 
-    @property
+    @cached_property
     def pairs(self) -> tuple[NDArray[np.int64], NDArray[np.int64]] | None:
         """Numbers of the pairs of light and view for training and for testing; None for a list of queries."""
         if not has_images(self.source):
@@ -146,11 +147,6 @@ class Import:
         size, total = self.config.output.shard_queries, self.count(split)
         names = (f"{split}-{k:05d}.{self.config.output.format}" for k in range(-(-total // size)))
         return [ShardEntry(split, k, n, min(size, total - k * size)) for k, n in enumerate(names)]
-
-    @property
-    def shards(self) -> list[ShardEntry]:
-        """All shards."""
-        return [entry for split in SPLITS for entry in self.entries(split)]
 
 
 def usable_blocks(source: MeasuredQueries, min_cos: float) -> Iterator[tuple[Queries, NDArray[np.int64]]]:
