@@ -1,0 +1,144 @@
+// The viewer: what is shown, and how mouse and panel change it.
+
+const byId = (id) => document.getElementById(id);
+const SHADERS = CONTENT.shaders;
+// Seconds of drawing after which the page answers; frames after which nothing moves any more.
+const SLOW = 0.06, STILL = 4;
+
+class Viewer {
+  constructor(content) {
+    Object.assign(this, { content, materials: [], scale: 0.3, full: 1, chosen: 0, still: 0 });
+    this.renderer = new Renderer(byId("canvas"));
+    this.state = stateOf(location.hash, new Camera());
+    this.camera = new Camera(this.state.camera);
+  }
+
+  async start() {
+    for (const material of this.content.materials) this.materials.push(await Material.load(this.renderer.gl, material));
+    this.pictures = (this.content.pictures ?? []).map((picture) => this._picture(picture));
+    this.state.material = clamp(Math.round(this.state.material), 0, this.materials.length - 1);
+    this.shapeChanged();
+    this.environmentChanged();
+    this.againstChanged();
+    this.ready = true;
+  }
+
+  _picture(picture) {
+    const rgb = floatsOf(picture.data), [rows, columns] = picture.shape, padded = new Float32Array(4 * rows * columns).fill(1);
+    // Row 0 of a picture is its top.
+    for (let j = 0; j < rows; j++)
+      for (let i = 0; i < columns; i++) padded.set(rgb.subarray(3 * (j * columns + i), 3 * (j * columns + i) + 3), 4 * ((rows - 1 - j) * columns + i));
+    return { ...picture, rows, columns, values: padded };
+  }
+
+  get material() {
+    return this.materials[this.state.material];
+  }
+
+  get shown() {
+    const other = /^material (\d+)$/.exec(this.state.against);
+    return other && this.materials[other[1]] ? [this.material, this.materials[other[1]]] : [this.material];
+  }
+
+  get picture() {
+    const found = /^picture (\d+)$/.exec(this.state.against);
+    return found ? this.pictures[found[1]] : undefined;
+  }
+
+  get scene() {
+    return { camera: this.camera, lights: this.state.lights, environment: this.state.environment, divide: this.state.divide };
+  }
+
+  changed() {
+    this.renderer.restart();
+    this.still = 0;
+    this.saveLater();
+  }
+
+  saveLater() {
+    clearTimeout(this.saving);
+    this.saving = setTimeout(() => history.replaceState(null, "", linkOf(this.state, this.camera)), 300);
+  }
+
+  shapeChanged() {
+    const { shape, tiles } = this.state, { aspect } = this.material.content, mesh = this.content.mesh;
+    if (mesh && shape === mesh.name) this.renderer.setShape(userShape(mesh, tiles, aspect));
+    else this.renderer.setShape((SHAPES[shape] ?? planeShape)(tiles, aspect));
+    this.changed();
+  }
+
+  // Put the camera where the whole shape is seen.
+  frameShape() {
+    const plane = this.state.shape === "plane", tiles = this.state.tiles;
+    const size = { plane: tiles, sphere: tiles / Math.PI, cloth: tiles * 1.2 }[this.state.shape] ?? tiles * (this.content.mesh?.unit ?? 1) * 2;
+    Object.assign(this.camera, { target: plane ? [0.5, 0.5 * this.material.content.aspect, 0] : [0, 0, 0], tiles_across: 1.25 * size,
+      elevation: plane ? 50 : 20, azimuth: -90 });
+    this.changed();
+  }
+
+  environmentChanged() {
+    const { name } = this.state.environment, user = this.content.environment;
+    const known = name in BUILT_IN || (user && user.name === name);
+    this.renderer.setEnvironment(known ? environmentOf(name, user) : undefined);
+    this.changed();
+  }
+
+  // A picture fixes view, light and shape; its values are M for unit irradiance of the plane.
+  againstChanged() {
+    const { gl } = this.renderer, picture = this.picture;
+    if (this.pictureTexture) gl.deleteTexture(this.pictureTexture.handle);
+    this.pictureTexture = undefined;
+    if (picture) {
+      const direction = fromAngles(picture.light.elevation, picture.light.azimuth), light = this.state.lights[0];
+      this.state.lights = [{ ...light, color: [1, 1, 1], direction }];
+      this.state.environment.name = "none";
+      this.renderer.setEnvironment(undefined);
+      this.state.shape = "plane";
+      this.renderer.setShape(planeShape(this.state.tiles, this.material.content.aspect));
+      const { elevation, azimuth, tiles_across, target, field_of_view } = picture.camera;
+      Object.assign(this.camera, { elevation, azimuth, tiles_across, field_of_view, target: [target[0], target[1], 0] });
+      const factor = light.intensity * direction[2];
+      this.pictureTexture = tableTexture(gl, picture.columns, picture.rows, picture.values.map((x, k) => (k % 4 < 3 ? x * factor : x)));
+    } else this.camera.field_of_view = new Camera().field_of_view;
+    this.layout();
+    this.changed();
+  }
+
+  // Size of the canvas: that of its place, or the proportions of the picture beside it.
+  layout() {
+    const { canvas } = this.renderer, box = canvas.parentElement.getBoundingClientRect();
+    const proportion = this.picture ? this.picture.columns / this.picture.rows : box.width / box.height;
+    const width = Math.min(box.width, box.height * proportion), height = width / proportion;
+    Object.assign(canvas.style, { width: `${width}px`, height: `${height}px`, left: `${(box.width - width) / 2}px`, top: `${(box.height - height) / 2}px`, inset: "auto" });
+    const density = Math.min(window.devicePixelRatio || 1, 2);
+    canvas.width = Math.max(1, Math.round(width * density));
+    canvas.height = Math.max(1, Math.round(height * density));
+    byId("divider").style.left = `${(box.width - width) / 2 + width * this.state.divide}px`;
+    this.changed();
+  }
+
+  // Draw: coarse pictures while something moves, then frames of full size in parts, so that the page answers.
+  // Returns whether anything changed.
+  draw() {
+    const { renderer, shown, scene } = this, { width, height } = renderer.canvas, moving = this.still++ < STILL;
+    const name = moving ? "coarse" : "full", scale = moving ? this.scale : 1;
+    const mean = renderer.mean(name, Math.max(2, Math.round(width * scale)), Math.max(2, Math.round(height * scale)), shown.length);
+    const rows = moving ? mean.height : Math.max(2, Math.round((mean.height * SLOW) / Math.max(this.full, SLOW)));
+    const before = performance.now(), drawn = renderer.frame(mean, shown, scene, rows);
+    if (!drawn) return false;
+    const seconds = (performance.now() - before) / 1000;
+    // Time of a full frame, from the part that was drawn.
+    this.full = moving ? seconds / (scale * scale) : (seconds * mean.height) / Math.min(rows, mean.height);
+    this.seconds = moving ? seconds : this.full;
+    if (moving) this.scale = clamp(Math.sqrt(SLOW / this.full), 0.15, 1);
+    // Until the first full frame is complete, the coarse picture stays.
+    if (mean.frames) renderer.show(mean, this.state.exposure, this.state.divide, this.pictureTexture);
+    return true;
+  }
+
+  // Show the last picture again.
+  redraw() {
+    const { full, coarse } = this.renderer.means, mean = full?.frames ? full : coarse;
+    if (mean?.frames) this.renderer.show(mean, this.state.exposure, this.state.divide, this.pictureTexture);
+  }
+}
