@@ -9,8 +9,10 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from mbtf_core.console import CONSOLE, Console
+from mbtf_core.errors import UsageError
 from mbtf_core.interruption import keep_on_interruption
 from mbtf_core.options import Output, Overwrite, Switch
+from mbtf_fit.cli.page_options import PAGE_OPTIONS, PageOptions
 
 
 def export_material(
@@ -18,10 +20,11 @@ def export_material(
     /,
     *,
     to: Annotated[
-        list[Literal["exr", "json", "material"]] | None, Parameter(show_default="exr, json")
+        list[Literal["exr", "json", "material", "web"]] | None, Parameter(show_default="exr, json")
     ] = None,
     output: Annotated[Output | None, Parameter(show_default="the material's own")] = None,
     half: Switch = False,
+    page: PageOptions = PAGE_OPTIONS,
     overwrite: Overwrite = False,
     console: Console = CONSOLE,
 ) -> None:
@@ -30,7 +33,7 @@ def export_material(
     exr: the latent textures, a part per level and a channel per feature, and those of the transmittance of a
     material with holes. json: the networks as a list of layers, with formulas, conventions and queries with
     expected values. material: another material folder, in a folder of its own; the same command again keeps
-    it.
+    it. web: a page that shows the material in a browser, without a network.
 
     Parameters
     ----------
@@ -41,14 +44,18 @@ def export_material(
     half
         Round all weights and texels to 16 bits, and print the resulting error.
     """
+    from mbtf_core.atomic import write_text
     from mbtf_core.folders import owned
     from mbtf_fit.material.export import LAYERS_NAME, TEXTURES_NAME, to_half, write_layers, write_textures
     from mbtf_fit.material.export_folder import claim_export
     from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME
     from mbtf_fit.material.material import Material, export
     from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME
+    from mbtf_fit.viewer.page import PAGE_NAME
 
     wanted = list(dict.fromkeys(to or ["exr", "json"]))
+    if page.given() and "web" not in wanted:
+        raise UsageError("is an option of pages", where=page.given()[0], hint="add --to web")
     folder = material if output is None else output
     loaded = Material.load(material)
     keep_on_interruption(f"the finished files are kept in {folder}")
@@ -59,13 +66,18 @@ def export_material(
         written, error = loaded, None
         if half:
             written, error = to_half(loaded)
-        files = []
+        files, notes = [], [] if error is None else [str(error)]
         if "exr" in wanted:
             write_textures(written, folder / TEXTURES_NAME, half=half)
             files.append(TEXTURES_NAME)
         if "json" in wanted:
             write_layers(written, folder / LAYERS_NAME, half=half)
             files.append(LAYERS_NAME)
+        if "web" in wanted:
+            html, precision = page.page(material)
+            write_text(folder / PAGE_NAME, html)
+            files.append(PAGE_NAME)
+            notes.append(precision)
         if "material" in wanted:
             description = loaded.description
             if not kept:
@@ -83,5 +95,5 @@ def export_material(
     lines = [f"{folder / name}: {size / 1e6:.3f} MB" for name, size in sizes.items()]
     console.report(
         {"folder": folder, "files": sizes, "half": None if error is None else asdict(error)},
-        "\n".join([*lines, *([] if error is None else [str(error)])]),
+        "\n".join([*lines, *notes]),
     )

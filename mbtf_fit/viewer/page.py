@@ -10,6 +10,7 @@ from typing import Any
 import jinja2
 from markupsafe import Markup
 
+PAGE_NAME = "viewer.html"
 # Parts of the script, in the order of their use.
 _SCRIPTS = (
     "vectors.js",

@@ -72,6 +72,10 @@ def _array(kind: str, values: Sequence[str]) -> str:
     return f"{kind}[{len(values)}]({', '.join(values)})"
 
 
+def _integers(name: str, values: Sequence[int]) -> str:
+    return f"const int {name}[{len(values)}] = {_array('int', list(map(str, values)))};"
+
+
 @dataclass
 class Weights:
     """Weights of the networks, in vectors of four."""
@@ -236,9 +240,8 @@ class ShaderSource:
             f"#define NODE_SHIFT {NODE_SHIFT}",
             f"#define NODE_COLUMNS {1 << NODE_SHIFT}",
             f"#define BLOCK_LEVELS {len(blocks)}",
-            f"const int BLOCK_STARTS[{len(blocks) + 1}] = {_array('int', ['0', *(str(a) for a, _ in blocks)])};",
-            f"const int BLOCK_STRIDES[{len(blocks) + 1}] = "
-            f"{_array('int', [str(columns), *(str(b) for _, b in blocks)])};",
+            _integers("BLOCK_STARTS", [0, *(start for start, _ in blocks)]),
+            _integers("BLOCK_STRIDES", [columns, *(stride for _, stride in blocks)]),
             f"const float LIGHT_WIDTH = {number(width)};",
             f"const float HORIZON_VARIANCE = {number((LIGHT_BLUR * width) ** 2)};",
             f"const float LEAST_VARIANCE = {number(LEAST_VARIANCE)};",
@@ -263,6 +266,7 @@ class ShaderSource:
             first = self.weights.add(weight, bias)
             outputs, read = (-(-size // 4) for size in weight.shape)
             activation = _ACTIVATIONS["none" if n == len(names) - 1 else self._network.activation]
+            # Unrolled code is slower in software rendering, and takes long to compile.
             out += [
                 f"  vec4 h{n + 1}[{outputs}];",
                 f"  for (int o = 0; o < {outputs}; o++) {{",
@@ -327,9 +331,7 @@ class ShaderSource:
                 "  vec2 spread = exp2(-seen.level) / vec2(1.0, ASPECT);",
             ]
             spreads = ["spread.x", "spread.y"] if encoding.footprint_filtered else None
-            inputs += _encoded(
-                ["position.x", "position.y"], encoding.position, encoding.pi, network, spreads
-            )
+            inputs += _encoded(["position.x", "position.y"], encoding.position, encoding.pi, network, spreads)
         axes = "xyz" if encoding.direction_xyz else "xy"
         for omega in ("omega_i", "omega_o"):
             coordinates = [f"{omega}.{axis}" for axis in axes]

@@ -89,7 +89,7 @@ class Viewer {
     if (this.pictureTexture) gl.deleteTexture(this.pictureTexture.handle);
     this.pictureTexture = undefined;
     if (picture) {
-      const direction = fromAngles(picture.light.elevation, picture.light.azimuth), light = this.state.lights[0];
+      const direction = picture.light, light = this.state.lights[0] ?? FIRST.lights[0];
       this.state.lights = [{ ...light, color: [1, 1, 1], direction }];
       this.state.environment.name = "none";
       this.renderer.setEnvironment(undefined);

@@ -1,0 +1,63 @@
+"""Options of pages of the viewer, and the page that they describe."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+
+@Parameter(name="*", group="Page")
+@dataclass(frozen=True)
+class PageOptions:
+    """What a page shows besides the material.
+
+    Attributes
+    ----------
+    against : other materials to compare with
+    reference : folder of mbtf-gen reference
+    mesh : a mesh with texture coordinates
+    environment : picture of the surroundings
+    """
+
+    against: Annotated[
+        list[Path] | None, Parameter(help="Another material to compare with in the page. Repeatable.")
+    ] = None
+    reference: Annotated[
+        Path | None, Parameter(help="Folder of mbtf-gen reference to compare with in the page.")
+    ] = None
+    mesh: Annotated[
+        Path | None, Parameter(help="Mesh with texture coordinates, as another shape of the page.")
+    ] = None
+    environment: Annotated[
+        Path | None, Parameter(help="Picture of the surroundings (EXR, HDR, PNG), as light in the page.")
+    ] = None
+
+    def given(self) -> list[str]:
+        """Flags that were given."""
+        return [f"--{name}" for name, value in vars(self).items() if value is not None]
+
+    def page(self, material: Path) -> tuple[str, str]:
+        """HTML of the page, and a line about its precision.
+
+        Raises
+        ------
+        InputError : a material or another file is at fault
+        """
+        from mbtf_fit.viewer.content import material_content
+        from mbtf_fit.viewer.extras import environment_content, mesh_content, pictures_content
+        from mbtf_fit.viewer.page import write_page
+
+        materials = [material_content(folder) for folder in (material, *(self.against or []))]
+        content = {
+            "materials": [held for held, _ in materials],
+            **({} if self.reference is None else {"pictures": pictures_content(self.reference)}),
+            **({} if self.mesh is None else {"mesh": mesh_content(self.mesh)}),
+            **({} if self.environment is None else {"environment": environment_content(self.environment)}),
+        }
+        return write_page(content, materials[0][0]["name"]), str(materials[0][1])
+
+
+PAGE_OPTIONS = PageOptions()

@@ -1,0 +1,42 @@
+"""``mbtf-fit view``: a material in the browser."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mbtf_core.console import CONSOLE, Console
+from mbtf_core.interruption import stop_on_interruption
+from mbtf_fit.cli.page_options import PAGE_OPTIONS, PageOptions
+
+
+def view(
+    material: Path,
+    /,
+    *,
+    options: PageOptions = PAGE_OPTIONS,
+    port: int = 0,
+    console: Console = CONSOLE,
+) -> None:
+    """Show a material in the browser: mbtf-fit view material/
+
+    Turn it under lights with the mouse, zoom, and compare it with other materials or with reference
+    pictures. The page is served on this machine alone until Ctrl-C. For a file, see mbtf-fit export --to
+    web.
+
+    Parameters
+    ----------
+    material
+        Folder made by mbtf-fit.
+    port
+        Port of the page; 0 takes a free one.
+    """
+    from mbtf_fit.viewer.server import PageServer
+
+    html, precision = options.page(material)
+    server = PageServer(html, port)
+    console.note(precision)
+    console.report({"url": server.url}, f"{server.url}\nopen it in a browser; Ctrl-C ends")
+    with stop_on_interruption() as stop:
+        while not stop.wait(0.5):
+            pass
+    server.close()
