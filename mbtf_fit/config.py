@@ -182,7 +182,9 @@ class TrainingSection(Settings):
     )
     warmup: int = Field(100, ge=0, description="steps in which the learning rates rise to their peaks")
     materials: tuple[str, ...] = Field(
-        (), description="rainer2020: folders of slices of other materials that the network learns, too"
+        (),
+        description="rainer2020: folders of slices of other materials that the network learns, too; relative "
+        "to the working directory",
     )
     own_material: bool = Field(
         True, description="rainer2020: whether the network also learns the material that it encodes"

@@ -113,16 +113,17 @@ def _remarks(errors: dict[str, Any], foreign: bool) -> list[str]:
     """Notes on undefined and large errors."""
     found = []
     groups = [g for e in errors.values() for g in (e, *e["levels"].values(), *e["elevations"].values())]
+    measured = bool(errors[headline(errors)].get("includes_noise"))
     if any(group["unexplained"]["value"] is None for group in groups):
-        found.append("undefined unexplained variance: the noise exceeds the variance of these values")
-    if errors[headline(errors)].get("includes_noise"):
+        why = "these values do not vary" if measured else "the noise exceeds the variance of these values"
+        found.append(f"undefined unexplained variance: {why}")
+    if measured:
         found.append("these errors include the noise of the data, which have one value per query")
     value = errors[headline(errors)]["unexplained"]["value"]
     if value is not None and value >= 1 and not foreign:
-        found.append(
-            "above 1: worse than the mean value; generate more queries (mbtf-gen --queries), more paths per "
-            "query (--spp), or a wider light (--light-width)"
-        )
+        advice = "generate more queries (mbtf-gen --queries), more paths per query (--spp), or a wider light "
+        advice = "import more queries (mbtf-gen import --queries)" if measured else f"{advice}(--light-width)"
+        found.append(f"above 1: worse than the mean value; {advice}")
     return found
 
 

@@ -124,8 +124,11 @@ class _RecipeRun:
         for name, config in recipe.fit.items():
             data = data_of[layout_of(config)]
             files, run = self._files(f"{FITS}/{name}"), partial(self._fit, name, data)
-            digests = {folder: _manifest_digest(Path(folder)) for folder in config.training.materials}
-            out.append(Stage(fit_stage(name), (data.stage,), config.fields(), digests, files, run))
+            fields = config.fields()
+            # Data sets of other materials count by what they hold, not by where they lie.
+            others = [_manifest_digest(Path(folder)) for folder in config.training.materials]
+            fields["training"] = {**fields["training"], "materials": others}
+            out.append(Stage(fit_stage(name), (data.stage,), fields, {}, files, run))
         compared = {"record": COMPARISON_SCHEMA, **recipe.compare.model_dump(mode="json")}
         needs = (GENERATE_STAGE, *map(fit_stage, recipe.fit))
         out.append(Stage(COMPARE_STAGE, needs, compared, {}, self._files(COMPARE), self._compare))

@@ -32,12 +32,14 @@ def identity_of(config: FitConfig, data: Dataset) -> dict[str, Any]:
         "aspect": data.lattice.aspect,
     }
     lengths = {split: len(names) for split, names in files.items()}
-    config_hash = config.hash(data_sha256({**described, "files": files}))
+    # Other data sets count by what they hold, not by where they lie.
+    others = tuple(Dataset.open(folder).manifest["config_hash"] for folder in config.training.materials)
+    training = config.training.model_copy(update={"materials": others})
+    located = config.model_copy(update={"training": training})
+    config_hash = located.hash(data_sha256({**described, "files": files}))
     if config.init_from is not None:
         description, _ = read_description(Path(config.init_from))
         config_hash += f"-{description['weights']['sha256']}"
-    for folder in config.training.materials:
-        config_hash += f"-{Dataset.open(folder).manifest['config_hash']}"
     queries = (data.manifest.get("config") or {}).get("queries") or {}
     directions = {"min_cos": queries["min_cos"]} if "min_cos" in queries else {}
     return {

@@ -20,6 +20,7 @@ from mbtf_gen.config.generator import count_queries
 from mbtf_gen.config.measured import ImportConfig
 from mbtf_gen.measured.interface import MeasuredBtf, MeasuredQueries, Queries
 from mbtf_gen.measured.open import open_measured
+from mbtf_gen.measured.ubo2003 import SUFFIXES
 from mbtf_gen.sampling.rng import Purpose, numpy_generator
 
 # Share of the pairs of light and view whose values are test queries alone.
@@ -172,8 +173,8 @@ def _scan(source: MeasuredQueries, min_cos: float) -> tuple[int, float]:
 
 
 def _digest(path: Path) -> str:
-    """SHA-256 of a file, or of the names and files of a folder."""
+    """SHA-256 of a file, or of the names and files of a folder's images."""
     if path.is_file():
         return file_sha256(path)
-    files = sorted(p for p in path.rglob("*") if p.is_file())
+    files = sorted(p for p in path.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
     return data_sha256({p.relative_to(path).as_posix(): file_sha256(p) for p in files})

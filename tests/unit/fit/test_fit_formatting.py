@@ -40,6 +40,15 @@ def test_bad_errors_are_explained(value: float | None, by_level: float | None, r
         assert line.startswith(remark)
 
 
+def test_advice_for_measured_data_names_their_options() -> None:
+    found = errors(1.5, None)
+    found["test"]["includes_noise"] = True
+    remarks = " ".join(describe_errors(found)[4:])
+    assert "these values do not vary" in remarks
+    assert "mbtf-gen import --queries" in remarks
+    assert "--spp" not in remarks
+
+
 def split(mse: float, error: float, unexplained: float | None = 0.16) -> dict[str, Any]:
     """At 0 EV, white is 1."""
     return {

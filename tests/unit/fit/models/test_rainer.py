@@ -22,6 +22,7 @@ from mbtf_fit.models.rainer import Rainer2019, Rainer2020
 from mbtf_fit.models.registry import build_model
 from mbtf_fit.training.checkpoint import read_checkpoint, write_checkpoint
 from mbtf_fit.training.fit import prepare_trainer, shared_slices
+from mbtf_fit.training.fit_folder import identity_of
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.sampling.slice_directions import direction_pairs, slice_directions
 
@@ -149,6 +150,21 @@ def test_a_network_of_other_materials_encodes_a_new_one(tmp_path: Path) -> None:
     shared = {"materials": [str(other)], "own_material": False}
     result = fit(config("rainer2020", **shared), own, tmp_path / "fit")
     assert result.errors["test"]["unexplained"]["value"] < 0.3
+
+
+def test_a_fit_is_known_by_what_other_data_hold(tmp_path: Path) -> None:
+    """Moved data are the same; any other set of them changes the fit."""
+
+    def hash_of(*others: Path) -> str:
+        options = config("rainer2020", materials=[str(other) for other in others])
+        return str(identity_of(options, own)["config_hash"])
+
+    own = Dataset.open(write_slices(tmp_path / "own"))
+    first, second = (write_slices(tmp_path / name, lights=n) for name, n in (("a", 12), ("b", 13)))
+    both, one, order = hash_of(first, second), hash_of(first), hash_of(second, first)
+    moved = first.rename(tmp_path / "elsewhere")
+    assert hash_of(moved, second) == both
+    assert len({both, one, order, hash_of(second), hash_of()}) == 5
 
 
 def test_the_network_learns_others_in_units_of_its_own_material(tmp_path: Path) -> None:

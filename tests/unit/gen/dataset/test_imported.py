@@ -244,6 +244,26 @@ def test_levels_without_data_are_averages(opened: Open, tmp_path: Path) -> None:
     assert np.abs(found - mean).mean() < 0.1 * mean.mean()
 
 
+def test_rounded_footprints_add_no_level(opened: Open) -> None:
+    """Half precision rounds by up to a part in 2000."""
+    for sigma, finest in ((0.5 / 16 * (1 - 5e-4), 4), (0.028, 5)):
+        source = Listed()
+        source.arrays["sigma"][:] = sigma
+        assert opened(source).finest == finest
+
+
+def test_only_images_identify_a_folder(tmp_path: Path) -> None:
+    """File managers leave files of their own behind."""
+    photographs = tmp_path / "photographs"
+    photographs.mkdir()
+    (photographs / "tl000 pl000 tv000 pv000.JPG").write_bytes(b"one")
+    before = import_job._digest(photographs)
+    (photographs / "Thumbs.db").write_bytes(b"cache")
+    assert import_job._digest(photographs) == before
+    (photographs / "tl015 pl000 tv000 pv000.png").write_bytes(b"two")
+    assert import_job._digest(photographs) != before
+
+
 def test_rounded_footprints_of_the_whole_tile_are_fitted(opened: Open, tmp_path: Path) -> None:
     """Half precision rounds 0.5 up; the fit must not look for a level before the first."""
     source = Listed()

@@ -12,6 +12,7 @@ from mbtf_core.console import run
 from mbtf_core.errors import InputError
 from mbtf_pipeline.cli.app import app
 from mbtf_pipeline.paper_tables.recipe import Planned, is_paper_recipe, load_paper_recipe, plan
+from mbtf_pipeline.paper_tables.suite import run_paper
 
 PIPELINES = ROOT / "pipelines"
 SHIPPED = sorted(PIPELINES.glob("paper_*.yaml"))
@@ -99,6 +100,21 @@ def test_errors_name_the_key(tmp_path: Path, change: tuple[str, str], key: str) 
     with pytest.raises(InputError) as raised:
         planned(path, True)
     assert key in str(raised.value)
+
+
+def test_a_fit_of_other_materials_needs_some(tmp_path: Path) -> None:
+    """Before anything is generated."""
+    text = (
+        "name: lonely\ntables: [methods]\nmaterials:\n  here: maps/height.npy\n"
+        "base:\n  generate: {queries: {train: 4/texel, resolution: 4}}\n"
+        "  fit:\n    rainer2020: {training: {own_material: false}}\n"
+    )
+    path = written(tmp_path, text)
+    paper = load_paper_recipe(path, [])
+    found, missing = plan(paper, path, False)
+    with pytest.raises(InputError, match="learns from other materials alone, and there is no other"):
+        run_paper(paper, found, missing, tmp_path / "out", quick=False, command="")
+    assert not (tmp_path / "out" / "runs").exists()
 
 
 def test_paper_recipes_are_distinguished(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
