@@ -152,9 +152,9 @@ def _with_other_materials(one: Planned, planned: Sequence[Planned], folder: Path
     fits = dict(one.recipe.fit)
     for name, config in fits.items():
         if config.model == "rainer2020" and not config.training.materials:
-            if not others and not config.training.own_material:
+            if not (others or config.training.own_material):
                 raise InputError(
-                    f"the fit '{name}' of {one.name} learns from other materials alone, and there is no other",
+                    f"the fit '{name}' of {one.name} learns from other materials alone, but there are none",
                     hint="add a material to the recipe, or leave this fit out",
                 )
             data = (folder / RUNS / p.name / slices_folder(p.recipe) for p in others)

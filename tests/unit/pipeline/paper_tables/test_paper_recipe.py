@@ -112,7 +112,7 @@ def test_a_fit_of_other_materials_needs_some(tmp_path: Path) -> None:
     path = written(tmp_path, text)
     paper = load_paper_recipe(path, [])
     found, missing = plan(paper, path, False)
-    with pytest.raises(InputError, match="learns from other materials alone, and there is no other"):
+    with pytest.raises(InputError, match="learns from other materials alone, but there are none"):
         run_paper(paper, found, missing, tmp_path / "out", quick=False, command="")
     assert not (tmp_path / "out" / "runs").exists()
 
