@@ -101,8 +101,8 @@ class Weights:
         return first
 
     def array(self) -> F32:
-        """All vectors (n, 4)."""
-        return np.concatenate(self.vectors)
+        """All vectors (n, 4); one of zeros where there is no network."""
+        return np.concatenate(self.vectors or [np.zeros((1, 4), np.float32)])
 
 
 def _encoded(

@@ -1,4 +1,4 @@
-// Light from all around: importance samples of a picture of the whole sphere (latitude by rows, top is z).
+// Light from all around: samples of a picture of the whole sphere (latitude by rows, top is z).
 
 const SAMPLES = 4096;
 

@@ -97,5 +97,5 @@ function testQueries(renderer, material) {
     }
   const beyond = new Set();
   deviations.forEach((d, k) => { if (!(d <= tolerance)) beyond.add(Math.floor(k / 3)); });
-  return { count, largest: Math.max(...deviations), beyond: beyond.size };
+  return { count, largest: Math.max(...deviations), beyond: beyond.size, values: [...found] };
 }

@@ -35,10 +35,11 @@ function gridOf(columns, rows, at) {
   return out;
 }
 
-// A horizontal square of so many tiles around the center of the first tile.
+// A horizontal square around the center of the first tile. Rasterizers snap vertices to fractions of a pixel:
+// many small triangles keep positions exact.
 function planeShape(tiles, aspect) {
   const side = Math.max(4 * tiles, 400);
-  return gridOf(1, 1, (s, t) => {
+  return gridOf(32, 32, (s, t) => {
     const p = [0.5 + (s - 0.5) * side, aspect * 0.5 + (t - 0.5) * side, 0];
     return { p, n: [0, 0, 1], t: [1, 0, 0], uv: [p[0], p[1] / aspect] };
   });

@@ -4,7 +4,7 @@ const FIRST = {
   camera: {},
   shape: "plane",
   tiles: 4,
-  lights: [{ direction: fromAngles(45, 45), color: [1, 1, 1], intensity: 3 }],
+  lights: [{ direction: fromAngles(45, -30), color: [1, 1, 1], intensity: 3 }],
   environment: { name: "none", intensity: 1, angle: 0 },
   exposure: 0,
   divide: 0.5,

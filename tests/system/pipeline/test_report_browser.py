@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -12,11 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from support.browser import browser
 from support.paths import ROOT
 
 from mbtf_core.console import run
 from mbtf_core.exposure import to_display
-from mbtf_gen.diagnostics.doctor import BROWSERS
 from mbtf_pipeline.cli.app import app
 from mbtf_pipeline.compare.pictures import read_picture
 
@@ -24,20 +23,6 @@ from mbtf_pipeline.compare.pictures import read_picture
 TIMEOUT = 120
 # Size of the images, and of the stage, a multiple of it.
 PIXELS, STAGE = 48, 480
-FLAGS = (
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-background-networking",
-    "--disable-dev-shm-usage",
-    "--no-first-run",
-    "--hide-scrollbars",
-    "--force-device-scale-factor=1",
-    "--window-size=1300,1000",
-    # No name can be resolved, so no other machine can be reached.
-    "--host-resolver-rules=MAP * ~NOTFOUND",
-)
-
 
 # A run with two fits, two widths and both kinds of reference.
 OPTIONS = (
@@ -47,33 +32,6 @@ OPTIONS = (
     f"compare.size={PIXELS}",
     "compare.spp=16",
 )
-
-
-def _start(profile: Path) -> Any:
-    """An installed browser with its driver; skips if there is none or it does not start."""
-    selenium = pytest.importorskip(
-        "selenium.webdriver", reason="no selenium; to enable: pip install selenium"
-    )
-    from selenium.common.exceptions import WebDriverException
-    from selenium.webdriver.chrome.service import Service
-    from urllib3.exceptions import HTTPError
-
-    browser = next((path for name in BROWSERS if (path := shutil.which(name))), None)
-    driver = shutil.which("chromedriver")
-    if browser is None or driver is None:
-        pytest.skip("no browser; to enable on Debian: apt-get install chromium chromium-driver")
-    options = selenium.ChromeOptions()
-    options.binary_location = browser
-    for flag in (*FLAGS, f"--user-data-dir={profile}"):
-        options.add_argument(flag)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
-    try:
-        started = selenium.Chrome(options=options, service=Service(executable_path=driver))
-        started.get("about:blank")
-        return started
-    except (WebDriverException, HTTPError, OSError) as error:
-        first = (str(error).strip() or type(error).__name__).splitlines()[0]
-        pytest.skip(f"the browser does not start ({first})")
 
 
 class Page:
@@ -144,30 +102,21 @@ class Page:
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
     folder = tmp_path_factory.mktemp("report") / "run"
-    with pytest.MonkeyPatch.context() as patch:
-        for name in ("no_proxy", "NO_PROXY"):
-            patch.setenv(name, "localhost,127.0.0.1")
-        patch.setenv("SE_OFFLINE", "true")
-        driver = _start(tmp_path_factory.mktemp("profile"))
-        try:
-            options = [word for option in OPTIONS for word in ("--set", option)]
-            assert (
-                run(app, ["run", str(ROOT / "pipelines" / "ci.yaml"), "-o", str(folder), "-q", *options]) == 0
-            )
-            opened = Page(driver, folder)
-            opened.until(lambda: opened.js("return document.body.dataset.sheet") == "drawn", "the sheet")
-            # An integer number of screen pixels per image pixel allows exact comparisons.
-            opened.js(
-                "const s = document.createElement('style'); document.head.append(s);"
-                f"s.textContent = '.stage {{ width: {STAGE}px; border-radius: 0 }}"
-                ".stage canvas { image-rendering: pixelated }"
-                ".side, .border { visibility: hidden }"
-                "#stage:focus { outline: none }';"
-            )
-            opened.wait_for(0, 0, 0)
-            yield opened
-        finally:
-            driver.quit()
+    with browser(tmp_path_factory.mktemp("profile")) as driver:
+        options = [word for option in OPTIONS for word in ("--set", option)]
+        assert run(app, ["run", str(ROOT / "pipelines" / "ci.yaml"), "-o", str(folder), "-q", *options]) == 0
+        opened = Page(driver, folder)
+        opened.until(lambda: opened.js("return document.body.dataset.sheet") == "drawn", "the sheet")
+        # An integer number of screen pixels per image pixel allows exact comparisons.
+        opened.js(
+            "const s = document.createElement('style'); document.head.append(s);"
+            f"s.textContent = '.stage {{ width: {STAGE}px; border-radius: 0 }}"
+            ".stage canvas { image-rendering: pixelated }"
+            ".side, .border { visibility: hidden }"
+            "#stage:focus { outline: none }';"
+        )
+        opened.wait_for(0, 0, 0)
+        yield opened
 
 
 @pytest.fixture

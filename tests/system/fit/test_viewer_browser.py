@@ -1,0 +1,396 @@
+"""The viewer in a headless browser: values, pictures, controls, and what it says where it cannot draw."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+import pytest
+import torch
+from support.browser import NO_WEBGL, SOFTWARE, browser
+from support.plugin_materials import net, write_material
+
+from mbtf_core.directions import from_angles
+from mbtf_core.lattice import Lattice
+from mbtf_fit.material.material import Material
+from mbtf_fit.material.transmittance import Transmittance
+from mbtf_fit.viewer.content import as_read, encode, material_content, pack_textures
+from mbtf_fit.viewer.extras import mesh_content
+from mbtf_fit.viewer.page import write_page
+from mbtf_gen.pictures.camera import Camera
+
+TIMEOUT = 120
+CHOOSE = """
+    const input = document.getElementById(arguments[0]);
+    input.value = arguments[1];
+    input.dispatchEvent(new Event("input"));
+"""
+BANDS = {"position": 3, "direction": 2, "direction_pi": False, "raw": True}
+CASES: dict[str, dict[str, Any]] = {
+    "neumip-baseline": {"model": "neumip-baseline"},
+    "calibrated": {},
+    "holes": {},
+    "direct offset, six outputs": net(offset="direct", output_channels=6, activation="leaky-relu"),
+    "concatenated, softplus": net(blending="concatenate", activation="sine", output_transform="softplus"),
+    "encoded": net(encoding={**BANDS, "band_attenuation": True, "footprint_filtered": True}),
+    "fourth root": net(output_transform="fourth-root", encoding={"direction_xyz": True, "half_vector": True}),
+    "relief": {"model": "relief"},
+    "relief, two places": {"model": "relief", **net(relief={"places": 2})},
+    "relief, diffuse, four places": {"model": "relief", "glossy": False, **net(relief={"places": 4})},
+    "relief without hints": {"model": "relief", **net(relief={"hints": False}, oversampling=1)},
+    "relief without gate": {
+        "model": "relief",
+        **net(relief={"gate": False, "frame": False}, output_channels=6),
+    },
+    "learned heights": {"model": "neumip+"},
+    "black": {"model": "relief", "weights": {"unit": torch.zeros(())}},
+    "rainer2019": {"model": "rainer2019"},
+}
+
+
+def make(case: str, folder: Path) -> Material:
+    """A material of random weights on a tile that is half as high as wide."""
+    lattice, generator = Lattice(4, 0.5), torch.Generator().manual_seed(0)
+    options = {"finest": 4, "aspect": 0.5, **CASES[case]}
+    if case == "calibrated":
+        options["weights"] = {"calibration": 0.7 + 0.6 * torch.rand((2, 5, 6, 3), generator=generator)}
+    if case == "holes":
+        shapes = [(*lattice.shape(s), 6) for s in range(5)]
+        coefficients = [0.3 + 0.2 * torch.randn(s, generator=generator).numpy() for s in shapes]
+        options["transmittance"] = Transmittance(lattice, coefficients)
+    return write_material(folder, **options)
+
+
+class Page:
+    """A page in a browser."""
+
+    def __init__(self, driver: Any, html: str, folder: Path, state: dict[str, Any] | None = None) -> None:
+        self.driver = driver
+        file = folder / "page.html"
+        file.write_text(html)
+        driver.set_page_load_timeout(TIMEOUT)
+        driver.set_script_timeout(TIMEOUT)
+        driver.get("about:blank")
+        driver.get(file.as_uri() + ("" if state is None else "#" + quote(json.dumps(state))))
+
+    def js(self, code: str, *arguments: Any) -> Any:
+        return self.driver.execute_script(code, *arguments)
+
+    def until(self, condition: Callable[[], Any]) -> Any:
+        start = time.monotonic()
+        while not (found := condition()):
+            assert time.monotonic() - start < TIMEOUT, "the page does not answer"
+            time.sleep(0.05)
+        return found
+
+    def ready(self) -> Page:
+        """Wait for the first picture."""
+        message = "document.getElementById('message').textContent"
+        self.until(lambda: self.js(f"return window.mbtf !== undefined || !/^Loading|^$/.test({message})"))
+        assert self.js("return window.mbtf !== undefined"), self.message()
+        return self
+
+    def message(self) -> str:
+        return str(self.js("return document.getElementById('message').textContent"))
+
+    def picture(self, rows: int, columns: int, side: int = 0) -> np.ndarray:
+        """Radiance (rows, columns, 4) of one frame."""
+        code = """
+            const { viewer } = window.mbtf, { renderer } = viewer, [rows, columns, side] = arguments;
+            viewer.draw = () => false;
+            const mean = renderer.mean("test", columns, rows, 1);
+            mean.restart();
+            renderer.frame(mean, [viewer.materials[side]], viewer.scene, rows);
+            return [...mean.sides[0][0].read(0, 0, columns, rows)];
+        """
+        found = np.array(self.js(code, rows, columns, side), np.float64).reshape(rows, columns, 4)
+        return found[::-1]
+
+    def faults(self) -> list[str]:
+        """Warnings and errors of the browser, and what was loaded from elsewhere."""
+        # Waiting for a pixel stalls the pipeline, of which a browser warns.
+        known = ("GPU stall due to ReadPixels", "swiftshader", "GroupMarkerNotSet")
+        found = [e["message"] for e in self.driver.get_log("browser")]
+        for entry in self.driver.get_log("performance"):
+            message = json.loads(entry["message"])["message"]
+            if message["method"] == "Network.requestWillBeSent":
+                found.append(message["params"]["request"]["url"])
+        ours = ("about:", "data:", "blob:", "file:", "chrome:")
+        return [f for f in found if not any(k in f for k in known) and not f.startswith(ours)]
+
+
+@pytest.fixture(scope="module")
+def driver(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    with browser(tmp_path_factory.mktemp("profile"), SOFTWARE, "700,500") as started:
+        yield started
+
+
+def test_values_are_those_of_the_material(driver: Any, tmp_path: Path) -> None:
+    """Against PyTorch on the same textures; the page itself compares with the exact material."""
+    materials = {case: make(case, tmp_path / str(k)) for k, case in enumerate(CASES)}
+    contents = [material_content(tmp_path / str(k), case)[0] for k, case in enumerate(CASES)]
+    page = Page(driver, write_page({"materials": contents}, "cases"), tmp_path).ready()
+    tests = page.js("return window.mbtf.tests")
+    for test, (case, material) in zip(tests, materials.items(), strict=True):
+        expected = as_read(material, pack_textures(material)).conformance["rgb"]
+        found = np.array(test["values"]).reshape(-1, 4)[:, :3]
+        deviation = np.abs(found - expected) / np.maximum(1.0, expected)
+        assert (expected.std() > 0.005) == (case != "black"), case
+        # Features have half precision; a traced ray may miss an edge.
+        assert (deviation.max(1) > 3e-3).sum() <= 2, (case, deviation.max())
+        exact = np.abs(found - material.conformance["rgb"]) / np.maximum(1.0, material.conformance["rgb"])
+        assert test["largest"] == pytest.approx(exact.max(), rel=1e-3, abs=1e-6)
+        assert test["beyond"] == (exact.max(1) > 1e-2).sum()
+    # The texels of random materials are noise, which is the hardest to round.
+    assert sum(test["beyond"] for test in tests) < 40
+    assert page.faults() == []
+
+
+@pytest.mark.parametrize(("elevation", "azimuth", "across"), [(90, 0, 0.5), (50, -90, 4), (25, 30, 90)])
+@pytest.mark.parametrize("case", ["relief", "calibrated"])
+def test_pictures_are_those_of_the_same_camera(
+    driver: Any, tmp_path: Path, case: str, elevation: float, azimuth: float, across: float
+) -> None:
+    """Pixel by pixel: positions, footprints, frames, orientation, and the light's cosine."""
+    material = make(case, tmp_path / "material")
+    content = material_content(tmp_path / "material")[0]
+    light = from_angles(40.0, 20.0)
+    state = {
+        "camera": {
+            "elevation": elevation,
+            "azimuth": azimuth,
+            "tiles_across": across,
+            "target": [0.5, 0.5, 0],
+        },
+        "lights": [{"direction": light.tolist(), "color": [1, 0.5, 0.25], "intensity": 2}],
+    }
+    page = Page(driver, write_page({"materials": [content]}, "view"), tmp_path, state).ready()
+    rows, columns = 24, 32
+    found = page.picture(rows, columns)
+    camera = Camera(elevation, azimuth, across, rows=rows, columns=columns)
+    q = camera.queries(light, material.lattice.aspect)
+    read = as_read(material, pack_textures(material))
+    flat = [np.asarray(a, np.float64).reshape(-1, *a.shape[2:]) for a in (q.u, q.sigma, q.omega_i, q.omega_o)]
+    value = read.evaluate(*flat).reshape(rows, columns, 3)
+    expected = value * light[2] * 2.0 * np.array([1, 0.5, 0.25])
+    # Derivatives are those of 2 x 2 pixels, so levels differ a little within the pixel.
+    difference = np.abs(found[..., :3] - expected)
+    assert np.median(difference) < 0.01 * expected.mean()
+    assert difference.mean() < 0.08 * expected.mean()
+    assert found[..., :3].mean((0, 1)) == pytest.approx(expected.mean((0, 1)), rel=0.01)
+    assert (found[..., 3] == 1).all()
+    assert page.faults() == []
+
+
+def test_holes_show_the_background(driver: Any, tmp_path: Path) -> None:
+    material = make("holes", tmp_path / "material")
+    content = material_content(tmp_path / "material")[0]
+    view = {"elevation": 60, "azimuth": -90, "tiles_across": 2, "target": [0.5, 0.5, 0]}
+    page = Page(driver, write_page({"materials": [content]}, "holes"), tmp_path, {"camera": view}).ready()
+    found = page.picture(16, 24)[..., 3]
+    q = Camera(60, -90, 2, rows=16, columns=24).queries(from_angles(45.0, 45.0), 0.5)
+    read = as_read(material, pack_textures(material)).transmittance
+    assert read is not None
+    flat = (a.reshape(-1, *a.shape[2:]) for a in (q.u, q.sigma, q.omega_o))
+    expected = 1.0 - read.evaluate(*flat).reshape(16, 24)
+    assert expected.std() > 0.05
+    np.testing.assert_allclose(found, expected, atol=0.03)
+
+
+def test_mouse_and_panel_change_the_picture(driver: Any, tmp_path: Path) -> None:
+    from selenium.webdriver.common.action_chains import ActionChains
+    from selenium.webdriver.common.keys import Keys
+
+    make("relief", tmp_path / "one")
+    make("calibrated", tmp_path / "two")
+    contents = [material_content(tmp_path / n)[0] for n in ("one", "two")]
+    html = write_page({"materials": contents}, "two materials")
+    page = Page(driver, html, tmp_path).ready()
+    canvas = driver.find_element("id", "canvas")
+    state = "const { camera, state } = window.mbtf.viewer;"
+
+    def drag(element: Any, dx: int, dy: int, key: str | None = None) -> None:
+        actions = ActionChains(driver, duration=20)
+        if key:
+            actions.key_down(key)
+        actions.click_and_hold(element).move_by_offset(dx, dy).release()
+        if key:
+            actions.key_up(key)
+        actions.perform()
+
+    drag(canvas, 60, 0)
+    assert page.js(state + "return [camera.azimuth < -100, camera.elevation]") == [True, 50]
+    drag(canvas, 0, 40)
+    assert page.js(state + "return camera.elevation > 55")
+    before = page.js(state + "return state.lights[0].direction")
+    drag(canvas, 60, 0, Keys.SHIFT)
+    after = page.js(state + "return state.lights[0].direction")
+    assert np.linalg.norm(np.subtract(before, after)) > 0.2
+    assert np.linalg.norm(after) == pytest.approx(1)
+    page.js("document.getElementById('canvas').dispatchEvent(new WheelEvent('wheel', { deltaY: 200 }))")
+    assert page.js(state + "return camera.tiles_across") > 4
+    page.js(CHOOSE, "against", "material 1")
+    assert [e.is_displayed() for e in driver.find_elements("css selector", ".side")] == [True, True]
+    divider = driver.find_element("id", "divider")
+    drag(divider, -80, 0)
+    assert page.js(state + "return state.divide") < 0.4
+    # A click asks for the values at a point.
+    ActionChains(driver, duration=20).move_to_element_with_offset(canvas, 60, 40).click().perform()
+    assert "footprint" in driver.find_element("id", "point").text
+    # The link restores all of it.
+    page.js("document.getElementById('link').click()")
+    link, kept = page.js("return location.href"), page.js(state + "return [camera.azimuth, state]")
+    driver.get("about:blank")
+    driver.get(link)
+    page.ready()
+    azimuth, restored = page.js(state + "return [camera.azimuth, state]")
+    assert azimuth == pytest.approx(kept[0], abs=1e-3)
+    assert restored["against"] == "material 1"
+    assert restored["divide"] == pytest.approx(kept[1]["divide"], abs=1e-3)
+    assert page.faults() == []
+
+
+def test_values_at_a_point_are_those_of_its_texel(driver: Any, tmp_path: Path) -> None:
+    material = make("relief", tmp_path / "material")
+    content = material_content(tmp_path / "material")[0]
+    page = Page(driver, write_page({"materials": [content]}, "point"), tmp_path).ready()
+    code = """
+        const { renderer, material, scene } = window.mbtf.viewer;
+        const point = renderer.pick(material, scene, 0.3, 0.6);
+        const light = [0.3, -0.2, Math.sqrt(1 - 0.13)];
+        const over = (omega, views) => [...renderer.overDirections(material, 16, point, omega, views)];
+        return [point, [over(point.omega_o, false), over(light, true)]];
+    """
+    point, planes = page.js(code)
+    read = as_read(material, pack_textures(material))
+    light = np.array([0.3, -0.2, np.sqrt(1 - 0.13)])
+    x = (np.arange(16) + 0.5) / 8 - 1
+    disk = np.stack(np.meshgrid(x, x), -1).reshape(-1, 2)
+    z = np.sqrt(np.maximum(0, 1 - (disk**2).sum(1)))
+    inside = z >= content["min_cos"]
+    over = np.concatenate([disk, z[:, None]], 1)[inside]
+    n = len(over)
+    u, sigma = np.tile(point["u"], (n, 1)), np.full(n, point["sigma"])
+    view = np.array(point["omega_o"]) / np.linalg.norm(point["omega_o"])
+    expected = [
+        read.evaluate(u, sigma, over, np.tile(view, (n, 1))),
+        read.evaluate(u, sigma, np.tile(light, (n, 1)), over),
+    ]
+    for plane, values in zip(planes, expected, strict=True):
+        found = np.array(plane).reshape(-1, 4)
+        assert (found[~inside] == 0).all()
+        deviation = np.abs(found[inside, :3] - values) / np.maximum(1.0, values)
+        assert (deviation.max(1) > 3e-3).mean() < 0.03
+
+
+def test_shapes_environments_and_pictures(driver: Any, tmp_path: Path) -> None:
+    """Each draws something that is finite; surroundings of radiance 1/π light a plane as they should."""
+    white = write_material(tmp_path / "white", constant=(0.2, 0.2, 0.2), model="neumip-baseline")
+    assert white.conformance["rgb"].min() > 0.19
+    obj = tmp_path / "square.obj"
+    obj.write_text("v 0 0 0\nv 1 0 0\nv 1 0 -1\nvt 0 0\nvt 1 0\nvt 1 1\nvn 0 1 0\nf 1/1/1 2/2/1 3/3/1\n")
+    gray = np.full((4, 8, 3), 0.5, np.float32)
+    content = {
+        "materials": [material_content(tmp_path / "white")[0]],
+        "mesh": mesh_content(obj),
+        "environment": {"name": "gray", "shape": [4, 8], "data": encode(gray)},
+        "pictures": [
+            {
+                "name": "reference",
+                "shape": [12, 12],
+                "camera": {
+                    "elevation": 50,
+                    "azimuth": -90,
+                    "tiles_across": 2,
+                    "target": [0.5, 0.5],
+                    "field_of_view": 20,
+                },
+                "light": from_angles(30.0, 0.0).tolist(),
+                "data": encode(np.full((12, 12, 3), 0.1, np.float32)),
+            }
+        ],
+    }
+    page = Page(driver, write_page(content, "shapes"), tmp_path).ready()
+    for shape in ("sphere", "cloth", "square", "plane"):
+        page.js(CHOOSE, "shape", shape)
+        found = page.picture(20, 30)
+        covered = found[..., 3] == 1
+        assert covered.mean() > 0.05, shape
+        assert np.isfinite(found).all()
+        assert found[covered][:, :3].max() > 0.1, shape
+    # Irradiance 1 of the plane, whatever the picture's brightness.
+    page.js(CHOOSE, "environment", "gray")
+    page.js("window.mbtf.viewer.state.lights.length = 0")
+    assert page.picture(64, 96)[..., :3].mean() == pytest.approx(0.2, rel=0.03)
+    page.js("document.getElementById('reset').click()")
+    page.js(CHOOSE, "against", "picture 0")
+    # Half of the plane's light from 30 degrees, of intensity 3.
+    shown = page.js(
+        "const { picture, state, camera } = window.mbtf.viewer;"
+        "return [picture.values[0], state.lights[0].direction, camera.elevation]"
+    )
+    assert shown == [pytest.approx(0.1), pytest.approx(from_angles(30.0, 0.0).tolist()), 50]
+    assert page.picture(8, 8)[..., :3].mean() == pytest.approx(0.2 * 3 * 0.5, rel=0.01)
+    assert page.faults() == []
+
+
+@pytest.mark.parametrize("size", [(320, 560), (800, 600), (1600, 900)])
+def test_the_page_fits_its_window(driver: Any, tmp_path: Path, size: tuple[int, int]) -> None:
+    make("calibrated", tmp_path / "material")
+    driver.set_window_size(*size)
+    page = Page(
+        driver, write_page({"materials": [material_content(tmp_path / "material")[0]]}, "size"), tmp_path
+    )
+    page.ready()
+    width, height = page.js("return [innerWidth, innerHeight]")
+    box = page.js("return document.getElementById('canvas').getBoundingClientRect().toJSON()")
+    assert box["width"] * box["height"] > 0.3 * width * height
+    assert page.js("return document.documentElement.scrollWidth") <= width
+    assert page.js("return document.getElementById('status').textContent.length || 1") > 0
+    driver.set_window_size(700, 500)
+
+
+def test_damaged_pages_say_so(driver: Any, tmp_path: Path) -> None:
+    make("calibrated", tmp_path / "material")
+    content = material_content(tmp_path / "material")[0]
+    short = json.loads(json.dumps(content))
+    short["textures"]["pyramid"]["data"] = short["textures"]["pyramid"]["data"][:400]
+    shader = {**content, "source": content["source"].replace("vec3 stage2", "vec4 stage2", 1)}
+    for damaged, what in ((short, ""), (shader, "refused a shader"), ({**content, "weights": "?"}, "")):
+        page = Page(driver, write_page({"materials": [damaged]}, "damaged"), tmp_path)
+        page.until(lambda page=page: not page.message().startswith("Loading"))
+        assert page.js("return window.mbtf === undefined")
+        assert what in page.message()
+        assert len(page.message()) > 10
+    page = Page(
+        driver,
+        write_page({"materials": [content]}, "link"),
+        tmp_path,
+        {"camera": 3, "tiles": "x", "lights": [1]},
+    )
+    page.ready()
+
+
+def test_names_are_text(driver: Any, tmp_path: Path) -> None:
+    make("calibrated", tmp_path / "material")
+    name = "</script><img src=x onerror=alert(1)>&amp; ünïcode\u2028"
+    content = material_content(tmp_path / "material", name)[0]
+    page = Page(driver, write_page({"materials": [content]}, name), tmp_path).ready()
+    assert driver.title.strip() == name.strip()
+    assert page.js("return document.getElementById('name').textContent") == name
+    assert page.js("return document.querySelectorAll('img').length") == 0
+    assert page.faults() == []
+
+
+def test_a_browser_without_webgl_gets_a_sentence(tmp_path: Path) -> None:
+    make("calibrated", tmp_path / "material")
+    html = write_page({"materials": [material_content(tmp_path / "material")[0]]}, "no WebGL")
+    with browser(tmp_path / "profile", NO_WEBGL) as started:
+        page = Page(started, html, tmp_path)
+        page.until(lambda: not page.message().startswith("Loading"))
+        assert "WebGL 2" in page.message()
