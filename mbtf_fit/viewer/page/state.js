@@ -33,7 +33,7 @@ function merged(known, given) {
 
 // State of a link's fragment; the first state where it is damaged.
 function stateOf(fragment, camera) {
-  const known = { ...FIRST, camera: { elevation: camera.elevation, azimuth: camera.azimuth, tiles_across: camera.tiles_across, target: camera.target } };
+  const known = { ...structuredClone(FIRST), camera: { elevation: camera.elevation, azimuth: camera.azimuth, tiles_across: camera.tiles_across, target: camera.target } };
   try {
     return merged(known, JSON.parse(decodeURIComponent(fragment.slice(1))));
   } catch {
