@@ -227,6 +227,14 @@ def stop_on_interruption() -> Iterator[threading.Event]:
             signal.signal(number, handler)
 
 
+def wait_for_interruption() -> None:
+    """Wait for the signal that ends a service: its regular end, with the exit code 0."""
+    with stop_on_interruption() as stop:
+        while not stop.wait(0.5):
+            pass
+    _State.received = 0
+
+
 def finish(code: int) -> int:
     """Last act of a program: the exit code of its command. After an interruption it ends the process, whose
     threads may still work; else exit functions run, and a signal can no longer change the code."""

@@ -24,6 +24,7 @@ from mbtf_pipeline.run_folder import (
     FITS,
     REPORT,
     SHARDS,
+    VIEWER,
     clear,
     is_run,
     write_run_record,
@@ -91,6 +92,8 @@ class RunResult:
         Folder of the run.
     report : Path
         HTML file.
+    viewer : Path or None
+        HTML file that shows the fits; None where no fit can be shown in a browser.
     stages : dict of str to StageResult
         Results by name of the stage, in order.
     comparison : dict
@@ -99,6 +102,7 @@ class RunResult:
 
     folder: Path
     report: Path
+    viewer: Path | None
     stages: dict[str, StageResult]
     comparison: dict[str, Any]
 
@@ -139,7 +143,7 @@ class _RecipeRun:
             **recipe.report.model_dump(mode="json"),
         }
         needs = (*needs, COMPARE_STAGE)
-        out.append(Stage(REPORT_STAGE, needs, shown, {}, lambda: [self.folder / REPORT], self._report))
+        out.append(Stage(REPORT_STAGE, needs, shown, {}, self._pages, self._report))
         return out
 
     def _files(self, sub: str) -> Callable[[], list[Path]]:
@@ -150,6 +154,10 @@ class _RecipeRun:
             for p in sorted(top.rglob("*"))
             if p.is_file() and not any(part.startswith(".") for part in p.relative_to(top).parts)
         ]
+
+    def _pages(self) -> list[Path]:
+        """The report, and the viewer's page where there is one."""
+        return [path for name in (REPORT, VIEWER) if (path := self.folder / name).is_file()]
 
     def _generate(self, data: DataSet, decision: Decision) -> None:
         from mbtf_core.shard_schema import MANIFEST_NAME
@@ -197,8 +205,10 @@ class _RecipeRun:
 
     def _report(self, decision: Decision) -> None:
         from mbtf_pipeline.report.report import write_report
+        from mbtf_pipeline.report.viewer import write_viewer
 
         write_report(self.folder, self.recipe, [stage.name for stage in self.stages({})][:-1])
+        write_viewer(self.folder, self.recipe.title, read_json(self.folder / COMPARE / COMPARISON_NAME))
 
 
 def _manifest_digest(shards: Path) -> str:
@@ -303,7 +313,14 @@ def run_recipe(
             write_run_record(folder, recipe, command)
             stages = _RecipeRun(recipe, folder, console).stages(inputs)[count:]
         results |= run_stages(folder, stages, force=force, notify=notify)
-    return RunResult(folder, folder / REPORT, results, read_json(folder / COMPARE / COMPARISON_NAME))
+    viewer = folder / VIEWER
+    return RunResult(
+        folder,
+        folder / REPORT,
+        viewer if viewer.is_file() else None,
+        results,
+        read_json(folder / COMPARE / COMPARISON_NAME),
+    )
 
 
 def survey(recipe: Recipe, folder: Path) -> dict[str, Decision]:

@@ -6,6 +6,7 @@ out/NAME/run.json        command and software versions
          fits/FIT/       fitted materials, as written by ``mbtf-fit``
          compare/        images, offsets and errors
          report.html     report
+         viewer.html     the fits in a browser
          stages/         one stamp per finished stage
 """
 
@@ -23,6 +24,7 @@ RUN_NAME = "run.json"
 RUN_FORMAT = "mbtf-run"
 RUN_SCHEMA = 2
 SHARDS, FITS, COMPARE, REPORT = "shards", "fits", "compare", "report.html"
+VIEWER = "viewer.html"
 
 
 def clear(folder: Path) -> None:

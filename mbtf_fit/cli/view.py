@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from mbtf_core.console import CONSOLE, Console
-from mbtf_core.interruption import stop_on_interruption
+from mbtf_core.interruption import wait_for_interruption
 from mbtf_fit.cli.page_options import PAGE_OPTIONS, PageOptions
 
 
@@ -36,7 +36,5 @@ def view(
     server = PageServer(html, port)
     console.note(precision)
     console.report({"url": server.url}, f"{server.url}\nopen it in a browser; Ctrl-C ends")
-    with stop_on_interruption() as stop:
-        while not stop.wait(0.5):
-            pass
+    wait_for_interruption()
     server.close()

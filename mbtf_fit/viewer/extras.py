@@ -13,6 +13,7 @@ from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError, reason
 from mbtf_core.suggest import suggest_path
 from mbtf_fit.viewer.content import encode
+from mbtf_fit.viewer.textures import pack
 from mbtf_gen.dataset.shard_io import read_exr
 from mbtf_gen.images.read import read_image
 from mbtf_gen.images.resample import resample
@@ -26,7 +27,7 @@ F64 = NDArray[np.float64]
 MOST_TRIANGLES = 200_000
 _ENVIRONMENT_ROWS = 64
 # Pixels along the longer side of a reference picture in a page.
-_PICTURE_SIZE = 1024
+_PICTURE_SIZE = 512
 
 
 def mesh_content(path: Path) -> dict[str, Any]:
@@ -176,8 +177,46 @@ def _radiance(path: Path) -> NDArray[np.float64]:
     return pixels
 
 
+def picture_content(
+    name: str, value: NDArray[np.float32], camera: Camera, light: NDArray[np.float64]
+) -> dict[str, Any]:
+    """A path-traced picture of the plane, at most 512 pixels along each side.
+
+    Parameters
+    ----------
+    name : str
+        Shown in the page.
+    value : (rows, columns, 3) array
+        M in 1/sr.
+    camera : Camera
+        That of the picture.
+    light : (3,) array
+        Direction towards the light.
+
+    Returns
+    -------
+    dict
+    """
+    rows, columns = value.shape[:2]
+    shrink = max(1, -(-max(rows, columns) // _PICTURE_SIZE))
+    small = resample(value, rows // shrink, columns // shrink) if shrink > 1 else value
+    return {
+        "name": name,
+        "camera": {
+            "elevation": camera.elevation,
+            "azimuth": camera.azimuth,
+            "tiles_across": camera.tiles_across,
+            "target": list(camera.target),
+            "field_of_view": camera.field_of_view,
+        },
+        "light": [float(x) for x in light],
+        # Square roots need fewer bits.
+        "roots": pack([np.sqrt(np.maximum(small, 0.0)).astype(np.float32)], bits=16).description,
+    }
+
+
 def pictures_content(folder: Path) -> list[dict[str, Any]]:
-    """Pictures of ``mbtf-gen reference``: name, camera, light, ``shape`` and M in 1/sr.
+    """Pictures of ``mbtf-gen reference``, as :func:`picture_content`.
 
     Parameters
     ----------
@@ -208,27 +247,9 @@ def pictures_content(folder: Path) -> list[dict[str, Any]]:
         if name is None:
             continue
         path = folder / f"{name}.exr"
-        value = read_value(path)
         light = read_exr(path, ("omega_i",))["omega_i"].reshape(-1, 3)[0]
         camera = Camera(options["view"]["elevation"], options["view"]["azimuth"], across)
-        shrink = max(1, -(-max(value.shape[:2]) // _PICTURE_SIZE))
-        small = resample(value, value.shape[0] // shrink, value.shape[1] // shrink) if shrink > 1 else value
-        small = np.asarray(small, np.float32)
-        out.append(
-            {
-                "name": f"path-traced, {across:g} tiles across",
-                "shape": list(small.shape[:2]),
-                "camera": {
-                    "elevation": camera.elevation,
-                    "azimuth": camera.azimuth,
-                    "tiles_across": camera.tiles_across,
-                    "target": list(camera.target),
-                    "field_of_view": camera.field_of_view,
-                },
-                "light": [float(x) for x in light],
-                "data": encode(small),
-            }
-        )
+        out.append(picture_content(f"path-traced, {across:g} tiles across", read_value(path), camera, light))
     if not out:
         raise InputError("holds no finished picture", where=folder, hint="run mbtf-gen reference again")
     return out

@@ -71,7 +71,7 @@ def write_page(content: Mapping[str, Any], title: str, *, live: bool = False) ->
     # Our own files: nothing in them is escaped.
     return environment.from_string(_read("viewer.html")).render(
         title=title,
-        connect="'self'" if live else "'none'",
+        connect=Markup("'self'" if live else "'none'"),
         style=Markup(_read("viewer.css")),
         content=Markup(safe_json({**content, "shaders": shaders})),
         script=Markup(script + "\n".join(_read(name) for name in _SCRIPTS)),

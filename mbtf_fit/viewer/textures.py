@@ -70,7 +70,9 @@ def pack(levels: Sequence[F32], bits: int = 8) -> PackedTexture:
         A number is not finite.
     """
     largest = (1 << bits) - 1
-    lows, steps, read, stored = [], [], [], []
+    lows: list[list[float]] = []
+    steps: list[list[float]] = []
+    read, stored = [], []
     for texels in levels:
         if not np.isfinite(texels).all():
             raise InputError("a texture of the material holds numbers that are not finite")
@@ -79,7 +81,9 @@ def pack(levels: Sequence[F32], bits: int = 8) -> PackedTexture:
         whole = np.rint((texels - low) / np.where(step > 0, step, 1.0)).astype(np.int64)
         lows.append([float(np.float32(x)) for x in low])
         steps.append([float(np.float32(x)) for x in step])
-        read.append((np.float32(lows[-1]) + whole * np.float32(steps[-1])).astype(np.float32))
+        read.append(
+            (np.array(lows[-1], np.float32) + whole * np.array(steps[-1], np.float32)).astype(np.float32)
+        )
         planes = np.moveaxis(whole, 2, 0)
         stored += [((plane - predicted(plane)) & largest).reshape(-1) for plane in planes]
     numbers = np.concatenate(stored)

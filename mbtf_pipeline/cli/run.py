@@ -129,6 +129,7 @@ def _report(result: RunResult, console: Console, quality: Quality | None) -> Non
     data = {
         "folder": result.folder,
         "report": result.report,
+        "viewer": result.viewer,
         "quality": quality,
         "seconds": round(sum(ran.values()), 3),
         "stages": {
@@ -142,4 +143,6 @@ def _report(result: RunResult, console: Console, quality: Quality | None) -> Non
     times = ", ".join(f"{name} {clock(seconds)}" for name, seconds in ran.items())
     lines = [f"{result.report}: {times or 'everything up to date'}"]
     lines += [f"  {fit}: unexplained variance {estimate(e['unexplained'])}" for fit, e in tests.items()]
+    if result.viewer is not None:
+        lines.append(f"{result.viewer}: open it in a browser to turn the fits under lights")
     console.report(data, "\n".join(lines))

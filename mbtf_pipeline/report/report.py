@@ -25,8 +25,8 @@ from mbtf_pipeline.report.times import provenance, time_context
 from mbtf_pipeline.report.training import read_training, training_context
 from mbtf_pipeline.run_folder import COMPARE, FITS, REPORT, RUN_NAME, SHARDS
 
-# Raised when the page changes; part of the stage's key.
-LAYOUT = 8
+# Raised when the report or the viewer's page changes; part of the stage's key.
+LAYOUT = 9
 
 _TABLE = """
 {%- set below = t.head[-1] == "command" %}

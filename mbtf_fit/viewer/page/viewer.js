@@ -15,7 +15,7 @@ class Viewer {
 
   async start() {
     for (const material of this.content.materials) this.materials.push(await Material.load(this.renderer.gl, material));
-    this.pictures = (this.content.pictures ?? []).map((picture) => this._picture(picture));
+    this.pictures = await Promise.all((this.content.pictures ?? []).map((picture) => this._picture(picture)));
     this.state.material = clamp(Math.round(this.state.material), 0, this.materials.length - 1);
     this.shapeChanged();
     this.environmentChanged();
@@ -23,12 +23,13 @@ class Viewer {
     this.ready = true;
   }
 
-  _picture(picture) {
-    const rgb = floatsOf(picture.data), [rows, columns] = picture.shape, padded = new Float32Array(4 * rows * columns).fill(1);
-    // Row 0 of a picture is its top.
+  async _picture(picture) {
+    const [{ rows, columns, planes }] = await unpack(picture.roots), values = new Float32Array(4 * rows * columns).fill(1);
+    // Row 0 of a picture is its top; square roots are stored.
     for (let j = 0; j < rows; j++)
-      for (let i = 0; i < columns; i++) padded.set(rgb.subarray(3 * (j * columns + i), 3 * (j * columns + i) + 3), 4 * ((rows - 1 - j) * columns + i));
-    return { ...picture, rows, columns, values: padded };
+      for (let i = 0; i < columns; i++)
+        for (let c = 0; c < 3; c++) values[4 * ((rows - 1 - j) * columns + i) + c] = planes[c][j * columns + i] ** 2;
+    return { ...picture, rows, columns, values };
   }
 
   get material() {

@@ -20,7 +20,7 @@ from mbtf_core.lattice import Lattice
 from mbtf_fit.material.material import Material
 from mbtf_fit.material.transmittance import Transmittance
 from mbtf_fit.viewer.content import as_read, encode, material_content, pack_textures
-from mbtf_fit.viewer.extras import mesh_content
+from mbtf_fit.viewer.extras import mesh_content, picture_content
 from mbtf_fit.viewer.page import write_page
 from mbtf_gen.pictures.camera import Camera
 
@@ -300,19 +300,9 @@ def test_shapes_environments_and_pictures(driver: Any, tmp_path: Path) -> None:
         "mesh": mesh_content(obj),
         "environment": {"name": "gray", "shape": [4, 8], "data": encode(gray)},
         "pictures": [
-            {
-                "name": "reference",
-                "shape": [12, 12],
-                "camera": {
-                    "elevation": 50,
-                    "azimuth": -90,
-                    "tiles_across": 2,
-                    "target": [0.5, 0.5],
-                    "field_of_view": 20,
-                },
-                "light": from_angles(30.0, 0.0).tolist(),
-                "data": encode(np.full((12, 12, 3), 0.1, np.float32)),
-            }
+            picture_content(
+                "reference", np.full((12, 12, 3), 0.1, np.float32), Camera(50, -90, 2), from_angles(30.0, 0.0)
+            )
         ],
     }
     page = Page(driver, write_page(content, "shapes"), tmp_path).ready()
