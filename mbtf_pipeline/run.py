@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mbtf_core.atomic import read_json
 from mbtf_core.console import Console
@@ -39,6 +39,9 @@ from mbtf_pipeline.stages import (
     run_again,
     run_stages,
 )
+
+if TYPE_CHECKING:
+    from mbtf_fit.viewer.live import LiveView
 
 GENERATE_STAGE, COMPARE_STAGE, REPORT_STAGE = "generate", "compare", "report"
 
@@ -114,6 +117,7 @@ class _RecipeRun:
     recipe: Recipe
     folder: Path
     console: Console
+    live: LiveView | None = None
 
     def stages(self, inputs: Mapping[str, str]) -> list[Stage]:
         """All stages; `inputs` holds the digests of the material's files by role."""
@@ -192,7 +196,13 @@ class _RecipeRun:
         steps = config.training.steps
         budget, unit = (config.training.time, "s") if steps is None else (steps, "steps")
         with self.console.progress(budget, fit_stage(name), unit) as bar:
-            fit(config, shards, out, progress=lambda share, note: bar.update(round(share * budget, 1), note))
+            fit(
+                config,
+                shards,
+                out,
+                progress=lambda share, note: bar.update(round(share * budget, 1), note),
+                observe=None if self.live is None else self.live.observer(name),
+            )
 
     def _compare(self, decision: Decision) -> None:
         from mbtf_pipeline.compare.compare import compare, steps
@@ -202,6 +212,27 @@ class _RecipeRun:
         recipe, fits = self.recipe, {name: self.folder / FITS / name for name in self.recipe.fit}
         with self.console.progress(steps(recipe.compare, len(fits)), "compare", "pictures") as bar:
             compare(recipe.compare, recipe.generate, shards, fits, out, lambda note: bar.advance(1, note))
+
+    def show(self, stage: str, decision: Decision, stamp: Stamp | None) -> None:
+        """Say a stage's state, and show what it has made."""
+        if stamp is None:
+            state = f"running ({decision.reason})" if decision.runs else "up to date"
+        else:
+            state = f"finished in {clock(stamp.seconds)}"
+        if decision.runs or stamp is None:
+            self.console.note(f"{stage}: {state}")
+        if self.live is None:
+            return
+        self.live.stage(stage, state)
+        if stamp is None:
+            return
+        for name in self.recipe.fit:
+            if stage == fit_stage(name):
+                self.live.finished(name, self.folder / FITS / name)
+        if stage == COMPARE_STAGE:
+            from mbtf_pipeline.report.viewer import run_pictures
+
+            self.live.pictures(run_pictures(self.folder))
 
     def _report(self, decision: Decision) -> None:
         from mbtf_pipeline.report.report import write_report
@@ -246,16 +277,9 @@ def generate_data(recipe: Recipe, folder: Path, *, command: str = "", console: C
     with owned(folder):
         check_folder(folder, is_run, "run")
         write_run_record(folder, recipe, command)
-        stages = _RecipeRun(recipe, folder, console).stages(_material_inputs(recipe))
-        run_stages(folder, stages[: len(data_sets(recipe))], notify=partial(_announce, console))
-
-
-def _announce(console: Console, stage: str, decision: Decision, stamp: Stamp | None) -> None:
-    if stamp is None:
-        state = f"running ({decision.reason})" if decision.runs else "up to date"
-        console.note(f"{stage}: {state}")
-    elif decision.runs:
-        console.note(f"{stage}: finished in {clock(stamp.seconds)}")
+        run = _RecipeRun(recipe, folder, console)
+        stages = run.stages(_material_inputs(recipe))
+        run_stages(folder, stages[: len(data_sets(recipe))], notify=run.show)
 
 
 def run_recipe(
@@ -266,6 +290,7 @@ def run_recipe(
     command: str = "",
     console: Console | None = None,
     generated: Callable[[Recipe], Recipe] | None = None,
+    live: LiveView | None = None,
 ) -> RunResult:
     """Run a recipe; stages whose inputs have not changed are skipped.
 
@@ -283,6 +308,8 @@ def run_recipe(
         Receives progress; quiet by default.
     generated : callable, optional
         Called once the data are generated; returns the recipe of the other stages.
+    live : LiveView, optional
+        Shows stages and fits as they come.
 
     Returns
     -------
@@ -299,20 +326,20 @@ def run_recipe(
     folder = recipe.folder if folder is None else folder
     console = console or Console(quiet=True)
     inputs = _material_inputs(recipe)
-    notify = partial(_announce, console)
-
     with owned(folder):
         check_folder(folder, is_run, "run")
         write_run_record(folder, recipe, command)
-        stages = _RecipeRun(recipe, folder, console).stages(inputs)
+        run = _RecipeRun(recipe, folder, console, live)
+        stages = run.stages(inputs)
         results: dict[str, StageResult] = {}
         if generated is not None:
             count = len(data_sets(recipe))
-            results = run_stages(folder, stages[:count], force=force, notify=notify)
+            results = run_stages(folder, stages[:count], force=force, notify=run.show)
             recipe = generated(recipe)
             write_run_record(folder, recipe, command)
-            stages = _RecipeRun(recipe, folder, console).stages(inputs)[count:]
-        results |= run_stages(folder, stages, force=force, notify=notify)
+            run = _RecipeRun(recipe, folder, console, live)
+            stages = run.stages(inputs)[count:]
+        results |= run_stages(folder, stages, force=force, notify=run.show)
     viewer = folder / VIEWER
     return RunResult(
         folder,

@@ -59,6 +59,7 @@ _SHARED = ("pyramid", "offset_texture", "offset_network")
 _DEPTH_WEIGHTS = "depth_weights"
 
 # Called with the fraction of the budget that is spent, and one line of text.
+Observer = Callable[[dict[str, Any], Trainer, ShardQueries], None]
 ProgressCallback = Callable[[float, str], None]
 
 
@@ -146,6 +147,7 @@ def fit(
     *,
     overwrite: bool = False,
     progress: ProgressCallback | None = None,
+    observe: Observer | None = None,
     partition: Partition | None = None,
 ) -> FitResult:
     """Fit a model to a data set and export it as a material.
@@ -164,6 +166,8 @@ def fit(
         Replace a fit of another configuration.
     progress : callable, optional
         Called with the fraction of the budget that is spent, in [0, 1], and one line of text.
+    observe : callable, optional
+        Called after each validation with its record, the trainer, and the queries of the validation.
     partition : Partition, optional
         Result of :func:`~mbtf_fit.data.loader.load_training` for these data, held-out settings and seed, to
         share among several fits; read from `shards` by default.
@@ -198,7 +202,7 @@ def fit(
         claim(out, identity, config, overwrite)
         progress = progress or (lambda fraction, note: None)
         finished = (out / DESCRIPTION_NAME).exists()
-        resumed = finished or _fit(config, data, identity, partition, device, out, progress)
+        resumed = finished or _fit(config, data, identity, partition, device, out, progress, observe)
         return _finished(out, time.perf_counter() - begin, resumed=resumed)
 
 
@@ -210,6 +214,7 @@ def _fit(
     device: torch.device,
     out: Path,
     progress: ProgressCallback,
+    observe: Observer | None,
 ) -> bool:
     """Train and export; whether an earlier run was resumed."""
     keep_freed_memory()
@@ -220,7 +225,7 @@ def _fit(
     name, queries = validation_set(data, partition)
     subset = validation_subset(trainer.model.positions, queries)
     del queries
-    _train(trainer, subset, out, progress)
+    _train(trainer, subset, out, progress, observe)
     trainer.fill_levels(float(level_of_sigma(partition.sample.sigma.max())))
     trainer.calibrate()
     errors = evaluate_splits(trainer.predict, data, partition)
@@ -353,7 +358,13 @@ def _resume(trainer: Trainer, out: Path) -> bool:
     return True
 
 
-def _train(trainer: Trainer, subset: ShardQueries, out: Path, progress: ProgressCallback) -> None:
+def _train(
+    trainer: Trainer,
+    subset: ShardQueries,
+    out: Path,
+    progress: ProgressCallback,
+    observe: Observer | None,
+) -> None:
     saved = time.perf_counter()
     done = trainer.fraction >= 1.0
     with stop_on_interruption() as stop:
@@ -363,6 +374,8 @@ def _train(trainer: Trainer, subset: ShardQueries, out: Path, progress: Progress
             with (out / HISTORY_NAME).open("a", encoding="utf-8") as stream:
                 stream.write(json.dumps(record) + "\n")
             progress(trainer.fraction, describe_record(record))
+            if observe is not None:
+                observe(record, trainer, subset)
             if time.perf_counter() - saved > _CHECKPOINT_SECONDS or done or stop.is_set():
                 write_checkpoint(trainer, out / CHECKPOINT_NAME)
                 saved = time.perf_counter()

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mbtf_fit.material.format import QUERY
+from mbtf_fit.material.format import DEFAULT_MIN_COS, QUERY
 from mbtf_fit.material.material import Material, conformance_values
 from mbtf_fit.models.constants import AZIMUTHS, HEIGHTS, HORIZONS, MAPS
 from mbtf_fit.models.registry import build_model
@@ -79,12 +79,12 @@ def _moments(name: str, texels: F32) -> F32:
     return texels
 
 
-def pack_textures(material: Material) -> dict[str, PackedTexture]:
+def pack_textures(material: Material, effort: int = 9) -> dict[str, PackedTexture]:
     """All textures by name; heights have 16 bits."""
     tensors = {name: t.cpu().float().numpy() for name, t in material.model.weights().items()}
-    packed = {name: pack(levels) for name, levels in _families(material, tensors).items()}
+    packed = {name: pack(levels, 8, effort) for name, levels in _families(material, tensors).items()}
     if HEIGHTS in tensors:
-        packed[HEIGHTS] = pack([tensors[HEIGHTS]], bits=16)
+        packed[HEIGHTS] = pack([tensors[HEIGHTS]], 16, effort)
     return packed
 
 
@@ -118,6 +118,47 @@ def rounding(material: Material, read: Material) -> Rounding:
     return Rounding(rms, float(np.abs(difference).max()), rms / power if power else 0.0)
 
 
+def content_of(material: Material, name: str, packed: dict[str, PackedTexture]) -> dict[str, Any]:
+    """What a page holds of a material with these textures, as JSON.
+
+    Raises
+    ------
+    InputError
+        The model is none that the viewer evaluates.
+    """
+    source = ShaderSource(material)
+    text = source.text()
+    tensors = material.model.weights()
+    known, conformance = material.description, material.conformance
+    training = known["training"]
+    content: dict[str, Any] = {
+        "name": name,
+        "model": material.config.model,
+        "aspect": material.lattice.aspect,
+        "finest": material.lattice.finest,
+        "min_cos": known["data"].get("min_cos", DEFAULT_MIN_COS),
+        "source": text,
+        "weights": encode(source.weights.array()),
+        "textures": {name: texture.description for name, texture in packed.items()},
+        "conformance": {q: encode(conformance[q]) for q in (*QUERY, "rgb")},
+        "tolerance": TOLERANCE,
+        "facts": {
+            "levels": f"0 to {material.lattice.finest}",
+            "network weights": sum(p.numel() for p in material.model.parameter_groups()[1]),
+            "texels": sum(p.numel() for p in material.model.parameter_groups()[0]),
+            "training steps": training.get("steps"),
+            "training time in s": training.get("seconds"),
+        },
+    }
+    if "calibration" in tensors:
+        tables = tensors["calibration"].cpu().numpy()
+        content["calibration"] = {"shape": list(tables.shape), "data": encode(tables.astype(np.float32))}
+    if HEIGHTS in packed:
+        rows, columns = packed[HEIGHTS].levels[0].shape[:2]
+        content |= {"blocks": node_blocks(rows, columns), "node_shift": NODE_SHIFT}
+    return content
+
+
 def material_content(folder: Path, name: str | None = None) -> tuple[dict[str, Any], Rounding]:
     """What a page holds of a material.
 
@@ -139,36 +180,6 @@ def material_content(folder: Path, name: str | None = None) -> tuple[dict[str, A
         The material is missing or corrupt, or of a model that the viewer does not evaluate.
     """
     material = Material.load(folder)
-    source = ShaderSource(material)
-    text = source.text()
     packed = pack_textures(material)
-    tensors = material.model.weights()
-    known, conformance = material.description, material.conformance
-    training = known["training"]
-    content: dict[str, Any] = {
-        "name": name or folder.resolve().name,
-        "model": material.config.model,
-        "aspect": material.lattice.aspect,
-        "finest": material.lattice.finest,
-        "min_cos": known["data"].get("min_cos", 0.1),
-        "unit": float(tensors["unit"]),
-        "source": text,
-        "weights": encode(source.weights.array()),
-        "textures": {name: texture.description for name, texture in packed.items()},
-        "conformance": {q: encode(conformance[q]) for q in (*QUERY, "rgb")},
-        "tolerance": TOLERANCE,
-        "facts": {
-            "levels": f"0 to {material.lattice.finest}",
-            "network weights": known["weights"]["network_weights"],
-            "texels": known["weights"]["texels"],
-            "training steps": training.get("steps"),
-            "training time in s": training.get("seconds"),
-        },
-    }
-    if "calibration" in tensors:
-        tables = tensors["calibration"].cpu().numpy()
-        content["calibration"] = {"shape": list(tables.shape), "data": encode(tables.astype(np.float32))}
-    if HEIGHTS in packed:
-        rows, columns = packed[HEIGHTS].levels[0].shape[:2]
-        content |= {"blocks": node_blocks(rows, columns), "node_shift": NODE_SHIFT}
+    content = content_of(material, name or folder.resolve().name, packed)
     return content, rounding(material, as_read(material, packed))

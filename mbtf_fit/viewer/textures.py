@@ -50,7 +50,7 @@ def predicted(values: NDArray[np.int64]) -> NDArray[np.int64]:
     return out
 
 
-def pack(levels: Sequence[F32], bits: int = 8) -> PackedTexture:
+def pack(levels: Sequence[F32], bits: int = 8, effort: int = 9) -> PackedTexture:
     """Quantize and compress a texture.
 
     Parameters
@@ -59,6 +59,8 @@ def pack(levels: Sequence[F32], bits: int = 8) -> PackedTexture:
         Coarsest first.
     bits : int
         8 or 16 bits per number.
+    effort : int
+        Of the compression, 1 to 9.
 
     Returns
     -------
@@ -88,7 +90,7 @@ def pack(levels: Sequence[F32], bits: int = 8) -> PackedTexture:
         stored += [((plane - predicted(plane)) & largest).reshape(-1) for plane in planes]
     numbers = np.concatenate(stored)
     parts = [numbers & 255, *([numbers >> 8] if bits == 16 else [])]
-    stream = zlib.compress(b"".join(part.astype(np.uint8).tobytes() for part in parts), 9)
+    stream = zlib.compress(b"".join(part.astype(np.uint8).tobytes() for part in parts), effort)
     description = {
         "shapes": [list(texels.shape[:2]) for texels in levels],
         "channels": int(levels[0].shape[2]),

@@ -7,13 +7,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.atomic import write_text
+from mbtf_core.atomic import read_json, write_text
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import InputError
 from mbtf_fit.viewer.content import material_content
 from mbtf_fit.viewer.extras import picture_content
 from mbtf_fit.viewer.page import write_page
 from mbtf_gen.pictures.camera import Camera
+from mbtf_pipeline.compare.compare import COMPARISON_NAME
 from mbtf_pipeline.compare.pictures import read_picture
 from mbtf_pipeline.run_folder import COMPARE, FITS, VIEWER
 
@@ -45,8 +46,13 @@ def write_viewer(folder: Path, title: str, comparison: Mapping[str, Any]) -> Non
     if not materials:
         path.unlink(missing_ok=True)
         return
-    pictures = [_picture(folder, picture) for picture in comparison["pictures"][:_MOST_PICTURES]]
-    write_text(path, write_page({"materials": materials, "pictures": pictures}, title))
+    write_text(path, write_page({"materials": materials, "pictures": run_pictures(folder)}, title))
+
+
+def run_pictures(folder: Path) -> list[dict[str, Any]]:
+    """The first path-traced pictures of a run's comparison."""
+    comparison = read_json(folder / COMPARE / COMPARISON_NAME)
+    return [_picture(folder, picture) for picture in comparison["pictures"][:_MOST_PICTURES]]
 
 
 def _picture(folder: Path, picture: Mapping[str, Any]) -> dict[str, Any]:

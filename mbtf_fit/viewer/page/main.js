@@ -5,12 +5,12 @@ const fail = (error) => (byId("message").textContent = error.message || String(e
 function statusLine(viewer, test) {
   const { renderer, camera, material, seconds } = viewer, pitch = camera.tiles_across / renderer.canvas.width;
   const level = clamp(-Math.log2(pitch), 0, material.content.finest);
-  const beyond = test.beyond ? `, ${test.beyond} of ${test.count} test queries deviate` : "";
+  const beyond = test?.beyond ? `, ${test.beyond} of ${test.count} test queries deviate` : "";
   return `level ${level.toFixed(1)} of ${material.content.finest}, ${camera.tiles_across.toPrecision(2)} tiles across, ${(1000 * seconds).toFixed(0)} ms per frame${beyond}`;
 }
 
-async function main() {
-  const viewer = new Viewer(CONTENT);
+async function show(content) {
+  const viewer = new Viewer(content);
   await viewer.start();
   bindPanel(viewer);
   viewer.layout();
@@ -24,7 +24,11 @@ async function main() {
     requestAnimationFrame(loop);
   };
   requestAnimationFrame(loop);
+  return viewer;
 }
 
 window.addEventListener("error", (event) => fail(event.error ?? new Error(event.message)));
-main().catch(fail);
+if (CONTENT.live) {
+  byId("message").textContent = "Waiting for the first material …";
+  follow((material) => show({ ...CONTENT, materials: [material] }));
+} else show(CONTENT).catch(fail);

@@ -78,6 +78,9 @@ FIND_PAIR(horizon_pair, HORIZON_LEVELS, HORIZON_COUNT)
 // (mbtf_gen/geometry/height_planes.py). `w` is the fold along the diagonal of a cell.
 vec4 node(int index) { return texelFetch(node_texture, ivec2(index & (NODE_COLUMNS - 1), index >> NODE_SHIFT), 0); }
 
+// Nodes that were visited, for measurements.
+int visited = 0;
+
 // Height at which the line through uv along omega, towards the viewer, first meets the surface.
 float trace(vec2 u, vec3 omega) {
   vec2 size = vec2(HEIGHT_SIZE);
@@ -93,6 +96,7 @@ float trace(vec2 u, vec3 omega) {
   float z = 0.0;
   int level = min(BLOCK_LEVELS, 4), crossings = 0;
   for (int n = 0; n < 4096; n++) {
+    visited++;
     int side = 1 << level;
     ivec2 low = cell & ~(side - 1);
     vec2 p = vec2(cell - low) + inside;

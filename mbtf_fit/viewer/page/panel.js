@@ -22,14 +22,19 @@ function bindPanel(viewer) {
   if (content.mesh) option(byId("shape"), content.mesh.name, content.mesh.name);
   for (const name of ["none", ...Object.keys(BUILT_IN), ...(content.environment ? [content.environment.name] : [])])
     option(byId("environment"), name, name);
-  option(byId("against"), "none", "nothing");
-  viewer.materials.forEach((material, k) => {
-    option(byId("material"), k, material.name);
-    option(byId("against"), `material ${k}`, material.name);
-  });
-  viewer.pictures.forEach((picture, k) => option(byId("against"), `picture ${k}`, picture.name));
-  byId("material").parentElement.hidden = viewer.materials.length < 2;
-  byId("against_label").hidden = viewer.materials.length < 2 && !viewer.pictures.length;
+  // What can be shown and compared; more comes while fits are trained.
+  viewer.choicesChanged = () => {
+    for (const id of ["material", "against"]) byId(id).replaceChildren();
+    option(byId("against"), "none", "nothing");
+    viewer.materials.forEach((material, k) => {
+      option(byId("material"), k, material.name);
+      option(byId("against"), `material ${k}`, material.name);
+    });
+    viewer.pictures.forEach((picture, k) => option(byId("against"), `picture ${k}`, picture.name));
+    byId("material").parentElement.hidden = viewer.materials.length < 2;
+    byId("against_label").hidden = viewer.materials.length < 2 && !viewer.pictures.length;
+    refresh();
+  };
 
   bind("shape", () => state.shape, (x) => { state.shape = x; viewer.shapeChanged(); viewer.frameShape(); });
   bind("tiles", () => Math.log2(state.tiles), (x) => { state.tiles = 2 ** x; viewer.shapeChanged(); });
@@ -173,7 +178,7 @@ function bindPanel(viewer) {
     refresh();
   });
   new ResizeObserver(() => viewer.layout()).observe(canvas.parentElement);
-  refresh();
+  viewer.choicesChanged();
 }
 
 // Values over all lights and views at a place of the picture.

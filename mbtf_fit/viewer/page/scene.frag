@@ -10,7 +10,7 @@ uniform vec3 environment_color;
 uniform int frame;
 uniform vec3 camera;
 uniform float min_cos;
-uniform int shown;  // 0: radiance; 1: u, v, sigma; 2: view in the tile's frame
+uniform int shown;  // 0: radiance; 1: u, v, sigma; 2: view in the tile's frame; 3: visited nodes
 in vec3 world;
 in vec3 normal_there;
 in vec4 tangent_there;
@@ -62,5 +62,8 @@ void main() {
     if (light.z <= 0.0) continue;
     sum += radiance * light.z * stage2(seen, raised(light), omega_o);
   }
+#ifdef PLACES
+  if (shown == 3) { color = vec4(visited); return; }
+#endif
   color = vec4(sum, 1.0 - transmittance(uv_there, sigma, omega_o));
 }

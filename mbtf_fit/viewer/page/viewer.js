@@ -32,6 +32,23 @@ class Viewer {
     return { ...picture, rows, columns, values };
   }
 
+  // A material that is new, or takes the place of the one of its name.
+  async setMaterial(content) {
+    const material = await Material.load(this.renderer.gl, content), known = this.materials.findIndex((m) => m.name === material.name);
+    if (known < 0) this.materials.push(material);
+    else {
+      this.materials[known].delete();
+      this.materials[known] = material;
+    }
+    this.choicesChanged();
+    this.changed();
+  }
+
+  async setPictures(pictures) {
+    this.pictures = await Promise.all(pictures.map((picture) => this._picture(picture)));
+    this.choicesChanged();
+  }
+
   get material() {
     return this.materials[this.state.material];
   }
