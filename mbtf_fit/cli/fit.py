@@ -13,7 +13,7 @@ from mbtf_core.errors import InputError, PartialError, UsageError
 from mbtf_core.interruption import keep_on_interruption
 from mbtf_core.options import DryRun, Options, Output, Overwrite, Verbose, takes_options
 from mbtf_core.units import clock, expectation, format_duration
-from mbtf_fit.cli.page_options import Watch, live_view
+from mbtf_fit.cli.page_options import Live, live_view
 from mbtf_fit.config import DEFAULT_MODEL, FIBER_MODEL, FitConfig, ModelName
 from mbtf_fit.formatting import describe_fit, format_estimate, format_table, headline, visibility
 from mbtf_gen.config.presets import Quality, QualityOption, as_assignments, overrides_of
@@ -29,7 +29,7 @@ def fit(
     options: Options[FitConfig],
     many: Annotated[list[Path] | None, Parameter(consume_multiple=True)] = None,
     processes: Annotated[int | None, Parameter(show_default="one per GPU, or 1")] = None,
-    view: Watch = False,
+    live: Live = False,
     dry_run: DryRun = False,
     overwrite: Overwrite = False,
     verbose: Verbose = False,
@@ -61,8 +61,8 @@ def fit(
         raise UsageError("--processes must be a positive number and requires --many")
     if shards is None and many is None:
         raise UsageError("no shards given", hint="mbtf-fit shards/ -o material/")
-    if many is not None and view:
-        raise UsageError("shows one fit", where="--view", hint="leave out --many, or --view")
+    if many is not None and live:
+        raise UsageError("shows one fit", where="--live", hint="leave out --many, or --live")
     if many is not None:
         _fit_many(options, quality, many, output, processes, overwrite, console)
         return
@@ -106,7 +106,7 @@ def fit(
         console.note(f"note: training runs in PyTorch, not in the compiled kernel ({missing})")
     keep_on_interruption(f"the last checkpoint is kept in {output}")
     with (
-        live_view(str(output), view, console) as live,
+        live_view(str(output), live, console) as shown,
         console.progress(total=100, label="fitting", unit="%") as bar,
     ):
         result = fit(
@@ -115,11 +115,11 @@ def fit(
             output,
             overwrite=overwrite,
             progress=lambda fraction, note: bar.update(round(100 * fraction, 1), note),
-            observe=None if live is None else live.observer(output.name),
+            observe=None if shown is None else shown.observer(output.name),
             partition=partition,
         )
-        if live is not None:
-            live.finished(output.name, output)
+        if shown is not None:
+            shown.finished(output.name, output)
     if finished:
         console.note(f"{output}: this fit is already finished; --overwrite trains it again")
     summary = result.as_dict()

@@ -26,7 +26,7 @@ class PageOptions:
     ----------
     against : other materials to compare with
     reference : folder of mbtf-gen reference
-    mesh : a mesh with texture coordinates
+    shape : a mesh with texture coordinates
     environment : picture of the surroundings
     """
 
@@ -36,7 +36,7 @@ class PageOptions:
     reference: Annotated[
         Path | None, Parameter(help="Folder of mbtf-gen reference to compare with in the page.")
     ] = None
-    mesh: Annotated[
+    shape: Annotated[
         Path | None, Parameter(help="Mesh with texture coordinates, as another shape of the page.")
     ] = None
     environment: Annotated[
@@ -62,7 +62,7 @@ class PageOptions:
         content = {
             "materials": [held for held, _ in materials],
             **({} if self.reference is None else {"pictures": pictures_content(self.reference)}),
-            **({} if self.mesh is None else {"mesh": mesh_content(self.mesh)}),
+            **({} if self.shape is None else {"mesh": mesh_content(self.shape)}),
             **({} if self.environment is None else {"environment": environment_content(self.environment)}),
         }
         return write_page(content, materials[0][0]["name"]), str(materials[0][1])
@@ -70,7 +70,7 @@ class PageOptions:
 
 PAGE_OPTIONS = PageOptions()
 
-Watch = Annotated[Switch, Parameter(help="Show the progress in the browser while the command runs.")]
+Live = Annotated[Switch, Parameter(help="Show the progress in the browser while the command runs.")]
 
 
 @contextmanager

@@ -14,10 +14,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.atomic import write_file
+from mbtf_core.atomic import read_json, write_file
+from mbtf_core.errors import InputError
 from mbtf_core.exposure import to_display
+from mbtf_core.suggest import suggest_path
 from mbtf_gen.dataset.shard_io import read_exr, write_exr
 from mbtf_gen.pictures.camera import PIXEL_SIGMA, Camera, PixelKind
+from mbtf_gen.pictures.folder import RECORD_NAME
 from mbtf_gen.sampling.query_sampler import Queries
 
 if TYPE_CHECKING:
@@ -69,6 +72,48 @@ class ReferenceImage:
         exr = path.with_name(f"{path.name}.exr")
         write_exr(exr, {name: array[None] for name, array in arrays.items()})
         return exr
+
+
+def read_references(folder: Path) -> list[tuple[NDArray[np.float32], Camera, NDArray[np.float32]]]:
+    """Value in 1/sr, camera, and direction of the light of the finished pictures of ``mbtf-gen reference``.
+
+    Parameters
+    ----------
+    folder : Path
+        Output folder of the command.
+
+    Returns
+    -------
+    list of (array (rows, columns, 3), Camera, array (3,))
+
+    Raises
+    ------
+    InputError
+        The folder has no such pictures.
+    """
+    record = folder / RECORD_NAME
+    if not record.is_file():
+        hint = suggest_path(folder, Path.is_dir)
+        raise InputError("holds no pictures of mbtf-gen reference", where=folder, hint=hint)
+    known = read_json(record)
+    options = known.get("depends", {}).get("reference", {})
+    if known.get("kind") != "reference" or not {"view", "light", "tiles_across"} <= set(options):
+        raise InputError("holds no pictures of mbtf-gen reference", where=folder)
+    out = []
+    for across in options["tiles_across"]:
+        name = next((n for n in known["pictures"] if n.endswith(f"-tiles{across:g}")), None)
+        if name is None:
+            continue
+        path = folder / f"{name}.exr"
+        value, light = read_value(path), read_exr(path, ("omega_i",))["omega_i"].reshape(-1, 3)[0]
+        rows, columns = value.shape[:2]
+        view = options["view"]
+        out.append(
+            (value, Camera(view["elevation"], view["azimuth"], across, rows=rows, columns=columns), light)
+        )
+    if not out:
+        raise InputError("holds no finished picture", where=folder, hint="run mbtf-gen reference again")
+    return out
 
 
 def read_value(path: Path) -> NDArray[np.float32]:

@@ -13,7 +13,7 @@ from mbtf_core.errors import UsageError
 from mbtf_core.interruption import keep_on_interruption
 from mbtf_core.options import Output, Set, Switch, Time, command_line
 from mbtf_core.units import clock
-from mbtf_fit.cli.page_options import Watch, live_view
+from mbtf_fit.cli.page_options import Live, live_view
 from mbtf_gen.config.presets import Quality, QualityOption
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ def run(
     time: Time = None,
     quick: Switch = False,
     force: Switch = False,
-    view: Watch = False,
+    live: Live = False,
     assignments: Set = None,
     console: Console = CONSOLE,
 ) -> None:
@@ -56,8 +56,8 @@ def run(
     command = command_line("mbtf-pipeline", "run", recipe, **given)
     own = assignments or []
     if is_paper_recipe(recipe):
-        if view:
-            raise UsageError("shows one run", where="--view", hint="leave it out for a paper recipe")
+        if live:
+            raise UsageError("shows one run", where="--live", hint="leave it out for a paper recipe")
         if quality is not None or time is not None:
             raise UsageError(
                 "a paper recipe has sizes and times of its own",
@@ -78,7 +78,7 @@ def run(
             recipe, seconds, output, command, console.note, quality=quality, assignments=own, began=began
         )
         keep_on_interruption(f"the finished stages are kept in {timed.folder}")
-        with live_view(timed.recipe.title, view, console) as live:
+        with live_view(timed.recipe.title, live, console) as shown:
             result = run_recipe(
                 timed.recipe,
                 timed.folder,
@@ -86,7 +86,7 @@ def run(
                 command=command,
                 console=console,
                 generated=timed.generated,
-                live=live,
+                live=shown,
             )
         return _report(result, console, timed.split.quality)
     from mbtf_pipeline.forecast import forecast_left
@@ -97,8 +97,8 @@ def run(
     expected = forecast_left(loaded, output or loaded.folder)
     if expected is not None:
         console.note(expected.describe())
-    with live_view(loaded.title, view, console) as live:
-        result = run_recipe(loaded, output, force=force, command=command, console=console, live=live)
+    with live_view(loaded.title, live, console) as shown:
+        result = run_recipe(loaded, output, force=force, command=command, console=console, live=shown)
     _report(result, console, quality)
 
 

@@ -21,7 +21,7 @@ _FLAGS = (
     "--hide-scrollbars",
     "--force-device-scale-factor=1",
     # No name can be resolved, so no other machine can be reached.
-    "--host-resolver-rules=MAP * ~NOTFOUND",
+    "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
 )
 # Without a graphics card: drawing by the processor, or no WebGL at all.
 SOFTWARE = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")

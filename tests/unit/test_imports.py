@@ -42,6 +42,7 @@ mbtf_fit.native
 mbtf_fit.material
 mbtf_fit.evaluation
 mbtf_fit.training
+mbtf_fit.viewer
 mbtf_fit.mitsuba_plugin
 mbtf_fit.cli
 mbtf_fit
@@ -63,14 +64,19 @@ FORBIDDEN = {
     "mbtf_fit": {"mitsuba", "drjit", "trimesh"},
     "mbtf_pipeline": set(),
 }
-# The fitter reads data sets; only its Mitsuba plugin, and the command that draws with it, knows the renderer.
+# The fitter reads data sets, and files that its viewer shows; only its Mitsuba plugin, and the command that
+# draws with it, knows the renderer.
 PLUGIN = "mbtf_fit.mitsuba_plugin"
 READS = (
     "mbtf_gen.dataset.geometry",
     "mbtf_gen.dataset.reader",
     "mbtf_gen.dataset.shard_io",
     "mbtf_gen.geometry.height_planes",
+    "mbtf_gen.images.environment",
     "mbtf_gen.images.resample",
+    "mbtf_gen.meshes.shape",
+    "mbtf_gen.pictures.camera",
+    "mbtf_gen.pictures.reference",
     "mbtf_gen.sampling.rng",
     "mbtf_gen.config.presets",
 )
