@@ -18,7 +18,7 @@ async function show(content) {
   viewer.draw();
   byId("message").textContent = "";
   // For tests and scripts.
-  window.mbtf = { viewer, tests };
+  window.mbtf = { viewer, tests, showPoint };
   const loop = () => {
     if (viewer.draw()) byId("status").textContent = statusLine(viewer, tests[viewer.state.material]);
     requestAnimationFrame(loop);
