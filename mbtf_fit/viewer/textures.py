@@ -1,9 +1,10 @@
-"""Textures of a page: 8 bits per number, predicted from their neighbors and compressed.
+"""Textures of a page: 6 to 16 bits per number, predicted from their neighbors and compressed.
 
 Each level and channel has its own range. A number is stored as the difference from the median edge detector's
 prediction by the texels to its left, above, and above left (LOCO-I: Weinberger, Seroussi and Sapiro, IEEE
-Transactions on Image Processing 9(8), 2000), modulo 2^bits. All differences of a texture form one zlib
-stream: first the low bytes of all, then the high bytes of those with 16 bits. ``page/data.js`` reads it.
+Transactions on Image Processing 9(8), 2000), modulo 2^bits; where neighboring channels are alike, the
+difference from the channel before takes the place of the number. All of a texture form one zlib stream: first
+the low bytes, then the high bytes where there are more than 8 bits. ``page/data.js`` reads it.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ class PackedTexture:
     Attributes
     ----------
     description : dict
-        ``shapes`` (rows, columns) of each level, coarsest first; ``channels``; ``bits``; ``low`` and ``step``
-        by level and channel; ``data``, the stream in base64.
+        ``shapes`` (rows, columns) of each level, coarsest first; ``channels``; ``bits``; ``alike``;
+        ``low`` and ``step`` by level and channel; ``data``, the stream in base64.
     levels : tuple of (rows, columns, channels) arrays
         What a reader gets.
     """
@@ -50,7 +51,7 @@ def predicted(values: NDArray[np.int64]) -> NDArray[np.int64]:
     return out
 
 
-def pack(levels: Sequence[F32], bits: int = 8, effort: int = 9) -> PackedTexture:
+def pack(levels: Sequence[F32], bits: int = 8, effort: int = 9, *, alike: bool = False) -> PackedTexture:
     """Quantize and compress a texture.
 
     Parameters
@@ -58,9 +59,11 @@ def pack(levels: Sequence[F32], bits: int = 8, effort: int = 9) -> PackedTexture
     levels : sequence of (rows, columns, channels) arrays
         Coarsest first.
     bits : int
-        8 or 16 bits per number.
+        Per number, up to 16.
     effort : int
         Of the compression, 1 to 9.
+    alike : bool
+        Neighboring channels are alike.
 
     Returns
     -------
@@ -87,14 +90,19 @@ def pack(levels: Sequence[F32], bits: int = 8, effort: int = 9) -> PackedTexture
             (np.array(lows[-1], np.float32) + whole * np.array(steps[-1], np.float32)).astype(np.float32)
         )
         planes = np.moveaxis(whole, 2, 0)
+        if alike:
+            planes = np.diff(planes, axis=0, prepend=0)
         stored += [((plane - predicted(plane)) & largest).reshape(-1) for plane in planes]
     numbers = np.concatenate(stored)
-    parts = [numbers & 255, *([numbers >> 8] if bits == 16 else [])]
-    stream = zlib.compress(b"".join(part.astype(np.uint8).tobytes() for part in parts), effort)
+    parts = [numbers & 255, *([numbers >> 8] if bits > 8 else [])]
+    # The strategy for data whose small numbers are frequent.
+    coder = zlib.compressobj(effort, strategy=zlib.Z_FILTERED)
+    stream = coder.compress(b"".join(part.astype(np.uint8).tobytes() for part in parts)) + coder.flush()
     description = {
         "shapes": [list(texels.shape[:2]) for texels in levels],
         "channels": int(levels[0].shape[2]),
         "bits": bits,
+        "alike": alike,
         "low": lows,
         "step": steps,
         "data": base64.b64encode(stream).decode(),

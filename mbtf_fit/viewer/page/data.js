@@ -15,16 +15,17 @@ async function inflate(base64) {
 
 // Levels of a texture, coarsest first: {rows, columns, planes}, a Float32Array per channel.
 async function unpack(texture) {
-  const bytes = await inflate(texture.data), { channels, bits } = texture;
-  const largest = 2 ** bits - 1, total = bytes.length / (bits / 8), levels = [];
+  const bytes = await inflate(texture.data), { channels, bits, alike } = texture;
+  const largest = 2 ** bits - 1, total = bytes.length / (bits > 8 ? 2 : 1), levels = [];
   let at = 0;
   texture.shapes.forEach(([rows, columns], level) => {
-    const planes = [], whole = new Uint16Array(rows * columns);
+    // Differences of channels may be negative, so they are kept as they are.
+    const planes = [], whole = new Int32Array(rows * columns), sum = new Int32Array(rows * columns);
     for (let c = 0; c < channels; c++) {
       const low = texture.low[level][c], step = texture.step[level][c], plane = new Float32Array(rows * columns);
       for (let j = 0, n = 0; j < rows; j++) {
         for (let i = 0; i < columns; i++, n++, at++) {
-          const difference = bits === 16 ? bytes[at] | (bytes[total + at] << 8) : bytes[at];
+          const difference = bits > 8 ? bytes[at] | (bytes[total + at] << 8) : bytes[at];
           let guess = 0;
           if (i && j) {
             const left = whole[n - 1], above = whole[n - columns], corner = whole[n - columns - 1];
@@ -32,8 +33,13 @@ async function unpack(texture) {
             guess = corner >= most ? least : corner <= least ? most : left + above - corner;
           } else if (i) guess = whole[n - 1];
           else if (j) guess = whole[n - columns];
-          whole[n] = (difference + guess) & largest;
-          plane[n] = low + step * whole[n];
+          if (alike && c) {
+            // The number is that of the channel before plus the difference, modulo 2^bits.
+            const number = (sum[n] + difference + guess) & largest;
+            whole[n] = number - sum[n];
+            sum[n] = number;
+          } else whole[n] = sum[n] = (difference + guess) & largest;
+          plane[n] = low + step * sum[n];
         }
       }
       planes.push(plane);
