@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Literal
@@ -20,10 +21,12 @@ def export_material(
     /,
     *,
     to: Annotated[
-        list[Literal["exr", "json", "material", "web"]] | None, Parameter(show_default="exr, json")
+        list[Literal["exr", "json", "material", "web", "gltf", "usd", "materialx"]] | None,
+        Parameter(show_default="exr, json"),
     ] = None,
     output: Annotated[Output | None, Parameter(show_default="the material's own")] = None,
     half: Switch = False,
+    level: Annotated[int | None, Parameter(show_default="the finest")] = None,
     page: PageOptions = PAGE_OPTIONS,
     overwrite: Overwrite = False,
     console: Console = CONSOLE,
@@ -33,7 +36,9 @@ def export_material(
     exr: the latent textures, a part per level and a channel per feature, and those of the transmittance of a
     material with holes. json: the networks as a list of layers, with formulas, conventions and queries with
     expected values. material: another material folder, in a folder of its own; the same command again keeps
-    it. web: a page that shows the material in a browser, without a network.
+    it. web: a page that shows the material in a browser, without a network. gltf, usd, materialx: maps for
+    programs that evaluate no networks; without shadows, interreflection and parallax, but with the same mean
+    reflectance.
 
     Parameters
     ----------
@@ -41,6 +46,8 @@ def export_material(
         Folder made by mbtf-fit.
     to
         Format to write. Repeatable.
+    level
+        Level of the maps of gltf, usd and materialx.
     half
         Round all weights and texels to 16 bits, and print the resulting error.
     """
@@ -49,6 +56,9 @@ def export_material(
     from mbtf_fit.material.export import LAYERS_NAME, TEXTURES_NAME, to_half, write_layers, write_textures
     from mbtf_fit.material.export_folder import claim_export
     from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME
+    from mbtf_fit.material.interchange.documents import WRITERS, Source
+    from mbtf_fit.material.interchange.images import write_maps
+    from mbtf_fit.material.interchange.maps import fit_color, maps_of
     from mbtf_fit.material.material import Material, export
     from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME
     from mbtf_fit.viewer.page import PAGE_NAME
@@ -57,6 +67,9 @@ def export_material(
     if page.given() and "web" not in wanted:
         raise UsageError("is an option of pages", where=page.given()[0], hint="add --to web")
     folder = material if output is None else output
+    tools = [name for name in wanted if name in WRITERS]
+    if level is not None and not tools:
+        raise UsageError("is an option of maps", where="--level", hint="add --to gltf, usd or materialx")
     loaded = Material.load(material)
     keep_on_interruption(f"the finished files are kept in {folder}")
     with owned(folder):
@@ -73,6 +86,20 @@ def export_material(
         if "json" in wanted:
             write_layers(written, folder / LAYERS_NAME, half=half)
             files.append(LAYERS_NAME)
+        if tools:
+            maps, agreement = fit_color(loaded, maps_of(loaded, level))
+            files += write_maps(maps, folder)
+            source = Source(
+                material.resolve().name,
+                Path(os.path.relpath(material, folder)).as_posix(),
+                loaded.config.model,
+                loaded.description["weights"]["sha256"],
+            )
+            for name in tools:
+                document, write = WRITERS[name]
+                write_text(folder / document, write(maps, source))
+                files.append(document)
+            notes.append(str(agreement))
         if "web" in wanted:
             html, precision = page.page(material)
             write_text(folder / PAGE_NAME, html)

@@ -1,0 +1,1 @@
+"""Materials as maps for programs that evaluate no networks: glTF, USD, MaterialX."""

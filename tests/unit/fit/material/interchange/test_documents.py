@@ -1,0 +1,204 @@
+"""Documents of glTF, USD and MaterialX, as the libraries of these formats read them."""
+
+from __future__ import annotations
+
+import base64
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from support.plugin_materials import write_material
+
+from mbtf_core.console import run
+from mbtf_core.lattice import Lattice
+from mbtf_fit.cli.app import app
+from mbtf_fit.material.interchange.documents import refractive_index
+from mbtf_fit.material.interchange.maps import maps_of
+from mbtf_fit.material.material import Material
+from mbtf_fit.material.transmittance import Transmittance
+
+FORMATS = ("gltf", "usd", "materialx")
+
+
+def exported(folder: Path, **options: object) -> Path:
+    """All documents of a material of half the height of its width."""
+    write_material(folder / "material", model="relief", aspect=0.5, **options)  # type: ignore[arg-type]
+    words = [word for name in FORMATS for word in ("--to", name)]
+    assert run(app, ["export", str(folder / "material"), *words, "-o", str(folder / "out"), "-q"]) == 0
+    return folder / "out"
+
+
+@pytest.fixture(scope="module")
+def glossy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return exported(tmp_path_factory.mktemp("glossy"))
+
+
+def f0(out: Path) -> float:
+    """Reflectance of the dielectric at normal incidence."""
+    return float(Material.load(out.parent / "material").model.weights()["surface.dielectric"])
+
+
+def f0_of(refractive: float) -> float:
+    return ((refractive - 1) / (refractive + 1)) ** 2
+
+
+def test_images_hold_the_maps(glossy: Path) -> None:
+    maps = maps_of(Material.load(glossy.parent / "material"))
+    normal = np.asarray(Image.open(glossy / "normal.png"), np.float64) / 255
+    np.testing.assert_allclose(2 * normal - 1, maps.normals, atol=0.004)
+    packed = np.asarray(Image.open(glossy / "roughness_metallic.png"), np.float64) / 255
+    np.testing.assert_allclose(packed[..., 1], maps.roughness, atol=0.002)
+    np.testing.assert_allclose(packed[..., 2], maps.metallic, atol=0.002)
+    height = np.asarray(Image.open(glossy / "height.png"), np.float64) / 65535
+    low = maps.heights.min()
+    np.testing.assert_allclose(low + height * (maps.heights.max() - low), maps.heights, atol=1e-5)
+    assert Image.open(glossy / "base_color.png").mode == "RGB"
+
+
+def test_gltf(glossy: Path) -> None:
+    pygltflib = pytest.importorskip("pygltflib")
+    document = pygltflib.GLTF2().load(str(glossy / "material.gltf"))
+    (material,) = document.materials
+    uris = [image.uri for image in document.images]
+    assert uris[material.pbrMetallicRoughness.baseColorTexture.index] == "base_color.png"
+    assert uris[material.normalTexture.index] == "normal.png"
+    assert material.alphaMode == "OPAQUE"
+    assert f0_of(material.extensions["KHR_materials_ior"]["ior"]) == pytest.approx(f0(glossy), rel=1e-4)
+    assert document.extensionsUsed == ["KHR_materials_ior"]
+    extras = material.extras
+    assert (glossy / extras["neural_material"] / "material.json").is_file()
+    description = json.loads((glossy / extras["neural_material"] / "material.json").read_text())
+    assert extras["weights_sha256"] == description["weights"]["sha256"]
+    data = base64.b64decode(document.buffers[0].uri.partition(",")[2])
+
+    def array(name: int, kind: str, count: int) -> np.ndarray:
+        view = document.bufferViews[document.accessors[name].bufferView]
+        return np.frombuffer(data, kind, offset=view.byteOffset, count=count * document.accessors[name].count)
+
+    positions, uv = array(0, "<f4", 3).reshape(-1, 3), array(3, "<f4", 2).reshape(-1, 2)
+    assert positions.max(0).tolist() == [1, 0.5, 0]
+    # Row 0 of an image, at 0 of the texture's second coordinate, is the tile's top.
+    np.testing.assert_allclose(uv, np.stack([positions[:, 0], 1 - positions[:, 1] / 0.5], 1))
+    triangles = positions[array(4, "<u2", 1).reshape(-1, 3)]
+    up = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    assert (up[:, 2] > 0).all()
+    normals, tangents = array(1, "<f4", 3).reshape(-1, 3), array(2, "<f4", 4).reshape(-1, 4)
+    # The bitangent of glTF runs upwards in the image.
+    np.testing.assert_allclose(
+        np.cross(normals, tangents[:, :3]) * tangents[:, 3:], np.tile([0, 1, 0], (4, 1))
+    )
+
+
+def test_usd(glossy: Path) -> None:
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdGeom, UsdShade
+
+    stage = Usd.Stage.Open(str(glossy / "material.usda"))
+    assert UsdGeom.GetStageUpAxis(stage) == "Z"
+    mesh = stage.GetPrimAtPath("/Tile/Plane")
+    bound, _ = UsdShade.MaterialBindingAPI(mesh).ComputeBoundMaterial()
+    surface = bound.ComputeSurfaceSource()[0]
+    assert surface.GetIdAttr().Get() == "UsdPreviewSurface"
+    spaces = {
+        "diffuseColor": "sRGB",
+        "normal": "raw",
+        "roughness": "raw",
+        "metallic": "raw",
+        "displacement": "raw",
+    }
+    for name, space in spaces.items():
+        source, channel, _ = surface.GetInput(name).GetConnectedSource()
+        texture = UsdShade.Shader(source.GetPrim())
+        assert texture.GetIdAttr().Get() == "UsdUVTexture"
+        assert texture.GetInput("sourceColorSpace").Get() == space
+        assert texture.GetInput("wrapS").Get() == "repeat"
+        assert Path(texture.GetInput("file").Get().resolvedPath).is_file()
+        assert texture.GetOutput(channel), name
+    normal = UsdShade.Shader(stage.GetPrimAtPath("/Tile/Material/normal"))
+    assert normal.GetInput("scale").Get() == (2, 2, 2, 1)
+    assert normal.GetInput("bias").Get() == (-1, -1, -1, 0)
+    heights = maps_of(Material.load(glossy.parent / "material")).heights
+    height = UsdShade.Shader(stage.GetPrimAtPath("/Tile/Material/height"))
+    assert height.GetInput("scale").Get()[0] == pytest.approx(np.ptp(heights), rel=1e-5)
+    assert height.GetInput("bias").Get()[0] == pytest.approx(heights.min(), rel=1e-5)
+    assert f0_of(surface.GetInput("ior").Get()) == pytest.approx(f0(glossy), rel=1e-4)
+    data = stage.GetPrimAtPath("/Tile").GetCustomData()
+    assert (glossy / data["neural_material"] / "material.json").is_file()
+
+
+def test_materialx(glossy: Path) -> None:
+    mx = pytest.importorskip("MaterialX")
+    document, library = mx.createDocument(), mx.createDocument()
+    mx.readFromXmlFile(document, str(glossy / "material.mtlx"))
+    mx.loadLibraries(mx.getDefaultDataLibraryFolders(), mx.getDefaultDataSearchPath(), library)
+    document.importLibrary(library)
+    assert document.validate() == (True, "")
+    (material,) = document.getMaterialNodes()
+    (surface,) = mx.getShaderNodes(material, "surfaceshader")
+    assert surface.getCategory() == "gltf_pbr"
+    assert f0_of(surface.getInput("ior").getValue()) == pytest.approx(f0(glossy), rel=1e-4)
+    image = document.getNodeGraph("maps").getNode("base")
+    assert image.getInput("file").getAttribute("colorspace") == "srgb_texture"
+    assert (glossy / image.getInput("file").getValue()).is_file()
+    assert (
+        document.getNodeGraph("maps").getNode("normal_image").getInput("file").getAttribute("colorspace")
+        == ""
+    )
+    (moved,) = mx.getShaderNodes(material, "displacementshader")
+    assert moved.getInput("scale").getValue() > 0
+
+
+def test_a_surface_without_gloss_with_holes(tmp_path: Path) -> None:
+    lattice = Lattice(3, 0.5)
+    levels = [np.zeros((*lattice.shape(s), 6), np.float32) for s in range(4)]
+    for texels in levels:
+        texels[0, :, 0] = 0.75
+    out = exported(tmp_path, glossy=False, transmittance=Transmittance(lattice, levels))
+    alpha = np.asarray(Image.open(out / "base_color.png"))[..., 3]
+    assert alpha[0].tolist() == [64] * 8
+    assert (alpha[1:] == 255).all()
+    document = json.loads((out / "material.gltf").read_text())
+    (material,) = document["materials"]
+    assert material["alphaMode"] == "BLEND"
+    assert material["extensions"] == {"KHR_materials_specular": {"specularFactor": 0.0}}
+    assert "int inputs:useSpecularWorkflow = 1" in (out / "material.usda").read_text()
+    mx = pytest.importorskip("MaterialX")
+    read, library = mx.createDocument(), mx.createDocument()
+    mx.readFromXmlFile(read, str(out / "material.mtlx"))
+    mx.loadLibraries(mx.getDefaultDataLibraryFolders(), mx.getDefaultDataSearchPath(), library)
+    read.importLibrary(library)
+    assert read.validate() == (True, "")
+    (surface,) = mx.getShaderNodes(read.getMaterialNodes()[0], "surfaceshader")
+    assert surface.getInput("specular").getValue() == 0
+    assert surface.getInput("alpha_mode").getValue() == 2
+
+
+def test_the_same_export_again_has_the_same_bytes(glossy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = {path.name: path.read_bytes() for path in glossy.iterdir()}
+    assert len(before) == 7
+    words = [word for name in FORMATS for word in ("--to", name)]
+    assert run(app, ["export", str(glossy.parent / "material"), *words, "-o", str(glossy)]) == 0
+    assert "mean reflectance of the maps" in capsys.readouterr().out
+    assert {path.name: path.read_bytes() for path in glossy.iterdir()} == before
+
+
+def test_options_of_maps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_material(tmp_path / "relief", model="relief")
+    write_material(tmp_path / "neumip")
+    out = ["-o", str(tmp_path / "out")]
+    for words, code, what in (
+        (["relief", "--level", "1"], 2, "--level: is an option of maps"),
+        (["relief", "--to", "usd", "--level", "9"], 2, "has the levels 0 to 3"),
+        (["neumip", "--to", "gltf"], 3, "knows no surface"),
+    ):
+        assert run(app, ["export", str(tmp_path / words[0]), *words[1:], *out]) == code
+        assert what in capsys.readouterr().err
+    assert run(app, ["export", str(tmp_path / "relief"), "--to", "usd", "--level", "1", *out, "-q"]) == 0
+    assert Image.open(tmp_path / "out" / "normal.png").size == (2, 2)
+
+
+def test_the_refractive_index_of_glass() -> None:
+    assert refractive_index(0.04) == pytest.approx(1.5)
+    assert refractive_index(0.0) == 1

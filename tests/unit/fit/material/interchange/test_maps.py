@@ -1,0 +1,141 @@
+"""Maps of a known surface: closed forms, orientation, and the mean reflectance of the tile."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from support.known_surfaces import geometry
+from support.plugin_materials import write_material
+
+from mbtf_core.directions import from_angles
+from mbtf_core.errors import InputError, UsageError
+from mbtf_core.lattice import Lattice
+from mbtf_fit import Material
+from mbtf_fit.material.interchange.maps import (
+    Maps,
+    direction_pairs,
+    evaluate_maps,
+    fit_color,
+    maps_of,
+    tile_means,
+)
+from mbtf_fit.surface.known import KnownSurface, ggx
+
+
+def known(folder: Path, **options: object) -> Material:
+    """A material whose surface has these slopes, color, roughness and metallic everywhere."""
+    lattice = Lattice(3, 1.0)
+    surface = KnownSurface.of(geometry(lattice, np.zeros((8, 8), np.float32), **options), lattice, 0.0)  # type: ignore[arg-type]
+    return write_material(folder, model="relief", glossy="roughness" in options, weights=surface.tensors())
+
+
+def test_a_flat_lambert_tile_keeps_its_color(tmp_path: Path) -> None:
+    """Its base color is π times its value."""
+    value = (0.05, 0.1, 0.25)
+    material = write_material(tmp_path, model="relief", constant=value)
+    maps, agreement = fit_color(material, maps_of(material))
+    np.testing.assert_allclose(
+        maps.base_color, np.broadcast_to(math.pi * np.array(value), maps.base_color.shape), rtol=2e-3
+    )
+    np.testing.assert_allclose(agreement.before, 1, rtol=1e-3)
+    np.testing.assert_allclose(agreement.after, 1, rtol=1e-3)
+    assert agreement.spread < 1e-3
+    assert (maps.metallic == 0).all()
+    assert (maps.roughness == 1).all()
+    assert maps.dielectric == 0
+
+
+def test_normals_and_roughness_are_those_of_the_surface(tmp_path: Path) -> None:
+    material = known(tmp_path, slope=(0.5, -0.25), roughness=0.3, metallic=0.8)
+    maps = maps_of(material, 2)
+    assert maps.roughness.shape == (4, 4)
+    expected = np.array([-0.5, 0.25, 1]) / np.linalg.norm([-0.5, 0.25, 1])
+    np.testing.assert_allclose(maps.normals, np.broadcast_to(expected, (4, 4, 3)), atol=1e-5)
+    np.testing.assert_allclose(maps.roughness, 0.3, rtol=1e-4)
+    np.testing.assert_allclose(maps.metallic, 0.8, rtol=1e-5)
+    # Slopes that vary within a texel: half ±0.4 along x.
+    tensors = material.model.weights()
+    tensors["surface.maps.2"][..., :2] = 0.0
+    tensors["surface.maps.2"][..., 2] = 0.16
+    material.model.load_weights(tensors)
+    np.testing.assert_allclose(maps_of(material, 2).roughness, (0.3**4 + 0.16) ** 0.25, rtol=1e-4)
+
+
+def one_texel(**changes: object) -> Maps:
+    flat = Maps(
+        0,
+        1.0,
+        np.full((1, 1, 3), 0.5),
+        np.zeros((1, 1, 2)),
+        np.full((1, 1), 0.5),
+        np.zeros((1, 1)),
+        np.ones((1, 1)),
+        0.04,
+        np.zeros((2, 2)),
+    )
+    return replace(flat, **changes)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("metallic", [0.0, 0.6, 1.0])
+def test_values_are_those_of_the_lobe(metallic: float) -> None:
+    """Against the GGX of the known surface; the dielectric's diffuse part is what Fresnel's term leaves."""
+    light, view = from_angles(50.0, 20.0), from_angles(35.0, 160.0)
+    slopes, base = np.array([[[0.3, -0.2]]]), np.array([0.8, 0.5, 0.2])
+    maps = one_texel(slopes=slopes, metallic=np.full((1, 1), metallic), base_color=base[None, None])
+    n = maps.normals[0, 0]
+    i, o, normal = (torch.from_numpy(np.asarray(x, np.float64))[None] for x in (light, view, n))
+    cosines = [torch.tensor([[float(n @ w)]], dtype=torch.float64) for w in (light, view)]
+    alpha2 = torch.tensor([[0.5**4]], dtype=torch.float64)
+
+    def lobe(f0: np.ndarray) -> np.ndarray:
+        return ggx(torch.from_numpy(f0)[None], alpha2, normal, *cosines, i, o)[0].numpy()
+
+    half = (light + view) / np.linalg.norm(light + view)
+    fresnel = 0.04 + 0.96 * (1 - view @ half) ** 5
+    dielectric = lobe(np.full(3, 0.04)) + (1 - fresnel) * base / math.pi
+    expected = ((1 - metallic) * dielectric + metallic * lobe(base)) * (n @ light) / light[2]
+    np.testing.assert_allclose(evaluate_maps(maps, light, view)[0, 0], expected, rtol=1e-10)
+
+
+def test_surfaces_that_face_away_are_black() -> None:
+    maps = one_texel(slopes=np.array([[[3.0, 0.0]]]))
+    away, towards, up = from_angles(10.0, 0.0), from_angles(30.0, 180.0), np.array([0.0, 0.0, 1.0])
+    assert (evaluate_maps(maps, away, up) == 0).all()
+    assert (evaluate_maps(maps, up, away) == 0).all()
+    assert (evaluate_maps(maps, towards, up) > 0).all()
+
+
+def test_directions_are_cosine_weighted() -> None:
+    """The mean of the cosine is 2/3 where all of the hemisphere counts."""
+    light, view = direction_pairs(1024, 1e-6)
+    for omega in (light, view):
+        np.testing.assert_allclose(np.linalg.norm(omega, axis=1), 1)
+        assert omega[:, 2].mean() == pytest.approx(2 / 3, abs=0.01)
+        np.testing.assert_allclose(omega[:, :2].mean(0), 0, atol=0.02)
+    assert min(direction_pairs(1024, 0.3)[0][:, 2]) >= 0.3
+
+
+def test_the_mean_reflectance_is_that_of_the_network(tmp_path: Path) -> None:
+    """With other lights and views than those of the fit, on a surface whose network differs from its maps."""
+    material = write_material(tmp_path, model="relief", finest=4, brightness=0.0, contrast=0.2)
+    plain = maps_of(material)
+    maps, agreement = fit_color(material, plain)
+    np.testing.assert_allclose(agreement.after, 1, rtol=0.01)
+    assert np.abs(agreement.before - 1).max() > 0.05
+    light, view = direction_pairs(512, 0.1, seed=1)
+    ours = np.mean([evaluate_maps(maps, i, o).mean((0, 1)) for i, o in zip(light, view, strict=True)], 0)
+    np.testing.assert_allclose(ours / tile_means(material, light, view).mean(0), 1, rtol=0.06)
+
+
+def test_what_has_no_maps_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="'neumip' knows no surface"):
+        maps_of(write_material(tmp_path / "neumip"))
+    material = write_material(tmp_path / "relief", model="relief")
+    for level in (-1, 4):
+        with pytest.raises(UsageError, match="has the levels 0 to 3"):
+            maps_of(material, level)
