@@ -134,7 +134,7 @@ float trace(vec2 u, vec3 omega) {
     ivec2 wrapped = moved;
     if (moved.x < 0) wrapped.x = HEIGHT_SIZE.x - 1; else if (moved.x >= HEIGHT_SIZE.x) wrapped.x = 0;
     if (moved.y < 0) wrapped.y = HEIGHT_SIZE.y - 1; else if (moved.y >= HEIGHT_SIZE.y) wrapped.y = 0;
-    if (wrapped != moved && ++crossings > MAX_CROSSINGS) break;
+    if ((wrapped.x != moved.x || wrapped.y != moved.y) && ++crossings > MAX_CROSSINGS) break;
     cell = wrapped;
   }
   return z;
