@@ -68,14 +68,15 @@ def verify(folder: Path, /, *, digests: Path | None = None, console: Console = C
         "faults": [asdict(f) for f in faults],
         "foreign": foreign,
     }
+    equal = ""
     known = "" if dataset.manifest["geometry"] is None else f" and {GEOMETRY_NAME}"
     if digests is not None and not faults:
         from mbtf_gen.publishing.digests import digest_faults
 
         data["differences"] = digest_faults(dataset, digests)
         lines = [f"{folder}: {text}" for text in data["differences"]]
-        known += f", equal to {digests} bit by bit"
-    lines = lines or [f"{folder}: {len(files)} shards{known}, all intact"]
+        equal = f", and equal to {digests} bit by bit"
+    lines = lines or [f"{folder}: {len(files)} shards{known}, all intact{equal}"]
     console.report(data, "\n".join([*lines, *_describe_foreign(folder, foreign)]))
     console.note(f"{read / 1e6:.1f} MB read in {clock(seconds)} ({read / 1e6 / max(seconds, 1e-9):.0f} MB/s)")
     return EXIT_BAD_INPUT if faults or data.get("differences") else EXIT_OK

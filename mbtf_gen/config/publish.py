@@ -89,9 +89,11 @@ class PublishConfig(Settings):
         (), description="authors of the data set, separated by semicolons"
     )
     url: Annotated[Url | None, Flag("--url", "URL")] = Field(
-        None, description="address where the data set will be found")
+        None, description="address where the data set will be found"
+    )
     citation: Annotated[Citation | None, Flag("--citation")] = Field(
-        None, description="how to cite the data set: BibTeX or plain text")
+        None, description="how to cite the data set: BibTeX or plain text"
+    )
     date: Annotated[str | None, BeforeValidator(_date), Flag("--date", "YYYY-MM-DD")] = Field(
         None, description="date of publication"
     )

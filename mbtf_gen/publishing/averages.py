@@ -44,7 +44,8 @@ class Averages:
     Attributes
     ----------
     tile : (lights, rows, columns, 3) array
-        Mean value over the lights of each entry of ``LIGHTS``, from views around the normal, row 0 at ``v → 1``.
+        Mean value over the lights of each entry of ``LIGHTS``, from views around the normal; row 0 at
+        ``v → 1``.
     brdf : (elevations, bins, bins, 3) array
         Mean value over the tile by the direction of view. The light lies on the right (azimuth 0) at each of
         ``ELEVATIONS``. Column and row count from -1 to 1 in x and from 1 to -1 in y.
@@ -154,9 +155,7 @@ def _add_brdf(brdf: _Bins, bins: int, light: F64, view: F64, value: F64) -> None
     sine = np.divide(light[:, 1], across, out=np.zeros_like(across), where=across > 0)
     x = cosine * view[:, 0] + sine * view[:, 1]
     y = cosine * view[:, 1] - sine * view[:, 0]
-    column, row = (
-        np.clip(np.floor((0.5 + 0.5 * c) * bins), 0, bins - 1).astype(np.int64) for c in (x, -y)
-    )
+    column, row = (np.clip(np.floor((0.5 + 0.5 * c) * bins), 0, bins - 1).astype(np.int64) for c in (x, -y))
     elevation = np.degrees(np.arcsin(np.clip(light[:, 2], -1.0, 1.0)))
     for number, (low, high) in enumerate(ELEVATIONS):
         found = (elevation >= low) & (elevation <= high if high == 90.0 else elevation < high)

@@ -10,10 +10,11 @@ from mbtf_core.atomic import Stored
 from mbtf_core.config_file import dump_yaml
 from mbtf_core.shard_schema import GEOMETRY_NAME, LEADING_AXES
 from mbtf_core.units import size_text
+from mbtf_gen.publishing.digests import DIGESTS_NAME
 from mbtf_gen.publishing.escape import code, escaped, fenced, table
 from mbtf_gen.publishing.facts import TAGS, Facts, bound_text
 from mbtf_gen.publishing.folder import DATA, PICTURES, RECIPE
-from mbtf_gen.publishing.loading import loading_section
+from mbtf_gen.publishing.loading import loading_section, same_shapes
 from mbtf_gen.publishing.recipe import MATERIAL, SCRIPT_NAME, remake_commands
 from mbtf_gen.publishing.statistics import SplitStatistics
 
@@ -31,10 +32,10 @@ _HUB_NAMES = {"odbl-1.0": "odbl", "odc-by-1.0": "odc-by", "pddl-1.0": "pddl"}
 _CAPTIONS = {
     "tile.png": "The tile from above: mean value of the training queries per position, over views within 32° "
     "of the normal. Drawn from the stored values; nothing was rendered for it.",
-    "brdf.png": "Apparent BRDF: mean value over the tile by direction of view, for three elevations of the "
-    "light (star). Both directions are turned until the light lies on the right. Gray: no data.",
-    "values.png": "Values of all queries, queries per level of detail, and their noise with error bars of one "
-    "standard error.",
+    "brdf.png": "Apparent BRDF: mean value over the tile by direction of view, for three elevations of "
+    "the light (star). Both directions are turned until the light lies on the right. Gray: no data.",
+    "values.png": "Values of all queries, queries per level of detail, and their noise with error bars of "
+    "one standard error.",
     "queries.png": "Positions, levels and directions of the training queries.",
     "surface.png": "The surface as simulated, from `geometry.exr`.",
 }
@@ -89,7 +90,9 @@ class Card:
         facts, config = self.facts, self.facts.config
         lower = config.license.lower()
         hub = _HUB_NAMES.get(lower, lower)
-        terms = {"license": hub} if hub in _HUB_LICENSES else {"license": "other", "license_name": config.license}
+        terms = (
+            {"license": hub} if hub in _HUB_LICENSES else {"license": "other", "license_name": config.license}
+        )
         data: dict[str, Any] = {
             **terms,
             "pretty_name": facts.name,
@@ -100,6 +103,9 @@ class Card:
         if suffix is not None:
             files = [{"split": split, "path": f"{DATA}/{split}-*{suffix}"} for split in self.splits]
             data["configs"] = [{"config_name": "default", "data_files": files}]
+            if not same_shapes(self.splits):
+                # Rows of one configuration must have one shape.
+                data["configs"] = [{"config_name": file["split"], "data_files": [file]} for file in files]
         return f"---\n{dump_yaml(data)}---"
 
     def _origin(self) -> str:
@@ -121,9 +127,9 @@ class Card:
         return "\n\n".join(
             [
                 "## What a query is",
-                "The data sample the multi-resolution BTF M(u, σ, ω_i, ω_o) in 1/sr: the radiance that leaves "
-                "the position u towards ω_o, averaged over a Gaussian footprint σ, under a light from ω_i that "
-                "gives the reference plane the irradiance 1. "
+                "The data sample the multi-resolution BTF M(u, σ, ω_i, ω_o) in 1/sr. It is the radiance that "
+                "leaves the position u towards ω_o, averaged over a Gaussian footprint σ. The light comes "
+                "from ω_i and gives the reference plane the irradiance 1. "
                 f"The finest level {lattice.finest} has {columns} × {rows} texels. "
                 f"One row is {self.facts.layout}.",
                 table(
@@ -135,13 +141,14 @@ class Card:
 
     def _fields(self) -> str:
         axes = LEADING_AXES[self.facts.data.layout][1:]
-        named = {split: fields for split, fields in self.splits.items()}
-        first = next(iter(named.values()), {})
+        first = next(iter(self.splits.values()), {})
         rows = []
         for name, field in first.items():
-            shapes = {split: _shape(fields[name]["shape"]) for split, fields in named.items()}
+            shapes = {split: _shape(fields[name]["shape"]) for split, fields in self.splits.items()}
             unique = list(dict.fromkeys(shapes.values()))
-            shown = unique[0] if len(unique) == 1 else "; ".join(f"{s}: {shape}" for s, shape in shapes.items())
+            shown = (
+                unique[0] if len(unique) == 1 else "; ".join(f"{s}: {shape}" for s, shape in shapes.items())
+            )
             rows.append((code(name), shown, escaped(field["unit"]), escaped(field["meaning"])))
         leading = f" The first axes are {' and '.join(axes)}." if axes else ""
         note = (
@@ -181,8 +188,9 @@ class Card:
             for part in (
                 "## Statistics",
                 table(heads, rows),
-                f"Means and noise have error bars of one standard error; what is independent are {self._units()}. "
-                "Noise is the pooled standard error of a query's value, relative to the mean value.",
+                "Means and noise have error bars of one standard error, from the scatter over "
+                f"{self._units()}. Noise is the pooled standard error of the value of one query, relative to "
+                "the mean value. It averages out over many queries.",
                 self._picture("brdf.png"),
                 self._picture("values.png"),
                 self._picture("queries.png"),
@@ -206,9 +214,9 @@ class Card:
                     ("effect", "state", "bias without it", "why"),
                     ((escaped(a), b, c, escaped(d)) for a, b, c, d in self.facts.effects),
                 ),
-                "Biases are root mean square changes of M relative to its mean: upper bounds where the effect "
-                f"is left out, estimates where it is simulated. All that is left out adds up to {total} at "
-                f"most. Surface interactions per path: {depth}.",
+                "Biases are root mean square changes of M relative to its mean: upper bounds where the "
+                "effect is left out, estimates where it is simulated. All that is left out adds up to "
+                f"{total} at most. Surface interactions per path: {depth}.",
             ]
         )
 
@@ -218,8 +226,8 @@ class Card:
         return "\n\n".join(
             [
                 "## Surface",
-                f"`{DATA}/{GEOMETRY_NAME}` holds the heights as traced, mean slopes with their second moments, "
-                "and the reflectance that the generator knew. Any EXR viewer opens it.",
+                f"`{DATA}/{GEOMETRY_NAME}` holds the heights as traced, mean slopes with their second "
+                "moments, and the reflectance that the generator knew. Any EXR viewer opens it.",
                 self._picture("surface.png"),
             ]
         )
@@ -235,8 +243,8 @@ class Card:
             return "\n\n".join(
                 [
                     "## How it was made",
-                    "The values are measured data, converted by `mbtf-gen import`. There is no recipe: the data "
-                    "cannot be generated again without the measurement.",
+                    "The values are measured data, converted by `mbtf-gen import`. There is no recipe: the "
+                    "data cannot be made again without the measurement.",
                     inputs,
                     f"Software: {software}.",
                 ]
@@ -244,20 +252,21 @@ class Card:
         whose = (
             f"The input files of the material are in `{RECIPE}/{MATERIAL}`."
             if self.maps
-            else "`MATERIAL` is the path of the material, whose files are not published. These are their digests; "
-            "`settings` covers its constants and options."
+            else "`MATERIAL` is the path of the material, whose files are not published. These are their "
+            "digests; `settings` covers its constants and options."
         )
         return "\n\n".join(
             [
                 "## How it was made",
-                "These commands make the same data set again, and compare every array with the published one:",
+                "These commands make the same data set again and compare every array with the published "
+                "one. They run in this folder:",
                 fenced("\n".join(remake_commands(self.maps))),
                 f"`sh {RECIPE}/{SCRIPT_NAME}` runs both. {whose}",
                 inputs,
-                "The queries are equal bit by bit on every machine. The values are equal bit by bit on one type "
-                f"of machine with this software: {software}.",
-                f"`{RECIPE}/digests.json` holds the SHA-256 of each array as little-endian float32 numbers in C "
-                "order. The published files hold the same numbers.",
+                "The queries are equal bit by bit on every machine. The values are equal bit by bit on one "
+                f"type of machine with this software: {software}.",
+                f"`{RECIPE}/{DIGESTS_NAME}` holds the SHA-256 of each array as little-endian float32 numbers "
+                "in C order. The published files hold the same numbers.",
             ]
         )
 
@@ -272,10 +281,12 @@ class Card:
         else:
             config = facts.manifest["config"]
             lines += [
-                "Values are Monte Carlo estimates. Errors of a model include this noise unless both estimates "
-                "are used: the mean of (p − a)(p − b) is the squared error of a prediction p without it.",
-                f"The cosine of both directions to the normal is at least {config['queries']['min_cos']:g}. The "
-                f"light has a width of {config['light']['width']:g}° (RMS per axis).",
+                "Values are Monte Carlo estimates. Errors of a model include this noise unless both "
+                "estimates are used: the mean of (p − a)(p − b) is the squared error of a prediction p "
+                "without it.",
+                "The cosine of both directions to the normal is at least "
+                f"{config['queries']['min_cos']:g}. The light has a width of {config['light']['width']:g}° "
+                "(RMS per axis).",
                 "Geometric optics: no diffraction, no polarization, no fluorescence.",
             ]
         return "\n\n".join(["## Limits", "\n".join(f"- {line}" for line in lines)])
@@ -292,7 +303,9 @@ class Card:
             (code(name), str(len(found)), size_text(sum(stored.bytes for stored in found)))
             for name, found in groups.items()
         ]
-        described = "`croissant.json` describes the data set to programs and lists the SHA-256 of these files."
+        described = (
+            "`croissant.json` describes the data set to programs and lists the SHA-256 of these files."
+        )
         return "\n\n".join(["## Files", table(("file", "number", "size"), rows), described])
 
     def _license(self) -> str:
@@ -306,7 +319,10 @@ class Card:
             lines.append(f"Address: <{config.url}>")
         parts = ["## License and citation", "\n".join(f"- {line}" for line in lines)]
         if config.citation:
-            parts += ["Cite as:", fenced(config.citation, "bibtex" if config.citation.startswith("@") else "")]
+            parts += [
+                "Cite as:",
+                fenced(config.citation, "bibtex" if config.citation.startswith("@") else ""),
+            ]
         return "\n\n".join(parts)
 
 

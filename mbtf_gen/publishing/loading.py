@@ -27,15 +27,23 @@ import numpy as np
 
 value_a = np.load("{folder}/{first}.npz")["value_a"]  # {shape}"""
 _DATASETS = """\
+import os
 from datasets import load_dataset
 
-data = load_dataset(".", split="{split}").with_format("numpy")  # or the name of the data set on the hub
+# In place of this folder, the name of the data set on the hub will do.
+data = load_dataset(os.getcwd(), {configuration}split="{split}").with_format("numpy")
 value_a = data[:100]["value_a"]"""
 _WEBDATASET = """\
 import webdataset
 
 samples = webdataset.WebDataset("{folder}/{first}.tar").decode()
 value_a = next(iter(samples))["value_a.npy"]"""
+
+
+def same_shapes(splits: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> bool:
+    """Whether rows of all splits have the same shapes."""
+    shapes = [{name: field["shape"] for name, field in fields.items()} for fields in splits.values()]
+    return all(shape == shapes[0] for shape in shapes)
 
 
 def loading_section(facts: Facts, splits: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> str:
@@ -56,6 +64,7 @@ def loading_section(facts: Facts, splits: Mapping[str, Mapping[str, Mapping[str,
         "folder": DATA,
         "first": f"{split}-00000",
         "split": split,
+        "configuration": "" if same_shapes(splits) else f'"{split}", ',
         "shape": lengths if form == "parquet" else f"shape ({lengths.replace('-1', 'n')})",
     }
     ways = {

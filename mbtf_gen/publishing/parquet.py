@@ -40,7 +40,9 @@ def check_pyarrow() -> None:
         ) from None
 
 
-def parquet_schema(arrays: Arrays, described: Mapping[str, Mapping[str, Any]], facts: Mapping[str, Any]) -> Any:
+def parquet_schema(
+    arrays: Arrays, described: Mapping[str, Mapping[str, Any]], facts: Mapping[str, Any]
+) -> Any:
     """Schema of the Parquet file of a shard.
 
     Parameters

@@ -77,7 +77,7 @@ def _figure(width: float, height: float) -> Any:
 
 def _shown(pictures: NDArray[np.float64]) -> NDArray[np.uint8]:
     """8-bit sRGB of pictures (..., 3) at one exposure; pixels without queries are light gray."""
-    known = np.isfinite(pictures).all(axis=-1)
+    known = np.asarray(np.isfinite(pictures).all(axis=-1))
     exposure = auto_exposure([brightness(pictures[known])] if known.any() else [0.0])
     shown = to_display(np.where(known[..., None], pictures, 0.0), exposure)
     shown[~known] = _EMPTY
@@ -147,7 +147,9 @@ def value_figure(found: Mapping[str, SplitStatistics]) -> Any:
                 capsize=3,
                 label=name,
             )
-    levels.set(title="queries per level", xlabel="level of detail (0: the tile)", ylabel="fraction of the split")
+    levels.set(
+        title="queries per level", xlabel="level of detail (0: the tile)", ylabel="fraction of the split"
+    )
     for axes in rest:
         axes.set(title="noise per level", xlabel="level of detail", ylabel="noise of a value, % of the mean")
         axes.set_ylim(bottom=0)
@@ -159,7 +161,9 @@ def value_figure(found: Mapping[str, SplitStatistics]) -> Any:
 
 def _histogram(axes: Any, found: Mapping[str, SplitStatistics]) -> None:
     counts = sum(split.histogram for split in found.values())
-    edges = 10.0 ** (LOWEST_DECADE + np.arange((HIGHEST_DECADE - LOWEST_DECADE) * PER_DECADE + 1) / PER_DECADE)
+    edges = 10.0 ** (
+        LOWEST_DECADE + np.arange((HIGHEST_DECADE - LOWEST_DECADE) * PER_DECADE + 1) / PER_DECADE
+    )
     # Single values far from all others would only widen the axis.
     used = np.flatnonzero(np.asarray(counts).sum(axis=1) > 1e-4 * np.max(counts))
     total = max(1, sum(split.queries for split in found.values()))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -147,27 +147,28 @@ class Publication:
 
     def _data_makers(self) -> Makers:
         makers: Makers = {}
-        for split, found in self.shards.items():
-            facts = {"format": "mbtf", "layout": self.data.layout, "split": split}
+        for found in self.shards.values():
             for shard in found:
-                if self.config.form == "parquet":
-                    makers[f"{DATA}/{shard.path.stem}.parquet"] = lambda path, shard=shard, facts=facts: (
-                        write_parquet(path, shard.read(), self.data.manifest["arrays"], facts)
-                    )
-                elif self.config.form == "webdataset":
-                    makers[f"{DATA}/{shard.path.stem}.tar"] = lambda path, shard=shard: write_tar(
-                        path, shard.read()
-                    )
-                else:
-                    for source in (shard.path, sidecar_of(shard.path)):
-                        makers[f"{DATA}/{source.name}"] = lambda path, source=source: link_or_copy(source, path)
+                makers |= self._shard_makers(shard)
         if self.data.manifest["geometry"] is not None:
-            source = self.data.folder / GEOMETRY_NAME
-            makers[f"{DATA}/{GEOMETRY_NAME}"] = lambda path: copy_file(source, path)
+            makers[f"{DATA}/{GEOMETRY_NAME}"] = partial(copy_file, self.data.folder / GEOMETRY_NAME)
         if self.config.form == "npz":
             for name, content in public_documents(self.data.manifest).items():
-                makers[f"{DATA}/{name}"] = lambda path, content=content: write_chunks(path, [content])
+                makers[f"{DATA}/{name}"] = partial(_write, content)
         return makers
+
+    def _shard_makers(self, shard: Shard) -> Makers:
+        stem, form = shard.path.stem, self.config.form
+        if form == "parquet":
+            facts = {"layout": self.data.layout, "split": shard.sidecar["split"]}
+            described = self.data.manifest["arrays"]
+            return {
+                f"{DATA}/{stem}.parquet": lambda path: write_parquet(path, shard.read(), described, facts)
+            }
+        if form == "webdataset":
+            return {f"{DATA}/{stem}.tar": lambda path: write_tar(path, shard.read())}
+        files = (shard.path, sidecar_of(shard.path))
+        return {f"{DATA}/{source.name}": partial(link_or_copy, source) for source in files}
 
     def makers(self) -> Makers:
         """Writers of all files but the card and ``croissant.json``, by name."""
@@ -221,7 +222,11 @@ class Publication:
             def card() -> str:
                 return Card(self.facts, self.splits, self.statistics, files, self.copy is not None).text
 
-            folder.add(CARD_NAME, lambda path: write_chunks(path, [card().encode()]))
+            folder.add(CARD_NAME, lambda path: _write(card().encode(), path))
             document = croissant_text(self.facts, files, self.splits)
-            folder.add(CROISSANT_NAME, lambda path: write_chunks(path, [document.encode()]))
+            folder.add(CROISSANT_NAME, partial(_write, document.encode()))
             return folder.files
+
+
+def _write(content: bytes, path: Path) -> Stored:
+    return write_chunks(path, [content])

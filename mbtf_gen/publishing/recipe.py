@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from mbtf_core.atomic import Stored, write_chunks
@@ -78,7 +79,7 @@ def recipe_makers(data: Dataset, copy: MaterialCopy | None) -> dict[str, Callabl
     if copy is not None:
         makers[f"{RECIPE}/{MATERIAL}/{MATERIAL_FILE}"] = _text(lambda: copy.text)
         for name, source in sorted(copy.files.items()):
-            makers[f"{RECIPE}/{MATERIAL}/{name}"] = lambda path, source=source: copy_file(source, path)
+            makers[f"{RECIPE}/{MATERIAL}/{name}"] = partial(copy_file, source)
     return makers
 
 

@@ -124,7 +124,10 @@ class SplitStatistics:
             count = int(found.sum()) * one.shape[1]
             self.level_queries[int(level)] = self.level_queries.get(int(level), 0) + count
         self.queries += one.size
-        self.lowest, self.highest = min(self.lowest, float(value.min())), max(self.highest, float(value.max()))
+        self.lowest, self.highest = (
+            min(self.lowest, float(value.min())),
+            max(self.highest, float(value.max())),
+        )
         edges = len(self.histogram)
         for channel in range(3):
             numbers = value[..., channel].reshape(-1)
