@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import re
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 from urllib.parse import urlsplit
@@ -36,8 +37,8 @@ def _one_line(text: str) -> str:
 
 
 def _names(value: Any) -> Any:
-    """Names of a list, also from ``NAME; NAME``."""
-    return [part.strip() for part in value.split(";")] if isinstance(value, str) else value
+    """Names of a list, also from ``NAME and NAME`` as in BibTeX."""
+    return re.split(r"\s+and\s+", value) if isinstance(value, str) else value
 
 
 def _url(text: str) -> str:
@@ -85,8 +86,8 @@ class PublishConfig(Settings):
     name: Annotated[Line | None, Flag("--name")] = Field(
         None, description="name of the published data set; default: that of the material"
     )
-    author: Annotated[Names, Flag("--author", "NAME;NAME")] = Field(
-        (), description="authors of the data set, separated by semicolons"
+    author: Annotated[Names, Flag("--author")] = Field(
+        (), description="authors of the data set, as in BibTeX: NAME and NAME"
     )
     url: Annotated[Url | None, Flag("--url", "URL")] = Field(
         None, description="address where the data set will be found"

@@ -21,25 +21,28 @@ MATERIAL = "material"
 _SCRIPT = """\
 #!/bin/sh
 # Makes the data set again and compares every array with the published one.
-# Usage: sh remake.sh {usage}
+# Usage: sh {script} {usage}
 set -eu
 recipe=$(dirname "$0")
 {begin}
-mbtf-gen {material}--config "$recipe/{config}" -o "$folder"
+mbtf-gen "$material" --config "$recipe/{config}" -o "$folder"
 mbtf-gen verify "$folder" --digests "$recipe/{digests}"
 """
-_WITH_MAPS = 'folder="${1:-remade}"'
+_WITH_MAPS = f"""\
+material="$recipe/{MATERIAL}/{MATERIAL_FILE}"
+folder="${{1:-remade}}\""""
 _WITHOUT_MAPS = """\
-if [ $# -lt 1 ]; then echo "usage: sh remake.sh MATERIAL [FOLDER]" >&2; exit 2; fi
+if [ $# -lt 1 ]; then echo "error: name the material: sh $0 MATERIAL [FOLDER]" >&2; exit 2; fi
+material="$1"
 folder="${2:-remade}\""""
 
 
 def remake_script(maps: bool) -> str:
     """The script, with the material beside it or with its path as the first argument."""
     return _SCRIPT.format(
+        script=SCRIPT_NAME,
         usage="[FOLDER]" if maps else "MATERIAL [FOLDER]",
         begin=_WITH_MAPS if maps else _WITHOUT_MAPS,
-        material="" if maps else '"$1" ',
         config=CONFIG_NAME,
         digests=DIGESTS_NAME,
     )
@@ -47,9 +50,9 @@ def remake_script(maps: bool) -> str:
 
 def remake_commands(maps: bool) -> list[str]:
     """The two commands of the script, as one gives them in the published folder."""
-    material = "" if maps else "MATERIAL "
+    material = f"{RECIPE}/{MATERIAL}/{MATERIAL_FILE}" if maps else "MATERIAL"
     return [
-        f"mbtf-gen {material}--config {RECIPE}/{CONFIG_NAME} -o remade/",
+        f"mbtf-gen {material} --config {RECIPE}/{CONFIG_NAME} -o remade/",
         f"mbtf-gen verify remade/ --digests {RECIPE}/{DIGESTS_NAME}",
     ]
 
