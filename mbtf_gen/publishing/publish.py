@@ -138,8 +138,11 @@ class Publication:
             shard.path.name: shard.sidecar["sha256"] for found in self.shards.values() for shard in found
         }
         options = self.config.model_dump(mode="json", exclude={"version"})
+        # A long text would make a long message.
+        citation = None if self.config.citation is None else data_sha256(self.config.citation)
         return {
             **options,
+            "citation": citation,
             "with_maps": self.copy is not None,
             "config_hash": self.data.manifest["config_hash"],
             "shards": data_sha256(stored),
