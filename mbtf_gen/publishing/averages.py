@@ -6,6 +6,7 @@ footprints, and those over directions at fine footprints are pictures of the til
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,6 +36,8 @@ _FROM_ABOVE = 0.85
 # directions, their mean has little noise.
 _TILE_QUERIES, _BRDF_QUERIES, _BRDF_SHARED = 64, 32, 2
 _MOST_TEXELS, _LEAST_BINS, _MOST_BINS = 256, 4, 64
+# Queries that a pixel of the tile averages, those of its neighbors included.
+_SMOOTHED_QUERIES = 48
 
 
 @dataclass(frozen=True)
@@ -73,8 +76,29 @@ class _Bins:
 
     def means(self) -> F64:
         """Mean of each bin, NaN where it is empty."""
-        with np.errstate(invalid="ignore", divide="ignore"):
-            return np.asarray((self.sums / self.counts[:, None]).reshape(*self.shape, 3))
+        return _ratio(self.sums, self.counts).reshape(*self.shape, 3)
+
+    def smoothed_means(self) -> F64:
+        """Means of the bins of periodic pictures, each with a Gaussian that is as wide as its noise needs."""
+        from scipy.ndimage import gaussian_filter
+
+        out = []
+        for sums, counts in zip(
+            self.sums.reshape(*self.shape, 3), self.counts.reshape(self.shape), strict=True
+        ):
+            mean = float(counts.mean())
+            if 0 < mean < _SMOOTHED_QUERIES:
+                # A Gaussian of σ pixels averages 4πσ² pixels.
+                width = math.sqrt(_SMOOTHED_QUERIES / mean / (4 * math.pi))
+                counts = gaussian_filter(counts, width, mode="wrap")
+                sums = gaussian_filter(sums, (width, width, 0), mode="wrap")
+            out.append(_ratio(sums, counts))
+        return np.stack(out)
+
+
+def _ratio(sums: F64, counts: F64) -> F64:
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(sums / counts[..., None])
 
 
 def directions_count(data: Dataset) -> int:
@@ -134,7 +158,7 @@ def averages(data: Dataset) -> Averages:
             i = np.minimum((u[:, 0] * columns).astype(np.int64), columns - 1)
             j = rows - 1 - np.minimum((u[:, 1] * rows).astype(np.int64), rows - 1)
             _add_tile(tile, j * columns + i, light[fine], value[fine])
-    return Averages(tile.means(), brdf.means())
+    return Averages(tile.smoothed_means(), brdf.means())
 
 
 def _add_tile(tile: _Bins, texel: NDArray[np.int64], light: F64, value: F64) -> None:

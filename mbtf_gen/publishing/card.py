@@ -31,7 +31,7 @@ _HUB_LICENSES = {
 _HUB_NAMES = {"odbl-1.0": "odbl", "odc-by-1.0": "odc-by", "pddl-1.0": "pddl"}
 _CAPTIONS = {
     "tile.png": "The tile from above: mean value of the training queries per position, over views within 32° "
-    "of the normal. Drawn from the stored values; nothing was rendered for it.",
+    "of the normal. Drawn from the stored values; pixels with few queries are averaged with their neighbors.",
     "brdf.png": "Apparent BRDF: mean value over the tile by direction of view, for three elevations of "
     "the light (star). Both directions are turned until the light lies on the right. Gray: no data.",
     "values.png": "Values of all queries, queries per level of detail, and their noise with error bars of "

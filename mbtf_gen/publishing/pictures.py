@@ -75,7 +75,7 @@ def _figure(width: float, height: float) -> Any:
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def _shown(pictures: NDArray[np.float64]) -> NDArray[np.uint8]:
+def displayed(pictures: NDArray[np.float64]) -> NDArray[np.uint8]:
     """8-bit sRGB of pictures (..., 3) at one exposure; pixels without queries are light gray."""
     known = np.asarray(np.isfinite(pictures).all(axis=-1))
     exposure = auto_exposure([brightness(pictures[known])] if known.any() else [0.0])
@@ -88,7 +88,7 @@ def tile_figure(data: Dataset, found: Averages) -> Any:
     """Matplotlib figure of the tile under all lights, and under lights from three sides."""
     aspect = data.lattice.aspect
     figure = _figure(3.0 * len(LIGHTS), 3.0 * float(np.clip(aspect, 0.3, 3.0)) + 0.5)
-    pictures = _shown(found.tile)
+    pictures = displayed(found.tile)
     for axes, name, picture in zip(
         figure.subplots(1, len(LIGHTS), squeeze=False)[0], LIGHTS, pictures, strict=True
     ):
@@ -99,16 +99,16 @@ def tile_figure(data: Dataset, found: Averages) -> Any:
 
 def brdf_figure(found: Averages) -> Any:
     """Matplotlib figure of the apparent BRDF by direction of view, for three elevations of the light."""
+    from matplotlib.patches import Circle
+
     figure = _figure(3.4 * len(ELEVATIONS), 3.9)
-    pictures = _shown(found.brdf)
+    pictures = displayed(found.brdf)
     angle = np.linspace(0.0, 2.0 * np.pi, 361)
-    across = np.linspace(-1.0, 1.0, pictures.shape[1])
-    outside = np.hypot(across[:, None], across[None, :]) > 1.0
     for axes, (low, high), picture in zip(
         figure.subplots(1, len(ELEVATIONS)), ELEVATIONS, pictures, strict=True
     ):
-        picture[outside & (picture == _EMPTY).all(axis=-1)] = 255
-        axes.imshow(picture, extent=(-1, 1, -1, 1), interpolation="nearest")
+        shown = axes.imshow(picture, extent=(-1, 1, -1, 1), interpolation="nearest")
+        shown.set_clip_path(Circle((0.0, 0.0), 1.0, transform=axes.transData))
         axes.plot(np.cos(angle), np.sin(angle), color="0.6", linewidth=1.0)
         middle = np.radians(0.5 * (low + high))
         axes.plot(

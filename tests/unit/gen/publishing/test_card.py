@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
@@ -13,12 +14,16 @@ import numpy as np
 import pytest
 import yaml
 from markdown_it import MarkdownIt
+from support.datasets import edit
 from support.measured_files import btf
 from support.published import LAYOUTS, publish, python_blocks, small, stored
 
 from mbtf_gen.config.measured import ImportConfig
+from mbtf_gen.config.publish import PublishConfig
 from mbtf_gen.dataset.import_job import Import
 from mbtf_gen.dataset.imported import import_measured
+from mbtf_gen.dataset.reader import Dataset
+from mbtf_gen.publishing.facts import Facts
 
 HOSTILE = '<script>alert("1")</script> ![x](https://example.org/p.png) | `*_'
 
@@ -160,9 +165,17 @@ def test_measured_data_say_what_they_lack(tmp_path: Path) -> None:
 
 
 def test_what_is_left_out_has_its_bound(tmp_path: Path) -> None:
-    data = small(tmp_path / "data")
-    text = (publish(tmp_path / "data", tmp_path / "card", form="npz") / "README.md").read_text()
-    said = {line.split(" | ")[0].removeprefix("| "): line for line in text.splitlines() if " | " in line}
-    for effect in data.manifest["effects"]["effects"]:
-        state = "simulated" if effect["on"] else "left out" if effect["present"] else "not present"
-        assert any(f" | {state} | " in line and effect["explanation"][:12] in line for line in said.values())
+    small(tmp_path / "data")
+    path = tmp_path / "data/manifest.json"
+    effects = json.loads(path.read_text())["effects"]
+    effects["bias_bound"] = 0.0043
+    shadowing = next(e for e in effects["effects"] if e["name"] == "shadowing")
+    shadowing.update(on=False, present=True, bias_bound=0.0041, error=0.0004, explanation="few | <slopes>")
+    opacity = next(e for e in effects["effects"] if e["name"] == "opacity")
+    assert not opacity["present"]
+    edit(path, lambda manifest: manifest.update(effects=effects))
+    data = Dataset.open(tmp_path / "data")
+    facts = {row[0]: row[1:] for row in Facts(data, PublishConfig(license="MIT")).effects}
+    assert facts["shadowing"] == ("left out", "0.41 ± 0.04 %", "few | <slopes>")
+    assert facts["opacity"][:2] == ("not present", "")
+    assert facts["parallax and masking"][0] == "simulated"

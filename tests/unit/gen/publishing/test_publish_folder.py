@@ -57,6 +57,13 @@ def test_an_interrupted_run_resumes(shards: Path, tmp_path: Path, monkeypatch: p
         shutil.rmtree(tmp_path / "cut")
 
 
+def test_finished_files_are_kept(shards: Path, tmp_path: Path) -> None:
+    card = publish(shards, tmp_path / "card", form="webdataset")
+    before = {path: path.stat().st_ino for path in card.rglob("*") if path.is_file()}
+    publish(shards, card, form="webdataset")
+    assert {path: path.stat().st_ino for path in card.rglob("*") if path.is_file()} == before
+
+
 def test_a_lost_file_is_written_again(shards: Path, tmp_path: Path) -> None:
     card = publish(shards, tmp_path / "card", form="webdataset")
     before = contents(card)
