@@ -34,7 +34,7 @@ _SECTOR, _LOW = 0.5, 0.26
 _FROM_ABOVE = 0.85
 # Queries per pixel that a picture needs, and its largest number of pixels across. Where queries share
 # directions, their mean has little noise.
-_TILE_QUERIES, _BRDF_QUERIES, _BRDF_SHARED = 64, 32, 2
+_TILE_QUERIES, _BRDF_QUERIES, _BRDF_SHARED = 64, 96, 2
 _MOST_TEXELS, _LEAST_BINS, _MOST_BINS = 256, 4, 64
 # Queries that a pixel of the tile averages, those of its neighbors included.
 _SMOOTHED_QUERIES = 48

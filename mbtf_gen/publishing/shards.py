@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.atomic import Stored, checksummed, temporary_of, write_chunks
+from mbtf_core.atomic import Stored, checksummed, sync_folder, temporary_of, write_chunks
 from mbtf_core.config_file import dump_yaml
 from mbtf_core.digest import file_sha256
 from mbtf_core.shard_schema import CONFIG_NAME, MANIFEST_NAME
@@ -53,6 +53,7 @@ def link_or_copy(source: Path, path: Path) -> Stored:
         temporary.unlink(missing_ok=True)
         os.link(source, temporary)
         os.replace(temporary, path)
+        sync_folder(path.parent)
         return Stored(path.stat().st_size, file_sha256(path))
     return copy_file(source, path)
 
