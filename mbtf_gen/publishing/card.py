@@ -276,8 +276,11 @@ class Card:
         if facts.measured:
             lines += [
                 "Each query has one value. Its noise, the width of the light and the surface are unknown.",
-                "Footprints are those of the measurement; there are no coarser levels.",
             ]
+            if "images" in facts.measured:
+                lines.append(
+                    "All footprints are those of a texel of the images; there are no coarser levels."
+                )
         else:
             config = facts.manifest["config"]
             lines += [

@@ -23,7 +23,7 @@ F64 = NDArray[np.float64]
 # Histogram of values: decades, and bins of a decade.
 LOWEST_DECADE, HIGHEST_DECADE, PER_DECADE = -8, 6, 40
 # Rows of shards that are averaged at once.
-_BLOCK_VALUES = 1 << 22
+_BLOCK_VALUES = 1 << 20
 
 
 class Moments:
