@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from support.datasets import edit, write_dataset
 from support.published import contents, publish, small
 
 from mbtf_core.atomic import Stored
@@ -33,23 +34,29 @@ def test_the_same_command_gives_the_same_bytes(form: str, shards: Path, tmp_path
     assert contents(first) == contents(second)
 
 
-def stop_before(patch: pytest.MonkeyPatch, number: int) -> None:
-    """Interrupt the next run before its file of this number."""
+def stop(patch: pytest.MonkeyPatch, number: int, written: bool) -> None:
+    """Interrupt the next run before its file of this number, or once it is `written` but not recorded."""
     add, left = module.PublishFolder.add, iter(range(number))
 
     def stopping(folder: module.PublishFolder, name: str, write: Callable[[Path], Stored]) -> Stored:
         if next(left, None) is None:
+            if written:
+                (folder.path / name).parent.mkdir(exist_ok=True)
+                write(folder.path / name)
             raise KeyboardInterrupt
         return add(folder, name, write)
 
     patch.setattr(module.PublishFolder, "add", stopping)
 
 
-def test_an_interrupted_run_resumes(shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("written", [False, True])
+def test_an_interrupted_run_resumes(
+    written: bool, shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     whole = contents(publish(shards, tmp_path / "whole", form="webdataset"))
     for number in range(len(whole) - 1):
         with monkeypatch.context() as patch:
-            stop_before(patch, number)
+            stop(patch, number, written)
             with pytest.raises(KeyboardInterrupt):
                 publish(shards, tmp_path / "cut", form="webdataset")
         publish(shards, tmp_path / "cut", form="webdataset")
@@ -69,6 +76,7 @@ def test_a_lost_file_is_written_again(shards: Path, tmp_path: Path) -> None:
     before = contents(card)
     for name in ("data/train-00000.tar", "README.md"):
         (card / name).unlink()
+    (card / "data/train-00001.tar").write_bytes(before["data/train-00001.tar"][:-512])
     (card / ".README.md.00000000-1.tmp").write_text("half")
     publish(shards, tmp_path / "card", form="webdataset")
     assert contents(card) == before
@@ -122,6 +130,12 @@ def test_an_unfinished_data_set_is_refused(shards: Path, tmp_path: Path) -> None
         publish(shards, tmp_path / "card", form="webdataset")
 
 
+def test_a_data_set_without_its_completion_is_refused(shards: Path, tmp_path: Path) -> None:
+    edit(shards / "manifest.json", lambda manifest: manifest.update(complete=False))
+    with pytest.raises(InputError, match="is not complete"):
+        publish(shards, tmp_path / "card", form="webdataset")
+
+
 def test_a_full_disk_is_said_before(shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mbtf_core.folders.shutil.disk_usage", lambda _: shutil._ntuple_diskusage(1, 1, 1000))
     with pytest.raises(InputError, match=r"needs .* MB; 1 kB are free"):
@@ -145,8 +159,6 @@ def test_without_pyarrow_one_line_says_so(shards: Path, monkeypatch: pytest.Monk
 
 
 def test_shards_of_exr_are_not_npz(tmp_path: Path) -> None:
-    from support.datasets import write_dataset
-
     write_dataset(tmp_path / "data", queries={"train": "40", "test": "8"}, output={"format": "exr"})
     with pytest.raises(UsageError, match="holds shards of another format"):
         publish(tmp_path / "data", tmp_path / "card", form="npz")
