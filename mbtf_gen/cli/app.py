@@ -11,6 +11,7 @@ from mbtf_gen.cli.import_measured import import_measured
 from mbtf_gen.cli.inspect import inspect
 from mbtf_gen.cli.plan import plan
 from mbtf_gen.cli.preview import preview
+from mbtf_gen.cli.publish import publish
 from mbtf_gen.cli.reference import reference
 from mbtf_gen.cli.selftest import selftest
 
@@ -20,3 +21,4 @@ for command in (inspect, plan, preview, merge, verify, repair, reference, selfte
     app.command(command)
 app.command(import_measured, name="import")
 app.command(export)
+app.command(publish)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import EXIT_BAD_INPUT, EXIT_OK, EXIT_PARTIAL
@@ -33,13 +33,15 @@ def merge(folder: Path, /, *, console: Console = CONSOLE) -> int:
     return EXIT_OK if summary.complete else EXIT_PARTIAL
 
 
-def verify(folder: Path, /, *, console: Console = CONSOLE) -> int:
+def verify(folder: Path, /, *, digests: Path | None = None, console: Console = CONSOLE) -> int:
     """Check every byte of a data set against its checksums and the manifest.
 
     Parameters
     ----------
     folder
         Folder of shards.
+    digests
+        Also compare its arrays with the digests.json of a published recipe.
     """
     from mbtf_core.shard_schema import GEOMETRY_NAME
     from mbtf_gen.dataset.reader import Dataset
@@ -58,7 +60,7 @@ def verify(folder: Path, /, *, console: Console = CONSOLE) -> int:
     if absent:
         missing = f"{len(absent)} of {len(files)} shards missing, first {absent[0].file}"
         lines.insert(0, f"{folder}: {missing}; {absent[0].hint}")
-    data = {
+    data: dict[str, Any] = {
         "folder": folder,
         "shards": len(files),
         "bytes": read,
@@ -66,11 +68,18 @@ def verify(folder: Path, /, *, console: Console = CONSOLE) -> int:
         "faults": [asdict(f) for f in faults],
         "foreign": foreign,
     }
+    equal = ""
     known = "" if dataset.manifest["geometry"] is None else f" and {GEOMETRY_NAME}"
-    lines = lines or [f"{folder}: {len(files)} shards{known}, all intact"]
+    if digests is not None and not faults:
+        from mbtf_gen.publishing.digests import digest_faults
+
+        data["differences"] = digest_faults(dataset, digests)
+        lines = [f"{folder}: {text}" for text in data["differences"]]
+        equal = f", and equal to {digests} bit by bit"
+    lines = lines or [f"{folder}: {len(files)} shards{known}, all intact{equal}"]
     console.report(data, "\n".join([*lines, *_describe_foreign(folder, foreign)]))
     console.note(f"{read / 1e6:.1f} MB read in {clock(seconds)} ({read / 1e6 / max(seconds, 1e-9):.0f} MB/s)")
-    return EXIT_BAD_INPUT if faults else EXIT_OK
+    return EXIT_BAD_INPUT if faults or data.get("differences") else EXIT_OK
 
 
 def repair(

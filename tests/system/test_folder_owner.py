@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.datasets import write_dataset
 from support.fit_data import parallax, write_data
 from support.invalid_inputs import call
 from support.plugin_materials import write_material
@@ -21,6 +22,8 @@ COMMANDS = [
     "mbtf-fit export material --to material -o out",
     "mbtf-fit preview material -o out",
     "mbtf-gen preview heights.npy -o out",
+    "mbtf-gen publish set --license CC0-1.0 --form npz -o out",
+    "mbtf-gen publish set --license CC0-1.0 --form npz -o out --overwrite",
     "mbtf-gen reference heights.npy -o out",
     "mbtf-gen reference heights.npy -o out --overwrite",
     "mbtf-pipeline run recipe.yaml -o out",
@@ -36,6 +39,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "recipe.yaml").write_text(RECIPE)
     write_data(folder / "shards", parallax, train=600)
     write_material(folder / "material", finest=1)
+    write_dataset(folder / "set", queries={"train": "40", "test": "8"})
     return folder
 
 

@@ -8,7 +8,7 @@ import pytest
 from conftest import RunPython
 
 PROGRAMS = {"mbtf-gen": "mbtf_gen", "mbtf-fit": "mbtf_fit", "mbtf-pipeline": "mbtf_pipeline"}
-HEAVY = {"torch", "mitsuba", "drjit", "matplotlib", "scipy", "trimesh", "pyvista", "OpenEXR"}
+HEAVY = {"torch", "mitsuba", "drjit", "matplotlib", "scipy", "trimesh", "pyvista", "OpenEXR", "pyarrow"}
 
 
 def answer(program: str, arguments: list[str], run_python: RunPython) -> tuple[str, set[str]]:
@@ -39,7 +39,7 @@ def test_help_answers_without_heavy_modules(program: str, run_python: RunPython)
     ("program", "command"),
     [
         *(("mbtf-gen", c) for c in ("plan", "inspect", "verify", "repair", "merge", "preview", "reference")),
-        *(("mbtf-gen", c) for c in ("selftest", "doctor")),
+        *(("mbtf-gen", c) for c in ("selftest", "doctor", "import", "export", "publish")),
         *(("mbtf-fit", c) for c in ("evaluate", "export", "info", "preview")),
         *(("mbtf-pipeline", c) for c in ("run", "list", "report", "cost")),
     ],

@@ -29,6 +29,7 @@ mbtf_gen.planning
 mbtf_gen.dataset
 mbtf_gen.generation mbtf_gen.repairs mbtf_gen.forecast
 mbtf_gen.pictures
+mbtf_gen.publishing
 mbtf_gen.diagnostics
 mbtf_gen.cli
 mbtf_gen

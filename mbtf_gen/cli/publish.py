@@ -1,0 +1,71 @@
+"""``mbtf-gen publish``: a data set as a folder for data hubs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mbtf_core.console import CONSOLE, Console
+from mbtf_core.errors import UsageError
+from mbtf_core.interruption import keep_on_interruption
+from mbtf_core.options import Options, Output, Overwrite, PathText, Switch, takes_options
+from mbtf_core.units import size_text
+from mbtf_gen.config.publish import PublishConfig
+
+
+@takes_options(PublishConfig)
+def publish(
+    shards: Path,
+    /,
+    *,
+    output: Output = Path("card"),
+    options: Options[PublishConfig],
+    with_maps: Switch = False,
+    material: PathText | None = None,
+    overwrite: Overwrite = False,
+    console: Console = CONSOLE,
+) -> None:
+    """Write a folder to share: mbtf-gen publish shards/ --license CC-BY-4.0 -o card/
+
+    It holds a data card with pictures, the data, croissant.json, and the recipe that makes the data again.
+
+    Parameters
+    ----------
+    shards
+        Folder of shards.
+    with_maps
+        Publish the input files of the material too, which their license must allow.
+    material
+        Path of the material, if it was moved.
+    """
+    given = [*options.given, *(text.partition("=")[0].strip() for text in options.assignments)]
+    if options.config is None and "license" not in given:
+        raise UsageError(
+            "state the license of the published data",
+            where="--license",
+            hint="an SPDX expression such as CC-BY-4.0; that of the material's maps may restrict it",
+        )
+    config = options.resolve()
+    if output.resolve() == shards.resolve() or shards.resolve() in output.resolve().parents:
+        raise UsageError("is the data set, or inside it", where=f"-o {output}", hint="choose another folder")
+    from mbtf_gen.publishing.publish import Publication
+
+    publication = Publication.prepare(
+        shards, config, with_maps=with_maps, material=None if material is None else Path(material)
+    )
+    console.note(f"{shards} -> {output}: {config.form}, at most {size_text(publication.size)}")
+    keep_on_interruption(f"the finished files are kept in {output}")
+    with console.progress(len(publication.makers()), "publishing", "files") as bar:
+        files = publication.write(output, overwrite=overwrite, progress=bar.advance)
+    size = sum(stored.bytes for stored in files.values())
+    recipe = "no recipe: measured data" if publication.facts.measured else "with a recipe"
+    console.report(
+        {
+            "folder": output,
+            "name": publication.facts.name,
+            "form": config.form,
+            "license": config.license,
+            "bytes": size,
+            "files": {name: {"bytes": s.bytes, "sha256": s.sha256} for name, s in files.items()},
+        },
+        f"{output}: {publication.facts.name}, {len(files)} files, {size_text(size)}, {recipe}",
+    )

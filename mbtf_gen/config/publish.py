@@ -1,0 +1,103 @@
+"""Configuration of ``mbtf-gen publish``: what only the people who publish a data set know."""
+
+from __future__ import annotations
+
+import datetime
+import re
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal
+from urllib.parse import urlsplit
+
+from pydantic import AfterValidator, BeforeValidator, Field
+
+from mbtf_core.config_file import Settings
+from mbtf_core.options import Flag
+
+Form = Literal["parquet", "webdataset", "npz"]
+# Longest citation; BibTeX of several papers fits.
+_LONGEST = 20_000
+
+
+def _license(text: str) -> str:
+    """The canonical spelling of an SPDX license expression."""
+    from packaging.licenses import InvalidLicenseExpression, canonicalize_license_expression
+
+    try:
+        return canonicalize_license_expression(text)
+    except InvalidLicenseExpression:
+        raise ValueError(
+            "must be an SPDX license expression, such as CC-BY-4.0, CC0-1.0 or LicenseRef-Ours"
+        ) from None
+
+
+def _one_line(text: str) -> str:
+    if not text.isprintable() or not text.strip():
+        raise ValueError("must be one line of printable text")
+    return text.strip()
+
+
+def _names(value: Any) -> Any:
+    """Names of a list, also from ``NAME and NAME`` as in BibTeX."""
+    return re.split(r"\s+and\s+", value) if isinstance(value, str) else value
+
+
+def _url(text: str) -> str:
+    try:
+        parts = urlsplit(text)
+        usable = parts.scheme in ("https", "http") and bool(parts.hostname)
+    except ValueError:
+        usable = False
+    if not usable or not text.isascii() or any(c in text for c in " \t\r\n\"'<>\\^`{|}()"):
+        raise ValueError("must be an address such as https://example.org/data")
+    return text
+
+
+def _lines(text: str) -> str:
+    text = text.strip()
+    if not text or not all(c.isprintable() or c == "\n" for c in text):
+        raise ValueError("must be printable text")
+    return text
+
+
+def _date(value: Any) -> Any:
+    if value is None:
+        return None
+    try:
+        # YAML reads 2026-11-23 as a date.
+        return datetime.date.fromisoformat(str(value)).isoformat()
+    except ValueError:
+        raise ValueError("must be a date such as 2026-11-23") from None
+
+
+Line = Annotated[str, Field(max_length=500), AfterValidator(_one_line)]
+License = Annotated[str, Field(max_length=500), AfterValidator(_license)]
+Url = Annotated[str, Field(max_length=2000), AfterValidator(_url)]
+Citation = Annotated[str, Field(max_length=_LONGEST), AfterValidator(_lines)]
+Names = Annotated[Sequence[Line], BeforeValidator(_names), Field(max_length=1000)]
+
+
+class PublishConfig(Settings):
+    """Everything that ``mbtf-gen publish`` is told."""
+
+    version: Literal[1] = 1
+    license: Annotated[License, Flag("--license", "SPDX")] = Field(
+        description="license of the published data, required: an SPDX expression such as CC-BY-4.0"
+    )
+    name: Annotated[Line | None, Flag("--name")] = Field(
+        None, description="name of the published data set; default: that of the material"
+    )
+    author: Annotated[Names, Flag("--author")] = Field(
+        (), description="authors of the data set, as in BibTeX: NAME and NAME"
+    )
+    url: Annotated[Url | None, Flag("--url", "URL")] = Field(
+        None, description="address where the data set will be found"
+    )
+    citation: Annotated[Citation | None, Flag("--citation")] = Field(
+        None, description="how to cite the data set: BibTeX or plain text"
+    )
+    date: Annotated[str | None, BeforeValidator(_date), Flag("--date", "YYYY-MM-DD")] = Field(
+        None, description="date of publication"
+    )
+    form: Annotated[Form, Flag("--form")] = Field(
+        "parquet", description="file format of the published data: Parquet, tar files of .npy, or the shards"
+    )

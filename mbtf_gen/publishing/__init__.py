@@ -1,0 +1,1 @@
+"""Data sets to share: a folder that is ready for a data hub."""

@@ -1,0 +1,134 @@
+"""``mbtf-gen publish`` as a user runs it: publish, make the data again from the recipe alone, compare."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.commands import Done, run_named
+from support.measured_files import btf
+from support.published import contents
+
+SMALL = "--height-scale 0.05 --resolution 8 --spp 4 --test-queries 64 --test-spp 16"
+LINES = {
+    "generate": f"wool {SMALL} --queries 20/texel -o shards --set output.shard_queries=500",
+    "images": f"wool {SMALL} --queries 20/texel --layout image --set queries.patch_size=4 -o images",
+    "import": "import felt.btf --queries 300 --test-queries 20 --min-cos 0.2 -o felt",
+    "publish": "publish shards --config said.yaml --form npz --with-maps -o card --json",
+    "again": "publish shards --config said.yaml --form npz --with-maps -o card --json",
+    "images card": "publish images --license CC0-1.0 --form webdataset -o images_card",
+    "measured card": "publish felt --license CC0-1.0 --form webdataset -o felt_card",
+    "measured maps": "publish felt --license CC0-1.0 --form webdataset --with-maps -o none",
+    "other": "publish shards --license MIT --form npz -o card",
+    "no license": "publish shards -o none",
+    "bad license": "publish shards --license Mine -o none",
+    "verify": "verify shards --digests card/recipe/digests.json --json",
+    "differs": "verify images --digests card/recipe/digests.json",
+    "copy": "verify card/data --digests card/recipe/digests.json",
+}
+SAID = """\
+license: CC-BY-4.0
+author: [Ada Lovelace]
+date: 2026-11-23
+citation: |
+  @misc{a,
+    title = {b}
+  }
+"""
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("publish")
+    (folder / "wool").mkdir()
+    np.save(folder / "wool/height.npy", np.random.default_rng(0).random((8, 8)).astype(np.float32))
+    (folder / "wool/material.yaml").write_text("height: height.npy\nbase_color: [0.8, 0.5, 0.2]\n")
+    (folder / "felt.btf").write_bytes(btf())
+    (folder / "said.yaml").write_text(SAID)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def done(work: Path) -> dict[str, Done]:
+    return run_named(LINES, work)
+
+
+def test_a_published_folder_is_complete(work: Path, done: dict[str, Done]) -> None:
+    result = done["publish"].result()
+    assert done["again"].result() == result
+    files = set(contents(work / "card"))
+    assert set(result["files"]) | {"publish.json"} == files
+    expected = (
+        "README.md croissant.json data/manifest.json data/geometry.exr recipe/remake.sh recipe/config.yaml"
+    )
+    assert {*expected.split(), "recipe/material/height.npy", "pictures/brdf.png"} <= files
+    card = (work / "card/README.md").read_text()
+    assert "# wool\n" in card
+    assert "@misc{a,\n  title = {b}\n}" in card
+    assert done["images card"].code == done["measured card"].code == 0
+    assert "no recipe: measured data" in done["measured card"].out
+
+
+def test_the_script_makes_the_data_again(work: Path, done: dict[str, Done], tmp_path: Path) -> None:
+    """In another folder, from the recipe alone."""
+    assert done["publish"].code == 0
+    shutil.copytree(work / "card/recipe", tmp_path / "recipe")
+    program = tmp_path / "bin/mbtf-gen"
+    program.parent.mkdir()
+    program.write_text(f'#!/bin/sh\nexec {sys.executable} -m mbtf_gen "$@"\n')
+    program.chmod(0o755)
+    path = f"{program.parent}{os.pathsep}{os.environ['PATH']}"
+    ran = subprocess.run(
+        ["sh", "recipe/remake.sh", "made"],
+        cwd=tmp_path,
+        env=os.environ | {"PATH": path},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert ran.returncode == 0, ran.stderr
+    assert "equal to recipe/digests.json bit by bit" in ran.stdout
+    shards = [path.name for path in (work / "shards").glob("*.npz")]
+    assert len(shards) == 4
+    for name in (*shards, "geometry.exr"):
+        assert (tmp_path / "made" / name).read_bytes() == (work / "shards" / name).read_bytes()
+
+
+def test_the_script_asks_for_a_material_that_is_not_published(work: Path, done: dict[str, Done]) -> None:
+    assert done["images card"].code == 0
+    ran = subprocess.run(
+        ["sh", "images_card/recipe/remake.sh"], cwd=work, capture_output=True, text=True, timeout=60
+    )
+    assert (ran.returncode, ran.stdout) == (2, "")
+    assert ran.stderr == "error: name the material: sh images_card/recipe/remake.sh MATERIAL [FOLDER]\n"
+
+
+def test_digests_are_compared(done: dict[str, Done]) -> None:
+    assert done["verify"].result()["differences"] == []
+    assert done["copy"].code == 0
+    assert done["differs"].code == 3
+    assert "belongs to another configuration" in done["differs"].out
+
+
+@pytest.mark.parametrize(
+    ("name", "code", "says"),
+    [
+        ("other", 3, "card: holds a published data set of another configuration: author:"),
+        ("no license", 2, "--license: state the license of the published data"),
+        ("bad license", 2, "--license: 'license': must be an SPDX license expression"),
+        ("measured maps", 2, "--with-maps: felt holds measured data, without maps"),
+    ],
+)
+def test_bad_input_is_one_clear_line(
+    name: str, code: int, says: str, work: Path, done: dict[str, Done]
+) -> None:
+    assert done[name].code == code
+    lines = done[name].err[done[name].err.index("error: ") :].splitlines()
+    assert lines[0].startswith(f"error: {says}")
+    assert len(lines) <= 2
+    assert not (work / "none").exists()

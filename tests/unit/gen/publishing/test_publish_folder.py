@@ -1,0 +1,173 @@
+"""The published folder: the same bytes twice, resumed, refused, replaced; bad input writes nothing."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from support.datasets import edit, write_dataset
+from support.published import contents, publish, small
+
+from mbtf_core.atomic import Stored
+from mbtf_core.errors import EngineError, InputError, PartialError, UsageError
+from mbtf_gen.config.publish import PublishConfig
+from mbtf_gen.publishing import parquet
+from mbtf_gen.publishing import publish as module
+from mbtf_gen.publishing.publish import Publication
+
+CONFIG = PublishConfig(license="CC0-1.0", form="webdataset")
+
+
+@pytest.fixture
+def shards(tmp_path: Path) -> Path:
+    small(tmp_path / "data")
+    return tmp_path / "data"
+
+
+@pytest.mark.parametrize("form", ["parquet", "webdataset", "npz"])
+def test_the_same_command_gives_the_same_bytes(form: str, shards: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    first, second = (publish(shards, tmp_path / name, form=form) for name in ("a", "b"))
+    assert contents(first) == contents(second)
+
+
+def stop(patch: pytest.MonkeyPatch, number: int, written: bool) -> None:
+    """Interrupt the next run before its file of this number, or once it is `written` but not recorded."""
+    add, left = module.PublishFolder.add, iter(range(number))
+
+    def stopping(folder: module.PublishFolder, name: str, write: Callable[[Path], Stored]) -> Stored:
+        if next(left, None) is None:
+            if written:
+                (folder.path / name).parent.mkdir(exist_ok=True)
+                write(folder.path / name)
+            raise KeyboardInterrupt
+        return add(folder, name, write)
+
+    patch.setattr(module.PublishFolder, "add", stopping)
+
+
+@pytest.mark.parametrize("written", [False, True])
+def test_an_interrupted_run_resumes(
+    written: bool, shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = contents(publish(shards, tmp_path / "whole", form="webdataset"))
+    for number in range(len(whole) - 1):
+        with monkeypatch.context() as patch:
+            stop(patch, number, written)
+            with pytest.raises(KeyboardInterrupt):
+                publish(shards, tmp_path / "cut", form="webdataset")
+        publish(shards, tmp_path / "cut", form="webdataset")
+        assert contents(tmp_path / "cut") == whole
+        shutil.rmtree(tmp_path / "cut")
+
+
+def test_finished_files_are_kept(shards: Path, tmp_path: Path) -> None:
+    card = publish(shards, tmp_path / "card", form="webdataset")
+    before = {path: path.stat().st_ino for path in card.rglob("*") if path.is_file()}
+    publish(shards, card, form="webdataset")
+    assert {path: path.stat().st_ino for path in card.rglob("*") if path.is_file()} == before
+
+
+def test_a_lost_file_is_written_again(shards: Path, tmp_path: Path) -> None:
+    card = publish(shards, tmp_path / "card", form="webdataset")
+    before = contents(card)
+    for name in ("data/train-00000.tar", "README.md"):
+        (card / name).unlink()
+    (card / "data/train-00001.tar").write_bytes(before["data/train-00001.tar"][:-512])
+    (card / ".README.md.00000000-1.tmp").write_text("half")
+    publish(shards, tmp_path / "card", form="webdataset")
+    assert contents(card) == before
+
+
+def test_other_options_are_refused_and_replace(shards: Path, tmp_path: Path) -> None:
+    card = publish(shards, tmp_path / "card", form="webdataset")
+    (card / "mine.txt").write_text("kept")
+    before = contents(card)
+    with pytest.raises(InputError, match=r"another configuration: license: CC0-1\.0 -> CC-BY-4\.0"):
+        publish(shards, card, form="webdataset", license="CC-BY-4.0")
+    assert contents(card) == before
+    config = PublishConfig(license="CC-BY-4.0", form="npz")
+    Publication.prepare(shards, config).write(card, overwrite=True)
+    assert not list(card.rglob("*.tar"))
+    assert (card / "mine.txt").read_text() == "kept"
+    assert "CC-BY-4.0" in (card / "README.md").read_text()
+
+
+def test_a_record_cannot_remove_what_lies_elsewhere(shards: Path, tmp_path: Path) -> None:
+    card = publish(shards, tmp_path / "card", form="webdataset")
+    record = json.loads((card / "publish.json").read_text())
+    record["listed"].append("../data/manifest.json")
+    (card / "publish.json").write_text(json.dumps(record))
+    with pytest.raises(InputError, match=r"is damaged .*must lie in the folder"):
+        Publication.prepare(shards, CONFIG).write(card, overwrite=True)
+    assert (shards / "manifest.json").exists()
+
+
+def test_a_folder_of_others_is_refused(shards: Path, tmp_path: Path) -> None:
+    (tmp_path / "card").mkdir()
+    (tmp_path / "card/notes.txt").write_text("mine")
+    for overwrite in (False, True):
+        with pytest.raises(InputError, match="is not empty and holds no published data set"):
+            Publication.prepare(shards, CONFIG).write(tmp_path / "card", overwrite=overwrite)
+
+
+def test_damage_is_found_before_anything_is_written(shards: Path, tmp_path: Path) -> None:
+    path = shards / "train-00001.npz"
+    content = bytearray(path.read_bytes())
+    content[-200] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"train-00001\.npz: has changed since it was written"):
+        publish(shards, tmp_path / "card", form="webdataset")
+    assert not (tmp_path / "card").exists()
+
+
+def test_an_unfinished_data_set_is_refused(shards: Path, tmp_path: Path) -> None:
+    (shards / "test-00000.npz").unlink()
+    with pytest.raises(InputError, match="is missing"):
+        publish(shards, tmp_path / "card", form="webdataset")
+
+
+def test_a_data_set_without_its_completion_is_refused(shards: Path, tmp_path: Path) -> None:
+    edit(shards / "manifest.json", lambda manifest: manifest.update(complete=False))
+    with pytest.raises(InputError, match="is not complete"):
+        publish(shards, tmp_path / "card", form="webdataset")
+
+
+def test_a_full_disk_is_said_before(shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mbtf_core.folders.shutil.disk_usage", lambda _: shutil._ntuple_diskusage(1, 1, 1000))
+    with pytest.raises(InputError, match=r"needs .* MB; 1 kB are free"):
+        publish(shards, tmp_path / "card", form="webdataset")
+    assert not (tmp_path / "card").exists()
+
+
+def test_the_announced_size_is_enough(shards: Path, tmp_path: Path) -> None:
+    publication = Publication.prepare(shards, CONFIG)
+    publication.write(tmp_path / "card")
+    assert sum(map(len, contents(tmp_path / "card").values())) < publication.size
+
+
+def test_without_pyarrow_one_line_says_so(shards: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import sys
+
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
+    with pytest.raises(EngineError, match="pyarrow is not installed"):
+        parquet.check_pyarrow()
+
+
+def test_shards_of_exr_are_not_npz(tmp_path: Path) -> None:
+    write_dataset(tmp_path / "data", queries={"train": "40", "test": "8"}, output={"format": "exr"})
+    with pytest.raises(UsageError, match="holds shards of another format"):
+        publish(tmp_path / "data", tmp_path / "card", form="npz")
+    card = publish(tmp_path / "data", tmp_path / "card", form="webdataset")
+    assert (card / "data/train-00000.tar").exists()
+
+
+def test_a_folder_in_use_is_refused(shards: Path, tmp_path: Path) -> None:
+    from mbtf_core.folders import owned
+
+    with owned(tmp_path / "card"), pytest.raises(PartialError, match="is being written by another process"):
+        publish(shards, tmp_path / "card", form="webdataset")

@@ -1,0 +1,167 @@
+"""The recipe makes the same data again; a planted difference is found; maps are copied whole."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from support.datasets import edit, rewrite, write_dataset
+from support.formula_runs import SMALL, Formula, cheap_plan
+from support.published import contents, publish, small
+
+from mbtf_core.config_file import resolve
+from mbtf_core.errors import InputError, UsageError
+from mbtf_gen import generation
+from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.config.publish import PublishConfig
+from mbtf_gen.dataset import render_shards
+from mbtf_gen.dataset.reader import Dataset
+from mbtf_gen.material.load import load_material
+from mbtf_gen.publishing.digests import dataset_digests, digest_faults
+from mbtf_gen.publishing.publish import Publication
+
+CONFIG = PublishConfig(license="CC0-1.0", form="webdataset")
+
+
+@pytest.fixture
+def engine(monkeypatch: pytest.MonkeyPatch) -> None:
+    fake = Formula()
+    monkeypatch.setattr(generation, "plan_run", cheap_plan)
+    monkeypatch.setattr(render_shards, "build_estimator", lambda job, plan: fake)
+
+
+def write_maps(folder: Path) -> Path:
+    """A material whose maps lie in several folders under the same names, with options."""
+    random = np.random.default_rng(1)
+    for name in ("a", "b"):
+        (folder / name).mkdir(parents=True)
+    np.save(folder / "a/map.npy", 0.1 * random.random((4, 8)))
+    np.save(folder / "b/map.npy", random.random((4, 8)))
+    Image.fromarray(random.integers(0, 255, (4, 8, 3), np.uint8)).save(folder / "color.png")
+    (folder / "material.yaml").write_text(
+        "height: {file: a/map.npy, scale: 0.5}\nroughness: {file: b/map.npy, invert: true}\n"
+        "base_color: color.png\nmetallic: 0.25\nmake_tileable: mirror\nresolution: 8\n"
+    )
+    return folder
+
+
+def remade(card: Path, output: Path, material: Path | None = None) -> Dataset:
+    config = resolve(GeneratorConfig, file=card / "recipe/config.yaml")
+    given = card / "recipe" / config.material if material is None else material
+    generation.generate(config.model_copy(update={"material": str(given)}), output)
+    return Dataset.open(output)
+
+
+def test_digests_are_those_of_the_numbers(tmp_path: Path) -> None:
+    data = small(tmp_path / "data")
+    arrays: dict[str, Any] = dataset_digests(data)["arrays"]
+    assert set(arrays) == {path.stem for path in (tmp_path / "data").glob("*.npz")}
+    for stem, digests in arrays.items():
+        with np.load(tmp_path / f"data/{stem}.npz") as shard:
+            assert digests == {n: hashlib.sha256(shard[n].tobytes()).hexdigest() for n in shard.files}
+
+
+@pytest.mark.usefixtures("engine")
+@pytest.mark.parametrize("with_maps", [False, True])
+def test_the_recipe_makes_the_same_data(with_maps: bool, tmp_path: Path) -> None:
+    maps = write_maps(tmp_path / "maps")
+    generation.generate(GeneratorConfig.model_validate({"material": str(maps), **SMALL}), tmp_path / "data")
+    card = tmp_path / "card"
+    Publication.prepare(tmp_path / "data", CONFIG, with_maps=with_maps).write(card)
+    assert (card / "recipe/material").exists() is with_maps
+    maps.rename(tmp_path / "moved")
+    made = remade(card, tmp_path / "made", None if with_maps else tmp_path / "moved")
+    assert digest_faults(made, card / "recipe/digests.json") == []
+    first, second = (contents(tmp_path / name) for name in ("data", "made"))
+    for name in first:
+        if name.endswith((".npz", ".exr")):
+            assert first[name] == second[name], name
+
+
+def test_differences_are_found_and_explained(tmp_path: Path) -> None:
+    small(tmp_path / "data")
+    digests = publish(tmp_path / "data", tmp_path / "card", form="npz") / "recipe/digests.json"
+    assert digest_faults(Dataset.open(tmp_path / "data"), digests) == []
+    path = tmp_path / "data/train-00001.npz"
+    before, sidecar = path.read_bytes(), path.with_suffix(".json").read_bytes()
+    with np.load(path) as shard:
+        value, sigma = shard["value_b"].copy(), shard["sigma"].copy()
+    value[3, 1] = np.nextafter(value[3, 1], np.float32(np.inf))
+    rewrite(path, value_b=value)
+    found = digest_faults(Dataset.open(tmp_path / "data"), digests)
+    assert found[0] == "value_b differs in 1 of 3 shards, first train-00001"
+    assert "values are equal on one type of machine" in found[1]
+    path.write_bytes(before)
+    path.with_suffix(".json").write_bytes(sidecar)
+    sigma[0] *= np.float32(0.5)
+    rewrite(path, sigma=sigma)
+    found = digest_faults(Dataset.open(tmp_path / "data"), digests)
+    assert found[0].startswith("sigma differs")
+    assert "another data set" in found[1]
+
+
+def test_other_software_is_named(tmp_path: Path) -> None:
+    small(tmp_path / "data")
+    digests = publish(tmp_path / "data", tmp_path / "card", form="npz") / "recipe/digests.json"
+    document = json.loads(digests.read_text())
+    document["arrays"]["test-00000"]["value_a"] = "0" * 64
+    document["software"]["mitsuba"] = "3.8.0"
+    digests.write_text(json.dumps(document))
+    found = digest_faults(Dataset.open(tmp_path / "data"), digests)
+    assert "mitsuba 3.8.0 -> " in found[-1]
+
+
+def test_digests_of_another_data_set(tmp_path: Path) -> None:
+    digests = publish(tmp_path / "a", tmp_path / "card", form="npz") if small(tmp_path / "a") else tmp_path
+    write_dataset(tmp_path / "b", queries={"train": "300", "test": "40"}, seed=1)
+    found = digest_faults(Dataset.open(tmp_path / "b"), digests / "recipe/digests.json")
+    assert found == ["belongs to another configuration, or was made from other maps"]
+    with pytest.raises(InputError, match="holds no digests of arrays"):
+        digest_faults(Dataset.open(tmp_path / "b"), tmp_path / "card/publish.json")
+
+
+@pytest.mark.usefixtures("engine")
+def test_maps_of_one_name_are_all_copied(tmp_path: Path) -> None:
+    maps = write_maps(tmp_path / "maps")
+    generation.generate(GeneratorConfig.model_validate({"material": str(maps), **SMALL}), tmp_path / "data")
+    Publication.prepare(tmp_path / "data", CONFIG, with_maps=True).write(tmp_path / "card")
+    copy = tmp_path / "card/recipe/material"
+    assert {p.name for p in copy.iterdir()} == {"material.yaml", "map.npy", "2-map.npy", "color.png"}
+    original, found = load_material(maps), load_material(copy)
+    assert found.digests == original.digests
+    np.testing.assert_array_equal(found.height, original.height)
+    np.testing.assert_array_equal(np.asarray(found.roughness), np.asarray(original.roughness))
+
+
+@pytest.mark.usefixtures("engine")
+def test_changed_and_lost_maps_are_refused(tmp_path: Path) -> None:
+    maps = write_maps(tmp_path / "maps")
+    generation.generate(GeneratorConfig.model_validate({"material": str(maps), **SMALL}), tmp_path / "data")
+    np.save(maps / "b/map.npy", np.zeros((4, 8)))
+    with pytest.raises(InputError, match="has changed since the data set was made"):
+        Publication.prepare(tmp_path / "data", CONFIG, with_maps=True)
+    maps.rename(tmp_path / "moved")
+    with pytest.raises(InputError, match="no such file or folder"):
+        Publication.prepare(tmp_path / "data", CONFIG, with_maps=True)
+    with pytest.raises(UsageError, match="goes with --with-maps"):
+        Publication.prepare(tmp_path / "data", CONFIG, material=tmp_path / "moved")
+
+
+def test_a_mesh_of_several_files_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "tile.mtl").write_text("newmtl a\nKd 1 0 0\n")
+    (tmp_path / "tile.obj").write_text(
+        "mtllib tile.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nusemtl a\nf 1 2 4\nf 1 4 3\n"
+    )
+    data = small(tmp_path / "data")
+    material = load_material(tmp_path / "tile.obj")
+    edit(tmp_path / "data/manifest.json", lambda m: m.update(inputs=dict(material.digests)))
+    from mbtf_gen.publishing.maps import copy_of_material
+
+    data = Dataset.open(data.folder)
+    with pytest.raises(InputError, match="names other files, which the digests do not cover"):
+        copy_of_material(data, tmp_path / "tile.obj")
