@@ -21,11 +21,12 @@ def export_material(
     /,
     *,
     to: Annotated[
-        list[Literal["exr", "json", "material", "web", "gltf", "usd", "materialx"]] | None,
+        list[Literal["exr", "json", "material", "web", "slang", "gltf", "usd", "materialx"]] | None,
         Parameter(show_default="exr, json"),
     ] = None,
     output: Annotated[Output | None, Parameter(show_default="the material's own")] = None,
     half: Switch = False,
+    shader_target: list[Literal["hlsl", "glsl", "wgsl", "metal", "cuda", "cpp"]] | None = None,
     level: Annotated[int | None, Parameter(show_default="the finest")] = None,
     page: PageOptions = PAGE_OPTIONS,
     overwrite: Overwrite = False,
@@ -36,9 +37,9 @@ def export_material(
     exr: the latent textures, a part per level and a channel per feature, and those of the transmittance of a
     material with holes. json: the networks as a list of layers, with formulas, conventions and queries with
     expected values. material: another material folder, in a folder of its own; the same command again keeps
-    it. web: a page that shows the material in a browser, without a network. gltf, usd, materialx: maps for
-    programs that evaluate no networks; without shadows, interreflection and parallax, but with the same mean
-    reflectance.
+    it. web: a page that shows the material in a browser, without a network. slang: a shader module and the
+    buffer that it reads. gltf, usd, materialx: maps for programs that evaluate no networks; without shadows,
+    interreflection and parallax, but with the same mean reflectance.
 
     Parameters
     ----------
@@ -46,6 +47,8 @@ def export_material(
         Folder made by mbtf-fit.
     to
         Format to write. Repeatable.
+    shader_target
+        Another language that Slang compiles the module to; needs the extra 'shaders'. Repeatable.
     level
         Level of the maps of gltf, usd and materialx.
     half
@@ -61,6 +64,7 @@ def export_material(
     from mbtf_fit.material.interchange.maps import fit_color, maps_of
     from mbtf_fit.material.material import Material, export
     from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME
+    from mbtf_fit.shaders.slang import write_module
     from mbtf_fit.viewer.page import PAGE_NAME
 
     wanted = list(dict.fromkeys(to or ["exr", "json"]))
@@ -70,6 +74,8 @@ def export_material(
     tools = [name for name in wanted if name in WRITERS]
     if level is not None and not tools:
         raise UsageError("is an option of maps", where="--level", hint="add --to gltf, usd or materialx")
+    if shader_target and "slang" not in wanted:
+        raise UsageError("is an option of shaders", where="--shader-target", hint="add --to slang")
     loaded = Material.load(material)
     keep_on_interruption(f"the finished files are kept in {folder}")
     with owned(folder):
@@ -86,6 +92,8 @@ def export_material(
         if "json" in wanted:
             write_layers(written, folder / LAYERS_NAME, half=half)
             files.append(LAYERS_NAME)
+        if "slang" in wanted:
+            files += write_module(loaded, folder, list(dict.fromkeys(shader_target or [])))
         if tools:
             maps, agreement = fit_color(loaded, maps_of(loaded, level))
             files += write_maps(maps, folder)

@@ -44,6 +44,7 @@ mbtf_fit.material
 mbtf_fit.evaluation
 mbtf_fit.training
 mbtf_fit.viewer
+mbtf_fit.shaders
 mbtf_fit.mitsuba_plugin
 mbtf_fit.cli
 mbtf_fit

@@ -1,0 +1,214 @@
+"""The Slang module: values on Slang's CPU device, sampling, other languages, and what is refused."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from support.plugin_materials import net, write_material
+
+from mbtf_core.console import run
+from mbtf_core.directions import from_angles
+from mbtf_core.errors import EngineError
+from mbtf_core.lattice import Lattice
+from mbtf_fit.cli.app import app
+from mbtf_fit.material.material import Material
+from mbtf_fit.material.transmittance import Transmittance
+from mbtf_fit.shaders.compiler import TARGETS, SlangCompiler
+from mbtf_fit.shaders.slang import ENTRY, module_of, translate
+
+BANDS = {"position": 3, "direction": 2, "direction_pi": False, "raw": True}
+CASES: dict[str, dict[str, Any]] = {
+    "calibrated": {},
+    "holes": {},
+    "six outputs": net(offset="direct", output_channels=6, activation="leaky-relu"),
+    "concatenated": net(blending="concatenate", activation="sine", output_transform="softplus"),
+    "encoded": net(encoding={**BANDS, "band_attenuation": True, "footprint_filtered": True}),
+    "relief": {"model": "relief"},
+    "relief, diffuse, four places": {"model": "relief", "glossy": False, **net(relief={"places": 4})},
+    "learned heights": {"model": "neumip+"},
+    "rainer2019": {"model": "rainer2019"},
+}
+
+
+def make(case: str, folder: Path) -> Material:
+    lattice, generator = Lattice(4, 0.5), torch.Generator().manual_seed(0)
+    options = {"finest": 4, "aspect": 0.5, **CASES[case]}
+    if case == "calibrated":
+        options["weights"] = {"calibration": 0.7 + 0.6 * torch.rand((2, 5, 6, 3), generator=generator)}
+    if case == "holes":
+        shapes = [(*lattice.shape(s), 6) for s in range(5)]
+        coefficients = [0.3 + 0.2 * torch.randn(s, generator=generator).numpy() for s in shapes]
+        options["transmittance"] = Transmittance(lattice, coefficients)
+    return write_material(folder, **options)
+
+
+class Device:
+    """Slang's CPU device with a module."""
+
+    def __init__(self, module: str, folder: Path) -> None:
+        spy = pytest.importorskip("slangpy", reason="no slangpy; to enable: pip install 'mbtf[shaders]'")
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "material.slang").write_text(module)
+        self._spy = spy
+        options = {"include_paths": [str(folder)]}
+        self._device = spy.Device(type=spy.DeviceType.cpu, compiler_options=options)
+        self._folder = folder
+
+    def buffer(self, array: np.ndarray) -> Any:
+        usage = self._spy.BufferUsage
+        return self._device.create_buffer(
+            size=array.nbytes,
+            struct_size=4 * array.shape[-1] if array.ndim > 1 else 4,
+            usage=usage.shader_resource | usage.unordered_access,
+            data=np.ascontiguousarray(array, np.float32),
+        )
+
+    def run(self, entry: str, count: int, width: int, inputs: dict[str, Any], output: str) -> np.ndarray:
+        program = self._device.load_program("material.slang", [entry])
+        out = self.buffer(np.zeros((count, width), np.float32))
+        kernel = self._device.create_compute_kernel(program)
+        kernel.dispatch(thread_count=[count, 1, 1], vars={**inputs, output: out})
+        return np.asarray(out.to_numpy().view(np.float32).reshape(count, width))
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_values_are_those_of_the_material(case: str, tmp_path: Path) -> None:
+    material = make(case, tmp_path / "material")
+    module, texels = module_of(material)
+    device = Device(module, tmp_path / "module")
+    q = material.conformance
+    queries = np.concatenate([q["u"], q["sigma"][:, None], q["omega_i"], q["omega_o"]], 1)
+    inputs = {
+        "query_count": len(queries),
+        "queries": device.buffer(queries.reshape(-1)),
+        "material_texels": device.buffer(texels),
+    }
+    found = device.run(ENTRY, len(queries), 4, inputs, "values")
+    deviation = np.abs(found[:, :3] - q["rgb"]) / np.maximum(1.0, q["rgb"])
+    assert q["rgb"].std() > 0.005
+    # A traced ray may miss an edge.
+    assert (deviation.max(1) > 1e-4).sum() <= 2
+    through = np.zeros(len(queries))
+    if material.transmittance is not None:
+        through = material.transmittance.evaluate(*(q[k] for k in ("u", "sigma", "omega_o")))
+        assert through.std() > 0.1
+    np.testing.assert_allclose(found[:, 3], through, atol=1e-4)
+
+
+SAMPLING = """
+StructuredBuffer<float> random_numbers;
+RWStructuredBuffer<float4> samples;
+uniform float3 view;
+[shader("compute")] [numthreads(64, 1, 1)]
+void sample_lights(uint3 thread : SV_DispatchThreadID) {
+  if (thread.x >= query_count) return;
+  uint k = 3 * thread.x;
+  LightSample s = sample_light(stage1(float2(0.3, 0.6), 0.1, view), view,
+                               float3(random_numbers[k], random_numbers[k + 1], random_numbers[k + 2]));
+  samples[thread.x] = float4(s.omega_i, s.pdf);
+}
+[shader("compute")] [numthreads(64, 1, 1)]
+void densities(uint3 thread : SV_DispatchThreadID) {
+  if (thread.x >= query_count) return;
+  uint k = 3 * thread.x;
+  float3 omega_i = float3(random_numbers[k], random_numbers[k + 1], random_numbers[k + 2]);
+  samples[thread.x] = float4(pdf_light(stage1(float2(0.3, 0.6), 0.1, view), omega_i, view));
+}
+"""
+
+
+@pytest.mark.parametrize("case", ["relief", "calibrated"])
+def test_lights_are_sampled_by_their_density(case: str, tmp_path: Path) -> None:
+    """The density integrates to 1, and samples weighted by it integrate known functions."""
+    material = make(case, tmp_path / "material")
+    module, texels = module_of(material)
+    device = Device(module + SAMPLING, tmp_path / "module")
+    view = from_angles(50.0, 30.0).astype(np.float32)
+    random, count = np.random.default_rng(0), 1 << 16
+    shared = {"material_texels": device.buffer(texels), "view": view.tolist(), "query_count": count}
+
+    def call(entry: str, numbers: np.ndarray) -> np.ndarray:
+        inputs = {**shared, "random_numbers": device.buffer(numbers.astype(np.float32).reshape(-1))}
+        return device.run(entry, count, 4, inputs, "samples").astype(np.float64)
+
+    z = 1 - 2 * (np.arange(count) + 0.5) / count
+    angle = np.pi * (1 + np.sqrt(5)) * np.arange(count)
+    sphere = np.stack([np.sqrt(1 - z**2) * np.cos(angle), np.sqrt(1 - z**2) * np.sin(angle), z], 1)
+    density = call("densities", sphere)[:, 0]
+    assert density.mean() * 4 * np.pi == pytest.approx(1, abs=0.02)
+    found = call("sample_lights", random.random((count, 3)))
+    omega, pdf = found[:, :3], found[:, 3]
+    np.testing.assert_allclose(np.linalg.norm(omega, axis=1), 1, atol=1e-4)
+    np.testing.assert_allclose(call("densities", omega)[:, 0], pdf, rtol=2e-2, atol=1e-3)
+    above = omega[:, 2] > 0.05
+    # Moments of the density by samples and by the sphere.
+    for function in (lambda w: w[:, 0], lambda w: w[:, 1], lambda w: w[:, 2] ** 2):
+        values = function(omega)
+        error = values.std() / np.sqrt(count)
+        expected = 4 * np.pi * (density * function(sphere)).mean()
+        assert abs(values.mean() - expected) < 4 * error + 0.003
+    solid = (above / np.maximum(pdf, 1e-9)).mean()
+    error = (above / np.maximum(pdf, 1e-9)).std() / np.sqrt(count)
+    assert abs(solid - 2 * np.pi * 0.95) < 5 * error
+
+
+def test_other_languages(tmp_path: Path) -> None:
+    pytest.importorskip("slangpy", reason="no slangpy; to enable: pip install 'mbtf[shaders]'")
+    make("relief", tmp_path / "material")
+    words = [word for target in TARGETS for word in ("--shader-target", target)]
+    out = tmp_path / "out"
+    command = ["export", str(tmp_path / "material"), "--to", "slang", *words, "-o", str(out), "-q"]
+    assert run(app, command) == 0
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    assert len(before) == 2 + len(TARGETS)
+    marks = {
+        ".hlsl": b"StructuredBuffer<float4",
+        ".comp": b"#version 450",
+        ".wgsl": b"@compute",
+        ".metal": b"[[kernel]]",
+        ".cu": b"__global__",
+        ".cpp": b"SLANG_PRELUDE_EXPORT",
+    }
+    for name, text in before.items():
+        ending = Path(name).suffix
+        assert ending not in marks or marks[ending] in text, name
+    assert run(app, command) == 0
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+    if shutil.which("g++"):
+        subprocess.run(["g++", "-fsyntax-only", "-w", str(out / "material.cpp")], check=True)
+
+
+def test_what_cannot_be_written_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_material(tmp_path / "patches", model="hierarchical")
+    make("calibrated", tmp_path / "good")
+    out = ["-o", str(tmp_path / "out")]
+    for words, code, what in (
+        (["patches", "--to", "slang"], 3, "decodes neighborhoods"),
+        (["good", "--shader-target", "hlsl"], 2, "--shader-target: is an option of shaders"),
+    ):
+        assert run(app, ["export", str(tmp_path / words[0]), *words[1:], *out]) == code
+        assert what in capsys.readouterr().err
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(EngineError, match="Slang's compiler is not installed"):
+        SlangCompiler()
+
+
+def test_a_module_with_a_fault_says_where(tmp_path: Path) -> None:
+    pytest.importorskip("slangpy", reason="no slangpy; to enable: pip install 'mbtf[shaders]'")
+    module = tmp_path / "bad.slang"
+    module.write_text("float4 f() { return nothing; }")
+    with pytest.raises(EngineError, match="Slang makes no hlsl of it"):
+        SlangCompiler().compile(module, "f", "hlsl")
+
+
+def test_reads_of_textures_become_reads_of_the_buffer() -> None:
+    found = translate("x = mix(texelFetch(a, ivec3(f(b, 1), k), 0).xy, vec2(0.0), 0.5);")
+    assert found == "x = lerp(texel(a, int3(f(b, 1), k)).xy, float2(0.0), 0.5);"
