@@ -85,7 +85,8 @@ class LiveView:
         def observe(record: dict[str, Any], trainer: Trainer, subset: ShardQueries) -> None:
             nonlocal next_picture
             start = time.perf_counter()
-            curve.append({key: record[key] for key in ("step", "seconds", "fraction", "loss", "unexplained")})
+            keys = ("step", "seconds", "fraction", "loss", "unexplained")
+            curve.append({key: _finite(record[key]) for key in keys})
             if start < next_picture:
                 self._messages.send("curve", {"records": curve}, name)
                 return
@@ -104,6 +105,10 @@ class LiveView:
         return observe
 
 
+def _finite(number: float | None) -> float | None:
+    return number if number is not None and math.isfinite(number) else None
+
+
 def errors_by_level(trainer: Trainer, queries: ShardQueries) -> dict[str, float | None]:
     """Unexplained variance by nearest level; None where it is undefined."""
     predicted = trainer.predict(queries)
@@ -113,7 +118,7 @@ def errors_by_level(trainer: Trainer, queries: ShardQueries) -> dict[str, float 
         rows = level == s
         arrays = (predicted[rows], queries.value_a[rows], queries.value_b[rows])
         value = unexplained_variance(*arrays).value
-        out[str(s)] = value if value is not None and math.isfinite(value) else None
+        out[str(s)] = _finite(value)
     return out
 
 

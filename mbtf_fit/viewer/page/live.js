@@ -50,9 +50,9 @@ function follow(begin) {
   byId("live").hidden = false;
   on("stages", (stages) => tableOf("stages", Object.entries(stages)));
   on("curve", ({ records }, name) => {
-    const last = records[records.length - 1], error = last.unexplained === null ? "undefined" : last.unexplained.toPrecision(3);
+    const last = records[records.length - 1], text = (x) => (x === null ? "undefined" : x.toPrecision(3));
     drawCurves(byId("curve"), records);
-    byId("curve_text").textContent = `${name}: step ${last.step}, ${(100 * last.fraction).toFixed(0)} %, loss ${last.loss.toPrecision(3)} (gray), validation error ${error} (blue)`;
+    byId("curve_text").textContent = `${name}: step ${last.step}, ${(100 * last.fraction).toFixed(0)} %, loss ${text(last.loss)} (gray), validation error ${text(last.unexplained)} (blue)`;
   });
   on("levels", (levels) => tableOf("levels", [["level", "validation error"], ...Object.entries(levels).map(([level, e]) => [level, e === null ? "undefined" : e.toPrecision(2)])]));
   on("material", (content) => next(async () => {

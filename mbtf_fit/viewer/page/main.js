@@ -27,6 +27,7 @@ async function show(content) {
   return viewer;
 }
 
+byId("canvas").addEventListener("webglcontextlost", () => fail(new Error("The graphics card was reset. Load the page again.")));
 window.addEventListener("error", (event) => fail(event.error ?? new Error(event.message)));
 if (CONTENT.live) {
   byId("message").textContent = "Waiting for the first material …";

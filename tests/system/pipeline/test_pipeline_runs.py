@@ -17,8 +17,11 @@ from support.pages import loads
 from support.paths import ROOT
 
 from mbtf_core.console import run
+from mbtf_core.directions import from_angles
 from mbtf_pipeline.cli.app import app
 from mbtf_pipeline.compare.pictures import read_picture
+from mbtf_pipeline.recipe import load_recipe
+from mbtf_pipeline.run import run_recipe
 
 RECIPE = ROOT / "pipelines" / "ci.yaml"
 STAGES = ["generate", "fit neumip", "compare", "report"]
@@ -70,6 +73,42 @@ def again(first: dict[str, Any], folder: Path, capsys: pytest.CaptureFixture[str
         return {name: s["reason"] for name, s in stages.items() if s["ran"]}
 
     return execute
+
+
+def test_a_run_ends_with_the_page_of_its_fits(first: dict[str, Any], folder: Path) -> None:
+    assert Path(first["viewer"]) == folder / "viewer.html"
+    html = (folder / "viewer.html").read_text()
+    assert loads(html).external == []
+    content = json.loads(re.search(r'<script id="content"[^>]*>(.*?)</script>', html, re.DOTALL)[1])  # type: ignore[index]
+    assert [m["name"] for m in content["materials"]] == ["neumip"]
+    record = json.loads((folder / "compare" / "comparison.json").read_text())
+    assert len(content["pictures"]) == min(4, len(record["pictures"]))
+    light, picture = record["pictures"][0]["light"], content["pictures"][0]
+    np.testing.assert_allclose(picture["light"], from_angles(light["elevation"], light["azimuth"]), atol=1e-6)
+
+
+def test_a_live_page_is_told_what_a_run_has(first: dict[str, Any], folder: Path) -> None:
+    """Also of stages that are up to date."""
+    told: list[tuple[str, ...]] = []
+
+    class Page:
+        def stage(self, name: str, state: str) -> None:
+            told.append(("stage", name, state))
+
+        def finished(self, name: str, path: Path) -> None:
+            assert (path / "material.json").is_file()
+            told.append(("fit", name))
+
+        def pictures(self, pictures: list[dict[str, Any]]) -> None:
+            told.append(("pictures", str(len(pictures))))
+
+    run_recipe(load_recipe(RECIPE), folder, live=Page())  # type: ignore[arg-type]
+    up = "up to date"
+    states = [entry for entry in told if entry[0] == "stage" and entry[2] == up]
+    assert [name for _, name, _ in states] == STAGES
+    assert told.index(("fit", "neumip")) < told.index(("stage", "compare", up))
+    count = len(json.loads((folder / "compare" / "comparison.json").read_text())["pictures"])
+    assert ("pictures", str(min(4, count))) in told
 
 
 def test_every_stage_runs_and_the_material_is_learned(first: dict[str, Any], folder: Path) -> None:

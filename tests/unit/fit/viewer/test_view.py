@@ -17,8 +17,9 @@ from support.plugin_materials import net, write_material
 from mbtf_core.console import run
 from mbtf_core.errors import UsageError
 from mbtf_fit.cli.app import app
+from mbtf_fit.viewer import live
 from mbtf_fit.viewer.page import safe_json, write_page
-from mbtf_fit.viewer.server import PageServer
+from mbtf_fit.viewer.server import Messages, PageServer
 
 
 def test_a_page_loads_nothing(tmp_path: Path) -> None:
@@ -102,3 +103,35 @@ def test_ctrl_c_ends_the_service(tmp_path: Path) -> None:
         assert (process.returncode, errors) == (0, "")
     finally:
         process.kill()
+
+
+def test_a_reader_gets_the_latest_messages_and_the_end() -> None:
+    messages = Messages()
+    messages.send("curve", 1, "a")
+    messages.send("stages", 2)
+    messages.send("curve", 3, "a")
+    messages.send("curve", 4, "b")
+    reader = messages.read()
+    found = [next(reader) for _ in range(3)]
+    assert found == [
+        ("stages", '{"name":"","content":2}'),
+        ("curve", '{"name":"a","content":3}'),
+        ("curve", '{"name":"b","content":4}'),
+    ]
+    messages.send("end", 5)
+    messages.close()
+    assert list(reader) == [("end", '{"name":"","content":5}')]
+
+
+def test_a_loss_that_is_not_finite_is_shown_as_undefined(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "errors_by_level", lambda trainer, queries: {})
+    monkeypatch.setattr(live, "snapshot", lambda trainer, name: {})
+    view = live.LiveView("diverging")
+    try:
+        record = {"step": 1, "seconds": 1.0, "fraction": 0.5, "loss": float("nan"), "unexplained": None}
+        view.observer("fit")(record, None, None)  # type: ignore[arg-type]
+        kind, text = next(m for m in view._messages.read() if m is not None)
+        assert kind == "curve"
+        assert json.loads(text)["content"]["records"][0]["loss"] is None
+    finally:
+        view.close()
