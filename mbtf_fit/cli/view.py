@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 from mbtf_core.console import CONSOLE, Console
@@ -36,5 +37,7 @@ def view(
     server = PageServer(html, port)
     console.note(precision)
     console.report({"url": server.url}, f"{server.url}\nopen it in a browser; Ctrl-C ends")
+    # A script that reads the address waits for it.
+    sys.stdout.flush()
     wait_for_interruption()
     server.close()

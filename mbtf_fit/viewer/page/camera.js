@@ -3,7 +3,14 @@
 
 class Camera {
   constructor(state) {
-    Object.assign(this, { elevation: 50, azimuth: -90, tiles_across: 3, target: [0.5, 0.5, 0], field_of_view: 20, ...state });
+    Object.assign(this, {
+      elevation: 50,
+      azimuth: -90,
+      tiles_across: 3,
+      target: [0.5, 0.5, 0],
+      field_of_view: 20,
+      ...state,
+    });
   }
 
   get distance() {
@@ -23,12 +30,47 @@ class Camera {
 
   // From the world to clip coordinates, for a picture of this width over height.
   viewProjection(proportion) {
-    const [forward, right, up] = this.frame, p = this.position, x = 1 / Math.tan(radians(this.field_of_view) / 2);
+    const [forward, right, up] = this.frame,
+      p = this.position,
+      x = 1 / Math.tan(radians(this.field_of_view) / 2);
     const [near, far] = [this.distance * 0.02, this.distance * 50 + 1000];
-    const view = [right[0], up[0], -forward[0], 0, right[1], up[1], -forward[1], 0, right[2], up[2], -forward[2], 0,
-      -dot(right, p), -dot(up, p), dot(forward, p), 1];
+    const view = [
+      right[0],
+      up[0],
+      -forward[0],
+      0,
+      right[1],
+      up[1],
+      -forward[1],
+      0,
+      right[2],
+      up[2],
+      -forward[2],
+      0,
+      -dot(right, p),
+      -dot(up, p),
+      dot(forward, p),
+      1,
+    ];
     const depth = (near + far) / (near - far);
-    const projection = [x, 0, 0, 0, 0, x * proportion, 0, 0, 0, 0, depth, -1, 0, 0, (2 * near * far) / (near - far), 0];
+    const projection = [
+      x,
+      0,
+      0,
+      0,
+      0,
+      x * proportion,
+      0,
+      0,
+      0,
+      0,
+      depth,
+      -1,
+      0,
+      0,
+      (2 * near * far) / (near - far),
+      0,
+    ];
     return product(projection, view);
   }
 
@@ -40,7 +82,8 @@ class Camera {
 
   // Move the target so that the picture moves by shares of its width.
   pan(right, up) {
-    const [, r, u] = this.frame, size = this.tiles_across;
+    const [, r, u] = this.frame,
+      size = this.tiles_across;
     this.target = add(this.target, add(scaled(r, -right * size), scaled(u, -up * size)));
   }
 

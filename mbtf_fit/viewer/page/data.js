@@ -1,7 +1,8 @@
 // Data of the page: numbers from base64, and textures as mbtf_fit/viewer/textures.py packs them.
 
 function bytesOf(base64) {
-  const text = atob(base64), bytes = new Uint8Array(text.length);
+  const text = atob(base64),
+    bytes = new Uint8Array(text.length);
   for (let k = 0; k < text.length; k++) bytes[k] = text.charCodeAt(k);
   return bytes;
 }
@@ -15,21 +16,31 @@ async function inflate(base64) {
 
 // Levels of a texture, coarsest first: {rows, columns, planes}, a Float32Array per channel.
 async function unpack(texture) {
-  const bytes = await inflate(texture.data), { channels, bits, alike } = texture;
-  const largest = 2 ** bits - 1, total = bytes.length / (bits > 8 ? 2 : 1), levels = [];
+  const bytes = await inflate(texture.data),
+    { channels, bits, alike } = texture;
+  const largest = 2 ** bits - 1,
+    total = bytes.length / (bits > 8 ? 2 : 1),
+    levels = [];
   let at = 0;
   texture.shapes.forEach(([rows, columns], level) => {
     // Differences of channels may be negative, so they are kept as they are.
-    const planes = [], whole = new Int32Array(rows * columns), sum = new Int32Array(rows * columns);
+    const planes = [],
+      whole = new Int32Array(rows * columns),
+      sum = new Int32Array(rows * columns);
     for (let c = 0; c < channels; c++) {
-      const low = texture.low[level][c], step = texture.step[level][c], plane = new Float32Array(rows * columns);
+      const low = texture.low[level][c],
+        step = texture.step[level][c],
+        plane = new Float32Array(rows * columns);
       for (let j = 0, n = 0; j < rows; j++) {
         for (let i = 0; i < columns; i++, n++, at++) {
           const difference = bits > 8 ? bytes[at] | (bytes[total + at] << 8) : bytes[at];
           let guess = 0;
           if (i && j) {
-            const left = whole[n - 1], above = whole[n - columns], corner = whole[n - columns - 1];
-            const least = Math.min(left, above), most = Math.max(left, above);
+            const left = whole[n - 1],
+              above = whole[n - columns],
+              corner = whole[n - columns - 1];
+            const least = Math.min(left, above),
+              most = Math.max(left, above);
             guess = corner >= most ? least : corner <= least ? most : left + above - corner;
           } else if (i) guess = whole[n - 1];
           else if (j) guess = whole[n - columns];
@@ -53,7 +64,8 @@ async function unpack(texture) {
 // Layers of four channels of all levels, one level below the other: {width, height, layers, data}. `channels`
 // lists what the four numbers of each layer are: functions of a level's planes and a texel's index.
 function stack(levels, layers) {
-  const width = Math.max(...levels.map((l) => l.columns)), height = levels.reduce((sum, l) => sum + l.rows, 0);
+  const width = Math.max(...levels.map((l) => l.columns)),
+    height = levels.reduce((sum, l) => sum + l.rows, 0);
   const data = new Float32Array(4 * width * height * layers.length);
   layers.forEach((channels, layer) => {
     let start = layer * height;
@@ -100,22 +112,33 @@ function horizonLayers(azimuths) {
 function nodesOf({ rows, columns, planes: [heights] }, blocks, shift) {
   const z = (i, j) => Math.min(0, heights[(rows - 1 - ((j + rows) % rows)) * columns + (i % columns)]);
   const [lastStart, lastStride] = blocks.length ? blocks[0] : [rows * columns, 0];
-  const size = lastStart + lastStride * Math.ceil(rows / 2), width = 1 << shift, height = Math.ceil(size / width);
+  const size = lastStart + lastStride * Math.ceil(rows / 2),
+    width = 1 << shift,
+    height = Math.ceil(size / width);
   const data = new Float32Array(4 * width * height);
   let tops = new Float32Array(rows * columns);
   for (let j = 0, n = 0; j < rows; j++)
     for (let i = 0; i < columns; i++, n++) {
-      const a = z(i, j), right = z(i + 1, j), up = z(i, j + 1), across = z(i + 1, j + 1);
+      const a = z(i, j),
+        right = z(i + 1, j),
+        up = z(i, j + 1),
+        across = z(i + 1, j + 1);
       data.set([a, right - a, up - a, across - right - up + a], 4 * n);
       tops[n] = Math.max(a, right, up, across);
     }
   let [w, h] = [columns, rows];
   for (const [start, stride] of blocks) {
-    const [nextW, nextH] = [Math.ceil(w / 2), Math.ceil(h / 2)], next = new Float32Array(nextW * nextH);
+    const [nextW, nextH] = [Math.ceil(w / 2), Math.ceil(h / 2)],
+      next = new Float32Array(nextW * nextH);
     for (let j = 0; j < nextH; j++)
       for (let i = 0; i < nextW; i++) {
         const [i1, j1] = [Math.min(2 * i + 1, w - 1), Math.min(2 * j + 1, h - 1)];
-        const top = Math.max(tops[2 * j * w + 2 * i], tops[2 * j * w + i1], tops[j1 * w + 2 * i], tops[j1 * w + i1]);
+        const top = Math.max(
+          tops[2 * j * w + 2 * i],
+          tops[2 * j * w + i1],
+          tops[j1 * w + 2 * i],
+          tops[j1 * w + i1],
+        );
         next[j * nextW + i] = top;
         data[4 * (start + j * stride + i)] = top;
       }

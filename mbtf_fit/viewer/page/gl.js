@@ -1,10 +1,19 @@
 // WebGL 2: context, programs, textures and targets.
 
 function openContext(canvas) {
-  const gl = canvas.getContext("webgl2", { antialias: false, alpha: false, powerPreference: "high-performance" });
-  if (!gl) throw new Error("This browser offers no WebGL 2, which draws the material. Turn on hardware acceleration, or open the page in another browser.");
+  const gl = canvas.getContext("webgl2", {
+    antialias: false,
+    alpha: false,
+    powerPreference: "high-performance",
+  });
+  if (!gl)
+    throw new Error(
+      "This browser offers no WebGL 2, which draws the material. Turn on hardware acceleration, or open the page in another browser.",
+    );
   if (!gl.getExtension("EXT_color_buffer_float"))
-    throw new Error("This browser cannot draw to textures of floats (EXT_color_buffer_float), which the page needs. Open it in another browser.");
+    throw new Error(
+      "This browser cannot draw to textures of floats (EXT_color_buffer_float), which the page needs. Open it in another browser.",
+    );
   return gl;
 }
 
@@ -25,7 +34,8 @@ class Program {
     ["position", "normal", "tangent", "uv"].forEach((name, k) => gl.bindAttribLocation(this.handle, k, name));
     gl.linkProgram(this.handle);
     if (!gl.getProgramParameter(this.handle, gl.LINK_STATUS)) {
-      const log = parts.map((part) => gl.getShaderInfoLog(part)).join(" ") || gl.getProgramInfoLog(this.handle);
+      const log =
+        parts.map((part) => gl.getShaderInfoLog(part)).join(" ") || gl.getProgramInfoLog(this.handle);
       throw new Error(`The graphics driver refused a shader: ${log.trim().split("\n")[0]}`);
     }
     this.uniforms = {};
@@ -42,7 +52,8 @@ class Program {
   }
 
   set(name, value) {
-    const { gl } = this, uniform = this.uniforms[name];
+    const { gl } = this,
+      uniform = this.uniforms[name];
     if (!uniform) return;
     const { location, type } = uniform;
     const list = Array.isArray(value) || ArrayBuffer.isView(value) ? value : [value];
@@ -69,20 +80,24 @@ class Program {
 }
 
 function unfiltered(gl, target) {
-  for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(target, name, gl.NEAREST);
+  for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER])
+    gl.texParameteri(target, name, gl.NEAREST);
   for (const name of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(target, name, gl.CLAMP_TO_EDGE);
 }
 
 function checkSize(gl, ...sizes) {
   const most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
   if (Math.max(...sizes) > most)
-    throw new Error(`The material needs textures of ${Math.max(...sizes)} texels; this device allows ${most}. Export a material of fewer levels.`);
+    throw new Error(
+      `The material needs textures of ${Math.max(...sizes)} texels; this device allows ${most}. Export a material of fewer levels.`,
+    );
 }
 
 // Layers of four numbers; `half` stores 16-bit floats.
 function layeredTexture(gl, { width, height, layers, data }, half) {
   checkSize(gl, width, height);
-  const handle = gl.createTexture(), target = gl.TEXTURE_2D_ARRAY;
+  const handle = gl.createTexture(),
+    target = gl.TEXTURE_2D_ARRAY;
   gl.bindTexture(target, handle);
   gl.texImage3D(target, 0, half ? gl.RGBA16F : gl.RGBA32F, width, height, layers, 0, gl.RGBA, gl.FLOAT, data);
   unfiltered(gl, target);
@@ -92,7 +107,8 @@ function layeredTexture(gl, { width, height, layers, data }, half) {
 // A table (rows, columns) of four numbers.
 function tableTexture(gl, width, height, data) {
   checkSize(gl, width, height);
-  const handle = gl.createTexture(), target = gl.TEXTURE_2D;
+  const handle = gl.createTexture(),
+    target = gl.TEXTURE_2D;
   gl.bindTexture(target, handle);
   gl.texImage2D(target, 0, gl.RGBA32F, width, height, 0, gl.RGBA, gl.FLOAT, data);
   unfiltered(gl, target);
@@ -121,7 +137,8 @@ class Target {
   }
 
   read(x, y, width, height) {
-    const { gl } = this, out = new Float32Array(4 * width * height);
+    const { gl } = this,
+      out = new Float32Array(4 * width * height);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.handle);
     gl.readPixels(x, y, width, height, gl.RGBA, gl.FLOAT, out);
     return out;

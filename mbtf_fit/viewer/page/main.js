@@ -3,7 +3,8 @@
 const fail = (error) => (byId("message").textContent = error.message || String(error));
 
 function statusLine(viewer, test) {
-  const { renderer, camera, material, seconds } = viewer, pitch = camera.tiles_across / renderer.canvas.width;
+  const { renderer, camera, material, seconds } = viewer,
+    pitch = camera.tiles_across / renderer.canvas.width;
   const level = clamp(-Math.log2(pitch), 0, material.content.finest);
   const beyond = test?.beyond ? `, ${test.beyond} of ${test.count} test queries deviate` : "";
   return `level ${level.toFixed(1)} of ${material.content.finest}, ${camera.tiles_across.toPrecision(2)} tiles across, ${(1000 * seconds).toFixed(0)} ms per frame${beyond}`;
@@ -27,7 +28,9 @@ async function show(content) {
   return viewer;
 }
 
-byId("canvas").addEventListener("webglcontextlost", () => fail(new Error("The graphics card was reset. Load the page again.")));
+byId("canvas").addEventListener("webglcontextlost", () =>
+  fail(new Error("The graphics card was reset. Load the page again.")),
+);
 window.addEventListener("error", (event) => fail(event.error ?? new Error(event.message)));
 if (CONTENT.live) {
   byId("message").textContent = "Waiting for the first material …";

@@ -1,6 +1,7 @@
 // A material on the graphics card: its textures and weights, and programs that evaluate it.
 
-const HEAD = "#version 300 es\nprecision highp float;\nprecision highp int;\nprecision highp sampler2D;\nprecision highp sampler2DArray;\n";
+const HEAD =
+  "#version 300 es\nprecision highp float;\nprecision highp int;\nprecision highp sampler2D;\nprecision highp sampler2DArray;\n";
 
 class Material {
   constructor(gl, content) {
@@ -9,19 +10,28 @@ class Material {
   }
 
   static async load(gl, content) {
-    const self = new Material(gl, content), names = Object.keys(content.textures);
+    const self = new Material(gl, content),
+      names = Object.keys(content.textures);
     const unpacked = await Promise.all(names.map((name) => unpack(content.textures[name])));
     const levels = Object.fromEntries(names.map((name, k) => [name, unpacked[k]]));
     const layered = (name, layers, half) => layeredTexture(gl, stack(levels[name], layers), half);
     const channels = (name) => content.textures[name].channels;
     self.textures = { pyramid_texture: layered("pyramid", plainLayers(channels("pyramid")), true) };
     if (levels.offset_texture)
-      self.textures.offset_texture = layered("offset_texture", plainLayers(channels("offset_texture")), false);
+      self.textures.offset_texture = layered(
+        "offset_texture",
+        plainLayers(channels("offset_texture")),
+        false,
+      );
     if (levels.transmittance)
       self.textures.transmittance_texture = layered("transmittance", plainLayers(6), false);
     if (levels["surface.maps"]) {
       self.textures.map_texture = layered("surface.maps", mapLayers(channels("surface.maps")), false);
-      self.textures.horizon_texture = layered("surface.horizons", horizonLayers(channels("surface.horizons") / 2), false);
+      self.textures.horizon_texture = layered(
+        "surface.horizons",
+        horizonLayers(channels("surface.horizons") / 2),
+        false,
+      );
       const nodes = nodesOf(levels["surface.heights"][0], content.blocks, content.node_shift);
       self.textures.node_texture = tableTexture(gl, nodes.width, nodes.height, nodes.data);
     }
@@ -31,14 +41,16 @@ class Material {
   }
 
   _calibrate({ shape: [tables, levels, knots], data }) {
-    const given = floatsOf(data), padded = new Float32Array(4 * tables * levels * knots);
+    const given = floatsOf(data),
+      padded = new Float32Array(4 * tables * levels * knots);
     for (let k = 0; k < given.length / 3; k++) padded.set(given.subarray(3 * k, 3 * k + 3), 4 * k);
     this.textures.calibration_texture = tableTexture(this.gl, knots, tables * levels, padded);
   }
 
   // Weights are uniforms where they fit, which is faster; otherwise a texture.
   _weigh(weights) {
-    const { gl } = this, count = weights.length / 4;
+    const { gl } = this,
+      count = weights.length / 4;
     this.uniform = 4 * weights.length <= gl.getParameter(gl.MAX_UNIFORM_BLOCK_SIZE);
     if (this.uniform) {
       this.buffer = gl.createBuffer();
@@ -49,7 +61,8 @@ class Material {
       const padded = new Float32Array(4 * 1024 * Math.ceil(count / 1024));
       padded.set(weights);
       this.textures.weight_texture = tableTexture(gl, 1024, padded.length / 4096, padded);
-      this.header = "uniform sampler2D weight_texture;\n" +
+      this.header =
+        "uniform sampler2D weight_texture;\n" +
         "#define WEIGHT(i) texelFetch(weight_texture, ivec2((i) & 1023, (i) >> 10), 0)\n";
     }
   }
@@ -57,7 +70,11 @@ class Material {
   // Program of a fragment shader that calls the material's functions, made at its first use.
   program(vertex, fragment) {
     const key = `${vertex} ${fragment}`;
-    this.programs[key] ??= new Program(this.gl, SHADERS[vertex], HEAD + this.header + this.content.source + SHADERS[fragment]);
+    this.programs[key] ??= new Program(
+      this.gl,
+      SHADERS[vertex],
+      HEAD + this.header + this.content.source + SHADERS[fragment],
+    );
     return this.programs[key];
   }
 
@@ -81,15 +98,20 @@ class Material {
 // Largest deviation of this device from the material's test queries, over max(1, value), and the number of
 // queries beyond the tolerance.
 function testQueries(renderer, material) {
-  const { gl } = renderer, { conformance, tolerance } = material.content;
-  const [u, sigma, light, view, expected] = ["u", "sigma", "omega_i", "omega_o", "rgb"].map((name) => floatsOf(conformance[name]));
-  const count = sigma.length, table = new Float32Array(4 * 3 * count);
+  const { gl } = renderer,
+    { conformance, tolerance } = material.content;
+  const [u, sigma, light, view, expected] = ["u", "sigma", "omega_i", "omega_o", "rgb"].map((name) =>
+    floatsOf(conformance[name]),
+  );
+  const count = sigma.length,
+    table = new Float32Array(4 * 3 * count);
   for (let k = 0; k < count; k++) {
     table.set([u[2 * k], u[2 * k + 1], sigma[k]], 4 * k);
     table.set(light.subarray(3 * k, 3 * k + 3), 4 * (count + k));
     table.set(view.subarray(3 * k, 3 * k + 3), 4 * (2 * count + k));
   }
-  const queries = tableTexture(gl, count, 3, table), target = new Target(gl, count, 1);
+  const queries = tableTexture(gl, count, 3, table),
+    target = new Target(gl, count, 1);
   target.begin();
   material.use(material.program("screen.vert", "queries.frag"), {}, { queries });
   renderer.drawScreen();
@@ -103,6 +125,8 @@ function testQueries(renderer, material) {
       deviations.push(Math.abs(found[4 * k + c] - value) / Math.max(1, value));
     }
   const beyond = new Set();
-  deviations.forEach((d, k) => { if (!(d <= tolerance)) beyond.add(Math.floor(k / 3)); });
+  deviations.forEach((d, k) => {
+    if (!(d <= tolerance)) beyond.add(Math.floor(k / 3));
+  });
   return { count, largest: Math.max(...deviations), beyond: beyond.size, values: [...found] };
 }

@@ -1,8 +1,10 @@
 // The panel and the mouse.
 
 function bindPanel(viewer) {
-  const { state, content, renderer } = viewer, canvas = renderer.canvas;
-  const refreshers = [], refresh = () => refreshers.forEach((update) => update());
+  const { state, content, renderer } = viewer,
+    canvas = renderer.canvas;
+  const refreshers = [],
+    refresh = () => refreshers.forEach((update) => update());
   viewer.refresh = refresh;
 
   const option = (select, value, text) => select.add(new Option(text, value));
@@ -15,12 +17,23 @@ function bindPanel(viewer) {
     });
   };
   const light = () => state.lights[viewer.chosen] ?? { color: [1, 1, 1], intensity: 1, direction: [0, 0, 1] };
-  const hex = (color) => `#${color.map((c) => Math.round(clamp(encoded(c), 0, 255)).toString(16).padStart(2, "0")).join("")}`;
+  const hex = (color) =>
+    `#${color
+      .map((c) =>
+        Math.round(clamp(encoded(c), 0, 255))
+          .toString(16)
+          .padStart(2, "0"),
+      )
+      .join("")}`;
   const linear = (x) => (x <= 0.04045 ? x / 12.92 : Math.pow((x + 0.055) / 1.055, 2.4));
 
   for (const name of Object.keys(SHAPES)) option(byId("shape"), name, name);
   if (content.mesh) option(byId("shape"), content.mesh.name, content.mesh.name);
-  for (const name of ["none", ...Object.keys(BUILT_IN), ...(content.environment ? [content.environment.name] : [])])
+  for (const name of [
+    "none",
+    ...Object.keys(BUILT_IN),
+    ...(content.environment ? [content.environment.name] : []),
+  ])
     option(byId("environment"), name, name);
   // What can be shown and compared; more comes while fits are trained.
   viewer.choicesChanged = () => {
@@ -36,17 +49,96 @@ function bindPanel(viewer) {
     refresh();
   };
 
-  bind("shape", () => state.shape, (x) => { state.shape = x; viewer.shapeChanged(); viewer.frameShape(); });
-  bind("tiles", () => Math.log2(state.tiles), (x) => { state.tiles = 2 ** x; viewer.shapeChanged(); });
-  bind("zoom", () => Math.log2(viewer.camera.tiles_across), (x) => { viewer.camera.tiles_across = 2 ** x; viewer.changed(); });
-  bind("intensity", () => Math.log2(light().intensity || 1e-3), (x) => { light().intensity = 2 ** x; viewer.picture ? viewer.againstChanged() : viewer.changed(); });
-  bind("color", () => hex(light().color), (x) => { light().color = [1, 3, 5].map((k) => linear(parseInt(x.slice(k, k + 2), 16) / 255)); viewer.changed(); });
-  bind("environment", () => state.environment.name, (x) => { state.environment.name = x; viewer.environmentChanged(); });
-  bind("environment_intensity", () => Math.log2(state.environment.intensity), (x) => { state.environment.intensity = 2 ** x; viewer.changed(); });
-  bind("environment_angle", () => state.environment.angle, (x) => { state.environment.angle = x; viewer.changed(); });
-  bind("exposure", () => state.exposure, (x) => { state.exposure = x; viewer.redraw(); viewer.saveLater(); });
-  bind("material", () => state.material, (x) => { state.material = Number(x); viewer.shapeChanged(); });
-  bind("against", () => state.against, (x) => { state.against = x; viewer.againstChanged(); });
+  bind(
+    "shape",
+    () => state.shape,
+    (x) => {
+      state.shape = x;
+      viewer.shapeChanged();
+      viewer.frameShape();
+    },
+  );
+  bind(
+    "tiles",
+    () => Math.log2(state.tiles),
+    (x) => {
+      state.tiles = 2 ** x;
+      viewer.shapeChanged();
+    },
+  );
+  bind(
+    "zoom",
+    () => Math.log2(viewer.camera.tiles_across),
+    (x) => {
+      viewer.camera.tiles_across = 2 ** x;
+      viewer.changed();
+    },
+  );
+  bind(
+    "intensity",
+    () => Math.log2(light().intensity || 1e-3),
+    (x) => {
+      light().intensity = 2 ** x;
+      viewer.picture ? viewer.againstChanged() : viewer.changed();
+    },
+  );
+  bind(
+    "color",
+    () => hex(light().color),
+    (x) => {
+      light().color = [1, 3, 5].map((k) => linear(parseInt(x.slice(k, k + 2), 16) / 255));
+      viewer.changed();
+    },
+  );
+  bind(
+    "environment",
+    () => state.environment.name,
+    (x) => {
+      state.environment.name = x;
+      viewer.environmentChanged();
+    },
+  );
+  bind(
+    "environment_intensity",
+    () => Math.log2(state.environment.intensity),
+    (x) => {
+      state.environment.intensity = 2 ** x;
+      viewer.changed();
+    },
+  );
+  bind(
+    "environment_angle",
+    () => state.environment.angle,
+    (x) => {
+      state.environment.angle = x;
+      viewer.changed();
+    },
+  );
+  bind(
+    "exposure",
+    () => state.exposure,
+    (x) => {
+      state.exposure = x;
+      viewer.redraw();
+      viewer.saveLater();
+    },
+  );
+  bind(
+    "material",
+    () => state.material,
+    (x) => {
+      state.material = Number(x);
+      viewer.shapeChanged();
+    },
+  );
+  bind(
+    "against",
+    () => state.against,
+    (x) => {
+      state.against = x;
+      viewer.againstChanged();
+    },
+  );
   refreshers.push(() => drawDome(byId("dome"), state.lights, viewer.chosen));
   refreshers.push(() => {
     const other = viewer.picture?.name ?? (viewer.shown[1] && viewer.shown[1].name);
@@ -56,17 +148,26 @@ function bindPanel(viewer) {
     byId("right_name").textContent = other ?? "";
     byId("name").textContent = viewer.material.name;
     byId("model").textContent = viewer.material.content.model;
-    byId("facts").replaceChildren(...Object.entries(viewer.material.content.facts).filter(([, value]) => value !== null && value !== undefined).map(([key, value]) => {
-      const row = document.createElement("tr");
-      row.insertCell().textContent = key;
-      row.insertCell().textContent = typeof value === "number" ? value.toLocaleString("en", { maximumFractionDigits: 1 }) : value;
-      return row;
-    }));
+    byId("facts").replaceChildren(
+      ...Object.entries(viewer.material.content.facts)
+        .filter(([, value]) => value !== null && value !== undefined)
+        .map(([key, value]) => {
+          const row = document.createElement("tr");
+          row.insertCell().textContent = key;
+          row.insertCell().textContent =
+            typeof value === "number" ? value.toLocaleString("en", { maximumFractionDigits: 1 }) : value;
+          return row;
+        }),
+    );
   });
 
   byId("add_light").addEventListener("click", () => {
     if (state.lights.length >= 4) return;
-    state.lights.push({ direction: fromAngles(40, 45 + 90 * state.lights.length), color: [1, 1, 1], intensity: 1.5 });
+    state.lights.push({
+      direction: fromAngles(40, 45 + 90 * state.lights.length),
+      color: [1, 1, 1],
+      intensity: 1.5,
+    });
     viewer.chosen = state.lights.length - 1;
     viewer.changed();
     refresh();
@@ -111,7 +212,8 @@ function bindPanel(viewer) {
   const drag = (element, begin) => {
     element.addEventListener("pointerdown", (event) => {
       element.setPointerCapture(event.pointerId);
-      const move = begin(event), at = { x: event.clientX, y: event.clientY };
+      const move = begin(event),
+        at = { x: event.clientX, y: event.clientY };
       const moved = (next) => {
         move(next, next.clientX - at.x, next.clientY - at.y);
         Object.assign(at, { x: next.clientX, y: next.clientY });
@@ -143,29 +245,45 @@ function bindPanel(viewer) {
   drag(canvas, (event) => {
     const box = canvas.getBoundingClientRect();
     let far = 0;
-    canvas.addEventListener("pointerup", (last) => {
-      if (far < 4 && event.button === 0 && !event.shiftKey)
-        showPoint(viewer, (last.clientX - box.left) / box.width, (last.clientY - box.top) / box.height);
-    }, { once: true });
+    canvas.addEventListener(
+      "pointerup",
+      (last) => {
+        if (far < 4 && event.button === 0 && !event.shiftKey)
+          showPoint(viewer, (last.clientX - box.left) / box.width, (last.clientY - box.top) / box.height);
+      },
+      { once: true },
+    );
     return (next, dx, dy) => {
       far += Math.abs(dx) + Math.abs(dy);
       if (viewer.picture) return;
       if (event.shiftKey && state.lights.length) {
         const [elevation, azimuth] = toAngles(light().direction);
-        light().direction = fromAngles(clamp(elevation - (90 * dy) / box.height, 1, 89.9), azimuth + (180 * dx) / box.width);
+        light().direction = fromAngles(
+          clamp(elevation - (90 * dy) / box.height, 1, 89.9),
+          azimuth + (180 * dx) / box.width,
+        );
       } else if (event.button === 2 || event.ctrlKey) viewer.camera.pan(dx / box.width, -dy / box.width);
-      else viewer.camera.orbit((180 * dx) / box.width, (120 * dy) / box.height, state.shape === "plane" ? 2 : -85);
+      else
+        viewer.camera.orbit(
+          (180 * dx) / box.width,
+          (120 * dy) / box.height,
+          state.shape === "plane" ? 2 : -85,
+        );
       viewer.changed();
     };
   });
   canvas.addEventListener("contextmenu", (event) => event.preventDefault());
-  canvas.addEventListener("wheel", (event) => {
-    event.preventDefault();
-    if (viewer.picture) return;
-    viewer.camera.zoom(2 ** (clamp(event.deltaY, -200, 200) / 400));
-    viewer.changed();
-    refresh();
-  }, { passive: false });
+  canvas.addEventListener(
+    "wheel",
+    (event) => {
+      event.preventDefault();
+      if (viewer.picture) return;
+      viewer.camera.zoom(2 ** (clamp(event.deltaY, -200, 200) / 400));
+      viewer.changed();
+      refresh();
+    },
+    { passive: false },
+  );
   canvas.addEventListener("keydown", (event) => {
     const step = { ArrowLeft: [-5, 0], ArrowRight: [5, 0], ArrowUp: [0, 5], ArrowDown: [0, -5] }[event.key];
     if (viewer.picture) return;
@@ -190,7 +308,8 @@ function showPoint(viewer, x, y) {
     return;
   }
   const light = viewer.state.lights[viewer.chosen]?.direction ?? [0, 0, 1];
-  const least = viewer.material.content.min_cos, towards = normalized([light[0], light[1], Math.max(light[2], least)]);
+  const least = viewer.material.content.min_cos,
+    towards = normalized([light[0], light[1], Math.max(light[2], least)]);
   const over = (id, omega, over_views, mark) => {
     const values = viewer.renderer.overDirections(viewer.material, 128, found, omega, over_views);
     return drawValues(byId(id), 128, values, mark);
@@ -198,5 +317,6 @@ function showPoint(viewer, x, y) {
   const largest = over("over_lights", found.omega_o, false, towards);
   over("over_views", towards, true, found.omega_o);
   const level = clamp(-Math.log2(2 * found.sigma), 0, viewer.material.content.finest);
-  byId("point").textContent = `u = (${found.u.map((c) => c.toFixed(4)).join(", ")}), footprint σ = ${found.sigma.toPrecision(2)} tiles (level ${level.toFixed(1)}), largest value ${largest.toPrecision(3)} 1/sr`;
+  byId("point").textContent =
+    `u = (${found.u.map((c) => c.toFixed(4)).join(", ")}), footprint σ = ${found.sigma.toPrecision(2)} tiles (level ${level.toFixed(1)}), largest value ${largest.toPrecision(3)} 1/sr`;
 }

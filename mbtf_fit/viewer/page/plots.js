@@ -2,7 +2,9 @@
 
 // Lights as dots on the disk of their x and y.
 function drawDome(canvas, lights, chosen) {
-  const ink = canvas.getContext("2d"), r = canvas.width / 2, size = 0.92 * r;
+  const ink = canvas.getContext("2d"),
+    r = canvas.width / 2,
+    size = 0.92 * r;
   ink.clearRect(0, 0, canvas.width, canvas.height);
   ink.strokeStyle = "#565b63";
   ink.fillStyle = "#2a2c31";
@@ -27,8 +29,10 @@ function drawDome(canvas, lights, chosen) {
 // Direction of a place on the dome, at least a degree above the horizon.
 function domeDirection(canvas, event) {
   const box = canvas.getBoundingClientRect();
-  const x = (2 * (event.clientX - box.left)) / box.width - 1, y = 1 - (2 * (event.clientY - box.top)) / box.height;
-  const length = Math.hypot(x, y) / 0.92, most = Math.cos(radians(1));
+  const x = (2 * (event.clientX - box.left)) / box.width - 1,
+    y = 1 - (2 * (event.clientY - box.top)) / box.height;
+  const length = Math.hypot(x, y) / 0.92,
+    most = Math.cos(radians(1));
   const s = (length > most ? most / length : 1) / 0.92;
   return [x * s, y * s, Math.sqrt(Math.max(0, 1 - (x * s) ** 2 - (y * s) ** 2))];
 }
@@ -38,13 +42,17 @@ const encoded = (x) => 255 * (x <= 0.0031308 ? 12.92 * x : 1.055 * Math.pow(x, 1
 // Values over directions: the largest is white; the chosen direction is a circle.
 function drawValues(canvas, size, values, [x, y]) {
   canvas.width = canvas.height = size;
-  const ink = canvas.getContext("2d"), image = ink.createImageData(size, size);
+  const ink = canvas.getContext("2d"),
+    image = ink.createImageData(size, size);
   let largest = 0;
-  for (let k = 0; k < values.length; k += 4) largest = Math.max(largest, values[k], values[k + 1], values[k + 2]);
+  for (let k = 0; k < values.length; k += 4)
+    largest = Math.max(largest, values[k], values[k + 1], values[k + 2]);
   for (let j = 0; j < size; j++)
     for (let i = 0; i < size; i++) {
-      const from = 4 * ((size - 1 - j) * size + i), to = 4 * (j * size + i);
-      for (let c = 0; c < 3; c++) image.data[to + c] = encoded(largest > 0 ? Math.max(0, values[from + c]) / largest : 0);
+      const from = 4 * ((size - 1 - j) * size + i),
+        to = 4 * (j * size + i);
+      for (let c = 0; c < 3; c++)
+        image.data[to + c] = encoded(largest > 0 ? Math.max(0, values[from + c]) / largest : 0);
       image.data[to + 3] = 255;
     }
   ink.putImageData(image, 0, 0);

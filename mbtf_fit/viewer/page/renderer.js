@@ -66,33 +66,39 @@ class Renderer {
   // The mean of a name ("full", or "coarse" while something moves), made anew for another size.
   mean(name, width, height, sides) {
     const known = this.means[name];
-    if (known && known.width === width && known.height === height && known.sides.length === sides) return known;
+    if (known && known.width === width && known.height === height && known.sides.length === sides)
+      return known;
     known?.delete();
     return (this.means[name] = new Mean(this.gl, width, height, sides));
   }
 
   _scene(material, target, scene, values, region) {
-    const { gl } = this, { camera, lights, environment } = scene;
+    const { gl } = this,
+      { camera, lights, environment } = scene;
     target.begin();
     gl.enable(gl.DEPTH_TEST);
     gl.enable(gl.SCISSOR_TEST);
     gl.scissor(...region);
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    material.use(material.program("scene.vert", "scene.frag"), {
-      view_projection: camera.viewProjection(target.width / target.height),
-      camera: camera.position,
-      light_count: lights.length,
-      light_direction: lights.flatMap((light) => light.direction),
-      light_color: lights.flatMap((light) => light.color.map((c) => c * light.intensity)),
-      has_environment: this.lit ? 1 : 0,
-      environment_angle: radians(environment.angle),
-      environment_color: [1, 1, 1].map((c) => c * environment.intensity),
-      frame: 0,
-      shown: 0,
-      jitter: [0, 0],
-      ...values,
-    }, { environment_samples: this.environment });
+    material.use(
+      material.program("scene.vert", "scene.frag"),
+      {
+        view_projection: camera.viewProjection(target.width / target.height),
+        camera: camera.position,
+        light_count: lights.length,
+        light_direction: lights.flatMap((light) => light.direction),
+        light_color: lights.flatMap((light) => light.color.map((c) => c * light.intensity)),
+        has_environment: this.lit ? 1 : 0,
+        environment_angle: radians(environment.angle),
+        environment_color: [1, 1, 1].map((c) => c * environment.intensity),
+        frame: 0,
+        shown: 0,
+        jitter: [0, 0],
+        ...values,
+      },
+      { environment_samples: this.environment },
+    );
     gl.bindVertexArray(this.mesh.array);
     gl.drawElements(gl.TRIANGLES, this.mesh.count, gl.UNSIGNED_INT, 0);
     gl.disable(gl.SCISSOR_TEST);
@@ -106,12 +112,14 @@ class Renderer {
     if (n >= FRAMES) return false;
     // The pixel's filter is that of the footprint: the first frame is not jittered.
     const jitter = n ? [(2 * halton(n, 2) - 1) / width, (2 * halton(n, 3) - 1) / height] : [0, 0];
-    const count = Math.min(rows, height - mean.row), last = mean.row + count >= height;
+    const count = Math.min(rows, height - mean.row),
+      last = mean.row + count >= height;
     const split = materials.length > 1 ? Math.round(scene.divide * width) : width;
     materials.forEach((material, side) => {
       const region = side === 0 ? [0, mean.row, split, count] : [split, mean.row, width - split, count];
       this._scene(material, mean.latest, scene, { jitter, frame: n }, region);
-      const { gl } = this, [known, next] = mean.sides[side];
+      const { gl } = this,
+        [known, next] = mean.sides[side];
       next.begin();
       gl.enable(gl.SCISSOR_TEST);
       gl.scissor(0, mean.row, width, count);
@@ -130,10 +138,17 @@ class Renderer {
 
   // Show means on the canvas; `picture` takes the place of the second.
   show(mean, exposure, divide, picture) {
-    const { gl, canvas } = this, [first, other] = mean.sides.map(([known]) => known.texture), second = picture ?? other;
+    const { gl, canvas } = this,
+      [first, other] = mean.sides.map(([known]) => known.texture),
+      second = picture ?? other;
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, canvas.width, canvas.height);
-    this.display.use({ exposure, divide: second ? divide : 1, size: [canvas.width, canvas.height], background: BACKGROUND });
+    this.display.use({
+      exposure,
+      divide: second ? divide : 1,
+      size: [canvas.width, canvas.height],
+      background: BACKGROUND,
+    });
     this.display.bind({ first, second: second ?? first });
     this.drawScreen();
   }
@@ -141,8 +156,12 @@ class Renderer {
   // Position, footprint and view of the material at a place of the picture (from the top left); null beside
   // the shape.
   pick(material, scene, x, y) {
-    const { width, height } = this.canvas, target = new Target(this.gl, width, height, true);
-    const at = [clamp(Math.floor(x * width), 0, width - 1), clamp(Math.floor((1 - y) * height), 0, height - 1)];
+    const { width, height } = this.canvas,
+      target = new Target(this.gl, width, height, true);
+    const at = [
+      clamp(Math.floor(x * width), 0, width - 1),
+      clamp(Math.floor((1 - y) * height), 0, height - 1),
+    ];
     // Derivatives need the neighbors.
     const region = [at[0] & ~1, at[1] & ~1, 2, 2];
     const [[u, v, sigma, hit], omega_o] = [1, 2].map((shown) => {
@@ -157,7 +176,12 @@ class Renderer {
   overDirections(material, size, { u, sigma }, omega, over_views) {
     if (!this.disk || this.disk.width !== size) this.disk = new Target(this.gl, size, size);
     this.disk.begin();
-    material.use(material.program("screen.vert", "directions.frag"), { u, sigma, omega, over_views: over_views ? 1 : 0 });
+    material.use(material.program("screen.vert", "directions.frag"), {
+      u,
+      sigma,
+      omega,
+      over_views: over_views ? 1 : 0,
+    });
     this.drawScreen();
     return this.disk.read(0, 0, size, size);
   }

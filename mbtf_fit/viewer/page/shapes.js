@@ -1,14 +1,20 @@
 // Shapes to put the material on. Lengths are in tile widths; (u, v) counts tiles.
 
 function meshOf(gl, { positions, normals, tangents, uvs, indices }) {
-  const array = gl.createVertexArray(), buffers = [];
+  const array = gl.createVertexArray(),
+    buffers = [];
   const fill = (target, data) => {
     buffers.push(gl.createBuffer());
     gl.bindBuffer(target, buffers.at(-1));
     gl.bufferData(target, data, gl.STATIC_DRAW);
   };
   gl.bindVertexArray(array);
-  [[positions, 3], [normals, 3], [tangents, 4], [uvs, 2]].forEach(([data, size], k) => {
+  [
+    [positions, 3],
+    [normals, 3],
+    [tangents, 4],
+    [uvs, 2],
+  ].forEach(([data, size], k) => {
     fill(gl.ARRAY_BUFFER, new Float32Array(data));
     gl.enableVertexAttribArray(k);
     gl.vertexAttribPointer(k, size, gl.FLOAT, false, 0, 0);
@@ -29,7 +35,8 @@ function gridOf(columns, rows, at) {
       out.tangents.push(...t, 1);
       out.uvs.push(...uv);
       if (i === columns || j === rows) continue;
-      const k = j * (columns + 1) + i, above = k + columns + 1;
+      const k = j * (columns + 1) + i,
+        above = k + columns + 1;
       out.indices.push(k, k + 1, above + 1, k, above + 1, above);
     }
   return out;
@@ -47,7 +54,8 @@ function planeShape(tiles, aspect) {
 
 // A sphere whose equator has so many tiles.
 function sphereShape(tiles, aspect) {
-  const around = Math.max(1, Math.round(tiles)), radius = around / (2 * Math.PI);
+  const around = Math.max(1, Math.round(tiles)),
+    radius = around / (2 * Math.PI);
   const up = Math.max(1, Math.round(around / 2 / aspect));
   return gridOf(128, 64, (s, t) => {
     const [a, e] = [2 * Math.PI * s, Math.PI * (t - 0.5)];
@@ -60,16 +68,26 @@ function sphereShape(tiles, aspect) {
 function clothShape(tiles, aspect) {
   const depth = (s, t) => 0.06 * (1.2 - t) * (Math.sin(9 * s + 1.5 * t) + 0.4 * Math.sin(21 * s - 2 * t));
   return gridOf(160, 80, (s, t) => {
-    const h = 1e-3, by_s = (depth(s + h, t) - depth(s - h, t)) / (2 * h), by_t = (depth(s, t + h) - depth(s, t - h)) / (2 * h);
-    const n = normalized([by_s, -1, by_t]), tangent = normalized([1, by_s, 0]);
+    const h = 1e-3,
+      by_s = (depth(s + h, t) - depth(s - h, t)) / (2 * h),
+      by_t = (depth(s, t + h) - depth(s, t - h)) / (2 * h);
+    const n = normalized([by_s, -1, by_t]),
+      tangent = normalized([1, by_s, 0]);
     const p = [(s - 0.5) * tiles, depth(s, t) * tiles, (t - 0.5) * tiles];
-    return { p, n: normalized(cross(tangent, normalized([0, by_t, 1]))), t: tangent, uv: [tiles * s, (tiles * t) / aspect] };
+    return {
+      p,
+      n: normalized(cross(tangent, normalized([0, by_t, 1]))),
+      t: tangent,
+      uv: [tiles * s, (tiles * t) / aspect],
+    };
   });
 }
 
 // The user's mesh, so many tiles per unit of its texture coordinates.
 function userShape(mesh, tiles, aspect) {
-  const [positions, normals, tangents, uvs] = ["positions", "normals", "tangents", "uvs"].map((k) => floatsOf(mesh[k]));
+  const [positions, normals, tangents, uvs] = ["positions", "normals", "tangents", "uvs"].map((k) =>
+    floatsOf(mesh[k]),
+  );
   const size = tiles * mesh.unit;
   return {
     positions: positions.map((x) => x * size),

@@ -16,7 +16,9 @@ const rounded = (x) => (typeof x === "number" ? Math.round(x * 1e4) / 1e4 : x);
 
 function linkOf(state, camera) {
   const { elevation, azimuth, tiles_across, target } = camera;
-  const text = JSON.stringify({ ...state, camera: { elevation, azimuth, tiles_across, target } }, (_, x) => rounded(x));
+  const text = JSON.stringify({ ...state, camera: { elevation, azimuth, tiles_across, target } }, (_, x) =>
+    rounded(x),
+  );
   return `#${encodeURIComponent(text)}`;
 }
 
@@ -24,16 +26,32 @@ function linkOf(state, camera) {
 function merged(known, given) {
   if (Array.isArray(known)) {
     if (!Array.isArray(given)) return known;
-    return known.length && typeof known[0] === "object" ? given.slice(0, 4).map((x) => merged(known[0], x)) : given.length === known.length ? given.map((x, k) => merged(known[k], x)) : known;
+    return known.length && typeof known[0] === "object"
+      ? given.slice(0, 4).map((x) => merged(known[0], x))
+      : given.length === known.length
+        ? given.map((x, k) => merged(known[k], x))
+        : known;
   }
   if (known && typeof known === "object")
-    return given && typeof given === "object" ? Object.fromEntries(Object.keys(known).map((k) => [k, merged(known[k], given[k])])) : known;
-  return typeof given === typeof known && (typeof given !== "number" || Number.isFinite(given)) ? given : known;
+    return given && typeof given === "object"
+      ? Object.fromEntries(Object.keys(known).map((k) => [k, merged(known[k], given[k])]))
+      : known;
+  return typeof given === typeof known && (typeof given !== "number" || Number.isFinite(given))
+    ? given
+    : known;
 }
 
 // State of a link's fragment; the first state where it is damaged.
 function stateOf(fragment, camera) {
-  const known = { ...structuredClone(FIRST), camera: { elevation: camera.elevation, azimuth: camera.azimuth, tiles_across: camera.tiles_across, target: camera.target } };
+  const known = {
+    ...structuredClone(FIRST),
+    camera: {
+      elevation: camera.elevation,
+      azimuth: camera.azimuth,
+      tiles_across: camera.tiles_across,
+      target: camera.target,
+    },
+  };
   try {
     return merged(known, JSON.parse(decodeURIComponent(fragment.slice(1))));
   } catch {

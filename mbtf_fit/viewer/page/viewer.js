@@ -3,7 +3,8 @@
 const byId = (id) => document.getElementById(id);
 const SHADERS = CONTENT.shaders;
 // Seconds of drawing after which the page answers; frames after which nothing moves any more.
-const SLOW = 0.06, STILL = 4;
+const SLOW = 0.06,
+  STILL = 4;
 
 class Viewer {
   constructor(content) {
@@ -14,7 +15,8 @@ class Viewer {
   }
 
   async start() {
-    for (const material of this.content.materials) this.materials.push(await Material.load(this.renderer.gl, material));
+    for (const material of this.content.materials)
+      this.materials.push(await Material.load(this.renderer.gl, material));
     this.pictures = await Promise.all((this.content.pictures ?? []).map((picture) => this._picture(picture)));
     this.state.material = clamp(Math.round(this.state.material), 0, this.materials.length - 1);
     this.shapeChanged();
@@ -24,17 +26,20 @@ class Viewer {
   }
 
   async _picture(picture) {
-    const [{ rows, columns, planes }] = await unpack(picture.roots), values = new Float32Array(4 * rows * columns).fill(1);
+    const [{ rows, columns, planes }] = await unpack(picture.roots),
+      values = new Float32Array(4 * rows * columns).fill(1);
     // Row 0 of a picture is its top; square roots are stored.
     for (let j = 0; j < rows; j++)
       for (let i = 0; i < columns; i++)
-        for (let c = 0; c < 3; c++) values[4 * ((rows - 1 - j) * columns + i) + c] = planes[c][j * columns + i] ** 2;
+        for (let c = 0; c < 3; c++)
+          values[4 * ((rows - 1 - j) * columns + i) + c] = planes[c][j * columns + i] ** 2;
     return { ...picture, rows, columns, values };
   }
 
   // A material that is new, or takes the place of the one of its name.
   async setMaterial(content) {
-    const material = await Material.load(this.renderer.gl, content), known = this.materials.findIndex((m) => m.name === material.name);
+    const material = await Material.load(this.renderer.gl, content),
+      known = this.materials.findIndex((m) => m.name === material.name);
     if (known < 0) this.materials.push(material);
     else {
       this.materials[known].delete();
@@ -64,7 +69,12 @@ class Viewer {
   }
 
   get scene() {
-    return { camera: this.camera, lights: this.state.lights, environment: this.state.environment, divide: this.state.divide };
+    return {
+      camera: this.camera,
+      lights: this.state.lights,
+      environment: this.state.environment,
+      divide: this.state.divide,
+    };
   }
 
   changed() {
@@ -79,7 +89,9 @@ class Viewer {
   }
 
   shapeChanged() {
-    const { shape, tiles } = this.state, { aspect } = this.material.content, mesh = this.content.mesh;
+    const { shape, tiles } = this.state,
+      { aspect } = this.material.content,
+      mesh = this.content.mesh;
     if (mesh && shape === mesh.name) this.renderer.setShape(userShape(mesh, tiles, aspect));
     else this.renderer.setShape((SHAPES[shape] ?? planeShape)(tiles, aspect));
     this.changed();
@@ -87,15 +99,23 @@ class Viewer {
 
   // Put the camera where the whole shape is seen.
   frameShape() {
-    const plane = this.state.shape === "plane", tiles = this.state.tiles;
-    const size = { plane: tiles, sphere: tiles / Math.PI, cloth: tiles * 1.2 }[this.state.shape] ?? tiles * (this.content.mesh?.unit ?? 1) * 2;
-    Object.assign(this.camera, { target: plane ? [0.5, 0.5 * this.material.content.aspect, 0] : [0, 0, 0], tiles_across: 1.25 * size,
-      elevation: plane ? 50 : 20, azimuth: -90 });
+    const plane = this.state.shape === "plane",
+      tiles = this.state.tiles;
+    const size =
+      { plane: tiles, sphere: tiles / Math.PI, cloth: tiles * 1.2 }[this.state.shape] ??
+      tiles * (this.content.mesh?.unit ?? 1) * 2;
+    Object.assign(this.camera, {
+      target: plane ? [0.5, 0.5 * this.material.content.aspect, 0] : [0, 0, 0],
+      tiles_across: 1.25 * size,
+      elevation: plane ? 50 : 20,
+      azimuth: -90,
+    });
     this.changed();
   }
 
   environmentChanged() {
-    const { name } = this.state.environment, user = this.content.environment;
+    const { name } = this.state.environment,
+      user = this.content.environment;
     const known = name in BUILT_IN || (user && user.name === name);
     this.renderer.setEnvironment(known ? environmentOf(name, user) : undefined);
     this.changed();
@@ -103,20 +123,33 @@ class Viewer {
 
   // A picture fixes view, light and shape; its values are M for unit irradiance of the plane.
   againstChanged() {
-    const { gl } = this.renderer, picture = this.picture;
+    const { gl } = this.renderer,
+      picture = this.picture;
     if (this.pictureTexture) gl.deleteTexture(this.pictureTexture.handle);
     this.pictureTexture = undefined;
     if (picture) {
-      const direction = picture.light, light = this.state.lights[0] ?? FIRST.lights[0];
+      const direction = picture.light,
+        light = this.state.lights[0] ?? FIRST.lights[0];
       this.state.lights = [{ ...light, color: [1, 1, 1], direction }];
       this.state.environment.name = "none";
       this.renderer.setEnvironment(undefined);
       this.state.shape = "plane";
       this.renderer.setShape(planeShape(this.state.tiles, this.material.content.aspect));
       const { elevation, azimuth, tiles_across, target, field_of_view } = picture.camera;
-      Object.assign(this.camera, { elevation, azimuth, tiles_across, field_of_view, target: [target[0], target[1], 0] });
+      Object.assign(this.camera, {
+        elevation,
+        azimuth,
+        tiles_across,
+        field_of_view,
+        target: [target[0], target[1], 0],
+      });
       const factor = light.intensity * direction[2];
-      this.pictureTexture = tableTexture(gl, picture.columns, picture.rows, picture.values.map((x, k) => (k % 4 < 3 ? x * factor : x)));
+      this.pictureTexture = tableTexture(
+        gl,
+        picture.columns,
+        picture.rows,
+        picture.values.map((x, k) => (k % 4 < 3 ? x * factor : x)),
+      );
     } else this.camera.field_of_view = new Camera().field_of_view;
     this.layout();
     this.changed();
@@ -124,10 +157,18 @@ class Viewer {
 
   // Size of the canvas: that of its place, or the proportions of the picture beside it.
   layout() {
-    const { canvas } = this.renderer, box = canvas.parentElement.getBoundingClientRect();
+    const { canvas } = this.renderer,
+      box = canvas.parentElement.getBoundingClientRect();
     const proportion = this.picture ? this.picture.columns / this.picture.rows : box.width / box.height;
-    const width = Math.min(box.width, box.height * proportion), height = width / proportion;
-    Object.assign(canvas.style, { width: `${width}px`, height: `${height}px`, left: `${(box.width - width) / 2}px`, top: `${(box.height - height) / 2}px`, inset: "auto" });
+    const width = Math.min(box.width, box.height * proportion),
+      height = width / proportion;
+    Object.assign(canvas.style, {
+      width: `${width}px`,
+      height: `${height}px`,
+      left: `${(box.width - width) / 2}px`,
+      top: `${(box.height - height) / 2}px`,
+      inset: "auto",
+    });
     const density = Math.min(window.devicePixelRatio || 1, 2);
     canvas.width = Math.max(1, Math.round(width * density));
     canvas.height = Math.max(1, Math.round(height * density));
@@ -138,11 +179,22 @@ class Viewer {
   // Draw: coarse pictures while something moves, then frames of full size in parts, so that the page answers.
   // Returns whether anything changed.
   draw() {
-    const { renderer, shown, scene } = this, { width, height } = renderer.canvas, moving = this.still++ < STILL;
-    const name = moving ? "coarse" : "full", scale = moving ? this.scale : 1;
-    const mean = renderer.mean(name, Math.max(2, Math.round(width * scale)), Math.max(2, Math.round(height * scale)), shown.length);
-    const rows = moving ? mean.height : Math.max(2, Math.round((mean.height * SLOW) / Math.max(this.full, SLOW)));
-    const before = performance.now(), drawn = renderer.frame(mean, shown, scene, rows);
+    const { renderer, shown, scene } = this,
+      { width, height } = renderer.canvas,
+      moving = this.still++ < STILL;
+    const name = moving ? "coarse" : "full",
+      scale = moving ? this.scale : 1;
+    const mean = renderer.mean(
+      name,
+      Math.max(2, Math.round(width * scale)),
+      Math.max(2, Math.round(height * scale)),
+      shown.length,
+    );
+    const rows = moving
+      ? mean.height
+      : Math.max(2, Math.round((mean.height * SLOW) / Math.max(this.full, SLOW)));
+    const before = performance.now(),
+      drawn = renderer.frame(mean, shown, scene, rows);
     if (!drawn) return false;
     const seconds = (performance.now() - before) / 1000;
     // Time of a full frame, from the part that was drawn.
@@ -156,7 +208,8 @@ class Viewer {
 
   // Show the last picture again.
   redraw() {
-    const { full, coarse } = this.renderer.means, mean = full?.frames ? full : coarse;
+    const { full, coarse } = this.renderer.means,
+      mean = full?.frames ? full : coarse;
     if (mean?.frames) this.renderer.show(mean, this.state.exposure, this.state.divide, this.pictureTexture);
   }
 }
