@@ -11,18 +11,15 @@ from urllib.parse import quote
 
 import numpy as np
 import pytest
-import torch
 from support.browser import NO_WEBGL, SOFTWARE, browser
 from support.fit_data import parallax, write_data
-from support.plugin_materials import net, write_material
+from support.plugin_materials import write_material
+from support.shader_cases import CASES, make
 
 from mbtf_core.directions import from_angles
-from mbtf_core.lattice import Lattice
 from mbtf_fit import fit
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries
-from mbtf_fit.material.material import Material
-from mbtf_fit.material.transmittance import Transmittance
 from mbtf_fit.training.trainer import Trainer
 from mbtf_fit.viewer.content import as_read, encode, material_content, pack_textures
 from mbtf_fit.viewer.extras import mesh_content, picture_content
@@ -36,40 +33,6 @@ CHOOSE = """
     input.value = arguments[1];
     input.dispatchEvent(new Event("input"));
 """
-BANDS = {"position": 3, "direction": 2, "direction_pi": False, "raw": True}
-CASES: dict[str, dict[str, Any]] = {
-    "neumip-baseline": {"model": "neumip-baseline"},
-    "calibrated": {},
-    "holes": {},
-    "direct offset, six outputs": net(offset="direct", output_channels=6, activation="leaky-relu"),
-    "concatenated, softplus": net(blending="concatenate", activation="sine", output_transform="softplus"),
-    "encoded": net(encoding={**BANDS, "band_attenuation": True, "footprint_filtered": True}),
-    "fourth root": net(output_transform="fourth-root", encoding={"direction_xyz": True, "half_vector": True}),
-    "relief": {"model": "relief"},
-    "relief, two places": {"model": "relief", **net(relief={"places": 2})},
-    "relief, diffuse, four places": {"model": "relief", "glossy": False, **net(relief={"places": 4})},
-    "relief without hints": {"model": "relief", **net(relief={"hints": False}, oversampling=1)},
-    "relief without gate": {
-        "model": "relief",
-        **net(relief={"gate": False, "frame": False}, output_channels=6),
-    },
-    "learned heights": {"model": "neumip+"},
-    "black": {"model": "relief", "weights": {"unit": torch.zeros(())}},
-    "rainer2019": {"model": "rainer2019"},
-}
-
-
-def make(case: str, folder: Path) -> Material:
-    """A material of random weights on a tile that is half as high as wide."""
-    lattice, generator = Lattice(4, 0.5), torch.Generator().manual_seed(0)
-    options = {"finest": 4, "aspect": 0.5, **CASES[case]}
-    if case == "calibrated":
-        options["weights"] = {"calibration": 0.7 + 0.6 * torch.rand((2, 5, 6, 3), generator=generator)}
-    if case == "holes":
-        shapes = [(*lattice.shape(s), 6) for s in range(5)]
-        coefficients = [0.3 + 0.2 * torch.randn(s, generator=generator).numpy() for s in shapes]
-        options["transmittance"] = Transmittance(lattice, coefficients)
-    return write_material(folder, **options)
 
 
 class Page:

@@ -135,7 +135,7 @@ def test_a_bcc_has_open_and_closed_curves_through_its_points(tmp_path: Path) -> 
 def test_the_deviation_from_catmull_rom_curves_is_told(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    caplog.set_level("INFO")
+    caplog.set_level("INFO", logger="mbtf_gen")
     path = tmp_path / "a.bcc"
     found = []
     for count in (8, 16):
