@@ -163,7 +163,7 @@ class _RecipeRun:
         """The report, and the viewer's page where there is one."""
         return [path for name in (REPORT, VIEWER) if (path := self.folder / name).is_file()]
 
-    def _generate(self, data: DataSet, decision: Decision) -> None:
+    def _generate(self, data: DataSet, decision: Decision) -> float:
         from mbtf_core.shard_schema import MANIFEST_NAME
         from mbtf_gen.dataset.folder import read_manifest
         from mbtf_gen.dataset.reader import is_dataset
@@ -185,9 +185,9 @@ class _RecipeRun:
         ):
             clear(shards)
         with self.console.progress(None, data.stage, "paths") as bar:
-            generate(job, shards, progress=bar.update)
+            return generate(job, shards, progress=bar.update).shard_seconds
 
-    def _fit(self, name: str, data: DataSet, decision: Decision) -> None:
+    def _fit(self, name: str, data: DataSet, decision: Decision) -> float:
         from mbtf_fit import fit
 
         config, shards, out = self.recipe.fit[name], self.folder / data.sub, self.folder / FITS / name
@@ -196,13 +196,14 @@ class _RecipeRun:
         steps = config.training.steps
         budget, unit = (config.training.time, "s") if steps is None else (steps, "steps")
         with self.console.progress(budget, fit_stage(name), unit) as bar:
-            fit(
+            done = fit(
                 config,
                 shards,
                 out,
                 progress=lambda share, note: bar.update(round(share * budget, 1), note),
                 observe=None if self.live is None else self.live.observer(name),
             )
+        return done.seconds
 
     def _compare(self, decision: Decision) -> None:
         from mbtf_pipeline.compare.compare import compare, steps
