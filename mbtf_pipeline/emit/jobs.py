@@ -187,7 +187,9 @@ def _configs(recipe: Recipe, folder: Path) -> dict[str, str]:
     """The configurations that the commands read, by file name; each finds the material from its own place."""
 
     def located(config: GeneratorConfig) -> dict[str, Any]:
-        material = os.path.relpath(config.material, folder / CONFIGS)
+        material = from_here(Path(config.material))
+        if not os.path.isabs(material):
+            material = os.path.relpath(material, folder / CONFIGS)
         return {**config.model_dump(mode="json"), "material": material}
 
     whole = {**recipe.model_dump(mode="json"), "generate": located(recipe.generate)}

@@ -152,7 +152,7 @@ def _job(step: Step, names: Mapping[str, str], cluster: Cluster) -> dict[str, An
     count = max(1, step.slices)
     policy = {
         "rules": [
-            {"action": "Ignore", "onPodConditions": [{"type": "DisruptionTarget"}]},
+            {"action": "Ignore", "onPodConditions": [{"type": "DisruptionTarget", "status": "True"}]},
             {"action": "FailJob", "onExitCodes": {"operator": "In", "values": _FINAL}},
         ]
     }

@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Sequence
 
 from mbtf_core.errors import UsageError
+from mbtf_core.units import format_duration
 from mbtf_pipeline.emit.places import Places
 from mbtf_pipeline.emit.steps import Step
 
@@ -13,8 +14,9 @@ SUBMIT, LIBRARY, LOGS = "submit.sh", "job.sh", "logs"
 # A job that has been queued again so often fails. SLURM waits two minutes before each time, and the lock of
 # another machine that has crashed counts for half an hour.
 _RESTARTS = 20
-# Seconds before the time limit at which the program is told to store its work.
-_NOTICE = 90
+# Seconds before the time limit at which the program is told to store its work, and the shortest limit: SLURM
+# may send the signal a minute earlier.
+_NOTICE, _SHORTEST = 90, 300
 
 _LIBRARY = """\
 # Runs the program of a job; the batch scripts read this file.
@@ -23,8 +25,10 @@ _LIBRARY = """\
 # Shortly before the time limit (USR1), the program stores its work, and the job is queued again. So it is
 # where the program exits with 4: unfinished, and the same command resumes.
 run_job() {{
-    local name=$1 program code again="" signaled
+    local name=$1 program code again="" signaled job=$SLURM_JOB_ID
     shift
+    # One of an array's tasks has the number of the whole array.
+    [ -z "${{SLURM_ARRAY_TASK_ID:-}}" ] || job=${{SLURM_ARRAY_JOB_ID}}_$SLURM_ARRAY_TASK_ID
     trap 'signaled=yes again=yes; kill -TERM "$program"' USR1
     trap 'signaled=yes; kill -TERM "$program"' TERM
     "$@" &
@@ -40,7 +44,7 @@ run_job() {{
     if [ "$code" -eq 4 ] || [ -n "$again" ]; then
         if [ "${{SLURM_RESTART_COUNT:-0}}" -lt {restarts} ]; then
             echo "$name: unfinished (exit code $code), queued again to resume" >&2
-            scontrol requeue "$SLURM_JOB_ID" && return "$code"
+            scontrol requeue "$job" && return "$code"
         fi
     fi
     echo "$name failed with exit code $code, see above. What is finished is kept;" {start} "resumes" >&2
@@ -86,8 +90,11 @@ def slurm_files(name: str, places: Places, steps: Sequence[Step]) -> dict[str, s
     Raises
     ------
     UsageError
-        SLURM cannot write logs to the folder.
+        SLURM cannot write logs to the folder, or a time limit is too short.
     """
+    if min(step.resources.seconds for step in steps) < _SHORTEST:
+        hint = f"give {format_duration(_SHORTEST)} or more"
+        raise UsageError("is too short for SLURM", where="--time-limit", hint=hint)
     if "%" in str(places.folder):
         raise UsageError("SLURM reads % in the names of logs", where="-o", hint="choose another folder")
     start = places.start(SUBMIT)
