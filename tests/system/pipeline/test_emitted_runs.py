@@ -24,35 +24,41 @@ from support.small_runs import contents
 from mbtf_core.console import run
 from mbtf_pipeline.cli.app import app
 
-RECIPE = f"""
+RECIPE = """
 name: small
 generate:
-  material: {ROOT / "assets/turtle_shell/height.exr"}
-  geometry: {{mesh: 64}}
-  queries: {{train: 400/texel, spp: 4, test: "4096", test_spp: 64, resolution: 16, min_cos: 0.3}}
-  light: {{width: 10}}
-  output: {{shard_queries: 20000}}
+  material: height.exr
+  geometry: {mesh: 64}
+  queries: {train: 400/texel, spp: 4, test: "4096", test_spp: 64, resolution: 16, min_cos: 0.3}
+  light: {width: 10}
+  output: {shard_queries: 20000}
 fit:
-  neumip: {{training: {{steps: 20, batch: 2048}}}}
-  baseline: {{model: neumip-baseline, training: {{steps: 20, batch: 2048}}}}
+  neumip: {training: {steps: 20, batch: 2048}}
+  baseline: {model: neumip-baseline, training: {steps: 20, batch: 2048}}
 compare:
-  views: [{{elevation: 90, azimuth: -90}}]
-  lights: [{{elevation: 50, azimuth: 45}}]
+  views: [{elevation: 90, azimuth: -90}]
+  lights: [{elevation: 50, azimuth: 45}]
   tiles_across: [2]
   size: 32
   spp: 16
-  offset_views: [{{elevation: 30, azimuth: 0}}]
+  offset_views: [{elevation: 30, azimuth: 0}]
 """
+HEIGHTS = ROOT / "assets" / "turtle_shell" / "height.exr"
 SLURM = ROOT / "tests" / "system" / "slurm"
+
+
+def write_recipe(folder: Path) -> None:
+    (folder / "recipe.yaml").write_text(RECIPE)
+    shutil.copy(HEIGHTS, folder)
 
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a run on one machine, beside its recipe."""
     folder = tmp_path_factory.mktemp("plain")
-    (folder / "recipe.yaml").write_text(RECIPE)
+    write_recipe(folder)
     environment = install_programs(folder / "bin")
-    command = ["mbtf-pipeline", "run", str(folder / "recipe.yaml"), "-o", str(folder / "run"), "-q"]
+    command = ["mbtf-pipeline", "run", "recipe.yaml", "-o", "run", "-q"]
     done = subprocess.run(
         command, env=environment, capture_output=True, text=True, timeout=300, check=False, cwd=folder
     )
@@ -64,7 +70,7 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder = tmp_path / "a folder"
     folder.mkdir()
-    (folder / "recipe.yaml").write_text(RECIPE)
+    write_recipe(folder)
     monkeypatch.chdir(folder)
     return folder
 
@@ -100,6 +106,21 @@ def test_make_gives_the_data_and_fits_of_one_machine(
     assert merged.returncode == 4
     assert "unfinished: run the other slices" in merged.stdout
     done = start("make -C jobs -j2", environment)
+    assert done.returncode == 0, done.stderr
+    check_run(place / "out/small", plain, capsys)
+
+
+@pytest.mark.slow
+def test_pods_give_the_data_and_fits_of_one_machine(
+    place: Path, plain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The commands of the pods with the programs, by a stand-in of kubectl."""
+    words = ["--slices", "2", "--image", "mbtf", "-q"]
+    assert run(app, ["emit", "recipe.yaml", "--to", "k8s", *words]) == 0
+    programs = install_programs(tmp_path / "bin")
+    scheduler = install(tmp_path / "scheduler", ("kubectl",))
+    environment = scheduler | {"PATH": f"{tmp_path / 'scheduler'}:{programs['PATH']}"}
+    done = start("jobs/apply.sh --namespace=test", environment)
     assert done.returncode == 0, done.stderr
     check_run(place / "out/small", plain, capsys)
 
