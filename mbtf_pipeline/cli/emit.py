@@ -88,6 +88,8 @@ def emit(
     from mbtf_pipeline.presets import preset_recipe
 
     loaded = preset_recipe(recipe, quality, assignments or [])
+    if seconds is None:
+        console.note("forecasting the jobs on this machine; --time-limit skips it")
     done = emit_jobs(
         loaded,
         output,

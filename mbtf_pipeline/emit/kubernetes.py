@@ -20,8 +20,10 @@ _MOUNT = "/work"
 _LONGEST = 50
 # Number of a slice, for a shell.
 _INDEX = "$((JOB_COMPLETION_INDEX + 1))"
-# Restarts of each command, besides those after an eviction, which do not count.
-_RESTARTS = 6
+# Restarts of each command, besides those after an eviction, which do not count. Kubernetes waits for ten
+# seconds before the first and up to six minutes before later ones: together longer than the half hour for
+# which the lock of a pod that was killed counts.
+_RESTARTS = 10
 # Exit codes that a repetition does not change: usage and bad input.
 _FINAL = [2, 3]
 

@@ -38,7 +38,7 @@ ALL = {
     "mbtf-gen shards-image",
     "mbtf-fit neumip+",
     "mbtf-fit images",
-    "mbtf-pipeline the $run",
+    "mbtf-pipeline the $$run",
 }
 
 
@@ -73,7 +73,7 @@ def start(line: str, environment: dict[str, str]) -> subprocess.CompletedProcess
 def emitted(recipe: Recipe, target: Target, jobs: Path = Path("my jobs")) -> str:
     """Emit jobs of three slices for one target; returns the command that starts them."""
     cluster = Cluster("registry/mbtf:1")
-    run_folder = Path("out/the $run")
+    run_folder = Path("out/the $$run")
     done = emit_jobs(recipe, jobs, [target], run=run_folder, slices=3, request=REQUEST, cluster=cluster)
     return done.start[target]
 

@@ -49,7 +49,7 @@ def test_all_commands_run_in_order_in_the_current_folder(
     assert max(map(order.index, SLICES)) < order.index("mbtf-gen shards") < order.index("mbtf-fit neumip+")
     assert max(map(order.index, IMAGES)) < order.index("mbtf-gen shards-image")
     assert order.index("mbtf-gen shards-image") < order.index("mbtf-fit images")
-    assert order[-1] == "mbtf-pipeline the $run"
+    assert order[-1] == "mbtf-pipeline the $$run"
 
 
 @pytest.mark.parametrize("target", TARGETS)
@@ -66,10 +66,10 @@ def test_commands_are_those_of_the_recipe(recipe: Recipe, target: Target, tmp_pa
             extra = {"material": None} if words[0] == "mbtf-gen" else {}
             read[words[words.index("-o") + 1]] = options.resolve(**extra)
     for data in data_sets(recipe):
-        found = read[f"out/the $run/{data.sub}"]
+        found = read[f"out/the $$run/{data.sub}"]
         assert Job.load(found).config_hash == Job.load(data.config).config_hash
     for name, config in recipe.fit.items():
-        assert read[f"out/the $run/fits/{name}"].fields() == config.fields()
+        assert read[f"out/the $$run/fits/{name}"].fields() == config.fields()
     again = load_recipe(Path("my jobs/config/recipe.yaml"))
     assert Path(again.generate.material).samefile(recipe.generate.material)
     same = {"generate": {"material"}}
@@ -87,7 +87,7 @@ def test_a_slice_that_is_unfinished_is_run_again(recipe: Recipe, tmp_path: Path)
         order = kinds(folder)
         assert order.count("shards 2/3") == 3
         assert order.count("shards 1/3") == 1
-        assert order[-1] == "mbtf-pipeline the $run"
+        assert order[-1] == "mbtf-pipeline the $$run"
     (log,) = Path("slurm/logs").glob("generate-[0-9]*-2.log")
     assert "slice 2/3 of generate: unfinished (exit code 4), queued again to resume" in log.read_text()
 
@@ -112,12 +112,12 @@ def test_a_failed_slice_is_named_and_a_second_start_finishes(
     assert "What is finished is kept; " in said
     assert line.removesuffix(" -j2") in said
     # Nothing that needs the slice has run.
-    assert not {"mbtf-gen shards", "mbtf-fit neumip+", "mbtf-pipeline the $run"} & set(
+    assert not {"mbtf-gen shards", "mbtf-fit neumip+", "mbtf-pipeline the $$run"} & set(
         kinds(tmp_path / "bin")
     )
     assert start(line, environment).returncode == 0
     assert set(kinds(tmp_path / "bin")) == ALL
-    assert kinds(tmp_path / "bin")[-1] == "mbtf-pipeline the $run"
+    assert kinds(tmp_path / "bin")[-1] == "mbtf-pipeline the $$run"
 
 
 def test_slurm_gives_up_at_last(recipe: Recipe, tmp_path: Path) -> None:
