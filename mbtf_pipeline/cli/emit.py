@@ -70,6 +70,8 @@ def emit(
     foreign = [flag for flag, value in given.items() if value is not None]
     if foreign and "k8s" not in to:
         raise UsageError("is an option of Kubernetes", where=foreign[0], hint="add --to k8s")
+    if "k8s" in to and image is None:
+        raise UsageError("is missing", where="--image", hint="name the container image with the programs")
     from mbtf_core.units import asked_duration, clock, parse_size
     from mbtf_pipeline.paper_tables.recipe import is_paper_recipe
 

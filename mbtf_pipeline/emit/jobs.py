@@ -110,6 +110,8 @@ def emit_jobs(
 
     Raises
     ------
+    ValueError
+        ``k8s`` without a cluster.
     InputError
         The material cannot be used, or a folder contains something else.
     UsageError
@@ -123,7 +125,7 @@ def emit_jobs(
     check_names(folder, run, material)
     if "k8s" in targets:
         if cluster is None:
-            raise UsageError("is missing", where="--image", hint="name the container image that has mbtf")
+            raise ValueError("k8s needs a cluster")
         _check_inside(recipe, folder, run)
     _check_outputs(recipe, run)
     expected = forecast_run(recipe) if request.seconds is None else None

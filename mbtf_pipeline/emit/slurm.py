@@ -47,7 +47,10 @@ run_job() {{
             scontrol requeue "$job" && return "$code"
         fi
     fi
-    echo "$name failed with exit code $code, see above. What is finished is kept;" {start} "resumes" >&2
+    local what="failed with exit code $code, see above" also=""
+    # By scancel, or before SLURM gives the node to another job and queues this one again.
+    [ "$code" -ne 143 ] || what="was stopped" also=", unless SLURM starts it again itself"
+    echo "$name $what. What is finished is kept;" {start} "resumes$also" >&2
     return "$code"
 }}
 """

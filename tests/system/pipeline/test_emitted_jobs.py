@@ -134,3 +134,15 @@ def test_the_makefile_is_refused_elsewhere(recipe: Recipe, tmp_path: Path) -> No
     done = start("make -f 'my jobs/Makefile'", install(tmp_path / "bin"))
     assert done.returncode == 2
     assert "make -C FOLDER" in done.stderr
+
+
+def test_a_job_that_slurm_stops_says_so(recipe: Recipe, tmp_path: Path) -> None:
+    """SIGTERM comes from scancel, which means it, or before SLURM itself queues the job again."""
+    environment = install(tmp_path / "bin")
+    fail(tmp_path / "bin", "shards --slice 2/3", [143])
+    start(emitted(recipe, "slurm"), environment)
+    assert kinds(tmp_path / "bin").count("shards 2/3") == 1
+    (log,) = Path("my jobs/logs").glob("generate-[0-9]*-2.log")
+    said = log.read_text().splitlines()[-1]
+    assert said.startswith("slice 2/3 of generate was stopped. What is finished is kept; ")
+    assert said.endswith("resumes, unless SLURM starts it again itself")
