@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 
@@ -30,6 +31,7 @@ def fit(
     many: Annotated[list[Path] | None, Parameter(consume_multiple=True)] = None,
     processes: Annotated[int | None, Parameter(show_default="one per GPU, or 1")] = None,
     live: Live = False,
+    tensorboard: Annotated[Path | None, Parameter(metavar="FOLDER")] = None,
     dry_run: DryRun = False,
     overwrite: Overwrite = False,
     verbose: Verbose = False,
@@ -50,6 +52,8 @@ def fit(
         files with one folder per line. A fit that fails does not stop the others.
     processes
         With --many, number of simultaneous fits.
+    tensorboard
+        Write the curves of the fit as event files for TensorBoard to a folder.
     """
     if dry_run and many is not None:
         raise UsageError("--dry-run takes one data set", hint="mbtf-fit shards/ --dry-run")
@@ -61,8 +65,9 @@ def fit(
         raise UsageError("--processes must be a positive number and requires --many")
     if shards is None and many is None:
         raise UsageError("no shards given", hint="mbtf-fit shards/ -o material/")
-    if many is not None and live:
-        raise UsageError("shows one fit", where="--live", hint="leave out --many, or --live")
+    for flag, used in (("--live", live), ("--tensorboard", tensorboard is not None)):
+        if many is not None and used:
+            raise UsageError("shows one fit", where=flag, hint=f"leave out --many, or {flag}")
     if many is not None:
         _fit_many(options, quality, many, output, processes, overwrite, console)
         return
@@ -104,18 +109,28 @@ def fit(
             console.note(expectation(seconds, size))
     if missing := missing_reason():
         console.note(f"note: training runs in PyTorch, not in the compiled kernel ({missing})")
+    from mbtf_fit.training.tensorboard import EventLog
+
     keep_on_interruption(f"the last checkpoint is kept in {output}")
     with (
+        nullcontext() if tensorboard is None else EventLog(tensorboard) as log,
         live_view(str(output), live, console) as shown,
         console.progress(total=100, label="fitting", unit="%") as bar,
     ):
+        curves = None if shown is None else shown.observer(output.name)
+        observers = [observer for observer in (curves, log) if observer is not None]
+
+        def observe(*validation: Any) -> None:
+            for observer in observers:
+                observer(*validation)
+
         result = fit(
             resolved,
             shards,
             output,
             overwrite=overwrite,
             progress=lambda fraction, note: bar.update(round(100 * fraction, 1), note),
-            observe=None if shown is None else shown.observer(output.name),
+            observe=observe if observers else None,
             partition=partition,
         )
         if shown is not None:
