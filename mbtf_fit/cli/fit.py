@@ -12,7 +12,7 @@ from cyclopts import Parameter
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import InputError, PartialError, UsageError
 from mbtf_core.interruption import keep_on_interruption
-from mbtf_core.options import DryRun, Options, Output, Overwrite, Verbose, takes_options
+from mbtf_core.options import ClusterOption, DryRun, Options, Output, Overwrite, Verbose, takes_options
 from mbtf_core.units import clock, expectation, format_duration
 from mbtf_fit.cli.page_options import Live, live_view
 from mbtf_fit.config import DEFAULT_MODEL, FIBER_MODEL, FitConfig, ModelName
@@ -32,6 +32,7 @@ def fit(
     processes: Annotated[int | None, Parameter(show_default="one per GPU, or 1")] = None,
     live: Live = False,
     tensorboard: Annotated[Path | None, Parameter(metavar="FOLDER")] = None,
+    cluster: ClusterOption = None,
     dry_run: DryRun = False,
     overwrite: Overwrite = False,
     verbose: Verbose = False,
@@ -63,13 +64,16 @@ def fit(
         )
     if processes is not None and (many is None or processes < 1):
         raise UsageError("--processes must be a positive number and requires --many")
+    if cluster is not None and (many is None or processes is not None):
+        hint = "leave out --processes" if many is not None else "mbtf-fit --many shards/ -o materials/"
+        raise UsageError("requires --many, and sets the number of processes", where="--cluster", hint=hint)
     if shards is None and many is None:
         raise UsageError("no shards given", hint="mbtf-fit shards/ -o material/")
     for flag, used in (("--live", live), ("--tensorboard", tensorboard is not None)):
         if many is not None and used:
             raise UsageError("shows one fit", where=flag, hint=f"leave out --many, or {flag}")
     if many is not None:
-        _fit_many(options, quality, many, output, processes, overwrite, console)
+        _fit_many(options, quality, many, output, processes, cluster, overwrite, console)
         return
     assert shards is not None
     resolved = resolve_config(options, quality, shards)
@@ -175,9 +179,12 @@ def _fit_many(
     many: list[Path],
     output: Path,
     processes: int | None,
+    cluster: str | None,
     overwrite: bool,
     console: Console,
 ) -> None:
+    from mbtf_core.cluster.engine import open_cluster
+    from mbtf_fit.training.fit_cluster import fit_on_cluster
     from mbtf_fit.training.fit_many import FitOutcome, find_data, fit_many, name_materials
 
     shards = find_data(many)
@@ -189,17 +196,26 @@ def _fit_many(
         processes = max(1, torch.cuda.device_count()) if configs[0].device != "cpu" else 1
     console.note(
         f"{len(shards)} data set{'s' * (len(shards) != 1)} -> {output}: "
-        f"{' and '.join(sorted({config.model for config in configs}))}, {processes} at a time"
+        f"{' and '.join(sorted({config.model for config in configs}))}"
+        f"{'' if cluster is not None else f', {processes} at a time'}"
     )
     keep_on_interruption(f"finished fits and the last checkpoints are kept in {output}")
-    with console.progress(total=len(shards), label="fitting", unit="data sets") as bar:
+    with (
+        open_cluster(cluster, console.note) as workers,
+        console.progress(total=len(shards), label="fitting", unit="data sets") as bar,
+    ):
 
         def finished(outcome: FitOutcome) -> None:
             bar.advance(1, f"{outcome.folder.name}: {'failed' if outcome.error else 'done'}")
 
-        outcomes = fit_many(
-            configs, shards, folders, processes=processes, overwrite=overwrite, finished=finished
-        )
+        if workers is None:
+            outcomes = fit_many(
+                configs, shards, folders, processes=processes, overwrite=overwrite, finished=finished
+            )
+        else:
+            outcomes = fit_on_cluster(
+                configs, shards, folders, workers, overwrite=overwrite, finished=finished
+            )
     rows = [["material", "unexplained variance", "PSNR", "beside the reference", "steps", "training"]]
     for outcome in outcomes:
         if outcome.result is None:
