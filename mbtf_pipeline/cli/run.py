@@ -11,7 +11,7 @@ from cyclopts import Parameter
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import UsageError
 from mbtf_core.interruption import keep_on_interruption
-from mbtf_core.options import Output, Set, Switch, Time, command_line
+from mbtf_core.options import ClusterOption, Output, Set, Switch, Time, command_line
 from mbtf_core.units import clock
 from mbtf_fit.cli.page_options import Live, live_view
 from mbtf_gen.config.presets import Quality, QualityOption
@@ -30,6 +30,7 @@ def run(
     quick: Switch = False,
     force: Switch = False,
     live: Live = False,
+    cluster: ClusterOption = None,
     assignments: Set = None,
     console: Console = CONSOLE,
 ) -> None:
@@ -56,8 +57,9 @@ def run(
     command = command_line("mbtf-pipeline", "run", recipe, **given)
     own = assignments or []
     if is_paper_recipe(recipe):
-        if live:
-            raise UsageError("shows one run", where="--live", hint="leave it out for a paper recipe")
+        for flag, used in (("--live", live), ("--cluster", cluster is not None)):
+            if used:
+                raise UsageError("is for a single run", where=flag, hint="leave it out for a paper recipe")
         if quality is not None or time is not None:
             raise UsageError(
                 "a paper recipe has sizes and times of its own",
@@ -67,6 +69,7 @@ def run(
         return _run_paper(recipe, output, quick, force, own, command, console)
     if quick:
         raise UsageError("only paper recipes have quick sizes", where="--quick", hint="use --quality draft")
+    from mbtf_core.cluster.engine import open_cluster
     from mbtf_pipeline.run import run_recipe
 
     if time is not None:
@@ -78,7 +81,10 @@ def run(
             recipe, seconds, output, command, console.note, quality=quality, assignments=own, began=began
         )
         keep_on_interruption(f"the finished stages are kept in {timed.folder}")
-        with live_view(timed.recipe.title, live, console) as shown:
+        with (
+            open_cluster(cluster, console.note) as workers,
+            live_view(timed.recipe.title, live, console) as shown,
+        ):
             result = run_recipe(
                 timed.recipe,
                 timed.folder,
@@ -87,6 +93,7 @@ def run(
                 console=console,
                 generated=timed.generated,
                 live=shown,
+                cluster=workers,
             )
         return _report(result, console, timed.split.quality)
     from mbtf_pipeline.forecast import forecast_left
@@ -97,8 +104,13 @@ def run(
     expected = forecast_left(loaded, output or loaded.folder)
     if expected is not None:
         console.note(expected.describe())
-    with live_view(loaded.title, live, console) as shown:
-        result = run_recipe(loaded, output, force=force, command=command, console=console, live=shown)
+    with (
+        open_cluster(cluster, console.note) as workers,
+        live_view(loaded.title, live, console) as shown,
+    ):
+        result = run_recipe(
+            loaded, output, force=force, command=command, console=console, live=shown, cluster=workers
+        )
     _report(result, console, quality)
 
 
