@@ -20,6 +20,8 @@ from mbtf_core.units import format_duration
 
 # Tasks that the scheduler knows at a time, beyond those that run.
 _AHEAD = 256
+# Seconds in which a scheduler must answer.
+_CONNECT_SECONDS = 30.0
 _RESUMES = "the same command goes on with the rest"
 _PRELOAD = "mbtf_core.cluster.task"
 _CLASSES = {
@@ -169,12 +171,13 @@ def open_cluster(where: str | None, note: Callable[[str], None]) -> Iterator[Clu
         "distributed.worker.memory.spill": False,
         "distributed.worker.memory.pause": False,
         "distributed.logging.distributed": "critical",
+        "distributed.comm.timeouts.connect": f"{_CONNECT_SECONDS}s",
     }
     with contextlib.ExitStack() as stack:
         stack.enter_context(dask.config.set(settings))
         try:
             address = config if isinstance(config, str) else stack.enter_context(_started(config))
-            client = stack.enter_context(Client(address, timeout="30s", set_as_default=False))
+            client = stack.enter_context(Client(address, timeout=_CONNECT_SECONDS, set_as_default=False))
         except (OSError, ValueError, TypeError, ImportError, RuntimeError) as error:
             raise InputError(f"cannot be used ({reason(error)})", where=f"--cluster {where}") from None
         cluster = Cluster(client, 5 if isinstance(config, str) else config.retries)

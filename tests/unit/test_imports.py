@@ -11,7 +11,19 @@ from conftest import RunPython
 from support.paths import ROOT
 
 PACKAGES = ("mbtf_core", "mbtf_gen", "mbtf_fit", "mbtf_pipeline")
-HEAVY = {"torch", "mitsuba", "drjit", "matplotlib", "scipy", "trimesh", "pyvista", "OpenEXR", "h5py"}
+HEAVY = {
+    "torch",
+    "mitsuba",
+    "drjit",
+    "matplotlib",
+    "scipy",
+    "trimesh",
+    "pyvista",
+    "OpenEXR",
+    "h5py",
+    "dask",
+    "distributed",
+}
 # From the lowest to the highest: a module imports from its own line and from those above it.
 ORDER = """
 mbtf_core
