@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from mbtf_core.console import CONSOLE, Console
-from mbtf_core.errors import UsageError
+from mbtf_core.errors import PartialError, UsageError
 from mbtf_core.interruption import keep_on_interruption
 from mbtf_core.options import ClusterOption, Output, Set, Switch, Time, command_line
 from mbtf_core.units import clock
@@ -51,6 +51,7 @@ def run(
     """
     # Python itself has run for about a second.
     began = clocks.perf_counter() - 1.0
+    from mbtf_pipeline.library.recipe import is_library_recipe
     from mbtf_pipeline.paper_tables.recipe import is_paper_recipe
 
     given = {"quality": quality, "time": time, "quick": quick, "output": output, "set": assignments}
@@ -67,6 +68,12 @@ def run(
                 hint="leave it out; --quick is the small size",
             )
         return _run_paper(recipe, output, quick, force, own, command, console)
+    if is_library_recipe(recipe):
+        refused = {"--quality": quality, "--time": time, "--quick": quick, "--force": force, "--live": live}
+        if wrong := [flag for flag, used in refused.items() if used]:
+            hint = "set 'base' and 'training' in the recipe"
+            raise UsageError("is not for a library of materials", where=wrong[0], hint=hint)
+        return _run_library(recipe, output, own, cluster, command, console)
     if quick:
         raise UsageError("only paper recipes have quick sizes", where="--quick", hint="use --quality draft")
     from mbtf_core.cluster.engine import open_cluster
@@ -138,6 +145,37 @@ def _run_paper(
     data = {"folder": done.folder, "page": done.page, "size": size, "tables": done.tables}
     data |= {"runs": [one.name for one in planned], "skipped": missing}
     console.report(data, f"{done.page}: {size} size, {len(planned)} runs{skipped}")
+
+
+def _run_library(
+    file: Path,
+    output: Path | None,
+    assignments: list[str],
+    cluster: str | None,
+    command: str,
+    console: Console,
+) -> None:
+    from mbtf_core.cluster.engine import open_cluster
+    from mbtf_pipeline.library.recipe import entries, load_library_recipe
+    from mbtf_pipeline.library.run import run_library
+
+    library = load_library_recipe(file, assignments)
+    found = entries(library, file)
+    folder = output if output is not None else library.folder
+    keep_on_interruption(f"the finished stages are kept in {folder}")
+    with open_cluster(cluster, console.note) as workers:
+        done = run_library(library, found, folder, command=command, console=console, cluster=workers)
+    count = len(found) - len(done.failed)
+    data = {"folder": done.folder, "page": done.page, "materials": done.record["materials"]}
+    console.report(data, f"{done.page}: {count} of {len(found)} materials")
+    for name, error in done.failed.items():
+        console.note(f"{name}: {error}")
+    if done.failed:
+        raise PartialError(
+            f"{len(done.failed)} of {len(found)} materials failed",
+            where=folder,
+            hint="the same command tries them again and keeps the others",
+        )
 
 
 def _report(result: RunResult, console: Console, quality: Quality | None) -> None:
