@@ -60,8 +60,9 @@ mbtf_fit.shaders
 mbtf_fit.mitsuba_plugin
 mbtf_fit.cli
 mbtf_fit
-mbtf_pipeline.recipe mbtf_pipeline.stages mbtf_pipeline.presets mbtf_pipeline.run_folder mbtf_pipeline.formatting mbtf_pipeline.layers
+mbtf_pipeline.recipe mbtf_pipeline.stages mbtf_pipeline.presets mbtf_pipeline.run_folder mbtf_pipeline.formatting
 mbtf_pipeline.compare
+mbtf_pipeline.layers
 mbtf_pipeline.report
 mbtf_pipeline.run
 mbtf_pipeline.forecast
