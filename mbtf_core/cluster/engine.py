@@ -44,7 +44,16 @@ class Cluster:
     @property
     def workers(self) -> int:
         """Number of workers that are there now."""
-        return len(self._client.scheduler_info(n_workers=-1)["workers"])
+        return len(self._known())
+
+    @property
+    def _gpus(self) -> bool:
+        """Whether workers state GPUs. A task that asks for one waits for ever where none does."""
+        return any("GPU" in worker["resources"] for worker in self._known().values())
+
+    def _known(self) -> dict[str, Any]:
+        found: dict[str, Any] = self._client.scheduler_info(n_workers=-1)["workers"]
+        return found
 
     def run(self, tasks: Iterable[Task], *, stop_when_fatal: bool = True) -> Iterator[TaskResult]:
         """Run tasks; yields each result as it comes, in no particular order.
@@ -73,7 +82,7 @@ class Cluster:
         run, waiting = uuid4().hex[:8], iter(tasks)
         pending: dict[str, Task] = {}
         done = as_completed(loop=self._client.loop)
-        expected = version("mbtf")
+        expected, gpus = version("mbtf"), self._gpus
 
         def submit() -> None:
             for task in waiting:
@@ -87,7 +96,7 @@ class Cluster:
                     key=key,
                     pure=False,
                     retries=self._retries,
-                    resources={"GPU": 1} if task.gpu else None,
+                    resources={"GPU": 1} if task.gpu and gpus else None,
                 )
                 done.add(future)
                 if len(pending) >= _AHEAD + 2 * self.workers:

@@ -69,6 +69,11 @@ def test_workers_state_their_threads(cluster: Cluster) -> None:
     assert environment == str(stated)
 
 
+def test_tasks_for_gpus_run_where_none_is_stated(cluster: Cluster) -> None:
+    (done,) = cluster.run([Task("gpu", f"{TASKS}:double", {"x": 3}, gpu=True)])
+    assert done.value == 6
+
+
 def test_other_versions_are_refused() -> None:
     found = run_task(f"{TASKS}:double", {"x": 1}, "0.0.0")
     assert found["fatal"]
