@@ -155,9 +155,8 @@ def main() -> int:
     for key, value in figures.items():
         print(f"{key:34} {value:12,.6g}")
     table = [projected(figures, options, workers) for workers in WORKERS]
-    print(
-        f"\n{options.library} materials, {options.paths:.3g} paths and a fit of {options.fit_seconds:g} s each:"
-    )
+    each = f"{options.paths:.3g} paths and a fit of {options.fit_seconds:g} s each"
+    print(f"\n{options.library} materials, {each}:")
     for row in table:
         print(
             f"{row['workers']:5} workers: {clock(row['seconds']):>10}, "
