@@ -49,6 +49,14 @@ Switch = Annotated[bool, Parameter(negative="", show_default=False)]
 Output = Annotated[Path, Parameter(name=["--output", "-o"], help="Output folder.")]
 Overwrite = Annotated[Switch, Parameter(help="Replace existing output.")]
 Time = Annotated[str | None, Parameter(metavar="DURATION", help="Time budget: 90s, 2min, 1h.")]
+ClusterOption = Annotated[
+    str | None,
+    Parameter(
+        name="--cluster",
+        metavar="WHERE",
+        help="Run on workers: local, local:4, a YAML file of a batch system, or tcp://scheduler:8786.",
+    ),
+]
 DryRun = Annotated[Switch, Parameter(help="Write nothing; only report what would be done.")]
 Verbose = Annotated[Switch, Parameter(alias="-v", help="Print all details.")]
 Config = Annotated[Path | None, Parameter(help="YAML file with the options.")]
