@@ -72,8 +72,8 @@ def known_brdf(folder: Path, slopes: F64, lobe: Lobe, **options: Any) -> KnownBr
 
 
 def gltf_brdf(base: F64, roughness: F64, metallic: F64) -> Lobe:
-    """The metallic-roughness BRDF times the cosine, by the equations of glTF 2.0, appendix B.3, for maps (rows,
-    columns, ...); with the visibility of the Khronos sample viewer."""
+    """The metallic-roughness BRDF times the cosine, by the equations of glTF 2.0, appendix B.3, for maps
+    (rows, columns, ...); with the visibility of the Khronos sample viewer."""
 
     def lobe(texel: NDArray[np.int64], light: F64, view: F64) -> F64:
         row, column = texel.T
