@@ -37,8 +37,9 @@ def export_material(
     material with holes. json: the networks as a list of layers, with formulas, conventions and queries with
     expected values. material: another material folder, in a folder of its own; the same command again keeps
     it. web: a page that shows the material in a browser, without a network. slang: a shader module and the
-    buffer that it reads. gltf, usd, materialx: maps for programs that evaluate no networks; without shadows,
-    interreflection and parallax, but with the same mean reflectance.
+    buffer that it reads. gltf, usd, materialx: maps for programs that evaluate no networks, of the surface
+    that the model knows or fitted to its values; without shadows, interreflection and parallax, but with the
+    same mean reflectance.
 
     Parameters
     ----------

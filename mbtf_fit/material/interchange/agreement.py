@@ -21,6 +21,7 @@ from mbtf_fit.material.interchange.values import (
     direction_pairs,
     followed,
     least_cosine,
+    one_thread_each,
     steep_views,
     texel_values,
     tile_means,
@@ -87,7 +88,8 @@ def _in_parts(maps: Maps, omega_i: F64, omega_o: F64) -> Iterator[tuple[F64, F64
     """Coefficients (texels, at most 32) of the maps for some pairs after the other."""
     for start in range(0, len(omega_i), _AT_ONCE):
         part = slice(start, start + _AT_ONCE)
-        constant, factor = coefficients(maps, Pairs.of(omega_i[part], omega_o[part], torch.float32))
+        with one_thread_each():
+            constant, factor = coefficients(maps, Pairs.of(omega_i[part], omega_o[part], torch.float32))
         yield constant.double().numpy(), factor.double().numpy()
 
 

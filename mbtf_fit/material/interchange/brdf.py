@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 F64 = NDArray[np.float64]
-# Least cosine to the normal in the lobe's denominators.
-_LEAST_COSINE = 1e-3
+# Least cosine to the normal of what is visible.
+_LEAST_COSINE = 1e-6
 
 
 @dataclass(frozen=True)

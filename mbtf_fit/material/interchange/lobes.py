@@ -14,9 +14,8 @@ Values of a material with holes are divided by what the view meets of it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -44,6 +43,7 @@ from mbtf_fit.material.interchange.values import (
     followed,
     highlight_pairs,
     least_cosine,
+    one_thread_each,
     steep_views,
     texel_values,
 )
@@ -64,7 +64,7 @@ _SUPPORT = 0.1
 # Steps until the better of two starts is chosen, and after that.
 _FIRST_STEPS, _STEPS = 6, 20
 # Texels that F0 is chosen by; factor on the mean square of the residuals up to which a tile has no gloss.
-_TRIED, _MATTE = 512, 1.05
+_TRIED, _MATTE = 256, 1.05
 # Texels whose values are in memory at once, and per block of a thread; least divisor of values.
 _CHUNK, _BLOCK, _LEAST_OPACITY = 4096, 512, 0.05
 
@@ -103,22 +103,10 @@ def _second_fit(
     return x, problem.residuals(x)
 
 
-@contextmanager
-def _threads() -> Iterator[ThreadPoolExecutor]:
-    """Threads for blocks of texels, each with single-threaded operations of PyTorch."""
-    count = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with ThreadPoolExecutor(count) as pool:
-            yield pool
-    finally:
-        torch.set_num_threads(count)
-
-
 def _in_blocks(work: Callable[[slice], tuple[Tensor, Tensor]], count: int) -> tuple[Tensor, Tensor]:
     """Results of `work` for some of `count` texels after the other."""
     parts = [slice(start, start + _BLOCK) for start in range(0, count, _BLOCK)]
-    with _threads() as pool:
+    with one_thread_each() as threads, ThreadPoolExecutor(threads) as pool:
         first, second = zip(*pool.map(work, parts), strict=True)
     return torch.cat(first), torch.cat(second)
 

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch.quasirandom import SobolEngine
 
 from mbtf_core.directions import from_projected_disk, normalize
 from mbtf_core.lattice import sigma_of_level
@@ -21,17 +25,31 @@ _HIGHLIGHT = (0.01, 0.6)
 _STEEP, _ITERATIONS = 0.7, 4
 
 
+@contextmanager
+def one_thread_each() -> Iterator[int]:
+    """PyTorch with one thread per operation, as small ones lose time waiting. Yields the usual number."""
+    count = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield count
+    finally:
+        torch.set_num_threads(count)
+
+
 def least_cosine(material: Material) -> float:
     """Least cosine of the directions of the material's data."""
     return float(material.description["data"].get("min_cos", 0.1))
 
 
+def _sobol(dimensions: int, count: int, seed: int) -> F64:
+    """Scrambled points (count, dimensions) of Sobol's sequence."""
+    engine = SobolEngine(dimensions, scramble=True, seed=seed)
+    return np.asarray(engine.draw(count, dtype=torch.float64).numpy(), np.float64)
+
+
 def direction_pairs(count: int, least: float, seed: int = 0) -> tuple[F64, F64]:
     """Lights and views (count, 3), cosine-weighted, with cosines of at least `least`."""
-    from scipy.stats import qmc
-
-    # Sobol's points are balanced in powers of two.
-    points = qmc.Sobol(4, rng=np.random.default_rng(seed)).random(1 << (count - 1).bit_length())[:count]
+    points = _sobol(4, count, seed)
     radius = np.sqrt((1.0 - least**2) * points[:, [0, 2]])
     angle = 2.0 * np.pi * points[:, [1, 3]]
     disk = np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1)
@@ -40,7 +58,7 @@ def direction_pairs(count: int, least: float, seed: int = 0) -> tuple[F64, F64]:
 
 
 def steep_views(count: int, seed: int = 0) -> F64:
-    """Views (count, 3), cosine-weighted, at most 44° from the normal.
+    """Views (count, 3), cosine-weighted, at most 45° from the normal.
 
     Maps have no parallax. Steep views show the same points of a surface, wherever its heights are.
     """
@@ -85,9 +103,7 @@ def highlight_pairs(slopes: F32, views: F64, least: float) -> F64:
     -------
     (n, k, 3) array
     """
-    from scipy.stats import qmc
-
-    points = qmc.Sobol(2, rng=np.random.default_rng(2)).random(len(views))
+    points = _sobol(2, len(views), 2)
     low, high = np.log(_HIGHLIGHT)
     tangent, angle = np.exp(low + (high - low) * points[:, 0]), 2.0 * np.pi * points[:, 1]
     normal = normalize(np.concatenate([-slopes, np.ones((len(slopes), 1))], 1))
