@@ -63,8 +63,9 @@ _RESOLVED, _NARROW = 0.35, 0.2
 _SUPPORT = 0.1
 # Steps until the better of two starts is chosen, and after that.
 _FIRST_STEPS, _STEPS = 6, 20
-# Texels that F0 is chosen by; factor on the mean square of the residuals up to which a tile has no gloss.
-_TRIED, _MATTE = 256, 1.05
+# Texels that F0 is chosen by. A tile has no gloss if the mean square of its residuals is at most that of a
+# glossy tile times a factor, and exceeds it by another factor at a small share of the texels.
+_TRIED, _MATTE, _GLOSSY, _SHARE = 256, 1.05, 1.5, 0.02
 # Texels whose values are in memory at once, and per block of a thread; least divisor of values.
 _CHUNK, _BLOCK, _LEAST_OPACITY = 4096, 512, 0.05
 
@@ -174,7 +175,8 @@ class LobeFitter:
         return x.numpy(), residuals.numpy(), met
 
     def choose_dielectric(self, u: F64) -> float:
-        """F0 of the tile: 0.04, that of glTF; or 0, if a tile without gloss agrees as well.
+        """F0 of the tile: 0.04, that of glTF; or 0, if the tile and nearly all its texels agree as well
+        without gloss.
 
         `u` (n, 2) are all texels, of which some are tried.
         """
@@ -182,8 +184,10 @@ class LobeFitter:
         residuals = []
         for dielectric in (0.0, GLTF_DIELECTRIC):
             _, squares, met = self.fit(some, dielectric)
-            residuals.append(squares[met >= _LEAST_OPACITY].sum())
-        return 0.0 if residuals[0] <= _MATTE * residuals[1] else GLTF_DIELECTRIC
+            residuals.append(squares[met >= _LEAST_OPACITY])
+        matte, glossy = residuals
+        few = np.count_nonzero(matte > _GLOSSY * glossy) <= _SHARE * len(matte)
+        return 0.0 if few and matte.sum() <= _MATTE * glossy.sum() else GLTF_DIELECTRIC
 
 
 def fit_lobes(material: Material, level: int, advance: Callable[[int], None] = lambda _: None) -> Maps:
