@@ -57,6 +57,8 @@ GLTF_DIELECTRIC = 0.04
 # read a neighborhood.
 _VIEWS, _OWN_VIEWS = 32, 16
 _LIGHTS, _FEW_LIGHTS = (6, 4), (3, 2)
+# Greatest sine of the views: without a neural offset, as parallax blurs what low views see, and with one.
+_SINES = (0.5, 0.7)
 # Least roughness that the shared pairs resolve; roughness of a start in search of narrow lobes.
 _RESOLVED, _NARROW = 0.35, 0.2
 # Weights of the priors of roughness and metallic, in units of the mean square of the residuals.
@@ -152,7 +154,8 @@ class LobeFitter:
         """
         lights, own = _LIGHTS if self.material.model.positions == 1 else _FEW_LIGHTS
         least = least_cosine(self.material)
-        views = steep_views(_VIEWS)
+        moves = self.material.model.network.offset != "none"
+        views = steep_views(_VIEWS, _SINES[moves])
         at = followed(self.material, u, views)
         omega_i = direction_pairs(_VIEWS * lights, least)[0]
         omega_o = np.tile(views, (lights, 1))

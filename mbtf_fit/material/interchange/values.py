@@ -21,8 +21,8 @@ F64 = NDArray[np.float64]
 _POSITIONS = 16
 # Tangents of the angles between half vectors and the normal, around highlights.
 _HIGHLIGHT = (0.01, 0.6)
-# Greatest sine of steep views; iterations of the search for a point that a view sees.
-_STEEP, _ITERATIONS = 0.7, 4
+# Iterations of the search for a point that a view sees.
+_ITERATIONS = 4
 
 
 @contextmanager
@@ -57,12 +57,12 @@ def direction_pairs(count: int, least: float, seed: int = 0) -> tuple[F64, F64]:
     return np.asarray(omega[:, 0], np.float64), np.asarray(omega[:, 1], np.float64)
 
 
-def steep_views(count: int, seed: int = 0) -> F64:
-    """Views (count, 3), cosine-weighted, at most 45° from the normal.
+def steep_views(count: int, sine: float = 0.7, seed: int = 0) -> F64:
+    """Views (count, 3), cosine-weighted, whose sine to the normal is at most `sine`; 0.7 is that of 45°.
 
     Maps have no parallax. Steep views show the same points of a surface, wherever its heights are.
     """
-    return inclined(direction_pairs(count, 0.0, seed)[1], _STEEP)
+    return inclined(direction_pairs(count, 0.0, seed)[1], sine)
 
 
 def inclined(omega: F64, factor: float) -> F64:
