@@ -9,7 +9,6 @@ import json
 import os
 import shutil
 import subprocess
-import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,6 +18,7 @@ import pytest
 from support.emitted import install_programs, make_place, start
 from support.fake_cluster import PROGRAMS, calls, fail, install
 from support.paths import ROOT
+from support.slurm import slurm_node
 from support.small_runs import contents
 
 from mbtf_core.console import run
@@ -44,7 +44,6 @@ compare:
   offset_views: [{elevation: 30, azimuth: 0}]
 """
 HEIGHTS = ROOT / "assets" / "turtle_shell" / "height.exr"
-SLURM = ROOT / "tests" / "system" / "slurm"
 
 
 def write_recipe(folder: Path) -> None:
@@ -128,23 +127,8 @@ def test_pods_give_the_data_and_fits_of_one_machine(
 @pytest.fixture
 def slurm(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """A SLURM of one node, which the environment names."""
-    missing = [name for name in ("slurmctld", "slurmd", "munged") if shutil.which(name) is None]
-    if missing:
-        pytest.skip(f"no {missing[0]}; to enable, on Debian: apt install slurm-wlm munge")
-    if os.geteuid() != 0:
-        pytest.skip("not root, as which SLURM runs; to enable: run the tests as root")
-    # Names of sockets are short.
-    folder = Path(tempfile.mkdtemp(prefix="slurm-", dir="/tmp"))
-    try:
-        done = subprocess.run(
-            [SLURM / "start.sh", folder, "2"], capture_output=True, text=True, timeout=60, check=False
-        )
-        assert done.returncode == 0, done.stderr
-        monkeypatch.setenv("SLURM_CONF", str(folder / "slurm.conf"))
+    with slurm_node(monkeypatch):
         yield
-    finally:
-        subprocess.run([SLURM / "stop.sh", folder], capture_output=True, timeout=60, check=False)
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 def wait_for_jobs(environment: dict[str, str], seconds: float = 240.0) -> None:
