@@ -15,7 +15,7 @@ from mbtf_core.console import run
 from mbtf_core.lattice import Lattice
 from mbtf_fit.cli.app import app
 from mbtf_fit.material.interchange.documents import refractive_index
-from mbtf_fit.material.interchange.maps import maps_of
+from mbtf_fit.material.interchange.maps import surface_maps
 from mbtf_fit.material.material import Material
 from mbtf_fit.material.transmittance import Transmittance
 
@@ -45,13 +45,14 @@ def f0_of(refractive: float) -> float:
 
 
 def test_images_hold_the_maps(glossy: Path) -> None:
-    maps = maps_of(Material.load(glossy.parent / "material"))
+    maps = surface_maps(Material.load(glossy.parent / "material"), 3)
     normal = np.asarray(Image.open(glossy / "normal.png"), np.float64) / 255
     np.testing.assert_allclose(2 * normal - 1, maps.normals, atol=0.004)
     packed = np.asarray(Image.open(glossy / "roughness_metallic.png"), np.float64) / 255
     np.testing.assert_allclose(packed[..., 1], maps.roughness, atol=0.002)
     np.testing.assert_allclose(packed[..., 2], maps.metallic, atol=0.002)
     height = np.asarray(Image.open(glossy / "height.png"), np.float64) / 65535
+    assert maps.heights is not None
     low = maps.heights.min()
     np.testing.assert_allclose(low + height * (maps.heights.max() - low), maps.heights, atol=1e-5)
     assert Image.open(glossy / "base_color.png").mode == "RGB"
@@ -119,7 +120,8 @@ def test_usd(glossy: Path) -> None:
     normal = UsdShade.Shader(stage.GetPrimAtPath("/Tile/Material/normal"))
     assert normal.GetInput("scale").Get() == (2, 2, 2, 1)
     assert normal.GetInput("bias").Get() == (-1, -1, -1, 0)
-    heights = maps_of(Material.load(glossy.parent / "material")).heights
+    heights = surface_maps(Material.load(glossy.parent / "material"), 3).heights
+    assert heights is not None
     height = UsdShade.Shader(stage.GetPrimAtPath("/Tile/Material/height"))
     assert height.GetInput("scale").Get()[0] == pytest.approx(np.ptp(heights), rel=1e-5)
     assert height.GetInput("bias").Get()[0] == pytest.approx(heights.min(), rel=1e-5)
@@ -175,6 +177,42 @@ def test_a_surface_without_gloss_with_holes(tmp_path: Path) -> None:
     assert surface.getInput("alpha_mode").getValue() == 2
 
 
+def test_a_model_that_knows_no_surface_has_no_heights(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_material(tmp_path / "material", aspect=0.5)
+    words = [word for name in FORMATS for word in ("--to", name)]
+    out = tmp_path / "out"
+    assert run(app, ["export", str(tmp_path / "material"), *words, "-o", str(out), "--json"]) == 0
+    reported = json.loads(capsys.readouterr().out)
+    images = {"base_color.png", "normal.png", "roughness_metallic.png"}
+    assert set(reported["files"]) == images | {"material.gltf", "material.usda", "material.mtlx"}
+    assert {path.name for path in out.iterdir()} == set(reported["files"])
+    maps = reported["maps"]
+    assert (maps["source"], maps["level"]) == ("fit", 3)
+    assert maps["dielectric_f0"] in (0, 0.04)
+    np.testing.assert_allclose(maps["after"], 1, rtol=1e-3)
+    assert maps["points"] > 0
+    for name in ("material.gltf", "material.usda", "material.mtlx"):
+        assert "height" not in (out / name).read_text()
+        assert "displacement" not in (out / name).read_text()
+    mx = pytest.importorskip("MaterialX")
+    document, library = mx.createDocument(), mx.createDocument()
+    mx.readFromXmlFile(document, str(out / "material.mtlx"))
+    mx.loadLibraries(mx.getDefaultDataLibraryFolders(), mx.getDefaultDataSearchPath(), library)
+    document.importLibrary(library)
+    assert document.validate() == (True, "")
+    (material,) = document.getMaterialNodes()
+    assert not mx.getShaderNodes(material, "displacementshader")
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdShade
+
+    stage = Usd.Stage.Open(str(out / "material.usda"))
+    bound, _ = UsdShade.MaterialBindingAPI(stage.GetPrimAtPath("/Tile/Plane")).ComputeBoundMaterial()
+    assert bound.ComputeSurfaceSource()[0].GetIdAttr().Get() == "UsdPreviewSurface"
+    assert not bound.ComputeDisplacementSource()[0]
+
+
 def test_the_same_export_again_has_the_same_bytes(glossy: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = {path.name: path.read_bytes() for path in glossy.iterdir()}
     assert len(before) == 7
@@ -186,12 +224,10 @@ def test_the_same_export_again_has_the_same_bytes(glossy: Path, capsys: pytest.C
 
 def test_options_of_maps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_material(tmp_path / "relief", model="relief")
-    write_material(tmp_path / "neumip")
     out = ["-o", str(tmp_path / "out")]
     for words, code, what in (
         (["relief", "--level", "1"], 2, "--level: is an option of maps"),
         (["relief", "--to", "usd", "--level", "9"], 2, "has the levels 0 to 3"),
-        (["neumip", "--to", "gltf"], 3, "knows no surface"),
     ):
         assert run(app, ["export", str(tmp_path / words[0]), *words[1:], *out]) == code
         assert what in capsys.readouterr().err
