@@ -155,9 +155,10 @@ def test_faults_of_the_command_line(
     assert "outside the current folder" in said()
     # Nothing was written.
     assert sorted(path.name for path in place.iterdir()) == ["recipe.yaml", "the maps"]
-    paper = ROOT / "pipelines" / "paper_methods.yaml"
-    assert run(app, ["emit", str(paper), "--to", "make"]) == 2
-    assert said().startswith(f"error: {paper}: has several runs")
+    for name in ("paper_methods", "library"):
+        path = ROOT / "pipelines" / f"{name}.yaml"
+        assert run(app, ["emit", str(path), "--to", "make"]) == 2
+        assert said().startswith(f"error: {path}: has several runs")
 
 
 def test_other_job_files_are_replaced_on_demand(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
