@@ -185,7 +185,7 @@ def usd(maps: Maps, source: Source) -> str:
         )
     kinds_of = {str: "string", int: "int", float: "double"}
     data = "\n".join(
-        f"        {kinds_of[type(value)]} {key} = {json.dumps(value)}"
+        f"        {kinds_of[type(value)]} {key} = {json.dumps(value, ensure_ascii=False)}"
         for key, value in source.described(maps).items()
     )
     ior = refractive_index(maps.dielectric)
@@ -315,7 +315,12 @@ def materialx(maps: Maps, source: Source) -> str:
     ElementTree.SubElement(shown, "input", name="surfaceshader", type="surfaceshader", nodename="surface")
     if maps.heights is not None:
         image("height", "float", HEIGHT)
-        output("height_out", "float", "height")
+        # Value of the image at height 0; heights are at most that.
+        plane = -float(maps.heights.min()) / (height_range(maps) or 1.0)
+        below = ElementTree.SubElement(graph, "subtract", name="below_plane", type="float")
+        ElementTree.SubElement(below, "input", name="in1", type="float", nodename="height")
+        ElementTree.SubElement(below, "input", name="in2", type="float", value=f"{plane:.9g}")
+        output("height_out", "float", "below_plane")
         moved = ElementTree.Element("displacement", name="relief", type="displacementshader")
         root.insert(list(root).index(shown), moved)
         ElementTree.SubElement(

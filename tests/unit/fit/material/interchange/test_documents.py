@@ -11,9 +11,11 @@ import pytest
 from PIL import Image
 from support.plugin_materials import write_material
 
+from mbtf_core.color import srgb_to_linear
 from mbtf_core.console import run
 from mbtf_core.lattice import Lattice
 from mbtf_fit.cli.app import app
+from mbtf_fit.material.interchange.agreement import fit_color
 from mbtf_fit.material.interchange.documents import refractive_index
 from mbtf_fit.material.interchange.maps import surface_maps
 from mbtf_fit.material.material import Material
@@ -55,7 +57,12 @@ def test_images_hold_the_maps(glossy: Path) -> None:
     assert maps.heights is not None
     low = maps.heights.min()
     np.testing.assert_allclose(low + height * (maps.heights.max() - low), maps.heights, atol=1e-5)
-    assert Image.open(glossy / "base_color.png").mode == "RGB"
+    image = Image.open(glossy / "base_color.png")
+    assert image.mode == "RGB"
+    # The fitted color, not that of the surface.
+    fitted, _ = fit_color(Material.load(glossy.parent / "material"), maps)
+    color = srgb_to_linear(np.asarray(image, np.float64) / 255)
+    np.testing.assert_allclose(color, fitted.base_color, atol=0.01)
 
 
 def test_gltf(glossy: Path) -> None:
@@ -65,6 +72,8 @@ def test_gltf(glossy: Path) -> None:
     uris = [image.uri for image in document.images]
     assert uris[material.pbrMetallicRoughness.baseColorTexture.index] == "base_color.png"
     assert uris[material.normalTexture.index] == "normal.png"
+    packed = material.pbrMetallicRoughness.metallicRoughnessTexture
+    assert uris[packed.index] == "roughness_metallic.png"
     assert material.alphaMode == "OPAQUE"
     assert f0_of(material.extensions["KHR_materials_ior"]["ior"]) == pytest.approx(f0(glossy), rel=1e-4)
     assert document.extensionsUsed == ["KHR_materials_ior"]
@@ -117,6 +126,21 @@ def test_usd(glossy: Path) -> None:
         assert texture.GetInput("wrapS").Get() == "repeat"
         assert Path(texture.GetInput("file").Get().resolvedPath).is_file()
         assert texture.GetOutput(channel), name
+    connections = {
+        "diffuseColor": ("base_color.png", "rgb"),
+        "normal": ("normal.png", "rgb"),
+        "roughness": ("roughness_metallic.png", "g"),
+        "metallic": ("roughness_metallic.png", "b"),
+        "displacement": ("height.png", "r"),
+    }
+    for name, expected in connections.items():
+        source, channel, _ = surface.GetInput(name).GetConnectedSource()
+        file = UsdShade.Shader(source.GetPrim()).GetInput("file").Get().path
+        assert (Path(file).name, channel) == expected
+    points = np.array(UsdGeom.Mesh(mesh).GetPointsAttr().Get())
+    st = np.array(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").Get())
+    # The origin of texture coordinates is at the lower left.
+    np.testing.assert_allclose(st, points[:, :2] / (1, 0.5))
     normal = UsdShade.Shader(stage.GetPrimAtPath("/Tile/Material/normal"))
     assert normal.GetInput("scale").Get() == (2, 2, 2, 1)
     assert normal.GetInput("bias").Get() == (-1, -1, -1, 0)
@@ -149,7 +173,34 @@ def test_materialx(glossy: Path) -> None:
         == ""
     )
     (moved,) = mx.getShaderNodes(material, "displacementshader")
-    assert moved.getInput("scale").getValue() > 0
+    graph = document.getNodeGraph("maps")
+    assert [graph.getNode(name).getInput("index").getValue() for name in ("roughness", "metallic")] == [1, 2]
+    files = {"base": "base_color.png", "normal_image": "normal.png", "packed": "roughness_metallic.png"}
+    for name, file in {**files, "height": "height.png"}.items():
+        assert graph.getNode(name).getInput("file").getValue() == file
+    heights = surface_maps(Material.load(glossy.parent / "material"), 3).heights
+    assert heights is not None
+    scale, plane = moved.getInput("scale").getValue(), graph.getNode("below_plane")
+    assert plane.getCategory() == "subtract"
+    offset = plane.getInput("in2").getValue()
+    # The values 0 and 1 of the image are the lowest and the highest vertex.
+    extremes = [scale * (value - offset) for value in (0, 1)]
+    np.testing.assert_allclose(extremes, [heights.min(), heights.max()], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["müller", "日本", 'a\'b "c"'])
+def test_names_outside_of_ascii(tmp_path: Path, name: str) -> None:
+    pxr = pytest.importorskip("pxr.Usd")
+    write_material(tmp_path / name, model="relief", finest=2)
+    out = tmp_path / "out"
+    assert (
+        run(app, ["export", str(tmp_path / name), "--to", "usd", "--to", "gltf", "-q", "-o", str(out)]) == 0
+    )
+    stage = pxr.Stage.Open(str(out / "material.usda"))
+    linked = stage.GetPrimAtPath("/Tile").GetCustomData()
+    extras = json.loads((out / "material.gltf").read_text())["materials"][0]["extras"]
+    for data in (linked, extras):
+        assert (out / data["neural_material"] / "material.json").is_file()
 
 
 def test_a_surface_without_gloss_with_holes(tmp_path: Path) -> None:

@@ -67,6 +67,21 @@ def test_normals_and_roughness_are_those_of_the_surface(tmp_path: Path) -> None:
     np.testing.assert_allclose(surface_maps(material, 2).roughness, (0.3**4 + 0.16) ** 0.25, rtol=1e-4)
 
 
+def test_rows_and_opacity(tmp_path: Path) -> None:
+    """Row 0 is that of the surface's maps; what passes through holes does not come back."""
+    material = write_material(tmp_path, model="relief", aspect=0.5)
+    maps, weights = surface_maps(material, material.lattice.finest), material.model.weights()
+    stored = weights[f"surface.maps.{material.lattice.finest}"].double().numpy()
+    np.testing.assert_array_equal(maps.base_color, np.clip(stored[..., 3:6], 0, 1))
+    np.testing.assert_array_equal(maps.heights, weights["surface.heights"][..., 0].double().numpy())
+    assert maps.heights is not None
+    assert not np.array_equal(maps.heights, maps.heights[::-1])
+    omega_i, omega_o = (from_angles(e, a)[None] for e, a in ((50.0, 20.0), (35.0, 160.0)))
+    half = replace(maps, opacity=np.full_like(maps.roughness, 0.5))
+    whole = evaluate_maps(maps, omega_i, omega_o)
+    np.testing.assert_allclose(evaluate_maps(half, omega_i, omega_o), 0.5 * whole)
+
+
 def one_texel(**changes: object) -> Maps:
     flat = Maps(
         0,
