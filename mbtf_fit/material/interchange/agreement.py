@@ -47,7 +47,7 @@ class Agreement:
     before, after : (3,) arrays
         Ratio of the means over lights and views, with their own base color and with the scaled one.
     spread : float
-        RMS over lights and views of the ratio of tile means, less 1, after the fit; all colors.
+        RMS difference of tile means over lights and views after the fit, in units of the mean; all colors.
     points_diffuse, points : float
         RMS difference over points of the surface, lights and steep views, in units of the mean value: of a
         diffuse plane with the mean color of each point, and of the maps.
@@ -66,7 +66,8 @@ class Agreement:
 
         return (
             f"mean reflectance of the maps over the material's (RGB): {text(self.before)} with their "
-            f"own base color, {text(self.after)} as written; RMS over lights and views {self.spread:.2f}\n"
+            f"own base color, {text(self.after)} as written\n"
+            f"RMS difference of tile means over lights and views: {self.spread:.0%} of the mean\n"
             f"RMS difference of points over lights and steep views, in units of the mean value: "
             f"{self.points:.2f} as written, {self.points_diffuse:.2f} for a diffuse plane of the mean colors"
         )
@@ -151,12 +152,12 @@ def fit_color(material: Material, maps: Maps) -> tuple[Maps, Agreement]:
         [c.mean(0)[:, None] + f.T @ scaled / len(scaled) for c, f in _in_parts(thin, omega_i, omega_o)]
     )
     safe = np.where(target > 0, target, 1.0)
-    ratio = np.where(wanted > 0, after / np.where(wanted > 0, wanted, 1.0), 1.0)
+    difference = float(np.sqrt(((after - wanted) ** 2).mean()))
     agreement = Agreement(
         scale,
         mean(np.ones(3)) / safe,
         after.mean(0) / safe,
-        float(np.sqrt(((ratio - 1.0) ** 2).mean())),
+        difference / (float(wanted.mean()) or 1.0),
         *_compare_points(material, fitted),
     )
     return fitted, agreement
