@@ -23,6 +23,8 @@ DEFAULT_MODEL: ModelName = "relief"
 FIBER_MODEL: ModelName = "neumip+"
 # Models that trace view rays to heights: those of the geometry, or learned ones.
 TRACING_MODELS: tuple[ModelName, ...] = ("relief", "neumip+")
+# Models whose network materials can share.
+DECODER_MODELS: tuple[ModelName, ...] = ("relief", "neumip")
 LossKind = Literal["relative", "squared", "linear", "log", "fourth-root", "gradient"]
 Correction = Literal["none", "second-order", "linear"]
 
@@ -189,6 +191,11 @@ class TrainingSection(Settings):
     own_material: bool = Field(
         True, description="rainer2020: whether the network also learns the material that it encodes"
     )
+    shared_decoder: bool = Field(
+        False,
+        description="relief and neumip: all data sets of one command share the network, each has textures of "
+        "its own; the budget is that of all together",
+    )
     energy_calibration: bool = Field(
         True, description="after training, scale the mean reflectance at each elevation to that of the data"
     )
@@ -289,6 +296,8 @@ class FitConfig(Settings):
         ``rainer2020``.
     init_from : str, optional
         Folder of a material that initializes textures and offset.
+    decoder : str, optional
+        Folder of a network, or of a material, whose network the fit keeps: it trains textures alone.
     network : NetworkSection
         Architecture.
     training : TrainingSection
@@ -314,6 +323,11 @@ class FitConfig(Settings):
     model: Annotated[ModelName, Flag("--model")] = Field(DEFAULT_MODEL, description="model to fit")
     init_from: Annotated[str | None, Flag("--init-from", "FOLDER")] = Field(
         None, description="folder of a material that initializes textures and offset"
+    )
+    decoder: Annotated[str | None, Flag("--decoder", "FOLDER")] = Field(
+        None,
+        description="folder of a shared network, or of a material, whose network is kept: the fit trains "
+        "textures alone",
     )
     network: NetworkSection = NetworkSection()
     training: TrainingSection = TrainingSection()
@@ -362,6 +376,12 @@ class FitConfig(Settings):
         shared = self.training.materials, self.training.own_material
         if self.model != "rainer2020" and shared != ((), True):
             raise ValueError("training.materials and training.own_material are options of rainer2020")
+        if self.model not in DECODER_MODELS and (self.decoder or self.training.shared_decoder):
+            raise ValueError(
+                f"{self.model} does not share its network: choose the model {' or '.join(DECODER_MODELS)}"
+            )
+        if self.decoder and (self.training.shared_decoder or self.init_from):
+            raise ValueError("decoder keeps a network as it is: leave out shared_decoder and init_from")
         if self.model != "hierarchical" and network.decoder == "inception":
             raise ValueError(
                 "the inception decoder reads neighboring queries: it needs the model hierarchical"
@@ -369,8 +389,14 @@ class FitConfig(Settings):
         return self
 
     def fields(self) -> dict[str, Any]:
-        """Options that determine the fit, as plain data: all but device and memory."""
-        return self.model_dump(mode="json", exclude={"device", "data"})
+        """Options that determine the fit, as plain data: all but device and memory, and without those of
+        shared networks where they are not used."""
+        found = self.model_dump(mode="json", exclude={"device", "data"})
+        if self.decoder is None:
+            del found["decoder"]
+        if not self.training.shared_decoder:
+            del found["training"]["shared_decoder"]
+        return found
 
     def hash(self, data_hash: str) -> str:
         """SHA-256 over :meth:`fields` and the data set's own hash, hexadecimal."""
