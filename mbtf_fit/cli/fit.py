@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -66,8 +66,6 @@ def fit(
         raise UsageError("--processes must be a positive number and requires --many")
     if shared_decoder and many is None:
         raise UsageError("--shared-decoder requires --many", hint="mbtf-fit --many a/ b/ --shared-decoder")
-    if shared_decoder and processes is not None:
-        raise UsageError("--shared-decoder is one fit: leave out --processes")
     if shards is None and many is None:
         raise UsageError("no shards given", hint="mbtf-fit shards/ -o material/")
     if many is not None and live:
@@ -157,6 +155,13 @@ def resolve_config(options: Options[FitConfig], quality: Quality | None, *shards
         # A time overrides the steps of a file or a preset.
         presets.append("training.steps=null")
     return options.resolve(presets)
+
+
+def _shares_decoder(options: Options[FitConfig]) -> bool:
+    """Whether the data sets of a command share a network."""
+    training = overrides_of(options.config, options.assignments).get("training")
+    # Values of --set are text.
+    return isinstance(training, Mapping) and str(training.get("shared_decoder")).lower() == "true"
 
 
 def _kept_options(folder: object) -> dict[str, Any]:
@@ -256,10 +261,12 @@ def _fit_many(
 
     shards = find_data(many)
     folders = name_materials(shards, output)
-    configs = [resolve_config(options, quality, folder) for folder in shards]
-    if any(config.training.shared_decoder for config in configs):
+    if _shares_decoder(options):
+        if processes is not None:
+            raise UsageError("a shared network is one fit: leave out --processes")
         _fit_jointly(resolve_config(options, quality, *shards), shards, folders, output, overwrite, console)
         return
+    configs = [resolve_config(options, quality, folder) for folder in shards]
     if processes is None:
         import torch
 

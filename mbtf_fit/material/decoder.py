@@ -124,20 +124,18 @@ class Decoder:
         """Tensors of the network, by their names in a material."""
         return read_tensors(self.folder / WEIGHTS_NAME)[0]
 
-    def load(self, model: NeuralMaterial, config: FitConfig) -> None:
-        """Give a model this network, which training then keeps.
+    def check(self, config: FitConfig) -> None:
+        """Refuse a fit of another model or architecture.
 
         Parameters
         ----------
-        model : NeuralMaterial
-            Model of a fit, initialized.
         config : FitConfig
             Options of the fit.
 
         Raises
         ------
         InputError
-            The fit has another model or architecture, or a tensor is missing.
+            The fit cannot have this network.
         """
         wanted = _architecture(config)
         for key, value in self.options().items():
@@ -147,6 +145,20 @@ class Decoder:
                     where=self.folder,
                     hint=f"leave out the option {key}, or fit the network again with it",
                 )
+
+    def load(self, model: NeuralMaterial) -> None:
+        """Give a model this network, which training then keeps.
+
+        Parameters
+        ----------
+        model : NeuralMaterial
+            Model of a fit, initialized.
+
+        Raises
+        ------
+        InputError
+            A tensor is missing.
+        """
         given = self.tensors()
         for name, tensor in network_tensors(model).items():
             if name not in given or given[name].shape != tensor.shape:

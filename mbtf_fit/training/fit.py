@@ -141,8 +141,10 @@ def keep_freed_memory() -> None:
         library.mallopt(_M_TRIM_THRESHOLD, 1 << 30)
 
 
-def check_losses(config: FitConfig) -> None:
-    """Refuse losses that the model cannot have."""
+def check_options(config: FitConfig) -> None:
+    """Refuse losses, and a network to keep, that the model cannot have."""
+    if config.decoder is not None:
+        Decoder.find(config.decoder).check(config)
     gradient = any(term.kind == "gradient" for term in config.training.losses)
     if MODELS[config.model].layout != "image" and gradient:
         raise InputError(
@@ -207,7 +209,7 @@ def fit(
         )
     device = choose_device(config.device)
     out = Path(out)
-    check_losses(config)
+    check_options(config)
     data = open_data(shards, MODELS[config.model].layout, config.model)
     identity = identity_of(config, data)
     with owned(out):
@@ -314,7 +316,7 @@ def prepare_trainer(
     if config.init_from is not None:
         _initialize_from(model, config.init_from)
     if config.decoder is not None:
-        Decoder.find(config.decoder).load(model, config)
+        Decoder.find(config.decoder).load(model)
     noise = NoiseModel.silent(unit, data.lattice)
     # A single value does not tell its noise; none is assumed.
     if data.estimates == 2:

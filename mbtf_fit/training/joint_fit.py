@@ -24,7 +24,7 @@ from mbtf_fit.training.checkpoint import CHECKPOINT_NAME
 from mbtf_fit.training.fit import (
     FitResult,
     ProgressCallback,
-    check_losses,
+    check_options,
     choose_device,
     export_fit,
     keep_freed_memory,
@@ -157,7 +157,7 @@ def _check(
         raise InputError(
             "this folder is that of the shared network: rename the data set of this name", where=decoder
         )
-    check_losses(config)
+    check_options(config)
 
 
 def _identity(members: Sequence[_Member]) -> dict[str, Any]:
