@@ -282,6 +282,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         "training": {"learning_rate": 3e-3},
     },
 }
+# Defaults of fits that share a network: each batch is of one material.
+SHARED_PRESET: dict[str, Any] = {"training": {"batch": 1 << 14}}
 # Models that encode angular slices.
 SLICE_MODELS: tuple[ModelName, ...] = ("rainer2019", "rainer2020")
 
@@ -347,7 +349,11 @@ class FitConfig(Settings):
         if not isinstance(data, Mapping):
             return data
         name = data.get("model", cls.model_fields["model"].default)
-        return deep_merge(PRESETS.get(name, {}) if isinstance(name, str) else {}, data)
+        preset = PRESETS.get(name, {}) if isinstance(name, str) else {}
+        training = data.get("training")
+        if isinstance(training, Mapping) and training.get("shared_decoder") is True:
+            preset = deep_merge(preset, SHARED_PRESET)
+        return deep_merge(preset, data)
 
     @model_validator(mode="after")
     def _consistent(self) -> FitConfig:
