@@ -7,6 +7,7 @@ materials share with the state of its optimizer: Adam's moments average the grad
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NoReturn
 
@@ -18,6 +19,15 @@ from mbtf_fit.objective.parallel import Workers
 from mbtf_fit.training.checkpoint import read_joint_checkpoint, write_joint_checkpoint
 from mbtf_fit.training.loop import Progress, TrainingLoop
 from mbtf_fit.training.trainer import Trainer
+
+
+def shared_decay(decays: Sequence[float]) -> float:
+    """Weight decay of a network that several materials share, from those of networks of their own.
+
+    The mean, divided by the square root of their number. More materials are more queries, which need less
+    decay, but the share of each in the network's weights is smaller.
+    """
+    return sum(decays) / len(decays) ** 1.5
 
 
 class JointTrainer(TrainingLoop):
@@ -39,6 +49,9 @@ class JointTrainer(TrainingLoop):
         self.device = self.trainers[0].device
         self.progress = Progress()
         self._link()
+        decay = shared_decay([trainer.weight_decay.weights for trainer in self.trainers])
+        for trainer in self.trainers:
+            trainer.weight_decay = replace(trainer.weight_decay, weights=decay)
 
     def _link(self) -> None:
         """Let all trainers have the same progress, and the same state of the networks' optimizer."""

@@ -165,6 +165,18 @@ def test_steps_take_the_materials_in_turn(data: dict[str, Path], tmp_path: Path)
     assert [record["step"] for record in read_history(tmp_path / "stripes")][-1] == 7
 
 
+def test_noisy_materials_do_not_decide_the_decay_alone(data: dict[str, Path], tmp_path: Path) -> None:
+    own = []
+    for name in NAMES[:2]:
+        fit(single_config(steps=1), data[name], tmp_path / "own" / name)
+        own.append(Material.load(tmp_path / "own" / name).description["training"]["weight_decay"])
+    fits = fit_two(joint_config(steps=2), data, tmp_path).fits
+    for found, alone in zip(fits, own, strict=True):
+        decay = found.material.description["training"]["weight_decay"]
+        assert decay["weights"] == pytest.approx(sum(o["weights"] for o in own) / 2 / np.sqrt(2))
+        assert decay["texels"] == alone["texels"]
+
+
 @pytest.mark.parametrize("kernel", ["kernel", "no_kernel"])
 def test_a_kept_network_keeps_its_bits(
     library_folder: Path,
