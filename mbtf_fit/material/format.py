@@ -104,15 +104,15 @@ def read_description(folder: Path) -> tuple[dict[str, Any], Path]:
     return description, check_digest(folder / WEIGHTS_NAME, description["weights"])
 
 
-def check_digest(path: Path, stated: Mapping[str, Any]) -> Path:
-    """The path of a file whose digest is the stated one.
+def check_digest(path: Path, stated: Mapping[str, Any], by: str = DESCRIPTION_NAME) -> Path:
+    """The path of a file whose digest is the one that the file `by` states.
 
     Raises
     ------
     InputError : it is missing or corrupt
     """
     if not path.is_file() or file_sha256(path) != stated["sha256"]:
-        raise InputError("is missing, or its SHA-256 differs from the one in material.json", where=path)
+        raise InputError(f"is missing, or its SHA-256 differs from the one in {by}", where=path)
     return path
 
 
