@@ -196,7 +196,7 @@ def fit(
             where="training.losses",
             hint="use another loss, or a model that learns from the image layout",
         )
-    data = open_data(shards, layout, config.model)
+    data = open_data(shards, layout, config.model, config.data.cache)
     identity = identity_of(config, data)
     with owned(out):
         claim(out, identity, config, overwrite)
@@ -297,7 +297,7 @@ def shared_slices(
         return own
     learned = [own] if config.training.own_material else []
     for folder in config.training.materials:
-        data = open_data(folder, "slices", config.model)
+        data = open_data(folder, "slices", config.model, config.data.cache)
         partition = load_training(data, config.held_out, config.seed)
         assert isinstance(partition.training, TrainingSlices)
         typical = typical_value(mean_value(partition.sample.value_a, partition.sample.value_b))

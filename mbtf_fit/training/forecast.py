@@ -113,7 +113,7 @@ def training_seconds(config: FitConfig, shards: str | Path) -> tuple[float, Part
         return config.training.time, None
     if steps * batch < LONG_FIT:
         return 0.0, None
-    data = open_data(shards, MODELS[config.model].layout, config.model)
+    data = open_data(shards, MODELS[config.model].layout, config.model, config.data.cache)
     keep_freed_memory()
     partition = load_training(data, config.held_out, config.seed, config.data.memory)
     trainer = prepare_trainer(config, data, partition, choose_device(config.device))
@@ -125,7 +125,7 @@ def forecast_fit(config: FitConfig, shards: str | Path) -> FitForecast:
     """Forecast the fit of a configuration by two pilot fits; nothing is written."""
     began = time.perf_counter()
     device = choose_device(config.device)
-    data = open_data(shards, MODELS[config.model].layout, config.model)
+    data = open_data(shards, MODELS[config.model].layout, config.model, config.data.cache)
     keep_freed_memory()
     partition = load_training(data, config.held_out, config.seed, config.data.memory)
     name, queries = validation_set(data, partition)
