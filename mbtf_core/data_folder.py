@@ -6,13 +6,18 @@ All but :func:`data_folder` do nothing, or return their argument, where the fold
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 from urllib.parse import unquote
 
+from mbtf_core.errors import InputError
 from mbtf_core.store import split_url
 from mbtf_core.store_folder import StoreFolder, StorePath
+
+T = TypeVar("T")
+# Times that a shard is downloaded again because it has left the cache.
+_READS = 8
 
 
 def data_folder(folder: str | Path) -> Path:
@@ -70,6 +75,24 @@ def local_copy(path: Path) -> Path:
     """
     parts = _parts(path)
     return path if parts is None else parts[0].local(parts[1])
+
+
+def read_local(path: Path, read: Callable[[Path], T]) -> T:
+    """Result of a function of a :func:`local_copy`. It is made again if other readers make room in the cache
+    before the function opens it. Errors name `path`.
+
+    Raises
+    ------
+    the errors of :func:`local_copy` and of `read`
+    """
+    for last in (*[False] * _READS, True):
+        file = local_copy(path)
+        try:
+            return read(file)
+        except InputError as error:
+            if last or file is path or file.exists() or not path.exists():
+                raise InputError(error.what, where=path, hint=error.hint) from None
+    raise AssertionError
 
 
 @contextlib.contextmanager

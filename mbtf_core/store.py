@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -114,7 +115,11 @@ class Store:
                 result = function()
                 self._lost.clear()
                 return result
-            except (FileNotFoundError, FileExistsError, MbtfError):
+            except (FileNotFoundError, FileExistsError):
+                # The store has answered.
+                self._lost.clear()
+                raise
+            except MbtfError:
                 raise
             except Exception as error:
                 if isinstance(error, _REFUSED) or type(error).__name__ in _NO_CREDENTIALS:
@@ -237,4 +242,5 @@ class Store:
 
 def _tag(info: dict[str, Any]) -> str:
     keys = ("ETag", "etag", "md5Hash", "content_md5", "LastModified", "last_modified", "mtime", "created")
-    return next((str(info[key]) for key in keys if info.get(key)), "")
+    value = next((info[key] for key in keys if info.get(key)), "")
+    return str(value.timestamp() if isinstance(value, datetime) else value)

@@ -39,8 +39,9 @@ _SPLIT = rf"(?:{'|'.join(SPLITS)})-\d+"
 _SHARD = re.compile(rf"{_SPLIT}\.(?:npz|exr)")
 _DOCUMENTS = "|".join(map(re.escape, (MANIFEST_NAME, CONFIG_NAME, GEOMETRY_NAME)))
 _COPIED = re.compile(rf"{_SPLIT}\.json|{_DOCUMENTS}")
-# Downloads of small files at once, and shards that are read ahead.
-_THREADS, _AHEAD = 16, 2
+# Small files, and shards to be read next, that are downloaded at once; shards that must fit into a cache for
+# others to be downloaded ahead.
+_THREADS, _AHEAD, _ROOM = 16, 2, 16
 _OWNER, _FILES = "owner.lock", "files"
 
 
@@ -136,9 +137,12 @@ class StoreFolder:
             os.close(handle)
         # Tags of the files as they were copied, or as they were uploaded.
         self._tags: dict[str, str] = {}
+        # Names of the shards in order, their numbers, and the one that was read last.
+        self._shards: list[str] = []
+        self._order: dict[str, int] = {}
         self._last = ""
         self._wanted: queue.Queue[str] = queue.Queue()
-        self._reader: threading.Thread | None = None
+        self._readers: list[threading.Thread] = []
 
     @classmethod
     def open(cls, url: str) -> StoreFolder:
@@ -173,6 +177,8 @@ class StoreFolder:
                         del self.listed[name]
                         continue
                     self._keep(name, content)
+            self._shards = sorted(name for name in self.listed if _SHARD.fullmatch(name))
+            self._order = {name: at for at, name in enumerate(self._shards)}
             for name in [name for name in self._tags if name not in self.listed]:
                 del self._tags[name]
                 self._at(name).unlink(missing_ok=True)
@@ -243,10 +249,10 @@ class StoreFolder:
         if self._at(name).exists() or name not in self.listed:
             return self._at(name)
         path = self._fetch(name)
-        names = sorted(n for n in self.listed if _SHARD.fullmatch(n))
-        at = names.index(name)
-        if at == 0 or names[at - 1] == self._last or self._last.partition("-")[0] != name.partition("-")[0]:
-            for following in names[at + 1 : at + 1 + _AHEAD]:
+        at = self._order.get(name, 0)
+        # Random access announces its shards itself.
+        if self._order.get(self._last, -1) in (-1, at - 1):
+            for following in self._shards[at + 1 : at + 1 + _AHEAD]:
                 self.prefetch(following)
         self._last = name
         return path
@@ -271,14 +277,16 @@ class StoreFolder:
             raise InputError(error.what, where=where, hint=hint) from None
 
     def prefetch(self, name: str) -> None:
-        """Download a shard in a background thread; failures are left to the reader."""
-        if name not in self.listed:
+        """Download a shard in a background thread; failures are left to the reader. A cache of a few shards
+        has no room for it."""
+        listed = self.listed.get(name)
+        if listed is None or _ROOM * listed.size > self.cache.limit:
             return
         with self._guard:
-            if self._reader is None:
+            while len(self._readers) < _AHEAD:
                 # As a daemon it does not delay the exit.
-                self._reader = threading.Thread(target=self._read_ahead, name="prefetch", daemon=True)
-                self._reader.start()
+                self._readers.append(threading.Thread(target=self._read_ahead, name="prefetch", daemon=True))
+                self._readers[-1].start()
         if name not in self._wanted.queue:
             self._wanted.put(name)
 

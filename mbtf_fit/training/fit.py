@@ -15,7 +15,7 @@ from typing import Any
 import torch
 
 from mbtf_core.atomic import write_text
-from mbtf_core.errors import EngineError, InputError
+from mbtf_core.errors import EngineError, InputError, PartialError
 from mbtf_core.folders import owned
 from mbtf_core.interruption import stop_on_interruption
 from mbtf_core.lattice import level_of_sigma
@@ -159,7 +159,7 @@ def fit(
     config : FitConfig
         Options of the fit.
     shards : str or Path
-        Folder made by ``mbtf-gen``.
+        Folder made by ``mbtf-gen``, or its URL.
     out : str or Path
         Folder of the material.
     overwrite : bool
@@ -184,7 +184,8 @@ def fit(
     EngineError
         The device is not available.
     PartialError
-        The disk is full, or another process writes to the folder; the same command resumes.
+        The disk is full, another process writes to the folder, or the store cannot be reached; the same
+        command resumes.
     """
     begin = time.perf_counter()
     device = choose_device(config.device)
@@ -369,7 +370,12 @@ def _train(
     done = trainer.fraction >= 1.0
     with stop_on_interruption() as stop:
         while not (done or stop.is_set()):
-            done = trainer.train(_REPORT_SECONDS, stop)
+            try:
+                done = trainer.train(_REPORT_SECONDS, stop)
+            except PartialError:
+                # The store of streamed queries cannot be reached.
+                write_checkpoint(trainer, out / CHECKPOINT_NAME)
+                raise
             record = history_record(trainer, subset)
             with (out / HISTORY_NAME).open("a", encoding="utf-8") as stream:
                 stream.write(json.dumps(record) + "\n")
