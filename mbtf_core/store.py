@@ -89,6 +89,7 @@ class Store:
         except ValueError as error:
             raise InputError(f"cannot be opened ({reason(error)})", where=url) from None
         self._root = str(root).rstrip("/")
+        _quiet(self._files)
         try:
             self.patience = float(os.environ.get(PATIENCE_VARIABLE) or PATIENCE_SECONDS)
         except ValueError:
@@ -238,6 +239,15 @@ class Store:
             self._request(name, lambda: self._files.rm_file(self._at(name)))
         except FileNotFoundError:
             return
+
+
+def _quiet(files: Any) -> None:
+    """Keep tracebacks of cut connections off the screen: the request fails with the error as well."""
+    loop = getattr(files, "loop", None)
+    if loop is not None and loop.get_exception_handler() is None:
+        loop.call_soon_threadsafe(
+            loop.set_exception_handler, lambda _, context: log.debug(reason(context.get("message")))
+        )
 
 
 def _tag(info: dict[str, Any]) -> str:

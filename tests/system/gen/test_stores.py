@@ -143,6 +143,7 @@ def test_a_store_that_is_gone(tmp_path: Path, proxy: Proxy, monkeypatch: pytest.
     err = running.communicate(timeout=300)[1]
     assert running.returncode == 4, err
     # What is wrong, and what to do; the material has a warning.
+    assert len(err.splitlines()) == 3, err
     warning, fault, hint = err.splitlines()
     assert warning.startswith("warning: ")
     assert fault.startswith(f"error: {URL}/")
@@ -156,7 +157,9 @@ def test_a_store_that_is_gone(tmp_path: Path, proxy: Proxy, monkeypatch: pytest.
     assert stored(tmp_path / "copy") == expected
     found = done.result()
     # Rendered by the second run: neither what was stored nor what waited.
-    assert found["paths"] < sum(r.get("paths", 0) for n, r in expected.items() if n[:5] in ("train", "test-"))
+    uploaded = [name for name in expected if name.endswith(".npz")]
+    paths = sum(expected[name.replace(".npz", ".json")]["paths"] for name in uploaded)
+    assert found["paths"] < paths
     assert list((tmp_path / "cache/mbtf/stores/work").iterdir()) == []
 
 
