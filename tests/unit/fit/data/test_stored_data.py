@@ -15,7 +15,7 @@ from support.object_stores import memory_store
 from mbtf_core.data_folder import data_folder, prefetch
 from mbtf_core.errors import PartialError
 from mbtf_core.store import Store
-from mbtf_core.store_folder import StorePath
+from mbtf_core.store_folder import StoreFolder, StorePath
 from mbtf_fit.config import FitConfig, HeldOutSection
 from mbtf_fit.data.loader import load_training
 from mbtf_fit.data.streaming import StreamedQueries
@@ -111,6 +111,25 @@ def test_a_shard_that_another_process_evicts_is_read_again(tmp_path: Path, url: 
     again = shards[0].read()
     # The first arrays stay readable: they are mapped.
     assert all((before[name] == again[name]).all() for name in before)
+
+
+def test_a_shard_that_leaves_the_cache_before_it_is_opened(
+    url: str, local: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original, left = StoreFolder.local, [3]
+
+    def evicted(self: StoreFolder, name: str) -> Path:
+        path = original(self, name)
+        if left[0]:
+            left[0] -= 1
+            path.unlink()
+        return path
+
+    monkeypatch.setattr(StoreFolder, "local", evicted)
+    found = Dataset.open(url).shards("train")[0].read()
+    assert left == [0]
+    expected = Dataset.open(local).shards("train")[0].read()
+    assert all((found[name] == expected[name]).all() for name in expected)
 
 
 def test_a_lost_store_leaves_a_checkpoint(
