@@ -52,6 +52,8 @@ def data_folder(folder: str | Path) -> Path:
     protocol, rest = url
     if protocol in ("file", "local"):
         return Path(unquote(f"/{rest}"))
+    if not rest.strip("/"):
+        raise InputError("names no bucket", where=folder, hint="such as s3://bucket/data")
     return StoreFolder.open(f"{protocol}://{rest}").path
 
 

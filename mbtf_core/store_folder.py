@@ -29,6 +29,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from mbtf_core import interruption
+from mbtf_core.atomic import unwritable
 from mbtf_core.errors import InputError, MbtfError
 from mbtf_core.file_cache import FileCache
 from mbtf_core.folders import cache_folder, make_folder
@@ -127,9 +128,12 @@ class StoreFolder:
         self._works = base / "work"
         self._key = hashlib.sha256(url.encode()).hexdigest()[:16]
         make_folder(self._works)
-        self._home, self._owner = self._new_home()
-        self.root = os.path.join(self._home, _FILES)
-        os.mkdir(self.root)
+        try:
+            self._home, self._owner = self._new_home()
+            self.root = os.path.join(self._home, _FILES)
+            os.mkdir(self.root)
+        except OSError as error:
+            raise unwritable(self._works, error) from None
         for home, handle in self._ended():
             # Shards that wait there are left to the next writer of their URL.
             if not _shards(home / _FILES):
@@ -194,8 +198,11 @@ class StoreFolder:
 
     def _keep(self, name: str, content: bytes) -> None:
         part = self._at(f".{name}.part")
-        part.write_bytes(content)
-        os.replace(part, self._at(name))
+        try:
+            part.write_bytes(content)
+            os.replace(part, self._at(name))
+        except OSError as error:
+            raise unwritable(part, error) from None
         self._tags[name] = self.listed[name].tag
 
     def delete(self, name: str) -> None:

@@ -234,6 +234,20 @@ def test_missing_data_sets_are_named(url: str) -> None:
         Dataset.open(url)
 
 
+def test_a_url_names_a_bucket() -> None:
+    with pytest.raises(InputError, match="names no bucket"):
+        Dataset.open("s3://")
+
+
+def test_a_cache_that_cannot_be_written(tmp_path: Path, url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert generate(command_at(tmp_path, url)) == 0
+    (tmp_path / "file").touch()
+    close_stores()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    with pytest.raises(InputError, match="cannot be created"):
+        Dataset.open(url)
+
+
 def test_a_corrupt_shard_is_not_read(tmp_path: Path, url: str) -> None:
     assert generate(command_at(tmp_path, url)) == 0
     store = Store(url)
