@@ -24,13 +24,15 @@ class Proxy:
     ----------
     port : where it listens
     down : refuse every connection, and cut those that exist
-    cut_after : bytes from the client after which each connection is cut; None for never
+    cut_after : bytes after which each connection is cut; None for never
+    answers : count the bytes of the server, not those of the client
     cuts : connections to cut; without a limit if None
     """
 
     def __init__(self, server: int) -> None:
         self.down = False
         self.cut_after: int | None = None
+        self.answers = False
         self.cuts: int | None = None
         self.done = 0
         self._server = server
@@ -53,17 +55,17 @@ class Proxy:
             return
         server = socket.create_connection(("127.0.0.1", self._server))
         pair = (client, server)
-        threading.Thread(target=self._forward, args=(server, client, pair, False), daemon=True).start()
-        self._forward(client, server, pair, True)
+        threading.Thread(target=self._forward, args=(server, client, pair, True), daemon=True).start()
+        self._forward(client, server, pair, False)
 
     def _forward(
-        self, source: socket.socket, sink: socket.socket, pair: tuple[socket.socket, ...], counted: bool
+        self, source: socket.socket, sink: socket.socket, pair: tuple[socket.socket, ...], answer: bool
     ) -> None:
         passed = 0
         with contextlib.suppress(OSError):
             while data := source.recv(4096):
                 passed += len(data)
-                if self.down or (counted and self._cuts(passed)):
+                if self.down or (answer == self.answers and self._cuts(passed)):
                     break
                 sink.sendall(data)
         for end in pair:

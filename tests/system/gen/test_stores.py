@@ -121,9 +121,19 @@ def test_connections_that_are_cut(tmp_path: Path, proxy: Proxy) -> None:
     assert proxy.done >= 4
     proxy.cut_after = None
     assert stored(tmp_path / "copy") == expected
-    proxy.cut_after, proxy.cuts, proxy.done = 600, 5, 0
-    assert call("verify", URL).code == 0
-    assert proxy.done == 5
+    proxy.cut_after, proxy.cuts, proxy.answers = 3000, 5, True
+    steps = ["--steps", "5", "--set", "training.batch=30"]
+    for program, line in (
+        ("mbtf-gen", ["verify", URL]),
+        ("mbtf-fit", [URL, *steps, "-o", tmp_path / "theirs"]),
+        ("mbtf-fit", [tmp_path / "local", *steps, "-o", tmp_path / "mine"]),
+    ):
+        proxy.done = 0
+        done = call(*line, program=program)
+        assert done.code == 0, done.err
+        assert proxy.done == (0 if tmp_path / "local" in line else 5)
+    weights = [(tmp_path / out / "weights.safetensors").read_bytes() for out in ("mine", "theirs")]
+    assert weights[0] == weights[1]
 
 
 def test_a_store_that_is_gone(tmp_path: Path, proxy: Proxy, monkeypatch: pytest.MonkeyPatch) -> None:
