@@ -10,7 +10,6 @@ import contextlib
 import os
 import re
 import shutil
-import threading
 from collections.abc import Callable, Container, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from typing import Any
 from mbtf_core.atomic import TEMPORARY, remove_file
 from mbtf_core.config_file import differences, in_short
 from mbtf_core.errors import InputError, PartialError
-from mbtf_core.locks import RENEW_SECONDS, Lock, lock_owner, take_lock
+from mbtf_core.locks import keep_renewing, lock_owner, take_lock
 from mbtf_core.units import size_text
 
 # Names of temporary files and locks, such as a killed process leaves.
@@ -60,17 +59,10 @@ def owned(folder: Path) -> Iterator[None]:
             where=folder,
             hint=f"wait for it and run the same command again, or {ELSEWHERE}",
         )
-    done = threading.Event()
-
-    def renew() -> None:
-        while not done.wait(RENEW_SECONDS):
-            Lock.renew()
-
-    threading.Thread(target=renew, name="lock renewal", daemon=True).start()
     try:
-        yield
+        with keep_renewing():
+            yield
     finally:
-        done.set()
         lock.release()
         if made:
             _remove_empty(folder)

@@ -96,6 +96,22 @@ class Lock:
 interruption.at_end(Lock.abandon)
 
 
+@contextlib.contextmanager
+def keep_renewing() -> Iterator[None]:
+    """Renew the locks of this process while a block runs."""
+    done = threading.Event()
+
+    def renew() -> None:
+        while not done.wait(RENEW_SECONDS):
+            Lock.renew()
+
+    threading.Thread(target=renew, name="lock renewal", daemon=True).start()
+    try:
+        yield
+    finally:
+        done.set()
+
+
 def lock_file_of(path: Path) -> Path:
     """The lock that belongs to a shard, or to another file of its folder."""
     return path.with_name(f".{path.stem}.lock")

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import os
 import shlex
 import types
 import typing
@@ -58,6 +59,14 @@ Output = Annotated[Path, Parameter(name=["--output", "-o"], help="Output folder.
 DataOutput = Annotated[Path, Parameter(name=["--output", "-o"], help="Output folder or URL.")]
 Overwrite = Annotated[Switch, Parameter(help="Replace existing output.")]
 Time = Annotated[str | None, Parameter(metavar="DURATION", help="Time budget: 90s, 2min, 1h.")]
+ClusterOption = Annotated[
+    str | None,
+    Parameter(
+        name="--cluster",
+        metavar="WHERE",
+        help="Run on workers: local, local:4, a YAML file of a batch system, or tcp://scheduler:8786.",
+    ),
+]
 DryRun = Annotated[Switch, Parameter(help="Write nothing; only report what would be done.")]
 Verbose = Annotated[Switch, Parameter(alias="-v", help="Print all details.")]
 Config = Annotated[Path | None, Parameter(help="YAML file with the options.")]
@@ -231,7 +240,8 @@ class Options(Generic[S]):
             return resolved
         folder = self.config.parent
         paths = [k for k, given in arguments.items() if given is None and k not in assigned]
-        return resolved.model_copy(update={k: str(folder / getattr(resolved, k)) for k in paths})
+        located = {k: os.path.normpath(folder / getattr(resolved, k)) for k in paths}
+        return resolved.model_copy(update=located)
 
 
 def takes_options(model: type[BaseModel], *keys: str) -> Callable[[C], C]:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, PlainSerializer
 
 from mbtf_core.errors import UsageError
 
@@ -86,6 +88,13 @@ def expectation(seconds: float | None, size: float) -> str:
     """What a command expects to take, in one line; unknown seconds are left out."""
     time = "" if seconds is None else f"about {clock(seconds)}, "
     return f"expected: {time}{size_text(size)} on disk"
+
+
+# Fields of configurations.
+Duration = Annotated[
+    float, BeforeValidator(parse_duration), PlainSerializer(format_duration, when_used="json")
+]
+Size = Annotated[float, BeforeValidator(parse_size), PlainSerializer(format_size, when_used="json")]
 
 
 def parse_numbers(value: Any) -> Any:

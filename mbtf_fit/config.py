@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from mbtf_core.config_file import Settings
 from mbtf_core.digest import data_sha256
 from mbtf_core.nested import deep_merge
 from mbtf_core.options import Flag
-from mbtf_core.units import format_duration, format_size, parse_duration, parse_size
+from mbtf_core.units import Duration, Size
 
 ModelName = Literal[
     "neumip-baseline", "neumip", "neumip+", "relief", "hierarchical", "rainer2019", "rainer2020"
@@ -25,11 +25,6 @@ FIBER_MODEL: ModelName = "neumip+"
 TRACING_MODELS: tuple[ModelName, ...] = ("relief", "neumip+")
 LossKind = Literal["relative", "squared", "linear", "log", "fourth-root", "gradient"]
 Correction = Literal["none", "second-order", "linear"]
-
-Duration = Annotated[
-    float, BeforeValidator(parse_duration), PlainSerializer(format_duration, when_used="json")
-]
-Size = Annotated[float, BeforeValidator(parse_size), PlainSerializer(format_size, when_used="json")]
 
 
 class EncodingSection(Settings):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from mbtf_core.atomic import read_json
 from mbtf_core.console import Console
 from mbtf_core.digest import file_sha256
-from mbtf_core.errors import InputError
+from mbtf_core.errors import InputError, PartialError
 from mbtf_core.folders import check_folder, owned
 from mbtf_core.units import clock
 from mbtf_fit.config import FitConfig
@@ -41,6 +41,7 @@ from mbtf_pipeline.stages import (
 )
 
 if TYPE_CHECKING:
+    from mbtf_core.cluster.engine import Cluster
     from mbtf_fit.viewer.live import LiveView
 
 GENERATE_STAGE, COMPARE_STAGE, REPORT_STAGE = "generate", "compare", "report"
@@ -118,6 +119,7 @@ class _RecipeRun:
     folder: Path
     console: Console
     live: LiveView | None = None
+    cluster: Cluster | None = None
 
     def stages(self, inputs: Mapping[str, str]) -> list[Stage]:
         """All stages; `inputs` holds the digests of the material's files by role."""
@@ -136,7 +138,8 @@ class _RecipeRun:
             # Data sets of other materials count by what they hold, not by where they lie.
             others = [_manifest_digest(Path(folder)) for folder in config.training.materials]
             fields["training"] = {**fields["training"], "materials": others}
-            out.append(Stage(fit_stage(name), (data.stage,), fields, {}, files, run))
+            remote = self.cluster is not None
+            out.append(Stage(fit_stage(name), (data.stage,), fields, {}, files, run, remote))
         compared = {"record": COMPARISON_SCHEMA, **recipe.compare.model_dump(mode="json")}
         needs = (GENERATE_STAGE, *map(fit_stage, recipe.fit))
         out.append(Stage(COMPARE_STAGE, needs, compared, {}, self._files(COMPARE), self._compare))
@@ -163,7 +166,7 @@ class _RecipeRun:
         """The report, and the viewer's page where there is one."""
         return [path for name in (REPORT, VIEWER) if (path := self.folder / name).is_file()]
 
-    def _generate(self, data: DataSet, decision: Decision) -> None:
+    def _generate(self, data: DataSet, decision: Decision) -> float:
         from mbtf_core.shard_schema import MANIFEST_NAME
         from mbtf_gen.dataset.folder import read_manifest
         from mbtf_gen.dataset.reader import is_dataset
@@ -185,24 +188,34 @@ class _RecipeRun:
         ):
             clear(shards)
         with self.console.progress(None, data.stage, "paths") as bar:
-            generate(job, shards, progress=bar.update)
+            done = generate(job, shards, progress=bar.update, cluster=self.cluster)
+        # Workers render at the same time; slices of earlier processes are the time that the data took.
+        return done.shard_seconds if self.cluster is None else 0.0
 
-    def _fit(self, name: str, data: DataSet, decision: Decision) -> None:
+    def _fit(self, name: str, data: DataSet, decision: Decision) -> float:
         from mbtf_fit import fit
+        from mbtf_fit.training.fit_cluster import fit_task
 
         config, shards, out = self.recipe.fit[name], self.folder / data.sub, self.folder / FITS / name
         if decision.reason != NOT_RUN or not _unfinished(out, config, shards):
             clear(out)
+        if self.cluster is not None:
+            # The worker's checkpoints make the fit resumable; its curve is in its folder.
+            (done,) = self.cluster.run([fit_task(name, config, shards, out, overwrite=False)])
+            if done.error:
+                raise PartialError(done.error, where=fit_stage(name), hint="the same command resumes the run")
+            return 0.0
         steps = config.training.steps
         budget, unit = (config.training.time, "s") if steps is None else (steps, "steps")
         with self.console.progress(budget, fit_stage(name), unit) as bar:
-            fit(
+            done = fit(
                 config,
                 shards,
                 out,
                 progress=lambda share, note: bar.update(round(share * budget, 1), note),
                 observe=None if self.live is None else self.live.observer(name),
             )
+        return done.seconds
 
     def _compare(self, decision: Decision) -> None:
         from mbtf_pipeline.compare.compare import compare, steps
@@ -211,7 +224,8 @@ class _RecipeRun:
         clear(out)
         recipe, fits = self.recipe, {name: self.folder / FITS / name for name in self.recipe.fit}
         with self.console.progress(steps(recipe.compare, len(fits)), "compare", "pictures") as bar:
-            compare(recipe.compare, recipe.generate, shards, fits, out, lambda note: bar.advance(1, note))
+            advance = partial(bar.advance, 1)
+            compare(recipe.compare, recipe.generate, shards, fits, out, advance, self.cluster)
 
     def show(self, stage: str, decision: Decision, stamp: Stamp | None) -> None:
         """Say a stage's state, and show what it has made."""
@@ -291,6 +305,7 @@ def run_recipe(
     console: Console | None = None,
     generated: Callable[[Recipe], Recipe] | None = None,
     live: LiveView | None = None,
+    cluster: Cluster | None = None,
 ) -> RunResult:
     """Run a recipe; stages whose inputs have not changed are skipped.
 
@@ -310,6 +325,8 @@ def run_recipe(
         Called once the data are generated; returns the recipe of the other stages.
     live : LiveView, optional
         Shows stages and fits as they come.
+    cluster : Cluster, optional
+        Its workers render shards and reference pictures and train the fits; this process by default.
 
     Returns
     -------
@@ -329,7 +346,7 @@ def run_recipe(
     with owned(folder):
         check_folder(folder, is_run, "run")
         write_run_record(folder, recipe, command)
-        run = _RecipeRun(recipe, folder, console, live)
+        run = _RecipeRun(recipe, folder, console, live, cluster)
         stages = run.stages(inputs)
         results: dict[str, StageResult] = {}
         if generated is not None:
@@ -337,7 +354,7 @@ def run_recipe(
             results = run_stages(folder, stages[:count], force=force, notify=run.show)
             recipe = generated(recipe)
             write_run_record(folder, recipe, command)
-            run = _RecipeRun(recipe, folder, console, live)
+            run = _RecipeRun(recipe, folder, console, live, cluster)
             stages = run.stages(inputs)[count:]
         results |= run_stages(folder, stages, force=force, notify=run.show)
     viewer = folder / VIEWER

@@ -8,9 +8,11 @@ that of its stamp and its files match their digests; a stage without a stamp has
 
 from __future__ import annotations
 
+import itertools
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,7 +40,8 @@ class Stage:
     config : resolved options, plain data
     inputs : digests of input files from outside the run, by role
     outputs : lists the files it has written
-    run : does the work
+    run : does the work; may return the seconds that it took in all, earlier processes included
+    remote : other machines do the work, so that consecutive stages of this kind run at the same time
     """
 
     name: str
@@ -46,7 +49,8 @@ class Stage:
     config: Mapping[str, Any]
     inputs: Mapping[str, str]
     outputs: Callable[[], Sequence[Path]]
-    run: Callable[[Decision], None]
+    run: Callable[[Decision], float | None]
+    remote: bool = False
 
 
 @dataclass(frozen=True)
@@ -58,7 +62,7 @@ class Stamp:
     key : the hash it ran with
     depends : data covered by the hash
     outputs : file, relative to the run's folder → SHA-256
-    seconds : wall-clock time of the run
+    seconds : wall-clock time of the run, or the time of the work where earlier processes did some of it
     """
 
     stage: str
@@ -165,12 +169,15 @@ class StageResult:
     reason: str
 
 
+Notify = Callable[[str, Decision, Stamp | None], None]
+
+
 def run_stages(
     folder: Path,
     stages: Sequence[Stage],
     *,
     force: bool = False,
-    notify: Callable[[str, Decision, Stamp | None], None] | None = None,
+    notify: Notify | None = None,
 ) -> dict[str, StageResult]:
     """Run all stages that are not up to date, in the given order.
 
@@ -180,18 +187,44 @@ def run_stages(
     notify : called before each stage with (stage, decision, None), and after it with its stamp
     """
     done: dict[str, StageResult] = {}
-    for stage in stages:
-        fresh = [name for name, result in done.items() if result.ran]
-        decision = Decision(FORCED) if force else decide(folder, stage, fresh)
-        if notify is not None:
-            notify(stage.name, decision, None)
-        stamp = read_stamp(folder, stage.name)
-        if decision.runs or stamp is None:
-            stamp = _run(folder, stage, decision)
-        done[stage.name] = StageResult(stamp, decision.runs, decision.reason)
-        if notify is not None:
-            notify(stage.name, decision, stamp)
+    for remote, group in itertools.groupby(stages, lambda stage: stage.remote):
+        together = list(group)
+        if not remote:
+            for stage in together:
+                decision = _decide(folder, stage, done, force, notify)
+                done[stage.name] = _finish(folder, stage, decision, notify)
+            continue
+        # Decided before any runs; none needs another.
+        decisions = [_decide(folder, stage, done, force, notify) for stage in together]
+        with ThreadPoolExecutor(len(together), "stages") as pool:
+            running = {
+                pool.submit(_finish, folder, stage, decision, notify): stage.name
+                for stage, decision in zip(together, decisions, strict=True)
+            }
+            results = {running[future]: future for future in as_completed(running)}
+        # In the stages' order; the first that failed raises, when all have ended.
+        done |= {stage.name: results[stage.name].result() for stage in together}
     return done
+
+
+def _decide(
+    folder: Path, stage: Stage, done: Mapping[str, StageResult], force: bool, notify: Notify | None
+) -> Decision:
+    fresh = [name for name, result in done.items() if result.ran]
+    decision = Decision(FORCED) if force else decide(folder, stage, fresh)
+    if notify is not None:
+        notify(stage.name, decision, None)
+    return decision
+
+
+def _finish(folder: Path, stage: Stage, decision: Decision, notify: Notify | None) -> StageResult:
+    """Run a stage if it must run."""
+    stamp = read_stamp(folder, stage.name)
+    if decision.runs or stamp is None:
+        stamp = _run(folder, stage, decision)
+    if notify is not None:
+        notify(stage.name, decision, stamp)
+    return StageResult(stamp, decision.runs, decision.reason)
 
 
 def run_again(folder: Path, stage: Stage) -> None:
@@ -214,8 +247,8 @@ def _run(folder: Path, stage: Stage, decision: Decision) -> Stamp:
     # Without a stamp, an interrupted stage counts as not run.
     path.unlink(missing_ok=True)
     start = time.perf_counter()
-    stage.run(decision)
-    seconds = time.perf_counter() - start
+    whole = stage.run(decision) or 0.0
+    seconds = max(whole, time.perf_counter() - start)
     depends, key = _depends(folder, stage)
     outputs = {file.relative_to(folder).as_posix(): file_sha256(file) for file in sorted(stage.outputs())}
     stamp = Stamp(stage.name, key, depends, outputs, round(seconds, 3))

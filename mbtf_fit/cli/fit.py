@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import InputError, PartialError, UsageError
 from mbtf_core.interruption import keep_on_interruption
-from mbtf_core.options import DryRun, Options, Output, Overwrite, Verbose, takes_options
+from mbtf_core.options import ClusterOption, DryRun, Options, Output, Overwrite, Verbose, takes_options
 from mbtf_core.units import clock, expectation, format_duration
 from mbtf_fit.cli.page_options import Live, live_view
 from mbtf_fit.config import DEFAULT_MODEL, FIBER_MODEL, FitConfig, ModelName
@@ -30,6 +31,8 @@ def fit(
     many: Annotated[list[Path] | None, Parameter(consume_multiple=True)] = None,
     processes: Annotated[int | None, Parameter(show_default="one per GPU, or 1")] = None,
     live: Live = False,
+    tensorboard: Annotated[Path | None, Parameter(metavar="FOLDER")] = None,
+    cluster: ClusterOption = None,
     dry_run: DryRun = False,
     overwrite: Overwrite = False,
     verbose: Verbose = False,
@@ -50,6 +53,8 @@ def fit(
         files with one folder per line. A fit that fails does not stop the others.
     processes
         With --many, number of simultaneous fits.
+    tensorboard
+        Write the curves of the fit as event files for TensorBoard to a folder.
     """
     if dry_run and many is not None:
         raise UsageError("--dry-run takes one data set", hint="mbtf-fit shards/ --dry-run")
@@ -59,12 +64,16 @@ def fit(
         )
     if processes is not None and (many is None or processes < 1):
         raise UsageError("--processes must be a positive number and requires --many")
+    if cluster is not None and (many is None or processes is not None):
+        hint = "leave out --processes" if many is not None else "mbtf-fit --many shards/ -o materials/"
+        raise UsageError("requires --many, and sets the number of processes", where="--cluster", hint=hint)
     if shards is None and many is None:
         raise UsageError("no shards given", hint="mbtf-fit shards/ -o material/")
-    if many is not None and live:
-        raise UsageError("shows one fit", where="--live", hint="leave out --many, or --live")
+    for flag, used in (("--live", live), ("--tensorboard", tensorboard is not None)):
+        if many is not None and used:
+            raise UsageError("shows one fit", where=flag, hint=f"leave out --many, or {flag}")
     if many is not None:
-        _fit_many(options, quality, many, output, processes, overwrite, console)
+        _fit_many(options, quality, many, output, processes, cluster, overwrite, console)
         return
     assert shards is not None
     from mbtf_core.data_folder import data_folder
@@ -107,18 +116,28 @@ def fit(
             console.note(expectation(seconds, size))
     if missing := missing_reason():
         console.note(f"note: training runs in PyTorch, not in the compiled kernel ({missing})")
+    from mbtf_fit.training.tensorboard import EventLog
+
     keep_on_interruption(f"the last checkpoint is kept in {output}")
     with (
+        nullcontext() if tensorboard is None else EventLog(tensorboard) as log,
         live_view(str(output), live, console) as shown,
         console.progress(total=100, label="fitting", unit="%") as bar,
     ):
+        curves = None if shown is None else shown.observer(output.name)
+        observers = [observer for observer in (curves, log) if observer is not None]
+
+        def observe(*validation: Any) -> None:
+            for observer in observers:
+                observer(*validation)
+
         result = fit(
             resolved,
             shards,
             output,
             overwrite=overwrite,
             progress=lambda fraction, note: bar.update(round(100 * fraction, 1), note),
-            observe=None if shown is None else shown.observer(output.name),
+            observe=observe if observers else None,
             partition=partition,
         )
         if shown is not None:
@@ -163,9 +182,12 @@ def _fit_many(
     many: list[Path],
     output: Path,
     processes: int | None,
+    cluster: str | None,
     overwrite: bool,
     console: Console,
 ) -> None:
+    from mbtf_core.cluster.engine import open_cluster
+    from mbtf_fit.training.fit_cluster import fit_on_cluster
     from mbtf_fit.training.fit_many import FitOutcome, find_data, fit_many, name_materials
 
     shards = find_data(many)
@@ -177,17 +199,26 @@ def _fit_many(
         processes = max(1, torch.cuda.device_count()) if configs[0].device != "cpu" else 1
     console.note(
         f"{len(shards)} data set{'s' * (len(shards) != 1)} -> {output}: "
-        f"{' and '.join(sorted({config.model for config in configs}))}, {processes} at a time"
+        f"{' and '.join(sorted({config.model for config in configs}))}"
+        f"{'' if cluster is not None else f', {processes} at a time'}"
     )
     keep_on_interruption(f"finished fits and the last checkpoints are kept in {output}")
-    with console.progress(total=len(shards), label="fitting", unit="data sets") as bar:
+    with (
+        open_cluster(cluster, console.note) as workers,
+        console.progress(total=len(shards), label="fitting", unit="data sets") as bar,
+    ):
 
         def finished(outcome: FitOutcome) -> None:
             bar.advance(1, f"{outcome.folder.name}: {'failed' if outcome.error else 'done'}")
 
-        outcomes = fit_many(
-            configs, shards, folders, processes=processes, overwrite=overwrite, finished=finished
-        )
+        if workers is None:
+            outcomes = fit_many(
+                configs, shards, folders, processes=processes, overwrite=overwrite, finished=finished
+            )
+        else:
+            outcomes = fit_on_cluster(
+                configs, shards, folders, workers, overwrite=overwrite, finished=finished
+            )
     rows = [["material", "unexplained variance", "PSNR", "beside the reference", "steps", "training"]]
     for outcome in outcomes:
         if outcome.result is None:

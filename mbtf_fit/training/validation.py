@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mbtf_core.stats import Estimate, unexplained_variance
+from mbtf_core.stats import Estimate, level_groups, unexplained_variance
 from mbtf_fit.data.loader import Partition, load_split
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.formatting import format_estimate
@@ -44,6 +44,24 @@ def validation_subset(positions: int, queries: ShardQueries, most: int = _SUBSET
 def validation_error(trainer: Trainer, queries: ShardQueries) -> Estimate:
     """Unexplained variance of queries by the current model."""
     return unexplained_variance(trainer.predict(queries), queries.value_a, queries.value_b)
+
+
+def finite(number: float | None) -> float | None:
+    """A number, or None where it is not finite; JSON and plots have no others."""
+    return number if number is not None and math.isfinite(number) else None
+
+
+def errors_by_level(trainer: Trainer, queries: ShardQueries) -> dict[str, float | None]:
+    """Unexplained variance by nearest level; None where it is undefined."""
+    predicted = trainer.predict(queries)
+    level = level_groups(queries.sigma, trainer.model.lattice.finest)
+    out = {}
+    for s in np.unique(level):
+        rows = level == s
+        arrays = (predicted[rows], queries.value_a[rows], queries.value_b[rows])
+        value = unexplained_variance(*arrays).value
+        out[str(s)] = finite(value)
+    return out
 
 
 def history_record(trainer: Trainer, subset: ShardQueries) -> dict[str, Any]:

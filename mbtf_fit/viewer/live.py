@@ -9,16 +9,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from mbtf_core.errors import InputError
-from mbtf_core.stats import level_groups, unexplained_variance
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.material.format import QUERY
 from mbtf_fit.material.material import Material, conformance_queries, conformance_values
 from mbtf_fit.models.registry import build_model
 from mbtf_fit.training.fit import Observer
 from mbtf_fit.training.trainer import Trainer
+from mbtf_fit.training.validation import errors_by_level, finite
 from mbtf_fit.viewer.content import content_of, material_content, pack_textures
 from mbtf_fit.viewer.page import write_page
 from mbtf_fit.viewer.server import Messages, PageServer
@@ -86,7 +84,7 @@ class LiveView:
             nonlocal next_picture
             start = time.perf_counter()
             keys = ("step", "seconds", "fraction", "loss", "unexplained")
-            curve.append({key: _finite(record[key]) for key in keys})
+            curve.append({key: finite(record[key]) for key in keys})
             if start < next_picture:
                 self._messages.send("curve", {"records": curve}, name)
                 return
@@ -103,23 +101,6 @@ class LiveView:
             next_picture = end + max(_SECONDS, (end - start) / _SHARE)
 
         return observe
-
-
-def _finite(number: float | None) -> float | None:
-    return number if number is not None and math.isfinite(number) else None
-
-
-def errors_by_level(trainer: Trainer, queries: ShardQueries) -> dict[str, float | None]:
-    """Unexplained variance by nearest level; None where it is undefined."""
-    predicted = trainer.predict(queries)
-    level = level_groups(queries.sigma, trainer.model.lattice.finest)
-    out = {}
-    for s in np.unique(level):
-        rows = level == s
-        arrays = (predicted[rows], queries.value_a[rows], queries.value_b[rows])
-        value = unexplained_variance(*arrays).value
-        out[str(s)] = _finite(value)
-    return out
 
 
 def snapshot(trainer: Trainer, name: str) -> dict[str, Any]:

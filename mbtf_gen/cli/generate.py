@@ -13,7 +13,7 @@ from cyclopts import Parameter
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import UsageError
 from mbtf_core.interruption import keep_on_interruption
-from mbtf_core.options import DataOutput, Options, Overwrite, PathText, takes_options
+from mbtf_core.options import ClusterOption, DataOutput, Options, Overwrite, PathText, takes_options
 from mbtf_core.units import clock, size_text
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.presets import (
@@ -77,6 +77,7 @@ def generate(
     quality: QualityOption = None,
     options: Options[GeneratorConfig],
     slice: Annotated[str, Parameter(metavar="I/N")] = "1/1",
+    cluster: ClusterOption = None,
     overwrite: Overwrite = False,
     console: Console = CONSOLE,
 ) -> None:
@@ -93,6 +94,7 @@ def generate(
     """
     index, count = _slice(slice)
     job = prepare_job(options, material, quality)
+    from mbtf_core.cluster.engine import open_cluster
     from mbtf_core.data_folder import data_folder, in_store
     from mbtf_core.folders import check_space
     from mbtf_gen.dataset.shard_io import data_bytes
@@ -111,7 +113,11 @@ def generate(
         check_space(output, size, SMALLER)
 
     keep_on_interruption(f"the shards that are finished are kept in {output}")
-    with console.progress(None, "generating", "paths") as bar:
+    # Without anything to render, no workers are started.
+    with (
+        open_cluster(cluster if left else None, console.note) as workers,
+        console.progress(None, "generating", "paths") as bar,
+    ):
         summary = generate(
             job,
             output,
@@ -120,6 +126,7 @@ def generate(
             slice_count=count,
             planned=lambda plan: announce_shards(console, job, plan, left, size),
             progress=bar.update,
+            cluster=workers,
         )
     console.report(asdict(summary), describe(summary))
 

@@ -46,7 +46,7 @@ class _Claim:
     queries: Future[Queries]
 
 
-class _ExpectedPaths:
+class ExpectedPaths:
     """Paths of shards to come. A target error or an allocation changes the planned number; it is corrected by
     the ratio of traced and planned paths of the shards so far, by split."""
 
@@ -117,7 +117,7 @@ def render_shards(
     """
     start = time.perf_counter() if start is None else start
     pending = {entry.file: entry for entry in entries}
-    expected = _ExpectedPaths(job)
+    expected = ExpectedPaths(job)
     total, own = ShardStatistics(), ShardStatistics()
     result = RenderResult()
     records: list[dict[str, Any]] = []
@@ -168,14 +168,7 @@ def render_shards(
                     estimator = build_estimator(job, plan.effects)
                 began = time.perf_counter()
                 queries, entry = claim.queries.result(), claim.entry
-                estimates = estimate_shard(
-                    estimator,
-                    queries.flat(),
-                    split_spp(job.config, entry.split),
-                    split_target(job.config, entry.split),
-                    Stream(job.config.seed, entry.split, entry.index),
-                    plan.allocation,
-                )
+                estimates = estimate_queries(job, plan, estimator, entry, queries)
                 seconds = time.perf_counter() - began
                 writer.submit(partial(store, entry, queries, estimates, seconds), claim.lock.release)
                 result.paths += estimates.paths
@@ -260,6 +253,20 @@ def _stamp(path: Path) -> tuple[int, int] | None:
     except OSError:
         return None
     return found.st_ino, found.st_mtime_ns
+
+
+def estimate_queries(
+    job: Job, plan: RunPlan, estimator: Any, entry: ShardEntry, queries: Queries
+) -> Estimates:
+    """Both halves of the queries of a shard; they depend on seed, split and index, not on the process."""
+    return estimate_shard(
+        estimator,
+        queries.flat(),
+        split_spp(job.config, entry.split),
+        split_target(job.config, entry.split),
+        Stream(job.config.seed, entry.split, entry.index),
+        plan.allocation,
+    )
 
 
 def store_shard(

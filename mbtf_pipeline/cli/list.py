@@ -35,6 +35,7 @@ def list_recipes(
 
 
 def _entry(path: Path, verbose: bool) -> dict[str, Any]:
+    from mbtf_pipeline.library.recipe import is_library_recipe, load_library_recipe
     from mbtf_pipeline.paper_tables.recipe import is_paper_recipe, load_paper_recipe
     from mbtf_pipeline.recipe import load_recipe
 
@@ -50,6 +51,10 @@ def _entry(path: Path, verbose: bool) -> dict[str, Any]:
             paper = load_paper_recipe(path, [])
             about = {"name": paper.name, "description": paper.description}
             return entry | about | {"folder": str(paper.folder(False))}
+        if is_library_recipe(path):
+            library = load_library_recipe(path, [])
+            about = {"name": library.name, "description": library.description}
+            return entry | about | {"folder": str(library.folder)}
         recipe = load_recipe(path)
         entry |= {"name": recipe.name, "description": recipe.description, "folder": str(recipe.folder)}
         if verbose:

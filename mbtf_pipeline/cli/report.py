@@ -21,7 +21,7 @@ def report(
     ] = None,
     console: Console = CONSOLE,
 ) -> None:
-    """Write the report of a finished run again, or the page and tables of a paper recipe.
+    """Write the report of a finished run again, or the page of a paper recipe or a library.
 
     Parameters
     ----------
@@ -31,14 +31,17 @@ def report(
         Exposure of the pictures: a value v in 1/sr is shown as 2^EV v.
     """
     from mbtf_core.exposure import describe_exposure
+    from mbtf_pipeline.library.run import is_library
+    from mbtf_pipeline.library.run import write_again as write_library
     from mbtf_pipeline.paper_tables.suite import is_paper, write_again
     from mbtf_pipeline.run import rerender
 
     used = None
-    if is_paper(folder):
+    again = write_again if is_paper(folder) else write_library if is_library(folder) else None
+    if again is not None:
         if exposure is not None:
-            raise UsageError("the page of a paper recipe has no exposure", where="--exposure")
-        path = write_again(folder)
+            raise UsageError("the page of several runs has no exposure", where="--exposure")
+        path = again(folder)
     else:
         path, used = rerender(folder, exposure)
     size = path.stat().st_size

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from mbtf_core.console import CONSOLE, Console
-from mbtf_core.errors import UsageError
+from mbtf_core.errors import PartialError, UsageError
 from mbtf_core.interruption import keep_on_interruption
-from mbtf_core.options import Output, Set, Switch, Time, command_line
+from mbtf_core.options import ClusterOption, Output, Set, Switch, Time, command_line
 from mbtf_core.units import clock
 from mbtf_fit.cli.page_options import Live, live_view
 from mbtf_gen.config.presets import Quality, QualityOption
@@ -30,6 +30,7 @@ def run(
     quick: Switch = False,
     force: Switch = False,
     live: Live = False,
+    cluster: ClusterOption = None,
     assignments: Set = None,
     console: Console = CONSOLE,
 ) -> None:
@@ -50,14 +51,16 @@ def run(
     """
     # Python itself has run for about a second.
     began = clocks.perf_counter() - 1.0
+    from mbtf_pipeline.library.recipe import is_library_recipe
     from mbtf_pipeline.paper_tables.recipe import is_paper_recipe
 
     given = {"quality": quality, "time": time, "quick": quick, "output": output, "set": assignments}
     command = command_line("mbtf-pipeline", "run", recipe, **given)
     own = assignments or []
     if is_paper_recipe(recipe):
-        if live:
-            raise UsageError("shows one run", where="--live", hint="leave it out for a paper recipe")
+        for flag, used in (("--live", live), ("--cluster", cluster is not None)):
+            if used:
+                raise UsageError("is for a single run", where=flag, hint="leave it out for a paper recipe")
         if quality is not None or time is not None:
             raise UsageError(
                 "a paper recipe has sizes and times of its own",
@@ -65,8 +68,15 @@ def run(
                 hint="leave it out; --quick is the small size",
             )
         return _run_paper(recipe, output, quick, force, own, command, console)
+    if is_library_recipe(recipe):
+        refused = {"--quality": quality, "--time": time, "--quick": quick, "--force": force, "--live": live}
+        if wrong := [flag for flag, used in refused.items() if used]:
+            hint = "set 'base' and 'training' in the recipe"
+            raise UsageError("is not for a library of materials", where=wrong[0], hint=hint)
+        return _run_library(recipe, output, own, cluster, command, console)
     if quick:
         raise UsageError("only paper recipes have quick sizes", where="--quick", hint="use --quality draft")
+    from mbtf_core.cluster.engine import open_cluster
     from mbtf_pipeline.run import run_recipe
 
     if time is not None:
@@ -78,7 +88,10 @@ def run(
             recipe, seconds, output, command, console.note, quality=quality, assignments=own, began=began
         )
         keep_on_interruption(f"the finished stages are kept in {timed.folder}")
-        with live_view(timed.recipe.title, live, console) as shown:
+        with (
+            open_cluster(cluster, console.note) as workers,
+            live_view(timed.recipe.title, live, console) as shown,
+        ):
             result = run_recipe(
                 timed.recipe,
                 timed.folder,
@@ -87,6 +100,7 @@ def run(
                 console=console,
                 generated=timed.generated,
                 live=shown,
+                cluster=workers,
             )
         return _report(result, console, timed.split.quality)
     from mbtf_pipeline.forecast import forecast_left
@@ -97,8 +111,13 @@ def run(
     expected = forecast_left(loaded, output or loaded.folder)
     if expected is not None:
         console.note(expected.describe())
-    with live_view(loaded.title, live, console) as shown:
-        result = run_recipe(loaded, output, force=force, command=command, console=console, live=shown)
+    with (
+        open_cluster(cluster, console.note) as workers,
+        live_view(loaded.title, live, console) as shown,
+    ):
+        result = run_recipe(
+            loaded, output, force=force, command=command, console=console, live=shown, cluster=workers
+        )
     _report(result, console, quality)
 
 
@@ -126,6 +145,37 @@ def _run_paper(
     data = {"folder": done.folder, "page": done.page, "size": size, "tables": done.tables}
     data |= {"runs": [one.name for one in planned], "skipped": missing}
     console.report(data, f"{done.page}: {size} size, {len(planned)} runs{skipped}")
+
+
+def _run_library(
+    file: Path,
+    output: Path | None,
+    assignments: list[str],
+    cluster: str | None,
+    command: str,
+    console: Console,
+) -> None:
+    from mbtf_core.cluster.engine import open_cluster
+    from mbtf_pipeline.library.recipe import entries, load_library_recipe
+    from mbtf_pipeline.library.run import run_library
+
+    library = load_library_recipe(file, assignments)
+    found = entries(library, file)
+    folder = output if output is not None else library.folder
+    keep_on_interruption(f"the finished stages are kept in {folder}")
+    with open_cluster(cluster, console.note) as workers:
+        done = run_library(library, found, folder, command=command, console=console, cluster=workers)
+    count = len(found) - len(done.failed)
+    data = {"folder": done.folder, "page": done.page, "materials": done.record["materials"]}
+    console.report(data, f"{done.page}: {count} of {len(found)} materials")
+    for name, error in done.failed.items():
+        console.note(f"{name}: {error}")
+    if done.failed:
+        raise PartialError(
+            f"{len(done.failed)} of {len(found)} materials failed",
+            where=folder,
+            hint="the same command tries them again and keeps the others",
+        )
 
 
 def _report(result: RunResult, console: Console, quality: Quality | None) -> None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mbtf_core.atomic import write_json
 from mbtf_core.directions import from_angles
+from mbtf_core.errors import PartialError
 from mbtf_core.exposure import auto_exposure, brightness, white_of
 from mbtf_core.stats import Estimate
 from mbtf_gen.config.generator import GeneratorConfig
@@ -34,7 +35,9 @@ from mbtf_pipeline.compare.unmodified_mitsuba import pick_scene, write_agreement
 from mbtf_pipeline.recipe import CompareSection
 
 if TYPE_CHECKING:
+    from mbtf_core.cluster.engine import Cluster
     from mbtf_fit import Material
+    from mbtf_gen.job import Job
     from mbtf_gen.pictures.camera import PixelKind
     from mbtf_gen.pictures.reference import ReferenceImage
     from mbtf_gen.render.estimator import Estimator
@@ -62,6 +65,7 @@ def compare(
     fits: Mapping[str, Path],
     out: Path,
     progress: Progress,
+    cluster: Cluster | None = None,
 ) -> None:
     """Render references, evaluate all fits at the same pixels, and measure their errors.
 
@@ -71,6 +75,7 @@ def compare(
     fits : folder of the fitted material by name of the fit
     out : folder for images and records; ``comparison.json`` is written last
     progress : called with a short note after each image
+    cluster : renders the references; this process by default
 
     Raises
     ------
@@ -93,7 +98,7 @@ def compare(
     start = time.perf_counter()
     job = Job.load(generate)
     estimator = build_estimator(job, reference_plan(job))
-    rendered = _render_references(section, estimator, progress)
+    rendered = _render_references(section, job, estimator, progress, cluster)
     seconds = time.perf_counter() - start
     # From the query references if there are any, otherwise from the pixel references.
     exposure = auto_exposure(brightness(next(iter(images.values())).value) for _, images in rendered)
@@ -137,22 +142,40 @@ def compare(
 
 
 def _render_references(
-    section: CompareSection, estimator: Estimator, progress: Progress
+    section: CompareSection,
+    job: Job,
+    estimator: Estimator,
+    progress: Progress,
+    cluster: Cluster | None,
 ) -> list[tuple[Scene, dict[PixelKind, ReferenceImage]]]:
     """References by scene and kind."""
+    from mbtf_gen.pictures.distribute import picture_task
     from mbtf_gen.pictures.reference import render_reference
 
     options = {"spp": section.spp, "seed": section.seed}
-    out = []
-    for scene in scenes(section):
-        images: dict[PixelKind, ReferenceImage] = {}
+    wanted = [(scene, kind) for scene in scenes(section) for kind in section.kinds]
+    rendered: dict[str, ReferenceImage] = {}
+    tasks = []
+    for scene, kind in wanted:
         camera = scene.camera(section.size)
         light = from_angles(scene.light.elevation, scene.light.azimuth)
-        for kind in section.kinds:
-            images[kind] = render_reference(estimator, camera, light, kind=kind, index=scene.index, **options)
+        if cluster is None:
+            image = render_reference(estimator, camera, light, kind=kind, index=scene.index, **options)
+            rendered[f"{scene.name}-{kind}"] = image
             progress(f"reference {scene.name}")
-        out.append((scene, images))
-    return out
+        else:
+            name = f"{scene.name}-{kind}"
+            tasks.append(picture_task(name, job, camera, light, kind=kind, index=scene.index, **options))
+    for done in cluster.run(tasks) if cluster is not None else ():
+        if done.error:
+            hint = "the same command resumes the run"
+            raise PartialError(f"picture {done.task.name} failed: {done.error}", hint=hint)
+        rendered[done.task.name] = done.value
+        progress(f"reference {done.task.name}")
+    return [
+        (scene, {kind: rendered[f"{scene.name}-{kind}"] for kind in section.kinds})
+        for scene in scenes(section)
+    ]
 
 
 def _compare_scene(

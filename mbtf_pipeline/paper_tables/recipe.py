@@ -5,36 +5,18 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Literal
 
-from pydantic import BeforeValidator, Field
+from pydantic import Field
 
-from mbtf_core.config_file import Settings, build, read_yaml, resolve
+from mbtf_core.config_file import Settings, read_yaml, resolve
 from mbtf_core.errors import InputError
-from mbtf_core.nested import deep_merge
-from mbtf_pipeline.compare.st_lpips import weights_file
+from mbtf_pipeline.layers import Layer, MaterialLayer, compose
 from mbtf_pipeline.recipe import Name, Recipe
 
 # Sub-folder of the runs.
 RUNS = "runs"
 TableName = Literal["methods", "levels", "weights", "ablations", "timing", "offsets", "zooms", "independence"]
-
-
-class Layer(Settings):
-    """Nested options of a recipe; missing ones are inherited from the layer below."""
-
-    generate: dict[str, Any] = Field({}, description="of the generator")
-    each_fit: dict[str, Any] = Field({}, description="of every fit; its own options override them")
-    fit: dict[Name, dict[str, Any] | None] = Field({}, description="name → options of a fit")
-    compare: dict[str, Any] = Field({}, description="of the comparison")
-
-
-def _layer(data: Any) -> Any:
-    """A plain path stands for a layer with only this material."""
-    return {"generate": {"material": data}} if isinstance(data, str) else data
-
-
-MaterialLayer = Annotated[Layer, BeforeValidator(_layer)]
 
 
 class PaperRecipe(Settings):
@@ -140,21 +122,8 @@ def plan(paper: PaperRecipe, path: Path, quick: bool) -> tuple[list[Planned], di
         for variant, over in variants.items():
             layers = [paper.base, *([paper.quick] if quick else []), own, over]
             name = f"{material}-{variant}" if variant else material
-            planned.append(Planned(material, variant, _compose(layers, name, file, path)))
+            planned.append(Planned(material, variant, compose(layers, name, file, str(path))))
     if not planned:
         hint = f"searched for {next(iter(missing.values()))}; edit 'materials'"
         raise InputError("all of its materials are missing", where=path, hint=hint)
     return planned, missing
-
-
-def _compose(layers: list[Layer], name: str, file: Path, path: Path) -> Recipe:
-    data: dict[str, Any] = {}
-    for layer in layers:
-        data = deep_merge(data, layer.model_dump(mode="json"))
-    each = data.pop("each_fit")
-    data["fit"] = {fit: deep_merge(each, {"model": fit, **(own or {})}) for fit, own in data["fit"].items()}
-    data["generate"]["material"] = str(file)
-    # The optional metric is computed if its weights are installed.
-    data["compare"] = {"st_lpips": weights_file() is not None, **data["compare"]}
-    data |= {"name": name, "report": {"title": name.replace("_", " ")}}
-    return build(Recipe, data, source=f"{path}: {name}")

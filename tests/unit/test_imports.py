@@ -11,7 +11,19 @@ from conftest import RunPython
 from support.paths import ROOT
 
 PACKAGES = ("mbtf_core", "mbtf_gen", "mbtf_fit", "mbtf_pipeline")
-HEAVY = {"torch", "mitsuba", "drjit", "matplotlib", "scipy", "trimesh", "pyvista", "OpenEXR", "h5py"}
+HEAVY = {
+    "torch",
+    "mitsuba",
+    "drjit",
+    "matplotlib",
+    "scipy",
+    "trimesh",
+    "pyvista",
+    "OpenEXR",
+    "h5py",
+    "dask",
+    "distributed",
+}
 # From the lowest to the highest: a module imports from its own line and from those above it.
 ORDER = """
 mbtf_core
@@ -50,11 +62,14 @@ mbtf_fit.cli
 mbtf_fit
 mbtf_pipeline.recipe mbtf_pipeline.stages mbtf_pipeline.presets mbtf_pipeline.run_folder mbtf_pipeline.formatting
 mbtf_pipeline.compare
+mbtf_pipeline.layers
 mbtf_pipeline.report
 mbtf_pipeline.run
 mbtf_pipeline.forecast
+mbtf_pipeline.emit
 mbtf_pipeline.cost_study
 mbtf_pipeline.paper_tables
+mbtf_pipeline.library
 mbtf_pipeline.cli
 mbtf_pipeline
 """  # noqa: E501

@@ -1,0 +1,1 @@
+"""Tasks on many processes and machines, run by Dask."""

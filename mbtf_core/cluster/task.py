@@ -1,0 +1,101 @@
+"""A task of a cluster, and how a worker runs it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib import import_module
+from importlib.metadata import version
+from typing import Any
+
+from mbtf_core.errors import MbtfError, PartialError
+
+# Environment variable with the threads of a worker.
+THREADS_VARIABLE = "MBTF_WORKER_THREADS"
+
+
+@dataclass(frozen=True)
+class Task:
+    """A function of ours with plain arguments. It may be run more than once, so it is idempotent: what it
+    writes is absent or complete, and it does nothing where that is done.
+
+    Attributes
+    ----------
+    name : for messages; unique in its run
+    function : ``package.module:function``
+    arguments : keyword arguments, plain data
+    gpu : whether it takes a GPU of its worker
+    """
+
+    name: str
+    function: str
+    arguments: Mapping[str, Any] = field(default_factory=dict)
+    gpu: bool = False
+
+
+@dataclass(frozen=True)
+class TaskResult:
+    """How a task ended.
+
+    Attributes
+    ----------
+    task : Task
+    value : what the function returned; None where it failed
+    error : why it failed, in one line; empty where it did not
+    fatal : the others fail for the same reason, such as files that a worker cannot read
+    worker : machine and process
+    seconds : duration on the worker
+    """
+
+    task: Task
+    value: Any = None
+    error: str = ""
+    fatal: bool = False
+    worker: str = ""
+    seconds: float = 0.0
+
+
+def run_task(function: str, arguments: Mapping[str, Any], expected: str) -> dict[str, Any]:
+    """Run a task; called on the worker.
+
+    Parameters
+    ----------
+    expected : version of this package where the task comes from
+
+    Returns
+    -------
+    dict
+        The fields of :class:`TaskResult` except for the task.
+    """
+    worker = f"{socket.gethostname()}:{os.getpid()}"
+    installed = version("mbtf")
+    if installed != expected:
+        error = f"the worker has version {installed} of mbtf, the command {expected}"
+        return {"error": error, "fatal": True, "worker": worker}
+    start = time.perf_counter()
+    try:
+        module, _, name = function.partition(":")
+        value = getattr(import_module(module), name)(**arguments)
+    except PartialError as error:
+        return {"error": " ".join(error.message.split()), "worker": worker}
+    except MbtfError as error:
+        return {"error": " ".join(error.message.split()), "fatal": True, "worker": worker}
+    return {"value": value, "worker": worker, "seconds": time.perf_counter() - start}
+
+
+def worker_threads() -> int | None:
+    """Threads that this worker may use; None outside of workers, and where nothing is stated."""
+    text = os.environ.get(THREADS_VARIABLE, "")
+    return int(text) if text.isdigit() and int(text) > 0 else None
+
+
+def dask_setup(worker: object) -> None:
+    """Prepare a worker process; Dask calls it at its start.
+
+    The signal of Ctrl-C reaches every process of a terminal; the command ends its workers itself.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

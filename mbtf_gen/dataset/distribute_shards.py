@@ -1,0 +1,209 @@
+"""Renders shards on the workers of a cluster: a task is a shard, done when its sidecar is there.
+
+Workers write into the data set's folder themselves, with the same locks and checks as a command of its own,
+so that the scheduler carries names and figures alone. A worker keeps material and scene for its next shard.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+from mbtf_core.cluster.engine import Cluster
+from mbtf_core.cluster.task import Task, worker_threads
+from mbtf_core.data_folder import data_folder, in_store, send_shard
+from mbtf_core.errors import InputError, PartialError
+from mbtf_core.locks import keep_renewing, take_lock
+from mbtf_core.shard_schema import MANIFEST_NAME, ShardEntry
+from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.dataset.folder import remove_leftovers
+from mbtf_gen.dataset.manifest import plan_digest
+from mbtf_gen.dataset.recover import recover_shards
+from mbtf_gen.dataset.render_shards import (
+    ExpectedPaths,
+    ProgressCallback,
+    RenderResult,
+    estimate_queries,
+    store_shard,
+)
+from mbtf_gen.dataset.sidecar import finished_record, sidecar_of
+from mbtf_gen.dataset.summary import ShardStatistics, read_run_plan, refuse_nonfinite
+from mbtf_gen.job import Job, most_paths
+from mbtf_gen.planning.run_plan import RunPlan
+from mbtf_gen.planning.simulation import build_estimator
+
+# Rounds in which shards that another process renders are tried, and the pause between two.
+_ROUNDS, _PAUSE = 4, 5.0
+_THIS = "mbtf_gen.dataset.distribute_shards:render_shard"
+
+
+def distribute_shards(
+    job: Job,
+    folder: Path,
+    entries: Iterable[ShardEntry],
+    plan: RunPlan,
+    cluster: Cluster,
+    *,
+    start: float | None = None,
+    progress: ProgressCallback | None = None,
+) -> RenderResult:
+    """Render those of the shards that are not finished on a cluster.
+
+    Parameters
+    ----------
+    start, progress : as for :func:`~mbtf_gen.dataset.render_shards.render_shards`
+
+    Raises
+    ------
+    InputError : a worker cannot read the material or the folder
+    PartialError : shards failed, other processes render some of them, the cluster is lost, the disk is full,
+        or there are too many non-finite samples; finished shards are kept
+    """
+    start = time.perf_counter() if start is None else start
+    remove_leftovers(folder)
+    recover_shards(folder, job.shards, job.config_hash, plan_digest(plan.to_manifest()))
+    pending = {entry.file: entry for entry in entries}
+    result, totals, expected = RenderResult(), ShardStatistics(), ExpectedPaths(job)
+    limit = most_paths(job)
+    shared = {
+        "config": {
+            **job.config.model_dump(mode="json"),
+            "material": str(Path(job.config.material).resolve()),
+        },
+        "folder": str(folder if in_store(folder) else folder.resolve()),
+        "config_hash": job.config_hash,
+        "plan": plan_digest(plan.to_manifest()),
+    }
+    failed: dict[str, str] = {}
+    for attempt in range(_ROUNDS):
+        if attempt:
+            time.sleep(_PAUSE)
+        tasks = [Task(file, _THIS, {**shared, "file": file}) for file in pending if file not in failed]
+        for done in cluster.run(tasks):
+            if done.error:
+                failed[done.task.name] = f"{done.error} (on {done.worker})" if done.worker else done.error
+                continue
+            if done.value is None:  # another process renders it
+                continue
+            entry = pending.pop(done.task.name)
+            totals.add(done.value["record"])
+            refuse_nonfinite(totals, limit, folder)
+            if done.value["rendered"]:
+                paths = done.value["record"]["paths"]
+                result.paths += paths
+                result.shards.append(entry.file)
+                expected.add(entry, paths)
+            if progress is not None:
+                rate = result.paths / max(time.perf_counter() - start, 1e-9)
+                left = expected.paths(pending.values())
+                noise = totals.relative_error() if totals.train else None
+                error = "" if noise is None else f", noise {noise:.2%}"
+                note = f"{rate / 1e6:.2f} M paths/s on {cluster.workers} workers{error}"
+                progress(result.paths, note, None if left is None else result.paths + left)
+        if len(failed) == len(pending):
+            break
+    result.seconds = time.perf_counter() - start
+    if failed:
+        name, why = next(iter(failed.items()))
+        raise PartialError(
+            f"{len(failed)} shard(s) failed, first {name}: {why}",
+            where=folder,
+            hint="the same command renders them again",
+        )
+    if pending:
+        raise PartialError(
+            f"{len(pending)} shard(s) are being written by another process, first {next(iter(pending))}",
+            where=folder,
+            hint="wait for it, then run the same command again",
+        )
+    return result
+
+
+def render_shard(
+    config: dict[str, Any], folder: str, config_hash: str, plan: str, file: str
+) -> dict[str, Any] | None:
+    """Render one shard into its folder, unless it is finished; runs on a worker.
+
+    Parameters
+    ----------
+    config : dict
+        Resolved configuration, whose material has an absolute path.
+    folder : str
+        The data set, whose manifest holds the run's plan.
+    config_hash, plan : str
+        Hash of the configuration, and digest of the plan, that the manifest must have.
+    file : str
+        Name of the shard.
+
+    Returns
+    -------
+    dict or None
+        ``record`` (the sidecar) and ``rendered`` (whether this call rendered it); None where another process
+        renders it.
+
+    Raises
+    ------
+    InputError
+        This machine does not see the folder, or its files differ.
+    PartialError
+        The folder cannot be written.
+    """
+    into = data_folder(folder)
+    if not (into / MANIFEST_NAME).exists():
+        raise InputError("this machine does not see the data set", where=into)
+    run = _run_of(json.dumps(config), into, config_hash, plan)
+    entry = next(entry for entry in run.job.shards if entry.file == file)
+    record = finished_record(into, entry, config_hash)
+    lock = None if record is not None else take_lock(into / file)
+    if lock is None:
+        return None if record is None else {"record": record, "rendered": False}
+    try:
+        # Another process may have finished it since.
+        if (record := finished_record(into, entry, config_hash)) is not None:
+            return {"record": record, "rendered": False}
+        with keep_renewing():
+            estimator = run.estimator
+            began = time.perf_counter()
+            queries = run.job.query_plan.draw(entry.split, entry.index, entry.rows)
+            estimates = estimate_queries(run.job, run.plan, estimator, entry, queries)
+            seconds = time.perf_counter() - began
+            record = store_shard(run.job, into, run.plan, entry, queries, estimates, seconds)
+            send_shard(into / file, sidecar_of(into / file))
+        return {"record": record, "rendered": True}
+    finally:
+        lock.release()
+
+
+@dataclass(frozen=True)
+class _Run:
+    """What the shards of a data set share."""
+
+    job: Job
+    plan: RunPlan
+
+    @cached_property
+    def estimator(self) -> Any:
+        """Built where a shard is to be rendered."""
+        built = build_estimator(self.job, self.plan.effects)
+        if (threads := worker_threads()) is not None and not self.plan.effects.closed_form:
+            import drjit
+
+            drjit.set_thread_count(threads)
+        return built
+
+
+@lru_cache(maxsize=1)
+def _run_of(config: str, folder: Path, config_hash: str, plan: str) -> _Run:
+    """The run of a data set, kept for its next shard."""
+    job = Job.load(GeneratorConfig.model_validate_json(config))
+    if job.config_hash != config_hash:
+        raise InputError("the material's files differ on this machine", where=job.config.material)
+    found = read_run_plan(folder)
+    if plan_digest(found.to_manifest()) != plan:
+        raise InputError("the manifest has another plan on this machine", where=folder)
+    return _Run(job, found)

@@ -1,0 +1,96 @@
+"""The page of a library: a picture of each material beside its fits, errors, times and failures."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from mbtf_core.units import clock
+from mbtf_pipeline.formatting import estimate, estimate_text
+from mbtf_pipeline.report.report import render
+from mbtf_pipeline.run_folder import REPORT, VIEWER
+
+# Pixels along a side of a thumbnail.
+_SIZE = 160
+_STATES = {"done": "done", "failed": "failed", "pending": "not run yet"}
+
+
+def library_page(record: Mapping[str, Any], runs: Path) -> str:
+    """HTML of a library.
+
+    Parameters
+    ----------
+    record : mapping
+        Content of ``library.json``.
+    runs : Path
+        Folder of the runs, by name of the material.
+
+    Returns
+    -------
+    str
+    """
+    cards = [_card(material, runs / material["name"], record) for material in record["materials"]]
+    counts = {state: sum(c["state"] == text for c in cards) for state, text in _STATES.items()}
+    first = record["first"].get("errors", {})
+    return render(
+        "library.html",
+        record=record,
+        # The largest errors first: they are what one looks for. Then failures, then the rest.
+        cards=sorted(cards, key=lambda c: (c["rank"], -c["error_value"], c["name"])),
+        counts=counts,
+        training=None if record["training"] is None else clock(record["training"]),
+        divided=bool(first),
+    )
+
+
+def _card(material: Mapping[str, Any], run: Path, record: Mapping[str, Any]) -> dict[str, Any]:
+    """What the page shows of one material."""
+    name, done = material["name"], material["state"] == "done"
+    fits = []
+    for fit, found in material.get("fits", {}).items() if done else ():
+        error = estimate(found["unexplained"])
+        thumbnail = _thumbnail(run / found["picture"])
+        fits.append({"name": fit, "error": estimate_text(error), "value": error.value, "image": thumbnail})
+    seconds = material.get("seconds", {})
+    links = [
+        (title, f"{runs_path(name)}/{file}")
+        for title, file in (("report", REPORT), ("viewer", VIEWER))
+        if done and (run / file).is_file()
+    ]
+    return {
+        "name": name,
+        "path": material["path"],
+        "state": _STATES[material["state"]],
+        "rank": list(_STATES).index(material["state"]),
+        "problem": material["error"],
+        "fits": fits,
+        "error_value": max((fit["value"] for fit in fits), default=0.0),
+        "reference": _thumbnail(run / material["reference"]) if done else None,
+        "times": ", ".join(f"{stage} {clock(s)}" for stage, s in seconds.items()),
+        "first": record["first"].get("errors", {}).get(name),
+        "training": record["first"].get("times", {}).get(name),
+        "links": links,
+    }
+
+
+def runs_path(name: str) -> str:
+    """Path of a material's run, relative to the page."""
+    return f"materials/{name}"
+
+
+def _thumbnail(path: Path) -> str | None:
+    """A picture as a small ``data:`` URI; None where it is missing or damaged."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as image:
+            small = image.convert("RGB")
+            small.thumbnail((_SIZE, _SIZE))
+    except OSError:
+        return None
+    stream = io.BytesIO()
+    small.save(stream, format="JPEG", quality=85)
+    return f"data:image/jpeg;base64,{base64.b64encode(stream.getvalue()).decode()}"

@@ -1,0 +1,87 @@
+"""Which materials a library has, and with which options."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mbtf_core.errors import InputError, UsageError
+from mbtf_pipeline.library.recipe import entries, is_library_recipe, load_library_recipe
+
+BASE = "base: {generate: {queries: {train: 10/texel}}}\n"
+
+
+def material(folder: Path) -> Path:
+    folder.mkdir(parents=True)
+    np.save(folder / "height.npy", np.zeros((4, 4), np.float32))
+    (folder / "material.yaml").write_text("height: height.npy\n")
+    return folder
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder of two materials, a broken one, and something else; another with one of the same name."""
+    for name in ("shell", "wool"):
+        material(tmp_path / "assets" / name)
+    (tmp_path / "assets" / "broken").mkdir()
+    (tmp_path / "assets" / "broken" / "material.yaml").write_text("heigth: x.png\n")
+    (tmp_path / "assets" / "scripts").mkdir()
+    (tmp_path / "assets" / "scripts" / "make.py").write_text("")
+    material(tmp_path / "more" / "wool")
+    (tmp_path / "more" / "list.txt").write_text("# a comment\nwool\nmissing\n")
+    return tmp_path
+
+
+def load(folder: Path, text: str) -> dict[str, tuple[object, str]]:
+    file = folder / "library.yaml"
+    file.write_text(f"name: test\n{text}")
+    assert is_library_recipe(file)
+    found = entries(load_library_recipe(file, []), file)
+    return {entry.name: (entry.recipe, entry.error) for entry in found}
+
+
+def test_folders_lists_and_broken_materials(folder: Path) -> None:
+    found = load(folder, "library: [assets, more/list.txt]\n" + BASE)
+    assert list(found) == ["broken", "shell", "assets-wool", "more-wool", "missing"]
+    assert "heigth" in found["broken"][1]
+    assert found["missing"] == (None, "does not exist")
+    assert found["shell"][1] == "" == found["more-wool"][1]
+
+
+def test_own_options_and_further_materials(folder: Path) -> None:
+    text = "library: [assets/shell]\n" + BASE
+    text += "materials:\n  shell: {generate: {geometry: {height_scale: 0.5}}}\n  fleece: more/wool\n"
+    file = folder / "library.yaml"
+    file.write_text(f"name: test\n{text}")
+    shell, fleece = entries(load_library_recipe(file, []), file)
+    assert shell.recipe is not None
+    assert fleece.recipe is not None
+    assert shell.recipe.generate.geometry.height_scale == 0.5
+    assert shell.recipe.generate.queries.train == "10/texel"
+    assert fleece.recipe.generate.geometry.height_scale is None
+    assert Path(fleece.recipe.generate.material) == folder / "more" / "wool"
+    assert list(shell.recipe.fit) == ["relief"]
+
+
+def test_cloths_get_the_model_without_geometry(folder: Path) -> None:
+    cloth = folder / "assets" / "cloth"
+    cloth.mkdir()
+    (cloth / "material.yaml").write_text("weave: plain\n")
+    file = folder / "library.yaml"
+    file.write_text("name: test\nlibrary: [assets/cloth]\n" + BASE)
+    (found,) = entries(load_library_recipe(file, []), file)
+    if found.recipe is None:
+        pytest.fail(found.error)
+    assert list(found.recipe.fit) == ["neumip+"]
+
+
+def test_faults_of_the_recipe(folder: Path) -> None:
+    with pytest.raises(InputError, match=r"materials\.shel\b.*no material of the library"):
+        load(folder, "library: [assets]\nmaterials:\n  shel: {fit: {relief: {}}}\n" + BASE)
+    with pytest.raises(UsageError, match="2 materials have the name"):
+        load(folder, "library: [assets/shell, assets/shell]\n" + BASE)
+    (folder / "empty").mkdir()
+    with pytest.raises(InputError, match="names no material"):
+        load(folder, "library: [empty]\n" + BASE)
