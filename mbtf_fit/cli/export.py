@@ -52,7 +52,7 @@ def export_material(
     level
         Level of the maps of gltf, usd and materialx.
     half
-        Round all weights and texels to 16 bits, and print the resulting error.
+        Round all weights and texels to 16 bits first, and print the resulting error; not for web.
     """
     from mbtf_core.atomic import write_text
     from mbtf_core.folders import owned
@@ -76,6 +76,12 @@ def export_material(
         raise UsageError("is an option of maps", where="--level", hint="add --to gltf, usd or materialx")
     if shader_target and "slang" not in wanted:
         raise UsageError("is an option of shaders", where="--shader-target", hint="add --to slang")
+    if half and "web" in wanted:
+        raise UsageError(
+            "has no meaning for pages, whose textures have 8 bits or fewer",
+            where="--half",
+            hint="leave it out, or export the page by a command of its own",
+        )
     loaded = Material.load(material)
     keep_on_interruption(f"the finished files are kept in {folder}")
     with owned(folder):
@@ -93,9 +99,9 @@ def export_material(
             write_layers(written, folder / LAYERS_NAME, half=half)
             files.append(LAYERS_NAME)
         if "slang" in wanted:
-            files += write_module(loaded, folder, list(dict.fromkeys(shader_target or [])))
+            files += write_module(written, folder, list(dict.fromkeys(shader_target or [])))
         if tools:
-            maps, agreement = fit_color(loaded, maps_of(loaded, level))
+            maps, agreement = fit_color(written, maps_of(written, level))
             files += write_maps(maps, folder)
             source = Source(
                 material.resolve().name,
