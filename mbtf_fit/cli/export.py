@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Literal
@@ -55,16 +56,17 @@ def export_material(
         Round all weights and texels to 16 bits first, and print the resulting error; not for web.
     """
     from mbtf_core.atomic import write_text
+    from mbtf_core.digest import file_sha256
     from mbtf_core.folders import owned
     from mbtf_fit.material.export import LAYERS_NAME, TEXTURES_NAME, to_half, write_layers, write_textures
-    from mbtf_fit.material.export_folder import claim_export
+    from mbtf_fit.material.export_folder import ExportClaim, ExportSource, claimed
     from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME
     from mbtf_fit.material.interchange.documents import WRITERS, Source
     from mbtf_fit.material.interchange.images import write_maps
     from mbtf_fit.material.interchange.maps import fit_color, maps_of
     from mbtf_fit.material.material import Material, export
     from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME
-    from mbtf_fit.shaders.slang import write_module
+    from mbtf_fit.shaders.slang import FILE_NAMES, write_module
     from mbtf_fit.viewer.page import PAGE_NAME
 
     wanted = list(dict.fromkeys(to or ["exr", "json"]))
@@ -84,14 +86,24 @@ def export_material(
         )
     loaded = Material.load(material)
     keep_on_interruption(f"the finished files are kept in {folder}")
-    with owned(folder):
-        kept = False
-        if "material" in wanted:
-            kept = claim_export(folder, material, half=half, overwrite=overwrite)
+    named = ExportSource(
+        material=file_sha256(material / DESCRIPTION_NAME),
+        to=sorted(wanted),
+        half=half,
+        shader_target=sorted(set(shader_target or [])),
+        level=level,
+        page=page.digests(),
+    )
+    names = [TEXTURES_NAME, LAYERS_NAME, DESCRIPTION_NAME, WEIGHTS_NAME, TRANSMITTANCE_NAME, PAGE_NAME]
+    names += [*FILE_NAMES, *(document for document, _ in WRITERS.values())]
+    # Files of other formats may lie in the material's own folder.
+    beside = "material" not in wanted and folder.is_dir() and folder.samefile(material)
+    claims = nullcontext(ExportClaim(False)) if beside else claimed(folder, named, names, overwrite=overwrite)
+    with owned(folder), claims as claim:
         written, error = loaded, None
         if half:
             written, error = to_half(loaded)
-        files, notes = [], [] if error is None else [str(error)]
+        files, notes = claim.files, [] if error is None else [str(error)]
         if "exr" in wanted:
             write_textures(written, folder / TEXTURES_NAME, half=half)
             files.append(TEXTURES_NAME)
@@ -121,7 +133,7 @@ def export_material(
             notes.append(precision)
         if "material" in wanted:
             description = loaded.description
-            if not kept:
+            if not claim.is_complete:
                 export(
                     written.model,
                     written.config,

@@ -19,6 +19,11 @@ from mbtf_fit.shaders.texels import F32, texels_of
 from mbtf_fit.viewer.shader import ShaderSource, number
 
 MODULE_NAME, TEXELS_NAME = "material.slang", "material.bin"
+FILE_NAMES = (
+    MODULE_NAME,
+    TEXELS_NAME,
+    *(str(Path(MODULE_NAME).with_suffix(end)) for end in ENDINGS.values()),
+)
 ENTRY = "evaluate_queries"
 
 _NAMES = (

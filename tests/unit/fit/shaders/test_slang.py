@@ -198,7 +198,7 @@ def test_other_languages(tmp_path: Path) -> None:
     command = ["export", str(tmp_path / "material"), "--to", "slang", *words, "-o", str(out), "-q"]
     assert run(app, command) == 0
     before = {path.name: path.read_bytes() for path in out.iterdir()}
-    assert len(before) == 2 + len(TARGETS)
+    assert len(before) == 3 + len(TARGETS)
     marks = {
         ".hlsl": b"StructuredBuffer<float4",
         ".comp": b"#version 450",
@@ -239,7 +239,8 @@ def test_what_cannot_be_written_is_refused(
 def test_the_documented_function_compiles(tmp_path: Path) -> None:
     pytest.importorskip("slangpy", reason="no slangpy; to enable: pip install 'mbtf[shaders]'")
     make("relief", tmp_path / "material")
-    assert run(app, ["export", str(tmp_path / "material"), "--to", "slang", "-o", str(tmp_path), "-q"]) == 0
+    out = tmp_path / "out"
+    assert run(app, ["export", str(tmp_path / "material"), "--to", "slang", "-o", str(out), "-q"]) == 0
     page = Path(__file__).parents[4] / "docs/how-to/use-in-shaders.md"
     function = page.read_text().split("```\nimport material;")[1].split("```")[0]
     entry = """
@@ -250,8 +251,8 @@ void shade_all(uint3 thread : SV_DispatchThreadID) {
   shaded[thread.x] = shade(uv, 0.01, 0.02, normalize(float3(1.0)), float3(0.0, 0.0, 1.0), float3(1.0));
 }
 """
-    (tmp_path / "page.slang").write_text(f"import material;{function}{entry}")
-    assert b"void shade_all(" in SlangCompiler().compile(tmp_path / "page.slang", "shade_all", "hlsl")
+    (out / "page.slang").write_text(f"import material;{function}{entry}")
+    assert b"void shade_all(" in SlangCompiler().compile(out / "page.slang", "shade_all", "hlsl")
 
 
 def test_a_module_with_a_fault_says_where(tmp_path: Path) -> None:

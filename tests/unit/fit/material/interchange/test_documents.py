@@ -177,7 +177,7 @@ def test_a_surface_without_gloss_with_holes(tmp_path: Path) -> None:
 
 def test_the_same_export_again_has_the_same_bytes(glossy: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = {path.name: path.read_bytes() for path in glossy.iterdir()}
-    assert len(before) == 7
+    assert len(before) == 8
     words = [word for name in FORMATS for word in ("--to", name)]
     assert run(app, ["export", str(glossy.parent / "material"), *words, "-o", str(glossy)]) == 0
     assert "mean reflectance of the maps" in capsys.readouterr().out
