@@ -155,8 +155,8 @@ def main() -> int:
     for key, value in figures.items():
         print(f"{key:34} {value:12,.6g}")
     table = [projected(figures, options, workers) for workers in WORKERS]
-    each = f"{options.paths:.3g} paths and a fit of {options.fit_seconds:g} s each"
-    print(f"\n{options.library} materials, {each}:")
+    load = f"{options.paths:.3g} paths and a fit of {options.fit_seconds:g} s each"
+    print(f"\n{options.library} materials, {load}:")
     for row in table:
         print(
             f"{row['workers']:5} workers: {clock(row['seconds']):>10}, "

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import os
 import shlex
 import types
 import typing
@@ -229,7 +230,8 @@ class Options(Generic[S]):
             return resolved
         folder = self.config.parent
         paths = [k for k, given in arguments.items() if given is None and k not in assigned]
-        return resolved.model_copy(update={k: str(folder / getattr(resolved, k)) for k in paths})
+        located = {k: os.path.normpath(folder / getattr(resolved, k)) for k in paths}
+        return resolved.model_copy(update=located)
 
 
 def takes_options(model: type[BaseModel], *keys: str) -> Callable[[C], C]:

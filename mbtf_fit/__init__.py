@@ -14,10 +14,11 @@ _PUBLIC = {
     "Material": "mbtf_fit.material.material",
     "evaluate": "mbtf_fit.evaluation",
     "fit": "mbtf_fit.training.fit",
+    "fit_jointly": "mbtf_fit.training.joint_fit",
     "read_history": "mbtf_fit.training.validation",
 }
 
-__all__ = ["FitConfig", "FitResult", "Material", "evaluate", "fit", "read_history"]
+__all__ = ["FitConfig", "FitResult", "Material", "evaluate", "fit", "fit_jointly", "read_history"]
 
 
 def __getattr__(name: str) -> Any:

@@ -23,6 +23,8 @@ DEFAULT_MODEL: ModelName = "relief"
 FIBER_MODEL: ModelName = "neumip+"
 # Models that trace view rays to heights: those of the geometry, or learned ones.
 TRACING_MODELS: tuple[ModelName, ...] = ("relief", "neumip+")
+# Models whose network materials can share.
+DECODER_MODELS: tuple[ModelName, ...] = ("relief", "neumip")
 LossKind = Literal["relative", "squared", "linear", "log", "fourth-root", "gradient"]
 Correction = Literal["none", "second-order", "linear"]
 
@@ -184,6 +186,11 @@ class TrainingSection(Settings):
     own_material: bool = Field(
         True, description="rainer2020: whether the network also learns the material that it encodes"
     )
+    shared_decoder: bool = Field(
+        False,
+        description="relief and neumip: all data sets of one command share the network, each has textures of "
+        "its own; the budget is that of all together",
+    )
     energy_calibration: bool = Field(
         True, description="after training, scale the mean reflectance at each elevation to that of the data"
     )
@@ -270,6 +277,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         "training": {"learning_rate": 3e-3},
     },
 }
+# Defaults of fits that share a network: each batch is of one material.
+SHARED_PRESET: dict[str, Any] = {"training": {"batch": 1 << 14}}
 # Models that encode angular slices.
 SLICE_MODELS: tuple[ModelName, ...] = ("rainer2019", "rainer2020")
 
@@ -284,6 +293,8 @@ class FitConfig(Settings):
         ``rainer2020``.
     init_from : str, optional
         Folder of a material that initializes textures and offset.
+    decoder : str, optional
+        Folder of a network, or of a material, whose network the fit keeps: it trains textures alone.
     network : NetworkSection
         Architecture.
     training : TrainingSection
@@ -310,6 +321,11 @@ class FitConfig(Settings):
     init_from: Annotated[str | None, Flag("--init-from", "FOLDER")] = Field(
         None, description="folder of a material that initializes textures and offset"
     )
+    decoder: Annotated[str | None, Flag("--decoder", "FOLDER")] = Field(
+        None,
+        description="folder of a shared network, or of a material, whose network is kept: the fit trains "
+        "textures alone",
+    )
     network: NetworkSection = NetworkSection()
     training: TrainingSection = TrainingSection()
     held_out: HeldOutSection = HeldOutSection()
@@ -328,7 +344,11 @@ class FitConfig(Settings):
         if not isinstance(data, Mapping):
             return data
         name = data.get("model", cls.model_fields["model"].default)
-        return deep_merge(PRESETS.get(name, {}) if isinstance(name, str) else {}, data)
+        preset = PRESETS.get(name, {}) if isinstance(name, str) else {}
+        training = data.get("training")
+        if isinstance(training, Mapping) and training.get("shared_decoder") is True:
+            preset = deep_merge(preset, SHARED_PRESET)
+        return deep_merge(preset, data)
 
     @model_validator(mode="after")
     def _consistent(self) -> FitConfig:
@@ -357,6 +377,12 @@ class FitConfig(Settings):
         shared = self.training.materials, self.training.own_material
         if self.model != "rainer2020" and shared != ((), True):
             raise ValueError("training.materials and training.own_material are options of rainer2020")
+        if self.model not in DECODER_MODELS and (self.decoder or self.training.shared_decoder):
+            raise ValueError(
+                f"{self.model} does not share its network: choose the model {' or '.join(DECODER_MODELS)}"
+            )
+        if self.decoder and (self.training.shared_decoder or self.init_from):
+            raise ValueError("decoder keeps a network as it is: leave out shared_decoder and init_from")
         if self.model != "hierarchical" and network.decoder == "inception":
             raise ValueError(
                 "the inception decoder reads neighboring queries: it needs the model hierarchical"
@@ -364,8 +390,14 @@ class FitConfig(Settings):
         return self
 
     def fields(self) -> dict[str, Any]:
-        """Options that determine the fit, as plain data: all but device and memory."""
-        return self.model_dump(mode="json", exclude={"device", "data"})
+        """Options that determine the fit, as plain data: all but device and memory, and without those of
+        shared networks where they are not used."""
+        found = self.model_dump(mode="json", exclude={"device", "data"})
+        if self.decoder is None:
+            del found["decoder"]
+        if not self.training.shared_decoder:
+            del found["training"]["shared_decoder"]
+        return found
 
     def hash(self, data_hash: str) -> str:
         """SHA-256 over :meth:`fields` and the data set's own hash, hexadecimal."""

@@ -71,7 +71,9 @@ def fitter_options(
     fits : name → explicit options of files and command line, nested, with the model
     seconds : training time that decides the network; the preset's by default
     """
-    free = not any("network" in given or given.get("init_from") for given in fits.values())
+    free = not any(
+        "network" in given or given.get("init_from") or given.get("decoder") for given in fits.values()
+    )
     out = {}
     for name, given in fits.items():
         training = given.get("training")

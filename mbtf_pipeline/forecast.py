@@ -134,6 +134,31 @@ class RunForecaster:
         )
 
 
+def forecast_run(recipe: Recipe) -> RunForecast:
+    """Forecast of a whole run; a run that is short and small on any machine is that of a slow one.
+
+    Parameters
+    ----------
+    recipe : Recipe
+
+    Returns
+    -------
+    RunForecast
+
+    Raises
+    ------
+    InputError
+        The material cannot be used.
+    """
+    forecaster = RunForecaster(recipe)
+    expected = forecaster.of(recipe, None, (0.0, _SLOW_PATH))
+    return expected if _is_short(expected) else forecaster.of(recipe)
+
+
+def _is_short(expected: RunForecast) -> bool:
+    return expected.seconds < _LONG and expected.bytes < _LARGE
+
+
 def forecast_left(recipe: Recipe, folder: Path) -> RunForecast | None:
     """Forecast of the stages that a run in a folder has yet to do; None where they are short and small on any
     machine.
@@ -150,6 +175,6 @@ def forecast_left(recipe: Recipe, folder: Path) -> RunForecast | None:
     expected = forecaster.of(recipe, stages, (0.0, _SLOW_PATH))
     hint = "reduce generate.queries with --set or --quality, or choose another folder with -o"
     check_space(folder, expected.bytes, hint)
-    if expected.seconds < _LONG and expected.bytes < _LARGE:
+    if _is_short(expected):
         return None
     return forecaster.of(recipe, stages)

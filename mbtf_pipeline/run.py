@@ -166,7 +166,7 @@ class _RecipeRun:
         """The report, and the viewer's page where there is one."""
         return [path for name in (REPORT, VIEWER) if (path := self.folder / name).is_file()]
 
-    def _generate(self, data: DataSet, decision: Decision) -> None:
+    def _generate(self, data: DataSet, decision: Decision) -> float:
         from mbtf_core.shard_schema import MANIFEST_NAME
         from mbtf_gen.dataset.folder import read_manifest
         from mbtf_gen.dataset.reader import is_dataset
@@ -188,9 +188,11 @@ class _RecipeRun:
         ):
             clear(shards)
         with self.console.progress(None, data.stage, "paths") as bar:
-            generate(job, shards, progress=bar.update, cluster=self.cluster)
+            done = generate(job, shards, progress=bar.update, cluster=self.cluster)
+        # Workers render at the same time; slices of earlier processes are the time that the data took.
+        return done.shard_seconds if self.cluster is None else 0.0
 
-    def _fit(self, name: str, data: DataSet, decision: Decision) -> None:
+    def _fit(self, name: str, data: DataSet, decision: Decision) -> float:
         from mbtf_fit import fit
         from mbtf_fit.training.fit_cluster import fit_task
 
@@ -202,17 +204,18 @@ class _RecipeRun:
             (done,) = self.cluster.run([fit_task(name, config, shards, out, overwrite=False)])
             if done.error:
                 raise PartialError(done.error, where=fit_stage(name), hint="the same command resumes the run")
-            return
+            return 0.0
         steps = config.training.steps
         budget, unit = (config.training.time, "s") if steps is None else (steps, "steps")
         with self.console.progress(budget, fit_stage(name), unit) as bar:
-            fit(
+            done = fit(
                 config,
                 shards,
                 out,
                 progress=lambda share, note: bar.update(round(share * budget, 1), note),
                 observe=None if self.live is None else self.live.observer(name),
             )
+        return done.seconds
 
     def _compare(self, decision: Decision) -> None:
         from mbtf_pipeline.compare.compare import compare, steps

@@ -40,7 +40,7 @@ class Stage:
     config : resolved options, plain data
     inputs : digests of input files from outside the run, by role
     outputs : lists the files it has written
-    run : does the work
+    run : does the work; may return the seconds that it took in all, earlier processes included
     remote : other machines do the work, so that consecutive stages of this kind run at the same time
     """
 
@@ -49,7 +49,7 @@ class Stage:
     config: Mapping[str, Any]
     inputs: Mapping[str, str]
     outputs: Callable[[], Sequence[Path]]
-    run: Callable[[Decision], None]
+    run: Callable[[Decision], float | None]
     remote: bool = False
 
 
@@ -62,7 +62,7 @@ class Stamp:
     key : the hash it ran with
     depends : data covered by the hash
     outputs : file, relative to the run's folder → SHA-256
-    seconds : wall-clock time of the run
+    seconds : wall-clock time of the run, or the time of the work where earlier processes did some of it
     """
 
     stage: str
@@ -247,8 +247,8 @@ def _run(folder: Path, stage: Stage, decision: Decision) -> Stamp:
     # Without a stamp, an interrupted stage counts as not run.
     path.unlink(missing_ok=True)
     start = time.perf_counter()
-    stage.run(decision)
-    seconds = time.perf_counter() - start
+    whole = stage.run(decision) or 0.0
+    seconds = max(whole, time.perf_counter() - start)
     depends, key = _depends(folder, stage)
     outputs = {file.relative_to(folder).as_posix(): file_sha256(file) for file in sorted(stage.outputs())}
     stamp = Stamp(stage.name, key, depends, outputs, round(seconds, 3))

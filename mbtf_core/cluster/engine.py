@@ -255,6 +255,7 @@ def _started(config: ClusterConfig) -> Any:
         "memory": f"{int(config.memory or 4e9 * max(1, config.threads / 2))}B",
         "walltime": f"{hours:02d}:{rest // 60:02d}:{rest % 60:02d}",
         "worker_extra_args": extra,
+        "log_directory": "worker-logs",
         "job_script_prologue": [f"export {name}={value}" for name, value in environment.items()],
         **config.options,
     }

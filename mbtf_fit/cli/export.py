@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
@@ -39,8 +38,9 @@ def export_material(
     material with holes. json: the networks as a list of layers, with formulas, conventions and queries with
     expected values. material: another material folder, in a folder of its own; the same command again keeps
     it. web: a page that shows the material in a browser, without a network. slang: a shader module and the
-    buffer that it reads. gltf, usd, materialx: maps for programs that evaluate no networks; without shadows,
-    interreflection and parallax, but with the same mean reflectance.
+    buffer that it reads. gltf, usd, materialx: maps for programs that evaluate no networks, of the surface
+    that the model knows or fitted to its values; without shadows, interreflection and parallax, but with the
+    same mean reflectance.
 
     Parameters
     ----------
@@ -61,9 +61,10 @@ def export_material(
     from mbtf_fit.material.export import LAYERS_NAME, TEXTURES_NAME, to_half, write_layers, write_textures
     from mbtf_fit.material.export_folder import ExportClaim, ExportSource, claimed
     from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME
-    from mbtf_fit.material.interchange.documents import WRITERS, Source
-    from mbtf_fit.material.interchange.images import write_maps
-    from mbtf_fit.material.interchange.maps import fit_color, maps_of
+    from mbtf_fit.material.interchange.documents import WRITERS
+    from mbtf_fit.material.interchange.images import BASE_COLOR, HEIGHT, NORMAL, ORM
+    from mbtf_fit.material.interchange.maps import level_of
+    from mbtf_fit.material.interchange.write import Interchange, write_interchange
     from mbtf_fit.material.material import Material, export
     from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME
     from mbtf_fit.shaders.slang import FILE_NAMES, write_module
@@ -95,7 +96,7 @@ def export_material(
         page=page.digests(),
     )
     names = [TEXTURES_NAME, LAYERS_NAME, DESCRIPTION_NAME, WEIGHTS_NAME, TRANSMITTANCE_NAME, PAGE_NAME]
-    names += [*FILE_NAMES, *(document for document, _ in WRITERS.values())]
+    names += [*FILE_NAMES, BASE_COLOR, NORMAL, ORM, HEIGHT, *(document for document, _ in WRITERS.values())]
     # Files of other formats may lie in the material's own folder.
     beside = "material" not in wanted and folder.is_dir() and folder.samefile(material)
     claims = nullcontext(ExportClaim(False)) if beside else claimed(folder, named, names, overwrite=overwrite)
@@ -103,6 +104,7 @@ def export_material(
         written, error = loaded, None
         if half:
             written, error = to_half(loaded)
+        made: Interchange | None = None
         files, notes = claim.files, [] if error is None else [str(error)]
         if "exr" in wanted:
             write_textures(written, folder / TEXTURES_NAME, half=half)
@@ -113,19 +115,11 @@ def export_material(
         if "slang" in wanted:
             files += write_module(written, folder, list(dict.fromkeys(shader_target or [])))
         if tools:
-            maps, agreement = fit_color(written, maps_of(written, level))
-            files += write_maps(maps, folder)
-            source = Source(
-                material.resolve().name,
-                Path(os.path.relpath(material, folder)).as_posix(),
-                loaded.config.model,
-                loaded.description["weights"]["sha256"],
-            )
-            for name in tools:
-                document, write = WRITERS[name]
-                write_text(folder / document, write(maps, source))
-                files.append(document)
-            notes.append(str(agreement))
+            label = "fitting maps"
+            with console.progress(total=loaded.lattice.texels(level_of(loaded, level)), label=label) as bar:
+                made = write_interchange(written, material, folder, tools, level, bar.advance)
+            files += made.files
+            notes.append(str(made))
         if "web" in wanted:
             html, precision = page.page(material)
             write_text(folder / PAGE_NAME, html)
@@ -147,6 +141,11 @@ def export_material(
     sizes = {name: (folder / name).stat().st_size for name in files}
     lines = [f"{folder / name}: {size / 1e6:.3f} MB" for name, size in sizes.items()]
     console.report(
-        {"folder": folder, "files": sizes, "half": None if error is None else asdict(error)},
+        {
+            "folder": folder,
+            "files": sizes,
+            "half": None if error is None else asdict(error),
+            "maps": None if made is None else made.as_dict(),
+        },
         "\n".join([*lines, *notes]),
     )

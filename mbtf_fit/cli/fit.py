@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,10 +13,19 @@ from cyclopts import Parameter
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import InputError, PartialError, UsageError
 from mbtf_core.interruption import keep_on_interruption
-from mbtf_core.options import ClusterOption, DryRun, Options, Output, Overwrite, Verbose, takes_options
+from mbtf_core.options import (
+    ClusterOption,
+    DryRun,
+    Options,
+    Output,
+    Overwrite,
+    Switch,
+    Verbose,
+    takes_options,
+)
 from mbtf_core.units import clock, expectation, format_duration
 from mbtf_fit.cli.page_options import Live, live_view
-from mbtf_fit.config import DEFAULT_MODEL, FIBER_MODEL, FitConfig, ModelName
+from mbtf_fit.config import DECODER_MODELS, DEFAULT_MODEL, FIBER_MODEL, FitConfig, ModelName
 from mbtf_fit.formatting import describe_fit, format_estimate, format_table, headline, visibility
 from mbtf_gen.config.presets import Quality, QualityOption, as_assignments, overrides_of
 
@@ -30,6 +40,7 @@ def fit(
     options: Options[FitConfig],
     many: Annotated[list[Path] | None, Parameter(consume_multiple=True)] = None,
     processes: Annotated[int | None, Parameter(show_default="one per GPU, or 1")] = None,
+    shared_decoder: Switch = False,
     live: Live = False,
     tensorboard: Annotated[Path | None, Parameter(metavar="FOLDER")] = None,
     cluster: ClusterOption = None,
@@ -53,6 +64,9 @@ def fit(
         files with one folder per line. A fit that fails does not stop the others.
     processes
         With --many, number of simultaneous fits.
+    shared_decoder
+        With --many, fit all data sets together with one network, which is also written to the folder decoder/
+        of the output. --time is that of all of them.
     tensorboard
         Write the curves of the fit as event files for TensorBoard to a folder.
     """
@@ -67,12 +81,16 @@ def fit(
     if cluster is not None and (many is None or processes is not None):
         hint = "leave out --processes" if many is not None else "mbtf-fit --many shards/ -o materials/"
         raise UsageError("requires --many, and sets the number of processes", where="--cluster", hint=hint)
+    if shared_decoder and many is None:
+        raise UsageError("--shared-decoder requires --many", hint="mbtf-fit --many a/ b/ --shared-decoder")
     if shards is None and many is None:
         raise UsageError("no shards given", hint="mbtf-fit shards/ -o material/")
     for flag, used in (("--live", live), ("--tensorboard", tensorboard is not None)):
         if many is not None and used:
             raise UsageError("shows one fit", where=flag, hint=f"leave out --many, or {flag}")
     if many is not None:
+        if shared_decoder:
+            options = replace(options, assignments=[*options.assignments, "training.shared_decoder=true"])
         _fit_many(options, quality, many, output, processes, cluster, overwrite, console)
         return
     assert shards is not None
@@ -146,31 +164,116 @@ def fit(
     console.report(summary, "\n".join([describe_fit(summary, verbose), *cost]))
 
 
-def resolve_config(options: Options[FitConfig], quality: Quality | None, shards: Path) -> FitConfig:
-    """Configuration of a fit. Without a model among the options, the data set decides."""
+def resolve_config(options: Options[FitConfig], quality: Quality | None, *shards: Path) -> FitConfig:
+    """Configuration of a fit, or of one of several data sets. Without a model among the options, the network
+    to keep decides, or the data sets."""
     from mbtf_fit.presets import fitter_options
 
     given = options.given
     flags = [f"{key}={value}" for key, value in given.items()]
-    overrides = {"model": _model_for(shards), **overrides_of(options.config, [*options.assignments, *flags])}
+    overrides = overrides_of(options.config, [*options.assignments, *flags])
+    kept = _kept_options(overrides.get("decoder"))
+    overrides = {"model": kept.get("model") or _model_for(shards), **overrides}
     presets = [f"model={overrides['model']}"]
     if quality is not None:
         presets += as_assignments(fitter_options(quality, {"": overrides})[""])
+    if overrides["model"] == kept.get("model"):
+        presets += as_assignments(kept)
     if "training.time" in given:
         # A time overrides the steps of a file or a preset.
         presets.append("training.steps=null")
     return options.resolve(presets)
 
 
-def _model_for(shards: Path) -> ModelName:
-    """The model that is best for a data set."""
+def _shares_decoder(options: Options[FitConfig]) -> bool:
+    """Whether the data sets of a command share a network."""
+    training = overrides_of(options.config, options.assignments).get("training")
+    # Values of --set are text.
+    return isinstance(training, Mapping) and str(training.get("shared_decoder")).lower() == "true"
+
+
+def _kept_options(folder: object) -> dict[str, Any]:
+    """Options of the network that a fit keeps, by dotted key; none without one."""
+    if not isinstance(folder, str):
+        return {}
+    from mbtf_fit.material.decoder import Decoder
+
+    return Decoder.find(folder).options()
+
+
+def _model_for(shards: Sequence[Path]) -> ModelName:
+    """The model that is best for a data set, or for several that share a network."""
     from mbtf_gen.dataset.reader import Dataset
 
     try:
-        known = Dataset.open(shards).manifest["geometry"] is not None
+        known = all(Dataset.open(folder).manifest["geometry"] is not None for folder in shards)
     except InputError:  # the fit refuses it, with the reason
         known = True
-    return DEFAULT_MODEL if known else FIBER_MODEL
+    if known:
+        return DEFAULT_MODEL
+    return FIBER_MODEL if len(shards) == 1 else DECODER_MODELS[-1]
+
+
+_COLUMNS = ["material", "unexplained variance", "PSNR", "beside the reference", "steps", "training"]
+
+
+def _row(name: str, result: dict[str, Any] | None) -> list[str]:
+    """Row of a table of fits."""
+    if result is None:
+        return [name, "failed", "-", "-", "-", "-"]
+    training, errors = result["training"], result["errors"]
+    split = errors[headline(errors)]
+    psnr, word = visibility(split)
+    cells = [format_estimate(split["unexplained"]), psnr.removeprefix("PSNR "), word or "-"]
+    return [name, *cells, str(training["steps"]), clock(training["seconds"])]
+
+
+def _fit_jointly(
+    config: FitConfig,
+    shards: list[Path],
+    folders: list[Path],
+    output: Path,
+    overwrite: bool,
+    console: Console,
+) -> None:
+    from mbtf_core.folders import check_space
+    from mbtf_fit.data.loader import open_data
+    from mbtf_fit.material.decoder import DECODER_FOLDER
+    from mbtf_fit.models.registry import MODELS
+    from mbtf_fit.training.fit_many import FitOutcome
+    from mbtf_fit.training.forecast import fit_bytes
+    from mbtf_fit.training.joint_fit import fit_jointly
+
+    training = config.training
+    budget = format_duration(training.time) if training.steps is None else f"{training.steps} steps"
+    layout = MODELS[config.model].layout
+    size = sum(fit_bytes(config, open_data(folder, layout, config.model).lattice) for folder in shards)
+    check_space(output, size, "reduce network.channels, or choose another folder with -o")
+    console.note(
+        f"{len(shards)} data sets -> {output}: {config.model} with a shared network, training for {budget} "
+        "(change it with --time or --steps)"
+    )
+    decoder = output / DECODER_FOLDER
+    keep_on_interruption(f"the last checkpoint is kept in {decoder}")
+    with console.progress(total=100, label="fitting", unit="%") as bar:
+        result = fit_jointly(
+            config,
+            shards,
+            folders,
+            decoder,
+            overwrite=overwrite,
+            progress=lambda fraction, note: bar.update(round(100 * fraction, 1), note),
+        )
+    outcomes = [
+        FitOutcome(data, fitted.folder, fitted.as_dict(), None)
+        for data, fitted in zip(shards, result.fits, strict=True)
+    ]
+    rows = [_COLUMNS, *(_row(outcome.folder.name, outcome.result) for outcome in outcomes)]
+    report = {
+        "decoder": {"folder": result.decoder.folder, "sha256": result.decoder.sha256},
+        "fits": [outcome.as_dict() for outcome in outcomes],
+    }
+    console.report(report, format_table(rows))
 
 
 def _fit_many(
@@ -189,6 +292,12 @@ def _fit_many(
 
     shards = find_data(many)
     folders = name_materials(shards, output)
+    if _shares_decoder(options):
+        if processes is not None or cluster is not None:
+            flag = "--cluster" if processes is None else "--processes"
+            raise UsageError(f"a shared network is one fit: leave out {flag}")
+        _fit_jointly(resolve_config(options, quality, *shards), shards, folders, output, overwrite, console)
+        return
     configs = [resolve_config(options, quality, folder) for folder in shards]
     if processes is None:
         import torch
@@ -216,16 +325,7 @@ def _fit_many(
             outcomes = fit_on_cluster(
                 configs, shards, folders, workers, overwrite=overwrite, finished=finished
             )
-    rows = [["material", "unexplained variance", "PSNR", "beside the reference", "steps", "training"]]
-    for outcome in outcomes:
-        if outcome.result is None:
-            rows.append([outcome.folder.name, "failed", "-", "-", "-", "-"])
-            continue
-        training, errors = outcome.result["training"], outcome.result["errors"]
-        split = errors[headline(errors)]
-        psnr, word = visibility(split)
-        cells = [format_estimate(split["unexplained"]), psnr.removeprefix("PSNR "), word or "-"]
-        rows.append([outcome.folder.name, *cells, str(training["steps"]), clock(training["seconds"])])
+    rows = [_COLUMNS, *(_row(outcome.folder.name, outcome.result) for outcome in outcomes)]
     console.report({"fits": [o.as_dict() for o in outcomes]}, format_table(rows))
     failed = [o for o in outcomes if o.error is not None]
     for outcome in failed:

@@ -31,7 +31,7 @@ CONFORMANCE_COUNT = 256
 CONFORMANCE = {"u": (2,), "sigma": (), "omega_i": (3,), "omega_o": (3,), "rgb": (3,)}
 QUERY = tuple(CONFORMANCE)[:-1]
 # Hint for a damaged material.
-_AGAIN = "copy the folder of the material again, or fit it again"
+_AGAIN = "copy the folder again, or fit again"
 
 
 class _File(BaseModel):
@@ -106,18 +106,18 @@ def read_description(folder: Path) -> tuple[dict[str, Any], Path]:
     return description, check_digest(folder / WEIGHTS_NAME, description["weights"])
 
 
-def check_digest(path: Path, stated: Mapping[str, Any]) -> Path:
-    """The path of a file whose digest is the stated one.
+def check_digest(path: Path, stated: Mapping[str, Any], by: str = DESCRIPTION_NAME) -> Path:
+    """The path of a file whose digest is the one that the file `by` states.
 
     Raises
     ------
     InputError : it is missing or corrupt
     """
     if not path.is_file():
-        raise InputError(f"no such file, but {DESCRIPTION_NAME} names it", where=path, hint=_AGAIN)
+        raise InputError(f"no such file, but {by} names it", where=path, hint=_AGAIN)
     if file_sha256(path) != stated["sha256"]:
         raise InputError(
-            f"is damaged, or of another material (its SHA-256 is not that in {DESCRIPTION_NAME})",
+            f"is damaged, or of another material (its SHA-256 is not that in {by})",
             where=path,
             hint=_AGAIN,
         )

@@ -190,7 +190,28 @@ class NeuralMaterial(nn.Module, ABC):
 
     def trained(self) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
         """(texels, network weights) that training changes."""
-        return self.parameter_groups()
+        texels, weights = self.parameter_groups()
+        return texels, [p for p in weights if p.requires_grad]
+
+    def networks(self) -> dict[str, nn.Module]:
+        """Networks that do not depend on the material, by name: materials can share them."""
+        names = ("decoder", "offset_network")
+        return {name: module for name, module in self.named_children() if name in names}
+
+    def share_networks(self, other: NeuralMaterial) -> None:
+        """Use the networks of another model of the same architecture in place of its own ones."""
+        for name, module in other.networks().items():
+            setattr(self, name, module)
+
+    def freeze(self) -> None:
+        """Exclude the networks from training."""
+        for module in self.networks().values():
+            module.requires_grad_(False)
+
+    @property
+    def frozen(self) -> bool:
+        """Whether the networks are excluded from training."""
+        return not any(p.requires_grad for module in self.networks().values() for p in module.parameters())
 
     def _layers(self) -> dict[str, nn.Parameter]:
         """Network weights by their names in a material."""

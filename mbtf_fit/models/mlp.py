@@ -59,8 +59,9 @@ class _FusedMlp(torch.autograd.Function):
         g = gradients[0].contiguous()
         ones = g.new_ones(len(g))
         for k in reversed(range(count)):
-            by_parameter[2 * k] = g.t() @ inputs[k]
-            by_parameter[2 * k + 1] = ones @ g
+            if ctx.needs_input_grad[1 + 2 * k]:
+                by_parameter[2 * k] = g.t() @ inputs[k]
+                by_parameter[2 * k + 1] = ones @ g
             if k == 0 and not ctx.needs_input_grad[0]:
                 return None, *by_parameter
             g = g @ weights[k]

@@ -54,6 +54,8 @@ class Sums:
         ]
         addresses = [t.data_ptr() for t in self.textures], [t.data_ptr() for t in self.networks]
         texture, network = ([*a, 0][:2] for a in addresses)
+        # Without sums the kernel leaves out the gradients of the weights.
+        network = [0, 0] if native.frozen else network
         self.depth_weights = torch.zeros(MAX_LEVELS)
         self.pointers = GradientSums(*texture, *network, self.depth_weights.data_ptr())
 
@@ -90,7 +92,7 @@ class CollectedGradients:
     def collect(self, sums: Sequence[Sums], workers: Workers) -> None:
         """Move the threads' sums to the gradients."""
         library = self.native.kernel.library
-        for k, gradients in enumerate(self.networks):
+        for k, gradients in enumerate([] if self.native.frozen else self.networks):
             description = (self.native.description.decoder, self.native.description.offset)[k]
             addresses = pointers([s.networks[k] for s in sums])
             library.mbtf_collect_weights(ctypes.byref(description), addresses, len(sums), pointers(gradients))
@@ -107,8 +109,10 @@ class CollectedGradients:
             )
 
     def weights(self) -> dict[Tensor, Tensor]:
-        """Gradients by all parameters but the texels."""
+        """Gradients by all parameters that are trained but the texels."""
         found: dict[Tensor, Tensor] = {}
+        if self.native.frozen:
+            return found
         for network, gradients in zip(networks(self.native.model), self.networks, strict=True):
             found.update(zip(network.parameters(), gradients, strict=True))
         return found

@@ -18,6 +18,8 @@ LIBRARY = "_kernel"
 MAX_CHANNELS, MAX_WIDTH, MAX_LAYERS, MAX_LEVELS, MAX_PLACES = 64, 128, 16, 16, 4
 
 _I32, _I64, _F32, _POINTER = ctypes.c_int32, ctypes.c_int64, ctypes.c_float, ctypes.c_void_p
+# Version of what the functions mean, where sizes of structures do not show it; as in src/kernel.h.
+INTERFACE = 1
 
 
 class Network(ctypes.Structure):
@@ -201,7 +203,7 @@ def open_library(path: Path) -> Any:
         except AttributeError:
             raise OSError(f"it lacks {name}") from None
         function.restype, *function.argtypes = (_TYPES[letter] for letter in letters)
-    if library.mbtf_layout() != ctypes.sizeof(Model) + 4096 * ctypes.sizeof(QueryPointers):
+    if library.mbtf_layout() != ctypes.sizeof(Model) + 4096 * ctypes.sizeof(QueryPointers) + INTERFACE:
         raise OSError("it was built from other sources")
     return library
 

@@ -142,11 +142,12 @@ def share(n: int, part: int, parts: int, *, whole: bool = False) -> tuple[int, i
 
 class NativeModel:
     """A supported model, evaluated by the kernel; :meth:`refresh` copies the model's current weights. Its
-    `description` is what the C functions take."""
+    `description` is what the C functions take; the networks of a `frozen` model are not trained."""
 
     def __init__(self, kernel: Kernel, model: NeuralMaterial) -> None:
         self.kernel = kernel
         self.model = model
+        self.frozen = model.frozen
         self.description = d = Model()
         d.offset_scale, d.grazing, d.aspect = OFFSET_SCALE, GRAZING, model.lattice.aspect
         encoding, relief = model.network.encoding, model.network.relief

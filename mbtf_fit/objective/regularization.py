@@ -41,7 +41,7 @@ class WeightDecay:
         """Decay a model's parameters by one step at these learning rates."""
         texels, weights = model.parameter_groups()
         # Biases do not decay: they keep the mean value.
-        matrices = [p for p in weights if p.ndim > 1]
+        matrices = [p for p in weights if p.ndim > 1 and p.requires_grad]
         with torch.no_grad():
             for parameters, amount in ((texels, texture_rate * self.texels), (matrices, rate * self.weights)):
                 if amount > 0:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,7 +14,8 @@ from torch import Tensor
 from mbtf_core.errors import InputError
 from mbtf_fit.material.storage import read_tensors, write_tensors
 from mbtf_fit.models.learned_relief import LearnedRelief
-from mbtf_fit.training.trainer import Progress, Trainer
+from mbtf_fit.training.loop import Progress
+from mbtf_fit.training.trainer import Trainer
 
 CHECKPOINT_NAME = "checkpoint.safetensors"
 _SURFACE = "surface."
@@ -34,23 +38,68 @@ def write_checkpoint(trainer: Trainer, path: Path) -> None:
     write_tensors(path, state_tensors(trainer), asdict(trainer.progress))
 
 
+def write_joint_checkpoint(trainers: Sequence[Trainer], path: Path) -> None:
+    """Write those of trainers that share networks and progress."""
+    tensors: dict[str, Tensor] = {}
+    for k, trainer in enumerate(trainers):
+        networks = () if k == 0 else tuple(trainer.model.networks())
+        tensors |= {
+            f"{k}.{name}": tensor
+            for name, tensor in state_tensors(trainer).items()
+            if not _is_of(name, networks)
+        }
+    write_tensors(path, tensors, asdict(trainers[0].progress))
+
+
+def _is_of(name: str, networks: Sequence[str]) -> bool:
+    """Whether a tensor of :func:`state_tensors` is of one of these networks."""
+    return any(f".{network}." in name for network in networks)
+
+
 def read_checkpoint(trainer: Trainer, path: Path) -> None:
     """Resume from a checkpoint of the same configuration and data, with identical results."""
-    try:
+    with _refused(path):
         tensors, progress = read_tensors(path)
-        with torch.no_grad():
-            for name, p in trainer.model.named_parameters():
-                p.copy_(tensors[f"model.{name}"])
-                trainer.optimizer.state[p] = {
-                    key: tensors[f"adam.{key}.{name}"].to(p.device)
-                    for key in _MOMENTS
-                    if f"adam.{key}.{name}" in tensors
-                }
-        if isinstance(trainer.model, LearnedRelief):
-            surface = {k.removeprefix(_SURFACE): t for k, t in tensors.items() if k.startswith(_SURFACE)}
-            trainer.model.restore_surface(surface)
-        step, seconds, loss = (progress[key] for key in ("step", "seconds", "loss"))
-        trainer.progress = Progress(int(step), float(seconds), float(loss))
+        _load(trainer, tensors)
+        trainer.progress = _progress(progress)
+
+
+def read_joint_checkpoint(trainers: Sequence[Trainer], path: Path) -> Progress:
+    """Load a checkpoint of trainers that share networks; returns their progress."""
+    with _refused(path):
+        tensors, progress = read_tensors(path)
+        for k, trainer in enumerate(trainers):
+            own = {name.partition(".")[2]: t for name, t in tensors.items() if name.startswith(f"{k}.")}
+            shared = tuple(trainer.model.networks())
+            networks = {n.partition(".")[2]: t for n, t in tensors.items() if _is_of(n, shared)}
+            _load(trainer, {**networks, **own})
+        return _progress(progress)
+
+
+def _load(trainer: Trainer, tensors: Mapping[str, Tensor]) -> None:
+    """Set parameters, optimizer state and surface of a trainer."""
+    with torch.no_grad():
+        for name, p in trainer.model.named_parameters():
+            p.copy_(tensors[f"model.{name}"])
+            trainer.optimizer.state[p] = {
+                key: tensors[f"adam.{key}.{name}"].to(p.device)
+                for key in _MOMENTS
+                if f"adam.{key}.{name}" in tensors
+            }
+    if isinstance(trainer.model, LearnedRelief):
+        surface = {k.removeprefix(_SURFACE): t for k, t in tensors.items() if k.startswith(_SURFACE)}
+        trainer.model.restore_surface(surface)
+
+
+def _progress(data: Mapping[str, Any]) -> Progress:
+    return Progress(int(data["step"]), float(data["seconds"]), float(data["loss"]))
+
+
+@contextlib.contextmanager
+def _refused(path: Path) -> Iterator[None]:
+    """Errors of a block that reads a checkpoint, in words."""
+    try:
+        yield
     except (InputError, KeyError, TypeError, ValueError, RuntimeError):
         raise InputError(
             "is not a checkpoint of this fit: corrupt, or of an older version",

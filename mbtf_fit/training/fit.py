@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import json
 import sys
 import time
 from collections.abc import Callable
@@ -14,7 +13,6 @@ from typing import Any
 
 import torch
 
-from mbtf_core.atomic import write_text
 from mbtf_core.errors import EngineError, InputError
 from mbtf_core.folders import owned
 from mbtf_core.interruption import stop_on_interruption
@@ -25,6 +23,7 @@ from mbtf_fit.data.loader import Partition, load_training, open_data
 from mbtf_fit.data.queries import ShardQueries, mean_value
 from mbtf_fit.data.slices import SharedSlices, TrainingSlices
 from mbtf_fit.evaluation import evaluate_splits
+from mbtf_fit.material.decoder import Decoder
 from mbtf_fit.material.format import DESCRIPTION_NAME
 from mbtf_fit.material.material import Material, export
 from mbtf_fit.material.transmittance_fit import evaluate_transmittance, fit_transmittance
@@ -38,12 +37,14 @@ from mbtf_fit.surface.known import KnownSurface
 from mbtf_fit.training.checkpoint import CHECKPOINT_NAME, read_checkpoint, write_checkpoint
 from mbtf_fit.training.convergence import MarginalCost, marginal_cost_of
 from mbtf_fit.training.fit_folder import claim, identity_of
+from mbtf_fit.training.loop import TrainingLoop
 from mbtf_fit.training.trainer import Trainer, TrainingData
 from mbtf_fit.training.validation import (
-    HISTORY_NAME,
+    append_history,
     describe_record,
     history_record,
     read_history,
+    truncate_history,
     validation_set,
     validation_subset,
 )
@@ -140,6 +141,19 @@ def keep_freed_memory() -> None:
         library.mallopt(_M_TRIM_THRESHOLD, 1 << 30)
 
 
+def check_options(config: FitConfig) -> None:
+    """Refuse losses, and a network to keep, that the model cannot have."""
+    if config.decoder is not None:
+        Decoder.find(config.decoder).check(config)
+    gradient = any(term.kind == "gradient" for term in config.training.losses)
+    if MODELS[config.model].layout != "image" and gradient:
+        raise InputError(
+            f"the gradient loss compares neighboring texels, which {config.model} never sees together",
+            where="training.losses",
+            hint="use another loss, or a model that learns from the image layout",
+        )
+
+
 def fit(
     config: FitConfig,
     shards: str | Path,
@@ -187,23 +201,23 @@ def fit(
         The disk is full, or another process writes to the folder; the same command resumes.
     """
     begin = time.perf_counter()
+    if config.training.shared_decoder:
+        raise InputError(
+            "a shared network takes several data sets",
+            where="training.shared_decoder",
+            hint="mbtf-fit --many SHARDS SHARDS --shared-decoder -o materials/",
+        )
     device = choose_device(config.device)
     out = Path(out)
-    layout = MODELS[config.model].layout
-    if layout != "image" and any(term.kind == "gradient" for term in config.training.losses):
-        raise InputError(
-            f"the gradient loss compares neighboring texels, which {config.model} never sees together",
-            where="training.losses",
-            hint="use another loss, or a model that learns from the image layout",
-        )
-    data = open_data(shards, layout, config.model)
+    check_options(config)
+    data = open_data(shards, MODELS[config.model].layout, config.model)
     identity = identity_of(config, data)
     with owned(out):
         claim(out, identity, config, overwrite)
         progress = progress or (lambda fraction, note: None)
         finished = (out / DESCRIPTION_NAME).exists()
         resumed = finished or _fit(config, data, identity, partition, device, out, progress, observe)
-        return _finished(out, time.perf_counter() - begin, resumed=resumed)
+        return result_of(out, time.perf_counter() - begin, resumed=resumed)
 
 
 def _fit(
@@ -226,6 +240,31 @@ def _fit(
     subset = validation_subset(trainer.model.positions, queries)
     del queries
     _train(trainer, subset, out, progress, observe)
+    kept = None if config.decoder is None else {"decoder": {"sha256": Decoder.find(config.decoder).sha256}}
+    export_fit(trainer, config, data, partition, identity, out, validated=name, more=kept)
+    (out / CHECKPOINT_NAME).unlink(missing_ok=True)
+    return resumed
+
+
+def export_fit(
+    trainer: Trainer,
+    config: FitConfig,
+    data: Dataset,
+    partition: Partition,
+    identity: dict[str, Any],
+    out: Path,
+    *,
+    validated: str,
+    more: dict[str, Any] | None = None,
+) -> None:
+    """Write the material of a finished training, with its errors.
+
+    Parameters
+    ----------
+    identity : content of ``fit.json``
+    validated : name of the set of the validations
+    more : what the summary of the training says besides, or otherwise
+    """
     trainer.fill_levels(float(level_of_sigma(partition.sample.sigma.max())))
     trainer.calibrate()
     errors = evaluate_splits(trainer.predict, data, partition)
@@ -238,10 +277,10 @@ def _fit(
         "queries": len(partition.training),
         "seconds": round(trainer.progress.seconds, 3),
         "loss": trainer.progress.loss,
-        "validation_set": name,
+        "validation_set": validated,
         "weight_decay": asdict(trainer.weight_decay),
         "coverage": {str(level): fraction for level, fraction in trainer.coverage().items()},
-        "device": str(device),
+        "device": str(trainer.device),
         "threads": torch.get_num_threads(),
         "backend": trainer.backend,
         "torch": torch.__version__,
@@ -254,13 +293,19 @@ def _fit(
     if transmittance is not None:
         found = evaluate_transmittance(transmittance, data, partition.selection)
         training["transmittance"] = {split: e.as_dict() for split, e in found.items()}
+    training |= more or {}
     export(trainer.model, config, out, data=identity["data"], training=training, transmittance=transmittance)
-    (out / CHECKPOINT_NAME).unlink(missing_ok=True)
-    return resumed
 
 
-def prepare_trainer(config: FitConfig, data: Dataset, partition: Partition, device: torch.device) -> Trainer:
-    """A trainer at its first step, for the model and the data of a configuration."""
+def prepare_trainer(
+    config: FitConfig,
+    data: Dataset,
+    partition: Partition,
+    device: torch.device,
+    shared: NeuralMaterial | None = None,
+) -> Trainer:
+    """A trainer at its first step, for the model and the data of a configuration; with the networks of the
+    model `shared`, if there is one."""
     model = build_model(config.model, data.lattice, **config.network.model_dump())
     if isinstance(model, LearnedRelief):
         model.light_width = _light_width(data)
@@ -270,6 +315,8 @@ def prepare_trainer(config: FitConfig, data: Dataset, partition: Partition, devi
     model.initialize(torch.Generator().manual_seed(config.seed), unit)
     if config.init_from is not None:
         _initialize_from(model, config.init_from)
+    if config.decoder is not None:
+        Decoder.find(config.decoder).load(model)
     noise = NoiseModel.silent(unit, data.lattice)
     # A single value does not tell its noise; none is assumed.
     if data.estimates == 2:
@@ -280,7 +327,10 @@ def prepare_trainer(config: FitConfig, data: Dataset, partition: Partition, devi
         generator = torch.Generator().manual_seed(config.seed + 1)
         model.prepare(len(training.omega_i), generator)
         training = shared_slices(config, training, unit, device)
-    return Trainer(config, model.to(device), training, noise, partition.selection)
+    model = model.to(device)
+    if shared is not None:
+        model.share_networks(shared)
+    return Trainer(config, model, training, noise, partition.selection)
 
 
 def shared_slices(
@@ -349,13 +399,11 @@ def _initialize_from(model: NeuralMaterial, folder: str | Path) -> None:
 def _resume(trainer: Trainer, out: Path) -> bool:
     """Resume from the checkpoint, if there is one."""
     path = out / CHECKPOINT_NAME
-    if not path.exists():
-        (out / HISTORY_NAME).unlink(missing_ok=True)
-        return False
-    read_checkpoint(trainer, path)
-    kept = [line for line in read_history(out) if line.get("step", 0) <= trainer.progress.step]
-    write_text(out / HISTORY_NAME, "".join(json.dumps(line) + "\n" for line in kept))
-    return True
+    resumed = path.exists()
+    if resumed:
+        read_checkpoint(trainer, path)
+    truncate_history(out, trainer.progress.step)
+    return resumed
 
 
 def _train(
@@ -365,25 +413,41 @@ def _train(
     progress: ProgressCallback,
     observe: Observer | None,
 ) -> None:
+    def report() -> None:
+        record = history_record(trainer, subset)
+        append_history(out, record)
+        progress(trainer.fraction, describe_record(record))
+        if observe is not None:
+            observe(record, trainer, subset)
+
+    run_training(trainer, report, lambda: write_checkpoint(trainer, out / CHECKPOINT_NAME))
+
+
+def run_training(
+    loop: TrainingLoop, report: Callable[[], None], save: Callable[[], None], *, reports: float = 1.0
+) -> None:
+    """Spend the budget of a loop, with reports and checkpoints at intervals; `reports` is a factor on the
+    interval of the reports.
+
+    Raises
+    ------
+    KeyboardInterrupt : the program is interrupted; a checkpoint is written first
+    """
     saved = time.perf_counter()
-    done = trainer.fraction >= 1.0
+    done = loop.fraction >= 1.0
     with stop_on_interruption() as stop:
         while not (done or stop.is_set()):
-            done = trainer.train(_REPORT_SECONDS, stop)
-            record = history_record(trainer, subset)
-            with (out / HISTORY_NAME).open("a", encoding="utf-8") as stream:
-                stream.write(json.dumps(record) + "\n")
-            progress(trainer.fraction, describe_record(record))
-            if observe is not None:
-                observe(record, trainer, subset)
+            done = loop.train(reports * _REPORT_SECONDS, stop)
+            report()
             if time.perf_counter() - saved > _CHECKPOINT_SECONDS or done or stop.is_set():
-                write_checkpoint(trainer, out / CHECKPOINT_NAME)
+                save()
                 saved = time.perf_counter()
         if stop.is_set():
             raise KeyboardInterrupt
 
 
-def _finished(out: Path, total: float, *, resumed: bool) -> FitResult:
+def result_of(out: Path, total: float, *, resumed: bool) -> FitResult:
+    """Result of a finished fit in a folder; `total`: seconds of this run."""
     material = Material.load(out)
     training = material.description["training"]
     return FitResult(

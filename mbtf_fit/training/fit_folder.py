@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from mbtf_core.config_file import check_schema, dump_yaml
 from mbtf_core.digest import data_sha256
 from mbtf_core.folders import ELSEWHERE, check_folder, make_folder, other_configuration
 from mbtf_fit.config import FitConfig
+from mbtf_fit.material.decoder import DECODER_NAME, Decoder
 from mbtf_fit.material.export import LAYERS_NAME, TEXTURES_NAME
 from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME, read_description
 from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME
@@ -23,8 +25,9 @@ _FORMAT = "mbtf-fit"
 _SCHEMA = 2
 
 
-def identity_of(config: FitConfig, data: Dataset) -> dict[str, Any]:
-    """Content of ``fit.json``: configuration and data of a fit, and the hash of both."""
+def identity_of(config: FitConfig, data: Dataset, group: Sequence[Dataset] = ()) -> dict[str, Any]:
+    """Content of ``fit.json``: configuration and data of a fit, and the hash of both; `group`: data sets of
+    the materials that share the network, in their order."""
     files = {split: [e["file"] for e in data.manifest["splits"][split]["shards"]] for split in data.splits}
     described = {
         "hash": str(data.manifest.get("config_hash", "")),
@@ -40,6 +43,10 @@ def identity_of(config: FitConfig, data: Dataset) -> dict[str, Any]:
     if config.init_from is not None:
         description, _ = read_description(Path(config.init_from))
         config_hash += f"-{description['weights']['sha256']}"
+    if config.decoder is not None:
+        config_hash += f"-{Decoder.find(config.decoder).sha256}"
+    if group:
+        config_hash += f"-{data_sha256([other.manifest['config_hash'] for other in group])}"
     queries = (data.manifest.get("config") or {}).get("queries") or {}
     directions = {"min_cos": queries["min_cos"]} if "min_cos" in queries else {}
     return {
@@ -64,7 +71,7 @@ def claim(out: Path, identity: dict[str, Any], config: FitConfig, overwrite: boo
         # The description goes first: without it nothing counts as a finished material.
         for name in (
             *(DESCRIPTION_NAME, FIT_NAME, CONFIG_NAME, HISTORY_NAME, CHECKPOINT_NAME),
-            *(WEIGHTS_NAME, TRANSMITTANCE_NAME, LAYERS_NAME, TEXTURES_NAME),
+            *(DECODER_NAME, WEIGHTS_NAME, TRANSMITTANCE_NAME, LAYERS_NAME, TEXTURES_NAME),
         ):
             (out / name).unlink(missing_ok=True)
     make_folder(out)

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
-from threading import Event
 from typing import NoReturn
 
 import numpy as np
@@ -38,6 +36,7 @@ from mbtf_fit.objective.noise import NoiseModel
 from mbtf_fit.objective.parallel import MAX_KERNEL_THREADS, MAX_THREADS, Batch, Workers
 from mbtf_fit.objective.regularization import WeightDecay
 from mbtf_fit.training.calibration import fit_calibration
+from mbtf_fit.training.loop import Progress, TrainingLoop, health_of
 
 TrainingData = TrainingQueries | TrainingImages | TrainingSlices | SharedSlices | StreamedQueries
 # Decay rates of Adam's moments.
@@ -72,16 +71,7 @@ def _with_hints(model: NeuralMaterial, queries: TrainingData, memory: float) -> 
     return replace(queries, hints=_hints(model, queries))
 
 
-@dataclass
-class Progress:
-    """Progress of training: steps done, seconds spent in them over all runs, mean loss of the last steps."""
-
-    step: int = 0
-    seconds: float = 0.0
-    loss: float = math.nan
-
-
-class Trainer:
+class Trainer(TrainingLoop):
     """Training of one model on one set of queries.
 
     Parameters
@@ -126,60 +116,35 @@ class Trainer:
         return "pytorch" if self._stepper is None else f"kernel {self._stepper.kernel.name}"
 
     @property
-    def fraction(self) -> float:
-        """Fraction of the budget that is spent, in [0, 1]."""
-        training = self.config.training
-        if training.steps is not None:
-            return min(1.0, self.progress.step / training.steps)
-        return min(1.0, self.progress.seconds / training.time)
+    def max_threads(self) -> int:
+        return MAX_THREADS if self._stepper is None else MAX_KERNEL_THREADS
 
-    def _batches(self) -> Iterator[Batch]:
-        """Endless batches from the current step on."""
-        return self.queries.batches(self.batch, self.config.seed, self.progress.step, self.model.margin)
+    def _batches(self, first: int | None = None) -> Iterator[Batch]:
+        """Endless batches, from that of a number or of the current step on."""
+        first = self.progress.step if first is None else first
+        return self.queries.batches(self.batch, self.config.seed, first, self.model.margin)
 
-    def train(self, seconds: float, stop: Event | None = None) -> bool:
-        """Train for about so long, or until the budget is spent; returns whether it is. Once `stop` is set,
-        training ends after the current step."""
-        until = time.perf_counter() + seconds
-        first = self.progress.step
-        losses: list[Tensor] = []
-        health: list[Tensor] = []
-        batches = self._batches()
-        limit = MAX_THREADS if self._stepper is None else MAX_KERNEL_THREADS
-        with Workers(self.device, limit=limit) as workers:
-            while self.fraction < 1.0 and not (stop is not None and stop.is_set() and losses):
-                start = time.perf_counter()
-                if start >= until and losses:
-                    break
-                try:
-                    losses.append(self._step(next(batches), workers))
-                except (RuntimeError, IndexError):
-                    # A lookup at NaN has no texel and fails before the loss could show it.
-                    if all(bool(p.isfinite().all()) for p in self.model.parameters()):
-                        raise
-                    self._stop_diverged(first, losses, health)
-                health.append(self._health())
-                self.progress.step += 1
-                self.progress.seconds += time.perf_counter() - start
-        if losses:
-            start = time.perf_counter()
-            # A GPU may still work on the last steps: reading the loss waits for them.
-            self.progress.loss = float(torch.stack(losses).mean())
-            self.progress.seconds += time.perf_counter() - start
-            if not math.isfinite(self.progress.loss + float(torch.stack(health).sum())):
-                self._stop_diverged(first, losses, health)
-        return self.fraction >= 1.0
+    def steps(self, workers: Workers, first: int) -> Iterator[Tensor]:
+        """Endless steps from the batch of a number on; each yields its mean loss."""
+        for batch in self._batches(first):
+            yield self._step(batch, workers)
 
-    def _health(self) -> Tensor:
+    def _steps(self, workers: Workers) -> Iterator[Tensor]:
+        return self.steps(workers, self.progress.step)
+
+    def _parameters(self) -> Iterator[Tensor]:
+        yield from self.model.parameters()
+
+    def health(self) -> Tensor:
         """A number that is finite if all network weights are."""
-        with torch.no_grad():
-            return torch.stack([p.sum() for p in self.model.trained()[1]]).sum()
+        return health_of(self.model.trained()[1], self.device)
 
-    def _stop_diverged(self, first: int, losses: list[Tensor], health: list[Tensor]) -> NoReturn:
-        """Report the first bad batch of the steps since `first`."""
-        finite = [math.isfinite(float(a) + float(b)) for a, b in zip(losses, health, strict=False)]
-        step = first + [*finite, False].index(False)
-        ranges = self.queries.batch_ranges(self.batch, self.config.seed, step)
+    def _stop_at(self, step: int) -> NoReturn:
+        self.stop_at(step, step)
+
+    def stop_at(self, step: int, batch: int) -> NoReturn:
+        """Report that training diverged at a step of the loop, which read the batch of this number."""
+        ranges = self.queries.batch_ranges(self.batch, self.config.seed, batch)
         named = f", {self.selection.describe(ranges)}," if self.selection is not None else ""
         raise InputError(
             f"training diverged at step {step + 1}: its batch{named} gave numbers that are not finite",
@@ -236,6 +201,7 @@ class Trainer:
         if self._stepper is not None:
             return self._stepper.step(self.loss, batch, self._sigmas(), workers)
         texels, weights = self.model.parameter_groups()
+        weights = [p for p in weights if p.requires_grad]
         # Lookups read detached tables; their gradients pass through the blur once, for the whole batch.
         tables = self._tables()
         leaves = [t.detach().requires_grad_() for t in tables]

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from mbtf_core.atomic import write_text
 from mbtf_core.stats import Estimate, level_groups, unexplained_variance
 from mbtf_fit.data.loader import Partition, load_split
 from mbtf_fit.data.queries import ShardQueries
@@ -77,6 +78,21 @@ def history_record(trainer: Trainer, subset: ShardQueries) -> dict[str, Any]:
         "unexplained_error": found.get("error"),
         "queries_per_second": round(state.step * trainer.batch / max(state.seconds, 1e-9)),
     }
+
+
+def append_history(folder: Path, record: dict[str, Any]) -> None:
+    """Add a record to the history of a fit."""
+    with (folder / HISTORY_NAME).open("a", encoding="utf-8") as stream:
+        stream.write(json.dumps(record) + "\n")
+
+
+def truncate_history(folder: Path, step: int) -> None:
+    """Remove the records after a step, to which a fit returns; all of them at step 0."""
+    if step == 0:
+        (folder / HISTORY_NAME).unlink(missing_ok=True)
+        return
+    kept = [line for line in read_history(folder) if line.get("step", 0) <= step]
+    write_text(folder / HISTORY_NAME, "".join(json.dumps(line) + "\n" for line in kept))
 
 
 def describe_record(record: dict[str, Any]) -> str:

@@ -45,7 +45,7 @@ class Source:
             "model": self.model,
             "weights_sha256": self.weights,
             "level": maps.level,
-            "height_range_in_tile_widths": round(height_range(maps), 9),
+            **({} if maps.heights is None else {"height_range_in_tile_widths": round(height_range(maps), 9)}),
         }
 
 
@@ -108,7 +108,10 @@ def gltf(maps: Maps, source: Source) -> str:
                 "normalTexture": {"index": 1},
                 **({"alphaMode": "BLEND"} if has_holes(maps) else {}),
                 "extensions": extension,
-                "extras": {**source.described(maps), "height_map": HEIGHT},
+                "extras": {
+                    **source.described(maps),
+                    **({} if maps.heights is None else {"height_map": HEIGHT}),
+                },
             }
         ],
         "textures": [{"sampler": 0, "source": n} for n in range(3)],
@@ -133,13 +136,18 @@ def usd(maps: Maps, source: Source) -> str:
         "normal": ("normal3f", "normal", "rgb", NORMAL, "raw"),
         "roughness": ("float", "roughness_metallic", "g", ORM, "raw"),
         "metallic": ("float", "roughness_metallic", "b", ORM, "raw"),
-        "displacement": ("float", "height", "r", HEIGHT, "raw"),
     }
     if has_holes(maps):
         inputs["opacity"] = ("float", "base_color", "a", BASE_COLOR, "sRGB")
     scale = {"normal": ("(2, 2, 2, 1)", "(-1, -1, -1, 0)")}
-    size = height_range(maps)
-    scale["height"] = (f"({size:.9g}, 0, 0, 1)", f"({maps.heights.min():.9g}, 0, 0, 0)")
+    moved = ""
+    if maps.heights is not None:
+        inputs["displacement"] = ("float", "height", "r", HEIGHT, "raw")
+        scale["height"] = (
+            f"({height_range(maps):.9g}, 0, 0, 1)",
+            f"({maps.heights.min():.9g}, 0, 0, 0)",
+        )
+        moved = "token outputs:displacement"
     kinds = {"rgb": "float3", "r": "float", "g": "float", "b": "float", "a": "float"}
     lines = []
     for name, (kind, texture, channel, _, _) in inputs.items():
@@ -177,7 +185,7 @@ def usd(maps: Maps, source: Source) -> str:
         )
     kinds_of = {str: "string", int: "int", float: "double"}
     data = "\n".join(
-        f"        {kinds_of[type(value)]} {key} = {json.dumps(value)}"
+        f"        {kinds_of[type(value)]} {key} = {json.dumps(value, ensure_ascii=False)}"
         for key, value in source.described(maps).items()
     )
     ior = refractive_index(maps.dielectric)
@@ -187,6 +195,7 @@ def usd(maps: Maps, source: Source) -> str:
         gloss = "            int inputs:useSpecularWorkflow = 1\n"
         gloss += "            color3f inputs:specularColor = (0, 0, 0)"
     height = f"{maps.aspect:.9g}"
+    connected = f"        {moved}.connect = </Tile/Material/Surface.outputs:displacement>" if moved else ""
     body = "\n".join(lines)
     return f"""#usda 1.0
 (
@@ -219,7 +228,7 @@ def Xform "Tile" (
     def Material "Material"
     {{
         token outputs:surface.connect = </Tile/Material/Surface.outputs:surface>
-        token outputs:displacement.connect = </Tile/Material/Surface.outputs:displacement>
+{connected}
 
         def Shader "Surface"
         {{
@@ -227,7 +236,7 @@ def Xform "Tile" (
 {gloss}
 {body}
             token outputs:surface
-            token outputs:displacement
+            {moved}
         }}
 
         def Shader "st"
@@ -278,7 +287,6 @@ def materialx(maps: Maps, source: Source) -> str:
     image("packed", "vector3", ORM)
     extract("roughness", "vector3", "packed", 1)
     extract("metallic", "vector3", "packed", 2)
-    image("height", "float", HEIGHT)
     for name, kind in (
         ("base", "color3"),
         ("normal", "vector3"),
@@ -286,7 +294,6 @@ def materialx(maps: Maps, source: Source) -> str:
         ("metallic", "float"),
     ):
         output(f"{name}_out", kind, name)
-    output("height_out", "float", "height")
 
     surface = ElementTree.SubElement(root, "gltf_pbr", name="surface", type="surfaceshader")
 
@@ -304,16 +311,25 @@ def materialx(maps: Maps, source: Source) -> str:
     ElementTree.SubElement(surface, "input", name="ior", type="float", value=ior)
     if maps.dielectric == 0:
         ElementTree.SubElement(surface, "input", name="specular", type="float", value="0")
-    moved = ElementTree.SubElement(root, "displacement", name="relief", type="displacementshader")
-    ElementTree.SubElement(
-        moved, "input", name="displacement", type="float", nodegraph="maps", output="height_out"
-    )
-    ElementTree.SubElement(moved, "input", name="scale", type="float", value=f"{height_range(maps):.9g}")
     shown = ElementTree.SubElement(root, "surfacematerial", name="Material", type="material")
     ElementTree.SubElement(shown, "input", name="surfaceshader", type="surfaceshader", nodename="surface")
-    ElementTree.SubElement(
-        shown, "input", name="displacementshader", type="displacementshader", nodename="relief"
-    )
+    if maps.heights is not None:
+        image("height", "float", HEIGHT)
+        # Value of the image at height 0; heights are at most that.
+        plane = -float(maps.heights.min()) / (height_range(maps) or 1.0)
+        below = ElementTree.SubElement(graph, "subtract", name="below_plane", type="float")
+        ElementTree.SubElement(below, "input", name="in1", type="float", nodename="height")
+        ElementTree.SubElement(below, "input", name="in2", type="float", value=f"{plane:.9g}")
+        output("height_out", "float", "below_plane")
+        moved = ElementTree.Element("displacement", name="relief", type="displacementshader")
+        root.insert(list(root).index(shown), moved)
+        ElementTree.SubElement(
+            moved, "input", name="displacement", type="float", nodegraph="maps", output="height_out"
+        )
+        ElementTree.SubElement(moved, "input", name="scale", type="float", value=f"{height_range(maps):.9g}")
+        ElementTree.SubElement(
+            shown, "input", name="displacementshader", type="displacementshader", nodename="relief"
+        )
     ElementTree.indent(root)
     return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
 

@@ -30,7 +30,8 @@ def write_maps(maps: Maps, folder: Path) -> list[str]:
     - ``base_color.png``: sRGB; with opacity as its alpha where there are holes.
     - ``normal.png``: normals n as (n + 1) / 2; x along u, which is right in the image, y along v, up.
     - ``roughness_metallic.png``: green roughness, blue metallic, red 1.
-    - ``height.png``: 16 bits, 0 the lowest and 65535 the highest vertex; the range is in the document.
+    - ``height.png``: 16 bits, 0 the lowest and 65535 the highest vertex; the range is in the document. Models
+      that know no surface have none.
     """
     color = linear_to_srgb(maps.base_color)
     if maps.opacity.min() < 1.0:
@@ -39,15 +40,16 @@ def write_maps(maps: Maps, folder: Path) -> list[str]:
     _write(folder / NORMAL, _bytes(0.5 * maps.normals + 0.5))
     ones = np.ones_like(maps.roughness)
     _write(folder / ORM, _bytes(np.stack([ones, maps.roughness, maps.metallic], -1)))
-    low, size = float(maps.heights.min()), height_range(maps)
-    share = (maps.heights - low) / (size or 1.0)
+    if maps.heights is None:
+        return [BASE_COLOR, NORMAL, ORM]
+    share = (maps.heights - maps.heights.min()) / (height_range(maps) or 1.0)
     _write(folder / HEIGHT, np.rint(share * 65535.0).astype(np.uint16))
     return [BASE_COLOR, NORMAL, ORM, HEIGHT]
 
 
 def height_range(maps: Maps) -> float:
-    """Highest minus lowest vertex, in tile widths."""
-    return float(maps.heights.max() - maps.heights.min())
+    """Highest minus lowest vertex, in tile widths; 0 without heights."""
+    return 0.0 if maps.heights is None else float(np.ptp(maps.heights))
 
 
 def has_holes(maps: Maps) -> bool:

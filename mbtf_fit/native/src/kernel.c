@@ -113,7 +113,9 @@ EXPORT int32_t mbtf_variants(void) { return COUNT; }
 EXPORT int32_t mbtf_block(void) { return BLOCK; }
 EXPORT int32_t mbtf_lanes(void) { return LANES; }
 /* Sizes of what the caller lays out, so that a kernel of another build is noticed. */
-EXPORT int32_t mbtf_layout(void) { return (int32_t)(sizeof(mbtf_model) + 4096 * sizeof(mbtf_queries)); }
+EXPORT int32_t mbtf_layout(void) {
+    return (int32_t)(sizeof(mbtf_model) + 4096 * sizeof(mbtf_queries) + INTERFACE);
+}
 
 EXPORT int64_t mbtf_state_floats(const mbtf_model *m) { return state_floats(m); }
 EXPORT int64_t mbtf_scratch_floats(void) { return 2 * MAX_WIDTH * BLOCK; }

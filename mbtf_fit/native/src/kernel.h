@@ -9,6 +9,8 @@
 
 #include <stdint.h>
 
+/* Version of what the functions mean; raised where sizes of structures do not show a change. */
+#define INTERFACE 1
 #define BLOCK 128
 #define MAX_CHANNELS 64
 #define MAX_WIDTH 128

@@ -60,6 +60,15 @@ def test_presets_keep_what_sections_set() -> None:
     assert (single.training.time, single.network.width) == (12.0, 40)
 
 
+def test_shared_networks_have_a_smaller_batch(tmp_path: Path) -> None:
+    shared = ("--set", "training.shared_decoder=true")
+    assert config_of(*shared).training.batch == 1 << 14
+    assert config_of(*shared, "--batch", "500").training.batch == 500
+    assert config_of("--set", "training.shared_decoder=false").training.batch == 1 << 15
+    (tmp_path / "c.yaml").write_text("training: {shared_decoder: true}\n")
+    assert config_of("--config", str(tmp_path / "c.yaml")).training.batch == 1 << 14
+
+
 def test_presets_keep_what_flags_set() -> None:
     assert config_of("--quality", "draft", "--model", "hierarchical").network.width == 25
     assert config_of("--quality", "draft", "--init-from", "material/").network.width == 25

@@ -159,7 +159,7 @@ def test_damaged_materials_are_refused(fitted: FitResult, tmp_path: Path) -> Non
     content = bytearray(weights.read_bytes())
     content[-1] ^= 1
     weights.write_bytes(content)
-    again = "copy the folder of the material again, or fit it again"
+    again = "copy the folder again, or fit again"
     with pytest.raises(InputError, match=rf"is damaged, .*SHA-256 is not .*\n  {again}"):
         Material.load(tmp_path)
     weights.unlink()

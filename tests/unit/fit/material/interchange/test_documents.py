@@ -11,11 +11,13 @@ import pytest
 from PIL import Image
 from support.plugin_materials import write_material
 
+from mbtf_core.color import srgb_to_linear
 from mbtf_core.console import run
 from mbtf_core.lattice import Lattice
 from mbtf_fit.cli.app import app
+from mbtf_fit.material.interchange.agreement import fit_color
 from mbtf_fit.material.interchange.documents import refractive_index
-from mbtf_fit.material.interchange.maps import maps_of
+from mbtf_fit.material.interchange.maps import surface_maps
 from mbtf_fit.material.material import Material
 from mbtf_fit.material.transmittance import Transmittance
 
@@ -45,16 +47,22 @@ def f0_of(refractive: float) -> float:
 
 
 def test_images_hold_the_maps(glossy: Path) -> None:
-    maps = maps_of(Material.load(glossy.parent / "material"))
+    maps = surface_maps(Material.load(glossy.parent / "material"), 3)
     normal = np.asarray(Image.open(glossy / "normal.png"), np.float64) / 255
     np.testing.assert_allclose(2 * normal - 1, maps.normals, atol=0.004)
     packed = np.asarray(Image.open(glossy / "roughness_metallic.png"), np.float64) / 255
     np.testing.assert_allclose(packed[..., 1], maps.roughness, atol=0.002)
     np.testing.assert_allclose(packed[..., 2], maps.metallic, atol=0.002)
     height = np.asarray(Image.open(glossy / "height.png"), np.float64) / 65535
+    assert maps.heights is not None
     low = maps.heights.min()
     np.testing.assert_allclose(low + height * (maps.heights.max() - low), maps.heights, atol=1e-5)
-    assert Image.open(glossy / "base_color.png").mode == "RGB"
+    image = Image.open(glossy / "base_color.png")
+    assert image.mode == "RGB"
+    # The fitted color, not that of the surface.
+    fitted, _ = fit_color(Material.load(glossy.parent / "material"), maps)
+    color = srgb_to_linear(np.asarray(image, np.float64) / 255)
+    np.testing.assert_allclose(color, fitted.base_color, atol=0.01)
 
 
 def test_gltf(glossy: Path) -> None:
@@ -64,6 +72,8 @@ def test_gltf(glossy: Path) -> None:
     uris = [image.uri for image in document.images]
     assert uris[material.pbrMetallicRoughness.baseColorTexture.index] == "base_color.png"
     assert uris[material.normalTexture.index] == "normal.png"
+    packed = material.pbrMetallicRoughness.metallicRoughnessTexture
+    assert uris[packed.index] == "roughness_metallic.png"
     assert material.alphaMode == "OPAQUE"
     assert f0_of(material.extensions["KHR_materials_ior"]["ior"]) == pytest.approx(f0(glossy), rel=1e-4)
     assert document.extensionsUsed == ["KHR_materials_ior"]
@@ -116,10 +126,26 @@ def test_usd(glossy: Path) -> None:
         assert texture.GetInput("wrapS").Get() == "repeat"
         assert Path(texture.GetInput("file").Get().resolvedPath).is_file()
         assert texture.GetOutput(channel), name
+    connections = {
+        "diffuseColor": ("base_color.png", "rgb"),
+        "normal": ("normal.png", "rgb"),
+        "roughness": ("roughness_metallic.png", "g"),
+        "metallic": ("roughness_metallic.png", "b"),
+        "displacement": ("height.png", "r"),
+    }
+    for name, expected in connections.items():
+        source, channel, _ = surface.GetInput(name).GetConnectedSource()
+        file = UsdShade.Shader(source.GetPrim()).GetInput("file").Get().path
+        assert (Path(file).name, channel) == expected
+    points = np.array(UsdGeom.Mesh(mesh).GetPointsAttr().Get())
+    st = np.array(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").Get())
+    # The origin of texture coordinates is at the lower left.
+    np.testing.assert_allclose(st, points[:, :2] / (1, 0.5))
     normal = UsdShade.Shader(stage.GetPrimAtPath("/Tile/Material/normal"))
     assert normal.GetInput("scale").Get() == (2, 2, 2, 1)
     assert normal.GetInput("bias").Get() == (-1, -1, -1, 0)
-    heights = maps_of(Material.load(glossy.parent / "material")).heights
+    heights = surface_maps(Material.load(glossy.parent / "material"), 3).heights
+    assert heights is not None
     height = UsdShade.Shader(stage.GetPrimAtPath("/Tile/Material/height"))
     assert height.GetInput("scale").Get()[0] == pytest.approx(np.ptp(heights), rel=1e-5)
     assert height.GetInput("bias").Get()[0] == pytest.approx(heights.min(), rel=1e-5)
@@ -147,7 +173,34 @@ def test_materialx(glossy: Path) -> None:
         == ""
     )
     (moved,) = mx.getShaderNodes(material, "displacementshader")
-    assert moved.getInput("scale").getValue() > 0
+    graph = document.getNodeGraph("maps")
+    assert [graph.getNode(name).getInput("index").getValue() for name in ("roughness", "metallic")] == [1, 2]
+    files = {"base": "base_color.png", "normal_image": "normal.png", "packed": "roughness_metallic.png"}
+    for name, file in {**files, "height": "height.png"}.items():
+        assert graph.getNode(name).getInput("file").getValue() == file
+    heights = surface_maps(Material.load(glossy.parent / "material"), 3).heights
+    assert heights is not None
+    scale, plane = moved.getInput("scale").getValue(), graph.getNode("below_plane")
+    assert plane.getCategory() == "subtract"
+    offset = plane.getInput("in2").getValue()
+    # The values 0 and 1 of the image are the lowest and the highest vertex.
+    extremes = [scale * (value - offset) for value in (0, 1)]
+    np.testing.assert_allclose(extremes, [heights.min(), heights.max()], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["müller", "日本", 'a\'b "c"'])
+def test_names_outside_of_ascii(tmp_path: Path, name: str) -> None:
+    pxr = pytest.importorskip("pxr.Usd")
+    write_material(tmp_path / name, model="relief", finest=2)
+    out = tmp_path / "out"
+    assert (
+        run(app, ["export", str(tmp_path / name), "--to", "usd", "--to", "gltf", "-q", "-o", str(out)]) == 0
+    )
+    stage = pxr.Stage.Open(str(out / "material.usda"))
+    linked = stage.GetPrimAtPath("/Tile").GetCustomData()
+    extras = json.loads((out / "material.gltf").read_text())["materials"][0]["extras"]
+    for data in (linked, extras):
+        assert (out / data["neural_material"] / "material.json").is_file()
 
 
 def test_a_surface_without_gloss_with_holes(tmp_path: Path) -> None:
@@ -175,6 +228,42 @@ def test_a_surface_without_gloss_with_holes(tmp_path: Path) -> None:
     assert surface.getInput("alpha_mode").getValue() == 2
 
 
+def test_a_model_that_knows_no_surface_has_no_heights(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_material(tmp_path / "material", aspect=0.5)
+    words = [word for name in FORMATS for word in ("--to", name)]
+    out = tmp_path / "out"
+    assert run(app, ["export", str(tmp_path / "material"), *words, "-o", str(out), "--json"]) == 0
+    reported = json.loads(capsys.readouterr().out)
+    images = {"base_color.png", "normal.png", "roughness_metallic.png"}
+    assert set(reported["files"]) == images | {"material.gltf", "material.usda", "material.mtlx"}
+    assert {path.name for path in out.iterdir()} == set(reported["files"]) | {"export.json"}
+    maps = reported["maps"]
+    assert (maps["source"], maps["level"]) == ("fit", 3)
+    assert maps["dielectric_f0"] in (0, 0.04)
+    np.testing.assert_allclose(maps["after"], 1, rtol=1e-3)
+    assert maps["points"] > 0
+    for name in ("material.gltf", "material.usda", "material.mtlx"):
+        assert "height" not in (out / name).read_text()
+        assert "displacement" not in (out / name).read_text()
+    mx = pytest.importorskip("MaterialX")
+    document, library = mx.createDocument(), mx.createDocument()
+    mx.readFromXmlFile(document, str(out / "material.mtlx"))
+    mx.loadLibraries(mx.getDefaultDataLibraryFolders(), mx.getDefaultDataSearchPath(), library)
+    document.importLibrary(library)
+    assert document.validate() == (True, "")
+    (material,) = document.getMaterialNodes()
+    assert not mx.getShaderNodes(material, "displacementshader")
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdShade
+
+    stage = Usd.Stage.Open(str(out / "material.usda"))
+    bound, _ = UsdShade.MaterialBindingAPI(stage.GetPrimAtPath("/Tile/Plane")).ComputeBoundMaterial()
+    assert bound.ComputeSurfaceSource()[0].GetIdAttr().Get() == "UsdPreviewSurface"
+    assert not bound.ComputeDisplacementSource()[0]
+
+
 def test_the_same_export_again_has_the_same_bytes(glossy: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = {path.name: path.read_bytes() for path in glossy.iterdir()}
     assert len(before) == 8
@@ -186,12 +275,10 @@ def test_the_same_export_again_has_the_same_bytes(glossy: Path, capsys: pytest.C
 
 def test_options_of_maps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_material(tmp_path / "relief", model="relief")
-    write_material(tmp_path / "neumip")
     out = ["-o", str(tmp_path / "out")]
     for words, code, what in (
         (["relief", "--level", "1"], 2, "--level: is an option of maps"),
         (["relief", "--to", "usd", "--level", "9"], 2, "has the levels 0 to 3"),
-        (["neumip", "--to", "gltf"], 3, "knows no surface"),
     ):
         assert run(app, ["export", str(tmp_path / words[0]), *words[1:], *out]) == code
         assert what in capsys.readouterr().err

@@ -13,17 +13,18 @@ from support.known_surfaces import geometry
 from support.plugin_materials import write_material
 
 from mbtf_core.directions import from_angles
-from mbtf_core.errors import InputError, UsageError
+from mbtf_core.errors import UsageError
 from mbtf_core.lattice import Lattice
 from mbtf_fit import Material
+from mbtf_fit.material.interchange.agreement import fit_color
 from mbtf_fit.material.interchange.maps import (
     Maps,
-    direction_pairs,
     evaluate_maps,
-    fit_color,
-    maps_of,
-    tile_means,
+    knows_surface,
+    level_of,
+    surface_maps,
 )
+from mbtf_fit.material.interchange.values import direction_pairs, tile_means
 from mbtf_fit.surface.known import KnownSurface, ggx
 
 
@@ -38,7 +39,7 @@ def test_a_flat_lambert_tile_keeps_its_color(tmp_path: Path) -> None:
     """Its base color is π times its value."""
     value = (0.05, 0.1, 0.25)
     material = write_material(tmp_path, model="relief", constant=value)
-    maps, agreement = fit_color(material, maps_of(material))
+    maps, agreement = fit_color(material, surface_maps(material, 3))
     np.testing.assert_allclose(
         maps.base_color, np.broadcast_to(math.pi * np.array(value), maps.base_color.shape), rtol=2e-3
     )
@@ -52,7 +53,7 @@ def test_a_flat_lambert_tile_keeps_its_color(tmp_path: Path) -> None:
 
 def test_normals_and_roughness_are_those_of_the_surface(tmp_path: Path) -> None:
     material = known(tmp_path, slope=(0.5, -0.25), roughness=0.3, metallic=0.8)
-    maps = maps_of(material, 2)
+    maps = surface_maps(material, 2)
     assert maps.roughness.shape == (4, 4)
     expected = np.array([-0.5, 0.25, 1]) / np.linalg.norm([-0.5, 0.25, 1])
     np.testing.assert_allclose(maps.normals, np.broadcast_to(expected, (4, 4, 3)), atol=1e-5)
@@ -63,7 +64,22 @@ def test_normals_and_roughness_are_those_of_the_surface(tmp_path: Path) -> None:
     tensors["surface.maps.2"][..., :2] = 0.0
     tensors["surface.maps.2"][..., 2] = 0.16
     material.model.load_weights(tensors)
-    np.testing.assert_allclose(maps_of(material, 2).roughness, (0.3**4 + 0.16) ** 0.25, rtol=1e-4)
+    np.testing.assert_allclose(surface_maps(material, 2).roughness, (0.3**4 + 0.16) ** 0.25, rtol=1e-4)
+
+
+def test_rows_and_opacity(tmp_path: Path) -> None:
+    """Row 0 is that of the surface's maps; what passes through holes does not come back."""
+    material = write_material(tmp_path, model="relief", aspect=0.5)
+    maps, weights = surface_maps(material, material.lattice.finest), material.model.weights()
+    stored = weights[f"surface.maps.{material.lattice.finest}"].double().numpy()
+    np.testing.assert_array_equal(maps.base_color, np.clip(stored[..., 3:6], 0, 1))
+    np.testing.assert_array_equal(maps.heights, weights["surface.heights"][..., 0].double().numpy())
+    assert maps.heights is not None
+    assert not np.array_equal(maps.heights, maps.heights[::-1])
+    omega_i, omega_o = (from_angles(e, a)[None] for e, a in ((50.0, 20.0), (35.0, 160.0)))
+    half = replace(maps, opacity=np.full_like(maps.roughness, 0.5))
+    whole = evaluate_maps(maps, omega_i, omega_o)
+    np.testing.assert_allclose(evaluate_maps(half, omega_i, omega_o), 0.5 * whole)
 
 
 def one_texel(**changes: object) -> Maps:
@@ -99,15 +115,16 @@ def test_values_are_those_of_the_lobe(metallic: float) -> None:
     fresnel = 0.04 + 0.96 * (1 - view @ half) ** 5
     dielectric = lobe(np.full(3, 0.04)) + (1 - fresnel) * base / math.pi
     expected = ((1 - metallic) * dielectric + metallic * lobe(base)) * (n @ light) / light[2]
-    np.testing.assert_allclose(evaluate_maps(maps, light, view)[0, 0], expected, rtol=1e-10)
+    np.testing.assert_allclose(evaluate_maps(maps, light[None], view[None])[0, 0, 0], expected, rtol=1e-10)
 
 
 def test_surfaces_that_face_away_are_black() -> None:
     maps = one_texel(slopes=np.array([[[3.0, 0.0]]]))
     away, towards, up = from_angles(10.0, 0.0), from_angles(30.0, 180.0), np.array([0.0, 0.0, 1.0])
-    assert (evaluate_maps(maps, away, up) == 0).all()
-    assert (evaluate_maps(maps, up, away) == 0).all()
-    assert (evaluate_maps(maps, towards, up) > 0).all()
+    lights, views = np.stack([away, up, towards]), np.stack([up, away, up])
+    values = evaluate_maps(maps, lights, views)[0, 0]
+    assert (values[:2] == 0).all()
+    assert (values[2] > 0).all()
 
 
 def test_directions_are_cosine_weighted() -> None:
@@ -123,19 +140,20 @@ def test_directions_are_cosine_weighted() -> None:
 def test_the_mean_reflectance_is_that_of_the_network(tmp_path: Path) -> None:
     """With other lights and views than those of the fit, on a surface whose network differs from its maps."""
     material = write_material(tmp_path, model="relief", finest=4, brightness=0.0, contrast=0.2)
-    plain = maps_of(material)
+    plain = surface_maps(material, 4)
     maps, agreement = fit_color(material, plain)
     np.testing.assert_allclose(agreement.after, 1, rtol=0.01)
     assert np.abs(agreement.before - 1).max() > 0.05
     light, view = direction_pairs(512, 0.1, seed=1)
-    ours = np.mean([evaluate_maps(maps, i, o).mean((0, 1)) for i, o in zip(light, view, strict=True)], 0)
+    ours = evaluate_maps(maps, light, view).mean((0, 1, 2))
     np.testing.assert_allclose(ours / tile_means(material, light, view).mean(0), 1, rtol=0.06)
 
 
-def test_what_has_no_maps_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="'neumip' knows no surface"):
-        maps_of(write_material(tmp_path / "neumip"))
+def test_levels_that_are_missing_are_refused(tmp_path: Path) -> None:
+    assert not knows_surface(write_material(tmp_path / "neumip"))
     material = write_material(tmp_path / "relief", model="relief")
+    assert knows_surface(material)
+    assert level_of(material) == 3
     for level in (-1, 4):
         with pytest.raises(UsageError, match="has the levels 0 to 3"):
-            maps_of(material, level)
+            level_of(material, level)

@@ -1,0 +1,169 @@
+"""``--shared-decoder`` and ``--decoder`` as a user runs them."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from conftest import RunPython
+from support.datasets import edit
+from support.fit_data import constant, parallax, write_data
+from support.invalid_inputs import call
+
+from mbtf_fit import Material
+from mbtf_fit.material.decoder import Decoder, network_tensors
+
+QUICK = ("--steps", "6", "--batch", "300", "--device", "cpu")
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("data")
+    for seed, name in enumerate(("a", "b", "c")):
+        write_data(folder / name, parallax, train=1000, test=100, seed=seed)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def materials(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("fits") / "materials"
+    narrow = ("--set", "network.width=16")
+    words = ["--many", str(data / "a"), str(data / "b"), "--shared-decoder", "-o", str(out)]
+    done = call(["mbtf-fit", *words, *QUICK, *narrow])
+    assert done.code == 0, done.err
+    assert "2 data sets -> " in done.err
+    assert "relief with a shared network, training for 6 steps" in done.err
+    lines = done.out.splitlines()
+    assert [line.split()[0] for line in lines] == ["material", "a", "b"]
+    assert all(re.search(r"\d\.\d{3} ± \d\.\d{3}", line) for line in lines[1:])
+    return out
+
+
+def fails(code: int, *arguments: str) -> str:
+    """Error message of a failing command: at most two lines, no traceback, nothing on standard output."""
+    done = call(["mbtf-fit", *arguments])
+    assert done.code == code, done.err
+    assert done.out == ""
+    start = done.err.index("error: ")
+    assert len(done.err[start:].splitlines()) <= 2, done.err
+    assert "Traceback" not in done.err
+    return done.err[start:]
+
+
+def test_every_command_takes_the_materials(
+    materials: Path, data: Path, tmp_path: Path, run_python: RunPython
+) -> None:
+    assert sorted(path.name for path in materials.iterdir()) == ["a", "b", "decoder"]
+    assert {"decoder.json", "weights.safetensors"} <= {p.name for p in (materials / "decoder").iterdir()}
+    done = run_python("-m", "mbtf_fit", "info", str(materials / "a"))
+    assert done.returncode == 0, done.stderr
+    done = run_python("-m", "mbtf_fit", "evaluate", str(materials / "b"), str(data / "b"))
+    assert done.returncode == 0, done.stderr
+    done = run_python("-m", "mbtf_fit", "export", str(materials / "a"), "-o", str(tmp_path / "export"))
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_fit_takes_model_and_network_from_the_folder(materials: Path, data: Path, tmp_path: Path) -> None:
+    shared = Decoder.find(materials).tensors()
+    for k, folder in enumerate((materials, materials / "decoder", materials / "a")):
+        out = tmp_path / str(k)
+        # A preset has another network.
+        words = [str(data / "c"), "--decoder", str(folder), "-o", str(out), "--quality", "draft", *QUICK]
+        done = call(["mbtf-fit", *words])
+        assert done.code == 0, done.err
+        found = Material.load(out)
+        assert found.config.network.width == 16
+        own = network_tensors(found.model)
+        assert all((own[name] == shared[name]).all() for name in shared)
+
+
+def test_many_fits_keep_one_network(
+    materials: Path, data: Path, tmp_path: Path, run_python: RunPython
+) -> None:
+    words = (
+        "--many",
+        str(data / "b"),
+        str(data / "c"),
+        "--decoder",
+        str(materials),
+        "-o",
+        str(tmp_path / "m"),
+    )
+    done = run_python("-m", "mbtf_fit", *words, *QUICK, "--json")
+    assert done.returncode == 0, done.stderr
+    fits = json.loads(done.stdout)["fits"]
+    assert [fit["result"]["training"]["decoder"]["sha256"] for fit in fits] == [
+        Decoder.find(materials).sha256
+    ] * 2
+
+
+def test_the_same_command_keeps_a_finished_fit(data: Path, tmp_path: Path, run_python: RunPython) -> None:
+    words = ("-m", "mbtf_fit", "--many", str(data), "--shared-decoder", "-o", str(tmp_path / "m"), *QUICK)
+    first = run_python(*words, "--json")
+    assert first.returncode == 0, first.stderr
+    found = json.loads(first.stdout)
+    assert Path(found["decoder"]["folder"]) == tmp_path / "m" / "decoder"
+    assert [fit["result"]["resumed"] for fit in found["fits"]] == [False] * 3
+    again = json.loads(run_python(*words, "--json").stdout)
+    assert again["decoder"] == found["decoder"]
+    assert [fit["result"]["resumed"] for fit in again["fits"]] == [True] * 3
+    other = fails(3, *words[2:], "--seed", "1")
+    assert "holds a fit of another configuration: seed" in other
+
+
+def test_data_without_geometry_share_a_network_of_neumip(data: Path, tmp_path: Path) -> None:
+    flat = write_data(tmp_path / "flat", constant(0.3), train=500, test=50)
+    edit(flat / "manifest.json", lambda manifest: manifest.update(geometry=None))
+    words = ["--many", str(data / "a"), str(flat), "--shared-decoder", "-o", str(tmp_path / "m"), *QUICK]
+    done = call(["mbtf-fit", *words])
+    assert done.code == 0, done.err
+    assert Material.load(tmp_path / "m" / "flat").config.model == "neumip"
+
+
+def test_command_lines_that_cannot_share_a_network(materials: Path, data: Path, tmp_path: Path) -> None:
+    a, out = str(data / "a"), ("-o", str(tmp_path / "m"), *QUICK)
+    assert "--shared-decoder requires --many" in fails(2, a, "--shared-decoder", *out)
+    words = ("--many", str(data), "--shared-decoder")
+    assert "leave out --processes" in fails(2, *words, "--processes", "2", *out)
+    assert "takes two data sets at least" in fails(3, "--many", a, "--shared-decoder", *out)
+    message = fails(2, *words, "--model", "hierarchical", *out)
+    assert "hierarchical does not share its network: choose the model relief or neumip" in message
+    message = fails(2, a, "--decoder", str(materials), "--shared-decoder", *out)
+    assert "--shared-decoder requires --many" in message
+    message = fails(2, *words, "--decoder", str(materials), *out)
+    assert "decoder keeps a network as it is" in message
+    write_data(tmp_path / "decoder", parallax, train=200, test=20)
+    message = fails(3, "--many", a, str(tmp_path / "decoder"), "--shared-decoder", *out)
+    assert "this folder is that of the shared network: rename the data set" in message
+    assert not (tmp_path / "m").exists()
+
+
+def test_folders_without_a_network_are_refused(materials: Path, data: Path, tmp_path: Path) -> None:
+    c, out = str(data / "c"), ("-o", str(tmp_path / "m"), *QUICK)
+    assert "nowhere: no such folder" in fails(3, c, "--decoder", str(tmp_path / "nowhere"), *out)
+    assert "holds neither a shared network nor a material" in fails(3, c, "--decoder", str(data), *out)
+    message = fails(3, c, "--decoder", str(materials), "--set", "network.width=25", *out)
+    assert "its network has network.width 16, the fit 25" in message
+    message = fails(3, c, "--decoder", str(materials), "--model", "neumip", *out)
+    assert "its network has model relief, the fit neumip" in message
+    done = call(["mbtf-fit", c, "--model", "neumip-baseline", "-o", str(tmp_path / "baseline"), *QUICK])
+    assert done.code == 0, done.err
+    assert not (tmp_path / "m").exists()
+    message = fails(3, c, "--decoder", str(tmp_path / "baseline"), *out)
+    assert "has the network of neumip-baseline; only those of relief and neumip are shared" in message
+
+
+@pytest.mark.parametrize("name", ["weights.safetensors", "decoder.json"])
+def test_corrupt_networks_are_refused(materials: Path, data: Path, tmp_path: Path, name: str) -> None:
+    broken = tmp_path / "broken"
+    broken.mkdir()
+    for path in (materials / "decoder").iterdir():
+        (broken / path.name).write_bytes(path.read_bytes())
+    whole = (broken / name).read_bytes()
+    (broken / name).write_bytes(whole[: len(whole) // 2])
+    message = fails(3, str(data / "c"), "--decoder", str(broken), "-o", str(tmp_path / "m"), *QUICK)
+    assert str(broken / name) in message
+    (broken / name).unlink()
+    fails(3, str(data / "c"), "--decoder", str(broken), "-o", str(tmp_path / "m"), *QUICK)

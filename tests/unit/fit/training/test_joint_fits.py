@@ -1,0 +1,381 @@
+"""Fits of several data sets that share one network, and fits that keep a network as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from support.fit_data import F32, parallax, write_data
+from support.known_surfaces import geometry, rough_heights
+
+import mbtf_fit.training.fit
+import mbtf_fit.training.joint_fit
+from mbtf_core.errors import InputError
+from mbtf_core.lattice import Lattice
+from mbtf_fit import FitConfig, Material, fit
+from mbtf_fit.data.loader import load_split
+from mbtf_fit.evaluation import evaluate
+from mbtf_fit.material.decoder import Decoder, network_tensors
+from mbtf_fit.native import library
+from mbtf_fit.training.joint_fit import JointResult, fit_jointly
+from mbtf_fit.training.joint_trainer import JointTrainer
+from mbtf_fit.training.trainer import Trainer
+from mbtf_fit.training.validation import read_history
+from mbtf_gen.dataset.reader import Dataset
+
+NAMES = ("waves", "stripes", "third")
+BATCH = {"batch": 512, "warmup": 10}
+
+
+def stripes(u: F32, sigma: F32, omega_i: F32, omega_o: F32) -> NDArray[np.float64]:
+    """Bright stripes, which the light's azimuth shifts."""
+    fade = np.exp(-2 * (2 * np.pi * sigma) ** 2)
+    wave = np.sin(2 * np.pi * (u[:, 1] + 0.1 * omega_i[:, 0])) * fade
+    return (0.5 * (1 + 0.7 * wave) * (0.5 + 0.5 * omega_i[:, 2]))[:, None] * np.array([0.5, 0.8, 1.0])
+
+
+def third(u: F32, sigma: F32, omega_i: F32, omega_o: F32) -> NDArray[np.float64]:
+    """Between the two."""
+    return 0.4 * parallax(u[:, ::-1], sigma, omega_i, omega_o) + 0.1 * stripes(u, sigma, omega_i, omega_o)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("data")
+    functions = dict(zip(NAMES, (parallax, stripes, third), strict=True))
+    # The materials differ in resolution, surface and brightness.
+    sizes = {"waves": 3, "stripes": 2, "third": 3}
+    return {
+        name: write_data(
+            folder / name,
+            function,
+            train=4000,
+            test=1000,
+            finest=sizes[name],
+            noise=0.01,
+            geometry=geometry(
+                Lattice(sizes[name]), rough_heights(16, 16, 0.05, k), roughness=0.5, metallic=0.2, seed=k
+            ),
+        )
+        for k, (name, function) in enumerate(functions.items())
+    }
+
+
+@pytest.fixture
+def no_kernel(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setenv(library.ENVIRONMENT, "off")
+    library.reload()
+    yield
+    monkeypatch.undo()
+    library.reload()
+
+
+def joint_config(model: str = "relief", steps: int = 300, **options: Any) -> FitConfig:
+    training = {"steps": steps, "shared_decoder": True, **BATCH}
+    return FitConfig.model_validate({"model": model, "training": training, **options})
+
+
+def single_config(model: str = "relief", steps: int = 100, **options: Any) -> FitConfig:
+    return FitConfig.model_validate({"model": model, "training": {"steps": steps, **BATCH}, **options})
+
+
+def fit_two(config: FitConfig, data: dict[str, Path], out: Path, **options: Any) -> JointResult:
+    names = NAMES[:2]
+    folders = [out / name for name in names]
+    return fit_jointly(config, [data[name] for name in names], folders, out / "decoder", **options)
+
+
+@pytest.fixture(scope="module", params=["relief", "neumip"])
+def library_folder(
+    data: dict[str, Path], tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest
+) -> Path:
+    """Materials that share a network."""
+    out = tmp_path_factory.mktemp(request.param)
+    fit_two(joint_config(request.param), data, out)
+    return out
+
+
+def networks_of(folder: Path) -> dict[str, torch.Tensor]:
+    return network_tensors(Material.load(folder).model)
+
+
+def unexplained(folder: Path, shards: Path) -> float:
+    value = evaluate(Material.load(folder), shards).values["test"].overall.unexplained.value
+    assert value is not None
+    return value
+
+
+def test_materials_share_the_bits_of_one_network(library_folder: Path) -> None:
+    first, second = (Material.load(library_folder / name).model for name in NAMES[:2])
+    shared = Decoder.find(library_folder).tensors()
+    for model in (first, second):
+        own = network_tensors(model)
+        assert own.keys() == shared.keys()
+        assert all(torch.equal(own[name], shared[name]) for name in shared)
+    assert ("offset_network.0.weight" in shared) == (first.name == "neumip")
+    # All else is the material's own.
+    assert first.unit != second.unit
+    assert not torch.equal(first.calibration, second.calibration[:, :3])
+    if first.name == "relief":
+        assert not torch.equal(first.depth_weights[:3], second.depth_weights)
+
+
+def test_joint_fits_learn_each_material(library_folder: Path, data: dict[str, Path], tmp_path: Path) -> None:
+    model = Material.load(library_folder / "waves").model.name
+    fit_two(joint_config(model, steps=2), data, tmp_path)
+    for name in NAMES[:2]:
+        after = unexplained(library_folder / name, data[name])
+        assert after < 0.25
+        assert after < 0.5 * unexplained(tmp_path / name, data[name])
+        # The library itself states the same error.
+        stated = Material.load(library_folder / name).description["training"]["errors"]["test"]
+        assert stated["unexplained"]["value"] == pytest.approx(after, rel=1e-6)
+
+
+def test_materials_evaluate_as_the_trainers_predict(
+    data: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    predicted = {}
+    export = mbtf_fit.training.joint_fit.export_fit
+
+    def observed(trainer: Trainer, config: FitConfig, shards: Dataset, *arguments: Any, **more: Any) -> None:
+        export(trainer, config, shards, *arguments, **more)
+        predicted[Path(shards.folder).name] = trainer.predict(load_split(shards, "test"))
+
+    monkeypatch.setattr(mbtf_fit.training.joint_fit, "export_fit", observed)
+    fit_two(joint_config(steps=40), data, tmp_path)
+    for name in NAMES[:2]:
+        material = Material.load(tmp_path / name)
+        queries = load_split(Dataset.open(data[name]), "test")
+        np.testing.assert_allclose(material.predict(queries), predicted[name], rtol=1e-5, atol=1e-6)
+        assert material.deviation() < 1e-5
+
+
+def test_steps_take_the_materials_in_turn(data: dict[str, Path], tmp_path: Path) -> None:
+    result = fit_two(joint_config(steps=7), data, tmp_path)
+    summaries = [found.material.description["training"] for found in result.fits]
+    assert [summary["steps"] for summary in summaries] == [4, 3]
+    assert summaries[0]["shared_decoder"]["steps"] == 7
+    assert summaries[0]["shared_decoder"]["materials"] == list(NAMES[:2])
+    assert [record["step"] for record in read_history(tmp_path / "stripes")][-1] == 7
+
+
+def test_noisy_materials_do_not_decide_the_decay_alone(data: dict[str, Path], tmp_path: Path) -> None:
+    own = []
+    for name in NAMES[:2]:
+        fit(single_config(steps=1), data[name], tmp_path / "own" / name)
+        own.append(Material.load(tmp_path / "own" / name).description["training"]["weight_decay"])
+    fits = fit_two(joint_config(steps=2), data, tmp_path).fits
+    for found, alone in zip(fits, own, strict=True):
+        decay = found.material.description["training"]["weight_decay"]
+        assert decay["weights"] == pytest.approx(sum(o["weights"] for o in own) / 2 / np.sqrt(2))
+        assert decay["texels"] == alone["texels"]
+
+
+@pytest.mark.parametrize("kernel", ["kernel", "no_kernel"])
+def test_a_kept_network_keeps_its_bits(
+    library_folder: Path,
+    data: dict[str, Path],
+    tmp_path: Path,
+    kernel: str,
+    request: pytest.FixtureRequest,
+) -> None:
+    if kernel == "no_kernel":
+        request.getfixturevalue("no_kernel")
+    model = Material.load(library_folder / "waves").model.name
+    shared = Decoder.find(library_folder).tensors()
+    errors = []
+    for steps in (1, 150):
+        out = tmp_path / str(steps)
+        fit(single_config(model, steps, decoder=str(library_folder)), data["third"], out)
+        found = networks_of(out)
+        assert all(torch.equal(found[name], shared[name]) for name in shared)
+        errors.append(unexplained(out, data["third"]))
+    assert errors[1] < min(0.5, 0.8 * errors[0])
+    before, after = (Material.load(tmp_path / steps).model for steps in ("1", "150"))
+    assert not torch.allclose(before.pyramid.texels, after.pyramid.texels, atol=1e-3)
+    if model == "relief":
+        assert not torch.allclose(before.depth_weights, after.depth_weights, atol=1e-3)
+    else:
+        assert not torch.allclose(before.offset_texture.texels, after.offset_texture.texels, atol=1e-5)
+
+
+def test_kernel_and_pytorch_agree_on_kept_networks(
+    library_folder: Path, data: dict[str, Path], tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    model = Material.load(library_folder / "waves").model.name
+    options = single_config(model, 3, decoder=str(library_folder))
+    fit(options, data["third"], tmp_path / "kernel")
+    request.getfixturevalue("no_kernel")
+    fit(options, data["third"], tmp_path / "pytorch")
+    one, other = (Material.load(tmp_path / name).model.pyramid.texels for name in ("kernel", "pytorch"))
+    # Adam normalizes gradients: the few that rounding decides differ by a step.
+    assert ((one - other).abs() > 1e-4).float().mean() < 0.02
+
+
+def test_any_material_has_a_network_to_keep(data: dict[str, Path], tmp_path: Path) -> None:
+    fit(single_config(steps=20), data["waves"], tmp_path / "m")
+    fit(single_config(steps=5, decoder=str(tmp_path / "m")), data["stripes"], tmp_path / "n")
+    one, other = networks_of(tmp_path / "m"), networks_of(tmp_path / "n")
+    assert all(torch.equal(one[name], other[name]) for name in one)
+    record = Material.load(tmp_path / "n").description["training"]["decoder"]
+    assert record == {"sha256": Decoder.find(tmp_path / "m").sha256}
+
+
+def test_another_network_is_another_fit(data: dict[str, Path], tmp_path: Path) -> None:
+    wanted = single_config(steps=3, decoder=str(tmp_path / "m"))
+    fit(single_config(steps=3), data["waves"], tmp_path / "m")
+    fit(wanted, data["stripes"], tmp_path / "n")
+    assert fit(wanted, data["stripes"], tmp_path / "n").resumed
+    fit(single_config(steps=4), data["waves"], tmp_path / "m", overwrite=True)
+    with pytest.raises(InputError, match="holds a fit of another configuration"):
+        fit(wanted, data["stripes"], tmp_path / "n")
+
+
+class Killed(BaseException):
+    """Nothing that runs after it may tidy up: stands for SIGKILL."""
+
+
+@pytest.mark.parametrize("model", ["relief", "neumip"])
+def test_a_killed_joint_fit_ends_with_the_same_bits(
+    data: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, model: str
+) -> None:
+    monkeypatch.setattr(mbtf_fit.training.fit, "_REPORT_SECONDS", 0.0)
+    monkeypatch.setattr(mbtf_fit.training.fit, "_CHECKPOINT_SECONDS", 0.0)
+    config = joint_config(model, steps=9)
+    whole = fit_two(config, data, tmp_path / "whole")
+    random = np.random.default_rng(0)
+    out, step, export = tmp_path / "killed", Trainer._step, mbtf_fit.training.joint_fit.export_fit
+    kills, exports = 0, 0
+    save = JointTrainer.save
+    while not (out / "decoder" / "decoder.json").exists():
+        left = int(random.integers(2, 6))
+
+        def dying(self: Trainer, *arguments: Any) -> torch.Tensor:
+            nonlocal left
+            left -= 1
+            if left == 0:
+                raise Killed
+            return step(self, *arguments)
+
+        def dying_export(*arguments: Any, **more: Any) -> None:
+            nonlocal exports
+            exports += 1
+            # Between the two materials, once.
+            if exports == 2:
+                raise Killed
+            export(*arguments, **more)
+
+        def forgetful(self: JointTrainer, path: Path) -> None:
+            # Not every step is saved: some are done again.
+            if random.random() < 0.6:
+                save(self, path)
+
+        monkeypatch.setattr(Trainer, "_step", dying)
+        monkeypatch.setattr(mbtf_fit.training.joint_fit, "export_fit", dying_export)
+        monkeypatch.setattr(JointTrainer, "save", forgetful)
+        try:
+            found = fit_two(config, data, out)
+        except Killed:
+            kills += 1
+            assert kills < 100
+    assert kills >= 2
+    for mine, other in zip(found.fits, whole.fits, strict=True):
+        expected = other.material.model.weights()
+        weights = mine.material.model.weights()
+        assert all(torch.equal(weights[name], expected[name]) for name in expected)
+        assert mine.errors == other.errors
+        steps = [record["step"] for record in read_history(mine.folder)]
+        assert steps == sorted(set(steps))
+    assert not (out / "decoder" / "checkpoint.safetensors").exists()
+    # A finished one is kept.
+    monkeypatch.undo()
+    assert all(again.resumed for again in fit_two(config, data, out).fits)
+
+
+def test_other_data_sets_are_another_fit(data: dict[str, Path], tmp_path: Path) -> None:
+    fit_two(joint_config(steps=2), data, tmp_path)
+    names = ("waves", "third")
+    arguments = [data[name] for name in names], [tmp_path / name for name in names], tmp_path / "decoder"
+    with pytest.raises(InputError, match=r"decoder: holds a fit of another configuration.*\n.*--overwrite"):
+        fit_jointly(joint_config(steps=2), *arguments)
+    with pytest.raises(InputError, match=r"waves: holds a fit of another configuration: .*shared_decoder"):
+        fit(single_config(steps=2), data["waves"], tmp_path / "waves")
+    fit_jointly(joint_config(steps=2), *arguments, overwrite=True)
+    shared = Decoder.find(tmp_path).tensors()
+    assert all(torch.equal(networks_of(tmp_path / "third")[name], shared[name]) for name in shared)
+
+
+def test_divergence_names_the_material(
+    data: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    step = Trainer._step
+
+    def poisoned(self: Trainer, *arguments: Any) -> torch.Tensor:
+        loss = step(self, *arguments)
+        return loss * float("nan") if self.progress.step == 3 else loss
+
+    monkeypatch.setattr(Trainer, "_step", poisoned)
+    with pytest.raises(InputError, match=r"stripes: training diverged at step 4: its batch.*train-0000"):
+        fit_two(joint_config(steps=6), data, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"model": "neumip"}, r"its network has model relief, the fit neumip"),
+        ({"network": {"width": 16}}, r"its network has network\.width 25, the fit 16"),
+        ({"network": {"encoding": {"half_vector": False}}}, r"network\.encoding\.half_vector True, the fit"),
+    ],
+)
+def test_other_architectures_are_refused(
+    data: dict[str, Path], tmp_path: Path, options: dict[str, Any], message: str
+) -> None:
+    fit(single_config(steps=2), data["waves"], tmp_path / "m")
+    wanted = FitConfig.model_validate({"decoder": str(tmp_path / "m"), **options})
+    with pytest.raises(InputError, match=message):
+        fit(wanted, data["waves"], tmp_path / "n")
+    assert not (tmp_path / "n").exists()
+
+
+@pytest.mark.parametrize("model", ["neumip-baseline", "neumip+", "hierarchical", "rainer2020"])
+@pytest.mark.parametrize("option", ["decoder", "shared_decoder"])
+def test_other_models_are_refused(model: str, option: str) -> None:
+    given: dict[str, Any] = {"decoder": "m"} if option == "decoder" else {"training": {option: True}}
+    with pytest.raises(ValueError, match="does not share its network: choose the model relief or neumip"):
+        FitConfig.model_validate({"model": model, **given})
+
+
+def test_a_network_is_kept_or_trained() -> None:
+    for more in ({"init_from": "m"}, {"training": {"shared_decoder": True}}):
+        with pytest.raises(ValueError, match="decoder keeps a network as it is: leave out"):
+            FitConfig.model_validate({"decoder": "m", **more})
+
+
+def test_too_few_data_sets_and_taken_names_are_refused(data: dict[str, Path], tmp_path: Path) -> None:
+    one = [data["waves"]]
+    with pytest.raises(InputError, match="takes two data sets at least"):
+        fit_jointly(joint_config(), one, [tmp_path / "waves"], tmp_path / "decoder")
+    with pytest.raises(InputError, match="a shared network takes several data sets"):
+        fit(joint_config(), data["waves"], tmp_path / "m")
+    folders = [tmp_path / "decoder", tmp_path / "b"]
+    with pytest.raises(InputError, match="decoder: this folder is that of the shared network"):
+        fit_jointly(joint_config(), one * 2, folders, tmp_path / "decoder")
+    with pytest.raises(InputError, match=r"training\.shared_decoder: is not set"):
+        fit_jointly(single_config(), one * 2, [tmp_path / "a", tmp_path / "b"], tmp_path / "decoder")
+    assert not any(tmp_path.iterdir())
+
+
+def test_options_of_shared_networks_leave_other_fits_as_they_are() -> None:
+    plain = FitConfig.model_validate({})
+    assert "decoder" not in plain.fields()
+    assert "shared_decoder" not in plain.fields()["training"]
+    joint = joint_config()
+    assert joint.fields()["training"]["shared_decoder"] is True
+    assert FitConfig.model_validate({"training": {"shared_decoder": True}}).training.batch == 1 << 14
+    assert joint.hash("x") != single_config(steps=300).hash("x")
