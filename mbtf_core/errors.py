@@ -73,6 +73,10 @@ class PartialError(MbtfError):
     exit_code = EXIT_PARTIAL
 
 
+class LockedError(PartialError):
+    """Another process works on the same files; later, they may be free or finished."""
+
+
 def reason(fault: BaseException | str | None, longest: int = 160) -> str:
     """Message of another library's error, on one line of at most `longest` characters."""
     text = printable(" ".join((str(fault) or type(fault).__name__).split()))

@@ -15,7 +15,7 @@ from typing import Any
 
 from mbtf_core.atomic import TEMPORARY, remove_file
 from mbtf_core.config_file import differences, in_short
-from mbtf_core.errors import InputError, PartialError
+from mbtf_core.errors import InputError, LockedError, PartialError
 from mbtf_core.locks import keep_renewing, lock_owner, take_lock
 from mbtf_core.units import size_text
 
@@ -48,7 +48,7 @@ def owned(folder: Path) -> Iterator[None]:
         raise
     if lock is None:
         owner = lock_owner(folder / "folder")
-        raise PartialError(
+        raise LockedError(
             f"is being written by another process{'' if owner is None else f' ({owner})'}",
             where=folder,
             hint=f"wait for it and run the same command again, or {ELSEWHERE}",

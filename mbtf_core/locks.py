@@ -24,8 +24,8 @@ from mbtf_core.atomic import unwritable
 from mbtf_core.errors import PartialError
 
 # Age after which the lock of another machine counts as abandoned, and the interval of renewal.
-STALE_SECONDS = 1800.0
-RENEW_SECONDS = 300.0
+STALE_SECONDS = 300.0
+RENEW_SECONDS = 60.0
 # Errors of file systems without advisory locks.
 _NO_LOCKS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK)
 # Polling interval and timeout of locks that are used briefly.

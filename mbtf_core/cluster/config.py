@@ -25,7 +25,9 @@ class ClusterConfig(Settings):
     workers: PositiveInt = Field(2, description="number of workers, each a process with one task at a time")
     threads: PositiveInt = Field(1, description="threads of a worker")
     memory: Size | None = Field(
-        None, description="memory of a worker; one that exceeds it is restarted; default: an equal share"
+        None,
+        description="memory of a worker; one that exceeds it is restarted; default: an equal share of this "
+        "machine's, or 2 GB per thread of a batch system",
     )
     gpus: int = Field(0, ge=0, description="GPUs of a worker")
     walltime: Duration = Field(3600.0, gt=0, description="time after which a batch system ends a worker")

@@ -8,54 +8,98 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Callable, Iterable, Iterator
+import shutil
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from importlib.metadata import version
 from typing import Any
 from uuid import uuid4
 
 from mbtf_core.cluster.config import ClusterConfig, read_cluster
-from mbtf_core.cluster.task import THREADS_VARIABLE, Task, TaskResult, run_task
+from mbtf_core.cluster.task import GPUS_VARIABLE, THREADS_VARIABLE, Task, TaskResult, run_task
 from mbtf_core.errors import InputError, PartialError, UsageError, reason
+from mbtf_core.locks import RENEW_SECONDS, STALE_SECONDS
 from mbtf_core.units import format_duration
 
 # Tasks that the scheduler knows at a time, beyond those that run.
 _AHEAD = 256
+# Version of this package, which workers must have.
+_VERSION = version("mbtf")
+# Seconds between two looks at the workers.
+_LOOK_SECONDS = 2.0
+# A task whose files another process works on is tried at this interval, until locks of dead ones have ended.
+_PAUSE_SECONDS, _LOCKED_SECONDS = 10.0, STALE_SECONDS + 2 * RENEW_SECONDS
 # Seconds in which a scheduler must answer.
 _CONNECT_SECONDS = 30.0
 _RESUMES = "the same command goes on with the rest"
 _PRELOAD = "mbtf_core.cluster.task"
-_CLASSES = {
-    "slurm": "SLURMCluster",
-    "pbs": "PBSCluster",
-    "sge": "SGECluster",
-    "lsf": "LSFCluster",
-    "oar": "OARCluster",
-    "htcondor": "HTCondorCluster",
+# Class of dask-jobqueue, and the command that submits a job.
+_SYSTEMS = {
+    "slurm": ("SLURMCluster", "sbatch"),
+    "pbs": ("PBSCluster", "qsub"),
+    "sge": ("SGECluster", "qsub"),
+    "lsf": ("LSFCluster", "bsub"),
+    "oar": ("OARCluster", "oarsub"),
+    "htcondor": ("HTCondorCluster", "condor_submit"),
 }
+# A renderer's memory is not Dask's to spill; what exceeds the limit is restarted.
+_MEMORY = {"target": False, "spill": False, "pause": False}
 
 
 class Cluster:
-    """Workers that run tasks; made by :func:`open_cluster`."""
+    """Workers that run tasks; made by :func:`open_cluster`.
 
-    def __init__(self, client: Any, retries: int) -> None:
-        self._client = client
-        self._retries = retries
+    Attributes
+    ----------
+    workers : number of workers, as last seen
+    """
 
-    @property
-    def workers(self) -> int:
-        """Number of workers that are there now."""
-        return len(self._known())
+    def __init__(self, client: Any, config: ClusterConfig, note: Callable[[str], None]) -> None:
+        self.workers = 0
+        self._client, self._config, self._note = client, config, note
+        # A task that asks for a GPU waits for ever where no worker states one.
+        self._gpus = False
+        self._ended = threading.Event()
+        self._watch = threading.Thread(target=self._observe, name="cluster", daemon=True)
 
-    @property
-    def _gpus(self) -> bool:
-        """Whether workers state GPUs. A task that asks for one waits for ever where none does."""
-        return any("GPU" in worker["resources"] for worker in self._known().values())
+    def close(self) -> None:
+        """Stop to observe the workers."""
+        self._ended.set()
 
-    def _known(self) -> dict[str, Any]:
-        found: dict[str, Any] = self._client.scheduler_info(n_workers=-1)["workers"]
-        return found
+    def wait(self) -> None:
+        """Wait for the first worker, and observe the workers from then on.
 
-    def run(self, tasks: Iterable[Task], *, stop_when_fatal: bool = True) -> Iterator[TaskResult]:
+        Raises
+        ------
+        TimeoutError : none has started within the time of the configuration
+        """
+        self._client.wait_for_workers(1, timeout=self._config.start_timeout)
+        self._look()
+        self._watch.start()
+
+    def _look(self) -> None:
+        try:
+            # Of all workers; older versions know no other answer.
+            found = self._client.scheduler_info(n_workers=-1)["workers"]
+        except TypeError:
+            found = self._client.scheduler_info()["workers"]
+        self.workers = len(found)
+        self._gpus = any("GPU" in worker["resources"] for worker in found.values())
+
+    def _observe(self) -> None:
+        """Keep the number of workers; says when none is left."""
+        while not self._ended.wait(_LOOK_SECONDS):
+            before = self.workers
+            try:
+                self._look()
+            except Exception:  # the tasks report it
+                continue
+            if before and not self.workers and not self._ended.is_set():
+                self._note("cluster: no worker is left; waiting for new ones")
+
+    def run(self, tasks: Iterable[Task], *, stop_when_fatal: bool = True) -> Generator[TaskResult]:
         """Run tasks; yields each result as it comes, in no particular order.
 
         Parameters
@@ -68,7 +112,9 @@ class Cluster:
         Yields
         ------
         TaskResult
-            A task that failed for a reason that another attempt may not meet has been tried again.
+            A task that failed for a reason that another attempt may not meet has been tried again: if its
+            worker died, at once; if another process works on its files, until locks of dead processes on
+            other machines have ended.
 
         Raises
         ------
@@ -82,37 +128,45 @@ class Cluster:
         run, waiting = uuid4().hex[:8], iter(tasks)
         pending: dict[str, Task] = {}
         done = as_completed(loop=self._client.loop)
-        expected, gpus = version("mbtf"), self._gpus
+        locked: deque[tuple[float, Task]] = deque()
+        since: dict[str, float] = {}
 
-        def submit() -> None:
-            for task in waiting:
-                key = f"{task.name}-{run}"
-                pending[key] = task
-                future = self._client.submit(
+        def submit(task: Task) -> None:
+            key = f"{task.name}-{run}-{uuid4().hex[:4]}"
+            pending[key] = task
+            done.add(
+                self._client.submit(
                     run_task,
                     task.function,
                     dict(task.arguments),
-                    expected,
+                    _VERSION,
                     key=key,
                     pure=False,
-                    retries=self._retries,
-                    resources={"GPU": 1} if task.gpu and gpus else None,
+                    retries=self._config.retries,
+                    resources={"GPU": 1} if task.gpu and self._gpus else None,
                 )
-                done.add(future)
-                if len(pending) >= _AHEAD + 2 * self.workers:
-                    return
+            )
 
         try:
-            submit()
-            while pending:
+            while True:
+                while locked and (locked[0][0] <= time.monotonic() or not pending):
+                    time.sleep(max(0.0, locked[0][0] - time.monotonic()))
+                    submit(locked.popleft()[1])
+                while len(pending) < _AHEAD + 2 * self.workers and (task := next(waiting, None)) is not None:
+                    submit(task)
+                if not pending:
+                    return
                 future = next(done)
                 task = pending.pop(future.key)
                 result = _result(task, future)
                 if result.fatal and stop_when_fatal:
                     hint = "files must lie at the same place on every machine"
                     raise InputError(result.error, where=f"{task.name} on {result.worker}", hint=hint)
+                now = time.monotonic()
+                if result.locked and now - since.setdefault(task.name, now) < _LOCKED_SECONDS:
+                    locked.append((now + _PAUSE_SECONDS, task))
+                    continue
                 yield result
-                submit()
         except (OSError, TimeoutError) as error:
             raise PartialError(f"the cluster is lost ({reason(error)})", hint=_RESUMES) from None
         finally:
@@ -161,57 +215,59 @@ def open_cluster(where: str | None, note: Callable[[str], None]) -> Iterator[Clu
     if where is None:
         yield None
         return
-    config = read_cluster(where)
+    found = read_cluster(where)
+    address = found if isinstance(found, str) else None
+    # Of workers that the user has started, only retries and times are ours.
+    config = ClusterConfig(start_timeout=60.0) if isinstance(found, str) else found
     try:
         import dask
         from distributed import Client
     except ImportError:
         hint = "pip install 'mbtf[cluster]'"
         raise UsageError("Dask is not installed", where="--cluster", hint=hint) from None
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    for name in [name for name in logging.root.manager.loggerDict if name.startswith("distributed")]:
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     settings = {
         # A worker that dies is started again; its task counts the deaths.
-        "distributed.scheduler.allowed-failures": 5 if isinstance(config, str) else config.retries,
+        "distributed.scheduler.allowed-failures": config.retries,
         "distributed.worker.multiprocessing-method": "spawn",
-        # Results are small; workers take a task when they have a free thread.
+        # Workers take a task when they have a free thread.
         "distributed.scheduler.worker-saturation": 1.0,
-        # A renderer's memory is not Dask's to spill; what exceeds the limit is restarted.
-        "distributed.worker.memory.target": False,
-        "distributed.worker.memory.spill": False,
-        "distributed.worker.memory.pause": False,
+        **{f"distributed.worker.memory.{name}": value for name, value in _MEMORY.items()},
         "distributed.logging.distributed": "critical",
         "distributed.comm.timeouts.connect": f"{_CONNECT_SECONDS}s",
     }
     with contextlib.ExitStack() as stack:
         stack.enter_context(dask.config.set(settings))
         try:
-            address = config if isinstance(config, str) else stack.enter_context(_started(config))
-            client = stack.enter_context(Client(address, timeout=_CONNECT_SECONDS, set_as_default=False))
+            started = stack.enter_context(_started(config)) if address is None else address
+            client = stack.enter_context(Client(started, timeout=_CONNECT_SECONDS, set_as_default=False))
+            cluster = Cluster(client, config, note)
+            stack.callback(cluster.close)
         except (OSError, ValueError, TypeError, ImportError, RuntimeError) as error:
-            raise InputError(f"cannot be used ({reason(error)})", where=f"--cluster {where}") from None
-        cluster = Cluster(client, 5 if isinstance(config, str) else config.retries)
-        _wait(client, config, where)
-        note(_describe(client, config, cluster))
+            hint = "" if address is None else f"it must have Dask {version('distributed')}, as this command"
+            raise InputError(
+                f"cannot be used ({reason(error)})", where=f"--cluster {where}", hint=hint
+            ) from None
+        limit = format_duration(config.start_timeout)
+        if config.engine != "local" or address is not None:
+            note(f"cluster: waiting for the first worker, at most {limit}")
+        try:
+            cluster.wait()
+        except TimeoutError:
+            hint = "see the batch system's queue and logs; 'start_timeout' is the time to wait"
+            raise InputError(
+                f"no worker has started within {limit}", where=f"--cluster {where}", hint=hint
+            ) from None
+        note(_describe(address or config.engine, client, cluster))
         yield cluster
 
 
-def _wait(client: Any, config: ClusterConfig | str, where: str) -> None:
-    """Wait for the first worker."""
-    seconds = 60.0 if isinstance(config, str) else config.start_timeout
-    try:
-        client.wait_for_workers(1, timeout=seconds)
-    except TimeoutError:
-        what = f"no worker has started within {format_duration(seconds)}"
-        hint = "see the batch system's queue and logs; 'start_timeout' is the time to wait"
-        raise InputError(what, where=f"--cluster {where}", hint=hint) from None
-
-
-def _describe(client: Any, config: ClusterConfig | str, cluster: Cluster) -> str:
-    if isinstance(config, str):
-        text = f"cluster: {config}, {cluster.workers} workers"
-    else:
-        shape = f"{config.workers} worker{'s' * (config.workers > 1)} of {config.threads} thread"
-        text = f"cluster: {config.engine}, {shape}{'s' * (config.threads > 1)}"
+def _describe(name: str, client: Any, cluster: Cluster) -> str:
+    """What a command says of its workers."""
+    text = f"cluster: {name}, {cluster.workers} worker{'s' * (cluster.workers != 1)} so far"
+    if name == "local":
+        text = text.removesuffix(" so far")
     try:
         import bokeh  # noqa: F401
     except ImportError:
@@ -222,44 +278,57 @@ def _describe(client: Any, config: ClusterConfig | str, cluster: Cluster) -> str
 def _started(config: ClusterConfig) -> Any:
     """A Dask cluster, which ends its workers when its block ends."""
     environment = {THREADS_VARIABLE: str(config.threads), "OMP_NUM_THREADS": str(config.threads)}
-    resources = {"GPU": config.gpus} if config.gpus else {}
-    if config.engine == "local":
-        from distributed import LocalCluster
+    if config.engine != "local":
+        return _jobs(config, environment)
+    from distributed import LocalCluster
+    from distributed.system import MEMORY_LIMIT
 
-        return LocalCluster(
-            n_workers=config.workers,
-            # One task at a time, which has the threads.
-            threads_per_worker=1,
-            processes=True,
-            memory_limit="auto" if config.memory is None else int(config.memory),
-            dashboard_address="127.0.0.1:0",
-            host="127.0.0.1",
-            env=environment,
-            resources=resources,
-            preload=[_PRELOAD],
-            silence_logs=logging.CRITICAL,
-            **config.options,
-        )
+    gpus = {GPUS_VARIABLE: str(config.gpus)} if config.gpus else {}
+    return LocalCluster(
+        n_workers=config.workers,
+        # One task at a time, which has the threads.
+        threads_per_worker=1,
+        processes=True,
+        memory_limit=int(config.memory or MEMORY_LIMIT / config.workers),
+        dashboard_address="127.0.0.1:0",
+        host="127.0.0.1",
+        env={**environment, **gpus},
+        resources={"GPU": config.gpus} if config.gpus else {},
+        preload=[_PRELOAD],
+        silence_logs=logging.CRITICAL,
+        **config.options,
+    )
+
+
+def _jobs(config: ClusterConfig, environment: Mapping[str, str]) -> Any:
+    """Workers as jobs of a batch system."""
     import dask_jobqueue
 
+    name, command = _SYSTEMS[config.engine]
+    if shutil.which(command) is None:
+        raise OSError(f"this machine has no command {command}")
     hours, rest = divmod(int(config.walltime), 3600)
     # One task at a time, which has the threads.
     extra = ["--nthreads", "1", "--preload", _PRELOAD]
-    if resources:
+    if config.gpus:
         extra += ["--resources", f"GPU={config.gpus}"]
     # Workers end before the batch system ends them, one after the other.
     extra += ["--lifetime", f"{max(60, int(0.9 * config.walltime))}s", "--lifetime-stagger", "60s"]
+    memory = {f"DASK_DISTRIBUTED__WORKER__MEMORY__{key.upper()}": str(v) for key, v in _MEMORY.items()}
+    own = dict(config.options)
+    exports = [f"export {key}={value}" for key, value in {**environment, **memory}.items()]
     options: dict[str, Any] = {
         "cores": config.threads,
         "processes": 1,
-        "memory": f"{int(config.memory or 4e9 * max(1, config.threads / 2))}B",
+        "memory": f"{int(config.memory or 2e9 * config.threads)}B",
         "walltime": f"{hours:02d}:{rest // 60:02d}:{rest % 60:02d}",
-        "worker_extra_args": extra,
+        # What a site needs comes on top.
+        "worker_extra_args": [*extra, *own.pop("worker_extra_args", [])],
+        "job_script_prologue": [*own.pop("job_script_prologue", []), *exports],
         "log_directory": "worker-logs",
-        "job_script_prologue": [f"export {name}={value}" for name, value in environment.items()],
-        **config.options,
+        **own,
     }
-    cluster = getattr(dask_jobqueue, _CLASSES[config.engine])(**options)
+    cluster = getattr(dask_jobqueue, name)(**options)
     # Unlike scale(), this replaces workers that have ended.
     cluster.adapt(minimum=config.workers, maximum=config.workers)
     return cluster

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import socket
+import threading
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,10 +13,14 @@ from importlib import import_module
 from importlib.metadata import version
 from typing import Any
 
-from mbtf_core.errors import MbtfError, PartialError
+from mbtf_core.errors import LockedError, MbtfError, PartialError
 
 # Environment variable with the threads of a worker.
 THREADS_VARIABLE = "MBTF_WORKER_THREADS"
+# GPUs of each worker of this machine.
+GPUS_VARIABLE = "MBTF_WORKER_GPUS"
+# Neither a renderer nor the working folder can be shared by the threads of a worker.
+_ALONE = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -47,6 +52,7 @@ class TaskResult:
     value : what the function returned; None where it failed
     error : why it failed, in one line; empty where it did not
     fatal : the others fail for the same reason, such as files that a worker cannot read
+    locked : another process works on the task's files
     worker : machine and process
     seconds : duration on the worker
     """
@@ -55,6 +61,7 @@ class TaskResult:
     value: Any = None
     error: str = ""
     fatal: bool = False
+    locked: bool = False
     worker: str = ""
     seconds: float = 0.0
 
@@ -76,15 +83,16 @@ def run_task(function: str, arguments: Mapping[str, Any], expected: str) -> dict
     if installed != expected:
         error = f"the worker has version {installed} of mbtf, the command {expected}"
         return {"error": error, "fatal": True, "worker": worker}
-    start = time.perf_counter()
-    try:
-        module, _, name = function.partition(":")
-        value = getattr(import_module(module), name)(**arguments)
-    except PartialError as error:
-        return {"error": " ".join(error.message.split()), "worker": worker}
-    except MbtfError as error:
-        return {"error": " ".join(error.message.split()), "fatal": True, "worker": worker}
-    return {"value": value, "worker": worker, "seconds": time.perf_counter() - start}
+    with _ALONE:
+        start = time.perf_counter()
+        try:
+            module, _, name = function.partition(":")
+            value = getattr(import_module(module), name)(**arguments)
+        except MbtfError as error:
+            text = f"{error.where}: {error.what}" if error.where else error.what
+            fatal, locked = not isinstance(error, PartialError), isinstance(error, LockedError)
+            return {"error": text, "fatal": fatal, "locked": locked, "worker": worker}
+        return {"value": value, "worker": worker, "seconds": time.perf_counter() - start}
 
 
 def worker_threads() -> int | None:
@@ -93,9 +101,16 @@ def worker_threads() -> int | None:
     return int(text) if text.isdigit() and int(text) > 0 else None
 
 
-def dask_setup(worker: object) -> None:
+def dask_setup(worker: Any) -> None:
     """Prepare a worker process; Dask calls it at its start.
 
-    The signal of Ctrl-C reaches every process of a terminal; the command ends its workers itself.
+    The signal of Ctrl-C reaches every process of a terminal; the command ends its workers itself. Workers of
+    this machine, whose names are numbers, divide its GPUs.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    each = os.environ.get(GPUS_VARIABLE, "")
+    if each.isdigit() and isinstance(worker.name, int):
+        visible = os.environ.get("CUDA_VISIBLE_DEVICES")
+        first = worker.name * int(each)
+        numbers = visible.split(",") if visible else [str(n) for n in range(first + int(each))]
+        os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(numbers[first : first + int(each)])

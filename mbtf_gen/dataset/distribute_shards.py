@@ -6,7 +6,9 @@ so that the scheduler carries names and figures alone. A worker keeps material a
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -16,7 +18,7 @@ from typing import Any
 
 from mbtf_core.cluster.engine import Cluster
 from mbtf_core.cluster.task import Task, worker_threads
-from mbtf_core.errors import InputError, PartialError
+from mbtf_core.errors import InputError, LockedError, PartialError
 from mbtf_core.locks import keep_renewing, take_lock
 from mbtf_core.shard_schema import MANIFEST_NAME, ShardEntry
 from mbtf_gen.config.generator import GeneratorConfig
@@ -35,8 +37,8 @@ from mbtf_gen.job import Job, most_paths
 from mbtf_gen.planning.run_plan import RunPlan
 from mbtf_gen.planning.simulation import build_estimator
 
-# Rounds in which shards that another process renders are tried, and the pause between two.
-_ROUNDS, _PAUSE = 4, 5.0
+# Failures in a row after which the other shards are not tried: the disk is full.
+_FAILURES = 8
 _THIS = "mbtf_gen.dataset.distribute_shards:render_shard"
 
 
@@ -59,8 +61,8 @@ def distribute_shards(
     Raises
     ------
     InputError : a worker cannot read the material or the folder
-    PartialError : shards failed, other processes render some of them, the cluster is lost, the disk is full,
-        or there are too many non-finite samples; finished shards are kept
+    PartialError : shards failed, the cluster is lost, the disk is full, or there are too many non-finite
+        samples; finished shards are kept
     """
     start = time.perf_counter() if start is None else start
     remove_leftovers(folder)
@@ -70,23 +72,24 @@ def distribute_shards(
     shared = {
         "config": {
             **job.config.model_dump(mode="json"),
-            "material": str(Path(job.config.material).resolve()),
+            "material": os.path.abspath(job.config.material),
         },
-        "folder": str(folder.resolve()),
+        "folder": os.path.abspath(folder),
         "config_hash": job.config_hash,
         "plan": plan_digest(plan.to_manifest()),
     }
     failed: dict[str, str] = {}
-    for attempt in range(_ROUNDS):
-        if attempt:
-            time.sleep(_PAUSE)
-        tasks = [Task(file, _THIS, {**shared, "file": file}) for file in pending if file not in failed]
-        for done in cluster.run(tasks):
+    row = 0
+    tasks = [Task(file, _THIS, {**shared, "file": file}) for file in pending]
+    with contextlib.closing(cluster.run(tasks)) as results:
+        for done in results:
             if done.error:
                 failed[done.task.name] = f"{done.error} (on {done.worker})" if done.worker else done.error
+                row += 1
+                if row >= max(_FAILURES, 2 * cluster.workers):
+                    break
                 continue
-            if done.value is None:  # another process renders it
-                continue
+            row = 0
             entry = pending.pop(done.task.name)
             totals.add(done.value["record"])
             refuse_nonfinite(totals, limit, folder)
@@ -102,28 +105,20 @@ def distribute_shards(
                 error = "" if noise is None else f", noise {noise:.2%}"
                 note = f"{rate / 1e6:.2f} M paths/s on {cluster.workers} workers{error}"
                 progress(result.paths, note, None if left is None else result.paths + left)
-        if len(failed) == len(pending):
-            break
     result.seconds = time.perf_counter() - start
     if failed:
         name, why = next(iter(failed.items()))
         raise PartialError(
-            f"{len(failed)} shard(s) failed, first {name}: {why}",
+            f"{len(failed)} shard(s) failed, {len(pending)} are left; first {name}: {why}",
             where=folder,
-            hint="the same command renders them again",
-        )
-    if pending:
-        raise PartialError(
-            f"{len(pending)} shard(s) are being written by another process, first {next(iter(pending))}",
-            where=folder,
-            hint="wait for it, then run the same command again",
+            hint="the same command goes on",
         )
     return result
 
 
 def render_shard(
     config: dict[str, Any], folder: str, config_hash: str, plan: str, file: str
-) -> dict[str, Any] | None:
+) -> dict[str, Any]:
     """Render one shard into its folder, unless it is finished; runs on a worker.
 
     Parameters
@@ -139,26 +134,28 @@ def render_shard(
 
     Returns
     -------
-    dict or None
-        ``record`` (the sidecar) and ``rendered`` (whether this call rendered it); None where another process
-        renders it.
+    dict
+        ``record`` (the sidecar) and ``rendered`` (whether this call rendered it).
 
     Raises
     ------
     InputError
         This machine does not see the folder, or its files differ.
     PartialError
-        The folder cannot be written.
+        The folder cannot be written, or another process of this machine renders the shard.
     """
     into = Path(folder)
     if not (into / MANIFEST_NAME).exists():
         raise InputError("this machine does not see the data set", where=into)
     run = _run_of(json.dumps(config), into, config_hash, plan)
     entry = next(entry for entry in run.job.shards if entry.file == file)
-    record = finished_record(into, entry, config_hash)
-    lock = None if record is not None else take_lock(into / file)
+    if (record := finished_record(into, entry, config_hash)) is not None:
+        return {"record": record, "rendered": False}
+    # The scheduler gives a shard to one worker. Locks of other machines are those of workers that have died,
+    # or of another command, whose shard has the same bytes.
+    lock = take_lock(into / file, stale=0.0)
     if lock is None:
-        return None if record is None else {"record": record, "rendered": False}
+        raise LockedError("is being written by another process", where=into / file)
     try:
         # Another process may have finished it since.
         if (record := finished_record(into, entry, config_hash)) is not None:

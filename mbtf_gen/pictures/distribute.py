@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import asdict
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,7 +34,7 @@ def picture_task(
     """The task of one picture, whose value is that of
     :func:`~mbtf_gen.pictures.reference.render_reference` with these arguments."""
     # Workers may have other working folders.
-    config = job.config.model_copy(update={"material": str(Path(job.config.material).resolve())})
+    config = job.config.model_copy(update={"material": os.path.abspath(job.config.material)})
     picture = {"kind": kind, "spp": spp, "seed": seed, "index": index}
     arguments = {
         "config": config.model_dump_json(),

@@ -12,7 +12,7 @@ from mbtf_pipeline.emit.steps import Step
 
 SUBMIT, LIBRARY, LOGS = "submit.sh", "job.sh", "logs"
 # A job that has been queued again so often fails. SLURM waits two minutes before each time, and the lock of
-# another machine that has crashed counts for half an hour.
+# another machine that has crashed counts for five minutes.
 _RESTARTS = 20
 # Seconds before the time limit at which the program is told to store its work, and the shortest limit: SLURM
 # may send the signal a minute earlier.

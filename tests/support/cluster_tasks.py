@@ -7,7 +7,7 @@ import signal
 import time
 from pathlib import Path
 
-from mbtf_core.errors import InputError, PartialError
+from mbtf_core.errors import InputError, LockedError, PartialError
 
 
 def double(x: int) -> int:
@@ -26,13 +26,48 @@ def fail(kind: str) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def die_at_first(marks: str, times: int) -> int:
-    """Kill the worker at the first calls; then return how often it was called."""
+def _called(marks: str) -> int:
+    """How often a task was called, this call included."""
     calls = len(list(Path(marks).iterdir())) + 1
     (Path(marks) / f"call-{time.time_ns()}").touch()
+    return calls
+
+
+def die_at_first(marks: str, times: int) -> int:
+    """Kill the worker at the first calls; then return how often it was called."""
+    calls = _called(marks)
     if calls <= times:
         os.kill(os.getpid(), signal.SIGKILL)
     return calls
+
+
+def fail_at_first(marks: str, times: int) -> int:
+    """Fail at the first calls by a bug; then return how often it was called."""
+    calls = _called(marks)
+    if calls <= times:
+        raise ZeroDivisionError("a bug")
+    return calls
+
+
+def locked_at_first(marks: str, times: int) -> int:
+    """Meet a lock at the first calls; then return how often it was called."""
+    calls = _called(marks)
+    if calls <= times:
+        raise LockedError("is being written by another process", where="folder")
+    return calls
+
+
+_running = 0
+
+
+def alone() -> bool:
+    """Whether no other task runs in this process meanwhile."""
+    global _running
+    _running += 1
+    time.sleep(0.02)
+    alone = _running == 1
+    _running -= 1
+    return alone
 
 
 def threads() -> tuple[int | None, str | None]:

@@ -42,7 +42,7 @@ def test_new_and_empty_folders_are_taken_and_ours_is_resumed(tmp_path: Path) -> 
 
 def test_one_command_owns_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder, renewed = tmp_path / "a/b", threading.Event()
-    monkeypatch.setattr("mbtf_core.folders.RENEW_SECONDS", 0.01)
+    monkeypatch.setattr("mbtf_core.locks.RENEW_SECONDS", 0.01)
     monkeypatch.setattr(Lock, "renew", renewed.set)
     with owned(folder):
         assert renewed.wait(10), "machines without common locks look at the age"

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from mbtf_core.cluster import engine, task
+from mbtf_core.cluster.config import ClusterConfig
 from mbtf_core.cluster.engine import Cluster, open_cluster
 from mbtf_core.cluster.task import Task, run_task
 from mbtf_core.errors import InputError, PartialError, UsageError
@@ -53,6 +56,24 @@ def test_a_task_is_run_again_when_its_worker_dies(cluster: Cluster, tmp_path: Pa
     arguments = {"marks": str(tmp_path), "times": 2}
     (done,) = cluster.run([Task("dies", f"{TASKS}:die_at_first", arguments)])
     assert (done.value, done.error) == (3, "")
+
+
+def test_a_task_is_run_again_when_it_fails_by_a_bug(cluster: Cluster, tmp_path: Path) -> None:
+    arguments = {"marks": str(tmp_path), "times": 2}
+    (done,) = cluster.run([Task("flaky", f"{TASKS}:fail_at_first", arguments)])
+    assert (done.value, done.error) == (3, "")
+
+
+def test_tasks_whose_files_are_locked_are_tried_later(
+    cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(engine, "_PAUSE_SECONDS", 0.2)
+    arguments = {"marks": str(tmp_path), "times": 3}
+    (done,) = cluster.run([Task("locked", f"{TASKS}:locked_at_first", arguments)])
+    assert (done.value, done.error) == (4, "")
+    monkeypatch.setattr(engine, "_LOCKED_SECONDS", 0.5)
+    (done,) = cluster.run([Task("for ever", f"{TASKS}:locked_at_first", arguments | {"times": 1000})])
+    assert done.error == "folder: is being written by another process"
 
 
 def test_workers_that_die_each_time_are_reported(cluster: Cluster) -> None:
@@ -111,6 +132,78 @@ def test_a_scheduler_that_ends_leaves_resumable_work(monkeypatch: pytest.MonkeyP
         started.close()
         with pytest.raises(PartialError, match="the cluster is lost"):
             list(results)
+
+
+def test_a_worker_with_several_threads_runs_one_task_at_a_time() -> None:
+    distributed = pytest.importorskip("distributed")
+    with (
+        distributed.LocalCluster(
+            n_workers=1, threads_per_worker=4, processes=True, dashboard_address="127.0.0.1:0"
+        ) as started,
+        open_cluster(started.scheduler_address, lambda line: None) as opened,
+    ):
+        assert opened is not None
+        found = list(opened.run(Task(f"x{i}", f"{TASKS}:alone") for i in range(16)))
+        assert [done.value for done in found] == 16 * [True]
+
+
+def test_jobs_of_batch_systems(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a site needs comes beside what tasks need."""
+    dask_jobqueue = pytest.importorskip("dask_jobqueue")
+    scripts = []
+    monkeypatch.setattr("shutil.which", lambda command: f"/usr/bin/{command}")
+    for system in ("SLURMCluster", "PBSCluster"):
+        monkeypatch.setattr(
+            getattr(dask_jobqueue, system), "adapt", lambda self, **numbers: scripts.append(self.job_script())
+        )
+    own = {
+        "job_script_prologue": ["module load python"],
+        "worker_extra_args": ["--local-directory", "/scratch"],
+        "queue": "short",
+    }
+    for name in ("slurm", "pbs"):
+        config = ClusterConfig(
+            engine=name,
+            threads=8,
+            gpus=1,
+            memory=16e9,
+            walltime=7200,
+            options=own,  # type: ignore[arg-type]
+        )
+        with engine._started(config):
+            pass
+    for script in scripts:
+        lines = script.splitlines()
+        assert lines.index("module load python") < lines.index(f"export {task.THREADS_VARIABLE}=8")
+        assert "export DASK_DISTRIBUTED__WORKER__MEMORY__PAUSE=False" in lines
+        for words in (
+            "--nthreads 1",
+            "--preload mbtf_core.cluster.task",
+            "--resources GPU=1",
+            "--lifetime 6480s",
+            "--local-directory /scratch",
+        ):
+            assert words in script
+    assert "--cpus-per-task=8" in scripts[0]
+    assert "-p short" in scripts[0]
+
+
+def test_a_batch_system_that_is_not_there() -> None:
+    pytest.importorskip("dask_jobqueue")
+    with pytest.raises(OSError, match="no command bsub"):
+        engine._started(ClusterConfig(engine="lsf"))
+
+
+def test_workers_of_this_machine_divide_its_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(task.GPUS_VARIABLE, "2")
+    monkeypatch.setattr("signal.signal", lambda *_: None)
+    for visible, name, expected in ((None, 1, "2,3"), ("4,5,6,7", 1, "6,7"), ("4,5,6,7", 0, "4,5")):
+        if visible is None:
+            monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+        else:
+            monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+        task.dask_setup(SimpleNamespace(name=name))
+        assert os.environ["CUDA_VISIBLE_DEVICES"] == expected
 
 
 def test_threads_outside_of_workers_are_unknown(monkeypatch: pytest.MonkeyPatch) -> None:
