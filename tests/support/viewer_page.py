@@ -52,14 +52,14 @@ class Page:
         return str(self.js("return document.getElementById('message').textContent"))
 
     def picture(self, rows: int, columns: int, side: int = 0) -> np.ndarray:
-        """Radiance (rows, columns, 4) of one frame."""
+        """Radiance (rows, columns, 4) of one frame; of a comparison, of one side."""
         code = """
             const { viewer } = window.mbtf, { renderer } = viewer, [rows, columns, side] = arguments;
             viewer.draw = () => false;
-            const mean = renderer.mean("test", columns, rows, 1);
+            const mean = renderer.mean("test", columns, rows, viewer.shown.length);
             mean.restart();
-            renderer.frame(mean, [viewer.materials[side]], viewer.scene, rows);
-            return [...mean.sides[0][0].read(0, 0, columns, rows)];
+            renderer.frame(mean, viewer.shown, viewer.scene, rows);
+            return [...mean.sides[side][0].read(0, 0, columns, rows)];
         """
         found = np.array(self.js(code, rows, columns, side), np.float64).reshape(rows, columns, 4)
         return found[::-1]
