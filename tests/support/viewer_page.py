@@ -29,6 +29,9 @@ class Page:
         driver.set_page_load_timeout(_TIMEOUT)
         driver.set_script_timeout(_TIMEOUT)
         driver.get("about:blank")
+        # Messages of the page before are not those of this one.
+        for kind in ("browser", "performance"):
+            driver.get_log(kind)
         driver.get(file.as_uri() + ("" if state is None else "#" + quote(json.dumps(state))))
 
     def js(self, code: str, *arguments: Any) -> Any:

@@ -14,10 +14,10 @@ function drawDome(canvas, lights, chosen) {
     if (!elevation) ink.fill();
     ink.stroke();
   }
-  ink.font = "24px sans-serif";
+  ink.font = "34px sans-serif";
   ink.fillStyle = "#9aa0a8";
-  ink.fillText("u", r + 0.8 * size, r + 8);
-  ink.fillText("v", r - 6, r - 0.8 * size);
+  ink.fillText("u", r + 0.76 * size, r + 10);
+  ink.fillText("v", r - 9, r - 0.76 * size);
   lights.forEach(({ direction: [x, y], color }, k) => {
     ink.beginPath();
     ink.arc(r + size * x, r - size * y, k === chosen ? 15 : 11, 0, 2 * Math.PI);

@@ -177,11 +177,16 @@ def test_inputs_set_what_they_say(page: Page) -> None:
         page.choose(name, value)
         found = page.js(STATE + f"return {path}")
         assert found == pytest.approx(expected, rel=0.005), name
+        if not isinstance(value, str) and abs(value) < 9:
+            assert float(
+                page.js("return document.getElementById(arguments[0]).value", name)
+            ) == pytest.approx(value, abs=0.01)
         written = (
             "return document.getElementById(arguments[0]).parentElement.querySelector('output')?.textContent"
         )
         assert (page.js(written, name) or "") == text
-    # The sun of the sky lights more than the rest where the light's color is white.
+    facts = page.js("return [...document.querySelectorAll('#facts td')].map((cell) => cell.textContent)")
+    assert facts[:2] == ["model", "neumip-baseline"]
     assert page.js(STATE + "return [renderer.lit, document.getElementById('dark').hidden]") == [True, True]
     page.choose("environment", "none")
     counts = []
@@ -283,6 +288,18 @@ def test_shapes_fit_the_picture(page: Page, size: tuple[int, int]) -> None:
     finally:
         page.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
         page.js(STATE + "viewer.layout()")
+
+
+def test_the_far_side_of_a_sphere_gets_no_light(page: Page) -> None:
+    """Also at its silhouette, where interpolated normals may point away from the viewer."""
+    camera = {**TOP, "elevation": 20, "azimuth": -60, "target": [0, 0, 0], "tiles_across": 1.4}
+    from_right = [{**ABOVE, "direction": from_angles(0.0, 30.0).tolist()}]
+    page.set({"camera": camera, "lights": from_right, "shape": "sphere"})
+    found = page.picture(300, 400)
+    left, right = found[:, :190], found[:, 210:]
+    assert (left[..., 3] > 0).mean() > 0.3
+    assert (left[..., :3] == 0).all()
+    assert (right[..., :3].max(2) > 0)[right[..., 3] > 0].mean() > 0.99
 
 
 def test_values_of_links_are_brought_into_their_range(page: Page) -> None:
