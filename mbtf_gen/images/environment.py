@@ -17,7 +17,10 @@ _RADIANCE = ".hdr"
 
 
 def read_environment(path: Path, most_rows: int) -> NDArray[np.float32]:
-    """A picture of the whole sphere, rows by latitude, the top one at z.
+    """A picture of the whole sphere, seen from inside: rows by latitude, the top one at z.
+
+    Column i of n is at azimuth 90° - 360° (i + ½) / n, as in an ``envmap`` of Mitsuba that is turned by 90°
+    about x, which puts z up.
 
     Parameters
     ----------
