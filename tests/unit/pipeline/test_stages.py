@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -183,6 +184,7 @@ def test_an_interruption_does_not_wait_for_other_machines(tmp_path: Path) -> Non
 
     def work(decision: Decision) -> None:
         if first.acquire(blocking=False):
+            time.sleep(0.2)  # all stages have begun
             signal.pthread_kill(main, signal.SIGINT)
         ended.wait(20.0)
 
