@@ -46,6 +46,10 @@ class LibraryRecipe(Settings):
         0.2, gt=0, lt=1, description="share of `training` for equal first fits, whose errors divide the rest"
     )
 
+    shared_network: Duration | None = Field(
+        None, description="training time of further fits that share one network; default: none"
+    )
+
     @property
     def folder(self) -> Path:
         """Default folder of the library, relative to the current folder."""
