@@ -40,14 +40,17 @@ def library_page(record: Mapping[str, Any], runs: Path) -> str:
     spent: Counter[str] = Counter()
     for material in record["materials"]:
         spent.update(material.get("seconds", {}))
-    shared = record["shared"]
+    shared, total = record["shared"], record["training"]
+    if "each" in record["division"]:
+        # Further materials bring a share of their own.
+        total = record["division"]["each"] * len(cards)
     return render(
         "library.html",
         record=record,
         # The largest errors first: they are what one looks for. Then failures, then the rest.
         cards=sorted(cards, key=lambda c: (c["rank"], -c["error_value"], c["name"])),
         counts=counts,
-        training=None if record["training"] is None else clock(record["training"]),
+        training=None if total is None else clock(total),
         divided=bool(record["division"].get("times")),
         spent=_times(spent),
         shared_error=shared.get("error", ""),

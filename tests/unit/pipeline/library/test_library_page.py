@@ -52,6 +52,11 @@ def test_first_fits_and_shared_networks(tmp_path: Path) -> None:
     assert "No shared network</b>: too few" in failed
 
 
+def test_the_training_time_includes_that_of_added_materials(tmp_path: Path) -> None:
+    found = record(material("a", "done"), material("added", "done"), training=60.0, division={"each": 60.0})
+    assert f"train for {clock(120.0)}" in library_page(found, tmp_path)
+
+
 def test_pictures_are_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a").mkdir()
     for name in ("fit", "reference"):
