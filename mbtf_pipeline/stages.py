@@ -196,12 +196,16 @@ def run_stages(
             continue
         # Decided before any runs; none needs another.
         decisions = [_decide(folder, stage, done, force, notify) for stage in together]
-        with ThreadPoolExecutor(len(together), "stages") as pool:
+        pool = ThreadPoolExecutor(len(together), "stages")
+        try:
             running = {
                 pool.submit(_finish, folder, stage, decision, notify): stage.name
                 for stage, decision in zip(together, decisions, strict=True)
             }
             results = {running[future]: future for future in as_completed(running)}
+        finally:
+            # An interruption does not wait for what other machines do.
+            pool.shutdown(wait=False, cancel_futures=True)
         # In the stages' order; the first that failed raises, when all have ended.
         done |= {stage.name: results[stage.name].result() for stage in together}
     return done

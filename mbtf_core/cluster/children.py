@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import signal
+import threading
 from collections.abc import Iterable, Iterator
 from importlib.metadata import version
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, wait
 from typing import Any
 
 from mbtf_core.cluster.task import Task, TaskResult, run_task
@@ -14,7 +16,16 @@ from mbtf_core.errors import reason
 from mbtf_core.interruption import SIGNALS, at_end
 
 
+def _end_with_parent() -> None:
+    """End this process when its parent is killed, so that no lock of its outlives the command."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    wait([parent.sentinel])
+    os._exit(1)
+
+
 def _work(function: str, arguments: dict[str, Any], pipe: Connection) -> None:
+    threading.Thread(target=_end_with_parent, name="parent", daemon=True).start()
     for number in SIGNALS:
         signal.signal(number, signal.default_int_handler)
     try:

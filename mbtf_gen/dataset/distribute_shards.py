@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.cluster.engine import Cluster
-from mbtf_core.cluster.task import Task, worker_threads
+from mbtf_core.cluster.task import Task
 from mbtf_core.data_folder import data_folder, in_store, send_shard
 from mbtf_core.errors import InputError, LockedError, PartialError
 from mbtf_core.locks import keep_renewing, take_lock
@@ -186,12 +186,7 @@ class _Run:
     @cached_property
     def estimator(self) -> Any:
         """Built where a shard is to be rendered."""
-        built = build_estimator(self.job, self.plan.effects)
-        if (threads := worker_threads()) is not None and not self.plan.effects.closed_form:
-            import drjit
-
-            drjit.set_thread_count(threads)
-        return built
+        return build_estimator(self.job, self.plan.effects)
 
 
 @lru_cache(maxsize=1)

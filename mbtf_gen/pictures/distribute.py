@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.cluster.task import Task, worker_threads
+from mbtf_core.cluster.task import Task
 from mbtf_core.errors import InputError
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
@@ -79,10 +79,4 @@ def _estimator(config: str, config_hash: str) -> Any:
     job = Job.load(GeneratorConfig.model_validate_json(config))
     if job.config_hash != config_hash:
         raise InputError("the material's files differ on this machine", where=job.config.material)
-    plan = reference_plan(job)
-    estimator = build_estimator(job, plan)
-    if (threads := worker_threads()) is not None and not plan.closed_form:
-        import drjit
-
-        drjit.set_thread_count(threads)
-    return estimator
+    return build_estimator(job, reference_plan(job))

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.child_process import Outcome, run_child
+from mbtf_core.cluster.task import worker_threads
 from mbtf_core.errors import EngineError, UsageError
 from mbtf_core.folders import cache_folder
 from mbtf_gen.render.llvm import (
@@ -76,8 +77,18 @@ def load_mitsuba(variant: str = CPU_VARIANT) -> Any:
         raise _mitsuba_error(" ".join(str(error).split())) from None
     if variant == CPU_VARIANT:
         refuse_old_llvm()
+        if variant not in _working:
+            limit_threads()
     _working.add(variant)
     return mitsuba
+
+
+def limit_threads() -> None:
+    """Render with the threads of this worker; with all processors elsewhere."""
+    if (threads := worker_threads()) is not None:
+        import drjit
+
+        drjit.set_thread_count(threads)
 
 
 def refuse_old_llvm() -> None:

@@ -176,6 +176,9 @@ def _run_library(
             where=folder,
             hint="the same command tries them again and keeps the others",
         )
+    if done.shared_error:
+        hint = "the same command tries it again"
+        raise PartialError(f"no shared network: {done.shared_error}", where=folder, hint=hint)
 
 
 def _report(result: RunResult, console: Console, quality: Quality | None) -> None:

@@ -7,7 +7,8 @@ measure a.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 # Typical exponent b of the curves in docs/results/2026-11-fit-speed.md.
 EXPONENT = 0.5
@@ -47,3 +48,72 @@ def divide(total: float, errors: Mapping[str, float | None]) -> dict[str, float]
         if not low:
             return {name: round((out | times)[name], 3) for name in errors}
         out |= dict.fromkeys(low, LEAST * equal)
+
+
+class Division:
+    """A training time, divided among the materials of a library.
+
+    Each material has an equal share: part of it is its first fit, the rest goes to a pool that is divided
+    among the materials of the pool. A time that was given stays, so that a further material trains no other
+    one again: it brings a share of its own. Materials whose options change divide the times that they had.
+
+    Attributes
+    ----------
+    record : dict
+        ``asked``: the options; ``each``: a share in seconds; ``errors`` and ``times`` of the materials by
+        name, each with the digest of their options.
+    """
+
+    def __init__(self, record: Mapping[str, Any], training: float, first_share: float, count: int) -> None:
+        """Continue a division, or begin one if the options have changed.
+
+        Parameters
+        ----------
+        record : mapping
+            That of an earlier command; empty without one.
+        training : float
+            Sum of all times, in seconds.
+        first_share : float
+            Part of it for first fits.
+        count : int
+            Number of materials, failed ones included.
+        """
+        asked = {"training": training, "first_share": first_share}
+        if record.get("asked") == asked:
+            self.record = dict(record)
+        else:
+            self.record = {"asked": asked, "each": training / count, "errors": {}, "times": {}}
+
+    @property
+    def first(self) -> float:
+        """Training time of a first fit, in seconds."""
+        return float(self.record["asked"]["first_share"] * self.record["each"])
+
+    def has_error(self, name: str, key: str) -> bool:
+        """Whether the error of a material's first fit is known for the options of this digest."""
+        return bool(self.record["errors"].get(name, {}).get("key") == key)
+
+    def add(self, name: str, key: str, error: float | None) -> None:
+        """Record the error of a first fit."""
+        self.record["errors"][name] = {"key": key, "error": error}
+
+    def times(self, keys: Iterable[tuple[str, str]]) -> dict[str, float]:
+        """Training times in seconds of the materials whose first fits have ended.
+
+        Parameters
+        ----------
+        keys : iterable of (str, str)
+            Name and digest of the options.
+
+        Returns
+        -------
+        dict of str to float
+        """
+        errors, times = self.record["errors"], self.record["times"]
+        known = {name: key for name, key in keys if self.has_error(name, key)}
+        new = [name for name, key in known.items() if times.get(name, {}).get("key") != key]
+        share = self.record["each"] - self.first
+        pool = sum(times[name]["seconds"] if name in times else share for name in new)
+        for name, seconds in divide(pool, {name: errors[name]["error"] for name in new}).items():
+            times[name] = {"key": known[name], "seconds": seconds}
+        return {name: times[name]["seconds"] for name in known}

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import base64
 import io
+import math
+from collections import Counter
 from collections.abc import Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -34,15 +37,24 @@ def library_page(record: Mapping[str, Any], runs: Path) -> str:
     """
     cards = [_card(material, runs / material["name"], record) for material in record["materials"]]
     counts = {state: sum(c["state"] == text for c in cards) for state, text in _STATES.items()}
-    first = record["first"].get("errors", {})
+    spent: Counter[str] = Counter()
+    for material in record["materials"]:
+        spent.update(material.get("seconds", {}))
+    shared, total = record["shared"], record["training"]
+    if "each" in record["division"]:
+        # Further materials bring a share of their own.
+        total = record["division"]["each"] * len(cards)
     return render(
         "library.html",
         record=record,
         # The largest errors first: they are what one looks for. Then failures, then the rest.
         cards=sorted(cards, key=lambda c: (c["rank"], -c["error_value"], c["name"])),
         counts=counts,
-        training=None if record["training"] is None else clock(record["training"]),
-        divided=bool(first),
+        training=None if total is None else clock(total),
+        divided=bool(record["division"].get("times")),
+        spent=_times(spent),
+        shared_error=shared.get("error", ""),
+        shared_training=clock(shared["training"]) if shared else None,
     )
 
 
@@ -50,30 +62,50 @@ def _card(material: Mapping[str, Any], run: Path, record: Mapping[str, Any]) -> 
     """What the page shows of one material."""
     name, done = material["name"], material["state"] == "done"
     fits = []
+    shared = record["shared"].get("errors", {}).get(name)
     for fit, found in material.get("fits", {}).items() if done else ():
         error = estimate(found["unexplained"])
-        thumbnail = _thumbnail(run / found["picture"])
-        fits.append({"name": fit, "error": estimate_text(error), "value": error.value, "image": thumbnail})
-    seconds = material.get("seconds", {})
+        with_shared = shared if fit == record["shared"].get("fit") else None
+        fits.append(
+            {
+                "name": fit,
+                "error": estimate_text(error),
+                "shared": None if with_shared is None else estimate_text(estimate(with_shared)),
+                "value": error.value if math.isfinite(error.value) else 0.0,
+                "image": _thumbnail(run / found["picture"]),
+            }
+        )
+    seconds = material.get("seconds", {}) if done else {}
     links = [
         (title, f"{runs_path(name)}/{file}")
         for title, file in (("report", REPORT), ("viewer", VIEWER))
         if done and (run / file).is_file()
     ]
+    division = record["division"]
+    first = division.get("errors", {}).get(name, {"error": None})["error"]
     return {
         "name": name,
         "path": material["path"],
         "state": _STATES[material["state"]],
         "rank": list(_STATES).index(material["state"]),
-        "problem": material["error"],
+        "problem": material["error"] if material["state"] == "failed" else "",
         "fits": fits,
         "error_value": max((fit["value"] for fit in fits), default=0.0),
         "reference": _thumbnail(run / material["reference"]) if done else None,
-        "times": ", ".join(f"{stage} {clock(s)}" for stage, s in seconds.items()),
-        "first": record["first"].get("errors", {}).get(name),
-        "training": record["first"].get("times", {}).get(name),
+        "seconds": sum(seconds.values()),
+        "times": _times(seconds),
+        "first": first,
+        "training": division.get("times", {}).get(name, {}).get("seconds"),
         "links": links,
     }
+
+
+def _times(seconds: Mapping[str, float]) -> str:
+    """Times of stages in words, and their sum."""
+    if not seconds:
+        return ""
+    parts = ", ".join(f"{stage} {clock(s)}" for stage, s in seconds.items())
+    return f"{clock(sum(seconds.values()))}: {parts}"
 
 
 def runs_path(name: str) -> str:
@@ -83,14 +115,20 @@ def runs_path(name: str) -> str:
 
 def _thumbnail(path: Path) -> str | None:
     """A picture as a small ``data:`` URI; None where it is missing or damaged."""
-    from PIL import Image
-
     try:
-        with Image.open(path) as image:
-            small = image.convert("RGB")
-            small.thumbnail((_SIZE, _SIZE))
+        return _small(path, path.stat().st_mtime_ns)
     except OSError:
         return None
+
+
+@lru_cache(maxsize=4096)
+def _small(path: Path, changed: int) -> str:
+    """A picture of a date as a small ``data:`` URI."""
+    from PIL import Image
+
+    with Image.open(path) as image:
+        small = image.convert("RGB")
+        small.thumbnail((_SIZE, _SIZE))
     stream = io.BytesIO()
     small.save(stream, format="JPEG", quality=85)
     return f"data:image/jpeg;base64,{base64.b64encode(stream.getvalue()).decode()}"

@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import os
-import re
-from collections import Counter
+from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field
 
-from mbtf_core.config_file import Settings, read_yaml, resolve
-from mbtf_core.errors import InputError, MbtfError, UsageError, reason
+from mbtf_core.config_file import Settings, build, read_yaml, resolve
+from mbtf_core.errors import InputError, MbtfError, UsageError
+from mbtf_core.nested import deep_merge
 from mbtf_core.units import Duration
-from mbtf_fit.config import DEFAULT_MODEL, FIBER_MODEL
+from mbtf_fit.config import DEFAULT_MODEL, FIBER_MODEL, FitConfig
 from mbtf_pipeline.layers import Layer, MaterialLayer, compose
+from mbtf_pipeline.library.materials import find_materials, name_materials
 from mbtf_pipeline.recipe import Name, Recipe
-
-# Files in a folder of materials that are materials.
-_SUFFIXES = {".yaml", ".yml", ".pyp", ".bcc", ".curves", ".glb", ".gltf", ".ply", ".obj", ".exr"}
 
 
 class LibraryRecipe(Settings):
@@ -44,6 +43,10 @@ class LibraryRecipe(Settings):
     )
     first_share: float = Field(
         0.2, gt=0, lt=1, description="share of `training` for equal first fits, whose errors divide the rest"
+    )
+
+    shared_network: Duration | None = Field(
+        None, description="training time of further fits that share one network; default: none"
     )
 
     @property
@@ -92,11 +95,52 @@ def load_library_recipe(path: Path, assignments: list[str]) -> LibraryRecipe:
     Raises
     ------
     InputError
-        The file cannot be read, or contains an unknown key or an invalid value.
+        The file cannot be read, or contains an unknown key or an invalid value, also in its options of runs.
     UsageError
-        An assignment is invalid, or sets one training time of all fits and one of each.
+        An assignment is invalid, or there is one training time of all fits and one of each.
     """
-    return resolve(LibraryRecipe, file=path, assignments=assignments)
+    library = resolve(LibraryRecipe, file=path, assignments=assignments)
+    if library.training is not None:
+        _refuse_own_times(library)
+    try:
+        _check_base(library.base.model_dump(mode="json"), f"{path}: base")
+    except InputError:
+        # The same from the file, which has line numbers.
+        _check_base(read_yaml(path).get("base") or {}, str(path))
+        raise
+    return library
+
+
+def _refuse_own_times(library: LibraryRecipe) -> None:
+    """Refuse training times of single fits beside one of all fits."""
+    layers = {"base": library.base, **{f"materials.{name}": one for name, one in library.materials.items()}}
+    for where, layer in layers.items():
+        fits = {"each_fit": layer.each_fit, **{f"fit.{name}": fit for name, fit in layer.fit.items()}}
+        for fit, options in fits.items():
+            training = (options or {}).get("training") or {}
+            for key in ("time", "steps"):
+                if isinstance(training, Mapping) and training.get(key) is not None:
+                    hint = "leave out one of them"
+                    what = "is a time of its own beside 'training', the time of all fits"
+                    raise UsageError(what, where=f"{where}.{fit}.training.{key}", hint=hint)
+
+
+def _check_base(base: Mapping[str, Any], source: str) -> None:
+    """Check the options of all runs once, in place of for every material."""
+    # A copy, which keeps line numbers.
+    data: Any = deepcopy(base)
+    each = data.pop("each_fit", None) or {}
+    data["name"] = "any"
+    data["generate"] = data.get("generate") or {}
+    data["generate"]["material"] = "any"
+    fits = data.get("fit") or {DEFAULT_MODEL: None}
+    data["fit"] = {name: deep_merge(each, {"model": name, **(own or {})}) for name, own in fits.items()}
+    try:
+        build(Recipe, data, source=source)
+    except InputError:
+        # A fault in `each_fit` has a line there.
+        build(FitConfig, each, source=source)
+        raise
 
 
 def entries(library: LibraryRecipe, path: Path) -> list[Entry]:
@@ -119,11 +163,12 @@ def entries(library: LibraryRecipe, path: Path) -> list[Entry]:
     InputError
         There are none, or a list cannot be read.
     UsageError
-        Two have the same name.
+        One is listed twice.
     """
     found: dict[str, tuple[Path, Layer]] = {}
-    paths = [file for text in library.library for file in _materials(path.parent / text)]
-    names = _names(paths)
+    paths = [file for text in library.library for file in find_materials(path.parent / text)]
+    named = [name for name, layer in library.materials.items() if "material" in layer.generate]
+    names = name_materials(paths, named)
     for name, file in zip(names, paths, strict=True):
         found[name] = (file, library.materials.get(name, Layer()))
     for name, layer in library.materials.items():
@@ -156,50 +201,3 @@ def _model_for(file: Path) -> str:
     from mbtf_gen.material.spec import MaterialFile
 
     return DEFAULT_MODEL if isinstance(described(file)[0], MaterialFile) else FIBER_MODEL
-
-
-def _materials(path: Path) -> list[Path]:
-    """Materials of an entry of `library`."""
-    path = Path(os.path.normpath(path))
-    if path.suffix == ".txt" and path.is_file():
-        try:
-            lines = [line.strip() for line in path.read_text(encoding="utf-8").splitlines()]
-        except (OSError, UnicodeDecodeError) as error:
-            raise InputError(f"cannot be read as a list ({reason(error)})", where=path) from None
-        listed = [path.parent / line for line in lines if line and not line.startswith("#")]
-        return [Path(os.path.normpath(file)) for file in listed]
-    if not path.is_dir() or _is_material(path):
-        return [path]
-    inside = [p for p in sorted(path.iterdir()) if not p.name.startswith((".", "_"))]
-    return [p for p in inside if (_is_material(p) if p.is_dir() else p.suffix.lower() in _SUFFIXES)]
-
-
-def _is_material(folder: Path) -> bool:
-    """Whether a folder holds maps or a description; whether they are usable is for its run to say."""
-    from mbtf_gen.images.read import is_image
-
-    return any(
-        file.name in ("material.yaml", "material.yml") or is_image(file)
-        for file in folder.iterdir()
-        if file.is_file()
-    )
-
-
-def _names(paths: list[Path]) -> list[str]:
-    """A name for each material, that of its file or folder; equal ones are prefixed by the parent's."""
-    plain = [_name(path.stem if path.suffix.lower() in _SUFFIXES else path.name) for path in paths]
-    often = Counter(plain)
-    names = [
-        name if often[name] == 1 else f"{_name(path.parent.name)}-{name}"
-        for name, path in zip(plain, paths, strict=True)
-    ]
-    for name, count in Counter(names).items():
-        if count > 1:
-            hint = "list each once, or rename one"
-            raise UsageError(f"{count} materials have the name {name}", where="library", hint=hint)
-    return names
-
-
-def _name(text: str) -> str:
-    cleaned = re.sub(r"[^A-Za-z0-9._+-]+", "_", text).lstrip("._+-")
-    return cleaned[:100] or "material"

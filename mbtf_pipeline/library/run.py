@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,20 +13,23 @@ from mbtf_core.cluster.children import run_in_children
 from mbtf_core.cluster.engine import Cluster
 from mbtf_core.cluster.task import Task, TaskResult
 from mbtf_core.console import Console
+from mbtf_core.digest import data_sha256
 from mbtf_core.errors import InputError, MbtfError
 from mbtf_core.folders import check_folder, owned
-from mbtf_pipeline.library.budget import divide
+from mbtf_fit.config import DECODER_MODELS, FitConfig
+from mbtf_fit.material.decoder import DECODER_FOLDER
+from mbtf_pipeline.library.budget import Division
 from mbtf_pipeline.library.page import library_page
 from mbtf_pipeline.library.recipe import Entry, LibraryRecipe
-from mbtf_pipeline.library.task import summarize
+from mbtf_pipeline.library.task import shards_of, summarize
 from mbtf_pipeline.run_folder import has_record, machine
 
 LIBRARY_NAME = "library.json"
 LIBRARY_FORMAT = "mbtf-library"
-LIBRARY_SCHEMA = 1
+LIBRARY_SCHEMA = 2
 PAGE = "library.html"
-# Sub-folder of the runs.
-MATERIALS = "materials"
+# Sub-folders of the runs, and of the fits with a shared network.
+MATERIALS, SHARED = "materials", "shared"
 _TASK = "mbtf_pipeline.library.task"
 
 
@@ -51,6 +55,11 @@ class LibraryResult:
     def failed(self) -> dict[str, str]:
         """Why materials failed, by name."""
         return {m["name"]: m["error"] for m in self.record["materials"] if m["state"] == "failed"}
+
+    @property
+    def shared_error(self) -> str:
+        """Why there is no shared network; empty if there is one, or none is asked for."""
+        return str(self.record["shared"].get("error", ""))
 
 
 def is_library(folder: Path) -> bool:
@@ -112,58 +121,93 @@ class _LibraryRun:
         self.library, self.folder, self.command = library, folder, command
         self.console, self.cluster = console, cluster
         before = read_json(folder / LIBRARY_NAME) if (folder / LIBRARY_NAME).is_file() else {}
-        self.first: dict[str, Any] = before.get("first", {})
+        self.before = {state["name"]: state for state in before.get("materials", [])}
+        self.division: dict[str, Any] = before.get("division", {})
+        self.shared: dict[str, Any] = before.get("shared", {})
         self.states: dict[str, dict[str, Any]] = {}
 
     def run(self, found: list[Entry]) -> LibraryResult:
         """All materials, then the page."""
         for entry in found:
-            begin = "failed" if entry.error else "pending"
-            self.states[entry.name] = {
-                "name": entry.name,
-                "path": str(entry.path),
-                "state": begin,
-                "error": entry.error,
-            }
+            # What an earlier command has made is shown until its run ends.
+            state = self.before.get(entry.name, {"state": "pending", "error": ""})
+            state |= {"name": entry.name, "path": os.path.relpath(entry.path, self.folder)}
+            self.states[entry.name] = state | (
+                {"state": "failed", "error": entry.error} if entry.error else {}
+            )
         self._write()
         left = [entry for entry in found if entry.recipe is not None]
-        if self.library.training is not None:
-            left = self._divided(left)
-        tasks = [self._task("run_material", entry) for entry in left]
+        timed = left if self.library.training is None else self._divided(left, len(found))
+        tasks = [self._task("run_material", entry) for entry in timed]
         with self.console.progress(len(tasks), "library", "materials") as bar:
             for done in self._results(tasks):
                 state = self.states[done.task.name]
                 self._finish(state, done)
                 self._write()
                 bar.advance(1, f"{done.task.name}: {state['state']}")
+        if self.library.shared_network is None:
+            self.shared = {}
+        else:
+            self._share([entry for entry in left if self.states[entry.name]["state"] == "done"])
         return LibraryResult(self.folder, self.folder / PAGE, self._write())
 
-    def _divided(self, left: list[Entry]) -> list[Entry]:
+    def _divided(self, left: list[Entry], count: int) -> list[Entry]:
         """The materials with the training times that follow from their first fits."""
         assert self.library.training is not None
-        each = self.library.training / max(len(left), 1)
-        first = self.library.first_share * each
-        extra = {"seconds": first}
-        kept = {"seconds": first, "materials": sorted(entry.name for entry in left)}
-        if self.first.get("asked") != kept:
-            tasks = [self._task("first_fit", entry, **extra) for entry in left]
-            errors: dict[str, float | None] = {}
-            with self.console.progress(len(tasks), "first fits", "materials") as bar:
-                for done in self._results(tasks):
-                    if done.error:
-                        self.states[done.task.name] |= {"state": "failed", "error": done.error}
-                    else:
-                        errors[done.task.name] = done.value
-                    self._write()
-                    bar.advance(1, f"{done.task.name}: {'failed' if done.error else 'done'}")
-            ordered = {entry.name: errors[entry.name] for entry in left if entry.name in errors}
-            rest = self.library.training - first * len(left)
-            self.first = {"asked": kept, "errors": ordered, "times": divide(rest, ordered)}
-            self._write()
-            left = [entry for entry in left if entry.name in errors]
-        # A first fit that failed in an earlier run leaves an equal share.
-        times = {entry.name: self.first["times"].get(entry.name, each - first) for entry in left}
-        return [_timed(entry, times[entry.name]) for entry in left]
+        division = Division(self.division, self.library.training, self.library.first_share, count)
+        self.division = division.record
+        keys = {entry.name: _digest(entry) for entry in left}
+        tasks = [
+            self._task("first_fit", entry, seconds=division.first)
+            for entry in left
+            if not division.has_error(entry.name, keys[entry.name])
+        ]
+        with self.console.progress(len(tasks), "first fits", "materials") as bar:
+            for done in self._results(tasks):
+                name = done.task.name
+                if done.error:
+                    self.states[name] |= {"state": "failed", "error": done.error}
+                    self.console.note(f"{name}: failed: {done.error}")
+                else:
+                    division.add(name, keys[name], done.value)
+                self._write()
+                bar.advance(1, f"{name}: {'failed' if done.error else 'done'}")
+        times = division.times(keys.items())
+        self._write()
+        return [_timed(entry, times[entry.name]) for entry in left if entry.name in times]
+
+    def _share(self, done: list[Entry]) -> None:
+        """Fit materials of one model and the same options with one network."""
+        assert self.library.shared_network is not None
+        asked = {"training": self.library.shared_network, "fit": "", "errors": {}}
+        group = _same_fits(done)
+        if len(group) < 2:
+            self.shared = asked | {
+                "error": "fewer than two finished materials have the same model and options"
+            }
+            return
+        _, name = group[0]
+        configs = [entry.recipe.fit[fit] for entry, fit in group if entry.recipe is not None]
+        update = {"time": self.library.shared_network, "steps": None, "shared_decoder": True}
+        config = configs[0].model_copy(update={"training": configs[0].training.model_copy(update=update)})
+        runs, folder = self.folder / MATERIALS, self.folder / SHARED
+        arguments = {
+            "config": config.model_dump(mode="json"),
+            "shards": [
+                str(shards_of(entry.recipe, config, runs / entry.name))
+                for entry, _ in group
+                if entry.recipe is not None
+            ],
+            "folders": [str(folder / entry.name) for entry, _ in group],
+            "decoder": str(folder / DECODER_FOLDER),
+            "working_folder": str(Path.cwd()),
+        }
+        self.console.note(f"{name}: a shared network of {len(group)} materials")
+        task = Task("shared network", f"{_TASK}:fit_shared", arguments, gpu=config.device == "cuda")
+        for result in self._results([task]):
+            found = zip(group, result.value or (), strict=not result.error)
+            errors = {entry.name: error for (entry, _), error in found}
+            self.shared = asked | {"fit": name, "errors": errors, "error": result.error}
 
     def _task(self, function: str, entry: Entry, **arguments: Any) -> Task:
         assert entry.recipe is not None
@@ -183,7 +227,8 @@ class _LibraryRun:
     def _finish(self, state: dict[str, Any], done: TaskResult) -> None:
         if not done.error:
             try:
-                state |= {"state": "done", **done.value, **summarize(self.folder / MATERIALS / state["name"])}
+                state |= {"state": "done", "error": ""}
+                state |= {**done.value, **summarize(self.folder / MATERIALS / state["name"])}
             except MbtfError as error:
                 state |= {"state": "failed", "error": " ".join(error.message.split())}
             return
@@ -201,7 +246,8 @@ class _LibraryRun:
             "command": self.command,
             "machine": machine(),
             "training": self.library.training,
-            "first": self.first,
+            "division": self.division if self.library.training is not None else {},
+            "shared": self.shared,
             "materials": list(self.states.values()),
         }
         write_json(self.folder / LIBRARY_NAME, record)
@@ -218,6 +264,31 @@ def _timed(entry: Entry, seconds: float) -> Entry:
         training = config.training.model_copy(update={"time": own, "steps": None})
         fits[name] = config.model_copy(update={"training": training})
     return replace(entry, recipe=entry.recipe.model_copy(update={"fit": fits}))
+
+
+def _untimed(config: FitConfig) -> dict[str, Any]:
+    """Options of a fit but for its training time."""
+    fields = config.fields()
+    training = {key: value for key, value in fields["training"].items() if key not in ("time", "steps")}
+    return {**fields, "training": training}
+
+
+def _digest(entry: Entry) -> str:
+    """Digest of the options that the error of a material's first fit depends on, its time excepted."""
+    assert entry.recipe is not None
+    fits = {name: _untimed(config) for name, config in entry.recipe.fit.items()}
+    generate = entry.recipe.generate.model_dump(mode="json", exclude={"material"})
+    return data_sha256({"generate": generate, "fit": fits})
+
+
+def _same_fits(done: Iterable[Entry]) -> list[tuple[Entry, str]]:
+    """Most materials whose fits can share a network: with the name of the fit, one of each material."""
+    groups: dict[str, dict[str, tuple[Entry, str]]] = {}
+    for entry in done:
+        for name, config in entry.recipe.fit.items() if entry.recipe is not None else ():
+            if config.model in DECODER_MODELS and config.decoder is None and config.init_from is None:
+                groups.setdefault(data_sha256(_untimed(config)), {}).setdefault(entry.name, (entry, name))
+    return list(max(groups.values(), key=len, default={}).values())
 
 
 def write_again(folder: Path) -> Path:

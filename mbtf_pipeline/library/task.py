@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mbtf_core.atomic import read_json
 from mbtf_core.cluster.task import worker_threads
 from mbtf_core.errors import InputError
+from mbtf_fit.config import FitConfig
 from mbtf_pipeline.recipe import Recipe
+
+if TYPE_CHECKING:
+    from mbtf_fit.training.fit import FitResult
+    from mbtf_gen.dataset.reader import Dataset
 
 # Sub-folder of a run with the first fit, whose error divides the training time.
 FIRST = "first"
@@ -43,21 +49,88 @@ def first_fit(recipe: str, folder: str, working_folder: str, seconds: float, com
     """
     with _in_folder(working_folder):
         from mbtf_fit.training.fit import fit
-        from mbtf_pipeline.run import data_sets, generate_data, layout_of
+        from mbtf_fit.training.fit_folder import identity_of
+        from mbtf_pipeline.run import generate_data
 
         loaded = Recipe.model_validate_json(recipe)
         run = Path(folder)
         generate_data(loaded, run, command=command)
         name, config = next(iter(loaded.fit.items()))
-        data = next(d for d in data_sets(loaded) if d.config.queries.layout == layout_of(config))
+        shards, out = shards_of(loaded, config, run), run / FIRST / name
         training = config.training.model_copy(update={"time": seconds, "steps": None})
         short = config.model_copy(update={"training": training})
-        # An earlier first fit of other options or data is worth nothing.
-        result = fit(short, run / data.sub, run / FIRST / name, overwrite=True)
-        errors = result.errors
-        found = errors.get("test") or errors["held_out_queries"]
-        value = found["unexplained"]["value"]
+        identity = identity_of(short, _open(shards, config))
+        value = _unexplained(fit(short, shards, out, overwrite=not _holds(out, identity)))["value"]
         return None if value is None else float(value)
+
+
+def fit_shared(
+    config: dict[str, Any], shards: list[str], folders: list[str], decoder: str, working_folder: str
+) -> list[dict[str, Any]]:
+    """Fit several materials with one network.
+
+    Parameters
+    ----------
+    config : dict
+        Resolved options of the fit.
+    shards, folders : list of str
+        Data set and folder of each material.
+    decoder : str
+        Folder of the network.
+    working_folder : str
+        Folder that all paths are relative to.
+
+    Returns
+    -------
+    list of dict
+        Unexplained variance of each material: ``value``, ``error``, ``n``.
+
+    Raises
+    ------
+    InputError, PartialError
+        As :func:`~mbtf_fit.training.joint_fit.fit_jointly`.
+    """
+    with _in_folder(working_folder):
+        from mbtf_fit.training.fit_folder import identity_of
+        from mbtf_fit.training.joint_fit import fit_jointly
+
+        loaded = FitConfig.model_validate(config)
+        group = [_open(folder, loaded) for folder in shards]
+        same = all(
+            _holds(Path(folder), identity_of(loaded, data, group))
+            for folder, data in zip(folders, group, strict=True)
+        )
+        result = fit_jointly(loaded, shards, folders, decoder, overwrite=not same)
+        return [_unexplained(done) for done in result.fits]
+
+
+def shards_of(recipe: Recipe, config: FitConfig, run: Path) -> Path:
+    """Folder of the data set that a fit of a run learns from."""
+    from mbtf_pipeline.run import data_sets, layout_of
+
+    return run / next(d.sub for d in data_sets(recipe) if d.config.queries.layout == layout_of(config))
+
+
+def _open(shards: str | Path, config: FitConfig) -> Dataset:
+    from mbtf_fit.data.loader import open_data
+    from mbtf_fit.models.registry import MODELS
+
+    return open_data(shards, MODELS[config.model].layout, config.model)
+
+
+def _unexplained(result: FitResult) -> dict[str, Any]:
+    found = result.errors.get("test") or result.errors["held_out_queries"]
+    return dict(found["unexplained"])
+
+
+def _holds(folder: Path, identity: Mapping[str, Any]) -> bool:
+    """Whether a folder holds this fit, finished or not; any other one is worth nothing."""
+    from mbtf_fit.training.fit_folder import FIT_NAME
+
+    try:
+        return bool(read_json(folder / FIT_NAME).get("config_hash") == identity["config_hash"])
+    except InputError:
+        return False
 
 
 def run_material(recipe: str, folder: str, working_folder: str, command: str) -> dict[str, Any]:

@@ -75,3 +75,11 @@ def threads() -> tuple[int | None, str | None]:
     from mbtf_core.cluster.task import worker_threads
 
     return worker_threads(), os.environ.get("OMP_NUM_THREADS")
+
+
+def wait_long(mark: str) -> None:
+    """Write the number of this process to a file, and work for long."""
+    part = Path(f"{mark}.part")
+    part.write_text(str(os.getpid()))
+    part.rename(mark)
+    time.sleep(600.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,13 @@ from PIL import Image
 from support.small_runs import contents
 
 from mbtf_core.console import run
+from mbtf_fit.material.decoder import Decoder
+from mbtf_fit.material.material import Material
+from mbtf_gen.generation import generate
+from mbtf_gen.job import Job
 from mbtf_pipeline.cli.app import app
+from mbtf_pipeline.library.task import first_fit
+from mbtf_pipeline.recipe import read_resolved
 
 RECIPE = """
 name: test
@@ -55,6 +62,21 @@ def record(out: Path) -> dict[str, dict[str, object]]:
     return {material["name"]: material for material in found["materials"]}
 
 
+def division(out: Path) -> dict[str, dict[str, dict[str, float]]]:
+    found: dict[str, dict[str, dict[str, float]]] = json.loads((out / "library.json").read_text())["division"]
+    return found
+
+
+def times_of(found: dict[str, dict[str, dict[str, float]]]) -> dict[str, float]:
+    return {name: time["seconds"] for name, time in found["times"].items()}
+
+
+def weights(out: Path, *names: str) -> dict[str, int]:
+    """When the fits of materials, and their first ones, were written."""
+    paths = [out / "materials" / name / sub / "neumip" for name in names for sub in ("fits", "first")]
+    return {str(path): (path / "weights.safetensors").stat().st_mtime_ns for path in paths}
+
+
 def test_failures_are_named_and_the_rest_is_kept(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = folder / "out"
     line = ["run", str(folder / "library.yaml"), "-o", str(out), "-q"]
@@ -71,32 +93,86 @@ def test_failures_are_named_and_the_rest_is_kept(folder: Path, capsys: pytest.Ca
     for name in ("flat", "rough"):
         assert f'href="materials/{name}/report.html"' in page
         assert (out / "materials" / name / "report.html").is_file()
-    first = json.loads((out / "library.json").read_text())["first"]
+    first = division(out)
     assert set(first["errors"]) == {"flat", "rough"}
-    # The times of both fits are recorded, and sum to what the first fits left.
-    times = {n: json.loads((out / f"materials/{n}/fits/neumip/fit.json").read_text()) for n in first["times"]}
-    assert sum(first["times"].values()) == pytest.approx(4.0 - 2 * 0.2 * 4.0 / 2, abs=0.5)
-    for name, fit in times.items():
-        assert str(first["times"][name]).rstrip("0").rstrip(".") in str(fit["config"]["training"]["time"])
+    # The times of both fits are recorded, and sum to what the first fits left them; the rest waits.
+    assert sum(times_of(first).values()) == pytest.approx(2 * 0.8 * 4.0 / 3, abs=0.01)
+    for name, time in times_of(first).items():
+        fit = json.loads((out / f"materials/{name}/fits/neumip/fit.json").read_text())
+        assert str(time).rstrip("0").rstrip(".") in str(fit["config"]["training"]["time"])
     # Repaired, it runs, and the others are not run again.
-    kept = {n: (out / f"materials/{n}/fits/neumip/weights.safetensors").stat().st_mtime_ns for n in times}
+    kept = weights(out, "flat", "rough")
     Image.fromarray(np.zeros((8, 8), np.uint8)).save(folder / "materials" / "broken" / "height.png")
     assert run(app, line) == 0
     assert record(out)["broken"]["state"] == "done"
-    for name, time in kept.items():
-        path = out / f"materials/{name}/fits/neumip/weights.safetensors"
-        assert (path.stat().st_mtime_ns == time) or name == "broken"
+    assert weights(out, "flat", "rough") == kept
+    assert sum(times_of(division(out)).values()) == pytest.approx(0.8 * 4.0, abs=0.01)
     assert run(app, ["report", str(out), "-q"]) == 0
+    # A further material trains no other one again.
+    kept = weights(out, "broken", "flat", "rough")
+    shutil.copytree(folder / "materials" / "rough", folder / "materials" / "added")
+    try:
+        assert run(app, line) == 0
+    finally:
+        shutil.rmtree(folder / "materials" / "added")
+    assert record(out)["added"]["state"] == "done"
+    assert weights(out, "broken", "flat", "rough") == kept
 
 
-def test_workers_make_the_same_data(folder: Path) -> None:
+TWO = RECIPE.replace("[materials]", "[materials/flat, materials/rough]")
+
+
+@pytest.fixture(scope="module")
+def two(folder: Path) -> Path:
+    """A library of two materials, made on workers, with a shared network."""
     pytest.importorskip("distributed", reason="no Dask; to enable: pip install 'mbtf[cluster]'")
+    (folder / "two.yaml").write_text(f"{TWO}shared_network: 1s\n")
     out = folder / "clustered"
-    line = ["run", str(folder / "library.yaml"), "-o", str(out), "-q", "--cluster", "local:2"]
-    assert run(app, line) in (0, 4)
-    assert record(out)["rough"]["state"] == "done"
-    own, clustered = (contents(folder / f / "materials/rough/shards") for f in ("out", "clustered"))
-    assert own == clustered
+    assert run(app, ["run", str(folder / "two.yaml"), "-o", str(out), "-q", "--cluster", "local:2"]) == 0
+    return out
+
+
+def test_workers_make_the_same_data(folder: Path, two: Path) -> None:
+    assert {material["state"] for material in record(two).values()} == {"done"}
+    config = read_resolved(two / "materials" / "rough").generate
+    material = str(folder / "materials" / "rough")
+    generate(Job.prepare(config.model_copy(update={"material": material})), folder / "own")
+    assert contents(folder / "own") == contents(two / "materials/rough/shards")
+
+
+def test_a_shared_network(two: Path) -> None:
+    shared = json.loads((two / "library.json").read_text())["shared"]
+    assert shared["fit"] == "neumip"
+    assert set(shared["errors"]) == {"flat", "rough"}
+    assert not shared["error"]
+    for name in ("flat", "rough"):
+        material = Material.load(two / "shared" / name)
+        assert material.description["training"]["shared_decoder"]["materials"] == ["flat", "rough"]
+    assert Decoder.find(two / "shared").config.training.time == 1.0
+    assert (two / "library.html").read_text().count("with the shared network") == 2
+    # Up to date, nothing is trained again; without it, the page no longer shows it.
+    before = (two / "shared/decoder/weights.safetensors").stat().st_mtime_ns
+    line = ["run", str(two.parent / "two.yaml"), "-o", str(two), "-q"]
+    assert run(app, line) == 0
+    assert (two / "shared/decoder/weights.safetensors").stat().st_mtime_ns == before
+    assert run(app, [*line, "--set", "shared_network=null"]) == 0
+    assert "with the shared network" not in (two / "library.html").read_text()
+
+
+def test_a_first_fit_is_kept_for_the_same_options(two: Path) -> None:
+    run_folder = two / "materials" / "rough"
+    weights = run_folder / "first" / "neumip" / "weights.safetensors"
+    recipe = read_resolved(run_folder)
+    generated = recipe.generate.model_copy(update={"material": str(two.parent / "materials" / "rough")})
+    text = recipe.model_copy(update={"generate": generated}).model_dump_json()
+    arguments = {"recipe": text, "folder": str(run_folder), "working_folder": ".", "command": ""}
+    before = weights.stat().st_mtime_ns
+    error = first_fit(**arguments, seconds=0.4)
+    assert error is not None
+    assert weights.stat().st_mtime_ns == before
+    assert error == division(two)["errors"]["rough"]["error"]
+    first_fit(**arguments, seconds=0.3)
+    assert weights.stat().st_mtime_ns != before
 
 
 def test_options_of_single_runs_are_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import signal
+import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -174,3 +177,24 @@ def test_running_one_stage_again(pipeline: Pipeline) -> None:
     stamp_path(pipeline.folder, "fit b").unlink()
     with pytest.raises(InputError, match="fit b"):
         run_again(pipeline.folder, pipeline.stage("report"))
+
+
+def test_an_interruption_does_not_wait_for_other_machines(tmp_path: Path) -> None:
+    first, ended, main = threading.Lock(), threading.Event(), threading.get_ident()
+
+    def work(decision: Decision) -> None:
+        if first.acquire(blocking=False):
+            time.sleep(0.2)  # all stages have begun
+            signal.pthread_kill(main, signal.SIGINT)
+        ended.wait(20.0)
+
+    stages = [Stage(f"fit {n}", (), {}, {}, list, work, remote=True) for n in "ab"]
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run_stages(tmp_path, stages)
+        # Its threads still wait.
+        assert any(thread.name.startswith("stages") for thread in threading.enumerate())
+    finally:
+        signal.signal(signal.SIGINT, before)
+        ended.set()

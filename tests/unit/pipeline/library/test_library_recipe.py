@@ -80,8 +80,56 @@ def test_cloths_get_the_model_without_geometry(folder: Path) -> None:
 def test_faults_of_the_recipe(folder: Path) -> None:
     with pytest.raises(InputError, match=r"materials\.shel\b.*no material of the library"):
         load(folder, "library: [assets]\nmaterials:\n  shel: {fit: {relief: {}}}\n" + BASE)
-    with pytest.raises(UsageError, match="2 materials have the name"):
+    with pytest.raises(UsageError, match="listed twice"):
         load(folder, "library: [assets/shell, assets/shell]\n" + BASE)
     (folder / "empty").mkdir()
     with pytest.raises(InputError, match="names no material"):
         load(folder, "library: [empty]\n" + BASE)
+
+
+def test_equal_names_are_numbered(tmp_path: Path) -> None:
+    for name in ("木", "石", "oak dark", "oak_dark"):
+        material(tmp_path / "u" / name)
+    assert sorted(load(tmp_path, "library: [u]\n" + BASE)) == [
+        *("u-material", "u-material-2", "u-oak_dark", "u-oak_dark-2")
+    ]
+
+
+def test_a_file_and_what_it_names_are_one_material(tmp_path: Path) -> None:
+    (tmp_path / "shirt.obj").write_text("")
+    (tmp_path / "other.obj").write_text("")
+    (tmp_path / "shirt.yaml").write_text("mesh: shirt.obj\n")
+    # The recipe itself is no material, nor is what an earlier run has written.
+    material(tmp_path / "out" / "runs")
+    (tmp_path / "out" / "library.json").write_text("{}")
+    assert list(load(tmp_path, "library: [.]\n" + BASE)) == ["other", "shirt"]
+
+
+def test_folders_of_folders_and_stray_pictures(tmp_path: Path) -> None:
+    material(tmp_path / "q" / "group" / "a")
+    material(tmp_path / "q" / "b")
+    np.save(material(tmp_path / "q" / "c") / "more.npy", np.zeros((4, 4), np.float32))
+    (tmp_path / "q" / "preview.png").write_bytes(b"")
+    (tmp_path / "q" / "unclear").mkdir()
+    (tmp_path / "q" / "unclear" / "wood.png").write_bytes(b"")
+    (tmp_path / "q" / "loop").symlink_to(tmp_path / "q", target_is_directory=True)
+    found = load(tmp_path, "library: [q]\n" + BASE)
+    assert list(found) == ["b", "c", "a", "unclear"]
+    assert "height" in found["unclear"][1]
+
+
+def test_a_fault_of_the_base_is_one_error_with_its_line(folder: Path) -> None:
+    base = "library: [assets]\nbase:\n  generate:\n    querys: {train: 10/texel}\n"
+    with pytest.raises(InputError, match=r"library\.yaml:5: unknown key 'generate\.querys'"):
+        load(folder, base)
+    with pytest.raises(InputError, match=r"library\.yaml:4: unknown key 'trainig'"):
+        load(folder, "library: [assets]\nbase:\n  each_fit: {trainig: {batch: 5}}\n")
+
+
+@pytest.mark.parametrize("key", ["time: 3s", "steps: 10"])
+def test_one_training_time_of_all_or_of_each(folder: Path, key: str) -> None:
+    own = "training: 10s\nlibrary: [assets]\n" + BASE
+    with pytest.raises(UsageError, match=r"materials\.shell\.fit\.relief\.training\."):
+        load(folder, f"{own}materials: {{shell: {{fit: {{relief: {{training: {{{key}}}}}}}}}}}\n")
+    with pytest.raises(UsageError, match=r"base\.each_fit\.training\."):
+        load(folder, f"training: 10s\nlibrary: [assets]\nbase: {{each_fit: {{training: {{{key}}}}}}}\n")

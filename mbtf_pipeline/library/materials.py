@@ -1,0 +1,144 @@
+"""Finds the materials of a library, and names them."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from mbtf_core.config_file import read_yaml
+from mbtf_core.errors import InputError, UsageError, reason
+
+# Files in a folder of materials that are materials.
+_SUFFIXES = {".yaml", ".yml", ".pyp", ".bcc", ".curves", ".glb", ".gltf", ".ply", ".obj"}
+_YAML = (".yaml", ".yml")
+# Records of folders that the programs have written, and keys of recipes.
+_RECORDS = {"library.json", "run.json", "manifest.json", "fit.json"}
+_RECIPE_KEYS = {"library", "generate"}
+
+
+def find_materials(path: Path) -> list[Path]:
+    """Materials of an entry of ``library``: a material, a folder of them, or a list of paths.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    list of Path
+        Those of a folder and the folders below it, sorted. Files that a YAML file beside them names are parts
+        of its material. Recipes and outputs of the programs are no materials.
+
+    Raises
+    ------
+    InputError
+        A list cannot be read.
+    """
+    path = Path(os.path.normpath(path))
+    if path.suffix == ".txt" and path.is_file():
+        try:
+            lines = [line.strip() for line in path.read_text(encoding="utf-8").splitlines()]
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(f"cannot be read as a list ({reason(error)})", where=path) from None
+        listed = [path.parent / line for line in lines if line and not line.startswith("#")]
+        return [Path(os.path.normpath(file)) for file in listed]
+    return _in_folder(path) if path.is_dir() else [path]
+
+
+def _in_folder(folder: Path) -> list[Path]:
+    """A folder that is a material, or the materials in it; their runs say whether they are usable."""
+    from mbtf_gen.images.read import is_image
+    from mbtf_gen.material.discovery import role_of
+
+    inside = [path for path in sorted(folder.iterdir()) if not path.name.startswith((".", "_"))]
+    files = {path.name for path in inside if path.is_file()}
+    images = [name for name in files if is_image(Path(name))]
+    if files & {"material.yaml", "material.yml"} or any(role_of(name) == "height" for name in images):
+        return [folder]
+    documents = {path: _document(path) for path in inside if path.suffix.lower() in _YAML and path.is_file()}
+    parts = {
+        os.path.normpath(folder / text)
+        for document in documents.values()
+        for text in _texts(document)
+        if "\0" not in text
+    }
+    out: list[Path] = []
+    for path in inside:
+        if path.is_dir():
+            loops = path.is_symlink() and folder.resolve().is_relative_to(path.resolve())
+            if not loops and not any((path / name).is_file() for name in _RECORDS):
+                out += _in_folder(path)
+        elif path.suffix.lower() in _SUFFIXES and not (
+            os.path.normpath(path) in parts or _RECIPE_KEYS & documents.get(path, {}).keys()
+        ):
+            out.append(path)
+    # Pictures beside materials are something else; alone, they may be meant as maps.
+    return out or ([folder] if images else [])
+
+
+def _document(path: Path) -> Mapping[str, Any]:
+    """Content of a YAML file; nothing where it is faulty, which its run says."""
+    try:
+        found: Mapping[str, Any] = read_yaml(path)
+    except InputError:
+        return {}
+    return found
+
+
+def _texts(data: Any) -> Iterator[str]:
+    """All texts in plain data."""
+    if isinstance(data, str):
+        yield data
+    elif isinstance(data, Mapping | Sequence):
+        for value in data.values() if isinstance(data, Mapping) else data:
+            yield from _texts(value)
+
+
+def name_materials(paths: Sequence[Path], taken: Collection[str] = ()) -> list[str]:
+    """Name of each material: that of its file or folder.
+
+    Equal ones are prefixed by the parent's name, and numbered if they are still equal.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+    taken : names of others
+
+    Returns
+    -------
+    list of str
+
+    Raises
+    ------
+    UsageError
+        A material is listed twice.
+    """
+    for path, count in Counter(os.path.realpath(path) for path in paths).items():
+        if count > 1:
+            raise UsageError("is listed twice", where=path, hint="list each material once in 'library'")
+    plain = [_name(path.stem if path.suffix.lower() in _SUFFIXES else path.name) for path in paths]
+    often = Counter(plain)
+    wanted = [
+        name if often[name] == 1 else f"{_name(path.parent.name)}-{name}"
+        for name, path in zip(plain, paths, strict=True)
+    ]
+    names: list[str] = []
+    # A number is no other material's name.
+    used = {*wanted, *taken}
+    for name in wanted:
+        number = 1
+        own = name
+        while own in names or (number > 1 and own in used):
+            number += 1
+            own = f"{name}-{number}"
+        names.append(own)
+    return names
+
+
+def _name(text: str) -> str:
+    cleaned = re.sub(r"[^A-Za-z0-9._+-]+", "_", text).lstrip("._+-")
+    return cleaned[:90] or "material"

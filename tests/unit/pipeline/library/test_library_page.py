@@ -1,0 +1,68 @@
+"""The page of a library."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mbtf_core.units import clock
+from mbtf_pipeline.library import page
+from mbtf_pipeline.library.page import library_page
+
+
+def material(name: str, state: str, value: float = 0.1, **more: Any) -> dict[str, Any]:
+    unexplained = {"value": value, "error": 0.001, "n": 100}
+    fits = {"relief": {"unexplained": unexplained, "picture": "fit.png"}} if state == "done" else {}
+    seconds = {"generate": 20.0, "fit relief": 30.0} if state == "done" else {}
+    found = {"name": name, "path": f"../{name}", "state": state, "error": "", "fits": fits}
+    return found | {"seconds": seconds, "reference": "reference.png", **more}
+
+
+def record(*materials: dict[str, Any], **more: Any) -> dict[str, Any]:
+    found = {"title": "Test", "description": "", "command": "run", "machine": {"system": "here"}}
+    found |= {"training": None, "division": {}, "shared": {}}
+    return found | more | {"materials": list(materials)}
+
+
+def test_order_and_sum_of_times_where_runs_are_finished(tmp_path: Path) -> None:
+    assert "largest errors" not in library_page(record(material("a", "pending")), tmp_path)
+    shown = library_page(record(material("a", "done", 0.1), material("b", "done", 0.3)), tmp_path)
+    assert "largest errors come first" in shown
+    assert shown.index('id="b"') < shown.index('id="a"')
+    assert f"took {clock(100.0)}: generate {clock(40.0)}, fit relief {clock(60.0)}." in shown
+
+
+def test_an_error_of_an_earlier_command_is_not_shown_once_done(tmp_path: Path) -> None:
+    assert "no memory" in library_page(record(material("a", "failed", error="no memory")), tmp_path)
+    assert "no memory" not in library_page(record(material("a", "done", error="no memory")), tmp_path)
+
+
+def test_first_fits_and_shared_networks(tmp_path: Path) -> None:
+    division = {"errors": {"a": {"key": "k", "error": 0.301}}, "times": {"a": {"key": "k", "seconds": 1.5}}}
+    errors = {"a": {"value": 0.2, "error": 0.01, "n": 100}}
+    shared = {"training": 60.0, "fit": "relief", "errors": errors, "error": ""}
+    shown = library_page(record(material("a", "done"), division=division, shared=shared), tmp_path)
+    assert "unexplained variance 0.301 after the first fit, therefore 1.5 s of training" in shown
+    assert "with the shared network 0.20" in shown
+    failed = library_page(record(material("a", "done"), shared=shared | {"error": "too few"}), tmp_path)
+    assert "No shared network</b>: too few" in failed
+
+
+def test_the_training_time_includes_that_of_added_materials(tmp_path: Path) -> None:
+    found = record(material("a", "done"), material("added", "done"), training=60.0, division={"each": 60.0})
+    assert f"train for {clock(120.0)}" in library_page(found, tmp_path)
+
+
+def test_pictures_are_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a").mkdir()
+    for name in ("fit", "reference"):
+        Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(tmp_path / "a" / f"{name}.png")
+    page._small.cache_clear()
+    first = library_page(record(material("a", "done")), tmp_path)
+    assert first.count("data:image/jpeg") == 2
+    monkeypatch.setattr(Image, "open", lambda path: pytest.fail(f"{path} is read again"))
+    assert library_page(record(material("a", "done")), tmp_path) == first
