@@ -48,7 +48,7 @@ from mbtf_fit.models.registry import build_model
 from mbtf_fit.native import library
 from mbtf_fit.objective.noise import NoiseModel
 from mbtf_fit.objective.parallel import MAX_KERNEL_THREADS, MAX_THREADS, Workers
-from mbtf_fit.training.fit import keep_freed_memory
+from mbtf_fit.training.device import keep_freed_memory
 from mbtf_fit.training.trainer import BETAS, Trainer
 
 # Times the plain way's samples per second, on two cores.

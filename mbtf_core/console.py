@@ -312,6 +312,9 @@ def run(app: App, argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _EXIT_BROKEN_PIPE
     except Exception as error:
+        if isinstance(error, ModuleNotFoundError) and not (error.name or "mbtf_").startswith("mbtf_"):
+            text = f"the Python package '{error.name}' is missing\n  run: mbtf-gen doctor"
+            return _fail(text, EXIT_BAD_INPUT, debug, as_json)
         if isinstance(error, OSError) and error.strerror:
             place = "" if error.filename is None else f"{reason(str(error.filename))}: "
             return _fail(f"{place}{error.strerror}", EXIT_BAD_INPUT, debug, as_json)

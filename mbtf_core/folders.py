@@ -7,6 +7,7 @@ folder is then its own, whatever instant the process is killed at.
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 import shutil
 from collections.abc import Callable, Container, Iterator, Mapping
@@ -23,6 +24,11 @@ from mbtf_core.units import size_text
 _LEFTOVER = re.compile(rf"\..+(?:{TEMPORARY}|\.lock)")
 
 ELSEWHERE = "choose another folder with -o"
+
+
+def cache_folder() -> Path:
+    """Cache folder: ``$XDG_CACHE_HOME/mbtf``, by default ``~/.cache/mbtf``."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "mbtf")
 
 
 @contextlib.contextmanager

@@ -32,6 +32,7 @@ from pydantic.fields import FieldInfo
 
 from mbtf_core.config_file import Settings, resolve
 from mbtf_core.errors import UsageError
+from mbtf_core.store import split_url
 
 S = TypeVar("S", bound=Settings)
 C = TypeVar("C", bound=Callable[..., Any])
@@ -46,7 +47,16 @@ else:
     # A path as it was given, of type str; shells complete it as a file.
     PathText = str | Path
 Switch = Annotated[bool, Parameter(negative="", show_default=False)]
-Output = Annotated[Path, Parameter(name=["--output", "-o"], help="Output folder.")]
+
+
+def _refuse_url(kind: object, path: Path) -> None:
+    """Only data sets are written to object stores."""
+    if split_url(path) is not None:
+        raise ValueError("is a URL, but only data sets are written to object stores; name a local folder")
+
+
+Output = Annotated[Path, Parameter(name=["--output", "-o"], help="Output folder.", validator=_refuse_url)]
+DataOutput = Annotated[Path, Parameter(name=["--output", "-o"], help="Output folder or URL.")]
 Overwrite = Annotated[Switch, Parameter(help="Replace existing output.")]
 Time = Annotated[str | None, Parameter(metavar="DURATION", help="Time budget: 90s, 2min, 1h.")]
 ClusterOption = Annotated[

@@ -209,6 +209,9 @@ class DataSection(Settings):
     memory: Annotated[Size, Flag("--memory", "SIZE")] = Field(
         4e9, description="memory for training queries: 500MB, 4GB; larger data are streamed from disk"
     )
+    cache: Annotated[Size, Flag("--cache", "SIZE")] = Field(
+        20e9, description="local disk for shards of object stores: 500MB, 20GB"
+    )
 
 
 def _on_disk(point: tuple[float, float]) -> tuple[float, float]:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from mbtf_core.cluster.engine import Cluster
+from mbtf_core.data_folder import data_folder
 from mbtf_core.errors import PartialError
 from mbtf_core.shard_schema import ShardEntry
 from mbtf_gen.config.generator import GeneratorConfig
@@ -24,7 +25,7 @@ def unfinished(
 ) -> list[ShardEntry]:
     """Shards of a slice that :func:`generate` has yet to render."""
     entries = job.shards[slice_index - 1 :: slice_count]
-    folder = Path(folder)
+    folder = data_folder(folder)
     return [e for e in entries if overwrite or not finished_record(folder, e, job.config_hash)]
 
 
@@ -48,7 +49,8 @@ def generate(
     source : GeneratorConfig or Job
         The configuration, or the job of one whose material is loaded already.
     folder : str or Path
-        Output folder. An unfinished data set of the same configuration is resumed.
+        Output folder, or a URL such as ``s3://bucket/data``. An unfinished data set of the same configuration
+        is resumed.
     overwrite : bool
         Replace the folder's data set. With several slices, a data set of the same configuration is kept,
         because another slice may have begun it.
@@ -72,10 +74,10 @@ def generate(
     InputError
         Material or folder cannot be used.
     PartialError
-        Other processes render some of the shards, the disk is full, or too many samples are non-finite.
-        The same command resumes.
+        Other processes render some of the shards, the disk is full, the store cannot be reached, or too many
+        samples are non-finite. The same command resumes.
     """
-    folder = Path(folder)
+    folder = data_folder(folder)
     start = time.perf_counter()
     job = source if isinstance(source, Job) else Job.prepare(source)
     overwrite = overwrite and not (slice_count > 1 and has_dataset(folder, job.config_hash))

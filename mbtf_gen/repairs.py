@@ -18,6 +18,7 @@ from pydantic import ValidationError
 
 from mbtf_core.atomic import read_checksummed, read_json, write_checksummed, write_text
 from mbtf_core.config_file import differences, dump_yaml, in_short, read_yaml
+from mbtf_core.data_folder import data_folder, send
 from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError, MbtfError
 from mbtf_core.locks import brief_lock
@@ -107,6 +108,7 @@ class Corruption:
     _jobs: dict[str, Job] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        self.folder = data_folder(self.folder)
         if not self.folder.is_dir():
             raise InputError("no such folder", where=self.folder)
         lost = not (self.folder / MANIFEST_NAME).exists()
@@ -332,14 +334,18 @@ class Corruption:
             with brief_lock(path):
                 if MANIFEST_NAME in documents:
                     write_checksummed(path, self._restored)
+                    send(path)
                 manifest = read_checksummed(path)
                 if entries and manifest["complete"]:
                     # Readers rely on this key, and rendering removes the corrupt shards.
                     write_checksummed(path, {**manifest, "complete": False, "summary": None})
+                    send(path)
                 if CONFIG_NAME in documents:
                     write_text(self.folder / CONFIG_NAME, dump_yaml(manifest["config"]))
+                    send(self.folder / CONFIG_NAME)
                 if GEOMETRY_NAME in documents and self._geometry is not None:
                     write_geometry(self.folder / GEOMETRY_NAME, self._geometry)
+                    send(self.folder / GEOMETRY_NAME)
         corrupt = {e.file for e in entries}
         result = render_shards(self.job, self.folder, entries, plan, corrupt=corrupt, progress=progress)
         return RepairResult(
@@ -366,7 +372,7 @@ def repair(
     Parameters
     ----------
     folder : str or Path
-        The data set.
+        The data set: a path or a URL.
     material : str, optional
         Current path of the material; by default the path in the data set's configuration.
     keep : str, optional
@@ -383,6 +389,7 @@ def repair(
     InputError
         No data set, its material is missing or has changed, or its files belong to several data sets.
     PartialError
-        Other processes write the data set, or the disk is full. The same command resumes.
+        Other processes write the data set, the disk is full, or the store cannot be reached. The same command
+        resumes.
     """
-    return Corruption(Path(folder), material, keep).repair(progress)
+    return Corruption(data_folder(folder), material, keep).repair(progress)

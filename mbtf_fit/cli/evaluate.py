@@ -24,12 +24,13 @@ def evaluate(
     material
         Folder made by mbtf-fit.
     shards
-        Folder made by mbtf-gen.
+        Folder made by mbtf-gen, or its URL.
     """
+    from mbtf_core.data_folder import data_folder
     from mbtf_fit.evaluation import evaluate, foreign_inputs
     from mbtf_fit.material.material import Material
 
-    loaded = Material.load(material)
+    loaded, shards = Material.load(material), data_folder(shards)
     foreign = foreign_inputs(loaded, shards)
     if foreign:
         console.note(

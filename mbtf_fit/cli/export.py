@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Literal
@@ -52,19 +53,21 @@ def export_material(
     level
         Level of the maps of gltf, usd and materialx.
     half
-        Round all weights and texels to 16 bits, and print the resulting error.
+        Round all weights and texels to 16 bits first, and print the resulting error; not for web.
     """
     from mbtf_core.atomic import write_text
+    from mbtf_core.digest import file_sha256
     from mbtf_core.folders import owned
     from mbtf_fit.material.export import LAYERS_NAME, TEXTURES_NAME, to_half, write_layers, write_textures
-    from mbtf_fit.material.export_folder import claim_export
+    from mbtf_fit.material.export_folder import ExportClaim, ExportSource, claimed
     from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME
     from mbtf_fit.material.interchange.documents import WRITERS
+    from mbtf_fit.material.interchange.images import BASE_COLOR, HEIGHT, NORMAL, ORM
     from mbtf_fit.material.interchange.maps import level_of
     from mbtf_fit.material.interchange.write import Interchange, write_interchange
     from mbtf_fit.material.material import Material, export
     from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME
-    from mbtf_fit.shaders.slang import write_module
+    from mbtf_fit.shaders.slang import FILE_NAMES, write_module
     from mbtf_fit.viewer.page import PAGE_NAME
 
     wanted = list(dict.fromkeys(to or ["exr", "json"]))
@@ -76,17 +79,33 @@ def export_material(
         raise UsageError("is an option of maps", where="--level", hint="add --to gltf, usd or materialx")
     if shader_target and "slang" not in wanted:
         raise UsageError("is an option of shaders", where="--shader-target", hint="add --to slang")
+    if half and "web" in wanted:
+        raise UsageError(
+            "has no meaning for pages, whose textures have 8 bits or fewer",
+            where="--half",
+            hint="leave it out, or export the page by a command of its own",
+        )
     loaded = Material.load(material)
     keep_on_interruption(f"the finished files are kept in {folder}")
-    with owned(folder):
-        kept = False
-        if "material" in wanted:
-            kept = claim_export(folder, material, half=half, overwrite=overwrite)
+    named = ExportSource(
+        material=file_sha256(material / DESCRIPTION_NAME),
+        to=sorted(wanted),
+        half=half,
+        shader_target=sorted(set(shader_target or [])),
+        level=level,
+        page=page.digests(),
+    )
+    names = [TEXTURES_NAME, LAYERS_NAME, DESCRIPTION_NAME, WEIGHTS_NAME, TRANSMITTANCE_NAME, PAGE_NAME]
+    names += [*FILE_NAMES, BASE_COLOR, NORMAL, ORM, HEIGHT, *(document for document, _ in WRITERS.values())]
+    # Files of other formats may lie in the material's own folder.
+    beside = "material" not in wanted and folder.is_dir() and folder.samefile(material)
+    claims = nullcontext(ExportClaim(False)) if beside else claimed(folder, named, names, overwrite=overwrite)
+    with owned(folder), claims as claim:
         written, error = loaded, None
         if half:
             written, error = to_half(loaded)
         made: Interchange | None = None
-        files, notes = [], [] if error is None else [str(error)]
+        files, notes = claim.files, [] if error is None else [str(error)]
         if "exr" in wanted:
             write_textures(written, folder / TEXTURES_NAME, half=half)
             files.append(TEXTURES_NAME)
@@ -94,11 +113,11 @@ def export_material(
             write_layers(written, folder / LAYERS_NAME, half=half)
             files.append(LAYERS_NAME)
         if "slang" in wanted:
-            files += write_module(loaded, folder, list(dict.fromkeys(shader_target or [])))
+            files += write_module(written, folder, list(dict.fromkeys(shader_target or [])))
         if tools:
             label = "fitting maps"
             with console.progress(total=loaded.lattice.texels(level_of(loaded, level)), label=label) as bar:
-                made = write_interchange(loaded, material, folder, tools, level, bar.advance)
+                made = write_interchange(written, material, folder, tools, level, bar.advance)
             files += made.files
             notes.append(str(made))
         if "web" in wanted:
@@ -108,7 +127,7 @@ def export_material(
             notes.append(precision)
         if "material" in wanted:
             description = loaded.description
-            if not kept:
+            if not claim.is_complete:
                 export(
                     written.model,
                     written.config,

@@ -58,7 +58,7 @@ def fit(
     Parameters
     ----------
     shards
-        Folder made by mbtf-gen.
+        Folder made by mbtf-gen, or its URL.
     many
         Fit several data sets, one material each: folders made by mbtf-gen, folders of such folders, or text
         files with one folder per line. A fit that fails does not stop the others.
@@ -94,6 +94,9 @@ def fit(
         _fit_many(options, quality, many, output, processes, cluster, overwrite, console)
         return
     assert shards is not None
+    from mbtf_core.data_folder import data_folder
+
+    shards = data_folder(shards)
     resolved = resolve_config(options, quality, shards)
     if dry_run:
         from mbtf_fit.training.forecast import forecast_fit

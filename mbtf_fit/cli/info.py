@@ -19,8 +19,11 @@ def info(path: Path, /, *, verbose: Verbose = False, console: Console = CONSOLE)
     Parameters
     ----------
     path
-        Folder made by mbtf-fit or by mbtf-gen.
+        Folder made by mbtf-fit or by mbtf-gen, or the URL of a data set.
     """
+    from mbtf_core.data_folder import data_folder
+
+    path = data_folder(path)
     if not path.is_dir():
         raise InputError("no such folder", where=path, hint=suggest_path(path, Path.is_dir))
     from mbtf_gen.dataset.reader import is_dataset

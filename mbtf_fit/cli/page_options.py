@@ -47,6 +47,20 @@ class PageOptions:
         """Flags that were given."""
         return [f"--{name}" for name, value in vars(self).items() if value is not None]
 
+    def digests(self) -> dict[str, list[str]]:
+        """Digests of the files that the given flags name; of a folder those of its records."""
+        from mbtf_core.digest import file_sha256
+
+        out: dict[str, list[str]] = {}
+        for name, value in vars(self).items():
+            paths = value if isinstance(value, list) else [] if value is None else [value]
+            files = [
+                file for path in paths for file in (sorted(path.glob("*.json")) if path.is_dir() else [path])
+            ]
+            if files:
+                out[name] = [file_sha256(file) if file.is_file() else "missing" for file in files]
+        return out
+
     def page(self, material: Path) -> tuple[str, str]:
         """HTML of the page, and a line about its precision.
 

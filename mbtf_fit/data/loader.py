@@ -51,13 +51,13 @@ class Partition:
     selection: Selection
 
 
-def open_data(folder: str | Path, layout: Layout, model: str) -> Dataset:
-    """Open a folder of shards to train a model that needs a layout."""
-    data = Dataset.open(folder)
+def open_data(folder: str | Path, layout: Layout, model: str, cache: float | None = None) -> Dataset:
+    """Open a folder of shards to train a model that needs a layout; `cache` as in :meth:`Dataset.open`."""
+    data = Dataset.open(folder, cache)
     if data.layout != layout:
         raise InputError(
             f"the data set has the {data.layout} layout, but {model} needs the {layout} layout",
-            where=folder,
+            where=data.folder,
             hint=f"generate them with: mbtf-gen ... --layout {layout}"
             if data.estimates == 2
             else "measured data have no other layout; choose another model: --model neumip+",

@@ -6,6 +6,7 @@ that the fit does not depend on where the data lie.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
@@ -15,11 +16,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from mbtf_core.data_folder import in_store, prefetch
 from mbtf_fit.data.queries import TrainingQueries, batch_ranges, batch_starts, mean_value, needed
 from mbtf_gen.dataset.shard_io import Arrays, read_shard
 
 # Rows of a shard between two cumulative counts of selected rows.
 _BLOCK = 4096
+# Batches whose shards are downloaded ahead.
+_AHEAD = 6
 # Most row ranges that a message names.
 _NAMED = 3
 
@@ -42,6 +46,11 @@ class Selection:
 
     def __len__(self) -> int:
         return self.starts[-1]
+
+    @property
+    def in_store(self) -> bool:
+        """Whether the shards are in an object store."""
+        return any(map(in_store, self.paths))
 
     def add(self, path: Path, chosen: NDArray[np.bool_]) -> None:
         """Append a shard with a mask of its selected rows."""
@@ -119,8 +128,9 @@ class StreamedQueries:
         return TrainingQueries(**{k: torch.from_numpy(v) for k, v in joined.items()}).to(self.device)
 
     def batches(self, size: int, seed: int, step: int, margin: int = 0) -> Iterator[TrainingQueries]:
-        """As :meth:`TrainingQueries.batches`; a thread reads the next batch in the meantime."""
-        starts = batch_starts(len(self), size, seed, step)
+        """As :meth:`TrainingQueries.batches`; a thread reads the next batch in the meantime. Shards of object
+        stores are downloaded several batches ahead."""
+        starts = self._announced(batch_starts(len(self), size, seed, step), size)
         with ThreadPoolExecutor(1) as reader:
             first = next(starts)
             waiting = reader.submit(self.slice, first, first + size)
@@ -128,3 +138,16 @@ class StreamedQueries:
                 batch = waiting.result()
                 waiting = reader.submit(self.slice, start, start + size)
                 yield batch
+
+    def _announced(self, starts: Iterator[int], size: int) -> Iterator[int]:
+        """The same starts; the shards of later ones are announced to their store."""
+        if not self.selection.in_store:
+            yield from starts
+            return
+        coming: deque[int] = deque()
+        for start in starts:
+            for path, _ in self.selection.pieces(start, start + size):
+                prefetch(path)
+            coming.append(start)
+            if len(coming) > _AHEAD:
+                yield coming.popleft()

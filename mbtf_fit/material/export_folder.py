@@ -1,76 +1,129 @@
-"""The folder of an exported material: the claim of one source on it."""
+"""The folder of an export: the claim of one command on it."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Annotated
 
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 
-from mbtf_core.atomic import read_json, write_json
+from mbtf_core.atomic import read_json, remove_file, write_json
 from mbtf_core.config_file import check_document, check_schema
-from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError
 from mbtf_core.folders import ELSEWHERE, check_folder, other_configuration, remove_unfinished
-from mbtf_fit.material.export import LAYERS_NAME, TEXTURES_NAME
-from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME
+from mbtf_fit.material.format import DESCRIPTION_NAME
 from mbtf_fit.material.material import Material
-from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME
 
 EXPORT_NAME = "export.json"
 _FORMAT = "mbtf-export"
-_SCHEMA = 1
-_FILES = (EXPORT_NAME, DESCRIPTION_NAME, WEIGHTS_NAME, TRANSMITTANCE_NAME, LAYERS_NAME, TEXTURES_NAME)
+_SCHEMA = 2
 
 
-class _Source(BaseModel):
-    """What determines an exported material: the digest of its source's description, and its precision."""
+class ExportSource(BaseModel):
+    """What determines an export.
+
+    Attributes
+    ----------
+    material : SHA-256 of the description of the exported material
+    to : formats, in alphabetical order
+    half : whether weights and texels are rounded to 16 bits
+    shader_target : languages that the shader module is compiled to, in alphabetical order
+    level : level of maps; None for the finest
+    page : option of the page → SHA-256 of the files that it names
+    """
 
     material: str
+    to: list[str]
     half: bool
+    shader_target: list[str] = []
+    level: int | None = None
+    page: dict[str, list[str]] = {}
 
 
 class _Record(BaseModel):
     """Content of ``export.json``."""
 
-    source: _Source
+    source: ExportSource
+    files: list[Annotated[str, Field(pattern=r"^\w[\w.-]*$")]]
 
 
-def claim_export(folder: Path, material: Path, *, half: bool, overwrite: bool) -> bool:
-    """Claim a folder for the export of a material; the caller owns it.
+class ExportClaim:
+    """A claim on a folder, while an export is written.
+
+    Attributes
+    ----------
+    is_complete : bool
+        Whether the folder holds this export of a material already, complete.
+    files : list of str
+        Names of the files that were written; the caller adds them.
+    """
+
+    def __init__(self, is_complete: bool) -> None:
+        self.is_complete = is_complete
+        self.files: list[str] = []
+
+
+@contextmanager
+def claimed(
+    folder: Path, source: ExportSource, names: Sequence[str], *, overwrite: bool
+) -> Iterator[ExportClaim]:
+    """Claim a folder for an export; the caller owns it.
+
+    A folder that holds another export is refused, or emptied of it with `overwrite`.
 
     Parameters
     ----------
     folder : Path
-    material : the exported material's folder
-    half : 16-bit floats are stored
-    overwrite : replace the export of another material
-
-    Returns
-    -------
-    bool
-        Whether the folder holds this export already, complete.
+    source : ExportSource
+    names : names of the files that exports may have
+    overwrite : replace another export
 
     Raises
     ------
     InputError : the folder holds something else
     """
-    source = _Source(material=file_sha256(material / DESCRIPTION_NAME), half=half)
     path = folder / EXPORT_NAME
-    if check_folder(folder, lambda place: (place / EXPORT_NAME).exists(), "export"):
-        old = read_json(path)
-        check_schema(old, _SCHEMA, path, ELSEWHERE)
-        found = check_document(_Record, old, path, ELSEWHERE).source
-        if found != source and not overwrite:
-            raise other_configuration(folder, "an export", found.model_dump(), source.model_dump())
-        remove_unfinished(folder, _FILES)
-        if found == source and not overwrite:
-            return _is_complete(folder)
+    old = _read(folder)
+    if old is not None and old.source != source and not overwrite:
+        raise other_configuration(folder, "an export", old.source.model_dump(), source.model_dump())
+    if old is not None:
+        remove_unfinished(folder, (EXPORT_NAME, *names, *old.files))
+    same = old is not None and old.source == source and not overwrite
+    complete = same and _is_complete(folder)
+    # A material is written anew if it is not complete; files of other formats are replaced one by one.
+    if old is not None and not complete and not (same and "material" not in source.to):
         # The description goes first: without it nothing counts as a finished material.
-        for name in (DESCRIPTION_NAME, *_FILES):
-            (folder / name).unlink(missing_ok=True)
-    # The record first: it claims the folder, even if the command is killed right after.
-    write_json(path, {"format": _FORMAT, "schema": _SCHEMA, "source": source.model_dump()})
-    return False
+        for name in dict.fromkeys((DESCRIPTION_NAME, *names, *old.files)):
+            remove_file(folder / name)
+    if not same:
+        # The record first: it claims the folder, even if the command is killed right after.
+        _write(path, source, [])
+    claim = ExportClaim(complete)
+    try:
+        yield claim
+    except Exception:
+        if not any((folder / name).exists() for name in names):
+            remove_file(path)
+        raise
+    if old is None or not same or set(old.files) != set(claim.files):
+        _write(path, source, claim.files)
+
+
+def _read(folder: Path) -> _Record | None:
+    """The record of a folder; None where it is missing or empty."""
+    if not check_folder(folder, lambda place: (place / EXPORT_NAME).exists(), "export"):
+        return None
+    path = folder / EXPORT_NAME
+    data = read_json(path)
+    check_schema(data, _SCHEMA, path, ELSEWHERE)
+    return check_document(_Record, data, path, ELSEWHERE)
+
+
+def _write(path: Path, source: ExportSource, files: Sequence[str]) -> None:
+    record = _Record(source=source, files=sorted(files))
+    write_json(path, {"format": _FORMAT, "schema": _SCHEMA, **record.model_dump()})
 
 
 def _is_complete(folder: Path) -> bool:

@@ -30,6 +30,8 @@ DEFAULT_MIN_COS = 0.1
 CONFORMANCE_COUNT = 256
 CONFORMANCE = {"u": (2,), "sigma": (), "omega_i": (3,), "omega_o": (3,), "rgb": (3,)}
 QUERY = tuple(CONFORMANCE)[:-1]
+# Hint for a damaged material.
+_AGAIN = "copy the folder again, or fit again"
 
 
 class _File(BaseModel):
@@ -96,11 +98,11 @@ def read_description(folder: Path) -> tuple[dict[str, Any], Path]:
             where=folder,
             hint="make a material with: mbtf-fit SHARDS -o FOLDER",
         )
-    description = read_json(path)
+    description = read_json(path, _AGAIN)
     if description.get("format") != FORMAT_NAME:
-        raise InputError(f"does not describe a material ({FORMAT_NAME})", where=path)
+        raise InputError(f"does not describe a material ({FORMAT_NAME})", where=path, hint=_AGAIN)
     check_schema(description, SCHEMA_VERSION, path, "fit it again with this version of mbtf-fit")
-    check_document(_Description, description, path, "fit it again, or copy it again")
+    check_document(_Description, description, path, _AGAIN)
     return description, check_digest(folder / WEIGHTS_NAME, description["weights"])
 
 
@@ -111,8 +113,14 @@ def check_digest(path: Path, stated: Mapping[str, Any], by: str = DESCRIPTION_NA
     ------
     InputError : it is missing or corrupt
     """
-    if not path.is_file() or file_sha256(path) != stated["sha256"]:
-        raise InputError(f"is missing, or its SHA-256 differs from the one in {by}", where=path)
+    if not path.is_file():
+        raise InputError(f"no such file, but {by} names it", where=path, hint=_AGAIN)
+    if file_sha256(path) != stated["sha256"]:
+        raise InputError(
+            f"is damaged, or of another material (its SHA-256 is not that in {by})",
+            where=path,
+            hint=_AGAIN,
+        )
     return path
 
 

@@ -32,7 +32,9 @@ def _library() -> ctypes.CDLL:
             for path in sorted(folder.glob(name)):
                 return ctypes.CDLL(str(path))
     raise EngineError(
-        "Slang's compiler is not installed", where="--target", hint="pip install 'mbtf[shaders]' (290 MB)"
+        "Slang's compiler is not installed",
+        where="--shader-target",
+        hint="pip install 'mbtf[shaders]' (290 MB)",
     )
 
 

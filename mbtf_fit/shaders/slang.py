@@ -12,12 +12,18 @@ from importlib.resources import files
 from pathlib import Path
 
 from mbtf_core.atomic import write_chunks, write_text
+from mbtf_fit.material.format import DEFAULT_MIN_COS
 from mbtf_fit.material.material import Material
 from mbtf_fit.shaders.compiler import ENDINGS, SlangCompiler, Target
 from mbtf_fit.shaders.texels import F32, texels_of
-from mbtf_fit.viewer.shader import ShaderSource
+from mbtf_fit.viewer.shader import ShaderSource, number
 
 MODULE_NAME, TEXELS_NAME = "material.slang", "material.bin"
+FILE_NAMES = (
+    MODULE_NAME,
+    TEXELS_NAME,
+    *(str(Path(MODULE_NAME).with_suffix(end)) for end in ENDINGS.values()),
+)
 ENTRY = "evaluate_queries"
 
 _NAMES = (
@@ -30,6 +36,10 @@ _NAMES = (
     (r"(?m)^const (\w+) (\w+)\[(\d+)\] = \w+\[\d+\]\((.*)\);$", r"static const \1 \2[\3] = { \4 };"),
     (r"(?m)^const ", "static const "),
     (r"(?m)^int visited\b", "static int visited"),
+    (
+        r"(?m)^float3 stage2\(.*\{$",
+        r"\g<0>\n  if (min(omega_i.z, omega_o.z) <= 0.0) return float3(0.0);  // below the plane",
+    ),
 )
 _FETCH = "texelFetch("
 
@@ -74,6 +84,8 @@ def module_of(material: Material) -> tuple[str, F32]:
     first, _, _ = images.pop("weights")
     template = files(__package__).joinpath("module.slang").read_text()
     constants = [f"static const int3 {name} = int3({a}, {w}, {h});" for name, (a, w, h) in images.items()]
+    least = material.description["data"].get("min_cos", DEFAULT_MIN_COS)
+    constants.append(f"static const float MIN_COS = {number(least)};")
     constants.append(f"#define WEIGHT(i) material_texels[{first} + (i)]")
     head, tail = template.split("//MATERIAL\n")
     name = material.config.model

@@ -99,17 +99,17 @@ def _number(x: Any) -> bool:
 
 
 def _noise_share(errors: dict[str, Any], noise: float | None) -> float | None:
-    """Overfitting over the error of held-out queries, or of test queries where that one is not significant.
+    """Overfitting over the error of new queries: test or held-out queries, whichever error is known best.
 
     A fit that overfits the noise of its training queries gains an error on other queries that equals the
     variance of what it has overfitted, and its error on the training queries falls by as much. The difference
     is twice that. Few queries cause such a difference without noise too, so the noise itself is the bound.
     """
     mse = {name: of["mse"] for name, of in errors.items() if all(map(_number, of["mse"].values()))}
-    others = (mse[name] for name in ("held_out_queries", "test") if name in mse)
-    new = next((e for e in others if e["value"] > _SIGNIFICANT * e["error"]), None)
+    others = [mse[name] for name in ("test", "held_out_queries") if name in mse]
+    new = min(others, key=lambda e: e["error"], default=None)
     training = mse.get("training")
-    if noise is None or training is None or new is None:
+    if noise is None or training is None or new is None or new["value"] <= _SIGNIFICANT * new["error"]:
         return None
     overfit = min(0.5 * (new["value"] - training["value"]), noise)
     if overfit <= _SIGNIFICANT * 0.5 * math.hypot(new["error"], training["error"]):

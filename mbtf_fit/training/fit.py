@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -13,7 +10,7 @@ from typing import Any
 
 import torch
 
-from mbtf_core.errors import EngineError, InputError
+from mbtf_core.errors import InputError, PartialError
 from mbtf_core.folders import owned
 from mbtf_core.interruption import stop_on_interruption
 from mbtf_core.lattice import level_of_sigma
@@ -36,6 +33,7 @@ from mbtf_fit.objective.noise import NoiseModel, typical_value
 from mbtf_fit.surface.known import KnownSurface
 from mbtf_fit.training.checkpoint import CHECKPOINT_NAME, read_checkpoint, write_checkpoint
 from mbtf_fit.training.convergence import MarginalCost, marginal_cost_of
+from mbtf_fit.training.device import choose_device, keep_freed_memory
 from mbtf_fit.training.fit_folder import claim, identity_of
 from mbtf_fit.training.loop import TrainingLoop
 from mbtf_fit.training.trainer import Trainer, TrainingData
@@ -53,7 +51,6 @@ from mbtf_gen.dataset.reader import Dataset
 # Seconds of training between two validations, and between two checkpoints.
 _REPORT_SECONDS = 2.0
 _CHECKPOINT_SECONDS = 15.0
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 # Tensors that ``init_from`` copies, by the first part of their names; the decoder keeps its initialization.
 _SHARED = ("pyramid", "offset_texture", "offset_network")
 # Displacement of `relief`, copied from materials that have it.
@@ -117,30 +114,6 @@ class FitResult:
         )
 
 
-def choose_device(name: str) -> torch.device:
-    """The device to train on; ``auto`` is CUDA if available."""
-    available = torch.cuda.is_available()
-    if name == "cuda" and not available:
-        raise EngineError(
-            "no CUDA device is available", where="--device cuda", hint="use --device cpu or auto"
-        )
-    return torch.device("cuda" if available and name != "cpu" else "cpu")
-
-
-def keep_freed_memory() -> None:
-    """Let glibc keep freed blocks of up to 32 MiB instead of returning them to the kernel.
-
-    A training step frees and allocates the same few megabytes; page faults would cost as much as the
-    arithmetic.
-    """
-    if sys.platform != "linux":
-        return
-    with contextlib.suppress(OSError, AttributeError):
-        library = ctypes.CDLL(None)
-        library.mallopt(_M_MMAP_THRESHOLD, 1 << 25)
-        library.mallopt(_M_TRIM_THRESHOLD, 1 << 30)
-
-
 def check_options(config: FitConfig) -> None:
     """Refuse losses, and a network to keep, that the model cannot have."""
     if config.decoder is not None:
@@ -173,7 +146,7 @@ def fit(
     config : FitConfig
         Options of the fit.
     shards : str or Path
-        Folder made by ``mbtf-gen``.
+        Folder made by ``mbtf-gen``, or its URL.
     out : str or Path
         Folder of the material.
     overwrite : bool
@@ -198,7 +171,8 @@ def fit(
     EngineError
         The device is not available.
     PartialError
-        The disk is full, or another process writes to the folder; the same command resumes.
+        The disk is full, another process writes to the folder, or the store cannot be reached; the same
+        command resumes.
     """
     begin = time.perf_counter()
     if config.training.shared_decoder:
@@ -210,7 +184,7 @@ def fit(
     device = choose_device(config.device)
     out = Path(out)
     check_options(config)
-    data = open_data(shards, MODELS[config.model].layout, config.model)
+    data = open_data(shards, MODELS[config.model].layout, config.model, config.data.cache)
     identity = identity_of(config, data)
     with owned(out):
         claim(out, identity, config, overwrite)
@@ -347,7 +321,7 @@ def shared_slices(
         return own
     learned = [own] if config.training.own_material else []
     for folder in config.training.materials:
-        data = open_data(folder, "slices", config.model)
+        data = open_data(folder, "slices", config.model, config.data.cache)
         partition = load_training(data, config.held_out, config.seed)
         assert isinstance(partition.training, TrainingSlices)
         typical = typical_value(mean_value(partition.sample.value_a, partition.sample.value_b))
@@ -437,7 +411,12 @@ def run_training(
     done = loop.fraction >= 1.0
     with stop_on_interruption() as stop:
         while not (done or stop.is_set()):
-            done = loop.train(reports * _REPORT_SECONDS, stop)
+            try:
+                done = loop.train(reports * _REPORT_SECONDS, stop)
+            except PartialError:
+                # The store of streamed queries cannot be reached.
+                save()
+                raise
             report()
             if time.perf_counter() - saved > _CHECKPOINT_SECONDS or done or stop.is_set():
                 save()

@@ -17,7 +17,8 @@ from mbtf_fit.formatting import SPLIT_NAMES
 from mbtf_fit.models.registry import MODELS, build_model
 from mbtf_fit.models.relief import Relief
 from mbtf_fit.surface.known import surface_bytes
-from mbtf_fit.training.fit import choose_device, keep_freed_memory, prepare_trainer
+from mbtf_fit.training.device import choose_device, keep_freed_memory
+from mbtf_fit.training.fit import prepare_trainer
 from mbtf_fit.training.validation import validation_error, validation_set, validation_subset
 
 # Training times of the two pilot fits in seconds; each runs the whole schedule.
@@ -113,7 +114,7 @@ def training_seconds(config: FitConfig, shards: str | Path) -> tuple[float, Part
         return config.training.time, None
     if steps * batch < LONG_FIT:
         return 0.0, None
-    data = open_data(shards, MODELS[config.model].layout, config.model)
+    data = open_data(shards, MODELS[config.model].layout, config.model, config.data.cache)
     keep_freed_memory()
     partition = load_training(data, config.held_out, config.seed, config.data.memory)
     trainer = prepare_trainer(config, data, partition, choose_device(config.device))
@@ -125,7 +126,7 @@ def forecast_fit(config: FitConfig, shards: str | Path) -> FitForecast:
     """Forecast the fit of a configuration by two pilot fits; nothing is written."""
     began = time.perf_counter()
     device = choose_device(config.device)
-    data = open_data(shards, MODELS[config.model].layout, config.model)
+    data = open_data(shards, MODELS[config.model].layout, config.model, config.data.cache)
     keep_freed_memory()
     partition = load_training(data, config.held_out, config.seed, config.data.memory)
     name, queries = validation_set(data, partition)

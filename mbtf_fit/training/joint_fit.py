@@ -21,13 +21,12 @@ from mbtf_fit.material.decoder import DECODER_NAME, Decoder, write_decoder
 from mbtf_fit.material.format import DESCRIPTION_NAME
 from mbtf_fit.models.registry import MODELS
 from mbtf_fit.training.checkpoint import CHECKPOINT_NAME
+from mbtf_fit.training.device import choose_device, keep_freed_memory
 from mbtf_fit.training.fit import (
     FitResult,
     ProgressCallback,
     check_options,
-    choose_device,
     export_fit,
-    keep_freed_memory,
     prepare_trainer,
     result_of,
     run_training,
@@ -120,7 +119,8 @@ def fit_jointly(
     decoder = Path(decoder)
     _check(config, shards, folders, decoder)
     device = choose_device(config.device)
-    group = [open_data(folder, MODELS[config.model].layout, config.model) for folder in shards]
+    layout, cache = MODELS[config.model].layout, config.data.cache
+    group = [open_data(folder, layout, config.model, cache) for folder in shards]
     members = [
         _Member(Path(folder), data, identity_of(config, data, group))
         for folder, data in zip(folders, group, strict=True)

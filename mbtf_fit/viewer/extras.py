@@ -84,6 +84,11 @@ def picture_content(
 def pictures_content(folder: Path) -> list[dict[str, Any]]:
     """Pictures of ``mbtf-gen reference`` (:func:`~mbtf_gen.pictures.reference.read_references`), as JSON."""
     return [
-        picture_content(f"path-traced, {camera.tiles_across:g} tiles across", value, camera, light)
+        picture_content(f"path-traced, {tiles_text(camera.tiles_across)} across", value, camera, light)
         for value, camera, light in read_references(folder)
     ]
+
+
+def tiles_text(count: float) -> str:
+    """A number of tiles in words."""
+    return "1 tile" if count == 1 else f"{count:g} tiles"

@@ -25,6 +25,7 @@ _SCRIPTS = (
     "plots.js",
     "viewer.js",
     "panel.js",
+    "pointer.js",
     "live.js",
     "main.js",
 )

@@ -24,15 +24,17 @@ def export(
     Parameters
     ----------
     shards
-        Folder of shards.
+        Folder of shards, or its URL.
     file
         HDF5 file to write.
     program
         The program that reads it: NeuMIP (shuffled layout) or NeuralBTF (slices layout).
     """
+    from mbtf_core.data_folder import data_folder
     from mbtf_gen.dataset.exported import export_neumip, export_neural_btf
     from mbtf_gen.dataset.reader import Dataset
 
+    shards = data_folder(shards)
     if file.is_dir() or shards.resolve() in file.resolve().parents:
         raise UsageError("is a folder, or inside the data set", where=file, hint="choose another name")
     if not file.resolve().parent.is_dir():

@@ -24,11 +24,12 @@ def merge(folder: Path, /, *, console: Console = CONSOLE) -> int:
     Parameters
     ----------
     folder
-        Folder of shards.
+        Folder of shards, or its URL.
     """
+    from mbtf_core.data_folder import data_folder
     from mbtf_gen.dataset.summary import finish
 
-    summary = finish(folder)
+    summary = finish(data_folder(folder))
     console.report(asdict(summary), describe(summary, ran=False))
     return EXIT_OK if summary.complete else EXIT_PARTIAL
 
@@ -39,16 +40,18 @@ def verify(folder: Path, /, *, digests: Path | None = None, console: Console = C
     Parameters
     ----------
     folder
-        Folder of shards.
+        Folder of shards, or its URL.
     digests
         Also compare its arrays with the digests.json of a published recipe.
     """
+    from mbtf_core.data_folder import data_folder
     from mbtf_core.shard_schema import GEOMETRY_NAME
     from mbtf_gen.dataset.reader import Dataset
     from mbtf_gen.dataset.sidecar import ABSENT
     from mbtf_gen.dataset.verify import foreign_files, verify
 
     start = time.perf_counter()
+    folder = data_folder(folder)
     faults = verify(folder)
     seconds = time.perf_counter() - start
     dataset = Dataset.open(folder)
@@ -96,14 +99,16 @@ def repair(
     Parameters
     ----------
     folder
-        Folder of shards.
+        Folder of shards, or its URL.
     material
         Path of the material, if it was moved.
     keep
         Which data set to restore, if the files belong to several: the name that the message gives it.
     """
+    from mbtf_core.data_folder import data_folder
     from mbtf_gen.repairs import Corruption, RepairResult
 
+    folder = data_folder(folder)
     found = Corruption(folder, material, keep)
     if dry_run:
         shards = [entry.file for entry in found.entries]
@@ -132,10 +137,10 @@ def _describe_repair(done: RepairResult, dry_run: bool) -> str:
         lines.append(f"{done.folder}: nothing to repair")
     if not done.complete and not dry_run:
         lines.append(f"{done.folder}: unfinished; run the same command again")
-    return "\n".join([*lines, *_describe_foreign(Path(done.folder), done.foreign)])
+    return "\n".join([*lines, *_describe_foreign(done.folder, done.foreign)])
 
 
-def _describe_foreign(folder: Path, names: list[str]) -> list[str]:
+def _describe_foreign(folder: str | Path, names: list[str]) -> list[str]:
     if not names:
         return []
     shown = ", ".join(names[:5]) + (", …" if len(names) > 5 else "")

@@ -13,7 +13,7 @@ from cyclopts import Parameter
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import UsageError
 from mbtf_core.interruption import keep_on_interruption
-from mbtf_core.options import ClusterOption, Options, Output, Overwrite, PathText, takes_options
+from mbtf_core.options import ClusterOption, DataOutput, Options, Overwrite, PathText, takes_options
 from mbtf_core.units import clock, size_text
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.presets import (
@@ -73,7 +73,7 @@ def generate(
     material: PathText | None = None,
     /,
     *,
-    output: Output = Path("shards"),
+    output: DataOutput = Path("shards"),
     quality: QualityOption = None,
     options: Options[GeneratorConfig],
     slice: Annotated[str, Parameter(metavar="I/N")] = "1/1",
@@ -95,19 +95,22 @@ def generate(
     index, count = _slice(slice)
     job = prepare_job(options, material, quality)
     from mbtf_core.cluster.engine import open_cluster
+    from mbtf_core.data_folder import data_folder, in_store
     from mbtf_core.folders import check_space
     from mbtf_gen.dataset.shard_io import data_bytes
     from mbtf_gen.forecast import announce_shards
     from mbtf_gen.generation import generate, unfinished
     from mbtf_gen.job import split_queries
 
+    output = data_folder(output)
     left = unfinished(job, output, index, count, overwrite)
     size = data_bytes(job, left)
     console.note(
         f"{job.config.material} -> {output}: {split_queries(job, 'train')} training + "
         f"{split_queries(job, 'test')} test queries, resolution {job.lattice.shape()[1]}, {size_text(size)}"
     )
-    check_space(output, size, SMALLER)
+    if not in_store(output):
+        check_space(output, size, SMALLER)
 
     keep_on_interruption(f"the shards that are finished are kept in {output}")
     # Without anything to render, no workers are started.

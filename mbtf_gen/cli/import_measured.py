@@ -8,7 +8,7 @@ from pathlib import Path
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import UsageError
 from mbtf_core.interruption import keep_on_interruption
-from mbtf_core.options import Options, Output, Overwrite, PathText, takes_options
+from mbtf_core.options import DataOutput, Options, Overwrite, PathText, takes_options
 from mbtf_core.units import size_text
 from mbtf_gen.cli.generate import describe
 from mbtf_gen.config.measured import ImportConfig
@@ -19,7 +19,7 @@ def import_measured(
     measured: PathText,
     /,
     *,
-    output: Output = Path("shards"),
+    output: DataOutput = Path("shards"),
     options: Options[ImportConfig],
     overwrite: Overwrite = False,
     console: Console = CONSOLE,
@@ -33,11 +33,13 @@ def import_measured(
     measured
         File of a BTF (.btf, .hdf5), or folder or zip archive of images.
     """
+    from mbtf_core.data_folder import data_folder, in_store
     from mbtf_core.folders import check_space
     from mbtf_gen.dataset.import_job import Import
     from mbtf_gen.dataset.imported import MEASURED_BYTES
     from mbtf_gen.dataset.imported import import_measured as run
 
+    output = data_folder(output)
     if Path(measured).is_dir() and Path(measured).resolve() in (output / "x").resolve().parents:
         raise UsageError("is inside the measured folder", where=f"-o {output}", hint="choose another folder")
     job = Import.prepare(Path(measured), options.resolve())
@@ -57,7 +59,8 @@ def import_measured(
             f"{job.left_out} of {job.left_out + job.usable} queries are left out: too low, NaN, or of a "
             "footprint that is no level's"
         )
-    check_space(output, size, "reduce --queries, or choose another folder with -o")
+    if not in_store(output):
+        check_space(output, size, "reduce --queries, or choose another folder with -o")
     keep_on_interruption(f"the shards that are finished are kept in {output}")
     with console.progress(total=total, label="importing", unit="queries") as bar:
         summary = run(job, output, overwrite=overwrite, progress=bar.update)

@@ -12,6 +12,7 @@ from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.folders import make_folder
 from mbtf_core.options import Options, Overwrite, PathText, takes_options
+from mbtf_core.store import split_url
 from mbtf_gen.cli.generate import resolve_config
 from mbtf_gen.config.generator import GeneratorConfig
 
@@ -39,6 +40,9 @@ def inspect(
     export
         Write the heights in use, on the mesh and in tile widths, as an EXR file.
     """
+    if split_url(material) is not None:
+        hint = f"describe a data set with: mbtf-fit info {material}"
+        raise UsageError("is a URL, but materials are local files", where=material, hint=hint)
     resolved = resolve_config(options, material)
     _check_new(write, "--write", (".yaml", ".yml"), overwrite)
     _check_new(export, "--export", (".exr",), overwrite)

@@ -29,10 +29,12 @@ def preview(
     Parameters
     ----------
     material
-        Height map, folder of maps, material.yaml, mesh, file of yarns or fibers, or a folder of shards.
+        Height map, folder of maps, material.yaml, mesh, file of yarns or fibers, or a folder of shards or its
+        URL.
     interactive
         Also show the mesh in a window, where the mouse turns it.
     """
+    from mbtf_core.data_folder import data_folder
     from mbtf_gen.dataset.reader import Dataset, is_dataset
     from mbtf_gen.pictures.preview.drawing import PreviewPictures
 
@@ -41,8 +43,8 @@ def preview(
 
         check_display()
     dataset = None
-    if material is not None and is_dataset(Path(material)):
-        dataset = Dataset.open(material)
+    if material is not None and is_dataset(folder := data_folder(material)):
+        dataset = Dataset.open(folder)
         given = [options.flags[key] for key in options.given if not key.startswith(("preview.", "exposure"))]
         given += ["--config"] * (options.config is not None) + ["--set"] * bool(options.assignments)
         if given:

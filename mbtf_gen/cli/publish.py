@@ -31,7 +31,7 @@ def publish(
     Parameters
     ----------
     shards
-        Folder of shards.
+        Folder of shards, or its URL.
     with_maps
         Publish the input files of the material too, which their license must allow.
     material
@@ -45,6 +45,9 @@ def publish(
             hint="an SPDX expression such as CC-BY-4.0; that of the material's maps may restrict it",
         )
     config = options.resolve()
+    from mbtf_core.data_folder import data_folder
+
+    shards = data_folder(shards)
     if output.resolve() == shards.resolve() or shards.resolve() in output.resolve().parents:
         raise UsageError("is the data set, or inside it", where=f"-o {output}", hint="choose another folder")
     from mbtf_gen.publishing.publish import Publication

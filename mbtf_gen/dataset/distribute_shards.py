@@ -18,12 +18,14 @@ from typing import Any
 
 from mbtf_core.cluster.engine import Cluster
 from mbtf_core.cluster.task import Task
+from mbtf_core.data_folder import data_folder, in_store, send_shard
 from mbtf_core.errors import InputError, LockedError, PartialError
 from mbtf_core.locks import keep_renewing, take_lock
 from mbtf_core.shard_schema import MANIFEST_NAME, ShardEntry
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.dataset.folder import remove_leftovers
 from mbtf_gen.dataset.manifest import plan_digest
+from mbtf_gen.dataset.recover import recover_shards
 from mbtf_gen.dataset.render_shards import (
     ExpectedPaths,
     ProgressCallback,
@@ -31,7 +33,7 @@ from mbtf_gen.dataset.render_shards import (
     estimate_queries,
     store_shard,
 )
-from mbtf_gen.dataset.sidecar import finished_record
+from mbtf_gen.dataset.sidecar import finished_record, sidecar_of
 from mbtf_gen.dataset.summary import ShardStatistics, read_run_plan, refuse_nonfinite
 from mbtf_gen.job import Job, most_paths
 from mbtf_gen.planning.run_plan import RunPlan
@@ -66,6 +68,7 @@ def distribute_shards(
     """
     start = time.perf_counter() if start is None else start
     remove_leftovers(folder)
+    recover_shards(folder, job.shards, job.config_hash, plan_digest(plan.to_manifest()))
     pending = {entry.file: entry for entry in entries}
     result, totals, expected = RenderResult(), ShardStatistics(), ExpectedPaths(job)
     limit = most_paths(job)
@@ -74,7 +77,7 @@ def distribute_shards(
             **job.config.model_dump(mode="json"),
             "material": os.path.abspath(job.config.material),
         },
-        "folder": os.path.abspath(folder),
+        "folder": str(folder) if in_store(folder) else os.path.abspath(folder),
         "config_hash": job.config_hash,
         "plan": plan_digest(plan.to_manifest()),
     }
@@ -144,7 +147,7 @@ def render_shard(
     PartialError
         The folder cannot be written, or another process of this machine renders the shard.
     """
-    into = Path(folder)
+    into = _folder_of(folder, config_hash, plan)
     if not (into / MANIFEST_NAME).exists():
         raise InputError("this machine does not see the data set", where=into)
     run = _run_of(json.dumps(config), into, config_hash, plan)
@@ -167,6 +170,7 @@ def render_shard(
             estimates = estimate_queries(run.job, run.plan, estimator, entry, queries)
             seconds = time.perf_counter() - began
             record = store_shard(run.job, into, run.plan, entry, queries, estimates, seconds)
+            send_shard(into / file, sidecar_of(into / file))
         return {"record": record, "rendered": True}
     finally:
         lock.release()
@@ -183,6 +187,12 @@ class _Run:
     def estimator(self) -> Any:
         """Built where a shard is to be rendered."""
         return build_estimator(self.job, self.plan.effects)
+
+
+@lru_cache(maxsize=1)
+def _folder_of(folder: str, config_hash: str, plan: str) -> Path:
+    """The folder of a data set; one in a store is not listed again for each shard."""
+    return data_folder(folder)
 
 
 @lru_cache(maxsize=1)

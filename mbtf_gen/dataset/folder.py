@@ -18,6 +18,7 @@ from mbtf_core.atomic import (
     write_text,
 )
 from mbtf_core.config_file import differences, dump_yaml
+from mbtf_core.data_folder import data_folder, send
 from mbtf_core.errors import InputError, PartialError
 from mbtf_core.folders import ELSEWHERE, check_folder, make_folder, other_configuration, remove_unfinished
 from mbtf_core.locks import brief_lock, lock_owner, shard_lock, take_lock
@@ -100,12 +101,14 @@ def open_folder(job: Job, folder: Path, plan: Callable[[Job], RunPlan], overwrit
     with brief_lock(existing):
         remove_unfinished(folder, (MANIFEST_NAME, CONFIG_NAME, GEOMETRY_NAME))
         # The manifest comes first: it marks the folder as a data set, at whatever instant the run is killed.
-        adopted = bool(content) and not create_file(existing, content)
+        adopted = bool(content) and not (create_file(existing, content) and send(existing, new=True))
         if adopted:
-            _check_same(job, folder)
+            # In a store it is known once the folder is read again.
+            _check_same(job, data_folder(folder))
         manifest = read_manifest(folder)
         if not (folder / CONFIG_NAME).exists():
             write_text(folder / CONFIG_NAME, dump_yaml(manifest["config"]))
+            send(folder / CONFIG_NAME)
         if geometry is not None and not (folder / GEOMETRY_NAME).exists():
             if adopted:
                 # The plan of the other writer may simulate other effects.
@@ -113,6 +116,7 @@ def open_folder(job: Job, folder: Path, plan: Callable[[Job], RunPlan], overwrit
             assert geometry is not None
             check_geometry(folder, geometry, manifest)
             write_geometry(folder / GEOMETRY_NAME, geometry)
+            send(folder / GEOMETRY_NAME)
 
 
 def check_geometry(folder: Path, geometry: Geometry, manifest: Mapping[str, Any]) -> None:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mbtf_core.atomic import read_json, remove_file, write_checksummed, write_text
 from mbtf_core.config_file import dump_yaml
+from mbtf_core.data_folder import data_folder, send, send_shard
 from mbtf_core.folders import check_folder, make_folder, other_configuration, owned
 from mbtf_core.lattice import sigma_of_level
 from mbtf_core.shard_schema import (
@@ -121,7 +122,7 @@ def _manifest(job: Import) -> dict[str, Any]:
 
 
 def import_measured(
-    job: Import, folder: Path, *, overwrite: bool = False, progress: Progress | None = None
+    job: Import, folder: str | Path, *, overwrite: bool = False, progress: Progress | None = None
 ) -> Summary:
     """Write a measured BTF as a data set, or finish an unfinished one.
 
@@ -129,8 +130,8 @@ def import_measured(
     ----------
     job : Import
         The measured BTF and the options.
-    folder : Path
-        Output folder.
+    folder : str or Path
+        Output folder, or a URL.
     overwrite : bool
         Replace the folder's data set.
     progress : callable, optional
@@ -149,6 +150,7 @@ def import_measured(
         The folder cannot be written, or another process writes to it; the same command resumes.
     """
     start = time.perf_counter()
+    folder = data_folder(folder)
     manifest = _manifest(job)
     with owned(folder):
         if check_folder(folder, lambda path: (path / MANIFEST_NAME).exists(), "data set"):
@@ -159,7 +161,9 @@ def import_measured(
         make_folder(folder)
         if not (folder / MANIFEST_NAME).exists():
             write_checksummed(folder / MANIFEST_NAME, manifest)
+            send(folder / MANIFEST_NAME)
         write_text(folder / CONFIG_NAME, dump_yaml(manifest["config"]))
+        send(folder / CONFIG_NAME)
         plan, written = plan_digest(manifest), 0
         source = job.source
         parts = (
@@ -294,3 +298,4 @@ def _store(job: Import, folder: Path, plan: str, entry: ShardEntry, arrays: Arra
         },
     }
     write_checksummed(sidecar_of(path), record)
+    send_shard(path, sidecar_of(path))

@@ -12,6 +12,7 @@ from pydantic import BaseModel, Field
 
 from mbtf_core.atomic import read_checksummed, read_json
 from mbtf_core.config_file import check_document, check_schema
+from mbtf_core.data_folder import data_folder, limit_cache
 from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import MAX_LEVEL, Lattice
@@ -174,13 +175,15 @@ class Dataset:
     manifest: dict[str, Any]
 
     @classmethod
-    def open(cls, folder: str | Path) -> Dataset:
+    def open(cls, folder: str | Path, cache: float | None = None) -> Dataset:
         """Open a folder of shards.
 
         Parameters
         ----------
         folder : str or Path
-            The data set.
+            The data set: a path, or a URL such as ``s3://bucket/data``.
+        cache : float, optional
+            Bytes of local disk for shards of object stores; 20 GB by default.
 
         Returns
         -------
@@ -190,8 +193,12 @@ class Dataset:
         ------
         InputError
             No manifest, another format or schema version, or invalid keys.
+        PartialError
+            The store cannot be reached.
         """
-        folder = Path(folder)
+        folder = data_folder(folder)
+        if cache is not None:
+            limit_cache(folder, cache)
         if not folder.is_dir():
             raise InputError("no such folder", where=folder, hint=suggest_path(folder, Path.is_dir))
         path = folder / MANIFEST_NAME

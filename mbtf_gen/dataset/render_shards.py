@@ -15,11 +15,13 @@ from typing import Any
 import numpy as np
 
 from mbtf_core.atomic import remove_file, write_checksummed
-from mbtf_core.errors import PartialError
+from mbtf_core.data_folder import send_shard
+from mbtf_core.errors import InputError, PartialError
 from mbtf_core.locks import Lock, lock_owner, take_lock
 from mbtf_core.shard_schema import FORMAT_NAME, SCHEMA_VERSION, ShardEntry
 from mbtf_gen.dataset.folder import remove_leftovers
 from mbtf_gen.dataset.manifest import plan_digest
+from mbtf_gen.dataset.recover import recover_shards
 from mbtf_gen.dataset.shard_io import write_shard
 from mbtf_gen.dataset.sidecar import finished_record, sidecar_of
 from mbtf_gen.dataset.summary import ShardStatistics, refuse_nonfinite
@@ -110,8 +112,8 @@ def render_shards(
 
     Raises
     ------
-    PartialError : other processes render some of them, the disk is full, or there are too many non-finite
-        samples; finished shards are kept
+    PartialError : other processes render some of them, the disk is full, the store cannot be reached, or
+        there are too many non-finite samples; finished shards are kept
     """
     start = time.perf_counter() if start is None else start
     pending = {entry.file: entry for entry in entries}
@@ -137,11 +139,20 @@ def render_shards(
             total_paths = None if left is None else result.paths + left
             progress(result.paths, f"{rate / 1e6:.2f} M paths/s{error}", total_paths)
 
+    unsent: list[PartialError | InputError] = []
+
     def store(entry: ShardEntry, *rendered: Any) -> None:
         records.append(store_shard(job, folder, plan, entry, *rendered))
+        path = folder / entry.file
+        try:
+            send_shard(path, sidecar_of(path))
+        except (PartialError, InputError) as error:
+            # What is rendered meanwhile is still written, and uploaded by the next run.
+            unsent.append(error)
 
     # Leftovers of killed runs take disk space.
     remove_leftovers(folder)
+    recover_shards(folder, job.shards, job.config_hash, plan_digest(plan.to_manifest()))
     estimator: Any = None
     # A corrupt shard counts as finished once its sidecar has changed.
     stamps = {file: _stamp(folder / file) for file in corrupt}
@@ -167,6 +178,10 @@ def render_shards(
                 own.add_quarantined(entry.file, _quarantined(estimates))
                 # These shards alone may exceed the limit of the whole data set.
                 refuse_nonfinite(own, limit, folder)
+                if unsent:
+                    break
+        if unsent:
+            raise unsent[0]
         result.writing += writer.busy
         result.waiting += writer.waited
         if len(busy) == len(tried):

@@ -19,6 +19,7 @@ from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
 from mbtf_core.atomic import Stored, write_chunks
+from mbtf_core.data_folder import read_local
 from mbtf_core.errors import InputError, reason
 from mbtf_core.shard_schema import ARRAY, ARRAYS, ShardEntry
 from mbtf_core.suggest import refuse_special
@@ -293,9 +294,15 @@ def read_shard(path: Path, names: Iterable[str] | None = None, *, mapped: bool =
     Raises
     ------
     InputError : missing, corrupt, or arrays with inconsistent shapes
+    PartialError : its store cannot be reached
     """
     refuse_special(path)
-    arrays = read_exr(path, names) if path.suffix == ".exr" else read_npz(path, names, mapped=mapped)
+    wanted = None if names is None else list(names)
+
+    def read(file: Path) -> Arrays:
+        return read_exr(file, wanted) if path.suffix == ".exr" else read_npz(file, wanted, mapped=mapped)
+
+    arrays = read_local(path, read)
     if arrays:
         check_arrays(arrays, path, complete=False)
     return arrays

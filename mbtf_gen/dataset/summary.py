@@ -14,6 +14,7 @@ from pydantic import BaseModel, PositiveInt
 
 from mbtf_core.atomic import write_checksummed
 from mbtf_core.config_file import check_document
+from mbtf_core.data_folder import data_folder, send
 from mbtf_core.errors import PartialError
 from mbtf_core.locks import brief_lock
 from mbtf_core.shard_schema import MANIFEST_NAME
@@ -213,7 +214,7 @@ def read_run_plan(folder: Path) -> RunPlan:
 
 
 def finish(
-    folder: Path, *, paths: int = 0, seconds: float = 0.0, writing: float = 0.0, waiting: float = 0.0
+    folder: str | Path, *, paths: int = 0, seconds: float = 0.0, writing: float = 0.0, waiting: float = 0.0
 ) -> Summary:
     """Complete the manifest if every shard is finished, and summarize (``mbtf-gen merge``).
 
@@ -226,6 +227,7 @@ def finish(
     InputError : no data set, or a corrupt manifest or sidecar
     PartialError : too many non-finite samples, or the folder cannot be written
     """
+    folder = data_folder(folder)
     dataset = Dataset.open(folder)
     manifest = read_manifest(folder)
     measured = "measured" in manifest
@@ -255,6 +257,7 @@ def finish(
                 manifest |= {"complete": True, "software": software_versions()}
                 manifest["summary"] = {**sums, "paths": totals.paths, **totals.counts}
                 write_checksummed(folder / MANIFEST_NAME, manifest)
+                send(folder / MANIFEST_NAME)
     if complete:
         remove_leftovers(folder)
     return Summary(

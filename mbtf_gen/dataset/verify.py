@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mbtf_core.data_folder import data_folder, fresh_copy
 from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError, reason
 from mbtf_core.shard_schema import CONFIG_NAME, GEOMETRY_NAME, MANIFEST_NAME, ShardEntry
@@ -53,7 +54,8 @@ def examine(folder: Path, entry: ShardEntry, config_hash: str) -> tuple[dict[str
     """(sidecar, None) or (None, fault) of a shard, whose whole file is read."""
     try:
         record = read_sidecar(folder, entry, config_hash)
-        _check_content(folder / entry.file, entry.rows, record)
+        with fresh_copy(folder / entry.file) as file:
+            _check_content(file, entry.rows, record)
         return record, None
     except InputError as error:
         return None, error.what
@@ -124,13 +126,13 @@ def foreign_files(folder: Path, entries: Iterable[ShardEntry]) -> list[str]:
     return sorted(path.name + "/" * path.is_dir() for path in found)
 
 
-def verify(folder: Path) -> list[Fault]:
+def verify(folder: str | Path) -> list[Fault]:
     """Find all faults of a data set: changed, truncated, missing or foreign shards, an unfinished manifest.
 
     Parameters
     ----------
-    folder : Path
-        The data set.
+    folder : str or Path
+        The data set: a path or a URL.
 
     Returns
     -------
@@ -141,8 +143,10 @@ def verify(folder: Path) -> list[Fault]:
     ------
     InputError
         The folder contains no data set of this schema version, or its manifest is damaged.
+    PartialError
+        The store cannot be reached.
     """
-    folder = Path(folder)
+    folder = data_folder(folder)
     dataset = Dataset.open(folder)
     faults = list(_document_faults(dataset))
     entries = [entry for split in dataset.splits for entry in dataset.entries(split)]

@@ -10,12 +10,17 @@ from numpy.typing import NDArray
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError, reason
 from mbtf_core.suggest import suggest_path
-from mbtf_gen.images.read import read_image
+from mbtf_gen.images.read import SUFFIXES, read_image
 from mbtf_gen.images.resample import resample
+
+_RADIANCE = ".hdr"
 
 
 def read_environment(path: Path, most_rows: int) -> NDArray[np.float32]:
-    """A picture of the whole sphere, rows by latitude, the top one at z.
+    """A picture of the whole sphere, seen from inside: rows by latitude, the top one at z.
+
+    Column i of n is at azimuth 90° - 360° (i + ½) / n, as in an ``envmap`` of Mitsuba that is turned by 90°
+    about x, which puts z up.
 
     Parameters
     ----------
@@ -34,7 +39,14 @@ def read_environment(path: Path, most_rows: int) -> NDArray[np.float32]:
     InputError
         The file cannot be read.
     """
-    pixels = _radiance(path) if path.suffix.lower() == ".hdr" else _pixels(path)
+    suffix = path.suffix.lower()
+    if path.is_file() and suffix not in (_RADIANCE, *SUFFIXES):
+        raise InputError(
+            f"'{path.suffix}' is not an image format that is read",
+            where=path,
+            hint=f"use one of {', '.join((_RADIANCE, *SUFFIXES))}",
+        )
+    pixels = _radiance(path) if suffix == _RADIANCE else _pixels(path)
     rows = min(most_rows, pixels.shape[0])
     columns = min(max(1, round(rows * pixels.shape[1] / pixels.shape[0])), pixels.shape[1])
     small = np.asarray(resample(pixels, rows, columns), np.float32)

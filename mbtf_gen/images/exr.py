@@ -127,7 +127,7 @@ def _read(
     broken = InputError("cannot be read as an EXR image: it is damaged or cut short", where=path)
     try:
         with silenced():
-            file = OpenEXR.File(str(path), separate_channels=True, header_only=True)
+            file = OpenEXR.File(os.fspath(path), separate_channels=True, header_only=True)
             heads = [part.header for part in file.parts]
     except Exception:  # a damaged file may make the library raise anything
         raise broken from None
@@ -138,7 +138,7 @@ def _read(
             f"claims {numbers:,} numbers; at most {_MOST_CHANNELS * max_pixels:,} are read", where=path
         )
     try:
-        with silenced(), OpenEXR.File(str(path), separate_channels=True) as file:
+        with silenced(), OpenEXR.File(os.fspath(path), separate_channels=True) as file:
             parts = [{n: np.array(c.pixels) for n, c in part.channels.items()} for part in file.parts]
     except Exception:
         raise broken from None
@@ -189,7 +189,9 @@ def write_channels(
     import OpenEXR
 
     head = {"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage, **(header or {})}
-    return write_through(path, lambda temporary: OpenEXR.File(head, dict(channels)).write(str(temporary)))
+    return write_through(
+        path, lambda temporary: OpenEXR.File(head, dict(channels)).write(os.fspath(temporary))
+    )
 
 
 def encode_parts(

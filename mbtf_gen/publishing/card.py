@@ -15,7 +15,7 @@ from mbtf_gen.publishing.escape import code, escaped, fenced, table
 from mbtf_gen.publishing.facts import TAGS, Facts, bound_text
 from mbtf_gen.publishing.folder import DATA, PICTURES, RECIPE
 from mbtf_gen.publishing.loading import loading_section, same_shapes
-from mbtf_gen.publishing.recipe import MATERIAL, SCRIPT_NAME, remake_commands
+from mbtf_gen.publishing.recipe import MATERIAL, remake_call, remake_commands
 from mbtf_gen.publishing.statistics import SplitStatistics
 
 CARD_NAME = "README.md"
@@ -261,7 +261,7 @@ class Card:
                 "These commands make the same data set again and compare every array with the published "
                 "one. They run in this folder:",
                 fenced("\n".join(remake_commands(self.maps))),
-                f"`sh {RECIPE}/{SCRIPT_NAME}` runs both. {whose}",
+                f"`{remake_call(self.maps)}` runs both. {whose}",
                 inputs,
                 "The queries are equal bit by bit on every machine. The values are equal bit by bit on one "
                 f"type of machine with this software: {software}.",

@@ -18,10 +18,13 @@ from mbtf_gen.publishing.shards import copy_file, public_config
 
 SCRIPT_NAME = "remake.sh"
 MATERIAL = "material"
+# Beside the published folder, so that it is not uploaded with it.
+DEFAULT_OUTPUT = "remade"
 _SCRIPT = """\
 #!/bin/sh
 # Makes the data set again and compares every array with the published one.
 # Usage: sh {script} {usage}
+# FOLDER is by default {default}, beside the published folder.
 set -eu
 recipe=$(dirname "$0")
 {begin}
@@ -30,17 +33,18 @@ mbtf-gen verify "$folder" --digests "$recipe/{digests}"
 """
 _WITH_MAPS = f"""\
 material="$recipe/{MATERIAL}/{MATERIAL_FILE}"
-folder="${{1:-remade}}\""""
-_WITHOUT_MAPS = """\
+folder="${{1:-$recipe/../../{DEFAULT_OUTPUT}}}\""""
+_WITHOUT_MAPS = f"""\
 if [ $# -lt 1 ]; then echo "error: name the material: sh $0 MATERIAL [FOLDER]" >&2; exit 2; fi
 material="$1"
-folder="${2:-remade}\""""
+folder="${{2:-$recipe/../../{DEFAULT_OUTPUT}}}\""""
 
 
 def remake_script(maps: bool) -> str:
     """The script, with the material beside it or with its path as the first argument."""
     return _SCRIPT.format(
         script=SCRIPT_NAME,
+        default=DEFAULT_OUTPUT,
         usage="[FOLDER]" if maps else "MATERIAL [FOLDER]",
         begin=_WITH_MAPS if maps else _WITHOUT_MAPS,
         config=CONFIG_NAME,
@@ -48,12 +52,17 @@ def remake_script(maps: bool) -> str:
     )
 
 
+def remake_call(maps: bool) -> str:
+    """The call of the script in the published folder."""
+    return f"sh {RECIPE}/{SCRIPT_NAME}" + ("" if maps else " MATERIAL")
+
+
 def remake_commands(maps: bool) -> list[str]:
     """The two commands of the script, as one gives them in the published folder."""
     material = f"{RECIPE}/{MATERIAL}/{MATERIAL_FILE}" if maps else "MATERIAL"
     return [
-        f"mbtf-gen {material} --config {RECIPE}/{CONFIG_NAME} -o remade/",
-        f"mbtf-gen verify remade/ --digests {RECIPE}/{DIGESTS_NAME}",
+        f"mbtf-gen {material} --config {RECIPE}/{CONFIG_NAME} -o ../{DEFAULT_OUTPUT}/",
+        f"mbtf-gen verify ../{DEFAULT_OUTPUT}/ --digests {RECIPE}/{DIGESTS_NAME}",
     ]
 
 

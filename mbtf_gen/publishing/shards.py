@@ -11,6 +11,7 @@ from typing import Any
 
 from mbtf_core.atomic import Stored, checksummed, sync_folder, temporary_of, write_chunks
 from mbtf_core.config_file import dump_yaml
+from mbtf_core.data_folder import local_copy
 from mbtf_core.digest import file_sha256
 from mbtf_core.shard_schema import CONFIG_NAME, MANIFEST_NAME
 
@@ -48,7 +49,7 @@ def link_or_copy(source: Path, path: Path) -> Stored:
     ------
     PartialError : the disk is full or the folder cannot be written
     """
-    temporary = temporary_of(path)
+    temporary, source = temporary_of(path), local_copy(source)
     with contextlib.suppress(OSError):
         temporary.unlink(missing_ok=True)
         os.link(source, temporary)

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from mbtf_gen.fibers.tile import FiberTile
 from mbtf_gen.render.geometry import Vertex
+from mbtf_gen.render.memory import padded
 from mbtf_gen.render.periodic_scene import OVERLAP, PeriodicScene
 from mbtf_gen.render.types import Float, Mask, Point3f, Ray3f, SurfaceInteraction3f, UInt32, Vector3f
 
@@ -69,10 +70,10 @@ class CurveGeometry(PeriodicScene):
             number(0.0),
             number(_OFFSET * extent),
             number(OVERLAP * extent),
-            mi.Point3f(rows[:, :3].T.copy()),
-            mi.Float(rows[:, 3].copy()),
-            mi.UInt32((np.repeat(start, segments) + within).astype(np.uint32)),
-            mi.Float(np.repeat(u, segments).astype(np.float32)),
+            mi.Point3f(padded(rows[:, :3].T)),
+            mi.Float(padded(rows[:, 3])),
+            mi.UInt32(padded((np.repeat(start, segments) + within).astype(np.uint32))),
+            mi.Float(padded(np.repeat(u, segments).astype(np.float32))),
         )
 
     def vertex(self, si: SurfaceInteraction3f) -> Vertex:

@@ -20,6 +20,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mbtf_gen.render.memory import padded
 from mbtf_gen.render.types import (
     DirectionSample3f,
     Float,
@@ -65,8 +66,8 @@ class DirectionalLight:
         if kernel is None:
             return cls("constant")
         w = np.asarray(omega_i, np.float32)
-        towards = mi.Vector3f(w.T.copy())
-        inverse = mi.Float((1.0 / kernel.irradiance(w)).astype(np.float32))
+        towards = mi.Vector3f(padded(w.T))
+        inverse = mi.Float(padded((1.0 / kernel.irradiance(w)).astype(np.float32)))
         # Evaluated before any kernel reads them: otherwise their number would be part of the kernel.
         dr.eval(towards, inverse)
         kappa = dr.opaque(mi.Float, 0.0 if kernel.is_delta else kernel.kappa)

@@ -18,6 +18,7 @@ from mbtf_core.directions import check_unit
 from mbtf_core.errors import PartialError
 from mbtf_gen.render.directional_light import DirectionalLight
 from mbtf_gen.render.estimates import MOST_LOCATED, BadSample, Estimates, Stream
+from mbtf_gen.render.memory import padded
 from mbtf_gen.render.path_tracer import PathTracer, Transport
 from mbtf_gen.render.scene import CLEARANCE, Tile
 from mbtf_gen.render.types import Color3f, Float, Float64, Point2f, Ray3f, UInt32
@@ -200,7 +201,7 @@ class _Launch:
         for attempt in range(1, MAX_RESAMPLES + 1):
             if not len(bad):
                 break
-            lanes = mi.UInt32(bad)
+            lanes = mi.UInt32(padded(bad))
             again, through, more_lost, more_capped = self._trace(lanes, attempt)
             dr.scatter(radiance, again, lanes)
             if self.estimator.holes:
@@ -256,7 +257,7 @@ class _Launch:
         after one interaction."""
         if not len(bad):
             return ()
-        direct = _nonfinite(self._trace(mi.UInt32(bad), limit=dr.opaque(mi.UInt32, 1))[0])
+        direct = _nonfinite(self._trace(mi.UInt32(padded(bad)), limit=dr.opaque(mi.UInt32, 1))[0])
         return tuple(
             BadSample(self._number(lane), "direct light" if k in direct else "interreflection")
             for k, lane in enumerate(bad)
@@ -336,7 +337,7 @@ def _position_key(point: Point2f) -> UInt32:
 def _aligned(numbers: NDArray[Any]) -> UInt32:
     """Lane numbers as a copy: NumPy's memory is aligned or not by chance, and kernels would be compiled for
     either case."""
-    copied = mi.UInt32(numbers.astype(np.uint32)) + dr.opaque(mi.UInt32, 0)
+    copied = mi.UInt32(padded(numbers.astype(np.uint32))) + dr.opaque(mi.UInt32, 0)
     dr.eval(copied)
     return copied
 

@@ -15,6 +15,7 @@ import numpy as np
 from mbtf_gen.geometry.height_planes import logarithms, node_table
 from mbtf_gen.geometry.heightfield import HeightGrid
 from mbtf_gen.render.geometry import Vertex
+from mbtf_gen.render.memory import padded
 from mbtf_gen.render.types import Float, Int32, Mask, Normal3f, Point3f, Ray3f, SurfaceInteraction3f, Vector3f
 
 # Ray offset relative to the largest coordinate: a few units in the last place of float32. An offset four
@@ -77,7 +78,7 @@ class HeightField:
 
         number, count = partial(dr.opaque, mi.Float), partial(dr.opaque, mi.Int32)
         # A copy: NumPy's memory need not have the alignment that reads of whole rows require.
-        nodes = mi.Float(np.concatenate(tables).ravel()) + number(0.0)
+        nodes = mi.Float(padded(np.concatenate(tables).ravel())) + number(0.0)
         dr.eval(nodes)
         return cls(
             nodes,

@@ -13,6 +13,8 @@ import os
 import re
 from pathlib import Path
 
+from mbtf_core.folders import cache_folder
+
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 CACHE_VARIABLE = "DRJIT_CACHE_DIR"
 # LLVM 14 is refused by Dr.Jit; 15 is accepted and then aborts the process at the first `minimum`.
@@ -42,11 +44,6 @@ def shipped_llvm() -> Path | None:
 def chosen_llvm() -> str | None:
     """Value of ``DRJIT_LIBLLVM_PATH``; None where it is unset or empty: Dr.Jit then searches the system."""
     return os.environ.get(VARIABLE) or None
-
-
-def cache_folder() -> Path:
-    """Cache folder: ``$XDG_CACHE_HOME/mbtf``, by default ``~/.cache/mbtf``."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "mbtf")
 
 
 def _load_runtime(library: Path) -> None:

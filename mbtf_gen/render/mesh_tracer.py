@@ -16,6 +16,7 @@ from mbtf_gen.geometry.heightfield import HeightGrid, grid_faces, grid_vertices
 from mbtf_gen.meshes.tile import MeshTile
 from mbtf_gen.render.geometry import Vertex
 from mbtf_gen.render.heightfield import surface_interaction
+from mbtf_gen.render.memory import padded
 from mbtf_gen.render.periodic_scene import OVERLAP, PeriodicScene
 from mbtf_gen.render.types import (
     Mask,
@@ -115,8 +116,8 @@ class MeshTileGeometry(MeshGeometry):
         return cls(
             **_triangles(vertices.reshape(-1, 3), faces, low, size),
             # Mitsuba's bitmaps have row 0 at v = 0, ours at v → 1.
-            uv=mi.Point2f((tile.uv[corners].reshape(-1, 2) * (1, -1) + (0, 1)).T.astype(np.float32).copy()),
-            part=mi.UInt32(tile.part[number].astype(np.uint32)),
+            uv=mi.Point2f(padded((tile.uv[corners].reshape(-1, 2) * (1, -1) + (0, 1)).T.astype(np.float32))),
+            part=mi.UInt32(padded(tile.part[number].astype(np.uint32))),
         )
 
     def vertex(self, si: SurfaceInteraction3f) -> Vertex:
@@ -165,6 +166,6 @@ def _triangles(
         "top": number(float(vertices[:, 2].max())),
         "offset": number(_OFFSET * extent),
         "overlap": number(OVERLAP * extent),
-        "vertices": mi.Point3f(vertices.T.astype(np.float32).copy()),
-        "faces": mi.Vector3u(faces.T.astype(np.uint32).copy()),
+        "vertices": mi.Point3f(padded(vertices.T.astype(np.float32))),
+        "faces": mi.Vector3u(padded(faces.T.astype(np.uint32))),
     }

@@ -13,6 +13,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mbtf_gen.render.memory import padded
 from mbtf_gen.render.types import Float, Mask, Point2f, Properties, Ray3f, Spectrum, UInt32, Vector3f
 from mbtf_gen.sampling.query_sampler import Queries
 
@@ -68,9 +69,9 @@ class QuerySensor(mi.Sensor):
 
     def set_queries(self, queries: Queries, first: int = 0) -> None:
         """Set a batch of queries (one leading axis); `first` is unused here."""
-        self.u = mi.Point2f(queries.u.T.copy())
-        self.sigma = mi.Float(queries.sigma)
-        self.omega_o = mi.Vector3f(queries.omega_o.T.copy())
+        self.u = mi.Point2f(padded(queries.u.T))
+        self.sigma = mi.Float(padded(queries.sigma))
+        self.omega_o = mi.Vector3f(padded(queries.omega_o.T))
         dr.eval(self.u, self.sigma, self.omega_o)
 
     def footprint(self, query: UInt32, xi: Point2f) -> Point2f:

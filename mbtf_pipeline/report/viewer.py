@@ -11,7 +11,7 @@ from mbtf_core.atomic import read_json, write_text
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import InputError
 from mbtf_fit.viewer.content import material_content
-from mbtf_fit.viewer.extras import picture_content
+from mbtf_fit.viewer.extras import picture_content, tiles_text
 from mbtf_fit.viewer.page import write_page
 from mbtf_gen.pictures.camera import Camera
 from mbtf_pipeline.compare.compare import COMPARISON_NAME
@@ -60,5 +60,5 @@ def _picture(folder: Path, picture: Mapping[str, Any]) -> dict[str, Any]:
     reference = picture["references"].get("query") or next(iter(picture["references"].values()))
     value = read_picture(folder / COMPARE / reference["file"])
     camera = Camera(view["elevation"], view["azimuth"], across)
-    name = f"path-traced, light {light['elevation']:g}°, {across:g} tiles across"
+    name = f"path-traced, light {light['elevation']:g}°, {tiles_text(across)} across"
     return picture_content(name, value, camera, from_angles(light["elevation"], light["azimuth"]))

@@ -175,7 +175,8 @@ def test_an_option_has_one_help_and_one_meaning() -> None:
             options: list[ConfigOption] = getattr(command.default_command, "config_options", [])
             for option in options:
                 keys.setdefault(option.flag, set()).add(option.key.rpartition(".")[2])
-    # Paths per query or per pixel.
+    # Paths per query or per pixel; only data sets are written to URLs.
     assert len(helps.pop("--spp")) == 2
+    assert helps.pop("--output") == {"Output folder.", "Output folder or URL."}
     assert {name: found for name, found in helps.items() if len(found) > 1 or not all(found)} == {}
     assert {flag: found for flag, found in keys.items() if len(found) > 1} == {}

@@ -1,6 +1,10 @@
 // A pinhole camera that looks at a point, as that of mbtf-gen reference: its field of view at the target is
 // so many tiles across.
 
+// Fields of view in tile widths, and the share of a picture that a shape fills.
+const NEAR_AND_FAR = [0.05, 400],
+  FILL = 0.9;
+
 class Camera {
   constructor(state) {
     Object.assign(this, {
@@ -21,10 +25,10 @@ class Camera {
     return add(this.target, scaled(fromAngles(this.elevation, this.azimuth), this.distance));
   }
 
-  // Forward, right, up.
+  // Forward, right, up. The picture turns with the azimuth, also seen from straight above.
   get frame() {
-    const forward = scaled(fromAngles(this.elevation, this.azimuth), -1);
-    const right = normalized(cross(forward, Math.abs(this.elevation) > 89.9 ? [0, 1, 0] : [0, 0, 1]));
+    const forward = scaled(fromAngles(this.elevation, this.azimuth), -1),
+      right = fromAngles(0, this.azimuth + 90);
     return [forward, right, cross(right, forward)];
   }
 
@@ -88,6 +92,19 @@ class Camera {
   }
 
   zoom(factor) {
-    this.tiles_across = clamp(this.tiles_across * factor, 0.05, 400);
+    this.tiles_across = clamp(this.tiles_across * factor, ...NEAR_AND_FAR);
+  }
+
+  // Go where points around the target (x, y, z of each) just fit a picture of this width over height.
+  fit(points, proportion) {
+    const [forward, right, up] = this.frame,
+      half = Math.tan(radians(this.field_of_view) / 2);
+    let distance = 0;
+    for (let k = 0; k < points.length; k += 3) {
+      const p = add([points[k], points[k + 1], points[k + 2]], scaled(this.target, -1));
+      const across = Math.max(Math.abs(dot(p, right)), Math.abs(dot(p, up)) * proportion);
+      distance = Math.max(distance, across / (FILL * half) - dot(p, forward));
+    }
+    this.tiles_across = clamp(2 * half * distance, ...NEAR_AND_FAR);
   }
 }

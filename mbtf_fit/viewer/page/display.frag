@@ -6,7 +6,7 @@ uniform sampler2D second;
 uniform float divide;  // in [0, 1]; 1 shows the first alone
 uniform float exposure;
 uniform vec2 size;
-uniform vec3 background;
+uniform vec3 background;  // linear
 in vec2 place;
 out vec4 color;
 vec4 at(sampler2D image) {
@@ -24,9 +24,10 @@ vec4 at(sampler2D image) {
 void main() {
   bool right = place.x > divide;
   vec4 found = right ? at(second) : at(first);
-  vec3 linear = max(found.rgb * exp2(exposure), vec3(0.0));
+  // Values are premultiplied: the background adds what passes through.
+  vec3 linear = max(found.rgb * exp2(exposure), vec3(0.0)) + background * (1.0 - clamp(found.a, 0.0, 1.0));
   vec3 low = 12.92 * linear, high = 1.055 * pow(linear, vec3(1.0 / 2.4)) - 0.055;
   vec3 curved = min(mix(high, low, vec3(lessThanEqual(linear, vec3(0.0031308)))), vec3(1.0));
-  color = vec4(curved + background * (1.0 - clamp(found.a, 0.0, 1.0)), 1.0);
+  color = vec4(curved, 1.0);
   if (divide < 1.0 && abs(place.x - divide) * size.x < 1.0) color = vec4(1.0);
 }

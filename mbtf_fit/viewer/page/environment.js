@@ -1,4 +1,6 @@
-// Light from all around: samples of a picture of the whole sphere (latitude by rows, top is z).
+// Light from all around: samples of a picture of the whole sphere, seen from inside. Rows are latitudes, the
+// top one at z; columns go to the right, which is clockwise from above: column i of n is at azimuth
+// 90° - 360° (i + ½) / n.
 
 const SAMPLES = 4096;
 
@@ -27,6 +29,9 @@ const BUILT_IN = {
   },
 };
 
+// Azimuth of a share of a picture's width.
+const azimuthOf = (share) => Math.PI * (0.5 - 2 * share);
+
 // Table of samples {width, height, data}: their density follows luminance; mean irradiance of a horizontal
 // plane is that of a directional light of irradiance 1 from above.
 function environmentSamples(rows, columns, radianceAt) {
@@ -37,7 +42,7 @@ function environmentSamples(rows, columns, radianceAt) {
   for (let j = 0; j < rows; j++)
     for (let i = 0; i < columns; i++) {
       const theta = (Math.PI * (j + 0.5)) / rows,
-        phi = (2 * Math.PI * (i + 0.5)) / columns;
+        phi = azimuthOf((i + 0.5) / columns);
       const solid = (((Math.PI / rows) * (2 * Math.PI)) / columns) * Math.sin(theta);
       const rgb = radianceAt(j, i, [
         Math.sin(theta) * Math.cos(phi),
@@ -58,7 +63,7 @@ function environmentSamples(rows, columns, radianceAt) {
     const at = ((s + random()) / SAMPLES) * total;
     while (k < cumulative.length - 1 && cumulative[k] < at) k++;
     const theta = (Math.PI * (Math.floor(k / columns) + random())) / rows,
-      phi = (2 * Math.PI * ((k % columns) + random())) / columns;
+      phi = azimuthOf(((k % columns) + random()) / columns);
     const { rgb, luminance } = values[k],
       weight = luminance > 0 ? total / luminance / (irradiance || 1) : 0;
     // Rows of pairs: 64 directions, then their radiances.
@@ -74,7 +79,7 @@ function environmentSamples(rows, columns, radianceAt) {
 }
 
 function environmentOf(name, user) {
-  if (user && name === user.name) {
+  if (name === user?.name) {
     const rgb = floatsOf(user.data),
       [rows, columns] = user.shape;
     return environmentSamples(rows, columns, (j, i) =>

@@ -2,12 +2,20 @@
 
 const fail = (error) => (byId("message").textContent = error.message || String(error));
 
+const timeText = (seconds) =>
+  seconds < 0.95 ? `${Math.max(1, Math.round(1000 * seconds))} ms` : `${Math.round(seconds)} s`;
+
 function statusLine(viewer, test) {
-  const { renderer, camera, material, seconds } = viewer,
-    pitch = camera.tiles_across / renderer.canvas.width;
-  const level = clamp(-Math.log2(pitch), 0, material.content.finest);
+  const { renderer, camera, material, full } = viewer,
+    pitch = camera.tiles_across / renderer.canvas.width,
+    level = clamp(-Math.log2(pitch), 0, material.content.finest);
+  const { frames = 0, row = 0, height = 1 } = renderer.means.full ?? {};
+  // The first full frame replaces the coarse picture; more of them remove its noise and jagged edges.
+  const progress = frames
+    ? `frame ${frames} of ${FRAMES}, ${timeText(full)} each`
+    : `full picture: ${Math.floor((100 * row) / height)} % of ${timeText(full)}`;
   const beyond = test?.beyond ? `, ${test.beyond} of ${test.count} test queries deviate` : "";
-  return `level ${level.toFixed(1)} of ${material.content.finest}, ${camera.tiles_across.toPrecision(2)} tiles across, ${(1000 * seconds).toFixed(0)} ms per frame${beyond}`;
+  return `level ${level.toFixed(1)} of ${material.content.finest}, ${tilesText(camera.tiles_across)} across, ${progress}${beyond}`;
 }
 
 async function show(content) {
@@ -20,6 +28,7 @@ async function show(content) {
   byId("message").textContent = "";
   // For tests and scripts.
   window.mbtf = { viewer, tests, showPoint };
+  window.addEventListener("hashchange", () => viewer.restore(location.hash));
   const loop = () => {
     if (viewer.draw()) byId("status").textContent = statusLine(viewer, tests[viewer.state.material]);
     requestAnimationFrame(loop);

@@ -1,6 +1,6 @@
 // Small pictures: the lights seen from above, and values over the disk of directions.
 
-// Lights as dots on the disk of their x and y.
+// Lights as dots on the disk of their x and y, along u and v of the plane.
 function drawDome(canvas, lights, chosen) {
   const ink = canvas.getContext("2d"),
     r = canvas.width / 2,
@@ -14,6 +14,10 @@ function drawDome(canvas, lights, chosen) {
     if (!elevation) ink.fill();
     ink.stroke();
   }
+  ink.font = "34px sans-serif";
+  ink.fillStyle = "#9aa0a8";
+  ink.fillText("u", r + 0.76 * size, r + 10);
+  ink.fillText("v", r - 9, r - 0.76 * size);
   lights.forEach(({ direction: [x, y], color }, k) => {
     ink.beginPath();
     ink.arc(r + size * x, r - size * y, k === chosen ? 15 : 11, 0, 2 * Math.PI);
@@ -37,8 +41,6 @@ function domeDirection(canvas, event) {
   return [x * s, y * s, Math.sqrt(Math.max(0, 1 - (x * s) ** 2 - (y * s) ** 2))];
 }
 
-const encoded = (x) => 255 * (x <= 0.0031308 ? 12.92 * x : 1.055 * Math.pow(x, 1 / 2.4) - 0.055);
-
 // Values over directions: the largest is white; the chosen direction is a circle.
 function drawValues(canvas, size, values, [x, y]) {
   canvas.width = canvas.height = size;
@@ -52,7 +54,7 @@ function drawValues(canvas, size, values, [x, y]) {
       const from = 4 * ((size - 1 - j) * size + i),
         to = 4 * (j * size + i);
       for (let c = 0; c < 3; c++)
-        image.data[to + c] = encoded(largest > 0 ? Math.max(0, values[from + c]) / largest : 0);
+        image.data[to + c] = 255 * encoded(largest > 0 ? Math.max(0, values[from + c]) / largest : 0);
       image.data[to + 3] = 255;
     }
   ink.putImageData(image, 0, 0);

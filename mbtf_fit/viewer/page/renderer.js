@@ -1,7 +1,7 @@
 // Draws the scene: frames accumulate to a mean, which is displayed with exposure.
 
 const FRAMES = 64;
-const BACKGROUND = [0.11, 0.12, 0.14];
+const BACKGROUND = [0.11, 0.12, 0.14].map(decoded);
 
 // Halton sequence, for positions within the pixel.
 function halton(index, base) {
@@ -25,6 +25,15 @@ class Mean {
     this.frames = this.row = 0;
   }
 
+  // First column and number of columns of each side.
+  columns(divide) {
+    const split = this.sides.length > 1 ? Math.round(divide * this.width) : this.width;
+    return [
+      [0, split],
+      [split, this.width - split],
+    ];
+  }
+
   delete() {
     for (const target of [this.latest, ...this.sides.flat()]) target.delete();
   }
@@ -38,6 +47,7 @@ class Renderer {
     this.accumulate = new Program(this.gl, SHADERS["screen.vert"], SHADERS["accumulate.frag"]);
     this.display = new Program(this.gl, SHADERS["screen.vert"], SHADERS["display.frag"]);
     this.means = {};
+    this.meshes = new Map();
   }
 
   drawScreen() {
@@ -45,10 +55,19 @@ class Renderer {
     this.gl.drawArrays(this.gl.TRIANGLES, 0, 3);
   }
 
-  setShape(data) {
-    this.mesh?.buffers.forEach((buffer) => this.gl.deleteBuffer(buffer));
-    if (this.mesh) this.gl.deleteVertexArray(this.mesh.array);
-    this.mesh = meshOf(this.gl, data);
+  // `shape` gives the data of a mesh for the aspect of a material's tile.
+  setShape(shape) {
+    for (const { array, buffers } of this.meshes.values()) {
+      buffers.forEach((buffer) => this.gl.deleteBuffer(buffer));
+      this.gl.deleteVertexArray(array);
+    }
+    this.meshes.clear();
+    this.shape = shape;
+  }
+
+  _mesh(aspect) {
+    if (!this.meshes.has(aspect)) this.meshes.set(aspect, meshOf(this.gl, this.shape(aspect)));
+    return this.meshes.get(aspect);
   }
 
   setEnvironment(table) {
@@ -99,8 +118,9 @@ class Renderer {
       },
       { environment_samples: this.environment },
     );
-    gl.bindVertexArray(this.mesh.array);
-    gl.drawElements(gl.TRIANGLES, this.mesh.count, gl.UNSIGNED_INT, 0);
+    const { array, count } = this._mesh(material.content.aspect);
+    gl.bindVertexArray(array);
+    gl.drawElements(gl.TRIANGLES, count, gl.UNSIGNED_INT, 0);
     gl.disable(gl.SCISSOR_TEST);
     gl.disable(gl.DEPTH_TEST);
   }
@@ -114,10 +134,10 @@ class Renderer {
     const jitter = n ? [(2 * halton(n, 2) - 1) / width, (2 * halton(n, 3) - 1) / height] : [0, 0];
     const count = Math.min(rows, height - mean.row),
       last = mean.row + count >= height;
-    const split = materials.length > 1 ? Math.round(scene.divide * width) : width;
+    const columns = mean.columns(scene.divide);
     materials.forEach((material, side) => {
-      const region = side === 0 ? [0, mean.row, split, count] : [split, mean.row, width - split, count];
-      this._scene(material, mean.latest, scene, { jitter, frame: n }, region);
+      const [first, across] = columns[side];
+      this._scene(material, mean.latest, scene, { jitter, frame: n }, [first, mean.row, across, count]);
       const { gl } = this,
         [known, next] = mean.sides[side];
       next.begin();

@@ -35,8 +35,10 @@ void main() {
   vec3 n = normalize(normal_there), towards = normalize(camera - world);
   vec3 t = normalize(tangent_there.xyz - n * dot(n, tangent_there.xyz));
   float hand = tangent_there.w;
-  // Both sides of open shapes have the material.
-  if (dot(n, towards) < 0.0) { n = -n; hand = -hand; }
+  // Both sides of open shapes have the material. At a silhouette normals between vertices may point away: then
+  // the triangle decides which side is seen.
+  vec3 facet = cross(dFdx(world), dFdy(world));
+  if (dot(n, towards) < 0.0 && dot(n, facet) * dot(facet, towards) < 0.0) { n = -n; hand = -hand; }
   vec3 b = hand * cross(n, t);
   vec3 view = vec3(dot(towards, t), dot(towards, b), dot(towards, n));
   vec3 omega_o = raised(view);

@@ -1,4 +1,4 @@
-// Vectors as arrays of three numbers, 4 × 4 matrices by columns.
+// Vectors as arrays of three numbers, 4 × 4 matrices by columns; the sRGB curve.
 
 const add = (a, b) => a.map((x, k) => x + b[k]);
 const scaled = (a, s) => a.map((x) => x * s);
@@ -18,6 +18,10 @@ function fromAngles(elevation, azimuth) {
 function toAngles([x, y, z]) {
   return [(Math.asin(clamp(z, -1, 1)) * 180) / Math.PI, (Math.atan2(y, x) * 180) / Math.PI];
 }
+
+// The sRGB curve, from linear values in [0, 1], and its inverse.
+const encoded = (x) => (x <= 0.0031308 ? 12.92 * x : 1.055 * Math.pow(x, 1 / 2.4) - 0.055);
+const decoded = (x) => (x <= 0.04045 ? x / 12.92 : Math.pow((x + 0.055) / 1.055, 2.4));
 
 function product(a, b) {
   const out = new Float32Array(16);

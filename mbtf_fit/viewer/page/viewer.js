@@ -10,19 +10,31 @@ class Viewer {
   constructor(content) {
     Object.assign(this, { content, materials: [], scale: 0.3, full: 1, chosen: 0, still: 0 });
     this.renderer = new Renderer(byId("canvas"));
-    this.state = stateOf(location.hash, new Camera());
-    this.camera = new Camera(this.state.camera);
+    this.state = stateOf("");
+    this.camera = new Camera();
   }
 
   async start() {
     for (const material of this.content.materials)
       this.materials.push(await Material.load(this.renderer.gl, material));
     this.pictures = await Promise.all((this.content.pictures ?? []).map((picture) => this._picture(picture)));
-    this.state.material = clamp(Math.round(this.state.material), 0, this.materials.length - 1);
+    this.restore(location.hash);
+  }
+
+  // Take over the choices of a link's fragment.
+  restore(fragment) {
+    const { state, camera } = this;
+    Object.assign(state, stateOf(fragment));
+    Object.assign(camera, new Camera(state.camera));
+    camera.elevation = Math.max(camera.elevation, this.lowest);
+    state.material = clamp(Math.round(state.material), 0, this.materials.length - 1);
+    // While a fit is trained, what is compared may come later.
+    if (!this.content.live && !this.picture && !this.shown[1]) state.against = "none";
+    Object.assign(this, { chosen: 0, automatic: false });
     this.shapeChanged();
     this.environmentChanged();
     this.againstChanged();
-    this.ready = true;
+    this.refresh?.();
   }
 
   async _picture(picture) {
@@ -45,6 +57,8 @@ class Viewer {
       this.materials[known].delete();
       this.materials[known] = material;
     }
+    // The first materials of a fit may be much darker or brighter than the last.
+    if (this.automatic) this.state.exposure = null;
     this.choicesChanged();
     this.changed();
   }
@@ -66,6 +80,11 @@ class Viewer {
   get picture() {
     const found = /^picture (\d+)$/.exec(this.state.against);
     return found ? this.pictures[found[1]] : undefined;
+  }
+
+  // Smallest elevation of the camera.
+  get lowest() {
+    return this.state.shape === "plane" ? 2 : -85;
   }
 
   get scene() {
@@ -90,34 +109,31 @@ class Viewer {
 
   shapeChanged() {
     const { shape, tiles } = this.state,
-      { aspect } = this.material.content,
       mesh = this.content.mesh;
-    if (mesh && shape === mesh.name) this.renderer.setShape(userShape(mesh, tiles, aspect));
-    else this.renderer.setShape((SHAPES[shape] ?? planeShape)(tiles, aspect));
+    this.renderer.setShape((aspect) =>
+      mesh && shape === mesh.name ? userShape(mesh, tiles, aspect) : SHAPES[shape](tiles, aspect),
+    );
     this.changed();
   }
 
   // Put the camera where the whole shape is seen.
   frameShape() {
     const plane = this.state.shape === "plane",
-      tiles = this.state.tiles;
-    const size =
-      { plane: tiles, sphere: tiles / Math.PI, cloth: tiles * 1.2 }[this.state.shape] ??
-      tiles * (this.content.mesh?.unit ?? 1) * 2;
-    Object.assign(this.camera, {
-      target: plane ? [0.5, 0.5 * this.material.content.aspect, 0] : [0, 0, 0],
-      tiles_across: 1.25 * size,
+      { aspect } = this.material.content,
+      { camera, renderer } = this;
+    Object.assign(camera, {
+      target: plane ? [0.5, 0.5 * aspect, 0] : [0, 0, 0],
+      tiles_across: this.state.tiles,
       elevation: plane ? 50 : 20,
       azimuth: -90,
     });
+    if (!plane) camera.fit(renderer.shape(aspect).positions, renderer.canvas.width / renderer.canvas.height);
     this.changed();
   }
 
   environmentChanged() {
-    const { name } = this.state.environment,
-      user = this.content.environment;
-    const known = name in BUILT_IN || (user && user.name === name);
-    this.renderer.setEnvironment(known ? environmentOf(name, user) : undefined);
+    const { name } = this.state.environment;
+    this.renderer.setEnvironment(name === "none" ? undefined : environmentOf(name, this.content.environment));
     this.changed();
   }
 
@@ -132,13 +148,14 @@ class Viewer {
         light = this.state.lights[0] ?? FIRST.lights[0];
       this.state.lights = [{ ...light, color: [1, 1, 1], direction }];
       this.state.environment.name = "none";
-      this.renderer.setEnvironment(undefined);
+      this.environmentChanged();
       this.state.shape = "plane";
-      this.renderer.setShape(planeShape(this.state.tiles, this.material.content.aspect));
+      this.shapeChanged();
       const { elevation, azimuth, tiles_across, target, field_of_view } = picture.camera;
       Object.assign(this.camera, {
         elevation,
-        azimuth,
+        // Seen from straight above, the picture's up is +v.
+        azimuth: elevation > 89.9 ? -90 : azimuth,
         tiles_across,
         field_of_view,
         target: [target[0], target[1], 0],
@@ -162,17 +179,21 @@ class Viewer {
     const proportion = this.picture ? this.picture.columns / this.picture.rows : box.width / box.height;
     const width = Math.min(box.width, box.height * proportion),
       height = width / proportion;
+    const left = (box.width - width) / 2,
+      top = (box.height - height) / 2;
     Object.assign(canvas.style, {
+      inset: "auto",
       width: `${width}px`,
       height: `${height}px`,
-      left: `${(box.width - width) / 2}px`,
-      top: `${(box.height - height) / 2}px`,
-      inset: "auto",
+      left: `${left}px`,
+      top: `${top}px`,
     });
+    for (const [id, side] of Object.entries({ left_name: "left", right_name: "right" }))
+      Object.assign(byId(id).style, { [side]: `${left + 12}px`, top: `${top + 8}px` });
     const density = Math.min(window.devicePixelRatio || 1, 2);
     canvas.width = Math.max(1, Math.round(width * density));
     canvas.height = Math.max(1, Math.round(height * density));
-    byId("divider").style.left = `${(box.width - width) / 2 + width * this.state.divide}px`;
+    byId("divider").style.left = `${left + width * this.state.divide}px`;
     this.changed();
   }
 
@@ -202,14 +223,35 @@ class Viewer {
     this.seconds = moving ? seconds : this.full;
     if (moving) this.scale = clamp(Math.sqrt(SLOW / this.full), 0.15, 1);
     // Until the first full frame is complete, the coarse picture stays.
-    if (mean.frames) renderer.show(mean, this.state.exposure, this.state.divide, this.pictureTexture);
+    if (mean.frames) this._show(mean);
     return true;
+  }
+
+  _show(mean) {
+    if (this.state.exposure === null) this._expose(mean);
+    this.renderer.show(mean, this.state.exposure, this.state.divide, this.pictureTexture);
+  }
+
+  // The exposure that shows the 95th percentile of the mean channel as 0.8, as mbtf-fit preview does.
+  _expose(mean) {
+    const values = [];
+    mean.columns(this.state.divide).forEach(([first, count], side) => {
+      if (!mean.sides[side] || !count) return;
+      const pixels = mean.sides[side][0].read(first, 0, count, mean.height);
+      for (let k = 0; k < pixels.length; k += 4)
+        if (pixels[k + 3] > 0) values.push((pixels[k] + pixels[k + 1] + pixels[k + 2]) / 3);
+    });
+    const bright = values.sort((a, b) => a - b)[Math.round(0.95 * (values.length - 1))],
+      stops = bright > 0 ? clamp(Math.log2(0.8 / bright), ...RANGES.exposure) : 0;
+    this.state.exposure = Math.round(100 * stops) / 100;
+    this.automatic = true;
+    this.refresh?.();
   }
 
   // Show the last picture again.
   redraw() {
     const { full, coarse } = this.renderer.means,
       mean = full?.frames ? full : coarse;
-    if (mean?.frames) this.renderer.show(mean, this.state.exposure, this.state.divide, this.pictureTexture);
+    if (mean?.frames) this._show(mean);
   }
 }

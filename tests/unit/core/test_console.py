@@ -195,6 +195,17 @@ def test_a_file_named_like_a_misspelt_command_is_a_file(
         (KeyboardInterrupt(), 130, "interrupted\n  run the same command again"),
         (FileNotFoundError(2, "No such file", "/no/map"), 3, "/no/map: No such file"),
         (
+            ModuleNotFoundError("No module named 'torch'", name="torch"),
+            3,
+            "the Python package 'torch' is missing\n  run: mbtf-gen doctor",
+        ),
+        (
+            ModuleNotFoundError("No module named 'mbtf_fit.no'", name="mbtf_fit.no"),
+            1,
+            "internal error: ModuleNotFoundError: No module named 'mbtf_fit.no' "
+            "(run again with --debug for the traceback)",
+        ),
+        (
             ZeroDivisionError("first\nsecond"),
             1,
             "internal error: ZeroDivisionError: first second (run again with --debug for the traceback)",

@@ -1,10 +1,12 @@
-"""``mbtf-fit export --to material``: the same command again keeps its output and replaces nothing else."""
+"""``mbtf-fit export``: the same command again keeps its output; another one replaces nothing unasked."""
 
 from __future__ import annotations
 
 import os
+import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 from support.plugin_materials import write_material
 
@@ -73,3 +75,45 @@ def test_what_is_no_export_is_refused(source: Path, tmp_path: Path, name: str) -
     assert export(source, out, "--overwrite") == 3
     assert os.listdir(out) == [name]
     assert (out / name).read_text() == "mine"
+
+
+def test_one_export_does_not_mix_with_another(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = ["-o", str(tmp_path / "out"), "-q"]
+    assert run(app, ["export", str(source), "--to", "web", *out]) == 0
+    assert run(app, ["export", str(source), "--to", "web", *out]) == 0
+    before = stamps(tmp_path / "out")
+    sky = tmp_path / "sky.npy"
+    np.save(sky, np.ones((2, 4, 3), np.float32))
+    for words, what in (
+        (["--to", "slang"], "to: ['web'] -> ['slang']"),
+        ([], "to: ['web'] -> ['exr', 'json']"),
+        (["--to", "web", "--environment", str(sky)], "page.environment"),
+    ):
+        assert run(app, ["export", str(source), *words, *out]) == 3
+        message = capsys.readouterr().err
+        assert what in message
+        assert "--overwrite" in message
+    assert stamps(tmp_path / "out") == before
+    assert run(app, ["export", str(source), "--to", "slang", *out, "--overwrite"]) == 0
+    assert set(os.listdir(tmp_path / "out")) == {"export.json", "material.slang", "material.bin"}
+
+
+def test_a_failed_export_claims_nothing(source: Path, tmp_path: Path) -> None:
+    out = ["-o", str(tmp_path / "out"), "-q"]
+    assert run(app, ["export", str(source), "--to", "web", "--against", str(tmp_path / "none"), *out]) == 3
+    assert not (tmp_path / "out").exists()
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "notes.txt").write_text("mine")
+    assert run(app, ["export", str(source), "--to", "web", "-o", str(tmp_path / "notes"), "--overwrite"]) == 3
+    assert os.listdir(tmp_path / "notes") == ["notes.txt"]
+
+
+def test_files_in_the_own_folder_are_replaced(source: Path, tmp_path: Path) -> None:
+    own = tmp_path / "own"
+    shutil.copytree(source, own)
+    before = set(os.listdir(own))
+    for words in ([], ["--half"], ["-o", str(own)], ["--to", "slang"]):
+        assert run(app, ["export", str(own), "-q", *words]) == 0
+    assert set(os.listdir(own)) == before | {"textures.exr", "layers.json", "material.slang", "material.bin"}

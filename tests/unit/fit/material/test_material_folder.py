@@ -159,11 +159,18 @@ def test_damaged_materials_are_refused(fitted: FitResult, tmp_path: Path) -> Non
     content = bytearray(weights.read_bytes())
     content[-1] ^= 1
     weights.write_bytes(content)
-    with pytest.raises(InputError, match="SHA-256 differs"):
+    again = "copy the folder again, or fit again"
+    with pytest.raises(InputError, match=rf"is damaged, .*SHA-256 is not .*\n  {again}"):
+        Material.load(tmp_path)
+    weights.unlink()
+    with pytest.raises(InputError, match=rf"weights\.safetensors: no such file, .*\n  {again}"):
         Material.load(tmp_path)
     description = json.loads((tmp_path / "material.json").read_text())
     (tmp_path / "material.json").write_text(json.dumps({**description, "schema": 99}))
     with pytest.raises(InputError, match="schema version 99"):
+        Material.load(tmp_path)
+    (tmp_path / "material.json").write_text("{")
+    with pytest.raises(InputError, match=f"not readable as JSON .*\n  {again}"):
         Material.load(tmp_path)
 
 

@@ -97,7 +97,7 @@ def test_a_fit_writes_it_beside_the_weights_and_only_for_holes(tmp_path: Path) -
     content = bytearray(path.read_bytes())
     content[-1] ^= 1
     path.write_bytes(content)
-    with pytest.raises(InputError, match="is missing, or its SHA-256") as caught:
+    with pytest.raises(InputError, match="its SHA-256 is not that in") as caught:
         read_transmittance(tmp_path / "b", description)
     check_message(caught.value)
 

@@ -73,6 +73,41 @@ def test_values_are_those_of_the_material(case: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(found[:, 3], through, atol=1e-4)
 
 
+RAISING = """
+[shader("compute")] [numthreads(64, 1, 1)]
+void raise_directions(uint3 thread : SV_DispatchThreadID) {
+  if (thread.x >= query_count) return;
+  uint k = 3 * thread.x;
+  values[thread.x] = float4(raised(float3(queries[k], queries[k + 1], queries[k + 2])), MIN_COS);
+}
+"""
+
+
+def test_directions_below_the_plane_and_the_data(tmp_path: Path) -> None:
+    """Lights and views below the plane give 0; directions below the smallest cosine are raised to it."""
+    material = make("relief", tmp_path / "material")
+    least = material.description["data"]["min_cos"] = 0.2
+    module, texels = module_of(material)
+    device = Device(module + RAISING, tmp_path / "module")
+    q, below = material.conformance, np.array([1, 1, -1], np.float32)
+    for factors in ((below, 1), (1, below), (np.array([1, 1, 0], np.float32), 1)):
+        omega_i, omega_o = q["omega_i"] * factors[0], q["omega_o"] * factors[1]
+        queries = np.concatenate([q["u"], q["sigma"][:, None], omega_i, omega_o], 1)
+        inputs = {
+            "query_count": len(queries),
+            "queries": device.buffer(queries.reshape(-1)),
+            "material_texels": device.buffer(texels),
+        }
+        assert (device.run(ENTRY, len(queries), 4, inputs, "values")[:, :3] == 0).all()
+    directions = from_angles(np.array([90.0, 30.0, 10.0, 0.1, -30.0]), np.full(5, 30.0)).astype(np.float32)
+    inputs = {"query_count": 5, "queries": device.buffer(directions.reshape(-1))}
+    found = device.run("raise_directions", 5, 4, inputs, "values")
+    expected = directions.copy()
+    expected[2:4] = from_angles(np.degrees(np.arcsin(least)), 30.0)
+    np.testing.assert_allclose(found[:, :3], expected, atol=1e-6)
+    np.testing.assert_allclose(found[:, 3], least, rtol=1e-6)
+
+
 SAMPLING = """
 StructuredBuffer<float> random_numbers;
 RWStructuredBuffer<float4> samples;
@@ -95,9 +130,16 @@ void densities(uint3 thread : SV_DispatchThreadID) {
 """
 
 
+def _cells(omega: np.ndarray) -> np.ndarray:
+    """Cell of each direction among 8 × 8 of equal solid angle: z, azimuth."""
+    azimuth = np.arctan2(omega[:, 1], omega[:, 0]) / (2 * np.pi) % 1
+    row, column = ((8 * x).astype(int).clip(0, 7) for x in ((omega[:, 2] + 1) / 2, azimuth))
+    return np.asarray(8 * row + column)
+
+
 @pytest.mark.parametrize("case", ["relief", "calibrated"])
 def test_lights_are_sampled_by_their_density(case: str, tmp_path: Path) -> None:
-    """The density integrates to 1, and samples weighted by it integrate known functions."""
+    """The density integrates to 1, and is that of the samples: their moments, their counts in cells."""
     material = make(case, tmp_path / "material")
     module, texels = module_of(material)
     device = Device(module + SAMPLING, tmp_path / "module")
@@ -125,9 +167,27 @@ def test_lights_are_sampled_by_their_density(case: str, tmp_path: Path) -> None:
         error = values.std() / np.sqrt(count)
         expected = 4 * np.pi * (density * function(sphere)).mean()
         assert abs(values.mean() - expected) < 4 * error + 0.003
+    # Samples per cell. The density peaks against the view, where 1 / (view . h) is not resolved.
+    expected_count = 4 * np.pi * np.bincount(_cells(sphere), density, 64)
+    deviation = np.bincount(_cells(omega), minlength=64) - expected_count
+    deviation /= np.sqrt(expected_count + (0.01 * expected_count) ** 2 + 25)
+    deviation[_cells(-view[None])] = 0
+    assert np.abs(deviation).max() < 4.5
     solid = (above / np.maximum(pdf, 1e-9)).mean()
     error = (above / np.maximum(pdf, 1e-9)).std() / np.sqrt(count)
     assert abs(solid - 2 * np.pi * 0.95) < 5 * error
+
+
+def test_half_precision_rounds_the_buffer(tmp_path: Path) -> None:
+    make("relief", tmp_path / "material")
+    command = ["export", str(tmp_path / "material"), "--to", "slang", "-q", "-o"]
+    assert run(app, [*command, str(tmp_path / "single")]) == 0
+    assert run(app, [*command, str(tmp_path / "half"), "--half"]) == 0
+    single, half = (np.fromfile(tmp_path / n / "material.bin", np.float32) for n in ("single", "half"))
+    assert single.shape == half.shape
+    assert (single != half).any()
+    # Nodes of the traced surface are computed from rounded heights, in single precision.
+    assert (half == half.astype(np.float16)).mean() > 0.9 > (single == single.astype(np.float16)).mean()
 
 
 def test_other_languages(tmp_path: Path) -> None:
@@ -138,7 +198,7 @@ def test_other_languages(tmp_path: Path) -> None:
     command = ["export", str(tmp_path / "material"), "--to", "slang", *words, "-o", str(out), "-q"]
     assert run(app, command) == 0
     before = {path.name: path.read_bytes() for path in out.iterdir()}
-    assert len(before) == 2 + len(TARGETS)
+    assert len(before) == 3 + len(TARGETS)
     marks = {
         ".hlsl": b"StructuredBuffer<float4",
         ".comp": b"#version 450",
@@ -165,12 +225,34 @@ def test_what_cannot_be_written_is_refused(
     for words, code, what in (
         (["patches", "--to", "slang"], 3, "decodes neighborhoods"),
         (["good", "--shader-target", "hlsl"], 2, "--shader-target: is an option of shaders"),
+        (["good", "--to", "slang", "--to", "web", "--half"], 2, "--half: has no meaning for pages"),
     ):
         assert run(app, ["export", str(tmp_path / words[0]), *words[1:], *out]) == code
         assert what in capsys.readouterr().err
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(EngineError, match="Slang's compiler is not installed"):
-        SlangCompiler()
+    assert run(app, ["export", str(tmp_path / "good"), "--to", "slang", "--shader-target", "hlsl", *out]) == 3
+    found = capsys.readouterr().err
+    assert "--shader-target: Slang's compiler is not installed" in found
+    assert "mbtf[shaders]" in found
+
+
+def test_the_documented_function_compiles(tmp_path: Path) -> None:
+    pytest.importorskip("slangpy", reason="no slangpy; to enable: pip install 'mbtf[shaders]'")
+    make("relief", tmp_path / "material")
+    out = tmp_path / "out"
+    assert run(app, ["export", str(tmp_path / "material"), "--to", "slang", "-o", str(out), "-q"]) == 0
+    page = Path(__file__).parents[4] / "docs/how-to/use-in-shaders.md"
+    function = page.read_text().split("```\nimport material;")[1].split("```")[0]
+    entry = """
+RWStructuredBuffer<float3> shaded;
+[shader("compute")] [numthreads(64, 1, 1)]
+void shade_all(uint3 thread : SV_DispatchThreadID) {
+  float2 uv = float2(thread.xy) / 64.0;
+  shaded[thread.x] = shade(uv, 0.01, 0.02, normalize(float3(1.0)), float3(0.0, 0.0, 1.0), float3(1.0));
+}
+"""
+    (out / "page.slang").write_text(f"import material;{function}{entry}")
+    assert b"void shade_all(" in SlangCompiler().compile(out / "page.slang", "shade_all", "hlsl")
 
 
 def test_a_module_with_a_fault_says_where(tmp_path: Path) -> None:

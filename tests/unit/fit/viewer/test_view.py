@@ -18,6 +18,7 @@ from mbtf_core.console import run
 from mbtf_core.errors import UsageError
 from mbtf_fit.cli.app import app
 from mbtf_fit.viewer import live
+from mbtf_fit.viewer.extras import tiles_text
 from mbtf_fit.viewer.page import safe_json, write_page
 from mbtf_fit.viewer.server import Messages, PageServer
 
@@ -66,6 +67,10 @@ def test_what_cannot_be_shown_is_refused(tmp_path: Path, capsys: pytest.CaptureF
         assert what in error
         assert "Traceback" not in error
     assert run(app, ["export", str(tmp_path / "mlp"), "--to", "web", *out, "-q"]) == 0
+
+
+def test_one_tile_is_singular() -> None:
+    assert [tiles_text(count) for count in (0.5, 1, 1.0, 3)] == ["0.5 tiles", "1 tile", "1 tile", "3 tiles"]
 
 
 def test_only_this_machine_gets_the_page() -> None:

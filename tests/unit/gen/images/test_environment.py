@@ -35,3 +35,13 @@ def test_surroundings_are_linear_and_small(tmp_path: Path) -> None:
     ):
         with pytest.raises(InputError, match=what):
             read_environment(tmp_path / name, 64)
+
+
+def test_other_formats_are_refused_with_those_that_are_read(tmp_path: Path) -> None:
+    (tmp_path / "README.md").write_text("text")
+    with pytest.raises(
+        InputError, match=r"'\.md' is not an image format .*\n  use one of \.hdr, \.exr, \.png"
+    ):
+        read_environment(tmp_path / "README.md", 64)
+    with pytest.raises(InputError, match="no such file"):
+        read_environment(tmp_path / "none.md", 64)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -81,6 +83,27 @@ def test_the_recipe_makes_the_same_data(with_maps: bool, tmp_path: Path) -> None
     for name in first:
         if name.endswith((".npz", ".exr")):
             assert first[name] == second[name], name
+
+
+@pytest.mark.usefixtures("engine")
+@pytest.mark.parametrize("with_maps", [False, True])
+def test_the_script_writes_beside_the_card(with_maps: bool, tmp_path: Path) -> None:
+    maps = write_maps(tmp_path / "maps")
+    generation.generate(GeneratorConfig.model_validate({"material": str(maps), **SMALL}), tmp_path / "data")
+    card = tmp_path / "card"
+    Publication.prepare(tmp_path / "data", CONFIG, with_maps=with_maps).write(card)
+    call = "sh recipe/remake.sh" if with_maps else "sh recipe/remake.sh MATERIAL"
+    assert f"`{call}` runs both" in " ".join((card / "README.md").read_text().split())
+    program = tmp_path / "mbtf-gen"
+    program.write_text(
+        '#!/bin/sh\nfor word; do case "$last" in -o) mkdir -p "$word";; esac; last="$word"; done\n'
+    )
+    program.chmod(0o755)
+    path = f"{tmp_path}:{os.environ['PATH']}"
+    before = set(card.rglob("*"))
+    subprocess.run(call.split(), cwd=card, env={"PATH": path}, check=True, timeout=60)
+    assert set(card.rglob("*")) == before
+    assert (tmp_path / "remade").is_dir()
 
 
 def test_differences_are_found_and_explained(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from mbtf_pipeline.compare.st_lpips import st_lpips, weights_file
 
 F64 = np.ndarray
 needs_weights = pytest.mark.skipif(
-    weights_file() is None, reason="no ST-LPIPS weights; to enable: .venv/bin/pip install -e '.[perceptual]'"
+    weights_file() is None, reason="no ST-LPIPS weights; to enable: pip install 'mbtf[perceptual]'"
 )
 
 

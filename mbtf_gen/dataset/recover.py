@@ -1,0 +1,59 @@
+"""Shards that an ended run rendered but could not upload to its object store."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from mbtf_core.atomic import read_checksummed
+from mbtf_core.data_folder import abandoned, send_shard
+from mbtf_core.digest import file_sha256
+from mbtf_core.errors import InputError
+from mbtf_core.shard_schema import ShardEntry
+from mbtf_gen.dataset.sidecar import finished_record, sidecar_of
+
+
+def recover_shards(folder: Path, entries: Sequence[ShardEntry], config_hash: str, plan: str) -> list[str]:
+    """Upload the whole shards that ended processes of this machine left, instead of rendering them again.
+
+    Parameters
+    ----------
+    folder : of the data set; nothing happens unless it is in a store
+    entries : all shards of the data set; those that the store lacks are uploaded
+    config_hash, plan : digests of the configuration and of the run plan that the shards must have
+
+    Returns
+    -------
+    list of str
+        Files that were uploaded.
+
+    Raises
+    ------
+    PartialError : the store cannot be reached; the shards are kept
+    """
+    sent: list[str] = []
+    with abandoned(folder) as folders:
+        for left in folders:
+            for entry in entries:
+                source, path = left / entry.file, folder / entry.file
+                if not _is_whole(source, entry, config_hash, plan):
+                    continue
+                if finished_record(folder, entry, config_hash) is not None:
+                    continue
+                # Links, so that a failure leaves the shard where the next run finds it.
+                os.link(source, path)
+                os.link(sidecar_of(source), sidecar_of(path))
+                send_shard(path, sidecar_of(path))
+                sent.append(entry.file)
+    return sent
+
+
+def _is_whole(shard: Path, entry: ShardEntry, config_hash: str, plan: str) -> bool:
+    try:
+        record = read_checksummed(sidecar_of(shard))
+        expected = (config_hash, plan, entry.file, entry.rows)
+        found = tuple(record.get(key) for key in ("config_hash", "plan", "file", "rows"))
+        return found == expected and file_sha256(shard) == record.get("sha256")
+    except (InputError, OSError):
+        return False

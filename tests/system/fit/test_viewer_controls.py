@@ -1,0 +1,347 @@
+"""What reaches the screen of the viewer, and what mouse, fingers, panel and links change."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from support.plugin_materials import write_material
+from support.viewer_page import Page
+
+from mbtf_core.color import linear_to_srgb, srgb_to_linear
+from mbtf_core.directions import from_angles
+from mbtf_core.lattice import Lattice
+from mbtf_fit.material.transmittance import Transmittance
+from mbtf_fit.viewer.content import material_content
+from mbtf_fit.viewer.extras import picture_content
+from mbtf_fit.viewer.page import write_page
+from mbtf_gen.pictures.camera import Camera
+
+# Values of constant materials; half of the light passes through the last.
+VALUES = {"dim": 0.1, "bright": 0.3, "veil": 0.2}
+BACKGROUND = np.array([0.11, 0.12, 0.14])
+TOP = {"elevation": 90, "azimuth": -90, "tiles_across": 2, "target": [0.5, 0.5, 0]}
+ABOVE: dict[str, Any] = {"direction": [0, 0, 1], "color": [1, 1, 1], "intensity": 1}
+FLAT = {"camera": TOP, "lights": [ABOVE], "exposure": 0}
+STATE = "const { viewer } = window.mbtf, { state, camera, renderer } = viewer;"
+
+
+@pytest.fixture(scope="module")
+def page(driver: Any, tmp_path_factory: pytest.TempPathFactory) -> Page:
+    """Constant materials and a picture of four colors; nothing is drawn unless a test asks for it."""
+    folder, lattice = tmp_path_factory.mktemp("controls"), Lattice(3, 1.0)
+    half = [np.zeros((*lattice.shape(s), 6), np.float32) for s in range(4)]
+    for coefficients in half:
+        coefficients[..., 0] = 0.5
+    for name, value in VALUES.items():
+        through = Transmittance(lattice, half) if name == "veil" else None
+        write_material(folder / name, constant=(value,) * 3, model="neumip-baseline", transmittance=through)
+    picture = np.full((60, 60, 3), 0.1, np.float32)
+    picture[:30, :, 0] = 0.4
+    picture[:, :30, 1] = 0.3
+    content = {
+        "materials": [material_content(folder / name)[0] for name in VALUES],
+        "pictures": [picture_content("path-traced", picture, Camera(50, -90, 2), from_angles(30.0, 0.0))],
+    }
+    page = Page(driver, write_page(content, "controls"), folder).ready()
+    page.js("window.mbtf.viewer.draw = () => false")
+    return page
+
+
+def shown(linear: Any) -> Any:
+    """8-bit values of the screen."""
+    return 255 * linear_to_srgb(np.asarray(linear, np.float64))
+
+
+def canvas_box(page: Page) -> dict[str, float]:
+    box: dict[str, float] = page.js(
+        "return document.getElementById('canvas').getBoundingClientRect().toJSON()"
+    )
+    return box
+
+
+def drag(page: Page, name: str, at: tuple[float, float], by: tuple[int, int], key: str | None = None) -> None:
+    """Drag from a place of an element, in shares of its size from its center, by pixels."""
+    from selenium.webdriver.common.action_chains import ActionChains
+
+    element = page.driver.find_element("id", name)
+    actions = ActionChains(page.driver, duration=10)
+    if key:
+        actions.key_down(key)
+    size = element.size
+    actions.move_to_element_with_offset(element, int(at[0] * size["width"]), int(at[1] * size["height"]))
+    actions.click_and_hold().move_by_offset(*by).release()
+    if key:
+        actions.key_up(key)
+    actions.perform()
+
+
+def touch(page: Page, *moments: tuple[tuple[float, float], ...]) -> None:
+    """Touch the page with fingers that move from moment to moment."""
+    for k, fingers in enumerate(moments):
+        points = [{"x": x, "y": y, "id": n} for n, (x, y) in enumerate(fingers)]
+        kind = "touchMove" if k else "touchStart"
+        page.driver.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+    page.driver.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+
+
+def test_the_screen_shows_both_sides_at_an_exposure(page: Page) -> None:
+    page.set({**FLAT, "exposure": 1, "against": "material 1", "divide": 0.25})
+    found = page.screen([(x, 0.5) for x in (0.1, 0.2, 0.3, 0.9)])
+    np.testing.assert_allclose(found[:, 0], shown([0.2, 0.2, 0.6, 0.6]), atol=1.5)
+    np.testing.assert_array_equal(found, found[:, :1].repeat(3, 1))
+
+
+def test_the_background_is_added_to_light(page: Page) -> None:
+    """Half of it, in linear values, behind a material that is half transparent; all of it beside a shape."""
+    page.set({**FLAT, "material": 2})
+    expected = shown(0.2 + 0.5 * srgb_to_linear(BACKGROUND))
+    np.testing.assert_allclose(page.screen([(0.5, 0.5)])[0], expected, atol=1.5)
+    page.set({**FLAT, "shape": "sphere", "camera": {**TOP, "target": [0, 0, 0]}})
+    found = page.screen([(0.5, 0.5), (0.02, 0.02)])
+    np.testing.assert_allclose(found, [shown([0.1] * 3), 255 * BACKGROUND], atol=1.5)
+
+
+def test_the_first_picture_sets_the_exposure(page: Page) -> None:
+    """95 % of the pixels are darker than 0.8, as in mbtf-fit preview; of both sides of a comparison."""
+    for against, brightest in (("none", 0.1), ("material 1", 0.3)):
+        page.set({"camera": TOP, "lights": [ABOVE], "against": against})
+        np.testing.assert_allclose(page.screen([(0.9, 0.5)])[0], shown([0.8] * 3), atol=1.5)
+        assert page.js(STATE + "return state.exposure") == pytest.approx(np.log2(0.8 / brightest), abs=0.006)
+    # Later changes keep it, until it is asked for again.
+    page.choose("intensity", 1)
+    assert page.screen([(0.9, 0.5)])[0, 0] == 255
+    page.js("document.getElementById('automatic').click()")
+    assert page.screen([(0.9, 0.5)])[0, 0] == pytest.approx(shown(0.8), abs=1.5)
+
+
+def test_a_reference_picture_fixes_view_shape_and_light(page: Page) -> None:
+    page.set({**FLAT, "lights": [ABOVE, ABOVE], "environment": {"name": "sky"}, "shape": "sphere"})
+    page.choose("against", "picture 0")
+    page.choose("intensity", 1)
+    for name, value in (("shape", "cloth"), ("environment", "studio"), ("color", "#ff0000"), ("zoom", 3)):
+        page.choose(name, value)
+    page.js("document.getElementById('add_light').click(); document.getElementById('remove_light').click()")
+    drag(page, "canvas", (-0.2, 0.1), (30, 20))
+    found = page.js(
+        STATE + "return [renderer.lit, state.shape, state.lights, camera.tiles_across, camera.azimuth]"
+    )
+    light = {"direction": pytest.approx(from_angles(30.0, 0.0).tolist()), "color": [1, 1, 1], "intensity": 2}
+    assert found == [False, "plane", [light], 2, -90]
+    used = (
+        "return [...document.querySelectorAll('#panel :is(input, select, button):enabled')].map((e) => e.id)"
+    )
+    left = {"intensity", "exposure", "material", "against", "reset", "automatic", "link", "save"}
+    assert set(page.js(used)) == left
+    # In the middle of its place.
+    box, place = (
+        canvas_box(page),
+        page.js("const s = document.getElementById('stage'); return [s.clientWidth, s.clientHeight]"),
+    )
+    assert box["width"] == pytest.approx(box["height"], abs=1)
+    assert [box["left"] + box["width"] / 2, box["top"] + box["height"] / 2] == pytest.approx(
+        [x / 2 for x in place], abs=1
+    )
+    # The picture is M, which unit irradiance lights; its rows begin at the top.
+    page.js(STATE + "state.divide = 0.02")
+    found = page.screen([(0.01, 0.5), (0.25, 0.25), (0.75, 0.75)])
+    np.testing.assert_allclose(found, shown([[0.1] * 3, [0.4, 0.3, 0.1], [0.1] * 3]), atol=1.5)
+    page.choose("against", "none")
+    assert not page.js("return document.getElementById('shape').disabled")
+
+
+def test_values_at_a_point_are_those_of_the_side(page: Page) -> None:
+    page.set({**FLAT, "against": "material 1", "divide": 0.6})
+    for x, name, value in ((0.55, "dim", "0.100"), (0.65, "bright", "0.300")):
+        page.js("window.mbtf.showPoint(window.mbtf.viewer, arguments[0], 0.4)", x)
+        text = page.js("return document.getElementById('point').textContent")
+        assert text.startswith(f"{name} at u")
+        assert f"largest value {value}" in text
+
+
+def test_inputs_set_what_they_say(page: Page) -> None:
+    page.set({**FLAT, "environment": {"name": "sky"}})
+    for name, value, path, expected, text in (
+        ("intensity", 2, "state.lights[0].intensity", 4, "4.0"),
+        ("color", "#bc8000", "state.lights[0].color", srgb_to_linear(np.array([188, 128, 0]) / 255), ""),
+        ("environment_intensity", -1, "state.environment.intensity", 0.5, "0.50"),
+        ("environment_angle", 30, "state.environment.angle", 30, "30°"),
+        ("exposure", 1.5, "state.exposure", 1.5, "1.5 EV"),
+        ("tiles", 3, "state.tiles", 8, "8"),
+        ("zoom", 1, "camera.tiles_across", 0.5, "0.5 tiles"),
+        ("zoom", 0, "camera.tiles_across", 1, "1 tile"),
+        ("zoom", 9, "camera.tiles_across", 0.05, "0.05 tiles"),
+        ("zoom", -9, "camera.tiles_across", 400, "400 tiles"),
+    ):
+        page.choose(name, value)
+        found = page.js(STATE + f"return {path}")
+        assert found == pytest.approx(expected, rel=0.005), name
+        if not isinstance(value, str) and abs(value) < 9:
+            assert float(
+                page.js("return document.getElementById(arguments[0]).value", name)
+            ) == pytest.approx(value, abs=0.01)
+        written = (
+            "return document.getElementById(arguments[0]).parentElement.querySelector('output')?.textContent"
+        )
+        assert (page.js(written, name) or "") == text
+    facts = page.js("return [...document.querySelectorAll('#facts td')].map((cell) => cell.textContent)")
+    assert facts[:2] == ["model", "neumip-baseline"]
+    assert page.js(STATE + "return [renderer.lit, document.getElementById('dark').hidden]") == [True, True]
+    page.choose("environment", "none")
+    counts = []
+    for button in ("add_light",) * 4 + ("remove_light",) * 5:
+        page.js("document.getElementById(arguments[0]).click()", button)
+        counts.append(page.js(STATE + "return state.lights.length"))
+    assert counts == [2, 3, 4, 4, 3, 2, 1, 0, 0]
+    assert page.driver.find_element("id", "dark").is_displayed()
+
+
+def test_the_dome_is_seen_from_above(page: Page) -> None:
+    """A light at +v is at the top, one that is dragged to the right is at +u."""
+    page.set({**FLAT, "lights": [{**ABOVE, "direction": [0, 0.8, 0.6], "color": [1, 0, 0]}]})
+    dots = page.js(
+        "const canvas = document.getElementById('dome'), size = canvas.width / 2;"
+        "const ink = canvas.getContext('2d');"
+        "return [[0, 1], [0, -1]].map(([x, y]) =>"
+        "  [...ink.getImageData(size * (1 + 0.736 * x), size * (1 - 0.736 * y), 1, 1).data].slice(0, 3));"
+    )
+    assert dots[0] == [255, 0, 0]
+    assert dots[1] != [255, 0, 0]
+    drag(page, "dome", (0, -0.35), (30, 30))
+    x, y, _ = page.js(STATE + "return state.lights[0].direction")
+    width = page.driver.find_element("id", "dome").size["width"]
+    assert [x, y] == pytest.approx([60 / width / 0.92, (0.7 - 60 / width) / 0.92], abs=0.03)
+    # Shift-drag moves the light, and the way to the right is that of growing azimuth.
+    page.set({**FLAT, "lights": [{**ABOVE, "direction": from_angles(40.0, 10.0).tolist()}]})
+    drag(page, "canvas", (0, 0), (50, 0), "\ue008")
+    box = canvas_box(page)
+    direction = from_angles(40.0, 10.0 + 180 * 50 / box["width"])
+    assert page.js(STATE + "return state.lights[0].direction") == pytest.approx(direction.tolist(), abs=1e-3)
+
+
+def test_a_texel_moves_with_pointer_and_fingers(page: Page) -> None:
+    box = canvas_box(page)
+    w, h = box["width"], box["height"]
+
+    def texel(x: float, y: float) -> list[float]:
+        found = page.pick(x / w, y / h)
+        assert found is not None
+        return list(found["u"])
+
+    page.set({**FLAT, "camera": {**TOP, "target": [0.3, 0.6, 0]}})
+    before = texel(0.5 * w, 0.5 * h)
+    drag(page, "canvas", (0, 0), (40, -30), "\ue009")
+    assert texel(0.5 * w + 40, 0.5 * h - 30) == pytest.approx(before, abs=0.02)
+    # Two fingers: the place between them stays while they spread, and moves with them.
+    before = texel(180, 120)
+    touch(page, ((160, 120), (200, 120)), ((140, 120), (220, 120)), ((170, 150), (250, 150)))
+    assert page.js(STATE + "return [camera.tiles_across, camera.azimuth]") == pytest.approx(
+        [1, -90], abs=0.01
+    )
+    assert texel(210, 150) == pytest.approx(before, abs=0.02)
+    touch(page, ((160, 120),), ((200, 120),))
+    assert page.js(STATE + "return [camera.tiles_across, camera.azimuth]") == pytest.approx(
+        [1, -90 - 180 * 40 / w], abs=0.01
+    )
+    # A tap is a click.
+    touch(page, ((100, 100),))
+    assert "dim at u" in page.js("return document.getElementById('point').textContent")
+
+
+def test_the_picture_turns_with_the_azimuth_up_to_the_top(page: Page) -> None:
+    found = page.js(
+        STATE + "return [89.8, 89.95, 90].map((elevation) => {"
+        "  Object.assign(camera, { elevation, azimuth: 40 }); return camera.frame; })"
+    )
+    for frame in np.array(found)[1:]:
+        np.testing.assert_allclose(frame, found[0], atol=0.01)
+    # A reference from there has +v up.
+    page.js(STATE + "viewer.pictures[0].camera.elevation = 90; viewer.pictures[0].camera.azimuth = 30")
+    page.set({**FLAT, "against": "picture 0"})
+    right, up = page.js(STATE + "return camera.frame.slice(1)")
+    assert [*right, *up] == pytest.approx([1, 0, 0, 0, 1, 0], abs=1e-9)
+    page.js(STATE + "Object.assign(viewer.pictures[0].camera, { elevation: 50, azimuth: -90 })")
+
+
+@pytest.mark.parametrize("size", [(1000, 360), (400, 800)])
+def test_shapes_fit_the_picture(page: Page, size: tuple[int, int]) -> None:
+    width, height = size
+    metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+    page.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
+    try:
+        page.set(FLAT)
+        page.js(STATE + "viewer.layout()")
+        for shape in ("sphere", "cloth"):
+            page.choose("shape", shape)
+            w, h = page.js(STATE + "return [renderer.canvas.width, renderer.canvas.height]")
+            covered = page.picture(60, round(60 * w / h))[..., 3] > 0
+            rows, columns = np.flatnonzero(covered.any(1)), np.flatnonzero(covered.any(0))
+            assert not covered[[0, -1]].any()
+            assert not covered[:, [0, -1]].any()
+            share = max(np.ptp(rows) / covered.shape[0], np.ptp(columns) / covered.shape[1])
+            assert 0.8 < share < 0.95
+            # With more tiles the shape is as large.
+            page.choose("tiles", 4)
+            again = page.picture(60, round(60 * w / h))[..., 3] > 0
+            assert (again != covered).mean() < 0.03
+    finally:
+        page.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+        page.js(STATE + "viewer.layout()")
+
+
+def test_the_far_side_of_a_sphere_gets_no_light(page: Page) -> None:
+    """Also at its silhouette, where interpolated normals may point away from the viewer."""
+    lit = 0
+    for azimuth in (-60.0, -61.3):
+        for elevation in (0, 20):
+            view = {"elevation": elevation, "azimuth": azimuth, "target": [0, 0, 0], "tiles_across": 1.5}
+            from_right = {**ABOVE, "direction": from_angles(0.0, azimuth + 90).tolist()}
+            page.set({"camera": view, "lights": [from_right], "shape": "sphere"})
+            found = page.picture(300, 400)
+            left, right = found[:, :190], found[:, 210:]
+            assert (left[..., 3] > 0).mean() > 0.3
+            assert (right[..., :3].max(2) > 0)[right[..., 3] > 0].mean() > 0.99
+            lit += int((left[..., :3].max(2) > 0).sum())
+    # Of 95,000 pixels.
+    assert lit < 5
+
+
+def test_values_of_links_are_brought_into_their_range(page: Page) -> None:
+    page.set(
+        {
+            "camera": {"tiles_across": -3, "elevation": -500, "target": [1e9, 0, 0], "azimuth": "x"},
+            "shape": "nope",
+            "tiles": 1e9,
+            "lights": [
+                {"direction": [0, 0, 0], "color": [2, -1, 0.5], "intensity": 1e9},
+                {"direction": [0.3, 0, 0.4]},
+                *[{}] * 9,
+            ],
+            "environment": {"name": "nope", "intensity": -1, "angle": 700},
+            "exposure": 50,
+            "divide": 4,
+            "material": 7,
+            "against": "material 7",
+        }
+    )
+    camera = "[camera.tiles_across, camera.elevation, camera.azimuth, camera.target]"
+    assert page.js(STATE + f"return {camera}") == [0.05, 2, -90, [1000, 0, 0]]
+    found = page.js(STATE + "return state")
+    assert [found[key] for key in ("shape", "tiles", "exposure", "divide", "material", "against")] == [
+        "plane",
+        64,
+        10,
+        0.98,
+        2,
+        "none",
+    ]
+    assert found["environment"] == {"name": "none", "intensity": 0, "angle": 180}
+    first, second = found["lights"][:2]
+    assert (len(found["lights"]), first["color"], first["intensity"]) == (4, [1, 0, 0.5], 16)
+    assert np.linalg.norm(first["direction"]) == pytest.approx(1)
+    assert second["direction"] == pytest.approx([0.6, 0, 0.8])
+    # A link that is opened in the same tab is taken over.
+    page.js("location.hash = encodeURIComponent(JSON.stringify({ tiles: 7 }))")
+    page.until(lambda: page.js(STATE + "return state.tiles") == 7)
+    assert np.isfinite(page.picture(4, 4)).all()

@@ -1,0 +1,288 @@
+"""What the viewer draws: shapes, frames, light from all around, two materials, and the mean of frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from support.plugin_materials import write_material
+from support.shader_cases import make
+from support.viewer_page import Page
+
+from mbtf_core.color import linear_to_srgb
+from mbtf_core.directions import from_angles
+from mbtf_fit.material.material import Material
+from mbtf_fit.viewer.content import as_read, encode, material_content, pack_textures
+from mbtf_fit.viewer.extras import mesh_content
+from mbtf_fit.viewer.page import write_page
+from mbtf_gen.pictures.camera import Camera
+
+F64 = NDArray[np.float64]
+ASPECT = 0.5
+# Two squares beside each other, the second one mirrored in the texture; files have y up.
+SQUARES = """
+v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 1 0 0\nv 2 0 0\nv 2 1 0\nv 1 1 0
+vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nvt 2 0\nvt 2 1
+vn 0 0 1
+f 1/1/1 2/2/1 3/3/1\nf 1/1/1 3/3/1 4/4/1\nf 5/5/1 6/2/1 7/3/1\nf 5/5/1 7/3/1 8/6/1
+"""
+# A sky with one bright pixel.
+SKY, SPOT, COLOR = (64, 128), (20, 13), np.array([4.0, 2.0, 1.0])
+LIGHT: dict[str, Any] = {"direction": [0, 0, 1], "color": [1, 1, 1], "intensity": 1}
+
+
+@pytest.fixture(scope="module")
+def page(driver: Any, tmp_path_factory: pytest.TempPathFactory) -> Page:
+    """Materials of aspects ½ and 1, two squares and a sky; nothing is drawn unless a test asks for it."""
+    folder = tmp_path_factory.mktemp("scene")
+    make("calibrated", folder / "half")
+    square(folder / "square")
+    (folder / "squares.obj").write_text(SQUARES)
+    sky = np.zeros((*SKY, 3), np.float32)
+    sky[SPOT] = COLOR
+    content = {
+        "materials": [material_content(folder / name)[0] for name in ("half", "square")],
+        "mesh": mesh_content(folder / "squares.obj"),
+        "environment": {"name": "spot", "shape": list(SKY), "data": encode(sky)},
+    }
+    page = Page(driver, write_page(content, "scene"), folder).ready()
+    page.js("window.mbtf.viewer.draw = () => false")
+    return page
+
+
+def square(folder: Path) -> Material:
+    return write_material(folder, model="neumip-baseline", finest=4)
+
+
+def view(elevation: float, azimuth: float, across: float, *target: float) -> dict[str, Any]:
+    return {
+        "elevation": elevation,
+        "azimuth": azimuth,
+        "tiles_across": across,
+        "target": [*target, 0, 0, 0][:3],
+    }
+
+
+def evaluate(material: Material, camera: Camera, light: F64) -> F64:
+    """M of a picture under a light, as the page's textures give it."""
+    q = camera.queries(light, material.lattice.aspect)
+    flat = (np.asarray(a, np.float64).reshape(-1, *a.shape[2:]) for a in (q.u, q.sigma, q.omega_i, q.omega_o))
+    value = as_read(material, pack_textures(material)).evaluate(*flat)
+    return np.asarray(value, np.float64).reshape(camera.rows, camera.columns, 3)
+
+
+def ray(page: Page, camera: Camera, x: float, y: float) -> F64:
+    """Unit direction from the camera through the pixel at a place from the top left."""
+    columns, rows = page.js(
+        "const { canvas } = window.mbtf.viewer.renderer; return [canvas.width, canvas.height]"
+    )
+    forward, right, up = camera.frame()
+    pitch = 2.0 * np.tan(np.radians(camera.field_of_view) / 2.0) / columns
+    across, along = np.floor(x * columns) + 0.5 - columns / 2, np.floor((1 - y) * rows) + 0.5 - rows / 2
+    d = forward + pitch * (across * right + along * up)
+    return np.asarray(d / np.linalg.norm(d), np.float64)
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_each_side_has_the_tile_of_its_material(page: Page, tmp_path: Path, first: int) -> None:
+    materials = [make("calibrated", tmp_path / "half"), square(tmp_path / "square")]
+    light = from_angles(40.0, 20.0)
+    page.set(
+        {
+            "camera": view(90, -90, 2, 0.5, 0.5),
+            "lights": [{**LIGHT, "direction": light.tolist()}],
+            "material": first,
+            "against": f"material {1 - first}",
+            "divide": 0.5,
+        }
+    )
+    for side, material in enumerate((materials[first], materials[1 - first])):
+        part = slice(16 * side, 16 * (side + 1))
+        found = page.picture(24, 32, side)[:, part, :3]
+        expected = evaluate(material, Camera(90, -90, 2, rows=24, columns=32), light)[:, part] * light[2]
+        assert np.abs(found - expected).mean() < 0.08 * expected.mean()
+
+
+def test_low_directions_are_raised_and_lights_add_up(page: Page, tmp_path: Path) -> None:
+    """Views and lights below the data's smallest cosine, and two lights of different colors."""
+    material = make("calibrated", tmp_path / "half")
+    low, high = from_angles(3.0, 20.0), from_angles(60.0, 110.0)
+    raised = np.array([*low[:2] / np.hypot(*low[:2]) * np.sqrt(0.99), 0.1])
+    page.set(
+        {
+            "camera": view(60, -90, 2, 0.5, 0.5),
+            "lights": [
+                {"direction": low.tolist(), "color": [1, 0, 0], "intensity": 16},
+                {"direction": high.tolist(), "color": [0, 1, 0.5], "intensity": 0.5},
+            ],
+        }
+    )
+    found = page.picture(24, 32)[..., :3]
+    camera = Camera(60, -90, 2, rows=24, columns=32)
+    expected = evaluate(material, camera, raised) * low[2] * 16 * (1, 0, 0)
+    expected += evaluate(material, camera, high) * high[2] * 0.5 * (0, 1, 0.5)
+    assert (np.abs(found - expected).mean((0, 1)) < 0.08 * expected.mean((0, 1))).all()
+    # A view from 3 degrees keeps its azimuth.
+    page.set({"camera": view(3, -60, 2, 0.5, 0.5)})
+    found_at = page.pick(0.5, 0.5)
+    assert found_at is not None
+    seen = np.array([0.5, -np.sqrt(0.75)]) * np.sqrt(0.99)
+    assert found_at["omega_o"] == pytest.approx([*seen, 0.1], abs=0.01)
+
+
+@pytest.mark.parametrize("angle", [0, 90])
+def test_a_bright_pixel_of_a_sky_is_a_directional_light(page: Page, angle: int) -> None:
+    """Of irradiance 1 on the plane: at the azimuth of an envmap of Mitsuba, plus the rotation."""
+    theta, phi = np.pi * (SPOT[0] + 0.5) / SKY[0], np.radians(90 - 360 * (SPOT[1] + 0.5) / SKY[1] + angle)
+    light = np.array([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
+    camera, luminance = view(60, -70, 1, 0.5, 0.25), COLOR @ (0.2126, 0.7152, 0.0722)
+    colored = {"color": (COLOR / 4).tolist(), "intensity": 4 / luminance * 2 / light[2]}
+    page.set({"camera": camera, "lights": [{"direction": light.tolist(), **colored}]})
+    expected = page.picture(24, 32)[..., :3]
+    page.set({"camera": camera, "lights": []})
+    for name, value in (("environment", "spot"), ("environment_intensity", 1), ("environment_angle", angle)):
+        page.choose(name, value)
+    found = page.picture(24, 32)[..., :3]
+    assert np.abs(found - expected).mean() < 0.06 * expected.mean()
+    assert found.mean((0, 1)) == pytest.approx(expected.mean((0, 1)), rel=0.02)
+
+
+def test_samples_of_the_built_in_sky_follow_its_radiance(page: Page) -> None:
+    """A quarter of the light comes from the sun; directions of equal radiance are uniform on the sphere."""
+    page.set({"environment": {"name": "sky"}})
+    code = """
+        const { gl, environment } = window.mbtf.viewer.renderer, out = new Float32Array(4 * 64 * 128);
+        gl.bindFramebuffer(gl.FRAMEBUFFER, gl.createFramebuffer());
+        gl.framebufferTexture2D(
+            gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, environment.handle, 0);
+        gl.readPixels(0, 0, 64, 128, gl.RGBA, gl.FLOAT, out);
+        return [...out];
+    """
+    table = np.array(page.js(code)).reshape(64, 2, 64, 4)
+    directions, radiance = table[:, 0, :, :3].reshape(-1, 3), table[:, 1, :, :3].reshape(-1, 3)
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-5)
+    near_sun = directions @ (0.48, -0.36, 0.8) > np.cos(np.radians(12.0))
+    assert 0.15 < near_sun.mean() < 0.4
+    # Irradiance 1 of the plane; samples have equal luminance.
+    luminance = radiance @ (0.2126, 0.7152, 0.0722)
+    assert np.ptp(luminance) < 1e-3 * luminance.mean()
+    assert (luminance * np.maximum(directions[:, 2], 0)).mean() == pytest.approx(1, abs=0.02)
+    # Below the horizon radiance is constant, and so is the density.
+    below = directions[directions[:, 2] < 0]
+    assert (below[:, 2] ** 2).mean() == pytest.approx(1 / 3, abs=4 * 0.3 / np.sqrt(len(below)))
+
+
+def test_values_on_a_sphere_are_where_its_texture_is(page: Page) -> None:
+    """Position and view of pixels, against the intersection of their rays with the sphere."""
+    page.set({"camera": view(20, -60, 2), "shape": "sphere", "tiles": 4})
+    camera, radius = Camera(20, -60, 2, (0, 0)), 4 / (2 * np.pi)
+    for x, y in ((0.45, 0.3), (0.6, 0.55), (0.35, 0.6)):
+        found = page.pick(x, y)
+        assert found is not None
+        d, o = ray(page, camera, x, y), camera.position
+        p = o + (-(o @ d) - np.sqrt((o @ d) ** 2 - o @ o + radius**2)) * d
+        n = p / radius
+        a, e = np.arctan2(n[1], n[0]), np.arcsin(n[2])
+        # As many tiles of half the height lie between the poles as around the equator.
+        u = np.array([4 * a / (2 * np.pi), 4 * (e / np.pi + 0.5)])
+        assert np.abs((np.array(found["u"]) - u + 0.5) % 1 - 0.5).max() < 0.02
+        east = np.array([-np.sin(a), np.cos(a), 0])
+        assert found["omega_o"] == pytest.approx([-d @ east, -d @ np.cross(n, east), -d @ n], abs=0.02)
+    assert page.pick(0.02, 0.5) is None
+
+
+@pytest.mark.parametrize("behind", [False, True])
+def test_values_on_a_mesh_have_the_frame_of_its_texture(page: Page, behind: bool) -> None:
+    """A square, and one with a mirrored texture, from both sides."""
+    camera = Camera(10, 110 if behind else -70, 5, (0, 0))
+    page.set({"camera": view(10, camera.azimuth, 5), "shape": "squares", "tiles": 2})
+    seen = set()
+    for x in (0.35, 0.65):
+        found = page.pick(x, 0.45)
+        assert found is not None
+        d, o = ray(page, camera, x, 0.45), camera.position
+        p = o - o[1] / d[1] * d
+        mirrored = -1 if p[0] > 0 else 1
+        u = np.array([mirrored * p[0], (p[2] + 1) / ASPECT])
+        assert np.abs((np.array(found["u"]) - u + 0.5) % 1 - 0.5).max() < 0.02
+        assert found["omega_o"] == pytest.approx([-mirrored * d[0], -d[2], abs(d[1])], abs=0.01)
+        seen.add(mirrored)
+    assert len(seen) == 2
+
+
+@pytest.mark.parametrize("shape", ["sphere", "cloth", "squares"])
+def test_frames_of_shapes_are_the_derivatives_of_their_texture(page: Page, shape: str) -> None:
+    page.set({"shape": shape, "tiles": 4})
+    data = page.js(
+        "const data = window.mbtf.viewer.renderer.shape(arguments[0]);"
+        "return Object.fromEntries(Object.entries(data).map(([key, values]) => [key, [...values]]))",
+        ASPECT,
+    )
+    corners = np.array(data["indices"]).reshape(-1, 3)
+    p, n, t, uv = (
+        np.array(data[key]).reshape(-1, size)[corners]
+        for key, size in (("positions", 3), ("normals", 3), ("tangents", 4), ("uvs", 2))
+    )
+    edges = np.linalg.inv(np.diff(uv, axis=1)) @ np.diff(p, axis=1)
+    # Frames at a triangle's center; near the poles of a sphere they differ within a triangle.
+    ok = np.abs(n[..., 2]).max(1) < 0.9
+    normal, tangent = n.mean(1)[ok], t[..., :3].mean(1)[ok]
+    by_u, by_v = edges[ok, 0], edges[ok, 1]
+    bitangent = t[ok][:, 0, 3:] * np.cross(normal, tangent)
+
+    def cosine(a: F64, b: F64) -> F64:
+        product = (a * b).sum(1) / np.linalg.norm(a, axis=1) / np.linalg.norm(b, axis=1)
+        return np.asarray(product, np.float64)
+
+    assert cosine(tangent, by_u).min() > 0.95
+    assert cosine(bitangent, by_v).min() > 0.85
+    # A texture unit is as long as a tile is wide, and as it is high.
+    assert np.median(np.linalg.norm(by_v, axis=1)) == pytest.approx(ASPECT, rel=0.1)
+    if shape != "sphere":
+        assert np.median(np.linalg.norm(by_u, axis=1)) == pytest.approx(1, rel=0.2)
+
+
+def test_frames_add_up_to_their_mean(page: Page) -> None:
+    page.set({"camera": view(20, -60, 1.8), "shape": "sphere", "tiles": 4})
+    code = """
+        const { viewer } = window.mbtf, { renderer } = viewer, [rows, columns, count] = arguments;
+        const mean = renderer.mean("test", columns, rows, 1), frames = [];
+        mean.restart();
+        for (let k = 0; k < count; k++) {
+            renderer.frame(mean, viewer.shown, viewer.scene, rows);
+            frames.push([...mean.latest.read(0, 0, columns, rows)]);
+        }
+        return [frames, [...mean.sides[0][0].read(0, 0, columns, rows)]];
+    """
+    frames, found = (np.array(x).reshape(-1, 24, 32, 4) for x in page.js(code, 24, 32, 12))
+    np.testing.assert_allclose(found[0], frames.mean(0), rtol=1e-4, atol=1e-5)
+    # Frames differ by less than a pixel: where all neighbors are covered, a pixel is.
+    first = frames[0, ..., 3]
+    inside = np.min([np.roll(first, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)], 0) > 0
+    assert inside.mean() > 0.2
+    assert (found[0][..., 3][inside] == 1).all()
+    edge = (found[0][..., 3] > 0) & (found[0][..., 3] < 1)
+    assert 20 < edge.sum() < 140
+
+
+def test_plots_have_y_up(page: Page) -> None:
+    """Pictures of the values over all views, against the values."""
+    page.set({"camera": view(60, -70, 1, 0.5, 0.25), "lights": [{**LIGHT, "direction": [0.6, 0, 0.8]}]})
+    code = """
+        const { viewer, showPoint } = window.mbtf, { renderer } = viewer, [x, y] = [0.4, 0.3];
+        showPoint(viewer, x, y);
+        const canvas = document.getElementById("over_views"), { width, height } = canvas;
+        const plot = canvas.getContext("2d").getImageData(0, 0, width, height).data;
+        const point = renderer.pick(viewer.material, viewer.scene, x, y);
+        const values = renderer.overDirections(viewer.material, width, point, [0.6, 0, 0.8], true);
+        return [[...plot], [...values]];
+    """
+    plot, values = (np.array(x, np.float64).reshape(128, 128, 4)[..., :3] for x in page.js(code))
+    # Row 0 of the values is at y = -1.
+    expected = 255 * linear_to_srgb(values[::-1] / values.max())
+    # All but the circle of the view.
+    assert (np.abs(plot - expected).max(2) < 1.5).mean() > 0.97
+    assert (np.abs(plot - expected[::-1]).max(2) < 1.5).mean() < 0.6

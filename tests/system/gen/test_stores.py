@@ -1,0 +1,240 @@
+"""An S3 server: runs, damages, fits, connections that are cut, writers that are killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.commands import Done
+from support.object_stores import BUCKET, Proxy, s3_server
+from support.small_runs import command, contents
+
+from mbtf_core.store import Store
+from mbtf_gen.dataset.reader import Dataset
+from mbtf_gen.dataset.verify import verify
+
+URL = f"s3://{BUCKET}/some/data"
+# A program with values that need no renderer. Before the writes of an object that it is told, it ends as by a
+# kill, or it waits.
+_CODE = """
+import os, signal, sys, time
+from mbtf_core.store import Store
+from mbtf_core.console import run
+from mbtf_gen.planning.simulation import ClosedForm
+from support.small_runs import noisy_plane
+ClosedForm.estimate = noisy_plane
+program, at, *line = sys.argv[1:]
+write = Store.write
+def stopped(self, name, content, *, new=False):
+    if name == at:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return write(self, name, content, new=new)
+Store.write = stopped
+if program == "mbtf-gen":
+    from mbtf_gen.cli.app import app
+else:
+    from mbtf_fit.cli.app import app
+sys.exit(run(app, line))
+"""
+
+
+@pytest.fixture
+def proxy(tmp_path: Path) -> Iterator[Proxy]:
+    with s3_server(tmp_path / "cache") as found:
+        yield found
+
+
+def call(*line: object, program: str = "mbtf-gen", kill_at: str = "") -> Done:
+    words = [sys.executable, "-c", _CODE, program, kill_at, *map(str, line)]
+    paths = os.pathsep.join(filter(None, [*sys.path]))
+    child = subprocess.run(
+        words,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+        env={**os.environ, "PYTHONPATH": paths},
+    )
+    return Done(child.returncode, child.stdout, child.stderr)
+
+
+def line_at(folder: Path, *more: str, train: int = 100) -> list[str]:
+    line = command(folder, Path("OUT"), train=train)
+    return [URL if word == "OUT" else word for word in line] + list(more)
+
+
+def generated(folder: Path, *, train: int = 100) -> dict[str, Any]:
+    """Contents of an undisturbed local run."""
+    done = call(*command(folder, folder / "local", train=train))
+    assert done.code == 0, done.err
+    return contents(folder / "local")
+
+
+def stored(folder: Path) -> dict[str, Any]:
+    """Contents of the store."""
+    store = Store(URL)
+    folder.mkdir()
+    for name in store.list():
+        (folder / name).write_bytes(store.read(name))
+    return contents(folder)
+
+
+def test_a_data_set_from_generation_to_fit(tmp_path: Path, proxy: Proxy) -> None:
+    expected = generated(tmp_path)
+    assert call(*line_at(tmp_path)).code == 0
+    assert stored(tmp_path / "copy") == expected
+    assert call("verify", URL).code == 0
+    assert call("merge", URL).code == 0
+    # A second machine has an empty cache.
+    os.environ["XDG_CACHE_HOME"] += "-2"
+    store = Store(URL)
+    flipped = bytearray(store.read("train-00001.npz"))
+    flipped[-100] ^= 1
+    store.write("train-00001.npz", bytes(flipped))
+    found = call("verify", URL)
+    assert found.code == 3
+    assert f"{URL}/train-00001.npz: has changed since it was written" in found.out
+    assert call("repair", URL).code == 0
+    assert stored(tmp_path / "repaired") == expected
+    steps = ["--steps", "5", "--set", "training.batch=30"]
+    for shards, out in ((URL, "theirs"), (tmp_path / "local", "mine")):
+        done = call(shards, *steps, "-o", tmp_path / out, program="mbtf-fit")
+        assert done.code == 0, done.err
+    weights = [(tmp_path / out / "weights.safetensors").read_bytes() for out in ("mine", "theirs")]
+    assert weights[0] == weights[1]
+
+
+def test_connections_that_are_cut(tmp_path: Path, proxy: Proxy) -> None:
+    """Uploads and downloads end in the middle, again and again."""
+    expected = generated(tmp_path)
+    proxy.cut_after, proxy.cuts = 3000, 8
+    done = call(*line_at(tmp_path))
+    assert done.code == 0, done.err
+    assert proxy.done >= 4
+    proxy.cut_after = None
+    assert stored(tmp_path / "copy") == expected
+    proxy.cut_after, proxy.cuts, proxy.answers = 3000, 5, True
+    steps = ["--steps", "5", "--set", "training.batch=30"]
+    for program, line in (
+        ("mbtf-gen", ["verify", URL]),
+        ("mbtf-fit", [URL, *steps, "-o", tmp_path / "theirs"]),
+        ("mbtf-fit", [tmp_path / "local", *steps, "-o", tmp_path / "mine"]),
+    ):
+        proxy.done = 0
+        done = call(*line, program=program)
+        assert done.code == 0, done.err
+        assert proxy.done == (0 if tmp_path / "local" in line else 5)
+    weights = [(tmp_path / out / "weights.safetensors").read_bytes() for out in ("mine", "theirs")]
+    assert weights[0] == weights[1]
+
+
+def test_a_store_that_is_gone(tmp_path: Path, proxy: Proxy, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One line, exit code 4, and the same command resumes; nothing is rendered twice."""
+    expected = generated(tmp_path, train=400)
+    monkeypatch.setenv("MBTF_STORE_PATIENCE", "1")
+    words = [sys.executable, "-c", _CODE, "mbtf-gen", "", *line_at(tmp_path, train=400)]
+    paths = os.pathsep.join(filter(None, sys.path))
+    running = subprocess.Popen(
+        words, stderr=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": paths}
+    )
+    watched = Store(URL)
+    while not any(name.endswith(".json") and name[0] == "t" for name in watched.list()):
+        assert running.poll() is None
+        time.sleep(0.01)
+    proxy.down = True
+    err = running.communicate(timeout=300)[1]
+    assert running.returncode == 4, err
+    # What is wrong, and what to do; the material has a warning.
+    assert len(err.splitlines()) == 3, err
+    warning, fault, hint = err.splitlines()
+    assert warning.startswith("warning: ")
+    assert fault.startswith(f"error: {URL}/")
+    assert "the store cannot be reached" in fault
+    assert "run the same command again" in hint
+    waiting = list((tmp_path / "cache/mbtf/stores/work").glob("*/files/*.npz"))
+    assert waiting
+    proxy.down = False
+    done = call(*line_at(tmp_path, train=400), "--json")
+    assert done.code == 0, done.err
+    assert stored(tmp_path / "copy") == expected
+    found = done.result()
+    # Rendered by the second run: neither what was stored nor what waited.
+    uploaded = [name for name in expected if name.endswith(".npz")]
+    paths = sum(expected[name.replace(".npz", ".json")]["paths"] for name in uploaded)
+    assert found["paths"] < paths
+    assert list((tmp_path / "cache/mbtf/stores/work").iterdir()) == []
+
+
+def test_no_store_at_all(tmp_path: Path, proxy: Proxy, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MBTF_STORE_PATIENCE", "1")
+    proxy.down = True
+    for program, line in (
+        ("mbtf-gen", line_at(tmp_path)),
+        ("mbtf-gen", ["verify", URL]),
+        ("mbtf-fit", [URL, "-o", tmp_path / "m"]),
+    ):
+        done = call(*line, program=program)
+        assert done.code == 4, done.err
+        assert "the store cannot be reached" in done.err
+
+
+@pytest.mark.parametrize("at", ["manifest.json", "geometry.exr", "train-00001.npz", "train-00001.json"])
+def test_a_writer_that_is_killed(tmp_path: Path, proxy: Proxy, at: str) -> None:
+    """Also between a shard and its sidecar; then another machine goes on, or the same one."""
+    expected = generated(tmp_path)
+    assert call(*line_at(tmp_path), kill_at=at).code == -signal.SIGKILL
+    names = set(Store(URL).list())
+    assert at not in names
+    assert ("train-00001.npz" in names) == (at == "train-00001.json")
+    assert call(*line_at(tmp_path)).code == 0
+    assert stored(tmp_path / "copy") == expected
+    assert verify(URL) == []
+
+
+def test_another_machine_goes_on(tmp_path: Path, proxy: Proxy, monkeypatch: pytest.MonkeyPatch) -> None:
+    expected = generated(tmp_path)
+    assert call(*line_at(tmp_path), kill_at="train-00001.json").code == -signal.SIGKILL
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "other"))
+    assert call(*line_at(tmp_path)).code == 0
+    assert stored(tmp_path / "copy") == expected
+
+
+def test_two_slices_at_the_same_time(tmp_path: Path, proxy: Proxy) -> None:
+    expected = generated(tmp_path, train=400)
+    paths = os.pathsep.join(filter(None, sys.path))
+    runs = [
+        subprocess.Popen(
+            [sys.executable, "-c", _CODE, "mbtf-gen", "", *line_at(tmp_path, "--slice", f"{i}/2", train=400)],
+            stderr=subprocess.PIPE,
+            env={**os.environ, "PYTHONPATH": paths},
+        )
+        for i in (1, 2)
+    ]
+    for one in runs:
+        err = one.communicate(timeout=300)[1]
+        assert one.returncode == 0, err
+    assert call("merge", URL).code == 0
+    assert stored(tmp_path / "copy") == expected
+
+
+def test_refusals_are_explained(tmp_path: Path, proxy: Proxy) -> None:
+    line = [word.replace(BUCKET, "nosuchbucket") for word in line_at(tmp_path)]
+    done = call(*line)
+    assert done.code == 3
+    assert "cannot be written (The specified bucket does not exist)" in done.err
+
+
+def test_arrays_are_read_from_python(tmp_path: Path, proxy: Proxy) -> None:
+    generated(tmp_path)
+    assert call(*line_at(tmp_path)).code == 0
+    mine, theirs = Dataset.open(tmp_path / "local").load("train"), Dataset.open(URL).load("train")
+    assert all((mine[name] == theirs[name]).all() for name in mine)
+    assert json.loads(Store(URL).read("manifest.json"))["complete"]

@@ -1,0 +1,152 @@
+"""Requests to an object store: tried again, refused or given up; objects that are written once."""
+
+from __future__ import annotations
+
+import builtins
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.object_stores import memory_store
+
+import mbtf_core.store
+from mbtf_core.errors import EngineError, InputError, PartialError
+from mbtf_core.store import Store, split_url
+
+
+@pytest.fixture
+def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Store]:
+    monkeypatch.setattr(mbtf_core.store, "_FIRST_PAUSE", 0.001)
+    with memory_store(tmp_path) as url:
+        found = Store(url)
+        found.patience = 0.05
+        yield found
+
+
+class Flaky:
+    """A file system whose requests fail: `before` or after they are carried out, so many times."""
+
+    def __init__(self, files: Any, error: Exception, times: int, before: bool = True) -> None:
+        self._files, self._error, self.left, self._before = files, error, times, before
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        function = getattr(self._files, name)
+
+        def call(*args: Any, **kwargs: Any) -> Any:
+            if name == "invalidate_cache" or not self.left:
+                return function(*args, **kwargs)
+            if not self._before:
+                function(*args, **kwargs)
+            self.left -= 1
+            raise self._error
+
+        return call
+
+
+def test_objects_are_listed_read_and_deleted(store: Store, tmp_path: Path) -> None:
+    assert store.list() == {}
+    assert store.write("a", b"one")
+    assert store.write("sub/b", b"two")
+    assert set(store.list()) == {"a", "sub/"}
+    assert store.list()["a"].size == 3 == store.info("a").size
+    assert store.read("a") == b"one"
+    store.download("a", tmp_path / "copy")
+    assert (tmp_path / "copy").read_bytes() == b"one"
+    store.delete("a")
+    store.delete("a")
+    assert set(store.list()) == {"sub/"}
+    with pytest.raises(FileNotFoundError):
+        store.read("a")
+
+
+def test_the_tag_changes_with_the_content(store: Store) -> None:
+    store.write("a", b"one")
+    before = store.list()["a"].tag
+    assert before == store.info("a").tag != ""
+    time.sleep(0.002)
+    store.write("a", b"two")
+    assert store.list()["a"].tag != before
+
+
+def test_a_new_object_never_replaces_another(store: Store) -> None:
+    assert store.write("a", b"one", new=True)
+    assert not store.write("a", b"two", new=True)
+    assert store.read("a") == b"one"
+    assert store.write("a", b"one", new=True)
+
+
+@pytest.mark.parametrize("new", [False, True])
+def test_an_object_is_written_although_the_answer_is_lost(store: Store, new: bool) -> None:
+    store._files = Flaky(store._files, ConnectionResetError("cut"), 1, before=False)
+    assert store.write("a", b"one", new=new)
+    assert store.read("a") == b"one"
+
+
+def test_a_store_without_conditional_writes(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    original = store._files.pipe_file
+    monkeypatch.setattr(store._files, "pipe_file", lambda path, value: original(path, value))
+    assert store.write("a", b"one", new=True)
+    assert not store.write("a", b"two", new=True)
+
+
+@pytest.mark.parametrize("error", [ConnectionResetError("cut"), TimeoutError(), RuntimeError("botocore")])
+def test_requests_are_tried_again(store: Store, error: Exception) -> None:
+    store.write("a", b"one")
+    store._files = Flaky(store._files, error, 3)
+    assert store.read("a") == b"one"
+
+
+def test_a_store_that_is_gone_is_given_up(store: Store) -> None:
+    store._files = Flaky(store._files, ConnectionResetError("cut"), -1)
+    with pytest.raises(PartialError, match=r"memory://data/x/a: the store cannot be reached \(cut\)"):
+        store.read("a")
+    # Other requests do not wait again, until one succeeds.
+    store.patience, start = 30.0, time.monotonic()
+    with pytest.raises(PartialError):
+        store.list()
+    assert time.monotonic() - start < 20.0
+    store._files.left = 0
+    assert store.list() == {}
+    assert not store._lost.is_set()
+
+
+@pytest.mark.parametrize("error", [PermissionError("AccessDenied"), ValueError("bad name")])
+def test_refusals_are_not_tried_again(store: Store, error: Exception) -> None:
+    store._files = Flaky(store._files, error, 1)
+    with pytest.raises(InputError, match="the store refuses it"):
+        store.read("a")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("s3://bucket/data", ("s3", "bucket/data")),
+        ("s3:/bucket/data/", ("s3", "bucket/data")),
+        (Path("gs://bucket/x"), ("gs", "bucket/x")),
+        ("file:///tmp/x", ("file", "tmp/x")),
+        ("shards", None),
+        ("C:/shards", None),
+        ("a/b:/c", None),
+        (None, None),
+    ],
+)
+def test_urls_are_recognized(text: object, expected: tuple[str, str] | None) -> None:
+    assert split_url(text) == expected
+
+
+def test_missing_packages_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    original = builtins.__import__
+
+    def without(name: str, *args: Any, **kwargs: Any) -> Any:
+        if name.partition(".")[0] in ("fsspec", "gcsfs"):
+            raise ImportError(name)
+        return original(name, *args, **kwargs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(builtins, "__import__", without)
+        with pytest.raises(EngineError, match=r"pip install 'mbtf\[stores\]'"):
+            Store("s3://bucket/data")
+    with pytest.raises(InputError, match="cannot be opened"):
+        Store("nosuchprotocol://bucket/data")

@@ -1,0 +1,175 @@
+"""Fits to data in an object store: equal bits, a bounded cache, shards that are downloaded ahead."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+
+import pytest
+from support.fit_data import parallax, write_data
+from support.object_stores import memory_store
+
+from mbtf_core.data_folder import data_folder, prefetch
+from mbtf_core.errors import PartialError
+from mbtf_core.store import Store
+from mbtf_core.store_folder import StoreFolder, StorePath
+from mbtf_fit.config import FitConfig, HeldOutSection
+from mbtf_fit.data.loader import load_training
+from mbtf_fit.data.streaming import StreamedQueries
+from mbtf_fit.training.checkpoint import CHECKPOINT_NAME
+from mbtf_fit.training.fit import fit
+from mbtf_gen.dataset.reader import Dataset
+
+HELD_OUT = HeldOutSection(queries=0.1, radius=0.3)
+
+
+@pytest.fixture
+def url(tmp_path: Path) -> Iterator[str]:
+    with memory_store(tmp_path / "cache") as found:
+        yield found
+
+
+@pytest.fixture
+def local(tmp_path: Path, url: str) -> Path:
+    """A data set of eight shards, and the same one in the store."""
+    folder = write_data(tmp_path / "local", parallax, train=8000, test=500, shards=8)
+    store = Store(url)
+    for path in folder.iterdir():
+        store.write(path.name, path.read_bytes())
+    return folder
+
+
+@pytest.fixture
+def downloads(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
+    """(shard, thread) of every download."""
+    found: list[tuple[str, str]] = []
+    original = Store.download
+
+    def watched(self: Store, name: str, path: Path) -> None:
+        found.append((name, threading.current_thread().name))
+        time.sleep(0.01)
+        original(self, name, path)
+
+    monkeypatch.setattr(Store, "download", watched)
+    return found
+
+
+def cached(folder: Path) -> int:
+    return sum(path.stat().st_size for path in (folder / "cache/mbtf/stores/shards").iterdir())
+
+
+@pytest.mark.parametrize("memory", ["1GB", "1kB"])
+@pytest.mark.parametrize("cache", ["20GB", "1kB"])
+def test_a_fit_is_identical(tmp_path: Path, url: str, local: Path, memory: str, cache: str) -> None:
+    options = {"training": {"steps": 6, "batch": 500}, "data": {"memory": memory, "cache": cache}}
+    config = FitConfig.model_validate(options)
+    mine = fit(config, local, tmp_path / "mine").material.model.weights()
+    theirs = fit(config, url, tmp_path / "theirs").material.model.weights()
+    assert all((mine[name] == theirs[name]).all() for name in mine)
+
+
+def test_batches_are_those_of_local_data(url: str, local: Path) -> None:
+    mine, theirs = (load_training(Dataset.open(f), HELD_OUT, 0, memory=1.0).training for f in (local, url))
+    assert isinstance(theirs, StreamedQueries)
+    for a, b in zip(*(islice(q.batches(700, 0, 5), 30) for q in (mine, theirs)), strict=True):
+        assert all((getattr(a, n) == getattr(b, n)).all() for n in ("u", "sigma", "omega_i", "value"))
+
+
+def test_shards_are_downloaded_once_and_ahead(
+    url: str, local: Path, downloads: list[tuple[str, str]]
+) -> None:
+    data = Dataset.open(url)
+    training = load_training(data, HELD_OUT, 0, memory=1.0).training
+    names = [name for name, _ in downloads]
+    assert sorted(names) == [path.name for path in sorted(local.glob("train-*.npz"))]
+    # The reader waits for the first shard only.
+    assert sum(thread == "prefetch" for _, thread in downloads) >= 6
+    list(islice(training.batches(700, 0, 0), 30))  # type: ignore[arg-type, call-overload]
+    assert len(downloads) == len(names)
+
+
+def test_the_cache_is_bounded(
+    tmp_path: Path, url: str, local: Path, downloads: list[tuple[str, str]]
+) -> None:
+    size = max(path.stat().st_size for path in local.glob("train-*.npz"))
+    data = Dataset.open(url, cache=5 * size)  # also without reading ahead
+    training = load_training(data, HELD_OUT, 0, memory=1.0).training
+    for _ in islice(training.batches(700, 0, 0), 30):  # type: ignore[arg-type, call-overload]
+        assert cached(tmp_path) <= 6 * size
+    assert len(downloads) > 8
+
+
+def test_a_shard_that_another_process_evicts_is_read_again(tmp_path: Path, url: str, local: Path) -> None:
+    data = Dataset.open(url)
+    shards = data.shards("train")
+    before = shards[0].read()
+    for path in (tmp_path / "cache/mbtf/stores/shards").iterdir():
+        path.unlink()
+    again = shards[0].read()
+    # The first arrays stay readable: they are mapped.
+    assert all((before[name] == again[name]).all() for name in before)
+
+
+def test_a_shard_that_leaves_the_cache_before_it_is_opened(
+    url: str, local: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original, left = StoreFolder.local, [3]
+
+    def evicted(self: StoreFolder, name: str) -> Path:
+        path = original(self, name)
+        if left[0]:
+            left[0] -= 1
+            path.unlink()
+        return path
+
+    monkeypatch.setattr(StoreFolder, "local", evicted)
+    found = Dataset.open(url).shards("train")[0].read()
+    assert left == [0]
+    expected = Dataset.open(local).shards("train")[0].read()
+    assert all((found[name] == expected[name]).all() for name in expected)
+
+
+def test_a_lost_store_leaves_a_checkpoint(
+    tmp_path: Path, url: str, local: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The fit resumes where it was, with the result of an undisturbed one."""
+    options = {"training": {"steps": 30, "batch": 700}, "data": {"memory": "1kB", "cache": "1kB"}}
+    config = FitConfig.model_validate(options)
+    whole = fit(config, local, tmp_path / "whole").material.model.weights()
+    original, left = StreamedQueries.slice, [12]
+
+    def cut(self: StreamedQueries, start: int, stop: int) -> object:
+        left[0] -= 1
+        if left[0] < 0:
+            raise PartialError("the store cannot be reached")
+        return original(self, start, stop)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(StreamedQueries, "slice", cut)
+        with pytest.raises(PartialError):
+            fit(config, url, tmp_path / "m")
+    assert (tmp_path / "m" / CHECKPOINT_NAME).exists()
+    result = fit(config, url, tmp_path / "m")
+    found = result.material.model.weights()
+    assert result.resumed
+    assert all((whole[name] == found[name]).all() for name in whole)
+
+
+def test_failures_of_the_background_are_left_to_the_reader(
+    url: str, local: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = data_folder(url)
+    assert isinstance(folder, StorePath)
+    with monkeypatch.context() as patch:
+        patch.setattr(Store, "download", _unreachable)
+        prefetch(folder / "train-00001.npz")
+        with pytest.raises(PartialError):
+            Dataset.open(url).shards("train")[1].read()
+    Dataset.open(url).shards("train")[1].read()
+
+
+def _unreachable(*_: object) -> None:
+    raise PartialError("the store cannot be reached")

@@ -1,0 +1,48 @@
+"""Kernels read whole packets of NumPy's memory: room behind it keeps them within the process's own."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from conftest import RunPython
+
+from mbtf_gen.render.memory import padded
+
+# Numbers at the end of readable memory.
+CODE = """
+import ctypes, mmap, sys
+import numpy as np
+from mbtf_gen.render.memory import padded
+from mbtf_gen.render.runtime import load_mitsuba
+mi = load_mitsuba()
+import drjit as dr
+half, n = 1 << 19, 1601
+memory = mmap.mmap(-1, 2 * half)
+start = ctypes.addressof(ctypes.c_char.from_buffer(memory))
+assert ctypes.CDLL(None).mprotect(ctypes.c_void_p(start + half), half, 0) == 0
+numbers = np.frombuffer(memory, np.uint32, count=n, offset=half - 4 * n)
+if sys.argv[1] == "padded":
+    numbers = padded(numbers)
+copied = mi.UInt32(numbers) + dr.opaque(mi.UInt32, 1)
+dr.eval(copied)
+assert (np.array(copied) == 1).all()
+"""
+
+
+@pytest.mark.parametrize("shape", [(5,), (3, 7), (0,)])
+def test_copies_have_room_behind_them(shape: tuple[int, ...]) -> None:
+    numbers = np.arange(np.prod(shape), dtype=np.float32).reshape(shape).T
+    copy = padded(numbers)
+    np.testing.assert_array_equal(copy, numbers)
+    assert copy.flags.c_contiguous
+    owner = copy
+    while isinstance(owner.base, np.ndarray):
+        owner = owner.base
+    end = copy.__array_interface__["data"][0] + copy.nbytes
+    assert owner.__array_interface__["data"][0] + owner.nbytes >= end + 15 * 4
+
+
+def test_kernels_stay_within_the_memory_of_the_process(run_python: RunPython) -> None:
+    assert run_python("-c", CODE, "padded").returncode == 0
+    # Where this passes, Dr.Jit reads no further any more, and nothing needs to be padded.
+    assert run_python("-c", CODE, "plain").returncode != 0
