@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+
+from support.paths import ROOT
 
 from mbtf_core.cluster.children import run_in_children
 from mbtf_core.cluster.task import Task
@@ -47,7 +50,8 @@ def test_failures_end_their_task_alone() -> None:
 def test_a_child_ends_with_a_killed_command(tmp_path: Path) -> None:
     script, mark = tmp_path / "command.py", tmp_path / "mark"
     script.write_text(COMMAND)
-    command = subprocess.Popen([sys.executable, str(script), str(mark)])
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (ROOT, ROOT / "tests")))}
+    command = subprocess.Popen([sys.executable, str(script), str(mark)], env=environment)
     wait_until(mark.exists)
     child = int(mark.read_text())
     assert is_running(child)
