@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.lattice import Lattice
@@ -108,6 +110,25 @@ class Job:
             job.material.height_source(given),
             job.grid.displacement_range,
         )
+        return job
+
+    def portable(self) -> dict[str, Any]:
+        """The configuration as plain data for :meth:`of_portable`: its material has an absolute path, because
+        other processes may have other working folders."""
+        config = self.config.model_dump(mode="json")
+        return {**config, "material": os.path.abspath(self.config.material)}
+
+    @classmethod
+    def of_portable(cls, config: str, config_hash: str) -> Job:
+        """The job of a process, perhaps on another machine, that sent :meth:`portable` as JSON.
+
+        Raises
+        ------
+        InputError : the material cannot be used, or its files differ from those of the sender
+        """
+        job = cls.load(GeneratorConfig.model_validate_json(config))
+        if job.config_hash != config_hash:
+            raise InputError("the material's files differ on this machine", where=job.config.material)
         return job
 
     @cached_property

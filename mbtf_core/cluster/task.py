@@ -6,7 +6,6 @@ import os
 import signal
 import socket
 import threading
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -54,7 +53,6 @@ class TaskResult:
     fatal : the others fail for the same reason, such as files that a worker cannot read
     locked : another process works on the task's files
     worker : machine and process
-    seconds : duration on the worker
     """
 
     task: Task
@@ -63,7 +61,6 @@ class TaskResult:
     fatal: bool = False
     locked: bool = False
     worker: str = ""
-    seconds: float = 0.0
 
 
 def run_task(function: str, arguments: Mapping[str, Any], expected: str) -> dict[str, Any]:
@@ -84,7 +81,6 @@ def run_task(function: str, arguments: Mapping[str, Any], expected: str) -> dict
         error = f"the worker has version {installed} of mbtf, the command {expected}"
         return {"error": error, "fatal": True, "worker": worker}
     with _ALONE:
-        start = time.perf_counter()
         try:
             module, _, name = function.partition(":")
             value = getattr(import_module(module), name)(**arguments)
@@ -92,7 +88,7 @@ def run_task(function: str, arguments: Mapping[str, Any], expected: str) -> dict
             text = f"{error.where}: {error.what}" if error.where else error.what
             fatal, locked = not isinstance(error, PartialError), isinstance(error, LockedError)
             return {"error": text, "fatal": fatal, "locked": locked, "worker": worker}
-        return {"value": value, "worker": worker, "seconds": time.perf_counter() - start}
+        return {"value": value, "worker": worker}
 
 
 def worker_threads() -> int | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -88,13 +88,25 @@ def fit_one(
     PartialError
         The disk is full, or another process writes to the folder.
     """
-    import torch
-
     from mbtf_fit.training.fit import fit
+
+    with in_folder(working_folder):
+        return fit(FitConfig.model_validate(config), shards, folder, overwrite=overwrite).as_dict()
+
+
+@contextlib.contextmanager
+def in_folder(working_folder: str) -> Iterator[None]:
+    """Work in the folder that paths of a task are relative to, with the worker's threads.
+
+    Raises
+    ------
+    InputError : this machine does not see the folder
+    """
+    import torch
 
     if not Path(working_folder).is_dir():
         raise InputError("this machine does not see the folder", where=working_folder)
     if (threads := worker_threads()) is not None:
         torch.set_num_threads(threads)
     with contextlib.chdir(working_folder):
-        return fit(FitConfig.model_validate(config), shards, folder, overwrite=overwrite).as_dict()
+        yield

@@ -22,7 +22,6 @@ from mbtf_core.data_folder import data_folder, in_store, send_shard
 from mbtf_core.errors import InputError, LockedError, PartialError
 from mbtf_core.locks import keep_renewing, take_lock
 from mbtf_core.shard_schema import MANIFEST_NAME, ShardEntry
-from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.dataset.folder import remove_leftovers
 from mbtf_gen.dataset.manifest import plan_digest
 from mbtf_gen.dataset.recover import recover_shards
@@ -31,6 +30,7 @@ from mbtf_gen.dataset.render_shards import (
     ProgressCallback,
     RenderResult,
     estimate_queries,
+    progress_of,
     store_shard,
 )
 from mbtf_gen.dataset.sidecar import finished_record, sidecar_of
@@ -73,10 +73,7 @@ def distribute_shards(
     result, totals, expected = RenderResult(), ShardStatistics(), ExpectedPaths(job)
     limit = most_paths(job)
     shared = {
-        "config": {
-            **job.config.model_dump(mode="json"),
-            "material": os.path.abspath(job.config.material),
-        },
+        "config": job.portable(),
         "folder": str(folder) if in_store(folder) else os.path.abspath(folder),
         "config_hash": job.config_hash,
         "plan": plan_digest(plan.to_manifest()),
@@ -102,12 +99,9 @@ def distribute_shards(
                 result.shards.append(entry.file)
                 expected.add(entry, paths)
             if progress is not None:
-                rate = result.paths / max(time.perf_counter() - start, 1e-9)
-                left = expected.paths(pending.values())
-                noise = totals.relative_error() if totals.train else None
-                error = "" if noise is None else f", noise {noise:.2%}"
-                note = f"{rate / 1e6:.2f} M paths/s on {cluster.workers} workers{error}"
-                progress(result.paths, note, None if left is None else result.paths + left)
+                seconds, left = time.perf_counter() - start, expected.paths(pending.values())
+                where = f" on {cluster.workers} workers"
+                progress(*progress_of(result.paths, seconds, totals, left, where))
     result.seconds = time.perf_counter() - start
     if failed:
         name, why = next(iter(failed.items()))
@@ -127,7 +121,7 @@ def render_shard(
     Parameters
     ----------
     config : dict
-        Resolved configuration, whose material has an absolute path.
+        :meth:`Job.portable <mbtf_gen.job.Job.portable>`.
     folder : str
         The data set, whose manifest holds the run's plan.
     config_hash, plan : str
@@ -151,7 +145,7 @@ def render_shard(
     if not (into / MANIFEST_NAME).exists():
         raise InputError("this machine does not see the data set", where=into)
     run = _run_of(json.dumps(config), into, config_hash, plan)
-    entry = next(entry for entry in run.job.shards if entry.file == file)
+    entry = run.entries[file]
     if (record := finished_record(into, entry, config_hash)) is not None:
         return {"record": record, "rendered": False}
     # The scheduler gives a shard to one worker. Locks of other machines are those of workers that have died,
@@ -184,6 +178,11 @@ class _Run:
     plan: RunPlan
 
     @cached_property
+    def entries(self) -> dict[str, ShardEntry]:
+        """Shards by file."""
+        return {entry.file: entry for entry in self.job.shards}
+
+    @cached_property
     def estimator(self) -> Any:
         """Built where a shard is to be rendered."""
         return build_estimator(self.job, self.plan.effects)
@@ -198,9 +197,7 @@ def _folder_of(folder: str, config_hash: str, plan: str) -> Path:
 @lru_cache(maxsize=1)
 def _run_of(config: str, folder: Path, config_hash: str, plan: str) -> _Run:
     """The run of a data set, kept for its next shard."""
-    job = Job.load(GeneratorConfig.model_validate_json(config))
-    if job.config_hash != config_hash:
-        raise InputError("the material's files differ on this machine", where=job.config.material)
+    job = Job.of_portable(config, config_hash)
     found = read_run_plan(folder)
     if plan_digest(found.to_manifest()) != plan:
         raise InputError("the manifest has another plan on this machine", where=folder)

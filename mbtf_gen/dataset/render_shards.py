@@ -72,6 +72,16 @@ class ExpectedPaths:
         return round(total)
 
 
+def progress_of(
+    paths: int, seconds: float, totals: ShardStatistics, left: float | None, where: str = ""
+) -> tuple[float, str, float | None]:
+    """Arguments of a :data:`ProgressCallback`: `paths` traced in `seconds`, `left` to come, by whom."""
+    noise = totals.relative_error() if totals.train else None
+    error = "" if noise is None else f", noise {noise:.2%}"
+    note = f"{paths / max(seconds, 1e-9) / 1e6:.2f} M paths/s{where}{error}"
+    return paths, note, None if left is None else paths + left
+
+
 @dataclass
 class RenderResult:
     """Result of :func:`render_shards`.
@@ -132,12 +142,8 @@ def render_shards(
         for done in [*([] if record is None else [record]), *(records.pop() for _ in range(len(records)))]:
             total.add(done)
         if progress is not None:
-            rate = result.paths / max(time.perf_counter() - start, 1e-9)
-            noise = total.relative_error() if total.train else None
-            error = "" if noise is None else f", noise {noise:.2%}"
-            left = expected.paths(pending.values())
-            total_paths = None if left is None else result.paths + left
-            progress(result.paths, f"{rate / 1e6:.2f} M paths/s{error}", total_paths)
+            seconds, left = time.perf_counter() - start, expected.paths(pending.values())
+            progress(*progress_of(result.paths, seconds, total, left))
 
     unsent: list[PartialError | InputError] = []
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import json
 from dataclasses import asdict
 from functools import lru_cache
 from typing import Any
@@ -11,8 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.cluster.task import Task
-from mbtf_core.errors import InputError
-from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
 from mbtf_gen.pictures.camera import Camera, PixelKind
 from mbtf_gen.pictures.reference import ReferenceImage, render_reference
@@ -33,11 +31,9 @@ def picture_task(
 ) -> Task:
     """The task of one picture, whose value is that of
     :func:`~mbtf_gen.pictures.reference.render_reference` with these arguments."""
-    # Workers may have other working folders.
-    config = job.config.model_copy(update={"material": os.path.abspath(job.config.material)})
     picture = {"kind": kind, "spp": spp, "seed": seed, "index": index}
     arguments = {
-        "config": config.model_dump_json(),
+        "config": json.dumps(job.portable()),
         "config_hash": job.config_hash,
         "camera": asdict(camera),
         "omega_i": [float(x) for x in omega_i],
@@ -54,7 +50,7 @@ def render_picture(
     Parameters
     ----------
     config : str
-        Resolved configuration as JSON, whose material has an absolute path.
+        :meth:`Job.portable <mbtf_gen.job.Job.portable>` as JSON.
     config_hash : str
         Its hash, contents of files included.
     camera, omega_i, picture
@@ -76,7 +72,5 @@ def render_picture(
 @lru_cache(maxsize=1)
 def _estimator(config: str, config_hash: str) -> Any:
     """The estimator of a material, kept for its next picture."""
-    job = Job.load(GeneratorConfig.model_validate_json(config))
-    if job.config_hash != config_hash:
-        raise InputError("the material's files differ on this machine", where=job.config.material)
+    job = Job.of_portable(config, config_hash)
     return build_estimator(job, reference_plan(job))

@@ -77,7 +77,7 @@ def _card(material: Mapping[str, Any], run: Path, record: Mapping[str, Any]) -> 
         )
     seconds = material.get("seconds", {}) if done else {}
     links = [
-        (title, f"{runs_path(name)}/{file}")
+        (title, f"{run.parent.name}/{name}/{file}")
         for title, file in (("report", REPORT), ("viewer", VIEWER))
         if done and (run / file).is_file()
     ]
@@ -106,11 +106,6 @@ def _times(seconds: Mapping[str, float]) -> str:
         return ""
     parts = ", ".join(f"{stage} {clock(s)}" for stage, s in seconds.items())
     return f"{clock(sum(seconds.values()))}: {parts}"
-
-
-def runs_path(name: str) -> str:
-    """Path of a material's run, relative to the page."""
-    return f"materials/{name}"
 
 
 def _thumbnail(path: Path) -> str | None:

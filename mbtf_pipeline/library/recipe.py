@@ -44,7 +44,6 @@ class LibraryRecipe(Settings):
     first_share: float = Field(
         0.2, gt=0, lt=1, description="share of `training` for equal first fits, whose errors divide the rest"
     )
-
     shared_network: Duration | None = Field(
         None, description="training time of further fits that share one network; default: none"
     )

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mbtf_core.atomic import read_json
-from mbtf_core.cluster.task import worker_threads
 from mbtf_core.errors import InputError
 from mbtf_fit.config import FitConfig
+from mbtf_fit.training.fit_cluster import in_folder
 from mbtf_pipeline.recipe import Recipe
 
 if TYPE_CHECKING:
@@ -47,7 +46,7 @@ def first_fit(recipe: str, folder: str, working_folder: str, seconds: float, com
     InputError, PartialError
         As :func:`~mbtf_pipeline.run.run_recipe`.
     """
-    with _in_folder(working_folder):
+    with in_folder(working_folder):
         from mbtf_fit.training.fit import fit
         from mbtf_fit.training.fit_folder import identity_of
         from mbtf_pipeline.run import generate_data
@@ -90,7 +89,7 @@ def fit_shared(
     InputError, PartialError
         As :func:`~mbtf_fit.training.joint_fit.fit_jointly`.
     """
-    with _in_folder(working_folder):
+    with in_folder(working_folder):
         from mbtf_fit.training.fit_folder import identity_of
         from mbtf_fit.training.joint_fit import fit_jointly
 
@@ -151,7 +150,7 @@ def run_material(recipe: str, folder: str, working_folder: str, command: str) ->
     InputError, PartialError
         As :func:`~mbtf_pipeline.run.run_recipe`.
     """
-    with _in_folder(working_folder):
+    with in_folder(working_folder):
         from mbtf_pipeline.run import run_recipe
 
         result = run_recipe(Recipe.model_validate_json(recipe), Path(folder), command=command)
@@ -181,16 +180,3 @@ def summarize(folder: Path) -> dict[str, Any]:
         },
         "reference": f"{COMPARE}/{reference['file']}.png",
     }
-
-
-@contextlib.contextmanager
-def _in_folder(working_folder: str) -> Any:
-    """Work in a folder, with the threads of the worker."""
-    import torch
-
-    if not Path(working_folder).is_dir():
-        raise InputError("this machine does not see the folder", where=working_folder)
-    if (threads := worker_threads()) is not None:
-        torch.set_num_threads(threads)
-    with contextlib.chdir(working_folder):
-        yield

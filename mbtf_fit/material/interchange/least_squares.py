@@ -5,7 +5,7 @@ Of each texel the parameters are slopes, roughness, metallic and base color: tho
     1/(3k) Σ [φ(f) - φ(y)]² + Σ w (x - x_0)²,    φ(y) = (y / s + ε)^(1/3)
 
 with y the values for k pairs of light and view, and s their mean. The cube root weights dim and bright
-directions alike, so that a highlight does not decide alone. Priors pull towards a rough dielectric. The
+directions alike, so that a highlight does not decide alone. Priors favor a rough dielectric. The
 algorithm of Levenberg and Marquardt (Marquardt 1963), with bounds, minimizes it for many texels at once.
 """
 
