@@ -14,6 +14,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
+from mbtf_core.cluster.children import answer_of_child, kill_children, prepare_child
 from mbtf_core.errors import InputError, MbtfError, UsageError, reason
 from mbtf_core.interruption import SIGNALS, at_end
 from mbtf_core.suggest import refuse_special
@@ -95,8 +96,7 @@ def _work(
         visible = os.environ.get("CUDA_VISIBLE_DEVICES")
         devices = visible.split(",") if visible else []
         os.environ["CUDA_VISIBLE_DEVICES"] = devices[worker % len(devices)] if devices else str(worker)
-    for number in SIGNALS:
-        signal.signal(number, signal.default_int_handler)
+    prepare_child()
     try:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
         import torch
@@ -114,11 +114,6 @@ def _work(
         pipe.send((None, f"internal error: {type(error).__name__}: {reason(error)}"))
 
 
-def _kill_children() -> None:
-    for child in multiprocessing.active_children():
-        child.kill()
-
-
 def fit_many(
     configs: Sequence[FitConfig],
     shards: Sequence[Path],
@@ -134,27 +129,17 @@ def fit_many(
     Each fit has its own process, so that a failure does not stop the others. With CUDA each worker uses the
     GPU of its number; on CPUs the workers divide the cores. `finished` is called with each outcome.
     """
-    context = multiprocessing.get_context("spawn")
-    at_end(_kill_children)
+    at_end(kill_children)
     free: SimpleQueue[int] = SimpleQueue()
     for worker in range(processes):
         free.put(worker)
 
     def run(config: FitConfig, data: Path, folder: Path) -> FitOutcome:
         worker = free.get()
-        mine, theirs = context.Pipe(duplex=False)
-        arguments = (config, data, folder, overwrite, worker, processes, theirs)
-        process = context.Process(target=_work, args=arguments)
-        # The process inherits this mask until it handles signals.
-        signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
         try:
-            process.start()
-            theirs.close()
-            result, error = mine.recv()
-            process.join()
-        except EOFError:
-            process.join()
-            result, error = None, f"its process ended with code {process.exitcode}"
+            result, error = answer_of_child(_work, config, data, folder, overwrite, worker, processes)
+        except ChildProcessError as ended:
+            result, error = None, str(ended)
         finally:
             free.put(worker)
         return FitOutcome(data, folder, result, error)
