@@ -239,3 +239,14 @@ def call(words: list[str]) -> Done:
             logger.handlers, logger.propagate = handlers, propagate
             logger.setLevel(level)
     return Done(code, out.getvalue(), err.getvalue())
+
+
+def fails(code: int, *arguments: str) -> str:
+    """Error message of a failing ``mbtf-fit``: at most two lines, no traceback, no standard output."""
+    done = call(["mbtf-fit", *arguments])
+    assert done.code == code, done.err
+    assert done.out == ""
+    start = done.err.index("error: ")
+    assert len(done.err[start:].splitlines()) <= 2, done.err
+    assert "Traceback" not in done.err
+    return done.err[start:]

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from mbtf_core.console import run
 from mbtf_gen.cli.app import app
@@ -80,3 +81,12 @@ def contents(folder: Path) -> dict[str, Any]:
         else:
             found[path.name] = path.read_bytes()
     return found
+
+
+def write_maps(folder: Path, shape: tuple[int, int] = (8, 16)) -> None:
+    """Heights and colors without any symmetry, in folder/maps."""
+    maps = folder / "maps"
+    maps.mkdir()
+    rng = np.random.default_rng(4)
+    np.save(maps / "height.npy", (0.1 * rng.random(shape)).astype(np.float32))
+    Image.fromarray(rng.integers(0, 255, (*shape, 3)).astype(np.uint8)).save(maps / "base_color.png")

@@ -13,7 +13,7 @@ import pytest
 from conftest import RunPython
 from support.datasets import edit
 from support.fit_data import parallax, write_data
-from support.invalid_inputs import call
+from support.invalid_inputs import call, fails
 
 QUICK = ("--steps", "5", "--batch", "500")
 
@@ -56,17 +56,6 @@ def test_export_writes_the_reported_files(material: Path, tmp_path: Path, run_py
     assert float(deviation[1]) < 1e-6
     message = fails(3, "export", str(material), "--to", "material")
     assert "choose another folder with -o" in message
-
-
-def fails(code: int, *arguments: str) -> str:
-    """Error message of a failing command: at most two lines, no traceback, nothing on standard output."""
-    done = call(["mbtf-fit", *arguments])
-    assert done.code == code, done.err
-    assert done.out == ""
-    start = done.err.index("error: ")
-    assert len(done.err[start:].splitlines()) <= 2, done.err
-    assert "Traceback" not in done.err
-    return done.err[start:]
 
 
 def test_json_is_one_object(shards: Path, tmp_path: Path, run_python: RunPython) -> None:

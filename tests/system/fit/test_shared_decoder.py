@@ -10,7 +10,7 @@ import pytest
 from conftest import RunPython
 from support.datasets import edit
 from support.fit_data import constant, parallax, write_data
-from support.invalid_inputs import call
+from support.invalid_inputs import call, fails
 
 from mbtf_fit import Material
 from mbtf_fit.material.decoder import Decoder, network_tensors
@@ -39,17 +39,6 @@ def materials(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert [line.split()[0] for line in lines] == ["material", "a", "b"]
     assert all(re.search(r"\d\.\d{3} ± \d\.\d{3}", line) for line in lines[1:])
     return out
-
-
-def fails(code: int, *arguments: str) -> str:
-    """Error message of a failing command: at most two lines, no traceback, nothing on standard output."""
-    done = call(["mbtf-fit", *arguments])
-    assert done.code == code, done.err
-    assert done.out == ""
-    start = done.err.index("error: ")
-    assert len(done.err[start:].splitlines()) <= 2, done.err
-    assert "Traceback" not in done.err
-    return done.err[start:]
 
 
 def test_every_command_takes_the_materials(

@@ -12,16 +12,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 from support.commands import Done, run_named
 from support.slurm import slurm_node
-from support.small_runs import contents
+from support.small_runs import contents, write_maps
 
 from mbtf_gen.dataset.verify import verify
 
 pytest.importorskip("distributed", reason="no Dask; to enable: pip install 'mbtf[cluster]'")
 
-MAP = (8, 16)
 SMALL = "maps --test-queries 200 --test-spp 8 --set output.shard_queries=128"
 COUNTS = {
     "allocated": f"{SMALL} --queries 16/texel",
@@ -29,15 +27,6 @@ COUNTS = {
     "adaptive": f"{SMALL} --queries 4/texel --target-error 20%",
     "images": f"{SMALL} --queries 8/texel --layout image",
 }
-
-
-def write_maps(folder: Path) -> None:
-    """Heights and colors without any symmetry, in folder/maps."""
-    maps = folder / "maps"
-    maps.mkdir()
-    rng = np.random.default_rng(4)
-    np.save(maps / "height.npy", (0.1 * rng.random(MAP)).astype(np.float32))
-    Image.fromarray(rng.integers(0, 255, (*MAP, 3)).astype(np.uint8)).save(maps / "base_color.png")
 
 
 @pytest.fixture(scope="module")

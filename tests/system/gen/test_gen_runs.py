@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from support.commands import Done, finished, run_all, run_named, start
 from support.datasets import edit
+from support.small_runs import write_maps
 
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.dataset.shard_io import read_exr
@@ -31,12 +32,7 @@ PICTURES = "reference maps -o pictures --view 50,20 --light 60,80 --tiles-across
 
 def write_material(folder: Path) -> None:
     """Heights and colors without any symmetry, in folder/maps; a description of them in folder."""
-    maps = folder / "maps"
-    maps.mkdir()
-    rng = np.random.default_rng(4)
-    np.save(maps / "height.npy", (0.1 * rng.random(MAP)).astype(np.float32))
-    color = rng.integers(0, 255, (*MAP, 3)).astype(np.uint8)
-    Image.fromarray(color).save(maps / "base_color.png")
+    write_maps(folder, MAP)
     (folder / "material.yaml").write_text("height: maps/height.npy\nbase_color: maps/base_color.png\n")
 
 
