@@ -8,7 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from mbtf_core.console import CONSOLE, Console
-from mbtf_core.options import Output, Set, Time, command_line
+from mbtf_core.options import ClusterOption, Output, Set, Time, command_line
 
 
 def cost(
@@ -19,13 +19,14 @@ def cost(
     time: Annotated[Time, Parameter(show_default="that of the study in the folder, or 10min")] = None,
     refine: Annotated[str | None, Parameter(metavar="DURATION")] = None,
     seed: Annotated[int | None, Parameter(show_default="the recipe's")] = None,
+    cluster: ClusterOption = None,
     assignments: Set = None,
     console: Console = CONSOLE,
 ) -> None:
     """Measure error against time for this material and machine: mbtf-pipeline cost RECIPE
 
     Writes cost.html, cost.csv and PNGs. The same command resumes. A longer time keeps the measurements of the
-    generator and of complete runs, and adds longer runs.
+    generator and of complete runs, and adds longer runs. With --cluster, workers measure, each for itself.
 
     Parameters
     ----------
@@ -36,6 +37,7 @@ def cost(
     seed
         Root seed of all random numbers.
     """
+    from mbtf_core.cluster.engine import open_cluster
     from mbtf_core.folders import owned
     from mbtf_core.interruption import keep_on_interruption
     from mbtf_core.units import asked_duration, format_duration
@@ -49,7 +51,10 @@ def cost(
     folder = output if output is not None else loaded.folder.with_name(f"{loaded.folder.name}-cost")
     seconds = time_of(folder) if time is None else asked_duration(time, "--time")
     keep_on_interruption(f"the measurements are kept in {folder}")
-    with console.progress(total=100, label="cost", unit="%") as bar:
+    with (
+        open_cluster(cluster, console.note) as workers,
+        console.progress(total=100, label="cost", unit="%") as bar,
+    ):
         study = run_study(
             loaded,
             folder,
@@ -62,10 +67,12 @@ def cost(
                 refine=refine,
                 output=output,
                 seed=seed,
+                cluster=cluster,
                 set=assignments,
             ),
             announce=console.note,
             progress=lambda share, note: bar.update(round(100 * share, 1), note),
+            cluster=workers,
         )
     with owned(folder):
         page = write_page(study)

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from itertools import takewhile
 
-from mbtf_core.errors import InputError
 from mbtf_core.stats import Estimate, mean_estimate
 from mbtf_pipeline.cost_study.measurements import HALF_WIDTH, NORMAL, Measurement, MeasurementFolder
 from mbtf_pipeline.cost_study.runs import Run, RunRunner
@@ -59,29 +59,45 @@ def measure_runs(
 
     Returns the measurements of every run, one per seed, and why runs failed, by their place in the plan.
     """
-    groups: list[list[Measurement]] = [[] for _ in runs]
+    found: dict[tuple[int, int], Measurement] = {}
+    # Measured, or given to the runner.
+    begun: set[tuple[int, int]] = set()
     failed: dict[int, str] = {}
     places = range(len(runs))
+
+    def group(k: int) -> list[Measurement]:
+        return [found[k, seed] for seed in takewhile(lambda seed: (k, seed) in found, range(MOST_SEEDS))]
+
+    def missing(order: Sequence[tuple[int, int]], deviation: Estimate | None) -> Iterator[tuple[int, Run]]:
+        """Runs to be measured; each is chosen when the runner takes it."""
+        tasks = [(k, replace(runs[k], data=replace(runs[k].data, seed=seed))) for k, seed in order]
+        for number, (k, task) in enumerate(tasks):
+            seed = task.data.seed
+            if seed == 0 or (k, seed - 1) in begun:
+                stored = store.get(task, runner.command_of(runs[k]))
+                if stored is not None:
+                    found[k, seed] = stored
+                    begun.add((k, seed))
+                elif k not in failed and (seed < FEWEST_SEEDS or too_wide(k, seed, deviation)) and fits(task):
+                    begun.add((k, seed))
+                    yield k, task
+            if all(other.data != task.data for _, other in tasks[number + 1 :]):
+                runner.forget(task.data)
+
+    def too_wide(k: int, seed: int, deviation: Estimate | None) -> bool:
+        own = group(k)
+        relative = combined(own, deviation).error.relative_error if len(own) == seed else 0.0
+        return seed < seeds and NORMAL * relative > HALF_WIDTH
+
     rounds = [[(k, seed) for k in places for seed in range(FEWEST_SEEDS)]]
     rounds += [[(k, seed) for k in places] for seed in range(1, MOST_SEEDS)]
     for order in rounds:
-        tasks = [(k, replace(runs[k], data=replace(runs[k].data, seed=seed))) for k, seed in order]
-        deviation = seed_deviation(groups)
-        for number, (k, task) in enumerate(tasks):
-            group, seed = groups[k], task.data.seed
-            if len(group) == seed:
-                found = store.get(task, runner.command_of(runs[k]))
-                wanted = seed < FEWEST_SEEDS or (
-                    seed < seeds and NORMAL * combined(group, deviation).error.relative_error > HALF_WIDTH
-                )
-                if found is None and wanted and k not in failed and fits(task):
-                    try:
-                        found = runner.measure(task)
-                        store.put(task, found)
-                    except InputError as error:
-                        # The other runs are worth a page all the same.
-                        failed[k] = f"{task.label}: {error.what}"
-                group += [] if found is None else [found]
-            if all(other.data != task.data for _, other in tasks[number + 1 :]):
-                runner.forget(task.data)
-    return groups, failed
+        deviation = seed_deviation([group(k) for k in places])
+        for k, task, measured in runner.measure_all(missing(order, deviation)):
+            if isinstance(measured, str):
+                # The other runs are worth a page all the same.
+                failed[k] = f"{task.label}: {measured}"
+                continue
+            found[k, task.data.seed] = measured
+            store.put(task, measured)
+    return [group(k) for k in places], failed

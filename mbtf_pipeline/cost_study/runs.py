@@ -11,7 +11,7 @@ from __future__ import annotations
 import shutil
 import time
 import timeit
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mbtf_core.digest import data_sha256
+from mbtf_core.errors import InputError
 from mbtf_core.stats import Estimate, unexplained_variance
 from mbtf_core.units import parse_duration
 from mbtf_gen.config.generator import GeneratorConfig
@@ -125,6 +126,15 @@ class RunRunner:
         if request in self._data:
             shutil.rmtree(self._data.pop(request)[0], ignore_errors=True)
 
+    def keep_only(self, request: DataRequest) -> None:
+        """Remove all training data but these."""
+        for other in [known for known in self._data if known != request]:
+            self.forget(other)
+
+    def work_left(self, seconds: float) -> float:
+        """Seconds of work that can be done in a time."""
+        return seconds
+
     def expected_seconds(self, run: Run) -> float:
         """Expected time of measuring a run; existing data take none."""
         test = 0.0 if run.data.seed in self._test_sets else self._test_seconds
@@ -177,6 +187,16 @@ class RunRunner:
         seconds = Estimate(details[_SECONDS[run.study]], 0.0, 1)
         command = self.command_of(run)
         return Measurement(run.study, run.series, run.name, command, seconds, error, details=details)
+
+    def measure_all(self, runs: Iterable[tuple[int, Run]]) -> Iterator[tuple[int, Run, Measurement | str]]:
+        """Measure numbered runs; yields number, run, and its measurement or why it failed. A run is taken
+        once the one before has been measured."""
+        for number, run in runs:
+            try:
+                measured: Measurement | str = self.measure(run)
+            except InputError as error:
+                measured = error.what
+            yield number, run, measured
 
     def command_of(self, run: Run) -> str:
         """The command that reproduces a run; the test split is that of the recipe."""

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import shlex
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from mbtf_core.atomic import read_json, write_json, write_text
+from mbtf_core.cluster.engine import Cluster
 from mbtf_core.config_file import dump_yaml
 from mbtf_core.errors import InputError
 from mbtf_core.folders import ELSEWHERE, check_folder, check_space, owned
@@ -18,9 +19,10 @@ from mbtf_core.units import expectation
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.dataset.shard_io import row_bytes
 from mbtf_gen.job import Job
+from mbtf_pipeline.cost_study.distribute import ClusterRunner, measure_configurations, worker_facts
 from mbtf_pipeline.cost_study.fit_runs import GENERATOR, RUN_SHARES, planned_runs
 from mbtf_pipeline.cost_study.generator_benchmark import GeneratorBenchmark
-from mbtf_pipeline.cost_study.generator_runs import generator_tasks
+from mbtf_pipeline.cost_study.generator_runs import GeneratorTask, generator_tasks
 from mbtf_pipeline.cost_study.measurements import Measurement, MeasurementFolder
 from mbtf_pipeline.cost_study.repeats import FEWEST_SEEDS, MOST_SEEDS, combined, measure_runs, seed_deviation
 from mbtf_pipeline.cost_study.runs import TEST, Run, RunRunner, forecast_seconds
@@ -61,11 +63,11 @@ def is_study(folder: Path) -> bool:
     return has_record(folder, STUDY_NAME, STUDY_FORMAT, STUDY_SCHEMA)
 
 
-def claim(folder: Path) -> None:
-    """Take an empty folder, or one that holds a study of this kind of machine."""
+def claim(folder: Path, on: Mapping[str, str]) -> None:
+    """Take an empty folder, or one that holds a study of the kind of machine that measures."""
     if not check_folder(folder, is_study, "cost study"):
         return
-    there, here = read_json(folder / STUDY_NAME)["machine"]["system"], machine()["system"]
+    there, here = read_json(folder / STUDY_NAME)["machine"]["system"], on["system"]
     if there != here:
         problem = f"holds a cost study of another kind of machine ({there}; this is {here})"
         raise InputError(problem, where=folder, hint=ELSEWHERE)
@@ -106,6 +108,7 @@ def run_study(
     command: str = "",
     progress: Callable[[float, str], None] = lambda share, note: None,
     announce: Callable[[str], None] = lambda text: None,
+    cluster: Cluster | None = None,
 ) -> Study:
     """Measure what the time allows for the material and generator of a recipe; stored measurements are kept
     and cost no time.
@@ -116,6 +119,7 @@ def run_study(
     seed : of queries, paths and initial weights; the recipe's by default
     progress : called with (share of the time spent, note)
     announce : called with expected time and size as a line, before anything is written
+    cluster : its workers measure configurations and runs, on their machines and with their threads
     """
     start = time.perf_counter()
 
@@ -129,14 +133,16 @@ def run_study(
     job = Job.prepare(config)
     config, material = job.config, job.material
     with owned(folder):
-        claim(folder)
+        on, per_path = (machine(), None) if cluster is None else worker_facts(cluster, config)
+        claim(folder, on)
         benchmark = GeneratorBenchmark(config, material)
         note("reference")
         # Before anything is written: a refused study leaves the folder as it was.
         _check_variation(benchmark)
         store = MeasurementFolder(folder, config.hash(material.digests))
-        path = path_seconds(config, store)
+        path = path_seconds(config, store, per_path)
         size = disk_bytes(planned_runs(seconds, config.queries.spp, path))
+        size *= 1 if cluster is None else cluster.workers
         check_space(folder, size, "give a shorter --time, or choose another folder with -o")
         announce(expectation(seconds + refine, size))
         description = {
@@ -148,7 +154,7 @@ def run_study(
             "seed": config.seed,
             "material": config.material,
             "date": time.strftime("%Y-%m-%d"),
-            "machine": machine(),
+            "machine": on,
         }
         write_json(folder / STUDY_NAME, description)
         write_text(folder / CONFIG_NAME, dump_yaml(config.model_dump(mode="json")))
@@ -156,33 +162,55 @@ def run_study(
         keep_path_seconds(store, path)
         generator = shlex.join(["mbtf-gen", config.material, "--config", str(folder / CONFIG_NAME)])
         each = 0.5 * GENERATOR * seconds / _CONFIGURATIONS
-        for task in generator_tasks(benchmark):
-            found = store.get(task, task.command(generator))
+        tasks = list(generator_tasks(benchmark))
+        found = {task.label: store.get(task, task.command(generator)) for task in tasks}
+
+        def missing() -> Iterator[GeneratorTask]:
             # Configurations take longer than their share where kernels are compiled.
-            if found is None and spent() < 1.2 * GENERATOR * seconds:
-                note(task.label)
-                found = task.run(benchmark, each, task.command(generator))
-                store.put(task, found)
-            if found is None:
-                study.skipped.append(task.label)
+            for task in tasks:
+                if found[task.label] is None and spent() < 1.2 * GENERATOR * seconds:
+                    note(task.label)
+                    yield task
+
+        measured: Iterator[tuple[GeneratorTask, Measurement]]
+        if cluster is None:
+            measured = ((task, task.run(benchmark, each, task.command(generator))) for task in missing())
+        else:
+            measured = measure_configurations(cluster, config, missing(), each, generator)
+        for task, measurement in measured:
+            found[task.label] = measurement
+            store.put(task, measurement)
+        for label, known in found.items():
+            if known is None:
+                study.skipped.append(label)
             else:
-                study.measurements.append(found)
-        runner = RunRunner(config, folder / WORK, generator, note, path_seconds=path)
+                study.measurements.append(known)
+        options: dict[str, Any] = {"path_seconds": path}
+        if cluster is None:
+            runner = RunRunner(config, folder / WORK, generator, note, **options)
+        else:
+            runner = ClusterRunner(config, folder / WORK, generator, note, cluster=cluster, **options)
         try:
             seeds = MOST_SEEDS if refine else FEWEST_SEEDS
-            _measure_runs(study, store, runner, lambda again: seconds + again * refine - spent(), seeds)
+            _measure_runs(
+                study,
+                store,
+                runner,
+                lambda again: runner.work_left(seconds + again * refine - spent()),
+                seeds,
+            )
         finally:
             runner.clear()
     return study
 
 
-def path_seconds(config: GeneratorConfig, store: MeasurementFolder) -> float:
+def path_seconds(config: GeneratorConfig, store: MeasurementFolder, expected: float | None = None) -> float:
     """Seconds to generate a query over its number of paths; those stored, so that a resumed study plans the
-    same runs."""
+    same runs, else those expected, by default the forecast of this machine."""
     try:
         return float(read_json(_seconds_file(store))["path_seconds"])
     except InputError:
-        return forecast_seconds(config) / config.queries.spp
+        return forecast_seconds(config) / config.queries.spp if expected is None else expected
 
 
 def keep_path_seconds(store: MeasurementFolder, seconds: float) -> None:

@@ -25,16 +25,17 @@ def divide(total: float, errors: Mapping[str, float | None]) -> dict[str, float]
         Sum of the times, in seconds.
     errors : mapping of str to float or None
         Unexplained variance of the first fits by name; None where it is undefined, which counts as the mean.
+        Above 1, that of the mean value, it says nothing of further training, and counts as 1.
 
     Returns
     -------
     dict of str to float
         Time by name; none is below a quarter of an equal share.
     """
-    known = [max(error, 0.0) for error in errors.values() if error is not None]
+    known = [_bounded(error) for error in errors.values() if error is not None]
     mean = sum(known) / len(known) if known else 1.0
     weights = {
-        name: (mean if error is None else max(error, 0.0)) ** (1 / (1 + EXPONENT))
+        name: (mean if error is None else _bounded(error)) ** (1 / (1 + EXPONENT))
         for name, error in errors.items()
     }
     equal = total / max(len(errors), 1)
@@ -48,6 +49,10 @@ def divide(total: float, errors: Mapping[str, float | None]) -> dict[str, float]
         if not low:
             return {name: round((out | times)[name], 3) for name in errors}
         out |= dict.fromkeys(low, LEAST * equal)
+
+
+def _bounded(error: float) -> float:
+    return min(max(error, 0.0), 1.0)
 
 
 class Division:

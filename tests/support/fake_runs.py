@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -54,6 +55,16 @@ class FakeRunner:
             Estimate(error, self.test * error, 1000),
             details={"total_seconds": total, "seed": float(run.data.seed)},
         )
+
+    def measure_all(self, runs: Iterable[tuple[int, Run]]) -> Iterator[tuple[int, Run, Measurement | str]]:
+        for number, run in runs:
+            try:
+                yield number, run, self.measure(run)
+            except InputError as error:
+                yield number, run, error.what
+
+    def work_left(self, seconds: float) -> float:
+        return seconds
 
     def expected_seconds(self, run: Run) -> float:
         return float(run.fit["training"]["time"])

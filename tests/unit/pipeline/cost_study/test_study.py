@@ -84,9 +84,9 @@ def test_the_csv_holds_every_number_with_its_error() -> None:
 def test_folders_of_something_else_are_refused(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("")
     with pytest.raises(InputError, match="holds no cost study"):
-        module.claim(tmp_path)
+        module.claim(tmp_path, machine())
     folder = tmp_path / "study"
-    module.claim(folder)
+    module.claim(folder, machine())
     folder.mkdir()
     record = {"format": module.STUDY_FORMAT, "schema": module.STUDY_SCHEMA, "machine": machine()}
     changes: list[tuple[dict[str, Any], str | None]] = [
@@ -97,10 +97,10 @@ def test_folders_of_something_else_are_refused(tmp_path: Path) -> None:
     for change, message in changes:
         write_json(folder / module.STUDY_NAME, {**record, **change})
         if message is None:
-            module.claim(folder)
+            module.claim(folder, machine())
         else:
             with pytest.raises(InputError, match=message):
-                module.claim(folder)
+                module.claim(folder, machine())
 
 
 def test_studies_vary_paths_whatever_the_recipe_sets() -> None:

@@ -24,10 +24,14 @@ def test_the_sum_of_errors_is_least_if_errors_fall_like_the_root_of_the_time() -
 
 
 def test_no_fit_starves() -> None:
-    times = divide(400.0, {"good": 1e-6, "also good": 0.0, "bad": 1.0, "worse": 3.0})
+    times = divide(400.0, {"good": 1e-6, "also good": 0.0, "bad": 0.3, "worse": 0.9})
     assert min(times.values()) == pytest.approx(LEAST * 100.0)
     assert sum(times.values()) == pytest.approx(400.0, abs=0.01)
     assert times["worse"] > times["bad"] > times["good"]
+
+
+def test_errors_above_that_of_the_mean_value_claim_no_more_time() -> None:
+    assert divide(400.0, {"a": 0.2, "b": 9.0}) == divide(400.0, {"a": 0.2, "b": 1.0})
 
 
 def test_undefined_errors_count_as_the_mean() -> None:
