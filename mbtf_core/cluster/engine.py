@@ -99,7 +99,9 @@ class Cluster:
             if before and not self.workers and not self._ended.is_set():
                 self._note("cluster: no worker is left; waiting for new ones")
 
-    def run(self, tasks: Iterable[Task], *, stop_when_fatal: bool = True) -> Generator[TaskResult]:
+    def run(
+        self, tasks: Iterable[Task], *, stop_when_fatal: bool = True, ahead: int = _AHEAD
+    ) -> Generator[TaskResult]:
         """Run tasks; yields each result as it comes, in no particular order.
 
         Parameters
@@ -108,6 +110,8 @@ class Cluster:
             Read as workers become free.
         stop_when_fatal : bool
             Whether a failure that concerns files or options concerns all tasks.
+        ahead : int
+            Tasks that are read before workers are free for them, beyond two for each worker.
 
         Yields
         ------
@@ -152,7 +156,7 @@ class Cluster:
                 while locked and (locked[0][0] <= time.monotonic() or not pending):
                     time.sleep(max(0.0, locked[0][0] - time.monotonic()))
                     submit(locked.popleft()[1])
-                while len(pending) < _AHEAD + 2 * self.workers and (task := next(waiting, None)) is not None:
+                while len(pending) < ahead + 2 * self.workers and (task := next(waiting, None)) is not None:
                     submit(task)
                 if not pending:
                     return

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mbtf_core.console import CONSOLE, Console
+from mbtf_core.errors import PartialError
 from mbtf_core.interruption import keep_on_interruption
-from mbtf_core.options import Options, Output, Overwrite, PathText, takes_options
+from mbtf_core.options import ClusterOption, Options, Output, Overwrite, PathText, takes_options
 from mbtf_gen.cli.generate import resolve_config
+from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.pictures import RENDERING, ReferenceConfig
+
+if TYPE_CHECKING:
+    from mbtf_core.cluster.engine import Cluster
+    from mbtf_core.cluster.task import Task
+    from mbtf_gen.pictures.reference import ReferenceImage
 
 
 @takes_options(ReferenceConfig, "reference", "exposure", *RENDERING)
@@ -19,6 +27,7 @@ def reference(
     *,
     output: Output = Path("reference"),
     options: Options[ReferenceConfig],
+    cluster: ClusterOption = None,
     overwrite: Overwrite = False,
     console: Console = CONSOLE,
 ) -> None:
@@ -33,6 +42,7 @@ def reference(
         Height map, folder of maps, material.yaml, mesh, or file of yarns or fibers.
     """
     resolved = resolve_config(options, material)
+    from mbtf_core.cluster.engine import open_cluster
     from mbtf_core.directions import from_angles
     from mbtf_core.exposure import auto_exposure, brightness, describe_exposure
     from mbtf_core.folders import check_space, owned
@@ -41,6 +51,7 @@ def reference(
     from mbtf_gen.forecast import announce
     from mbtf_gen.job import Job
     from mbtf_gen.pictures.camera import Camera, PixelKind
+    from mbtf_gen.pictures.distribute import picture_task
     from mbtf_gen.pictures.folder import PictureFolder
     from mbtf_gen.pictures.reference import (
         PNG_BYTES,
@@ -67,7 +78,6 @@ def reference(
     names = {(camera, one): f"{one}-tiles{camera.tiles_across:g}" for camera in cameras for one in kinds}
     size = len(names) * wanted.size**2 * (row_bytes(job.material.opacity is not None) + PNG_BYTES)
     check_space(output, size, "reduce --size, or choose another folder with -o")
-    estimator: Any = None
     pictures: list[dict[str, Any]] = []
     bright: list[float] = []
     keep_on_interruption(f"the finished pictures are kept in {output}")
@@ -83,34 +93,51 @@ def reference(
             inputs=job.material.digests,
             overwrite=overwrite,
         )
-        missing = sum(c.rows * c.columns for (c, _), name in names.items() if not folder.finished(name))
-        paths = missing * wanted.spp
-        if missing:
-            estimator = build_estimator(job, reference_plan(job))
-        announce(console, paths, lambda: picture_seconds(estimator, cameras[0], omega_i, paths), size)
-        for index, camera in enumerate(cameras):
-            for one in kinds:
-                name = names[camera, one]
-                facts = folder.finished(name)
-                kept = facts is not None
-                if facts is None:
-                    image = render_reference(
-                        estimator, camera, omega_i, kind=one, spp=wanted.spp, seed=resolved.seed, index=index
-                    )
-                    noise = pooled_relative_error(image.value_a.reshape(-1, 3), image.value_b.reshape(-1, 3))
-                    facts = {"relative_noise": noise.value, "brightness": brightness(image.value)}
-                    folder.keep(name, [image.write(folder.path / name)], facts)
-                bright.append(facts["brightness"])
-                pictures.append(
-                    {
-                        "file": folder.path / f"{name}.exr",
-                        "kind": one,
-                        "tiles_across": camera.tiles_across,
-                        "relative_noise": facts["relative_noise"],
-                        "kept": kept,
-                    }
+        missing = {key: name for key, name in names.items() if folder.finished(name) is None}
+        options_of: dict[str, dict[str, Any]] = {
+            name: {"kind": one, "spp": wanted.spp, "seed": resolved.seed, "index": cameras.index(camera)}
+            for (camera, one), name in names.items()
+        }
+
+        def rendered(workers: Cluster | None) -> Iterator[tuple[str, ReferenceImage]]:
+            if workers is not None:
+                # Workers know the generator's options alone.
+                fields = job.config.model_dump(mode="json", include=set(GeneratorConfig.model_fields))
+                plain = Job(GeneratorConfig.model_validate(fields), job.material)
+                yield from _of_workers(
+                    workers,
+                    [
+                        picture_task(name, plain, camera, omega_i, **options_of[name])
+                        for (camera, _), name in missing.items()
+                    ],
                 )
+                return
+            paths = sum(camera.rows * camera.columns for camera, _ in missing) * wanted.spp
+            estimator: Any = build_estimator(job, reference_plan(job)) if missing else None
+            announce(console, paths, lambda: picture_seconds(estimator, cameras[0], omega_i, paths), size)
+            for (camera, _), name in missing.items():
+                yield name, render_reference(estimator, camera, omega_i, **options_of[name])
+
+        bar.advance(len(names) - len(missing))
+        with open_cluster(cluster if missing else None, console.note) as workers:
+            for name, image in rendered(workers):
+                noise = pooled_relative_error(image.value_a.reshape(-1, 3), image.value_b.reshape(-1, 3))
+                facts = {"relative_noise": noise.value, "brightness": brightness(image.value)}
+                folder.keep(name, [image.write(folder.path / name)], facts)
                 bar.advance(1)
+        for (camera, one), name in names.items():
+            known = folder.finished(name)
+            assert known is not None
+            bright.append(known["brightness"])
+            pictures.append(
+                {
+                    "file": folder.path / f"{name}.exr",
+                    "kind": one,
+                    "tiles_across": camera.tiles_across,
+                    "relative_noise": known["relative_noise"],
+                    "kept": (camera, one) not in missing,
+                }
+            )
     exposure = auto_exposure(bright) if resolved.exposure is None else resolved.exposure
     for name in names.values():
         if folder.finished(f"{name}.png") != {"exposure": exposure}:
@@ -122,3 +149,12 @@ def reference(
     ]
     text = "\n".join([*lines, f"PNG: {describe_exposure(exposure)}"])
     console.report({"pictures": pictures, "exposure": exposure}, text)
+
+
+def _of_workers(cluster: Cluster, tasks: list[Task]) -> Iterator[tuple[str, ReferenceImage]]:
+    """Pictures that workers render, by name, as they come."""
+    for done in cluster.run(tasks):
+        if done.error:
+            hint = "the same command renders the missing pictures"
+            raise PartialError(f"picture {done.task.name} failed: {done.error}", hint=hint)
+        yield done.task.name, done.value

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import socket
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -68,19 +68,23 @@ def measure_configurations(
     Yields
     ------
     (GeneratorTask, Measurement)
-        As they come; the tasks and their measurements are those of :meth:`GeneratorTask.run`.
+        As they come; each task is taken once a worker is nearly free.
 
     Raises
     ------
     PartialError : a worker failed; finished measurements are kept
     """
-    by_name = {f"configuration-{i}": task for i, task in enumerate(tasks)}
     shared = {**_shared(config), "seconds": seconds}
     function = f"{_THIS}:measure_configuration"
-    for done in cluster.run(
-        Task(name, function, {**shared, "task": asdict(task), "command": task.command(generator)})
-        for name, task in by_name.items()
-    ):
+    by_name: dict[str, GeneratorTask] = {}
+
+    def given() -> Iterator[Task]:
+        for number, task in enumerate(tasks):
+            by_name[f"configuration-{number}"] = task
+            arguments = {**shared, "task": asdict(task), "command": task.command(generator)}
+            yield Task(f"configuration-{number}", function, arguments)
+
+    for done in cluster.run(given(), ahead=0):
         task = by_name[done.task.name]
         if done.error:
             raise PartialError(f"{task.label} failed: {done.error}", hint=_RESUMES)
@@ -115,8 +119,10 @@ class ClusterRunner(RunRunner):
     """
 
     cluster: Cluster | None = None
-    # Seconds of work that the workers have yet to do: at first, a test set of each seed for every worker.
-    _committed: float | None = None
+    # Expected seconds of runs that have been taken, by name.
+    _taken: dict[str, float] = field(default_factory=dict)
+    # Test sets that the workers have yet to make, and seconds of one.
+    _tests: int | None = None
 
     @property
     def _workers(self) -> int:
@@ -124,25 +130,24 @@ class ClusterRunner(RunRunner):
 
     def work_left(self, seconds: float) -> float:
         """Seconds of work that the workers can begin and finish in a time."""
-        if self._committed is None:
+        if self._tests is None:
             queries, spp = self.test
-            self._committed = FEWEST_SEEDS * self._workers * queries * spp * self.path_seconds
-        return self._workers * seconds - self._committed
+            self._tests, self.test_seconds = FEWEST_SEEDS * self._workers, queries * spp * self.path_seconds
+        return self._workers * seconds - self._tests * self.test_seconds - sum(self._taken.values())
 
     def forget(self, request: DataRequest) -> None:
         """Nothing: each worker removes its data itself."""
 
     def measure_all(self, runs: Iterable[tuple[int, Run]]) -> Iterator[tuple[int, Run, Measurement | str]]:
-        """Measure runs as they come; the workers take as many as fit into the time."""
+        """As of the base class; a run is taken once a worker is nearly free."""
         assert self.cluster is not None
-        pending: dict[str, tuple[int, Run, float]] = {}
+        by_name: dict[str, tuple[int, Run]] = {}
 
         def tasks() -> Iterator[Task]:
             for number, run in runs:
-                expected = self.expected_seconds(run)
-                self._committed = (self._committed or 0.0) + expected
                 name = f"run-{number}-{run.data.seed}"
-                pending[name] = number, run, expected
+                by_name[name] = number, run
+                self._taken[name] = self.planned_seconds(run) + self.overhead
                 arguments = {
                     **_shared(self.config),
                     "folder": str(self.folder),
@@ -152,16 +157,27 @@ class ClusterRunner(RunRunner):
                 }
                 yield Task(name, f"{_THIS}:measure_run", arguments, gpu=run.fit.get("device") == "cuda")
 
-        for done in self.cluster.run(tasks(), stop_when_fatal=False):
-            number, run, expected = pending.pop(done.task.name)
-            self._committed = (self._committed or 0.0) - expected
+        for done in self.cluster.run(tasks(), stop_when_fatal=False, ahead=0):
+            number, run = by_name[done.task.name]
+            del self._taken[done.task.name]
             self.progress(run.label)
-            yield number, run, done.error or done.value
+            if done.error:
+                yield number, run, done.error
+                continue
+            self.overhead = max(self.overhead, done.value["overhead"])
+            if done.value["test_seconds"] is not None:
+                self.test_seconds = done.value["test_seconds"]
+                self._tests = max(0, (self._tests or 0) - 1)
+            yield number, run, done.value["measurement"]
+
+    def expected_seconds(self, run: Run) -> float:
+        """Expected time of measuring a run, in which a worker generates its data."""
+        return self.planned_seconds(run) + self.overhead
 
 
 def measure_run(
     config: str, working_folder: str, folder: str, command: str, test: list[int], run: dict[str, Any]
-) -> Measurement:
+) -> dict[str, Any]:
     """Measure one run; runs on a worker.
 
     Parameters
@@ -181,7 +197,9 @@ def measure_run(
 
     Returns
     -------
-    Measurement
+    dict
+        ``measurement``, ``overhead`` (seconds besides generating and training, the most so far), and
+        ``test_seconds`` (of the test set, None unless this call made it).
 
     Raises
     ------
@@ -194,7 +212,10 @@ def measure_run(
         runner = _runner(config, folder, command, (test[0], test[1]))
         own = Run(**{**run, "data": DataRequest(**run["data"])})
         runner.keep_only(own.data)
-        return runner.measure(own)
+        known = own.data.seed in runner.test_sets
+        found = runner.measure(own)
+        seconds = None if known else runner.test_seconds
+        return {"measurement": found, "overhead": runner.overhead, "test_seconds": seconds}
 
 
 @lru_cache(maxsize=1)

@@ -86,12 +86,12 @@ class RunRunner:
     # Time to generate a query over its number of paths.
     path_seconds: float = 0.0
     # Seconds by which a run exceeds generating and training: the most of all so far, or a guess.
-    _overhead: float = _OVERHEAD
+    overhead: float = _OVERHEAD
     # Folder and seconds by request.
     _data: dict[DataRequest, tuple[Path, float]] = field(default_factory=dict)
     # By seed.
-    _test_sets: dict[int, ShardQueries] = field(default_factory=dict)
-    _test_seconds: float = 0.0
+    test_sets: dict[int, ShardQueries] = field(default_factory=dict)
+    test_seconds: float = 0.0
 
     def clear(self) -> None:
         """Remove data and fits."""
@@ -137,35 +137,35 @@ class RunRunner:
 
     def expected_seconds(self, run: Run) -> float:
         """Expected time of measuring a run; existing data take none."""
-        test = 0.0 if run.data.seed in self._test_sets else self._test_seconds
-        return test + self._planned_seconds(run) + self._overhead
+        test = 0.0 if run.data.seed in self.test_sets else self.test_seconds
+        return test + self.planned_seconds(run) + self.overhead
 
-    def _planned_seconds(self, run: Run) -> float:
+    def planned_seconds(self, run: Run) -> float:
         paths = 0 if run.data in self._data else run.data.queries * run.data.spp
         training = run.fit["training"].get("time")
         return paths * self.path_seconds + (parse_duration(training) if training else 0.0)
 
     def test_set(self, seed: int) -> ShardQueries:
         """The test queries of all runs with an offset of the seed."""
-        if seed not in self._test_sets:
+        if seed not in self.test_sets:
             from mbtf_fit.data.loader import load_split
             from mbtf_gen.dataset.reader import Dataset
 
             self.progress("test set")
-            folder, self._test_seconds = self._generate(seed, _NO_QUERIES, self.test)
-            if len(self._test_sets) > 1:
+            folder, self.test_seconds = self._generate(seed, _NO_QUERIES, self.test)
+            if len(self.test_sets) > 1:
                 # Further seeds are measured one after the other.
-                self._test_sets.popitem()
-            self._test_sets[seed] = load_split(Dataset.open(folder), "test")
+                self.test_sets.popitem()
+            self.test_sets[seed] = load_split(Dataset.open(folder), "test")
             shutil.rmtree(folder, ignore_errors=True)
-        return self._test_sets[seed]
+        return self.test_sets[seed]
 
     def measure(self, run: Run) -> Measurement:
         """Generate the data, fit, and evaluate."""
         from mbtf_fit import FitConfig, fit
 
         test = self.test_set(run.data.seed)
-        start, planned = time.perf_counter(), self._planned_seconds(run)
+        start, planned = time.perf_counter(), self.planned_seconds(run)
         folder, generation_seconds = self.data(run.data)
         self.progress(run.label)
         config = FitConfig.model_validate({"seed": self.config.seed + run.data.seed, **run.fit})
@@ -183,7 +183,7 @@ class RunRunner:
             "bytes": float(sum(p.stat().st_size for p in out.glob("weights*"))),
         }
         shutil.rmtree(out, ignore_errors=True)
-        self._overhead = max(self._overhead, time.perf_counter() - start - planned)
+        self.overhead = max(self.overhead, time.perf_counter() - start - planned)
         seconds = Estimate(details[_SECONDS[run.study]], 0.0, 1)
         command = self.command_of(run)
         return Measurement(run.study, run.series, run.name, command, seconds, error, details=details)

@@ -165,10 +165,12 @@ def run_study(
         tasks = list(generator_tasks(benchmark))
         found = {task.label: store.get(task, task.command(generator)) for task in tasks}
 
+        # Configurations take longer than their share where kernels are compiled; workers start anew.
+        until = 1.2 * GENERATOR * seconds + (0.0 if cluster is None else spent())
+
         def missing() -> Iterator[GeneratorTask]:
-            # Configurations take longer than their share where kernels are compiled.
             for task in tasks:
-                if found[task.label] is None and spent() < 1.2 * GENERATOR * seconds:
+                if found[task.label] is None and spent() < until:
                     note(task.label)
                     yield task
 

@@ -49,6 +49,9 @@ def runs(scheduler: str, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
         lines[f"{name}-cluster"] = f"{line} -o {name}-cluster --json --cluster {scheduler}"
     again = "fixed-cluster"
     lines["again"] = f"{COUNTS['fixed']} -o {again} --json --cluster tcp://127.0.0.1:9"
+    pictures = "maps --size 24 --spp 8 --tiles-across 1,2 --kind both --json"
+    lines["pictures"] = f"reference {pictures} -o pictures"
+    lines["pictures-cluster"] = f"reference {pictures} -o pictures-cluster --cluster {scheduler}"
     lines["local"] = f"{COUNTS['allocated']} -o local --json --cluster local:2"
     return folder, run_named(lines, folder)
 
@@ -68,6 +71,17 @@ def test_workers_of_its_own(runs: tuple[Path, dict[str, Done]]) -> None:
     folder, done = runs
     assert done["local"].result()["complete"]
     assert contents(folder / "local") == contents(folder / "allocated")
+
+
+def test_reference_pictures_are_those_of_one_process(runs: tuple[Path, dict[str, Done]]) -> None:
+    folder, done = runs
+    own, clustered = done["pictures"].result(), done["pictures-cluster"].result()
+    assert len(own["pictures"]) == 4
+    assert clustered["exposure"] == own["exposure"]
+    for name in [Path(picture["file"]).stem for picture in own["pictures"]]:
+        for suffix in ("exr", "png"):
+            files = [folder / kind / f"{name}.{suffix}" for kind in ("pictures", "pictures-cluster")]
+            assert files[0].read_bytes() == files[1].read_bytes()
 
 
 def test_a_finished_data_set_needs_no_cluster(runs: tuple[Path, dict[str, Done]]) -> None:

@@ -1,4 +1,4 @@
-"""Runs of a cost study on workers: those of one process, each measured once, within the time of all workers."""
+"""Runs of a cost study on workers: those of one process, each measured once, within the time of all."""
 
 from __future__ import annotations
 
@@ -28,14 +28,16 @@ ONE = Estimate(1.0, 0.1, 4)
 
 
 class Workers:
-    """Stands for :class:`mbtf_core.cluster.engine.Cluster`: takes all tasks at once, and ends the last first."""
+    """Stands for :class:`mbtf_core.cluster.engine.Cluster`: takes all tasks, and ends the last first."""
 
     workers = 2
 
     def __init__(self) -> None:
         self.names: list[str] = []
 
-    def run(self, tasks: Iterable[Task], *, stop_when_fatal: bool = True) -> Iterator[TaskResult]:
+    def run(
+        self, tasks: Iterable[Task], *, stop_when_fatal: bool = True, ahead: int = 9
+    ) -> Iterator[TaskResult]:
         for task in reversed(list(tasks)):
             self.names.append(task.name)
             # What reaches a worker is plain data.
@@ -55,6 +57,8 @@ def measured(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[tuple[str,
             raise InputError("training diverged at step 7")
         found.append((run.name, run.data.seed))
         self._data[run.data] = (self.folder / "data", 1.0)
+        if run.data.seed not in self.test_sets:
+            self.test_sets[run.data.seed], self.test_seconds = None, 0.25  # type: ignore[assignment]
         # A worker has one data set at a time.
         assert self.folder == tmp_path or list(self._data) == [run.data]
         error = Estimate(0.1 + 0.03 * run.data.seed + 0.01 * len(run.name), 0.001, 9)
@@ -102,8 +106,8 @@ def test_workers_begin_what_fits_into_the_time_of_all(
         2,
     )
     assert sorted(measured) == [("long", 0), ("long", 1), ("one", 0), ("one", 1)]
-    # What has ended takes no more time.
-    assert runner.work_left(20.0) == pytest.approx(40.0 - 4 * 0.01)
+    # What has ended takes no more time. The workers, here one process, made two test sets, in 0.25 s each.
+    assert runner.work_left(20.0) == pytest.approx(40.0 - 2 * 0.25)
 
 
 def test_workers_measure_configurations_of_the_generator(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -90,7 +90,7 @@ def runner(folder: Path, seed: int = 0, **options: Any) -> RunRunner:
     )
     value = np.repeat(np.arange(1000) % 2.0, 3).reshape(1000, 3).astype(np.float32)
     zero = np.zeros((1000, 3), np.float32)
-    made._test_sets = dict.fromkeys((0, 2), ShardQueries(zero[:, :2], zero[:, 0], zero, zero, value, value))
+    made.test_sets = dict.fromkeys((0, 2), ShardQueries(zero[:, :2], zero[:, 0], zero, zero, value, value))
     return made
 
 
@@ -118,7 +118,7 @@ def test_the_expected_time_learns_from_earlier_runs(clock: Any, tmp_path: Path) 
     one.forget(run.data)
     assert one.expected_seconds(run) == pytest.approx(7 + 6 + 2.5)
     # A seed without a test set takes the time of another one's.
-    one._test_sets, one._test_seconds = {2: one.test_set(2)}, 3.0
+    one.test_sets, one.test_seconds = {2: one.test_set(2)}, 3.0
     other = replace(run, data=replace(run.data, seed=2))
     assert one.expected_seconds(run) == one.expected_seconds(other) + 3.0
     # Fits that count steps have no planned time.
@@ -174,7 +174,7 @@ def test_every_seed_has_one_test_set(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("mbtf_gen.dataset.reader.Dataset.open", lambda folder: folder)
     monkeypatch.setattr("mbtf_fit.data.loader.load_split", lambda data, split: split)
     one = runner(tmp_path, 3, test=(1 << 17, 8))
-    one._test_sets = {}
+    one.test_sets = {}
     for seed in (0, 1, 0, 1, 2, 0, 2):
         assert one.test_set(seed) == "test"
     assert [config.seed for config in asked] == [3, 4, 5]
