@@ -145,6 +145,13 @@ def limit_cache(folder: Path, limit: float) -> None:
         parts[0].cache.limit = limit
 
 
+def waiting_shards(folder: Path) -> list[Path]:
+    """Shards of a data set in a store that this process has written and could not upload; none of a local
+    one."""
+    parts = _parts(folder)
+    return [] if parts is None else [folder / name for name in parts[0].waiting()]
+
+
 @contextlib.contextmanager
 def abandoned(folder: Path) -> Iterator[list[Path]]:
     """Local folders with shards that ended processes could not upload to a data set's store, for a block that

@@ -14,7 +14,7 @@ from collections import defaultdict, deque
 from collections.abc import Callable
 from pathlib import Path
 
-from mbtf_core.atomic import unwritable
+from mbtf_core.atomic import temporary_of, unwritable
 from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError
 from mbtf_core.folders import make_folder
@@ -25,7 +25,7 @@ CACHE_BYTES = 20e9
 _KEPT = 4
 # Seconds after which the unfinished file of another process counts as abandoned.
 _ABANDONED_SECONDS = 86400.0
-_UNFINISHED = ".part"
+_UNFINISHED = ".tmp"
 
 
 class FileCache:
@@ -77,7 +77,7 @@ class FileCache:
                 return path
             make_folder(self.folder)
             self._make_room(size)
-            part = path.with_name(f"{path.name}.{os.getpid()}{_UNFINISHED}")
+            part = temporary_of(path)
             try:
                 download(part)
                 if file_sha256(part) != sha256:

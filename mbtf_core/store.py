@@ -40,13 +40,36 @@ _REFUSED = (
     NotADirectoryError,
 )
 _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
-_NO_CREDENTIALS = ("NoCredentialsError", "PartialCredentialsError", "ProfileNotFound")
+_REFUSED_NAMES = (
+    "NoCredentialsError",
+    "PartialCredentialsError",
+    "ProfileNotFound",
+    "DefaultCredentialsError",
+    "ParamValidationError",
+)
+# The same by the code of an answer: that of HTTP in errors of gcsfs, those of S3 that s3fs has no class for.
+_REFUSED_CODES = (
+    401,
+    403,
+    "AuthorizationHeaderMalformed",
+    "InvalidBucketName",
+    "InvalidToken",
+    "KeyTooLongError",
+    "MethodNotAllowed",
+    "PermanentRedirect",
+)
+# Answers of S3 to a conditional write: there is such an object, and this store has no such writes. s3fs knows
+# the first one only where the answer names the condition, as that of Amazon does.
+_EXISTS, _UNCONDITIONAL = ("PreconditionFailed", "412"), ("NotImplemented", "501")
 
 
 def split_url(folder: object) -> tuple[str, str] | None:
-    """(protocol, rest) of a URL, also of one that pathlib has changed to ``s3:/bucket``; None for a path."""
+    """(protocol, rest) of a URL, also of one that pathlib has changed to ``s3:/bucket``; None for a path. The
+    rest has the form that pathlib gives it, so that a text and a path name the same folder."""
     match = _URL.fullmatch(str(folder))
-    return None if match is None else (match[1].lower(), match[2].rstrip("/"))
+    if match is None:
+        return None
+    return match[1].lower(), "/".join(part for part in match[2].split("/") if part not in ("", "."))
 
 
 @dataclass(frozen=True)
@@ -123,7 +146,7 @@ class Store:
             except MbtfError:
                 raise
             except Exception as error:
-                if isinstance(error, _REFUSED) or type(error).__name__ in _NO_CREDENTIALS:
+                if _is_refusal(error):
                     raise InputError(
                         f"the store refuses it ({reason(error)})",
                         where=where,
@@ -191,8 +214,8 @@ class Store:
             try:
                 self._files.get_file(self._at(name), str(path))
             except OSError as error:
-                # The network raises the same class with other numbers.
-                if error.errno in _DISK:
+                # The network raises the same class with other numbers, and without the file.
+                if error.errno in _DISK or error.filename == str(path):
                     raise unwritable(path, error) from None
                 raise
 
@@ -213,16 +236,20 @@ class Store:
         """
 
         def request() -> None:
-            if not new:
-                self._files.pipe_file(self._at(name), content)
-                return
-            try:
-                self._files.pipe_file(self._at(name), content, mode="create")
-            except TypeError:
-                # A file system without the parameter.
+            if new:
+                try:
+                    self._files.pipe_file(self._at(name), content, mode="create")
+                    return
+                except (TypeError, OSError) as error:
+                    code = _code(error)
+                    if code in _EXISTS:
+                        raise FileExistsError(name) from None
+                    # A file system without the parameter, or a store without such writes.
+                    if not (isinstance(error, TypeError) or code in _UNCONDITIONAL):
+                        raise
                 if self._files.exists(self._at(name)):
-                    raise FileExistsError(name) from None
-                self._files.pipe_file(self._at(name), content)
+                    raise FileExistsError(name)
+            self._files.pipe_file(self._at(name), content)
 
         try:
             self._request(name, request)
@@ -241,8 +268,28 @@ class Store:
             return
 
 
+def _is_refusal(error: Exception) -> bool:
+    """Whether another attempt would not help."""
+    if isinstance(error, _REFUSED) or type(error).__name__ in _REFUSED_NAMES:
+        return True
+    # The text is that of gcsfs, whose error has no code.
+    return _code(error) in _REFUSED_CODES or str(error).startswith("Forbidden: ")
+
+
+def _code(error: BaseException) -> str | int:
+    """Code of a store's answer: that of S3 behind an error of s3fs, that of HTTP in one of gcsfs; else an
+    empty text."""
+    answer = getattr(error.__cause__, "response", None)
+    stated = answer.get("Error") if isinstance(answer, dict) else None
+    found = stated.get("Code") if stated else getattr(error, "code", None)
+    return found if isinstance(found, str | int) else ""
+
+
 def _quiet(files: Any) -> None:
-    """Keep tracebacks of cut connections off the screen: the request fails with the error as well."""
+    """Keep tracebacks and notes of requests off the screen: those that fail raise the error as well."""
+    logger = logging.getLogger(type(files).__module__.partition(".")[0])
+    if logger.level == logging.NOTSET:
+        logger.setLevel(logging.CRITICAL)
     loop = getattr(files, "loop", None)
     if loop is not None and loop.get_exception_handler() is None:
         loop.call_soon_threadsafe(

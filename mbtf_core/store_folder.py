@@ -50,7 +50,8 @@ class StorePath(type(Path())):  # type: ignore[misc]
     """A file or folder of a data set in a store. Messages show its URL; programs use the working copy.
 
     Shards exist where the store lists them, with the store's size, although their bytes are elsewhere: see
-    :meth:`StoreFolder.local`. Removing a file also deletes it in the store.
+    :meth:`StoreFolder.local`. One that is not uploaded yet does not exist. Removing a file also deletes it in
+    the store.
     """
 
     def __fspath__(self) -> str:
@@ -74,16 +75,15 @@ class StorePath(type(Path())):  # type: ignore[misc]
         return None if folder is None else folder.listed.get(self.name)
 
     def exists(self, *, follow_symlinks: bool = True) -> bool:
+        if self.folder is not None and _SHARD.fullmatch(self.name):
+            return self._listed is not None
         return os.path.exists(self.__fspath__()) or self._listed is not None
 
     def stat(self, *, follow_symlinks: bool = True) -> os.stat_result:
-        try:
-            return os.stat(self.__fspath__(), follow_symlinks=follow_symlinks)
-        except FileNotFoundError:
-            listed = self._listed
-            if listed is None:
-                raise
+        listed = self._listed
+        if listed is not None and (_SHARD.fullmatch(self.name) or not os.path.exists(self.__fspath__())):
             return os.stat_result((stat.S_IFREG | 0o444, 0, 0, 1, 0, 0, listed.size, 0, 0, 0))
+        return os.stat(self.__fspath__(), follow_symlinks=follow_symlinks)
 
     def iterdir(self) -> Generator[StorePath]:
         folder = self.folder
@@ -190,6 +190,10 @@ class StoreFolder:
     def _at(self, name: str) -> Path:
         return Path(self.root, name)
 
+    def _is_here(self, name: str) -> bool:
+        """Whether the working folder has what the store lists. Its shards are those that are not uploaded."""
+        return name not in self.listed or (self._at(name).exists() and not _SHARD.fullmatch(name))
+
     def _read(self, name: str) -> bytes | None:
         try:
             return self.store.read(name)
@@ -253,7 +257,7 @@ class StoreFolder:
         InputError : the shard has no readable sidecar, or is not the one that it describes
         PartialError : the store cannot be reached, or the disk is full
         """
-        if self._at(name).exists() or name not in self.listed:
+        if self._is_here(name):
             return self._at(name)
         path = self._fetch(name)
         at = self._order.get(name, 0)
@@ -306,7 +310,7 @@ class StoreFolder:
     @contextlib.contextmanager
     def fresh(self, name: str) -> Iterator[Path]:
         """A file as the store has it now, for a block."""
-        if self._at(name).exists() or name not in self.listed:
+        if self._is_here(name):
             yield self._at(name)
             return
         with tempfile.TemporaryDirectory(dir=self._home) as folder:

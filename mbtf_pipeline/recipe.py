@@ -191,7 +191,8 @@ def load_recipe(path: Path, assignments: Sequence[str] = (), presets: Sequence[s
     recipe = resolve(Recipe, file=path, presets=presets, assignments=assignments)
     assigned = any(a.partition("=")[0].strip() == "generate.material" for a in assignments)
     written = Path(recipe.generate.material)
-    material = written if assigned else path.parent / written
+    # By its words, as it is used below: folders of the path may be links.
+    material = written if assigned else Path(os.path.normpath(path.parent / written))
     if not material.exists():
         line = None if assigned else line_of(read_yaml(path), ("generate", "material"))
         raise InputError(

@@ -164,7 +164,7 @@ class Cluster:
                 task = pending.pop(future.key)
                 result = _result(task, future)
                 if result.fatal and stop_when_fatal:
-                    hint = "files must lie at the same place on every machine"
+                    hint = result.hint or "files must lie at the same place on every machine"
                     raise InputError(result.error, where=f"{task.name} on {result.worker}", hint=hint)
                 now = time.monotonic()
                 if result.locked and now - since.setdefault(task.name, now) < _LOCKED_SECONDS:

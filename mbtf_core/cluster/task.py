@@ -50,6 +50,7 @@ class TaskResult:
     task : Task
     value : what the function returned; None where it failed
     error : why it failed, in one line; empty where it did not
+    hint : what to do about it, where that is known
     fatal : the others fail for the same reason, such as files that a worker cannot read
     locked : another process works on the task's files
     worker : machine and process
@@ -58,6 +59,7 @@ class TaskResult:
     task: Task
     value: Any = None
     error: str = ""
+    hint: str = ""
     fatal: bool = False
     locked: bool = False
     worker: str = ""
@@ -79,7 +81,8 @@ def run_task(function: str, arguments: Mapping[str, Any], expected: str) -> dict
     installed = version("mbtf")
     if installed != expected:
         error = f"the worker has version {installed} of mbtf, the command {expected}"
-        return {"error": error, "fatal": True, "worker": worker}
+        hint = "install the same version on every machine"
+        return {"error": error, "hint": hint, "fatal": True, "worker": worker}
     with _ALONE:
         try:
             module, _, name = function.partition(":")
@@ -87,7 +90,8 @@ def run_task(function: str, arguments: Mapping[str, Any], expected: str) -> dict
         except MbtfError as error:
             text = f"{error.where}: {error.what}" if error.where else error.what
             fatal, locked = not isinstance(error, PartialError), isinstance(error, LockedError)
-            return {"error": text, "fatal": fatal, "locked": locked, "worker": worker}
+            found = {"error": text, "hint": error.hint, "fatal": fatal, "locked": locked}
+            return {**found, "worker": worker}
         return {"value": value, "worker": worker}
 
 

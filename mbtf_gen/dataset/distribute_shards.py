@@ -146,7 +146,7 @@ def render_shard(
         raise InputError("this machine does not see the data set", where=into)
     run = _run_of(json.dumps(config), into, config_hash, plan)
     entry = run.entries[file]
-    if (record := finished_record(into, entry, config_hash)) is not None:
+    if (record := _record_now(into, entry, config_hash)) is not None:
         return {"record": record, "rendered": False}
     # The scheduler gives a shard to one worker. Locks of other machines are those of workers that have died,
     # or of another command, whose shard has the same bytes.
@@ -155,7 +155,7 @@ def render_shard(
         raise LockedError("is being written by another process", where=into / file)
     try:
         # Another process may have finished it since.
-        if (record := finished_record(into, entry, config_hash)) is not None:
+        if (record := _record_now(into, entry, config_hash)) is not None:
             return {"record": record, "rendered": False}
         with keep_renewing():
             estimator = run.estimator
@@ -168,6 +168,15 @@ def render_shard(
         return {"record": record, "rendered": True}
     finally:
         lock.release()
+
+
+def _record_now(folder: Path, entry: ShardEntry, config_hash: str) -> dict[str, Any] | None:
+    """Sidecar of a finished shard. A store is listed again: the shard may have been removed since this worker
+    saw it there."""
+    record = finished_record(folder, entry, config_hash)
+    if record is None or not in_store(folder):
+        return record
+    return finished_record(data_folder(folder), entry, config_hash)
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,14 @@
-"""Shards that an ended run rendered but could not upload to its object store."""
+"""Shards that an earlier run rendered but could not upload to its object store."""
 
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
-from mbtf_core.atomic import read_checksummed
-from mbtf_core.data_folder import abandoned, send_shard
+from mbtf_core.atomic import read_checksummed, remove_file, unwritable
+from mbtf_core.data_folder import abandoned, send_shard, waiting_shards
 from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError
 from mbtf_core.shard_schema import ShardEntry
@@ -15,7 +16,8 @@ from mbtf_gen.dataset.sidecar import finished_record, sidecar_of
 
 
 def recover_shards(folder: Path, entries: Sequence[ShardEntry], config_hash: str, plan: str) -> list[str]:
-    """Upload the whole shards that ended processes of this machine left, instead of rendering them again.
+    """Upload the whole shards that ended processes of this machine left, or an earlier run of this process,
+    instead of rendering them again.
 
     Parameters
     ----------
@@ -33,6 +35,11 @@ def recover_shards(folder: Path, entries: Sequence[ShardEntry], config_hash: str
     PartialError : the store cannot be reached; the shards are kept
     """
     sent: list[str] = []
+    known = {entry.file: entry for entry in entries}
+    for path in waiting_shards(folder):
+        if path.name in known and _is_whole(path, known[path.name], config_hash, plan):
+            send_shard(path, sidecar_of(path))
+            sent.append(path.name)
     with abandoned(folder) as folders:
         for left in folders:
             for entry in entries:
@@ -41,12 +48,27 @@ def recover_shards(folder: Path, entries: Sequence[ShardEntry], config_hash: str
                     continue
                 if finished_record(folder, entry, config_hash) is not None:
                     continue
+                # The store may have another one, of a shard that is lost.
+                remove_file(sidecar_of(path))
                 # Links, so that a failure leaves the shard where the next run finds it.
-                os.link(source, path)
-                os.link(sidecar_of(source), sidecar_of(path))
+                _link(source, path)
+                _link(sidecar_of(source), sidecar_of(path))
                 send_shard(path, sidecar_of(path))
                 sent.append(entry.file)
     return sent
+
+
+def _link(source: Path, path: Path) -> None:
+    """Give a file a second name in the working folder of a store; a copy where the disk has no links."""
+    there = Path(os.fspath(path))
+    try:
+        there.unlink(missing_ok=True)
+        try:
+            os.link(source, there)
+        except OSError:
+            shutil.copyfile(source, there)
+    except OSError as error:
+        raise unwritable(path, error) from None
 
 
 def _is_whole(shard: Path, entry: ShardEntry, config_hash: str, plan: str) -> bool:

@@ -152,7 +152,10 @@ def emit_jobs(
 def _check_inside(recipe: Recipe, folder: Path, run: Path) -> None:
     """Refuse paths outside the current folder, which the volume of Kubernetes holds."""
     others = [
-        path for fit in recipe.fit.values() for path in (fit.init_from, *fit.training.materials) if path
+        path
+        for fit in recipe.fit.values()
+        for path in (fit.init_from, fit.decoder, *fit.training.materials)
+        if path
     ]
     for path in (folder, run, Path(recipe.generate.material), *map(Path, others)):
         if os.path.isabs(from_here(path)):

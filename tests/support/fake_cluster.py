@@ -46,7 +46,8 @@ def calls(folder: Path) -> list[dict[str, Any]]:
 
 
 def fail(folder: Path, text: str, codes: list[int]) -> None:
-    """Let the next commands that contain a text exit with these codes, then with 0."""
+    """Let the next commands that contain a text exit with these codes, then with 0; those that start jobs do
+    nothing then."""
     (folder / "failures.json").write_text(json.dumps({"text": text, "codes": codes}))
 
 
@@ -54,17 +55,23 @@ def _state(name: str) -> Path:
     return Path(os.environ[_STATE]) / name
 
 
-def _program(words: list[str]) -> int:
+def _planted(words: list[str]) -> int:
+    """Exit code of a command by :func:`fail`; 0 if it is none of these."""
     code, plan = 0, _state("failures.json")
     if plan.exists():
         failures = json.loads(plan.read_text())
         if failures["text"] in " ".join(words) and failures["codes"]:
             code = failures["codes"].pop(0)
             plan.write_text(json.dumps(failures))
-    with _state("calls").open("a") as stream:
-        stream.write(json.dumps({"words": words, "cwd": os.getcwd(), "code": code}) + "\n")
     if code:
         print("error: planted", file=sys.stderr)
+    return code
+
+
+def _program(words: list[str]) -> int:
+    code = _planted(words)
+    with _state("calls").open("a") as stream:
+        stream.write(json.dumps({"words": words, "cwd": os.getcwd(), "code": code}) + "\n")
     return code
 
 
@@ -82,6 +89,8 @@ def _sbatch(words: list[str]) -> int:
     number = str(len(list(_state("").glob("job-*"))) + 1)
     job = _state(f"job-{number}")
     needs = options.get("dependency", "").removeprefix("afterok:").split(":")
+    # Without it, they would wait for ever for a job that has failed.
+    assert options.get("kill-on-invalid-dep") == "yes" or "dependency" not in options
     results = {}
     if all(_state(f"job-{need}").read_text() == "done" for need in filter(None, needs)):
         first, _, last = options.get("array", "").partition("-")
@@ -103,7 +112,7 @@ def _run_task(script: Path, number: str, task: int | None, options: dict[str, st
     restarts = 0
     while True:
         environment["SLURM_RESTART_COUNT"] = str(restarts)
-        with Path(log).open("a") as stream:
+        with Path(log).open("a" if options.get("open-mode") == "append" else "w") as stream:
             done = subprocess.run(
                 ["bash", str(script)], stdout=stream, stderr=stream, env=environment, check=False
             )
@@ -182,6 +191,8 @@ def _run_pods(spec: dict[str, Any]) -> str:
 def _main(name: str, words: list[str]) -> int:
     if name in PROGRAMS:
         return _program([name, *words])
+    if code := _planted([name, *words]):
+        return code
     return {"sbatch": _sbatch, "scontrol": _scontrol, "kubectl": _kubectl}[name](words)
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 from support.commands import Done
 from support.object_stores import BUCKET, Proxy, s3_server
-from support.small_runs import command, contents
+from support.small_runs import command, contents, write_maps
 
 from mbtf_core.store import Store
 from mbtf_gen.dataset.reader import Dataset
@@ -223,6 +223,27 @@ def test_two_slices_at_the_same_time(tmp_path: Path, proxy: Proxy) -> None:
         assert one.returncode == 0, err
     assert call("merge", URL).code == 0
     assert stored(tmp_path / "copy") == expected
+
+
+def test_workers_upload_their_shards(tmp_path: Path, proxy: Proxy, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the store, the shards fail by name; the same command goes on."""
+    pytest.importorskip("distributed", reason="no Dask; to enable: pip install 'mbtf[cluster]'")
+    write_maps(tmp_path)
+    line = f"{tmp_path}/maps --queries 16/texel --test-queries 200 --test-spp 8 -q".split()
+    line += ["--set", "output.shard_queries=512", "-o"]
+    assert call(*line, tmp_path / "local").code == 0
+    monkeypatch.setenv("MBTF_STORE_PATIENCE", "1")
+    assert call(*line, URL, "--slice", "1/5").code == 0
+    # Workers can list the store, but not upload to it.
+    proxy.cut_after = 20_000
+    done = call(*line, URL, "--cluster", "local:2")
+    assert done.code == 4, done.err
+    assert "shard(s) failed" in done.err
+    assert "the store cannot be reached" in done.err
+    proxy.cut_after = None
+    done = call(*line, URL, "--cluster", "local:2")
+    assert done.code == 0, done.err
+    assert stored(tmp_path / "copy") == contents(tmp_path / "local")
 
 
 def test_refusals_are_explained(tmp_path: Path, proxy: Proxy) -> None:

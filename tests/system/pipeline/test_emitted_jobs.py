@@ -120,6 +120,18 @@ def test_a_failed_slice_is_named_and_a_second_start_finishes(
     assert kinds(tmp_path / "bin")[-1] == "mbtf-pipeline the $$run"
 
 
+@pytest.mark.parametrize(("target", "file"), [("slurm", "merge.sbatch"), ("k8s", "merge.yaml")])
+def test_nothing_follows_a_job_that_is_refused(
+    recipe: Recipe, target: Target, file: str, tmp_path: Path
+) -> None:
+    line, environment = emitted(recipe, target), install(tmp_path / "bin")
+    fail(tmp_path / "bin", f"my jobs/{file}", [1])
+    assert start(line, environment).returncode == 1
+    assert not {"mbtf-gen shards", "mbtf-fit neumip+", "mbtf-pipeline the $$run"} & set(
+        kinds(tmp_path / "bin")
+    )
+
+
 def test_slurm_gives_up_at_last(recipe: Recipe, tmp_path: Path) -> None:
     environment = install(tmp_path / "bin")
     fail(tmp_path / "bin", "shards --slice 2/3", [4] * 100)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import threading
@@ -10,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from mbtf_core.errors import InputError
+from mbtf_core.errors import InputError, PartialError
 from mbtf_core.file_cache import FileCache
 
 
@@ -64,6 +65,27 @@ def test_a_file_that_was_cut_is_downloaded_again(tmp_path: Path) -> None:
     fetch(cache, 1)
     next(tmp_path.iterdir()).write_bytes(b"short")
     assert fetch(cache, 1)
+
+
+def test_unfinished_files_of_others_stay_for_a_day(tmp_path: Path) -> None:
+    cache = FileCache(tmp_path, limit=0)
+    fresh, old = tmp_path / ".a.npz.00000000-1.tmp", tmp_path / ".b.npz.00000000-1.tmp"
+    for path in (fresh, old):
+        path.write_bytes(content(1))
+    os.utime(old, (time.time() - 1e5, time.time() - 1e5))
+    fetch(cache, 2)
+    assert fresh.exists()
+    assert not old.exists()
+
+
+def test_a_full_disk_is_named(tmp_path: Path) -> None:
+    def full(path: Path) -> None:
+        path.write_bytes(b"x")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(PartialError, match="No space left"):
+        FileCache(tmp_path).fetch("0" * 64, ".npz", 3, full)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_threads_share_a_download(tmp_path: Path) -> None:

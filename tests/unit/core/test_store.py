@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import builtins
+import errno
+import os
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -61,6 +63,13 @@ def test_objects_are_listed_read_and_deleted(store: Store, tmp_path: Path) -> No
         store.read("a")
 
 
+def test_the_mark_of_a_folder_is_no_object_of_it(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Programs of stores make an empty object of a folder's own name."""
+    found = [{"name": f"/data/x/{name}", "size": 0, "type": "file"} for name in ("", "a")]
+    monkeypatch.setattr(store._files, "ls", lambda path, detail: found)
+    assert set(store.list()) == {"a"}
+
+
 def test_the_tag_changes_with_the_content(store: Store) -> None:
     store.write("a", b"one")
     before = store.list()["a"].tag
@@ -91,6 +100,37 @@ def test_a_store_without_conditional_writes(store: Store, monkeypatch: pytest.Mo
     assert not store.write("a", b"two", new=True)
 
 
+class Answer(Exception):
+    """A store's answer, as s3fs keeps it in the cause of its error."""
+
+    def __init__(self, code: str) -> None:
+        self.response = {"Error": {"Code": code}}
+
+
+def answered(code: str) -> OSError:
+    """An error of s3fs for an answer."""
+    error = OSError(22, "refused")
+    error.__cause__ = Answer(code)
+    return error
+
+
+@pytest.mark.parametrize("code", ["PreconditionFailed", "NotImplemented"])
+def test_answers_to_conditional_writes(store: Store, monkeypatch: pytest.MonkeyPatch, code: str) -> None:
+    """Some stores do not say which condition is not met, others know none."""
+    original = store._files.pipe_file
+
+    def pipe_file(path: str, value: bytes, mode: str = "overwrite") -> None:
+        if mode == "create" and (code == "NotImplemented" or store._files.exists(path)):
+            raise answered(code)
+        original(path, value)
+
+    monkeypatch.setattr(store._files, "pipe_file", pipe_file)
+    assert store.write("a", b"one", new=True)
+    assert not store.write("a", b"two", new=True)
+    assert store.write("a", b"one", new=True)
+    assert store.read("a") == b"one"
+
+
 @pytest.mark.parametrize("error", [ConnectionResetError("cut"), TimeoutError(), RuntimeError("botocore")])
 def test_requests_are_tried_again(store: Store, error: Exception) -> None:
     store.write("a", b"one")
@@ -112,11 +152,42 @@ def test_a_store_that_is_gone_is_given_up(store: Store) -> None:
     assert not store._lost.is_set()
 
 
-@pytest.mark.parametrize("error", [PermissionError("AccessDenied"), ValueError("bad name")])
+NoCredentialsError = type("NoCredentialsError", (Exception,), {})
+HttpError = type("HttpError", (Exception,), {"code": 401})
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        PermissionError("AccessDenied"),
+        ValueError("bad name"),
+        NoCredentialsError("Unable to locate credentials"),
+        HttpError("Anonymous caller"),
+        OSError("Forbidden: b/bucket"),
+        answered("PermanentRedirect"),
+    ],
+)
 def test_refusals_are_not_tried_again(store: Store, error: Exception) -> None:
     store._files = Flaky(store._files, error, 1)
     with pytest.raises(InputError, match="the store refuses it"):
         store.read("a")
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EACCES])
+def test_faults_of_the_disk_are_not_those_of_the_store(
+    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    path = tmp_path / "copy"
+    calls: list[int] = []
+
+    def get_file(source: str, target: str) -> None:
+        calls.append(number)
+        raise OSError(number, os.strerror(number), *([target] if number == errno.EACCES else []))
+
+    monkeypatch.setattr(store._files, "get_file", get_file)
+    with pytest.raises(PartialError, match=f"{path}: cannot be written"):
+        store.download("a", path)
+    assert len(calls) == 1
 
 
 @pytest.mark.parametrize(
@@ -124,6 +195,8 @@ def test_refusals_are_not_tried_again(store: Store, error: Exception) -> None:
     [
         ("s3://bucket/data", ("s3", "bucket/data")),
         ("s3:/bucket/data/", ("s3", "bucket/data")),
+        ("s3://bucket//a/./b//", ("s3", "bucket/a/b")),
+        ("S3A://bucket/Some Data%20#1?x=y", ("s3a", "bucket/Some Data%20#1?x=y")),
         (Path("gs://bucket/x"), ("gs", "bucket/x")),
         ("file:///tmp/x", ("file", "tmp/x")),
         ("shards", None),

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -99,6 +101,7 @@ def test_other_versions_are_refused() -> None:
     found = run_task(f"{TASKS}:double", {"x": 1}, "0.0.0")
     assert found["fatal"]
     assert "version" in found["error"]
+    assert "version" in found["hint"]
 
 
 def test_without_dask_one_line_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -196,7 +199,8 @@ def test_a_batch_system_that_is_not_there() -> None:
 
 def test_workers_of_this_machine_divide_its_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(task.GPUS_VARIABLE, "2")
-    monkeypatch.setattr("signal.signal", lambda *_: None)
+    handlers: dict[Any, Any] = {}
+    monkeypatch.setattr("signal.signal", handlers.__setitem__)
     for visible, name, expected in ((None, 1, "2,3"), ("4,5,6,7", 1, "6,7"), ("4,5,6,7", 0, "4,5")):
         if visible is None:
             monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
@@ -204,6 +208,8 @@ def test_workers_of_this_machine_divide_its_gpus(monkeypatch: pytest.MonkeyPatch
             monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
         task.dask_setup(SimpleNamespace(name=name))
         assert os.environ["CUDA_VISIBLE_DEVICES"] == expected
+    # The signal of Ctrl-C is the command's.
+    assert handlers == {signal.SIGINT: signal.SIG_IGN}
 
 
 def test_threads_outside_of_workers_are_unknown(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -44,6 +44,7 @@ def arguments(tmp_path: Path) -> dict[str, Any]:
 
 def test_a_shard_is_rendered_once(arguments: dict[str, Any]) -> None:
     first, again = render_shard(**arguments), render_shard(**arguments)
+    assert not lock_file_of(Path(arguments["folder"]) / SHARD).exists()
     assert (first["rendered"], again["rendered"]) == (True, False)
     assert first["record"] == again["record"]
 
@@ -75,15 +76,30 @@ def test_other_files_plans_and_folders_are_refused(arguments: dict[str, Any], tm
 
 
 class FullDisk:
-    """In place of a cluster: every task fails."""
+    """In place of a cluster: every task fails, but for one that has a result."""
 
     workers = 2
     tried = 0
 
+    def __init__(self, number: int = 0, value: Any = None) -> None:
+        self.number, self.value = number, value
+
     def run(self, tasks: list[Any]) -> Any:
         for task in tasks:
             self.tried += 1
-            yield TaskResult(task, error="no space left", worker="node:1")
+            if self.tried == self.number:
+                yield TaskResult(task, self.value)
+            else:
+                yield TaskResult(task, error="no space left", worker="node:1")
+
+
+def test_samples_that_are_not_finite_end_the_run(arguments: dict[str, Any], tmp_path: Path) -> None:
+    value = render_shard(**arguments)
+    value["record"]["quarantined"]["nonfinite_samples"] = 9
+    job = Job.prepare(GeneratorConfig.model_validate(arguments["config"]))
+    plan = read_run_plan(tmp_path / "out")
+    with pytest.raises(PartialError, match="NaN or infinite"):
+        distribute_shards(job, tmp_path / "out", job.shards, plan, FullDisk(1, value))  # type: ignore[arg-type]
 
 
 def test_a_full_disk_ends_the_run(arguments: dict[str, Any], tmp_path: Path) -> None:
@@ -93,3 +109,8 @@ def test_a_full_disk_ends_the_run(arguments: dict[str, Any], tmp_path: Path) -> 
     with pytest.raises(PartialError, match=r"8 shard\(s\) failed, 103 are left.*no space left \(on node:1\)"):
         distribute_shards(job, tmp_path / "out", job.shards, read_run_plan(tmp_path / "out"), disk)  # type: ignore[arg-type]
     assert disk.tried == 8
+    # Failures that are not in a row do not end it.
+    disk = FullDisk(6, render_shard(**arguments))
+    with pytest.raises(PartialError, match=r"13 shard\(s\) failed"):
+        distribute_shards(job, tmp_path / "out", job.shards, read_run_plan(tmp_path / "out"), disk)  # type: ignore[arg-type]
+    assert disk.tried == 14

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from collections.abc import Iterator
@@ -13,13 +14,17 @@ from support.object_stores import memory_store
 from support.small_runs import command, contents, generate, noisy_plane
 
 import mbtf_core.store_folder
+from mbtf_core.atomic import checksummed
 from mbtf_core.console import run
 from mbtf_core.data_folder import data_folder, in_store, local_copy
-from mbtf_core.errors import InputError, PartialError
-from mbtf_core.store import Store
+from mbtf_core.errors import InputError, MbtfError, PartialError
+from mbtf_core.shard_schema import ShardEntry
+from mbtf_core.store import Store, StoredObject
 from mbtf_core.store_folder import StorePath, close_stores
 from mbtf_gen.cli.app import app
+from mbtf_gen.dataset.distribute_shards import render_shard
 from mbtf_gen.dataset.reader import Dataset
+from mbtf_gen.dataset.recover import recover_shards
 from mbtf_gen.dataset.verify import verify
 from mbtf_gen.planning.simulation import ClosedForm
 
@@ -92,7 +97,7 @@ def test_a_path_of_a_store(tmp_path: Path, url: str) -> None:
     shard.unlink()
     assert not shard.exists()
     assert "train-00000.npz" not in Store(url).list()
-    assert data_folder(f"file://{tmp_path}") == tmp_path
+    assert data_folder(f"file://{tmp_path}/a%20b") == tmp_path / "a b"
     assert not in_store(data_folder(tmp_path))
 
 
@@ -102,6 +107,22 @@ def test_a_finished_run_renders_nothing(tmp_path: Path, url: str, capsys: pytest
     capsys.readouterr()
     assert generate(command_at(tmp_path, url)) == 0
     assert "nothing left to do" in capsys.readouterr().out
+
+
+def test_a_list_that_lags_behind(tmp_path: Path, url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The data set is not complete before the store shows all of it."""
+    original = Store.list
+
+    def late(self: Store) -> dict[str, StoredObject]:
+        return {name: found for name, found in original(self).items() if name != "train-00001.npz"}
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Store, "list", late)
+        assert generate(command_at(tmp_path, url)) == 4
+    assert not json.loads(Store(url).read("manifest.json"))["complete"]
+    assert generate(command_at(tmp_path, url)) == 0
+    assert generate(command(tmp_path, tmp_path / "local")) == 0
+    assert contents(downloaded(url, tmp_path / "copy")) == contents(tmp_path / "local")
 
 
 def test_slices_and_merge(tmp_path: Path, url: str) -> None:
@@ -119,14 +140,14 @@ def test_the_manifest_of_another_writer_is_adopted(
 ) -> None:
     """Another machine stores its manifest between this one's look at the store and its own."""
     assert generate(command_at(tmp_path, url)) == 0
-    theirs = Store(url).read("manifest.json")
+    theirs = checksummed({**json.loads(Store(url).read("manifest.json")), "note": "theirs"})
     for name in Store(url).list():
         Store(url).delete(name)
     close_stores()
     original = Store.write
 
     def late(self: Store, name: str, content: bytes, *, new: bool = False) -> bool:
-        if name == "manifest.json" and new:
+        if name == "manifest.json" and not self.list():
             original(self, name, theirs)
         return original(self, name, content, new=new)
 
@@ -134,6 +155,7 @@ def test_the_manifest_of_another_writer_is_adopted(
         patch.setattr(Store, "write", late)
         assert generate(command_at(tmp_path, url)) == 0
     assert verify(url) == []
+    assert json.loads(Store(url).read("manifest.json"))["note"] == "theirs"
 
 
 @pytest.mark.parametrize("same", [True, False])
@@ -188,8 +210,10 @@ def test_corruption_is_found_and_repaired(
     store.write("train-00001.npz", bytes(flipped))
     store.delete("train-00000.npz")
     store.write("geometry.exr", store.read("geometry.exr")[:-1])
+    store.delete("config.yaml")
     store.write("notes.txt", b"mine")
-    assert {fault.file for fault in verify(url)} == {"train-00000.npz", "train-00001.npz", "geometry.exr"}
+    faulty = {"train-00000.npz", "train-00001.npz", "geometry.exr", "config.yaml"}
+    assert {fault.file for fault in verify(url)} == faulty
     close_stores()
     assert run(app, ["verify", url, "-q"]) == 3
     assert f"mbtf-gen repair {url}" in capsys.readouterr().out
@@ -258,17 +282,29 @@ def test_a_corrupt_shard_is_not_read(tmp_path: Path, url: str) -> None:
         Dataset.open(url).load("train")
 
 
+def test_a_digest_names_no_file_elsewhere(tmp_path: Path, url: str) -> None:
+    assert generate(command_at(tmp_path, url)) == 0
+    store = Store(url)
+    record = json.loads(store.read("train-00001.json"))
+    store.write("train-00001.json", checksummed(record | {"sha256": f"../{'0' * 61}"}))
+    with pytest.raises(InputError, match=f"{url}/train-00001.npz: has no readable sidecar"):
+        Dataset.open(url).load("train")
+
+
+@pytest.mark.parametrize("error", [PartialError, InputError])
+@pytest.mark.parametrize("ended", [True, False])
 def test_shards_that_could_not_be_uploaded_wait(
-    tmp_path: Path, url: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, url: str, monkeypatch: pytest.MonkeyPatch, error: type[MbtfError], ended: bool
 ) -> None:
-    """The connection ends during a run: what is rendered is kept, and the next run uploads it."""
+    """The connection ends during a run, or the credentials do: what is rendered is kept, and the next run
+    uploads it, also in the same process."""
     assert generate(command(tmp_path, tmp_path / "local", train=200)) == 0
     rendered: list[str] = []
     original, estimate = Store.write, ClosedForm.estimate
 
     def cut(self: Store, name: str, content: bytes, *, new: bool = False) -> bool:
         if name.startswith("train-00001"):
-            raise PartialError("the store cannot be reached", where=self.url)
+            raise error("the store cannot be reached", where=self.url)
         return original(self, name, content, new=new)
 
     def counted(self: ClosedForm, *arguments: Any) -> Any:
@@ -278,10 +314,12 @@ def test_shards_that_could_not_be_uploaded_wait(
     monkeypatch.setattr(ClosedForm, "estimate", counted)
     with monkeypatch.context() as patch:
         patch.setattr(Store, "write", cut)
-        assert generate(command_at(tmp_path, url, train=200)) == 4
-    assert "the store cannot be reached" in capsys.readouterr().err
-    assert "train-00001.npz" not in Store(url).list()
-    close_stores()
+        # The second one has to leave what the first one left.
+        for _ in range(2):
+            assert generate(command_at(tmp_path, url, train=200)) == error.exit_code
+            assert "train-00001.npz" in {fault.file for fault in verify(url)}
+            if ended:
+                close_stores()
     assert generate(command_at(tmp_path, url, train=200)) == 0
     # Every shard was rendered once.
     assert len(rendered) == 6
@@ -290,22 +328,64 @@ def test_shards_that_could_not_be_uploaded_wait(
     assert os.listdir(tmp_path / "cache" / "mbtf" / "stores" / "work") == []
 
 
-def test_damaged_leftovers_are_rendered_again(
-    tmp_path: Path, url: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert generate(command(tmp_path, tmp_path / "local")) == 0
+@pytest.fixture
+def left(tmp_path: Path, url: str, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A shard that a process which has ended could not upload."""
     with monkeypatch.context() as patch:
         patch.setattr(mbtf_core.store_folder.StoreFolder, "send_shard", _unreachable)
         assert generate(command_at(tmp_path, url)) == 4
-    root = data_folder(url).__fspath__()
-    waiting = sorted(Path(root).glob("*.npz"))
-    assert waiting
-    content = bytearray(waiting[0].read_bytes())
-    content[-100] ^= 1
+    found = min(Path(os.fspath(data_folder(url))).glob("*.npz"))
     close_stores()
-    waiting[0].write_bytes(bytes(content))
+    return found
+
+
+def test_damaged_leftovers_are_rendered_again(tmp_path: Path, url: str, left: Path) -> None:
+    content = bytearray(left.read_bytes())
+    content[-100] ^= 1
+    left.write_bytes(bytes(content))
     assert generate(command_at(tmp_path, url)) == 0
+    assert generate(command(tmp_path, tmp_path / "local")) == 0
     assert contents(downloaded(url, tmp_path / "copy")) == contents(tmp_path / "local")
+
+
+@pytest.mark.parametrize("other", ["url", "config_hash", "plan", ""])
+def test_leftovers_of_another_data_set_are_not_uploaded(url: str, left: Path, other: str) -> None:
+    record = json.loads(left.with_suffix(".json").read_bytes())
+    entry = ShardEntry(record["split"], record["index"], record["file"], record["rows"])
+    record = {"url": url} | record | {other: f"{url}-other" if other == "url" else "0" * 64}
+    sent = recover_shards(data_folder(record["url"]), [entry], record["config_hash"], record["plan"])
+    assert sent == ([] if other else [left.name])
+    assert (left.name in Store(record["url"]).list()) == (not other)
+    # It is left to the next writer of its URL.
+    assert left.exists() == (other == "url")
+
+
+def test_a_leftover_replaces_the_sidecar_of_a_lost_shard(
+    tmp_path: Path, url: str, left: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, sidecar = Store(url), f"{left.stem}.json"
+    store.write(sidecar, b"of a shard that is gone")
+    with monkeypatch.context() as patch:
+        patch.setattr(mbtf_core.store_folder.StoreFolder, "send_shard", _unreachable)
+        assert generate(command_at(tmp_path, url)) == 4
+    # A sidecar is never there before its shard, nor does a leftover go before it is uploaded.
+    assert sidecar not in store.list()
+    assert left.exists()
+    assert generate(command_at(tmp_path, url)) == 0
+    assert verify(url) == []
+
+
+def test_a_worker_looks_again_for_a_shard_that_it_knows(tmp_path: Path, url: str) -> None:
+    """It runs longer than a command, and others may remove what it has stored."""
+    assert generate(command_at(tmp_path, url)) == 0
+    record = json.loads(Store(url).read("train-00001.json"))
+    material = str(tmp_path / "plane.npy")
+    config = json.loads(Store(url).read("manifest.json"))["config"] | {"material": material}
+    arguments = {key: record[key] for key in ("config_hash", "plan", "file")}
+    assert not render_shard(config, url, **arguments)["rendered"]
+    Store(url).delete("train-00001.npz")
+    assert render_shard(config, url, **arguments)["rendered"]
+    assert verify(url) == []
 
 
 def _unreachable(*_: object) -> None:

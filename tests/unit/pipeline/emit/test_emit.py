@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -17,6 +19,7 @@ from mbtf_gen.job import Job
 from mbtf_pipeline.cli.app import app
 from mbtf_pipeline.emit.jobs import emit_jobs
 from mbtf_pipeline.emit.kubernetes import Cluster
+from mbtf_pipeline.emit.places import Places
 from mbtf_pipeline.emit.steps import Request, steps_of, waves
 from mbtf_pipeline.forecast import RunForecast
 from mbtf_pipeline.recipe import Recipe, load_recipe
@@ -75,13 +78,22 @@ def test_limits_follow_the_forecast(recipe: Recipe, monkeypatch: pytest.MonkeyPa
     # Steps are not forecast.
     assert found["fit-neumip+"] == 4 * 3600
     assert set(limit(Request(seconds=700.0), 4).values()) == {700.0}
+    little = steps_of(timed, Path("run"), Path("jobs"), 4, Request(memory=1e9), expected)
+    assert {step.resources.memory for step in little} == {1e9}
 
 
 def test_batch_scripts_state_their_resources(recipe: Recipe) -> None:
     request = Request(cpus=6, memory=4e9, seconds=5400.0, gpus=1)
     emit_jobs(recipe, Path("jobs"), ["slurm"], request=request)
     text = Path("jobs/generate.sbatch").read_text()
-    for option in ("array=1-5", "cpus-per-task=6", "mem=3815M", "time=01:30:00", "requeue"):
+    for option in (
+        "array=1-5",
+        "cpus-per-task=6",
+        "mem=3815M",
+        "time=01:30:00",
+        "requeue",
+        "signal=B:USR1@90",
+    ):
         assert f"#SBATCH --{option}\n" in text
     assert "gres" not in text
     assert "#SBATCH --gres=gpu:1\n" in Path("jobs/fit-images.sbatch").read_text()
@@ -102,6 +114,62 @@ def test_kubernetes_accepts_the_jobs(recipe: Recipe) -> None:
         job["spec"]["template"]["spec"]["restart"] = "Never"
         with pytest.raises(validator.ValidationError):
             validator.validate(job, "1.31", strict=True)
+
+
+def test_pods_state_their_resources_and_are_restarted_but_for_bad_input(recipe: Recipe) -> None:
+    request = Request(cpus=6, memory=4e9, seconds=5400.0, gpus=1)
+    emit_jobs(recipe, Path("jobs"), ["k8s"], request=request, cluster=Cluster("registry/mbtf:1", "claim"))
+    slices, fit = (read_job(Path("jobs") / name)["spec"] for name in ("generate.yaml", "fit-images.yaml"))
+    assert (slices["completions"], slices["parallelism"], slices["completionMode"]) == (5, 5, "Indexed")
+    # All slices share it.
+    assert slices["backoffLimit"] == 5 * fit["backoffLimit"] > 0
+    disrupted, final = slices["podFailurePolicy"]["rules"]
+    assert disrupted["action"] == "Ignore"
+    assert disrupted["onPodConditions"][0]["type"] == "DisruptionTarget"
+    assert (final["action"], final["onExitCodes"]["values"]) == ("FailJob", [2, 3])
+    pods = [spec["template"]["spec"] for spec in (slices, fit)]
+    # At its limit a pod is replaced; that of a job would end it.
+    assert [pod["activeDeadlineSeconds"] for pod in pods] == [5400, 5400]
+    assert {pod["restartPolicy"] for pod in pods} == {"Never"}
+    assert pods[0]["volumes"][0]["persistentVolumeClaim"] == {"claimName": "claim"}
+    container, training = (pod["containers"][0] for pod in pods)
+    assert container["image"] == "registry/mbtf:1"
+    assert container["workingDir"] == container["volumeMounts"][0]["mountPath"]
+    assert container["resources"] == {
+        "requests": {"cpu": "6", "memory": "3815Mi"},
+        "limits": {"memory": "3815Mi"},
+    }
+    assert training["resources"]["limits"]["nvidia.com/gpu"] == "1"
+    # Signals reach the program, not a shell.
+    assert container["command"][-1].startswith("exec mbtf-gen ")
+
+
+def test_the_material_is_found_from_a_linked_folder(recipe: Recipe, tmp_path: Path) -> None:
+    (tmp_path / "far" / "away").mkdir(parents=True)
+    Path("jobs").symlink_to(tmp_path / "far" / "away")
+    emit_jobs(recipe, Path("jobs"), ["make"], request=REQUEST)
+    found = load_recipe(Path("jobs/config/recipe.yaml"))
+    assert Path(found.generate.material).samefile(recipe.generate.material)
+    assert (Path("jobs").resolve() / Places.of(Path("jobs")).up).samefile(Path())
+
+
+STOPPED = """
+source jobs/job.sh
+export SLURM_JOB_ID=7
+scontrol() { echo "$@" >> requeued; }
+(sleep 0.2; kill -$0 $$) &
+run_job test bash -c 'trap "sleep 0.2; touch stored; exit 143" TERM; while true; do sleep 0.05; done'
+"""
+
+
+@pytest.mark.parametrize("signal", ["USR1", "TERM"])
+def test_a_job_that_is_stopped_stores_its_work(recipe: Recipe, signal: str) -> None:
+    """It is queued again near its limit, but not by scancel."""
+    emit_jobs(recipe, Path("jobs"), ["slurm"], request=REQUEST)
+    done = subprocess.run(["bash", "-c", STOPPED, signal], capture_output=True, check=False, timeout=10)
+    assert done.returncode == 143
+    assert Path("stored").exists()
+    assert Path("requeued").exists() == (signal == "USR1")
 
 
 def test_names_of_kubernetes_jobs_are_valid_and_differ(place: Path) -> None:
@@ -153,6 +221,15 @@ def test_faults_of_the_command_line(
     assert "cannot name it" in said()
     assert emit("--to", "k8s", "--image", "x", "--time-limit", "1h", "-o", str(tmp_path / "jobs")) == 2
     assert "outside the current folder" in said()
+    away = tmp_path / "away.npy"
+    shutil.copy(next((place / "the maps").iterdir()), away)
+    for assigned in (
+        [f"generate.material={away}"],
+        ["fit.images.model=neumip", f"fit.images.decoder={away}"],
+    ):
+        options = [word for text in assigned for word in ("--set", text)]
+        assert emit("--to", "k8s", "--image", "x", "--time-limit", "1h", *options) == 2
+        assert said().startswith(f"error: {away}: lies outside")
     # Nothing was written.
     assert sorted(path.name for path in place.iterdir()) == ["recipe.yaml", "the maps"]
     for name in ("paper_methods", "library"):
@@ -172,6 +249,7 @@ def test_other_job_files_are_replaced_on_demand(place: Path, capsys: pytest.Capt
     assert emit(*words) == 0
     assert emit(*words, "--slices", "2") == 3
     assert "holds other job files: Makefile" in capsys.readouterr().err
+    assert "generate-3" in (place / "jobs" / "Makefile").read_text()
     assert emit("--to", "slurm", "--time-limit", "1h", "--overwrite") == 0
     assert not (place / "jobs" / "Makefile").exists()
     assert emit("--to", "make", "--time-limit", "1h", "-o", "the maps") == 3
