@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from mbtf_core.errors import InputError, PartialError
-from mbtf_core.folders import owned
+from mbtf_core.folders import ELSEWHERE, owned
 from mbtf_core.interruption import stop_on_interruption
 from mbtf_core.lattice import level_of_sigma
 from mbtf_core.stats import pooled_variance
@@ -127,6 +127,17 @@ def check_options(config: FitConfig) -> None:
         )
 
 
+def _check_folder(config: FitConfig, out: Path) -> None:
+    """Refuse to replace the network or the material that the fit reads."""
+    read = []
+    if config.decoder is not None:
+        read.append(Decoder.find(config.decoder).folder)
+    if config.init_from is not None:
+        read.append(Path(config.init_from))
+    if out.resolve() in (folder.resolve() for folder in read):
+        raise InputError("holds what the fit starts from", where=out, hint=ELSEWHERE)
+
+
 def fit(
     config: FitConfig,
     shards: str | Path,
@@ -184,6 +195,7 @@ def fit(
     device = choose_device(config.device)
     out = Path(out)
     check_options(config)
+    _check_folder(config, out)
     data = open_data(shards, MODELS[config.model].layout, config.model, config.data.cache)
     identity = identity_of(config, data)
     with owned(out):

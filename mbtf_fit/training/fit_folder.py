@@ -68,12 +68,13 @@ def claim(out: Path, identity: dict[str, Any], config: FitConfig, overwrite: boo
             check_schema(old, _SCHEMA, out / FIT_NAME, f"{ELSEWHERE}, or replace it with --overwrite")
             before, after = ({**r.get("config", {}), "data": r.get("data")} for r in (old, identity))
             raise other_configuration(out, "a fit", before, after, "other shards")
-        # The description goes first: without it nothing counts as a finished material.
+        # The description goes first: without it nothing counts as a finished material. The record stays until
+        # it is replaced, so that a killed process leaves the folder of a fit.
         for name in (
-            *(DESCRIPTION_NAME, FIT_NAME, CONFIG_NAME, HISTORY_NAME, CHECKPOINT_NAME),
-            *(DECODER_NAME, WEIGHTS_NAME, TRANSMITTANCE_NAME, LAYERS_NAME, TEXTURES_NAME),
+            *(DESCRIPTION_NAME, DECODER_NAME, CONFIG_NAME, HISTORY_NAME, CHECKPOINT_NAME),
+            *(WEIGHTS_NAME, TRANSMITTANCE_NAME, LAYERS_NAME, TEXTURES_NAME),
         ):
             (out / name).unlink(missing_ok=True)
     make_folder(out)
-    write_text(out / CONFIG_NAME, dump_yaml(config.model_dump(mode="json")))
     write_json(out / FIT_NAME, identity)
+    write_text(out / CONFIG_NAME, dump_yaml(config.model_dump(mode="json")))

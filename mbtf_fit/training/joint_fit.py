@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -128,7 +129,8 @@ def fit_jointly(
     with ExitStack() as stack:
         for folder in (decoder, *(member.folder for member in members)):
             stack.enter_context(owned(folder))
-        claim(decoder, _identity(members), config, overwrite)
+        identities = {member.folder.name: member.identity for member in members}
+        claim(decoder, joint_identity(identities), config, overwrite)
         for member in members:
             claim(member.folder, member.identity, config, overwrite)
         finished = (decoder / DECODER_NAME).exists() and all(
@@ -157,14 +159,27 @@ def _check(
         raise InputError(
             "this folder is that of the shared network: rename the data set of this name", where=decoder
         )
+    for name, count in Counter(Path(folder).name for folder in folders).items():
+        if count > 1:
+            raise InputError(f"{count} of the folders have this name", where=name, hint="rename them")
     check_options(config)
 
 
-def _identity(members: Sequence[_Member]) -> dict[str, Any]:
-    """Content of ``fit.json`` of the shared network: that of the first material, with the hash of all."""
-    hashes = [member.identity["config_hash"] for member in members]
-    data = {member.folder.name: member.identity["data"] for member in members}
-    return {**members[0].identity, "config_hash": data_sha256(hashes), "data": data}
+def joint_identity(identities: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
+    """Content of ``fit.json`` of the shared network: that of the first material, with the hash of all.
+
+    Parameters
+    ----------
+    identities : mapping
+        Name → content of ``fit.json`` of each material (:func:`~mbtf_fit.training.fit_folder.identity_of`).
+
+    Returns
+    -------
+    dict
+    """
+    hashes = [identity["config_hash"] for identity in identities.values()]
+    data = {name: identity["data"] for name, identity in identities.items()}
+    return {**next(iter(identities.values())), "config_hash": data_sha256(hashes), "data": data}
 
 
 def _fit(

@@ -18,6 +18,8 @@ _YAML = (".yaml", ".yml")
 # Records of folders that the programs have written, and keys of recipes.
 _RECORDS = {"library.json", "run.json", "manifest.json", "fit.json"}
 _RECIPE_KEYS = {"library", "generate"}
+# Characters of a name besides its number, and those that it does not begin with.
+_LONGEST, _PUNCTUATION = 90, "._+-"
 
 
 def find_materials(path: Path) -> list[Path]:
@@ -41,9 +43,11 @@ def find_materials(path: Path) -> list[Path]:
     path = Path(os.path.normpath(path))
     if path.suffix == ".txt" and path.is_file():
         try:
-            lines = [line.strip() for line in path.read_text(encoding="utf-8").splitlines()]
+            lines = [line.strip() for line in path.read_text(encoding="utf-8-sig").splitlines()]
         except (OSError, UnicodeDecodeError) as error:
             raise InputError(f"cannot be read as a list ({reason(error)})", where=path) from None
+        if any("\0" in line for line in lines):
+            raise InputError("is no list of paths: it holds null characters", where=path)
         listed = [path.parent / line for line in lines if line and not line.startswith("#")]
         return [Path(os.path.normpath(file)) for file in listed]
     return _in_folder(path) if path.is_dir() else [path]
@@ -106,7 +110,7 @@ def name_materials(paths: Sequence[Path], taken: Collection[str] = ()) -> list[s
     Parameters
     ----------
     paths : sequence of Path
-    taken : names of others
+    taken : other names, which none of them gets
 
     Returns
     -------
@@ -121,24 +125,25 @@ def name_materials(paths: Sequence[Path], taken: Collection[str] = ()) -> list[s
         if count > 1:
             raise UsageError("is listed twice", where=path, hint="list each material once in 'library'")
     plain = [_name(path.stem if path.suffix.lower() in _SUFFIXES else path.name) for path in paths]
-    often = Counter(plain)
+    often = Counter([*plain, *taken])
     wanted = [
-        name if often[name] == 1 else f"{_name(path.parent.name)}-{name}"
+        name if often[name] == 1 else f"{_name(path.parent.name)}-{name}"[-_LONGEST:].lstrip(_PUNCTUATION)
         for name, path in zip(plain, paths, strict=True)
     ]
     names: list[str] = []
-    # A number is no other material's name.
-    used = {*wanted, *taken}
+    used, asked = {*taken}, {*wanted}
     for name in wanted:
         number = 1
         own = name
-        while own in names or (number > 1 and own in used):
+        # A number is no other material's name.
+        while own in used or (number > 1 and own in asked):
             number += 1
             own = f"{name}-{number}"
         names.append(own)
+        used.add(own)
     return names
 
 
 def _name(text: str) -> str:
-    cleaned = re.sub(r"[^A-Za-z0-9._+-]+", "_", text).lstrip("._+-")
-    return cleaned[:90] or "material"
+    cleaned = re.sub(r"[^A-Za-z0-9._+-]+", "_", text).lstrip(_PUNCTUATION)
+    return cleaned[:_LONGEST] or "material"

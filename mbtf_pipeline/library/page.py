@@ -39,7 +39,7 @@ def library_page(record: Mapping[str, Any], runs: Path) -> str:
     counts = {state: sum(c["state"] == text for c in cards) for state, text in _STATES.items()}
     spent: Counter[str] = Counter()
     for material in record["materials"]:
-        spent.update(material.get("seconds", {}))
+        spent.update(material.get("seconds", {}) if material["state"] == "done" else {})
     shared, total = record["shared"], record["training"]
     if "each" in record["division"]:
         # Further materials bring a share of their own.
@@ -65,7 +65,7 @@ def _card(material: Mapping[str, Any], run: Path, record: Mapping[str, Any]) -> 
     shared = record["shared"].get("errors", {}).get(name)
     for fit, found in material.get("fits", {}).items() if done else ():
         error = estimate(found["unexplained"])
-        with_shared = shared if fit == record["shared"].get("fit") else None
+        with_shared = shared if shared and shared.get("fit", record["shared"]["fit"]) == fit else None
         fits.append(
             {
                 "name": fit,

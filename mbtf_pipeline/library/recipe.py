@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from mbtf_core.config_file import Settings, build, read_yaml, resolve
+from mbtf_core.config_file import FileName, Settings, build, read_yaml, resolve
 from mbtf_core.errors import InputError, MbtfError, UsageError
 from mbtf_core.nested import deep_merge
 from mbtf_core.units import Duration
@@ -29,7 +29,7 @@ class LibraryRecipe(Settings):
     title: str | None = Field(None, description="title of the page; default: the name")
     description: str = ""
     output: str | None = Field(None, description="folder; default: out/NAME")
-    library: list[str] = Field(
+    library: list[FileName] = Field(
         description="folders of materials, materials, and text files with one of them per line"
     )
     materials: dict[Name, MaterialLayer] = Field(
@@ -164,10 +164,13 @@ def entries(library: LibraryRecipe, path: Path) -> list[Entry]:
     UsageError
         One is listed twice.
     """
+    from mbtf_fit.material.decoder import DECODER_FOLDER
+
     found: dict[str, tuple[Path, Layer]] = {}
     paths = [file for text in library.library for file in find_materials(path.parent / text)]
     named = [name for name, layer in library.materials.items() if "material" in layer.generate]
-    names = name_materials(paths, named)
+    # Materials that share a network lie beside its folder.
+    names = name_materials(paths, [*named, DECODER_FOLDER])
     for name, file in zip(names, paths, strict=True):
         found[name] = (file, library.materials.get(name, Layer()))
     for name, layer in library.materials.items():
@@ -183,6 +186,10 @@ def entries(library: LibraryRecipe, path: Path) -> list[Entry]:
 
 
 def _entry(library: LibraryRecipe, name: str, file: Path, layer: Layer, path: Path) -> Entry:
+    try:
+        str(file).encode()
+    except UnicodeEncodeError:
+        return Entry(name, file, None, "its path is not UTF-8 text: rename it")
     if not file.exists():
         return Entry(name, file, None, "does not exist")
     try:

@@ -14,9 +14,9 @@ from mbtf_core.cluster.engine import Cluster
 from mbtf_core.cluster.task import Task, TaskResult
 from mbtf_core.console import Console
 from mbtf_core.digest import data_sha256
-from mbtf_core.errors import InputError, MbtfError
+from mbtf_core.errors import InputError, MbtfError, printable
 from mbtf_core.folders import check_folder, owned
-from mbtf_fit.config import DECODER_MODELS, FitConfig
+from mbtf_fit.config import DECODER_MODELS, SHARED_PRESET, FitConfig
 from mbtf_fit.material.decoder import DECODER_FOLDER
 from mbtf_pipeline.library.budget import Division
 from mbtf_pipeline.library.page import library_page
@@ -131,7 +131,7 @@ class _LibraryRun:
         for entry in found:
             # What an earlier command has made is shown until its run ends.
             state = self.before.get(entry.name, {"state": "pending", "error": ""})
-            state |= {"name": entry.name, "path": os.path.relpath(entry.path, self.folder)}
+            state |= {"name": entry.name, "path": printable(os.path.relpath(entry.path, self.folder))}
             self.states[entry.name] = state | (
                 {"state": "failed", "error": entry.error} if entry.error else {}
             )
@@ -188,8 +188,12 @@ class _LibraryRun:
             return
         _, name = group[0]
         configs = [entry.recipe.fit[fit] for entry, fit in group if entry.recipe is not None]
+        training = configs[0].training
         update = {"time": self.library.shared_network, "steps": None, "shared_decoder": True}
-        config = configs[0].model_copy(update={"training": configs[0].training.model_copy(update=update)})
+        # The defaults of such fits, where the recipe says nothing.
+        unset = SHARED_PRESET["training"].keys() - training.model_fields_set
+        update |= {key: SHARED_PRESET["training"][key] for key in unset}
+        config = configs[0].model_copy(update={"training": training.model_copy(update=update)})
         runs, folder = self.folder / MATERIALS, self.folder / SHARED
         arguments = {
             "config": config.model_dump(mode="json"),
@@ -206,7 +210,7 @@ class _LibraryRun:
         task = Task("shared network", f"{_TASK}:fit_shared", arguments, gpu=config.device == "cuda")
         for result in self._results([task]):
             found = zip(group, result.value or (), strict=not result.error)
-            errors = {entry.name: error for (entry, _), error in found}
+            errors = {entry.name: {"fit": fit, **error} for (entry, fit), error in found}
             self.shared = asked | {"fit": name, "errors": errors, "error": result.error}
 
     def _task(self, function: str, entry: Entry, **arguments: Any) -> Task:
@@ -217,7 +221,8 @@ class _LibraryRun:
             "working_folder": str(Path.cwd()),
             "command": self.command,
         }
-        return Task(entry.name, f"{_TASK}:{function}", shared | arguments)
+        gpu = any(config.device == "cuda" for config in entry.recipe.fit.values())
+        return Task(entry.name, f"{_TASK}:{function}", shared | arguments, gpu=gpu)
 
     def _results(self, tasks: Iterable[Task]) -> Iterator[TaskResult]:
         if self.cluster is not None:
@@ -225,15 +230,16 @@ class _LibraryRun:
         return run_in_children(tasks)
 
     def _finish(self, state: dict[str, Any], done: TaskResult) -> None:
-        if not done.error:
+        fault = done.error
+        if not fault:
             try:
-                state |= {"state": "done", "error": ""}
-                state |= {**done.value, **summarize(self.folder / MATERIALS / state["name"])}
+                found = {**done.value, **summarize(self.folder / MATERIALS / state["name"])}
+                state |= {"state": "done", "error": "", **found}
+                return
             except MbtfError as error:
-                state |= {"state": "failed", "error": " ".join(error.message.split())}
-            return
-        state |= {"state": "failed", "error": done.error}
-        self.console.note(f"{state['name']}: failed: {done.error}")
+                fault = " ".join(error.message.split())
+        state |= {"state": "failed", "error": fault}
+        self.console.note(f"{state['name']}: failed: {fault}")
 
     def _write(self) -> dict[str, Any]:
         """Record and page as they are now."""

@@ -11,6 +11,7 @@ from mbtf_core.errors import InputError
 from mbtf_fit.config import FitConfig
 from mbtf_fit.training.fit_cluster import in_folder
 from mbtf_pipeline.recipe import Recipe
+from mbtf_pipeline.run_folder import COMPARE, SHARDS
 
 if TYPE_CHECKING:
     from mbtf_fit.training.fit import FitResult
@@ -59,7 +60,8 @@ def first_fit(recipe: str, folder: str, working_folder: str, seconds: float, com
         training = config.training.model_copy(update={"time": seconds, "steps": None})
         short = config.model_copy(update={"training": training})
         identity = identity_of(short, _open(shards, config))
-        value = _unexplained(fit(short, shards, out, overwrite=not _holds(out, identity)))["value"]
+        done = fit(short, shards, out, overwrite=not _holds(out, identity))
+        value = _unexplained(done, shards)["value"]
         return None if value is None else float(value)
 
 
@@ -91,16 +93,17 @@ def fit_shared(
     """
     with in_folder(working_folder):
         from mbtf_fit.training.fit_folder import identity_of
-        from mbtf_fit.training.joint_fit import fit_jointly
+        from mbtf_fit.training.joint_fit import fit_jointly, joint_identity
 
         loaded = FitConfig.model_validate(config)
         group = [_open(folder, loaded) for folder in shards]
-        same = all(
-            _holds(Path(folder), identity_of(loaded, data, group))
-            for folder, data in zip(folders, group, strict=True)
-        )
+        identities = {
+            folder: identity_of(loaded, data, group) for folder, data in zip(folders, group, strict=True)
+        }
+        identities[decoder] = joint_identity(identities)
+        same = all(_holds(Path(folder), identity) for folder, identity in identities.items())
         result = fit_jointly(loaded, shards, folders, decoder, overwrite=not same)
-        return [_unexplained(done) for done in result.fits]
+        return [_unexplained(done, Path(folder)) for done, folder in zip(result.fits, shards, strict=True)]
 
 
 def shards_of(recipe: Recipe, config: FitConfig, run: Path) -> Path:
@@ -117,8 +120,17 @@ def _open(shards: str | Path, config: FitConfig) -> Dataset:
     return open_data(shards, MODELS[config.model].layout, config.model)
 
 
-def _unexplained(result: FitResult) -> dict[str, Any]:
-    found = result.errors.get("test") or result.errors["held_out_queries"]
+def _unexplained(result: FitResult, shards: Path) -> dict[str, Any]:
+    """Unexplained variance of a fit to a data set of a run, on the test queries of all fits of the run."""
+    errors = result.errors
+    if shards.name != SHARDS:
+        # A data set of another layout has hardly any test queries.
+        from mbtf_gen.dataset.reader import Dataset
+        from mbtf_pipeline.compare.dataset_errors import dataset_errors
+
+        tested = Dataset.open(shards.parent / SHARDS)
+        errors = dataset_errors({"fit": result.material}, tested)["fit"]["splits"]
+    found = errors.get("test") or errors["held_out_queries"]
     return dict(found["unexplained"])
 
 
@@ -165,7 +177,6 @@ def summarize(folder: Path) -> dict[str, Any]:
     InputError : a file of the run is missing or corrupt
     """
     from mbtf_pipeline.compare.compare import COMPARISON_NAME
-    from mbtf_pipeline.run_folder import COMPARE
 
     comparison = read_json(folder / COMPARE / COMPARISON_NAME)
     picture = comparison["pictures"][0]

@@ -150,6 +150,11 @@ def test_corrupt_networks_are_refused(materials: Path, data: Path, tmp_path: Pat
     broken.mkdir()
     for path in (materials / "decoder").iterdir():
         (broken / path.name).write_bytes(path.read_bytes())
+    # Those of a material hold the same network.
+    (broken / "weights.safetensors").write_bytes((materials / "a" / "weights.safetensors").read_bytes())
+    message = fails(3, str(data / "c"), "--decoder", str(broken), "-o", str(tmp_path / "m"), *QUICK)
+    assert "is damaged, or of another material" in message
+    (broken / "weights.safetensors").write_bytes((materials / "decoder/weights.safetensors").read_bytes())
     whole = (broken / name).read_bytes()
     (broken / name).write_bytes(whole[: len(whole) // 2])
     message = fails(3, str(data / "c"), "--decoder", str(broken), "-o", str(tmp_path / "m"), *QUICK)

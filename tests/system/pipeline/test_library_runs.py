@@ -9,16 +9,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from support.datasets import edit
+from support.fit_data import parallax, write_data
 from support.small_runs import contents
 
 from mbtf_core.console import run
+from mbtf_fit.config import FitConfig
+from mbtf_fit.evaluation import evaluate
 from mbtf_fit.material.decoder import Decoder
 from mbtf_fit.material.material import Material
 from mbtf_gen.generation import generate
 from mbtf_gen.job import Job
 from mbtf_pipeline.cli.app import app
-from mbtf_pipeline.library.task import first_fit
-from mbtf_pipeline.recipe import read_resolved
+from mbtf_pipeline.library.task import first_fit, fit_shared
+from mbtf_pipeline.recipe import Recipe, read_resolved
 
 RECIPE = """
 name: test
@@ -173,6 +177,51 @@ def test_a_first_fit_is_kept_for_the_same_options(two: Path) -> None:
     assert error == division(two)["errors"]["rough"]["error"]
     first_fit(**arguments, seconds=0.3)
     assert weights.stat().st_mtime_ns != before
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Path:
+    """Data sets of runs: of another layout than the fits', and those that the fits learn from."""
+    for seed, name in enumerate("abc"):
+        write_data(tmp_path / name / "shards", parallax, train=200, test=300, seed=seed)
+        write_data(tmp_path / name / "shards-shuffled", parallax, train=1000, test=1, seed=seed)
+    return tmp_path
+
+
+def error_on(material: Path, shards: Path) -> float | None:
+    return evaluate(Material.load(material), shards).values["test"].overall.unexplained.value
+
+
+def test_first_fits_are_tested_as_all_fits(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mbtf_pipeline.run.generate_data", lambda *arguments, **options: None)
+    fits = {"neumip": {}, "other": {"model": "neumip", "seed": 3}}
+    generate = {"material": "maps", "queries": {"layout": "image"}}
+    recipe = Recipe.model_validate({"name": "a", "generate": generate, "fit": fits}).model_dump_json()
+    error = first_fit(recipe, str(runs / "a"), str(runs), 0.1, "")
+    assert error == pytest.approx(error_on(runs / "a/first/neumip", runs / "a/shards"))
+
+
+def test_materials_join_and_leave_a_shared_network(runs: Path) -> None:
+    training = {"steps": 4, "batch": 300, "shared_decoder": True}
+    config = FitConfig.model_validate({"model": "neumip", "training": training}).model_dump(mode="json")
+    network = runs / "shared/decoder"
+
+    def share(names: str) -> int:
+        shards = [f"{name}/shards-shuffled" for name in names]
+        found = fit_shared(config, shards, [f"shared/{name}" for name in names], "shared/decoder", str(runs))
+        expected = [error_on(runs / "shared" / name, runs / name / "shards") for name in names]
+        assert [error["value"] for error in found] == pytest.approx(expected)
+        return (network / "weights.safetensors").stat().st_mtime_ns
+
+    first = share("ab")
+    assert share("ab") == first
+    joined = share("abc")
+    assert joined != first
+    left = share("ab")
+    assert left != joined
+    # As after a kill between the claims of the network's folder and those of the materials.
+    edit(network / "fit.json", lambda record: record.update(config_hash="another"))
+    assert share("ab") != left
 
 
 def test_options_of_single_runs_are_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

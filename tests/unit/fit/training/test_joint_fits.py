@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -132,9 +133,13 @@ def test_joint_fits_learn_each_material(library_folder: Path, data: dict[str, Pa
         after = unexplained(library_folder / name, data[name])
         assert after < 0.25
         assert after < 0.5 * unexplained(tmp_path / name, data[name])
-        # The library itself states the same error.
-        stated = Material.load(library_folder / name).description["training"]["errors"]["test"]
-        assert stated["unexplained"]["value"] == pytest.approx(after, rel=1e-6)
+        # The library itself states the same errors, of queries that training used or never saw.
+        material = Material.load(library_folder / name)
+        stated = material.description["training"]["errors"]
+        for split, found in evaluate(material, data[name]).values.items():
+            assert stated[split]["unexplained"]["value"] == pytest.approx(
+                found.overall.unexplained.value, rel=1e-6
+            )
 
 
 def test_materials_evaluate_as_the_trainers_predict(
@@ -161,6 +166,10 @@ def test_steps_take_the_materials_in_turn(data: dict[str, Path], tmp_path: Path)
     summaries = [found.material.description["training"] for found in result.fits]
     assert [summary["steps"] for summary in summaries] == [4, 3]
     assert summaries[0]["shared_decoder"]["steps"] == 7
+    seconds = summaries[0]["shared_decoder"]["seconds"]
+    assert [summary["seconds"] for summary in summaries] == pytest.approx(
+        [seconds * 4 / 7, seconds * 3 / 7], abs=1e-3
+    )
     assert summaries[0]["shared_decoder"]["materials"] == list(NAMES[:2])
     assert [record["step"] for record in read_history(tmp_path / "stripes")][-1] == 7
 
@@ -225,6 +234,18 @@ def test_any_material_has_a_network_to_keep(data: dict[str, Path], tmp_path: Pat
     assert all(torch.equal(one[name], other[name]) for name in one)
     record = Material.load(tmp_path / "n").description["training"]["decoder"]
     assert record == {"sha256": Decoder.find(tmp_path / "m").sha256}
+
+
+@pytest.mark.parametrize("option", ["decoder", "init_from"])
+def test_a_fit_does_not_replace_what_it_starts_from(
+    data: dict[str, Path], tmp_path: Path, option: str
+) -> None:
+    fit(single_config(steps=2), data["waves"], tmp_path / "m")
+    before = Decoder.find(tmp_path / "m").sha256
+    wanted = single_config(steps=2, **{option: str(tmp_path / "m")})
+    with pytest.raises(InputError, match="m: holds what the fit starts from"):
+        fit(wanted, data["stripes"], tmp_path / "m", overwrite=True)
+    assert Decoder.find(tmp_path / "m").sha256 == before
 
 
 def test_another_network_is_another_fit(data: dict[str, Path], tmp_path: Path) -> None:
@@ -298,6 +319,26 @@ def test_a_killed_joint_fit_ends_with_the_same_bits(
     assert all(again.resumed for again in fit_two(config, data, out).fits)
 
 
+def test_a_lost_material_is_fitted_again(data: dict[str, Path], tmp_path: Path) -> None:
+    fit_two(joint_config(steps=2), data, tmp_path)
+    shutil.rmtree(tmp_path / "stripes")
+    assert [found.resumed for found in fit_two(joint_config(steps=2), data, tmp_path).fits] == [False] * 2
+
+
+def test_materials_divide_the_memory(
+    data: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    load, memory = mbtf_fit.training.joint_fit.load_training, []
+
+    def observed(shards: Dataset, held_out: Any, seed: int, given: float) -> Any:
+        memory.append(given)
+        return load(shards, held_out, seed, given)
+
+    monkeypatch.setattr(mbtf_fit.training.joint_fit, "load_training", observed)
+    fit_two(joint_config(steps=2, data={"memory": "1GB"}), data, tmp_path)
+    assert memory == [5e8] * 2
+
+
 def test_other_data_sets_are_another_fit(data: dict[str, Path], tmp_path: Path) -> None:
     fit_two(joint_config(steps=2), data, tmp_path)
     names = ("waves", "third")
@@ -306,6 +347,9 @@ def test_other_data_sets_are_another_fit(data: dict[str, Path], tmp_path: Path) 
         fit_jointly(joint_config(steps=2), *arguments)
     with pytest.raises(InputError, match=r"waves: holds a fit of another configuration: .*shared_decoder"):
         fit(single_config(steps=2), data["waves"], tmp_path / "waves")
+    # Also where the network lies elsewhere.
+    with pytest.raises(InputError, match="waves: holds a fit of another configuration"):
+        fit_jointly(joint_config(steps=2), *arguments[:2], tmp_path / "network")
     fit_jointly(joint_config(steps=2), *arguments, overwrite=True)
     shared = Decoder.find(tmp_path).tensors()
     assert all(torch.equal(networks_of(tmp_path / "third")[name], shared[name]) for name in shared)
@@ -365,6 +409,9 @@ def test_too_few_data_sets_and_taken_names_are_refused(data: dict[str, Path], tm
         fit(joint_config(), data["waves"], tmp_path / "m")
     folders = [tmp_path / "decoder", tmp_path / "b"]
     with pytest.raises(InputError, match="decoder: this folder is that of the shared network"):
+        fit_jointly(joint_config(), one * 2, folders, tmp_path / "decoder")
+    folders = [tmp_path / "x" / "a", tmp_path / "y" / "a"]
+    with pytest.raises(InputError, match="a: 2 of the folders have this name"):
         fit_jointly(joint_config(), one * 2, folders, tmp_path / "decoder")
     with pytest.raises(InputError, match=r"training\.shared_decoder: is not set"):
         fit_jointly(single_config(), one * 2, [tmp_path / "a", tmp_path / "b"], tmp_path / "decoder")

@@ -14,6 +14,7 @@ from support.known_surfaces import geometry, rough_heights
 import mbtf_fit.training.fit
 from mbtf_core.lattice import Lattice
 from mbtf_fit.config import FitConfig
+from mbtf_fit.training import fit_folder
 from mbtf_fit.training.fit import fit
 from mbtf_fit.training.trainer import Trainer
 from mbtf_fit.training.validation import read_history
@@ -81,6 +82,28 @@ def test_a_fit_killed_at_random_steps_ends_with_the_same_bits(
     steps = [record["step"] for record in read_history(out)]
     assert steps == sorted(set(steps))
     assert steps[-1] == STEPS
+
+
+@pytest.mark.parametrize("at", ["unlink", "write_json", "write_text"])
+def test_a_fit_killed_while_it_replaces_another_is_repeated(
+    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: str
+) -> None:
+    unlink = Path.unlink
+
+    def die(path: Path, *arguments: Any, **options: Any) -> None:
+        if at != "unlink" or path.name == "weights.safetensors":
+            raise Killed
+        unlink(path, *arguments, **options)
+
+    short = {"steps": 2, "batch": 300}
+    first, other = (FitConfig.model_validate({"training": short, "seed": seed}) for seed in (0, 1))
+    fit(first, shards, tmp_path / "m")
+    with monkeypatch.context() as patch:
+        patch.setattr(Path if at == "unlink" else fit_folder, at, die)
+        with pytest.raises(Killed):
+            fit(other, shards, tmp_path / "m", overwrite=True)
+    assert not (tmp_path / "m" / "material.json").exists()
+    assert not fit(other, shards, tmp_path / "m", overwrite=True).resumed
 
 
 def test_ctrl_c_loses_no_step(shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

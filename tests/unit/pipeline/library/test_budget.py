@@ -78,9 +78,10 @@ def test_changed_options_divide_the_times_that_they_had() -> None:
     assert later["a"] == later["b"] == pytest.approx((times["a"] + times["b"]) / 2, abs=0.01)
 
 
-def test_another_training_time_divides_anew() -> None:
+@pytest.mark.parametrize(("training", "first_share"), [(60.0, 0.2), (30.0, 0.4)])
+def test_another_training_time_divides_anew(training: float, first_share: float) -> None:
     division = Division({}, 30.0, 0.2, count=2)
     known(division, {"a": 0.1, "b": 0.2})
-    again = Division(division.record, 60.0, 0.2, count=2)
+    again = Division(division.record, training, first_share, count=2)
     assert not again.has_error("a", "k")
     assert again.first == pytest.approx(6.0)

@@ -36,6 +36,17 @@ def test_order_and_sum_of_times_where_runs_are_finished(tmp_path: Path) -> None:
     assert f"took {clock(100.0)}: generate {clock(40.0)}, fit relief {clock(60.0)}." in shown
 
 
+def test_failures_come_after_errors_and_show_nothing_of_earlier_runs(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "report.html").write_text("")
+    failed = material("a", "done", 0.9) | {"state": "failed", "error": "no memory"}
+    shown = library_page(record(failed, material("b", "done", 0.0, path="<b>&")), tmp_path)
+    assert shown.index('id="b"') < shown.index('id="a"')
+    assert "report.html" not in shown
+    assert f"took {clock(50.0)}" in shown
+    assert "&lt;b&gt;&amp;" in shown
+
+
 def test_an_error_of_an_earlier_command_is_not_shown_once_done(tmp_path: Path) -> None:
     assert "no memory" in library_page(record(material("a", "failed", error="no memory")), tmp_path)
     assert "no memory" not in library_page(record(material("a", "done", error="no memory")), tmp_path)
@@ -43,11 +54,17 @@ def test_an_error_of_an_earlier_command_is_not_shown_once_done(tmp_path: Path) -
 
 def test_first_fits_and_shared_networks(tmp_path: Path) -> None:
     division = {"errors": {"a": {"key": "k", "error": 0.301}}, "times": {"a": {"key": "k", "seconds": 1.5}}}
-    errors = {"a": {"value": 0.2, "error": 0.01, "n": 100}}
+    errors: dict[str, dict[str, Any]] = {"a": {"value": 0.2, "error": 0.01, "n": 100}}
     shared = {"training": 60.0, "fit": "relief", "errors": errors, "error": ""}
-    shown = library_page(record(material("a", "done"), division=division, shared=shared), tmp_path)
+    two = material("a", "done")
+    two["fits"]["other"] = two["fits"]["relief"]
+    shown = library_page(record(two, division=division, shared=shared), tmp_path)
     assert "unexplained variance 0.301 after the first fit, therefore 1.5 s of training" in shown
-    assert "with the shared network 0.20" in shown
+    assert shown.count("with the shared network 0.20") == 1
+    # Fits of the same options may have other names.
+    errors["a"]["fit"] = "other"
+    again = library_page(record(two, shared=shared), tmp_path)
+    assert again.index("<b>other") < again.index("with the shared network 0.20")
     failed = library_page(record(material("a", "done"), shared=shared | {"error": "too few"}), tmp_path)
     assert "No shared network</b>: too few" in failed
 
@@ -59,10 +76,11 @@ def test_the_training_time_includes_that_of_added_materials(tmp_path: Path) -> N
 
 def test_pictures_are_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a").mkdir()
-    for name in ("fit", "reference"):
-        Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(tmp_path / "a" / f"{name}.png")
+    for value, name in enumerate(("fit", "reference")):
+        Image.fromarray(np.full((4, 4, 3), 200 * value, np.uint8)).save(tmp_path / "a" / f"{name}.png")
     page._small.cache_clear()
     first = library_page(record(material("a", "done")), tmp_path)
     assert first.count("data:image/jpeg") == 2
+    assert f'src="{page._thumbnail(tmp_path / "a" / "reference.png")}" alt="a: path-traced"' in first
     monkeypatch.setattr(Image, "open", lambda path: pytest.fail(f"{path} is read again"))
     assert library_page(record(material("a", "done")), tmp_path) == first

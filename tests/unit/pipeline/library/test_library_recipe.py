@@ -30,7 +30,7 @@ def folder(tmp_path: Path) -> Path:
     (tmp_path / "assets" / "scripts").mkdir()
     (tmp_path / "assets" / "scripts" / "make.py").write_text("")
     material(tmp_path / "more" / "wool")
-    (tmp_path / "more" / "list.txt").write_text("# a comment\nwool\nmissing\n")
+    (tmp_path / "more" / "list.txt").write_text("# a comment\nwool\nmissing\n", encoding="utf-8-sig")
     return tmp_path
 
 
@@ -80,8 +80,15 @@ def test_cloths_get_the_model_without_geometry(folder: Path) -> None:
 def test_faults_of_the_recipe(folder: Path) -> None:
     with pytest.raises(InputError, match=r"materials\.shel\b.*no material of the library"):
         load(folder, "library: [assets]\nmaterials:\n  shel: {fit: {relief: {}}}\n" + BASE)
-    with pytest.raises(UsageError, match="listed twice"):
-        load(folder, "library: [assets/shell, assets/shell]\n" + BASE)
+    (folder / "link").symlink_to(folder / "assets" / "shell")
+    for again in ("assets/shell", "link"):
+        with pytest.raises(UsageError, match="listed twice"):
+            load(folder, f"library: [assets/shell, {again}]\n" + BASE)
+    (folder / "list.txt").write_text("assets/shell\n\0\n")
+    with pytest.raises(InputError, match=r"list\.txt: is no list of paths"):
+        load(folder, "library: [list.txt]\n" + BASE)
+    with pytest.raises(InputError, match="is not a valid file name"):
+        load(folder, f"library: [{'x' * 300}]\n" + BASE)
     (folder / "empty").mkdir()
     with pytest.raises(InputError, match="names no material"):
         load(folder, "library: [empty]\n" + BASE)
@@ -95,10 +102,20 @@ def test_equal_names_are_numbered(tmp_path: Path) -> None:
     ]
 
 
+def test_names_are_short_and_of_one_material(tmp_path: Path) -> None:
+    long = "n" * 95
+    for path in (f"{'p' * 95}/{long}", f"{'q' * 95}/{long}", "q/decoder", "q/wool", "other"):
+        material(tmp_path / "u" / path)
+    # Another material has the name of one in the folder; the network of several lies in `decoder`.
+    found = load(tmp_path, "library: [u]\nmaterials: {wool: u/other, q-wool: u/q/wool}\n" + BASE)
+    assert list(found) == ["other", long[:90], "q-decoder", "q-wool-2", f"{long[:90]}-2", "wool", "q-wool"]
+    assert not any(error for _, error in found.values())
+
+
 def test_a_file_and_what_it_names_are_one_material(tmp_path: Path) -> None:
-    (tmp_path / "shirt.obj").write_text("")
-    (tmp_path / "other.obj").write_text("")
-    (tmp_path / "shirt.yaml").write_text("mesh: shirt.obj\n")
+    for name in ("shirt", "sleeve", "other"):
+        (tmp_path / f"{name}.obj").write_text("")
+    (tmp_path / "shirt.yaml").write_text("mesh: shirt.obj\nparts: [{file: ./sleeve.obj}]\n")
     # The recipe itself is no material, nor is what an earlier run has written.
     material(tmp_path / "out" / "runs")
     (tmp_path / "out" / "library.json").write_text("{}")
@@ -113,6 +130,8 @@ def test_folders_of_folders_and_stray_pictures(tmp_path: Path) -> None:
     (tmp_path / "q" / "unclear").mkdir()
     (tmp_path / "q" / "unclear" / "wood.png").write_bytes(b"")
     (tmp_path / "q" / "loop").symlink_to(tmp_path / "q", target_is_directory=True)
+    for hidden in (".cache", "_old"):
+        material(tmp_path / "q" / hidden / "d")
     found = load(tmp_path, "library: [q]\n" + BASE)
     assert list(found) == ["b", "c", "a", "unclear"]
     assert "height" in found["unclear"][1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,18 +12,23 @@ import numpy as np
 import pytest
 
 from mbtf_core.cluster.task import Task, TaskResult
+from mbtf_core.errors import InputError
+from mbtf_fit.config import SHARED_PRESET
 from mbtf_pipeline.library import run as library_run
 from mbtf_pipeline.library.recipe import entries, load_library_recipe
 from mbtf_pipeline.library.run import LibraryResult, run_library
+from mbtf_pipeline.library.task import summarize
 
 BASE = "library: [a, b]\nbase: {fit: {relief: {}}, generate: {queries: {train: 10/texel}}}\n"
 
 
 class Runs:
-    """In place of processes: records the calls, and what the record says before each."""
+    """In place of processes: records the calls, their arguments, and what the record says before each."""
 
     def __init__(self, out: Path) -> None:
         self.out, self.calls = out, [("", "")]
+        self.arguments: dict[tuple[str, str], Any] = {}
+        self.gpus: set[bool] = set()
         self.seen: list[dict[str, str]] = []
         self.interrupted_at = 0
         self.errors: dict[str, str] = {}
@@ -31,11 +37,27 @@ class Runs:
         for task in tasks:
             self.seen.append({m["name"]: m["state"] for m in self.record()["materials"]})
             self.calls.append((task.function.rpartition(":")[2], task.name))
+            self.arguments[self.calls[-1]] = task.arguments
+            self.gpus.add(task.gpu)
             if len(self.calls) - 1 == self.interrupted_at:
                 raise KeyboardInterrupt
             error = self.errors.get(task.name, "")
-            value: Any = 0.1 if self.calls[-1][0] == "first_fit" else {"seconds": {"generate": 1.0}}
+            value = getattr(self, self.calls[-1][0])(task.arguments)
             yield TaskResult(task, None if error else value, error)
+
+    def first_fit(self, arguments: Any) -> float:
+        return 0.1
+
+    def run_material(self, arguments: Any) -> dict[str, Any]:
+        return {"seconds": {"generate": 1.0}}
+
+    def fit_shared(self, arguments: Any) -> list[dict[str, Any]]:
+        return [{"value": 0.1 * k, "error": 0.01, "n": 9} for k in range(len(arguments["folders"]))]
+
+    def run(self, tasks: Iterable[Task], *, stop_when_fatal: bool = True) -> Iterator[TaskResult]:
+        """As those of a cluster."""
+        assert not stop_when_fatal
+        return self(tasks)
 
     def record(self) -> dict[str, Any]:
         found: dict[str, Any] = json.loads((self.out / "library.json").read_text())
@@ -44,7 +66,7 @@ class Runs:
 
 @pytest.fixture
 def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Runs:
-    for name in "ab":
+    for name in "abc":
         (tmp_path / name).mkdir()
         np.save(tmp_path / name / "height.npy", np.zeros((4, 4), np.float32))
     found = Runs(tmp_path / "out")
@@ -53,12 +75,12 @@ def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Runs:
     return found
 
 
-def again(runs: Runs, options: str = "") -> LibraryResult:
+def again(runs: Runs, options: str = "", base: str = BASE, cluster: Any = None) -> LibraryResult:
     file = runs.out.parent / "library.yaml"
-    file.write_text(f"name: test\n{options}{BASE}")
+    file.write_text(f"name: test\n{options}{base}")
     library = load_library_recipe(file, [])
-    runs.calls, runs.seen = [("", "")], []
-    return run_library(library, entries(library, file), runs.out, command="")
+    runs.calls, runs.seen, runs.arguments = [("", "")], [], {}
+    return run_library(library, entries(library, file), runs.out, command="", cluster=cluster)
 
 
 def test_earlier_results_stay_until_their_run_ends(runs: Runs) -> None:
@@ -82,14 +104,113 @@ def test_each_first_fit_is_recorded_as_it_comes(runs: Runs) -> None:
     assert runs.calls[1:] == [("first_fit", "b"), ("run_material", "a"), ("run_material", "b")]
 
 
+def test_a_summary_has_test_errors_and_the_first_pictures(tmp_path: Path) -> None:
+    (tmp_path / "compare").mkdir()
+    pictures = [
+        {"references": {"query": {"file": f"{k}-r"}}, "fits": {f: {"file": f"{k}-{f}"} for f in "xy"}}
+        for k in "12"
+    ]
+    errors = {f: {"splits": {s: {"unexplained": f + s} for s in ("training", "test")}} for f in "xy"}
+    comparison = {"pictures": pictures, "test": errors}
+    (tmp_path / "compare" / "comparison.json").write_text(json.dumps(comparison))
+    assert summarize(tmp_path) == {
+        "fits": {f: {"unexplained": f"{f}test", "picture": f"compare/1-{f}.png"} for f in "xy"},
+        "reference": "compare/1-r.png",
+    }
+
+
 def test_paths_are_relative_to_the_page(runs: Runs) -> None:
     again(runs)
     assert [m["path"] for m in runs.record()["materials"]] == ["../a", "../b"]
 
 
+def test_workers_go_on_after_a_failure(runs: Runs) -> None:
+    runs.errors = {"a": "no memory"}
+    assert again(runs, "training: 10s\n", cluster=runs).failed == runs.errors
+    assert runs.calls[1:] == [("first_fit", "a"), ("first_fit", "b"), ("run_material", "b")]
+
+
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+def test_fits_on_a_gpu_take_one_of_their_worker(runs: Runs, device: str) -> None:
+    options = "training: 10s\nshared_network: 5s\n"
+    again(runs, options, BASE.replace("relief: {}", f"relief: {{device: {device}}}"))
+    assert runs.gpus == {device == "cuda"}
+
+
+def test_a_run_whose_files_are_damaged_fails_alone(runs: Runs, monkeypatch: pytest.MonkeyPatch) -> None:
+    def summarize(folder: Path) -> dict[str, Any]:
+        if folder.name == "a":
+            raise InputError("no such file", where="comparison.json")
+        return {"fits": {}, "reference": "none.png"}
+
+    monkeypatch.setattr(library_run, "summarize", summarize)
+    assert again(runs).failed == {"a": "comparison.json: no such file"}
+
+
+def test_only_other_options_of_data_or_fits_need_first_fits(runs: Runs) -> None:
+    again(runs, "training: 10s\n")
+    for own, needed in (
+        ("compare: {size: 64}", False),
+        ("generate: {seed: 3}", True),
+        ("generate: {seed: 3}, fit: {relief: {seed: 3}}", True),
+    ):
+        again(runs, f"training: 10s\nmaterials: {{b: {{{own}}}}}\n")
+        assert (("first_fit", "b") in runs.calls) == needed, own
+        assert ("first_fit", "a") not in runs.calls
+
+
+def test_fits_of_a_material_share_its_time_and_missing_ones_keep_theirs(runs: Runs) -> None:
+    again(runs, "training: 9s\nmaterials: {a: {fit: {neumip: {}}}, gone: gone}\n")
+    assert runs.arguments["first_fit", "a"]["seconds"] == pytest.approx(0.2 * 3.0)
+    for name, expected in (("a", ["1.2s"] * 2), ("b", ["2.4s"])):
+        fits = json.loads(runs.arguments["run_material", name]["recipe"])["fit"]
+        assert [fit["training"]["time"] for fit in fits.values()] == expected
+
+
+def test_paths_that_are_no_text_are_shown(runs: Runs) -> None:
+    folder = Path(os.fsdecode(os.fsencode(runs.out.parent / "more") + b"/w\xffol"))
+    folder.mkdir(parents=True)
+    np.save(folder / "height.npy", np.zeros((4, 4), np.float32))
+    done = again(runs, base=BASE.replace("[a, b]", "[a, more]"))
+    assert list(done.failed) == ["w_ol"]
+    assert "not UTF-8" in done.failed["w_ol"]
+    assert r"more/w\udcffol" in done.page.read_text()
+
+
 def test_a_shared_network_takes_two_fits_of_the_same_options(runs: Runs) -> None:
     other = "materials: {b: {fit: {relief: {seed: 3}}}}\n"
-    done = again(runs, f"shared_network: 5s\n{other}")
-    assert "fewer than two" in done.shared_error
-    assert all(function != "fit_shared" for function, _ in runs.calls)
+    # Fits that start from others share nothing.
+    bases = [BASE.replace("relief: {}", f"relief: {{{kept}: m}}") for kept in ("decoder", "init_from")]
+    for options, base in ((other, BASE), *(("", base) for base in bases)):
+        done = again(runs, f"shared_network: 5s\n{options}", base)
+        assert "fewer than two" in done.shared_error
+        assert all(function != "fit_shared" for function, _ in runs.calls)
     assert not again(runs).shared_error
+
+
+def test_the_most_fits_that_differ_in_time_alone_share_a_network(runs: Runs) -> None:
+    # The name of a fit is no option.
+    named = "c: {generate: {material: c}, fit: {relief: {seed: 3}, mine: {model: relief}}}"
+    times = "a: {fit: {relief: {training: {time: 3s}}}}, b: {fit: {relief: {training: {steps: 7}}}}"
+    again(runs, f"shared_network: 5s\nmaterials: {{{named}, {times}}}\n")
+    found = runs.arguments["fit_shared", "shared network"]
+    assert found["shards"] == [str(runs.out / "materials" / name / "shards") for name in "abc"]
+    assert found["folders"] == [str(runs.out / "shared" / name) for name in "abc"]
+    training = found["config"]["training"]
+    assert (training["time"], training["steps"], training["shared_decoder"]) == ("5s", None, True)
+    assert training["batch"] == SHARED_PRESET["training"]["batch"]
+    errors = runs.record()["shared"]["errors"]
+    assert {name: (error["fit"], error["value"]) for name, error in errors.items()} == {
+        **{"a": ("relief", 0.0), "b": ("relief", 0.1), "c": ("mine", 0.2)}
+    }
+
+
+def test_failures_and_batches_of_shared_networks(runs: Runs) -> None:
+    options = "shared_network: 5s\nmaterials: {c: c, a: {fit: {relief: {training: {batch: 32768}}}}}\n"
+    runs.errors = {"c": "no memory"}
+    again(runs, options)
+    found = runs.arguments["fit_shared", "shared network"]
+    assert [Path(folder).name for folder in found["folders"]] == ["a", "b"]
+    assert found["config"]["training"]["batch"] == 32768
+    runs.errors = {"shared network": "no memory"}
+    assert again(runs, options).shared_error == "no memory"
