@@ -1,7 +1,7 @@
 """A library of small materials on this machine, and new materials that keep the network of others.
 
     python benchmarks/library.py --out FOLDER [--materials 20] [--training 5min] [--cluster local]
-    python benchmarks/library.py --out FOLDER --network [--model relief] [--time 10s] [--only NAME ...]
+    python benchmarks/library.py --out FOLDER --network [--model relief] [--time 8s] [--only NAME ...]
 
 The first call runs a library of the assets and of variants of them: half the height, a smoother surface, or
 both. Its figures are the seconds of the whole command, and those of its stages.
@@ -187,7 +187,7 @@ def main() -> int:
     parser.add_argument("--network", action="store_true", help="measure kept networks")
     parser.add_argument("--model", default="relief", choices=("relief", "neumip"))
     parser.add_argument("--shared", default="2min", help="training time of the network of the others")
-    parser.add_argument("--time", default="10s", help="training time of the new material")
+    parser.add_argument("--time", default="8s", help="training time of the new material")
     parser.add_argument("--only", nargs="*", choices=RELIEFS, help="new materials; all by default")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
