@@ -9,10 +9,11 @@ from __future__ import annotations
 import contextlib
 import logging
 import shutil
+import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from importlib.metadata import version
 from typing import Any
 from uuid import uuid4
@@ -29,6 +30,8 @@ _AHEAD = 256
 _VERSION = version("mbtf")
 # Seconds between two looks at the workers.
 _LOOK_SECONDS = 2.0
+# The same until the first one has started.
+_START_SECONDS = 0.1
 # A task whose files another process works on is tried at this interval, until locks of dead ones have ended.
 _PAUSE_SECONDS, _LOCKED_SECONDS = 10.0, STALE_SECONDS + 2 * RENEW_SECONDS
 # Seconds in which a scheduler must answer.
@@ -56,8 +59,16 @@ class Cluster:
     workers : number of workers, as last seen
     """
 
-    def __init__(self, client: Any, config: ClusterConfig, note: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        client: Any,
+        config: ClusterConfig,
+        note: Callable[[str], None],
+        refused: Sequence[str] = (),
+    ) -> None:
         self.workers = 0
+        # Why the batch system took no job; grows while they are submitted.
+        self._refused = refused
         self._client, self._config, self._note = client, config, note
         # A task that asks for a GPU waits for ever where no worker states one.
         self._gpus = False
@@ -74,9 +85,17 @@ class Cluster:
         Raises
         ------
         TimeoutError : none has started within the time of the configuration
+        ConnectionRefusedError : the batch system refuses the jobs
         """
-        self._client.wait_for_workers(1, timeout=self._config.start_timeout)
+        until = time.monotonic() + self._config.start_timeout
         self._look()
+        while not self.workers:
+            if self._refused:
+                raise ConnectionRefusedError(self._refused[0])
+            if time.monotonic() > until:
+                raise TimeoutError
+            time.sleep(_START_SECONDS)
+            self._look()
         self._watch.start()
 
     def _look(self) -> None:
@@ -229,7 +248,9 @@ def open_cluster(where: str | None, note: Callable[[str], None]) -> Iterator[Clu
     except ImportError:
         hint = "pip install 'mbtf[cluster]'"
         raise UsageError("Dask is not installed", where="--cluster", hint=hint) from None
-    for name in [name for name in logging.root.manager.loggerDict if name.startswith("distributed")]:
+    names = [name for name in logging.root.manager.loggerDict if name.startswith("distributed")]
+    # Tornado prints the traceback of a job that cannot be submitted.
+    for name in [*names, "tornado.application"]:
         logging.getLogger(name).setLevel(logging.CRITICAL)
     settings = {
         # A worker that dies is started again; its task counts the deaths.
@@ -241,12 +262,13 @@ def open_cluster(where: str | None, note: Callable[[str], None]) -> Iterator[Clu
         "distributed.logging.distributed": "critical",
         "distributed.comm.timeouts.connect": f"{_CONNECT_SECONDS}s",
     }
+    refused: list[str] = []
     with contextlib.ExitStack() as stack:
         stack.enter_context(dask.config.set(settings))
         try:
-            started = stack.enter_context(_started(config)) if address is None else address
+            started = stack.enter_context(_started(config, refused)) if address is None else address
             client = stack.enter_context(Client(started, timeout=_CONNECT_SECONDS, set_as_default=False))
-            cluster = Cluster(client, config, note)
+            cluster = Cluster(client, config, note, refused)
             stack.callback(cluster.close)
         except (OSError, ValueError, TypeError, ImportError, RuntimeError) as error:
             hint = "" if address is None else f"it must have Dask {version('distributed')}, as this command"
@@ -262,6 +284,11 @@ def open_cluster(where: str | None, note: Callable[[str], None]) -> Iterator[Clu
             hint = "see the batch system's queue and logs; 'start_timeout' is the time to wait"
             raise InputError(
                 f"no worker has started within {limit}", where=f"--cluster {where}", hint=hint
+            ) from None
+        except ConnectionRefusedError as error:
+            hint = "correct the options of the file, such as queue and account"
+            raise InputError(
+                f"the batch system refuses the jobs ({error})", where=f"--cluster {where}", hint=hint
             ) from None
         note(_describe(address or config.engine, client, cluster))
         yield cluster
@@ -279,11 +306,12 @@ def _describe(name: str, client: Any, cluster: Cluster) -> str:
     return f"{text}, dashboard {client.dashboard_link}"
 
 
-def _started(config: ClusterConfig) -> Any:
-    """A Dask cluster, which ends its workers when its block ends."""
+def _started(config: ClusterConfig, refused: list[str]) -> Any:
+    """A Dask cluster, which ends its workers when its block ends; `refused` gets the reasons why jobs cannot
+    be submitted."""
     environment = {THREADS_VARIABLE: str(config.threads), "OMP_NUM_THREADS": str(config.threads)}
     if config.engine != "local":
-        return _jobs(config, environment)
+        return _jobs(config, environment, refused)
     from distributed import LocalCluster
     from distributed.system import MEMORY_LIMIT
 
@@ -304,9 +332,15 @@ def _started(config: ClusterConfig) -> Any:
     )
 
 
-def _jobs(config: ClusterConfig, environment: Mapping[str, str]) -> Any:
-    """Workers as jobs of a batch system."""
+@contextlib.contextmanager
+def _jobs(config: ClusterConfig, environment: Mapping[str, str], refused: list[str]) -> Iterator[Any]:
+    """Workers as jobs of a batch system, canceled when the block ends."""
+    handler = signal.getsignal(signal.SIGINT)
     import dask_jobqueue
+
+    # Its import lets Ctrl-C end the program as if all were done.
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, handler)
 
     name, command = _SYSTEMS[config.engine]
     if shutil.which(command) is None:
@@ -332,7 +366,28 @@ def _jobs(config: ClusterConfig, environment: Mapping[str, str]) -> Any:
         "log_directory": "worker-logs",
         **own,
     }
-    cluster = getattr(dask_jobqueue, name)(**options)
-    # Unlike scale(), this replaces workers that have ended.
-    cluster.adapt(minimum=config.workers, maximum=config.workers)
-    return cluster
+    system = getattr(dask_jobqueue, name)
+    cluster = system(job_cls=_reporting(system.job_cls, refused), **options)
+    try:
+        # Unlike scale(), this replaces workers that have ended.
+        cluster.adapt(minimum=config.workers, maximum=config.workers)
+        yield cluster
+    finally:
+        # Jobs that were never submitted cannot be closed.
+        with contextlib.suppress(Exception):
+            cluster.close()
+
+
+def _reporting(job: Any, refused: list[str]) -> Any:
+    """A class of jobs that also reports why one cannot be submitted."""
+
+    class Reporting(job):
+        async def start(self) -> None:
+            try:
+                await super().start()
+            except Exception as error:
+                # dask-jobqueue appends what the command has printed.
+                refused.append(" ".join(str(error).rpartition("stderr:")[2].split())[:300])
+                raise
+
+    return Reporting

@@ -8,6 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from mbtf_core.console import CONSOLE, Console
+from mbtf_core.errors import UsageError
 from mbtf_core.options import ClusterOption, Output, Set, Time, command_line
 
 
@@ -44,8 +45,12 @@ def cost(
     from mbtf_pipeline.cost_study.page import whole_runs, write_page
     from mbtf_pipeline.cost_study.pareto import pareto_front
     from mbtf_pipeline.cost_study.study import run_study, time_of
+    from mbtf_pipeline.library.recipe import is_library_recipe
+    from mbtf_pipeline.paper_tables.recipe import is_paper_recipe
     from mbtf_pipeline.recipe import load_recipe
 
+    if is_library_recipe(recipe) or is_paper_recipe(recipe):
+        raise UsageError("has several materials", where=recipe, hint="study the recipe of one of them")
     more = 0.0 if refine is None else asked_duration(refine, "--refine")
     loaded = load_recipe(recipe, assignments or [])
     folder = output if output is not None else loaded.folder.with_name(f"{loaded.folder.name}-cost")

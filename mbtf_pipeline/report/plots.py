@@ -305,7 +305,8 @@ def points(
         # The values set the range: an error bar that reaches zero has no end on a logarithmic axis.
         axes.set_ylim(*_limits([v[0] for row in series.values() for v in row if v is not None]))
         _plain_ticks(axes.yaxis)
-        axes.legend(frameon=False)
+        if axes.get_legend_handles_labels()[0]:
+            axes.legend(frameon=False)
         return _svg(axes.figure, label)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -52,6 +53,47 @@ def test_bad_input_ends_the_run_unless_the_tasks_are_independent(cluster: Cluste
         list(cluster.run(tasks))
     (done,) = cluster.run(tasks, stop_when_fatal=False)
     assert done.error == "map.png: is not there"
+
+
+def test_a_batch_system_that_refuses_the_jobs_is_no_wait(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("dask_jobqueue", reason="no dask-jobqueue; to enable: pip install 'mbtf[cluster]'")
+    command = tmp_path / "sbatch"
+    command.write_text("#!/bin/sh\necho 'sbatch: error: invalid partition' >&2\nexit 1\n")
+    command.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    file = tmp_path / "site.yaml"
+    file.write_text("engine: slurm\nworkers: 1\nstart_timeout: 30s\noptions: {interface: lo}\n")
+    with (
+        pytest.raises(InputError, match=r"refuses the jobs \(sbatch: error: invalid partition\)"),
+        open_cluster(str(file), lambda line: None),
+    ):
+        pass
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_an_interruption_while_waiting_for_jobs_is_one(tmp_path: Path) -> None:
+    pytest.importorskip("dask_jobqueue", reason="no dask-jobqueue; to enable: pip install 'mbtf[cluster]'")
+    for name, text in (("sbatch", "echo Submitted batch job 5"), ("scancel", "exit 0")):
+        (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n")
+        (tmp_path / name).chmod(0o755)
+    (tmp_path / "site.yaml").write_text("engine: slurm\nworkers: 1\noptions: {interface: lo}\n")
+    program = (
+        "import os, signal\n"
+        "from mbtf_core.cluster.engine import open_cluster\n"
+        "def note(line): signal.setitimer(signal.ITIMER_REAL, 0.5)\n"
+        "signal.signal(signal.SIGALRM, lambda *_: os.kill(os.getpid(), signal.SIGINT))\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "try:\n"
+        "    with open_cluster('site.yaml', note): pass\n"
+        "except KeyboardInterrupt: print('interrupted')\n"
+    )
+    environment = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, env=environment, capture_output=True, text=True
+    )
+    assert done.stdout == "interrupted\n", done.stderr
 
 
 def test_a_task_is_run_again_when_its_worker_dies(cluster: Cluster, tmp_path: Path) -> None:
@@ -173,7 +215,7 @@ def test_jobs_of_batch_systems(monkeypatch: pytest.MonkeyPatch) -> None:
             walltime=7200,
             options=own,  # type: ignore[arg-type]
         )
-        with engine._started(config):
+        with engine._started(config, []):
             pass
     for script in scripts:
         lines = script.splitlines()
@@ -193,8 +235,11 @@ def test_jobs_of_batch_systems(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_batch_system_that_is_not_there() -> None:
     pytest.importorskip("dask_jobqueue")
-    with pytest.raises(OSError, match="no command bsub"):
-        engine._started(ClusterConfig(engine="lsf"))
+    with (
+        pytest.raises(OSError, match="no command bsub"),
+        engine._started(ClusterConfig(engine="lsf"), []),
+    ):
+        pass
 
 
 def test_workers_of_this_machine_divide_its_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
