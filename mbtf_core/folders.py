@@ -32,10 +32,11 @@ def cache_folder() -> Path:
 
 
 @contextlib.contextmanager
-def owned(folder: Path) -> Iterator[None]:
+def owned(folder: Path, elsewhere: str = ELSEWHERE) -> Iterator[None]:
     """Own a folder in a block that writes to it, so that no other command does.
 
-    The folder is made if it is missing, and removed again if nothing was written.
+    The folder is made if it is missing, and removed again if nothing was written. `elsewhere` names the
+    option that chooses another one.
 
     Raises
     ------
@@ -57,7 +58,7 @@ def owned(folder: Path) -> Iterator[None]:
         raise LockedError(
             f"is being written by another process{'' if owner is None else f' ({owner})'}",
             where=folder,
-            hint=f"wait for it and run the same command again, or {ELSEWHERE}",
+            hint=f"wait for it and run the same command again, or {elsewhere}",
         )
     try:
         with keep_renewing():
@@ -78,7 +79,9 @@ def is_empty(folder: Path) -> bool:
     return not folder.exists() or all(_LEFTOVER.fullmatch(p.name) for p in folder.iterdir())
 
 
-def check_folder(folder: Path, is_ours: Callable[[Path], bool], what: str) -> bool:
+def check_folder(
+    folder: Path, is_ours: Callable[[Path], bool], what: str, elsewhere: str = ELSEWHERE
+) -> bool:
     """Does an output folder contain a run to resume? False where it is missing or empty.
 
     Parameters
@@ -89,6 +92,8 @@ def check_folder(folder: Path, is_ours: Callable[[Path], bool], what: str) -> bo
         Does the folder contain a record of this kind?
     what : str
         Name of the record, for the message.
+    elsewhere : str
+        Advice that names the option of the folder.
 
     Returns
     -------
@@ -106,7 +111,7 @@ def check_folder(folder: Path, is_ours: Callable[[Path], bool], what: str) -> bo
     if is_ours(folder):
         return True
     if not empty:
-        raise InputError(f"is not empty and holds no {what}", where=folder, hint=ELSEWHERE)
+        raise InputError(f"is not empty and holds no {what}", where=folder, hint=elsewhere)
     return False
 
 

@@ -39,6 +39,8 @@ _REFUSED = (
     IsADirectoryError,
     NotADirectoryError,
 )
+# Packages of protocols that the extra `stores` leaves out.
+_PACKAGES = {"gs": "gcsfs", "gcs": "gcsfs", "abfs": "adlfs", "az": "adlfs"}
 _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 _REFUSED_NAMES = (
     "NoCredentialsError",
@@ -107,7 +109,8 @@ class Store:
         try:
             self._files, root = fsspec.url_to_fs(url, use_listings_cache=False)
         except ImportError as error:
-            hint = "pip install 'mbtf[stores]'" if protocol in ("s3", "s3a") else "install it with pip"
+            package = "'mbtf[stores]'" if protocol in ("s3", "s3a") else _PACKAGES.get(protocol)
+            hint = f"pip install {package}" if package else "install it with pip"
             raise EngineError(f"a package is not installed ({reason(error)})", where=url, hint=hint) from None
         except ValueError as error:
             raise InputError(f"cannot be opened ({reason(error)})", where=url) from None

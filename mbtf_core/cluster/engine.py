@@ -7,7 +7,10 @@ neither a dead worker nor a dead command loses or doubles anything: the same com
 from __future__ import annotations
 
 import contextlib
+import difflib
+import inspect
 import logging
+import re
 import shutil
 import signal
 import threading
@@ -265,13 +268,16 @@ def open_cluster(where: str | None, note: Callable[[str], None]) -> Iterator[Clu
     refused: list[str] = []
     with contextlib.ExitStack() as stack:
         stack.enter_context(dask.config.set(settings))
+        if address is not None:
+            note(f"cluster: connecting to {address}, at most {_CONNECT_SECONDS:.0f} s")
         try:
             started = stack.enter_context(_started(config, refused)) if address is None else address
             client = stack.enter_context(Client(started, timeout=_CONNECT_SECONDS, set_as_default=False))
             cluster = Cluster(client, config, note, refused)
             stack.callback(cluster.close)
         except (OSError, ValueError, TypeError, ImportError, RuntimeError) as error:
-            hint = "" if address is None else f"it must have Dask {version('distributed')}, as this command"
+            own = version("distributed")
+            hint = "" if address is None else f"start one with: dask scheduler, of Dask {own} as this command"
             raise InputError(
                 f"cannot be used ({reason(error)})", where=f"--cluster {where}", hint=hint
             ) from None
@@ -367,7 +373,14 @@ def _jobs(config: ClusterConfig, environment: Mapping[str, str], refused: list[s
         **own,
     }
     system = getattr(dask_jobqueue, name)
-    cluster = system(job_cls=_reporting(system.job_cls, refused), **options)
+    try:
+        cluster = system(job_cls=_reporting(system.job_cls, refused), **options)
+    except (TypeError, ValueError) as error:
+        # Its text goes on with all the options.
+        unknown = re.search(r"unexpected keyword argument '(\w+)'", str(error))
+        if unknown is None:
+            raise
+        raise ValueError(_no_option(unknown[1], system)) from None
     try:
         # Unlike scale(), this replaces workers that have ended.
         cluster.adapt(minimum=config.workers, maximum=config.workers)
@@ -376,6 +389,15 @@ def _jobs(config: ClusterConfig, environment: Mapping[str, str], refused: list[s
         # Jobs that were never submitted cannot be closed.
         with contextlib.suppress(Exception):
             cluster.close()
+
+
+def _no_option(given: str, system: Any) -> str:
+    """What is said of an option that a class of dask-jobqueue does not have."""
+    classes = {*system.__mro__, *system.job_cls.__mro__}
+    known = {name for cls in classes for name in inspect.signature(cls.__init__).parameters}
+    near = difflib.get_close_matches(given, known, n=1)
+    text = f"options: {system.__name__} has no option '{given}'"
+    return text + (f"; did you mean '{near[0]}'?" if near else "")
 
 
 def _reporting(job: Any, refused: list[str]) -> Any:

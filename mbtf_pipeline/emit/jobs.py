@@ -40,6 +40,7 @@ Target = Literal["slurm", "k8s", "make"]
 
 RECORD_NAME, RECORD_FORMAT, RECORD_SCHEMA = f"{CONFIGS}/jobs.json", "mbtf-jobs", 1
 _SCRIPTS = (SUBMIT, APPLY)
+_ELSEWHERE = "choose another folder of the run with --run-folder"
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,9 @@ def emit_jobs(
         if cluster is None:
             raise ValueError("k8s needs a cluster")
         _check_inside(recipe, folder, run)
+    check_folder(folder, _is_ours, "job files")
     _check_outputs(recipe, run)
+    check_folder(run, is_run, "run", _ELSEWHERE)
     expected = forecast_run(recipe) if request.seconds is None else None
     steps = steps_of(recipe, run, folder, slices, request, expected)
     places = Places.of(folder)
@@ -142,8 +145,8 @@ def emit_jobs(
     if "make" in targets:
         files |= makefile(recipe.name, places, steps)
         start["make"] = f"{places.make} -j2"
-    with owned(run):
-        check_folder(run, is_run, "run")
+    with owned(run, _ELSEWHERE):
+        check_folder(run, is_run, "run", _ELSEWHERE)
         _write(folder, files, overwrite)
         write_run_record(run, recipe, command)
     return EmittedJobs(folder, run, tuple(steps), tuple(sorted(files)), start)
@@ -184,7 +187,7 @@ def _check_outputs(recipe: Recipe, run: Path) -> None:
 
 
 def _other(path: Path) -> InputError:
-    hint = "choose another folder of the run with --run-folder, or remove it"
+    hint = f"{_ELSEWHERE}, or remove it"
     return InputError("is of another configuration, which the jobs would not replace", where=path, hint=hint)
 
 

@@ -16,6 +16,7 @@ from mbtf_core.console import Console
 from mbtf_core.digest import data_sha256
 from mbtf_core.errors import InputError, MbtfError, printable
 from mbtf_core.folders import check_folder, owned
+from mbtf_core.units import format_duration
 from mbtf_fit.config import DECODER_MODELS, SHARED_PRESET, FitConfig
 from mbtf_fit.material.decoder import DECODER_FOLDER
 from mbtf_pipeline.library.budget import Division
@@ -206,7 +207,8 @@ class _LibraryRun:
             "decoder": str(folder / DECODER_FOLDER),
             "working_folder": str(Path.cwd()),
         }
-        self.console.note(f"{name}: a shared network of {len(group)} materials")
+        time = format_duration(self.library.shared_network)
+        self.console.note(f"{name}: a shared network of {len(group)} materials, training for {time}")
         task = Task("shared network", f"{_TASK}:fit_shared", arguments, gpu=config.device == "cuda")
         for result in self._results([task]):
             found = zip(group, result.value or (), strict=not result.error)

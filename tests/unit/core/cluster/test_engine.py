@@ -156,10 +156,11 @@ def test_a_scheduler_that_is_not_there_is_bad_input(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(engine, "_CONNECT_SECONDS", 1.0)
     pytest.importorskip("distributed")
     with (
-        pytest.raises(InputError, match=r"tcp://127\.0\.0\.1:9"),
+        pytest.raises(InputError, match=r"tcp://127\.0\.0\.1:9") as caught,
         open_cluster("tcp://127.0.0.1:9", lambda line: None),
     ):
         pass
+    assert "dask scheduler" in caught.value.hint
 
 
 def test_a_scheduler_that_ends_leaves_resumable_work(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -238,6 +239,18 @@ def test_a_batch_system_that_is_not_there() -> None:
     with (
         pytest.raises(OSError, match="no command bsub"),
         engine._started(ClusterConfig(engine="lsf"), []),
+    ):
+        pass
+
+
+def test_unknown_options_of_a_batch_system_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("dask_jobqueue")
+    monkeypatch.setattr("shutil.which", lambda command: f"/usr/bin/{command}")
+    file = tmp_path / "slurm.yaml"
+    file.write_text("engine: slurm\noptions: {qeue: short}\n")
+    with (
+        pytest.raises(InputError, match="has no option 'qeue'; did you mean 'queue'"),
+        open_cluster(str(file), lambda line: None),
     ):
         pass
 

@@ -14,9 +14,11 @@ from support.fake_cluster import read_job
 from support.paths import ROOT
 
 from mbtf_core.console import run
+from mbtf_core.folders import owned
 from mbtf_gen.cli.app import app as gen_app
 from mbtf_gen.job import Job
 from mbtf_pipeline.cli.app import app
+from mbtf_pipeline.emit import jobs
 from mbtf_pipeline.emit.jobs import emit_jobs
 from mbtf_pipeline.emit.kubernetes import Cluster
 from mbtf_pipeline.emit.places import Places
@@ -254,6 +256,23 @@ def test_other_job_files_are_replaced_on_demand(place: Path, capsys: pytest.Capt
     assert not (place / "jobs" / "Makefile").exists()
     assert emit("--to", "make", "--time-limit", "1h", "-o", "the maps") == 3
     assert "holds no job files" in capsys.readouterr().err
+
+
+def test_folders_of_others_are_refused_before_the_forecast(
+    place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def forecast(recipe: Recipe) -> RunForecast:
+        raise AssertionError
+
+    monkeypatch.setattr(jobs, "forecast_run", forecast)
+    assert emit("--to", "make", "-o", "the maps") == 3
+    assert "holds no job files" in capsys.readouterr().err
+    assert emit("--to", "make", "--run-folder", "the maps") == 3
+    assert "--run-folder" in capsys.readouterr().err
+    # A lock in a run's folder: a run goes on there.
+    with owned(place / "run"):
+        assert emit("--to", "make", "--run-folder", "run", "--time-limit", "1h") == 4
+    assert "--run-folder" in capsys.readouterr().err
 
 
 def test_data_of_another_configuration_is_refused(
