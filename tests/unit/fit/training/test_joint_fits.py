@@ -424,5 +424,6 @@ def test_options_of_shared_networks_leave_other_fits_as_they_are() -> None:
     assert "shared_decoder" not in plain.fields()["training"]
     joint = joint_config()
     assert joint.fields()["training"]["shared_decoder"] is True
-    assert FitConfig.model_validate({"training": {"shared_decoder": True}}).training.batch == 1 << 14
+    shared = FitConfig.model_validate({"training": {"shared_decoder": True}}).training
+    assert (shared.batch, shared.learning_rate) == (1 << 14, 0.01)
     assert joint.hash("x") != single_config(steps=300).hash("x")

@@ -198,7 +198,8 @@ def test_the_most_fits_that_differ_in_time_alone_share_a_network(runs: Runs) -> 
     assert found["folders"] == [str(runs.out / "shared" / name) for name in "abc"]
     training = found["config"]["training"]
     assert (training["time"], training["steps"], training["shared_decoder"]) == ("5s", None, True)
-    assert training["batch"] == SHARED_PRESET["training"]["batch"]
+    preset = SHARED_PRESET["training"]
+    assert {key: training[key] for key in preset} == preset
     errors = runs.record()["shared"]["errors"]
     assert {name: (error["fit"], error["value"]) for name, error in errors.items()} == {
         **{"a": ("relief", 0.0), "b": ("relief", 0.1), "c": ("mine", 0.2)}

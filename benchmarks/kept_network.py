@@ -1,0 +1,143 @@
+"""New materials that keep the network of others: their error beside that of a network of their own.
+
+    python benchmarks/kept_network.py --out FOLDER [--shared 5min] [--time 8s] [--only NAME ...]
+
+Each of the five assets with a height map is in turn a material that the network has not seen. One network is
+trained on the other four and on three variants of each: turned by 90°, by 180°, and by 270° with half the
+height. Then the new material is fitted twice for ``--time``: with that network kept, and with a network of
+its own of the default options. Its figures are the two errors, their ratio, and the seconds of the whole
+command with the kept network.
+
+Data and networks of an earlier call are kept. Times mean little on a busy machine. The last line is a JSON
+object.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+from PIL import Image
+
+from mbtf_core.atomic import write_text
+from mbtf_core.config_file import dump_yaml, read_yaml
+
+ASSETS = Path(__file__).resolve().parents[1] / "assets"
+NAMES = ("cliff_rock", "insulation_foam", "straight_wool", "turtle_shell", "twisted_wool")
+# Quarter turns and factors of heights, by the suffix of a variant's name.
+VARIANTS = {"": (0, 1.0), "_90": (1, 1.0), "_180": (2, 1.0), "_270_low": (3, 0.5)}
+DATA = ("--resolution", "64", "--queries", "200/texel", "--test-queries", "8192")
+DATA_SETTINGS = ("light.width=5", "queries.min_cos=0.2", "queries.test_spp=128")
+THRESHOLDS = {"seconds with the kept network": 15.0, "ratio": 1.3}
+
+
+def turned(name: str, suffix: str, folder: Path) -> Path:
+    """A material with the maps of an asset turned counterclockwise."""
+    turns, scale = VARIANTS[suffix]
+    source, out = ASSETS / name, folder / f"{name}{suffix}"
+    if (out / "material.yaml").is_file():
+        return out
+    out.mkdir(parents=True, exist_ok=True)
+    with OpenEXR.File(str(source / "height.exr")) as file:
+        heights = next(iter(file.channels().values())).pixels
+    with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Y": np.rot90(heights, turns).copy()}) as file:
+        file.write(str(out / "height.exr"))
+    for role in ("base_color", "roughness"):
+        with Image.open(source / f"{role}.png") as image:
+            Image.fromarray(np.rot90(np.asarray(image), turns).copy()).save(out / f"{role}.png")
+    described = read_yaml(source / "material.yaml") if (source / "material.yaml").is_file() else {}
+    maps: dict[str, Any] = {"base_color": "base_color.png", "roughness": "roughness.png"}
+    maps["height"] = {"file": "height.exr", "scale": scale}
+    if "specular" in described:
+        maps["specular"] = float(described["specular"])
+    write_text(out / "material.yaml", dump_yaml(maps))
+    return out
+
+
+def command(*words: object) -> tuple[dict[str, Any], float]:
+    """What a command of the programs reports as JSON, and its seconds."""
+    program = Path(sys.executable).parent / str(words[0])
+    start = time.perf_counter()
+    done = subprocess.run([str(program), *map(str, words[1:]), "--json"], stdout=subprocess.PIPE, check=False)
+    seconds = time.perf_counter() - start
+    if done.returncode:
+        raise SystemExit(f"error: {' '.join(map(str, words))}: exit code {done.returncode}")
+    return dict(json.loads(done.stdout)), seconds
+
+
+def settings(assignments: list[str] | tuple[str, ...]) -> list[str]:
+    """Command-line words of assignments."""
+    return [word for text in assignments for word in ("--set", text)]
+
+
+def unexplained(report: dict[str, Any]) -> tuple[float, float]:
+    """Error of a fit's test split and its standard error."""
+    found = report["errors"]["test"]["unexplained"]
+    return float(found["value"]), float(found["error"])
+
+
+def fold(name: str, data: dict[str, Path], options: argparse.Namespace) -> dict[str, Any]:
+    """Errors of one material with the network of the others and with its own."""
+    fits = options.out / "fits" / options.model / name
+    others = [folder for variant, folder in data.items() if not variant.startswith(name)]
+    joint = [*others, "--shared-decoder", "--model", options.model, "--time", options.shared]
+    command("mbtf-fit", "--many", *joint, *settings(options.set), "-o", fits / "others")
+    # Files that a fit has just written are still on their way to the disk.
+    os.sync()
+    found = []
+    for kind in (["--decoder", fits / "others" / "decoder"], ["--model", options.model]):
+        out = fits / kind[0].strip("-")
+        words = [data[name], *kind, "--time", options.time, "-o", out, "--overwrite"]
+        report, seconds = command("mbtf-fit", *words)
+        found.append((*unexplained(report), seconds))
+    (a, a_bar, seconds), (b, b_bar, _) = found
+    # Both errors are of the same test queries, so this bar of the ratio is an upper bound.
+    bar = a / b * math.hypot(a_bar / a, b_bar / b)
+    print(
+        f"{name:18} {len(others):3} others: kept {a:.4f} ± {a_bar:.4f}, own {b:.4f} ± {b_bar:.4f}, "
+        f"ratio {a / b:.2f} ± {bar:.2f}, {seconds:.1f} s",
+        flush=True,
+    )
+    return {"kept": [a, a_bar], "own": [b, b_bar], "ratio": [a / b, bar], "seconds": round(seconds, 2)}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, help="folder to work in")
+    parser.add_argument("--model", default="relief", choices=("relief", "neumip"))
+    parser.add_argument("--shared", default="5min", help="training time of the network of the others")
+    parser.add_argument("--time", default="8s", help="training time of the new material")
+    parser.add_argument("--only", nargs="*", choices=NAMES, help="new materials; all by default")
+    size = ["network.width=64", "network.channels=16"]
+    parser.add_argument(
+        "--set", action="append", metavar="KEY=VALUE", help=f"of the network; {' '.join(size)}"
+    )
+    options = parser.parse_args()
+    options.set = options.set or size
+    data = {}
+    for variant in [name + suffix for name in NAMES for suffix in VARIANTS]:
+        name = next(name for name in NAMES if variant.startswith(name))
+        material = turned(name, variant.removeprefix(name), options.out / "materials")
+        data[variant] = options.out / "data" / variant
+        command("mbtf-gen", material, *DATA, *settings(DATA_SETTINGS), "-o", data[variant])
+    folds = {name: fold(name, data, options) for name in options.only or NAMES}
+    mean = math.exp(float(np.mean([math.log(one["ratio"][0]) for one in folds.values()])))
+    slowest = max(one["seconds"] for one in folds.values())
+    print(f"geometric mean of the ratios {mean:.3f}; the slowest command {slowest:.1f} s")
+    figures = {"folds": folds, "geometric mean of the ratios": round(mean, 4), "slowest, s": slowest}
+    print(json.dumps({**figures, "thresholds": THRESHOLDS}))
+    met = mean <= THRESHOLDS["ratio"] and slowest <= THRESHOLDS["seconds with the kept network"]
+    return 0 if met else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
