@@ -15,24 +15,22 @@ object.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import math
 import os
-import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import OpenEXR
+from library import ASSETS, RELIEFS, command
 from PIL import Image
 
 from mbtf_core.atomic import write_text
 from mbtf_core.config_file import dump_yaml, read_yaml
 
-ASSETS = Path(__file__).resolve().parents[1] / "assets"
-NAMES = ("cliff_rock", "insulation_foam", "straight_wool", "turtle_shell", "twisted_wool")
 # Quarter turns and factors of heights, by the suffix of a variant's name.
 VARIANTS = {"": (0, 1.0), "_90": (1, 1.0), "_180": (2, 1.0), "_270_low": (3, 0.5)}
 DATA = ("--resolution", "64", "--queries", "200/texel", "--test-queries", "8192")
@@ -61,17 +59,6 @@ def turned(name: str, suffix: str, folder: Path) -> Path:
         maps["specular"] = float(described["specular"])
     write_text(out / "material.yaml", dump_yaml(maps))
     return out
-
-
-def command(*words: object) -> tuple[dict[str, Any], float]:
-    """What a command of the programs reports as JSON, and its seconds."""
-    program = Path(sys.executable).parent / str(words[0])
-    start = time.perf_counter()
-    done = subprocess.run([str(program), *map(str, words[1:]), "--json"], stdout=subprocess.PIPE, check=False)
-    seconds = time.perf_counter() - start
-    if done.returncode:
-        raise SystemExit(f"error: {' '.join(map(str, words))}: exit code {done.returncode}")
-    return dict(json.loads(done.stdout)), seconds
 
 
 def settings(assignments: list[str] | tuple[str, ...]) -> list[str]:
@@ -116,20 +103,18 @@ def main() -> int:
     parser.add_argument("--model", default="relief", choices=("relief", "neumip"))
     parser.add_argument("--shared", default="1min", help="training time of the network of the others")
     parser.add_argument("--time", default="8s", help="training time of the new material")
-    parser.add_argument("--only", nargs="*", choices=NAMES, help="new materials; all by default")
+    parser.add_argument("--only", nargs="*", choices=RELIEFS, help="new materials; all by default")
     size = ["network.width=64", "network.channels=16"]
-    parser.add_argument(
-        "--set", action="append", metavar="KEY=VALUE", help=f"of the network; {' '.join(size)}"
-    )
+    described = f"option of the network; by default {' and '.join(size)}"
+    parser.add_argument("--set", action="append", metavar="KEY=VALUE", help=described)
     options = parser.parse_args()
     options.set = options.set or size
     data = {}
-    for variant in [name + suffix for name in NAMES for suffix in VARIANTS]:
-        name = next(name for name in NAMES if variant.startswith(name))
-        material = turned(name, variant.removeprefix(name), options.out / "materials")
-        data[variant] = options.out / "data" / variant
-        command("mbtf-gen", material, *DATA, *settings(DATA_SETTINGS), "-o", data[variant])
-    folds = {name: fold(name, data, options) for name in options.only or NAMES}
+    for name, suffix in itertools.product(RELIEFS, VARIANTS):
+        material = turned(name, suffix, options.out / "materials")
+        out = data[material.name] = options.out / "data" / material.name
+        command("mbtf-gen", material, *DATA, *settings(DATA_SETTINGS), "-o", out)
+    folds = {name: fold(name, data, options) for name in options.only or RELIEFS}
     # A few values can decide the error of a glossy material, so each fold counts by its error bar.
     logs = np.array([[math.log(r), bar / r] for r, bar in (one["ratio"] for one in folds.values())])
     weights = logs[:, 1] ** -2

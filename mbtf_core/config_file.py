@@ -6,7 +6,6 @@ nearest valid key; a value that does not fit is refused with its key and what wa
 
 from __future__ import annotations
 
-import difflib
 import io
 import os
 import re
@@ -27,7 +26,7 @@ from pydantic import (
 
 from mbtf_core.errors import InputError, MbtfError, UsageError, reason
 from mbtf_core.nested import deep_merge, leaves, merge, nested
-from mbtf_core.suggest import refuse_special, suggest_path
+from mbtf_core.suggest import refuse_special, suggest_name, suggest_path
 from mbtf_core.validation_messages import explain, models_in, parts_of
 
 
@@ -241,9 +240,8 @@ def _explain(
     where = flag or (f"{source}:{line}" if line is not None else source)
     if fault["type"] == "extra_forbidden":
         known = _known_keys(model, location)
-        near = difflib.get_close_matches(str(location[-1]), known, n=1, cutoff=0.5)
         what = f"unknown key '{dotted}'"
-        hint = f"did you mean '{near[0]}'?" if near else f"valid keys: {', '.join(known)}"
+        hint = suggest_name(str(location[-1]), known, 0.5) or f"valid keys: {', '.join(known)}"
         return where, what, hint
     if fault["type"] == "missing":
         return where, f"key '{dotted}' is missing", "add it"

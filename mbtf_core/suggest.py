@@ -1,11 +1,11 @@
-"""Checks of the names of input files: suggestions for misspelt names; special files are refused."""
+"""Suggestions for misspelt names of files and options; special files are refused."""
 
 from __future__ import annotations
 
 import difflib
 import os
 import stat
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from mbtf_core.errors import InputError
@@ -43,6 +43,13 @@ def suggest_path(path: Path, wanted: Callable[[Path], bool] | None = None) -> st
     alike = [n for n in near if difflib.SequenceMatcher(None, stem, Path(n).stem).ratio() >= _LEAST]
     near = alike or [n for n, p in names.items() if p.stem.lower() == stem][:1]
     return f"did you mean '{names[near[0]]}'?" if near else ""
+
+
+def suggest_name(given: str, known: Sequence[str], least: float = _LEAST) -> str:
+    """``did you mean 'queue'?`` for a name that is not known; empty where no known name has at least the
+    similarity `least`."""
+    near = difflib.get_close_matches(given, known, n=1, cutoff=least)
+    return f"did you mean '{near[0]}'?" if near else ""
 
 
 def refuse_special(path: Path) -> None:

@@ -7,7 +7,6 @@ neither a dead worker nor a dead command loses or doubles anything: the same com
 from __future__ import annotations
 
 import contextlib
-import difflib
 import inspect
 import logging
 import re
@@ -25,6 +24,7 @@ from mbtf_core.cluster.config import ClusterConfig, read_cluster
 from mbtf_core.cluster.task import GPUS_VARIABLE, THREADS_VARIABLE, Task, TaskResult, run_task
 from mbtf_core.errors import InputError, PartialError, UsageError, reason
 from mbtf_core.locks import RENEW_SECONDS, STALE_SECONDS
+from mbtf_core.suggest import suggest_name
 from mbtf_core.units import format_duration
 
 # Tasks that the scheduler knows at a time, beyond those that run.
@@ -395,9 +395,8 @@ def _no_option(given: str, system: Any) -> str:
     """What is said of an option that a class of dask-jobqueue does not have."""
     classes = {*system.__mro__, *system.job_cls.__mro__}
     known = {name for cls in classes for name in inspect.signature(cls.__init__).parameters}
-    near = difflib.get_close_matches(given, known, n=1)
-    text = f"options: {system.__name__} has no option '{given}'"
-    return text + (f"; did you mean '{near[0]}'?" if near else "")
+    parts = f"options: {system.__name__} has no option '{given}'", suggest_name(given, sorted(known))
+    return "; ".join(filter(None, parts))
 
 
 def _reporting(job: Any, refused: list[str]) -> Any:
@@ -409,7 +408,7 @@ def _reporting(job: Any, refused: list[str]) -> Any:
                 await super().start()
             except Exception as error:
                 # dask-jobqueue appends what the command has printed.
-                refused.append(" ".join(str(error).rpartition("stderr:")[2].split())[:300])
+                refused.append(reason(str(error).rpartition("stderr:")[2], 300))
                 raise
 
     return Reporting
