@@ -156,18 +156,13 @@ def _run_library(
     console: Console,
 ) -> None:
     from mbtf_core.cluster.engine import open_cluster
-    from mbtf_core.folders import check_folder
-    from mbtf_pipeline.library.forecast import describe_library
     from mbtf_pipeline.library.recipe import entries, load_library_recipe
-    from mbtf_pipeline.library.run import is_library, run_library
+    from mbtf_pipeline.library.run import run_library
 
     library = load_library_recipe(file, assignments)
     found = entries(library, file)
     folder = output if output is not None else library.folder
     keep_on_interruption(f"the finished stages are kept in {folder}")
-    resumed = check_folder(folder, is_library, "library")
-    if cluster is None and not resumed and (expected := describe_library(library, found)):
-        console.note(expected)
     with open_cluster(cluster, console.note) as workers:
         done = run_library(library, found, folder, command=command, console=console, cluster=workers)
     count = len(found) - len(done.failed)
