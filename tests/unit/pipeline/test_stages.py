@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 import threading
-import time
 from pathlib import Path
 from typing import Any
 
@@ -180,13 +179,12 @@ def test_running_one_stage_again(pipeline: Pipeline) -> None:
 
 
 def test_an_interruption_does_not_wait_for_other_machines(tmp_path: Path) -> None:
-    first, ended, main = threading.Lock(), threading.Event(), threading.get_ident()
+    begun, ended, main = threading.Barrier(2), threading.Event(), threading.get_ident()
 
     def work(decision: Decision) -> None:
-        if first.acquire(blocking=False):
-            time.sleep(0.2)  # all stages have begun
+        if begun.wait(60.0) == 0:
             signal.pthread_kill(main, signal.SIGINT)
-        ended.wait(20.0)
+        ended.wait(60.0)
 
     stages = [Stage(f"fit {n}", (), {}, {}, list, work, remote=True) for n in "ab"]
     before = signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -18,7 +18,9 @@ from mbtf_core.errors import PartialError
 from mbtf_core.store import Store
 from mbtf_core.store_folder import StoreFolder, StorePath
 from mbtf_fit.config import FitConfig, HeldOutSection
+from mbtf_fit.data import streaming
 from mbtf_fit.data.loader import load_training
+from mbtf_fit.data.queries import batch_starts
 from mbtf_fit.data.streaming import StreamedQueries
 from mbtf_fit.training.checkpoint import CHECKPOINT_NAME
 from mbtf_fit.training.fit import fit
@@ -84,17 +86,40 @@ def test_batches_are_those_of_local_data(url: str, local: Path) -> None:
         assert all((getattr(a, n) == getattr(b, n)).all() for n in ("u", "sigma", "omega_i", "value"))
 
 
-def test_shards_are_downloaded_once_and_ahead(
-    url: str, local: Path, downloads: list[tuple[str, str]]
-) -> None:
+def test_shards_are_downloaded_once(url: str, local: Path, downloads: list[tuple[str, str]]) -> None:
     data = Dataset.open(url)
     training = load_training(data, HELD_OUT, 0, memory=1.0).training
     names = [name for name, _ in downloads]
     assert sorted(names) == [path.name for path in sorted(local.glob("train-*.npz"))]
-    # The reader waits for the first shard only.
-    assert sum(thread == "prefetch" for _, thread in downloads) >= 6
     list(islice(training.batches(700, 0, 0), 30))  # type: ignore[arg-type, call-overload]
     assert len(downloads) == len(names)
+
+
+def test_the_shards_after_the_one_that_is_read_are_downloaded_ahead(
+    url: str, local: Path, downloads: list[tuple[str, str]]
+) -> None:
+    Dataset.open(url).shards("train")[0].read()
+    give_up = time.monotonic() + 60.0
+    while len(downloads) < 3 and time.monotonic() < give_up:
+        time.sleep(0.01)
+    first, *ahead = downloads
+    assert first == ("train-00000.npz", threading.current_thread().name)
+    assert sorted(ahead) == [("train-00001.npz", "prefetch"), ("train-00002.npz", "prefetch")]
+
+
+def test_the_shards_of_later_batches_are_announced(
+    url: str, local: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of the six batches that follow the one that is being read."""
+    training = load_training(Dataset.open(url), HELD_OUT, 0, memory=1.0).training
+    assert isinstance(training, StreamedQueries)
+    announced: list[str] = []
+    monkeypatch.setattr(streaming, "prefetch", lambda path: announced.append(path.name))
+    starts = list(islice(batch_starts(len(training), 300, 0, 0), 20))
+    expected = [{path.name for path, _ in training.selection.pieces(s, s + 300)} for s in starts]
+    for at, start in enumerate(islice(training._announced(iter(starts), 300), 14)):
+        assert start == starts[at]
+        assert set(announced) == set().union(*expected[: at + 7])
 
 
 def test_the_cache_is_bounded(
