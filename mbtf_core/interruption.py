@@ -227,9 +227,12 @@ def stop_on_interruption() -> Iterator[threading.Event]:
             signal.signal(number, handler)
 
 
-def wait_for_interruption() -> None:
-    """Wait for the signal that ends a service: its regular end, with the exit code 0."""
+@contextlib.contextmanager
+def served_until_interruption() -> Iterator[None]:
+    """After a block, which announces a service, wait for the signal that ends it. A signal during the block
+    counts too: it is the regular end, with the exit code 0."""
     with stop_on_interruption() as stop:
+        yield
         while not stop.wait(0.5):
             pass
     _State.received = 0

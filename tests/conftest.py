@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -18,6 +19,14 @@ use_shipped_llvm()
 # The same examples in every run, and no limit on the time of one: neither machine nor luck decides a test.
 settings.register_profile("project", derandomize=True, deadline=None)
 settings.load_profile("project")
+
+
+@pytest.fixture(autouse=True)
+def ctrl_c_interrupts() -> None:
+    """Python's own handler. A shell without job control starts background processes with the signal ignored;
+    Mitsuba and dask-jobqueue leave handlers behind."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
 
 RunPython = Callable[..., "subprocess.CompletedProcess[str]"]
 

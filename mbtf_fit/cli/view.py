@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 from mbtf_core.console import CONSOLE, Console
-from mbtf_core.interruption import wait_for_interruption
+from mbtf_core.interruption import served_until_interruption
 from mbtf_fit.cli.page_options import PAGE_OPTIONS, PageOptions
 
 
@@ -36,8 +36,8 @@ def view(
     html, precision = options.page(material)
     server = PageServer(html, port)
     console.note(precision)
-    console.report({"url": server.url}, f"{server.url}\nopen it in a browser; Ctrl-C ends")
-    # A script that reads the address waits for it.
-    sys.stdout.flush()
-    wait_for_interruption()
+    with served_until_interruption():
+        console.report({"url": server.url}, f"{server.url}\nopen it in a browser; Ctrl-C ends")
+        # A script that reads the address waits for it.
+        sys.stdout.flush()
     server.close()

@@ -63,20 +63,15 @@ sys.exit(interruption.finish(run(app, [])))
 def run_program(
     number: signal.Signals, folder: Path, *arguments: str, **variables: str
 ) -> subprocess.CompletedProcess[str]:
-    # Background processes of a shell without job control ignore it.
-    usual = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        return subprocess.run(
-            [sys.executable, *arguments],
-            cwd=folder,
-            env={**os.environ, "TEST_SIGNAL": str(int(number)), **variables},
-            capture_output=True,
-            text=True,
-            timeout=15,
-            check=False,
-        )
-    finally:
-        signal.signal(signal.SIGINT, usual)
+    return subprocess.run(
+        [sys.executable, *arguments],
+        cwd=folder,
+        env={**os.environ, "TEST_SIGNAL": str(int(number)), **variables},
+        capture_output=True,
+        text=True,
+        timeout=15,
+        check=False,
+    )
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -191,16 +186,12 @@ def test_a_closed_stream_is_no_error(closed: str, tmp_path: Path) -> None:
 
 def test_work_stops_at_a_step_and_then_as_usual(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(interruption._State, "received", 0)
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        with stop_on_interruption() as stop:
+    with stop_on_interruption() as stop:
+        signal.raise_signal(signal.SIGINT)
+        assert stop.is_set()
+        # The echo of a wrapper.
+        signal.raise_signal(signal.SIGINT)
+        monkeypatch.setattr(interruption, "_ECHO_SECONDS", 0.0)
+        with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
-            assert stop.is_set()
-            # The echo of a wrapper.
-            signal.raise_signal(signal.SIGINT)
-            monkeypatch.setattr(interruption, "_ECHO_SECONDS", 0.0)
-            with pytest.raises(KeyboardInterrupt):
-                signal.raise_signal(signal.SIGINT)
-        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    finally:
-        signal.signal(signal.SIGINT, before)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -7,7 +7,6 @@ import json
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -102,7 +101,6 @@ def test_ctrl_c_ends_the_service(tmp_path: Path) -> None:
         assert process.stdout is not None
         url = process.stdout.readline()
         assert url.startswith("http://127.0.0.1:")
-        time.sleep(0.2)
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate(timeout=60)
         assert (process.returncode, errors) == (0, "")
