@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 from contextvars import ContextVar
 
 from mbtf_core.errors import UsageError
+from mbtf_core.suggest import suggest_name
 from mbtf_gen.render.runtime import CPU_VARIANT, CUDA_VARIANT
 from mbtf_gen.render.types import Properties
 
@@ -27,6 +27,5 @@ def refuse_unknown(props: Properties, known: Sequence[str], where: str) -> None:
     """
     unknown = sorted(set(props.unqueried()) - set(known))
     if unknown:
-        similar = difflib.get_close_matches(unknown[0], known, n=1)
-        hint = f"did you mean '{similar[0]}'?" if similar else f"it has: {', '.join(known)}"
+        hint = suggest_name(unknown[0], known) or f"it has: {', '.join(known)}"
         raise UsageError(f"has no parameter '{unknown[0]}'", where=where, hint=hint)

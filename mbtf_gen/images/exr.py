@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import difflib
 import errno
 import os
 import sys
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from mbtf_core.atomic import Stored, unwritable, write_through
 from mbtf_core.errors import InputError, reason
+from mbtf_core.suggest import suggest_name
 
 # Limit of the numbers in all channels of all parts, in multiples of the largest image.
 _MOST_CHANNELS = 4
@@ -270,11 +270,10 @@ def choose_channels(
             return [channel]
         if channel in found:
             return found[channel]
-        near = difflib.get_close_matches(channel, [*names, *found], n=1, cutoff=0.5)
         raise InputError(
             f"has no channel or layer '{channel}'",
             where=path,
-            hint=f"did you mean '{near[0]}'?" if near and near[0] else f"it has {listed}",
+            hint=suggest_name(channel, [*names, *found], 0.5) or f"it has {listed}",
         )
     if len(found) == 1:
         return next(iter(found.values()))

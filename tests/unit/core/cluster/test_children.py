@@ -18,12 +18,10 @@ from mbtf_core.cluster.task import Task
 
 TASKS = "support.cluster_tasks"
 COMMAND = f"""
-import signal
 import sys
 from mbtf_core.cluster.children import run_in_children
 from mbtf_core.cluster.task import Task
 if __name__ == "__main__":
-    signal.signal(signal.SIGINT, signal.default_int_handler)
     list(run_in_children([Task("a", "{TASKS}:wait_long", {{"mark": sys.argv[1]}})]))
 """
 
