@@ -25,12 +25,12 @@ import numpy as np
 
 from mbtf_core.cluster.engine import Cluster, open_cluster
 from mbtf_core.cluster.task import Task
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.shard_files import row_bytes, write_shard
+from mbtf_core.data.sidecar import finished_record
 from mbtf_core.units import clock
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.dataset.reader import Dataset
-from mbtf_gen.dataset.shard_io import row_bytes, write_shard
-from mbtf_gen.dataset.sidecar import finished_record
-from mbtf_gen.generation import generate
+from mbtf_gen.generation.run import generate
 
 ASSETS = Path(__file__).parents[1] / "assets"
 WORKERS = (1, 16, 256, 4096)

@@ -38,9 +38,9 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from support.file_operations import FileOperations, Operation
 from support.small_runs import command, contents, die, ending, generate, in_child, noisy_plane
 
+from mbtf_core.data.sidecar import ABSENT
+from mbtf_core.data.verify import INCOMPLETE, verify
 from mbtf_core.errors import InputError
-from mbtf_gen.dataset.sidecar import ABSENT
-from mbtf_gen.dataset.verify import INCOMPLETE, verify
 from mbtf_gen.planning.simulation import ClosedForm
 
 KILLED = -signal.SIGKILL

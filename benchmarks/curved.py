@@ -161,10 +161,10 @@ def fit_alone(
     """
     import drjit as dr
 
+    from mbtf_core.data.queries import Queries
     from mbtf_fit.mitsuba_plugin.bsdf import Frame, clamped
     from mbtf_fit.mitsuba_plugin.integrator import camera_cone, write_footprint
     from mbtf_gen.render.estimator import Stream
-    from mbtf_gen.sampling.query_sampler import Queries
 
     random, size = np.random.default_rng(5), len(inside)
     pixel = mi.UInt32(random.choice(np.flatnonzero(inside), QUERIES).astype(np.uint32))

@@ -37,8 +37,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from mbtf_core.data.lattice import Lattice, sigma_of_level
 from mbtf_core.directions import from_projected_disk
-from mbtf_core.lattice import Lattice, sigma_of_level
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.material.inference import predict

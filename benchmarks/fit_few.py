@@ -25,11 +25,11 @@ from quality import generator_config
 
 from mbtf_core.config_file import resolve
 from mbtf_core.errors import MbtfError
+from mbtf_core.quality import as_assignments
 from mbtf_fit import fit
 from mbtf_fit.config import FitConfig
 from mbtf_fit.presets import best_options
-from mbtf_gen.config.presets import as_assignments
-from mbtf_gen.generation import generate
+from mbtf_gen.generation.run import generate
 from mbtf_gen.render.runtime import load_mitsuba
 
 STEPS = (200, 800, 3000)

@@ -89,11 +89,11 @@ def by_halves(p: Tensor, a: Tensor, b: Tensor) -> Tensor:
 
 def real_noise(material: Path, shards: Path) -> dict[str, float]:
     """Relative noise, share of values beyond the bound, relative bias of their mean: 65 536 queries."""
+    from mbtf_core.data.dataset import Dataset
     from mbtf_fit import Material
     from mbtf_fit.data.loader import load_training
     from mbtf_fit.data.queries import mean_value
     from mbtf_fit.objective.noise import typical_value
-    from mbtf_gen.dataset.reader import Dataset
 
     loaded, data = Material.load(material), Dataset.open(shards)
     # Half a gigabyte at most: what is trained on stays on disk.

@@ -21,12 +21,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from mbtf_core.data.dataset import Dataset
 from mbtf_core.errors import MbtfError
 from mbtf_fit import FitConfig, Material, fit
 from mbtf_fit.data.loader import load_split
 from mbtf_fit.evaluation import split_errors
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.dataset.reader import Dataset
 
 ROOT = Path(__file__).resolve().parents[1]
 TEXTURE_SETS = ROOT.parent / "shared" / "data" / "materials"
@@ -46,7 +46,7 @@ WINDOW = 4
 
 def make_data(name: str, folder: Path, layout: str) -> Path:
     """A material's data set of one layout, resumed where it is unfinished."""
-    from mbtf_gen.generation import generate
+    from mbtf_gen.generation.run import generate
 
     material, height = MATERIALS[name]
     queries: dict[str, Any] = {

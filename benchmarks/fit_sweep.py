@@ -33,8 +33,9 @@ import numpy as np
 from fit import MOMENTS, random_batch
 from rock_cliff_128 import RECIPE, make_shards
 
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import MbtfError
-from mbtf_core.lattice import Lattice
 from mbtf_fit import FitConfig, Material, fit, read_history
 from mbtf_fit.data.loader import Partition, load_split, load_training, open_data
 from mbtf_fit.evaluation import split_errors
@@ -42,7 +43,6 @@ from mbtf_fit.models.registry import build_model
 from mbtf_fit.objective.noise import NoiseModel
 from mbtf_fit.objective.parallel import MAX_KERNEL_THREADS, MAX_THREADS, Workers
 from mbtf_fit.training.trainer import Trainer
-from mbtf_gen.dataset.reader import Dataset
 
 PUBLISHED = [{"kind": "log"}, {"kind": "linear", "weight": 0.1}]
 # Directions as (x, y, z).
@@ -147,7 +147,7 @@ class Data:
         queries = SWEEP[name].get("queries")
         if queries is None:
             return self.given or make_shards(self.out / "shards")
-        from mbtf_gen.generation import generate
+        from mbtf_gen.generation.run import generate
         from mbtf_pipeline.recipe import load_recipe
 
         config = load_recipe(RECIPE).generate

@@ -28,11 +28,11 @@ from quality import HEIGHT_SCALES, generator_config, source
 
 from mbtf_core.config_file import resolve
 from mbtf_core.errors import MbtfError
+from mbtf_core.quality import Quality, as_assignments
 from mbtf_core.units import parse_duration
 from mbtf_fit.config import FitConfig
 from mbtf_fit.presets import best_options
 from mbtf_fit.training.forecast import PERSISTENCE, PILOT_SECONDS, extrapolated
-from mbtf_gen.config.presets import Quality, as_assignments
 from mbtf_gen.render.runtime import load_mitsuba
 
 ASSETS = ("cliff_rock", "insulation_foam", "straight_wool", "turtle_shell", "twisted_wool")
@@ -43,7 +43,7 @@ THRESHOLDS = {"seconds": 1.3, "error": 1.5}
 def generated(name: str, quality: Quality, resolution: int, shards: Path) -> dict[str, Any]:
     """Forecast and run of the generator."""
     from mbtf_gen.forecast import forecast
-    from mbtf_gen.generation import generate
+    from mbtf_gen.generation.run import generate
     from mbtf_gen.job import Job
     from mbtf_gen.planning.effects_plan import plan_effects
     from mbtf_gen.planning.run_plan import allocate

@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.data.schema import Layout
 from mbtf_core.errors import InputError
-from mbtf_core.shard_schema import Layout
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.render.runtime import CPU_VARIANT, CUDA_VARIANT
 
 if TYPE_CHECKING:
-    from mbtf_gen.sampling.query_sampler import Queries
+    from mbtf_core.data.queries import Queries
 
 VARIANTS = {"cpu": CPU_VARIANT, "cuda": CUDA_VARIANT}
 # File of a fit's values at the test queries.
@@ -107,7 +107,7 @@ def selftest(sizes: str) -> Answers:
 
 def generate_data(sizes: str, layout: Layout, folder: str) -> Answers:
     """A data set, on the CPU."""
-    from mbtf_gen.generation import generate
+    from mbtf_gen.generation.run import generate
 
     summary = generate(configuration(Sizes.read(sizes), layout), folder)
     yield {"paths": summary.paths}
@@ -116,13 +116,13 @@ def generate_data(sizes: str, layout: Layout, folder: str) -> Answers:
 def estimate(device: str, sizes: str, shards: str, out: str) -> Answers:
     """Both halves at the test queries of a data set, with its random numbers and effects, as arrays in a
     file; rate of a second run, as the first one compiles."""
+    from mbtf_core.data.dataset import Dataset
+    from mbtf_core.data.queries import Queries
     from mbtf_fit.data.loader import load_split
-    from mbtf_gen.dataset.reader import Dataset
-    from mbtf_gen.dataset.summary import read_run_plan
+    from mbtf_gen.generation.summary import read_run_plan
     from mbtf_gen.job import Job
     from mbtf_gen.planning.simulation import build_estimator
     from mbtf_gen.render.estimates import Stream
-    from mbtf_gen.sampling.query_sampler import Queries
 
     wanted = Sizes.read(sizes)
     data = Dataset.open(shards)
@@ -148,10 +148,10 @@ def estimate(device: str, sizes: str, shards: str, out: str) -> Answers:
 def train(device: str, model: str, sizes: str, shards: str, out: str) -> Answers:
     """Test error and rate of a fit of so many steps; its values at the test queries, and both halves of the
     data, as arrays in its folder."""
+    from mbtf_core.data.dataset import Dataset
     from mbtf_fit import FitConfig, fit
     from mbtf_fit.data.loader import load_split
     from mbtf_fit.models.registry import MODELS
-    from mbtf_gen.dataset.reader import Dataset
 
     wanted = Sizes.read(sizes)
     steps, batch = wanted.steps, wanted.batch
@@ -177,7 +177,7 @@ def train(device: str, model: str, sizes: str, shards: str, out: str) -> Answers
 def picture(sizes: Sizes) -> Queries:
     """Queries of a perspective picture of the plane."""
     from mbtf_core.directions import from_angles
-    from mbtf_gen.pictures.camera import Camera
+    from mbtf_core.pictures.camera import Camera
 
     camera = Camera(elevation=45, tiles_across=4.0, rows=sizes.rows, columns=sizes.columns)
     return camera.queries(from_angles(40, 30)).flat()

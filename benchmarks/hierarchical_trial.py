@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from mbtf_core.data.dataset import Dataset
 from mbtf_core.errors import MbtfError
 from mbtf_fit import FitConfig, Material, fit
 from mbtf_fit.data.loader import load_split, load_training, open_data
@@ -31,7 +32,6 @@ from mbtf_fit.models.registry import MODELS
 from mbtf_fit.training.fit import prepare_trainer
 from mbtf_fit.training.validation import read_history
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.dataset.reader import Dataset
 
 ROOT = Path(__file__).resolve().parents[1]
 PAPER_ENCODING = {"direction_pi": True, "band_attenuation": False, "footprint_filtered": False}
@@ -65,7 +65,7 @@ TIMED, EQUAL_TIME = 12, ("neumip", "mlp")
 
 def make_data(folder: Path, layout: str, arguments: argparse.Namespace) -> Path:
     """A data set of one layout, resumed where it is unfinished."""
-    from mbtf_gen.generation import generate
+    from mbtf_gen.generation.run import generate
 
     queries: dict[str, Any] = {
         "train": arguments.queries,

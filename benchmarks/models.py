@@ -21,8 +21,8 @@ import numpy as np
 import torch
 from rock_cliff_128 import MODELS as TRAINED
 
+from mbtf_core.data.lattice import Lattice
 from mbtf_core.directions import from_projected_disk
-from mbtf_core.lattice import Lattice
 from mbtf_fit.models.registry import MODELS, build_model
 
 # Places that are read at a time.

@@ -25,11 +25,11 @@ from quality import generator_config
 
 from mbtf_core.errors import MbtfError
 from mbtf_core.nested import nested
+from mbtf_core.quality import Quality
 from mbtf_core.units import parse_duration
 from mbtf_fit.presets import best_options
 from mbtf_gen.config.generator import count_queries
-from mbtf_gen.config.presets import Quality
-from mbtf_gen.generation import Job
+from mbtf_gen.generation.run import Job
 from mbtf_gen.render.runtime import load_mitsuba
 from mbtf_pipeline.cost_study.runs import DataRequest, Run, RunRunner
 from mbtf_pipeline.run_folder import machine

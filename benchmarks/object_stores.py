@@ -23,7 +23,7 @@ from typing import Any
 
 import torch
 
-from mbtf_core.store import Store
+from mbtf_core.data.store import Store
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import load_training, open_data
 from mbtf_fit.models.registry import MODELS
@@ -31,7 +31,7 @@ from mbtf_fit.training.device import keep_freed_memory
 from mbtf_fit.training.fit import prepare_trainer
 from mbtf_fit.training.trainer import Trainer
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.generation import generate
+from mbtf_gen.generation.run import generate
 
 ASSETS = Path(__file__).parents[1] / "assets"
 URL = "s3://bucket/data"

@@ -135,13 +135,13 @@ def variance_of(mi: Any, dr: Any, bsdf: Any, each: int = 2048, places: int = 512
 def energies(material: Path, shards: Path, evaluator: Any) -> list[dict[str, float]]:
     """Reflected share by elevation of the light: fit, reference, error of their difference. Of views, those
     that the data have, and of elevations too."""
+    from mbtf_core.data.dataset import Dataset
+    from mbtf_core.data.queries import Queries
     from mbtf_gen.config.generator import GeneratorConfig
-    from mbtf_gen.dataset.reader import Dataset
     from mbtf_gen.job import Job
     from mbtf_gen.planning.effects_plan import reference_plan
     from mbtf_gen.planning.simulation import build_estimator
     from mbtf_gen.render.estimator import Stream
-    from mbtf_gen.sampling.query_sampler import Queries
 
     config = GeneratorConfig.model_validate(Dataset.open(shards).manifest["config"])
     job = Job.load(config)
@@ -234,8 +234,8 @@ def measure(source: Path, shards: Path, folder: Path) -> dict[str, Any]:
     import drjit as dr
 
     import mbtf_fit.mitsuba_plugin
+    from mbtf_core.data.dataset import Dataset
     from mbtf_fit.mitsuba_plugin import Evaluator, read_material
-    from mbtf_gen.dataset.reader import Dataset
 
     mbtf_fit.mitsuba_plugin.register()
     start = time.perf_counter()

@@ -20,8 +20,8 @@ from typing import Any
 
 from throughput import DEPTH, LIGHT_WIDTH, MESH, rocky
 
+from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import MbtfError
-from mbtf_core.lattice import Lattice
 from mbtf_gen.render.runtime import load_mitsuba
 from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
 

@@ -29,15 +29,16 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, get_args
 
-from mbtf_core.atomic import read_json, write_json
 from mbtf_core.config_file import resolve
-from mbtf_core.digest import data_sha256
 from mbtf_core.errors import InputError
+from mbtf_core.files.atomic import read_json, write_json
+from mbtf_core.files.digest import data_sha256
+from mbtf_core.quality import Quality, as_assignments
 from mbtf_core.units import clock
 from mbtf_fit.config import FitConfig
 from mbtf_fit.presets import FITTER, best_at
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.config.presets import GENERATOR, RESOLUTION, Quality, as_assignments
+from mbtf_gen.config.presets import GENERATOR, RESOLUTION
 from mbtf_pipeline.presets import COMPARE
 from mbtf_pipeline.run_folder import machine
 

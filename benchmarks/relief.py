@@ -28,11 +28,11 @@ from typing import Any
 
 from quality import HEIGHT_SCALES, ROOT, generator_config, source
 
-from mbtf_core.atomic import read_json, write_json
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.files.atomic import read_json, write_json
 from mbtf_core.nested import deep_merge
 from mbtf_fit import FitConfig, fit
-from mbtf_gen.dataset.reader import Dataset
-from mbtf_gen.generation import generate
+from mbtf_gen.generation.run import generate
 from mbtf_pipeline.paper_tables.published import mse_ratio
 
 RESOLUTION = 128

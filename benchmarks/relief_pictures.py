@@ -28,10 +28,11 @@ from relief import MODELS, RESOLUTION, fit_name, shards, train
 
 from mbtf_core.directions import from_angles
 from mbtf_core.exposure import auto_exposure, brightness, to_display
+from mbtf_core.pictures.camera import Camera
+from mbtf_core.pictures.reference import write_png
 from mbtf_fit import Material
 from mbtf_gen.job import Job
-from mbtf_gen.pictures.camera import Camera
-from mbtf_gen.pictures.reference import render_reference, write_png
+from mbtf_gen.pictures.reference import render_reference
 from mbtf_gen.planning.effects_plan import reference_plan
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_pipeline.compare.contrast import contrast, phase_contrasts, picture_blocks

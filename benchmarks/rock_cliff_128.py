@@ -48,7 +48,7 @@ BARS = {
 
 def make_shards(folder: Path) -> Path:
     """The recipe's data set, resumed where it is unfinished."""
-    from mbtf_gen.generation import generate
+    from mbtf_gen.generation.run import generate
     from mbtf_pipeline.recipe import load_recipe
 
     print(f"generating {folder} as {RECIPE.name} says", file=sys.stderr)

@@ -20,10 +20,10 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from mbtf_core.digest import file_sha256
+from mbtf_core.data.verify import verify
+from mbtf_core.files.digest import file_sha256
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.dataset.verify import verify
-from mbtf_gen.generation import generate
+from mbtf_gen.generation.run import generate
 
 ASSETS = Path(__file__).parents[1] / "assets"
 ROUNDS = 5

@@ -103,12 +103,12 @@ def surfaces(mi: Any) -> dict[str, dict[str, Any]]:
 
 def costs(mi: Any, runs: int, count: int, spp: int) -> dict[str, float]:
     """Processor seconds per million paths."""
+    from mbtf_core.data.queries import Queries
     from mbtf_gen.geometry.heightfield import HeightGrid
     from mbtf_gen.render.estimator import Estimator, Stream
     from mbtf_gen.render.path_tracer import Transport
     from mbtf_gen.render.scene import build_tile
     from mbtf_gen.sampling.light_kernel import LightKernel
-    from mbtf_gen.sampling.query_sampler import Queries
 
     rng = np.random.default_rng(3)
 

@@ -33,8 +33,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import MbtfError
-from mbtf_core.lattice import Lattice
 from mbtf_gen.config.generator import Tracer
 from mbtf_gen.material.load import load_material
 from mbtf_gen.material.material import Material

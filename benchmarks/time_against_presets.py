@@ -28,7 +28,7 @@ from typing import Any
 
 from quality import HEIGHT_SCALES, source
 
-from mbtf_core.atomic import read_json, write_json
+from mbtf_core.files.atomic import read_json, write_json
 from mbtf_core.units import parse_duration
 
 RECIPE = """\

@@ -31,7 +31,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mbtf_core.lattice import Lattice
+from mbtf_core.data.geometry import Geometry
+from mbtf_core.data.lattice import Lattice
+from mbtf_core.images.resample import resample
 from mbtf_fit.config import FitConfig
 from mbtf_fit.material.material import Material, export
 from mbtf_fit.models.constants import PLACES
@@ -41,8 +43,6 @@ from mbtf_fit.presets import best_options
 from mbtf_fit.surface.known import KnownSurface
 from mbtf_fit.viewer.content import material_content
 from mbtf_fit.viewer.page import write_page
-from mbtf_gen.dataset.geometry import Geometry
-from mbtf_gen.images.resample import resample
 
 F32 = NDArray[np.float32]
 SIZE, SECONDS, FRAMES_PER_SECOND = 5.0, 2.0, 30.0

@@ -6,6 +6,8 @@ as one or two lines (what, where, what to do) and exit with its code. Anything e
 
 from __future__ import annotations
 
+from pathlib import Path
+
 EXIT_OK = 0
 EXIT_USAGE = 2
 EXIT_BAD_INPUT = 3
@@ -75,6 +77,15 @@ class PartialError(MbtfError):
 
 class LockedError(PartialError):
     """Another process works on the same files; later, they may be free or finished."""
+
+
+def unwritable(path: Path, error: OSError) -> PartialError:
+    """The error for a file or folder that cannot be written."""
+    return PartialError(
+        f"cannot be written ({error.strerror or error})",
+        where=path,
+        hint="finished files are kept; free space or fix the folder, then run the same command again",
+    )
 
 
 def reason(fault: BaseException | str | None, longest: int = 160) -> str:

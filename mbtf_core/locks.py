@@ -20,8 +20,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from mbtf_core import interruption
-from mbtf_core.atomic import unwritable
-from mbtf_core.errors import PartialError
+from mbtf_core.errors import PartialError, unwritable
 
 # Age after which the lock of another machine counts as abandoned, and the interval of renewal.
 STALE_SECONDS = 300.0

@@ -32,7 +32,7 @@ from pydantic.fields import FieldInfo
 
 from mbtf_core.config_file import Settings, resolve
 from mbtf_core.errors import UsageError
-from mbtf_core.store import split_url
+from mbtf_core.urls import split_url
 
 S = TypeVar("S", bound=Settings)
 C = TypeVar("C", bound=Callable[..., Any])

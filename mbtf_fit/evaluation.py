@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.lattice import Lattice
 from mbtf_core.directions import ELEVATION_BANDS
 from mbtf_core.errors import InputError
 from mbtf_core.exposure import auto_exposure, brightness, white_of
-from mbtf_core.lattice import Lattice
 from mbtf_core.stats import (
     Estimate,
     by_group,
@@ -28,7 +29,6 @@ from mbtf_fit.data.loader import MAX_HELD_OUT_OF_IMAGES, SAMPLE, Partition, load
 from mbtf_fit.data.queries import ShardQueries, mean_value
 from mbtf_fit.formatting import visibility
 from mbtf_fit.material.transmittance_fit import TransmittanceError, evaluate_transmittance, has_transmittance
-from mbtf_gen.dataset.reader import Dataset
 
 if TYPE_CHECKING:
     from mbtf_fit.material.material import Material

@@ -9,19 +9,19 @@ from importlib import import_module
 from typing import Any
 
 _PUBLIC = {
-    "Camera": "mbtf_gen.pictures.camera",
-    "Dataset": "mbtf_gen.dataset.reader",
+    "Camera": "mbtf_core.pictures.camera",
+    "Dataset": "mbtf_core.data.dataset",
     "GeneratorConfig": "mbtf_gen.config.generator",
-    "Geometry": "mbtf_gen.dataset.geometry",
-    "Lattice": "mbtf_core.lattice",
+    "Geometry": "mbtf_core.data.geometry",
+    "Lattice": "mbtf_core.data.lattice",
     "LightKernel": "mbtf_gen.sampling.light_kernel",
     "MbtfError": "mbtf_core.errors",
     "Queries": "mbtf_gen.sampling.query_sampler",
-    "generate": "mbtf_gen.generation",
+    "generate": "mbtf_gen.generation.run",
     "load_material": "mbtf_gen.material.load",
     "render_reference": "mbtf_gen.pictures.reference",
-    "repair": "mbtf_gen.repairs",
-    "verify": "mbtf_gen.dataset.verify",
+    "repair": "mbtf_gen.generation.repair",
+    "verify": "mbtf_core.data.verify",
 }
 
 __all__ = [*_PUBLIC]

@@ -15,17 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.console import Console
-from mbtf_core.shard_schema import ShardEntry, Split
+from mbtf_core.data.queries import Queries
+from mbtf_core.data.schema import ShardEntry, Split
+from mbtf_core.data.shard_files import row_bytes, write_shard
 from mbtf_core.stats import pooled_error
 from mbtf_core.units import clock, expectation, size_text
-from mbtf_gen.dataset.shard_io import row_bytes, write_shard
 from mbtf_gen.job import Job, most_paths, planned_paths, split_queries, split_spp, split_target
 from mbtf_gen.planning.adaptive import estimate_shard
 from mbtf_gen.planning.pilot import pilot_queries
 from mbtf_gen.planning.run_plan import RunPlan
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream, Target
-from mbtf_gen.sampling.query_sampler import Queries
 
 # Paths of one piece of the pilot, and the minimum number of timed pieces.
 _PIECE_PATHS = 1 << 19

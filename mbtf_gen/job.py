@@ -10,9 +10,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
+from mbtf_core.data.lattice import Lattice
+from mbtf_core.data.schema import SPLITS, ShardEntry, Split
+from mbtf_core.data.shard_files import row_bytes
 from mbtf_core.errors import InputError, UsageError
-from mbtf_core.lattice import Lattice
-from mbtf_core.shard_schema import SPLITS, ShardEntry, Split
 from mbtf_gen.config.generator import GeneratorConfig, GeometrySection, count_queries
 from mbtf_gen.geometry.heightfield import HeightGrid
 from mbtf_gen.material.checks import displacement_fault
@@ -314,3 +315,9 @@ def most_paths(job: Job) -> int:
         spp = split_spp(job.config, split) if target is None else target.max_spp + TARGET_PILOT_SPP
         total += split_queries(job, split) * spp
     return total
+
+
+def data_bytes(job: Job, entries: Iterable[ShardEntry]) -> int:
+    """Bytes of some shards of a job."""
+    queries = sum(entry.rows * row_queries(job, entry.split) for entry in entries)
+    return queries * row_bytes(job.material.opacity is not None)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from mbtf_core.folders import check_folder, check_space
+from mbtf_core.files.folders import check_folder, check_space
 from mbtf_core.units import clock, expectation
 from mbtf_gen.job import Job, planned_paths, split_queries
 from mbtf_pipeline.compare.pictures import scenes
@@ -109,7 +109,7 @@ class RunForecaster:
             job = Job.of(data.config, self.material)
             queries = split_queries(job, "train")
             if runs(data.stage):
-                from mbtf_gen.dataset.shard_io import data_bytes
+                from mbtf_gen.job import data_bytes
 
                 paths += planned_paths(job, job.shards)
                 size += data_bytes(job, job.shards)

@@ -6,9 +6,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from mbtf_core.quality import Quality, as_assignments, overrides_of
 from mbtf_fit.config import DEFAULT_MODEL
 from mbtf_fit.presets import fitter_options
-from mbtf_gen.config.presets import RESOLUTION, Quality, as_assignments, generator_options, overrides_of
+from mbtf_gen.config.presets import RESOLUTION, generator_options
 from mbtf_pipeline.recipe import Recipe, fit_names, load_recipe
 
 # Options of the comparison by preset.

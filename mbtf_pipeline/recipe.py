@@ -237,7 +237,7 @@ def _find(path: Path) -> Path:
 
 def write_recipe(recipe: Recipe, folder: Path) -> None:
     """Write the resolved recipe into a run's folder; it can be run again from there."""
-    from mbtf_core.atomic import write_text
+    from mbtf_core.files.atomic import write_text
 
     data = recipe.model_dump(mode="json")
     data["generate"]["material"] = os.path.relpath(recipe.generate.material, folder)

@@ -8,11 +8,11 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from mbtf_core.atomic import read_json
 from mbtf_core.console import Console
-from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError, PartialError
-from mbtf_core.folders import check_folder, owned
+from mbtf_core.files.atomic import read_json
+from mbtf_core.files.digest import file_sha256
+from mbtf_core.files.folders import check_folder, owned
 from mbtf_core.units import clock
 from mbtf_fit.config import FitConfig
 from mbtf_gen.config.generator import GeneratorConfig
@@ -167,11 +167,11 @@ class _RecipeRun:
         return [path for name in (REPORT, VIEWER) if (path := self.folder / name).is_file()]
 
     def _generate(self, data: DataSet, decision: Decision) -> float:
-        from mbtf_core.shard_schema import MANIFEST_NAME
-        from mbtf_gen.dataset.folder import read_manifest
-        from mbtf_gen.dataset.reader import is_dataset
-        from mbtf_gen.dataset.sidecar import sidecar_of
-        from mbtf_gen.generation import generate
+        from mbtf_core.data.dataset import is_dataset
+        from mbtf_core.data.folder import read_manifest
+        from mbtf_core.data.schema import MANIFEST_NAME
+        from mbtf_core.data.sidecar import sidecar_of
+        from mbtf_gen.generation.run import generate
         from mbtf_gen.job import Job
 
         job = Job.prepare(data.config)
@@ -258,7 +258,7 @@ class _RecipeRun:
 
 def _manifest_digest(shards: Path) -> str:
     """SHA-256 of a data set's manifest; empty where there is none."""
-    from mbtf_core.shard_schema import MANIFEST_NAME
+    from mbtf_core.data.schema import MANIFEST_NAME
 
     path = shards / MANIFEST_NAME
     return file_sha256(path) if path.is_file() else ""
@@ -266,7 +266,7 @@ def _manifest_digest(shards: Path) -> str:
 
 def _unfinished(out: Path, config: FitConfig, shards: Path) -> bool:
     """Whether a folder contains this fit from an interrupted run."""
-    from mbtf_core.shard_schema import MANIFEST_NAME
+    from mbtf_core.data.schema import MANIFEST_NAME
 
     try:
         record, manifest = read_json(out / "fit.json"), read_json(shards / MANIFEST_NAME)

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.atomic import read_json, write_json
-from mbtf_core.digest import data_sha256, file_sha256
 from mbtf_core.errors import InputError
+from mbtf_core.files.atomic import read_json, write_json
+from mbtf_core.files.digest import data_sha256, file_sha256
 
 STAMP_FORMAT = "mbtf-stage"
 # Part of every key; raised when a stage produces different outputs from the same inputs.

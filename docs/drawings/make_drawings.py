@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from mbtf_core.lattice import Lattice
+from mbtf_core.data.lattice import Lattice
 from mbtf_gen.sampling.light_kernel import LightKernel
 
 FOLDER = Path(__file__).parent

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.images.resample import resample
 from mbtf_fit import Material
-from mbtf_gen.dataset.reader import Dataset
-from mbtf_gen.images.resample import resample
 
 OUT = Path(__file__).parent / "learned_heights.png"
 FIT = "neumip+-30s-0"

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mbtf_core.data.lattice import level_of_sigma
 from mbtf_core.directions import ELEVATION_BANDS
-from mbtf_core.lattice import level_of_sigma
 from mbtf_core.stats.estimate import Estimate
 
 

@@ -26,7 +26,7 @@ def evaluate(
     shards
         Folder made by mbtf-gen, or its URL.
     """
-    from mbtf_core.data_folder import data_folder
+    from mbtf_core.data.data_folder import data_folder
     from mbtf_fit.evaluation import evaluate, foreign_inputs
     from mbtf_fit.material.material import Material
 

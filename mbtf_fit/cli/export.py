@@ -55,9 +55,9 @@ def export_material(
     half
         Round all weights and texels to 16 bits first, and print the resulting error; not for web.
     """
-    from mbtf_core.atomic import write_text
-    from mbtf_core.digest import file_sha256
-    from mbtf_core.folders import owned
+    from mbtf_core.files.atomic import write_text
+    from mbtf_core.files.digest import file_sha256
+    from mbtf_core.files.folders import owned
     from mbtf_fit.material.export import LAYERS_NAME, TEXTURES_NAME, to_half, write_layers, write_textures
     from mbtf_fit.material.export_folder import ExportClaim, ExportSource, claimed
     from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME

@@ -23,11 +23,11 @@ from mbtf_core.options import (
     Verbose,
     takes_options,
 )
+from mbtf_core.quality import Quality, QualityOption, as_assignments, overrides_of
 from mbtf_core.units import clock, expectation, format_duration
 from mbtf_fit.cli.page_options import Live, live_view
 from mbtf_fit.config import DECODER_MODELS, DEFAULT_MODEL, FIBER_MODEL, FitConfig, ModelName
 from mbtf_fit.formatting import describe_fit, format_estimate, format_table, headline, visibility
-from mbtf_gen.config.presets import Quality, QualityOption, as_assignments, overrides_of
 
 
 @takes_options(FitConfig)
@@ -94,7 +94,7 @@ def fit(
         _fit_many(options, quality, many, output, processes, cluster, overwrite, console)
         return
     assert shards is not None
-    from mbtf_core.data_folder import data_folder
+    from mbtf_core.data.data_folder import data_folder
 
     shards = data_folder(shards)
     resolved = resolve_config(options, quality, shards)
@@ -106,7 +106,7 @@ def fit(
             {"shards": shards, "model": resolved.model, "forecast": asdict(expected)}, expected.describe()
         )
         return
-    from mbtf_core.folders import check_space
+    from mbtf_core.files.folders import check_space
     from mbtf_fit.data.loader import open_data
     from mbtf_fit.material.format import DESCRIPTION_NAME
     from mbtf_fit.material.transmittance_fit import has_transmittance
@@ -206,7 +206,7 @@ def _kept_options(folder: object) -> dict[str, Any]:
 
 def _model_for(shards: Sequence[Path]) -> ModelName:
     """The model that is best for a data set, or for several that share a network."""
-    from mbtf_gen.dataset.reader import Dataset
+    from mbtf_core.data.dataset import Dataset
 
     try:
         known = all(Dataset.open(folder).manifest["geometry"] is not None for folder in shards)
@@ -239,7 +239,7 @@ def _fit_jointly(
     overwrite: bool,
     console: Console,
 ) -> None:
-    from mbtf_core.folders import check_space
+    from mbtf_core.files.folders import check_space
     from mbtf_fit.data.loader import open_data
     from mbtf_fit.material.decoder import DECODER_FOLDER
     from mbtf_fit.models.registry import MODELS

@@ -21,19 +21,19 @@ def info(path: Path, /, *, verbose: Verbose = False, console: Console = CONSOLE)
     path
         Folder made by mbtf-fit or by mbtf-gen, or the URL of a data set.
     """
-    from mbtf_core.data_folder import data_folder
+    from mbtf_core.data.data_folder import data_folder
 
     path = data_folder(path)
     if not path.is_dir():
         raise InputError("no such folder", where=path, hint=suggest_path(path, Path.is_dir))
-    from mbtf_gen.dataset.reader import is_dataset
+    from mbtf_core.data.dataset import is_dataset
 
     data, text = _shards_info(path) if is_dataset(path) else _material_info(path, verbose)
     console.report(data, text)
 
 
 def _shards_info(path: Path) -> tuple[dict[str, Any], str]:
-    from mbtf_gen.dataset.reader import Dataset
+    from mbtf_core.data.dataset import Dataset
 
     data = Dataset.open(path)
     lattice = data.lattice

@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mbtf_core.lattice import Lattice, level_of_sigma
+from mbtf_core.data.lattice import Lattice, level_of_sigma
 
 
 def philox(seed: int, stream: int) -> np.random.Generator:

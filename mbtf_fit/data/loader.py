@@ -10,14 +10,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from mbtf_core.data.dataset import Dataset, Shard
+from mbtf_core.data.schema import Layout, Split
 from mbtf_core.errors import InputError
-from mbtf_core.shard_schema import Layout, Split
 from mbtf_fit.config import HeldOutSection
 from mbtf_fit.data.images import TrainingImages, nearest_shapes, philox, strides
 from mbtf_fit.data.queries import QUERY_BYTES, ShardQueries, TrainingQueries, mean_value, needed
 from mbtf_fit.data.slices import TrainingSlices
 from mbtf_fit.data.streaming import Selection, StreamedQueries
-from mbtf_gen.dataset.reader import Dataset, Shard
 
 # Training queries that are kept with both halves, as a sample of all.
 SAMPLE = 1 << 16

@@ -16,9 +16,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mbtf_core.data_folder import in_store, prefetch
+from mbtf_core.data.data_folder import in_store, prefetch
+from mbtf_core.data.shard_files import Arrays, read_shard
 from mbtf_fit.data.queries import TrainingQueries, batch_ranges, batch_starts, mean_value, needed
-from mbtf_gen.dataset.shard_io import Arrays, read_shard
 
 # Rows of a shard between two cumulative counts of selected rows.
 _BLOCK = 4096

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mbtf_core.atomic import write_text, write_through
 from mbtf_core.errors import InputError
+from mbtf_core.files.atomic import write_text, write_through
 from mbtf_fit.material.material import Material, conformance_values, describe_model
 from mbtf_fit.material.transmittance import FORMULA
 from mbtf_fit.models.constants import DIELECTRIC, LIGHT_WIDTH

@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from mbtf_core.atomic import write_json
 from mbtf_core.config_file import build
+from mbtf_core.data.lattice import Lattice, sigma_of_level
+from mbtf_core.data.schema import CONVENTIONS
 from mbtf_core.directions import check_unit, from_projected_disk
 from mbtf_core.errors import InputError
-from mbtf_core.lattice import Lattice, sigma_of_level
-from mbtf_core.shard_schema import CONVENTIONS
+from mbtf_core.files.atomic import write_json
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.material.format import (

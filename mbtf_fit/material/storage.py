@@ -6,8 +6,8 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mbtf_core.atomic import Stored, write_chunks
 from mbtf_core.errors import InputError, reason
+from mbtf_core.files.atomic import Stored, write_chunks
 from mbtf_core.suggest import refuse_special
 
 if TYPE_CHECKING:

@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mbtf_core.atomic import Stored, write_chunks
+from mbtf_core.data.lattice import Lattice, level_of_sigma
 from mbtf_core.errors import InputError
-from mbtf_core.lattice import Lattice, level_of_sigma
+from mbtf_core.files.atomic import Stored, write_chunks
 from mbtf_fit.material.format import check_digest, lattice_of
 from mbtf_fit.material.storage import read_tensors
 

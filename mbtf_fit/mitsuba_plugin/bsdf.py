@@ -16,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from mbtf_core.errors import InputError, UsageError
+from mbtf_core.pictures.camera import pixel_sigma
 from mbtf_fit.material.format import QUERY
 from mbtf_fit.mitsuba_plugin.evaluator import Evaluator
 from mbtf_fit.mitsuba_plugin.lobe_fit import fit_lobes
@@ -23,7 +24,6 @@ from mbtf_fit.mitsuba_plugin.lobes import LobeTextures, Mixture
 from mbtf_fit.mitsuba_plugin.material_arrays import StoredMaterial, read_material
 from mbtf_fit.mitsuba_plugin.names import BSDF_NAME, footprints_provided, refuse_unknown
 from mbtf_fit.mitsuba_plugin.network import Arithmetic
-from mbtf_gen.pictures.camera import pixel_sigma
 from mbtf_gen.render.types import (
     BSDFContext,
     BSDFSample3f,

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mbtf_core.lattice import Lattice
+from mbtf_core.data.lattice import Lattice
 from mbtf_fit.mitsuba_plugin.material_arrays import F32, StoredSurface
 from mbtf_fit.mitsuba_plugin.textures import GROUP, Textures
 from mbtf_fit.models.constants import (

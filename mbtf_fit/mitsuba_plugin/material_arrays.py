@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.config_file import build
+from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
-from mbtf_core.lattice import Lattice
 from mbtf_fit.config import SLICE_MODELS, TRACING_MODELS, FitConfig, NetworkSection
 from mbtf_fit.material.format import (
     DEFAULT_MIN_COS,

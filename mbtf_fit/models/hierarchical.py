@@ -26,7 +26,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from mbtf_core.shard_schema import Layout
+from mbtf_core.data.schema import Layout
 from mbtf_fit.models.inception import InceptionDecoder
 from mbtf_fit.models.interface import NeuralMaterial
 

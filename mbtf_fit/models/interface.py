@@ -8,9 +8,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
+from mbtf_core.data.lattice import Lattice
+from mbtf_core.data.schema import Layout
 from mbtf_core.errors import InputError
-from mbtf_core.lattice import Lattice
-from mbtf_core.shard_schema import Layout
 from mbtf_fit.config import NetworkSection
 from mbtf_fit.models.constants import GRAZING, OFFSET_SCALE, directions_size, position_size
 from mbtf_fit.models.encodings import (

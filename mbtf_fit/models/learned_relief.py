@@ -24,14 +24,14 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
-from mbtf_core.lattice import Lattice
+from mbtf_core.data.geometry import Geometry
+from mbtf_core.data.lattice import Lattice
 from mbtf_fit.config import NetworkSection
 from mbtf_fit.models.constants import FIRST_DEPTH, HEIGHT_SCALE, LEAST_FACING
 from mbtf_fit.models.lookup import lookup
 from mbtf_fit.models.relief import Relief
 from mbtf_fit.models.textures import FeatureTextures
 from mbtf_fit.surface.known import KnownSurface
-from mbtf_gen.dataset.geometry import Geometry
 
 # Steps of training after which rays are traced to the current heights.
 TRACED = 10

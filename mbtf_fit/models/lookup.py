@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-from mbtf_core.lattice import Lattice
+from mbtf_core.data.lattice import Lattice
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from mbtf_core.lattice import Lattice
-from mbtf_core.shard_schema import Layout
+from mbtf_core.data.lattice import Lattice
+from mbtf_core.data.schema import Layout
 from mbtf_fit.config import NetworkSection
 from mbtf_fit.data.slices import SliceBatch, TrainingSlices
 from mbtf_fit.models.constants import LEAST_COSINE, STATISTICS

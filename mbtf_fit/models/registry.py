@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from mbtf_core.lattice import Lattice
+from mbtf_core.data.lattice import Lattice
 from mbtf_fit.config import FitConfig
 from mbtf_fit.models.hierarchical import Hierarchical
 from mbtf_fit.models.interface import NeuralMaterial

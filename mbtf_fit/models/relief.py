@@ -16,8 +16,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
-from mbtf_core.lattice import Lattice
 from mbtf_fit.config import NetworkSection
 from mbtf_fit.models.constants import IRRADIANCE_SCALE, hint_size
 from mbtf_fit.models.encodings import rotate_to_z

@@ -15,8 +15,8 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from mbtf_core.data.lattice import Lattice
 from mbtf_core.directions import ELEVATION_BANDS
-from mbtf_core.lattice import Lattice
 from mbtf_core.stats import elevation_groups, level_groups, pooled_variance, signal_variance
 from mbtf_fit.data.queries import ShardQueries
 

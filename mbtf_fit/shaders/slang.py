@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 
-from mbtf_core.atomic import write_chunks, write_text
+from mbtf_core.files.atomic import write_chunks, write_text
 from mbtf_fit.material.format import DEFAULT_MIN_COS
 from mbtf_fit.material.material import Material
 from mbtf_fit.shaders.compiler import ENDINGS, SlangCompiler, Target

@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.height_planes import node_table
 from mbtf_fit.material.material import Material
 from mbtf_fit.models.constants import AZIMUTHS, HEIGHTS, HORIZONS, MAPS
 from mbtf_fit.viewer.shader import NODE_SHIFT
-from mbtf_gen.geometry.height_planes import node_table
 
 F32 = NDArray[np.float32]
 

@@ -20,10 +20,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mbtf_core.height_planes import node_table
 from mbtf_fit.models.constants import MAX_CROSSINGS
 from mbtf_fit.native.library import Heightfield, kernel
 from mbtf_fit.surface.copies import DeviceCopies
-from mbtf_gen.geometry.height_planes import node_table
 
 # Rays, and vertices, per task of a thread.
 _RAYS, _VERTICES = 1 << 14, 1 << 12
@@ -134,7 +134,7 @@ def trace_reference(cells: Tensor, aspect: float, u: Tensor, omega: Tensor) -> T
     Parameters
     ----------
     cells : (rows, columns, 4) tensor
-        Surface of each cell, see :mod:`mbtf_gen.geometry.height_planes`; row index along +y.
+        Surface of each cell, see :mod:`mbtf_core.height_planes`; row index along +y.
     """
     rows, columns = cells.shape[:2]
     table = cells.reshape(-1, 4)

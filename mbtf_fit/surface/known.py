@@ -28,7 +28,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mbtf_core.lattice import Lattice
+from mbtf_core.data.lattice import Lattice
+from mbtf_core.images.resample import resample
 from mbtf_fit.models.constants import (
     ALPHA2,
     AZIMUTHS,
@@ -49,10 +50,9 @@ from mbtf_fit.models.lookup import Packing, lookup
 from mbtf_fit.surface.copies import DeviceCopies
 from mbtf_fit.surface.heightfield import HeightfieldTracer
 from mbtf_fit.surface.prefilter import prefiltered_levels
-from mbtf_gen.images.resample import resample
 
 if TYPE_CHECKING:
-    from mbtf_gen.dataset.geometry import Geometry
+    from mbtf_core.data.geometry import Geometry
 
 # Reflectance of the surface where the data set states none.
 UNKNOWN_COLOR = 0.5

@@ -12,7 +12,7 @@ import math
 import torch
 from torch import Tensor
 
-from mbtf_core.lattice import Lattice, sigma_of_level
+from mbtf_core.data.lattice import Lattice, sigma_of_level
 
 
 def prefilter(image: Tensor, shape: tuple[int, int], sigma: float, aspect: float) -> Tensor:

@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mbtf_core.data.lattice import Lattice, sigma_of_level
 from mbtf_core.directions import from_projected_disk
-from mbtf_core.lattice import Lattice, sigma_of_level
 from mbtf_fit.config import HeldOutSection
 from mbtf_fit.data.loader import in_region
 from mbtf_fit.data.queries import TrainingQueries

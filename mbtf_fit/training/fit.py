@@ -10,10 +10,11 @@ from typing import Any
 
 import torch
 
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.lattice import level_of_sigma
 from mbtf_core.errors import InputError, PartialError
-from mbtf_core.folders import ELSEWHERE, owned
+from mbtf_core.files.folders import ELSEWHERE, owned
 from mbtf_core.interruption import stop_on_interruption
-from mbtf_core.lattice import level_of_sigma
 from mbtf_core.stats import pooled_variance
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import Partition, load_training, open_data
@@ -46,7 +47,6 @@ from mbtf_fit.training.validation import (
     validation_set,
     validation_subset,
 )
-from mbtf_gen.dataset.reader import Dataset
 
 # Seconds of training between two validations, and between two checkpoints.
 _REPORT_SECONDS = 2.0

@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.atomic import read_json, write_json, write_text
 from mbtf_core.config_file import check_schema, dump_yaml
-from mbtf_core.digest import data_sha256
-from mbtf_core.folders import ELSEWHERE, check_folder, make_folder, other_configuration
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.files.atomic import read_json, write_json, write_text
+from mbtf_core.files.digest import data_sha256
+from mbtf_core.files.folders import ELSEWHERE, check_folder, make_folder, other_configuration
 from mbtf_fit.config import FitConfig
 from mbtf_fit.material.decoder import DECODER_NAME, Decoder
 from mbtf_fit.material.export import LAYERS_NAME, TEXTURES_NAME
@@ -17,7 +18,6 @@ from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME, read_descri
 from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME
 from mbtf_fit.training.checkpoint import CHECKPOINT_NAME
 from mbtf_fit.training.validation import HISTORY_NAME
-from mbtf_gen.dataset.reader import Dataset
 
 FIT_NAME = "fit.json"
 CONFIG_NAME = "config.yaml"

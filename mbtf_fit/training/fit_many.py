@@ -15,11 +15,11 @@ from queue import SimpleQueue
 from typing import Any
 
 from mbtf_core.cluster.children import answer_of_child, kill_children, prepare_child
+from mbtf_core.data.dataset import is_dataset
 from mbtf_core.errors import InputError, MbtfError, UsageError, reason
 from mbtf_core.interruption import SIGNALS, at_end
 from mbtf_core.suggest import refuse_special
 from mbtf_fit.config import FitConfig
-from mbtf_gen.dataset.reader import is_dataset
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,10 @@ from typing import Any
 
 import torch
 
-from mbtf_core.digest import data_sha256
+from mbtf_core.data.dataset import Dataset
 from mbtf_core.errors import InputError
-from mbtf_core.folders import owned
+from mbtf_core.files.digest import data_sha256
+from mbtf_core.files.folders import owned
 from mbtf_fit.config import DataSection, FitConfig
 from mbtf_fit.data.loader import Partition, load_training, open_data
 from mbtf_fit.data.queries import ShardQueries
@@ -42,7 +43,6 @@ from mbtf_fit.training.validation import (
     validation_set,
     validation_subset,
 )
-from mbtf_gen.dataset.reader import Dataset
 
 # Materials that are validated in the interval of a single fit.
 _VALIDATED = 4

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from mbtf_core.atomic import write_text
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.files.atomic import write_text
 from mbtf_core.stats import Estimate, level_groups, unexplained_variance
 from mbtf_fit.data.loader import Partition, load_split
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.formatting import format_estimate
 from mbtf_fit.training.trainer import Trainer
-from mbtf_gen.dataset.reader import Dataset
 
 HISTORY_NAME = "metrics.jsonl"
 # Queries of the validation subset, and the fewest test queries that are preferred over held-out queries.

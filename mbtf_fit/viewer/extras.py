@@ -8,20 +8,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.images.environment import read_environment
+from mbtf_core.images.resample import resample
+from mbtf_core.pictures.camera import Camera
+from mbtf_core.pictures.reference import read_references
 from mbtf_fit.viewer.content import encode
+from mbtf_fit.viewer.shape import read_shape
 from mbtf_fit.viewer.textures import pack
-from mbtf_gen.images.environment import read_environment
-from mbtf_gen.images.resample import resample
-from mbtf_gen.meshes.shape import read_shape
-from mbtf_gen.pictures.camera import Camera
-from mbtf_gen.pictures.reference import read_references
 
 # Rows of an environment, and pixels along the longer side of a reference picture, in a page.
 _ENVIRONMENT_ROWS, _PICTURE_SIZE = 64, 512
 
 
 def mesh_content(path: Path) -> dict[str, Any]:
-    """A mesh with texture coordinates (:func:`~mbtf_gen.meshes.shape.read_shape`) as JSON of a page."""
+    """A mesh with texture coordinates (:func:`~mbtf_fit.viewer.shape.read_shape`) as JSON of a page."""
     shape = read_shape(path)
     arrays = {
         "positions": shape.positions,
@@ -38,7 +38,7 @@ def mesh_content(path: Path) -> dict[str, Any]:
 
 
 def environment_content(path: Path) -> dict[str, Any]:
-    """A picture of the whole sphere (:func:`~mbtf_gen.images.environment.read_environment`), as JSON."""
+    """A picture of the whole sphere (:func:`~mbtf_core.images.environment.read_environment`), as JSON."""
     pixels = read_environment(path, _ENVIRONMENT_ROWS)
     return {"name": path.stem, "shape": list(pixels.shape[:2]), "data": encode(pixels)}
 
@@ -82,7 +82,7 @@ def picture_content(
 
 
 def pictures_content(folder: Path) -> list[dict[str, Any]]:
-    """Pictures of ``mbtf-gen reference`` (:func:`~mbtf_gen.pictures.reference.read_references`), as JSON."""
+    """Pictures of ``mbtf-gen reference`` (:func:`~mbtf_core.pictures.reference.read_references`), as JSON."""
     return [
         picture_content(f"path-traced, {tiles_text(camera.tiles_across)} across", value, camera, light)
         for value, camera, light in read_references(folder)

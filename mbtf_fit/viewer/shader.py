@@ -389,7 +389,7 @@ NODE_SHIFT = 11
 
 def node_blocks(rows: int, columns: int) -> list[tuple[int, int]]:
     """(first node, nodes per row) of the blocks of 2, 4, … cells, after the nodes of the cells
-    (mbtf_gen.geometry.height_planes)."""
+    (mbtf_core.height_planes)."""
     columns_log2, rows_log2 = (columns - 1).bit_length(), (rows - 1).bit_length()
     return [
         (rows * columns + (1 << (columns_log2 + rows_log2 - 2 * level)), 1 << (columns_log2 - level))

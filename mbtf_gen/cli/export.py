@@ -30,9 +30,9 @@ def export(
     program
         The program that reads it: NeuMIP (shuffled layout) or NeuralBTF (slices layout).
     """
-    from mbtf_core.data_folder import data_folder
-    from mbtf_gen.dataset.exported import export_neumip, export_neural_btf
-    from mbtf_gen.dataset.reader import Dataset
+    from mbtf_core.data.data_folder import data_folder
+    from mbtf_core.data.dataset import Dataset
+    from mbtf_gen.measured.exported import export_neumip, export_neural_btf
 
     shards = data_folder(shards)
     if file.is_dir() or shards.resolve() in file.resolve().parents:

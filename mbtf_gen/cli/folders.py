@@ -15,7 +15,7 @@ from mbtf_core.units import clock
 from mbtf_gen.cli.generate import describe
 
 if TYPE_CHECKING:
-    from mbtf_gen.repairs import RepairResult
+    from mbtf_gen.generation.repair import RepairResult
 
 
 def merge(folder: Path, /, *, console: Console = CONSOLE) -> int:
@@ -26,8 +26,8 @@ def merge(folder: Path, /, *, console: Console = CONSOLE) -> int:
     folder
         Folder of shards, or its URL.
     """
-    from mbtf_core.data_folder import data_folder
-    from mbtf_gen.dataset.summary import finish
+    from mbtf_core.data.data_folder import data_folder
+    from mbtf_gen.generation.summary import finish
 
     summary = finish(data_folder(folder))
     console.report(asdict(summary), describe(summary, ran=False))
@@ -44,11 +44,11 @@ def verify(folder: Path, /, *, digests: Path | None = None, console: Console = C
     digests
         Also compare its arrays with the digests.json of a published recipe.
     """
-    from mbtf_core.data_folder import data_folder
-    from mbtf_core.shard_schema import GEOMETRY_NAME
-    from mbtf_gen.dataset.reader import Dataset
-    from mbtf_gen.dataset.sidecar import ABSENT
-    from mbtf_gen.dataset.verify import foreign_files, verify
+    from mbtf_core.data.data_folder import data_folder
+    from mbtf_core.data.dataset import Dataset
+    from mbtf_core.data.schema import GEOMETRY_NAME
+    from mbtf_core.data.sidecar import ABSENT
+    from mbtf_core.data.verify import foreign_files, verify
 
     start = time.perf_counter()
     folder = data_folder(folder)
@@ -105,8 +105,8 @@ def repair(
     keep
         Which data set to restore, if the files belong to several: the name that the message gives it.
     """
-    from mbtf_core.data_folder import data_folder
-    from mbtf_gen.repairs import Corruption, RepairResult
+    from mbtf_core.data.data_folder import data_folder
+    from mbtf_gen.generation.repair import Corruption, RepairResult
 
     folder = data_folder(folder)
     found = Corruption(folder, material, keep)
@@ -123,7 +123,7 @@ def repair(
 
 
 def _describe_repair(done: RepairResult, dry_run: bool) -> str:
-    from mbtf_gen.dataset.sidecar import ABSENT
+    from mbtf_core.data.sidecar import ABSENT
 
     rendered, written = ("would be rendered", "would be written") if dry_run else ("rendered", "written")
     shown = [f for f in done.faults if f.what not in ABSENT]

@@ -14,19 +14,13 @@ from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import UsageError
 from mbtf_core.interruption import keep_on_interruption
 from mbtf_core.options import ClusterOption, DataOutput, Options, Overwrite, PathText, takes_options
+from mbtf_core.quality import Quality, QualityOption, as_assignments, overrides_of
 from mbtf_core.units import clock, size_text
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.config.presets import (
-    RESOLUTION,
-    Quality,
-    QualityOption,
-    as_assignments,
-    generator_options,
-    overrides_of,
-)
+from mbtf_gen.config.presets import RESOLUTION, generator_options
 
 if TYPE_CHECKING:
-    from mbtf_gen.dataset.summary import Summary
+    from mbtf_gen.generation.summary import Summary
     from mbtf_gen.job import Job
 
 G = TypeVar("G", bound=GeneratorConfig)
@@ -95,12 +89,11 @@ def generate(
     index, count = _slice(slice)
     job = prepare_job(options, material, quality)
     from mbtf_core.cluster.engine import open_cluster
-    from mbtf_core.data_folder import data_folder, in_store
-    from mbtf_core.folders import check_space
-    from mbtf_gen.dataset.shard_io import data_bytes
+    from mbtf_core.data.data_folder import data_folder, in_store
+    from mbtf_core.files.folders import check_space
     from mbtf_gen.forecast import announce_shards
-    from mbtf_gen.generation import generate, unfinished
-    from mbtf_gen.job import split_queries
+    from mbtf_gen.generation.run import generate, unfinished
+    from mbtf_gen.job import data_bytes, split_queries
 
     output = data_folder(output)
     left = unfinished(job, output, index, count, overwrite)

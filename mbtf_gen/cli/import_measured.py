@@ -33,11 +33,11 @@ def import_measured(
     measured
         File of a BTF (.btf, .hdf5), or folder or zip archive of images.
     """
-    from mbtf_core.data_folder import data_folder, in_store
-    from mbtf_core.folders import check_space
-    from mbtf_gen.dataset.import_job import Import
-    from mbtf_gen.dataset.imported import MEASURED_BYTES
-    from mbtf_gen.dataset.imported import import_measured as run
+    from mbtf_core.data.data_folder import data_folder, in_store
+    from mbtf_core.files.folders import check_space
+    from mbtf_gen.generation.import_job import Import
+    from mbtf_gen.generation.imported import MEASURED_BYTES
+    from mbtf_gen.generation.imported import import_measured as run
 
     output = data_folder(output)
     if Path(measured).is_dir() and Path(measured).resolve() in (output / "x").resolve().parents:

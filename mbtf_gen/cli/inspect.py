@@ -10,9 +10,9 @@ from cyclopts import Parameter
 
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import InputError, UsageError
-from mbtf_core.folders import make_folder
+from mbtf_core.files.folders import make_folder
 from mbtf_core.options import Options, Overwrite, PathText, takes_options
-from mbtf_core.store import split_url
+from mbtf_core.urls import split_url
 from mbtf_gen.cli.generate import resolve_config
 from mbtf_gen.config.generator import GeneratorConfig
 
@@ -46,8 +46,8 @@ def inspect(
     resolved = resolve_config(options, material)
     _check_new(write, "--write", (".yaml", ".yml"), overwrite)
     _check_new(export, "--export", (".exr",), overwrite)
+    from mbtf_core.images.exr import write_channels
     from mbtf_gen.fibers.inspect import fiber_text
-    from mbtf_gen.images.exr import write_channels
     from mbtf_gen.job import check_options
     from mbtf_gen.material.choices import write_material_file
     from mbtf_gen.material.cloth import inspect_cloth

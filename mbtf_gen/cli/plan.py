@@ -11,9 +11,9 @@ from cyclopts import Parameter
 
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.options import Options, PathText, takes_options
+from mbtf_core.quality import QualityOption
 from mbtf_gen.cli.generate import prepare_job
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.config.presets import QualityOption
 
 if TYPE_CHECKING:
     from mbtf_gen.planning.effects import Effect, EffectsPlan

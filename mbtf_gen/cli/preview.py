@@ -34,8 +34,8 @@ def preview(
     interactive
         Also show the mesh in a window, where the mouse turns it.
     """
-    from mbtf_core.data_folder import data_folder
-    from mbtf_gen.dataset.reader import Dataset, is_dataset
+    from mbtf_core.data.data_folder import data_folder
+    from mbtf_core.data.dataset import Dataset, is_dataset
     from mbtf_gen.pictures.preview.drawing import PreviewPictures
 
     if interactive:

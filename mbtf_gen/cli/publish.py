@@ -45,7 +45,7 @@ def publish(
             hint="an SPDX expression such as CC-BY-4.0; that of the material's maps may restrict it",
         )
     config = options.resolve()
-    from mbtf_core.data_folder import data_folder
+    from mbtf_core.data.data_folder import data_folder
 
     shards = data_folder(shards)
     if output.resolve() == shards.resolve() or shards.resolve() in output.resolve().parents:

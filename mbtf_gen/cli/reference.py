@@ -17,7 +17,7 @@ from mbtf_gen.config.pictures import RENDERING, ReferenceConfig
 if TYPE_CHECKING:
     from mbtf_core.cluster.engine import Cluster
     from mbtf_core.cluster.task import Task
-    from mbtf_gen.pictures.reference import ReferenceImage
+    from mbtf_core.pictures.reference import ReferenceImage
 
 
 @takes_options(ReferenceConfig, "reference", "exposure", *RENDERING)
@@ -43,23 +43,18 @@ def reference(
     """
     resolved = resolve_config(options, material)
     from mbtf_core.cluster.engine import open_cluster
+    from mbtf_core.data.shard_files import row_bytes
     from mbtf_core.directions import from_angles
     from mbtf_core.exposure import auto_exposure, brightness, describe_exposure
-    from mbtf_core.folders import check_space, owned
+    from mbtf_core.files.folders import check_space, owned
+    from mbtf_core.pictures.camera import Camera, PixelKind
+    from mbtf_core.pictures.reference import PNG_BYTES, read_value, write_display
     from mbtf_core.stats import pooled_relative_error
-    from mbtf_gen.dataset.shard_io import row_bytes
     from mbtf_gen.forecast import announce
     from mbtf_gen.job import Job
-    from mbtf_gen.pictures.camera import Camera, PixelKind
     from mbtf_gen.pictures.distribute import picture_task
     from mbtf_gen.pictures.folder import PictureFolder
-    from mbtf_gen.pictures.reference import (
-        PNG_BYTES,
-        picture_seconds,
-        read_value,
-        render_reference,
-        write_display,
-    )
+    from mbtf_gen.pictures.reference import picture_seconds, render_reference
     from mbtf_gen.planning.effects_plan import reference_plan
     from mbtf_gen.planning.simulation import build_estimator
 

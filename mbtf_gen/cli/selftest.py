@@ -40,7 +40,7 @@ def selftest(*, report: Path | None = None, time: Time = "2min", console: Consol
             all_checks(), seconds, lambda done, name: bar.update(round(min(done, seconds)), name)
         )
     if report is not None:
-        from mbtf_core.atomic import write_text
+        from mbtf_core.files.atomic import write_text
 
         write_text(report, as_html(findings))
     console.report(as_json(findings), as_text(findings))

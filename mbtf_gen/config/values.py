@@ -6,8 +6,8 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field
 
+from mbtf_core.data.schema import Tiling
 from mbtf_core.errors import UsageError
-from mbtf_core.shard_schema import Tiling
 
 
 def _gray(value: Any) -> Any:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mbtf_core.data.queries import Queries
 from mbtf_core.directions import from_angles, normalize
 from mbtf_core.stats import Estimate, mean_estimate, mean_of_halves
 from mbtf_gen.diagnostics.closed_forms import Groove, Wall, mirror
@@ -20,7 +21,6 @@ from mbtf_gen.fibers.curves import Curve
 from mbtf_gen.fibers.tile import FiberTile
 from mbtf_gen.geometry.heightfield import HeightGrid
 from mbtf_gen.sampling.light_kernel import LightKernel
-from mbtf_gen.sampling.query_sampler import Queries
 
 F64 = NDArray[np.float64]
 Cases = Mapping[str, Case]
@@ -344,7 +344,7 @@ def _launches(round_number: int) -> Cases:
 
 
 def _stored(round_number: int) -> Cases:
-    from mbtf_gen.dataset.shard_io import read_shard, write_shard
+    from mbtf_core.data.shard_files import read_shard, write_shard
 
     n, out = 20_000, {}
     rng = np.random.default_rng(13)

@@ -22,7 +22,7 @@ def machine() -> dict[str, Any]:
     """Software versions, and the kind and number of processors."""
     import os
 
-    from mbtf_gen.dataset.manifest import software_versions
+    from mbtf_core.data.manifest import software_versions
 
     return {**software_versions(), "processors": os.cpu_count() or 1}
 

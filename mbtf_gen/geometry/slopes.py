@@ -10,8 +10,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.data.geometry import mesh_slopes
+from mbtf_core.images.resample import resample
 from mbtf_gen.geometry.heightfield import HeightGrid
-from mbtf_gen.images.resample import resample
 
 NormalMode = Literal["residual", "absolute", "off"]
 
@@ -21,10 +22,7 @@ _SMALLEST_Z = 0.05
 
 def height_slopes(grid: HeightGrid) -> NDArray[np.float64]:
     """Slopes (H, W, 2) of the mesh at its vertices, by central differences over the period."""
-    rows, columns = grid.z.shape
-    along_x = (np.roll(grid.z, -1, 1) - np.roll(grid.z, 1, 1)) * (0.5 * columns)
-    along_y = (np.roll(grid.z, 1, 0) - np.roll(grid.z, -1, 0)) * (0.5 * rows / grid.aspect)
-    return np.stack([along_x, along_y], axis=-1)
+    return mesh_slopes(grid.z, grid.aspect)
 
 
 def normal_slopes(normal: NDArray[np.floating[Any]], smallest_z: float = _SMALLEST_Z) -> NDArray[np.float64]:

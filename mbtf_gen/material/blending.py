@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_gen.images.resample import resample
+from mbtf_core.images.resample import resample
 
 Floats = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mbtf_core.errors import InputError
-from mbtf_gen.images.read import Image
+from mbtf_core.images.read import Image
 from mbtf_gen.material.discovery import Convention
 from mbtf_gen.material.normal_map import NormalFit
 from mbtf_gen.material.quantization import Codes

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.atomic import write_text
 from mbtf_core.config_file import dump_yaml
+from mbtf_core.data.schema import Tiling
 from mbtf_core.errors import UsageError
-from mbtf_core.folders import make_folder
-from mbtf_core.shard_schema import Tiling
+from mbtf_core.files.atomic import write_text
+from mbtf_core.files.folders import make_folder
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.material.load import described
 from mbtf_gen.material.material import Material

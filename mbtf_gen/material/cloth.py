@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mbtf_core.digest import data_sha256, file_sha256
+from mbtf_core.files.digest import data_sha256, file_sha256
 from mbtf_gen.fibers.cloth import fiber_tile, loose_ends
 from mbtf_gen.fibers.cloth_file import ClothFile
 from mbtf_gen.fibers.inspect import inspect_fibers

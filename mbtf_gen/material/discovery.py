@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from mbtf_core.errors import InputError
-from mbtf_gen.images.read import SUFFIXES, is_image
+from mbtf_core.images.read import SUFFIXES, is_image
 
 Role = Literal["height", "base_color", "roughness", "metallic", "normal", "opacity"]
 Convention = Literal["gl", "dx"]

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from mbtf_core.images.read import LUMINANCE
 from mbtf_gen.geometry.heightfield import HeightGrid
 from mbtf_gen.geometry.slope_statistics import detail_size, repeats, rms_slope, slope_angles
-from mbtf_gen.images.read import LUMINANCE
 from mbtf_gen.material.checks import CONVENTION_NAMES, displacement_fault, signed
 from mbtf_gen.material.material import MAPS, Material, layers_above
 from mbtf_gen.material.tiling import broken

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from mbtf_core.digest import file_sha256
-from mbtf_core.shard_schema import Tiling
+from mbtf_core.data.schema import Tiling
+from mbtf_core.files.digest import file_sha256
 from mbtf_gen.material.load import described, material_of
 from mbtf_gen.material.material import MAPS, Material
 

@@ -6,11 +6,11 @@ import contextlib
 from pathlib import Path
 
 from mbtf_core.config_file import build, read_yaml
+from mbtf_core.data.schema import Tiling
 from mbtf_core.errors import InputError
-from mbtf_core.shard_schema import Tiling
+from mbtf_core.images.read import SUFFIXES, is_image
 from mbtf_core.suggest import suggest_path
 from mbtf_gen.fibers.cloth_file import CLOTH_KEYS, CURVE_FILES, ClothFile
-from mbtf_gen.images.read import SUFFIXES, is_image
 from mbtf_gen.material.cloth import cloth_material
 from mbtf_gen.material.discovery import FoundMaps, find_maps, unpack
 from mbtf_gen.material.material import Material, assemble, retiled

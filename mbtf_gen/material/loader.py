@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError
-from mbtf_gen.images.metadata import ColorSpace
-from mbtf_gen.images.read import Image, count_and_first, gray, read_image
+from mbtf_core.images.metadata import ColorSpace
+from mbtf_core.images.read import Image, count_and_first, gray, read_image
 from mbtf_gen.material.discovery import role_of
 from mbtf_gen.material.spec import ColorEntry, HeightEntry, NormalEntry, ShareEntry
 

@@ -12,15 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.color import srgb_to_linear
-from mbtf_core.digest import data_sha256, file_sha256
+from mbtf_core.data.lattice import Lattice
+from mbtf_core.data.schema import Tiling
 from mbtf_core.errors import InputError
-from mbtf_core.lattice import Lattice
-from mbtf_core.shard_schema import Tiling
+from mbtf_core.files.digest import data_sha256, file_sha256
+from mbtf_core.images.read import MAX_PIXELS, gray
+from mbtf_core.images.resample import dequantize, resample
 from mbtf_core.suggest import suggest_path
 from mbtf_gen.fibers.tile import FiberTile
 from mbtf_gen.geometry.heightfield import HeightGrid
-from mbtf_gen.images.read import MAX_PIXELS, gray
-from mbtf_gen.images.resample import dequantize, resample
 from mbtf_gen.material.blending import BAND
 from mbtf_gen.material.checks import (
     choose_convention,

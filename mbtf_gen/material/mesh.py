@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mbtf_core.digest import data_sha256, file_sha256
+from mbtf_core.files.digest import data_sha256, file_sha256
 from mbtf_gen.material.material import Material
 from mbtf_gen.meshes.mesh_file import MeshFile, read_mesh
 from mbtf_gen.meshes.tile import MeshTile

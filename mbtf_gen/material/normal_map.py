@@ -17,9 +17,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.images.resample import resample
 from mbtf_gen.geometry.heightfield import HeightGrid
 from mbtf_gen.geometry.slopes import height_slopes, normal_slopes
-from mbtf_gen.images.resample import resample
 from mbtf_gen.material.discovery import Convention
 
 Array = NDArray[np.floating[Any]]

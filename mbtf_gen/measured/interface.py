@@ -13,8 +13,8 @@ from typing import Any, Protocol, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.data.lattice import MAX_LEVEL
 from mbtf_core.errors import InputError
-from mbtf_core.lattice import MAX_LEVEL
 
 F32 = NDArray[np.float32]
 I64 = NDArray[np.int64]

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.atomic import write_through
 from mbtf_core.errors import InputError
+from mbtf_core.files.atomic import write_through
 from mbtf_gen.measured.hdf5 import data_set, floats, opened
 from mbtf_gen.measured.interface import (
     F32,

@@ -11,8 +11,8 @@ from pydantic import Field
 
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.config_file import FileName, Settings
+from mbtf_core.data.schema import Tiling
 from mbtf_core.errors import InputError, reason
-from mbtf_core.shard_schema import Tiling
 from mbtf_gen.config.generator import Resolution
 from mbtf_gen.config.values import Positive, Rgb, Share, no_tiling
 from mbtf_gen.meshes.tile import F64, MeshPart, MeshTile

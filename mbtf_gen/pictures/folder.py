@@ -14,14 +14,20 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from mbtf_core.atomic import read_json, write_json, write_text
 from mbtf_core.config_file import check_document, dump_yaml
-from mbtf_core.digest import data_sha256
+from mbtf_core.data.schema import CONFIG_NAME
 from mbtf_core.errors import InputError
-from mbtf_core.folders import ELSEWHERE, check_folder, make_folder, other_configuration, remove_unfinished
-from mbtf_core.shard_schema import CONFIG_NAME
+from mbtf_core.files.atomic import read_json, write_json, write_text
+from mbtf_core.files.digest import data_sha256
+from mbtf_core.files.folders import (
+    ELSEWHERE,
+    check_folder,
+    make_folder,
+    other_configuration,
+    remove_unfinished,
+)
+from mbtf_core.pictures.reference import RECORD_NAME
 
-RECORD_NAME = "pictures.json"
 FORMAT_NAME = "mbtf-pictures"
 _VERSION = 2
 # What does not change the content of pictures: the name of the material, and how values are displayed.

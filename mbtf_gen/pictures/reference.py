@@ -7,134 +7,18 @@ A picture is stored as an EXR image with the channels of the shard schema (``u.x
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.atomic import read_json, write_file
-from mbtf_core.errors import InputError
-from mbtf_core.exposure import to_display
-from mbtf_core.suggest import suggest_path
-from mbtf_gen.dataset.shard_io import read_exr, write_exr
-from mbtf_gen.pictures.camera import PIXEL_SIGMA, Camera, PixelKind
-from mbtf_gen.pictures.folder import RECORD_NAME
-from mbtf_gen.sampling.query_sampler import Queries
+from mbtf_core.data.queries import Queries
+from mbtf_core.pictures.camera import PIXEL_SIGMA, Camera, PixelKind
+from mbtf_core.pictures.reference import ReferenceImage
 
 if TYPE_CHECKING:
     from mbtf_gen.render.estimator import Estimator
-
-# Of an 8-bit pixel, at most.
-PNG_BYTES = 3
-
-
-@dataclass(frozen=True)
-class ReferenceImage:
-    """A rendered picture.
-
-    Attributes
-    ----------
-    kind : {"query", "pixel"}
-        Meaning of a pixel, see :mod:`mbtf_gen.pictures.camera`.
-    camera : Camera
-        The camera.
-    queries : Queries
-        One per pixel, with leading axes (rows, columns).
-    value_a, value_b : (rows, columns, 3) float32 array
-        Independent halves, in 1/sr.
-    spp : int
-        Paths per pixel, both halves together.
-    transmittance : (rows, columns) float32 array or None
-        Fraction of the view rays that the opacity mask transmits; None without a mask.
-    """
-
-    kind: PixelKind
-    camera: Camera
-    queries: Queries
-    value_a: NDArray[np.float32]
-    value_b: NDArray[np.float32]
-    spp: int
-    transmittance: NDArray[np.float32] | None = None
-
-    @property
-    def value(self) -> NDArray[np.float32]:
-        """Mean of the halves, (rows, columns, 3)."""
-        return 0.5 * (self.value_a + self.value_b)
-
-    def write(self, path: Path) -> Path:
-        """Write ``path`` + ``.exr`` with all channels, atomically, and return its path."""
-        spp = np.full(self.queries.lead, self.spp, np.float32)
-        arrays = {**vars(self.queries), "value_a": self.value_a, "value_b": self.value_b, "spp": spp}
-        if self.transmittance is not None:
-            arrays["transmittance"] = self.transmittance
-        exr = path.with_name(f"{path.name}.exr")
-        write_exr(exr, {name: array[None] for name, array in arrays.items()})
-        return exr
-
-
-def read_references(folder: Path) -> list[tuple[NDArray[np.float32], Camera, NDArray[np.float32]]]:
-    """Value in 1/sr, camera, and direction of the light of the finished pictures of ``mbtf-gen reference``.
-
-    Parameters
-    ----------
-    folder : Path
-        Output folder of the command.
-
-    Returns
-    -------
-    list of (array (rows, columns, 3), Camera, array (3,))
-
-    Raises
-    ------
-    InputError
-        The folder has no such pictures.
-    """
-    record = folder / RECORD_NAME
-    if not record.is_file():
-        hint = suggest_path(folder, Path.is_dir)
-        raise InputError("holds no pictures of mbtf-gen reference", where=folder, hint=hint)
-    known = read_json(record)
-    options = known.get("depends", {}).get("reference", {})
-    if known.get("kind") != "reference" or not {"view", "light", "tiles_across"} <= set(options):
-        raise InputError("holds no pictures of mbtf-gen reference", where=folder)
-    out = []
-    for across in options["tiles_across"]:
-        name = next((n for n in known["pictures"] if n.endswith(f"-tiles{across:g}")), None)
-        if name is None:
-            continue
-        path = folder / f"{name}.exr"
-        value, light = read_value(path), read_exr(path, ("omega_i",))["omega_i"].reshape(-1, 3)[0]
-        rows, columns = value.shape[:2]
-        view = options["view"]
-        out.append(
-            (value, Camera(view["elevation"], view["azimuth"], across, rows=rows, columns=columns), light)
-        )
-    if not out:
-        raise InputError("holds no finished picture", where=folder, hint="run mbtf-gen reference again")
-    return out
-
-
-def read_value(path: Path) -> NDArray[np.float32]:
-    """Value (rows, columns, 3) of a picture that :meth:`ReferenceImage.write` wrote."""
-    stored = read_exr(path, ("value_a", "value_b"))
-    value: NDArray[np.float32] = 0.5 * (stored["value_a"] + stored["value_b"])
-    return value.reshape(value.shape[-3:])
-
-
-def write_display(path: Path, value: NDArray[np.float32], exposure: float) -> Path:
-    """Write ``path`` + ``.png``, sRGB of a linear picture at an exposure in EV, and return its path."""
-    png = path.with_name(f"{path.name}.png")
-    write_png(png, to_display(value, exposure))
-    return png
-
-
-def write_png(path: Path, pixels: NDArray[np.uint8]) -> None:
-    """Write an 8-bit picture (rows, columns, 3), atomically."""
-    from PIL import Image
-
-    write_file(path, lambda stream: Image.fromarray(pixels).save(stream, format="PNG"))
 
 
 def _camera_rays(camera: Camera, estimator: Estimator) -> Any:
@@ -211,7 +95,7 @@ def render_reference(
     omega_i : (3,) float array
         Direction towards the light.
     kind : {"query", "pixel"}
-        Meaning of a pixel, see :mod:`mbtf_gen.pictures.camera`.
+        Meaning of a pixel, see :mod:`mbtf_core.pictures.camera`.
     spp : int
         Paths per pixel, both halves together; even.
     seed, index : int

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from mbtf_core.data.queries import Queries
 from mbtf_gen.config.effects_request import EFFECTS
 from mbtf_gen.job import Job
 from mbtf_gen.planning.bounds import CAUTION, FEW, NONE_OF
 from mbtf_gen.planning.effects import Effect, EffectsPlan, without
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream
-from mbtf_gen.sampling.query_sampler import Queries
 
 # Queries of the pilot and paths of each.
 PILOT_QUERIES, PILOT_SPP = 8192, 4

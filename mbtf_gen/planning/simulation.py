@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.data.queries import Queries
+from mbtf_core.images.resample import resample
 from mbtf_gen.geometry.slopes import height_slopes, residual_slopes
-from mbtf_gen.images.resample import resample
 from mbtf_gen.job import Job
 from mbtf_gen.planning.effects import EffectsPlan
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.render.runtime import CPU_VARIANT
-from mbtf_gen.sampling.query_sampler import Queries
 
 # Effects that change the tile: its shape or its surface.
 _TILE_EFFECTS = frozenset(

@@ -9,9 +9,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.images.resample import resample
 from mbtf_gen.fibers.tile import FiberTile
 from mbtf_gen.geometry.slope_statistics import triangle_slopes
-from mbtf_gen.images.resample import resample
 from mbtf_gen.job import Job
 from mbtf_gen.meshes.tile import MeshTile
 from mbtf_gen.planning.bounds import DisplacementBounds

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.lattice import level_of_sigma
-from mbtf_gen.dataset.exported import mean_of
-from mbtf_gen.dataset.reader import Dataset
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.lattice import level_of_sigma
+from mbtf_gen.measured.exported import mean_of
 from mbtf_gen.publishing.statistics import blocks
 
 F64 = NDArray[np.float64]

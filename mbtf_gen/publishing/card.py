@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from mbtf_core.atomic import Stored
 from mbtf_core.config_file import dump_yaml
-from mbtf_core.shard_schema import GEOMETRY_NAME, LEADING_AXES
+from mbtf_core.data.schema import GEOMETRY_NAME, LEADING_AXES
+from mbtf_core.files.atomic import Stored
 from mbtf_core.units import size_text
 from mbtf_gen.publishing.digests import DIGESTS_NAME
 from mbtf_gen.publishing.escape import code, escaped, fenced, table

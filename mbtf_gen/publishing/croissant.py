@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from pathlib import PurePosixPath
 from typing import Any
 
-from mbtf_core.atomic import Stored
+from mbtf_core.files.atomic import Stored
 from mbtf_gen.publishing.facts import TAGS, Facts
 from mbtf_gen.publishing.folder import DATA
 

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
-from mbtf_core.atomic import read_json
 from mbtf_core.config_file import check_document
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.manifest import software_versions
 from mbtf_core.errors import InputError
-from mbtf_gen.dataset.manifest import software_versions
-from mbtf_gen.dataset.reader import Dataset
+from mbtf_core.files.atomic import read_json
 
 DIGESTS_NAME = "digests.json"
 _FORMAT, _VERSION = "mbtf-digests", 1

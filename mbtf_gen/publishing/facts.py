@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.shard_files import Arrays
 from mbtf_gen.config.effects_request import EFFECTS
 from mbtf_gen.config.publish import PublishConfig
-from mbtf_gen.dataset.reader import Dataset
-from mbtf_gen.dataset.shard_io import Arrays
 
 # Upper ends of the size categories of data hubs.
 _SIZES = (

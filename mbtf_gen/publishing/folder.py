@@ -13,11 +13,17 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel
 
-from mbtf_core.atomic import Stored, read_json, remove_file, write_json
 from mbtf_core.config_file import check_document
-from mbtf_core.digest import data_sha256
 from mbtf_core.errors import InputError
-from mbtf_core.folders import ELSEWHERE, check_folder, make_folder, other_configuration, remove_unfinished
+from mbtf_core.files.atomic import Stored, read_json, remove_file, write_json
+from mbtf_core.files.digest import data_sha256
+from mbtf_core.files.folders import (
+    ELSEWHERE,
+    check_folder,
+    make_folder,
+    other_configuration,
+    remove_unfinished,
+)
 
 RECORD_NAME = "publish.json"
 FORMAT_NAME = "mbtf-publication"

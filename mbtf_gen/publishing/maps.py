@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.config_file import dump_yaml
-from mbtf_core.digest import file_sha256
+from mbtf_core.data.dataset import Dataset
 from mbtf_core.errors import InputError
-from mbtf_gen.dataset.reader import Dataset
+from mbtf_core.files.digest import file_sha256
 from mbtf_gen.material.load import described, load_material
 
 MATERIAL_FILE = "material.yaml"

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.atomic import Stored, write_through
+from mbtf_core.data.shard_files import Arrays
 from mbtf_core.errors import EngineError
-from mbtf_gen.dataset.shard_io import Arrays
+from mbtf_core.files.atomic import Stored, write_through
 
 # Bytes of the numbers of one row group.
 _GROUP_BYTES = 32 << 20

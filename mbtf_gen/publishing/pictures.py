@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.atomic import Stored, write_chunks
 from mbtf_core.color import linear_to_srgb
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.geometry import Geometry
 from mbtf_core.exposure import auto_exposure, brightness, to_display
-from mbtf_gen.dataset.geometry import Geometry
-from mbtf_gen.dataset.reader import Dataset
+from mbtf_core.files.atomic import Stored, write_chunks
 from mbtf_gen.pictures.preview.plots import query_figure
 from mbtf_gen.pictures.preview.sample import stored_queries
 from mbtf_gen.publishing.averages import ELEVATIONS, LIGHTS, Averages, averages

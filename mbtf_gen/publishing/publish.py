@@ -8,15 +8,15 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.atomic import Stored, write_chunks
-from mbtf_core.digest import data_sha256
+from mbtf_core.data.dataset import Dataset, Shard
+from mbtf_core.data.schema import GEOMETRY_NAME
+from mbtf_core.data.sidecar import sidecar_of
+from mbtf_core.data.verify import verify
 from mbtf_core.errors import InputError, UsageError
-from mbtf_core.folders import check_space, owned
-from mbtf_core.shard_schema import GEOMETRY_NAME
+from mbtf_core.files.atomic import Stored, write_chunks
+from mbtf_core.files.digest import data_sha256
+from mbtf_core.files.folders import check_space, owned
 from mbtf_gen.config.publish import PublishConfig
-from mbtf_gen.dataset.reader import Dataset, Shard
-from mbtf_gen.dataset.sidecar import sidecar_of
-from mbtf_gen.dataset.verify import verify
 from mbtf_gen.publishing.card import CARD_NAME, Card
 from mbtf_gen.publishing.croissant import CROISSANT_NAME, croissant_text
 from mbtf_gen.publishing.facts import Facts

@@ -7,10 +7,10 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from mbtf_core.atomic import Stored, write_chunks
 from mbtf_core.config_file import dump_yaml
-from mbtf_core.shard_schema import CONFIG_NAME
-from mbtf_gen.dataset.reader import Dataset
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.schema import CONFIG_NAME
+from mbtf_core.files.atomic import Stored, write_chunks
 from mbtf_gen.publishing.digests import DIGESTS_NAME, dataset_digests
 from mbtf_gen.publishing.folder import RECIPE
 from mbtf_gen.publishing.maps import MATERIAL_FILE, MaterialCopy

@@ -12,11 +12,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.lattice import level_of_sigma
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.lattice import level_of_sigma
+from mbtf_core.data.shard_files import Arrays
 from mbtf_core.stats.estimate import Estimate
-from mbtf_gen.dataset.exported import mean_of
-from mbtf_gen.dataset.reader import Dataset
-from mbtf_gen.dataset.shard_io import Arrays
+from mbtf_gen.measured.exported import mean_of
 
 F64 = NDArray[np.float64]
 

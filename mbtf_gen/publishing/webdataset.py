@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mbtf_core.atomic import Stored, write_chunks
-from mbtf_gen.dataset.shard_io import Arrays
+from mbtf_core.data.shard_files import Arrays
+from mbtf_core.files.atomic import Stored, write_chunks
 
 # Bytes of the numbers of a sample.
 _SAMPLE_BYTES = 1 << 20

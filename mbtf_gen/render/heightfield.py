@@ -1,5 +1,5 @@
 """The periodic height field as kernels read it: exact cells, bounding planes of blocks
-(:mod:`~mbtf_gen.geometry.height_planes`), and hits on it.
+(:mod:`~mbtf_core.height_planes`), and hits on it.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mbtf_gen.geometry.height_planes import logarithms, node_table
+from mbtf_core.height_planes import logarithms, node_table
 from mbtf_gen.geometry.heightfield import HeightGrid
 from mbtf_gen.render.geometry import Vertex
 from mbtf_gen.render.memory import padded

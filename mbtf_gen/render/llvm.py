@@ -13,7 +13,7 @@ import os
 import re
 from pathlib import Path
 
-from mbtf_core.folders import cache_folder
+from mbtf_core.files.folders import cache_folder
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 CACHE_VARIABLE = "DRJIT_CACHE_DIR"

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.shard_schema import SliceDirections
+from mbtf_core.data.schema import SliceDirections
 from mbtf_gen.sampling.exact_math import sincos_turns
 
 F32 = NDArray[np.float32]

@@ -39,7 +39,7 @@ def cost(
         Root seed of all random numbers.
     """
     from mbtf_core.cluster.engine import open_cluster
-    from mbtf_core.folders import owned
+    from mbtf_core.files.folders import owned
     from mbtf_core.interruption import keep_on_interruption
     from mbtf_core.units import asked_duration, format_duration
     from mbtf_pipeline.cost_study.page import whole_runs, write_page

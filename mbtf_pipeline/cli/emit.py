@@ -11,7 +11,7 @@ from cyclopts.validators import Number
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import UsageError
 from mbtf_core.options import Output, Overwrite, Set, command_line
-from mbtf_gen.config.presets import QualityOption
+from mbtf_core.quality import QualityOption
 
 _AT_LEAST_ONE = Number(gte=1, lte=10_000)
 

@@ -12,9 +12,9 @@ from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import PartialError, UsageError
 from mbtf_core.interruption import keep_on_interruption
 from mbtf_core.options import ClusterOption, Output, Set, Switch, Time, command_line
+from mbtf_core.quality import Quality, QualityOption
 from mbtf_core.units import clock
 from mbtf_fit.cli.page_options import Live, live_view
-from mbtf_gen.config.presets import Quality, QualityOption
 
 if TYPE_CHECKING:
     from mbtf_pipeline.run import RunResult

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.atomic import write_json
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import PartialError
 from mbtf_core.exposure import auto_exposure, brightness, white_of
+from mbtf_core.files.atomic import write_json
 from mbtf_core.stats import Estimate
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.compare.contrast import contrast, phase_contrasts, picture_blocks
@@ -36,10 +36,10 @@ from mbtf_pipeline.recipe import CompareSection
 
 if TYPE_CHECKING:
     from mbtf_core.cluster.engine import Cluster
+    from mbtf_core.pictures.camera import PixelKind
+    from mbtf_core.pictures.reference import ReferenceImage
     from mbtf_fit import Material
     from mbtf_gen.job import Job
-    from mbtf_gen.pictures.camera import PixelKind
-    from mbtf_gen.pictures.reference import ReferenceImage
     from mbtf_gen.render.estimator import Estimator
 
 COMPARISON_NAME = "comparison.json"
@@ -83,8 +83,8 @@ def compare(
     UsageError : ``unmodified_mitsuba`` is set and no scene is suitable for it
     EngineError : ST-LPIPS is requested and its weights are not installed
     """
+    from mbtf_core.data.dataset import Dataset
     from mbtf_fit import Material
-    from mbtf_gen.dataset.reader import Dataset
     from mbtf_gen.job import Job
     from mbtf_gen.planning.effects_plan import reference_plan
     from mbtf_gen.planning.simulation import build_estimator
@@ -188,9 +188,9 @@ def _compare_scene(
     progress: Progress,
 ) -> dict[str, Any]:
     """Write the images of one scene and measure their errors."""
-    from mbtf_core.lattice import level_of_sigma
+    from mbtf_core.data.lattice import level_of_sigma
+    from mbtf_core.pictures.reference import write_display
     from mbtf_core.stats import mse_difference, pooled_relative_error
-    from mbtf_gen.pictures.reference import write_display
 
     white = white_of(exposure)
     record: dict[str, Any] = {

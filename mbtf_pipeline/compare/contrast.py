@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mbtf_core.lattice import Lattice, sigma_of_level
+from mbtf_core.data.lattice import Lattice, sigma_of_level
+from mbtf_core.data.queries import Queries
+from mbtf_core.images.read import LUMINANCE
 from mbtf_core.stats import Estimate
-from mbtf_gen.images.read import LUMINANCE
 from mbtf_gen.render.estimates import Stream
-from mbtf_gen.sampling.query_sampler import Queries
 
 if TYPE_CHECKING:
     from mbtf_fit import Material

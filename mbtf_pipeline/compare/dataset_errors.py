@@ -7,8 +7,8 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from mbtf_core.data.dataset import Dataset
 from mbtf_core.stats import by_group, level_groups, mse_difference
-from mbtf_gen.dataset.reader import Dataset
 
 if TYPE_CHECKING:
     from mbtf_fit import Material

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.data.lattice import Lattice, texel_centers
 from mbtf_core.directions import from_angles
-from mbtf_core.lattice import Lattice, texel_centers
 from mbtf_pipeline.compare.pictures import write_channels
 from mbtf_pipeline.recipe import SceneView
 
@@ -59,7 +59,7 @@ def read_offset(path: Path) -> F32:
     ------
     InputError : missing or corrupt
     """
-    from mbtf_gen.images.exr import read_channels
+    from mbtf_core.images.exr import read_channels
 
     channels = read_channels(path, 1 << 26)
     return np.stack([channels["X"], channels["Y"]], axis=-1).astype(np.float32)

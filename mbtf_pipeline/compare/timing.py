@@ -45,8 +45,8 @@ def timed(work: Callable[[], T]) -> tuple[T, float]:
 
 def _random_queries(count: int, finest: int) -> list[NDArray[np.float32]]:
     """u, σ, ω_i and ω_o of queries over all levels, with directions within 60° of the normal."""
+    from mbtf_core.data.lattice import sigma_of_level
     from mbtf_core.directions import from_projected_disk
-    from mbtf_core.lattice import sigma_of_level
 
     rng = np.random.default_rng(_SEED)
     angle = 2 * np.pi * rng.random((2, count))

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import UsageError
+from mbtf_core.pictures.camera import PIXEL_SIGMA, Camera
 from mbtf_core.stats import Estimate, mean_estimate
-from mbtf_gen.pictures.camera import PIXEL_SIGMA, Camera
 from mbtf_pipeline.compare.pictures import PICTURES, write_picture
 
 if TYPE_CHECKING:

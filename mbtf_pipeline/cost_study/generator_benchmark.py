@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import median_abs_deviation
 
+from mbtf_core.data.queries import Queries
 from mbtf_core.nested import deep_merge, nested
 from mbtf_core.stats import Estimate, mean_estimate
 from mbtf_gen.config.generator import GeneratorConfig
@@ -28,7 +29,6 @@ from mbtf_gen.planning.effects_plan import plan_effects
 from mbtf_gen.planning.run_plan import allocate
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Stream
-from mbtf_gen.sampling.query_sampler import Queries
 from mbtf_pipeline.cost_study.measurements import HALF_WIDTH, NORMAL
 
 # Queries of one batch of the reference, and paths of each there and in the configuration.

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mbtf_core.atomic import write_json, write_text
+from mbtf_core.files.atomic import write_json, write_text
 from mbtf_core.stats import Estimate
 from mbtf_core.units import clock
 from mbtf_pipeline.cost_study.figures import (

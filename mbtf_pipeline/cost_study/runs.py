@@ -18,12 +18,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mbtf_core.digest import data_sha256
 from mbtf_core.errors import InputError
+from mbtf_core.files.digest import data_sha256
 from mbtf_core.stats import Estimate, unexplained_variance
 from mbtf_core.units import parse_duration
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.generation import generate
+from mbtf_gen.generation.run import generate
 from mbtf_gen.job import Job
 from mbtf_pipeline.cost_study.measurements import Configuration, Measurement
 
@@ -148,8 +148,8 @@ class RunRunner:
     def test_set(self, seed: int) -> ShardQueries:
         """The test queries of all runs with an offset of the seed."""
         if seed not in self.test_sets:
+            from mbtf_core.data.dataset import Dataset
             from mbtf_fit.data.loader import load_split
-            from mbtf_gen.dataset.reader import Dataset
 
             self.progress("test set")
             folder, self.test_seconds = self._generate(seed, _NO_QUERIES, self.test)

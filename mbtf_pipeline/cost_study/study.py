@@ -9,15 +9,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.atomic import read_json, write_json, write_text
 from mbtf_core.cluster.engine import Cluster
 from mbtf_core.config_file import dump_yaml
+from mbtf_core.data.shard_files import row_bytes
 from mbtf_core.errors import InputError
-from mbtf_core.folders import ELSEWHERE, check_folder, check_space, owned
+from mbtf_core.files.atomic import read_json, write_json, write_text
+from mbtf_core.files.folders import ELSEWHERE, check_folder, check_space, owned
 from mbtf_core.stats import Estimate, signal_variance
 from mbtf_core.units import expectation
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.dataset.shard_io import row_bytes
 from mbtf_gen.job import Job
 from mbtf_pipeline.cost_study.distribute import ClusterRunner, measure_configurations, worker_facts
 from mbtf_pipeline.cost_study.fit_runs import GENERATOR, RUN_SHARES, planned_runs

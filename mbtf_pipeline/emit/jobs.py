@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from mbtf_core.atomic import read_json, write_json, write_text
 from mbtf_core.config_file import dump_yaml
+from mbtf_core.data.schema import MANIFEST_NAME
 from mbtf_core.errors import InputError, UsageError
-from mbtf_core.folders import ELSEWHERE, check_folder, make_folder, owned
-from mbtf_core.shard_schema import MANIFEST_NAME
+from mbtf_core.files.atomic import read_json, write_json, write_text
+from mbtf_core.files.folders import ELSEWHERE, check_folder, make_folder, owned
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.dataset.folder import has_dataset
+from mbtf_gen.generation.folder import has_dataset
 from mbtf_gen.job import Job
 from mbtf_pipeline.emit.kubernetes import APPLY, Cluster, kubernetes_files
 from mbtf_pipeline.emit.makefile import makefile

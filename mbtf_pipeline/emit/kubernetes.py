@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from mbtf_core.digest import data_sha256
+from mbtf_core.files.digest import data_sha256
 from mbtf_pipeline.emit.places import Places
 from mbtf_pipeline.emit.steps import Step, waves
 

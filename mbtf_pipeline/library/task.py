@@ -6,16 +6,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mbtf_core.atomic import read_json
 from mbtf_core.errors import InputError
+from mbtf_core.files.atomic import read_json
 from mbtf_fit.config import FitConfig
 from mbtf_fit.training.fit_cluster import in_folder
 from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.run_folder import COMPARE, SHARDS
 
 if TYPE_CHECKING:
+    from mbtf_core.data.dataset import Dataset
     from mbtf_fit.training.fit import FitResult
-    from mbtf_gen.dataset.reader import Dataset
 
 # Sub-folder of a run with the first fit, whose error divides the training time.
 FIRST = "first"
@@ -125,7 +125,7 @@ def _unexplained(result: FitResult, shards: Path) -> dict[str, Any]:
     errors = result.errors
     if shards.name != SHARDS:
         # A data set of another layout has hardly any test queries.
-        from mbtf_gen.dataset.reader import Dataset
+        from mbtf_core.data.dataset import Dataset
         from mbtf_pipeline.compare.dataset_errors import dataset_errors
 
         tested = Dataset.open(shards.parent / SHARDS)

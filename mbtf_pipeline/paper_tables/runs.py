@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.atomic import read_json
-from mbtf_core.lattice import Lattice
+from mbtf_core.data.lattice import Lattice
+from mbtf_core.files.atomic import read_json
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.compare.compare import COMPARISON_NAME
 from mbtf_pipeline.formatting import estimate

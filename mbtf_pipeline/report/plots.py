@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from mbtf_core.atomic import write_through
+from mbtf_core.files.atomic import write_through
 
 # Okabe and Ito (2008) with gray instead of black and without yellow: distinguishable under every common
 # color-vision deficiency.

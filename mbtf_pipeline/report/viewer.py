@@ -7,13 +7,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.atomic import read_json, write_text
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import InputError
+from mbtf_core.files.atomic import read_json, write_text
+from mbtf_core.pictures.camera import Camera
 from mbtf_fit.viewer.content import material_content
 from mbtf_fit.viewer.extras import picture_content, tiles_text
 from mbtf_fit.viewer.page import write_page
-from mbtf_gen.pictures.camera import Camera
 from mbtf_pipeline.compare.compare import COMPARISON_NAME
 from mbtf_pipeline.compare.pictures import read_picture
 from mbtf_pipeline.run_folder import COMPARE, FITS, VIEWER

@@ -11,20 +11,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.atomic import checksummed
-from mbtf_core.digest import file_sha256
-from mbtf_core.shard_schema import FORMAT_NAME, SCHEMA_VERSION
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.queries import Queries
+from mbtf_core.data.schema import FORMAT_NAME, SCHEMA_VERSION
+from mbtf_core.data.shard_files import read_shard, write_shard
+from mbtf_core.files.atomic import checksummed
+from mbtf_core.files.digest import file_sha256
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.dataset.folder import open_folder
-from mbtf_gen.dataset.reader import Dataset
-from mbtf_gen.dataset.render_shards import store_shard
-from mbtf_gen.dataset.shard_io import read_shard, write_shard
-from mbtf_gen.dataset.summary import finish
+from mbtf_gen.generation.folder import open_folder
+from mbtf_gen.generation.render_shards import store_shard
+from mbtf_gen.generation.summary import finish
 from mbtf_gen.job import Job, split_spp
 from mbtf_gen.planning.effects_plan import reference_plan
 from mbtf_gen.planning.run_plan import RunPlan
 from mbtf_gen.render.estimates import Estimates
-from mbtf_gen.sampling.query_sampler import Queries
 
 F32 = NDArray[np.float32]
 NOISE = 0.05

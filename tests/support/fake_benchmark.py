@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mbtf_core.data.queries import Queries
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.generation import Job
+from mbtf_gen.generation.run import Job
 from mbtf_gen.material.material import Material
 from mbtf_gen.render.estimates import Estimates, Stream
-from mbtf_gen.sampling.query_sampler import Queries
 from mbtf_pipeline.cost_study.generator_benchmark import GeneratorBenchmark
 
 NOISE = 0.8  # standard deviation of one path, relative to the value

@@ -10,17 +10,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mbtf_core.atomic import checksummed
+from mbtf_core.data.geometry import Geometry, geometry_record, write_geometry
+from mbtf_core.data.lattice import Lattice, sigma_of_level
+from mbtf_core.data.schema import FORMAT_NAME, GEOMETRY_NAME, MANIFEST_NAME, SCHEMA_VERSION
+from mbtf_core.data.shard_files import write_shard
 from mbtf_core.directions import from_projected_disk
-from mbtf_core.lattice import Lattice, sigma_of_level
-from mbtf_core.shard_schema import FORMAT_NAME, GEOMETRY_NAME, MANIFEST_NAME, SCHEMA_VERSION
+from mbtf_core.files.atomic import checksummed
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.models.registry import build_model
 from mbtf_fit.objective.noise import NoiseModel, typical_value
 from mbtf_fit.training.trainer import Trainer
-from mbtf_gen.dataset.geometry import Geometry, geometry_record, write_geometry
-from mbtf_gen.dataset.shard_io import write_shard
 
 from .datasets import write_sidecar
 

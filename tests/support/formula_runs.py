@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.generation import unfinished
+from mbtf_gen.generation.run import unfinished
 from mbtf_gen.job import Job, planned_paths
 from mbtf_gen.planning.effects_plan import reference_plan
 from mbtf_gen.planning.run_plan import RunPlan

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.lattice import Lattice
+from mbtf_core.data.geometry import Geometry
+from mbtf_core.data.lattice import Lattice
 from mbtf_fit.surface.known import KnownSurface
-from mbtf_gen.dataset.geometry import Geometry
 
 F32 = NDArray[np.float32]
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.data.queries import Queries
 from mbtf_gen.geometry.heightfield import HeightGrid, tile_mesh
-from mbtf_gen.sampling.query_sampler import Queries
 from support.scenes import mi, queries, rocks
 
 # After support.scenes, which loads Mitsuba.

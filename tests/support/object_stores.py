@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from mbtf_core.store_folder import close_stores
+from mbtf_core.data.store_folder import close_stores
 
 BUCKET = "bucket"
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import mbtf_fit.mitsuba_plugin
-from mbtf_gen.pictures.camera import Camera
+from mbtf_core.pictures.camera import Camera
 
 from .scenes import mi
 

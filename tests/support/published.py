@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.data.dataset import Dataset
 from mbtf_gen.config.publish import PublishConfig
-from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.publishing.publish import Publication
 
 from .datasets import write_dataset

@@ -14,12 +14,12 @@ from support.paths import ROOT
 
 mi = load_mitsuba()
 
+from mbtf_core.data.queries import Queries  # noqa: E402
 from mbtf_gen.geometry.heightfield import HeightGrid  # noqa: E402
 from mbtf_gen.render.estimator import Estimates, Estimator, Stream  # noqa: E402
 from mbtf_gen.render.path_tracer import Transport  # noqa: E402
 from mbtf_gen.render.scene import build_tile, register_plugins  # noqa: E402
 from mbtf_gen.sampling.light_kernel import LightKernel  # noqa: E402
-from mbtf_gen.sampling.query_sampler import Queries  # noqa: E402
 
 register_plugins()
 

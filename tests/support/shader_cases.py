@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from mbtf_core.lattice import Lattice
+from mbtf_core.data.lattice import Lattice
 from mbtf_fit.material.material import Material
 from mbtf_fit.material.transmittance import Transmittance
 

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from mbtf_core.atomic import checksummed
-from mbtf_core.lattice import Lattice
-from mbtf_core.shard_schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION
-from mbtf_gen.dataset.shard_io import write_shard
+from mbtf_core.data.lattice import Lattice
+from mbtf_core.data.schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION
+from mbtf_core.data.shard_files import write_shard
+from mbtf_core.files.atomic import checksummed
 from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
 from mbtf_gen.sampling.slice_directions import slice_directions
 

@@ -13,10 +13,10 @@ import numpy as np
 from PIL import Image
 
 from mbtf_core.console import run
+from mbtf_core.data.queries import Queries
 from mbtf_gen.cli.app import app
 from mbtf_gen.planning.simulation import ClosedForm
 from mbtf_gen.render.estimates import Estimates, Stream
-from mbtf_gen.sampling.query_sampler import Queries
 from mbtf_gen.sampling.rng import Purpose, numpy_generator
 
 

@@ -12,7 +12,7 @@ from support.fit_data import parallax, write_data
 from support.invalid_inputs import call
 from support.plugin_materials import write_material
 
-from mbtf_core.folders import owned
+from mbtf_core.files.folders import owned
 
 RECIPE = "name: r\ngenerate: {material: heights.npy, queries: {train: 64, test: 16}}\nfit: {model: neumip}\n"
 COMMANDS = [

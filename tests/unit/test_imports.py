@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -24,10 +24,16 @@ HEAVY = {
     "dask",
     "distributed",
 }
-# From the lowest to the highest: a module imports from its own line and from those above it.
-ORDER = """
+# The rooms from the lowest to the highest: folders, or single files, of the packages. A room imports from its
+# own line and from those above it. A package's name stands for its files that no line names.
+ROOMS = """
 mbtf_core
-mbtf_gen.images
+mbtf_core.files
+mbtf_core.images
+mbtf_core.data
+mbtf_core.pictures
+mbtf_core.stats
+mbtf_core.cluster
 mbtf_gen.geometry
 mbtf_gen.sampling
 mbtf_gen.config
@@ -38,8 +44,8 @@ mbtf_gen.material
 mbtf_gen.render
 mbtf_gen.job
 mbtf_gen.planning
-mbtf_gen.dataset
-mbtf_gen.generation mbtf_gen.repairs mbtf_gen.forecast
+mbtf_gen.generation
+mbtf_gen.forecast
 mbtf_gen.pictures
 mbtf_gen.publishing
 mbtf_gen.diagnostics
@@ -47,11 +53,7 @@ mbtf_gen.cli
 mbtf_gen
 mbtf_fit.config mbtf_fit.presets mbtf_fit.formatting
 mbtf_fit.data
-mbtf_fit.native.library mbtf_fit.models.constants mbtf_fit.models.lookup
-mbtf_fit.surface
-mbtf_fit.models
-mbtf_fit.objective
-mbtf_fit.native
+mbtf_fit.native mbtf_fit.surface mbtf_fit.models mbtf_fit.objective
 mbtf_fit.material
 mbtf_fit.evaluation
 mbtf_fit.training
@@ -73,36 +75,21 @@ mbtf_pipeline.library
 mbtf_pipeline.cli
 mbtf_pipeline
 """  # noqa: E501
-RANK = {name: rank for rank, line in enumerate(ORDER.split("\n")) for name in line.split()}
-# Top-level names that a package may not import anywhere, not even inside a function.
+RANK = {name: rank for rank, line in enumerate(ROOMS.split("\n")) for name in line.split()}
+# What a package, or one of its rooms, may not import anywhere, not even inside a function.
 FORBIDDEN = {
     "mbtf_core": {"torch", "mitsuba", "drjit", "trimesh"},
     "mbtf_gen": {"torch"},
-    "mbtf_fit": {"mitsuba", "drjit", "trimesh"},
+    "mbtf_fit": {"mitsuba", "drjit", "mbtf_gen"},
+    "mbtf_fit.mitsuba_plugin": {"torch", "trimesh"},
     "mbtf_pipeline": set(),
 }
-# The fitter reads data sets, and files that its viewer shows; only its Mitsuba plugin, and the command that
-# draws with it, knows the renderer.
-PLUGIN = "mbtf_fit.mitsuba_plugin"
-READS = (
-    "mbtf_gen.dataset.geometry",
-    "mbtf_gen.dataset.reader",
-    "mbtf_gen.dataset.shard_io",
-    "mbtf_gen.geometry.height_planes",
-    "mbtf_gen.images.environment",
-    "mbtf_gen.images.resample",
-    "mbtf_gen.meshes.shape",
-    "mbtf_gen.pictures.camera",
-    "mbtf_gen.pictures.reference",
-    "mbtf_gen.sampling.rng",
-    "mbtf_gen.config.presets",
-)
 
 
-def rank(module: str) -> int:
-    """Rank of the room that a module lies in."""
-    parts = module.split(".")
-    return next(RANK[name] for n in range(len(parts), 0, -1) if (name := ".".join(parts[:n])) in RANK)
+def room(module: str) -> str:
+    """The line of the table that a module lies in."""
+    name = ".".join(module.split(".")[:2])
+    return name if name in RANK else module.split(".")[0]
 
 
 def module_name(path: Path) -> str:
@@ -127,15 +114,12 @@ def imported(source: str) -> Iterator[str]:
 
 def faults(source: str, module: str) -> list[str]:
     """Imports of a source text that break the rules above."""
-    package = module.split(".")[0]
-    plugin = module == PLUGIN or module.startswith(PLUGIN + ".")
-    forbidden = {"torch", "trimesh"} if plugin else FORBIDDEN[package]
+    own = room(module)
+    forbidden = FORBIDDEN.get(own, FORBIDDEN[own.split(".")[0]])
     out = []
     for name in imported(source):
         top = name.split(".")[0]
-        upwards = top in PACKAGES and rank(name) > rank(module)
-        beyond = package == "mbtf_fit" and top == "mbtf_gen" and not plugin and not name.startswith(READS)
-        if top in forbidden or upwards or beyond:
+        if top in forbidden or (top in PACKAGES and RANK[room(name)] > RANK[own]):
             out.append(f"{module} imports {name}")
     return out
 
@@ -161,8 +145,9 @@ def test_imports_run_downwards() -> None:
         ("mbtf_core.a", "from mbtf_gen.config import presets", True),
         ("mbtf_fit.data.a", "from mbtf_core.errors import InputError", False),
         ("mbtf_fit.data.a", "from mbtf_gen.geometry import heightfield", True),
-        ("mbtf_fit.data.a", "from mbtf_gen.dataset.reader import Dataset", False),
-        ("mbtf_fit.a.b", "from mbtf_pipeline.stages import run", True),
+        ("mbtf_fit.data.a", "from mbtf_core.data.dataset import Dataset", False),
+        ("mbtf_core.errors", "from mbtf_core.data.dataset import Dataset", True),
+        ("mbtf_fit.cli.b", "from mbtf_pipeline.stages import run", True),
         ("mbtf_fit.data.a", "import drjit as dr", True),
         ("mbtf_fit.mitsuba_plugin.a", "import drjit as dr", False),
         ("mbtf_fit.mitsuba_plugin.a", "import torch", True),
@@ -170,7 +155,6 @@ def test_imports_run_downwards() -> None:
     ],
 )
 def test_the_check_finds_planted_faults(module: str, source: str, broken: bool) -> None:
-    RANK.setdefault("mbtf_fit.a", RANK["mbtf_fit.cli"])
     assert bool(faults(source, module)) is broken
 
 
@@ -202,9 +186,22 @@ def circles(graph: dict[str, set[str]]) -> list[list[str]]:
     return found
 
 
-def test_no_circle() -> None:
-    graph = {name: {i for i in imported(path.read_text()) if i in SOURCES} for name, path in SOURCES.items()}
-    assert circles(graph) == []
+def graph_of(name_of: Callable[[str], str]) -> dict[str, set[str]]:
+    """Who imports whom, of all sources by the names that `name_of` gives them."""
+    graph: dict[str, set[str]] = {}
+    for module, path in SOURCES.items():
+        names = {name_of(name) for name in imported(path.read_text()) if name in SOURCES}
+        graph.setdefault(name_of(module), set()).update(names - {name_of(module)})
+    return graph
+
+
+def test_no_circle_of_modules() -> None:
+    assert circles(graph_of(lambda module: module)) == []
+
+
+@pytest.mark.xfail(strict=True, reason="native, surface, models and objective import each other")
+def test_no_circle_of_rooms() -> None:
+    assert circles(graph_of(room)) == []
 
 
 def test_a_planted_circle_is_found() -> None:
@@ -216,3 +213,18 @@ def test_importing_a_package_loads_nothing_heavy(package: str, run_python: RunPy
     done = run_python("-c", f"import sys, {package}; print(*sorted({HEAVY!r} & set(sys.modules)))")
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == []
+
+
+def public_classes() -> dict[str, list[str]]:
+    """Modules that define a public class, by its name."""
+    found: dict[str, list[str]] = {}
+    for module, path in SOURCES.items():
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                found.setdefault(node.name, []).append(module)
+    return found
+
+
+@pytest.mark.xfail(strict=True, reason="about fifteen names are double")
+def test_no_two_public_classes_share_a_name() -> None:
+    assert {name: where for name, where in public_classes().items() if len(where) > 1} == {}

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mbtf_core.lattice import texel_centers
+from mbtf_core.data.lattice import texel_centers
 from mbtf_fit.material.interchange.brdf import Pairs
 from mbtf_fit.material.interchange.maps import Maps, coefficients
 from mbtf_fit.material.interchange.values import (

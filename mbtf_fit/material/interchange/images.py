@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.atomic import write_chunks
 from mbtf_core.color import linear_to_srgb
+from mbtf_core.files.atomic import write_chunks
 from mbtf_fit.material.interchange.maps import Maps
 
 BASE_COLOR, NORMAL, ORM, HEIGHT = "base_color.png", "normal.png", "roughness_metallic.png", "height.png"

@@ -23,7 +23,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mbtf_core.lattice import texel_centers
+from mbtf_core.data.lattice import texel_centers
 from mbtf_fit.material.interchange.brdf import Pairs
 from mbtf_fit.material.interchange.least_squares import (
     BASE,

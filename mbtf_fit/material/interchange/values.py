@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch.quasirandom import SobolEngine
 
+from mbtf_core.data.lattice import sigma_of_level
 from mbtf_core.directions import from_projected_disk, normalize
-from mbtf_core.lattice import sigma_of_level
 from mbtf_fit.material.material import Material
 
 F32 = NDArray[np.float32]

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.atomic import write_text
+from mbtf_core.files.atomic import write_text
 from mbtf_fit.material.interchange.agreement import Agreement, fit_color
 from mbtf_fit.material.interchange.documents import WRITERS, Source
 from mbtf_fit.material.interchange.images import write_maps

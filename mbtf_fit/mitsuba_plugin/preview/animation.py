@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from mbtf_core.atomic import write_file, write_through
 from mbtf_core.errors import EngineError, reason
+from mbtf_core.files.atomic import write_file, write_through
 
 # Milliseconds of one rotation.
 TURN = 2400

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mbtf_core.console import Console
-from mbtf_core.folders import owned
+from mbtf_core.files.folders import owned
 from mbtf_core.interruption import keep_on_interruption
 
 if TYPE_CHECKING:
@@ -41,13 +41,13 @@ def _draw(
     config: PreviewConfig, path: Path, overwrite: bool, console: Console, sheet_only: bool, mp4: bool
 ) -> None:
     from mbtf_core.exposure import describe_exposure, to_display
-    from mbtf_core.folders import check_space
+    from mbtf_core.files.folders import check_space
+    from mbtf_core.pictures.reference import PNG_BYTES, write_png
     from mbtf_fit.material.format import read_description
     from mbtf_fit.mitsuba_plugin import load_scene
     from mbtf_fit.mitsuba_plugin.preview.animation import find_encoder, write_gif, write_mp4
     from mbtf_gen.forecast import announce
     from mbtf_gen.pictures.folder import PictureFolder
-    from mbtf_gen.pictures.reference import PNG_BYTES, write_png
     from mbtf_gen.render.runtime import load_mitsuba
 
     encoder = find_encoder() if mp4 else ""

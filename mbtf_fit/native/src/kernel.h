@@ -70,7 +70,7 @@ typedef struct {
     const float *u, *sigma, *omega_o, *factors, *inputs;
 } mbtf_patches;
 
-/* A periodic height field: nodes and logarithms as in mbtf_gen/geometry/height_planes.py; heights z (rows,
+/* A periodic height field: nodes and logarithms as in mbtf_core/height_planes.py; heights z (rows,
  * columns) at most 0, row index along +y. */
 typedef struct {
     const float *nodes, *z;

@@ -7,21 +7,22 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.console import Console
+from mbtf_core.data.dataset import Dataset
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import InputError, PartialError
 from mbtf_core.exposure import auto_exposure, brightness, describe_exposure
-from mbtf_core.folders import check_space, owned
+from mbtf_core.files.folders import check_space, owned
 from mbtf_core.interruption import keep_on_interruption
+from mbtf_core.pictures.camera import tiles_camera
+from mbtf_core.pictures.reference import PNG_BYTES, write_display
 from mbtf_gen.config.pictures import PreviewConfig
-from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.forecast import announce
 from mbtf_gen.job import Job
-from mbtf_gen.pictures.camera import tiles_camera
 from mbtf_gen.pictures.folder import PictureFolder
 from mbtf_gen.pictures.preview import mesh
 from mbtf_gen.pictures.preview.plots import level_histogram, write_plots
 from mbtf_gen.pictures.preview.sample import sampled_queries, stored_queries
-from mbtf_gen.pictures.reference import PNG_BYTES, picture_seconds, render_reference, write_display
+from mbtf_gen.pictures.reference import picture_seconds, render_reference
 from mbtf_gen.planning.effects_plan import reference_plan
 from mbtf_gen.planning.simulation import build_estimator
 

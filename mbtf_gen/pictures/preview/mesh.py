@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from mbtf_core.child_process import run_child
 from mbtf_core.errors import EngineError
 from mbtf_core.exposure import to_display
+from mbtf_core.images.resample import resample
+from mbtf_core.pictures.camera import Camera
 from mbtf_gen.geometry.heightfield import HeightGrid, grid_faces, grid_vertices
-from mbtf_gen.images.resample import resample
 from mbtf_gen.material.material import Material
-from mbtf_gen.pictures.camera import Camera
 
 # Largest number of cells along each side of all tiles together, and of texels across the texture.
 MOST_CELLS = 1024

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.atomic import write_file
+from mbtf_core.files.atomic import write_file
 from mbtf_gen.pictures.preview.sample import QuerySample
 
 # Number of points below which points are plotted instead of a histogram.

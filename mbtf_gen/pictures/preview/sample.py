@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.lattice import level_of_sigma
+from mbtf_core.data.queries import Queries
 from mbtf_core.errors import InputError
-from mbtf_core.lattice import level_of_sigma
-from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.job import Job, split_queries
-from mbtf_gen.sampling.query_sampler import Mixture, Queries
+from mbtf_gen.sampling.query_sampler import Mixture
 
 # Shards are read until there are this many queries.
 MAX_QUERIES = 1 << 20

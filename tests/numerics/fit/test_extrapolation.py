@@ -10,7 +10,7 @@ import torch
 from support.fit_data import make_trainer, parallax, random_queries, train_fully, training_queries
 from support.surfaces import towards
 
-from mbtf_core.lattice import Lattice
+from mbtf_core.data.lattice import Lattice
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.material.material import Material, export

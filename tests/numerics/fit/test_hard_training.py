@@ -16,8 +16,8 @@ from support.fit_data import (
     training_queries,
 )
 
+from mbtf_core.data.lattice import Lattice
 from mbtf_core.directions import from_projected_disk
-from mbtf_core.lattice import Lattice
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.objective.noise import NoiseModel, typical_value

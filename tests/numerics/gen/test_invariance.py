@@ -23,8 +23,8 @@ from support.scenes import (
     tile_mean_queries,
 )
 
+from mbtf_core.data.shard_files import read_shard, write_shard
 from mbtf_core.stats import mean_of_halves
-from mbtf_gen.dataset.shard_io import read_shard, write_shard
 from mbtf_gen.render import scene
 
 RELIEF = rocks(32)

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from support.surfaces import towards
 
+from mbtf_core.data.shard_files import read_shard, write_shard
 from mbtf_core.directions import from_angles, to_angles
-from mbtf_gen.dataset.shard_io import read_shard, write_shard
 
 N = 3000
 

@@ -12,7 +12,7 @@ from support.plugin_materials import write_material
 from support.plugin_scenes import interaction, plane
 from support.scenes import mi
 
-from mbtf_core.lattice import Lattice
+from mbtf_core.data.lattice import Lattice
 from mbtf_fit.material.transmittance import Transmittance
 from mbtf_fit.mitsuba_plugin.evaluator import Evaluator
 from mbtf_fit.mitsuba_plugin.material_arrays import read_material

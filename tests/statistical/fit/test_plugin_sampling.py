@@ -15,7 +15,7 @@ from support.plugin_materials import write_material
 from support.plugin_scenes import interaction, plane
 from support.scenes import mi
 
-from mbtf_core.lattice import Lattice
+from mbtf_core.data.lattice import Lattice
 from mbtf_core.stats import Estimate, t_test
 from mbtf_fit.mitsuba_plugin.lobe_fit import fit_lobes
 from mbtf_fit.mitsuba_plugin.lobes import Lobe, LobeTextures, Mixture

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from support.fit_data import F32, random_queries, write_data
 
-from mbtf_core.lattice import Lattice
+from mbtf_core.data.lattice import Lattice
 from mbtf_fit import FitConfig, fit
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.models.interface import NeuralMaterial

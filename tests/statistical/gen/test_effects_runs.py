@@ -12,11 +12,12 @@ import pytest
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
-from mbtf_core.atomic import write_checksummed
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.queries import Queries
+from mbtf_core.files.atomic import write_checksummed
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.dataset import render_shards
-from mbtf_gen.dataset.reader import Dataset
-from mbtf_gen.generation import generate
+from mbtf_gen.generation import render_shards
+from mbtf_gen.generation.run import generate
 from mbtf_gen.job import Job
 from mbtf_gen.material.material import Material
 from mbtf_gen.planning.effects import EffectsPlan, without
@@ -26,7 +27,6 @@ from mbtf_gen.planning.run_plan import RunPlan
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.render.runtime import load_mitsuba
-from mbtf_gen.sampling.query_sampler import Queries
 
 load_mitsuba()
 
@@ -140,7 +140,7 @@ def test_resumed_and_sliced_runs_follow_the_plan_of_the_manifest(
     def never(job: Job) -> RunPlan:
         raise AssertionError("planned again although the manifest has a plan")
 
-    monkeypatch.setattr("mbtf_gen.generation.plan_run", never)
+    monkeypatch.setattr("mbtf_gen.generation.run.plan_run", never)
     generate(config, out, slice_index=2, slice_count=2)
     assert recorder.plans[-1] == stored
     assert json.loads((out / "manifest.json").read_text())["effects"] == stored.to_manifest()

@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 from support.scenes import Estimator, LightKernel, Stream, Transport, build_tile, direction, flat, mi, queries
 
+from mbtf_core.pictures.camera import Camera
 from mbtf_core.stats import mean_of_halves, t_test
-from mbtf_gen.pictures.camera import Camera
 from mbtf_gen.pictures.reference import _camera_rays
 from mbtf_gen.render.scene import CLEARANCE, LONG_SIDE
 

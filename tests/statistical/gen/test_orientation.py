@@ -21,9 +21,9 @@ from support.scenes import (
     queries,
 )
 
-from mbtf_core.lattice import Lattice, texel_centers
+from mbtf_core.data.lattice import Lattice, texel_centers
+from mbtf_core.pictures.camera import Camera
 from mbtf_gen.geometry.heightfield import tile_mesh
-from mbtf_gen.pictures.camera import Camera
 from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
 
 ROWS, COLUMNS = 4, 8

@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 from scipy.special import kolmogorov
 from support.chi_square import Cap, chi_square_test, uniformity
 
-from mbtf_core.lattice import Lattice, level_of_sigma
+from mbtf_core.data.lattice import Lattice, level_of_sigma
+from mbtf_core.data.queries import Queries
 from mbtf_core.stats import holm
-from mbtf_gen.sampling.query_sampler import Mixture, Queries, QueryPlan
+from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
 
 ROWS = 1 << 16
 MIN_COS = 0.15

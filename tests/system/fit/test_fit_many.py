@@ -10,9 +10,9 @@ import pytest
 from conftest import RunPython
 from support.fit_data import parallax, write_data
 
+from mbtf_core.data.shard_files import read_shard, write_shard
 from mbtf_core.errors import InputError, UsageError
 from mbtf_fit.training.fit_many import find_data, name_materials
-from mbtf_gen.dataset.shard_io import read_shard, write_shard
 
 QUICK = ("--steps", "3", "--batch", "300", "--device", "cpu")
 

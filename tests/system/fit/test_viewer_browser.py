@@ -16,6 +16,7 @@ from support.shader_cases import CASES, make
 from support.viewer_page import Page
 
 from mbtf_core.directions import from_angles
+from mbtf_core.pictures.camera import Camera
 from mbtf_fit import fit
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries
@@ -24,7 +25,6 @@ from mbtf_fit.viewer.content import as_read, encode, material_content, pack_text
 from mbtf_fit.viewer.extras import mesh_content, picture_content
 from mbtf_fit.viewer.live import LiveView
 from mbtf_fit.viewer.page import write_page
-from mbtf_gen.pictures.camera import Camera
 
 
 def test_values_are_those_of_the_material(driver: Any, tmp_path: Path) -> None:

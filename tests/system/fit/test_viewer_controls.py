@@ -10,13 +10,13 @@ from support.plugin_materials import write_material
 from support.viewer_page import Page
 
 from mbtf_core.color import linear_to_srgb, srgb_to_linear
+from mbtf_core.data.lattice import Lattice
 from mbtf_core.directions import from_angles
-from mbtf_core.lattice import Lattice
+from mbtf_core.pictures.camera import Camera
 from mbtf_fit.material.transmittance import Transmittance
 from mbtf_fit.viewer.content import material_content
 from mbtf_fit.viewer.extras import picture_content
 from mbtf_fit.viewer.page import write_page
-from mbtf_gen.pictures.camera import Camera
 
 # Values of constant materials; half of the light passes through the last.
 VALUES = {"dim": 0.1, "bright": 0.3, "veil": 0.2}

@@ -11,7 +11,7 @@ from conftest import RunPython
 from PIL import Image
 from support.commands import Done, run_named
 
-from mbtf_gen.dataset.reader import Dataset
+from mbtf_core.data.dataset import Dataset
 
 # Loose yarns of few fibers, one and a half times as high as wide.
 CLOTH = """weave: "X.\\n.X\\nXX"

@@ -16,7 +16,7 @@ from support.commands import Done, run_named
 from support.slurm import slurm_node
 from support.small_runs import contents, write_maps
 
-from mbtf_gen.dataset.verify import verify
+from mbtf_core.data.verify import verify
 
 pytest.importorskip("distributed", reason="no Dask; to enable: pip install 'mbtf[cluster]'")
 

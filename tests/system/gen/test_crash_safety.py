@@ -20,12 +20,12 @@ from support.file_operations import FileOperations, Operation
 from support.paths import ROOT
 from support.small_runs import command, contents, die, ending, generate, in_child, noisy_plane
 
-from mbtf_core.shard_schema import ShardEntry
-from mbtf_gen.dataset.sidecar import finished_record
-from mbtf_gen.dataset.verify import verify
+from mbtf_core.data.queries import Queries
+from mbtf_core.data.schema import ShardEntry
+from mbtf_core.data.sidecar import finished_record
+from mbtf_core.data.verify import verify
 from mbtf_gen.planning.simulation import ClosedForm
 from mbtf_gen.render.estimates import Estimates, Stream
-from mbtf_gen.sampling.query_sampler import Queries
 
 ERRORS = (errno.EIO, errno.ENOSPC, errno.EACCES, errno.EMFILE)
 PARTIAL_OR_INPUT = (3, 4)

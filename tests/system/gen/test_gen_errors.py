@@ -15,7 +15,7 @@ from support.commands import Done, finished, run_all, start
 from support.datasets import edit, write_dataset
 from support.image_files import exr
 
-from mbtf_core.shard_schema import SCHEMA_VERSION
+from mbtf_core.data.schema import SCHEMA_VERSION
 
 INPUT, USAGE = 3, 2
 

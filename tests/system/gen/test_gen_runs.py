@@ -16,9 +16,9 @@ from support.commands import Done, finished, run_all, run_named, start
 from support.datasets import edit
 from support.small_runs import write_maps
 
-from mbtf_gen.dataset.reader import Dataset
-from mbtf_gen.dataset.shard_io import read_exr
-from mbtf_gen.dataset.verify import verify
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.shard_files import read_exr
+from mbtf_core.data.verify import verify
 
 Arrays = dict[str, NDArray[np.float32]]
 

@@ -10,7 +10,7 @@ import pytest
 from support.commands import Done, run_named
 from support.measured_files import btf, factorized, photographs, write_folder, zipped
 
-from mbtf_gen.dataset.reader import Dataset
+from mbtf_core.data.dataset import Dataset
 
 SMALL = "--height-scale 0.05 --resolution 8 --spp 4 --test-queries 64 --test-spp 16"
 LINES = {

@@ -10,7 +10,7 @@ import trimesh
 from PIL import Image
 from support.commands import Done, run_named
 
-from mbtf_gen.dataset.reader import Dataset
+from mbtf_core.data.dataset import Dataset
 
 LINES = {
     "generate": "pebbles.glb --resolution 16 --queries 40/texel --test-queries 256 -o data --json",

@@ -13,11 +13,11 @@ from support.commands import Done, finished, run_named, start
 from support.datasets import write_dataset
 
 from mbtf_core.color import srgb_to_linear
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.lattice import level_of_sigma
 from mbtf_core.directions import from_angles
-from mbtf_core.lattice import level_of_sigma
-from mbtf_gen.dataset.reader import Dataset
+from mbtf_core.pictures.camera import tiles_camera
 from mbtf_gen.material.load import load_material
-from mbtf_gen.pictures.camera import tiles_camera
 from mbtf_gen.pictures.preview.mesh import draw, tiled_mesh
 
 # Quadrants of the map: top left, top right, bottom left, bottom right.

@@ -17,16 +17,16 @@ from support.commands import Done
 from support.object_stores import BUCKET, Proxy, s3_server
 from support.small_runs import command, contents, write_maps
 
-from mbtf_core.store import Store
-from mbtf_gen.dataset.reader import Dataset
-from mbtf_gen.dataset.verify import verify
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.store import Store
+from mbtf_core.data.verify import verify
 
 URL = f"s3://{BUCKET}/some/data"
 # A program with values that need no renderer. Before the writes of an object that it is told, it ends as by a
 # kill, or it waits.
 _CODE = """
 import os, signal, sys, time
-from mbtf_core.store import Store
+from mbtf_core.data.store import Store
 from mbtf_core.console import run
 from mbtf_gen.planning.simulation import ClosedForm
 from support.small_runs import noisy_plane

@@ -18,7 +18,7 @@ from mbtf_fit.config import FitConfig
 from mbtf_fit.evaluation import evaluate
 from mbtf_fit.material.decoder import Decoder
 from mbtf_fit.material.material import Material
-from mbtf_gen.generation import generate
+from mbtf_gen.generation.run import generate
 from mbtf_gen.job import Job
 from mbtf_pipeline.cli.app import app
 from mbtf_pipeline.library.task import first_fit, fit_shared

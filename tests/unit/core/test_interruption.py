@@ -44,7 +44,7 @@ from mbtf_core import interruption
 interruption._NOTE_SECONDS = interruption._GRACE_SECONDS = 0.2
 interruption.handle_signals()
 from mbtf_core.console import new_app, run
-from mbtf_core.folders import owned
+from mbtf_core.files.folders import owned
 app = new_app("prog", "A program.")
 def send_once():
     os.kill(os.getpid(), int(os.environ["TEST_SIGNAL"]))

@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 from support.fit_data import parallax, write_data
 
-from mbtf_core import folders
 from mbtf_core.console import run
-from mbtf_core.lattice import Lattice
+from mbtf_core.data.lattice import Lattice
+from mbtf_core.files import folders
 from mbtf_fit.cli.app import app
 from mbtf_fit.config import FitConfig
 from mbtf_fit.training import fit as fits

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mbtf_core import folders
 from mbtf_core.console import CONSOLE, run
-from mbtf_gen import forecast, generation
+from mbtf_core.data.shard_files import row_bytes
+from mbtf_core.files import folders
+from mbtf_gen import forecast
 from mbtf_gen.cli.app import app
-from mbtf_gen.dataset import render_shards
-from mbtf_gen.dataset.shard_io import row_bytes
+from mbtf_gen.generation import render_shards
+from mbtf_gen.generation import run as generation
 
 DRAFT = 400 * 128**2 + 65536
 

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from support.datasets import write_dataset
 
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.queries import Queries
+from mbtf_core.data.shard_files import row_bytes
 from mbtf_core.units import size_text
 from mbtf_gen import forecast as module
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.dataset.reader import Dataset
-from mbtf_gen.dataset.shard_io import row_bytes
 from mbtf_gen.forecast import forecast
 from mbtf_gen.job import Job, split_target
 from mbtf_gen.material.material import Material
@@ -23,7 +24,6 @@ from mbtf_gen.planning.effects_plan import plan_effects
 from mbtf_gen.planning.pilot import pilot_queries
 from mbtf_gen.planning.run_plan import RunPlan, allocate
 from mbtf_gen.render.estimates import Estimates, Stream
-from mbtf_gen.sampling.query_sampler import Queries
 
 RATE = 1e6
 

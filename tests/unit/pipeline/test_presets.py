@@ -11,10 +11,11 @@ import pytest
 from support.paths import ROOT
 
 from mbtf_core.config_file import resolve
+from mbtf_core.quality import Quality, as_assignments, overrides_of
 from mbtf_fit.config import FitConfig
 from mbtf_fit.presets import FITTER, best_at, best_options, fitter_options
 from mbtf_gen.config.generator import GeneratorConfig, count_queries
-from mbtf_gen.config.presets import GENERATOR, Quality, as_assignments, overrides_of
+from mbtf_gen.config.presets import GENERATOR
 from mbtf_pipeline.presets import COMPARE, preset_recipe, quality_assignments
 from mbtf_pipeline.recipe import load_recipe
 

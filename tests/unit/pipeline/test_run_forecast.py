@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 from support.paths import ROOT
 
-from mbtf_core import folders
 from mbtf_core.console import run
+from mbtf_core.data.shard_files import row_bytes
 from mbtf_core.errors import InputError
-from mbtf_gen.dataset.shard_io import row_bytes
+from mbtf_core.files import folders
 from mbtf_pipeline import forecast as module
 from mbtf_pipeline import run as runs
 from mbtf_pipeline.cli.app import app

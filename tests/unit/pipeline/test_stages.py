@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from mbtf_core.atomic import read_json
 from mbtf_core.errors import InputError
+from mbtf_core.files.atomic import read_json
 from mbtf_pipeline.stages import (
     Decision,
     Stage,

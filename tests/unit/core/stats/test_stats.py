@@ -8,8 +8,8 @@ import math
 import numpy as np
 import pytest
 
+from mbtf_core.data.lattice import sigma_of_level
 from mbtf_core.errors import InputError
-from mbtf_core.lattice import sigma_of_level
 from mbtf_core.stats import (
     Estimate,
     by_group,

@@ -12,8 +12,9 @@ import torch
 from support.fit_data import constant, parallax, random_queries, write_data
 from support.image_data import random_images, write_images
 
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.lattice import Lattice, sigma_of_level
 from mbtf_core.errors import InputError
-from mbtf_core.lattice import Lattice, sigma_of_level
 from mbtf_fit import FitConfig, Material, evaluate, fit
 from mbtf_fit.config import HeldOutSection
 from mbtf_fit.data.images import Patches, TrainingImages, nearest_shapes, strides
@@ -24,7 +25,6 @@ from mbtf_fit.models.hierarchical import Hierarchical
 from mbtf_fit.models.registry import build_model
 from mbtf_fit.training.fit import prepare_trainer
 from mbtf_fit.training.trainer import BETAS
-from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
 
 HELD_OUT = HeldOutSection(queries=0.1, radius=0.3)

@@ -13,10 +13,11 @@ import pytest
 from support.fit_data import parallax, write_data
 from support.object_stores import memory_store
 
-from mbtf_core.data_folder import data_folder, prefetch
+from mbtf_core.data.data_folder import data_folder, prefetch
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.store import Store
+from mbtf_core.data.store_folder import StoreFolder, StorePath
 from mbtf_core.errors import PartialError
-from mbtf_core.store import Store
-from mbtf_core.store_folder import StoreFolder, StorePath
 from mbtf_fit.config import FitConfig, HeldOutSection
 from mbtf_fit.data import streaming
 from mbtf_fit.data.loader import load_training
@@ -24,7 +25,6 @@ from mbtf_fit.data.queries import batch_starts
 from mbtf_fit.data.streaming import StreamedQueries
 from mbtf_fit.training.checkpoint import CHECKPOINT_NAME
 from mbtf_fit.training.fit import fit
-from mbtf_gen.dataset.reader import Dataset
 
 HELD_OUT = HeldOutSection(queries=0.1, radius=0.3)
 

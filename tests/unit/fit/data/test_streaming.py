@@ -11,6 +11,7 @@ from conftest import RunPython
 from support.fit_data import parallax, write_data
 
 import mbtf_fit.evaluation
+from mbtf_core.data.dataset import Dataset
 from mbtf_core.errors import InputError
 from mbtf_core.units import format_size, parse_size
 from mbtf_fit.config import FitConfig, HeldOutSection
@@ -18,7 +19,6 @@ from mbtf_fit.data.loader import Partition, load_training
 from mbtf_fit.data.streaming import Selection, StreamedQueries
 from mbtf_fit.evaluation import Predict, SplitErrors
 from mbtf_fit.training.fit import fit
-from mbtf_gen.dataset.reader import Dataset
 
 HELD_OUT = HeldOutSection(queries=0.1, radius=0.3)
 
@@ -111,7 +111,7 @@ def test_memory_does_not_grow_with_the_data(tmp_path: Path, run_python: RunPytho
             "import resource, sys\n"
             "from mbtf_fit.config import HeldOutSection\n"
             "from mbtf_fit.data.loader import load_training\n"
-            "from mbtf_gen.dataset.reader import Dataset\n"
+            "from mbtf_core.data.dataset import Dataset\n"
             f"part = load_training(Dataset.open({str(folder)!r}), HeldOutSection(), 0, memory=1e6)\n"
             "for k, batch in enumerate(part.training.batches(10_000, 0, 0)):\n"
             f"    if k == {10 * shards}: break\n"

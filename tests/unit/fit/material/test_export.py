@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from support.plugin_materials import net, write_material
 from support.surface_formulas import WrittenSurface, bilinear, rotate
 
+from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
-from mbtf_core.lattice import Lattice
 from mbtf_fit import Material
 from mbtf_fit.material.export import to_half, write_layers, write_textures
 from mbtf_fit.material.material import export

@@ -15,14 +15,14 @@ from support.datasets import edit
 from support.fit_data import constant, parallax, random_queries, write_data
 
 import mbtf_fit.material.material
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import EngineError, InputError
-from mbtf_core.lattice import Lattice
 from mbtf_fit import FitConfig, FitResult, Material, evaluate, fit, read_history
 from mbtf_fit.data.loader import load_training
 from mbtf_fit.evaluation import split_errors
 from mbtf_fit.material.material import conformance_queries, export
 from mbtf_fit.training.fit import prepare_trainer
-from mbtf_gen.dataset.reader import Dataset
 
 
 def config(steps: int = 30, **options: Any) -> FitConfig:
@@ -175,8 +175,8 @@ def test_damaged_materials_are_refused(fitted: FitResult, tmp_path: Path) -> Non
 
 
 def test_errors_of_a_perfect_prediction_are_zero(data: Path) -> None:
+    from mbtf_core.data.dataset import Dataset
     from mbtf_fit.data.loader import load_split
-    from mbtf_gen.dataset.reader import Dataset
 
     opened = Dataset.open(data)
     queries = load_split(opened, "test")

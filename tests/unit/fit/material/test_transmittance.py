@@ -12,8 +12,10 @@ from support.fuzzing import check_message
 from support.image_data import write_images
 from support.plugin_materials import write_material
 
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.lattice import Lattice
+from mbtf_core.data.shard_files import read_shard, write_shard
 from mbtf_core.errors import InputError
-from mbtf_core.lattice import Lattice
 from mbtf_fit.config import FitConfig, HeldOutSection
 from mbtf_fit.data.loader import load_training
 from mbtf_fit.data.streaming import Selection
@@ -23,8 +25,6 @@ from mbtf_fit.material.format import read_description
 from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME, Transmittance, read_transmittance
 from mbtf_fit.material.transmittance_fit import evaluate_transmittance, fit_transmittance
 from mbtf_fit.training.fit import fit
-from mbtf_gen.dataset.reader import Dataset
-from mbtf_gen.dataset.shard_io import read_shard, write_shard
 
 
 def lace(u: np.ndarray, sigma: np.ndarray, omega_o: np.ndarray) -> np.ndarray:

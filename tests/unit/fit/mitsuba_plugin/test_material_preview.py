@@ -21,9 +21,9 @@ from mbtf_core.config_file import resolve
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import EngineError, UsageError
 from mbtf_core.exposure import to_display
+from mbtf_core.pictures.camera import Camera
 from mbtf_fit.mitsuba_plugin.preview.config import PreviewConfig, SheetSection, TurntableSection
 from mbtf_gen.config.pictures import Direction
-from mbtf_gen.pictures.camera import Camera
 
 mbtf_fit.mitsuba_plugin.register()
 

@@ -14,13 +14,13 @@ from support.plugin_materials import deviation, net, replace_tensors, write_mate
 from support.plugin_scenes import interaction, plane, sensor_of, through_pixel_centers
 from support.scenes import directional, mi
 
+from mbtf_core.data.lattice import Lattice
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import InputError, MbtfError, UsageError
-from mbtf_core.lattice import Lattice
+from mbtf_core.pictures.camera import Camera
 from mbtf_fit import Material
 from mbtf_fit.material.transmittance import Transmittance
 from mbtf_fit.mitsuba_plugin import load_scene
-from mbtf_gen.pictures.camera import Camera
 
 LIGHT = from_angles(40.0, 20.0)
 # A narrow view: differentials, which the footprint comes from, are differences over a pixel.

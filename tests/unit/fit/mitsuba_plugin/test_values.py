@@ -17,8 +17,8 @@ from support.known_surfaces import rough_heights
 from support.plugin_materials import deviation, net, replace_tensors, write_material
 from support.scenes import mi
 
+from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
-from mbtf_core.lattice import Lattice
 from mbtf_fit.surface.heightfield import HeightfieldTracer
 
 assert mi.variant()

@@ -10,7 +10,7 @@ import torch
 from support.fit_data import parallax, random_queries, training_queries
 from torch import Tensor
 
-from mbtf_core.lattice import Lattice
+from mbtf_core.data.lattice import Lattice
 from mbtf_fit import FitConfig
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.models import learned_relief

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from mbtf_core.lattice import Lattice, texel_centers
+from mbtf_core.data.lattice import Lattice, texel_centers
 from mbtf_fit.models.lookup import Packing, lookup, lookup_reference
 
 F64 = torch.float64

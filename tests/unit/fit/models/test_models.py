@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from mbtf_core.config_file import resolve
+from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError, UsageError
-from mbtf_core.lattice import Lattice
 from mbtf_fit.config import EncodingSection, FitConfig, OutputTransform
 from mbtf_fit.models.constants import direction_size, position_size
 from mbtf_fit.models.encodings import encode_direction, encode_position

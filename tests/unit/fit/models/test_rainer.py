@@ -11,8 +11,9 @@ import torch
 from support.fit_data import constant
 from support.slice_data import spots, write_slices
 
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError, UsageError
-from mbtf_core.lattice import Lattice
 from mbtf_fit import fit
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import load_training
@@ -23,7 +24,6 @@ from mbtf_fit.models.registry import build_model
 from mbtf_fit.training.checkpoint import read_checkpoint, write_checkpoint
 from mbtf_fit.training.fit import prepare_trainer, shared_slices
 from mbtf_fit.training.fit_folder import identity_of
-from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.sampling.slice_directions import direction_pairs, slice_directions
 
 NAMES = ("rainer2019", "rainer2020")

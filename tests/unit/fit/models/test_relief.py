@@ -15,10 +15,10 @@ from support.fuzzing import check_message
 from support.known_surfaces import rough_surface
 from torch import Tensor
 
-from mbtf_core.atomic import checksummed, read_checksummed
+from mbtf_core.data.lattice import Lattice
+from mbtf_core.data.schema import MANIFEST_NAME
 from mbtf_core.errors import InputError
-from mbtf_core.lattice import Lattice
-from mbtf_core.shard_schema import MANIFEST_NAME
+from mbtf_core.files.atomic import checksummed, read_checksummed
 from mbtf_fit import FitConfig, fit
 from mbtf_fit.material.inference import predict
 from mbtf_fit.models.encodings import encode_directions, rotate_to_z

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from support.fit_data import make_trainer, parallax, random_queries, train_fully, training_queries
 from torch import Tensor
 
-from mbtf_core.lattice import Lattice
+from mbtf_core.data.lattice import Lattice
 from mbtf_fit.config import FitConfig, NetworkSection
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.material.inference import evaluate_in_chunks, predict

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from support.fit_data import random_directions
 from torch import Tensor
 
-from mbtf_core.lattice import Lattice
+from mbtf_core.data.lattice import Lattice
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.images import Patches, TrainingImages, nearest_shapes
 from mbtf_fit.material.inference import predict

@@ -11,7 +11,7 @@ import torch
 from pydantic import ValidationError
 from torch import Tensor
 
-from mbtf_core.lattice import Lattice
+from mbtf_core.data.lattice import Lattice
 from mbtf_fit.config import TrainingSection
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.objective.losses import Curve, FourthRoot, Log, Objective

@@ -9,7 +9,7 @@ import pytest
 import torch
 from support.fit_data import parallax, random_queries
 
-from mbtf_core.lattice import Lattice
+from mbtf_core.data.lattice import Lattice
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.objective.noise import NoiseModel, typical_value
 

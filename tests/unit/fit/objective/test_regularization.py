@@ -9,7 +9,7 @@ import pytest
 import torch
 from support.fit_data import make_trainer, parallax, random_queries, training_queries, write_data
 
-from mbtf_core.lattice import Lattice
+from mbtf_core.data.lattice import Lattice
 from mbtf_fit.config import FitConfig, ModelName, TrainingSection
 from mbtf_fit.data.loader import load_training, open_data
 from mbtf_fit.models.registry import build_model

@@ -14,7 +14,7 @@ from support.known_surfaces import geometry, rough_heights, rough_surface
 from support.scenes import mi
 from torch import Tensor
 
-from mbtf_core.lattice import Lattice
+from mbtf_core.data.lattice import Lattice
 from mbtf_fit.models.lookup import lookup
 from mbtf_fit.native import library
 from mbtf_fit.surface import hints, known

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from mbtf_core.lattice import Lattice, sigma_of_level
+from mbtf_core.data.lattice import Lattice, sigma_of_level
 from mbtf_fit.models.lookup import Packing, lookup
 from mbtf_fit.surface.prefilter import prefilter, prefiltered_levels
 

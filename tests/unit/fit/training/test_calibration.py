@@ -10,8 +10,8 @@ import torch
 from support.fit_data import random_queries, training_queries, write_data
 from support.plugin_materials import write_material
 
+from mbtf_core.data.lattice import Lattice, level_of_sigma
 from mbtf_core.errors import InputError
-from mbtf_core.lattice import Lattice, level_of_sigma
 from mbtf_fit import FitConfig, fit
 from mbtf_fit.config import HeldOutSection
 from mbtf_fit.data.loader import in_region

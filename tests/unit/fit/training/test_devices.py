@@ -9,7 +9,7 @@ from support.fit_data import random_queries
 from support.known_surfaces import rough_surface
 from torch import Tensor
 
-from mbtf_core.lattice import Lattice
+from mbtf_core.data.lattice import Lattice
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.images import Patches
 from mbtf_fit.data.queries import TrainingQueries

@@ -16,8 +16,9 @@ from support.known_surfaces import geometry, rough_heights
 
 import mbtf_fit.training.fit
 import mbtf_fit.training.joint_fit
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
-from mbtf_core.lattice import Lattice
 from mbtf_fit import FitConfig, Material, fit
 from mbtf_fit.data.loader import load_split
 from mbtf_fit.evaluation import evaluate
@@ -27,7 +28,6 @@ from mbtf_fit.training.joint_fit import JointResult, fit_jointly
 from mbtf_fit.training.joint_trainer import JointTrainer
 from mbtf_fit.training.trainer import Trainer
 from mbtf_fit.training.validation import read_history
-from mbtf_gen.dataset.reader import Dataset
 
 NAMES = ("waves", "stripes", "third")
 BATCH = {"batch": 512, "warmup": 10}

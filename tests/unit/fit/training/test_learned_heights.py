@@ -12,8 +12,10 @@ import torch
 from support.fit_data import parallax, write_data
 from support.paths import ROOT
 
-from mbtf_core.atomic import read_checksummed, write_checksummed
-from mbtf_core.lattice import Lattice
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.lattice import Lattice
+from mbtf_core.files.atomic import read_checksummed, write_checksummed
+from mbtf_core.images.resample import resample
 from mbtf_fit import FitConfig, fit
 from mbtf_fit.data.loader import load_training, open_data
 from mbtf_fit.models.learned_relief import LearnedRelief
@@ -22,9 +24,7 @@ from mbtf_fit.training.checkpoint import read_checkpoint, write_checkpoint
 from mbtf_fit.training.fit import prepare_trainer
 from mbtf_fit.training.trainer import Trainer
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.dataset.reader import Dataset
-from mbtf_gen.generation import generate
-from mbtf_gen.images.resample import resample
+from mbtf_gen.generation.run import generate
 
 
 @pytest.fixture(scope="module")

@@ -16,12 +16,12 @@ from support.paths import ROOT
 from torch import Tensor
 
 import mbtf_fit.training.trainer
-from mbtf_core.lattice import Lattice
+from mbtf_core.data.lattice import Lattice
 from mbtf_fit import FitConfig, Material, fit
 from mbtf_fit.native import library
 from mbtf_fit.training.fit import FitResult
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.generation import generate
+from mbtf_gen.generation.run import generate
 
 LATTICE = Lattice(3, 0.75)
 ROUGH = geometry(LATTICE, rough_heights(12, 16), roughness=0.4, metallic=0.7, seed=0)

@@ -12,7 +12,7 @@ from support.fit_data import parallax, write_data
 from support.known_surfaces import geometry, rough_heights
 
 import mbtf_fit.training.fit
-from mbtf_core.lattice import Lattice
+from mbtf_core.data.lattice import Lattice
 from mbtf_fit.config import FitConfig
 from mbtf_fit.training import fit_folder
 from mbtf_fit.training.fit import fit

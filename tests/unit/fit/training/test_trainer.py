@@ -11,8 +11,8 @@ import pytest
 import torch
 from support.fit_data import make_trainer, parallax, random_queries, train_fully, training_queries
 
+from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
-from mbtf_core.lattice import Lattice
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries, TrainingQueries
 from mbtf_fit.data.streaming import Selection

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mbtf_gen.dataset import shard_io as shard_files
+from mbtf_core.data import shard_files
 from mbtf_gen.diagnostics import checks as selftest_checks
 from mbtf_gen.diagnostics import closed_forms
 from mbtf_gen.diagnostics import report as selftest_report

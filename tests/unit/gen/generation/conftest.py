@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from support.formula_runs import SMALL, Formula, cheap_plan
 
-from mbtf_gen import generation
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.dataset import render_shards
+from mbtf_gen.generation import render_shards
+from mbtf_gen.generation import run as generation
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def engine(monkeypatch: pytest.MonkeyPatch) -> Formula:
     fake = Formula()
     monkeypatch.setattr(generation, "plan_run", cheap_plan)

@@ -13,17 +13,19 @@ import pytest
 from support.datasets import formula
 from support.formula_runs import FILES, Formula, changed, cheap_plan, contents, left_of, listing
 
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.geometry import Geometry
+from mbtf_core.data.shard_files import read_shard
+from mbtf_core.data.sidecar import sidecar_of
+from mbtf_core.data.verify import verify
 from mbtf_core.errors import InputError, PartialError
-from mbtf_gen import generation, repairs
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.dataset import folder, render_shards
-from mbtf_gen.dataset.geometry import Geometry, geometry_of
-from mbtf_gen.dataset.reader import Dataset
-from mbtf_gen.dataset.shard_io import read_shard
-from mbtf_gen.dataset.sidecar import sidecar_of
-from mbtf_gen.dataset.summary import finish
-from mbtf_gen.dataset.verify import verify
-from mbtf_gen.generation import generate, unfinished
+from mbtf_gen.generation import folder, render_shards
+from mbtf_gen.generation import repair as repairs
+from mbtf_gen.generation import run as generation
+from mbtf_gen.generation.geometry import geometry_of
+from mbtf_gen.generation.run import generate, unfinished
+from mbtf_gen.generation.summary import finish
 from mbtf_gen.job import Job, split_queries
 from mbtf_gen.planning.effects import EffectsPlan
 from mbtf_gen.planning.run_plan import RunPlan
@@ -32,6 +34,8 @@ from mbtf_gen.render.runtime import load_mitsuba
 load_mitsuba()
 
 from mbtf_gen.render.estimates import BadSample  # noqa: E402
+
+pytestmark = pytest.mark.usefixtures("engine")
 
 
 def test_a_run_is_complete_and_counts(config: GeneratorConfig, out: Path) -> None:

@@ -12,20 +12,21 @@ from typing import Any
 import pytest
 from support.formula_runs import FILES, Formula, changed, cheap_plan, contents, listing
 
-from mbtf_core.atomic import checksummed, create_file
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.folder import remove_leftovers
+from mbtf_core.data.geometry import geometry_record
+from mbtf_core.data.sidecar import sidecar_of
+from mbtf_core.data.verify import verify
 from mbtf_core.errors import InputError, PartialError
+from mbtf_core.files.atomic import checksummed, create_file
 from mbtf_core.locks import shard_lock, take_lock
-from mbtf_gen import generation
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.dataset import render_shards
-from mbtf_gen.dataset.folder import remove_leftovers
-from mbtf_gen.dataset.geometry import geometry_of, geometry_record
-from mbtf_gen.dataset.manifest import build_manifest
-from mbtf_gen.dataset.reader import Dataset
-from mbtf_gen.dataset.sidecar import sidecar_of
-from mbtf_gen.dataset.summary import finish
-from mbtf_gen.dataset.verify import verify
-from mbtf_gen.generation import generate
+from mbtf_gen.generation import render_shards
+from mbtf_gen.generation import run as generation
+from mbtf_gen.generation.geometry import geometry_of
+from mbtf_gen.generation.manifest import build_manifest
+from mbtf_gen.generation.run import generate
+from mbtf_gen.generation.summary import finish
 from mbtf_gen.job import Job
 from mbtf_gen.planning.effects import without
 from mbtf_gen.planning.effects_plan import reference_plan
@@ -33,6 +34,8 @@ from mbtf_gen.planning.run_plan import RunPlan
 from mbtf_gen.render.runtime import load_mitsuba
 
 load_mitsuba()
+
+pytestmark = pytest.mark.usefixtures("engine")
 
 
 def write_while_planning(patch: pytest.MonkeyPatch, out: Path, job: Job, plan: RunPlan) -> bytes:

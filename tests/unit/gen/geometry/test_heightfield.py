@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mbtf_core.lattice import texel_centers
+from mbtf_core.data.lattice import texel_centers
 from mbtf_gen.geometry.heightfield import HeightGrid, grid_faces, grid_vertices, tile_mesh
 
 SHAPES = [(4, 6), (1, 1), (1, 5), (5, 1), (3, 3)]

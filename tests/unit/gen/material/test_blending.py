@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from support.height_maps import Floats, fractal, normals_of, slopes
 
-from mbtf_core.lattice import texel_centers
-from mbtf_gen.images.resample import resample
+from mbtf_core.data.lattice import texel_centers
+from mbtf_core.images.resample import resample
 from mbtf_gen.material.blending import BAND, blend_maps
 from mbtf_gen.material.tiling import broken, seams
 

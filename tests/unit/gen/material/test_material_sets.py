@@ -77,7 +77,7 @@ def test_normals_are_recognized(name: str) -> None:
 @pytest.mark.parametrize("name", SETS)
 def test_cut_maps_do_not_tile(name: str, tmp_path: Path) -> None:
     """Three quarters of 900 texels: no multiple of any cell."""
-    from mbtf_gen.images.read import gray, read_image
+    from mbtf_core.images.read import gray, read_image
 
     (path,) = folder_of(name).glob("height.*")
     height = gray(read_image(path))[0]

@@ -9,7 +9,7 @@ import pytest
 from support.height_maps import Floats, fractal, normals_of, save_heights, save_normals
 from support.paths import ROOT
 
-from mbtf_gen.images.read import gray, read_image
+from mbtf_core.images.read import gray, read_image
 from mbtf_gen.material.load import load_material
 from mbtf_gen.material.normal_map import SYMMETRIES, NormalFit, fit_normals
 

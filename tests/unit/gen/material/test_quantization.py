@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support.height_maps import Floats, fractal, rms, save_heights, slopes
 
-from mbtf_gen.images.resample import dequantize
+from mbtf_core.images.resample import dequantize
 from mbtf_gen.material.load import load_material
 from mbtf_gen.material.quantization import code_use
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from support.height_maps import Floats, fractal, normals_of, save_heights, save_normals
 
+from mbtf_core.data.schema import Tiling
 from mbtf_core.errors import InputError
-from mbtf_core.shard_schema import Tiling
 from mbtf_gen.material.load import load_material
 from mbtf_gen.material.material import Material
 from mbtf_gen.material.normal_map import fit_normals

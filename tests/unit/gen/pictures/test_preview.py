@@ -11,13 +11,13 @@ import pytest
 from support.datasets import write_dataset
 
 from mbtf_core.child_process import run_child
+from mbtf_core.data.lattice import level_of_sigma, texel_centers
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import EngineError, InputError
-from mbtf_core.lattice import level_of_sigma, texel_centers
+from mbtf_core.pictures.camera import Camera, tiles_camera
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
 from mbtf_gen.material.material import Material
-from mbtf_gen.pictures.camera import Camera, tiles_camera
 from mbtf_gen.pictures.preview import mesh
 from mbtf_gen.pictures.preview.mesh import MOST_CELLS, draw, tiled_mesh
 from mbtf_gen.pictures.preview.plots import level_histogram, query_figure, write_plots

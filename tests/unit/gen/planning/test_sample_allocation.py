@@ -11,7 +11,8 @@ from conftest import RunPython
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
-from mbtf_core.lattice import Lattice
+from mbtf_core.data.lattice import Lattice
+from mbtf_core.data.queries import Queries
 from mbtf_gen.planning.adaptive import DOUBT, MOST_CORRECTION, PRIOR_PATHS, correction, needed_paths, round_up
 from mbtf_gen.planning.sample_allocation import (
     FLOOR,
@@ -22,7 +23,7 @@ from mbtf_gen.planning.sample_allocation import (
     fit_log_linear,
 )
 from mbtf_gen.render.estimates import Estimates
-from mbtf_gen.sampling.query_sampler import Mixture, Queries, QueryPlan
+from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
 
 SPP = 16
 
@@ -155,7 +156,7 @@ from pydantic import TypeAdapter
 from mbtf_gen.planning.adaptive import round_up, needed_paths
 from mbtf_gen.planning.sample_allocation import Allocation
 from mbtf_gen.render.estimates import Estimates
-from mbtf_core.lattice import Lattice
+from mbtf_core.data.lattice import Lattice
 from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
 n = 20000
 allocation = TypeAdapter(Allocation).validate_json(sys.argv[1])

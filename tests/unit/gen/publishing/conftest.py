@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from mbtf_core.atomic import write_chunks
+from mbtf_core.files.atomic import write_chunks
 from mbtf_gen.publishing import publish
 
 

@@ -10,7 +10,7 @@ from PIL import Image
 from support.fit_data import write_data
 from support.published import LAYOUTS, small
 
-from mbtf_gen.dataset.reader import Dataset
+from mbtf_core.data.dataset import Dataset
 from mbtf_gen.publishing.averages import ELEVATIONS, LIGHTS, Averages, averages, brdf_bins, tile_shape
 from mbtf_gen.publishing.pictures import displayed, picture_makers
 from mbtf_gen.publishing.statistics import split_statistics

@@ -18,11 +18,11 @@ from support.datasets import edit
 from support.measured_files import btf
 from support.published import LAYOUTS, publish, python_blocks, small, stored
 
+from mbtf_core.data.dataset import Dataset
 from mbtf_gen.config.measured import ImportConfig
 from mbtf_gen.config.publish import PublishConfig
-from mbtf_gen.dataset.import_job import Import
-from mbtf_gen.dataset.imported import import_measured
-from mbtf_gen.dataset.reader import Dataset
+from mbtf_gen.generation.import_job import Import
+from mbtf_gen.generation.imported import import_measured
 from mbtf_gen.publishing.facts import Facts
 
 HOSTILE = '<script>alert("1")</script> ![x](https://example.org/p.png) | `*_'

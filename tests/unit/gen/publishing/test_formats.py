@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from support.published import LAYOUTS, contents, publish, small, stored
 
-from mbtf_core.shard_schema import ARRAY
-from mbtf_gen.dataset.verify import verify
+from mbtf_core.data.schema import ARRAY
+from mbtf_core.data.verify import verify
 from mbtf_gen.publishing.webdataset import write_tar
 
 pq = pytest.importorskip("pyarrow.parquet")

@@ -11,8 +11,8 @@ import pytest
 from support.datasets import edit, write_dataset
 from support.published import contents, publish, small
 
-from mbtf_core.atomic import Stored
 from mbtf_core.errors import EngineError, InputError, PartialError, UsageError
+from mbtf_core.files.atomic import Stored
 from mbtf_gen.config.publish import PublishConfig
 from mbtf_gen.publishing import parquet
 from mbtf_gen.publishing import publish as module
@@ -137,7 +137,9 @@ def test_a_data_set_without_its_completion_is_refused(shards: Path, tmp_path: Pa
 
 
 def test_a_full_disk_is_said_before(shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mbtf_core.folders.shutil.disk_usage", lambda _: shutil._ntuple_diskusage(1, 1, 1000))
+    monkeypatch.setattr(
+        "mbtf_core.files.folders.shutil.disk_usage", lambda _: shutil._ntuple_diskusage(1, 1, 1000)
+    )
     with pytest.raises(InputError, match=r"needs .* MB; 1 kB are free"):
         publish(shards, tmp_path / "card", form="webdataset")
     assert not (tmp_path / "card").exists()
@@ -167,7 +169,7 @@ def test_shards_of_exr_are_not_npz(tmp_path: Path) -> None:
 
 
 def test_a_folder_in_use_is_refused(shards: Path, tmp_path: Path) -> None:
-    from mbtf_core.folders import owned
+    from mbtf_core.files.folders import owned
 
     with owned(tmp_path / "card"), pytest.raises(PartialError, match="is being written by another process"):
         publish(shards, tmp_path / "card", form="webdataset")

@@ -17,12 +17,12 @@ from support.formula_runs import SMALL, Formula, cheap_plan
 from support.published import contents, publish, small
 
 from mbtf_core.config_file import resolve
+from mbtf_core.data.dataset import Dataset
 from mbtf_core.errors import InputError, UsageError
-from mbtf_gen import generation
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.publish import PublishConfig
-from mbtf_gen.dataset import render_shards
-from mbtf_gen.dataset.reader import Dataset
+from mbtf_gen.generation import render_shards
+from mbtf_gen.generation import run as generation
 from mbtf_gen.material.load import load_material
 from mbtf_gen.publishing.digests import dataset_digests, digest_faults
 from mbtf_gen.publishing.publish import Publication

@@ -10,8 +10,9 @@ import pytest
 from conftest import RunPython
 from numpy.typing import NDArray
 
-from mbtf_core.lattice import Lattice
-from mbtf_gen.sampling.query_sampler import Mixture, Queries, QueryPlan
+from mbtf_core.data.lattice import Lattice
+from mbtf_core.data.queries import Queries
+from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
 
 # Draws of every kind, and the elementary functions in double precision, where the last bit shows; prints
 # NumPy's features in use and the digest of all bits.
@@ -19,7 +20,7 @@ CODE = """
 import hashlib, json
 import numpy as np
 from mbtf_gen.sampling.exact_math import exp2, sincos_turns
-from mbtf_core.lattice import Lattice
+from mbtf_core.data.lattice import Lattice
 from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
 h = hashlib.sha256()
 for layout, lattice, rows in (("shuffled", Lattice(5, 0.75), 5000), ("image", Lattice(4, 1.0), 7)):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from support.datasets import write_dataset
 
+from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import UsageError
-from mbtf_core.lattice import Lattice
 from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
 from mbtf_gen.sampling.slice_directions import direction_pairs, slice_directions
 

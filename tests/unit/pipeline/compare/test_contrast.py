@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mbtf_core.lattice import Lattice
+from mbtf_core.data.lattice import Lattice
+from mbtf_core.images.read import LUMINANCE
 from mbtf_core.stats import Estimate
-from mbtf_gen.images.read import LUMINANCE
 from mbtf_pipeline.compare.contrast import PHASES, contrast, phase_contrasts, phase_queries, picture_blocks
 
 SIZE = 128

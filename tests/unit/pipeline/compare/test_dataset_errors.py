@@ -12,9 +12,9 @@ import torch
 from support.fit_data import parallax, write_data
 
 from mbtf_core.console import Console
-from mbtf_core.lattice import Lattice
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.lattice import Lattice
 from mbtf_fit.models.registry import build_model
-from mbtf_gen.dataset.reader import Dataset
 from mbtf_pipeline.compare import timing
 from mbtf_pipeline.compare.dataset_errors import dataset_errors
 from mbtf_pipeline.compare.timing import LIGHTS, measure_timing

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import mbtf_fit
-from mbtf_core.atomic import write_text
 from mbtf_core.config_file import dump_yaml, resolve
+from mbtf_core.files.atomic import write_text
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_gen.config.generator import GeneratorConfig
@@ -171,7 +171,7 @@ def test_every_seed_has_one_test_set(tmp_path: Path, monkeypatch: pytest.MonkeyP
     asked: list[GeneratorConfig] = []
     monkeypatch.setattr(module, "generate", lambda job, folder: asked.append(job.config))
     monkeypatch.setattr(module, "Job", SimpleNamespace(load=lambda config: SimpleNamespace(config=config)))
-    monkeypatch.setattr("mbtf_gen.dataset.reader.Dataset.open", lambda folder: folder)
+    monkeypatch.setattr("mbtf_core.data.dataset.Dataset.open", lambda folder: folder)
     monkeypatch.setattr("mbtf_fit.data.loader.load_split", lambda data, split: split)
     one = runner(tmp_path, 3, test=(1 << 17, 8))
     one.test_sets = {}

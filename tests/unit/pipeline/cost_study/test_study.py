@@ -14,9 +14,9 @@ import pytest
 from support.fake_runs import FakeRunner, run
 from support.paths import ROOT
 
-from mbtf_core import folders
-from mbtf_core.atomic import write_json
 from mbtf_core.errors import InputError
+from mbtf_core.files import folders
+from mbtf_core.files.atomic import write_json
 from mbtf_core.stats import Estimate
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.cost_study import study as module

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from support.paths import ROOT
 
+from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError, UsageError
-from mbtf_core.lattice import Lattice
 from mbtf_gen.config.generator import count_queries
 from mbtf_gen.config.presets import GENERATOR
 from mbtf_pipeline.cost_study import time_split as module

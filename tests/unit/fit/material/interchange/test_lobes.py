@@ -12,7 +12,7 @@ import torch
 from support.known_brdf import KnownBrdf, gltf_brdf, known_brdf
 from support.plugin_materials import write_material
 
-from mbtf_core.lattice import Lattice, texel_centers
+from mbtf_core.data.lattice import Lattice, texel_centers
 from mbtf_fit.material.interchange.agreement import fit_color
 from mbtf_fit.material.interchange.brdf import Pairs, affine, affine_derivatives
 from mbtf_fit.material.interchange.lobes import LobeFitter, fit_lobes

@@ -12,9 +12,9 @@ import torch
 from support.known_surfaces import geometry
 from support.plugin_materials import write_material
 
+from mbtf_core.data.lattice import Lattice
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import UsageError
-from mbtf_core.lattice import Lattice
 from mbtf_fit import Material
 from mbtf_fit.material.interchange.agreement import fit_color
 from mbtf_fit.material.interchange.maps import (

@@ -1,0 +1,1 @@
+"""Data sets on disk: schema, arrays, manifest, sidecars, verification, stores."""

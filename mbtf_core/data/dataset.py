@@ -1,0 +1,368 @@
+"""A folder of shards as one data set: manifest, splits, sidecars, arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, cast
+
+import numpy as np
+from pydantic import BaseModel, Field
+
+from mbtf_core.config_file import check_document, check_schema
+from mbtf_core.data.data_folder import data_folder, limit_cache
+from mbtf_core.data.geometry import Geometry, read_geometry
+from mbtf_core.data.lattice import MAX_LEVEL, Lattice
+from mbtf_core.data.schema import ARRAY, FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, Layout, ShardEntry, Split
+from mbtf_core.data.shard_files import Arrays, check_values, column_means, read_shard
+from mbtf_core.data.sidecar import ABSENT, CHANGED, read_sidecar, repair_hint, sidecar_of, sidecars
+from mbtf_core.errors import InputError
+from mbtf_core.files.atomic import read_checksummed, read_json
+from mbtf_core.files.digest import file_sha256
+from mbtf_core.suggest import suggest_path
+
+_Count = Annotated[int, Field(strict=True, ge=0, lt=1 << 40)]
+_FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*\.(npz|exr)$", max_length=100)]
+_MAKE_AGAIN = "generate or download the data set again"
+# The sidecar's mean and that of the shard are float64 sums in different orders.
+_SAME_MEAN = 1e-7
+
+
+class _Entry(BaseModel):
+    file: _FileName
+    rows: _Count
+
+
+class _Split(BaseModel):
+    shards: list[_Entry]
+
+
+class _Levels(BaseModel):
+    finest: Annotated[int, Field(strict=True, ge=0, le=MAX_LEVEL)]
+
+
+class _Tile(BaseModel):
+    aspect: float = Field(gt=0, le=1e6, allow_inf_nan=False)
+
+
+class _Geometry(BaseModel):
+    file: Literal["geometry.exr"]
+    sha256: str
+
+
+class _Manifest(BaseModel):
+    """Keys of a manifest that readers need; others are ignored."""
+
+    config_hash: str
+    layout: Layout
+    levels: _Levels
+    tile: _Tile
+    splits: dict[str, _Split]
+    geometry: _Geometry | None
+    patch_size: _Count | None = None
+    slice_size: _Count | None = None
+    estimates: Literal[1, 2] = 2
+
+
+class _Statistics(BaseModel, allow_inf_nan=False):
+    mean_value: tuple[float, float, float]
+
+
+class _Sidecar(BaseModel):
+    """Keys of a sidecar that readers need; others are ignored."""
+
+    statistics: _Statistics
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One finished shard.
+
+    Attributes
+    ----------
+    path : Path
+        Its file.
+    sidecar : dict
+        The content of its sidecar.
+    image : tuple of int
+        Rows and columns of an image in the image layout, the number of directions in the slices layout;
+        empty in the shuffled layout.
+    estimates : int
+        Independent estimates of every value: 2, or 1 of measured data.
+    """
+
+    path: Path
+    sidecar: dict[str, Any]
+    image: tuple[int, ...] = ()
+    estimates: int = 2
+
+    @property
+    def rows(self) -> int:
+        """Queries in the shuffled layout, images in the image layout, positions in the slices layout."""
+        return int(self.sidecar["rows"])
+
+    def read(self, names: Iterable[str] | None = None) -> Arrays:
+        """Its arrays, memory-mapped if the format allows, every number checked.
+
+        Parameters
+        ----------
+        names : iterable of str, optional
+            Arrays to read; all by default.
+
+        Returns
+        -------
+        dict of str to float32 array
+
+        Raises
+        ------
+        InputError
+            It cannot be read, its numbers are invalid, or they are those of another shard. Its size and its
+            rows are compared with the sidecar's, and where both values are read, their mean. Without the
+            values, the numbers of a shard that was copied over another of the same size are returned;
+            ``mbtf-gen verify`` compares digests and finds it.
+        """
+        arrays = read_shard(self.path, names)
+        hint = f"check the data set with: mbtf-gen verify {self.path.parent}"
+        for name, array in arrays.items():
+            rows, image = len(array), array.shape[1 : array.ndim - len(ARRAY[name].trailing)]
+            if rows != self.rows:
+                what = f"has {rows} rows, its sidecar says {self.rows}"
+                raise InputError(what, where=self.path, hint=hint)
+            if image != self.image:
+                found, expected = (" x ".join(map(str, s)) or "1" for s in (image, self.image))
+                what = f"has {found} queries per row, {MANIFEST_NAME} says {expected}"
+                raise InputError(what, where=self.path, hint=hint)
+        try:
+            check_values(arrays, self.path)
+        except InputError as error:
+            raise InputError(error.what, where=self.path, hint=hint) from None
+        halves = ("value_a", "value_b")[: self.estimates]
+        if self.rows and all(name in arrays for name in halves):
+            mean = np.mean([column_means(arrays[name]) for name in halves], axis=0)
+            stated = np.asarray(self.sidecar["statistics"]["mean_value"])
+            if np.abs(mean - stated).max() > _SAME_MEAN * np.abs(stated).max():
+                raise InputError("is not the shard that its sidecar describes", where=self.path, hint=hint)
+        return arrays
+
+
+def is_dataset(folder: Path) -> bool:
+    """Whether a folder contains a data set, possibly without its manifest."""
+    return (folder / MANIFEST_NAME).exists() or bool(sidecars(folder))
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A data set generated by ``mbtf-gen``.
+
+    Attributes
+    ----------
+    folder : Path
+        Its folder.
+    manifest : dict
+        The content of ``manifest.json``.
+    """
+
+    folder: Path
+    manifest: dict[str, Any]
+
+    @classmethod
+    def open(cls, folder: str | Path, cache: float | None = None) -> Dataset:
+        """Open a folder of shards.
+
+        Parameters
+        ----------
+        folder : str or Path
+            The data set: a path, or a URL such as ``s3://bucket/data``.
+        cache : float, optional
+            Bytes of local disk for shards of object stores; 20 GB by default.
+
+        Returns
+        -------
+        Dataset
+
+        Raises
+        ------
+        InputError
+            No manifest, another format or schema version, or invalid keys.
+        PartialError
+            The store cannot be reached.
+        """
+        folder = data_folder(folder)
+        if cache is not None:
+            limit_cache(folder, cache)
+        if not folder.is_dir():
+            raise InputError("no such folder", where=folder, hint=suggest_path(folder, Path.is_dir))
+        path = folder / MANIFEST_NAME
+        if not path.exists():
+            lost = repair_hint(folder) if is_dataset(folder) else ""
+            raise InputError(
+                f"no {MANIFEST_NAME} in it",
+                where=folder,
+                hint=lost or "generate one: mbtf-gen heightfield.exr -o FOLDER",
+            )
+        hint = repair_hint(folder)
+        manifest = read_json(path, hint)
+        if manifest.get("format") != FORMAT_NAME:
+            hint = hint if sidecars(folder) else ""
+            raise InputError(f"is not a manifest of {FORMAT_NAME}", where=path, hint=hint)
+        if manifest.get("schema") == SCHEMA_VERSION or "checksum" in manifest:
+            read_checksummed(path, hint)
+        check_schema(
+            manifest, SCHEMA_VERSION, path, "generate the shards again with this version of mbtf-gen"
+        )
+        check_document(_Manifest, manifest, path, _MAKE_AGAIN)
+        return cls(folder, manifest)
+
+    @property
+    def layout(self) -> Layout:
+        """``shuffled``, ``image`` or ``slices``."""
+        layout: Layout = self.manifest["layout"]
+        return layout
+
+    @property
+    def patch_size(self) -> int | None:
+        """Texels along each side of an image; None: images cover the whole finest level."""
+        size: int | None = self.manifest.get("patch_size")
+        return size
+
+    @property
+    def estimates(self) -> int:
+        """Independent estimates of every value: 2, or 1 of measured data, which have no array ``value_b``."""
+        return int(self.manifest.get("estimates", 2))
+
+    @property
+    def lattice(self) -> Lattice:
+        """Texel grids of the tile."""
+        return Lattice(int(self.manifest["levels"]["finest"]), float(self.manifest["tile"]["aspect"]))
+
+    @property
+    def splits(self) -> list[str]:
+        """Names of the splits, usually ``train`` and ``test``."""
+        return list(self.manifest["splits"])
+
+    def entries(self, split: str) -> list[ShardEntry]:
+        """Shards that the manifest lists for a split, finished or not."""
+        listed = self.manifest["splits"].get(split, {"shards": []})["shards"]
+        return [ShardEntry(cast(Split, split), i, e["file"], e["rows"]) for i, e in enumerate(listed)]
+
+    def shards(self, split: str, *, finished_only: bool = False) -> list[Shard]:
+        """Shards of a split in order.
+
+        Parameters
+        ----------
+        split : str
+            ``train`` or ``test``.
+        finished_only : bool
+            Leave out shards that are not rendered yet.
+
+        Returns
+        -------
+        list of Shard
+
+        Raises
+        ------
+        InputError
+            No such split, a missing shard, a corrupt sidecar, or a shard that is not the one listed.
+        """
+        if split not in self.manifest["splits"]:
+            raise InputError(f"has no split '{split}' (it has: {', '.join(self.splits)})", where=self.folder)
+        image: tuple[int, ...] = ()
+        if self.layout == "image":
+            image = self.lattice.shape() if self.patch_size is None else (self.patch_size,) * 2
+        elif self.layout == "slices":
+            image = (int(self.manifest["slice_size"] or 1) if split == "train" else 1,)
+        out = []
+        for entry in self.entries(split):
+            path = self.folder / entry.file
+            try:
+                record = read_sidecar(self.folder, entry, self.manifest["config_hash"])
+            except InputError as error:
+                if error.what in ABSENT and finished_only:
+                    continue
+                if error.what in ABSENT:
+                    raise InputError(
+                        f"shard {entry.file} is missing or unfinished",
+                        where=self.folder,
+                        hint="run the mbtf-gen command that generated it again: it resumes",
+                    ) from None
+                hint = f"check the data set with: mbtf-gen verify {self.folder}"
+                raise InputError(error.what, where=path, hint=hint) from None
+            check_document(_Sidecar, record, sidecar_of(path), _MAKE_AGAIN)
+            out.append(Shard(path, record, image, self.estimates))
+        return out
+
+    def geometry(self) -> Geometry | None:
+        """Heights, slopes and reflectance of the surface, their digest checked.
+
+        Returns
+        -------
+        Geometry or None
+            None where the data set has none.
+
+        Raises
+        ------
+        InputError
+            The file is missing or is not the one that was written.
+        """
+        record = self.manifest["geometry"]
+        if record is None:
+            return None
+        path, hint = self.folder / record["file"], repair_hint(self.folder)
+        try:
+            changed = file_sha256(path) != record["sha256"]
+        except FileNotFoundError:
+            raise InputError(ABSENT[0], where=path, hint=hint) from None
+        except OSError as error:
+            raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+        if changed:
+            raise InputError(CHANGED, where=path, hint=hint)
+        return read_geometry(path)
+
+    def iterate(self, split: str, names: Iterable[str] | None = None) -> Iterator[Arrays]:
+        """Arrays of each shard of a split in turn, memory-mapped if the format allows.
+
+        Parameters
+        ----------
+        split : str
+            ``train`` or ``test``.
+        names : iterable of str, optional
+            Arrays to read; all by default.
+
+        Yields
+        ------
+        dict of str to float32 array
+            The first axis is the query, or the image in the image layout.
+
+        Raises
+        ------
+        InputError
+            See :meth:`shards` and :meth:`Shard.read`.
+        """
+        wanted = None if names is None else list(names)
+        yield from (shard.read(wanted) for shard in self.shards(split))
+
+    def load(self, split: str, names: Iterable[str] | None = None) -> Arrays:
+        """All queries of a split in memory.
+
+        Parameters
+        ----------
+        split : str
+            ``train`` or ``test``.
+        names : iterable of str, optional
+            Arrays to read; all by default.
+
+        Returns
+        -------
+        dict of str to float32 array
+            The first axis is the query, or the image in the image layout.
+
+        Raises
+        ------
+        InputError
+            See :meth:`iterate`; or the split has no shards.
+        """
+        parts = list(self.iterate(split, names))
+        if not parts:
+            raise InputError(f"split '{split}' has no shards", where=self.folder)
+        return {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}

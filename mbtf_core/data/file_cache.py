@@ -1,0 +1,125 @@
+"""A bounded cache of whole files by their SHA-256, which all processes of a user share.
+
+A file is complete once it has its name, and never changes. The files that were used least recently make room
+for new ones. A mapped file stays readable after it has been removed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+import time
+from collections import defaultdict, deque
+from collections.abc import Callable
+from pathlib import Path
+
+from mbtf_core.errors import InputError, unwritable
+from mbtf_core.files.atomic import temporary_of
+from mbtf_core.files.digest import file_sha256
+from mbtf_core.files.folders import make_folder
+
+# Bytes of a cache by default.
+CACHE_BYTES = 20e9
+# Files that were fetched last and that are never removed: their readers are about to open them.
+_KEPT = 4
+# Seconds after which the unfinished file of another process counts as abandoned.
+_ABANDONED_SECONDS = 86400.0
+_UNFINISHED = ".tmp"
+
+
+class FileCache:
+    """Files in a folder, at most `limit` bytes of them, but at least the few that were fetched last.
+
+    Parameters
+    ----------
+    folder : made if it is missing
+    limit : in bytes
+    """
+
+    def __init__(self, folder: Path, limit: float = CACHE_BYTES) -> None:
+        self.folder = folder
+        self.limit = limit
+        self._guard = threading.Lock()
+        self._locks: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
+        self._recent: deque[str] = deque(maxlen=_KEPT)
+
+    def path(self, sha256: str, suffix: str) -> Path:
+        """Where a file is, if it is there."""
+        return self.folder / f"{sha256}{suffix}"
+
+    def fetch(self, sha256: str, suffix: str, size: int, download: Callable[[Path], None]) -> Path:
+        """The file with a digest; downloaded and checked if it is missing.
+
+        Parameters
+        ----------
+        sha256 : in hexadecimal
+        suffix : of its name
+        size : in bytes
+        download : writes the file of the path that it is given
+
+        Raises
+        ------
+        InputError : what was downloaded has another digest
+        PartialError : the disk is full
+        the errors of `download`
+        """
+        path = self.path(sha256, suffix)
+        with self._guard:
+            lock = self._locks[path.name]
+        # Another thread may be downloading it.
+        with lock:
+            with self._guard:
+                if path.name in self._recent:
+                    self._recent.remove(path.name)
+                self._recent.append(path.name)
+            if self._is_whole(path, size):
+                return path
+            make_folder(self.folder)
+            self._make_room(size)
+            part = temporary_of(path)
+            try:
+                download(part)
+                if file_sha256(part) != sha256:
+                    raise InputError("has changed since it was written (SHA-256 differs)")
+                os.replace(part, path)
+            except OSError as error:
+                if isinstance(error, FileNotFoundError):
+                    raise
+                raise unwritable(part, error) from None
+            finally:
+                with contextlib.suppress(OSError):
+                    part.unlink()
+            return path
+
+    def _is_whole(self, path: Path, size: int) -> bool:
+        try:
+            if path.stat().st_size != size:
+                return False
+            # Its age is the time since it was used.
+            os.utime(path)
+        except OSError:
+            return False
+        return True
+
+    def _make_room(self, size: int) -> None:
+        """Remove files until `size` bytes more fit."""
+        with self._guard:
+            found: list[tuple[float, int, str]] = []
+            with contextlib.suppress(OSError), os.scandir(self.folder) as entries:
+                for entry in entries:
+                    with contextlib.suppress(OSError):
+                        stat = entry.stat()
+                        found.append((stat.st_mtime, stat.st_size, entry.name))
+            total = size + sum(bytes_ for _, bytes_, _ in found)
+            now = time.time()
+            for used, bytes_, name in sorted(found):
+                if name.endswith(_UNFINISHED):
+                    removed = now - used > _ABANDONED_SECONDS
+                else:
+                    removed = total > self.limit and name not in self._recent
+                if not removed:
+                    continue
+                with contextlib.suppress(OSError):
+                    os.unlink(self.folder / name)
+                    total -= bytes_

@@ -1,0 +1,293 @@
+"""One folder of an object store, such as ``s3://bucket/data``, through fsspec.
+
+A connection that drops is tried again with growing pauses until the patience ends. Objects are written whole:
+a store shows an object only once all of it has arrived.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any, TypeVar
+
+from mbtf_core.errors import EngineError, InputError, MbtfError, PartialError, UsageError, reason, unwritable
+
+log = logging.getLogger(__name__)
+T = TypeVar("T")
+
+# Seconds from the first failure of a request to the last attempt; the environment variable overrides them.
+PATIENCE_VARIABLE, PATIENCE_SECONDS = "MBTF_STORE_PATIENCE", 60.0
+# First pause between two attempts, and the longest one; each is twice as long as the one before.
+_FIRST_PAUSE, _LONGEST_PAUSE = 0.5, 10.0
+# Errors of a request that another attempt does not help, by class or, of optional packages, by name.
+_REFUSED = (
+    PermissionError,
+    NotImplementedError,
+    TypeError,
+    ValueError,
+    IsADirectoryError,
+    NotADirectoryError,
+)
+# Packages of protocols that the extra `stores` leaves out.
+_PACKAGES = {"gs": "gcsfs", "gcs": "gcsfs", "abfs": "adlfs", "az": "adlfs"}
+_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+_REFUSED_NAMES = (
+    "NoCredentialsError",
+    "PartialCredentialsError",
+    "ProfileNotFound",
+    "DefaultCredentialsError",
+    "ParamValidationError",
+)
+# The same by the code of an answer: that of HTTP in errors of gcsfs, those of S3 that s3fs has no class for.
+_REFUSED_CODES = (
+    401,
+    403,
+    "AuthorizationHeaderMalformed",
+    "InvalidBucketName",
+    "InvalidToken",
+    "KeyTooLongError",
+    "MethodNotAllowed",
+    "PermanentRedirect",
+)
+# Answers of S3 to a conditional write: there is such an object, and this store has no such writes. s3fs knows
+# the first one only where the answer names the condition, as that of Amazon does.
+_EXISTS, _UNCONDITIONAL = ("PreconditionFailed", "412"), ("NotImplemented", "501")
+
+
+@dataclass(frozen=True)
+class StoredObject:
+    """An object of a store: size in bytes, and a text that changes with its content (empty: unknown)."""
+
+    size: int
+    tag: str
+
+
+class Store:
+    """The objects of one folder of a store, by name.
+
+    Parameters
+    ----------
+    url : such as ``s3://bucket/data``; fsspec reads credentials and endpoint from the environment
+
+    Raises
+    ------
+    EngineError : the package of the protocol is not installed
+    InputError : the URL is invalid
+    """
+
+    def __init__(self, url: str) -> None:
+        self.url = url
+        try:
+            import fsspec
+        except ImportError:
+            raise EngineError(
+                "fsspec is not installed, which reads object stores",
+                where=url,
+                hint="pip install 'mbtf[stores]'",
+            ) from None
+        protocol = url.partition("://")[0]
+        try:
+            self._files, root = fsspec.url_to_fs(url, use_listings_cache=False)
+        except ImportError as error:
+            package = "'mbtf[stores]'" if protocol in ("s3", "s3a") else _PACKAGES.get(protocol)
+            hint = f"pip install {package}" if package else "install it with pip"
+            raise EngineError(f"a package is not installed ({reason(error)})", where=url, hint=hint) from None
+        except ValueError as error:
+            raise InputError(f"cannot be opened ({reason(error)})", where=url) from None
+        self._root = str(root).rstrip("/")
+        _quiet(self._files)
+        try:
+            self.patience = float(os.environ.get(PATIENCE_VARIABLE) or PATIENCE_SECONDS)
+        except ValueError:
+            raise UsageError("must be a number of seconds", where=PATIENCE_VARIABLE) from None
+        # Set once the patience has ended: requests of other threads do not wait for it again.
+        self._lost = threading.Event()
+
+    def _at(self, name: str) -> str:
+        return f"{self._root}/{name}"
+
+    def _request(self, name: str, function: Callable[[], T]) -> T:
+        """Result of a request, tried again where the connection fails.
+
+        Raises
+        ------
+        FileNotFoundError, FileExistsError : as the store says
+        InputError : the store refuses the request
+        PartialError : the store cannot be reached
+        """
+        where = f"{self.url}/{name}" if name else self.url
+        pause, give_up = _FIRST_PAUSE, 0.0
+        while True:
+            try:
+                result = function()
+                self._lost.clear()
+                return result
+            except (FileNotFoundError, FileExistsError):
+                # The store has answered.
+                self._lost.clear()
+                raise
+            except MbtfError:
+                raise
+            except Exception as error:
+                if _is_refusal(error):
+                    raise InputError(
+                        f"the store refuses it ({reason(error)})",
+                        where=where,
+                        hint="check the credentials, the endpoint and the name of the bucket",
+                    ) from None
+                now = time.monotonic()
+                if give_up == 0.0:
+                    give_up = now + (0.0 if self._lost.is_set() else self.patience)
+                    log.debug("%s: %s; trying again for %.0f s", where, reason(error), self.patience)
+                if now + pause > give_up:
+                    self._lost.set()
+                    raise PartialError(
+                        f"the store cannot be reached ({reason(error)})",
+                        where=where,
+                        hint="what is finished is kept; run the same command again",
+                    ) from None
+                time.sleep(pause)
+                pause = min(2.0 * pause, _LONGEST_PAUSE)
+
+    def list(self) -> dict[str, StoredObject]:
+        """All objects and folders, without those in sub-folders; names of folders end with "/"."""
+
+        def request() -> list[dict[str, Any]]:
+            self._files.invalidate_cache()
+            found: list[dict[str, Any]] = self._files.ls(self._root, detail=True)
+            return found
+
+        try:
+            found = self._request("", request)
+        except FileNotFoundError:
+            return {}
+        out = {}
+        for info in found:
+            parent, _, name = str(info["name"]).rstrip("/").rpartition("/")
+            if name and parent.lstrip("/") == self._root.lstrip("/"):
+                is_folder = info["type"] == "directory"
+                out[name + "/" * is_folder] = StoredObject(int(info.get("size") or 0), _tag(info))
+        return out
+
+    def info(self, name: str) -> StoredObject:
+        """Size and tag of an object; a FileNotFoundError where there is none."""
+
+        def request() -> dict[str, Any]:
+            self._files.invalidate_cache()
+            found: dict[str, Any] = self._files.info(self._at(name))
+            return found
+
+        found = self._request(name, request)
+        return StoredObject(int(found.get("size") or 0), _tag(found))
+
+    def read(self, name: str) -> bytes:
+        """Content of an object; a FileNotFoundError where there is none."""
+        return bytes(self._request(name, lambda: self._files.cat_file(self._at(name))))
+
+    def download(self, name: str, path: Path) -> None:
+        """Copy an object to a file, which an interruption leaves incomplete; a FileNotFoundError where there
+        is none.
+
+        Raises
+        ------
+        PartialError : the store cannot be reached, or the disk is full
+        """
+
+        def request() -> None:
+            try:
+                self._files.get_file(self._at(name), str(path))
+            except OSError as error:
+                # The network raises the same class with other numbers, and without the file.
+                if error.errno in _DISK or error.filename == str(path):
+                    raise unwritable(path, error) from None
+                raise
+
+        self._request(name, request)
+
+    def write(self, name: str, content: bytes, *, new: bool = False) -> bool:
+        """Write an object whole.
+
+        Parameters
+        ----------
+        new : never replace an object of that name. The store decides where it has conditional writes, such as
+            S3; others have a short window in which the last writer succeeds
+
+        Returns
+        -------
+        bool
+            False where `new`, and another object has that name.
+        """
+
+        def request() -> None:
+            if new:
+                try:
+                    self._files.pipe_file(self._at(name), content, mode="create")
+                    return
+                except (TypeError, OSError) as error:
+                    code = _code(error)
+                    if code in _EXISTS:
+                        raise FileExistsError(name) from None
+                    # A file system without the parameter, or a store without such writes.
+                    if not (isinstance(error, TypeError) or code in _UNCONDITIONAL):
+                        raise
+                if self._files.exists(self._at(name)):
+                    raise FileExistsError(name)
+            self._files.pipe_file(self._at(name), content)
+
+        try:
+            self._request(name, request)
+        except FileExistsError:
+            # An attempt whose answer was lost may have written it.
+            return self.read(name) == content
+        except FileNotFoundError as error:
+            raise InputError(f"cannot be written ({reason(error)})", where=self.url) from None
+        return True
+
+    def delete(self, name: str) -> None:
+        """Delete an object, if it is there."""
+        try:
+            self._request(name, lambda: self._files.rm_file(self._at(name)))
+        except FileNotFoundError:
+            return
+
+
+def _is_refusal(error: Exception) -> bool:
+    """Whether another attempt would not help."""
+    if isinstance(error, _REFUSED) or type(error).__name__ in _REFUSED_NAMES:
+        return True
+    # The text is that of gcsfs, whose error has no code.
+    return _code(error) in _REFUSED_CODES or str(error).startswith("Forbidden: ")
+
+
+def _code(error: BaseException) -> str | int:
+    """Code of a store's answer: that of S3 behind an error of s3fs, that of HTTP in one of gcsfs; else an
+    empty text."""
+    answer = getattr(error.__cause__, "response", None)
+    stated = answer.get("Error") if isinstance(answer, dict) else None
+    found = stated.get("Code") if stated else getattr(error, "code", None)
+    return found if isinstance(found, str | int) else ""
+
+
+def _quiet(files: Any) -> None:
+    """Keep tracebacks and notes of requests off the screen: those that fail raise the error as well."""
+    logger = logging.getLogger(type(files).__module__.partition(".")[0])
+    if logger.level == logging.NOTSET:
+        logger.setLevel(logging.CRITICAL)
+    loop = getattr(files, "loop", None)
+    if loop is not None and loop.get_exception_handler() is None:
+        loop.call_soon_threadsafe(
+            loop.set_exception_handler, lambda _, context: log.debug(reason(context.get("message")))
+        )
+
+
+def _tag(info: dict[str, Any]) -> str:
+    keys = ("ETag", "etag", "md5Hash", "content_md5", "LastModified", "last_modified", "mtime", "created")
+    value = next((info[key] for key in keys if info.get(key)), "")
+    return str(value.timestamp() if isinstance(value, datetime) else value)

@@ -1,0 +1,1 @@
+"""Perspective pictures of a tile: cameras, and stored references."""

@@ -1,0 +1,168 @@
+"""Perspective pictures of the infinitely repeated tile: pixels as queries, and exactly filtered pixels.
+
+The pixel filter is a Gaussian with a standard deviation of half a pixel. A picture of kind ``query``
+evaluates M at each pixel's position, view direction and isotropic footprint σ, which is the geometric mean of
+the two radii of the projected filter. Kind ``pixel`` is the filtered image itself: every path has its own
+position and view direction. The two agree near normal incidence.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbtf_core.data.queries import Queries
+from mbtf_core.directions import from_angles
+from mbtf_core.errors import UsageError
+
+PixelKind = Literal["query", "pixel"]
+
+# Standard deviation of the pixel filter, in pixels.
+PIXEL_SIGMA = 0.5
+# Smallest cosine between the plane's normal and a pixel's ray; at the horizon footprints are unbounded.
+SMALLEST_COSINE = 0.01
+# Fraction of a picture, along its tighter side, that tiles fill, and its height over its width.
+_FILL, _PROPORTION = 0.94, 0.75
+
+
+def pixel_sigma(area: Any) -> Any:
+    """Footprint σ of a pixel: the geometric mean of the two radii of its projected Gaussian.
+
+    Parameters
+    ----------
+    area : float, array or Float
+        Area of the pixel on the surface, in squared tile widths.
+
+    Returns
+    -------
+    float, array or Float
+        σ in tile widths.
+    """
+    return PIXEL_SIGMA * area**0.5
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera that looks at a point of the reference plane; the image's up is towards +v.
+
+    Parameters
+    ----------
+    elevation, azimuth : float
+        Direction from the target to the camera, in degrees.
+    tiles_across : float
+        Width of the field of view at the target, in tile widths.
+    target : (float, float)
+        Point of the reference plane at the image's center, in tile widths.
+    rows, columns : int
+        Size of the image in pixels.
+    field_of_view : float
+        Horizontal angle, in degrees.
+    """
+
+    elevation: float = 60.0
+    azimuth: float = -90.0
+    tiles_across: float = 2.0
+    target: tuple[float, float] = (0.5, 0.5)
+    rows: int = 256
+    columns: int = 256
+    field_of_view: float = 20.0
+
+    @property
+    def distance(self) -> float:
+        """Distance from the target in tile widths."""
+        return self.tiles_across / (2.0 * np.tan(np.radians(self.field_of_view) / 2.0))
+
+    @property
+    def position(self) -> NDArray[np.float64]:
+        """Position (3,) in tile widths."""
+        out: NDArray[np.float64] = np.array([*self.target, 0.0]) + self.distance * self._towards
+        return out
+
+    @property
+    def _towards(self) -> NDArray[np.float64]:
+        return from_angles(self.elevation, self.azimuth)
+
+    def frame(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """(forward, right, up) unit vectors; right and up are those of the image."""
+        forward = -self._towards
+        # Seen from above, the image's up is +v; otherwise it is the projected normal.
+        vertical = np.array([0.0, 1.0, 0.0]) if self.elevation > 89.9 else np.array([0.0, 0.0, 1.0])
+        right = np.cross(forward, vertical)
+        right /= np.linalg.norm(right)
+        return forward, right, np.cross(right, forward)
+
+    @property
+    def pixel_pitch(self) -> float:
+        """Distance between pixel centers on the image plane at distance 1."""
+        return 2.0 * float(np.tan(np.radians(self.field_of_view) / 2.0)) / self.columns
+
+    def queries(self, omega_i: NDArray[np.float64], aspect: float = 1.0) -> Queries:
+        """One query per pixel, leading axes (rows, columns).
+
+        Parameters
+        ----------
+        omega_i : (3,) float array
+            Direction towards the light.
+        aspect : float
+            H/W of the tile.
+
+        Returns
+        -------
+        Queries
+
+        Raises
+        ------
+        UsageError
+            The image shows the horizon.
+        """
+        forward, right, up = self.frame()
+        x = (np.arange(self.columns) + 0.5 - self.columns / 2) * self.pixel_pitch
+        y = (self.rows / 2 - np.arange(self.rows) - 0.5) * self.pixel_pitch
+        ray = forward + x[None, :, None] * right + y[:, None, None] * up
+        length = np.linalg.norm(ray, axis=-1)
+        direction = ray / length[..., None]
+        cosine = -direction[..., 2]
+        if cosine.min() < SMALLEST_COSINE:
+            raise UsageError(
+                f"the view from elevation {self.elevation:g} degrees shows the horizon",
+                hint="raise the elevation or narrow the field of view",
+            )
+        distance = self.position[2] / cosine
+        point = self.position + distance[..., None] * direction
+        # A pixel's solid angle is pitch² · cos³ of its angle to the image axis; `cosine` is the plane's.
+        area = distance**2 * self.pixel_pitch**2 / length**3 / cosine
+        shape = (self.rows, self.columns)
+        return Queries(
+            np.mod(point[..., :2] / (1.0, aspect), 1.0).astype(np.float32) % np.float32(1.0),
+            pixel_sigma(area).astype(np.float32),
+            np.broadcast_to(np.asarray(omega_i, np.float32), (*shape, 3)).copy(),
+            (-direction).astype(np.float32),
+        )
+
+
+def tiles_camera(
+    elevation: float, azimuth: float, *, tiles: int, aspect: float, displacement_range: float, columns: int
+) -> Camera:
+    """Camera that looks at the center of `tiles` × `tiles` tiles and just fits them.
+
+    Parameters
+    ----------
+    elevation, azimuth : direction towards the camera, in degrees
+    aspect : H/W of the tile
+    displacement_range : largest depth of the tile, in tile widths
+    columns : pixels across; pictures are 4:3
+    """
+    x, y = 0.5 * tiles, 0.5 * tiles * aspect
+    rows = max(1, round(_PROPORTION * columns))
+    camera = Camera(elevation, azimuth, 1.0, (x, y), rows, columns)
+    forward, right, up = camera.frame()
+    # Relative to the target. At distance d, a corner c fits if |c·right| ≤ half the width · (d + c·forward).
+    corners = np.array(list(product((-x, x), (-y, y), (0.0, -displacement_range))))
+    half = 0.5 * _FILL * camera.pixel_pitch
+    across, along = np.abs(corners @ right) / (half * columns), np.abs(corners @ up) / (half * rows)
+    distance = float((np.maximum(across, along) - corners @ forward).max())
+    return replace(camera, tiles_across=distance / camera.distance)

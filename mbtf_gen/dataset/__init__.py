@@ -1,1 +1,0 @@
-"""Data sets on disk: shards, manifest, locks, verification."""

@@ -1,0 +1,1 @@
+"""Data sets from materials and measured BTFs: generated, resumed, repaired, imported."""

@@ -1,0 +1,181 @@
+"""Data sets as folders: opening, splits, both layouts, both formats, and folders that are none."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.datasets import FOREIGN, NOISE, formula, rewrite, write_dataset
+
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.queries import Queries
+from mbtf_core.data.shard_files import Arrays, read_shard
+from mbtf_core.errors import InputError
+from mbtf_core.stats import pooled_error
+
+OUTPUT = {"shard_queries": 64}
+
+
+def queries_of(arrays: Arrays) -> Queries:
+    return Queries(arrays["u"], arrays["sigma"], arrays["omega_i"], arrays["omega_o"])
+
+
+@pytest.mark.parametrize("array_format", ["npz", "exr"])
+def test_shuffled_layout(tmp_path: Path, array_format: str) -> None:
+    written = {"train": "150", "test": "1000"}
+    data = write_dataset(tmp_path / "shards", queries=written, output={**OUTPUT, "format": array_format})
+    assert data.layout == "shuffled"
+    assert data.splits == ["train", "test"]
+    assert [s.rows for s in data.shards("train")] == [64, 64, 22]
+    assert [s.path.name for s in data.shards("train")] == [f"train-{i:05d}.{array_format}" for i in range(3)]
+    arrays = data.load("train")
+    assert {a.shape[0] for a in arrays.values()} == {150}
+    test = data.load("test")
+    error = (test["value_a"] + test["value_b"]) / 2 - formula(queries_of(test))
+    expected = pooled_error(test["value_a"], test["value_b"]).value
+    assert np.sqrt(np.mean(error**2)) == pytest.approx(expected, rel=0.1)
+    assert np.abs(error).max() < 6 * NOISE
+
+
+@pytest.mark.parametrize("array_format", ["npz", "exr"])
+def test_images_share_direction_and_footprint(tmp_path: Path, array_format: str) -> None:
+    data = write_dataset(
+        tmp_path / "shards",
+        queries={"train": "160", "test": "32", "layout": "image"},
+        output={**OUTPUT, "format": array_format},
+    )
+    assert data.layout == "image"
+    assert data.lattice.shape() == (4, 8)
+    assert [shard.rows for shard in data.shards("train")] == [2, 2, 1]
+    arrays = data.load("train")
+    assert arrays["u"].shape == (5, 4, 8, 2)
+    for name in ("sigma", "omega_i", "omega_o"):
+        assert np.array_equal(arrays[name], np.broadcast_to(arrays[name][:, :1, :1], arrays[name].shape))
+    column = np.floor(arrays["u"][..., 0] * 8)
+    row = np.floor((1.0 - arrays["u"][..., 1]) * 4)
+    assert np.array_equal(column, np.broadcast_to(np.arange(8), (5, 4, 8)))
+    assert np.array_equal(row, np.broadcast_to(np.arange(4)[:, None], (5, 4, 8)))
+
+
+def test_chosen_arrays_are_mapped(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "shards", queries={"train": "100", "test": "10"}, output=OUTPUT)
+    parts = list(data.iterate("train", ["u", "sigma"]))
+    assert [len(p["sigma"]) for p in parts] == [64, 36]
+    assert set(parts[0]) == {"u", "sigma"}
+    assert isinstance(parts[0]["u"], np.memmap)
+
+
+def test_a_folder_can_move(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "here", queries={"train": "100", "test": "10"}, output=OUTPUT)
+    before = data.load("train")
+    moved = (tmp_path / "here").rename(tmp_path / "there")
+    (tmp_path / "here.npy").unlink()
+    assert np.array_equal(Dataset.open(moved).load("train")["u"], before["u"])
+
+
+@pytest.mark.parametrize("suffix", ["npz", "json"])
+def test_missing_and_unfinished_shards(tmp_path: Path, suffix: str) -> None:
+    data = write_dataset(tmp_path / "shards", queries={"train": "100", "test": "10"}, output=OUTPUT)
+    (data.folder / f"train-00001.{suffix}").unlink()
+    with pytest.raises(InputError, match=r"train-00001\.npz is missing or unfinished") as caught:
+        data.load("train")
+    assert "resumes" in caught.value.hint
+    assert len(data.load("test")["u"]) == 10
+    with pytest.raises(InputError, match=r"no split 'valid' \(it has: train, test\)"):
+        data.shards("valid")
+
+
+def test_folders_that_hold_no_data_set(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such folder"):
+        Dataset.open(tmp_path / "gone")
+    (tmp_path / "shards").mkdir()
+    (tmp_path / "shards.xy").touch()
+    with pytest.raises(InputError) as caught:
+        Dataset.open(tmp_path / "shards.x")
+    assert caught.value.hint == f"did you mean '{tmp_path / 'shards'}'?"
+    with pytest.raises(InputError, match=r"no manifest\.json"):
+        Dataset.open(tmp_path)
+    path = tmp_path / "manifest.json"
+    for text, message in (
+        ("{", "not readable as JSON"),
+        ("[1]", "must hold a JSON object"),
+        ('{"format": "other"}', "is not a manifest"),
+        ('{"format": "mbtf-shards", "schema": 99}', "schema version 99, this program reads version 5"),
+        ('{"format": "mbtf-shards"}', "schema version None"),
+    ):
+        path.write_text(text)
+        with pytest.raises(InputError, match=message) as caught:
+            Dataset.open(tmp_path)
+        assert caught.value.exit_code == 3
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Data sets of two layouts and formats, and beside each the same of another seed."""
+    folder = tmp_path_factory.mktemp("runs")
+    for layout in ("shuffled", "image"):
+        for suffix in ("npz", "exr"):
+            for seed in (0, 1):
+                write_dataset(
+                    folder / f"{layout}-{suffix}-{seed}",
+                    queries={"train": "128", "test": "32", "layout": layout},
+                    output={"shard_queries": 64, "format": suffix},
+                    seed=seed,
+                )
+    return {name: folder / f"{name}-0" for name in ("shuffled-npz", "shuffled-exr", "image-npz", "image-exr")}
+
+
+@pytest.mark.parametrize("kind", ["shuffled-npz", "shuffled-exr", "image-npz", "image-exr"])
+@pytest.mark.parametrize("name", FOREIGN)
+def test_foreign_and_impossible_data_are_refused(
+    name: str, kind: str, runs: dict[str, Path], tmp_path: Path
+) -> None:
+    shutil.copytree(runs[kind], tmp_path / "set")
+    other = runs[kind].with_name(f"{kind}-1")
+    change, says = FOREIGN[name]
+    change(tmp_path / "set", other, f".{kind[-3:]}")
+    with pytest.raises(InputError, match=says) as caught:
+        Dataset.open(tmp_path / "set").load("train")
+    assert caught.value.exit_code == 3
+    assert caught.value.hint == f"check the data set with: mbtf-gen verify {tmp_path / 'set'}"
+    with pytest.raises(InputError, match=says):
+        list(Dataset.open(tmp_path / "set").iterate("train"))
+
+
+def test_images_have_one_direction_and_the_size_of_the_lattice(runs: dict[str, Path], tmp_path: Path) -> None:
+    shard = tmp_path / "set/train-00001.npz"
+
+    def found(**arrays: Any) -> str:
+        shutil.copytree(runs["image-npz"], tmp_path / "set", dirs_exist_ok=True)
+        rewrite(shard, **arrays)
+        with pytest.raises(InputError) as caught:
+            Dataset.open(tmp_path / "set").load("train")
+        return caught.value.what
+
+    intact = {n: np.array(a) for n, a in read_shard(runs["image-npz"] / shard.name).items()}
+    sigma = intact["sigma"].copy()
+    sigma[1, 2, 3] *= 0.5
+    assert found(sigma=sigma) == "'sigma' differs between texels of an image"
+    smaller = {name: array[:, :, :4] for name, array in intact.items()}
+    assert found(**smaller) == "has 4 x 4 queries per row, manifest.json says 4 x 8"
+    flat = {name: array[:, 0, 0] for name, array in intact.items()}
+    assert found(**flat) == "has 1 queries per row, manifest.json says 4 x 8"
+
+
+@pytest.mark.parametrize("damage", ["deleted", "flipped", "cut", "other format"])
+def test_a_lost_manifest_is_answered_by_repair(damage: str, runs: dict[str, Path], tmp_path: Path) -> None:
+    folder = tmp_path / "set"
+    shutil.copytree(runs["shuffled-npz"], folder)
+    path = folder / "manifest.json"
+    text = path.read_text()
+    path.write_text(
+        {"flipped": text.replace("0.5", "0.4"), "cut": text[:99], "other format": "{}"}.get(damage, "")
+    )
+    if damage == "deleted":
+        path.unlink()
+    with pytest.raises(InputError) as caught:
+        Dataset.open(folder)
+    assert caught.value.hint == f"repair it with: mbtf-gen repair {folder}"

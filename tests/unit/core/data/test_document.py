@@ -1,0 +1,125 @@
+"""``docs/reference/data-format.md``: its reader runs, and it explains every stored name."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.datasets import write_dataset
+from support.paths import ROOT
+
+from mbtf_core.data.schema import ARRAYS, CONVENTIONS, GEOMETRY, SCHEMA_VERSION
+
+DOCUMENT = (ROOT / "docs/reference/data-format.md").read_text(encoding="utf-8")
+QUERIES = {"train": "160", "test": "64"}
+SMALL = {"shard_queries": 64}
+
+
+def section(title: str) -> str:
+    """Text of one section of the document."""
+    found = re.search(rf"^## {title}\n(.*?)(?=^## |\Z)", DOCUMENT, re.M | re.S)
+    assert found is not None, title
+    return found[1]
+
+
+def reader() -> Any:
+    """The function of the document's reader."""
+    source = re.findall(r"```python\n(.*?)```", section("Reader"), re.S)[0]
+    namespace: dict[str, Any] = {}
+    exec(source, namespace)
+    return namespace["read_split"]
+
+
+@pytest.mark.parametrize("layout", ["shuffled", "image"])
+def test_the_reader_reads_what_is_written(tmp_path: Path, layout: str) -> None:
+    data = write_dataset(tmp_path / "shards", queries={**QUERIES, "layout": layout}, output=SMALL)
+    read_split = reader()
+    for split in ("train", "test"):
+        expected, found = data.load(split), read_split(str(data.folder), split)
+        assert set(found) == set(expected)
+        assert all(np.array_equal(found[name], expected[name]) for name in expected)
+
+
+def test_the_reader_refuses_other_schemas_and_unfinished_data(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "shards", queries=QUERIES)
+    read_split = reader()
+    for change in ({"schema": SCHEMA_VERSION + 1}, {"complete": False}, {"format": "other"}):
+        (data.folder / "manifest.json").write_text(json.dumps({**data.manifest, **change}))
+        with pytest.raises(ValueError, match="no complete data set"):
+            read_split(data.folder, "train")
+
+
+def table(title: str) -> dict[str, list[str]]:
+    """Cells of the rows of a section's table by the name in the first one."""
+    rows = [line.split("|")[1:-1] for line in section(title).splitlines() if line.startswith("| `")]
+    return {cells[0].strip(" `"): [c.strip() for c in cells[1:]] for cells in rows}
+
+
+def test_every_image_of_the_geometry_has_its_row() -> None:
+    rows = table("Geometry")
+    assert list(rows) == [spec.name for spec in GEOMETRY]
+    for spec in GEOMETRY:
+        part, unit, channels, _ = rows[spec.name]
+        assert part == ("`heights`" if spec.name == "height" else "`maps`")
+        assert unit == spec.unit
+        assert re.findall(r"`([^`]+)`", channels) == list(spec.channels)
+
+
+def test_every_array_has_its_row() -> None:
+    rows = table("Arrays")
+    assert list(rows) == [a.name for a in ARRAYS]
+    for spec in ARRAYS:
+        trailing, unit, channels, _ = rows[spec.name]
+        assert trailing == (str(spec.trailing[0]) if spec.trailing else "–")
+        assert unit == spec.unit
+        assert re.findall(r"`([^`]+)`", channels) == list(spec.channels)
+
+
+def test_every_key_of_manifest_and_sidecar_is_explained(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "shards", queries=QUERIES, output=SMALL)
+    manifest, sidecar = data.manifest, data.shards("train")[0].sidecar
+    split = manifest["splits"]["train"]
+    in_manifest = [manifest, manifest["tile"], manifest["levels"], manifest["levels"]["mixture"], split]
+    in_manifest += [manifest["effects"], manifest["effects"]["effects"][0]]
+    in_manifest += [split["shards"][0], next(iter(manifest["arrays"].values())), manifest["geometry"]]
+    in_sidecar = [sidecar, sidecar["seed"], sidecar["quarantined"], sidecar["statistics"]]
+    counts = set(sidecar["quarantined"])
+    for title, objects in (
+        ("Manifest", [*in_manifest, set(manifest["summary"]) - counts]),
+        ("Sidecar", in_sidecar),
+    ):
+        missing = [key for found in objects for key in found if f"`{key}`" not in section(title)]
+        assert not missing, f"{title} does not explain {missing}"
+    for title, top in (("Manifest", manifest), ("Sidecar", sidecar)):
+        first_cells = "".join(re.findall(r"^\| (`[^|]*) \|", section(title), re.M))
+        # Two keys are those of measured data alone.
+        measured = {"estimates", "measured"} if title == "Manifest" else set()
+        assert set(re.findall(r"`([^`]+)`", first_cells)) == {*top, "checksum", *measured}
+
+
+def test_the_conventions_are_those_of_the_manifest() -> None:
+    keys = re.findall(r"^\| `(\w+)` \|", section("What a query is"), re.M)
+    assert keys == list(CONVENTIONS)
+    assert f"Schema {SCHEMA_VERSION}." in DOCUMENT
+
+
+def test_members_lie_where_the_document_says(tmp_path: Path) -> None:
+    """The recipe for mapping a member by hand, followed literally."""
+    import zipfile
+
+    data = write_dataset(tmp_path / "shards", queries=QUERIES)
+    path = data.shards("train")[0].path
+    whole = path.read_bytes()
+    with zipfile.ZipFile(path) as archive:
+        for info in archive.infolist():
+            name, extra = (int.from_bytes(whole[info.header_offset + i :][:2], "little") for i in (26, 28))
+            start = info.header_offset + 30 + name + extra
+            assert whole[start : start + 6] == b"\x93NUMPY"
+            numbers = start + 10 + int.from_bytes(whole[start + 8 : start + 10], "little")
+            assert numbers % 64 == 0
+            first = np.frombuffer(whole, "<f4", 1, numbers)[0]
+            assert first == np.load(path)[info.filename.removesuffix(".npy")].flat[0]

@@ -1,0 +1,105 @@
+"""The bounded cache: least recently used files go first; what has another digest never gets in."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from mbtf_core.data.file_cache import FileCache
+from mbtf_core.errors import InputError, PartialError
+
+
+def content(number: int) -> bytes:
+    return bytes([number]) * 100
+
+
+def fetch(cache: FileCache, number: int) -> bool:
+    """Whether a file was downloaded."""
+    downloads: list[Path] = []
+
+    def download(path: Path) -> None:
+        downloads.append(path)
+        path.write_bytes(content(number))
+
+    found = cache.fetch(hashlib.sha256(content(number)).hexdigest(), ".npz", 100, download)
+    assert found.read_bytes() == content(number)
+    return bool(downloads)
+
+
+def test_the_least_recently_used_files_make_room(tmp_path: Path) -> None:
+    cache = FileCache(tmp_path / "cache", limit=600)
+    for number in range(6):
+        assert fetch(cache, number)
+        path = cache.path(hashlib.sha256(content(number)).hexdigest(), ".npz")
+        os.utime(path, (number, number))
+    assert not fetch(cache, 0)
+    assert fetch(cache, 6)
+    assert sum(path.stat().st_size for path in cache.folder.iterdir()) <= 600
+    assert not fetch(cache, 0)
+    assert fetch(cache, 1)
+
+
+def test_the_files_fetched_last_stay(tmp_path: Path) -> None:
+    cache = FileCache(tmp_path, limit=0)
+    for number in range(9):
+        fetch(cache, number)
+    assert len(list(tmp_path.iterdir())) == 4
+    assert not fetch(cache, 8)
+
+
+def test_another_digest_is_refused(tmp_path: Path) -> None:
+    cache = FileCache(tmp_path)
+    with pytest.raises(InputError, match="SHA-256"):
+        cache.fetch("0" * 64, ".npz", 3, lambda path: path.write_bytes(b"abc") and None)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_that_was_cut_is_downloaded_again(tmp_path: Path) -> None:
+    cache = FileCache(tmp_path)
+    fetch(cache, 1)
+    next(tmp_path.iterdir()).write_bytes(b"short")
+    assert fetch(cache, 1)
+
+
+def test_unfinished_files_of_others_stay_for_a_day(tmp_path: Path) -> None:
+    cache = FileCache(tmp_path, limit=0)
+    fresh, old = tmp_path / ".a.npz.00000000-1.tmp", tmp_path / ".b.npz.00000000-1.tmp"
+    for path in (fresh, old):
+        path.write_bytes(content(1))
+    os.utime(old, (time.time() - 1e5, time.time() - 1e5))
+    fetch(cache, 2)
+    assert fresh.exists()
+    assert not old.exists()
+
+
+def test_a_full_disk_is_named(tmp_path: Path) -> None:
+    def full(path: Path) -> None:
+        path.write_bytes(b"x")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(PartialError, match="No space left"):
+        FileCache(tmp_path).fetch("0" * 64, ".npz", 3, full)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_threads_share_a_download(tmp_path: Path) -> None:
+    cache, downloads = FileCache(tmp_path), []
+
+    def download(path: Path) -> None:
+        downloads.append(path)
+        time.sleep(0.05)
+        path.write_bytes(content(1))
+
+    digest = hashlib.sha256(content(1)).hexdigest()
+    threads = [threading.Thread(target=cache.fetch, args=(digest, "", 100, download)) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(downloads) == 1

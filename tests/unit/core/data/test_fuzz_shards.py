@@ -1,0 +1,178 @@
+"""Damaged data sets: they load, or are refused in a line or two; no other exception, whatever is damaged."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.datasets import edit, write_dataset
+from support.fuzzing import altered, damaged, examples, loads_or_refuses
+
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.schema import MANIFEST_NAME
+from mbtf_core.data.shard_files import read_shard, write_exr, write_npz
+from mbtf_core.data.verify import verify
+from mbtf_core.errors import InputError
+from mbtf_fit.config import HeldOutSection
+from mbtf_fit.data.loader import load_split, load_training, open_data
+from mbtf_gen.generation.summary import finish
+
+TRAILING = {"u": 2, "omega_i": 3, "omega_o": 3, "value_a": 3, "value_b": 3}
+ARRAYS = {name: np.ones((3, size), np.float32) for name, size in TRAILING.items()}
+ARRAYS |= {name: np.ones(3, np.float32) for name in ("sigma", "spp")}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Room for one damaged file at a time."""
+    return tmp_path_factory.mktemp("shards")
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data set of three shards."""
+    made = tmp_path_factory.mktemp("set") / "set"
+    write_dataset(made, queries={"train": "20", "test": "4"}, output={"shard_queries": 10})
+    manifest = made / MANIFEST_NAME
+    # The same bytes in every run, wherever the folder lies.
+    edit(manifest, lambda document: document["config"].update(material="of/set.npy"))
+    return made
+
+
+@pytest.fixture(scope="module")
+def samples(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    made = tmp_path_factory.mktemp("samples")
+    write_npz(made / "a.npz", ARRAYS)
+    write_exr(made / "a.exr", ARRAYS)
+    # Another writer's archive: sizes without zip64, no padding.
+    np.savez(made / "b.npz", **ARRAYS)
+    return {path.name: path.read_bytes() for path in made.iterdir()}
+
+
+@given(data=st.data())
+@examples(250)
+def test_a_damaged_shard(data: st.DataObject, samples: dict[str, bytes], folder: Path) -> None:
+    name, content = data.draw(damaged(samples))
+    path = folder / name
+    path.write_bytes(content)
+    for mapped in (True, False):
+        arrays = loads_or_refuses(lambda mapped=mapped: read_shard(path, mapped=mapped))
+        if arrays:
+            # What is loaded can be read to its end: nothing is mapped beyond the file.
+            assert all(np.isfinite(a).size == a.size for a in arrays.values())
+            assert sum(a.nbytes for a in arrays.values()) <= len(content)
+
+
+def read_all(folder: Path) -> None:
+    """What the programs do with a data set."""
+    for read in (
+        lambda: verify(folder),
+        lambda: Dataset.open(folder).lattice,
+        lambda: Dataset.open(folder).load("train"),
+        lambda: load_training(open_data(folder, "shuffled", "neumip"), HeldOutSection(), 0),
+        lambda: load_split(open_data(folder, "shuffled", "neumip"), "test"),
+        lambda: finish(folder),
+    ):
+        loads_or_refuses(read)
+
+
+@given(data=st.data())
+@examples(150)
+def test_an_altered_manifest_or_sidecar(data: st.DataObject, whole: Path) -> None:
+    manifest = (whole / MANIFEST_NAME).read_text()
+    path = whole / data.draw(st.sampled_from([MANIFEST_NAME, MANIFEST_NAME, "train-00001.json"]))
+    before = path.read_text()
+    try:
+        path.write_text(data.draw(altered(before)))
+        read_all(whole)
+    finally:
+        path.write_text(before)
+        # Reading may have completed it.
+        (whole / MANIFEST_NAME).write_text(manifest)
+
+
+@given(data=st.data())
+@examples(100)
+def test_damaged_bytes_of_a_data_set(data: st.DataObject, whole: Path) -> None:
+    files = {n: (whole / n).read_bytes() for n in (MANIFEST_NAME, "train-00000.json", "train-00000.npz")}
+    name, content = data.draw(damaged(files))
+    try:
+        (whole / name).write_bytes(content)
+        read_all(whole)
+    finally:
+        for each, content in files.items():
+            (whole / each).write_bytes(content)
+
+
+def archive(members: dict[str, bytes], compression: int = zipfile.ZIP_STORED) -> bytes:
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", compression) as out:
+        for name, content in members.items():
+            out.writestr(f"{name}.npy", content)
+    return stream.getvalue()
+
+
+def npy(header: str, content: bytes = b"") -> bytes:
+    """An npy file of a header in words."""
+    text = header.encode().ljust(118) + b"\n"
+    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text + content
+
+
+def header(dtype: str, shape: str) -> str:
+    return f"{{'descr': '{dtype}', 'fortran_order': False, 'shape': {shape}}}"
+
+
+CLAIMS = {
+    "more than there is": (archive({"sigma": npy(header("<f4", "(9,)"), b"\0" * 32)}), "not as long as"),
+    "less than nothing": (archive({"sigma": npy(header("<f4", "(-4,)"))}), "not as long as"),
+    "an overflow": (archive({"u": npy(header("<f4", f"({2**63}, 2)"))}), "not as long as"),
+    "objects": (archive({"sigma": npy(header("|O", "(4,)"), b"\0" * 32)}), "not C-ordered float32"),
+    "doubles": (archive({"sigma": npy(header("<f8", "(4,)"), b"\0" * 32)}), "not C-ordered float32"),
+    "no array": (archive({"sigma": b"not an array"}), "cannot be read"),
+    "giant elements": (archive({"sigma": npy(header("|V999999999", "(4,)"))}), "not C-ordered float32"),
+    "one number": (archive({"sigma": npy(header("<f4", "()"), b"\0" * 4)}), "has the shape ()"),
+    "four axes": (
+        archive({"sigma": npy(header("<f4", "(2, 1, 1, 2)"), b"\0" * 16)}),
+        "has the shape (2, 1, 1, 2)",
+    ),
+    "another array": (archive({"weights": npy(header("<f4", "(1,)"), b"\0" * 4)}), "unknown array"),
+    "a bomb": (
+        archive({"sigma": npy(header("<f4", "(2500000,)"), bytes(10_000_000))}, zipfile.ZIP_DEFLATED),
+        "shard is compressed",
+    ),
+}
+
+
+@pytest.mark.parametrize("claim", CLAIMS)
+def test_claims_of_an_archive(claim: str, tmp_path: Path) -> None:
+    content, says = CLAIMS[claim]
+    path = tmp_path / "s.npz"
+    path.write_bytes(content)
+    for mapped in (True, False):
+        with pytest.raises(InputError) as caught:
+            read_shard(path, mapped=mapped)
+        assert says in caught.value.what
+
+
+def test_a_manifest_cannot_name_files_elsewhere(whole: Path) -> None:
+    manifest = whole / MANIFEST_NAME
+    before = manifest.read_text()
+    edit(manifest, lambda m: m["splits"]["train"]["shards"][1].update(file="../outside.npz"))
+    with pytest.raises(InputError, match=r"splits\.train\.shards\.1\.file"):
+        Dataset.open(whole)
+    manifest.write_text(before)
+
+
+@pytest.mark.parametrize("rows", ["ten", None, -1, 1.5, [10], {}, 10**9])
+def test_a_sidecar_states_the_number_of_rows_that_the_manifest_lists(rows: object, whole: Path) -> None:
+    sidecar = whole / "train-00001.json"
+    before = sidecar.read_text()
+    edit(sidecar, lambda record: record.update(rows=rows))
+    with pytest.raises(InputError, match=r"rows, manifest\.json says 10"):
+        Dataset.open(whole).shards("train")
+    sidecar.write_text(before)

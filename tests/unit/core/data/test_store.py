@@ -1,0 +1,238 @@
+"""Requests to an object store: tried again, refused or given up; objects that are written once."""
+
+from __future__ import annotations
+
+import builtins
+import errno
+import os
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.object_stores import memory_store
+
+import mbtf_core.data.store
+from mbtf_core.data.store import Store
+from mbtf_core.errors import EngineError, InputError, PartialError
+from mbtf_core.urls import split_url
+
+
+@pytest.fixture
+def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Store]:
+    monkeypatch.setattr(mbtf_core.data.store, "_FIRST_PAUSE", 0.001)
+    with memory_store(tmp_path) as url:
+        found = Store(url)
+        found.patience = 60.0
+        yield found
+
+
+class Flaky:
+    """A file system whose requests fail: `before` or after they are carried out, so many times."""
+
+    def __init__(self, files: Any, error: Exception, times: int, before: bool = True) -> None:
+        self._files, self._error, self.left, self._before = files, error, times, before
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        function = getattr(self._files, name)
+
+        def call(*args: Any, **kwargs: Any) -> Any:
+            if name == "invalidate_cache" or not self.left:
+                return function(*args, **kwargs)
+            if not self._before:
+                function(*args, **kwargs)
+            self.left -= 1
+            raise self._error
+
+        return call
+
+
+def test_objects_are_listed_read_and_deleted(store: Store, tmp_path: Path) -> None:
+    assert store.list() == {}
+    assert store.write("a", b"one")
+    assert store.write("sub/b", b"two")
+    assert set(store.list()) == {"a", "sub/"}
+    assert store.list()["a"].size == 3 == store.info("a").size
+    assert store.read("a") == b"one"
+    store.download("a", tmp_path / "copy")
+    assert (tmp_path / "copy").read_bytes() == b"one"
+    store.delete("a")
+    store.delete("a")
+    assert set(store.list()) == {"sub/"}
+    with pytest.raises(FileNotFoundError):
+        store.read("a")
+
+
+def test_the_mark_of_a_folder_is_no_object_of_it(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Programs of stores make an empty object of a folder's own name."""
+    found = [{"name": f"/data/x/{name}", "size": 0, "type": "file"} for name in ("", "a")]
+    monkeypatch.setattr(store._files, "ls", lambda path, detail: found)
+    assert set(store.list()) == {"a"}
+
+
+def test_the_tag_changes_with_the_content(store: Store) -> None:
+    store.write("a", b"one")
+    before = store.list()["a"].tag
+    assert before == store.info("a").tag != ""
+    time.sleep(0.002)
+    store.write("a", b"two")
+    assert store.list()["a"].tag != before
+
+
+def test_a_new_object_never_replaces_another(store: Store) -> None:
+    assert store.write("a", b"one", new=True)
+    assert not store.write("a", b"two", new=True)
+    assert store.read("a") == b"one"
+    assert store.write("a", b"one", new=True)
+
+
+@pytest.mark.parametrize("new", [False, True])
+def test_an_object_is_written_although_the_answer_is_lost(store: Store, new: bool) -> None:
+    store._files = Flaky(store._files, ConnectionResetError("cut"), 1, before=False)
+    assert store.write("a", b"one", new=new)
+    assert store.read("a") == b"one"
+
+
+def test_a_store_without_conditional_writes(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    original = store._files.pipe_file
+    monkeypatch.setattr(store._files, "pipe_file", lambda path, value: original(path, value))
+    assert store.write("a", b"one", new=True)
+    assert not store.write("a", b"two", new=True)
+
+
+class Answer(Exception):
+    """A store's answer, as s3fs keeps it in the cause of its error."""
+
+    def __init__(self, code: str) -> None:
+        self.response = {"Error": {"Code": code}}
+
+
+def answered(code: str) -> OSError:
+    """An error of s3fs for an answer."""
+    error = OSError(22, "refused")
+    error.__cause__ = Answer(code)
+    return error
+
+
+@pytest.mark.parametrize("code", ["PreconditionFailed", "NotImplemented"])
+def test_answers_to_conditional_writes(store: Store, monkeypatch: pytest.MonkeyPatch, code: str) -> None:
+    """Some stores do not say which condition is not met, others know none."""
+    original = store._files.pipe_file
+
+    def pipe_file(path: str, value: bytes, mode: str = "overwrite") -> None:
+        if mode == "create" and (code == "NotImplemented" or store._files.exists(path)):
+            raise answered(code)
+        original(path, value)
+
+    monkeypatch.setattr(store._files, "pipe_file", pipe_file)
+    assert store.write("a", b"one", new=True)
+    assert not store.write("a", b"two", new=True)
+    assert store.write("a", b"one", new=True)
+    assert store.read("a") == b"one"
+
+
+@pytest.mark.parametrize("error", [ConnectionResetError("cut"), TimeoutError(), RuntimeError("botocore")])
+def test_requests_are_tried_again(store: Store, error: Exception) -> None:
+    store.write("a", b"one")
+    store._files = Flaky(store._files, error, 3)
+    assert store.read("a") == b"one"
+
+
+def test_a_store_that_is_gone_is_given_up(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    pauses: list[float] = []
+    clock = 0.0
+
+    def sleep(seconds: float) -> None:
+        nonlocal clock
+        clock += seconds
+        pauses.append(seconds)
+
+    monkeypatch.setattr(mbtf_core.data.store.time, "sleep", sleep)
+    monkeypatch.setattr(mbtf_core.data.store.time, "monotonic", lambda: clock)
+    store._files = Flaky(store._files, ConnectionResetError("cut"), -1)
+    with pytest.raises(PartialError, match=r"memory://data/x/a: the store cannot be reached \(cut\)"):
+        store.read("a")
+    assert pauses[0] < pauses[-1]
+    assert 30.0 < sum(pauses) <= 60.0
+    # Other requests do not wait again, until one succeeds.
+    pauses.clear()
+    with pytest.raises(PartialError):
+        store.list()
+    assert pauses == []
+    store._files.left = 0
+    assert store.list() == {}
+    assert not store._lost.is_set()
+
+
+NoCredentialsError = type("NoCredentialsError", (Exception,), {})
+HttpError = type("HttpError", (Exception,), {"code": 401})
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        PermissionError("AccessDenied"),
+        ValueError("bad name"),
+        NoCredentialsError("Unable to locate credentials"),
+        HttpError("Anonymous caller"),
+        OSError("Forbidden: b/bucket"),
+        answered("PermanentRedirect"),
+    ],
+)
+def test_refusals_are_not_tried_again(store: Store, error: Exception) -> None:
+    store._files = Flaky(store._files, error, 1)
+    with pytest.raises(InputError, match="the store refuses it"):
+        store.read("a")
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EACCES])
+def test_faults_of_the_disk_are_not_those_of_the_store(
+    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    path = tmp_path / "copy"
+    calls: list[int] = []
+
+    def get_file(source: str, target: str) -> None:
+        calls.append(number)
+        raise OSError(number, os.strerror(number), *([target] if number == errno.EACCES else []))
+
+    monkeypatch.setattr(store._files, "get_file", get_file)
+    with pytest.raises(PartialError, match=f"{path}: cannot be written"):
+        store.download("a", path)
+    assert len(calls) == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("s3://bucket/data", ("s3", "bucket/data")),
+        ("s3:/bucket/data/", ("s3", "bucket/data")),
+        ("s3://bucket//a/./b//", ("s3", "bucket/a/b")),
+        ("S3A://bucket/Some Data%20#1?x=y", ("s3a", "bucket/Some Data%20#1?x=y")),
+        (Path("gs://bucket/x"), ("gs", "bucket/x")),
+        ("file:///tmp/x", ("file", "tmp/x")),
+        ("shards", None),
+        ("C:/shards", None),
+        ("a/b:/c", None),
+        (None, None),
+    ],
+)
+def test_urls_are_recognized(text: object, expected: tuple[str, str] | None) -> None:
+    assert split_url(text) == expected
+
+
+def test_missing_packages_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    original = builtins.__import__
+
+    def without(name: str, *args: Any, **kwargs: Any) -> Any:
+        if name.partition(".")[0] in ("fsspec", "gcsfs"):
+            raise ImportError(name)
+        return original(name, *args, **kwargs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(builtins, "__import__", without)
+        with pytest.raises(EngineError, match=r"pip install 'mbtf\[stores\]'"):
+            Store("s3://bucket/data")
+    with pytest.raises(InputError, match="cannot be opened"):
+        Store("nosuchprotocol://bucket/data")

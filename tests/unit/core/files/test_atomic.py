@@ -1,0 +1,247 @@
+"""Files are absent or complete, whatever happens while they are written."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import itertools
+import json
+import os
+import signal
+import stat
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import BinaryIO
+
+import pytest
+
+from mbtf_core.errors import InputError, PartialError
+from mbtf_core.files import atomic
+
+
+def no_leftovers(folder: Path) -> bool:
+    return not any(p.name.endswith(".tmp") for p in folder.iterdir())
+
+
+def test_a_failing_writer_leaves_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.bin"
+    path.write_bytes(b"old")
+
+    def write(stream: BinaryIO) -> None:
+        stream.write(b"half of the ne")
+        raise RuntimeError("crash")
+
+    with pytest.raises(RuntimeError, match="crash"):
+        atomic.write_file(path, write)
+    assert path.read_bytes() == b"old"
+    assert no_leftovers(tmp_path)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
+@pytest.mark.parametrize("moment", ["write", "fsync", "replace"])
+def test_a_kill_leaves_the_old_file(moment: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.bin"
+    path.write_bytes(b"old")
+    code = f"""
+import os, signal
+from pathlib import Path
+from mbtf_core import atomic
+def die(*arguments):
+    os.kill(os.getpid(), signal.SIGKILL)
+if {moment!r} != "write":
+    setattr(os, {moment!r}, die)
+def write(stream):
+    stream.write(b"x" * 100000)
+    if {moment!r} == "write":
+        stream.flush()
+        die()
+atomic.write_file(Path({str(path)!r}), write)
+"""
+    done = subprocess.run([sys.executable, "-c", code], check=False)
+    assert done.returncode == -signal.SIGKILL
+    assert path.read_bytes() == b"old"
+
+
+@pytest.mark.parametrize("through_name", [False, True])
+def test_a_full_disk_is_partial_and_keeps_the_old_file(tmp_path: Path, through_name: bool) -> None:
+    path = tmp_path / "a.bin"
+    path.write_bytes(b"old")
+
+    def full(target: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with pytest.raises(PartialError, match="No space left on device") as caught:
+        (atomic.write_through if through_name else atomic.write_file)(path, full)
+    assert caught.value.exit_code == 4
+    assert caught.value.where == str(path)
+    assert "run the same command again" in caught.value.hint
+    assert path.read_bytes() == b"old"
+    assert no_leftovers(tmp_path)
+
+
+def test_a_missing_folder_is_partial(tmp_path: Path) -> None:
+    with pytest.raises(PartialError, match="No such file or directory"):
+        atomic.write_text(tmp_path / "none" / "a.txt", "text")
+
+
+def test_the_data_are_synced_before_the_rename(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    events: list[str] = []
+    for name in ("fsync", "replace", "link"):
+        real = getattr(os, name)
+        monkeypatch.setattr(atomic.os, name, lambda *a, n=name, f=real: events.append(n) or f(*a))
+    for operation, expected in (
+        (lambda: atomic.write_file(tmp_path / "a", lambda stream: None), ["fsync", "replace", "fsync"]),
+        (lambda: atomic.write_through(tmp_path / "b", Path.touch), ["fsync", "replace", "fsync"]),
+        (lambda: atomic.create_file(tmp_path / "c", b"text"), ["fsync", "link", "fsync"]),
+        (lambda: atomic.remove_file(tmp_path / "a"), ["fsync"]),
+    ):
+        events.clear()
+        operation()
+        assert events == expected
+
+
+def test_json_goes_there_and_back(tmp_path: Path) -> None:
+    data = {"name": "α", "rows": [1, 2.5, None], "nested": {"flag": True}}
+    atomic.write_json(tmp_path / "a.json", data)
+    assert atomic.read_json(tmp_path / "a.json") == data
+
+
+def test_json_refuses_what_is_no_number(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        atomic.write_json(tmp_path / "a.json", {"loss": float("nan")})
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("content", "what"),
+    [
+        (None, "no such file"),
+        (b"{", "not readable as JSON"),
+        (b"\xff", "not readable"),
+        (b"[1]", "a JSON object"),
+    ],
+)
+def test_bad_json_is_bad_input(tmp_path: Path, content: bytes | None, what: str) -> None:
+    path = tmp_path / "a.json"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match=what) as caught:
+        atomic.read_json(path)
+    assert caught.value.where == str(path)
+
+
+def test_of_several_creators_one_wins_and_its_content_stays(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    gate, won = threading.Barrier(8), []
+
+    def create(number: int) -> None:
+        # Temporary names are a process's own; threads stand in for processes here.
+        gate.wait()
+        if atomic.create_file(path.with_name("a"), str(number).encode() * 1000):
+            won.append(number)
+
+    names = itertools.count()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(atomic, "temporary_of", lambda p: p.with_name(f".a.{next(names)}.tmp"))
+        threads = [threading.Thread(target=create, args=(n,)) for n in range(8)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert len(won) == 1
+    assert path.read_bytes() == str(won[0]).encode() * 1000
+    assert no_leftovers(tmp_path)
+
+
+@pytest.mark.parametrize("number", [errno.EPERM, errno.EOPNOTSUPP])
+def test_files_without_hard_links(number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def unsupported(*_: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(atomic.os, "link", unsupported)
+    assert atomic.create_file(tmp_path / "a", b"first")
+    assert not atomic.create_file(tmp_path / "a", b"second")
+    assert (tmp_path / "a").read_bytes() == b"first"
+    assert no_leftovers(tmp_path)
+
+
+def test_a_leftover_that_is_the_file_itself_does_not_spoil_it(tmp_path: Path) -> None:
+    """A kill between link and unlink leaves two names of one file; a process of the same number follows."""
+    path = tmp_path / "a"
+    path.write_bytes(b"whole")
+    os.link(path, atomic.temporary_of(path))
+    assert not atomic.create_file(path, b"other content")
+    assert path.read_bytes() == b"whole"
+    assert no_leftovers(tmp_path)
+
+
+def test_any_changed_byte_of_a_checksummed_document_is_found(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    data = {"name": "α", "rows": [1, 2.5, None], "checksum": "of before", "nested": {"zeros": "0" * 64}}
+    atomic.write_checksummed(path, data)
+    assert atomic.read_checksummed(path) == {k: v for k, v in data.items() if k != "checksum"}
+    content = path.read_bytes()
+    for at in range(len(content)):
+        for mask in (1, 0x20, 0x80):
+            changed = bytearray(content)
+            changed[at] ^= mask
+            path.write_bytes(changed)
+            with pytest.raises(InputError):
+                atomic.read_checksummed(path)
+    for changed in (content[:-1], content + b" ", content.replace(b"\n", b"\r\n"), b"{}"):
+        path.write_bytes(changed)
+        with pytest.raises(InputError):
+            atomic.read_checksummed(path)
+
+
+def test_the_checksum_is_that_of_the_file_with_its_digits_at_zero(tmp_path: Path) -> None:
+    atomic.write_checksummed(tmp_path / "a.json", {"rows": 3})
+    content = (tmp_path / "a.json").read_bytes()
+    stored = json.loads(content)["checksum"]
+    assert stored == hashlib.sha256(content.replace(stored.encode(), b"0" * 64)).hexdigest()
+    assert list(json.loads(content)) == ["rows", "checksum"]
+
+
+def test_what_a_library_wrote_is_digested_not_what_it_replaces(tmp_path: Path) -> None:
+    for content in (b"old", b"newer"):
+        stored = atomic.write_through(tmp_path / "a", lambda temporary, c=content: temporary.write_bytes(c))
+        assert stored == atomic.Stored(len(content), hashlib.sha256(content).hexdigest())
+        assert (tmp_path / "a").read_bytes() == content
+    assert no_leftovers(tmp_path)
+
+
+def test_pieces_are_digested_as_they_are_written(tmp_path: Path) -> None:
+    pieces = [b"abc", memoryview(b"x" * 100_000), b"", bytearray(b"z")]
+    stored = atomic.write_chunks(tmp_path / "a", pieces)
+    content = (tmp_path / "a").read_bytes()
+    assert content == b"".join(pieces)
+    assert stored == atomic.Stored(len(content), hashlib.sha256(content).hexdigest())
+
+
+@pytest.mark.parametrize("number", [errno.EIO, errno.ENOSPC])
+@pytest.mark.parametrize("folder", [False, True])
+def test_a_failing_sync_is_partial(
+    folder: bool, number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = os.fsync
+
+    def fails(handle: int) -> None:
+        if stat.S_ISDIR(os.fstat(handle).st_mode) == folder:
+            raise OSError(number, os.strerror(number))
+        real(handle)
+
+    monkeypatch.setattr(atomic.os, "fsync", fails)
+    with pytest.raises(PartialError, match=os.strerror(number)):
+        atomic.write_text(tmp_path / "a", "text")
+    assert no_leftovers(tmp_path)
+
+
+def test_write_errors_of_openexr_are_those_of_the_system(tmp_path: Path) -> None:
+    def write(temporary: Path) -> None:
+        raise RuntimeError(f'Cannot write image file "{temporary}". No space left on device.')
+
+    with pytest.raises(PartialError, match=r"a\.exr: cannot be written \(No space left on device\)"):
+        atomic.write_through(tmp_path / "a.exr", write)
+    assert not list(tmp_path.iterdir())

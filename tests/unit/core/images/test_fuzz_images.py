@@ -1,0 +1,89 @@
+"""Damaged images of every format: they load, or are refused in a line or two; no other exception."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.fuzzing import check_message, damaged, examples, loads_or_refuses, with_checksums
+from support.image_samples import exrs, jpgs, npys, pngs, tiffs
+
+from mbtf_core.errors import InputError
+from mbtf_core.images.read import read_image
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Room for one damaged file at a time."""
+    return tmp_path_factory.mktemp("images")
+
+
+@pytest.fixture(scope="module")
+def samples(folder: Path) -> dict[str, dict[str, bytes]]:
+    """Suffix → name → content."""
+    return {"png": pngs(), "jpg": jpgs(), "tif": tiffs(), "npy": npys(), "exr": exrs(folder)}
+
+
+def read(folder: Path, name: str, content: bytes) -> None:
+    """Read a file of that content."""
+    path = folder / f"damaged{Path(name).suffix}"
+    path.write_bytes(content)
+    image = loads_or_refuses(lambda: read_image(path))
+    if image is not None:
+        assert image.pixels.ndim == 3
+        assert 1 <= image.pixels.shape[2] <= 4
+        assert np.isfinite(image.pixels).all()
+
+
+@pytest.mark.parametrize("kind", ["png", "jpg", "tif", "npy", "exr"])
+def test_the_undamaged_files(kind: str, samples: dict[str, dict[str, bytes]], folder: Path) -> None:
+    for name, content in samples[kind].items():
+        read(folder, name, content)
+
+
+@pytest.mark.parametrize("kind", ["png", "jpg", "tif", "npy", "exr"])
+@given(data=st.data())
+@examples(200)
+def test_a_damaged_image(
+    kind: str, data: st.DataObject, samples: dict[str, dict[str, bytes]], folder: Path
+) -> None:
+    name, content = data.draw(damaged(samples[kind]))
+    if kind == "png" and data.draw(st.booleans()):
+        content = with_checksums(content)
+    read(folder, name, content)
+
+
+@pytest.mark.parametrize("kind", ["png", "jpg", "tif", "exr"])
+def test_decoders_say_nothing(
+    kind: str, samples: dict[str, dict[str, bytes]], folder: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for name, content in samples[kind].items():
+        for share in (0.3, 0.6, 0.9):
+            at = int(share * len(content))
+            read(folder, name, content[:at] + bytes([content[at] ^ 0x55]) + content[at + 1 :])
+    assert capfd.readouterr() == ("", "")
+
+
+# A byte whose change makes the decoder raise something else than an error of reading.
+@pytest.mark.parametrize(
+    ("name", "place", "value", "says"),
+    [
+        ("RGB.png", 36, 1, "broken PNG file"),
+        ("L.png", 15, 255, "its header is damaged"),
+        ("L.jpg", 92, 27, "its header is damaged"),
+    ],
+)
+def test_faults_of_other_kinds(
+    name: str, place: int, value: int, says: str, samples: dict[str, dict[str, bytes]], tmp_path: Path
+) -> None:
+    content = bytearray(samples[name[-3:]][name])
+    content[place] = value
+    path = tmp_path / name
+    path.write_bytes(with_checksums(bytes(content)) if name.endswith("png") else bytes(content))
+    with pytest.raises(InputError) as caught:
+        read_image(path)
+    assert says in caught.value.what
+    check_message(caught.value)

@@ -1,0 +1,191 @@
+"""Small files that claim to be huge: refused in a line, without the memory that they claim."""
+
+from __future__ import annotations
+
+import io
+import json
+import resource
+import struct
+import subprocess
+import sys
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from support.image_samples import png
+
+SIDE = 60_000
+# MiB that reading all of them may take: of memory (a library loads tables, but no picture), and of addresses
+# (threads reserve some without using them; a claim of 60000 x 60000 asks for 3400 at least).
+ALLOWED, ADDRESSES = 100, 1000
+
+# Reads each file; then message what came of it and by how much the peak of memory rose, in MiB. The limit on
+# addresses makes sure that memory taken and never touched counts as well.
+_CODE = """
+import json, resource, sys
+from pathlib import Path
+import numpy, OpenEXR, PIL.Image, tifffile
+from mbtf_core.errors import MbtfError
+from mbtf_core.images.read import read_image
+from mbtf_core.data.shard_files import read_shard
+allowed = int(sys.argv[2])
+read_image(sys.argv[3])
+size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (size + allowed * 2**20, resource.RLIM_INFINITY))
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+found = {}
+for path in sorted(Path(sys.argv[1]).iterdir()):
+    try:
+        if path.name.startswith("shard"):
+            for mapped in (True, False):
+                read_shard(path, mapped=mapped)
+        else:
+            read_image(path)
+        found[path.name] = "was read"
+    except MbtfError as error:
+        found[path.name] = error.what
+rise = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) // 1024
+print(json.dumps([rise, found]))
+"""
+
+
+def _tiff(*entries: tuple[int, int, int, int], following: int = 0, big: bool = False) -> bytes:
+    """A TIFF file of one directory: (tag, type, count, value or offset) each."""
+    form = "<HHQQ" if big else "<HHII"
+    head = struct.pack("<2sHHHQ", b"II", 43, 8, 0, 16) if big else struct.pack("<2sHI", b"II", 42, 8)
+    count = struct.pack("<Q" if big else "<H", len(entries))
+    listed = b"".join(struct.pack(form, *entry) for entry in sorted(entries))
+    return head + count + listed + struct.pack("<Q" if big else "<I", following) + bytes(64)
+
+
+def _gray(columns: int, rows: int, bits: int = 8, compression: int = 1) -> list[tuple[int, int, int, int]]:
+    return [
+        *((256, 4, 1, columns), (257, 4, 1, rows), (258, 3, 1, bits), (259, 3, 1, compression)),
+        *((262, 3, 1, 1), (273, 4, 1, 8), (277, 3, 1, 1), (278, 4, 1, rows), (279, 4, 1, 60)),
+    ]
+
+
+def _jpg(side: int) -> bytes:
+    """A JPG file whose frame header claims another size."""
+    stream = io.BytesIO()
+    Image.new("L", (8, 8)).save(stream, "JPEG")
+    content = bytearray(stream.getvalue())
+    at = content.index(b"\xff\xc0") + 5
+    content[at : at + 4] = side.to_bytes(2, "big") * 2
+    return bytes(content)
+
+
+def _npy(descr: str, shape: str) -> bytes:
+    text = f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}, }}".encode() + b"\n"
+    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text + bytes(64)
+
+
+def _exr(folder: Path, **changes: bytes) -> bytes:
+    """An EXR file with the content of some of its header's attributes exchanged."""
+    import OpenEXR
+
+    tiles = OpenEXR.TileDescription()
+    tiles.xSize = tiles.ySize = 8
+    pixels = {"Y": np.zeros((8, 8), np.float32)}
+    path = folder / "made.exr"
+    tiled = "tiles" in changes
+    kind = OpenEXR.tiledimage if tiled else OpenEXR.scanlineimage
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": kind, **({"tiles": tiles} if tiled else {})}
+    OpenEXR.File(header, pixels).write(str(path))
+    content = bytearray(path.read_bytes())
+    for name, value in changes.items():
+        at = content.index(name.encode() + b"\0") + len(name) + 1
+        at = content.index(b"\0", at) + 5  # behind the type and the size
+        content[at : at + len(value)] = value
+    return bytes(content)
+
+
+def _window(columns: int, rows: int) -> bytes:
+    return struct.pack("<4i", 0, 0, columns - 1, rows - 1)
+
+
+def write_claims(folder: Path, beside: Path) -> dict[str, str]:
+    """Files that claim more than they hold; name → text of the refusal."""
+    lines = zlib.compress(bytes(100_000))
+    huge = _window(SIDE, SIDE)
+    claims: dict[str, tuple[bytes, str]] = {
+        "gray.png": (png(SIDE, SIDE, 8, 0, lines), "claims 60000 x 60000 pixels"),
+        "deep.png": (png(SIDE, SIDE, 16, 6, lines), "claims 60000 x 60000 pixels"),
+        "bits.png": (png(11000, 11000, 1, 0, lines), "cannot hold 11000 x 11000 pixels"),
+        "cap.png": (png(11000, 11000, 8, 6, lines), "cannot hold 11000 x 11000 pixels"),
+        "cap16.png": (png(11000, 11000, 16, 6, lines), "cannot hold 11000 x 11000 pixels"),
+        "line.png": (png(2**31 - 1, 1, 8, 2, lines), "claims 2147483647 x 1 pixels"),
+        "side.jpg": (_jpg(SIDE), "claims more than 134,217,728 pixels"),
+        "cap.jpg": (_jpg(11000), "cannot hold 11000 x 11000 pixels"),
+        "side.tif": (_tiff(*_gray(SIDE, SIDE)), "claims 60000 x 60000 pixels"),
+        "cap.tif": (_tiff(*_gray(11000, 11000)), "cannot hold 11000 x 11000 pixels"),
+        "packed.tif": (_tiff(*_gray(11000, 11000, compression=8)), "cannot hold 11000 x 11000 pixels"),
+        "fax.tif": (_tiff(*_gray(11000, 11000, 1, 4)), "cannot hold 11000 x 11000 pixels"),
+        "loop.tif": (_tiff(*_gray(SIDE, SIDE), following=8), "claims 60000 x 60000 pixels"),
+        "values.tif": (_tiff(*_gray(8, 8), (700, 7, 2**31, 8)), ""),
+        "entries.tif": (b"II*\0\x08\0\0\0\xff\xff" + bytes(100), "cannot be read as a TIFF"),
+        "big.tif": (_tiff(*_gray(SIDE, SIDE), big=True), "claims 60000 x 60000 pixels"),
+        "side.npy": (_npy("'<f4'", f"({SIDE}, {SIDE})"), "cannot be read as an npy array"),
+        "pickle.npy": (_npy("'|O'", "(4, 4)"), "cannot be read as an npy array"),
+        "giant.npy": (_npy("'|V2000000000'", "(4, 4)"), "cannot be read as an npy array"),
+        "nested.npy": (_npy("[('a', '<f4', (100000, 100000))]", "(4, 4)"), "cannot be read as an npy array"),
+        "lines.exr": (_exr(beside, dataWindow=huge, displayWindow=huge), "claims 60000 x 60000 pixels"),
+        "window.exr": (
+            _exr(beside, dataWindow=struct.pack("<4i", -(2**31), -(2**31), 2**31 - 1, 2**31 - 1)),
+            "cannot be read as an EXR",
+        ),
+        "inside.exr": (_exr(beside, dataWindow=struct.pack("<4i", 9, 9, 0, 0)), ""),
+        "tiles.exr": (_exr(beside, tiles=struct.pack("<2IB", 30_000, 30_000, 0)), "tiles of 30000 x 30000"),
+        "strips.exr": (_exr(beside, tiles=struct.pack("<2IB", 8, 10_616_840, 0)), "tiles of 8 x 10616840"),
+        "mipmaps.exr": (_exr(beside, tiles=struct.pack("<2IB", 2**31 - 1, 1, 1)), ""),
+        "shard.exr": (_exr(beside, dataWindow=huge, displayWindow=huge), "claims 60000 x 60000 pixels"),
+        "shard.npz": (_bomb(), "shard is compressed"),
+        "shard-claim.npz": (_claim(), "not as long as its header says"),
+    }
+    for name, (content, _) in claims.items():
+        (folder / name).write_bytes(content)
+    return {name: message for name, (_, message) in claims.items()}
+
+
+def _bomb() -> bytes:
+    """A hundred megabytes of zeros in a few kilobytes."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as out:
+        out.writestr("sigma.npy", _npy("'<f4'", "(25000000,)")[:-64] + bytes(100_000_000))
+    return stream.getvalue()
+
+
+def _claim() -> bytes:
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as out:
+        out.writestr("sigma.npy", _npy("'<f4'", "(1000000000,)"))
+    return stream.getvalue()
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+def test_claims_take_no_memory(tmp_path: Path) -> None:
+    folder = tmp_path / "claims"
+    folder.mkdir()
+    expected = write_claims(folder, tmp_path)
+    Image.new("L", (8, 8)).save(tmp_path / "small.tif")
+    assert max(path.stat().st_size for path in folder.iterdir()) < 200_000
+    child = subprocess.run(
+        [sys.executable, "-c", _CODE, str(folder), str(ADDRESSES), str(tmp_path / "small.tif")],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CORE, (0, 0)),
+    )
+    assert child.returncode == 0, child.stderr
+    # Nothing but the answer: no remark of a decoder.
+    assert child.stderr == ""
+    rise, found = json.loads(child.stdout)
+    for name, message in expected.items():
+        assert message in found[name], (name, found[name])
+        # Refused by what it claims, not because memory ran out.
+        assert "memory" not in found[name].lower(), (name, found[name])
+    assert rise < ALLOWED, found

@@ -1,0 +1,180 @@
+"""Images that need care: TIFF, layers of EXR, single channels, claims about color and orientation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from support.image_files import exr, png, rng
+
+from mbtf_core.errors import InputError
+from mbtf_core.images.exr import choose_channels, layers
+from mbtf_core.images.read import read_image
+
+
+class TestTiff:
+    @pytest.mark.parametrize("compression", [None, "lzw", "zlib", "packbits", "zstd"])
+    @pytest.mark.parametrize("channels", [1, 3, 4])
+    @pytest.mark.parametrize("dtype", ["u1", "u2", "f4", "f2"])
+    def test_every_number_is_kept(
+        self, tmp_path: Path, compression: str | None, channels: int, dtype: str
+    ) -> None:
+        noise = rng().random((20, 37, channels))
+        stored = (noise * 65535).astype(dtype) if dtype[0] == "u" else (100 * noise - 50).astype(dtype)
+        path = tmp_path / "x.tif"
+        extra: dict[str, Any] = {"extrasamples": ["unassalpha"]} if channels == 4 else {}
+        tifffile.imwrite(
+            path,
+            stored if channels > 1 else stored[..., 0],
+            compression=compression,
+            photometric="minisblack" if channels == 1 else "rgb",
+            **extra,
+        )
+        image = read_image(path)
+        assert image.bits == {"u1": 8, "u2": 16}.get(dtype)
+        assert image.pixels.shape == stored.shape
+        if image.bits:
+            codes = np.rint(image.pixels.astype(np.float64) * (2**image.bits - 1))
+            assert np.array_equal(codes, stored)
+        else:
+            assert np.array_equal(image.pixels, stored)
+
+    def test_tiles_and_planes(self, tmp_path: Path) -> None:
+        codes = rng().integers(0, 65536, (70, 50, 3)).astype(np.uint16)
+        tifffile.imwrite(tmp_path / "tiled.tif", codes, tile=(32, 16), compression="lzw", photometric="rgb")
+        planes = np.moveaxis(codes, -1, 0)
+        tifffile.imwrite(tmp_path / "planes.tif", planes, photometric="rgb", planarconfig="separate")
+        for name in ("tiled.tif", "planes.tif"):
+            assert np.array_equal(np.rint(read_image(tmp_path / name).pixels.astype(float) * 65535), codes)
+
+    def test_what_cannot_be_kept_is_refused(self, tmp_path: Path) -> None:
+        tifffile.imwrite(tmp_path / "x.tif", np.zeros((4, 4), np.uint32))
+        with pytest.raises(InputError, match="uint32 numbers"):
+            read_image(tmp_path / "x.tif")
+        tifffile.imwrite(
+            tmp_path / "y.tif", np.zeros((4, 4, 5), np.uint8), photometric="minisblack", planarconfig="contig"
+        )
+        with pytest.raises(InputError, match="5 channels"):
+            read_image(tmp_path / "y.tif")
+
+    def test_a_cut_file_is_refused(self, tmp_path: Path) -> None:
+        codes = rng().integers(0, 65536, (64, 64, 3)).astype(np.uint16)
+        for compression in (None, "lzw"):
+            path = tmp_path / "x.tif"
+            tifffile.imwrite(path, codes, compression=compression, photometric="rgb", rowsperstrip=8)
+            data = path.read_bytes()
+            for share in (0.02, 0.4, 0.95):
+                path.write_bytes(data[: int(share * len(data))])
+                with pytest.raises(InputError):
+                    read_image(path)
+
+
+class TestLayers:
+    def test_grouping(self) -> None:
+        found = layers(["R", "G", "B", "A", "N.X", "N.Y", "N.Z", "displacement.Y", "rough", "id.number"])
+        assert found == {
+            "": ["R", "G", "B", "A"],
+            "N": ["N.X", "N.Y", "N.Z"],
+            "displacement": ["displacement.Y"],
+            "rough": ["rough"],
+            "id.number": ["id.number"],
+        }
+
+    def test_choice_by_name(self, tmp_path: Path) -> None:
+        names = ["R", "G", "B", "displacement.Y", "roughness.Y"]
+        path = tmp_path / "x.exr"
+        assert choose_channels(names, path, None, lambda label: label == "displacement") == ["displacement.Y"]
+        assert choose_channels(names, path, None) == ["R", "G", "B"]
+        assert choose_channels(names, path, "roughness") == ["roughness.Y"]
+        assert choose_channels(names, path, "G") == ["G"]
+        with pytest.raises(InputError, match=r"no channel or layer 'roughnes'") as caught:
+            choose_channels(names, path, "roughnes")
+        assert "'roughness'" in caught.value.hint
+        with pytest.raises(InputError, match="unclear") as caught:
+            choose_channels(["a.Y", "b.Y"], path, None)
+        assert "channel: a" in caught.value.hint
+
+    def test_several_parts(self, tmp_path: Path) -> None:
+        import OpenEXR
+
+        rough, disp = (rng().random((4, 6)).astype(np.float32) for _ in range(2))
+        head = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        parts = [
+            OpenEXR.Part({**head, "name": "rough"}, {"Y": rough}, "rough"),
+            OpenEXR.Part({**head, "name": "disp"}, {"Y": disp + 1}, "disp"),
+        ]
+        OpenEXR.File(parts).write(str(tmp_path / "x.exr"))
+        image = read_image(tmp_path / "x.exr", "disp")
+        assert np.array_equal(image.pixels[..., 0], disp + 1)
+        assert image.channels == ("disp.Y",)
+        assert np.array_equal(read_image(tmp_path / "x.exr", "rough.Y").pixels[..., 0], rough)
+
+    def test_whole_numbers_matter_only_where_they_are_meant(self, tmp_path: Path) -> None:
+        path = exr(tmp_path / "x.exr", {"Y": np.ones((4, 6), np.float32), "id": np.zeros((4, 6), np.uint32)})
+        assert read_image(path).pixels.shape == (4, 6, 1)
+        with pytest.raises(InputError, match="'id' stores integers"):
+            read_image(path, "id")
+
+
+def test_single_channels_of_other_kinds(tmp_path: Path) -> None:
+    codes = rng().integers(0, 65536, (5, 6, 4))
+    path = png(tmp_path / "packed.png", codes, 6, 16)
+    for index, name in enumerate("RGBA"):
+        image = read_image(path, name.lower())
+        assert np.array_equal(image.pixels, codes[..., index : index + 1] / 65535)
+        assert image.channels == (name,)
+    with pytest.raises(InputError, match="no channel 'Y'") as caught:
+        read_image(path, "Y")
+    assert "R, G, B, A" in caught.value.hint
+    gray = png(tmp_path / "gray.png", codes[..., :1], 0, 16)
+    assert np.array_equal(read_image(gray, "Y").pixels, read_image(gray).pixels)
+
+
+class TestClaims:
+    @pytest.mark.parametrize(
+        ("chunks", "space", "foreign"),
+        [
+            ((), None, None),
+            (((b"sRGB", b"\x00"),), "srgb", None),
+            (((b"gAMA", (45455).to_bytes(4, "big")),), "srgb", None),
+            (((b"gAMA", (100000).to_bytes(4, "big")),), "linear", None),
+            (((b"gAMA", (100000).to_bytes(4, "big")), (b"sRGB", b"\x00")), "srgb", None),
+            (((b"gAMA", (55556).to_bytes(4, "big")),), None, "gamma of 0.55556"),
+        ],
+    )
+    @pytest.mark.parametrize("bits", [8, 16])
+    def test_png(
+        self, tmp_path: Path, chunks: tuple[Any, ...], space: str | None, foreign: str | None, bits: int
+    ) -> None:
+        path = png(tmp_path / "x.png", rng().integers(0, 256, (4, 4, 3)), 2, bits, extra=chunks)
+        tags = read_image(path).tags
+        assert (tags.space, tags.foreign) == (space, foreign)
+
+    def test_profiles(self, tmp_path: Path) -> None:
+        from PIL import Image as Pillow
+        from PIL import ImageCms
+
+        picture = Pillow.fromarray(np.zeros((8, 8, 3), np.uint8))
+        srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+        picture.save(tmp_path / "s.jpg", icc_profile=srgb)
+        assert read_image(tmp_path / "s.jpg").tags.space == "srgb"
+        lab = ImageCms.ImageCmsProfile(ImageCms.createProfile("LAB")).tobytes()
+        picture.save(tmp_path / "l.png", icc_profile=lab)
+        assert "color profile 'Lab" in (read_image(tmp_path / "l.png").tags.foreign or "")
+        picture.save(tmp_path / "b.png", icc_profile=b"broken")
+        assert read_image(tmp_path / "b.png").tags.foreign == "color profile 'unreadable'"
+
+    def test_orientation_is_reported_but_not_applied(self, tmp_path: Path) -> None:
+        from PIL import Image as Pillow
+
+        codes = np.zeros((8, 16), np.uint8)
+        codes[0] = 255
+        exif = Pillow.Exif()
+        exif[0x0112] = 6
+        Pillow.fromarray(codes).save(tmp_path / "x.png", exif=exif)
+        image = read_image(tmp_path / "x.png")
+        assert image.tags.orientation == 6
+        assert np.array_equal(image.pixels[..., 0] * 255, codes)

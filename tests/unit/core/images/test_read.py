@@ -1,0 +1,218 @@
+"""Images decode to exact numbers, and unusable ones are refused in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.image_files import exr, png, rng
+
+from mbtf_core.color import linear_to_srgb, srgb_to_linear
+from mbtf_core.errors import InputError
+from mbtf_core.images.read import Image, gray, read_image
+
+
+@pytest.mark.parametrize(("color", "channels"), [(0, 1), (4, 2), (2, 3), (6, 4)])
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize("interlace", [False, True])
+def test_png_keeps_every_code(tmp_path: Path, color: int, channels: int, bits: int, interlace: bool) -> None:
+    largest = 2**bits - 1
+    codes = rng().integers(0, largest + 1, (11, 7, channels))
+    codes[0, 0], codes[0, 1] = 0, largest
+    codes[5:] = codes[5:6] // 2 + np.arange(6)[:, None, None]  # so that filters predict something
+    image = read_image(png(tmp_path / "x.png", codes, color, bits, [0, 1, 2, 3, 4], interlace=interlace))
+    assert image.bits == bits
+    assert image.pixels.shape == (11, 7, channels)
+    assert np.array_equal(np.rint(image.pixels.astype(np.float64) * largest), codes)
+    assert image.pixels.max() == 1.0
+    if channels == 1:
+        assert np.array_equal(image.pixels, codes / largest)
+
+
+@pytest.mark.parametrize("suffix", ["png", "tif"])
+def test_palettes_and_single_bits(suffix: str, tmp_path: Path) -> None:
+    from PIL import Image as Pillow
+
+    codes = rng().integers(0, 4, (5, 6)).astype(np.uint8)
+    palette = np.array([[0, 0, 0], [255, 10, 20], [30, 40, 50], [255, 255, 255]], np.uint8)
+    picture = Pillow.fromarray(codes)
+    picture.putpalette(palette.tobytes())
+    picture.save(tmp_path / f"x.{suffix}")
+    image = read_image(tmp_path / f"x.{suffix}")
+    assert image.bits == 8
+    assert np.array_equal(np.rint(image.pixels * 255), palette[codes])
+    picture.save(tmp_path / "y.png", transparency=2)
+    assert np.array_equal(read_image(tmp_path / "y.png").pixels[..., 3] == 0.0, codes == 2)
+    mask = rng().random((5, 9)) < 0.5
+    Pillow.fromarray(mask).save(tmp_path / f"b.{suffix}")
+    assert np.array_equal(read_image(tmp_path / f"b.{suffix}").pixels[..., 0], mask.astype(float))
+
+
+def test_jpg(tmp_path: Path) -> None:
+    from PIL import Image as Pillow
+
+    Pillow.fromarray(np.full((16, 24), 77, np.uint8)).save(tmp_path / "x.JPG", "JPEG", quality=95)
+    assert read_image(tmp_path / "x.JPG").pixels[..., 0] == pytest.approx(77 / 255, abs=1.5 / 255)
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32])
+def test_exr(tmp_path: Path, dtype: type) -> None:
+    numbers = (100 * rng().normal(size=(5, 6, 4))).astype(dtype)
+    r, g, b, a = (np.ascontiguousarray(numbers[..., i]) for i in range(4))
+    one = read_image(exr(tmp_path / "y.exr", {"displacement.height": r}))
+    assert one.bits is None
+    assert np.array_equal(one.pixels[..., 0], r)
+    rgb = read_image(exr(tmp_path / "rgb.exr", {"R": r, "G": g, "B": b}))
+    assert np.array_equal(rgb.pixels, numbers[..., :3])
+    rgba = read_image(exr(tmp_path / "rgba.exr", {"R": r, "G": g, "B": b, "A": a, "depth.Z": a}))
+    assert np.array_equal(rgba.pixels, numbers)
+    layer = read_image(exr(tmp_path / "layer.exr", {"albedo.R": r, "albedo.G": g, "albedo.B": b}))
+    assert np.array_equal(layer.pixels, numbers[..., :3])
+    with pytest.raises(InputError, match=r"unclear: p, q"):
+        read_image(exr(tmp_path / "pq.exr", {"p": r, "q": g}))
+
+
+def test_npy(tmp_path: Path) -> None:
+    numbers = rng().normal(size=(5, 6))
+    np.save(tmp_path / "d.npy", numbers)
+    assert np.array_equal(read_image(tmp_path / "d.npy").pixels[..., 0], numbers)
+    np.save(tmp_path / "t.npy", np.asfortranarray(numbers.astype(">f4")))
+    assert np.array_equal(read_image(tmp_path / "t.npy").pixels[..., 0], numbers.astype(np.float32))
+    for dtype, bits in ((np.uint8, 8), (np.uint16, 16)):
+        codes = rng().integers(0, 2**bits, (5, 6, 3)).astype(dtype)
+        np.save(tmp_path / "i.npy", codes)
+        image = read_image(tmp_path / "i.npy")
+        assert image.bits == bits
+        assert np.array_equal(np.rint(image.pixels.astype(np.float64) * (2**bits - 1)), codes)
+    np.save(tmp_path / "w.npy", np.zeros((5, 6), np.int64))
+    with pytest.raises(InputError, match="int64 numbers"):
+        read_image(tmp_path / "w.npy")
+    np.save(tmp_path / "s.npy", np.zeros((5, 6, 7)))
+    with pytest.raises(InputError, match=r"shape \(5, 6, 7\)"):
+        read_image(tmp_path / "s.npy")
+    np.save(tmp_path / "o.npy", np.array([[None]]), allow_pickle=True)
+    with pytest.raises(InputError, match="npy"):
+        read_image(tmp_path / "o.npy")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_pixels_that_are_not_finite_are_counted_and_placed(tmp_path: Path, value: float) -> None:
+    numbers = np.zeros((4, 6), np.float32)
+    numbers[2, 5] = numbers[3, 0] = value
+    with pytest.raises(
+        InputError, match=r"x\.exr: 2 pixels, the first at column 5, row 2, are NaN or infinite"
+    ):
+        read_image(exr(tmp_path / "x.exr", {"Y": numbers}))
+    color = np.zeros((4, 6, 3))
+    color[1, 2] = value
+    np.save(tmp_path / "x.npy", color)
+    with pytest.raises(InputError, match=r"x\.npy: 1 pixel, at column 2, row 1, is NaN or infinite"):
+        read_image(tmp_path / "x.npy")
+
+
+def test_half_precision_overflow_is_reported_not_hidden(tmp_path: Path) -> None:
+    np.save(tmp_path / "x.npy", np.full((2, 2, 3), 1e300))
+    with pytest.raises(InputError, match="4 pixels"):
+        read_image(tmp_path / "x.npy")
+
+
+def good_files(folder: Path) -> list[Path]:
+    """One good file of every kind, of noise, so that cutting it anywhere loses pixels."""
+    from PIL import Image as Pillow
+
+    codes = rng().integers(0, 256, (64, 64, 3)).astype(np.uint8)
+    Pillow.fromarray(codes).save(folder / "a.png")
+    Pillow.fromarray(codes).save(folder / "a.jpg")
+    Pillow.fromarray(codes).save(folder / "a.tif")
+    png(folder / "deep.png", rng().integers(0, 65536, (64, 64, 3)), 2, 16, [4])
+    np.save(folder / "a.npy", codes)
+    exr(folder / "a.exr", {"Y": rng().random((64, 64)).astype(np.float32)})
+    return sorted(folder.iterdir())
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.9])
+def test_truncated_files_are_refused(tmp_path: Path, share: float, capfd: pytest.CaptureFixture[str]) -> None:
+    for path in good_files(tmp_path):
+        assert read_image(path).shape == (64, 64)
+        data = path.read_bytes()
+        path.write_bytes(data[: int(share * len(data))])
+        with pytest.raises(InputError) as caught:
+            read_image(path)
+        assert "\n" not in caught.value.what
+        assert str(path) in caught.value.message
+    assert capfd.readouterr() == ("", "")
+
+
+def test_files_that_are_no_images(tmp_path: Path) -> None:
+    cases = {
+        "missing.png": (None, "no such file"),
+        "empty.png": (b"", "is empty"),
+        "text.png": (b"hello, this is text", "is not a valid PNG image"),
+        "text.exr": (b"hello, this is text", "is not a valid EXR image"),
+        "notes.txt": (b"hello", "'.txt' is not an image format"),
+        "none": (b"hello", "'' is not an image format"),
+        "jpeg.png": (b"\xff\xd8\xff\xe0rest", "contains JPEG data"),
+    }
+    for name, (content, message) in cases.items():
+        if content is not None:
+            (tmp_path / name).write_bytes(content)
+        with pytest.raises(InputError) as caught:
+            read_image(tmp_path / name)
+        assert message in caught.value.what
+        assert caught.value.exit_code == 3
+    with pytest.raises(InputError, match="is a folder"):
+        read_image(tmp_path)
+    assert "rename it to jpeg.jpg" in caught.value.message
+
+
+def test_kinds_that_would_lose_something_are_refused(tmp_path: Path) -> None:
+    from PIL import Image as Pillow
+
+    Pillow.new("CMYK", (4, 4)).save(tmp_path / "cmyk.jpg")
+    with pytest.raises(InputError, match="CMYK"):
+        read_image(tmp_path / "cmyk.jpg")
+    window = (np.array([1, 0], np.int32), np.array([6, 4], np.int32))
+    cropped = exr(tmp_path / "crop.exr", {"Y": np.zeros((5, 6), np.float32)}, dataWindow=window)
+    with pytest.raises(InputError, match="cropped tile"):
+        read_image(cropped)
+    whole = exr(tmp_path / "int.exr", {"Y": np.zeros((5, 6), np.uint32)})
+    with pytest.raises(InputError, match="stores integers"):
+        read_image(whole)
+
+
+class TestGray:
+    def test_exact_for_equal_channels(self) -> None:
+        codes = rng().integers(0, 256, (4, 5, 1))
+        image = Image((np.repeat(codes, 3, axis=2) / 255).astype(np.float32), 8, Path("x.png"))
+        numbers, warnings = gray(image)
+        assert np.array_equal(numbers, codes[..., 0] / 255)
+        assert warnings == []
+        # Rounding of JPG is no color.
+        pixels = np.full((4, 5, 3), 100 / 255, np.float32)
+        pixels[0, 0, 1] = 102 / 255
+        assert gray(Image(pixels, 8, Path("x.jpg")))[1] == []
+
+    def test_color_becomes_luminance_with_a_warning(self) -> None:
+        pixels = np.zeros((4, 5, 3), np.float32)
+        pixels[..., 1] = 0.5
+        numbers, warnings = gray(Image(pixels, 8, Path("x.png")))
+        assert numbers == pytest.approx(0.7152 * 0.5)
+        assert len(warnings) == 1
+        assert "luminance" in warnings[0]
+
+    def test_alpha_that_means_something_is_mentioned(self) -> None:
+        pixels = np.ones((4, 5, 2), np.float32)
+        assert gray(Image(pixels, 8, Path("x.png")))[1] == []
+        pixels[0, 0, 1] = 0.5
+        assert "alpha" in gray(Image(pixels, 8, Path("x.png")))[1][0]
+
+
+def test_srgb() -> None:
+    assert srgb_to_linear([0.0, 0.04045, 0.5, 1.0]) == pytest.approx(
+        [0.0, 0.0031308, 0.2140411, 1.0], abs=1e-6
+    )
+    x = np.linspace(0.0, 1.0, 1001)
+    assert linear_to_srgb(srgb_to_linear(x)) == pytest.approx(x, abs=1e-6)
+    assert srgb_to_linear(np.float32([0.5])).dtype == np.float32
+    assert np.all(np.diff(srgb_to_linear(x)) > 0)

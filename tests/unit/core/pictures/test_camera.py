@@ -1,0 +1,44 @@
+"""The camera's queries against what a pinhole sees, from finite differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mbtf_core.directions import from_angles
+from mbtf_core.pictures.camera import Camera
+
+UP = np.array([0.0, 0.0, 1.0])
+CAMERA = Camera(
+    elevation=30.0, azimuth=40.0, tiles_across=0.3, target=(0.5, 0.45), rows=61, columns=81, field_of_view=25
+)
+
+
+@pytest.mark.parametrize("aspect", [1.0, 0.5, 3.0])
+def test_footprint_is_half_the_geometric_mean_of_the_pixel(aspect: float) -> None:
+    q = CAMERA.queries(UP, aspect)
+    # Positions in tile widths; steps between pixels never leave half a tile.
+    x = q.u.astype(np.float64) * (1.0, aspect)
+    period = np.array([1.0, aspect])
+
+    def step(axis: int) -> np.ndarray:
+        full = np.roll(x, -1, axis) - np.roll(x, 1, axis)
+        return 0.5 * (full - period * np.round(full / period))[1:-1, 1:-1]
+
+    down, right = step(0), step(1)
+    area = np.abs(right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0])
+    np.testing.assert_allclose(q.sigma[1:-1, 1:-1], 0.5 * np.sqrt(area), rtol=2e-3)
+
+
+@pytest.mark.parametrize("aspect", [1.0, 0.5, 3.0])
+def test_views_point_from_the_plane_to_the_camera(aspect: float) -> None:
+    q = CAMERA.queries(UP, aspect)
+    # Going back along ω_o from the height of the camera meets the plane at u, up to whole periods.
+    omega = q.omega_o.astype(np.float64)
+    x = CAMERA.position[:2] - CAMERA.position[2] * omega[..., :2] / omega[..., 2:]
+    difference = x / (1.0, aspect) - q.u
+    np.testing.assert_allclose(difference, np.round(difference), atol=1e-5)
+    # The middle pixel looks at the target, from the stated direction; there the picture is that wide.
+    np.testing.assert_allclose(omega[30, 40], from_angles(30.0, 40.0), atol=1e-6)
+    np.testing.assert_allclose(x[30, 40], CAMERA.target, atol=1e-5)
+    assert np.linalg.norm(x[30, 80] - x[30, 0]) * 81 / 80 == pytest.approx(CAMERA.tiles_across, rel=1e-2)

@@ -1,0 +1,274 @@
+"""Imports of measured BTFs: values, conventions, splits, resumption, and what readers make of one value."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from support.measured_data import Images, Listed, known
+from support.paths import ROOT
+
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.schema import CONVENTIONS
+from mbtf_core.data.verify import verify
+from mbtf_core.errors import InputError
+from mbtf_fit import fit
+from mbtf_fit.config import FitConfig
+from mbtf_fit.data.loader import load_split, load_training
+from mbtf_fit.formatting import describe_coverage, summarize_errors
+from mbtf_fit.training.fit import prepare_trainer
+from mbtf_gen.cli.generate import describe
+from mbtf_gen.config.measured import ImportConfig
+from mbtf_gen.generation import import_job
+from mbtf_gen.generation.import_job import Import
+from mbtf_gen.generation.imported import import_measured
+from mbtf_gen.generation.repair import Corruption
+from mbtf_gen.sampling.slice_directions import slice_directions
+from mbtf_pipeline.compare.dataset_errors import dataset_errors
+
+Open = Callable[..., Import]
+
+
+@pytest.fixture
+def opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Open:
+    """Opens a source as if it were a file."""
+    file = tmp_path / "measured.btf"
+    file.write_bytes(b"measured")
+
+    def open_(source: Any, **options: Any) -> Import:
+        monkeypatch.setattr(import_job, "open_measured", lambda path: source)
+        options["output"] = {"shard_queries": 300, **options.get("output", {})}
+        return Import.prepare(file, ImportConfig.model_validate(options))
+
+    return open_
+
+
+def test_values_are_those_of_the_reference_plane(opened: Open, tmp_path: Path) -> None:
+    job = opened(Images(), queries={"train": "20/texel", "test": "150", "min_cos": 0.2})
+    summary = import_measured(job, tmp_path / "shards")
+    assert summary.complete
+    assert verify(tmp_path / "shards") == []
+    data = Dataset.open(tmp_path / "shards")
+    assert (data.lattice.finest, data.lattice.aspect, data.estimates) == (4, 0.5, 1)
+    assert data.geometry() is None
+    for split, count in (("train", 20 * 128), ("test", 150)):
+        arrays = data.load(split)
+        assert set(arrays) == {"u", "sigma", "omega_i", "omega_o", "value_a"}
+        assert len(arrays["sigma"]) == count
+        # The stored cosine is divided out.
+        expected = known(arrays["u"], arrays["omega_i"], arrays["omega_o"])
+        np.testing.assert_allclose(arrays["value_a"], expected, rtol=1e-5)
+        np.testing.assert_allclose(arrays["sigma"], 0.5 / 12)
+        assert min(arrays["omega_i"][:, 2].min(), arrays["omega_o"][:, 2].min()) >= 0.2
+    measured = data.manifest["measured"]
+    page = (ROOT / "docs/reference/data-format.md").read_text()
+    assert all(f"`{key}`" in page for key in measured)
+    assert measured["divided_by_cosine"]
+    assert measured["left_out"] + sum(map(len, job.pairs or ())) == 64 + 3
+
+
+def test_test_queries_have_pairs_of_their_own(opened: Open, tmp_path: Path) -> None:
+    import_measured(opened(Images(), queries={"test": "500"}), tmp_path / "shards")
+    data = Dataset.open(tmp_path / "shards")
+    train, test = (
+        {tuple(p) for p in np.concatenate([a["omega_i"], a["omega_o"]], 1).tolist()}
+        for a in (data.load("train"), data.load("test"))
+    )
+    assert len(test) == 3
+    assert not train & test
+    assert len(train | test) > 55
+
+
+def test_options_of_values(opened: Open, tmp_path: Path) -> None:
+    plain = opened(Images(), queries={"train": "300", "test": "1"}, seed=3)
+    import_measured(plain, tmp_path / "plain")
+    kept = opened(Images(), queries={"train": "300", "test": "1"}, seed=3, cosine="excluded", scale=2.0)
+    import_measured(kept, tmp_path / "kept")
+    a, b = (Dataset.open(tmp_path / name).load("train") for name in ("plain", "kept"))
+    assert (a["u"] == b["u"]).all()
+    np.testing.assert_allclose(b["value_a"], 2.0 * a["value_a"] * a["omega_i"][:, 2:], rtol=1e-5)
+    silent = Images()
+    silent.cosine = None
+    with pytest.raises(InputError, match="does not say whether values include the cosine"):
+        import_measured(opened(silent), tmp_path / "silent")
+    with pytest.raises(InputError, match="no pair of light and view"):
+        opened(Images(), queries={"min_cos": 0.9999})
+
+
+def test_an_interrupted_import_resumes_with_the_same_bytes(opened: Open, tmp_path: Path) -> None:
+    queries = {"train": "20/texel", "test": "100"}
+    import_measured(opened(Images(), queries=queries), tmp_path / "whole")
+    for name in ("train-00002.json", "train-00004.npz"):
+        job = opened(Images(), queries=queries)
+        import_measured(job, tmp_path / "part")
+        before = {p.name: p.read_bytes() for p in (tmp_path / "part").glob("*.npz")}
+        (tmp_path / "part" / name).unlink()
+        import_measured(opened(Images(), queries=queries), tmp_path / "part")
+        assert {p.name: p.read_bytes() for p in (tmp_path / "part").glob("*.npz")} == before
+    assert before == {p.name: p.read_bytes() for p in (tmp_path / "whole").glob("*.npz")}
+    again = Images()
+    import_measured(opened(again, queries=queries), tmp_path / "part")
+    assert again.calls == 0
+    with pytest.raises(InputError, match="seed"):
+        import_measured(opened(Images(), queries=queries, seed=1), tmp_path / "part")
+    import_measured(opened(Images(), queries=queries, seed=1), tmp_path / "part", overwrite=True)
+    with pytest.raises(InputError, match="cannot be generated again"):
+        Corruption(tmp_path / "part")
+
+
+def test_no_noise_is_claimed(opened: Open, tmp_path: Path) -> None:
+    summary = import_measured(opened(Images(), queries={"train": "300", "test": "9"}), tmp_path / "shards")
+    assert summary.relative_error is None
+    assert "nothing left to do" not in describe(summary)
+    assert "its noise is unknown" in describe(summary)
+    data = Dataset.open(tmp_path / "shards")
+    (shard,) = data.shards("train")
+    assert shard.sidecar["statistics"]["mean_variance"] is None
+    assert data.manifest["summary"]["relative_error"] is None
+    assert data.manifest["measured"]["light_width"] is None
+    assert "only value" in data.manifest["arrays"]["value_a"]["meaning"]
+    assert data.manifest["conventions"].keys() == CONVENTIONS.keys()
+    config = FitConfig.model_validate({"model": "neumip-baseline"})
+    partition = load_training(data, config.held_out, 0)
+    trainer = prepare_trainer(config, data, partition, torch.device("cpu"))
+    assert trainer.weight_decay.weights == 0
+
+
+@pytest.mark.parametrize("test", [100, 300, 499])
+def test_blocks_of_a_list_keep_every_query_once(
+    opened: Open, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, test: int
+) -> None:
+    monkeypatch.setattr(import_job, "_BLOCK", 256)
+    source = Listed()
+    import_measured(opened(source, queries={"test": str(test)}), tmp_path / "shards")
+    data = Dataset.open(tmp_path / "shards")
+    parts = [data.load(split) for split in ("train", "test")]
+    assert [len(p["sigma"]) for p in parts] == [1000 - test, test]
+
+    def rows(*arrays: Any) -> list[tuple[float, ...]]:
+        return sorted(map(tuple, np.concatenate(arrays, 1).tolist()))
+
+    found = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
+    names = ("u", "omega_i", "omega_o")
+    assert rows(*(found[n] for n in names), found["value_a"]) == rows(
+        *(source.arrays[n] for n in names), source.arrays["value"]
+    )
+    # In random order, and test queries from the whole list.
+    assert (found["u"][:100] != source.arrays["u"][:100]).any()
+    order = {tuple(u): k for k, u in enumerate(source.arrays["u"].tolist())}
+    at = [order[tuple(u)] for u in parts[1]["u"].tolist()]
+    assert min(at) < 50
+    assert max(at) > 950
+
+
+def test_options_select_from_a_list(opened: Open, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(import_job, "_BLOCK", 256)
+    source = Listed()
+    queries = {"train": "123", "test": "45", "min_cos": 0.6}
+    job = opened(source, queries=queries, cosine="included", scale=2.0)
+    import_measured(job, tmp_path / "shards")
+    data = Dataset.open(tmp_path / "shards")
+    parts = [data.load(split) for split in ("train", "test")]
+    assert [len(p["sigma"]) for p in parts] == [123, 45]
+    lowest = np.minimum(source.arrays["omega_i"][:, 2], source.arrays["omega_o"][:, 2])
+    assert data.manifest["measured"]["queries"] == 1000
+    assert data.manifest["measured"]["left_out"] == (lowest < 0.6).sum() == job.left_out
+    assert data.manifest["measured"]["divided_by_cosine"]
+    found = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
+    assert len(np.unique(found["u"], axis=0)) == 168
+    assert min(found["omega_i"][:, 2].min(), found["omega_o"][:, 2].min()) >= 0.6
+    expected = 2.0 * known(found["u"], found["omega_i"], found["omega_o"]) / found["omega_i"][:, 2:]
+    np.testing.assert_allclose(found["value_a"], expected, rtol=1e-5)
+    # From the whole list: its first and its last blocks.
+    order = {tuple(u): k for k, u in enumerate(source.arrays["u"].tolist())}
+    at = np.array([order[tuple(u)] for u in found["u"].tolist()])
+    counts = np.histogram(at, bins=4, range=(0, 1000))[0]
+    assert counts.min() > 25
+    with pytest.raises(InputError, match="has 0 usable queries of 1,000"):
+        opened(Listed(), queries={"min_cos": 0.999})
+
+
+def test_footprints_of_a_list_are_those_of_levels(opened: Open, tmp_path: Path) -> None:
+    source = Listed()
+    source.arrays["sigma"][::10], source.arrays["sigma"][5::10] = 1e-20, 7.0
+    job = opened(source, queries={"test": "100"})
+    assert (job.usable, job.left_out, job.finest) == (800, 200, 4)
+    import_measured(job, tmp_path / "shards")
+    assert (Dataset.open(tmp_path / "shards").load("train")["sigma"] == np.float32(0.5 / 16)).all()
+
+
+def test_errors_of_a_fit_include_the_noise(opened: Open, tmp_path: Path) -> None:
+    class Noisy(Images):
+        def values(self, pair: Any, texel: Any) -> Any:
+            noise = np.random.default_rng(0).normal(0, 0.05, (len(pair), 1)).astype(np.float32)
+            return super().values(pair, texel) + noise * self.light[pair, 2:]
+
+    queries = {"train": "200/texel", "test": "2000", "min_cos": 0.2}
+    import_measured(opened(Noisy(lights=16), queries=queries), tmp_path / "shards")
+    config = FitConfig.model_validate({"model": "neumip-baseline", "training": {"steps": 200, "batch": 4096}})
+    result = fit(config, tmp_path / "shards", tmp_path / "fit")
+    test = result.errors["test"]
+    assert test["includes_noise"]
+    assert test["mse"]["value"] == pytest.approx(0.05**2, rel=0.15)
+    assert result.material.description["training"]["noise_variance"] is None
+    assert any("include the noise of the data" in line for line in summarize_errors(result.errors))
+    compared = dataset_errors({"a": result.material}, Dataset.open(tmp_path / "shards"))
+    assert compared["a"]["splits"]["test"]["includes_noise"]
+    # Error bars are the scatter of squared errors over queries.
+    held = load_split(Dataset.open(tmp_path / "shards"), "test")
+    squares = ((result.material.predict(held) - held.value_a).astype(np.float64) ** 2).mean(axis=1)
+    assert test["mse"]["error"] == pytest.approx(squares.std(ddof=1) / np.sqrt(len(squares)), rel=1e-3)
+    streamed = load_training(Dataset.open(tmp_path / "shards"), config.held_out, 0, memory=None).training
+    kept = load_training(Dataset.open(tmp_path / "shards"), config.held_out, 0).training
+    assert (streamed.slice(5, 50).value == kept.slice(5, 50).value).all()  # type: ignore[union-attr]
+
+
+def test_levels_without_data_are_averages(opened: Open, tmp_path: Path) -> None:
+    queries = {"train": "400/texel", "test": "500", "min_cos": 0.2}
+    import_measured(opened(Images(lights=16), queries=queries), tmp_path / "shards")
+    config = FitConfig.model_validate({"model": "neumip-baseline", "training": {"steps": 400, "batch": 4096}})
+    material = fit(config, tmp_path / "shards", tmp_path / "fit").material
+    line = describe_coverage(material.description["training"]["coverage"])
+    assert line.endswith("levels coarser than 3 have no data and are averages of it")
+    pyramid = material.model.pyramid.export()
+    np.testing.assert_allclose(pyramid["0"][0, 0], pyramid["3"].mean((0, 1)), atol=1e-5)
+    omega = slice_directions("spiral", 40, 0.3)
+    light, view = omega[:20], omega[20:]
+    found = material.evaluate(np.full((20, 2), 0.5), np.full(20, 0.5), light, view)
+    grid = (np.stack(np.mgrid[:12, :12], -1).reshape(-1, 2) + 0.5) / 12
+    mean = np.mean([known(np.repeat(u[None], 20, 0), light, view) for u in grid], axis=0)
+    assert np.abs(found - mean).mean() < 0.1 * mean.mean()
+
+
+def test_rounded_footprints_add_no_level(opened: Open) -> None:
+    """Half precision rounds by up to a part in 2000."""
+    for sigma, finest in ((0.5 / 16 * (1 - 5e-4), 4), (0.028, 5)):
+        source = Listed()
+        source.arrays["sigma"][:] = sigma
+        assert opened(source).finest == finest
+
+
+def test_only_images_identify_a_folder(tmp_path: Path) -> None:
+    """File managers leave files of their own behind."""
+    photographs = tmp_path / "photographs"
+    photographs.mkdir()
+    (photographs / "tl000 pl000 tv000 pv000.JPG").write_bytes(b"one")
+    before = import_job._digest(photographs)
+    (photographs / "Thumbs.db").write_bytes(b"cache")
+    assert import_job._digest(photographs) == before
+    (photographs / "tl015 pl000 tv000 pv000.png").write_bytes(b"two")
+    assert import_job._digest(photographs) != before
+
+
+def test_rounded_footprints_of_the_whole_tile_are_fitted(opened: Open, tmp_path: Path) -> None:
+    """Half precision rounds 0.5 up; the fit must not look for a level before the first."""
+    source = Listed()
+    source.arrays["sigma"][:] = 0.5003
+    import_measured(opened(source, queries={"test": "100"}), tmp_path / "shards")
+    assert Dataset.open(tmp_path / "shards").load("train")["sigma"].max() == 0.5
+    config = FitConfig.model_validate({"model": "neumip-baseline", "training": {"steps": 3, "batch": 500}})
+    assert fit(config, tmp_path / "shards", tmp_path / "fit").errors["test"]["n"] == 100

@@ -1,0 +1,360 @@
+"""``repair`` restores what ``verify`` finds missing or corrupt, and nothing else."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.datasets import edit
+from support.small_runs import command, contents, generate, noisy_plane
+
+from mbtf_core.console import run
+from mbtf_core.data.verify import verify
+from mbtf_core.errors import InputError
+from mbtf_fit.cli.app import app as fit_app
+from mbtf_gen.cli.app import app
+from mbtf_gen.generation import repair as repairs
+from mbtf_gen.generation.repair import Corruption, repair
+from mbtf_gen.job import Job
+from mbtf_gen.planning.effects_plan import reference_plan
+from mbtf_gen.planning.run_plan import RunPlan, plan_run
+from mbtf_gen.planning.simulation import ClosedForm
+
+
+@pytest.fixture(autouse=True)
+def fast_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ClosedForm, "estimate", noisy_plane)
+    monkeypatch.setattr(os, "fsync", lambda handle: None)
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    """A data set of three training shards and a test shard, and beside it another copy, `whole`."""
+    assert generate(command(tmp_path, tmp_path / "out")) == 0
+    shutil.copytree(tmp_path / "out", tmp_path / "whole")
+    return tmp_path / "out"
+
+
+def flip(path: Path, at: int) -> None:
+    content = bytearray(path.read_bytes())
+    content[at] ^= 4
+    path.write_bytes(content)
+
+
+def moments(folder: Path) -> dict[str, int]:
+    return {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
+
+
+def replace_by_another(out: Path) -> None:
+    """Shard 1 is a copy of shard 0 under its own name."""
+    for suffix in (".npz", ".json"):
+        shutil.copy(out / f"train-00000{suffix}", out / f"train-00001{suffix}")
+    edit(out / "train-00001.json", lambda record: record.update(file="train-00001.npz", index=1))
+
+
+CORRUPTIONS: dict[str, tuple[Callable[[Path], object], set[str], set[str]]] = {
+    "nothing": (lambda out: None, set(), set()),
+    "byte": (lambda out: flip(out / "train-00002.npz", 2000), {"train-00002.npz"}, set()),
+    "cut": (lambda out: os.truncate(out / "test-00000.npz", 900), {"test-00000.npz"}, set()),
+    "shard gone": (lambda out: (out / "train-00000.npz").unlink(), {"train-00000.npz"}, set()),
+    "sidecar gone": (lambda out: (out / "train-00001.json").unlink(), {"train-00001.npz"}, set()),
+    "sidecar": (lambda out: flip(out / "train-00001.json", 500), {"train-00001.npz"}, set()),
+    "copy": (replace_by_another, {"train-00000.npz", "train-00001.npz"}, set()),
+    "configuration": (lambda out: flip(out / "config.yaml", 30), set(), {"config.yaml"}),
+    "configuration gone": (lambda out: (out / "config.yaml").unlink(), set(), {"config.yaml"}),
+    "geometry": (lambda out: flip(out / "geometry.exr", 700), set(), {"geometry.exr"}),
+    "geometry cut": (lambda out: os.truncate(out / "geometry.exr", 900), set(), {"geometry.exr"}),
+    "geometry gone": (lambda out: (out / "geometry.exr").unlink(), set(), {"geometry.exr"}),
+    "manifest and geometry": (
+        lambda out: (flip(out / "manifest.json", 90), flip(out / "geometry.exr", 2000)),
+        set(),
+        {"manifest.json", "geometry.exr"},
+    ),
+    "blank of the manifest": (lambda out: flip(out / "manifest.json", 3), set(), {"manifest.json"}),
+    "manifest gone": (lambda out: (out / "manifest.json").unlink(), set(), {"manifest.json"}),
+    "no JSON": (lambda out: (out / "manifest.json").write_text("{"), set(), {"manifest.json"}),
+    "listed twice": (
+        lambda out: edit(
+            out / "manifest.json",
+            lambda m: m["splits"]["train"]["shards"].append(m["splits"]["train"]["shards"][0]),
+        ),
+        set(),
+        {"manifest.json"},
+    ),
+    "manifest and shard": (
+        lambda out: (flip(out / "manifest.json", 90), flip(out / "train-00000.npz", 700)),
+        {"train-00000.npz"},
+        {"manifest.json"},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CORRUPTIONS)
+def test_faulty_files_are_restored_and_nothing_else(name: str, out: Path) -> None:
+    corrupt, shards, documents = CORRUPTIONS[name]
+    corrupt(out)
+    before = moments(out)
+    planned = Corruption(out)
+    assert {e.file for e in planned.entries} == shards
+    assert set(planned.documents) == documents
+    assert moments(out) == before
+    done = repair(out)
+    assert (set(done.shards), set(done.documents), done.complete) == (shards, documents, True)
+    assert contents(out) == contents(out.parent / "whole")
+    assert verify(out) == []
+    touched = shards | {Path(s).with_suffix(".json").name for s in shards} | documents | {"manifest.json"}
+    kept = set(before) - touched
+    assert {f: t for f, t in moments(out).items() if f in kept} == {f: before[f] for f in kept}
+    # A second repair finds nothing and writes nothing.
+    before = moments(out)
+    assert repair(out).faults == []
+    assert moments(out) == before
+
+
+def test_foreign_files_are_named_and_left_alone(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copy(out / "train-00000.npz", out / "train-00007.npz")
+    flip(out / "train-00000.npz", 700)
+    done = repair(out)
+    (out / "notes.txt").write_text("harmless")
+    assert done.foreign == ["train-00007.npz"]
+    assert done.shards == ["train-00000.npz"]
+    assert verify(out) == []
+    capsys.readouterr()
+    # The data set is whole: both commands say so, and name what else is there.
+    for name, says in (("repair", "nothing to repair"), ("verify", "4 shards and geometry.exr, all intact")):
+        assert generate([name, str(out)]) == 0
+        text = capsys.readouterr().out
+        assert f"{out}: {says}\n" in text
+        assert f"{out}: not part of the data set, left alone: notes.txt, train-00007.npz\n" in text
+        assert generate([name, str(out), "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)["foreign"] == ["notes.txt", "train-00007.npz"]
+
+
+@pytest.fixture
+def other(out: Path) -> Path:
+    """The same of another seed."""
+    line = command(out.parent, out.parent / "other")
+    assert generate([*line, "--seed", "1"]) == 0
+    return out.parent / "other"
+
+
+def copy_files(source: Path, out: Path, *names: str) -> None:
+    for name in names:
+        shutil.copy(source / name, out)
+
+
+DISAGREEMENTS: dict[str, tuple[tuple[str, ...], str, str, set[str]]] = {
+    # files of the other run: what belongs to this run and to the other one, shards to render for this run
+    "manifest": (("manifest.json",), "config.yaml, 4 shards", "manifest.json", set()),
+    "manifest and configuration": (
+        ("manifest.json", "config.yaml"),
+        "4 shards",
+        "manifest.json, config.yaml",
+        set(),
+    ),
+    "configuration": (("config.yaml",), "manifest.json, 4 shards", "config.yaml", set()),
+    "shard": (
+        ("train-00001.npz", "train-00001.json"),
+        "manifest.json, config.yaml, 3 shards",
+        "1 shard",
+        {"train-00001.npz"},
+    ),
+    "everything but shards": (
+        ("train-00000.json", "manifest.json"),
+        "config.yaml, 3 shards",
+        "manifest.json, 1 shard",
+        {"train-00000.npz"},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", DISAGREEMENTS)
+def test_files_that_disagree_are_named_and_not_touched(name: str, out: Path, other: Path) -> None:
+    files, mine, theirs, rendered = DISAGREEMENTS[name]
+    this, that = (json.loads((f / "manifest.json").read_text())["config_hash"][:8] for f in (out, other))
+    copy_files(other, out, *files)
+    before = moments(out)
+    for dry_run in (False, True):
+        with pytest.raises(InputError, match="its files belong to 2 data sets") as caught:
+            Corruption(out).entries if dry_run else repair(out)
+        assert f"{this} ({mine})" in caught.value.what
+        assert f"{that} ({theirs})" in caught.value.what
+        assert caught.value.hint == f"nothing was changed; choose one: mbtf-gen repair {out} --keep NAME"
+    with pytest.raises(InputError, match="--keep 01234567 names no data set"):
+        repair(out, keep="01234567")
+    assert generate(["repair", str(out), "-q"]) == 3
+    assert moments(out) == before
+    if name == "manifest and configuration":
+        # Nothing knows this run's options any more.
+        with pytest.raises(InputError, match="the material or the configuration has changed"):
+            repair(out, keep=this)
+        assert moments(out) == before
+        return
+    done = repair(out, keep=this)
+    assert set(done.shards) == rendered
+    assert contents(out) == contents(out.parent / "whole")
+    assert verify(out) == []
+
+
+def test_the_other_data_set_can_be_kept(out: Path, other: Path) -> None:
+    copy_files(other, out, "manifest.json")
+    that = json.loads((other / "manifest.json").read_text())["config_hash"][:8]
+    assert len(repair(out, keep=that).shards) == 4
+    assert contents(out) == contents(other)
+
+
+def test_a_configuration_alone_is_nothing_to_keep(out: Path, other: Path) -> None:
+    copy_files(other, out, "config.yaml")
+    that = json.loads((other / "manifest.json").read_text())["config_hash"][:8]
+    before = moments(out)
+    with pytest.raises(InputError, match=f"--keep {that} names no data set that can be restored"):
+        repair(out, keep=that)
+    assert moments(out) == before
+
+
+@pytest.mark.parametrize("damage", ["deleted", "flipped"])
+def test_a_lost_manifest_is_answered_everywhere(
+    damage: str, out: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = out / "manifest.json"
+    if damage == "deleted":
+        path.unlink()
+    else:
+        flip(path, path.read_bytes().index(b'"aspect": ') + 10)
+    before = contents_of_shards(out)
+    again = command(out.parent, out)
+    lines = [again, ["verify", str(out)], ["merge", str(out)]]
+    lines.append(["preview", str(out), "-o", str(out.parent / "pictures")])
+    if damage == "deleted":
+        lines.append([*again, "--overwrite"])
+    fits = [[str(out), "--time", "1s", "-o", str(out.parent / "material")], ["info", str(out)]]
+    for program, line in [*((app, line) for line in lines), *((fit_app, line) for line in fits)]:
+        capsys.readouterr()
+        assert run(program, line) == 3, line
+        assert f"repair it with: mbtf-gen repair {out}" in capsys.readouterr().err, line
+    assert contents_of_shards(out) == before
+    assert repair(out).documents == ["manifest.json"]
+    assert contents(out) == contents(out.parent / "whole")
+
+
+def contents_of_shards(out: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in out.glob("t*-*")}
+
+
+def test_words_of_another_version_are_no_other_plan(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def reworded(job: Job) -> RunPlan:
+        plan = plan_run(job)
+        effects = tuple(
+            replace(effect, explanation=f"in other words: {effect.explanation}", error=0.1)
+            for effect in plan.effects.effects
+        )
+        return replace(plan, effects=replace(plan.effects, effects=effects))
+
+    monkeypatch.setattr(repairs, "plan_run", reworded)
+    (out / "manifest.json").unlink()
+    done = repair(out)
+    assert (done.shards, done.documents, done.complete) == ([], ["manifest.json"], True)
+    assert "in other words" in (out / "manifest.json").read_text()
+    assert verify(out) == []
+
+
+def test_another_material_is_refused_untouched(out: Path) -> None:
+    flip(out / "train-00000.npz", 700)
+    np.save(out.parent / "plane.npy", np.full((4, 8), 0.25))
+    before = contents(out)
+    with pytest.raises(InputError, match=r"since the data set was generated \(height: [0-9a-f]{8}… -> "):
+        repair(out)
+    assert contents(out) == before
+
+
+def test_a_material_that_has_moved_is_named(out: Path) -> None:
+    flip(out / "train-00000.npz", 700)
+    moved = out.parent / "moved.npy"
+    (out.parent / "plane.npy").rename(moved)
+    with pytest.raises(InputError, match="the material is not at") as caught:
+        repair(out)
+    assert "--material" in caught.value.hint
+    assert repair(out, material=str(moved)).complete
+    assert contents(out) == contents(out.parent / "whole")
+
+
+def test_a_manifest_is_not_restored_without_sidecars(out: Path) -> None:
+    flip(out / "manifest.json", 90)
+    for sidecar in out.glob("t*.json"):
+        flip(sidecar, 200)
+    before = moments(out)
+    with pytest.raises(InputError, match="no sidecar of the folder is intact"):
+        repair(out)
+    assert moments(out) == before
+
+
+def test_a_manifest_is_not_restored_with_another_plan(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    flip(out / "manifest.json", 90)
+
+    def other_plan(job: repairs.Job) -> RunPlan:
+        config = job.config.model_copy(
+            update={"effects": job.config.effects.model_copy(update={"mode": "all"})}
+        )
+        return RunPlan(reference_plan(repairs.Job(config, job.material)))
+
+    monkeypatch.setattr(repairs, "plan_run", other_plan)
+    with pytest.raises(InputError, match="plans the run differently"):
+        repair(out)
+
+
+def test_an_interrupted_repair_is_incomplete(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    flip(out / "train-00000.npz", 700)
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ClosedForm, "estimate", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            repair(out)
+    assert json.loads((out / "manifest.json").read_text())["complete"] is False
+    assert repair(out).complete
+    assert contents(out) == contents(out.parent / "whole")
+
+
+def test_a_dry_run_changes_nothing(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    flip(out / "train-00000.npz", 700)
+    (out / "config.yaml").unlink()
+    before = moments(out)
+    capsys.readouterr()
+    assert generate(["repair", str(out), "--dry-run", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["dry_run"] is True
+    assert (report["shards"], report["documents"]) == (["train-00000.npz"], ["config.yaml"])
+    assert {f["file"] for f in report["faults"]} == {"train-00000.npz", "config.yaml"}
+    assert moments(out) == before
+    assert generate(["repair", str(out)]) == 0
+    text = capsys.readouterr().out
+    assert f"{out}: 1 shards rendered again (train-00000.npz)" in text
+    assert f"{out}: config.yaml written again" in text
+
+
+def test_verify_tells_documents_from_shards(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (out / "geometry.exr").unlink()
+    (out / "test-00000.json").unlink()
+    capsys.readouterr()
+    assert generate(["verify", str(out)]) == 3
+    text = capsys.readouterr().out
+    assert f"{out}: 1 of 4 shards missing, first test-00000.npz" in text
+    assert f"{out / 'geometry.exr'}: is missing; repair it with: mbtf-gen repair {out}" in text
+
+
+def test_folders_without_a_data_set_are_refused(tmp_path: Path) -> None:
+    for folder, message in ((tmp_path / "nowhere", "no such folder"), (tmp_path, r"no manifest\.json")):
+        with pytest.raises(InputError, match=message):
+            repair(folder)
+    (tmp_path / "manifest.json").write_text('{"name": "a web page"}')
+    with pytest.raises(InputError):
+        repair(tmp_path)
+    assert (tmp_path / "manifest.json").read_text() == '{"name": "a web page"}'

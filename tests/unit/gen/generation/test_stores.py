@@ -1,0 +1,409 @@
+"""Data sets in an object store behave as local ones: made, resumed, checked, repaired, replaced."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.object_stores import memory_store
+from support.small_runs import command, contents, generate, noisy_plane
+
+import mbtf_core.data.store_folder
+from mbtf_core.console import run
+from mbtf_core.data.data_folder import data_folder, in_store, local_copy
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.recover import recover_shards
+from mbtf_core.data.schema import ShardEntry
+from mbtf_core.data.store import Store, StoredObject
+from mbtf_core.data.store_folder import StorePath, close_stores
+from mbtf_core.data.verify import verify
+from mbtf_core.errors import InputError, MbtfError, PartialError
+from mbtf_core.files.atomic import checksummed
+from mbtf_gen.cli.app import app
+from mbtf_gen.generation.distribute_shards import render_shard
+from mbtf_gen.planning.simulation import ClosedForm
+
+
+@pytest.fixture(autouse=True)
+def fast_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ClosedForm, "estimate", noisy_plane)
+    monkeypatch.setattr(os, "fsync", lambda handle: None)
+
+
+@pytest.fixture
+def url(tmp_path: Path) -> Iterator[str]:
+    with memory_store(tmp_path / "cache") as found:
+        yield found
+
+
+def command_at(folder: Path, url: str, *more: str, **options: Any) -> list[str]:
+    line = command(folder, Path("OUT"), **options)
+    return [url if word == "OUT" else word for word in line] + list(more)
+
+
+def downloaded(url: str, folder: Path) -> Path:
+    """A local copy of everything in a store."""
+    store = Store(url)
+    folder.mkdir()
+    for name in store.list():
+        (folder / name).write_bytes(store.read(name))
+    return folder
+
+
+@pytest.mark.parametrize("suffix", ["npz", "exr"])
+def test_the_bits_are_those_of_a_local_run(tmp_path: Path, url: str, suffix: str) -> None:
+    form = ["--format", suffix]
+    assert generate(command(tmp_path, tmp_path / "local") + form) == 0
+    assert generate(command_at(tmp_path, url, *form)) == 0
+    assert contents(downloaded(url, tmp_path / "copy")) == contents(tmp_path / "local")
+    assert verify(url) == []
+    local, stored = Dataset.open(tmp_path / "local"), Dataset.open(url)
+    for split in local.splits:
+        mine, theirs = local.load(split), stored.load(split)
+        assert all((mine[name] == theirs[name]).all() for name in mine)
+    assert stored.geometry() is not None
+
+
+def test_nothing_stays_on_the_machine_but_the_cache(tmp_path: Path, url: str) -> None:
+    assert generate(command_at(tmp_path, url)) == 0
+    folder = data_folder(url)
+    assert in_store(folder)
+    assert not [name for name in os.listdir(folder) if name.endswith(".npz")]
+    close_stores()
+    assert os.listdir(tmp_path / "cache" / "mbtf" / "stores" / "work") == []
+
+
+def test_a_path_of_a_store(tmp_path: Path, url: str) -> None:
+    assert generate(command_at(tmp_path, url)) == 0
+    folder = data_folder(Path(url))
+    shard = folder / "train-00000.npz"
+    assert isinstance(shard, StorePath)
+    assert isinstance(shard.parent, StorePath)
+    assert (str(folder), f"{shard}", str(shard.parent)) == (url, f"{url}/train-00000.npz", url)
+    assert shard.exists()
+    assert shard.is_file()
+    assert shard.stat().st_size == local_copy(shard).stat().st_size > 0
+    assert shard.with_suffix(".json").read_bytes().startswith(b"{")
+    assert not (folder / "train-00009.npz").exists()
+    with pytest.raises(FileNotFoundError):
+        (folder / "train-00009.npz").stat()
+    assert {path.name for path in folder.iterdir()} == set(Store(url).list())
+    assert [path.name for path in folder.glob("test-*.json")] == ["test-00000.json"]
+    shard.unlink()
+    assert not shard.exists()
+    assert "train-00000.npz" not in Store(url).list()
+    assert data_folder(f"file://{tmp_path}/a%20b") == tmp_path / "a b"
+    assert not in_store(data_folder(tmp_path))
+
+
+def test_a_finished_run_renders_nothing(tmp_path: Path, url: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert generate(command_at(tmp_path, url)) == 0
+    close_stores()
+    capsys.readouterr()
+    assert generate(command_at(tmp_path, url)) == 0
+    assert "nothing left to do" in capsys.readouterr().out
+
+
+def test_a_list_that_lags_behind(tmp_path: Path, url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The data set is not complete before the store shows all of it."""
+    original = Store.list
+
+    def late(self: Store) -> dict[str, StoredObject]:
+        return {name: found for name, found in original(self).items() if name != "train-00001.npz"}
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Store, "list", late)
+        assert generate(command_at(tmp_path, url)) == 4
+    assert not json.loads(Store(url).read("manifest.json"))["complete"]
+    assert generate(command_at(tmp_path, url)) == 0
+    assert generate(command(tmp_path, tmp_path / "local")) == 0
+    assert contents(downloaded(url, tmp_path / "copy")) == contents(tmp_path / "local")
+
+
+def test_slices_and_merge(tmp_path: Path, url: str) -> None:
+    assert generate(command(tmp_path, tmp_path / "local")) == 0
+    assert generate(command_at(tmp_path, url, "--slice", "1/2")) == 0
+    close_stores()
+    assert generate(command_at(tmp_path, url, "--slice", "2/2")) == 0
+    close_stores()
+    assert run(app, ["merge", url, "-q"]) == 0
+    assert contents(downloaded(url, tmp_path / "copy")) == contents(tmp_path / "local")
+
+
+def test_the_manifest_of_another_writer_is_adopted(
+    tmp_path: Path, url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another machine stores its manifest between this one's look at the store and its own."""
+    assert generate(command_at(tmp_path, url)) == 0
+    theirs = checksummed({**json.loads(Store(url).read("manifest.json")), "note": "theirs"})
+    for name in Store(url).list():
+        Store(url).delete(name)
+    close_stores()
+    original = Store.write
+
+    def late(self: Store, name: str, content: bytes, *, new: bool = False) -> bool:
+        if name == "manifest.json" and not self.list():
+            original(self, name, theirs)
+        return original(self, name, content, new=new)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Store, "write", late)
+        assert generate(command_at(tmp_path, url)) == 0
+    assert verify(url) == []
+    assert json.loads(Store(url).read("manifest.json"))["note"] == "theirs"
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_a_shard_without_sidecar_is_replaced(tmp_path: Path, url: str, same: bool) -> None:
+    """A writer was killed between the two; another machine may compute other bits."""
+    assert generate(command_at(tmp_path, url)) == 0
+    expected = contents(downloaded(url, tmp_path / "before"))
+    store = Store(url)
+    store.delete("train-00001.json")
+    if not same:
+        store.write("train-00001.npz", b"other bits")
+    close_stores()
+    assert generate(command_at(tmp_path, url)) == 0
+    assert contents(downloaded(url, tmp_path / "after")) == expected
+
+
+def test_the_shard_of_another_writer_is_kept(
+    tmp_path: Path, url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two writers without slices: the one that comes second adopts what the first has finished."""
+    assert generate(command_at(tmp_path, url)) == 0
+    store = Store(url)
+    shard, sidecar = store.read("train-00001.npz"), store.read("train-00001.json")
+    store.delete("train-00001.json")
+    store.delete("train-00001.npz")
+    close_stores()
+    original = Store.write
+
+    def late(self: Store, name: str, content: bytes, *, new: bool = False) -> bool:
+        if name == "train-00001.npz":
+            original(self, name, shard)
+            original(self, "train-00001.json", sidecar)
+            content = content[:-1]  # the bits of another type of machine
+        return original(self, name, content, new=new)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Store, "write", late)
+        assert generate(command_at(tmp_path, url)) == 0
+    assert store.read("train-00001.json") == sidecar
+    assert verify(url) == []
+
+
+def test_corruption_is_found_and_repaired(
+    tmp_path: Path, url: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert generate(command_at(tmp_path, url)) == 0
+    expected = contents(downloaded(url, tmp_path / "before"))
+    Dataset.open(url).load("train")  # the cache has the intact shards
+    store = Store(url)
+    flipped = bytearray(store.read("train-00001.npz"))
+    flipped[-100] ^= 1
+    store.write("train-00001.npz", bytes(flipped))
+    store.delete("train-00000.npz")
+    store.write("geometry.exr", store.read("geometry.exr")[:-1])
+    store.delete("config.yaml")
+    store.write("notes.txt", b"mine")
+    faulty = {"train-00000.npz", "train-00001.npz", "geometry.exr", "config.yaml"}
+    assert {fault.file for fault in verify(url)} == faulty
+    close_stores()
+    assert run(app, ["verify", url, "-q"]) == 3
+    assert f"mbtf-gen repair {url}" in capsys.readouterr().out
+    assert run(app, ["repair", url, "-q"]) == 0
+    assert verify(url) == []
+    found = contents(downloaded(url, tmp_path / "after"))
+    assert found.pop("notes.txt") == b"mine"
+    assert found == expected
+
+
+def test_a_lost_manifest_is_restored(tmp_path: Path, url: str) -> None:
+    assert generate(command_at(tmp_path, url)) == 0
+    expected = contents(downloaded(url, tmp_path / "before"))
+    Store(url).delete("manifest.json")
+    close_stores()
+    assert run(app, ["repair", url, "-q"]) == 0
+    assert contents(downloaded(url, tmp_path / "after")) == expected
+
+
+def test_another_configuration_is_refused_and_replaced(
+    tmp_path: Path, url: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert generate(command_at(tmp_path, url)) == 0
+    assert generate(command_at(tmp_path, url, train=50)) == 3
+    assert f"{url}: holds a data set of another configuration" in capsys.readouterr().err
+    assert generate(command_at(tmp_path, url, "--overwrite", train=50)) == 0
+    assert generate(command(tmp_path, tmp_path / "local", train=50)) == 0
+    assert contents(downloaded(url, tmp_path / "copy")) == contents(tmp_path / "local")
+
+
+def test_a_folder_of_something_else_is_refused(
+    tmp_path: Path, url: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Store(url).write("thesis.tex", b"text")
+    assert generate(command_at(tmp_path, url)) == 3
+    assert f"{url}: is not empty and holds no data set" in capsys.readouterr().err
+    assert set(Store(url).list()) == {"thesis.tex"}
+
+
+def test_missing_data_sets_are_named(url: str) -> None:
+    with pytest.raises(InputError, match=f"{url}: no manifest.json in it"):
+        Dataset.open(url)
+
+
+def test_a_url_names_a_bucket() -> None:
+    with pytest.raises(InputError, match="names no bucket"):
+        Dataset.open("s3://")
+
+
+def test_a_cache_that_cannot_be_written(tmp_path: Path, url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert generate(command_at(tmp_path, url)) == 0
+    (tmp_path / "file").touch()
+    close_stores()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    with pytest.raises(InputError, match="cannot be created"):
+        Dataset.open(url)
+
+
+def test_a_corrupt_shard_is_not_read(tmp_path: Path, url: str) -> None:
+    assert generate(command_at(tmp_path, url)) == 0
+    store = Store(url)
+    flipped = bytearray(store.read("train-00001.npz"))
+    flipped[-100] ^= 1
+    store.write("train-00001.npz", bytes(flipped))
+    with pytest.raises(InputError, match=f"{url}/train-00001.npz: has changed since it was written"):
+        Dataset.open(url).load("train")
+
+
+def test_a_digest_names_no_file_elsewhere(tmp_path: Path, url: str) -> None:
+    assert generate(command_at(tmp_path, url)) == 0
+    store = Store(url)
+    record = json.loads(store.read("train-00001.json"))
+    store.write("train-00001.json", checksummed(record | {"sha256": f"../{'0' * 61}"}))
+    with pytest.raises(InputError, match=f"{url}/train-00001.npz: has no readable sidecar"):
+        Dataset.open(url).load("train")
+
+
+@pytest.mark.parametrize("error", [PartialError, InputError])
+@pytest.mark.parametrize("ended", [True, False])
+def test_shards_that_could_not_be_uploaded_wait(
+    tmp_path: Path, url: str, monkeypatch: pytest.MonkeyPatch, error: type[MbtfError], ended: bool
+) -> None:
+    """The connection ends during a run, or the credentials do: what is rendered is kept, and the next run
+    uploads it, also in the same process."""
+    assert generate(command(tmp_path, tmp_path / "local", train=200)) == 0
+    rendered: list[str] = []
+    original, estimate = Store.write, ClosedForm.estimate
+
+    def cut(self: Store, name: str, content: bytes, *, new: bool = False) -> bool:
+        if name.startswith("train-00001"):
+            raise error("the store cannot be reached", where=self.url)
+        return original(self, name, content, new=new)
+
+    def counted(self: ClosedForm, *arguments: Any) -> Any:
+        rendered.append("")
+        return estimate(self, *arguments)
+
+    monkeypatch.setattr(ClosedForm, "estimate", counted)
+    with monkeypatch.context() as patch:
+        patch.setattr(Store, "write", cut)
+        # The second one has to leave what the first one left.
+        for _ in range(2):
+            assert generate(command_at(tmp_path, url, train=200)) == error.exit_code
+            assert "train-00001.npz" in {fault.file for fault in verify(url)}
+            if ended:
+                close_stores()
+    assert generate(command_at(tmp_path, url, train=200)) == 0
+    # Every shard was rendered once.
+    assert len(rendered) == 6
+    assert contents(downloaded(url, tmp_path / "copy")) == contents(tmp_path / "local")
+    close_stores()
+    assert os.listdir(tmp_path / "cache" / "mbtf" / "stores" / "work") == []
+
+
+@pytest.fixture
+def left(tmp_path: Path, url: str, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A shard that a process which has ended could not upload."""
+    with monkeypatch.context() as patch:
+        patch.setattr(mbtf_core.data.store_folder.StoreFolder, "send_shard", _unreachable)
+        assert generate(command_at(tmp_path, url)) == 4
+    found = min(Path(os.fspath(data_folder(url))).glob("*.npz"))
+    close_stores()
+    return found
+
+
+def test_damaged_leftovers_are_rendered_again(tmp_path: Path, url: str, left: Path) -> None:
+    content = bytearray(left.read_bytes())
+    content[-100] ^= 1
+    left.write_bytes(bytes(content))
+    assert generate(command_at(tmp_path, url)) == 0
+    assert generate(command(tmp_path, tmp_path / "local")) == 0
+    assert contents(downloaded(url, tmp_path / "copy")) == contents(tmp_path / "local")
+
+
+@pytest.mark.parametrize("other", ["url", "config_hash", "plan", ""])
+def test_leftovers_of_another_data_set_are_not_uploaded(url: str, left: Path, other: str) -> None:
+    record = json.loads(left.with_suffix(".json").read_bytes())
+    entry = ShardEntry(record["split"], record["index"], record["file"], record["rows"])
+    record = {"url": url} | record | {other: f"{url}-other" if other == "url" else "0" * 64}
+    sent = recover_shards(data_folder(record["url"]), [entry], record["config_hash"], record["plan"])
+    assert sent == ([] if other else [left.name])
+    assert (left.name in Store(record["url"]).list()) == (not other)
+    # It is left to the next writer of its URL.
+    assert left.exists() == (other == "url")
+
+
+def test_a_leftover_replaces_the_sidecar_of_a_lost_shard(
+    tmp_path: Path, url: str, left: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, sidecar = Store(url), f"{left.stem}.json"
+    store.write(sidecar, b"of a shard that is gone")
+    with monkeypatch.context() as patch:
+        patch.setattr(mbtf_core.data.store_folder.StoreFolder, "send_shard", _unreachable)
+        assert generate(command_at(tmp_path, url)) == 4
+    # A sidecar is never there before its shard, nor does a leftover go before it is uploaded.
+    assert sidecar not in store.list()
+    assert left.exists()
+    assert generate(command_at(tmp_path, url)) == 0
+    assert verify(url) == []
+
+
+def test_a_worker_looks_again_for_a_shard_that_it_knows(tmp_path: Path, url: str) -> None:
+    """It runs longer than a command, and others may remove what it has stored."""
+    assert generate(command_at(tmp_path, url)) == 0
+    record = json.loads(Store(url).read("train-00001.json"))
+    material = str(tmp_path / "plane.npy")
+    config = json.loads(Store(url).read("manifest.json"))["config"] | {"material": material}
+    arguments = {key: record[key] for key in ("config_hash", "plan", "file")}
+    assert not render_shard(config, url, **arguments)["rendered"]
+    Store(url).delete("train-00001.npz")
+    assert render_shard(config, url, **arguments)["rendered"]
+    assert verify(url) == []
+
+
+def _unreachable(*_: object) -> None:
+    raise PartialError("the store cannot be reached")
+
+
+def test_a_stored_data_set_is_published(tmp_path: Path, url: str) -> None:
+    assert generate(command_at(tmp_path, url)) == 0
+    card = tmp_path / "card"
+    assert run(app, ["publish", url, "--license", "CC0-1.0", "--form", "npz", "-o", str(card), "-q"]) == 0
+    assert verify(card / "data") == []
+    shutil.rmtree(card)
+
+
+@pytest.mark.parametrize("program", ["preview", "reference"])
+def test_only_data_sets_are_written_to_stores(
+    tmp_path: Path, url: str, program: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = command(tmp_path, tmp_path / "unused")
+    assert run(app, [program, line[0], "-o", url]) == 2
+    assert "only data sets are written to object stores" in capsys.readouterr().err
