@@ -1,29 +1,30 @@
-"""Paths per second of the estimator on random queries, beside stock Mitsuba on an easy picture.
+"""Speed of the generator, and where its time goes.
 
-    python benchmarks/throughput.py [--material PATH] [--runs 5] [--queries 262144] [--spp 16]
+    python benchmarks/generator.py [speed] [--material PATH] [--runs 5] [--queries 262144] [--spp 16]
+    python benchmarks/generator.py steps [--runs 3]
 
-**ours**: random 7D queries (σ over all levels, both directions uniform on the projected disk) against a tile
-of 512² cells with bitmaps of color and roughness, light of 1° RMS, at most 6 interactions.
-**mesh**: the same with ``geometry.tracer: mesh``, Mitsuba's ray tracing of the tile's triangles.
-**stock**: ``mi.render`` with the ``path`` integrator, one directional light, the same mesh as a single tile
-seen straight from above by an orthographic camera, as many paths, the same limits on depth: coherent rays,
-every one of which hits. It is what the renderer can do at best, not a goal for random queries.
+``speed`` measures paths per second in three ways that alternate:
 
-All reflect by ``mbtf_surface`` with the same maps, and end paths by the same rule and depth. Variance
-× time is the noise of a query (a pixel) of `spp` paths, relative to the mean, times the seconds of the run;
-queries and pixels do not show the same, so only figures of one side are to be compared with each other.
+- **generator**: random queries (σ over all levels, both directions uniform on the projected disk) on a tile
+  of 512² cells with maps of color and roughness, light of 1° RMS, at most six interactions.
+- **mesh**: the same with ``geometry.tracer: mesh``, Mitsuba's ray tracing of the tile's triangles.
+- **mitsuba**: ``mi.render`` with the ``path`` integrator, one directional light, the same mesh as a single
+  tile from straight above, as many paths, the same depth and roulette. Its rays are coherent and all hit: it
+  is the renderer's best case, not a goal for random queries.
 
-They alternate, run by run, after one run of each that compiles the kernels. The last line is one JSON
-object: figures, and the bar they are held to, which is the ratio of the first rate to the last. Exit code 1
-where the bar is missed; on other than two cores it is only reported.
+All reflect by ``mbtf_surface``. Variance × time is that of one query or pixel relative to the squared mean;
+queries and pixels differ, so compare it only within one way.
+
+``steps`` traces the same queries with one step of light transport after the other: the plane alone, the first
+ray, the ray to the light, light that BSDF sampling finds, and up to six interactions.
+
+The last line is one JSON object. The threshold holds on two cores; elsewhere the ratio is only reported.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
-import sys
 import time
 from collections.abc import Callable
 from functools import partial
@@ -31,9 +32,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from common import alternate, finish, parser_of, start
 from numpy.typing import NDArray
 
-from mbtf_core.errors import MbtfError
 from mbtf_core.lattice import Lattice
 from mbtf_gen.config.generator import Tracer
 from mbtf_gen.material.load import load_material
@@ -48,9 +49,8 @@ MESH = 512
 DEPTH = 6
 ROULETTE = 3
 LIGHT_WIDTH = 1.0
-# Our rate over the stock rate, on two cores; the aim is 1.
-BAR = 0.75
-BAR_CORES = 2
+THRESHOLDS = {"generator over mitsuba": 0.75}
+CORES = 2
 
 
 # (seconds, variance over the squared mean of one query or pixel) of a run of a given number.
@@ -84,7 +84,13 @@ def rocky() -> Material:
     )
 
 
-def our_run(
+def query_plan(grid: HeightGrid, count: int) -> QueryPlan:
+    """Levels log-uniform; the generator's default favors fine ones, which are faster."""
+    lattice = Lattice.for_map(*grid.z.shape)
+    return QueryPlan(lattice, Mixture(1.0, 0.0), 0.1, "shuffled", 0, count)
+
+
+def generator_run(
     material: Material, grid: HeightGrid, count: int, spp: int, tracer: Tracer = "heightfield"
 ) -> Run:
     """A function of the run's number that traces `count` queries."""
@@ -94,13 +100,9 @@ def our_run(
     from mbtf_gen.render.scene import build_tile
     from mbtf_gen.sampling.light_kernel import LightKernel
 
-    estimator = Estimator(
-        build_tile(grid, bsdf_of(material), tracer), LightKernel(LIGHT_WIDTH), Transport(DEPTH, ROULETTE)
-    )
-    lattice = Lattice.for_map(*grid.z.shape)
-    # Levels log-uniform, as a reader of "all levels" expects; the generator's default favors fine ones,
-    # which are faster.
-    plan = QueryPlan(lattice, Mixture(1.0, 0.0), 0.1, "shuffled", 0, count)
+    light, transport = LightKernel(LIGHT_WIDTH), Transport(DEPTH, ROULETTE)
+    estimator = Estimator(build_tile(grid, bsdf_of(material), tracer), light, transport)
+    plan = query_plan(grid, count)
 
     def run(number: int) -> tuple[float, float]:
         queries = plan.draw("train", number, count)
@@ -115,7 +117,7 @@ def our_run(
     return run
 
 
-def stock_run(material: Material, grid: HeightGrid, count: int, spp: int) -> Run:
+def mitsuba_run(material: Material, grid: HeightGrid, count: int, spp: int) -> Run:
     """The same for ``mi.render`` and a picture of `count` pixels."""
     import drjit as dr
     import mitsuba as mi
@@ -190,68 +192,105 @@ def spread(seconds: list[float], paths: int) -> dict[str, float]:
     }
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument(
-        "--material", type=Path, help="height map, folder or material.yaml; own one by default"
-    )
-    parser.add_argument("--height-scale", type=float, help="factor on its stored heights")
-    parser.add_argument("--runs", type=int, default=5, help="timed runs of each")
-    parser.add_argument("--queries", type=int, default=1 << 18, help="queries per run")
-    parser.add_argument("--spp", type=int, default=16, help="paths per query (even)")
-    arguments = parser.parse_args()
-    try:
-        load_mitsuba()
-        material = load_material(arguments.material) if arguments.material else rocky()
-    except MbtfError as error:
-        print(f"error: {error.message}", file=sys.stderr)
-        return error.exit_code
+def measure_speed(material: Material, arguments: argparse.Namespace) -> int:
+    """Paths per second in the three ways."""
     import drjit as dr
 
     grid = material.grid(arguments.height_scale, MESH)
-    makers: dict[str, Any] = {"ours": our_run, "mesh": partial(our_run, tracer="mesh"), "stock": stock_run}
+    makers: dict[str, Any] = {
+        "generator": generator_run,
+        "mesh": partial(generator_run, tracer="mesh"),
+        "mitsuba": mitsuba_run,
+    }
     runs = {name: make(material, grid, arguments.queries, arguments.spp) for name, make in makers.items()}
     seconds: dict[str, list[float]] = {name: [] for name in runs}
     variances: dict[str, list[float]] = {name: [] for name in runs}
-    for number in range(-1, arguments.runs):
+    for number in range(arguments.runs + 1):
         for name, run in runs.items():
-            took, variance = run(number + 1)
-            if number >= 0:
+            took, variance = run(number)
+            if number:
                 seconds[name].append(took)
                 variances[name].append(variance)
-                print(f"run {number + 1}: {name:5s} {took:.2f} s", file=sys.stderr)
     paths = arguments.queries * arguments.spp
     figures = {name: spread(took, paths) for name, took in seconds.items()}
-    cores = dr.thread_count()
     products = {
         name: float(f"{statistics.median(seconds[name]) * statistics.mean(variances[name]):.3g}")
         for name in runs
     }
     for name, rates in figures.items():
         print(
-            f"{name:5s} {rates['median']:.2f} M paths/s ({rates['min']:.2f} to {rates['max']:.2f}), "
+            f"{name:9s} {rates['median']:.2f} M paths/s ({rates['min']:.2f} to {rates['max']:.2f}), "
             f"relative variance x time {products[name]:.3g} s"
         )
-    ratio = round(figures["ours"]["median"] / figures["stock"]["median"], 3)
-    over_mesh = round(figures["ours"]["median"] / figures["mesh"]["median"], 3)
-    print(f"ours / stock {ratio:.2f}, ours / mesh {over_mesh:.2f}; {cores} threads, {paths} paths per run")
-    met = ratio >= BAR
+    ratio = round(figures["generator"]["median"] / figures["mitsuba"]["median"], 3)
+    cores = dr.thread_count()
+    print(f"generator over mitsuba {ratio:.2f}; {cores} threads, {paths} paths per run")
     report = {
-        "figures": {
-            "million_paths_per_second": figures,
-            "ours_over_stock": ratio,
-            "ours_over_mesh": over_mesh,
-            "relative_variance_times_seconds": products,
-            "threads": cores,
-            "paths_per_run": paths,
-            "material": str(arguments.material) if arguments.material else "own relief",
-        },
-        "bars": {"ours_over_stock_on_two_cores": BAR},
-        "met": met if cores == BAR_CORES else None,
+        "million_paths_per_second": figures,
+        "generator over mitsuba": ratio,
+        "generator over mesh": round(figures["generator"]["median"] / figures["mesh"]["median"], 3),
+        "relative_variance_times_seconds": products,
+        "threads": cores,
+        "paths_per_run": paths,
+        "material": str(arguments.material or "random heights"),
     }
-    print(json.dumps(report))
-    return 1 if cores == BAR_CORES and not met else 0
+    met = ratio >= THRESHOLDS["generator over mitsuba"]
+    return finish(report, THRESHOLDS, met if cores == CORES else None)
+
+
+def measure_steps(material: Material, arguments: argparse.Namespace) -> int:
+    """Time per path with one step of light transport after the other."""
+    from mbtf_gen.render.bsdf.plugin import bsdf_of
+    from mbtf_gen.render.estimator import Estimator, Stream
+    from mbtf_gen.render.path_tracer import Transport
+    from mbtf_gen.render.scene import build_tile
+    from mbtf_gen.sampling.light_kernel import LightKernel
+
+    grid = material.grid(arguments.height_scale, MESH)
+    tile, light = build_tile(grid, bsdf_of(material)), LightKernel(LIGHT_WIDTH)
+    bare: dict[str, Any] = {"shadowing": False, "interreflection": False, "bsdf_sampling": False}
+    steps = {
+        "plane": Transport(1, displacement=False, **bare),
+        "first ray": Transport(1, **bare),
+        "ray to the light": Transport(1, interreflection=False, bsdf_sampling=False),
+        "light found by BSDF sampling": Transport(1, interreflection=False),
+        "up to six interactions": Transport(DEPTH),
+    }
+    plan = query_plan(grid, arguments.queries)
+
+    def traced(transport: Transport) -> Callable[[int], Any]:
+        estimator = Estimator(tile, light, transport)
+        return lambda number: estimator.estimate(
+            plan.draw("train", number, arguments.queries), arguments.spp, Stream(0, "train", number)
+        )
+
+    seconds = alternate({name: traced(step) for name, step in steps.items()}, arguments.runs)
+    before, rows = 0.0, []
+    for name, took in seconds.items():
+        each = 1e6 * statistics.median(took) / (arguments.queries * arguments.spp)
+        rows.append({"step": name, "million_paths_per_second": 1 / each, "microseconds": each})
+        print(f"{name:28s} {1 / each:6.2f} M paths/s  {each:.3f} µs per path, {each - before:+.3f}")
+        before = each
+    return finish(rows, {}, None)
+
+
+def main() -> int:
+    parser = parser_of(__doc__)
+    parser.add_argument("part", nargs="?", choices=("speed", "steps"), default="speed")
+    parser.add_argument("--material", type=Path, help="height map, folder or material.yaml")
+    parser.add_argument("--height-scale", type=float, help="factor on its stored heights")
+    parser.add_argument("--runs", type=int, default=5, help="timed runs of each way")
+    parser.add_argument("--queries", type=int, default=1 << 18, help="queries per run")
+    parser.add_argument("--spp", type=int, default=16, help="paths per query (even)")
+    arguments = parser.parse_args()
+    load_mitsuba()
+    material = load_material(arguments.material) if arguments.material else rocky()
+    return (
+        measure_speed(material, arguments)
+        if arguments.part == "speed"
+        else measure_steps(material, arguments)
+    )
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    start(main)
