@@ -1,4 +1,4 @@
-"""The example of ``docs/explanation/statistics.md`` runs as printed and agrees with the text."""
+"""``examples/dataset_statistics.py`` runs, and finds what the data were made with."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from support.paths import ROOT
 
 from mbtf_core import stats
 
-DOCUMENT = (ROOT / "docs/explanation/statistics.md").read_text(encoding="utf-8")
+EXAMPLE = (ROOT / "examples/dataset_statistics.py").read_text(encoding="utf-8")
 
 
 def test_the_worked_example(
@@ -21,7 +21,7 @@ def test_the_worked_example(
     write_dataset(tmp_path / "shards", queries={"train": "2000", "test": "4000"})
     monkeypatch.chdir(tmp_path)
     found: dict[str, Any] = {}
-    exec(re.findall(r"```python\n(.*?)```", DOCUMENT, re.S)[0], found)
+    exec(EXAMPLE, found)
     printed = capsys.readouterr().out
     assert len(re.findall(r" ± ", printed)) >= 8
     constant = stats.unexplained_variance(found["constant"], found["a"], found["b"])
