@@ -15,10 +15,8 @@ The last line is a JSON object.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
-import json
 import os
 import random
 import shutil
@@ -32,6 +30,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from common import finish, parser_of, start
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
@@ -185,7 +184,7 @@ def rendered(folder: Path, kills: int, dice: random.Random) -> dict[str, Any]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = parser_of(__doc__)
     for name, default in (("kills", 500), ("flips", 10_000), ("repairs", 200), ("rendered", 20), ("seed", 0)):
         parser.add_argument(f"--{name}", type=int, default=default)
     options = parser.parse_args()
@@ -206,9 +205,9 @@ def main() -> int:
             print(f"{step}: {figures[step]}", file=sys.stderr)
     bad = ("damaged", "different", "refused", "missed", "not repaired")
     lost = sum(counts.get(name, 0) for counts in figures.values() for name in bad)
-    print(json.dumps({**figures, "bars": {"lost or not found": 0}, "lost or not found": lost}))
-    return int(lost > 0)
+    figures["lost or not found"] = lost
+    return finish(figures, {"lost or not found": 0}, lost == 0)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    start(main)

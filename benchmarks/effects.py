@@ -1,28 +1,23 @@
-"""Speed of ``--effects auto`` against ``--effects all``, planning included, and whether their values agree;
-with ``--costs``, whether what the plan states about costs is true.
+"""What the effects plan saves, and whether its bias bounds hold.
 
     python benchmarks/effects.py [MATERIAL ...] [--only] [--queries N] [--spp N] [--rounds N]
-    python benchmarks/effects.py [MATERIAL ...] [--only] --costs
+    python benchmarks/effects.py [MATERIAL ...] [--only] --bias
 
-For made surfaces (flat Lambert, black, dark, mid-gray), the project's assets and every material given it
-prints the time of both, their ratio, what auto leaves out with the cost that the plan
-states, and the cost measured: the RMS change of M, free of noise, relative to its mean.
+Without ``--bias``: time of ``--effects auto``, planning included, and of ``--effects all``, what the plan
+leaves out, its bias bound, and the measured RMS change of M relative to its mean, free of noise. Materials
+are surfaces made here, the assets, and every material given.
 
-``--costs`` measures for each material, with many paths at queries of their own, what leaving out each effect
-that is off, or that has a cap, really costs; no bound of the plan may lie below it by more than two standard
-errors. Both sides use the same random numbers: a path that neither setting changes cancels exactly, and of a
-cap only the light gathered beyond it is left. Where the plan says that nothing changes, what is measured is
-noise alone: more paths of fewer queries make it small. Effects that stay on are measured as ``mbtf-gen plan``
-does, too, and its figures, which decide nothing, compared.
+``--bias`` measures the bias of leaving out each effect that is off or capped, with many paths at queries of
+their own. No bias bound may lie below it by more than two standard errors. Both sides use the same random
+numbers, so a path that the setting does not change cancels exactly. Where the plan says that nothing changes,
+noise alone is measured: more paths of fewer queries make it small. For effects that stay on, the bias that
+``mbtf-gen plan`` measures is compared as well; it decides nothing.
 
-The last line is a JSON object.
+The last line is one JSON object.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -30,6 +25,7 @@ from statistics import median
 from typing import Any
 
 import numpy as np
+from common import ASSETS, finish, parser_of, start
 
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
@@ -42,10 +38,9 @@ from mbtf_gen.planning.run_plan import SMALL_RUN
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream
 
-ASSETS = Path(__file__).parents[1] / "assets"
 # Ratio of the times, auto over all, that the surfaces are held to: at least 20 times faster, or never slower
 # beyond 3 %.
-BARS = {"flat Lambert": 0.05, "black": 0.05, "dark (albedo 0.05)": 1.0, "mid-gray": 1.03}
+THRESHOLDS = {"flat Lambert": 0.05, "black": 0.05, "dark (albedo 0.05)": 1.0, "mid-gray": 1.03}
 
 
 def surfaces() -> dict[str, Material]:
@@ -71,11 +66,11 @@ def run(
     """Seconds of planning and tracing, the plan, and the values."""
     config = GeneratorConfig.model_validate({"material": "benchmark", "effects": {"mode": mode}})
     job = Job(config, material)
-    asked = job.query_plan.draw("train", 0, queries)
+    chosen = job.query_plan.draw("train", 0, queries)
     start = time.perf_counter()
     # Pilots where a run of this size takes them.
     plan = plan_effects(job, pilots=queries * spp >= SMALL_RUN)
-    found: Estimates = build_estimator(job, plan).estimate(asked, spp, Stream(seed, "train", 0))
+    found: Estimates = build_estimator(job, plan).estimate(chosen, spp, Stream(seed, "train", 0))
     return time.perf_counter() - start, plan, found
 
 
@@ -105,17 +100,17 @@ def compare(name: str, material: Material, queries: int, spp: int, rounds: int) 
         "off": [e.name for e in plan.effects if e.present and not e.on],
         "max_depth": plan.max_depth,
         "closed_form": plan.closed_form,
-        "planned_cost": plan.bias_bound,
-        "measured_cost": change,
-        "measured_cost_at_most": cautious,
+        "bias_bound": plan.bias_bound,
+        "measured_bias": change,
+        "measured_at_most": cautious,
         "mean_shift": float(shift.mean() / mean) if mean > 0 else 0.0,
         "z": z,
-        "bar": BARS.get(name),
+        "threshold": THRESHOLDS.get(name),
     }
     cap = f", at most {plan.max_depth} interactions" if plan.max_depth else ""
     print(
         f"{name:<20} {row['seconds_auto']:8.2f} s {row['seconds_all']:8.2f} s  x{1 / row['ratio']:<7.3g}"
-        f" cost {plan.bias_bound:.1e}, measured {change:.1e} (<= {cautious:.1e}),"
+        f" bias bound {plan.bias_bound:.1e}, measured {change:.1e} (<= {cautious:.1e}),"
         f" mean {row['mean_shift']:+.1e} (z {z:+.1f});"
         f" off: {', '.join(row['off']) or 'nothing'}{cap}",
         flush=True,
@@ -137,21 +132,21 @@ def truth(full: Estimates, cut: Estimates) -> tuple[float, float, float]:
 def verdict(stated: float, low: float, high: float) -> str:
     """Of a bound, against what was measured."""
     if low > stated:
-        return "WRONG"
+        return "wrong"
     if stated == 0.0:
         return "no change seen"
     return "holds" if high <= stated else "not refuted"
 
 
-def costs_of(name: str, material: Material, queries: int, spp: int) -> list[dict[str, Any]]:
-    """Stated and true costs of one material, printed as they come."""
+def biases_of(name: str, material: Material, queries: int, spp: int) -> list[dict[str, Any]]:
+    """Stated and measured biases of one material, printed as they come."""
     job = Job(GeneratorConfig.model_validate({"material": "benchmark"}), material)
     plan = plan_effects(job)
 
     def values(plan: EffectsPlan, limit: int | None = None, fewer: int = 1) -> Estimates:
-        asked = job.query_plan.draw("test", 0, queries // fewer).flat()
+        chosen = job.query_plan.draw("test", 0, queries // fewer).flat()
         found: Estimates = build_estimator(job, plan).estimate(
-            asked, spp * fewer**2, Stream(7, "test", 0), limit=limit, roulette=PILOT_ROULETTE
+            chosen, spp * fewer**2, Stream(7, "test", 0), limit=limit, roulette=PILOT_ROULETTE
         )
         return found
 
@@ -209,39 +204,35 @@ def costs_of(name: str, material: Material, queries: int, spp: int) -> list[dict
     return rows
 
 
-def costs(cases: dict[str, Material], queries: int, spp: int) -> int:
-    """Print the table of costs; 1 where a bound is wrong."""
+def biases(cases: dict[str, Material], queries: int, spp: int) -> int:
+    """Compare bounds with measured biases; 1 where a bound is wrong."""
     print(f"{'material':<16} {'effect':<16} {'':<8} {'plan states':<18} measured (two standard errors)")
-    rows = [row for name, material in cases.items() for row in costs_of(name, material, queries, spp)]
-    met = all(row["verdict"] != "WRONG" for row in rows)
-    print(json.dumps({"figures": rows, "bars": {"wrong bounds": 0}, "met": met}))
-    return 0 if met else 1
+    rows = [row for name, material in cases.items() for row in biases_of(name, material, queries, spp)]
+    met = all(row["verdict"] != "wrong" for row in rows)
+    return finish(rows, {"wrong bounds": 0}, met)
 
 
 def main() -> int:
     """Print the table; 1 where a bar is missed."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = parser_of(__doc__)
     parser.add_argument("materials", nargs="*", type=Path, help="besides the project's assets")
     parser.add_argument("--only", action="store_true", help="the given materials without the assets")
-    parser.add_argument("--queries", type=int, help="default: 2^20, or 2^14 for costs")
-    parser.add_argument("--spp", type=int, help="default: 4, or 64 for costs")
+    parser.add_argument("--queries", type=int, help="default: 2^20, or 2^14 with --bias")
+    parser.add_argument("--spp", type=int, help="default: 4, or 64 with --bias")
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--costs", action="store_true", help="measure what the plan states")
+    parser.add_argument("--bias", action="store_true", help="measure the bias of what is left out")
     options = parser.parse_args()
     assets = sorted(p.parent for p in ASSETS.glob("*/height.exr"))
     folders = [*assets, *options.materials] if not options.only else options.materials
     loaded = {folder.name: load_material(folder) for folder in folders}
-    if options.costs:
-        return costs(loaded, options.queries or 1 << 14, options.spp or 64)
+    if options.bias:
+        return biases(loaded, options.queries or 1 << 14, options.spp or 64)
     queries, spp = options.queries or 1 << 20, options.spp or 4
     print(f"{'':<20} {'auto':>10} {'all':>10}  speed-up ({queries} queries, {spp} paths)")
     rows = [compare(n, m, queries, spp, options.rounds) for n, m in (surfaces() | loaded).items()]
-    met = all(row["bar"] is None or row["ratio"] <= row["bar"] for row in rows)
-    print(
-        json.dumps({"figures": rows, "bars": {f"{n}: auto over all": b for n, b in BARS.items()}, "met": met})
-    )
-    return 0 if met else 1
+    met = all(row["threshold"] is None or row["ratio"] <= row["threshold"] for row in rows)
+    return finish(rows, {f"{n}: auto over all": limit for n, limit in THRESHOLDS.items()}, met)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    start(main)

@@ -1,23 +1,19 @@
-"""Speed and memory of fibers: paths per second beside unmodified Mitsuba, and a tile of a million points.
+"""Speed and memory of fibers: paths per second, and a tile of a million control points.
 
     python benchmarks/fibers.py [--material assets/basket_weave] [--runs 5] [--queries 16384] [--spp 16]
 
-**ours**: random 7D queries (σ over all levels, both directions uniform on the projected disk), all
-interactions of light until roulette ends a path.
-**mitsuba**: ``mi.render`` with the ``path`` integrator without a limit on depth, one directional light, the
-same fibers of one period seen from above by an orthographic camera, as many paths, roulette from the 64th
-interaction: before it, ours ends few paths of such cloth either.
+- **generator**: random queries (σ over all levels, both directions uniform on the projected disk), all
+  interactions of light until roulette ends a path.
+- **mitsuba**: ``mi.render`` with the ``path`` integrator without a limit on depth, one directional light, the
+  same fibers of one period from above, as many paths, roulette from the 64th interaction: before it, the
+  generator ends few paths of such cloth either.
 
-They alternate, run by run, after one run of each that compiles the kernels. Then a process of its own
-generates a small data set from a felt of a million control points: its peak memory, and the time from its
-start to its first shard. The last line is one JSON object with figures and bars; exit code 1 where a bar is
-missed.
+They alternate. Then a process of its own generates a small data set from a felt of a million control points:
+its peak memory, and the time from its start to its first shard. The last line is one JSON object.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import resource
 import statistics
@@ -25,21 +21,24 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from common import ASSETS, alternate, finish, parser_of, start
 
 from mbtf_gen.fibers.tile import FiberTile
 from mbtf_gen.material.load import load_material
 from mbtf_gen.render.runtime import load_mitsuba
 from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
 
-RATIO_BAR, MEMORY_BAR_GIB, START_BAR_SECONDS = 0.5, 2.0, 30.0
+LEAST_RATIO = 0.5
+MOST = {"gib": 2.0, "start_seconds": 30.0}
 MILLION = 1_000_000
 PER_FIBER = 100
 
 
-def our_run(material: Path, count: int, spp: int):  # type: ignore[no-untyped-def]
+def generator_run(material: Path, count: int, spp: int) -> Callable[[int], None]:
     """A function of the run's number that traces `count` queries."""
     from mbtf_gen.render.estimator import Estimator, Stream
     from mbtf_gen.render.path_tracer import Transport
@@ -52,18 +51,16 @@ def our_run(material: Path, count: int, spp: int):  # type: ignore[no-untyped-de
     estimator = Estimator(build_tile(loaded.shape, loaded.shape.bsdf()), LightKernel(1.0), transport)
     plan = QueryPlan(loaded.lattice(), Mixture(1.0, 0.0), 0.1, "shuffled", 0, count)
 
-    def run(number: int) -> float:
+    def run(number: int) -> None:
         queries = plan.draw("train", number, count)
-        start = time.perf_counter()
         estimates = estimator.estimate(queries, spp, Stream(0, "train", number))
         if not estimates.value_a.mean() > 0:
             raise SystemExit("the values are black: the figures mean nothing")
-        return time.perf_counter() - start
 
     return run
 
 
-def mitsuba_run(material: Path, count: int, spp: int):  # type: ignore[no-untyped-def]
+def mitsuba_run(material: Path, count: int, spp: int) -> Callable[[int], None]:
     """The same for ``mi.render`` and a picture of `count` pixels."""
     import drjit as dr
     import mitsuba as mi
@@ -102,14 +99,12 @@ def mitsuba_run(material: Path, count: int, spp: int):  # type: ignore[no-untype
             }
         )
 
-    def run(number: int) -> float:
-        start = time.perf_counter()
+    def run(number: int) -> None:
         picture = mi.render(scene, seed=number)
         dr.eval(picture)
         dr.sync_thread()
         if not np.array(picture).mean() > 0:
             raise SystemExit("the picture is black: the figures mean nothing")
-        return time.perf_counter() - start
 
     return run
 
@@ -149,35 +144,28 @@ def million() -> tuple[float, float]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--material", type=Path, default=Path("assets/basket_weave"))
+    parser = parser_of(__doc__)
+    parser.add_argument("--material", type=Path, default=ASSETS / "basket_weave")
     parser.add_argument("--runs", type=int, default=5, help="timed runs of each")
     parser.add_argument("--queries", type=int, default=1 << 14, help="queries per run")
     parser.add_argument("--spp", type=int, default=16, help="paths per query (even)")
     arguments = parser.parse_args()
     load_mitsuba()
-    makers = {"ours": our_run, "mitsuba": mitsuba_run}
+    makers = {"generator": generator_run, "mitsuba": mitsuba_run}
     runs = {n: make(arguments.material, arguments.queries, arguments.spp) for n, make in makers.items()}
-    seconds: dict[str, list[float]] = {name: [] for name in runs}
-    for number in range(arguments.runs + 1):
-        for name, run in runs.items():
-            took = run(number)
-            if number:
-                seconds[name].append(took)
     paths = arguments.queries * arguments.spp
+    seconds = alternate(runs, arguments.runs)
     rates = {name: paths / statistics.median(took) / 1e6 for name, took in seconds.items()}
     for name, rate in rates.items():
-        print(f"{name:8s} {rate:.3f} M paths/s")
-    ratio = rates["ours"] / rates["mitsuba"]
-    print(f"ours / mitsuba {ratio:.2f}, {os.cpu_count()} cores")
-    memory, start = million()
-    print(f"a million control points: {memory:.2f} GiB, {start:.1f} s to the first shard")
-    figures = {"million_paths_per_second": rates, "ratio": ratio, "gib": memory, "start_seconds": start}
-    bars = {"ratio": RATIO_BAR, "gib": MEMORY_BAR_GIB, "start_seconds": START_BAR_SECONDS}
-    met = ratio >= RATIO_BAR and memory <= MEMORY_BAR_GIB and start <= START_BAR_SECONDS
-    print(json.dumps({"figures": figures, "bars": bars, "met": met}))
-    return 0 if met else 1
+        print(f"{name:9s} {rate:.3f} M paths/s")
+    ratio = rates["generator"] / rates["mitsuba"]
+    print(f"generator over mitsuba {ratio:.2f}, {os.cpu_count()} cores")
+    memory, first = million()
+    print(f"a million control points: {memory:.2f} GiB, {first:.1f} s to the first shard")
+    figures = {"million_paths_per_second": rates, "ratio": ratio, "gib": memory, "start_seconds": first}
+    met = ratio >= LEAST_RATIO and all(figures[name] <= most for name, most in MOST.items())
+    return finish(figures, {"ratio": LEAST_RATIO, **MOST}, met)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    start(main)

@@ -21,8 +21,6 @@ checks. Exit code 1 where a check fails or a process ends early.
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 import tempfile
 from collections.abc import Callable, Mapping
@@ -31,6 +29,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from common import ASSETS, finish, parser_of, start
 from gpu_measurements import PREDICTIONS, Sizes
 from numpy.typing import NDArray
 
@@ -38,8 +37,7 @@ from mbtf_core.child_process import Outcome, run_child
 from mbtf_core.stats import Estimate, level_groups, mean_estimate, mse_difference, noise_free_mse
 from mbtf_gen.diagnostics.selftest import STANDARD_ERRORS
 
-ROOT = Path(__file__).resolve().parents[1]
-ASSET = ROOT / "assets" / "cliff_rock"
+ASSET = ASSETS / "cliff_rock"
 # Relative differences that are accepted beside the statistical error: of the mean value; of the values of a
 # level, RMS.
 MEAN, VALUES = 1e-3, 1e-2
@@ -321,19 +319,12 @@ def report(comparison: Comparison) -> int:
         print(check.line())
     met = all(check.held for check in comparison.checks)
     checks = [{**asdict(check), "held": check.held} for check in comparison.checks]
-    result = {
-        "device": comparison.device,
-        "sizes": asdict(comparison.sizes),
-        "figures": comparison.figures,
-        "checks": checks,
-        "met": met,
-    }
-    print(json.dumps(result))
-    return 0 if met else 1
+    figures = {"device": comparison.device, "sizes": asdict(comparison.sizes), **comparison.figures}
+    return finish({**figures, "checks": checks}, {"standard errors": STANDARD_ERRORS}, met)
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--out", type=Path, help="folder to work in; a temporary one by default")
     parser.add_argument("--material", type=Path, default=ASSET, help="input of the generator")
     parser.add_argument("--resolution", type=int, default=Sizes.resolution, help="texels across")
@@ -341,8 +332,7 @@ def main() -> int:
     options = parser.parse_args()
     if not has_device():
         print("no CUDA device: nothing to measure")
-        print(json.dumps({"device": None, "figures": {}, "checks": [], "met": None}))
-        return 0
+        return finish({"device": None}, {}, None)
     sizes = replace(
         Sizes(str(options.material)),
         resolution=options.resolution,
@@ -358,4 +348,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    start(main)

@@ -1,32 +1,26 @@
-"""One 1080p picture's queries, evaluated by the Mitsuba plugin and by PyTorch, or of two models.
+"""Speed of the Mitsuba plugin: one 1080p picture's queries, beside PyTorch or another model.
 
     python benchmarks/plugin.py [--material FOLDER] [--runs 7] [--resolution 512] [--threads N]
     python benchmarks/plugin.py --model relief [--places 2]
 
 The queries are those of a perspective picture of the plane: 1920 × 1080 positions, footprints and views, one
-light. **unrolled** and **cooperative** are the plugin's ways to evaluate networks, ``unrolled`` its default
-on a CPU; **pytorch** is ``Material.evaluate``. All three alternate in one process, after a first run of each
-that compiles: its time is reported as well, from an empty kernel cache. The material is a ``neumip`` of the
-paper's size with random weights, or one given: the time does not depend on the weights.
+light. **unrolled** and **cooperative** are the plugin's ways to evaluate networks, **pytorch** is
+``Material.evaluate``. They alternate; the first run of each compiles, from an empty kernel cache. The
+material is a ``neumip`` of the paper's size with random weights, or one given.
 
-With ``--model relief`` the material has random heights of a displacement range of 0.12 tile widths besides,
-and **neumip**, unrolled, takes the place of PyTorch. Each part of the time is measured as well: **trace**
-(view rays alone) and **surface** (all that is known of it, without pyramid and decoder).
+With ``--model relief`` the material has random heights besides, and ``neumip`` takes the place of PyTorch.
+**trace** (view rays alone) and **surface** (everything known of it) are parts of its time.
 
-The last line is one JSON object: figures, and the bars they are held to. Exit code 1 where a bar is missed;
-with other than two threads they are only reported.
+The last line is one JSON object. Thresholds hold with two threads.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import statistics
-import sys
 import tempfile
-import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +29,7 @@ _CACHE = tempfile.TemporaryDirectory(prefix="mbtf-kernels-")
 os.environ["DRJIT_CACHE_DIR"] = _CACHE.name
 
 import numpy as np  # noqa: E402
+from common import alternate, conformance_deviation, finish, parser_of, start, timed  # noqa: E402
 
 from mbtf_core.data.geometry import Geometry  # noqa: E402
 from mbtf_core.data.lattice import Lattice  # noqa: E402
@@ -49,12 +44,12 @@ FASTER, COMPILE, DEVIATION = 3.0, 10.0, 1e-4
 SLOWER = 1.5
 # Displacement range of the random heights in tile widths.
 RELIEF = 0.12
-BAR_THREADS = 2
+THREADS = 2
 
 
-def say(line: str) -> None:
-    """One line to standard error."""
-    print(line, file=sys.stderr, flush=True)
+def ignoring_round(way: Callable[[], Any], number: int) -> None:
+    """Evaluate the same queries in every round."""
+    way()
 
 
 def random_surface(lattice: Lattice) -> Geometry:
@@ -97,9 +92,7 @@ def random_material(folder: Path, levels: int, model: ModelName, network: dict[s
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--model", choices=("neumip", "relief"), default="neumip")
     parser.add_argument("--places", type=int, choices=(1, 2, 4), default=1)
     parser.add_argument("--material", type=Path)
@@ -142,7 +135,7 @@ def main() -> int:
     light, view = mi.Vector3f(queries.omega_i.T), mi.Vector3f(queries.omega_o.T)
     dr.eval(u, sigma, light, view)
 
-    def timed(function: Callable[[], Any]) -> Callable[[], None]:
+    def evaluated(function: Callable[[], Any]) -> Callable[[], None]:
         def run() -> None:
             dr.eval(function())
             dr.sync_thread()
@@ -151,7 +144,7 @@ def main() -> int:
 
     def plugin(material: StoredMaterial, arithmetic: Any) -> Callable[[], None]:
         evaluator = Evaluator(material, arithmetic)
-        return timed(
+        return evaluated(
             lambda: evaluator.value(evaluator.features(u, evaluator.level(sigma), view), light, view)
         )
 
@@ -168,38 +161,27 @@ def main() -> int:
         known, level = surface, evaluator.level(sigma)
         dr.eval(level)
         ways["neumip"] = plugin(neumip, "unrolled")
-        ways["trace"] = timed(lambda: known.height(u, view))
-        ways["surface"] = timed(
+        ways["trace"] = evaluated(lambda: known.height(u, view))
+        ways["surface"] = evaluated(
             lambda: known.shading(known.intersections(u, level, view)[1], level, light, view)
         )
     first: dict[str, float] = {}
-    seconds: dict[str, list[float]] = {name: [] for name in ways}
-    for run in range(options.runs + 1):
-        for name, way in ways.items():
-            start = time.perf_counter()
-            way()
-            passed = time.perf_counter() - start
-            if run:
-                seconds[name].append(passed)
-            else:
-                first[name] = passed
+    for name, way in ways.items():
+        first[name] = timed(way)
+    seconds = alternate({name: partial(ignoring_round, way) for name, way in ways.items()}, options.runs)
     median = {name: statistics.median(s) for name, s in seconds.items()}
     for name, values in seconds.items():
-        say(
+        print(
             f"{name:12} median {1e3 * median[name]:6.1f} ms "
             f"({1e3 * min(values):.0f} to {1e3 * max(values):.0f}), "
             f"{queries.sigma.size / median[name] / 1e6:5.1f} M queries/s, first run {first[name]:.2f} s"
         )
-    wanted = stored.conformance["rgb"]
-    found = Evaluator(stored, "unrolled").evaluate(
-        *(stored.conformance[name] for name in ("u", "sigma", "omega_i", "omega_o"))
-    )
-    deviation = float((np.abs(found - wanted) / np.maximum(wanted, max(wanted.mean(), 1e-9))).max())
+    deviation = conformance_deviation(Evaluator(stored, "unrolled"), stored)
     ratio = median[baseline] / median["unrolled"]
     least = FASTER if surface is None else 1 / SLOWER
-    say(f"unrolled {ratio:.2f} times as fast as {baseline}; deviation on conformance queries {deviation:.1e}")
+    print(f"{ratio:.2f} times as fast as {baseline}; deviation on conformance queries {deviation:.1e}")
     fast = ratio >= least or options.places != 1
-    held = fast and first["unrolled"] <= COMPILE and deviation <= DEVIATION
+    met = fast and first["unrolled"] <= COMPILE and deviation <= DEVIATION
     figures = {
         "model": options.model,
         "milliseconds": {name: round(1e3 * value, 1) for name, value in median.items()},
@@ -207,16 +189,14 @@ def main() -> int:
         f"times_{baseline}": round(ratio, 2),
         "conformance_deviation": deviation,
         "threads": options.threads,
-        "bars": {
-            f"times_{baseline}": round(least, 2),
-            "first_run_seconds": COMPILE,
-            "conformance_deviation": DEVIATION,
-        },
-        "held": held,
     }
-    print(json.dumps(figures))
-    return int(not held and options.threads == BAR_THREADS)
+    thresholds = {
+        f"times_{baseline}": round(least, 2),
+        "first_run_seconds": COMPILE,
+        "conformance_deviation": DEVIATION,
+    }
+    return finish(figures, thresholds, met if options.threads == THREADS else None)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    start(main)

@@ -1,24 +1,21 @@
-"""What the renderer's plugin does with fitted materials: sampling, energy, precision, first picture.
+"""The Mitsuba plugin on fitted materials: sampling, energy, precision, first picture.
 
-    python benchmarks/plugin_materials.py [MATERIAL ...] [--work out/plugin_materials] [--time 80s] [--only]
+    python benchmarks/plugin_materials.py [MATERIAL ...] [--work out/plugin_materials] [--time 80s]
 
-MATERIAL is what ``mbtf-gen`` takes; by default the five of ``assets/`` and the texture sets in
-``../shared/data/materials``, which are left out by name where they are missing. Data (128 x 128 texels, 200
-queries per texel) and fits are made in ``--work`` where they are not there yet, two or three minutes each;
-``--only`` takes those that are there. Every material is then measured in a process of its own, with an
-empty kernel cache:
+MATERIAL is what ``mbtf-gen`` takes; by default five assets and six texture sets. Data (128 × 128 texels, 200
+queries per texel) and fits are made in ``--work`` where they are missing, two or three minutes each. Every
+material is then measured in a process of its own, with an empty kernel cache:
 
-- **first picture**: seconds from loading the material to its first 1080p picture of a plane, compilation and
-  the fit of the lobes included.
-- **conformance**: largest deviation from the material's own values, in single and in half precision.
+- **first picture**: seconds from loading the material to its first 1080p picture of a plane;
+- **conformance**: largest deviation from the material's conformance values, in single and half precision;
 - **χ²** of the plugin's samples at 32 random positions, footprints and views; the smallest p of all
-  materials is corrected for their number (Šidák).
-- **variance** of the light reflected under a constant sky by cosine sampling, over that by the lobes; the bar
-  is for glossy materials, told by their maps and by what the cosine leaves to be gained.
-- **energy**: what the tile's mean reflects, by elevation of the light, beside the reference that
-  ``mbtf-gen`` traces for the same queries; the error bar is that of the paired difference.
+  materials is corrected for their number (Šidák);
+- **variance** of the light reflected under a constant sky by cosine sampling, over that by the lobes; the
+  threshold is for glossy materials, as their maps and the variance of cosine sampling show;
+- **energy**: reflectance of the tile by elevation of the light, beside the path-traced one of the same
+  queries, with the error of the paired difference.
 
-The last line is one JSON object: figures, and the bars they are held to. Exit code 1 where a bar is missed.
+The last line is one JSON object.
 """
 
 from __future__ import annotations
@@ -36,17 +33,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from common import (
+    HEIGHT_SCALES,
+    RELIEFS,
+    ROOT,
+    conformance_deviation,
+    finish,
+    is_available,
+    parser_of,
+    source,
+    start,
+)
 from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-
 from support.chi_square import Cap, chi_square_test
 
 from mbtf_core.directions import from_angles, from_projected_disk
 
-ROOT = Path(__file__).resolve().parents[1]
-ASSETS = ("turtle_shell", "cliff_rock", "twisted_wool", "straight_wool", "insulation_foam")
-TEXTURES = ("metal_plate", "leather_fine", "knit_fabric", "rock_cliff", "stone_bricks", "tree_bark")
 # What counts as glossy: at least this share of what the maps reflect is specular, the median roughness is at
 # most this, and light sampled by the cosine alone varies by at least this, as a relative variance.
 GLOSSY_SHARE, GLOSSY_ROUGHNESS, GLOSSY_VARIANCE = 0.33, 0.65, 0.1
@@ -54,7 +58,7 @@ GLOSSY_SHARE, GLOSSY_ROUGHNESS, GLOSSY_VARIANCE = 0.33, 0.65, 0.1
 FRESNEL = 0.092
 # First picture in seconds, deviations, χ² after correction, variance ratio of glossy materials, and what
 # energies have too much, in standard errors.
-BARS = {
+THRESHOLDS = {
     "first_picture": 10.0,
     "single": 1e-4,
     "half": 1e-2,
@@ -219,13 +223,6 @@ def plane_scene(mi: Any, bsdf: Any) -> Any:
     )
 
 
-def deviation(evaluator: Any, stored: Any) -> float:
-    """Largest deviation from the conformance values, as a share of max(value, mean)."""
-    wanted = stored.conformance["rgb"]
-    found = evaluator.evaluate(*(stored.conformance[name] for name in ("u", "sigma", "omega_i", "omega_o")))
-    return float((np.abs(found - wanted) / np.maximum(wanted, max(wanted.mean(), 1e-9))).max())
-
-
 def measure(source: Path, shards: Path, folder: Path) -> dict[str, Any]:
     """All figures of one material; the kernel cache is empty."""
     from mbtf_gen.render.runtime import load_mitsuba
@@ -257,8 +254,8 @@ def measure(source: Path, shards: Path, folder: Path) -> dict[str, Any]:
         "load_seconds": loaded - start,
         "first_picture_seconds": first - start,
         "picture_seconds": again - first,
-        "single": deviation(bsdf.evaluator, stored),
-        "half": deviation(Evaluator(stored, "half"), stored),
+        "single": conformance_deviation(bsdf.evaluator, stored),
+        "half": conformance_deviation(Evaluator(stored, "half"), stored),
         "chi_square": chi_squares(mi, dr, bsdf),
         "reflected": [mean, flat_mean],
         "variance_ratio": flat_variance / variance,
@@ -268,22 +265,20 @@ def measure(source: Path, shards: Path, folder: Path) -> dict[str, Any]:
     }
 
 
-def prepare(source: Path, work: Path, budget: str, only: bool) -> tuple[Path, Path] | None:
-    """(shards, material) of a material, made where they are missing; None where they may not be made.
+def prepare(material: Path, work: Path, time: str) -> tuple[Path, Path]:
+    """(shards, fit) of a material, made where they are missing.
 
     Raises
     ------
     SystemExit : generator or fitter failed; their message was shown
     """
-    shards, folder = work / "shards" / source.name, work / "materials" / source.name
+    shards, folder = work / "shards" / material.name, work / "materials" / material.name
     if not (folder / "material.json").exists():
-        if only:
-            return None
         options = ["--resolution", "128", "--mesh", "256", "--queries", "200/texel", "--spp", "4", "--quiet"]
         options += ["--set", "queries.test=16384", "--set", "queries.test_spp=128"]
         for words in (
-            ["mbtf_gen", str(source), "-o", str(shards), *options],
-            ["mbtf_fit", str(shards), "-o", str(folder), "--time", budget, "--quiet"],
+            ["mbtf_gen", str(material), "-o", str(shards), *options],
+            ["mbtf_fit", str(shards), "-o", str(folder), "--time", time, "--quiet"],
         ):
             if subprocess.run([sys.executable, "-m", *words], stdout=sys.stderr, cwd=ROOT).returncode:
                 raise SystemExit(f"{' '.join(words)} failed")
@@ -318,54 +313,39 @@ def verdict(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("materials", nargs="*", type=Path)
     parser.add_argument("--work", type=Path, default=ROOT / "out" / "plugin_materials")
-    parser.add_argument("--time", default="80s")
-    parser.add_argument("--only", action="store_true")
+    parser.add_argument("--time", default="80s", help="training time of each fit that is missing")
     parser.add_argument("--one", nargs=3, type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.one:
         print(json.dumps(measure(*options.one)))
         return 0
-    wanted = options.materials or [
-        *(ROOT / "assets" / name for name in ASSETS),
-        *(ROOT.parent / "shared" / "data" / "materials" / name for name in TEXTURES),
-    ]
+    default = [source(name)[0] for name in (*RELIEFS, *HEIGHT_SCALES) if is_available(name)]
     rows = []
-    for source in wanted:
-        if not source.exists():
-            print(f"{source.name}: left out, {source} is missing", file=sys.stderr)
-            continue
-        made = prepare(source, options.work, options.time, options.only)
-        if made is None:
-            print(f"{source.name}: left out, not fitted in {options.work}", file=sys.stderr)
-            continue
+    for material in options.materials or default:
+        made = prepare(material, options.work, options.time)
         with tempfile.TemporaryDirectory(prefix="mbtf-kernels-") as cache:
             done = subprocess.run(
-                [sys.executable, __file__, "--one", str(source), *map(str, made)],
+                [sys.executable, __file__, "--one", str(material), *map(str, made)],
                 stdout=subprocess.PIPE,
                 text=True,
                 env={**os.environ, "DRJIT_CACHE_DIR": cache},
             )
         if done.returncode:
-            raise SystemExit(f"{source.name} failed")
+            raise SystemExit(f"{material.name} failed")
         rows.append(json.loads(done.stdout.splitlines()[-1]))
-        print(row_of(rows[-1]), file=sys.stderr, flush=True)
-    if not rows:
-        raise SystemExit("nothing to measure")
+        print(row_of(rows[-1]), flush=True)
     figures = verdict(rows)
     above = ("chi_square", "variance")
     missed = [
         name
-        for name, bar in BARS.items()
-        if (value := figures[name]) is not None and (value < bar if name in above else value > bar)
+        for name, limit in THRESHOLDS.items()
+        if (value := figures[name]) is not None and (value < limit if name in above else value > limit)
     ]
-    print(json.dumps({"figures": figures, "bars": BARS, "missed": missed, "materials": rows}))
-    return int(bool(missed))
+    return finish({**figures, "missed": missed, "materials": rows}, THRESHOLDS, not missed)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    start(main)

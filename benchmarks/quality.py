@@ -1,24 +1,20 @@
-"""Time, error and size of the quality presets: whole runs, from height map to report.
+"""Time, error and size of the quality presets: complete runs, from height map to report.
 
     python benchmarks/quality.py --out FOLDER [--only MATERIAL:QUALITY ...] [--store] [--check]
     python benchmarks/quality.py --table
 
-Runs ``mbtf-pipeline run --quality`` in a process of its own: ``draft`` on six texture sets that lie beside
-the project, ``standard`` on three of them, ``high`` on one. ``paper`` needs a GPU and is not run. ``--only``
-(repeatable) selects single runs, also of ``assets/``, such as ``turtle_shell:draft``. FOLDER keeps every
-finished run, so the same command resumes; a run is repeated only if its preset has changed since.
+Runs ``mbtf-pipeline run --quality`` in a process of its own: ``draft`` on six texture sets, ``standard`` on
+three of them, ``high`` on one. ``paper`` needs a GPU and is not run. ``--only`` (repeatable) selects single
+runs, also of assets, such as ``turtle_shell:draft``. FOLDER keeps every finished run, so the same command
+resumes; a run is repeated only if its preset has changed since.
 
 ``--store`` writes the runs of FOLDER to ``quality_measured.json`` beside this script. ``--table`` prints that
-file as the Markdown table of the documentation. ``--check`` compares FOLDER with that file.
-
-The last line is one JSON object with the figures and their thresholds. On two cores, a draft takes at most a
-minute and a standard run ten minutes. Under ``--check`` seconds differ by at most 30 %
-and errors by at most a factor 1.5. Exit code 1 where a threshold is exceeded.
+file as the Markdown table of the documentation. ``--check`` compares FOLDER with that file: seconds may
+differ by 30 %, errors by a factor of 1.5. The last line is one JSON object.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import shutil
 import subprocess
@@ -28,6 +24,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, get_args
+
+from common import HEIGHT_SCALES, finish, is_available, parser_of, source, start
 
 from mbtf_core.config_file import resolve
 from mbtf_core.errors import InputError
@@ -42,19 +40,8 @@ from mbtf_gen.config.presets import GENERATOR, RESOLUTION
 from mbtf_pipeline.presets import COMPARE
 from mbtf_pipeline.run_folder import machine
 
-ROOT = Path(__file__).resolve().parents[1]
-TEXTURE_SETS = ROOT.parent / "shared" / "data" / "materials"
 STORED = Path(__file__).with_name("quality_measured.json")
 FORMAT, SCHEMA = "mbtf-quality", 2
-# Height scale of each texture set, exaggerated where the structure is fine.
-HEIGHT_SCALES: dict[str, float] = {
-    "knit_fabric": 0.05,
-    "leather_fine": 0.02,
-    "metal_plate": 0.05,
-    "rock_cliff": 0.12,
-    "stone_bricks": 0.06,
-    "tree_bark": 0.1,
-}
 # Texture sets of the longer runs.
 LONGER: dict[Quality, tuple[str, ...]] = {
     "standard": ("metal_plate", "rock_cliff", "tree_bark"),
@@ -105,13 +92,6 @@ class MeasuredRun:
             f"fit {self.fit:.1f})  unexplained {self.unexplained:.3f} ± {self.unexplained_error:.3f}  "
             f"data {self.data_bytes / 1e6:.0f} MB  material {self.material_bytes / 1e6:.2f} MB"
         )
-
-
-def source(name: str) -> tuple[Path, float | None]:
-    """Folder of a material and its height scale."""
-    if name in HEIGHT_SCALES:
-        return TEXTURE_SETS / name, HEIGHT_SCALES[name]
-    return ROOT / "assets" / name, None
 
 
 def options_hash(quality: Quality) -> str:
@@ -276,7 +256,7 @@ def compare(runs: Sequence[MeasuredRun]) -> list[dict[str, Any]]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--out", type=Path, help="folder of the finished runs")
     parser.add_argument("--only", action="append", help="MATERIAL:QUALITY (repeatable)")
     parser.add_argument("--resolution", type=int, help="texels across; default: the preset's")
@@ -286,35 +266,29 @@ def main() -> int:
     arguments = parser.parse_args()
     if arguments.table:
         print(markdown_table(stored_runs()))
-        return 0
+        return finish({"runs": len(stored_runs())}, {}, None)
     if arguments.out is None:
         parser.error("--out is required")
     arguments.out.mkdir(parents=True, exist_ok=True)
     for name, quality in requested(arguments.only):
         resolution = resolution_of(quality, arguments.resolution)
         path = arguments.out / f"{name}-{quality}-{resolution}.json"
-        if finished(path) is not None:
-            continue
-        if not source(name)[0].is_dir():
-            print(f"{name}: skipped, {source(name)[0]} is missing", file=sys.stderr)
-            continue
-        found = run(name, quality, resolution, arguments.out / ".work")
-        write_json(path, asdict(found))
-        print(found, flush=True)
+        if finished(path) is None and is_available(name):
+            found = run(name, quality, resolution, arguments.out / ".work")
+            write_json(path, asdict(found))
+            print(found, flush=True)
     runs = finished_runs(arguments.out, arguments.resolution)
     timed = [r for r in runs if r.quality in THRESHOLDS and arguments.resolution is None]
     met = all(r.seconds <= THRESHOLDS[r.quality] for r in timed)
-    report: dict[str, Any] = {"figures": [asdict(r) for r in runs], "thresholds": {**THRESHOLDS}}
+    figures: dict[str, Any] = {"runs": [asdict(r) for r in runs]}
     if arguments.check:
-        rows = compare(runs)
-        report |= {"compared": rows, "thresholds": {**THRESHOLDS, **CHECK}}
+        figures["compared"] = rows = compare(runs)
         met &= bool(rows)
         met &= all(f <= CHECK[name] for row in rows for name, f in row["factors"].items())
     if arguments.store:
         store(runs, arguments.resolution)
-    print(json.dumps({**report, "met": met}))
-    return 0 if met else 1
+    return finish(figures, THRESHOLDS | (CHECK if arguments.check else {}), met)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    start(main)

@@ -18,7 +18,13 @@ author = "the mbtf authors"
 copyright = "the mbtf authors, Apache-2.0"
 release = version = installed_version("mbtf")
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "configuration_reference"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "configuration_reference",
+    "schema_tables",
+]
 html_math_renderer = "mathml"
 myst_enable_extensions = ["dollarmath", "attrs_inline", "colon_fence"]
 myst_heading_anchors = 3

@@ -281,7 +281,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
 }
 # Defaults of fits that share a network: each batch is of one material, so that the gradients of the network
-# scatter more (docs/results/2026-11-models.md, "Shared networks").
+# scatter more (docs/results/models.md, "Shared networks").
 SHARED_PRESET: dict[str, Any] = {"training": {"batch": 1 << 14, "learning_rate": 0.01}}
 # Models that encode angular slices.
 SLICE_MODELS: tuple[ModelName, ...] = ("rainer2019", "rainer2020")

@@ -19,7 +19,7 @@ SPLIT_NAMES = {
 
 
 # Smallest PSNR in dB of each word for a fit beside its reference. There, the mean HDR-FLIP of pictures is
-# that of grays that differ by 1, 2.3 and 5 in L*; materials vary by 3 dB (benchmarks/visible_errors.py).
+# that of grays that differ by 1, 2.3 and 5 in L*; materials vary by 3 dB.
 VISIBILITY = (
     (40.0, "not visible"),
     (33.0, "barely visible"),

@@ -24,11 +24,10 @@ from mbtf_fit.training.validation import validation_error, validation_set, valid
 # Training times of the two pilot fits in seconds; each runs the whole schedule.
 PILOT_SECONDS = (4.0, 8.0)
 # Each doubling of the time improves the logarithm of the error by this share of the improvement before. Least
-# squares over fits of 60 s with quality options on draft data of eleven materials
-# (benchmarks/forecasts.py).
+# squares over fits of 60 s with quality options on draft data of eleven materials.
 PERSISTENCE = 0.45
 # Seconds of a fit besides training (loading, calibration, evaluation), of each query of its data, and of each
-# query's transmittance, on two processor cores (benchmarks/quality.py, benchmarks/time_against_presets.py).
+# query's transmittance, on two processor cores (benchmarks/quality.py).
 FIT_SECONDS, _QUERY_SECONDS, _TRANSMITTANCE_SECONDS = 4.0, 1.1e-6, 0.4e-6
 # Fits of fewer queries in all steps take less than a minute at a third of a million queries per second.
 LONG_FIT = 20_000_000

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-# Typical exponent b of the curves in docs/results/2026-11-fit-speed.md.
+# Typical exponent b of the error over training time.
 EXPONENT = 0.5
 # No fit gets less than this share of an equal one.
 LEAST = 0.25

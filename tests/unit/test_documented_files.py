@@ -13,7 +13,7 @@ PATH = re.compile(r"`(?:python )?((?:tests|benchmarks|pipelines|docs|mbtf_\w+)/[
 def test_every_file_that_pages_name_exists() -> None:
     pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]
     named = {(page.name, name) for page in pages for name in PATH.findall(page.read_text())}
-    assert len(named) > 50
+    assert named
     named -= {("README.md", "docs/_build/html/index.html")}  # made by `make docs`
     missing = [(page, name) for page, name in sorted(named) if not any(ROOT.glob(where(name)))]
     assert missing == []

@@ -304,7 +304,7 @@ def test_random_kills_lose_nothing_and_corruption_is_found(amounts: str, run_pyt
     script = ROOT / "benchmarks/crash_safety.py"
     done = run_python(str(script), *amounts.split())
     assert done.returncode == 0, done.stdout + done.stderr
-    figures = json.loads(done.stdout.splitlines()[-1])
+    figures = json.loads(done.stdout.splitlines()[-1])["figures"]
     assert figures["lost or not found"] == 0
     assert figures["killed"]["kills"] >= 6
     assert figures["killed"]["data sets"] > 0

@@ -13,7 +13,7 @@ from conftest import RunPython
 CODE = """
 import json, sys
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.generation import generate
+from mbtf_gen.generation.run import generate
 shards = int(sys.argv[2])
 def resident():
     with open("/proc/self/status") as status:

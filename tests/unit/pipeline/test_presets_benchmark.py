@@ -6,10 +6,14 @@ import json
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from support.scripts import benchmark_module
+import pytest
+from support.scripts import BENCHMARKS, benchmark_module
 
 
-def test_runs_of_other_options_and_damaged_ones_are_repeated(tmp_path: Path) -> None:
+def test_runs_of_other_options_and_damaged_ones_are_repeated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
     quality = benchmark_module("quality")
     old = quality.MeasuredRun("rock", "high", 0.12, 800.0, 100.0, 600.0, 0.12, 0.003, 10**9, 10**6, "old")
     now = replace(old, options_hash=quality.options_hash("high"))

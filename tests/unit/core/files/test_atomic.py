@@ -47,7 +47,7 @@ def test_a_kill_leaves_the_old_file(moment: str, tmp_path: Path) -> None:
     code = f"""
 import os, signal
 from pathlib import Path
-from mbtf_core import atomic
+from mbtf_core.files import atomic
 def die(*arguments):
     os.kill(os.getpid(), signal.SIGKILL)
 if {moment!r} != "write":

@@ -241,7 +241,7 @@ def test_the_documented_function_compiles(tmp_path: Path) -> None:
     make("relief", tmp_path / "material")
     out = tmp_path / "out"
     assert run(app, ["export", str(tmp_path / "material"), "--to", "slang", "-o", str(out), "-q"]) == 0
-    page = Path(__file__).parents[4] / "docs/how-to/use-in-shaders.md"
+    page = Path(__file__).parents[4] / "docs/how-to/export-a-material.md"
     function = page.read_text().split("```\nimport material;")[1].split("```")[0]
     entry = """
 RWStructuredBuffer<float3> shaded;

@@ -1,0 +1,296 @@
+"""Speed of the generator, and where its time goes.
+
+    python benchmarks/generator.py [speed] [--material PATH] [--runs 5] [--queries 262144] [--spp 16]
+    python benchmarks/generator.py steps [--runs 3]
+
+``speed`` measures paths per second in three ways that alternate:
+
+- **generator**: random queries (σ over all levels, both directions uniform on the projected disk) on a tile
+  of 512² cells with maps of color and roughness, light of 1° RMS, at most six interactions.
+- **mesh**: the same with ``geometry.tracer: mesh``, Mitsuba's ray tracing of the tile's triangles.
+- **mitsuba**: ``mi.render`` with the ``path`` integrator, one directional light, the same mesh as a single
+  tile from straight above, as many paths, the same depth and roulette. Its rays are coherent and all hit: it
+  is the renderer's best case, not a goal for random queries.
+
+All reflect by ``mbtf_surface``. Variance × time is that of one query or pixel relative to the squared mean;
+queries and pixels differ, so compare it only within one way.
+
+``steps`` traces the same queries with one step of light transport after the other: the plane alone, the first
+ray, the ray to the light, light that BSDF sampling finds, and up to six interactions.
+
+The last line is one JSON object. The threshold holds on two cores; elsewhere the ratio is only reported.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from common import alternate, finish, parser_of, start
+from numpy.typing import NDArray
+
+from mbtf_core.data.lattice import Lattice
+from mbtf_gen.config.generator import Tracer
+from mbtf_gen.material.load import load_material
+from mbtf_gen.material.material import Material
+from mbtf_gen.render.runtime import load_mitsuba
+from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
+
+if TYPE_CHECKING:
+    from mbtf_gen.geometry.heightfield import HeightGrid
+
+MESH = 512
+DEPTH = 6
+ROULETTE = 3
+LIGHT_WIDTH = 1.0
+THRESHOLDS = {"generator over mitsuba": 0.75}
+CORES = 2
+
+
+# (seconds, variance over the squared mean of one query or pixel) of a run of a given number.
+Run = Callable[[int], tuple[float, float]]
+
+
+def noise(rng: np.random.Generator, cutoff: float) -> NDArray[np.float64]:
+    """Periodic random relief (MESH, MESH) in [0, 1] of features up to `cutoff` per tile."""
+    frequency = np.fft.fftfreq(MESH, 1.0 / MESH)
+    radius = np.hypot(frequency[:, None], frequency[None, :])
+    amplitude = np.where(radius <= cutoff, 1.0 / np.maximum(radius, 2.0) ** 1.6, 0.0)
+    h = np.fft.ifft2(amplitude * np.exp(2j * np.pi * rng.random((MESH, MESH)))).real
+    return (h - h.min()) / np.ptp(h)
+
+
+def rocky() -> Material:
+    """Terraces with rough flanks, 0.12 tile widths deep; color and roughness follow them."""
+    rng = np.random.default_rng(1)
+    coarse, fine = noise(rng, 24.0), noise(rng, 200.0)
+    h = 0.7 * np.floor(6.0 * coarse) / 6.0 + 0.2 * coarse + 0.1 * fine
+    h = (h - h.min()) / np.ptp(h)
+    color = np.stack([0.15 + 0.5 * h, 0.12 + 0.4 * fine, 0.1 + 0.3 * coarse], axis=-1).astype(np.float32)
+    return Material(
+        height=h,
+        height_scale=0.12,
+        height_bits=None,
+        base_color=color,
+        roughness=0.3 + 0.5 * fine,
+        metallic=0.0,
+        specular=0.5,
+    )
+
+
+def query_plan(grid: HeightGrid, count: int) -> QueryPlan:
+    """Levels log-uniform; the generator's default favors fine ones, which are faster."""
+    lattice = Lattice.for_map(*grid.z.shape)
+    return QueryPlan(lattice, Mixture(1.0, 0.0), 0.1, "shuffled", 0, count)
+
+
+def generator_run(
+    material: Material, grid: HeightGrid, count: int, spp: int, tracer: Tracer = "heightfield"
+) -> Run:
+    """A function of the run's number that traces `count` queries."""
+    from mbtf_gen.render.bsdf.plugin import bsdf_of
+    from mbtf_gen.render.estimator import Estimator, Stream
+    from mbtf_gen.render.path_tracer import Transport
+    from mbtf_gen.render.scene import build_tile
+    from mbtf_gen.sampling.light_kernel import LightKernel
+
+    light, transport = LightKernel(LIGHT_WIDTH), Transport(DEPTH, ROULETTE)
+    estimator = Estimator(build_tile(grid, bsdf_of(material), tracer), light, transport)
+    plan = query_plan(grid, count)
+
+    def run(number: int) -> tuple[float, float]:
+        queries = plan.draw("train", number, count)
+        start = time.perf_counter()
+        estimates = estimator.estimate(queries, spp, Stream(0, "train", number))
+        seconds = time.perf_counter() - start
+        if estimates.lost or not estimates.value_a.mean() > 0:
+            raise SystemExit("rays were lost, or the picture is black: the figures mean nothing")
+        a, b = estimates.value_a.astype(np.float64), estimates.value_b.astype(np.float64)
+        return seconds, float(np.mean((a - b) ** 2) / np.mean(a + b) ** 2)
+
+    return run
+
+
+def mitsuba_run(material: Material, grid: HeightGrid, count: int, spp: int) -> Run:
+    """The same for ``mi.render`` and a picture of `count` pixels."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from mbtf_gen.geometry.heightfield import mesh_of_grid
+    from mbtf_gen.render.bsdf.plugin import bsdf_of
+    from mbtf_gen.render.scene import unit_of
+
+    unit = unit_of(grid.aspect)
+    columns = max(1, round((count / grid.aspect) ** 0.5))
+    rows = max(1, count // columns)
+    half = 0.5 * unit
+    # The camera looks down, its picture exactly as wide as the tile; pixels are square.
+    above = mi.ScalarTransform4f().look_at(origin=[0, 0, 10 * unit], target=[0, 0, 0], up=[0, 1, 0])
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {
+                "type": "path",
+                # Stock depth counts the emitter's vertex too.
+                "max_depth": DEPTH + 1,
+                "rr_depth": ROULETTE,
+                "hide_emitters": True,
+            },
+            "sensor": {
+                "type": "orthographic",
+                "to_world": above @ mi.ScalarTransform4f().scale([half, half, 1]),
+                "sampler": {"type": "independent", "sample_count": spp},
+                "film": {
+                    "type": "hdrfilm",
+                    "width": columns,
+                    "height": rows,
+                    "rfilter": {"type": "box"},
+                    "component_format": "float32",
+                },
+            },
+            "light": {"type": "directional", "direction": [-0.5, -0.5, -0.707]},
+            "tile": mesh_of_grid(grid, unit, (0, 0), mi.load_dict(bsdf_of(material))),
+        }
+    )
+
+    last: NDArray[np.float64] | None = None
+
+    def run(number: int) -> tuple[float, float]:
+        nonlocal last
+        start = time.perf_counter()
+        picture = mi.render(scene, seed=number)
+        dr.eval(picture)
+        dr.sync_thread()
+        seconds = time.perf_counter() - start
+        image = np.array(picture, np.float64)
+        if not image.mean() > 0:
+            raise SystemExit("the stock picture is black: the figures mean nothing")
+        # From this run's picture and the one before, of other random numbers.
+        variance = (
+            float("nan") if last is None else float(np.mean((image - last) ** 2) / 2 / image.mean() ** 2)
+        )
+        last = image
+        # As if it had exactly as many paths as ours.
+        return seconds * count / (rows * columns), variance
+
+    return run
+
+
+def spread(seconds: list[float], paths: int) -> dict[str, float]:
+    """Median, smallest and largest rate in million paths per second."""
+    rates = [paths / s / 1e6 for s in seconds]
+    return {
+        "median": round(statistics.median(rates), 3),
+        "min": round(min(rates), 3),
+        "max": round(max(rates), 3),
+    }
+
+
+def measure_speed(material: Material, arguments: argparse.Namespace) -> int:
+    """Paths per second in the three ways."""
+    import drjit as dr
+
+    grid = material.grid(arguments.height_scale, MESH)
+    makers: dict[str, Any] = {
+        "generator": generator_run,
+        "mesh": partial(generator_run, tracer="mesh"),
+        "mitsuba": mitsuba_run,
+    }
+    runs = {name: make(material, grid, arguments.queries, arguments.spp) for name, make in makers.items()}
+    seconds: dict[str, list[float]] = {name: [] for name in runs}
+    variances: dict[str, list[float]] = {name: [] for name in runs}
+    for number in range(arguments.runs + 1):
+        for name, run in runs.items():
+            took, variance = run(number)
+            if number:
+                seconds[name].append(took)
+                variances[name].append(variance)
+    paths = arguments.queries * arguments.spp
+    figures = {name: spread(took, paths) for name, took in seconds.items()}
+    products = {
+        name: float(f"{statistics.median(seconds[name]) * statistics.mean(variances[name]):.3g}")
+        for name in runs
+    }
+    for name, rates in figures.items():
+        print(
+            f"{name:9s} {rates['median']:.2f} M paths/s ({rates['min']:.2f} to {rates['max']:.2f}), "
+            f"relative variance x time {products[name]:.3g} s"
+        )
+    ratio = round(figures["generator"]["median"] / figures["mitsuba"]["median"], 3)
+    cores = dr.thread_count()
+    print(f"generator over mitsuba {ratio:.2f}; {cores} threads, {paths} paths per run")
+    report = {
+        "million_paths_per_second": figures,
+        "generator over mitsuba": ratio,
+        "generator over mesh": round(figures["generator"]["median"] / figures["mesh"]["median"], 3),
+        "relative_variance_times_seconds": products,
+        "threads": cores,
+        "paths_per_run": paths,
+        "material": str(arguments.material or "random heights"),
+    }
+    met = ratio >= THRESHOLDS["generator over mitsuba"]
+    return finish(report, THRESHOLDS, met if cores == CORES else None)
+
+
+def measure_steps(material: Material, arguments: argparse.Namespace) -> int:
+    """Time per path with one step of light transport after the other."""
+    from mbtf_gen.render.bsdf.plugin import bsdf_of
+    from mbtf_gen.render.estimator import Estimator, Stream
+    from mbtf_gen.render.path_tracer import Transport
+    from mbtf_gen.render.scene import build_tile
+    from mbtf_gen.sampling.light_kernel import LightKernel
+
+    grid = material.grid(arguments.height_scale, MESH)
+    tile, light = build_tile(grid, bsdf_of(material)), LightKernel(LIGHT_WIDTH)
+    bare: dict[str, Any] = {"shadowing": False, "interreflection": False, "bsdf_sampling": False}
+    steps = {
+        "plane": Transport(1, displacement=False, **bare),
+        "first ray": Transport(1, **bare),
+        "ray to the light": Transport(1, interreflection=False, bsdf_sampling=False),
+        "light found by BSDF sampling": Transport(1, interreflection=False),
+        "up to six interactions": Transport(DEPTH),
+    }
+    plan = query_plan(grid, arguments.queries)
+
+    def traced(transport: Transport) -> Callable[[int], Any]:
+        estimator = Estimator(tile, light, transport)
+        return lambda number: estimator.estimate(
+            plan.draw("train", number, arguments.queries), arguments.spp, Stream(0, "train", number)
+        )
+
+    seconds = alternate({name: traced(step) for name, step in steps.items()}, arguments.runs)
+    before, rows = 0.0, []
+    for name, took in seconds.items():
+        each = 1e6 * statistics.median(took) / (arguments.queries * arguments.spp)
+        rows.append({"step": name, "million_paths_per_second": 1 / each, "microseconds": each})
+        print(f"{name:28s} {1 / each:6.2f} M paths/s  {each:.3f} µs per path, {each - before:+.3f}")
+        before = each
+    return finish(rows, {}, None)
+
+
+def main() -> int:
+    parser = parser_of(__doc__)
+    parser.add_argument("part", nargs="?", choices=("speed", "steps"), default="speed")
+    parser.add_argument("--material", type=Path, help="height map, folder or material.yaml")
+    parser.add_argument("--height-scale", type=float, help="factor on its stored heights")
+    parser.add_argument("--runs", type=int, default=5, help="timed runs of each way")
+    parser.add_argument("--queries", type=int, default=1 << 18, help="queries per run")
+    parser.add_argument("--spp", type=int, default=16, help="paths per query (even)")
+    arguments = parser.parse_args()
+    load_mitsuba()
+    material = load_material(arguments.material) if arguments.material else rocky()
+    return (
+        measure_speed(material, arguments)
+        if arguments.part == "speed"
+        else measure_steps(material, arguments)
+    )
+
+
+if __name__ == "__main__":
+    start(main)
