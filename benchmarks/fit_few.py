@@ -23,7 +23,7 @@ from typing import Any
 
 from quality import generator_config
 
-from mbtf_core.config_file import resolve
+from mbtf_core.config.settings import resolve
 from mbtf_core.errors import MbtfError
 from mbtf_fit import fit
 from mbtf_fit.config import FitConfig

@@ -26,7 +26,7 @@ from typing import Any, get_args
 import numpy as np
 from quality import HEIGHT_SCALES, generator_config, source
 
-from mbtf_core.config_file import resolve
+from mbtf_core.config.settings import resolve
 from mbtf_core.errors import MbtfError
 from mbtf_core.units import parse_duration
 from mbtf_fit.config import FitConfig

@@ -23,8 +23,8 @@ from typing import Any, get_args
 
 from quality import generator_config
 
+from mbtf_core.config.nested import nested
 from mbtf_core.errors import MbtfError
-from mbtf_core.nested import nested
 from mbtf_core.units import parse_duration
 from mbtf_fit.presets import best_options
 from mbtf_gen.config.generator import count_queries

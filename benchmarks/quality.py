@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from mbtf_core.atomic import read_json, write_json
-from mbtf_core.config_file import resolve
+from mbtf_core.config.settings import resolve
 from mbtf_core.digest import data_sha256
 from mbtf_core.errors import InputError
 from mbtf_core.units import clock

@@ -29,7 +29,7 @@ from typing import Any
 from quality import HEIGHT_SCALES, ROOT, generator_config, source
 
 from mbtf_core.atomic import read_json, write_json
-from mbtf_core.nested import deep_merge
+from mbtf_core.config.nested import deep_merge
 from mbtf_fit import FitConfig, fit
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.generation import generate

@@ -25,8 +25,8 @@ from typing import Any
 
 import numpy as np
 
+from mbtf_core.app.console import Console
 from mbtf_core.atomic import read_json
-from mbtf_core.console import Console
 from mbtf_fit.formatting import VISIBILITY
 from mbtf_pipeline.compare.flip import flip
 from mbtf_pipeline.compare.pictures import read_picture

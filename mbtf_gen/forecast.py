@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.console import Console
+from mbtf_core.app.console import Console
 from mbtf_core.shard_schema import ShardEntry, Split
 from mbtf_core.stats import pooled_error
 from mbtf_core.units import clock, expectation, size_text

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from mbtf_core.config_file import Settings, dump_yaml, line_of, read_yaml, resolve
+from mbtf_core.config.settings import Settings, dump_yaml, line_of, read_yaml, resolve
 from mbtf_core.errors import InputError
 from mbtf_fit.config import FitConfig
 from mbtf_gen.config.generator import GeneratorConfig, Paths

@@ -8,8 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from mbtf_core.app.console import Console
 from mbtf_core.atomic import read_json
-from mbtf_core.console import Console
 from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError, PartialError
 from mbtf_core.folders import check_folder, owned

@@ -10,10 +10,8 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from mbtf_core.console import CONSOLE, Console
-from mbtf_core.errors import InputError, PartialError, UsageError
-from mbtf_core.interruption import keep_on_interruption
-from mbtf_core.options import (
+from mbtf_core.app.console import CONSOLE, Console
+from mbtf_core.app.options import (
     ClusterOption,
     DryRun,
     Options,
@@ -23,6 +21,8 @@ from mbtf_core.options import (
     Verbose,
     takes_options,
 )
+from mbtf_core.errors import InputError, PartialError, UsageError
+from mbtf_core.interruption import keep_on_interruption
 from mbtf_core.units import clock, expectation, format_duration
 from mbtf_fit.cli.page_options import Live, live_view
 from mbtf_fit.config import DECODER_MODELS, DEFAULT_MODEL, FIBER_MODEL, FitConfig, ModelName

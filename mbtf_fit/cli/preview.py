@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mbtf_core.console import CONSOLE, Console
+from mbtf_core.app.console import CONSOLE, Console
+from mbtf_core.app.options import Options, Output, Overwrite, PathText, Switch, takes_options
 from mbtf_core.errors import UsageError
-from mbtf_core.options import Options, Output, Overwrite, PathText, Switch, takes_options
 from mbtf_fit.mitsuba_plugin.preview.config import PreviewConfig
 
 

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, Field
 
 from mbtf_core.atomic import read_json
-from mbtf_core.config_file import check_document, check_schema
+from mbtf_core.config.settings import check_document, check_schema
 from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import MAX_LEVEL, Lattice

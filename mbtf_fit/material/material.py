@@ -12,7 +12,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from mbtf_core.atomic import write_json
-from mbtf_core.config_file import build
+from mbtf_core.config.settings import build
 from mbtf_core.directions import check_unit, from_projected_disk
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import Lattice, sigma_of_level

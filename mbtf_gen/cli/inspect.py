@@ -8,10 +8,10 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from mbtf_core.console import CONSOLE, Console
+from mbtf_core.app.console import CONSOLE, Console
+from mbtf_core.app.options import Options, Overwrite, PathText, takes_options
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.folders import make_folder
-from mbtf_core.options import Options, Overwrite, PathText, takes_options
 from mbtf_core.store import split_url
 from mbtf_gen.cli.generate import resolve_config
 from mbtf_gen.config.generator import GeneratorConfig

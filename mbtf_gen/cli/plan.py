@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from mbtf_core.console import CONSOLE, Console
-from mbtf_core.options import Options, PathText, takes_options
+from mbtf_core.app.console import CONSOLE, Console
+from mbtf_core.app.options import Options, PathText, takes_options
 from mbtf_gen.cli.generate import prepare_job
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.presets import QualityOption

@@ -11,11 +11,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from mbtf_core.config_file import FileName, Settings
+from mbtf_core.app.options import Flag
+from mbtf_core.config.settings import FileName, Settings
 from mbtf_core.digest import data_sha256
 from mbtf_core.errors import UsageError
 from mbtf_core.lattice import MAX_LEVEL
-from mbtf_core.options import Flag
 from mbtf_core.shard_schema import SCHEMA_VERSION, ArrayFormat, Layout, SliceDirections, Tiling
 from mbtf_gen.config.effects_request import EffectsRequest
 from mbtf_gen.geometry.slopes import NormalMode

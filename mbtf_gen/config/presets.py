@@ -12,8 +12,8 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from mbtf_core.config_file import parse_value, read_yaml
-from mbtf_core.nested import merge
+from mbtf_core.config.nested import merge
+from mbtf_core.config.settings import parse_value, read_yaml
 
 Quality = Literal["draft", "standard", "high", "paper"]
 QualityOption = Annotated[

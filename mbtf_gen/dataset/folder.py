@@ -17,7 +17,7 @@ from mbtf_core.atomic import (
     unwritable,
     write_text,
 )
-from mbtf_core.config_file import differences, dump_yaml
+from mbtf_core.config.settings import differences, dump_yaml
 from mbtf_core.data_folder import data_folder, send
 from mbtf_core.errors import InputError, PartialError
 from mbtf_core.folders import ELSEWHERE, check_folder, make_folder, other_configuration, remove_unfinished

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import BaseModel, Field
 
 from mbtf_core.atomic import read_checksummed, read_json
-from mbtf_core.config_file import check_document, check_schema
+from mbtf_core.config.settings import check_document, check_schema
 from mbtf_core.data_folder import data_folder, limit_cache
 from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError

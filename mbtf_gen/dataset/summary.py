@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, PositiveInt
 
 from mbtf_core.atomic import write_checksummed
-from mbtf_core.config_file import check_document
+from mbtf_core.config.settings import check_document
 from mbtf_core.data_folder import data_folder, send
 from mbtf_core.errors import PartialError
 from mbtf_core.locks import brief_lock

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from mbtf_core.atomic import read_json
-from mbtf_core.config_file import check_document
+from mbtf_core.config.settings import check_document
 from mbtf_core.errors import InputError
 from mbtf_gen.dataset.manifest import software_versions
 from mbtf_gen.dataset.reader import Dataset

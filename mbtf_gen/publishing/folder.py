@@ -14,7 +14,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BaseModel
 
 from mbtf_core.atomic import Stored, read_json, remove_file, write_json
-from mbtf_core.config_file import check_document
+from mbtf_core.config.settings import check_document
 from mbtf_core.digest import data_sha256
 from mbtf_core.errors import InputError
 from mbtf_core.folders import ELSEWHERE, check_folder, make_folder, other_configuration, remove_unfinished

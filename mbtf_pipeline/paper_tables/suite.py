@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from mbtf_core.app.console import Console
 from mbtf_core.atomic import read_json, write_json, write_text
-from mbtf_core.console import Console
 from mbtf_core.errors import InputError
 from mbtf_core.folders import check_folder, owned
 from mbtf_pipeline.compare.metrics import DEFINITIONS

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.atomic import read_json, write_text
-from mbtf_core.config_file import check_schema
+from mbtf_core.config.settings import check_schema
 from mbtf_core.exposure import describe_exposure
 from mbtf_pipeline.compare.compare import COMPARISON_NAME, COMPARISON_SCHEMA
 from mbtf_pipeline.formatting import NOT_SIGNIFICANT

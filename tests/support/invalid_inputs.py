@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mbtf_core.console import run
+from mbtf_core.app.console import run
 
 from .commands import Done
 from .datasets import edit, write_dataset

@@ -12,9 +12,9 @@ from cyclopts import App, CycloptsError, MissingArgumentError
 from support.documented import Shown, in_markdown, in_strings, shown_commands
 from support.paths import ROOT
 
-from mbtf_core.config_file import resolve
+from mbtf_core.app.options import ConfigOption
+from mbtf_core.config.settings import resolve
 from mbtf_core.errors import MbtfError
-from mbtf_core.options import ConfigOption
 from mbtf_fit.cli.app import app as fit
 from mbtf_gen.cli.app import app as generate
 from mbtf_pipeline.cli.app import app as pipeline

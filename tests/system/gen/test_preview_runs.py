@@ -206,7 +206,7 @@ def test_invalid_inputs_are_named_before_anything_is_written(
 def test_a_preview_without_drawing_is_partial_and_resumes(
     work: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from mbtf_core.console import run
+    from mbtf_core.app.console import run
     from mbtf_gen.cli.app import app
     from mbtf_gen.pictures.preview import mesh
 

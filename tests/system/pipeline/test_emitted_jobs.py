@@ -9,7 +9,7 @@ import pytest
 from support.emitted import ALL, IMAGES, SLICES, TARGETS, emitted, kinds, make_place, start
 from support.fake_cluster import calls, fail, install
 
-from mbtf_core.config_file import resolve
+from mbtf_core.config.settings import resolve
 from mbtf_fit.cli.app import app as fit_app
 from mbtf_fit.config import FitConfig
 from mbtf_gen.cli.app import app as gen_app

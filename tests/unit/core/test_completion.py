@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from cyclopts import App
 
-from mbtf_core.console import run
+from mbtf_core.app.console import run
 from mbtf_fit.cli.app import app as fit
 from mbtf_gen.cli.app import app as generate
 from mbtf_pipeline.cli.app import app as pipeline

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import pytest
 from pydantic import Field
 
-from mbtf_core.config_file import Settings, build, differences, dump_yaml, in_short, read_yaml, resolve
+from mbtf_core.config.settings import Settings, build, differences, dump_yaml, in_short, read_yaml, resolve
 from mbtf_core.errors import InputError, UsageError
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from cyclopts import App
 
-from mbtf_core.console import CONSOLE, Console, new_app, run
+from mbtf_core.app.console import CONSOLE, Console, new_app, run
 from mbtf_core.errors import EngineError, InputError, MbtfError, PartialError, UsageError
 from mbtf_core.units import clock
 
@@ -255,7 +255,7 @@ def test_plain_progress_ends_with_a_line(capsys: pytest.CaptureFixture[str]) -> 
 
 def test_progress_intervals(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     now = 0.0
-    monkeypatch.setattr("mbtf_core.progress.time.monotonic", lambda: now)
+    monkeypatch.setattr("mbtf_core.app.progress.time.monotonic", lambda: now)
     with CONSOLE.progress(100, "fitting", "steps") as bar:
         for _ in range(50):
             now += 0.5
@@ -297,7 +297,7 @@ def test_progress_on_a_terminal_is_a_bar(columns: int) -> None:
     import subprocess
 
     code = (
-        "from mbtf_core.console import CONSOLE\n"
+        "from mbtf_core.app.console import CONSOLE\n"
         "with CONSOLE.progress(3, 'rendering') as bar:\n"
         "    bar.advance(3, 'loss 0.123, unexplained 0.250 ± 0.010, 1.23 M queries/s')\n"
         "CONSOLE.report({}, 'result')\n"

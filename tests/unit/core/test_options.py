@@ -8,9 +8,9 @@ from typing import Annotated, Literal
 import pytest
 from pydantic import Field
 
-from mbtf_core.config_file import Settings
-from mbtf_core.console import new_app, run
-from mbtf_core.options import Flag, Options, command_line, config_options, takes_options
+from mbtf_core.app.console import new_app, run
+from mbtf_core.app.options import Flag, Options, command_line, config_options, takes_options
+from mbtf_core.config.settings import Settings
 
 
 class Query(Settings):

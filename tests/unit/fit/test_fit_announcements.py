@@ -10,7 +10,7 @@ import pytest
 from support.fit_data import parallax, write_data
 
 from mbtf_core import folders
-from mbtf_core.console import run
+from mbtf_core.app.console import run
 from mbtf_core.lattice import Lattice
 from mbtf_fit.cli.app import app
 from mbtf_fit.config import FitConfig

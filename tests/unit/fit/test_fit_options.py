@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from mbtf_core.config_file import dump_yaml
+from mbtf_core.config.settings import dump_yaml
 from mbtf_core.errors import UsageError
 from mbtf_fit.cli.app import app
 from mbtf_fit.cli.fit import resolve_config

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mbtf_core import folders
-from mbtf_core.console import CONSOLE, run
+from mbtf_core.app.console import CONSOLE, run
 from mbtf_gen import forecast, generation
 from mbtf_gen.cli.app import app
 from mbtf_gen.dataset import render_shards
@@ -124,7 +124,7 @@ def test_a_preset_sets_the_resolution_up_to_that_of_the_map(
 
 
 def test_the_resolution_of_a_material_overrides_that_of_a_preset(heights: Path) -> None:
-    from mbtf_core.config_file import build
+    from mbtf_core.config.settings import build
     from mbtf_gen.config.generator import GeneratorConfig
     from mbtf_gen.job import Job, limit_resolution
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mbtf_core.console import Console, run
+from mbtf_core.app.console import Console, run
 from mbtf_core.errors import InputError
 from mbtf_pipeline.cli.app import app
 from mbtf_pipeline.recipe import load_recipe, read_resolved, write_recipe

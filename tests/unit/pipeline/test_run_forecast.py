@@ -10,7 +10,7 @@ import pytest
 from support.paths import ROOT
 
 from mbtf_core import folders
-from mbtf_core.console import run
+from mbtf_core.app.console import run
 from mbtf_core.errors import InputError
 from mbtf_gen.dataset.shard_io import row_bytes
 from mbtf_pipeline import forecast as module

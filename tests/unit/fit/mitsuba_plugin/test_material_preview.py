@@ -17,7 +17,7 @@ from support.scenes import mi
 
 import mbtf_fit.mitsuba_plugin
 from mbtf_core import interruption
-from mbtf_core.config_file import resolve
+from mbtf_core.config.settings import resolve
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import EngineError, UsageError
 from mbtf_core.exposure import to_display
@@ -194,7 +194,7 @@ def test_invalid_options_are_refused() -> None:
 
 
 def test_bad_input_of_previews_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from mbtf_core.console import run
+    from mbtf_core.app.console import run
     from mbtf_fit.cli.app import app
 
     for code, what, *words in (

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mbtf_core.config_file import resolve
+from mbtf_core.config.settings import resolve
 from mbtf_core.errors import UsageError
 from mbtf_gen.config.generator import GeneratorConfig, count_queries, parse_count
 from mbtf_gen.material.load import load_material

@@ -14,8 +14,8 @@ from support.object_stores import memory_store
 from support.small_runs import command, contents, generate, noisy_plane
 
 import mbtf_core.store_folder
+from mbtf_core.app.console import run
 from mbtf_core.atomic import checksummed
-from mbtf_core.console import run
 from mbtf_core.data_folder import data_folder, in_store, local_copy
 from mbtf_core.errors import InputError, MbtfError, PartialError
 from mbtf_core.shard_schema import ShardEntry

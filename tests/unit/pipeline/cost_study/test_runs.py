@@ -14,7 +14,7 @@ import pytest
 
 import mbtf_fit
 from mbtf_core.atomic import write_text
-from mbtf_core.config_file import dump_yaml, resolve
+from mbtf_core.config.settings import dump_yaml, resolve
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_gen.config.generator import GeneratorConfig

@@ -24,10 +24,10 @@ from pydantic import (
     field_validator,
 )
 
+from mbtf_core.config.messages import explain, models_in, parts_of
+from mbtf_core.config.nested import deep_merge, leaves, merge, nested
 from mbtf_core.errors import InputError, MbtfError, UsageError, reason
-from mbtf_core.nested import deep_merge, leaves, merge, nested
 from mbtf_core.suggest import refuse_special, suggest_name, suggest_path
-from mbtf_core.validation_messages import explain, models_in, parts_of
 
 
 class Settings(BaseModel):

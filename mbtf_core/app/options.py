@@ -30,7 +30,7 @@ from cyclopts import Parameter
 from pydantic import BaseModel, TypeAdapter
 from pydantic.fields import FieldInfo
 
-from mbtf_core.config_file import Settings, resolve
+from mbtf_core.config.settings import Settings, resolve
 from mbtf_core.errors import UsageError
 from mbtf_core.store import split_url
 

@@ -39,7 +39,9 @@ from typing import Annotated, Any
 from cyclopts import App, CycloptsError, Parameter, UnusedCliTokensError
 
 from mbtf_core import interruption
-from mbtf_core.completion import CompletedApp, add_completion
+from mbtf_core.app.completion import CompletedApp, add_completion
+from mbtf_core.app.options import Switch
+from mbtf_core.app.progress import BarProgress, LineProgress, Progress
 from mbtf_core.errors import (
     EXIT_BAD_INPUT,
     EXIT_INTERRUPTED,
@@ -50,8 +52,6 @@ from mbtf_core.errors import (
     printable,
     reason,
 )
-from mbtf_core.options import Switch
-from mbtf_core.progress import BarProgress, LineProgress, Progress
 
 EXIT_INTERNAL = 1
 _EXIT_BROKEN_PIPE = 141
