@@ -28,7 +28,6 @@ from mbtf_core.errors import MbtfError
 from mbtf_fit import fit
 from mbtf_fit.config import FitConfig
 from mbtf_fit.presets import best_options
-from mbtf_gen.config.presets import as_assignments
 from mbtf_gen.generation import generate
 from mbtf_gen.render.runtime import load_mitsuba
 
@@ -44,7 +43,7 @@ def fitted(shards: Path, out: Path, steps: int, noise_regularization: float, see
         "training.noise_regularization": noise_regularization,
         "seed": seed,
     }
-    result = fit(resolve(FitConfig, assignments=as_assignments(options)), shards, out)
+    result = fit(resolve(FitConfig, presets=options), shards, out)
     training = result.material.description["training"]
     missed = result.errors["test"]["unexplained"]
     return {

@@ -26,13 +26,13 @@ from typing import Any, get_args
 import numpy as np
 from quality import HEIGHT_SCALES, generator_config, source
 
+from mbtf_core.app.options import Quality
 from mbtf_core.config.settings import resolve
 from mbtf_core.errors import MbtfError
 from mbtf_core.units import parse_duration
 from mbtf_fit.config import FitConfig
 from mbtf_fit.presets import best_options
 from mbtf_fit.training.forecast import PERSISTENCE, PILOT_SECONDS, extrapolated
-from mbtf_gen.config.presets import Quality, as_assignments
 from mbtf_gen.render.runtime import load_mitsuba
 
 ASSETS = ("cliff_rock", "insulation_foam", "straight_wool", "turtle_shell", "twisted_wool")
@@ -68,10 +68,10 @@ def fitted(shards: Path, seconds: str, out: Path) -> dict[str, Any]:
     from mbtf_fit.training.forecast import forecast_fit
 
     options = {**best_options(parse_duration(seconds)), "training.time": seconds, "training.steps": None}
-    config = resolve(FitConfig, assignments=as_assignments(options))
+    config = resolve(FitConfig, presets=options)
     expected = forecast_fit(config, shards)
     # As many steps as forecast, so that the seconds compare the forecast rate.
-    run = resolve(FitConfig, assignments=as_assignments({**options, "training.steps": expected.steps}))
+    run = resolve(FitConfig, presets={**options, "training.steps": expected.steps})
     result = fit(run, shards, out)
     reached = result.errors["test"]["unexplained"]
     return {

@@ -29,7 +29,7 @@ from library import ASSETS, RELIEFS, command
 from PIL import Image
 
 from mbtf_core.atomic import write_text
-from mbtf_core.config.settings import dump_yaml, read_yaml
+from mbtf_core.config.yaml_file import dump_yaml, read_yaml
 
 # Quarter turns and factors of heights, by the suffix of a variant's name.
 VARIANTS = {"": (0, 1.0), "_90": (1, 1.0), "_180": (2, 1.0), "_270_low": (3, 0.5)}

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from mbtf_core.atomic import write_text
-from mbtf_core.config.settings import dump_yaml, read_yaml
+from mbtf_core.config.yaml_file import dump_yaml, read_yaml
 from mbtf_core.units import clock
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -29,6 +29,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, get_args
 
+from mbtf_core.app.options import Quality
 from mbtf_core.atomic import read_json, write_json
 from mbtf_core.config.settings import resolve
 from mbtf_core.digest import data_sha256
@@ -37,7 +38,7 @@ from mbtf_core.units import clock
 from mbtf_fit.config import FitConfig
 from mbtf_fit.presets import FITTER, best_at
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.config.presets import GENERATOR, RESOLUTION, Quality, as_assignments
+from mbtf_gen.config.presets import GENERATOR, RESOLUTION
 from mbtf_pipeline.presets import COMPARE
 from mbtf_pipeline.run_folder import machine
 
@@ -116,7 +117,7 @@ def source(name: str) -> tuple[Path, float | None]:
 def options_hash(quality: Quality) -> str:
     """Hash of all options of a preset and of the fitter's other training options."""
     options = best_at(quality) | FITTER[quality]
-    training = resolve(FitConfig, assignments=as_assignments(options)).training.model_dump(mode="json")
+    training = resolve(FitConfig, presets=options).training.model_dump(mode="json")
     return data_sha256([GENERATOR[quality], options, training, COMPARE[quality]])[:12]
 
 
@@ -130,11 +131,12 @@ def generator_config(name: str, quality: Quality, resolution: int) -> GeneratorC
     material, height = source(name)
     return resolve(
         GeneratorConfig,
-        assignments=[
-            f"material={json.dumps(str(material))}",
-            *as_assignments(GENERATOR[quality]),
-            *as_assignments({"geometry.height_scale": height, "queries.resolution": resolution}),
-        ],
+        presets=GENERATOR[quality],
+        flags={
+            "material": str(material),
+            "geometry.height_scale": height,
+            "queries.resolution": resolution,
+        },
     )
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.atomic import TEMPORARY, remove_file
-from mbtf_core.config.settings import differences, in_short
+from mbtf_core.config.nested import differences, in_short
 from mbtf_core.errors import InputError, LockedError, PartialError
 from mbtf_core.locks import keep_renewing, lock_owner, take_lock
 from mbtf_core.units import size_text

@@ -6,9 +6,9 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from mbtf_core.app.options import Quality
 from mbtf_core.units import parse_duration
 from mbtf_fit.config import DEFAULT_MODEL, ModelName
-from mbtf_gen.config.presets import Quality
 
 # Options of least error per time in the cost studies: larger networks and textures than the paper's, growing
 # with the training time (seconds).

@@ -17,7 +17,8 @@ from typing import Any
 from pydantic import ValidationError
 
 from mbtf_core.atomic import read_checksummed, read_json, write_checksummed, write_text
-from mbtf_core.config.settings import differences, dump_yaml, in_short, read_yaml
+from mbtf_core.config.nested import differences, in_short
+from mbtf_core.config.yaml_file import dump_yaml, read_yaml
 from mbtf_core.data_folder import data_folder, send
 from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError, MbtfError

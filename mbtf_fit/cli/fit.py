@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,9 +17,11 @@ from mbtf_core.app.options import (
     Options,
     Output,
     Overwrite,
+    Quality,
+    QualityOption,
     Switch,
     Verbose,
-    takes_options,
+    options_from,
 )
 from mbtf_core.errors import InputError, PartialError, UsageError
 from mbtf_core.interruption import keep_on_interruption
@@ -27,17 +29,20 @@ from mbtf_core.units import clock, expectation, format_duration
 from mbtf_fit.cli.page_options import Live, live_view
 from mbtf_fit.config import DECODER_MODELS, DEFAULT_MODEL, FIBER_MODEL, FitConfig, ModelName
 from mbtf_fit.formatting import describe_fit, format_estimate, format_table, headline, visibility
-from mbtf_gen.config.presets import Quality, QualityOption, as_assignments, overrides_of
 
 
-@takes_options(FitConfig)
+@options_from(FitConfig)
+class FitOptions(Options[FitConfig]):
+    """Options of ``mbtf-fit``."""
+
+
 def fit(
     shards: Path | None = None,
     /,
     *,
     output: Output = Path("material"),
     quality: QualityOption = None,
-    options: Options[FitConfig],
+    options: FitOptions = FitOptions(),  # noqa: B008
     many: Annotated[list[Path] | None, Parameter(consume_multiple=True)] = None,
     processes: Annotated[int | None, Parameter(show_default="one per GPU, or 1")] = None,
     shared_decoder: Switch = False,
@@ -90,7 +95,7 @@ def fit(
             raise UsageError("shows one fit", where=flag, hint=f"leave out --many, or {flag}")
     if many is not None:
         if shared_decoder:
-            options = replace(options, assignments=[*options.assignments, "training.shared_decoder=true"])
+            options = options.assigning("training.shared_decoder=true")
         _fit_many(options, quality, many, output, processes, cluster, overwrite, console)
         return
     assert shards is not None
@@ -172,25 +177,23 @@ def resolve_config(options: Options[FitConfig], quality: Quality | None, *shards
     to keep decides, or the data sets."""
     from mbtf_fit.presets import fitter_options
 
-    given = options.given
-    flags = [f"{key}={value}" for key, value in given.items()]
-    overrides = overrides_of(options.config, [*options.assignments, *flags])
+    overrides = options.explicit()
     kept = _kept_options(overrides.get("decoder"))
     overrides = {"model": kept.get("model") or _model_for(shards), **overrides}
-    presets = [f"model={overrides['model']}"]
+    presets = {"model": overrides["model"]}
     if quality is not None:
-        presets += as_assignments(fitter_options(quality, {"": overrides})[""])
+        presets |= fitter_options(quality, {"": overrides})[""]
     if overrides["model"] == kept.get("model"):
-        presets += as_assignments(kept)
-    if "training.time" in given:
+        presets |= kept
+    if "training.time" in options.given:
         # A time overrides the steps of a file or a preset.
-        presets.append("training.steps=null")
+        presets["training.steps"] = None
     return options.resolve(presets)
 
 
 def _shares_decoder(options: Options[FitConfig]) -> bool:
     """Whether the data sets of a command share a network."""
-    training = overrides_of(options.config, options.assignments).get("training")
+    training = options.explicit().get("training")
     # Values of --set are text.
     return isinstance(training, Mapping) and str(training.get("shared_decoder")).lower() == "true"
 
@@ -280,7 +283,7 @@ def _fit_jointly(
 
 
 def _fit_many(
-    options: Options[FitConfig],
+    options: FitOptions,
     quality: Quality | None,
     many: list[Path],
     output: Path,

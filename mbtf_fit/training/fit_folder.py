@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.atomic import read_json, write_json, write_text
-from mbtf_core.config.settings import check_schema, dump_yaml
+from mbtf_core.config.settings import check_schema
+from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.digest import data_sha256
 from mbtf_core.folders import ELSEWHERE, check_folder, make_folder, other_configuration
 from mbtf_fit.config import FitConfig

@@ -10,10 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from mbtf_core.app.console import CONSOLE, Console
-from mbtf_core.app.options import Options, PathText, takes_options
-from mbtf_gen.cli.generate import prepare_job
-from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.config.presets import QualityOption
+from mbtf_core.app.options import PathText, QualityOption
+from mbtf_gen.cli.generate import GenerateOptions, prepare_job
 
 if TYPE_CHECKING:
     from mbtf_gen.planning.effects import Effect, EffectsPlan
@@ -22,13 +20,12 @@ if TYPE_CHECKING:
 _NAME, _BOUND, _WIDTH = 24, 24, 108
 
 
-@takes_options(GeneratorConfig)
 def plan(
     material: PathText | None = None,
     /,
     *,
     quality: QualityOption = None,
-    options: Options[GeneratorConfig],
+    options: GenerateOptions = GenerateOptions(),  # noqa: B008
     measure: Annotated[bool, Parameter(show_default=False)] = True,
     console: Console = CONSOLE,
 ) -> None:

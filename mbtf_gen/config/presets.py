@@ -6,22 +6,10 @@ measures the time that each preset takes and the error that it reaches.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Annotated, Any, Literal
+from collections.abc import Mapping
+from typing import Any
 
-from cyclopts import Parameter
-
-from mbtf_core.config.nested import merge
-from mbtf_core.config.settings import parse_value, read_yaml
-
-Quality = Literal["draft", "standard", "high", "paper"]
-QualityOption = Annotated[
-    Quality | None,
-    Parameter(
-        help="Preset of sizes and times; overrides the file of --config; other options override the preset."
-    ),
-]
+from mbtf_core.app.options import Quality
 
 
 def _queries(train: str, spp: int, test: str, test_spp: int) -> dict[str, Any]:
@@ -53,24 +41,3 @@ def generator_options(quality: Quality | None, given: Mapping[str, Any]) -> dict
     explicit = isinstance(queries, Mapping) and queries.get("resolution") is not None
     options = {} if quality is None else GENERATOR[quality]
     return {name: value for name, value in options.items() if not (explicit and name == RESOLUTION)}
-
-
-def overrides_of(file: Path | None, assignments: Sequence[str]) -> dict[str, Any]:
-    """Options of a configuration file and of ``a.b=c``, nested; single values of the latter as text.
-
-    Raises
-    ------
-    InputError : the file cannot be read
-    """
-    found = read_yaml(file) if file is not None else {}
-    given = dict(found) if isinstance(found, Mapping) else {}
-    for text in assignments:
-        name, _, value = text.partition("=")
-        parsed = parse_value(value)
-        merge(given, name.strip().split("."), parsed if isinstance(parsed, Mapping) else value.strip())
-    return given
-
-
-def as_assignments(options: dict[str, Any], prefix: str = "") -> list[str]:
-    """Options as ``a.b=c`` of ``--set``."""
-    return [f"{prefix}{name}={'null' if value is None else value}" for name, value in options.items()]

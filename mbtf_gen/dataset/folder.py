@@ -17,7 +17,8 @@ from mbtf_core.atomic import (
     unwritable,
     write_text,
 )
-from mbtf_core.config.settings import differences, dump_yaml
+from mbtf_core.config.nested import differences
+from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.data_folder import data_folder, send
 from mbtf_core.errors import InputError, PartialError
 from mbtf_core.folders import ELSEWHERE, check_folder, make_folder, other_configuration, remove_unfinished

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.atomic import read_json, remove_file, write_checksummed, write_text
-from mbtf_core.config.settings import dump_yaml
+from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.data_folder import data_folder, send, send_shard
 from mbtf_core.folders import check_folder, make_folder, other_configuration, owned
 from mbtf_core.lattice import sigma_of_level

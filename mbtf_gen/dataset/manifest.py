@@ -11,7 +11,8 @@ from typing import Any
 
 from pydantic import BaseModel, field_validator
 
-from mbtf_core.config.settings import check_document, dump_yaml
+from mbtf_core.config.settings import check_document
+from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.digest import data_sha256
 from mbtf_core.lattice import sigma_of_level
 from mbtf_core.shard_schema import ARRAYS, CONVENTIONS, FORMAT_NAME, LEADING_AXES, SCHEMA_VERSION, SPLITS

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.atomic import write_text
-from mbtf_core.config.settings import dump_yaml
+from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.errors import UsageError
 from mbtf_core.folders import make_folder
 from mbtf_core.shard_schema import Tiling

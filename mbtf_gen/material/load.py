@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 from pathlib import Path
 
-from mbtf_core.config.settings import build, read_yaml
+from mbtf_core.config.settings import build
+from mbtf_core.config.yaml_file import read_yaml
 from mbtf_core.errors import InputError
 from mbtf_core.shard_schema import Tiling
 from mbtf_core.suggest import suggest_path

@@ -15,7 +15,8 @@ from typing import Any
 from pydantic import BaseModel
 
 from mbtf_core.atomic import read_json, write_json, write_text
-from mbtf_core.config.settings import check_document, dump_yaml
+from mbtf_core.config.settings import check_document
+from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.digest import data_sha256
 from mbtf_core.errors import InputError
 from mbtf_core.folders import ELSEWHERE, check_folder, make_folder, other_configuration, remove_unfinished

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from mbtf_core.atomic import Stored
-from mbtf_core.config.settings import dump_yaml
+from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.shard_schema import GEOMETRY_NAME, LEADING_AXES
 from mbtf_core.units import size_text
 from mbtf_gen.publishing.digests import DIGESTS_NAME

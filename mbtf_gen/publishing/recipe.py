@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from mbtf_core.atomic import Stored, write_chunks
-from mbtf_core.config.settings import dump_yaml
+from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.shard_schema import CONFIG_NAME
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.publishing.digests import DIGESTS_NAME, dataset_digests

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.atomic import Stored, checksummed, sync_folder, temporary_of, write_chunks
-from mbtf_core.config.settings import dump_yaml
+from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.data_folder import local_copy
 from mbtf_core.digest import file_sha256
 from mbtf_core.shard_schema import CONFIG_NAME, MANIFEST_NAME

@@ -11,7 +11,7 @@ from typing import Any
 
 from mbtf_core.atomic import read_json, write_json, write_text
 from mbtf_core.cluster.engine import Cluster
-from mbtf_core.config.settings import dump_yaml
+from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.errors import InputError
 from mbtf_core.folders import ELSEWHERE, check_folder, check_space, owned
 from mbtf_core.stats import Estimate, signal_variance

@@ -21,6 +21,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+from mbtf_core.app.options import Quality
 from mbtf_core.atomic import read_json, write_json
 from mbtf_core.config.nested import deep_merge
 from mbtf_core.digest import data_sha256
@@ -30,7 +31,7 @@ from mbtf_core.units import clock, format_duration
 from mbtf_fit.config import FitConfig
 from mbtf_fit.training.forecast import query_seconds
 from mbtf_gen.config.generator import count_queries
-from mbtf_gen.config.presets import GENERATOR, Quality
+from mbtf_gen.config.presets import GENERATOR
 from mbtf_gen.dataset.shard_io import row_bytes
 from mbtf_gen.job import Job, split_queries
 from mbtf_pipeline.cost_study.fit_runs import round_down

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from mbtf_core.atomic import read_json, write_json, write_text
-from mbtf_core.config.settings import dump_yaml
+from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.folders import ELSEWHERE, check_folder, make_folder, owned
 from mbtf_core.shard_schema import MANIFEST_NAME

@@ -60,9 +60,9 @@ def test_commands_are_those_of_the_recipe(recipe: Recipe, target: Target, tmp_pa
     programs = {"mbtf-gen": gen_app, "mbtf-fit": fit_app, "mbtf-pipeline": app}
     for words in (call["words"] for call in calls(tmp_path / "bin")):
         program = programs[words[0]]
-        command, bound, _ = program.parse_args(words[1:], exit_on_error=False, print_error=False)
-        if hasattr(command, "read_options"):
-            options = command.read_options(dict(bound.arguments))
+        _, bound, _ = program.parse_args(words[1:], exit_on_error=False, print_error=False)
+        options = bound.arguments.get("options")
+        if options is not None:
             extra = {"material": None} if words[0] == "mbtf-gen" else {}
             read[words[words.index("-o") + 1]] = options.resolve(**extra)
     for data in data_sets(recipe):

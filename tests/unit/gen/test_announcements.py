@@ -113,13 +113,12 @@ def test_a_short_run_needs_no_forecast(
 def test_a_preset_sets_the_resolution_up_to_that_of_the_map(
     heights: Path, quality: str, options: tuple[str, ...], resolution: int
 ) -> None:
-    from mbtf_gen.cli.generate import prepare_job
+    from mbtf_gen.cli.generate import GenerateOptions, prepare_job
 
-    command: Any
     words = ["plan", str(heights), "--height-scale", "0.01", "--quality", quality, *options]
-    command, bound, _ = app.parse_args(words, exit_on_error=False, print_error=False)
+    _, bound, _ = app.parse_args(words, exit_on_error=False, print_error=False)
     arguments = dict(bound.arguments)
-    job = prepare_job(command.read_options(arguments), str(heights), arguments["quality"])
+    job = prepare_job(arguments.get("options", GenerateOptions()), str(heights), arguments["quality"])
     assert job.lattice.shape() == (resolution, resolution)
 
 

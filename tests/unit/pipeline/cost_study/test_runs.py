@@ -14,7 +14,8 @@ import pytest
 
 import mbtf_fit
 from mbtf_core.atomic import write_text
-from mbtf_core.config.settings import dump_yaml, resolve
+from mbtf_core.config.settings import resolve
+from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_gen.config.generator import GeneratorConfig
