@@ -25,10 +25,10 @@ from mbtf_core.app.options import (
 )
 from mbtf_core.errors import InputError, PartialError, UsageError
 from mbtf_core.interruption import keep_on_interruption
-from mbtf_core.units import clock, expectation, format_duration
+from mbtf_core.units import expectation, format_duration
 from mbtf_fit.cli.page_options import Live, live_view
 from mbtf_fit.config import DECODER_MODELS, DEFAULT_MODEL, FIBER_MODEL, FitConfig, ModelName
-from mbtf_fit.formatting import describe_fit, format_estimate, format_table, headline, visibility
+from mbtf_fit.formatting import describe_fit, fits_table
 
 
 @options_from(FitConfig)
@@ -220,20 +220,6 @@ def _model_for(shards: Sequence[Path]) -> ModelName:
     return FIBER_MODEL if len(shards) == 1 else DECODER_MODELS[-1]
 
 
-_COLUMNS = ["material", "unexplained variance", "PSNR", "beside the reference", "steps", "training"]
-
-
-def _row(name: str, result: dict[str, Any] | None) -> list[str]:
-    """Row of a table of fits."""
-    if result is None:
-        return [name, "failed", "-", "-", "-", "-"]
-    training, errors = result["training"], result["errors"]
-    split = errors[headline(errors)]
-    psnr, word = visibility(split)
-    cells = [format_estimate(split["unexplained"]), psnr.removeprefix("PSNR "), word or "-"]
-    return [name, *cells, str(training["steps"]), clock(training["seconds"])]
-
-
 def _fit_jointly(
     config: FitConfig,
     shards: list[Path],
@@ -274,12 +260,11 @@ def _fit_jointly(
         FitOutcome(data, fitted.folder, fitted.as_dict(), None)
         for data, fitted in zip(shards, result.fits, strict=True)
     ]
-    rows = [_COLUMNS, *(_row(outcome.folder.name, outcome.result) for outcome in outcomes)]
     report = {
         "decoder": {"folder": result.decoder.folder, "sha256": result.decoder.sha256},
         "fits": [outcome.as_dict() for outcome in outcomes],
     }
-    console.report(report, format_table(rows))
+    console.report(report, fits_table({o.folder.name: o.result for o in outcomes}))
 
 
 def _fit_many(
@@ -331,8 +316,9 @@ def _fit_many(
             outcomes = fit_on_cluster(
                 configs, shards, folders, workers, overwrite=overwrite, finished=finished
             )
-    rows = [_COLUMNS, *(_row(outcome.folder.name, outcome.result) for outcome in outcomes)]
-    console.report({"fits": [o.as_dict() for o in outcomes]}, format_table(rows))
+    console.report(
+        {"fits": [o.as_dict() for o in outcomes]}, fits_table({o.folder.name: o.result for o in outcomes})
+    )
     failed = [o for o in outcomes if o.error is not None]
     for outcome in failed:
         console.note(f"{outcome.shards}: {outcome.error}")
