@@ -157,16 +157,20 @@ def _commands(app: App) -> list[str]:
     return [name for name in app if not name.startswith("-")]
 
 
-def _command_hint(app: App, tokens: Sequence[str]) -> str:
-    """How to name the command that a failed line of the default command may have meant; empty where none."""
-    word = next((token for token in tokens if not token.startswith("-")), None)
-    if word is None or os.path.exists(word):
+def _missed_command(app: App, tokens: Sequence[str], text: str) -> str:
+    """Message of a failed line of the default command that may have meant another one; empty where none."""
+    words = [token for token in tokens if not token.startswith("-") and not os.path.exists(token)]
+    if not words:
         return ""
-    near = difflib.get_close_matches(word, _commands(app), n=1, cutoff=0.75)
-    if not near or word == tokens[0] == near[0]:
+    if tokens[0] != words[0]:
+        # The value of an option may be named like a command.
+        meant = words if text.startswith("unexpected argument") else words[: words[0] in text]
+        late = next((word for word in meant if word in _commands(app)), None)
+        return "" if late is None else f"{text}\n  did you mean: {app.name[0]} {late} {tokens[0]} …"
+    near = difflib.get_close_matches(words[0], _commands(app), n=1, cutoff=0.75)
+    if not near or near[0] == words[0]:
         return ""
-    rule = " (the command comes first)" if word == near[0] else ""
-    return f"did you mean: {app.name[0]} {near[0]}{rule}"
+    return f"{printable(words[0])}: no such file or command\n  did you mean: {app.name[0]} {near[0]}"
 
 
 def _usage_message(app: App, fault: CycloptsError, tokens: Sequence[str]) -> str:
@@ -175,8 +179,8 @@ def _usage_message(app: App, fault: CycloptsError, tokens: Sequence[str]) -> str
         text = f"unexpected argument '{reason(fault.unused_tokens[0])}'"
     else:
         text = reason(fault, 300)
-    if hint := _command_hint(app, tokens):
-        return f"{text}\n  {hint}"
+    if missed := _missed_command(app, tokens, text):
+        return missed
     command = f" {tokens[0]}" if tokens and tokens[0] in _commands(app) else ""
     return f"{text}\n  see {app.name[0]}{command} --help"
 
@@ -238,8 +242,8 @@ def run(app: App, argv: Sequence[str] | None = None) -> int:
             raise KeyboardInterrupt
         return result if type(result) is int else EXIT_OK
     except MbtfError as error:
-        if hint := _command_hint(app, tokens):
-            return _fail(f"{error.message.splitlines()[0]}\n  {hint}", EXIT_USAGE, debug, as_json)
+        if missed := _missed_command(app, tokens, error.message.splitlines()[0]):
+            return _fail(missed, EXIT_USAGE, debug, as_json)
         return _fail(error.message, error.exit_code, debug, as_json)
     except CycloptsError as error:
         return _fail(_usage_message(app, error, tokens), EXIT_USAGE, debug, as_json)

@@ -173,7 +173,7 @@ def test_usage_errors(app: App, arguments: str, expected: str, capsys: pytest.Ca
     assert captured.out == "" or "--json" in arguments
 
 
-@pytest.mark.parametrize("line", ["doctr", "--json doctor", "doctr --code 3"])
+@pytest.mark.parametrize("line", ["doctr", "--json doctor", "doctr --code 3", "--json doctor more"])
 def test_a_line_that_fails_suggests_the_command_that_it_may_mean(
     app: App, line: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
