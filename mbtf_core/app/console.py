@@ -34,7 +34,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 from cyclopts import App, CycloptsError, Parameter, UnusedCliTokensError
-from pydantic_core import to_json
+from pydantic_core import to_jsonable_python
 
 from mbtf_core import interruption
 from mbtf_core.app.options import Switch
@@ -90,7 +90,8 @@ class Console:
         global _reported
         _reported = True
         if self.json:
-            text = to_json(dict(data), indent=2, inf_nan_mode="null", fallback=_plain).decode()
+            plain = to_jsonable_python(dict(data), inf_nan_mode="null", fallback=_plain)
+            text = json_module.dumps(plain, indent=2, ensure_ascii=False, allow_nan=False)
         print(text)
 
     @contextlib.contextmanager

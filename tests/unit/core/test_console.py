@@ -338,3 +338,14 @@ def test_help_and_version_answer(app: App, capsys: pytest.CaptureFixture[str]) -
 )
 def test_clock(seconds: float, text: str) -> None:
     assert clock(seconds) == text
+
+
+def test_json_takes_names_that_are_no_text(capsys: pytest.CaptureFixture[str]) -> None:
+    app = new_app("prog", "A program.")
+
+    @app.default
+    def show(console: Console = CONSOLE) -> None:
+        console.report({"file": Path("x\udcff")}, "x")
+
+    assert run(app, ["--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"file": "x?"}
