@@ -26,8 +26,8 @@ from typing import Any
 from common import HEIGHT_SCALES, RELIEFS, finish, is_available, kept, parser_of, start
 from quality import generator_config
 
+from mbtf_core.config.nested import deep_merge
 from mbtf_core.data.dataset import Dataset
-from mbtf_core.nested import deep_merge
 from mbtf_fit import FitConfig, fit
 from mbtf_gen.generation.run import generate
 from mbtf_pipeline.paper_tables.published import mse_ratio

@@ -27,11 +27,11 @@ from typing import Any, get_args
 
 from common import HEIGHT_SCALES, finish, is_available, parser_of, source, start
 
-from mbtf_core.config_file import resolve
+from mbtf_core.app.options import Quality
+from mbtf_core.config.settings import resolve
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import read_json, write_json
 from mbtf_core.files.digest import data_sha256
-from mbtf_core.quality import Quality, as_assignments
 from mbtf_core.units import clock
 from mbtf_fit.config import FitConfig
 from mbtf_fit.presets import FITTER, best_at
@@ -97,7 +97,7 @@ class MeasuredRun:
 def options_hash(quality: Quality) -> str:
     """Hash of all options of a preset and of the fitter's other training options."""
     options = best_at(quality) | FITTER[quality]
-    training = resolve(FitConfig, assignments=as_assignments(options)).training.model_dump(mode="json")
+    training = resolve(FitConfig, presets=options).training.model_dump(mode="json")
     return data_sha256([GENERATOR[quality], options, training, COMPARE[quality]])[:12]
 
 
@@ -111,11 +111,12 @@ def generator_config(name: str, quality: Quality, resolution: int) -> GeneratorC
     material, height = source(name)
     return resolve(
         GeneratorConfig,
-        assignments=[
-            f"material={json.dumps(str(material))}",
-            *as_assignments(GENERATOR[quality]),
-            *as_assignments({"geometry.height_scale": height, "queries.resolution": resolution}),
-        ],
+        presets=GENERATOR[quality],
+        flags={
+            "material": str(material),
+            "geometry.height_scale": height,
+            "queries.resolution": resolution,
+        },
     )
 
 

@@ -33,7 +33,7 @@ class _State:
     Attributes
     ----------
     program : it runs one of our programs, so that a signal may end it; not so in notebooks and tests
-    raising : a signal raises KeyboardInterrupt, which :func:`mbtf_core.console.run` handles
+    raising : a signal raises KeyboardInterrupt, which :func:`mbtf_core.app.console.run` handles
     received, since : the first signal, or 0, and its time
     dropped : its exception was raised where Python drops exceptions, and is to be raised again
     kept : what an interruption leaves, for the message

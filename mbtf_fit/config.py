@@ -7,10 +7,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from mbtf_core.config_file import Settings
+from mbtf_core.app.options import Flag
+from mbtf_core.config.nested import deep_merge
+from mbtf_core.config.settings import Settings
 from mbtf_core.files.digest import data_sha256
-from mbtf_core.nested import deep_merge
-from mbtf_core.options import Flag
 from mbtf_core.units import Duration, Size
 
 ModelName = Literal[

@@ -87,6 +87,21 @@ def format_table(rows: list[list[str]]) -> str:
     return "\n".join(line.rstrip() for line in lines)
 
 
+def fits_table(results: Mapping[str, dict[str, Any] | None]) -> str:
+    """A row per fit: name → what the fit reported, or None where it failed."""
+    rows = [["material", "unexplained variance", "PSNR", "beside the reference", "steps", "training"]]
+    for name, result in results.items():
+        if result is None:
+            rows.append([name, "failed", "-", "-", "-", "-"])
+            continue
+        training, errors = result["training"], result["errors"]
+        split = errors[headline(errors)]
+        psnr, word = visibility(split)
+        cells = [format_estimate(split["unexplained"]), psnr.removeprefix("PSNR "), word or "-"]
+        rows.append([name, *cells, str(training["steps"]), clock(training["seconds"])])
+    return format_table(rows)
+
+
 def describe_errors(errors: dict[str, Any], *, foreign: bool = False) -> list[str]:
     """A table of unexplained variance: overall, by level and by lowest cosine; a column per split.
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from mbtf_core.quality import Quality
+from mbtf_core.app.options import Quality
 from mbtf_core.units import parse_duration
 from mbtf_fit.config import DEFAULT_MODEL, ModelName
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.console import Console
+from mbtf_core.app.console import Console
 from mbtf_core.data.queries import Queries
 from mbtf_core.data.schema import ShardEntry, Split
 from mbtf_core.data.shard_files import row_bytes, write_shard

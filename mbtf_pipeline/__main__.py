@@ -10,7 +10,7 @@ from mbtf_core.interruption import finish, handle_signals
 def main() -> int:
     """Run the command line; returns the exit code."""
     handle_signals()
-    from mbtf_core.console import run
+    from mbtf_core.app.console import run
     from mbtf_pipeline.cli.app import app
 
     return finish(run(app))

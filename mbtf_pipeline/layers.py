@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field
 
-from mbtf_core.config_file import Settings, build
-from mbtf_core.nested import deep_merge
+from mbtf_core.config.nested import deep_merge
+from mbtf_core.config.settings import Settings, build
 from mbtf_pipeline.compare.st_lpips import weights_file
 from mbtf_pipeline.recipe import Name, Recipe
 

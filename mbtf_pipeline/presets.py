@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.quality import Quality, as_assignments, overrides_of
+from mbtf_core.app.options import Quality
+from mbtf_core.config.settings import explicit_options
 from mbtf_fit.config import DEFAULT_MODEL
 from mbtf_fit.presets import fitter_options
 from mbtf_gen.config.presets import RESOLUTION, generator_options
@@ -21,14 +22,14 @@ COMPARE: dict[Quality, dict[str, Any]] = {
 }
 
 
-def quality_assignments(
+def quality_options(
     path: Path, quality: Quality | None, assignments: Sequence[str] = (), training: float | None = None
-) -> list[str]:
-    """Assignments ``a.b=c`` that apply a preset to the recipe of a file.
+) -> dict[str, Any]:
+    """Options, by dotted key, that apply a preset to the recipe of a file.
 
     Parameters
     ----------
-    assignments : those that will override them
+    assignments : ``a.b=c`` that will override them
     training : seconds of training that decide the networks; the preset's by default
 
     Raises
@@ -36,15 +37,15 @@ def quality_assignments(
     InputError : the file cannot be read
     """
     if quality is None:
-        return []
-    given = overrides_of(path, assignments)
+        return {}
+    given = explicit_options(path, assignments)
     generate = given.get("generate")
     preset = generator_options(quality, generate if isinstance(generate, Mapping) else {})
-    out = as_assignments(preset, "generate.")
+    out = {f"generate.{key}": value for key, value in preset.items()}
     fits = {prefix: _options_of_fit(given, prefix) for prefix in fit_names(given)}
     for prefix, options in fitter_options(quality, fits, training).items():
-        out += as_assignments(options, f"{prefix}.")
-    return out + as_assignments(COMPARE[quality])
+        out |= {f"{prefix}.{key}": value for key, value in options.items()}
+    return out | COMPARE[quality]
 
 
 def preset_recipe(
@@ -55,16 +56,16 @@ def preset_recipe(
     Parameters
     ----------
     assignments : ``a.b=c``, which override the preset
-    training : as in :func:`quality_assignments`
+    training : as in :func:`quality_options`
 
     Raises
     ------
     InputError : file or material cannot be read
     UsageError : an assignment is invalid
     """
-    preset = quality_assignments(path, quality, assignments, training)
+    preset = quality_options(path, quality, assignments, training)
     recipe = load_recipe(path, assignments, presets=preset)
-    if not any(text.startswith(f"generate.{RESOLUTION}=") for text in preset):
+    if f"generate.{RESOLUTION}" not in preset:
         return recipe
     from mbtf_gen.job import Job, limit_resolution
 

@@ -10,7 +10,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from mbtf_core.config_file import Settings, dump_yaml, line_of, read_yaml, resolve
+from mbtf_core.config.settings import Settings, resolve
+from mbtf_core.config.yaml_file import dump_yaml, line_of, read_yaml
 from mbtf_core.errors import InputError
 from mbtf_fit.config import FitConfig
 from mbtf_gen.config.generator import GeneratorConfig, Paths
@@ -161,7 +162,9 @@ class Recipe(Settings):
         return self.report.title or self.name
 
 
-def load_recipe(path: Path, assignments: Sequence[str] = (), presets: Sequence[str] = ()) -> Recipe:
+def load_recipe(
+    path: Path, assignments: Sequence[str] = (), presets: Mapping[str, Any] | None = None
+) -> Recipe:
     """Read a recipe.
 
     The path of a material in the file is relative to the file, that in an assignment to the current folder.
@@ -172,8 +175,8 @@ def load_recipe(path: Path, assignments: Sequence[str] = (), presets: Sequence[s
         YAML file.
     assignments : sequence of str
         ``a.b=c``; override values of the file and of `presets`.
-    presets : sequence of str
-        ``a.b=c``; override values of the file.
+    presets : mapping, optional
+        Dotted key → value; override values of the file.
 
     Returns
     -------

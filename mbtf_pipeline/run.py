@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from mbtf_core.console import Console
+from mbtf_core.app.console import Console
 from mbtf_core.errors import InputError, PartialError
 from mbtf_core.files.atomic import read_json
 from mbtf_core.files.digest import file_sha256

@@ -15,7 +15,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-from mbtf_core.config_file import check_schema
+from mbtf_core.config.settings import check_schema
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import read_json, write_json
 from mbtf_pipeline.recipe import Recipe, write_recipe

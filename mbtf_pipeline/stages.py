@@ -127,7 +127,7 @@ def _depends(folder: Path, stage: Stage) -> tuple[dict[str, Any], str]:
 
 
 def _what_changed(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
-    from mbtf_core.config_file import differences
+    from mbtf_core.config.nested import differences
 
     if changes := differences(old["config"], new["config"]):
         more = f" and {len(changes) - 3} more" if len(changes) > 3 else ""

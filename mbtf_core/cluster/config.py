@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from pydantic import Field, PositiveInt
 
-from mbtf_core.config_file import Settings, resolve
+from mbtf_core.config.settings import Settings, resolve
 from mbtf_core.errors import UsageError
 from mbtf_core.units import Duration, Size
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, cast
 import numpy as np
 from pydantic import BaseModel, Field
 
-from mbtf_core.config_file import check_document, check_schema
+from mbtf_core.config.settings import check_document, check_schema
 from mbtf_core.data.data_folder import data_folder, limit_cache
 from mbtf_core.data.geometry import Geometry, read_geometry
 from mbtf_core.data.lattice import MAX_LEVEL, Lattice

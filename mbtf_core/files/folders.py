@@ -14,7 +14,7 @@ from collections.abc import Callable, Container, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.config_file import differences, in_short
+from mbtf_core.config.nested import differences, in_short
 from mbtf_core.errors import InputError, LockedError, PartialError
 from mbtf_core.files.atomic import TEMPORARY, remove_file
 from mbtf_core.locks import keep_renewing, lock_owner, take_lock

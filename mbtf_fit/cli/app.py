@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mbtf_core.console import new_app
+from mbtf_core.app.console import new_app
 from mbtf_fit.cli.evaluate import evaluate
 from mbtf_fit.cli.export import export_material
 from mbtf_fit.cli.fit import fit

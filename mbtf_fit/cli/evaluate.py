@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mbtf_core.console import CONSOLE, Console
-from mbtf_core.options import Verbose
+from mbtf_core.app.console import CONSOLE, Console
+from mbtf_core.app.options import Verbose
 from mbtf_fit.formatting import report_errors
 
 

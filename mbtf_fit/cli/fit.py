@@ -4,40 +4,45 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from mbtf_core.console import CONSOLE, Console
-from mbtf_core.errors import InputError, PartialError, UsageError
-from mbtf_core.interruption import keep_on_interruption
-from mbtf_core.options import (
+from mbtf_core.app.console import CONSOLE, Console
+from mbtf_core.app.options import (
     ClusterOption,
     DryRun,
     Options,
     Output,
     Overwrite,
+    Quality,
+    QualityOption,
     Switch,
     Verbose,
-    takes_options,
+    options_from,
 )
-from mbtf_core.quality import Quality, QualityOption, as_assignments, overrides_of
-from mbtf_core.units import clock, expectation, format_duration
+from mbtf_core.errors import InputError, PartialError, UsageError
+from mbtf_core.interruption import keep_on_interruption
+from mbtf_core.units import expectation, format_duration
 from mbtf_fit.cli.page_options import Live, live_view
 from mbtf_fit.config import DECODER_MODELS, DEFAULT_MODEL, FIBER_MODEL, FitConfig, ModelName
-from mbtf_fit.formatting import describe_fit, format_estimate, format_table, headline, visibility
+from mbtf_fit.formatting import describe_fit, fits_table
 
 
-@takes_options(FitConfig)
+@options_from(FitConfig)
+class FitOptions(Options[FitConfig]):
+    """Options of ``mbtf-fit``."""
+
+
 def fit(
     shards: Path | None = None,
     /,
     *,
     output: Output = Path("material"),
     quality: QualityOption = None,
-    options: Options[FitConfig],
+    options: FitOptions = FitOptions(),  # noqa: B008
     many: Annotated[list[Path] | None, Parameter(consume_multiple=True)] = None,
     processes: Annotated[int | None, Parameter(show_default="one per GPU, or 1")] = None,
     shared_decoder: Switch = False,
@@ -90,7 +95,7 @@ def fit(
             raise UsageError("shows one fit", where=flag, hint=f"leave out --many, or {flag}")
     if many is not None:
         if shared_decoder:
-            options = replace(options, assignments=[*options.assignments, "training.shared_decoder=true"])
+            options = options.assigning("training.shared_decoder=true")
         _fit_many(options, quality, many, output, processes, cluster, overwrite, console)
         return
     assert shards is not None
@@ -172,25 +177,23 @@ def resolve_config(options: Options[FitConfig], quality: Quality | None, *shards
     to keep decides, or the data sets."""
     from mbtf_fit.presets import fitter_options
 
-    given = options.given
-    flags = [f"{key}={value}" for key, value in given.items()]
-    overrides = overrides_of(options.config, [*options.assignments, *flags])
+    overrides = options.explicit()
     kept = _kept_options(overrides.get("decoder"))
     overrides = {"model": kept.get("model") or _model_for(shards), **overrides}
-    presets = [f"model={overrides['model']}"]
+    presets = {"model": overrides["model"]}
     if quality is not None:
-        presets += as_assignments(fitter_options(quality, {"": overrides})[""])
+        presets |= fitter_options(quality, {"": overrides})[""]
     if overrides["model"] == kept.get("model"):
-        presets += as_assignments(kept)
-    if "training.time" in given:
+        presets |= kept
+    if "training.time" in options.given:
         # A time overrides the steps of a file or a preset.
-        presets.append("training.steps=null")
+        presets["training.steps"] = None
     return options.resolve(presets)
 
 
 def _shares_decoder(options: Options[FitConfig]) -> bool:
     """Whether the data sets of a command share a network."""
-    training = overrides_of(options.config, options.assignments).get("training")
+    training = options.explicit().get("training")
     # Values of --set are text.
     return isinstance(training, Mapping) and str(training.get("shared_decoder")).lower() == "true"
 
@@ -215,20 +218,6 @@ def _model_for(shards: Sequence[Path]) -> ModelName:
     if known:
         return DEFAULT_MODEL
     return FIBER_MODEL if len(shards) == 1 else DECODER_MODELS[-1]
-
-
-_COLUMNS = ["material", "unexplained variance", "PSNR", "beside the reference", "steps", "training"]
-
-
-def _row(name: str, result: dict[str, Any] | None) -> list[str]:
-    """Row of a table of fits."""
-    if result is None:
-        return [name, "failed", "-", "-", "-", "-"]
-    training, errors = result["training"], result["errors"]
-    split = errors[headline(errors)]
-    psnr, word = visibility(split)
-    cells = [format_estimate(split["unexplained"]), psnr.removeprefix("PSNR "), word or "-"]
-    return [name, *cells, str(training["steps"]), clock(training["seconds"])]
 
 
 def _fit_jointly(
@@ -271,16 +260,15 @@ def _fit_jointly(
         FitOutcome(data, fitted.folder, fitted.as_dict(), None)
         for data, fitted in zip(shards, result.fits, strict=True)
     ]
-    rows = [_COLUMNS, *(_row(outcome.folder.name, outcome.result) for outcome in outcomes)]
     report = {
         "decoder": {"folder": result.decoder.folder, "sha256": result.decoder.sha256},
         "fits": [outcome.as_dict() for outcome in outcomes],
     }
-    console.report(report, format_table(rows))
+    console.report(report, fits_table({o.folder.name: o.result for o in outcomes}))
 
 
 def _fit_many(
-    options: Options[FitConfig],
+    options: FitOptions,
     quality: Quality | None,
     many: list[Path],
     output: Path,
@@ -328,8 +316,9 @@ def _fit_many(
             outcomes = fit_on_cluster(
                 configs, shards, folders, workers, overwrite=overwrite, finished=finished
             )
-    rows = [_COLUMNS, *(_row(outcome.folder.name, outcome.result) for outcome in outcomes)]
-    console.report({"fits": [o.as_dict() for o in outcomes]}, format_table(rows))
+    console.report(
+        {"fits": [o.as_dict() for o in outcomes]}, fits_table({o.folder.name: o.result for o in outcomes})
+    )
     failed = [o for o in outcomes if o.error is not None]
     for outcome in failed:
         console.note(f"{outcome.shards}: {outcome.error}")

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from mbtf_core.console import Console
-from mbtf_core.options import Switch
+from mbtf_core.app.console import Console
+from mbtf_core.app.options import Switch
 
 if TYPE_CHECKING:
     from mbtf_fit.viewer.live import LiveView

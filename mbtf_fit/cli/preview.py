@@ -4,19 +4,23 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mbtf_core.console import CONSOLE, Console
+from mbtf_core.app.console import CONSOLE, Console
+from mbtf_core.app.options import Options, Output, Overwrite, PathText, Switch, options_from
 from mbtf_core.errors import UsageError
-from mbtf_core.options import Options, Output, Overwrite, PathText, Switch, takes_options
 from mbtf_fit.mitsuba_plugin.preview.config import PreviewConfig
 
 
-@takes_options(PreviewConfig)
+@options_from(PreviewConfig)
+class PreviewOptions(Options[PreviewConfig]):
+    """Options of ``mbtf-fit preview``."""
+
+
 def preview(
     material: PathText | None = None,
     /,
     *,
     output: Output = Path("preview"),
-    options: Options[PreviewConfig],
+    options: PreviewOptions = PreviewOptions(),  # noqa: B008
     sheet_only: Switch = False,
     mp4: Switch = False,
     overwrite: Overwrite = False,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from mbtf_core.console import CONSOLE, Console
+from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.interruption import served_until_interruption
 from mbtf_fit.cli.page_options import PAGE_OPTIONS, PageOptions
 

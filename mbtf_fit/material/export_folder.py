@@ -9,7 +9,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, Field
 
-from mbtf_core.config_file import check_document, check_schema
+from mbtf_core.config.settings import check_document, check_schema
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import read_json, remove_file, write_json
 from mbtf_core.files.folders import ELSEWHERE, check_folder, other_configuration, remove_unfinished

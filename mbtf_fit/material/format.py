@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, Field
 
-from mbtf_core.config_file import check_document, check_schema
+from mbtf_core.config.settings import check_document, check_schema
 from mbtf_core.data.lattice import MAX_LEVEL, Lattice
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import read_json

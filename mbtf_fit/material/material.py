@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from mbtf_core.config_file import build
+from mbtf_core.config.settings import build
 from mbtf_core.data.lattice import Lattice, sigma_of_level
 from mbtf_core.data.schema import CONVENTIONS
 from mbtf_core.directions import check_unit, from_projected_disk

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.config_file import build
+from mbtf_core.config.settings import build
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
 from mbtf_fit.config import SLICE_MODELS, TRACING_MODELS, FitConfig, NetworkSection

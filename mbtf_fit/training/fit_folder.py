@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.config_file import check_schema, dump_yaml
+from mbtf_core.config.settings import check_schema
+from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.files.atomic import read_json, write_json, write_text
 from mbtf_core.files.digest import data_sha256

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mbtf_core.console import new_app
+from mbtf_core.app.console import new_app
 from mbtf_gen.cli.doctor import doctor
 from mbtf_gen.cli.export import export
 from mbtf_gen.cli.folders import merge, repair, verify

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mbtf_core.console import CONSOLE, Console
+from mbtf_core.app.console import CONSOLE, Console
 
 
 def doctor(*, console: Console = CONSOLE) -> int:

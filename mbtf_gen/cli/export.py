@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from mbtf_core.console import CONSOLE, Console
+from mbtf_core.app.console import CONSOLE, Console
+from mbtf_core.app.options import Overwrite
 from mbtf_core.errors import UsageError
-from mbtf_core.options import Overwrite
 
 
 def export(

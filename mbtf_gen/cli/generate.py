@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from cyclopts import Parameter
 
-from mbtf_core.console import CONSOLE, Console
+from mbtf_core.app.console import CONSOLE, Console
+from mbtf_core.app.options import (
+    ClusterOption,
+    DataOutput,
+    Options,
+    Overwrite,
+    PathText,
+    Quality,
+    QualityOption,
+    options_from,
+)
 from mbtf_core.errors import UsageError
 from mbtf_core.interruption import keep_on_interruption
-from mbtf_core.options import ClusterOption, DataOutput, Options, Overwrite, PathText, takes_options
-from mbtf_core.quality import Quality, QualityOption, as_assignments, overrides_of
 from mbtf_core.units import clock, size_text
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.presets import RESOLUTION, generator_options
@@ -29,7 +37,7 @@ G = TypeVar("G", bound=GeneratorConfig)
 SMALLER = "reduce --queries or --resolution, or choose another folder with -o"
 
 
-def resolve_config(options: Options[G], material: str | None, presets: Sequence[str] = ()) -> G:
+def resolve_config(options: Options[G], material: str | None, presets: Mapping[str, Any] | None = None) -> G:
     """Configuration of a command for a material.
 
     Raises
@@ -49,9 +57,8 @@ def prepare_job(
     and of the material."""
     from mbtf_gen.job import Job, limit_resolution
 
-    flags = [f"{key}={value}" for key, value in options.given.items()]
-    preset = generator_options(quality, overrides_of(options.config, [*options.assignments, *flags]))
-    job = Job.prepare(resolve_config(options, material, as_assignments(preset)))
+    preset = generator_options(quality, options.explicit())
+    job = Job.prepare(resolve_config(options, material, preset))
     return limit_resolution(job) if RESOLUTION in preset else job
 
 
@@ -62,14 +69,18 @@ def _slice(text: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-@takes_options(GeneratorConfig)
+@options_from(GeneratorConfig)
+class GenerateOptions(Options[GeneratorConfig]):
+    """Options of ``mbtf-gen``."""
+
+
 def generate(
     material: PathText | None = None,
     /,
     *,
     output: DataOutput = Path("shards"),
     quality: QualityOption = None,
-    options: Options[GeneratorConfig],
+    options: GenerateOptions = GenerateOptions(),  # noqa: B008
     slice: Annotated[str, Parameter(metavar="I/N")] = "1/1",
     cluster: ClusterOption = None,
     overwrite: Overwrite = False,

@@ -5,22 +5,26 @@ from __future__ import annotations
 from dataclasses import asdict
 from pathlib import Path
 
-from mbtf_core.console import CONSOLE, Console
+from mbtf_core.app.console import CONSOLE, Console
+from mbtf_core.app.options import DataOutput, Options, Overwrite, PathText, options_from
 from mbtf_core.errors import UsageError
 from mbtf_core.interruption import keep_on_interruption
-from mbtf_core.options import DataOutput, Options, Overwrite, PathText, takes_options
 from mbtf_core.units import size_text
 from mbtf_gen.cli.generate import describe
 from mbtf_gen.config.measured import ImportConfig
 
 
-@takes_options(ImportConfig)
+@options_from(ImportConfig)
+class ImportOptions(Options[ImportConfig]):
+    """Options of ``mbtf-gen import``."""
+
+
 def import_measured(
     measured: PathText,
     /,
     *,
     output: DataOutput = Path("shards"),
-    options: Options[ImportConfig],
+    options: ImportOptions = ImportOptions(),  # noqa: B008
     overwrite: Overwrite = False,
     console: Console = CONSOLE,
 ) -> None:

@@ -8,21 +8,25 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from mbtf_core.console import CONSOLE, Console
+from mbtf_core.app.console import CONSOLE, Console
+from mbtf_core.app.options import Options, Overwrite, PathText, options_from
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.files.folders import make_folder
-from mbtf_core.options import Options, Overwrite, PathText, takes_options
 from mbtf_core.urls import split_url
 from mbtf_gen.cli.generate import resolve_config
 from mbtf_gen.config.generator import GeneratorConfig
 
 
-@takes_options(GeneratorConfig, "geometry", "queries.resolution")
+@options_from(GeneratorConfig, "geometry", "queries.resolution")
+class InspectOptions(Options[GeneratorConfig]):
+    """Options of ``mbtf-gen inspect``."""
+
+
 def inspect(
     material: PathText | None = None,
     /,
     *,
-    options: Options[GeneratorConfig],
+    options: InspectOptions = InspectOptions(),  # noqa: B008
     write: Annotated[Path | None, Parameter(metavar="FILE")] = None,
     export: Annotated[Path | None, Parameter(metavar="FILE")] = None,
     overwrite: Overwrite = False,

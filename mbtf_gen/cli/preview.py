@@ -4,22 +4,26 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mbtf_core.console import CONSOLE, Console
+from mbtf_core.app.console import CONSOLE, Console
+from mbtf_core.app.options import Options, Output, Overwrite, PathText, Switch, options_from
 from mbtf_core.errors import InputError, UsageError
-from mbtf_core.options import Options, Output, Overwrite, PathText, Switch, takes_options
 from mbtf_gen.cli.generate import resolve_config
 from mbtf_gen.config.pictures import RENDERING, PreviewConfig
 
 _QUERIES = ("train", "resolution", "min_cos", "layout", "patch_size")
 
 
-@takes_options(PreviewConfig, "preview", "exposure", *(f"queries.{key}" for key in _QUERIES), *RENDERING)
+@options_from(PreviewConfig, "preview", "exposure", *(f"queries.{key}" for key in _QUERIES), *RENDERING)
+class PreviewOptions(Options[PreviewConfig]):
+    """Options of ``mbtf-gen preview``."""
+
+
 def preview(
     material: PathText | None = None,
     /,
     *,
     output: Output = Path("preview"),
-    options: Options[PreviewConfig],
+    options: PreviewOptions = PreviewOptions(),  # noqa: B008
     interactive: Switch = False,
     overwrite: Overwrite = False,
     console: Console = CONSOLE,

@@ -4,21 +4,25 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mbtf_core.console import CONSOLE, Console
+from mbtf_core.app.console import CONSOLE, Console
+from mbtf_core.app.options import Options, Output, Overwrite, PathText, Switch, options_from
 from mbtf_core.errors import UsageError
 from mbtf_core.interruption import keep_on_interruption
-from mbtf_core.options import Options, Output, Overwrite, PathText, Switch, takes_options
 from mbtf_core.units import size_text
 from mbtf_gen.config.publish import PublishConfig
 
 
-@takes_options(PublishConfig)
+@options_from(PublishConfig)
+class PublishOptions(Options[PublishConfig]):
+    """Options of ``mbtf-gen publish``."""
+
+
 def publish(
     shards: Path,
     /,
     *,
     output: Output = Path("card"),
-    options: Options[PublishConfig],
+    options: PublishOptions = PublishOptions(),  # noqa: B008
     with_maps: Switch = False,
     material: PathText | None = None,
     overwrite: Overwrite = False,
@@ -37,7 +41,7 @@ def publish(
     material
         Path of the material, if it was moved.
     """
-    given = [*options.given, *(text.partition("=")[0].strip() for text in options.assignments)]
+    given = [*options.given, *(text.partition("=")[0].strip() for text in options.assignments or ())]
     if options.config is None and "license" not in given:
         raise UsageError(
             "state the license of the published data",

@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mbtf_core.console import CONSOLE, Console
+from mbtf_core.app.console import CONSOLE, Console
+from mbtf_core.app.options import ClusterOption, Options, Output, Overwrite, PathText, options_from
 from mbtf_core.errors import PartialError
 from mbtf_core.interruption import keep_on_interruption
-from mbtf_core.options import ClusterOption, Options, Output, Overwrite, PathText, takes_options
 from mbtf_gen.cli.generate import resolve_config
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.pictures import RENDERING, ReferenceConfig
@@ -20,13 +20,17 @@ if TYPE_CHECKING:
     from mbtf_core.pictures.reference import ReferenceImage
 
 
-@takes_options(ReferenceConfig, "reference", "exposure", *RENDERING)
+@options_from(ReferenceConfig, "reference", "exposure", *RENDERING)
+class ReferenceOptions(Options[ReferenceConfig]):
+    """Options of ``mbtf-gen reference``."""
+
+
 def reference(
     material: PathText | None = None,
     /,
     *,
     output: Output = Path("reference"),
-    options: Options[ReferenceConfig],
+    options: ReferenceOptions = ReferenceOptions(),  # noqa: B008
     cluster: ClusterOption = None,
     overwrite: Overwrite = False,
     console: Console = CONSOLE,

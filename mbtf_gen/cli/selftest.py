@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mbtf_core.console import CONSOLE, Console
+from mbtf_core.app.console import CONSOLE, Console
+from mbtf_core.app.options import Time
 from mbtf_core.errors import UsageError
-from mbtf_core.options import Time
 
 # Of the HTML report, about.
 REPORT_BYTES = 100_000

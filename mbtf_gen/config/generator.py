@@ -11,12 +11,12 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from mbtf_core.config_file import FileName, Settings
+from mbtf_core.app.options import Flag
+from mbtf_core.config.settings import FileName, Settings
 from mbtf_core.data.lattice import MAX_LEVEL
 from mbtf_core.data.schema import SCHEMA_VERSION, ArrayFormat, Layout, SliceDirections, Tiling
 from mbtf_core.errors import UsageError
 from mbtf_core.files.digest import data_sha256
-from mbtf_core.options import Flag
 from mbtf_gen.config.effects_request import EffectsRequest
 from mbtf_gen.geometry.slopes import NormalMode
 from mbtf_gen.sampling.light_kernel import MAX_WIDTH_DEG, MIN_WIDTH_DEG

@@ -6,10 +6,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from mbtf_core.config_file import Settings
+from mbtf_core.app.options import Flag
+from mbtf_core.config.settings import Settings
 from mbtf_core.data.schema import SCHEMA_VERSION
 from mbtf_core.files.digest import data_sha256
-from mbtf_core.options import Flag
 from mbtf_gen.config.generator import Count, OutputSection
 
 Cosine = Literal["auto", "included", "excluded"]

@@ -6,8 +6,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from mbtf_core.config_file import Settings
-from mbtf_core.options import Flag
+from mbtf_core.app.options import Flag
+from mbtf_core.config.settings import Settings
 from mbtf_core.units import parse_numbers
 from mbtf_gen.config.generator import GeneratorConfig, Paths
 

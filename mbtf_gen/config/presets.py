@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from mbtf_core.quality import Quality
+from mbtf_core.app.options import Quality
 
 
 def _queries(train: str, spp: int, test: str, test_spp: int) -> dict[str, Any]:

@@ -10,8 +10,8 @@ from urllib.parse import urlsplit
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from mbtf_core.config_file import Settings
-from mbtf_core.options import Flag
+from mbtf_core.app.options import Flag
+from mbtf_core.config.settings import Settings
 
 Form = Literal["parquet", "webdataset", "npz"]
 # Longest citation; BibTeX of several papers fits.

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from mbtf_core.config_file import FileName, Settings
+from mbtf_core.config.settings import FileName, Settings
 from mbtf_core.data.schema import Tiling
 from mbtf_gen.config.generator import Resolution
 from mbtf_gen.config.values import Positive, Rgb, no_tiling

@@ -6,7 +6,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.config_file import differences, dump_yaml
+from mbtf_core.config.nested import differences
+from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.data.data_folder import data_folder, send
 from mbtf_core.data.folder import clear, read_manifest
 from mbtf_core.data.geometry import Geometry, geometry_record, write_geometry

@@ -12,7 +12,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.config_file import dump_yaml
+from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.data.data_folder import data_folder, send, send_shard
 from mbtf_core.data.folder import clear, read_manifest
 from mbtf_core.data.lattice import sigma_of_level

@@ -9,7 +9,8 @@ from typing import Any
 
 from pydantic import BaseModel, field_validator
 
-from mbtf_core.config_file import check_document, dump_yaml
+from mbtf_core.config.settings import check_document
+from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.data.lattice import sigma_of_level
 from mbtf_core.data.manifest import CHECK_HINT, software_versions
 from mbtf_core.data.schema import ARRAYS, CONVENTIONS, FORMAT_NAME, LEADING_AXES, SCHEMA_VERSION, SPLITS

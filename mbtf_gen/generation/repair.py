@@ -16,7 +16,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from mbtf_core.config_file import differences, dump_yaml, in_short, read_yaml
+from mbtf_core.config.nested import differences, in_short
+from mbtf_core.config.yaml_file import dump_yaml, read_yaml
 from mbtf_core.data.data_folder import data_folder, send
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.geometry import Geometry, geometry_record, write_geometry

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, PositiveInt
 
-from mbtf_core.config_file import check_document
+from mbtf_core.config.settings import check_document
 from mbtf_core.data.data_folder import data_folder, send
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.folder import read_manifest, remove_leftovers

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.config_file import dump_yaml
+from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.data.schema import Tiling
 from mbtf_core.errors import UsageError
 from mbtf_core.files.atomic import write_text

@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 from pathlib import Path
 
-from mbtf_core.config_file import build, read_yaml
+from mbtf_core.config.settings import build
+from mbtf_core.config.yaml_file import read_yaml
 from mbtf_core.data.schema import Tiling
 from mbtf_core.errors import InputError
 from mbtf_core.images.read import SUFFIXES, is_image

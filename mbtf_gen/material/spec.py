@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from mbtf_core.config_file import FileName, Settings
+from mbtf_core.config.settings import FileName, Settings
 from mbtf_core.data.schema import Tiling
 from mbtf_core.images.metadata import ColorSpace
 from mbtf_gen.config.generator import MAX_SCALE, Resolution

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mbtf_core.color import srgb_to_linear
-from mbtf_core.config_file import FileName, Settings
+from mbtf_core.config.settings import FileName, Settings
 from mbtf_core.data.schema import Tiling
 from mbtf_core.errors import InputError, reason
 from mbtf_gen.config.generator import Resolution

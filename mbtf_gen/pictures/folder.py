@@ -14,7 +14,8 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from mbtf_core.config_file import check_document, dump_yaml
+from mbtf_core.config.settings import check_document
+from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.data.schema import CONFIG_NAME
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import read_json, write_json, write_text

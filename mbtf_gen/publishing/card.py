@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from mbtf_core.config_file import dump_yaml
+from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.data.schema import GEOMETRY_NAME, LEADING_AXES
 from mbtf_core.files.atomic import Stored
 from mbtf_core.units import size_text

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
-from mbtf_core.config_file import check_document
+from mbtf_core.config.settings import check_document
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.manifest import software_versions
 from mbtf_core.errors import InputError

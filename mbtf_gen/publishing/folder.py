@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel
 
-from mbtf_core.config_file import check_document
+from mbtf_core.config.settings import check_document
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import Stored, read_json, remove_file, write_json
 from mbtf_core.files.digest import data_sha256

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.config_file import dump_yaml
+from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.errors import InputError
 from mbtf_core.files.digest import file_sha256

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from mbtf_core.config_file import dump_yaml
+from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.schema import CONFIG_NAME
 from mbtf_core.files.atomic import Stored, write_chunks

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.config_file import dump_yaml
+from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.data.data_folder import local_copy
 from mbtf_core.data.schema import CONFIG_NAME, MANIFEST_NAME
 from mbtf_core.files.atomic import Stored, checksummed, sync_folder, temporary_of, write_chunks

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mbtf_core.console import new_app
+from mbtf_core.app.console import new_app
 from mbtf_pipeline.cli.cost import cost
 from mbtf_pipeline.cli.emit import emit
 from mbtf_pipeline.cli.list import list_recipes

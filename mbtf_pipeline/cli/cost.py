@@ -7,9 +7,9 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from mbtf_core.console import CONSOLE, Console
+from mbtf_core.app.console import CONSOLE, Console
+from mbtf_core.app.options import ClusterOption, Output, Set, Time, command_line
 from mbtf_core.errors import UsageError
-from mbtf_core.options import ClusterOption, Output, Set, Time, command_line
 
 
 def cost(

@@ -8,10 +8,9 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from mbtf_core.console import CONSOLE, Console
+from mbtf_core.app.console import CONSOLE, Console
+from mbtf_core.app.options import Output, Overwrite, QualityOption, Set, command_line
 from mbtf_core.errors import UsageError
-from mbtf_core.options import Output, Overwrite, Set, command_line
-from mbtf_core.quality import QualityOption
 
 _AT_LEAST_ONE = Number(gte=1, lte=10_000)
 

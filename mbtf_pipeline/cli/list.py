@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.console import CONSOLE, Console
+from mbtf_core.app.console import CONSOLE, Console
+from mbtf_core.app.options import Verbose
 from mbtf_core.errors import InputError, MbtfError
-from mbtf_core.options import Verbose
 
 
 def list_recipes(

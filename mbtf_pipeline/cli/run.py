@@ -8,11 +8,19 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from mbtf_core.console import CONSOLE, Console
+from mbtf_core.app.console import CONSOLE, Console
+from mbtf_core.app.options import (
+    ClusterOption,
+    Output,
+    Quality,
+    QualityOption,
+    Set,
+    Switch,
+    Time,
+    command_line,
+)
 from mbtf_core.errors import PartialError, UsageError
 from mbtf_core.interruption import keep_on_interruption
-from mbtf_core.options import ClusterOption, Output, Set, Switch, Time, command_line
-from mbtf_core.quality import Quality, QualityOption
 from mbtf_core.units import clock
 from mbtf_fit.cli.page_options import Live, live_view
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from itertools import product
 
-from mbtf_core.nested import nested
+from mbtf_core.config.nested import nested
 from mbtf_fit.config import DEFAULT_MODEL
 from mbtf_fit.presets import best_options
 from mbtf_pipeline.cost_study.repeats import FEWEST_SEEDS

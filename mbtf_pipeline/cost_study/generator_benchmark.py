@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import median_abs_deviation
 
+from mbtf_core.config.nested import deep_merge, nested
 from mbtf_core.data.queries import Queries
-from mbtf_core.nested import deep_merge, nested
 from mbtf_core.stats import Estimate, mean_estimate
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job, split_spp, split_target

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.cluster.engine import Cluster
-from mbtf_core.config_file import dump_yaml
+from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.data.shard_files import row_bytes
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import read_json, write_json, write_text

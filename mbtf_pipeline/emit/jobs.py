@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from mbtf_core.config_file import dump_yaml
+from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.data.schema import MANIFEST_NAME
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.files.atomic import read_json, write_json, write_text

@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.config_file import read_yaml
+from mbtf_core.config.yaml_file import read_yaml
 from mbtf_core.errors import InputError, UsageError, reason
 
 # Files in a folder of materials that are materials.

@@ -11,9 +11,10 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from mbtf_core.config_file import FileName, Settings, build, read_yaml, resolve
+from mbtf_core.config.nested import deep_merge
+from mbtf_core.config.settings import FileName, Settings, build, resolve
+from mbtf_core.config.yaml_file import read_yaml
 from mbtf_core.errors import InputError, MbtfError, UsageError
-from mbtf_core.nested import deep_merge
 from mbtf_core.units import Duration
 from mbtf_fit.config import DEFAULT_MODEL, FIBER_MODEL, FitConfig
 from mbtf_pipeline.layers import Layer, MaterialLayer, compose

@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from mbtf_core.app.console import Console
 from mbtf_core.cluster.children import run_in_children
 from mbtf_core.cluster.engine import Cluster
 from mbtf_core.cluster.task import Task, TaskResult
-from mbtf_core.console import Console
 from mbtf_core.errors import InputError, MbtfError, printable
 from mbtf_core.files.atomic import read_json, write_json, write_text
 from mbtf_core.files.digest import data_sha256

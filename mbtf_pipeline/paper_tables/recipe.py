@@ -9,7 +9,8 @@ from typing import Literal
 
 from pydantic import Field
 
-from mbtf_core.config_file import Settings, read_yaml, resolve
+from mbtf_core.config.settings import Settings, resolve
+from mbtf_core.config.yaml_file import read_yaml
 from mbtf_core.errors import InputError
 from mbtf_pipeline.layers import Layer, MaterialLayer, compose
 from mbtf_pipeline.recipe import Name, Recipe

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.console import Console
+from mbtf_core.app.console import Console
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import read_json, write_json, write_text
 from mbtf_core.files.folders import check_folder, owned

@@ -15,7 +15,7 @@ from typing import Any
 _CODE = """
 import contextlib, io, json, sys
 from mbtf_gen.cli.app import app
-from mbtf_core.console import run
+from mbtf_core.app.console import run
 answers = []
 for line in json.load(sys.stdin):
     out, err = io.StringIO(), io.StringIO()

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from mbtf_core.console import run
+from mbtf_core.app.console import run
 from mbtf_core.data.queries import Queries
 from mbtf_gen.cli.app import app
 from mbtf_gen.planning.simulation import ClosedForm

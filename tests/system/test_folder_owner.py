@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.command_lines import call
 from support.datasets import write_dataset
 from support.fit_data import parallax, write_data
-from support.invalid_inputs import call
 from support.plugin_materials import write_material
 
 from mbtf_core.files.folders import owned

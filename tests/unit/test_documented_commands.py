@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 import shlex
 from dataclasses import replace
@@ -12,9 +13,8 @@ from cyclopts import App, CycloptsError, MissingArgumentError
 from support.documented import Shown, in_markdown, in_strings, shown_commands
 from support.paths import ROOT
 
-from mbtf_core.config_file import resolve
+from mbtf_core.config.settings import resolve
 from mbtf_core.errors import MbtfError
-from mbtf_core.options import ConfigOption
 from mbtf_fit.cli.app import app as fit
 from mbtf_gen.cli.app import app as generate
 from mbtf_pipeline.cli.app import app as pipeline
@@ -63,6 +63,12 @@ def fault(shown: Shown) -> str:
     return ""
 
 
+def options_of(command: Any) -> Any:
+    """The options of a command where none is given; None where it has none."""
+    parameter = inspect.signature(command).parameters.get("options")
+    return None if parameter is None else parameter.default
+
+
 def unknown_flags(command: App, text: str) -> str:
     """What is wrong with the options of a text; empty if nothing is."""
     known = {name for argument in command.assemble_argument_collection() for name in argument.names}
@@ -77,11 +83,11 @@ def check_values(command: Any, arguments: dict[str, Any]) -> None:
     ------
     MbtfError : a key or a value that there is not
     """
-    if hasattr(command, "read_options"):
-        options = command.read_options(arguments)
+    options = arguments.get("options", options_of(command))
+    if hasattr(options, "table"):
         if options.config is not None and not (ROOT / options.config).exists():
             options = replace(options, config=None)
-        options.resolve(**({"material": "X"} if "material" in options.model.model_fields else {}))
+        options.resolve(**({"material": "X"} if "material" in options.configuration.model_fields else {}))
     if arguments.get("assignments"):
         recipe = ROOT / arguments["recipe"]
         if not recipe.exists():
@@ -154,7 +160,7 @@ def test_a_flag_sets_the_key_that_it_is_named_after() -> None:
         (option.flag, option.key)
         for app in APPS.values()
         for command in commands(app).values()
-        for option in getattr(command.default_command, "config_options", [])
+        for option in getattr(options_of(command.default_command), "table", ())
     }
     assert len(found) > 20
     for flag, key in found:
@@ -172,8 +178,7 @@ def test_an_option_has_one_help_and_one_meaning() -> None:
                 for name in argument.names:
                     if name.startswith("--"):
                         helps.setdefault(name, set()).add(argument.parameter.help)
-            options: list[ConfigOption] = getattr(command.default_command, "config_options", [])
-            for option in options:
+            for option in getattr(options_of(command.default_command), "table", ()):
                 keys.setdefault(option.flag, set()).add(option.key.rpartition(".")[2])
     # Paths per query or per pixel; only data sets are written to URLs.
     assert len(helps.pop("--spp")) == 2

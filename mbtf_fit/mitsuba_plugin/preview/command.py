@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mbtf_core.console import Console
+from mbtf_core.app.console import Console
 from mbtf_core.files.folders import owned
 from mbtf_core.interruption import keep_on_interruption
 

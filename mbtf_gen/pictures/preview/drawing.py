@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.console import Console
+from mbtf_core.app.console import Console
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import InputError, PartialError

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 from conftest import RunPython
+from support.command_lines import call, fails
 from support.datasets import edit
 from support.fit_data import parallax, write_data
-from support.invalid_inputs import call, fails
 
 QUICK = ("--steps", "5", "--batch", "500")
 
@@ -151,11 +151,3 @@ def test_bad_input_exits_with_3_and_a_hint(shards: Path, material: Path, tmp_pat
     )
     assert "no such folder" in fails(3, "info", str(tmp_path / "none"))
     assert "no material.json" in fails(3, "evaluate", str(empty), str(shards))
-
-
-def test_invalid_command_lines_exit_with_2(shards: Path) -> None:
-    assert "mbtf-fit shards/" in fails(2)
-    assert "2min" in fails(2, str(shards), "--time", "soon")
-    assert "mutually exclusive" in fails(2, str(shards), "--time", "1s", "--steps", "3")
-    assert "training.bach" in fails(2, str(shards), "--set", "training.bach=3")
-    fails(2, str(shards), "--model", "neumop")

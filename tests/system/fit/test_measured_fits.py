@@ -6,8 +6,8 @@ import json
 from pathlib import Path
 
 import pytest
+from support.command_lines import call
 from support.commands import run_all
-from support.invalid_inputs import call
 from support.measured_files import photographs, zipped
 
 SMALL = "--sheet-only --size 64 --spp 1 --view 60,0 --light 60,0 --tiles-across 1"

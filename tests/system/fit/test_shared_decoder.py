@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 from conftest import RunPython
+from support.command_lines import call, fails
 from support.datasets import edit
 from support.fit_data import constant, parallax, write_data
-from support.invalid_inputs import call, fails
 
 from mbtf_fit import Material
 from mbtf_fit.material.decoder import Decoder, network_tensors

@@ -27,7 +27,7 @@ URL = f"s3://{BUCKET}/some/data"
 _CODE = """
 import os, signal, sys, time
 from mbtf_core.data.store import Store
-from mbtf_core.console import run
+from mbtf_core.app.console import run
 from mbtf_gen.planning.simulation import ClosedForm
 from support.small_runs import noisy_plane
 ClosedForm.estimate = noisy_plane

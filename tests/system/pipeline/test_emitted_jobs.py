@@ -9,7 +9,7 @@ import pytest
 from support.emitted import ALL, IMAGES, SLICES, TARGETS, emitted, kinds, make_place, start
 from support.fake_cluster import calls, fail, install
 
-from mbtf_core.config_file import resolve
+from mbtf_core.config.settings import resolve
 from mbtf_fit.cli.app import app as fit_app
 from mbtf_fit.config import FitConfig
 from mbtf_gen.cli.app import app as gen_app
@@ -60,9 +60,9 @@ def test_commands_are_those_of_the_recipe(recipe: Recipe, target: Target, tmp_pa
     programs = {"mbtf-gen": gen_app, "mbtf-fit": fit_app, "mbtf-pipeline": app}
     for words in (call["words"] for call in calls(tmp_path / "bin")):
         program = programs[words[0]]
-        command, bound, _ = program.parse_args(words[1:], exit_on_error=False, print_error=False)
-        if hasattr(command, "read_options"):
-            options = command.read_options(dict(bound.arguments))
+        _, bound, _ = program.parse_args(words[1:], exit_on_error=False, print_error=False)
+        options = bound.arguments.get("options")
+        if options is not None:
             extra = {"material": None} if words[0] == "mbtf-gen" else {}
             read[words[words.index("-o") + 1]] = options.resolve(**extra)
     for data in data_sets(recipe):

@@ -21,7 +21,7 @@ from support.paths import ROOT
 from support.slurm import slurm_node
 from support.small_runs import contents
 
-from mbtf_core.console import run
+from mbtf_core.app.console import run
 from mbtf_pipeline.cli.app import app
 
 RECIPE = """

@@ -13,7 +13,7 @@ from support.datasets import edit
 from support.fit_data import parallax, write_data
 from support.small_runs import contents
 
-from mbtf_core.console import run
+from mbtf_core.app.console import run
 from mbtf_fit.config import FitConfig
 from mbtf_fit.evaluation import evaluate
 from mbtf_fit.material.decoder import Decoder

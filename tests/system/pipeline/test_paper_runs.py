@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from support.pages import loads
 
-from mbtf_core.console import run
+from mbtf_core.app.console import run
 from mbtf_pipeline.cli.app import app
 
 RECIPE = """\

@@ -16,7 +16,7 @@ import pytest
 from support.pages import loads
 from support.paths import ROOT
 
-from mbtf_core.console import run
+from mbtf_core.app.console import run
 from mbtf_core.directions import from_angles
 from mbtf_pipeline.cli.app import app
 from mbtf_pipeline.compare.pictures import read_picture

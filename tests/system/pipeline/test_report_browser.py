@@ -14,7 +14,7 @@ from PIL import Image
 from support.browser import browser
 from support.paths import ROOT
 
-from mbtf_core.console import run
+from mbtf_core.app.console import run
 from mbtf_core.exposure import to_display
 from mbtf_pipeline.cli.app import app
 from mbtf_pipeline.compare.pictures import read_picture

@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.fuzzing import damaged, examples, loads_or_refuses
 
-from mbtf_core.config_file import read_yaml, resolve
+from mbtf_core.config.settings import resolve
+from mbtf_core.config.yaml_file import read_yaml
 from mbtf_core.errors import InputError
 from mbtf_fit.config import FitConfig
 from mbtf_gen.config.generator import GeneratorConfig
@@ -237,7 +238,7 @@ def test_brackets_are_counted_first(
     text: str, write: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # The reader's time grows with the square of their depth.
-    monkeypatch.setattr("mbtf_core.config_file._yaml", lambda: pytest.fail("the text was read"))
+    monkeypatch.setattr("mbtf_core.config.yaml_file._yaml", lambda: pytest.fail("the text was read"))
     with pytest.raises(InputError, match="levels deep"):
         read_yaml(write(text))
 

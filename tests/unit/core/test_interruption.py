@@ -43,7 +43,7 @@ from pathlib import Path
 from mbtf_core import interruption
 interruption._NOTE_SECONDS = interruption._GRACE_SECONDS = 0.2
 interruption.handle_signals()
-from mbtf_core.console import new_app, run
+from mbtf_core.app.console import new_app, run
 from mbtf_core.files.folders import owned
 app = new_app("prog", "A program.")
 def send_once():
@@ -173,7 +173,7 @@ def test_a_reader_that_has_gone_is_no_error(tmp_path: Path) -> None:
 @pytest.mark.parametrize("closed", ["stdout", "stderr"])
 def test_a_closed_stream_is_no_error(closed: str, tmp_path: Path) -> None:
     code = "import sys\nfrom mbtf_core import interruption as i\ni.handle_signals()\n"
-    code += "from mbtf_core.console import new_app, run\napp = new_app('prog', 'A program.')\n"
+    code += "from mbtf_core.app.console import new_app, run\napp = new_app('prog', 'A program.')\n"
     code += "app.default(lambda: print('result'))\nsys.exit(i.finish(run(app, [])))"
     number = {"stdout": 1, "stderr": 2}[closed]
     shell = f'exec "$0" -c "$1" {number}>&-'

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from support.fit_data import parallax, write_data
 
-from mbtf_core.console import run
+from mbtf_core.app.console import run
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.files import folders
 from mbtf_fit.cli.app import app

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from mbtf_core.config_file import dump_yaml
+from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.errors import UsageError
 from mbtf_fit.cli.app import app
-from mbtf_fit.cli.fit import resolve_config
+from mbtf_fit.cli.fit import FitOptions, resolve_config
 from mbtf_fit.config import FitConfig
 
 
 def config_of(*words: str) -> FitConfig:
-    command: Any
-    command, bound, _ = app.parse_args(["shards", *words], exit_on_error=False, print_error=False)
+    _, bound, _ = app.parse_args(["shards", *words], exit_on_error=False, print_error=False)
     arguments = dict(bound.arguments)
-    return resolve_config(command.read_options(arguments), arguments.get("quality"), Path("shards"))
+    return resolve_config(arguments.get("options", FitOptions()), arguments.get("quality"), Path("shards"))
 
 
 def test_flags_override_assignments_presets_and_files(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mbtf_core.console import CONSOLE, run
+from mbtf_core.app.console import CONSOLE, run
 from mbtf_core.data.shard_files import row_bytes
 from mbtf_core.files import folders
 from mbtf_gen import forecast
@@ -114,18 +114,17 @@ def test_a_short_run_needs_no_forecast(
 def test_a_preset_sets_the_resolution_up_to_that_of_the_map(
     heights: Path, quality: str, options: tuple[str, ...], resolution: int
 ) -> None:
-    from mbtf_gen.cli.generate import prepare_job
+    from mbtf_gen.cli.generate import GenerateOptions, prepare_job
 
-    command: Any
     words = ["plan", str(heights), "--height-scale", "0.01", "--quality", quality, *options]
-    command, bound, _ = app.parse_args(words, exit_on_error=False, print_error=False)
+    _, bound, _ = app.parse_args(words, exit_on_error=False, print_error=False)
     arguments = dict(bound.arguments)
-    job = prepare_job(command.read_options(arguments), str(heights), arguments["quality"])
+    job = prepare_job(arguments.get("options", GenerateOptions()), str(heights), arguments["quality"])
     assert job.lattice.shape() == (resolution, resolution)
 
 
 def test_the_resolution_of_a_material_overrides_that_of_a_preset(heights: Path) -> None:
-    from mbtf_core.config_file import build
+    from mbtf_core.config.settings import build
     from mbtf_gen.config.generator import GeneratorConfig
     from mbtf_gen.job import Job, limit_resolution
 

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from support.paths import ROOT
 
-from mbtf_core.config_file import resolve
-from mbtf_core.quality import Quality, as_assignments, overrides_of
+from mbtf_core.app.options import Quality
+from mbtf_core.config.settings import explicit_options, resolve
 from mbtf_fit.config import FitConfig
 from mbtf_fit.presets import FITTER, best_at, best_options, fitter_options
 from mbtf_gen.config.generator import GeneratorConfig, count_queries
 from mbtf_gen.config.presets import GENERATOR
-from mbtf_pipeline.presets import COMPARE, preset_recipe, quality_assignments
+from mbtf_pipeline.presets import COMPARE, preset_recipe, quality_options
 from mbtf_pipeline.recipe import load_recipe
 
 QUALITIES: tuple[Quality, ...] = get_args(Quality)
@@ -25,7 +25,7 @@ QUALITIES: tuple[Quality, ...] = get_args(Quality)
 def test_each_preset_takes_more_paths_than_the_one_before() -> None:
     paths = []
     for quality in QUALITIES:
-        config = resolve(GeneratorConfig, assignments=["material=m", *as_assignments(GENERATOR[quality])])
+        config = resolve(GeneratorConfig, presets={"material": "m", **GENERATOR[quality]})
         paths.append(count_queries(config.queries.train, 128**2) * config.queries.spp)
     assert paths == sorted(paths)
     assert len(set(paths)) == len(paths)
@@ -38,14 +38,14 @@ def test_each_preset_takes_more_paths_than_the_one_before() -> None:
 @pytest.mark.parametrize("name", ["quickstart", "ci"])
 def test_recipes_take_a_preset(quality: Quality, name: str) -> None:
     path = ROOT / "pipelines" / f"{name}.yaml"
-    recipe = load_recipe(path, quality_assignments(path, quality))
+    recipe = load_recipe(path, presets=quality_options(path, quality))
     assert recipe.generate.queries.train == GENERATOR[quality]["queries.train"]
     # Other options stay those of the recipe.
     plain = load_recipe(path)
     assert recipe.generate.light == plain.generate.light
     assert list(recipe.fit) == list(plain.fit)
     for fit in recipe.fit.values():
-        expected = resolve(FitConfig, assignments=as_assignments(FITTER[quality]))
+        expected = resolve(FitConfig, presets=FITTER[quality])
         assert fit.training.steps == expected.training.steps
         if expected.training.steps is None:
             assert fit.training.time == expected.training.time
@@ -56,7 +56,7 @@ def test_recipes_take_a_preset(quality: Quality, name: str) -> None:
 @pytest.mark.parametrize("quality", QUALITIES)
 def test_recipes_that_compare_networks_keep_them(quality: Quality, name: str) -> None:
     path = ROOT / "pipelines" / f"{name}.yaml"
-    plain, raised = load_recipe(path), load_recipe(path, quality_assignments(path, quality))
+    plain, raised = load_recipe(path), load_recipe(path, presets=quality_options(path, quality))
     assert {n: f.network for n, f in raised.fit.items()} == {n: f.network for n, f in plain.fit.items()}
     for one, fit in raised.fit.items():
         if plain.fit[one].training.blur.initial_sigma == 0 or fit.model == "hierarchical":
@@ -69,14 +69,14 @@ def test_other_recipes_get_the_network_of_the_preset() -> None:
     assert {n: {**best_at("draft", n), **FITTER["draft"]} for n in fits} == fitter_options("draft", fits)
     fits["hierarchical"] = {"model": "hierarchical"}
     assert fitter_options("draft", fits)["hierarchical"] == FITTER["draft"]
-    text = quality_assignments(path, "draft")
-    assert "fit.neumip.network.width=40" in text
-    assert "fit.neumip-baseline.training.texture_weight_decay=1.0" in text
+    text = quality_options(path, "draft")
+    assert text["fit.neumip.network.width"] == 40
+    assert text["fit.neumip-baseline.training.texture_weight_decay"] == 1.0
     # A network or smoothing set on the command line is kept as a whole.
     own = ["fit.neumip.network.width=25", "fit.neumip.training.texture_weight_decay=0"]
-    text = quality_assignments(path, "draft", own)
+    text = quality_options(path, "draft", own)
     assert not any("network" in t or t.startswith("fit.neumip.training.texture_weight_decay") for t in text)
-    assert "fit.neumip.training.blur.min_sigma=0.8" in text
+    assert text["fit.neumip.training.blur.min_sigma"] == 0.8
 
 
 def test_longer_training_gets_a_larger_network() -> None:
@@ -87,26 +87,26 @@ def test_longer_training_gets_a_larger_network() -> None:
     assert best_at("draft") == best_options(12.0)
     assert best_at("high") == best_options(600.0) == best_at("paper")
     path = ROOT / "pipelines" / "rock_cliff.yaml"
-    assert "fit.neumip.network.width=64" in quality_assignments(path, "high")
+    assert quality_options(path, "high")["fit.neumip.network.width"] == 64
 
 
 def test_options_of_a_fit_file_are_kept(tmp_path: Path) -> None:
     file = tmp_path / "fit.yaml"
     file.write_text("network: {channels: 5}\ntraining: {blur: {initial_sigma: 4}}\n")
-    given = {"model": "neumip", **overrides_of(file, ["seed=3"])}
+    given = {"model": "neumip", **explicit_options(file, ["seed=3"])}
     expected = {"training.texture_weight_decay": 1.0, **FITTER["draft"]}
     assert fitter_options("draft", {"": given})[""] == expected
-    given = {"model": "neumip", **overrides_of(None, ["model=hierarchical"])}
+    given = {"model": "neumip", **explicit_options(None, ["model=hierarchical"])}
     assert fitter_options("high", {"": given})[""] == FITTER["high"]
 
 
 def test_explicit_options_override_the_preset(tmp_path: Path) -> None:
     path = ROOT / "pipelines" / "quickstart.yaml"
-    given = [*quality_assignments(path, "draft"), "generate.queries.train=5/texel"]
-    assert load_recipe(path, given).generate.queries.train == "5/texel"
+    given = ["generate.queries.train=5/texel"]
+    assert load_recipe(path, given, quality_options(path, "draft")).generate.queries.train == "5/texel"
     file = tmp_path / "fit.yaml"
     file.write_text("training: {steps: 7}\n")
-    resolved = resolve(FitConfig, file=file, assignments=as_assignments(FITTER["draft"]))
+    resolved = resolve(FitConfig, file=file, presets=FITTER["draft"])
     assert resolved.training.steps is None
     assert resolved.training.time == 12
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support.plugin_materials import write_material
 
-from mbtf_core.console import run
+from mbtf_core.app.console import run
 from mbtf_fit.cli.app import app
 from mbtf_fit.material.material import Material
 

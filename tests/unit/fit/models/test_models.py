@@ -7,7 +7,7 @@ from typing import Any, get_args
 import pytest
 import torch
 
-from mbtf_core.config_file import resolve
+from mbtf_core.config.settings import resolve
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError, UsageError
 from mbtf_fit.config import EncodingSection, FitConfig, OutputTransform

@@ -12,7 +12,7 @@ import pytest
 from support.plugin_materials import write_material
 from support.shader_cases import CASES, make
 
-from mbtf_core.console import run
+from mbtf_core.app.console import run
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import EngineError
 from mbtf_fit.cli.app import app

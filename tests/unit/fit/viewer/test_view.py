@@ -13,7 +13,7 @@ import pytest
 from support.pages import loads
 from support.plugin_materials import net, write_material
 
-from mbtf_core.console import run
+from mbtf_core.app.console import run
 from mbtf_core.errors import UsageError
 from mbtf_fit.cli.app import app
 from mbtf_fit.viewer import live

@@ -14,7 +14,7 @@ import pytest
 from support.datasets import edit
 from support.small_runs import command, contents, generate, noisy_plane
 
-from mbtf_core.console import run
+from mbtf_core.app.console import run
 from mbtf_core.data.verify import verify
 from mbtf_core.errors import InputError
 from mbtf_fit.cli.app import app as fit_app

@@ -14,7 +14,7 @@ from support.object_stores import memory_store
 from support.small_runs import command, contents, generate, noisy_plane
 
 import mbtf_core.data.store_folder
-from mbtf_core.console import run
+from mbtf_core.app.console import run
 from mbtf_core.data.data_folder import data_folder, in_store, local_copy
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.recover import recover_shards

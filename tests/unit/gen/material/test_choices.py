@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from support.height_maps import fractal, normals_of, save_heights, save_normals
 
-from mbtf_core.config_file import read_yaml
-from mbtf_core.console import run
+from mbtf_core.app.console import run
+from mbtf_core.config.yaml_file import read_yaml
 from mbtf_gen.cli.app import app
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support.height_maps import Floats, fractal, normals_of, save_heights, save_normals
 
-from mbtf_core.console import run
+from mbtf_core.app.console import run
 from mbtf_gen.cli.app import app
 from mbtf_gen.geometry.heightfield import HeightGrid
 from mbtf_gen.geometry.slope_statistics import (

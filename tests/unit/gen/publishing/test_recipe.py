@@ -16,7 +16,7 @@ from support.datasets import edit, rewrite, write_dataset
 from support.formula_runs import SMALL, Formula, cheap_plan
 from support.published import contents, publish, small
 
-from mbtf_core.config_file import resolve
+from mbtf_core.config.settings import resolve
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.errors import InputError, UsageError
 from mbtf_gen.config.generator import GeneratorConfig

@@ -11,7 +11,7 @@ import pytest
 import torch
 from support.fit_data import parallax, write_data
 
-from mbtf_core.console import Console
+from mbtf_core.app.console import Console
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.lattice import Lattice
 from mbtf_fit.models.registry import build_model

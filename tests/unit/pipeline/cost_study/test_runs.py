@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 import mbtf_fit
-from mbtf_core.config_file import dump_yaml, resolve
+from mbtf_core.config.settings import resolve
+from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.files.atomic import write_text
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries

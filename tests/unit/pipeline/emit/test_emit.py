@@ -13,7 +13,7 @@ from support.emitted import RECIPE, REQUEST, make_place
 from support.fake_cluster import read_job
 from support.paths import ROOT
 
-from mbtf_core.console import run
+from mbtf_core.app.console import run
 from mbtf_core.files.folders import owned
 from mbtf_gen.cli.app import app as gen_app
 from mbtf_gen.job import Job

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support.paths import ROOT
 
-from mbtf_core.console import run
+from mbtf_core.app.console import run
 from mbtf_core.errors import InputError
 from mbtf_pipeline.cli.app import app
 from mbtf_pipeline.paper_tables.recipe import Planned, is_paper_recipe, load_paper_recipe, plan

@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 from support.plugin_materials import write_material
 
+from mbtf_core.app.console import run
 from mbtf_core.color import srgb_to_linear
-from mbtf_core.console import run
 from mbtf_core.data.lattice import Lattice
 from mbtf_fit.cli.app import app
 from mbtf_fit.material.interchange.agreement import fit_color

@@ -13,22 +13,19 @@ A program defines its commands with cyclopts and passes the application to :func
 
     sys.exit(run(app))
 
-``mbtf-fit shards/`` runs the default command, ``mbtf-fit info …`` a named one; flags may come before or after
-the command's name. A command returns None or an exit code, and raises
-:class:`~mbtf_core.errors.MbtfError` for every error that a user can cause. Results go to standard output.
-Progress, notes and warnings (of any logger of the packages) go to standard error.
+``mbtf-fit shards/`` runs the default command, ``mbtf-fit info …`` a named one. A command returns None or an
+exit code, and raises :class:`~mbtf_core.errors.MbtfError` for every error that a user can cause.
+Results go to standard output. Progress, notes and warnings (of any logger of the packages) go to standard
+error.
 """
 
 from __future__ import annotations
 
 import contextlib
 import difflib
-import inspect
 import json as json_module
 import logging
-import math
 import os
-import re
 import sys
 import traceback
 import warnings
@@ -37,21 +34,20 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 from cyclopts import App, CycloptsError, Parameter, UnusedCliTokensError
+from pydantic_core import to_jsonable_python
 
 from mbtf_core import interruption
-from mbtf_core.completion import CompletedApp, add_completion
+from mbtf_core.app.options import Switch
+from mbtf_core.app.progress import BarProgress, LineProgress, Progress
 from mbtf_core.errors import (
     EXIT_BAD_INPUT,
     EXIT_INTERRUPTED,
     EXIT_OK,
     EXIT_USAGE,
     MbtfError,
-    UsageError,
     printable,
     reason,
 )
-from mbtf_core.options import Switch
-from mbtf_core.progress import BarProgress, LineProgress, Progress
 
 EXIT_INTERNAL = 1
 _EXIT_BROKEN_PIPE = 141
@@ -61,20 +57,8 @@ _PACKAGES = ("mbtf_core", "mbtf_gen", "mbtf_fit", "mbtf_pipeline")
 
 
 def _plain(value: Any) -> Any:
-    """JSON's own types for paths, arrays, NumPy numbers and models; NaN and infinities become null."""
-    if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if value is None or isinstance(value, str | int):
-        return value
-    if hasattr(value, "model_dump"):
-        return _plain(value.model_dump())
-    if hasattr(value, "tolist"):
-        return _plain(value.tolist())
-    return str(value)
+    """An array, a NumPy number or anything else that JSON does not know, in its types."""
+    return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
 @Parameter(name="*", group="Output")
@@ -86,10 +70,12 @@ class Console:
     ----------
     json : print one JSON object on standard output instead of text
     quiet : no progress and no notes; warnings and errors stay
+    debug : an error shows its traceback; the logs of developers are shown
     """
 
     json: Annotated[Switch, Parameter(help="Print one JSON object on standard output.")] = False
     quiet: Annotated[Switch, Parameter(alias="-q", help="Hide progress and notes.")] = False
+    debug: Annotated[Switch, Parameter(help="Show the traceback of an error.")] = False
 
     def note(self, text: str) -> None:
         """A line for people, on standard error."""
@@ -104,7 +90,8 @@ class Console:
         global _reported
         _reported = True
         if self.json:
-            text = json_module.dumps(_plain(data), indent=2, ensure_ascii=False, allow_nan=False)
+            plain = to_jsonable_python(dict(data), inf_nan_mode="null", fallback=_plain)
+            text = json_module.dumps(plain, indent=2, ensure_ascii=False, allow_nan=False)
         print(text)
 
     @contextlib.contextmanager
@@ -135,19 +122,18 @@ def new_app(name: str, description: str) -> App:
 
         return f"{name} {installed('mbtf')}"
 
-    app = CompletedApp(
+    app = App(
         name=name,
         help=description,
         version=version,
-        help_format="plaintext",
-        help_epilogue="With --debug, an error shows its traceback.",
+        help_format="markdown",
         default_parameter=Parameter(negative_iterable=()),
         exit_on_error=False,
         print_error=False,
         suppress_keyboard_interrupt=False,
         result_action="return_value",
     )
-    add_completion(app)
+    app.register_install_completion_command()
     return app
 
 
@@ -168,69 +154,24 @@ def _route_logs(tokens: Sequence[str], debug: bool) -> None:
         logger.setLevel(logging.DEBUG if debug else level)
 
 
-def _take_debug(tokens: Sequence[str]) -> tuple[bool, list[str]]:
-    """Whether ``--debug`` is among the tokens (what follows ``--`` is no flag), and the tokens without it."""
-    end = tokens.index("--") if "--" in tokens else len(tokens)
-    kept = [t for t in tokens[:end] if t != "--debug"]
-    return len(kept) < end, [*kept, *tokens[end:]]
-
-
-def _join_negative_pairs(tokens: Sequence[str]) -> list[str]:
-    """``--view -10,0`` as ``--view=-10,0``: a list of numbers that begins with a minus sign is no flag."""
-    out: list[str] = []
-    for token in tokens:
-        if re.fullmatch(r"-[\d.][^,\s]*,\S+", token) and out and re.fullmatch(r"--[\w-]+", out[-1]):
-            out[-1] += f"={token}"
-        else:
-            out.append(token)
-    return out
-
-
 def _commands(app: App) -> list[str]:
     return [name for name in app if not name.startswith("-")]
 
 
-def _join_lines(app: App) -> None:
-    """Join the lines of each paragraph of the commands' help, so that the terminal's width breaks them."""
-    for command in (part.default_command for part in (app, *(app[name] for name in _commands(app)))):
-        text, rule, rest = (inspect.getdoc(command) or "").partition("\n\nParameters\n---")
-        if command is not None:
-            command.__doc__ = re.sub(r"(?<!\n)\n(?!\n)", " ", text) + rule + rest
-
-
-def _first_word(app: App, tokens: Sequence[str]) -> int | None:
-    """Index of the first token that is neither a flag nor a flag's value, by the flags of all commands."""
-    values: dict[str, int] = {}
-    for part in (app, *(app[name] for name in _commands(app))):
-        if part.default_command is None:
-            continue
-        for argument in part.assemble_argument_collection():
-            for name in argument.names:
-                values.setdefault(name, argument.token_count()[0])
-    index = 0
-    while index < len(tokens) and tokens[index].startswith("-") and tokens[index] not in ("-", "--"):
-        index += 1 if "=" in tokens[index] else 1 + values.get(tokens[index], 0)
-    return index if index < len(tokens) else None
-
-
-def _command_first(app: App, tokens: list[str]) -> list[str]:
-    """Tokens with the command's name first, also where flags precede it.
-
-    Raises
-    ------
-    UsageError : the first word is no file and looks like a misspelt command
-    """
-    commands = _commands(app)
-    index = _first_word(app, tokens) if tokens and tokens[0].startswith("-") else 0
-    if not tokens or index is None:
-        return tokens
-    word = tokens[index]
-    if word in commands:
-        return [word, *tokens[:index], *tokens[index + 1 :]]
-    near = difflib.get_close_matches(word, commands, n=1, cutoff=0.75)
-    if near and not re.search(r"[./\\]", word) and not os.path.exists(word):
-        raise UsageError("no such file or command", where=word, hint=f"did you mean: {app.name[0]} {near[0]}")
-    return tokens
+def _missed_command(app: App, tokens: Sequence[str], text: str) -> str:
+    """Message of a failed line of the default command that may have meant another one; empty where none."""
+    words = [token for token in tokens if not token.startswith("-") and not os.path.exists(token)]
+    if not words:
+        return ""
+    if tokens[0] != words[0]:
+        # The value of an option may be named like a command.
+        meant = words if text.startswith("unexpected argument") else words[: words[0] in text]
+        late = next((word for word in meant if word in _commands(app)), None)
+        return "" if late is None else f"{text}\n  did you mean: {app.name[0]} {late} {tokens[0]} …"
+    near = difflib.get_close_matches(words[0], _commands(app), n=1, cutoff=0.75)
+    if not near or near[0] == words[0]:
+        return ""
+    return f"{printable(words[0])}: no such file or command\n  did you mean: {app.name[0]} {near[0]}"
 
 
 def _usage_message(app: App, fault: CycloptsError, tokens: Sequence[str]) -> str:
@@ -239,6 +180,8 @@ def _usage_message(app: App, fault: CycloptsError, tokens: Sequence[str]) -> str
         text = f"unexpected argument '{reason(fault.unused_tokens[0])}'"
     else:
         text = reason(fault, 300)
+    if missed := _missed_command(app, tokens, text):
+        return missed
     command = f" {tokens[0]}" if tokens and tokens[0] in _commands(app) else ""
     return f"{text}\n  see {app.name[0]}{command} --help"
 
@@ -282,8 +225,9 @@ def run(app: App, argv: Sequence[str] | None = None) -> int:
     """
     global _reported
     _reported = False
-    debug, tokens = _take_debug(sys.argv[1:] if argv is None else list(argv))
-    as_json = "--json" in tokens
+    tokens = sys.argv[1:] if argv is None else list(argv)
+    # Known before the line is parsed, which may fail.
+    debug, as_json = "--debug" in tokens, "--json" in tokens
     _route_logs(tokens, debug)
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
@@ -291,9 +235,6 @@ def run(app: App, argv: Sequence[str] | None = None) -> int:
             stream.reconfigure(errors="replace")
     try:
         with interruption.raising(), _library_warnings(debug):
-            if {"-h", "--help"} & set(tokens):
-                _join_lines(app)
-            tokens = _command_first(app, _join_negative_pairs(tokens))
             result = app(tokens)
         # None where it was closed before the start.
         if sys.stdout is not None:
@@ -302,6 +243,8 @@ def run(app: App, argv: Sequence[str] | None = None) -> int:
             raise KeyboardInterrupt
         return result if type(result) is int else EXIT_OK
     except MbtfError as error:
+        if missed := _missed_command(app, tokens, error.message.splitlines()[0]):
+            return _fail(missed, EXIT_USAGE, debug, as_json)
         return _fail(error.message, error.exit_code, debug, as_json)
     except CycloptsError as error:
         return _fail(_usage_message(app, error, tokens), EXIT_USAGE, debug, as_json)

@@ -4,38 +4,40 @@ A field names its flag beside its type; help, default, type and order are the fi
 
     train: Annotated[Count, Flag("--queries")] = Field("100/texel", description="number of training queries")
 
-A command names the keys that it takes (all of them by default) and receives the given values::
+A command's options are a class, made of the keys that it takes (all of them by default), and arrive as the
+values that were given::
 
-    @takes_options(GeneratorConfig, "geometry", "seed")
-    def inspect(material: str, /, *, options: Options[GeneratorConfig], console: Console = CONSOLE) -> None:
+    @options_from(GeneratorConfig, "geometry", "seed")
+    class InspectOptions(Options[GeneratorConfig]):
+        "Options of ``mbtf-gen inspect``."
+
+    def inspect(material: str, /, *, options: InspectOptions, console: Console = CONSOLE) -> None:
         config = options.resolve(material=material)
 
-``--config FILE`` and ``--set a.b=c`` come with them.
+``--config FILE`` and ``--set a.b=c`` come with them. Options that several commands share are declared here.
 """
 
 from __future__ import annotations
 
-import functools
-import inspect
 import os
 import shlex
 import types
 import typing
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, make_dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, TypeVar, Union
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Generic, Literal, TypeVar, Union
 
 from cyclopts import Parameter
 from pydantic import BaseModel, TypeAdapter
 from pydantic.fields import FieldInfo
 
-from mbtf_core.config_file import Settings, resolve
+from mbtf_core.config.settings import Settings, explicit_options, resolve
 from mbtf_core.errors import UsageError
 from mbtf_core.urls import split_url
 
 S = TypeVar("S", bound=Settings)
-C = TypeVar("C", bound=Callable[..., Any])
+C = TypeVar("C", bound="Options[Any]")
 
 # What a description says of a default that only the command knows.
 _DEFAULT = "; default: "
@@ -69,6 +71,13 @@ ClusterOption = Annotated[
 ]
 DryRun = Annotated[Switch, Parameter(help="Write nothing; only report what would be done.")]
 Verbose = Annotated[Switch, Parameter(alias="-v", help="Print all details.")]
+Quality = Literal["draft", "standard", "high", "paper"]
+QualityOption = Annotated[
+    Quality | None,
+    Parameter(
+        help="Preset of sizes and times; overrides the file of --config; other options override the preset."
+    ),
+]
 Config = Annotated[Path | None, Parameter(help="YAML file with the options.")]
 Set = Annotated[
     list[str] | None,
@@ -104,6 +113,7 @@ class ConfigOption:
     metavar : what the help shows for its value; None for choices
     default : as one would write it; empty if there is none
     help : one sentence
+    is_list : whether its value is several numbers, of which the first may be negative
     """
 
     flag: str
@@ -112,6 +122,7 @@ class ConfigOption:
     metavar: str | None
     default: str
     help: str
+    is_list: bool
 
     @property
     def parameter(self) -> str:
@@ -122,8 +133,16 @@ class ConfigOption:
     def annotation(self) -> Any:
         """Type of the Python parameter, with what the help shows."""
         default = self.default or False
-        shown = Parameter(name=self.flag, metavar=self.metavar, help=self.help, show_default=default)
-        return Annotated[self.type | None, shown]
+        return Annotated[
+            self.type | None,
+            Parameter(
+                name=self.flag,
+                metavar=self.metavar,
+                help=self.help,
+                show_default=default,
+                allow_leading_hyphen=self.is_list,
+            ),
+        ]
 
 
 def config_options(model: type[BaseModel], *keys: str) -> list[ConfigOption]:
@@ -139,7 +158,7 @@ def config_options(model: type[BaseModel], *keys: str) -> list[ConfigOption]:
     return [o for o in found if any(f"{o.key}.".startswith(f"{key}.") for key in keys)]
 
 
-def _walk(model: type[BaseModel], prefix: str) -> typing.Iterator[ConfigOption]:
+def _walk(model: type[BaseModel], prefix: str) -> Iterator[ConfigOption]:
     for name, field in model.model_fields.items():
         flag = next((m for m in field.metadata if isinstance(m, Flag)), None)
         if flag is not None:
@@ -159,6 +178,7 @@ def _option(flag: Flag, key: str, field: FieldInfo) -> ConfigOption:
         flag.metavar or (None if choices else _METAVARS.get(kind, "TEXT")),
         default or _default_text(field),
         f"{text[:1].upper()}{text[1:]}.",
+        typing.get_origin(kind) is list or (isinstance(kind, type) and issubclass(kind, BaseModel)),
     )
 
 
@@ -189,31 +209,46 @@ def _written(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-@dataclass(frozen=True)
 class Options(Generic[S]):
-    """What a command line says of a configuration.
+    """What a command line says of a configuration; made by :func:`options_from`.
 
     Attributes
     ----------
-    model : the configuration
-    flags : dotted key → its flag
-    given : dotted key → its value, for the flags that were given
     config : file with options
     assignments : ``a.b=c``
     """
 
-    model: type[S]
-    flags: Mapping[str, str]
-    given: Mapping[str, str]
-    config: Path | None = None
-    assignments: Sequence[str] = ()
+    configuration: ClassVar[type[Settings]]
+    table: ClassVar[Sequence[ConfigOption]] = ()
+    config: Path | None
+    assignments: list[str] | None
 
-    def resolve(self, presets: Sequence[str] = (), **arguments: Any) -> S:
+    @property
+    def flags(self) -> dict[str, str]:
+        """Dotted key → its flag."""
+        return {option.key: option.flag for option in self.table}
+
+    @property
+    def given(self) -> dict[str, str]:
+        """Dotted key → its value, for the flags that were given."""
+        values = {option.key: getattr(self, option.parameter) for option in self.table}
+        return {key: value for key, value in values.items() if value is not None}
+
+    def explicit(self) -> dict[str, Any]:
+        """The options of file and command line, nested, without presets; see :func:`explicit_options`."""
+        flags = [f"{key}={value}" for key, value in self.given.items()]
+        return explicit_options(self.config, [*(self.assignments or ()), *flags])
+
+    def assigning(self: C, assignment: str) -> C:
+        """The same command line with one more ``a.b=c``."""
+        return replace(self, assignments=[*(self.assignments or ()), assignment])  # type: ignore[type-var]
+
+    def resolve(self, presets: Mapping[str, Any] | None = None, **arguments: Any) -> S:
         """The configuration: defaults, file, presets, assignments, flags.
 
         Parameters
         ----------
-        presets : ``a.b=c`` that assignments and flags override
+        presets : dotted key → value; assignments and flags override them
         arguments : values by key that have no flag; a path that is None here and that the file gives is
             relative to the file, so that the file works from anywhere
 
@@ -222,17 +257,18 @@ class Options(Generic[S]):
         InputError : the file is at fault
         UsageError : an assignment or a flag is at fault
         """
-        assigned = {text.partition("=")[0].strip() for text in self.assignments}
+        assignments = self.assignments or ()
+        assigned = {text.partition("=")[0].strip() for text in assignments}
         doubled = [key for key, value in arguments.items() if value is not None and key in assigned]
         if doubled:
             raise UsageError(
                 f"the argument gives '{doubled[0]}' already", where="--set", hint="give one of them"
             )
         resolved = resolve(
-            self.model,
+            typing.cast(type[S], self.configuration),
             file=self.config,
             presets=presets,
-            assignments=self.assignments,
+            assignments=assignments,
             flags={**arguments, **self.given},
             spelled=self.flags,
         )
@@ -244,9 +280,8 @@ class Options(Generic[S]):
         return resolved.model_copy(update=located)
 
 
-def takes_options(model: type[BaseModel], *keys: str) -> Callable[[C], C]:
-    """Decorator of a command: its parameter `options` becomes a parameter per option, and those of
-    ``--config`` and ``--set``.
+def options_from(model: type[BaseModel], *keys: str) -> Callable[[type[C]], type[C]]:
+    """Decorator of a class of :class:`Options`: gives it a field per option, and ``--config`` and ``--set``.
 
     Parameters
     ----------
@@ -258,41 +293,16 @@ def takes_options(model: type[BaseModel], *keys: str) -> Callable[[C], C]:
     ValueError
         If two of them have the same flag.
     """
-    options = config_options(model, *keys)
-    if len({o.flag for o in options}) < len(options):
+    table = config_options(model, *keys)
+    if len({o.flag for o in table}) < len(table):
         raise ValueError(f"two options of {model.__name__} have the same flag: choose one of their keys")
+    own: list[tuple[str, Any, None]] = [(o.parameter, o.annotation, None) for o in table]
+    own += [("config", Config, None), ("assignments", Set, None)]
 
-    def decorate(command: C) -> C:
-        hints = typing.get_type_hints(command, include_extras=True)
-        annotations = {o.parameter: o.annotation for o in options} | {"config": Config, "assignments": Set}
-        generated = [
-            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
-            for name, annotation in annotations.items()
-        ]
-        parameters: list[inspect.Parameter] = []
-        for parameter in inspect.signature(command).parameters.values():
-            own = parameter.replace(annotation=hints[parameter.name])
-            parameters += generated if parameter.name == "options" else [own]
-
-        def read(arguments: dict[str, Any]) -> Options[Any]:
-            values = {o.key: arguments.pop(o.parameter, None) for o in options}
-            return Options(
-                model,
-                {o.key: o.flag for o in options},
-                {key: value for key, value in values.items() if value is not None},
-                arguments.pop("config", None),
-                arguments.pop("assignments", None) or (),
-            )
-
-        @functools.wraps(command)
-        def run(*args: Any, **kwargs: Any) -> Any:
-            return command(*args, options=read(kwargs), **kwargs)
-
-        # For tests of documented commands.
-        run.config_options, run.read_options = options, read  # type: ignore[attr-defined]
-        run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        run.__annotations__ = {p.name: p.annotation for p in parameters} | {"return": hints["return"]}
-        return typing.cast(C, run)
+    def decorate(cls: type[C]) -> type[C]:
+        names = {"__module__": cls.__module__, "__doc__": cls.__doc__, "configuration": model, "table": table}
+        made = make_dataclass(cls.__name__, own, bases=(cls,), namespace=names, frozen=True, kw_only=True)
+        return typing.cast(type[C], Parameter(name="*")(made))
 
     return decorate
 

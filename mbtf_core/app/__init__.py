@@ -1,0 +1,1 @@
+"""Command lines: options from configurations, output, progress, errors and exit codes."""

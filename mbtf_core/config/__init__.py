@@ -1,0 +1,1 @@
+"""Configurations: typed sections, YAML files, and nested mappings."""

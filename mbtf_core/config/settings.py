@@ -1,0 +1,278 @@
+"""Typed configuration: YAML file, then ``--set a.b=c``, then flags, checked by pydantic.
+
+Used by all three programs. A key that the model does not know is refused with its file and line and the
+nearest valid key; a value that does not fit is refused with its key and what was expected.
+"""
+
+from __future__ import annotations
+
+import os
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, TypeVar, Union
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+)
+
+from mbtf_core.config.nested import deep_merge, leaves, merge, nested
+from mbtf_core.config.yaml_file import line_of, parse_value, read_yaml, shortened
+from mbtf_core.errors import InputError, MbtfError, UsageError
+from mbtf_core.suggest import suggest_name
+
+_COMMAND_LINE = "command line"
+
+
+def parts_of(annotation: Any) -> list[Any]:
+    """The types within an annotation's Optional, unions, lists and dicts, without metadata."""
+    origin = typing.get_origin(annotation)
+    if origin is Annotated:
+        return parts_of(typing.get_args(annotation)[0])
+    if origin in (Union, types.UnionType, list, tuple, dict):
+        return [part for inner in typing.get_args(annotation) for part in parts_of(inner)]
+    return [annotation]
+
+
+class Settings(BaseModel):
+    """Base of every configuration section: unknown keys are errors, numbers are finite, values are fixed.
+
+    Attributes
+    ----------
+    exclusive : class attribute, pairs of dotted keys that a file or a command line must not both give
+    """
+
+    exclusive: ClassVar[tuple[tuple[str, str], ...]] = ()
+    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False)
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _no_boolean_numbers(cls, value: Any, info: ValidationInfo) -> Any:
+        """Spell out true and false where a number is wanted: pydantic would read them as 1 and 0."""
+        kinds = parts_of(cls.model_fields[str(info.field_name)].annotation)
+        numeric = (int in kinds or float in kinds) and bool not in kinds
+        return _spelled_out(value) if numeric else value
+
+
+def _spelled_out(value: Any) -> Any:
+    # The YAML reader's boolean with an anchor is no bool.
+    if isinstance(value, bool) or type(value).__name__ == "ScalarBoolean":
+        return "true" if value else "false"
+    if isinstance(value, list | tuple):
+        return [_spelled_out(item) for item in value]
+    return value
+
+
+B = TypeVar("B", bound=BaseModel)
+S = TypeVar("S", bound=Settings)
+
+
+def _file_name(name: str) -> str:
+    try:
+        usable = "\0" not in name and all(len(os.fsencode(part)) <= 255 for part in name.split("/"))
+    except UnicodeError:
+        usable = False
+    if not usable or len(name) > 4000:
+        raise ValueError("is not a valid file name")
+    return name
+
+
+# The name of a file, or a path to it.
+FileName = Annotated[str, Field(min_length=1), AfterValidator(_file_name)]
+
+
+def _known_keys(model: type[BaseModel], location: Sequence[str | int]) -> list[str]:
+    """Valid keys of the section that `location` lies in (the last part is the offending key)."""
+    models = [model]
+    for name in location[:-1]:
+        kinds = [
+            k for m in models if name in m.model_fields for k in parts_of(m.model_fields[name].annotation)
+        ]
+        models = [k for k in kinds if isinstance(k, type) and issubclass(k, BaseModel)] or models
+    return sorted({key for m in models for key in m.model_fields})
+
+
+def _explain(
+    error: ValidationError, model: type[BaseModel], data: Any, source: str, spelled: Mapping[str, str]
+) -> tuple[str, str, str]:
+    """(where, what, hint) of one fault: an unknown key before others, since it may explain a missing one."""
+    faults = error.errors()
+    fault = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
+    location = list(fault["loc"])
+    dotted = ".".join(str(p) for p in location)
+    # Data that the command line has changed may still carry the file's line numbers.
+    line = None if source == _COMMAND_LINE else line_of(data, location)
+    flag = next((f for key, f in spelled.items() if f"{dotted}.".startswith(f"{key}.")), None)
+    where = flag or (f"{source}:{line}" if line is not None else source)
+    if fault["type"] == "extra_forbidden":
+        known = _known_keys(model, location)
+        hint = suggest_name(str(location[-1]), known, 0.5) or f"valid keys: {', '.join(known)}"
+        return where, f"unknown key '{dotted}'", hint
+    if fault["type"] == "missing":
+        return where, f"key '{dotted}' is missing", "add it"
+    what = fault["msg"].removeprefix("Value error, ").replace("Input should", "must")
+    given = fault["input"]
+    shown = "" if isinstance(given, Mapping | BaseModel) else f" (given {shortened(given)})"
+    return where, (f"'{dotted}': " if dotted else "") + what + shown, ""
+
+
+def build(
+    model: type[B],
+    data: Mapping[str, Any],
+    *,
+    source: str,
+    error: type[MbtfError] = InputError,
+    spelled: Mapping[str, str] | None = None,
+) -> B:
+    """Check `data` against `model`.
+
+    Parameters
+    ----------
+    source : where the data come from, for messages: a file, "command line"
+    error : class of the error to raise
+    spelled : dotted key → the flag that gave it, named in place of `source`
+
+    Raises
+    ------
+    error : with the key, its line where `data` came from :func:`read_yaml`, and the nearest valid key
+    """
+    try:
+        return model.model_validate(data)
+    except ValidationError as fault:
+        where, what, hint = _explain(fault, model, data, source, spelled or {})
+        raise error(what, where=where, hint=hint) from None
+
+
+def check_schema(document: Mapping[str, Any], version: int, where: Path, hint: str) -> None:
+    """Refuse a JSON document of the programs that another version of them wrote.
+
+    Raises
+    ------
+    InputError : with both schema versions
+    """
+    found = document.get("schema")
+    if found != version:
+        what = f"has schema version {found}, this program reads version {version}"
+        raise InputError(what, where=where, hint=hint)
+
+
+def check_document(model: type[B], data: Mapping[str, Any], path: Path, hint: str) -> B:
+    """A JSON document of the programs as `model`.
+
+    Raises
+    ------
+    InputError : with the first key that is missing or holds something else
+    """
+    try:
+        return build(model, data, source=str(path))
+    except InputError as error:
+        raise InputError(f"is damaged ({error.what})", where=path, hint=hint) from None
+
+
+def parse_assignment(text: str) -> tuple[str, Any]:
+    """(dotted key, value) of ``a.b=c``.
+
+    Raises
+    ------
+    UsageError : it has another form
+    """
+    key, sign, value = text.partition("=")
+    if not sign or not key.strip():
+        raise UsageError(f"{shortened(text)} is not of the form key=value", where="--set")
+    return key.strip(), parse_value(value)
+
+
+def _over_presets(presets: Any, key: str, value: Any) -> tuple[str, Any]:
+    """An assignment that replaces all of a section but what presets say of it and the assignment does not."""
+    for part in key.split("."):
+        presets = presets.get(part) if isinstance(presets, Mapping) else None
+    both = isinstance(presets, Mapping) and isinstance(value, Mapping)
+    return key, deep_merge(presets, value) if both else value
+
+
+def _contradiction(model: type[Settings], data: Mapping[str, Any]) -> tuple[str, str] | None:
+    """The first two keys of nested data that the model declares exclusive, at any depth."""
+    given = [key for key, value in leaves(data) if value is not None]
+    for key in given:
+        for first, second in model.exclusive:
+            other = key.removesuffix(first) + second
+            if f".{key}".endswith(f".{first}") and other in given:
+                return key, other
+    return None
+
+
+def explicit_options(file: Path | None, assignments: Sequence[str]) -> dict[str, Any]:
+    """Options of a configuration file and of ``a.b=c``, nested; single values of the latter as text.
+
+    Raises
+    ------
+    InputError : the file cannot be read
+    UsageError : an assignment has another form
+    """
+    given = {} if file is None else dict(read_yaml(file))
+    for text in assignments:
+        key, parsed = parse_assignment(text)
+        value = parsed if isinstance(parsed, Mapping) else text.partition("=")[2].strip()
+        merge(given, key.split("."), value)
+    return given
+
+
+def resolve(
+    model: type[S],
+    *,
+    file: Path | None = None,
+    presets: Mapping[str, Any] | None = None,
+    assignments: Sequence[str] = (),
+    flags: Mapping[str, Any] | None = None,
+    spelled: Mapping[str, str] | None = None,
+) -> S:
+    """Resolved configuration: defaults, then the file, presets, ``a.b=c`` assignments, and flags.
+
+    Parameters
+    ----------
+    presets : dotted key → value; assignments and flags override them, value by value also where one of them
+        gives a whole section
+    flags : dotted key → value; None values are flags that were not given
+    spelled : dotted key → its flag, for messages
+
+    Raises
+    ------
+    InputError : the file is at fault
+    UsageError : an assignment or a flag is at fault
+    """
+    data: Any = read_yaml(file) if file is not None else {}
+    defaults = dict(presets or {})
+    own = [_over_presets(nested(defaults), *parse_assignment(text)) for text in assignments]
+    switches = [(key, value) for key, value in (flags or {}).items() if value is not None]
+    given = [*defaults.items(), *own, *switches]
+    names = {key: flag for key, flag in (spelled or {}).items() if (flags or {}).get(key) is not None}
+    both = _contradiction(model, nested(dict(own) | {key: value for key, value in switches if key in names}))
+    if both:
+        raise UsageError(
+            " and ".join(names.get(key, f"'{key}'") for key in both) + " are mutually exclusive",
+            hint="give one of them",
+        )
+    if file is not None:
+        both = _contradiction(model, data)
+        # A resolved configuration, which states its version, holds every key.
+        if both and "version" not in data:
+            what = f"'{both[0]}' and '{both[1]}' are mutually exclusive"
+            line = max(line_of(data, key.split(".")) or 1 for key in both)
+            raise InputError(what, where=f"{file}:{line}", hint="give one of them")
+        # Report errors of the file as such, also where the command line supplies a key that it lacks.
+        for key, value in given:
+            if key in model.model_fields and model.model_fields[key].is_required() and key not in data:
+                data[key] = value
+        resolved = build(model, data, source=str(file))
+        if not given:
+            return resolved
+    for key, value in given:
+        merge(data, key.split("."), value)
+    return build(model, data, source=_COMMAND_LINE, error=UsageError, spelled=names)

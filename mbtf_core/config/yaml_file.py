@@ -1,0 +1,162 @@
+"""YAML files: read with line numbers and within bounds, and written."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Mapping, Sequence, Set
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+from mbtf_core.errors import InputError, reason
+from mbtf_core.suggest import refuse_special, suggest_path
+
+# Bounds on the length, the depth and (because of YAML's aliases) the number of values of a configuration.
+_MAX_CHARACTERS = 1 << 18
+_MAX_DEPTH = 100
+_MAX_VALUES = 100_000
+_TOO_DEEP = f"is nested more than {_MAX_DEPTH} levels deep"
+# Tags of plain values.
+_TAGS = ("map", "seq", "str", "int", "float", "bool", "null", "timestamp", "binary", "set", "omap")
+
+
+def _yaml() -> Any:
+    from ruamel.yaml import YAML
+
+    return YAML(typ="rt")
+
+
+def _is_yaml(path: Path) -> bool:
+    return path.suffix.lower() in (".yaml", ".yml")
+
+
+def read_yaml(path: Path) -> Any:
+    """Mapping stored in a YAML file, with line numbers kept.
+
+    Raises
+    ------
+    InputError : the file is missing, unreadable, not YAML, or not a mapping
+    """
+    from ruamel.yaml.error import MarkedYAMLError
+
+    refuse_special(path)
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise InputError("no such file", where=path, hint=suggest_path(path, _is_yaml)) from None
+    except UnicodeDecodeError as error:
+        raise InputError(f"is not UTF-8 text (byte {error.start})", where=path) from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot be read ({getattr(error, 'strerror', error)})", where=path) from None
+    if len(text) > _MAX_CHARACTERS:
+        raise InputError(f"is too long: more than {_MAX_CHARACTERS:,} characters", where=path)
+    if _bracket_depth(text) > _MAX_DEPTH:
+        raise InputError(_TOO_DEEP, where=path)
+    try:
+        data = _yaml().load(text)
+    except MarkedYAMLError as error:
+        mark = error.problem_mark
+        line = f":{mark.line + 1}" if mark is not None else ""
+        raise InputError(f"not valid YAML ({reason(error.problem)})", where=f"{path}{line}") from None
+    except RecursionError:
+        raise InputError(_TOO_DEEP, where=path) from None
+    except Exception as error:  # the reader turns scalars into numbers and dates, and may raise anything
+        raise InputError(f"not valid YAML ({reason(error)})", where=path) from None
+    if data is None:
+        return {}
+    if not isinstance(data, Mapping):
+        raise InputError("must hold a mapping of keys to values", where=path)
+    _check_tree(data, path)
+    return data
+
+
+def _bracket_depth(text: str) -> int:
+    """How deep brackets are nested: the reader's time grows with the square of it."""
+    depth = deepest = 0
+    for bracket in re.finditer(r"[\[\]{}]", text):
+        depth += 1 if bracket[0] in "[{" else -1
+        deepest = max(deepest, depth)
+    return deepest
+
+
+def _check_tree(data: Any, where: object) -> None:
+    """Refuse YAML that no configuration contains.
+
+    Raises
+    ------
+    InputError : nested too deeply, repeated through aliases (or holding itself), keys that are no text, or
+        tags of some program's own
+    """
+    waiting: list[tuple[Any, int]] = [(data, 1)]
+    seen = 0
+    while waiting:
+        value, depth = waiting.pop()
+        seen += 1
+        if depth > _MAX_DEPTH or seen > _MAX_VALUES:
+            what = _TOO_DEEP if depth > _MAX_DEPTH else f"holds more than {_MAX_VALUES:,} values"
+            raise InputError(what, where=where, hint="each alias (*name) counts in full")
+        tag = getattr(getattr(value, "tag", None), "value", None)
+        if tag is not None and str(tag).removeprefix("tag:yaml.org,2002:") not in _TAGS:
+            raise InputError(f"holds the tag '{tag}'", where=where, hint="use plain values")
+        if isinstance(value, Mapping):
+            for key, inner in value.items():
+                if not isinstance(key, str):
+                    raise InputError(
+                        f"key {shortened(key)} is not text", where=where, hint="put it in quotes"
+                    )
+                waiting.append((inner, depth + 1))
+        elif isinstance(value, Sequence | Set) and not isinstance(value, str | bytes):
+            waiting += ((inner, depth + 1) for inner in value)
+
+
+def shortened(value: Any) -> str:
+    """A value as it was given, shortened to a part of a line."""
+    text = str(value) if isinstance(value, date) else repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def dump_yaml(data: Mapping[str, Any]) -> str:
+    """YAML text of plain data (dicts, lists, strings, numbers), keys in the given order."""
+    from ruamel.yaml import YAML
+
+    yaml = YAML(typ="safe", pure=True)
+    yaml.default_flow_style = False
+    yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
+    stream = io.StringIO()
+    yaml.dump(dict(data), stream)
+    return stream.getvalue()
+
+
+def parse_value(text: str) -> Any:
+    """A ``--set`` value, read as YAML reads a scalar."""
+    from ruamel.yaml import YAML
+
+    try:
+        value = YAML(typ="safe", pure=True).load(text)
+    except Exception:  # text that is not YAML is taken as it is; the reader may raise anything
+        return text
+    _check_tree(value, "--set")
+    return value
+
+
+def _holder(data: Any, key: str) -> Any:
+    """The mapping that states a key: `data`, or one that is merged into it (``<<: *name``)."""
+    merged = () if key in (data.lc.data or {}) else data.merge
+    return next((_holder(one, key) for one in merged if key in one), data)
+
+
+def line_of(data: Any, location: Sequence[str | int]) -> int | None:
+    """Line (from 1) of a key in data that :func:`read_yaml` returned; None where it is not in the file."""
+    line = None
+    for part in location:
+        try:
+            if isinstance(part, str) and part not in data:
+                continue  # pydantic inserts tags of unions into its locations
+            data = _holder(data, part) if isinstance(part, str) else data
+            position = data.lc.key(part) if isinstance(part, str) else data.lc.item(part)
+            line = position[0] + 1
+            data = data[part]
+        except (AttributeError, KeyError, IndexError, TypeError):
+            break
+    return line

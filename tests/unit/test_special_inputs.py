@@ -1,0 +1,75 @@
+"""Pipes, devices, links without an end and control characters are refused in one or two printable lines."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.command_lines import call
+from support.fit_data import constant, write_data
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("special")
+    np.save(made / "heights.npy", np.random.default_rng(0).random((4, 8)))
+    for suffix in ("npy", "exr", "yaml"):
+        os.mkfifo(made / f"pipe.{suffix}")
+    links = {"zero.png": "/dev/zero", "zero.yaml": "/dev/zero", "lost.npy": "nowhere/heights.npy"}
+    for name, target in {**links, "loop.npy": "loop.npy", "loop.yaml": "loop.yaml"}.items():
+        (made / name).symlink_to(target)
+    (made / "piped.yaml").write_text("height: heights.npy\nroughness: pipe.npy\n")
+    shards = write_data(made / "shards", constant(0.2), train=100, test=20, shards=1)
+    (shards / "train-00000.npz").unlink()
+    os.mkfifo(shards / "train-00000.npz")
+    return made
+
+
+def message(words: list[str]) -> str:
+    """The message, or the report on standard output, of a command that fails."""
+    done = call(words)
+    assert done.code in (2, 3), done
+    assert "Traceback" not in done.err
+    lines = done.err[done.err.find("error: ") :].splitlines() if "error: " in done.err else []
+    assert len(lines) <= 2, done
+    assert all(text.isprintable() and len(text) < 600 for text in lines), done
+    assert lines or done.out, done
+    return "\n".join([*lines, done.out])
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        *(f"mbtf-gen inspect pipe.{suffix}" for suffix in ("npy", "exr", "yaml")),
+        *(f"mbtf-gen inspect {name}" for name in ("zero.png", "zero.yaml", "piped.yaml")),
+        *(f"mbtf-gen inspect {name}" for name in ("loop.npy", "loop.yaml", "lost.npy")),
+        "mbtf-gen plan heights.npy --config pipe.yaml",
+        "mbtf-pipeline run pipe.yaml",
+        "mbtf-gen verify shards",
+        "mbtf-fit shards --steps 1",
+    ],
+)
+def test_special_files_are_refused(line: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    message(line.split())
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["heights.npy", "--mesh", "\x1b[31m"],
+        ["heights.npy", "--mesh", "9" * 5000],
+        ["heights.npy", "--make-tileable", "\0"],
+        ["heights.npy", "--set", "\x1b[2J=1"],
+        ["heights.npy", "two\x1b[31mwords"],
+        ["two\nlines.npy"],
+        ["x" * 5000],
+    ],
+)
+def test_control_characters_are_escaped(
+    words: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    assert "two\\nlines" in message(["mbtf-gen", *words]) or "\n" not in "".join(words)
