@@ -64,7 +64,7 @@ def run_tasks(cluster: Cluster, count: int, function: str, arguments: dict[str, 
 def shard_seconds(folder: Path) -> list[float]:
     """Seconds of each training shard, by its sidecar."""
     data = Dataset.open(folder)
-    records = [finished_record(folder, e, data.manifest["config_hash"]) for e in data.entries("train")]
+    records = [finished_record(data.folder, e, data.manifest["config_hash"]) for e in data.entries("train")]
     return [record["seconds"] for record in records if record is not None]
 
 

@@ -23,7 +23,7 @@ from typing import Any
 
 import torch
 
-from mbtf_core.data.store import Store
+from mbtf_core.data.store import ObjectStore
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import load_training, open_data
 from mbtf_fit.models.registry import MODELS
@@ -88,7 +88,7 @@ def main() -> int:
             summary = generate(config, folder)
             figures[f"seconds of generation, {'store' if folder == URL else 'local'}"] = summary.seconds
         copy = Path(shutil.copytree(local, Path(name) / "copy"))
-        store = Store(URL)
+        store = ObjectStore(URL)
         for path in sorted(local.glob("*.npz")):
             assert store.read(path.name) == path.read_bytes(), path.name
         figures["loading, cold cache"] = round(started(URL, "4GB")[1], 2)

@@ -152,13 +152,18 @@ def make_folder(folder: Path) -> None:
 
 
 def other_configuration(
-    folder: Path, what: str, old: Mapping[str, Any], new: Mapping[str, Any], otherwise: str = "inputs differ"
+    folder: object,
+    what: str,
+    old: Mapping[str, Any],
+    new: Mapping[str, Any],
+    otherwise: str = "inputs differ",
 ) -> InputError:
     """Error for a folder that was written with another configuration.
 
     Parameters
     ----------
-    folder : Path
+    folder : Path or DataFolder
+        For the message.
     what : str
         Content of the folder, for the message.
     old, new : mapping
