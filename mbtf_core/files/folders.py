@@ -17,7 +17,7 @@ from typing import Any
 from mbtf_core.config_file import differences, in_short
 from mbtf_core.errors import InputError, LockedError, PartialError
 from mbtf_core.files.atomic import TEMPORARY, remove_file
-from mbtf_core.locks import keep_renewing, lock_owner, take_lock
+from mbtf_core.locks import lock_owner, take_lock
 from mbtf_core.units import size_text
 
 # Names of temporary files and locks, such as a killed process leaves.
@@ -61,8 +61,7 @@ def owned(folder: Path, elsewhere: str = ELSEWHERE) -> Iterator[None]:
             hint=f"wait for it and run the same command again, or {elsewhere}",
         )
     try:
-        with keep_renewing():
-            yield
+        yield
     finally:
         lock.release()
         if made:

@@ -22,7 +22,7 @@ from mbtf_core.data.manifest import plan_digest
 from mbtf_core.data.schema import MANIFEST_NAME, ShardEntry
 from mbtf_core.data.sidecar import finished_record, upload_waiting
 from mbtf_core.errors import InputError, LockedError, PartialError
-from mbtf_core.locks import keep_renewing, take_lock
+from mbtf_core.locks import take_lock
 from mbtf_gen.generation.folder import read_run_plan
 from mbtf_gen.generation.render_shards import (
     ExpectedPaths,
@@ -146,22 +146,19 @@ def render_shard(
     entry = run.entries[file]
     if (record := _record_now(into, entry, config_hash)) is not None:
         return {"record": record, "rendered": False}
-    # The scheduler gives a shard to one worker. Locks of other machines are those of workers that have died,
-    # or of another command, whose shard has the same bytes.
-    lock = take_lock(into.workspace / file, stale=0.0)
+    lock = take_lock(into.workspace / file)
     if lock is None:
         raise LockedError("is being written by another process", where=into.at(file))
     try:
         # Another process may have finished it since.
         if (record := _record_now(into, entry, config_hash)) is not None:
             return {"record": record, "rendered": False}
-        with keep_renewing():
-            estimator = run.estimator
-            began = time.perf_counter()
-            queries = run.job.query_plan.draw(entry.split, entry.index, entry.rows)
-            estimates = estimate_queries(run.job, run.plan, estimator, entry, queries)
-            seconds = time.perf_counter() - began
-            record = store_shard(run.job, into, run.plan, entry, queries, estimates, seconds)
+        estimator = run.estimator
+        began = time.perf_counter()
+        queries = run.job.query_plan.draw(entry.split, entry.index, entry.rows)
+        estimates = estimate_queries(run.job, run.plan, estimator, entry, queries)
+        seconds = time.perf_counter() - began
+        record = store_shard(run.job, into, run.plan, entry, queries, estimates, seconds)
         return {"record": record, "rendered": True}
     finally:
         lock.release()

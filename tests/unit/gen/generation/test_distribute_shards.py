@@ -108,13 +108,21 @@ def test_a_full_disk_ends_the_run(arguments: dict[str, Any], tmp_path: Path) -> 
     disk = FullDisk()
     with pytest.raises(PartialError, match=r"8 shard\(s\) failed, 103 are left.*no space left \(on node:1\)"):
         distribute_shards(
-            job, DataFolder.open(tmp_path / "out"), job.shards, read_run_plan(tmp_path / "out"), disk  # type: ignore[arg-type]
+            job,
+            DataFolder.open(tmp_path / "out"),
+            job.shards,
+            read_run_plan(tmp_path / "out"),
+            disk,  # type: ignore[arg-type]
         )
     assert disk.tried == 8
     # Failures that are not in a row do not end it.
     disk = FullDisk(6, render_shard(**arguments))
     with pytest.raises(PartialError, match=r"13 shard\(s\) failed"):
         distribute_shards(
-            job, DataFolder.open(tmp_path / "out"), job.shards, read_run_plan(tmp_path / "out"), disk  # type: ignore[arg-type]
+            job,
+            DataFolder.open(tmp_path / "out"),
+            job.shards,
+            read_run_plan(tmp_path / "out"),
+            disk,  # type: ignore[arg-type]
         )
     assert disk.tried == 14
