@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -17,7 +16,6 @@ from support.commands import Done
 from support.object_stores import BUCKET, Proxy, s3_server
 from support.small_runs import command, contents, write_maps
 
-from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.store import ObjectStore
 from mbtf_core.data.verify import verify
 
@@ -199,14 +197,6 @@ def test_a_writer_that_is_killed(tmp_path: Path, proxy: Proxy, at: str) -> None:
     assert verify(URL) == []
 
 
-def test_another_machine_goes_on(tmp_path: Path, proxy: Proxy, monkeypatch: pytest.MonkeyPatch) -> None:
-    expected = generated(tmp_path)
-    assert call(*line_at(tmp_path), kill_at="train-00001.json").code == -signal.SIGKILL
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "other"))
-    assert call(*line_at(tmp_path)).code == 0
-    assert stored(tmp_path / "copy") == expected
-
-
 def test_two_slices_at_the_same_time(tmp_path: Path, proxy: Proxy) -> None:
     expected = generated(tmp_path, train=400)
     paths = os.pathsep.join(filter(None, sys.path))
@@ -251,11 +241,3 @@ def test_refusals_are_explained(tmp_path: Path, proxy: Proxy) -> None:
     done = call(*line)
     assert done.code == 3
     assert "cannot be written (The specified bucket does not exist)" in done.err
-
-
-def test_arrays_are_read_from_python(tmp_path: Path, proxy: Proxy) -> None:
-    generated(tmp_path)
-    assert call(*line_at(tmp_path)).code == 0
-    mine, theirs = Dataset.open(tmp_path / "local").load("train"), Dataset.open(URL).load("train")
-    assert all((mine[name] == theirs[name]).all() for name in mine)
-    assert json.loads(ObjectStore(URL).read("manifest.json"))["complete"]

@@ -116,14 +116,6 @@ def test_a_list_that_lags_behind(tmp_path: Path, url: str, monkeypatch: pytest.M
     assert contents(downloaded(url, tmp_path / "copy")) == contents(tmp_path / "local")
 
 
-def test_slices_and_merge(tmp_path: Path, url: str) -> None:
-    assert generate(command(tmp_path, tmp_path / "local")) == 0
-    assert generate(command_at(tmp_path, url, "--slice", "1/2")) == 0
-    assert generate(command_at(tmp_path, url, "--slice", "2/2")) == 0
-    assert run(app, ["merge", url, "-q"]) == 0
-    assert contents(downloaded(url, tmp_path / "copy")) == contents(tmp_path / "local")
-
-
 def test_the_manifest_of_another_writer_is_adopted(
     tmp_path: Path, url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
