@@ -119,7 +119,7 @@ def estimate(device: str, sizes: str, shards: str, out: str) -> Answers:
     from mbtf_core.data.dataset import Dataset
     from mbtf_core.data.queries import Queries
     from mbtf_fit.data.loader import load_split
-    from mbtf_gen.generation.summary import read_run_plan
+    from mbtf_gen.generation.folder import read_run_plan
     from mbtf_gen.job import Job
     from mbtf_gen.planning.simulation import build_estimator
     from mbtf_gen.render.estimates import Stream

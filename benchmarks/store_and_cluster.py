@@ -40,7 +40,7 @@ from mbtf_core.cluster.task import Task
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.shard_files import row_bytes, write_shard
 from mbtf_core.data.sidecar import finished_record
-from mbtf_core.data.store import Store
+from mbtf_core.data.store import ObjectStore
 from mbtf_core.data.verify import verify
 from mbtf_core.files.digest import file_sha256
 from mbtf_core.units import clock
@@ -146,7 +146,7 @@ def measure_store(options: argparse.Namespace) -> int:
             summary = generate(config, folder)
             figures[f"seconds of generation, {'store' if folder == URL else 'local'}"] = summary.seconds
         copy = Path(shutil.copytree(local, Path(name) / "copy"))
-        store = Store(URL)
+        store = ObjectStore(URL)
         for path in sorted(local.glob("*.npz")):
             assert store.read(path.name) == path.read_bytes(), path.name
         figures["loading, cold cache"] = round(started(URL, "4GB")[1], 2)
@@ -191,7 +191,7 @@ def run_tasks(cluster: Cluster, count: int, function: str, arguments: dict[str, 
 def shard_seconds(folder: Path) -> list[float]:
     """Seconds of each training shard, by its sidecar."""
     data = Dataset.open(folder)
-    records = [finished_record(folder, e, data.manifest["config_hash"]) for e in data.entries("train")]
+    records = [finished_record(data.folder, e, data.manifest["config_hash"]) for e in data.entries("train")]
     return [record["seconds"] for record in records if record is not None]
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.directions import ELEVATION_BANDS
 from mbtf_core.errors import InputError
@@ -154,7 +155,7 @@ def evaluate_splits(predict: Predict, data: Dataset, partition: Partition) -> di
     }
 
 
-def foreign_inputs(material: Material, shards: str | Path) -> list[str]:
+def foreign_inputs(material: Material, shards: str | Path | DataFolder) -> list[str]:
     """Inputs (height, base_color, …) that differ between a data set and the training data of a material;
     empty where either records none."""
     trained, given = material.description["data"].get("inputs"), Dataset.open(shards).manifest.get("inputs")
@@ -179,7 +180,7 @@ class Evaluation:
     transmittance: dict[str, TransmittanceError] | None
 
 
-def evaluate(material: Material, shards: str | Path) -> Evaluation:
+def evaluate(material: Material, shards: str | Path | DataFolder) -> Evaluation:
     """Evaluate a fitted material on a data set of either layout.
 
     Held-out queries are selected by the material's own configuration; they are held out only in the data set

@@ -168,9 +168,9 @@ class _RecipeRun:
 
     def _generate(self, data: DataSet, decision: Decision) -> float:
         from mbtf_core.data.dataset import is_dataset
-        from mbtf_core.data.folder import read_manifest
+        from mbtf_core.data.folder import sidecar_name
+        from mbtf_core.data.manifest import read_manifest
         from mbtf_core.data.schema import MANIFEST_NAME
-        from mbtf_core.data.sidecar import sidecar_of
         from mbtf_gen.generation.run import generate
         from mbtf_gen.job import Job
 
@@ -179,7 +179,7 @@ class _RecipeRun:
         for path in decision.changed_files:
             if path.name != MANIFEST_NAME:
                 path.unlink(missing_ok=True)
-                sidecar_of(path).unlink(missing_ok=True)
+                path.with_name(sidecar_name(path.name)).unlink(missing_ok=True)
         # A lost or damaged manifest is refused: the shards may be whole.
         if (
             decision.forced

@@ -23,7 +23,6 @@ from uuid import uuid4
 from mbtf_core.cluster.config import ClusterConfig, read_cluster
 from mbtf_core.cluster.task import GPUS_VARIABLE, THREADS_VARIABLE, Task, TaskResult, run_task
 from mbtf_core.errors import InputError, PartialError, UsageError, reason
-from mbtf_core.locks import RENEW_SECONDS, STALE_SECONDS
 from mbtf_core.suggest import suggest_name
 from mbtf_core.units import format_duration
 
@@ -36,7 +35,7 @@ _LOOK_SECONDS = 2.0
 # The same until the first one has started.
 _START_SECONDS = 0.1
 # A task whose files another process works on is tried at this interval, until locks of dead ones have ended.
-_PAUSE_SECONDS, _LOCKED_SECONDS = 10.0, STALE_SECONDS + 2 * RENEW_SECONDS
+_PAUSE_SECONDS, _LOCKED_SECONDS = 10.0, 420.0
 # Seconds in which a scheduler must answer.
 _CONNECT_SECONDS = 30.0
 _RESUMES = "the same command goes on with the rest"

@@ -150,7 +150,7 @@ def build(
         raise error(what, where=where, hint=hint) from None
 
 
-def check_schema(document: Mapping[str, Any], version: int, where: Path, hint: str) -> None:
+def check_schema(document: Mapping[str, Any], version: int, where: object, hint: str) -> None:
     """Refuse a JSON document of the programs that another version of them wrote.
 
     Raises
@@ -163,7 +163,7 @@ def check_schema(document: Mapping[str, Any], version: int, where: Path, hint: s
         raise InputError(what, where=where, hint=hint)
 
 
-def check_document(model: type[B], data: Mapping[str, Any], path: Path, hint: str) -> B:
+def check_document(model: type[B], data: Mapping[str, Any], path: object, hint: str) -> B:
     """A JSON document of the programs as `model`.
 
     Raises

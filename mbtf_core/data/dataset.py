@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
@@ -11,20 +11,23 @@ import numpy as np
 from pydantic import BaseModel, Field
 
 from mbtf_core.config.settings import check_document, check_schema
-from mbtf_core.data.data_folder import data_folder, limit_cache
+from mbtf_core.data.folder import DataFolder, sidecar_name
 from mbtf_core.data.geometry import Geometry, read_geometry
 from mbtf_core.data.lattice import MAX_LEVEL, Lattice
 from mbtf_core.data.schema import ARRAY, FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, Layout, ShardEntry, Split
 from mbtf_core.data.shard_files import Arrays, check_values, column_means, read_shard
-from mbtf_core.data.sidecar import ABSENT, CHANGED, read_sidecar, repair_hint, sidecar_of, sidecars
+from mbtf_core.data.sidecar import ABSENT, CHANGED, read_sidecar, repair_hint
 from mbtf_core.errors import InputError
-from mbtf_core.files.atomic import read_checksummed, read_json
 from mbtf_core.files.digest import file_sha256
 from mbtf_core.suggest import suggest_path
 
 _Count = Annotated[int, Field(strict=True, ge=0, lt=1 << 40)]
 _FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*\.(npz|exr)$", max_length=100)]
 _MAKE_AGAIN = "generate or download the data set again"
+# Shards that are downloaded ahead of their reader.
+_AHEAD = 2
+# Times that a shard is downloaded again because it has left the cache.
+_READS = 8
 # The sidecar's mean and that of the shard are float64 sums in different orders.
 _SAME_MEAN = 1e-7
 
@@ -73,6 +76,7 @@ class _Sidecar(BaseModel):
     """Keys of a sidecar that readers need; others are ignored."""
 
     statistics: _Statistics
+    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
 @dataclass(frozen=True)
@@ -81,8 +85,10 @@ class Shard:
 
     Attributes
     ----------
-    path : Path
-        Its file.
+    folder : DataFolder
+        The data set that it belongs to.
+    file : str
+        Name of its file.
     sidecar : dict
         The content of its sidecar.
     image : tuple of int
@@ -92,7 +98,8 @@ class Shard:
         Independent estimates of every value: 2, or 1 of measured data.
     """
 
-    path: Path
+    folder: DataFolder
+    file: str
     sidecar: dict[str, Any]
     image: tuple[int, ...] = ()
     estimates: int = 2
@@ -101,6 +108,40 @@ class Shard:
     def rows(self) -> int:
         """Queries in the shuffled layout, images in the image layout, positions in the slices layout."""
         return int(self.sidecar["rows"])
+
+    @property
+    def where(self) -> str:
+        """Path or URL of its file, for messages."""
+        return self.folder.at(self.file)
+
+    def local(self) -> Path:
+        """A local file with its content: itself, or a checked copy in the cache.
+
+        Raises
+        ------
+        InputError
+            It is missing, or not the shard that its sidecar describes.
+        PartialError
+            Its store cannot be reached, or the disk is full.
+        """
+        return self.folder.file(self.file, str(self.sidecar["sha256"]), int(self.sidecar["bytes"]))
+
+    def prefetch(self) -> None:
+        """Start to download it in the background if it is in a store."""
+        self.folder.prefetch(self.file, str(self.sidecar["sha256"]))
+
+    def map(self, names: Iterable[str] | None = None) -> Arrays:
+        """Its arrays, memory-mapped if the format allows, their numbers unchecked; see :meth:`read`."""
+        wanted = None if names is None else list(names)
+        for last in (*[False] * _READS, True):
+            path = self.local()
+            try:
+                return read_shard(path, wanted)
+            except InputError as error:
+                # Other readers may have made room in the cache before it was opened.
+                if last or path.exists() or not self.folder.has(self.file):
+                    raise InputError(error.what, where=self.where, hint=error.hint) from None
+        raise AssertionError
 
     def read(self, names: Iterable[str] | None = None) -> Arrays:
         """Its arrays, memory-mapped if the format allows, every number checked.
@@ -122,33 +163,42 @@ class Shard:
             values, the numbers of a shard that was copied over another of the same size are returned;
             ``mbtf-gen verify`` compares digests and finds it.
         """
-        arrays = read_shard(self.path, names)
-        hint = f"check the data set with: mbtf-gen verify {self.path.parent}"
+        arrays = self.map(names)
+        hint = f"check the data set with: mbtf-gen verify {self.folder}"
         for name, array in arrays.items():
             rows, image = len(array), array.shape[1 : array.ndim - len(ARRAY[name].trailing)]
             if rows != self.rows:
                 what = f"has {rows} rows, its sidecar says {self.rows}"
-                raise InputError(what, where=self.path, hint=hint)
+                raise InputError(what, where=self.where, hint=hint)
             if image != self.image:
                 found, expected = (" x ".join(map(str, s)) or "1" for s in (image, self.image))
                 what = f"has {found} queries per row, {MANIFEST_NAME} says {expected}"
-                raise InputError(what, where=self.path, hint=hint)
+                raise InputError(what, where=self.where, hint=hint)
         try:
-            check_values(arrays, self.path)
+            check_values(arrays, self.where)
         except InputError as error:
-            raise InputError(error.what, where=self.path, hint=hint) from None
+            raise InputError(error.what, where=self.where, hint=hint) from None
         halves = ("value_a", "value_b")[: self.estimates]
         if self.rows and all(name in arrays for name in halves):
             mean = np.mean([column_means(arrays[name]) for name in halves], axis=0)
             stated = np.asarray(self.sidecar["statistics"]["mean_value"])
             if np.abs(mean - stated).max() > _SAME_MEAN * np.abs(stated).max():
-                raise InputError("is not the shard that its sidecar describes", where=self.path, hint=hint)
+                raise InputError("is not the shard that its sidecar describes", where=self.where, hint=hint)
         return arrays
 
 
-def is_dataset(folder: Path) -> bool:
+def ahead(shards: Sequence[Shard]) -> Iterator[Shard]:
+    """Shards in order, of which the next ones are downloaded ahead if they are in a store."""
+    for index, shard in enumerate(shards):
+        for following in shards[index + 1 : index + 1 + _AHEAD]:
+            following.prefetch()
+        yield shard
+
+
+def is_dataset(folder: str | Path | DataFolder) -> bool:
     """Whether a folder contains a data set, possibly without its manifest."""
-    return (folder / MANIFEST_NAME).exists() or bool(sidecars(folder))
+    found = folder if isinstance(folder, DataFolder) else DataFolder.open(folder)
+    return found.has(MANIFEST_NAME) or bool(found.sidecars())
 
 
 @dataclass(frozen=True)
@@ -157,22 +207,22 @@ class Dataset:
 
     Attributes
     ----------
-    folder : Path
-        Its folder.
+    folder : DataFolder
+        Its files.
     manifest : dict
         The content of ``manifest.json``.
     """
 
-    folder: Path
+    folder: DataFolder
     manifest: dict[str, Any]
 
     @classmethod
-    def open(cls, folder: str | Path, cache: float | None = None) -> Dataset:
+    def open(cls, folder: str | Path | DataFolder, cache: float | None = None) -> Dataset:
         """Open a folder of shards.
 
         Parameters
         ----------
-        folder : str or Path
+        folder : str, Path or DataFolder
             The data set: a path, or a URL such as ``s3://bucket/data``.
         cache : float, optional
             Bytes of local disk for shards of object stores; 20 GB by default.
@@ -188,26 +238,22 @@ class Dataset:
         PartialError
             The store cannot be reached.
         """
-        folder = data_folder(folder)
+        folder = DataFolder.open(folder)
         if cache is not None:
-            limit_cache(folder, cache)
-        if not folder.is_dir():
-            raise InputError("no such folder", where=folder, hint=suggest_path(folder, Path.is_dir))
-        path = folder / MANIFEST_NAME
-        if not path.exists():
-            lost = repair_hint(folder) if is_dataset(folder) else ""
-            raise InputError(
-                f"no {MANIFEST_NAME} in it",
-                where=folder,
-                hint=lost or "generate one: mbtf-gen heightfield.exr -o FOLDER",
-            )
+            folder.cache.limit = cache
+        if not folder.exists():
+            raise InputError("no such folder", where=folder, hint=suggest_path(folder.workspace, Path.is_dir))
         hint = repair_hint(folder)
-        manifest = read_json(path, hint)
+        if not folder.has(MANIFEST_NAME):
+            hint = hint if is_dataset(folder) else "generate one: mbtf-gen heightfield.exr -o FOLDER"
+            raise InputError(f"no {MANIFEST_NAME} in it", where=folder, hint=hint)
+        path = folder.at(MANIFEST_NAME)
+        manifest = folder.read_json(MANIFEST_NAME, hint)
         if manifest.get("format") != FORMAT_NAME:
-            hint = hint if sidecars(folder) else ""
+            hint = hint if folder.sidecars() else ""
             raise InputError(f"is not a manifest of {FORMAT_NAME}", where=path, hint=hint)
         if manifest.get("schema") == SCHEMA_VERSION or "checksum" in manifest:
-            read_checksummed(path, hint)
+            folder.read_checksummed(MANIFEST_NAME, hint)
         check_schema(
             manifest, SCHEMA_VERSION, path, "generate the shards again with this version of mbtf-gen"
         )
@@ -274,7 +320,6 @@ class Dataset:
             image = (int(self.manifest["slice_size"] or 1) if split == "train" else 1,)
         out = []
         for entry in self.entries(split):
-            path = self.folder / entry.file
             try:
                 record = read_sidecar(self.folder, entry, self.manifest["config_hash"])
             except InputError as error:
@@ -287,9 +332,9 @@ class Dataset:
                         hint="run the mbtf-gen command that generated it again: it resumes",
                     ) from None
                 hint = f"check the data set with: mbtf-gen verify {self.folder}"
-                raise InputError(error.what, where=path, hint=hint) from None
-            check_document(_Sidecar, record, sidecar_of(path), _MAKE_AGAIN)
-            out.append(Shard(path, record, image, self.estimates))
+                raise InputError(error.what, where=self.folder.at(entry.file), hint=hint) from None
+            check_document(_Sidecar, record, self.folder.at(sidecar_name(entry.file)), _MAKE_AGAIN)
+            out.append(Shard(self.folder, entry.file, record, image, self.estimates))
         return out
 
     def geometry(self) -> Geometry | None:
@@ -308,15 +353,17 @@ class Dataset:
         record = self.manifest["geometry"]
         if record is None:
             return None
-        path, hint = self.folder / record["file"], repair_hint(self.folder)
+        name, hint = record["file"], repair_hint(self.folder)
+        where = self.folder.at(name)
+        if not self.folder.has(name):
+            raise InputError(ABSENT[0], where=where, hint=hint)
+        path = self.folder.file(name, record["sha256"])
         try:
             changed = file_sha256(path) != record["sha256"]
-        except FileNotFoundError:
-            raise InputError(ABSENT[0], where=path, hint=hint) from None
         except OSError as error:
-            raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+            raise InputError(f"cannot be read ({error.strerror})", where=where) from None
         if changed:
-            raise InputError(CHANGED, where=path, hint=hint)
+            raise InputError(CHANGED, where=where, hint=hint)
         return read_geometry(path)
 
     def iterate(self, split: str, names: Iterable[str] | None = None) -> Iterator[Arrays]:
@@ -340,7 +387,7 @@ class Dataset:
             See :meth:`shards` and :meth:`Shard.read`.
         """
         wanted = None if names is None else list(names)
-        yield from (shard.read(wanted) for shard in self.shards(split))
+        yield from (shard.read(wanted) for shard in ahead(self.shards(split)))
 
     def load(self, split: str, names: Iterable[str] | None = None) -> Arrays:
         """All queries of a split in memory.

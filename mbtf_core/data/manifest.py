@@ -5,8 +5,12 @@ from __future__ import annotations
 import platform
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Any
 
+from mbtf_core.data.folder import DataFolder
+from mbtf_core.data.schema import MANIFEST_NAME
+from mbtf_core.data.sidecar import repair_hint
 from mbtf_core.files.digest import data_sha256
 
 CHECK_HINT = "check the data set with: mbtf-gen verify"
@@ -33,3 +37,9 @@ def plan_digest(manifest: Mapping[str, Any]) -> str:
     decided = {key: plan.get(key) for key in ("max_depth", "roulette_depth", "closed_form")}
     on = sorted(effect["name"] for effect in plan.get("effects", []) if effect["on"])
     return data_sha256({**decided, "effects": on, "allocation": manifest.get("allocation")})
+
+
+def read_manifest(folder: str | Path | DataFolder) -> dict[str, Any]:
+    """The manifest of a folder; an InputError unless it is exactly as it was written."""
+    found = folder if isinstance(folder, DataFolder) else DataFolder.open(folder)
+    return found.read_checksummed(MANIFEST_NAME, repair_hint(found))

@@ -18,7 +18,6 @@ import numpy as np
 from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
-from mbtf_core.data.data_folder import read_local
 from mbtf_core.data.schema import ARRAY, ARRAYS
 from mbtf_core.errors import InputError, reason
 from mbtf_core.files.atomic import Stored, write_chunks
@@ -287,15 +286,10 @@ def read_shard(path: Path, names: Iterable[str] | None = None, *, mapped: bool =
     Raises
     ------
     InputError : missing, corrupt, or arrays with inconsistent shapes
-    PartialError : its store cannot be reached
     """
     refuse_special(path)
     wanted = None if names is None else list(names)
-
-    def read(file: Path) -> Arrays:
-        return read_exr(file, wanted) if path.suffix == ".exr" else read_npz(file, wanted, mapped=mapped)
-
-    arrays = read_local(path, read)
+    arrays = read_exr(path, wanted) if path.suffix == ".exr" else read_npz(path, wanted, mapped=mapped)
     if arrays:
         check_arrays(arrays, path, complete=False)
     return arrays

@@ -1,12 +1,12 @@
-"""One folder of an object store, such as ``s3://bucket/data``, through fsspec.
+"""Where the files of a data set lie: a local folder, or a folder of an object store through fsspec.
 
-A connection that drops is tried again with growing pauses until the patience ends. Objects are written whole:
-a store shows an object only once all of it has arrived.
+A store lists, reads, writes once and deletes. Files are written whole: a store shows a file only once all of
+it has arrived.
 """
 
 from __future__ import annotations
 
-import errno
+import contextlib
 import logging
 import os
 import threading
@@ -15,9 +15,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
+from urllib.parse import unquote
 
-from mbtf_core.errors import EngineError, InputError, MbtfError, PartialError, UsageError, reason, unwritable
+from mbtf_core.errors import EngineError, InputError, MbtfError, PartialError, UsageError, reason
+from mbtf_core.files.atomic import create_file, remove_file, write_chunks
+from mbtf_core.suggest import refuse_special
+from mbtf_core.urls import split_url
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -37,7 +41,6 @@ _REFUSED = (
 )
 # Packages of protocols that the extra `stores` leaves out.
 _PACKAGES = {"gs": "gcsfs", "gcs": "gcsfs", "abfs": "adlfs", "az": "adlfs"}
-_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 _REFUSED_NAMES = (
     "NoCredentialsError",
     "PartialCredentialsError",
@@ -62,15 +65,73 @@ _EXISTS, _UNCONDITIONAL = ("PreconditionFailed", "412"), ("NotImplemented", "501
 
 
 @dataclass(frozen=True)
-class StoredObject:
-    """An object of a store: size in bytes, and a text that changes with its content (empty: unknown)."""
+class StoredFile:
+    """A file of a store: size in bytes, and a text that changes with its content (empty: unknown)."""
 
     size: int
     tag: str
 
 
-class Store:
-    """The objects of one folder of a store, by name.
+class Store(Protocol):
+    """A folder of files, by name.
+
+    Attributes
+    ----------
+    url : path or URL, for messages
+    """
+
+    url: str
+
+    def list(self) -> dict[str, StoredFile]:
+        """All files and folders, without those in sub-folders; names of folders end with "/"."""
+
+    def read(self, name: str) -> bytes:
+        """Content of a file; a FileNotFoundError where there is none."""
+
+    def write(self, name: str, content: bytes, *, new: bool = False) -> bool:
+        """Write a file whole; False where `new`, and another file has that name."""
+
+    def delete(self, name: str) -> None:
+        """Delete a file, if it is there."""
+
+
+class LocalStore:
+    """A local folder, which may be missing; see :class:`Store`."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.url = str(folder)
+
+    def list(self) -> dict[str, StoredFile]:
+        """All files and folders; names of folders end with "/"."""
+        found = {}
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError), os.scandir(self.folder) as entries:
+            for entry in entries:
+                # Other processes remove their locks and unfinished files.
+                with contextlib.suppress(FileNotFoundError):
+                    found[entry.name + "/" * entry.is_dir()] = StoredFile(entry.stat().st_size, "")
+        return found
+
+    def read(self, name: str) -> bytes:
+        """Content of a regular file."""
+        refuse_special(self.folder / name)
+        return (self.folder / name).read_bytes()
+
+    def write(self, name: str, content: bytes, *, new: bool = False) -> bool:
+        """Write a file atomically; False where `new`, and there is one."""
+        if new:
+            return create_file(self.folder / name, content)
+        write_chunks(self.folder / name, [content])
+        return True
+
+    def delete(self, name: str) -> None:
+        """Delete a file for good, if it is there."""
+        remove_file(self.folder / name)
+
+
+class ObjectStore:
+    """The objects of one folder of an object store, by name; see :class:`Store`. A connection that drops is
+    tried again with growing pauses until the patience ends.
 
     Parameters
     ----------
@@ -156,7 +217,7 @@ class Store:
                 time.sleep(pause)
                 pause = min(2.0 * pause, _LONGEST_PAUSE)
 
-    def list(self) -> dict[str, StoredObject]:
+    def list(self) -> dict[str, StoredFile]:
         """All objects and folders, without those in sub-folders; names of folders end with "/"."""
 
         def request() -> list[dict[str, Any]]:
@@ -173,43 +234,12 @@ class Store:
             parent, _, name = str(info["name"]).rstrip("/").rpartition("/")
             if name and parent.lstrip("/") == self._root.lstrip("/"):
                 is_folder = info["type"] == "directory"
-                out[name + "/" * is_folder] = StoredObject(int(info.get("size") or 0), _tag(info))
+                out[name + "/" * is_folder] = StoredFile(int(info.get("size") or 0), _tag(info))
         return out
-
-    def info(self, name: str) -> StoredObject:
-        """Size and tag of an object; a FileNotFoundError where there is none."""
-
-        def request() -> dict[str, Any]:
-            self._files.invalidate_cache()
-            found: dict[str, Any] = self._files.info(self._at(name))
-            return found
-
-        found = self._request(name, request)
-        return StoredObject(int(found.get("size") or 0), _tag(found))
 
     def read(self, name: str) -> bytes:
         """Content of an object; a FileNotFoundError where there is none."""
         return bytes(self._request(name, lambda: self._files.cat_file(self._at(name))))
-
-    def download(self, name: str, path: Path) -> None:
-        """Copy an object to a file, which an interruption leaves incomplete; a FileNotFoundError where there
-        is none.
-
-        Raises
-        ------
-        PartialError : the store cannot be reached, or the disk is full
-        """
-
-        def request() -> None:
-            try:
-                self._files.get_file(self._at(name), str(path))
-            except OSError as error:
-                # The network raises the same class with other numbers, and without the file.
-                if error.errno in _DISK or error.filename == str(path):
-                    raise unwritable(path, error) from None
-                raise
-
-        self._request(name, request)
 
     def write(self, name: str, content: bytes, *, new: bool = False) -> bool:
         """Write an object whole.
@@ -256,6 +286,25 @@ class Store:
             self._request(name, lambda: self._files.rm_file(self._at(name)))
         except FileNotFoundError:
             return
+
+
+def open_store(where: str | Path) -> Store:
+    """The store of a path, or of a URL such as ``s3://bucket/data``; ``file://`` is a local path.
+
+    Raises
+    ------
+    EngineError : the package of the protocol is not installed
+    InputError : the URL is invalid
+    """
+    url = split_url(where)
+    if url is None:
+        return LocalStore(Path(where))
+    protocol, rest = url
+    if protocol in ("file", "local"):
+        return LocalStore(Path(unquote(f"/{rest}")))
+    if not rest.strip("/"):
+        raise InputError("names no bucket", where=where, hint="such as s3://bucket/data")
+    return ObjectStore(f"{protocol}://{rest}")
 
 
 def _is_refusal(error: Exception) -> bool:

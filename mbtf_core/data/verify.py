@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import threading
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.data.data_folder import data_folder, fresh_copy
 from mbtf_core.data.dataset import Dataset
-from mbtf_core.data.folder import is_leftover
+from mbtf_core.data.folder import DataFolder, is_leftover, sidecar_name
 from mbtf_core.data.manifest import plan_digest
 from mbtf_core.data.schema import CONFIG_NAME, GEOMETRY_NAME, MANIFEST_NAME, ShardEntry
 from mbtf_core.data.shard_files import check_arrays, check_values, read_shard
-from mbtf_core.data.sidecar import ABSENT, CHANGED, read_sidecar, repair_hint, sidecar_of
+from mbtf_core.data.sidecar import ABSENT, CHANGED, read_sidecar, repair_hint
 from mbtf_core.errors import InputError, reason
 from mbtf_core.files.digest import file_sha256
 
@@ -50,11 +50,13 @@ class Fault:
     hint: str
 
 
-def examine(folder: Path, entry: ShardEntry, config_hash: str) -> tuple[dict[str, Any] | None, str | None]:
+def examine(
+    folder: DataFolder, entry: ShardEntry, config_hash: str
+) -> tuple[dict[str, Any] | None, str | None]:
     """(sidecar, None) or (None, fault) of a shard, whose whole file is read."""
     try:
         record = read_sidecar(folder, entry, config_hash)
-        with fresh_copy(folder / entry.file) as file:
+        with folder.fresh(entry.file) as file:
             _check_content(file, entry.rows, record)
         return record, None
     except InputError as error:
@@ -75,20 +77,22 @@ def _check_content(path: Path, rows: int, record: dict[str, Any]) -> None:
     check_values(arrays, path)
 
 
-def _document_faults(dataset: Dataset) -> Iterator[Fault]:
-    digests = {CONFIG_NAME: dataset.manifest.get("config_yaml")}
-    if dataset.manifest["geometry"] is not None:
-        digests[GEOMETRY_NAME] = dataset.manifest["geometry"]["sha256"]
-    hint = repair_hint(dataset.folder)
+def document_faults(folder: DataFolder, manifest: Mapping[str, Any]) -> Iterator[Fault]:
+    """Faults of configuration and geometry, whose digests a manifest contains."""
+    digests = {CONFIG_NAME: manifest.get("config_yaml")}
+    if manifest["geometry"] is not None:
+        digests[GEOMETRY_NAME] = manifest["geometry"]["sha256"]
+    hint = repair_hint(folder)
     for name, digest in digests.items():
-        path = dataset.folder / name
-        if not path.exists():
+        if not folder.has(name):
             yield Fault(name, ABSENT[0], hint)
-        elif file_sha256(path) != digest:
+        elif hashlib.sha256(folder.read(name)).hexdigest() != digest:
             yield Fault(name, CHANGED, hint)
 
 
-def shard_faults(folder: Path, entries: Sequence[ShardEntry], config_hash: str, plan: str) -> Iterator[Fault]:
+def shard_faults(
+    folder: DataFolder, entries: Sequence[ShardEntry], config_hash: str, plan: str
+) -> Iterator[Fault]:
     """Faults of the listed shards, read by several threads.
 
     Parameters
@@ -117,21 +121,20 @@ def shard_faults(folder: Path, entries: Sequence[ShardEntry], config_hash: str, 
                 yield Fault(entry.file, fault, _RESUME if fault in ABSENT else hint)
 
 
-def foreign_files(folder: Path, entries: Iterable[ShardEntry]) -> list[str]:
+def foreign_files(folder: DataFolder, entries: Iterable[ShardEntry]) -> list[str]:
     """Names in a folder that are no part of the data set with these shards; folders end with "/"."""
     own = {MANIFEST_NAME, CONFIG_NAME, GEOMETRY_NAME}
     for entry in entries:
-        own |= {entry.file, sidecar_of(Path(entry.file)).name}
-    found = (path for path in folder.iterdir() if path.name not in own and not is_leftover(path.name))
-    return sorted(path.name + "/" * path.is_dir() for path in found)
+        own |= {entry.file, sidecar_name(entry.file)}
+    return [name for name in folder.names() if name not in own and not is_leftover(name)]
 
 
-def verify(folder: str | Path) -> list[Fault]:
+def verify(folder: str | Path | DataFolder) -> list[Fault]:
     """Find all faults of a data set: changed, truncated, missing or foreign shards, an unfinished manifest.
 
     Parameters
     ----------
-    folder : str or Path
+    folder : str, Path or DataFolder
         The data set: a path or a URL.
 
     Returns
@@ -146,9 +149,9 @@ def verify(folder: str | Path) -> list[Fault]:
     PartialError
         The store cannot be reached.
     """
-    folder = data_folder(folder)
+    folder = DataFolder.open(folder)
     dataset = Dataset.open(folder)
-    faults = list(_document_faults(dataset))
+    faults = list(document_faults(folder, dataset.manifest))
     entries = [entry for split in dataset.splits for entry in dataset.entries(split)]
     faults += shard_faults(folder, entries, dataset.manifest["config_hash"], plan_digest(dataset.manifest))
     if not faults and not dataset.manifest.get("complete"):

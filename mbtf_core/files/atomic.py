@@ -206,43 +206,39 @@ def write_checksummed(path: Path, data: Mapping[str, Any]) -> None:
     write_chunks(path, [checksummed(data)])
 
 
-def read_checksummed(path: Path, hint: str = "") -> dict[str, Any]:
+def parse_checksummed(content: bytes, where: object, hint: str = "") -> dict[str, Any]:
     """JSON object of a checksummed document, its checksum left out.
 
     Parameters
     ----------
-    path : Path
+    content : of the document
+    where : its name, for messages
     hint : what to do about a damaged document
 
     Raises
     ------
-    InputError : missing, unreadable, not a JSON object, or not what was written
+    InputError : not a JSON object, or not what was written
     """
-    content, data = _read_json(path, hint)
+    data = parse_json(content, where, hint)
     try:
         unchanged = checksummed(data) == content
     except (ValueError, RecursionError):  # a number beyond float64; nested too deeply
         unchanged = False
     if not unchanged:
-        raise InputError("has changed since it was written (its checksum differs)", where=path, hint=hint)
+        raise InputError("has changed since it was written (its checksum differs)", where=where, hint=hint)
     del data[_CHECKSUM]
     return data
 
 
-def _read_json(path: Path, hint: str = "") -> tuple[bytes, dict[str, Any]]:
-    refuse_special(path)
+def parse_json(content: bytes, where: object, hint: str = "") -> dict[str, Any]:
+    """A JSON object; parameters and errors as :func:`parse_checksummed`."""
     try:
-        content = path.read_bytes()
         data = json.loads(content.decode(), parse_constant=_refuse_constant)
-    except FileNotFoundError:
-        raise InputError("no such file", where=path, hint=hint) from None
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
     except (ValueError, RecursionError) as error:
-        raise InputError(f"not readable as JSON ({reason(error)})", where=path, hint=hint) from None
+        raise InputError(f"not readable as JSON ({reason(error)})", where=where, hint=hint) from None
     if not isinstance(data, dict):
-        raise InputError("must hold a JSON object", where=path, hint=hint)
-    return content, data
+        raise InputError("must hold a JSON object", where=where, hint=hint)
+    return data
 
 
 def read_json(path: Path, hint: str = "") -> dict[str, Any]:
@@ -257,7 +253,14 @@ def read_json(path: Path, hint: str = "") -> dict[str, Any]:
     ------
     InputError : missing, unreadable, or not a JSON object
     """
-    return _read_json(path, hint)[1]
+    refuse_special(path)
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        raise InputError("no such file", where=path, hint=hint) from None
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+    return parse_json(content, path, hint)
 
 
 def _refuse_constant(name: str) -> None:

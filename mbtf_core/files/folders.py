@@ -17,7 +17,7 @@ from typing import Any
 from mbtf_core.config.nested import differences, in_short
 from mbtf_core.errors import InputError, LockedError, PartialError
 from mbtf_core.files.atomic import TEMPORARY, remove_file
-from mbtf_core.locks import keep_renewing, lock_owner, take_lock
+from mbtf_core.locks import lock_owner, take_lock
 from mbtf_core.units import size_text
 
 # Names of temporary files and locks, such as a killed process leaves.
@@ -61,8 +61,7 @@ def owned(folder: Path, elsewhere: str = ELSEWHERE) -> Iterator[None]:
             hint=f"wait for it and run the same command again, or {elsewhere}",
         )
     try:
-        with keep_renewing():
-            yield
+        yield
     finally:
         lock.release()
         if made:
@@ -152,13 +151,18 @@ def make_folder(folder: Path) -> None:
 
 
 def other_configuration(
-    folder: Path, what: str, old: Mapping[str, Any], new: Mapping[str, Any], otherwise: str = "inputs differ"
+    folder: object,
+    what: str,
+    old: Mapping[str, Any],
+    new: Mapping[str, Any],
+    otherwise: str = "inputs differ",
 ) -> InputError:
     """Error for a folder that was written with another configuration.
 
     Parameters
     ----------
-    folder : Path
+    folder : Path or DataFolder
+        For the message.
     what : str
         Content of the folder, for the message.
     old, new : mapping

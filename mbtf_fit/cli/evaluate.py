@@ -26,23 +26,23 @@ def evaluate(
     shards
         Folder made by mbtf-gen, or its URL.
     """
-    from mbtf_core.data.data_folder import data_folder
+    from mbtf_core.data.folder import DataFolder
     from mbtf_fit.evaluation import evaluate, foreign_inputs
     from mbtf_fit.material.material import Material
 
-    loaded, shards = Material.load(material), data_folder(shards)
-    foreign = foreign_inputs(loaded, shards)
+    loaded, folder = Material.load(material), DataFolder.open(shards)
+    foreign = foreign_inputs(loaded, folder)
     if foreign:
         console.note(
-            f"warning: {shards} was made from another material than {material} was trained on "
+            f"warning: {folder} was made from another material than {material} was trained on "
             f"({', '.join(foreign)} differ{'s' if len(foreign) == 1 else ''}); the errors compare two "
             "materials and do not measure the quality of the fit"
         )
-    found = evaluate(loaded, shards)
+    found = evaluate(loaded, folder)
     errors = {name: e.as_dict() for name, e in found.values.items()}
     through = {name: e.as_dict() for name, e in (found.transmittance or {}).items()}
     lines = [
-        f"{material}: {loaded.config.model} on {shards}",
+        f"{material}: {loaded.config.model} on {folder}",
         *report_errors(errors, through, verbose, foreign=bool(foreign)),
     ]
     report = {"material": material, "shards": shards, "foreign_inputs": foreign, "errors": errors}

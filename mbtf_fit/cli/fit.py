@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
@@ -34,6 +34,10 @@ from mbtf_fit.formatting import describe_fit, fits_table
 @options_from(FitConfig)
 class FitOptions(Options[FitConfig]):
     """Options of ``mbtf-fit``."""
+
+
+if TYPE_CHECKING:
+    from mbtf_core.data.folder import DataFolder
 
 
 def fit(
@@ -99,16 +103,17 @@ def fit(
         _fit_many(options, quality, many, output, processes, cluster, overwrite, console)
         return
     assert shards is not None
-    from mbtf_core.data.data_folder import data_folder
+    from mbtf_core.data.folder import DataFolder
 
-    shards = data_folder(shards)
-    resolved = resolve_config(options, quality, shards)
+    data_folder = DataFolder.open(shards)
+    resolved = resolve_config(options, quality, data_folder)
     if dry_run:
         from mbtf_fit.training.forecast import forecast_fit
 
-        expected = forecast_fit(resolved, shards)
+        expected = forecast_fit(resolved, data_folder)
         console.report(
-            {"shards": shards, "model": resolved.model, "forecast": asdict(expected)}, expected.describe()
+            {"shards": str(data_folder), "model": resolved.model, "forecast": asdict(expected)},
+            expected.describe(),
         )
         return
     from mbtf_core.files.folders import check_space
@@ -123,16 +128,16 @@ def fit(
     finished = not overwrite and (output / DESCRIPTION_NAME).exists()
     partition = None
     if not finished:
-        data = open_data(shards, MODELS[resolved.model].layout, resolved.model)
+        data = open_data(data_folder, MODELS[resolved.model].layout, resolved.model)
         size = fit_bytes(resolved, data.lattice)
         check_space(output, size, "reduce network.channels, or choose another folder with -o")
         training = resolved.training
         budget = format_duration(training.time) if training.steps is None else f"{training.steps} steps"
         console.note(
-            f"{shards} -> {output}: {resolved.model}, training for {budget} "
+            f"{data_folder} -> {output}: {resolved.model}, training for {budget} "
             "(change it with --time or --steps)"
         )
-        seconds, partition = training_seconds(resolved, shards)
+        seconds, partition = training_seconds(resolved, data_folder)
         queries = int(data.manifest["splits"]["train"].get("queries", 0))
         seconds += FIT_SECONDS + queries * query_seconds(has_transmittance(data))
         if seconds >= 60.0 or size >= 1e9:
@@ -156,7 +161,7 @@ def fit(
 
         result = fit(
             resolved,
-            shards,
+            data_folder,
             output,
             overwrite=overwrite,
             progress=lambda fraction, note: bar.update(round(100 * fraction, 1), note),
@@ -172,7 +177,9 @@ def fit(
     console.report(summary, "\n".join([describe_fit(summary, verbose), *cost]))
 
 
-def resolve_config(options: Options[FitConfig], quality: Quality | None, *shards: Path) -> FitConfig:
+def resolve_config(
+    options: Options[FitConfig], quality: Quality | None, *shards: Path | DataFolder
+) -> FitConfig:
     """Configuration of a fit, or of one of several data sets. Without a model among the options, the network
     to keep decides, or the data sets."""
     from mbtf_fit.presets import fitter_options
@@ -207,7 +214,7 @@ def _kept_options(folder: object) -> dict[str, Any]:
     return Decoder.find(folder).options()
 
 
-def _model_for(shards: Sequence[Path]) -> ModelName:
+def _model_for(shards: Sequence[Path | DataFolder]) -> ModelName:
     """The model that is best for a data set, or for several that share a network."""
     from mbtf_core.data.dataset import Dataset
 

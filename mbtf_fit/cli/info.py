@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.options import Verbose
@@ -11,6 +11,9 @@ from mbtf_core.errors import InputError
 from mbtf_core.suggest import suggest_path
 from mbtf_core.units import clock
 from mbtf_fit.formatting import report_errors
+
+if TYPE_CHECKING:
+    from mbtf_core.data.folder import DataFolder
 
 
 def info(path: Path, /, *, verbose: Verbose = False, console: Console = CONSOLE) -> None:
@@ -21,21 +24,21 @@ def info(path: Path, /, *, verbose: Verbose = False, console: Console = CONSOLE)
     path
         Folder made by mbtf-fit or by mbtf-gen, or the URL of a data set.
     """
-    from mbtf_core.data.data_folder import data_folder
+    from mbtf_core.data.folder import DataFolder
 
-    path = data_folder(path)
-    if not path.is_dir():
+    folder = DataFolder.open(path)
+    if not folder.exists():
         raise InputError("no such folder", where=path, hint=suggest_path(path, Path.is_dir))
     from mbtf_core.data.dataset import is_dataset
 
-    data, text = _shards_info(path) if is_dataset(path) else _material_info(path, verbose)
+    data, text = _shards_info(folder) if is_dataset(folder) else _material_info(path, verbose)
     console.report(data, text)
 
 
-def _shards_info(path: Path) -> tuple[dict[str, Any], str]:
+def _shards_info(folder: DataFolder) -> tuple[dict[str, Any], str]:
     from mbtf_core.data.dataset import Dataset
 
-    data = Dataset.open(path)
+    data = Dataset.open(folder)
     lattice = data.lattice
     rows, columns = lattice.shape()
     splits = {
@@ -43,7 +46,7 @@ def _shards_info(path: Path) -> tuple[dict[str, Any], str]:
     }
     kind = {"shuffled": "queries", "image": "images", "slices": "positions"}[data.layout]
     lines = [
-        f"{path}: shards, {data.layout} layout",
+        f"{folder}: shards, {data.layout} layout",
         f"levels 0 to {lattice.finest}, finest {columns} x {rows} texels, aspect {lattice.aspect:g}",
         *(
             f"{s}: {n['rows']} {kind} in {n['shards']} {'shard' if n['shards'] == 1 else 'shards'}"
@@ -51,7 +54,7 @@ def _shards_info(path: Path) -> tuple[dict[str, Any], str]:
         ),
     ]
     return {
-        "shards": path,
+        "shards": str(folder),
         "layout": data.layout,
         "levels": {"finest": lattice.finest, "shape": [rows, columns]},
         "aspect": lattice.aspect,

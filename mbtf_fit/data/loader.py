@@ -10,7 +10,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mbtf_core.data.dataset import Dataset, Shard
+from mbtf_core.data.dataset import Dataset, Shard, ahead
+from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.schema import Layout, Split
 from mbtf_core.errors import InputError
 from mbtf_fit.config import HeldOutSection
@@ -51,7 +52,9 @@ class Partition:
     selection: Selection
 
 
-def open_data(folder: str | Path, layout: Layout, model: str, cache: float | None = None) -> Dataset:
+def open_data(
+    folder: str | Path | DataFolder, layout: Layout, model: str, cache: float | None = None
+) -> Dataset:
     """Open a folder of shards to train a model that needs a layout; `cache` as in :meth:`Dataset.open`."""
     data = Dataset.open(folder, cache)
     if data.layout != layout:
@@ -142,7 +145,7 @@ def load_training(
     if data.layout == "slices":
         return _load_slices(data, shards, held_out, seed)
     streamed = memory is None or total * QUERY_BYTES > memory
-    if memory is not None and streamed and any(shard.path.suffix == ".exr" for shard in shards):
+    if memory is not None and streamed and any(shard.file.endswith(".exr") for shard in shards):
         raise InputError(
             f"its {total} queries take {total * QUERY_BYTES / 1e9:.3g} GB, more than data.memory allows, and "
             "EXR shards cannot be read in parts",
@@ -155,13 +158,13 @@ def load_training(
     kept_out: tuple[list[ShardQueries], list[ShardQueries]] = ([], [])
     sample: list[ShardQueries] = []
     selection = Selection()
-    for index, shard in enumerate(shards):
+    for index, shard in enumerate(ahead(shards)):
         queries = read_checked(shard)
         labels = label_queries(held_out, queries, seed, index)
         for group, label in zip(kept_out, (HELD_OUT_QUERY, HELD_OUT_DIRECTION), strict=True):
             missing = MAX_HELD_OUT - sum(map(len, group))
             group.append(queries.take(np.flatnonzero(labels == label)[:missing]))
-        selection.add(shard.path, labels == TRAINING)
+        selection.add(shard, labels == TRAINING)
         rows = np.flatnonzero(labels == TRAINING)
         # Shards store queries in random order, so the first ones are a random sample.
         sample.append(queries.take(rows[: -(-SAMPLE * len(rows) // total)]))
@@ -202,14 +205,14 @@ def _load_images(data: Dataset, shards: list[Shard], held_out: HeldOutSection, s
     sample: list[ShardQueries] = []
     selection = Selection()
     read = 0
-    for shard in shards:
+    for shard in ahead(shards):
         images = read_checked(shard)
         mine = labels[read : read + len(images)]
         read += len(images)
         for group, label in zip(kept_out, (HELD_OUT_QUERY, HELD_OUT_DIRECTION), strict=True):
             group.append(images.take(np.flatnonzero(mine == label)))
         kept = np.flatnonzero(mine == TRAINING)
-        selection.add(shard.path, mine == TRAINING)
+        selection.add(shard, mine == TRAINING)
         sample.append(sample_images(images.take(kept), -(-SAMPLE * len(kept) // count), random))
         part = slice(*selection.starts[-2:])
         u[part], sigma[part] = images.u[kept], images.sigma[kept, 0, 0]
@@ -243,16 +246,16 @@ def _load_slices(data: Dataset, shards: list[Shard], held_out: HeldOutSection, s
     kept_out: tuple[list[ShardQueries], list[ShardQueries]] = ([], [])
     sample: list[ShardQueries] = []
     selection = Selection()
-    for shard in shards:
+    for shard in ahead(shards):
         slices = read_checked(shard)
         if (slices.omega_i != light).any() or (slices.omega_o != view).any():
-            raise InputError("its slices do not share their directions", where=shard.path)
+            raise InputError("its slices do not share their directions", where=shard.where)
         for group, label in zip(kept_out, (HELD_OUT_QUERY, HELD_OUT_DIRECTION), strict=True):
             group.append(
                 _pairs(slices, labels == label, MAX_HELD_OUT * len(slices) // value.shape[0] + 1, random)
             )
         sample.append(_pairs(slices, labels == TRAINING, SAMPLE * len(slices) // value.shape[0] + 1, random))
-        selection.add(shard.path, np.ones(len(slices), bool))
+        selection.add(shard, np.ones(len(slices), bool))
         value[data.lattice.texel_of(slices.u[:, 0])] = mean_value(slices.value_a, slices.value_b)[:, kept]
     if np.isnan(value).any():
         raise InputError("lacks slices of some texels", where=data.folder, hint="generate the data set again")
@@ -281,7 +284,7 @@ def load_split(data: Dataset, split: Split, limit: int | None = None) -> ShardQu
     InputError : no such split, no queries in it, NaN or infinity, corrupt shards
     """
     parts: list[ShardQueries] = []
-    for shard in data.shards(split):
+    for shard in ahead(data.shards(split)):
         left = None if limit is None else limit - sum(map(len, parts))
         if left is None or left > 0:
             parts.append(read_checked(shard).flat().take(slice(left)))

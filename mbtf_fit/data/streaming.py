@@ -10,14 +10,13 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mbtf_core.data.data_folder import in_store, prefetch
-from mbtf_core.data.shard_files import Arrays, read_shard
+from mbtf_core.data.dataset import Shard
+from mbtf_core.data.shard_files import Arrays
 from mbtf_fit.data.queries import TrainingQueries, batch_ranges, batch_starts, mean_value, needed
 
 # Rows of a shard between two cumulative counts of selected rows.
@@ -33,12 +32,12 @@ class Selection:
 
     Attributes
     ----------
-    paths : of the shards
+    shards : in the order in which they were added
     starts : index of the first selected row of each shard, and the number of all selected rows
     """
 
     def __init__(self) -> None:
-        self.paths: list[Path] = []
+        self.shards: list[Shard] = []
         self.starts: list[int] = [0]
         self._bits: list[NDArray[np.uint8]] = []
         self._counts: list[NDArray[np.int64]] = []
@@ -50,21 +49,21 @@ class Selection:
     @property
     def in_store(self) -> bool:
         """Whether the shards are in an object store."""
-        return any(map(in_store, self.paths))
+        return any(shard.folder.local is None for shard in self.shards)
 
-    def add(self, path: Path, chosen: NDArray[np.bool_]) -> None:
+    def add(self, shard: Shard, chosen: NDArray[np.bool_]) -> None:
         """Append a shard with a mask of its selected rows."""
         blocks = np.add.reduceat(chosen, np.arange(0, len(chosen), _BLOCK), dtype=np.int64)
-        self.paths.append(path)
+        self.shards.append(shard)
         self._sizes.append(len(chosen))
         self._bits.append(np.packbits(chosen))
         self._counts.append(np.concatenate([[0], np.cumsum(blocks)]))
         self.starts.append(self.starts[-1] + int(self._counts[-1][-1]))
 
-    def masks(self) -> Iterator[tuple[Path, NDArray[np.bool_]]]:
+    def masks(self) -> Iterator[tuple[Shard, NDArray[np.bool_]]]:
         """(shard, mask of its selected rows)."""
-        for path, bits, size in zip(self.paths, self._bits, self._sizes, strict=True):
-            yield path, np.unpackbits(bits, count=size).astype(bool)
+        for shard, bits, size in zip(self.shards, self._bits, self._sizes, strict=True):
+            yield shard, np.unpackbits(bits, count=size).astype(bool)
 
     def _rows(self, shard: int, start: int, stop: int) -> NDArray[np.int64]:
         counts = self._counts[shard]
@@ -74,20 +73,20 @@ class Selection:
         rows = np.flatnonzero(np.unpackbits(bits)) + first * _BLOCK
         return rows[start - counts[first] : stop - counts[first]]
 
-    def pieces(self, start: int, stop: int) -> Iterator[tuple[Path, NDArray[np.int64]]]:
+    def pieces(self, start: int, stop: int) -> Iterator[tuple[Shard, NDArray[np.int64]]]:
         """(shard, rows) of the selected rows with indices in [start, stop)."""
         for shard, (begin, end) in enumerate(pairwise(self.starts)):
             low, high = max(start, begin), min(stop, end)
             if low < high:
-                yield self.paths[shard], self._rows(shard, low - begin, high - begin)
+                yield self.shards[shard], self._rows(shard, low - begin, high - begin)
 
     def describe(self, ranges: Sequence[range]) -> str:
         """Text that names the first few rows: ``train-00003.npz rows 17-4112``."""
         found = [piece for part in ranges for piece in self.pieces(part.start, part.stop)]
         words = [
-            f"{path.name} row{'s' if len(rows) > 1 else ''} "
+            f"{shard.file} row{'s' if len(rows) > 1 else ''} "
             + "-".join(str(r) for r in rows[[0, -1][: len(rows)]])
-            for path, rows in found[:_NAMED]
+            for shard, rows in found[:_NAMED]
         ]
         more = [f"{len(found) - _NAMED} more"] if len(found) > _NAMED else []
         return " and ".join([*words, *more])
@@ -118,8 +117,8 @@ class StreamedQueries:
     def slice(self, start: int, stop: int) -> TrainingQueries:
         """Consecutive queries, read from disk."""
         parts: list[Arrays] = []
-        for path, rows in self.selection.pieces(start, stop):
-            mapped = read_shard(path, needed(self.estimates))
+        for shard, rows in self.selection.pieces(start, stop):
+            mapped = shard.map(needed(self.estimates))
             span, inside = slice(rows[0], rows[-1] + 1), rows - rows[0]
             parts.append({name: array[span][inside] for name, array in mapped.items()})
         joined = {name: np.concatenate([p[name] for p in parts]) for name in needed(self.estimates)}
@@ -146,8 +145,8 @@ class StreamedQueries:
             return
         coming: deque[int] = deque()
         for start in starts:
-            for path, _ in self.selection.pieces(start, start + size):
-                prefetch(path)
+            for shard, _ in self.selection.pieces(start, start + size):
+                shard.prefetch()
             coming.append(start)
             if len(coming) > _AHEAD:
                 yield coming.popleft()

@@ -9,16 +9,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.dataset import Dataset, Shard
 from mbtf_core.data.lattice import Lattice, level_of_sigma
-from mbtf_core.data.shard_files import Arrays, check_values, read_shard
+from mbtf_core.data.shard_files import Arrays, check_values
 from mbtf_core.stats import Estimate, mean_estimate
 from mbtf_fit.material.transmittance import COEFFICIENTS, Transmittance, basis, corners
 from mbtf_fit.models.lookup import add_up
@@ -46,10 +45,10 @@ def has_transmittance(data: Dataset) -> bool:
     return "transmittance" in data.manifest.get("arrays", {})
 
 
-def _blocks(path: Path, chosen: NDArray[np.bool_] | None = None) -> Iterator[Arrays]:
+def _blocks(shard: Shard, chosen: NDArray[np.bool_] | None = None) -> Iterator[Arrays]:
     """Blocks of arrays (n, ...) of the chosen rows of a shard, or of all."""
-    arrays = read_shard(path, _TRAILING)
-    check_values(arrays, path)
+    arrays = shard.map(_TRAILING)
+    check_values(arrays, shard.where)
     count = len(arrays["sigma"])
     rows = np.arange(count) if chosen is None else np.flatnonzero(chosen)
     step = max(1, _BLOCK * max(count, 1) // max(arrays["sigma"].size, 1))
@@ -166,9 +165,9 @@ def evaluate_transmittance(
     queries is left out."""
     sets: dict[str, Iterator[Arrays]] = {}
     if "test" in data.splits:
-        sets["test"] = (block for shard in data.shards("test") for block in _blocks(shard.path))
-    sets["held_out"] = (block for path, chosen in selection.masks() for block in _blocks(path, ~chosen))
-    sets["training"] = (block for path, chosen in selection.masks() for block in _blocks(path, chosen))
+        sets["test"] = (block for shard in data.shards("test") for block in _blocks(shard))
+    sets["held_out"] = (block for shard, chosen in selection.masks() for block in _blocks(shard, ~chosen))
+    sets["training"] = (block for shard, chosen in selection.masks() for block in _blocks(shard, chosen))
     found = {name: _error(model, blocks) for name, blocks in sets.items()}
     return {name: error for name, error in found.items() if error is not None}
 

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.lattice import level_of_sigma
 from mbtf_core.errors import InputError, PartialError
 from mbtf_core.files.folders import ELSEWHERE, owned
@@ -140,7 +141,7 @@ def _check_folder(config: FitConfig, out: Path) -> None:
 
 def fit(
     config: FitConfig,
-    shards: str | Path,
+    shards: str | Path | DataFolder,
     out: str | Path,
     *,
     overwrite: bool = False,

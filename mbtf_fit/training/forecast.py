@@ -9,6 +9,7 @@ from pathlib import Path
 
 import torch
 
+from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.units import clock
 from mbtf_fit.config import FitConfig
@@ -105,7 +106,7 @@ def fit_bytes(config: FitConfig, lattice: Lattice) -> int:
     return 6 * sum(p.nbytes for p in model.parameters()) + surface
 
 
-def training_seconds(config: FitConfig, shards: str | Path) -> tuple[float, Partition | None]:
+def training_seconds(config: FitConfig, shards: str | Path | DataFolder) -> tuple[float, Partition | None]:
     """Seconds that a fit trains, and the data where they were loaded: a number of steps is timed by a pilot,
     unless no machine needs a minute."""
     steps, batch = config.training.steps, config.training.batch
@@ -121,7 +122,7 @@ def training_seconds(config: FitConfig, shards: str | Path) -> tuple[float, Part
     return steps * trainer.progress.seconds / trainer.progress.step, partition
 
 
-def forecast_fit(config: FitConfig, shards: str | Path) -> FitForecast:
+def forecast_fit(config: FitConfig, shards: str | Path | DataFolder) -> FitForecast:
     """Forecast the fit of a configuration by two pilot fits; nothing is written."""
     began = time.perf_counter()
     device = choose_device(config.device)

@@ -30,18 +30,19 @@ def export(
     program
         The program that reads it: NeuMIP (shuffled layout) or NeuralBTF (slices layout).
     """
-    from mbtf_core.data.data_folder import data_folder
     from mbtf_core.data.dataset import Dataset
+    from mbtf_core.data.folder import DataFolder
     from mbtf_gen.measured.exported import export_neumip, export_neural_btf
 
-    shards = data_folder(shards)
-    if file.is_dir() or shards.resolve() in file.resolve().parents:
+    folder = DataFolder.open(shards)
+    inside = folder.local is not None and folder.local.resolve() in file.resolve().parents
+    if file.is_dir() or inside:
         raise UsageError("is a folder, or inside the data set", where=file, hint="choose another name")
     if not file.resolve().parent.is_dir():
         raise UsageError("the folder does not exist", where=file.parent)
     if file.exists() and not overwrite:
         raise UsageError("exists", where=file, hint="choose another name, or --overwrite")
-    data = Dataset.open(shards)
+    data = Dataset.open(folder)
     count = (export_neumip if program == "neumip" else export_neural_btf)(data, file)
     total = int(data.manifest["splits"]["train"]["queries"])
     left = f"; {total - count} that do not fill an image are left out" if count < total else ""

@@ -26,10 +26,9 @@ def merge(folder: Path, /, *, console: Console = CONSOLE) -> int:
     folder
         Folder of shards, or its URL.
     """
-    from mbtf_core.data.data_folder import data_folder
     from mbtf_gen.generation.summary import finish
 
-    summary = finish(data_folder(folder))
+    summary = finish(folder)
     console.report(asdict(summary), describe(summary, ran=False))
     return EXIT_OK if summary.complete else EXIT_PARTIAL
 
@@ -44,27 +43,27 @@ def verify(folder: Path, /, *, digests: Path | None = None, console: Console = C
     digests
         Also compare its arrays with the digests.json of a published recipe.
     """
-    from mbtf_core.data.data_folder import data_folder
     from mbtf_core.data.dataset import Dataset
+    from mbtf_core.data.folder import DataFolder
     from mbtf_core.data.schema import GEOMETRY_NAME
     from mbtf_core.data.sidecar import ABSENT
     from mbtf_core.data.verify import foreign_files, verify
 
     start = time.perf_counter()
-    folder = data_folder(folder)
-    faults = verify(folder)
+    data_folder = DataFolder.open(folder)
+    faults = verify(data_folder)
     seconds = time.perf_counter() - start
-    dataset = Dataset.open(folder)
+    dataset = Dataset.open(data_folder)
     entries = [entry for split in dataset.splits for entry in dataset.entries(split)]
-    files, foreign = [folder / entry.file for entry in entries], foreign_files(folder, entries)
-    read = sum(path.stat().st_size for path in files if path.exists())
-    absent = [f for f in faults if f.what in ABSENT and folder / f.file in files]
-    lines = [f"{folder / f.file}: {f.what}; {f.hint}" for f in faults if f not in absent]
+    files, foreign = [entry.file for entry in entries], foreign_files(data_folder, entries)
+    read = sum(data_folder.size(file) or 0 for file in files)
+    absent = [f for f in faults if f.what in ABSENT and f.file in files]
+    lines = [f"{data_folder.at(f.file)}: {f.what}; {f.hint}" for f in faults if f not in absent]
     if absent:
         missing = f"{len(absent)} of {len(files)} shards missing, first {absent[0].file}"
-        lines.insert(0, f"{folder}: {missing}; {absent[0].hint}")
+        lines.insert(0, f"{data_folder}: {missing}; {absent[0].hint}")
     data: dict[str, Any] = {
-        "folder": folder,
+        "folder": str(data_folder),
         "shards": len(files),
         "bytes": read,
         "seconds": round(seconds, 3),
@@ -77,10 +76,10 @@ def verify(folder: Path, /, *, digests: Path | None = None, console: Console = C
         from mbtf_gen.publishing.digests import digest_faults
 
         data["differences"] = digest_faults(dataset, digests)
-        lines = [f"{folder}: {text}" for text in data["differences"]]
+        lines = [f"{data_folder}: {text}" for text in data["differences"]]
         equal = f", and equal to {digests} bit by bit"
-    lines = lines or [f"{folder}: {len(files)} shards{known}, all intact{equal}"]
-    console.report(data, "\n".join([*lines, *_describe_foreign(folder, foreign)]))
+    lines = lines or [f"{data_folder}: {len(files)} shards{known}, all intact{equal}"]
+    console.report(data, "\n".join([*lines, *_describe_foreign(data_folder, foreign)]))
     console.note(f"{read / 1e6:.1f} MB read in {clock(seconds)} ({read / 1e6 / max(seconds, 1e-9):.0f} MB/s)")
     return EXIT_BAD_INPUT if faults or data.get("differences") else EXIT_OK
 
@@ -90,7 +89,6 @@ def repair(
     /,
     *,
     material: PathText | None = None,
-    keep: str | None = None,
     dry_run: DryRun = False,
     console: Console = CONSOLE,
 ) -> int:
@@ -102,21 +100,17 @@ def repair(
         Folder of shards, or its URL.
     material
         Path of the material, if it was moved.
-    keep
-        Which data set to restore, if the files belong to several: the name that the message gives it.
     """
-    from mbtf_core.data.data_folder import data_folder
-    from mbtf_gen.generation.repair import Corruption, RepairResult
+    from mbtf_core.data.folder import DataFolder
+    from mbtf_gen.generation.repair import repair as run
 
-    folder = data_folder(folder)
-    found = Corruption(folder, material, keep)
+    data_folder = DataFolder.open(folder)
     if dry_run:
-        shards = [entry.file for entry in found.entries]
-        done = RepairResult(str(folder), found.faults, shards, found.documents, found.foreign, False, 0, 0.0)
+        done = run(data_folder, material=material, dry_run=True)
     else:
-        keep_on_interruption(f"{folder}: the shards rendered so far are kept")
+        keep_on_interruption(f"{data_folder}: the shards rendered so far are kept")
         with console.progress(None, "repairing", "paths") as bar:
-            done = found.repair(bar.update)
+            done = run(data_folder, material=material, progress=bar.update)
     data = {"dry_run": dry_run, **asdict(done)}
     console.report(data, _describe_repair(done, dry_run))
     return EXIT_OK if done.complete or dry_run else EXIT_PARTIAL
@@ -140,7 +134,7 @@ def _describe_repair(done: RepairResult, dry_run: bool) -> str:
     return "\n".join([*lines, *_describe_foreign(done.folder, done.foreign)])
 
 
-def _describe_foreign(folder: str | Path, names: list[str]) -> list[str]:
+def _describe_foreign(folder: object, names: list[str]) -> list[str]:
     if not names:
         return []
     shown = ", ".join(names[:5]) + (", …" if len(names) > 5 else "")

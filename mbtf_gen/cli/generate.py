@@ -100,23 +100,23 @@ def generate(
     index, count = _slice(slice)
     job = prepare_job(options, material, quality)
     from mbtf_core.cluster.engine import open_cluster
-    from mbtf_core.data.data_folder import data_folder, in_store
+    from mbtf_core.data.folder import DataFolder
     from mbtf_core.files.folders import check_space
     from mbtf_gen.forecast import announce_shards
     from mbtf_gen.generation.run import generate, unfinished
     from mbtf_gen.job import data_bytes, split_queries
 
-    output = data_folder(output)
-    left = unfinished(job, output, index, count, overwrite)
+    folder = DataFolder.open(output)
+    left = unfinished(job, folder, index, count, overwrite)
     size = data_bytes(job, left)
     console.note(
-        f"{job.config.material} -> {output}: {split_queries(job, 'train')} training + "
+        f"{job.config.material} -> {folder}: {split_queries(job, 'train')} training + "
         f"{split_queries(job, 'test')} test queries, resolution {job.lattice.shape()[1]}, {size_text(size)}"
     )
-    if not in_store(output):
-        check_space(output, size, SMALLER)
+    if folder.local is not None:
+        check_space(folder.local, size, SMALLER)
 
-    keep_on_interruption(f"the shards that are finished are kept in {output}")
+    keep_on_interruption(f"the shards that are finished are kept in {folder}")
     # Without anything to render, no workers are started.
     with (
         open_cluster(cluster if left else None, console.note) as workers,
@@ -124,7 +124,7 @@ def generate(
     ):
         summary = generate(
             job,
-            output,
+            folder,
             overwrite=overwrite,
             slice_index=index,
             slice_count=count,

@@ -37,20 +37,21 @@ def import_measured(
     measured
         File of a BTF (.btf, .hdf5), or folder or zip archive of images.
     """
-    from mbtf_core.data.data_folder import data_folder, in_store
+    from mbtf_core.data.folder import DataFolder
     from mbtf_core.files.folders import check_space
     from mbtf_gen.generation.import_job import Import
     from mbtf_gen.generation.imported import MEASURED_BYTES
     from mbtf_gen.generation.imported import import_measured as run
 
-    output = data_folder(output)
-    if Path(measured).is_dir() and Path(measured).resolve() in (output / "x").resolve().parents:
+    folder = DataFolder.open(output)
+    inside = folder.local is not None and Path(measured).resolve() in (folder.local / "x").resolve().parents
+    if Path(measured).is_dir() and inside:
         raise UsageError("is inside the measured folder", where=f"-o {output}", hint="choose another folder")
     job = Import.prepare(Path(measured), options.resolve())
     total = job.count("train") + job.count("test")
     size = total * MEASURED_BYTES
     console.note(
-        f"{measured} ({type(job.source).__name__}) -> {output}: {job.count('train')} training + "
+        f"{measured} ({type(job.source).__name__}) -> {folder}: {job.count('train')} training + "
         f"{job.count('test')} test queries, {size_text(size)}"
     )
     if job.pairs is not None:
@@ -63,9 +64,9 @@ def import_measured(
             f"{job.left_out} of {job.left_out + job.usable} queries are left out: too low, NaN, or of a "
             "footprint that is no level's"
         )
-    if not in_store(output):
-        check_space(output, size, "reduce --queries, or choose another folder with -o")
-    keep_on_interruption(f"the shards that are finished are kept in {output}")
+    if folder.local is not None:
+        check_space(folder.local, size, "reduce --queries, or choose another folder with -o")
+    keep_on_interruption(f"the shards that are finished are kept in {folder}")
     with console.progress(total=total, label="importing", unit="queries") as bar:
-        summary = run(job, output, overwrite=overwrite, progress=bar.update)
+        summary = run(job, folder, overwrite=overwrite, progress=bar.update)
     console.report(asdict(summary), describe(summary))

@@ -38,8 +38,8 @@ def preview(
     interactive
         Also show the mesh in a window, where the mouse turns it.
     """
-    from mbtf_core.data.data_folder import data_folder
     from mbtf_core.data.dataset import Dataset, is_dataset
+    from mbtf_core.data.folder import DataFolder
     from mbtf_gen.pictures.preview.drawing import PreviewPictures
 
     if interactive:
@@ -47,7 +47,7 @@ def preview(
 
         check_display()
     dataset = None
-    if material is not None and is_dataset(folder := data_folder(material)):
+    if material is not None and is_dataset(folder := DataFolder.open(material)):
         dataset = Dataset.open(folder)
         given = [options.flags[key] for key in options.given if not key.startswith(("preview.", "exposure"))]
         given += ["--config"] * (options.config is not None) + ["--set"] * bool(options.assignments)

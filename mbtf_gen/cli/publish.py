@@ -49,17 +49,17 @@ def publish(
             hint="an SPDX expression such as CC-BY-4.0; that of the material's maps may restrict it",
         )
     config = options.resolve()
-    from mbtf_core.data.data_folder import data_folder
+    from mbtf_core.data.folder import DataFolder
 
-    shards = data_folder(shards)
-    if output.resolve() == shards.resolve() or shards.resolve() in output.resolve().parents:
+    data = DataFolder.open(shards)
+    if data.local is not None and data.local.resolve() in (output.resolve(), *output.resolve().parents):
         raise UsageError("is the data set, or inside it", where=f"-o {output}", hint="choose another folder")
     from mbtf_gen.publishing.publish import Publication
 
     publication = Publication.prepare(
-        shards, config, with_maps=with_maps, material=None if material is None else Path(material)
+        data, config, with_maps=with_maps, material=None if material is None else Path(material)
     )
-    console.note(f"{shards} -> {output}: {config.form}, at most {size_text(publication.size)}")
+    console.note(f"{data} -> {output}: {config.form}, at most {size_text(publication.size)}")
     keep_on_interruption(f"the finished files are kept in {output}")
     with console.progress(len(publication.makers()), "publishing", "files") as bar:
         files = publication.write(output, overwrite=overwrite, progress=bar.advance)

@@ -13,19 +13,17 @@ import time
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from pathlib import Path
 from typing import Any
 
 from mbtf_core.cluster.engine import Cluster
 from mbtf_core.cluster.task import Task
-from mbtf_core.data.data_folder import data_folder, in_store, send_shard
-from mbtf_core.data.folder import remove_leftovers
+from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.manifest import plan_digest
-from mbtf_core.data.recover import recover_shards
 from mbtf_core.data.schema import MANIFEST_NAME, ShardEntry
-from mbtf_core.data.sidecar import finished_record, sidecar_of
+from mbtf_core.data.sidecar import finished_record, upload_waiting
 from mbtf_core.errors import InputError, LockedError, PartialError
-from mbtf_core.locks import keep_renewing, take_lock
+from mbtf_core.locks import take_lock
+from mbtf_gen.generation.folder import read_run_plan
 from mbtf_gen.generation.render_shards import (
     ExpectedPaths,
     ProgressCallback,
@@ -34,7 +32,7 @@ from mbtf_gen.generation.render_shards import (
     progress_of,
     store_shard,
 )
-from mbtf_gen.generation.summary import ShardStatistics, read_run_plan, refuse_nonfinite
+from mbtf_gen.generation.summary import ShardStatistics, refuse_nonfinite
 from mbtf_gen.job import Job, most_paths
 from mbtf_gen.planning.run_plan import RunPlan
 from mbtf_gen.planning.simulation import build_estimator
@@ -46,7 +44,7 @@ _THIS = "mbtf_gen.generation.distribute_shards:render_shard"
 
 def distribute_shards(
     job: Job,
-    folder: Path,
+    folder: DataFolder,
     entries: Iterable[ShardEntry],
     plan: RunPlan,
     cluster: Cluster,
@@ -67,14 +65,14 @@ def distribute_shards(
         samples; finished shards are kept
     """
     start = time.perf_counter() if start is None else start
-    remove_leftovers(folder)
-    recover_shards(folder, job.shards, job.config_hash, plan_digest(plan.to_manifest()))
+    folder.remove_leftovers()
+    upload_waiting(folder, job.shards, job.config_hash, plan_digest(plan.to_manifest()))
     pending = {entry.file: entry for entry in entries}
     result, totals, expected = RenderResult(), ShardStatistics(), ExpectedPaths(job)
     limit = most_paths(job)
     shared = {
         "config": job.portable(),
-        "folder": str(folder) if in_store(folder) else os.path.abspath(folder),
+        "folder": str(folder) if folder.local is None else os.path.abspath(folder.local),
         "config_hash": job.config_hash,
         "plan": plan_digest(plan.to_manifest()),
     }
@@ -142,41 +140,38 @@ def render_shard(
         The folder cannot be written, or another process of this machine renders the shard.
     """
     into = _folder_of(folder, config_hash, plan)
-    if not (into / MANIFEST_NAME).exists():
+    if not into.has(MANIFEST_NAME):
         raise InputError("this machine does not see the data set", where=into)
     run = _run_of(json.dumps(config), into, config_hash, plan)
     entry = run.entries[file]
     if (record := _record_now(into, entry, config_hash)) is not None:
         return {"record": record, "rendered": False}
-    # The scheduler gives a shard to one worker. Locks of other machines are those of workers that have died,
-    # or of another command, whose shard has the same bytes.
-    lock = take_lock(into / file, stale=0.0)
+    lock = take_lock(into.workspace / file)
     if lock is None:
-        raise LockedError("is being written by another process", where=into / file)
+        raise LockedError("is being written by another process", where=into.at(file))
     try:
         # Another process may have finished it since.
         if (record := _record_now(into, entry, config_hash)) is not None:
             return {"record": record, "rendered": False}
-        with keep_renewing():
-            estimator = run.estimator
-            began = time.perf_counter()
-            queries = run.job.query_plan.draw(entry.split, entry.index, entry.rows)
-            estimates = estimate_queries(run.job, run.plan, estimator, entry, queries)
-            seconds = time.perf_counter() - began
-            record = store_shard(run.job, into, run.plan, entry, queries, estimates, seconds)
-            send_shard(into / file, sidecar_of(into / file))
+        estimator = run.estimator
+        began = time.perf_counter()
+        queries = run.job.query_plan.draw(entry.split, entry.index, entry.rows)
+        estimates = estimate_queries(run.job, run.plan, estimator, entry, queries)
+        seconds = time.perf_counter() - began
+        record = store_shard(run.job, into, run.plan, entry, queries, estimates, seconds)
         return {"record": record, "rendered": True}
     finally:
         lock.release()
 
 
-def _record_now(folder: Path, entry: ShardEntry, config_hash: str) -> dict[str, Any] | None:
+def _record_now(folder: DataFolder, entry: ShardEntry, config_hash: str) -> dict[str, Any] | None:
     """Sidecar of a finished shard. A store is listed again: the shard may have been removed since this worker
     saw it there."""
     record = finished_record(folder, entry, config_hash)
-    if record is None or not in_store(folder):
+    if record is None or folder.local is not None:
         return record
-    return finished_record(data_folder(folder), entry, config_hash)
+    folder.refresh()
+    return finished_record(folder, entry, config_hash)
 
 
 @dataclass(frozen=True)
@@ -198,13 +193,13 @@ class _Run:
 
 
 @lru_cache(maxsize=1)
-def _folder_of(folder: str, config_hash: str, plan: str) -> Path:
+def _folder_of(folder: str, config_hash: str, plan: str) -> DataFolder:
     """The folder of a data set; one in a store is not listed again for each shard."""
-    return data_folder(folder)
+    return DataFolder.open(folder)
 
 
 @lru_cache(maxsize=1)
-def _run_of(config: str, folder: Path, config_hash: str, plan: str) -> _Run:
+def _run_of(config: str, folder: DataFolder, config_hash: str, plan: str) -> _Run:
     """The run of a data set, kept for its next shard."""
     job = Job.of_portable(config, config_hash)
     found = read_run_plan(folder)

@@ -18,7 +18,7 @@ from mbtf_core.errors import InputError
 from mbtf_core.files.digest import data_sha256, file_sha256
 from mbtf_gen.config.generator import count_queries
 from mbtf_gen.config.measured import ImportConfig
-from mbtf_gen.measured.interface import MeasuredBtf, MeasuredQueries, Queries
+from mbtf_gen.measured.interface import MeasuredBtf, MeasuredQueries, QueryBlock
 from mbtf_gen.measured.open import open_measured
 from mbtf_gen.measured.ubo2003 import SUFFIXES
 from mbtf_gen.sampling.rng import Purpose, numpy_generator
@@ -150,7 +150,7 @@ class Import:
         return [ShardEntry(split, k, n, min(size, total - k * size)) for k, n in enumerate(names)]
 
 
-def usable_blocks(source: MeasuredQueries, min_cos: float) -> Iterator[tuple[Queries, NDArray[np.int64]]]:
+def usable_blocks(source: MeasuredQueries, min_cos: float) -> Iterator[tuple[QueryBlock, NDArray[np.int64]]]:
     """The queries of a list, block by block, and the rows of the usable ones: not too low, and with the
     footprint of one of the levels that data can have."""
     least, most = (float(sigma_of_level(level)) for level in (MAX_LEVEL, 0))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, cast
 
@@ -13,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.config.yaml_file import dump_yaml
-from mbtf_core.data.data_folder import data_folder, send, send_shard
-from mbtf_core.data.folder import clear, read_manifest
+from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.lattice import sigma_of_level
-from mbtf_core.data.manifest import plan_digest, software_versions
+from mbtf_core.data.manifest import plan_digest, read_manifest, software_versions
 from mbtf_core.data.schema import (
     ARRAYS,
     CONFIG_NAME,
@@ -29,9 +27,10 @@ from mbtf_core.data.schema import (
     ShardEntry,
 )
 from mbtf_core.data.shard_files import Arrays, write_shard
-from mbtf_core.data.sidecar import finished_record, sidecar_of
-from mbtf_core.files.atomic import read_json, remove_file, write_checksummed, write_text
-from mbtf_core.files.folders import check_folder, make_folder, other_configuration, owned
+from mbtf_core.data.sidecar import finished_record, sidecar
+from mbtf_core.files.atomic import Stored, checksummed
+from mbtf_core.files.folders import make_folder, owned
+from mbtf_gen.generation.folder import holds_dataset, other_data_set
 from mbtf_gen.generation.import_job import Import, has_images, usable_blocks
 from mbtf_gen.generation.summary import Summary, finish
 from mbtf_gen.measured.interface import MeasuredBtf, MeasuredQueries
@@ -122,7 +121,11 @@ def _manifest(job: Import) -> dict[str, Any]:
 
 
 def import_measured(
-    job: Import, folder: str | Path, *, overwrite: bool = False, progress: Progress | None = None
+    job: Import,
+    folder: str | Path | DataFolder,
+    *,
+    overwrite: bool = False,
+    progress: Progress | None = None,
 ) -> Summary:
     """Write a measured BTF as a data set, or finish an unfinished one.
 
@@ -150,20 +153,18 @@ def import_measured(
         The folder cannot be written, or another process writes to it; the same command resumes.
     """
     start = time.perf_counter()
-    folder = data_folder(folder)
+    folder = DataFolder.open(folder)
     manifest = _manifest(job)
-    with owned(folder):
-        if check_folder(folder, lambda path: (path / MANIFEST_NAME).exists(), "data set"):
+    with owned(folder.workspace):
+        if holds_dataset(folder):
             if overwrite:
-                clear(folder)
+                folder.clear()
             else:
                 _check_same(folder, manifest)
-        make_folder(folder)
-        if not (folder / MANIFEST_NAME).exists():
-            write_checksummed(folder / MANIFEST_NAME, manifest)
-            send(folder / MANIFEST_NAME)
-        write_text(folder / CONFIG_NAME, dump_yaml(manifest["config"]))
-        send(folder / CONFIG_NAME)
+        make_folder(folder.workspace)
+        if not folder.has(MANIFEST_NAME):
+            folder.write(MANIFEST_NAME, checksummed(manifest))
+        folder.write(CONFIG_NAME, dump_yaml(manifest["config"]).encode())
         plan, written = plan_digest(manifest), 0
         source = job.source
         parts = (
@@ -180,16 +181,17 @@ def import_measured(
         return finish(folder, seconds=time.perf_counter() - start)
 
 
-def _check_same(folder: Path, manifest: dict[str, Any]) -> None:
-    old = read_json(folder / MANIFEST_NAME)
-    if old.get("config_hash") == manifest["config_hash"]:
-        read_manifest(folder)
-        return
-    before, after = ({"inputs": m.get("inputs", {}), **(m.get("config") or {})} for m in (old, manifest))
-    raise other_configuration(folder, "a data set", before, after)
+def _check_same(folder: DataFolder, manifest: dict[str, Any]) -> None:
+    old = folder.read_json(MANIFEST_NAME)
+    if old.get("config_hash") != manifest["config_hash"]:
+        after = {**manifest["config"], "inputs": manifest["inputs"], "schema": SCHEMA_VERSION}
+        raise other_data_set(folder, old, after)
+    read_manifest(folder)
 
 
-def _of_images(job: Import, source: MeasuredBtf, folder: Path) -> Iterator[tuple[ShardEntry, Arrays | None]]:
+def _of_images(
+    job: Import, source: MeasuredBtf, folder: DataFolder
+) -> Iterator[tuple[ShardEntry, Arrays | None]]:
     """Shards with their arrays; None where the shard is finished already."""
     assert job.pairs is not None
     factor = np.full(len(source.light), job.config.scale, np.float32)
@@ -271,31 +273,27 @@ def _of_list(job: Import, source: MeasuredQueries) -> Iterator[tuple[ShardEntry,
         begin += entry.rows
 
 
-def _store(job: Import, folder: Path, plan: str, entry: ShardEntry, arrays: Arrays) -> None:
+def _store(job: Import, folder: DataFolder, plan: str, entry: ShardEntry, arrays: Arrays) -> None:
     """Write a shard and its sidecar."""
-    path = folder / entry.file
-    remove_file(sidecar_of(path))
     started = time.perf_counter()
-    stored = write_shard(path, {name: arrays[name] for name in MEASURED})
-    record = {
-        "format": FORMAT_NAME,
-        "schema": SCHEMA_VERSION,
-        "config_hash": job.config_hash,
-        "plan": plan,
-        **{key: getattr(entry, key) for key in ("file", "split", "index", "rows")},
-        **asdict(stored),
-        "seed": {"root": job.config.seed, "split": entry.split, "shard": entry.index},
-        "spp": None,
-        "queries": entry.rows,
-        "paths": 0,
-        "seconds": round(time.perf_counter() - started, 4),
-        "quarantined": {"nonfinite_samples": 0, "lost_rays": 0, "capped_rays": 0, "nonfinite_at": []},
-        "target": None,
-        "statistics": {
-            "mean_value": arrays["value_a"].mean(axis=0, dtype=np.float64).tolist(),
+
+    def record(stored: Stored) -> dict[str, Any]:
+        return sidecar(
+            entry,
+            stored,
+            config_hash=job.config_hash,
+            plan=plan,
+            seed=job.config.seed,
+            spp=None,
+            queries=entry.rows,
+            paths=0,
+            seconds=round(time.perf_counter() - started, 4),
+            quarantined={"nonfinite_samples": 0, "lost_rays": 0, "capped_rays": 0, "nonfinite_at": []},
+            target=None,
+            mean_value=arrays["value_a"].mean(axis=0, dtype=np.float64).tolist(),
             # Unknown: a query has a single value.
-            "mean_variance": None,
-        },
-    }
-    write_checksummed(sidecar_of(path), record)
-    send_shard(path, sidecar_of(path))
+            mean_variance=None,
+        )
+
+    measured = {name: arrays[name] for name in MEASURED}
+    folder.write_shard(entry.file, lambda path: write_shard(path, measured), record)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, field_validator
@@ -37,7 +36,7 @@ class _Plan(BaseModel, allow_inf_nan=False):
         return plan
 
 
-def stored_plan(manifest: Mapping[str, Any], path: Path) -> RunPlan:
+def stored_plan(manifest: Mapping[str, Any], path: object) -> RunPlan:
     """The run plan in a manifest, of the file `path`; an InputError where that is corrupt."""
     found = check_document(_Plan, manifest, path, CHECK_HINT)
     return RunPlan(found.effects, found.allocation)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable, Mapping, Set
@@ -9,21 +10,18 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, field
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mbtf_core.data.data_folder import send_shard
-from mbtf_core.data.folder import remove_leftovers
+from mbtf_core.data.folder import DataFolder, sidecar_name
 from mbtf_core.data.manifest import plan_digest
 from mbtf_core.data.queries import Queries
-from mbtf_core.data.recover import recover_shards
-from mbtf_core.data.schema import FORMAT_NAME, SCHEMA_VERSION, ShardEntry
+from mbtf_core.data.schema import ShardEntry
 from mbtf_core.data.shard_files import write_shard
-from mbtf_core.data.sidecar import finished_record, sidecar_of
+from mbtf_core.data.sidecar import finished_record, sidecar, upload_waiting
 from mbtf_core.errors import InputError, PartialError
-from mbtf_core.files.atomic import remove_file, write_checksummed
+from mbtf_core.files.atomic import Stored
 from mbtf_core.locks import Lock, lock_owner, take_lock
 from mbtf_gen.generation.summary import ShardStatistics, refuse_nonfinite
 from mbtf_gen.generation.writer import ShardWriter
@@ -103,7 +101,7 @@ class RenderResult:
 
 def render_shards(
     job: Job,
-    folder: Path,
+    folder: DataFolder,
     entries: Iterable[ShardEntry],
     plan: RunPlan,
     *,
@@ -148,20 +146,18 @@ def render_shards(
     unsent: list[PartialError | InputError] = []
 
     def store(entry: ShardEntry, *rendered: Any) -> None:
-        records.append(store_shard(job, folder, plan, entry, *rendered))
-        path = folder / entry.file
         try:
-            send_shard(path, sidecar_of(path))
+            records.append(store_shard(job, folder, plan, entry, *rendered))
         except (PartialError, InputError) as error:
             # What is rendered meanwhile is still written, and uploaded by the next run.
             unsent.append(error)
 
     # Leftovers of killed runs take disk space.
-    remove_leftovers(folder)
-    recover_shards(folder, job.shards, job.config_hash, plan_digest(plan.to_manifest()))
+    folder.remove_leftovers()
+    upload_waiting(folder, job.shards, job.config_hash, plan_digest(plan.to_manifest()))
     estimator: Any = None
     # A corrupt shard counts as finished once its sidecar has changed.
-    stamps = {file: _stamp(folder / file) for file in corrupt}
+    stamps = {file: _stamp(folder, file) for file in corrupt}
     # Shards of other processes are tried again after the own ones: the process that ends last leaves none.
     while pending:
         tried, busy = [*pending.values()], list[ShardEntry]()
@@ -191,7 +187,7 @@ def render_shards(
         result.writing += writer.busy
         result.waiting += writer.waited
         if len(busy) == len(tried):
-            owner = lock_owner(folder / busy[0].file)
+            owner = lock_owner(folder.workspace / busy[0].file)
             who = "" if owner is None else f" ({owner})"
             raise PartialError(
                 f"{len(busy)} shard(s) are being written by another process, first {busy[0].file}{who}",
@@ -204,9 +200,9 @@ def render_shards(
 
 def _claims(
     job: Job,
-    folder: Path,
+    folder: DataFolder,
     entries: Iterable[ShardEntry],
-    stamps: Mapping[str, tuple[int, int] | None],
+    stamps: Mapping[str, str | None],
     pool: ThreadPoolExecutor,
     busy: list[ShardEntry],
     skipped: Callable[[ShardEntry, dict[str, Any] | None], None],
@@ -219,22 +215,21 @@ def _claims(
     not claimed, with its sidecar if it is finished.
     """
 
-    def finished(entry: ShardEntry, path: Path) -> dict[str, Any] | None:
-        if entry.file in stamps and stamps[entry.file] == _stamp(path):
+    def finished(entry: ShardEntry) -> dict[str, Any] | None:
+        if entry.file in stamps and stamps[entry.file] == _stamp(folder, entry.file):
             return None
         return finished_record(folder, entry, job.config_hash)
 
     held: deque[_Claim] = deque()
     try:
         for entry in entries:
-            path = folder / entry.file
-            record = finished(entry, path)
-            lock = take_lock(path) if record is None else None
+            record = finished(entry)
+            lock = take_lock(folder.workspace / entry.file) if record is None else None
             if record is None and lock is None:
                 busy.append(entry)
             elif lock is not None:
                 # Another process may have finished it since.
-                record = finished(entry, path)
+                record = finished(entry)
                 if record is None:
                     drawn = pool.submit(job.query_plan.draw, entry.split, entry.index, entry.rows)
                     held.append(_Claim(entry, lock, drawn))
@@ -252,13 +247,12 @@ def _claims(
             claim.lock.release()
 
 
-def _stamp(path: Path) -> tuple[int, int] | None:
+def _stamp(folder: DataFolder, file: str) -> str | None:
     """Identity of a shard's sidecar, which changes when it is written again; None without one."""
     try:
-        found = sidecar_of(path).stat()
-    except OSError:
+        return hashlib.sha256(folder.read(sidecar_name(file))).hexdigest()
+    except InputError:
         return None
-    return found.st_ino, found.st_mtime_ns
 
 
 def estimate_queries(
@@ -277,52 +271,45 @@ def estimate_queries(
 
 def store_shard(
     job: Job,
-    folder: Path,
+    folder: DataFolder,
     plan: RunPlan,
     entry: ShardEntry,
     queries: Queries,
     estimates: Estimates,
     seconds: float,
 ) -> dict[str, Any]:
-    """Write a rendered shard and its sidecar; returns the sidecar."""
-    path = folder / entry.file
-    # If the run is killed between the two, an old sidecar would mark the new shard as finished.
-    remove_file(sidecar_of(path))
+    """Write a rendered shard and its sidecar; returns the sidecar. Errors are those of
+    :meth:`~mbtf_core.data.folder.DataFolder.write_shard`."""
     lead, through = queries.lead, estimates.transmittance
     a, b = estimates.value_a, estimates.value_b
     planned = split_spp(job.config, entry.split)
     spp = planned if estimates.spp is None else estimates.spp.reshape(lead)
-    stored = write_shard(
-        path,
-        {
-            **vars(queries),
-            "value_a": a.reshape(*lead, 3),
-            "value_b": b.reshape(*lead, 3),
-            "spp": np.broadcast_to(np.asarray(spp, np.float32), lead).copy(),
-            **({} if through is None else {"transmittance": through.reshape(lead)}),
-        },
-    )
-    record = {
-        "format": FORMAT_NAME,
-        "schema": SCHEMA_VERSION,
-        "config_hash": job.config_hash,
-        "plan": plan_digest(plan.to_manifest()),
-        **{key: getattr(entry, key) for key in ("file", "split", "index", "rows")},
-        **asdict(stored),
-        "seed": {"root": job.config.seed, "split": entry.split, "shard": entry.index},
-        "spp": planned,
-        "queries": len(a),
-        "paths": estimates.paths,
-        "seconds": round(seconds, 4),
-        "quarantined": _quarantined(estimates),
-        "target": None if estimates.target is None else asdict(estimates.target),
-        "statistics": {
-            "mean_value": (0.5 * sum(half.mean(axis=0, dtype=np.float64) for half in (a, b))).tolist(),
-            "mean_variance": (0.25 * np.square((a - b).astype(np.float64)).mean(axis=0)).tolist(),
-        },
+    arrays = {
+        **vars(queries),
+        "value_a": a.reshape(*lead, 3),
+        "value_b": b.reshape(*lead, 3),
+        "spp": np.broadcast_to(np.asarray(spp, np.float32), lead).copy(),
+        **({} if through is None else {"transmittance": through.reshape(lead)}),
     }
-    write_checksummed(sidecar_of(path), record)
-    return record
+
+    def record(stored: Stored) -> dict[str, Any]:
+        return sidecar(
+            entry,
+            stored,
+            config_hash=job.config_hash,
+            plan=plan_digest(plan.to_manifest()),
+            seed=job.config.seed,
+            spp=planned,
+            queries=len(a),
+            paths=estimates.paths,
+            seconds=round(seconds, 4),
+            quarantined=_quarantined(estimates),
+            target=None if estimates.target is None else asdict(estimates.target),
+            mean_value=(0.5 * sum(half.mean(axis=0, dtype=np.float64) for half in (a, b))).tolist(),
+            mean_variance=(0.25 * np.square((a - b).astype(np.float64)).mean(axis=0)).tolist(),
+        )
+
+    return folder.write_shard(entry.file, lambda path: write_shard(path, arrays), record)
 
 
 def _quarantined(estimates: Estimates) -> dict[str, Any]:

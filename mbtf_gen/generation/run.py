@@ -7,31 +7,35 @@ from collections.abc import Callable
 from pathlib import Path
 
 from mbtf_core.cluster.engine import Cluster
-from mbtf_core.data.data_folder import data_folder
+from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.schema import ShardEntry
 from mbtf_core.data.sidecar import finished_record
 from mbtf_core.errors import PartialError
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.distribute_shards import distribute_shards
-from mbtf_gen.generation.folder import has_dataset, open_folder
+from mbtf_gen.generation.folder import has_dataset, open_folder, read_run_plan
 from mbtf_gen.generation.render_shards import ProgressCallback, render_shards
-from mbtf_gen.generation.summary import Summary, finish, read_run_plan
+from mbtf_gen.generation.summary import Summary, finish
 from mbtf_gen.job import Job
 from mbtf_gen.planning.run_plan import RunPlan, plan_run
 
 
 def unfinished(
-    job: Job, folder: str | Path, slice_index: int = 1, slice_count: int = 1, overwrite: bool = False
+    job: Job,
+    folder: str | Path | DataFolder,
+    slice_index: int = 1,
+    slice_count: int = 1,
+    overwrite: bool = False,
 ) -> list[ShardEntry]:
     """Shards of a slice that :func:`generate` has yet to render."""
     entries = job.shards[slice_index - 1 :: slice_count]
-    folder = data_folder(folder)
-    return [e for e in entries if overwrite or not finished_record(folder, e, job.config_hash)]
+    found = folder if isinstance(folder, DataFolder) else DataFolder.open(folder)
+    return [e for e in entries if overwrite or not finished_record(found, e, job.config_hash)]
 
 
 def generate(
     source: GeneratorConfig | Job,
-    folder: str | Path,
+    folder: str | Path | DataFolder,
     *,
     overwrite: bool = False,
     slice_index: int = 1,
@@ -48,7 +52,7 @@ def generate(
     ----------
     source : GeneratorConfig or Job
         The configuration, or the job of one whose material is loaded already.
-    folder : str or Path
+    folder : str, Path or DataFolder
         Output folder, or a URL such as ``s3://bucket/data``. An unfinished data set of the same configuration
         is resumed.
     overwrite : bool
@@ -77,7 +81,7 @@ def generate(
         Other processes render some of the shards, the disk is full, the store cannot be reached, or too many
         samples are non-finite. The same command resumes.
     """
-    folder = data_folder(folder)
+    folder = DataFolder.open(folder)
     start = time.perf_counter()
     job = source if isinstance(source, Job) else Job.prepare(source)
     overwrite = overwrite and not (slice_count > 1 and has_dataset(folder, job.config_hash))

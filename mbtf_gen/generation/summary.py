@@ -13,18 +13,16 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, PositiveInt
 
 from mbtf_core.config.settings import check_document
-from mbtf_core.data.data_folder import data_folder, send
 from mbtf_core.data.dataset import Dataset
-from mbtf_core.data.folder import read_manifest, remove_leftovers
-from mbtf_core.data.manifest import CHECK_HINT, software_versions
+from mbtf_core.data.folder import DataFolder, sidecar_name
+from mbtf_core.data.manifest import CHECK_HINT, read_manifest, software_versions
 from mbtf_core.data.schema import MANIFEST_NAME
-from mbtf_core.data.sidecar import finished_record, sidecar_of
+from mbtf_core.data.sidecar import finished_record
 from mbtf_core.errors import PartialError
-from mbtf_core.files.atomic import write_checksummed
+from mbtf_core.files.atomic import checksummed
 from mbtf_core.locks import brief_lock
 from mbtf_gen.config.effects_request import EFFECTS
 from mbtf_gen.generation.manifest import stored_plan
-from mbtf_gen.planning.run_plan import RunPlan
 from mbtf_gen.render.estimates import BadSample, TargetReached
 
 # A run fails beyond this share of non-finite samples, but never for so few: with one expected, more than four
@@ -172,7 +170,7 @@ class ShardStatistics:
         return float(np.sqrt(variance)) / mean if mean > 0 else 0.0
 
 
-def refuse_nonfinite(totals: ShardStatistics, paths: int, folder: Path) -> None:
+def refuse_nonfinite(totals: ShardStatistics, paths: int, folder: object) -> None:
     """Fail if the shards have more non-finite samples than a data set of `paths` may have."""
     count = totals.counts["nonfinite_samples"]
     if count > max(NONFINITE_FEW, NONFINITE_SHARE * paths):
@@ -209,13 +207,13 @@ class _Sidecar(BaseModel, allow_inf_nan=False):
     target: TargetReached | None
 
 
-def read_run_plan(folder: Path) -> RunPlan:
-    """The run plan in a data set's manifest; an InputError where that is corrupt."""
-    return stored_plan(read_manifest(folder), folder / MANIFEST_NAME)
-
-
 def finish(
-    folder: str | Path, *, paths: int = 0, seconds: float = 0.0, writing: float = 0.0, waiting: float = 0.0
+    folder: str | Path | DataFolder,
+    *,
+    paths: int = 0,
+    seconds: float = 0.0,
+    writing: float = 0.0,
+    waiting: float = 0.0,
 ) -> Summary:
     """Complete the manifest if every shard is finished, and summarize (``mbtf-gen merge``).
 
@@ -228,18 +226,18 @@ def finish(
     InputError : no data set, or a corrupt manifest or sidecar
     PartialError : too many non-finite samples, or the folder cannot be written
     """
-    folder = data_folder(folder)
+    folder = DataFolder.open(folder)
     dataset = Dataset.open(folder)
     manifest = read_manifest(folder)
     measured = "measured" in manifest
-    effects = () if measured else stored_plan(manifest, folder / MANIFEST_NAME).effects.effects
+    effects = () if measured else stored_plan(manifest, folder.at(MANIFEST_NAME)).effects.effects
     totals, complete = ShardStatistics(), True
     for entry in (entry for split in dataset.splits for entry in dataset.entries(split)):
         record = finished_record(folder, entry, manifest["config_hash"])
         if record is None:
             complete = False
         else:
-            check_document(_Sidecar, record, sidecar_of(folder / entry.file), CHECK_HINT)
+            check_document(_Sidecar, record, folder.at(sidecar_name(entry.file)), CHECK_HINT)
             totals.add(record)
     if complete:
         refuse_nonfinite(totals, totals.paths, folder)
@@ -251,16 +249,15 @@ def finish(
         "target": totals.target(),
     }
     if complete and not manifest["complete"]:
-        with brief_lock(folder / MANIFEST_NAME):
+        with brief_lock(folder.workspace / MANIFEST_NAME):
             # Another process may have completed it since.
             manifest = read_manifest(folder)
             if not manifest["complete"]:
                 manifest |= {"complete": True, "software": software_versions()}
                 manifest["summary"] = {**sums, "paths": totals.paths, **totals.counts}
-                write_checksummed(folder / MANIFEST_NAME, manifest)
-                send(folder / MANIFEST_NAME)
+                folder.write(MANIFEST_NAME, checksummed(manifest))
     if complete:
-        remove_leftovers(folder)
+        folder.remove_leftovers()
     return Summary(
         folder=str(folder),
         complete=complete,

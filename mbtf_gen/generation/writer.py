@@ -9,8 +9,6 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
-from mbtf_core.locks import RENEW_SECONDS, Lock
-
 Step = Callable[[], None]
 
 
@@ -71,11 +69,7 @@ class ShardWriter:
 
     def _work(self) -> None:
         while True:
-            try:
-                task = self._tasks.get(timeout=RENEW_SECONDS)
-            except queue.Empty:
-                Lock.renew()
-                continue
+            task = self._tasks.get()
             if task is None:
                 return
             write, after = task

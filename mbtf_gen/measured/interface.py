@@ -77,7 +77,7 @@ class MeasuredBtf(Protocol):
         """
 
 
-class Queries(TypedDict):
+class QueryBlock(TypedDict):
     """Queries in the conventions of our data sets; the fields are parallel arrays.
 
     Attributes
@@ -109,7 +109,7 @@ class MeasuredQueries(Protocol):
     def count(self) -> int:
         """Queries of the file."""
 
-    def read(self, start: int, stop: int) -> Queries:
+    def read(self, start: int, stop: int) -> QueryBlock:
         """Queries from `start` to before `stop`.
 
         Queries that cannot be used are left out: NaN or infinite numbers, a direction at the horizon or

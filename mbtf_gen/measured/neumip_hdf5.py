@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import write_through
 from mbtf_gen.measured.hdf5 import data_set, floats, opened
-from mbtf_gen.measured.interface import F32, HORIZON, Queries, from_plane
+from mbtf_gen.measured.interface import F32, HORIZON, QueryBlock, from_plane
 
 COLOR, PLACE, RADIUS = "ground_color", "ground_camera_target_loc", "ground_camera_query_radius"
 VIEW, LIGHT, OTHER_LIGHT = "ground_camera_dir", "ground_light", "ground_light_dir"
@@ -54,7 +54,7 @@ class NeumipQueries:
         self._each = math.prod(shape[1:])
         self.count = shape[0] * self._each
 
-    def read(self, start: int, stop: int) -> Queries:
+    def read(self, start: int, stop: int) -> QueryBlock:
         """Queries from `start` to before `stop`, those left out that cannot be used."""
         start, stop = max(start, 0), min(stop, self.count)
         number = np.arange(start, max(start, stop), dtype=np.int64)
@@ -71,7 +71,7 @@ class NeumipQueries:
             sigma = part[RADIUS][:, 0]
             if self.base_radius is not None:
                 sigma = np.where(sigma == 0.0, self.base_radius, sigma)
-            out = Queries(
+            out = QueryBlock(
                 query=number,
                 u=u,
                 sigma=sigma.astype(np.float32),
@@ -93,7 +93,7 @@ class NeumipQueries:
         return rows[start - first * self._each : stop - first * self._each]
 
 
-def _usable(queries: Queries) -> Queries:
+def _usable(queries: QueryBlock) -> QueryBlock:
     ok = (queries["sigma"] > 0) & np.isfinite(queries["sigma"])
     for array in (queries["u"], queries["value"], queries["omega_i"], queries["omega_o"]):
         ok &= np.isfinite(array).all(axis=-1)
@@ -101,7 +101,7 @@ def _usable(queries: Queries) -> Queries:
         ok &= omega[:, 2] > HORIZON
     if ok.all():
         return queries
-    return Queries(
+    return QueryBlock(
         query=queries["query"][ok],
         u=queries["u"][ok],
         sigma=queries["sigma"][ok],

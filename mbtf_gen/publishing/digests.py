@@ -67,7 +67,7 @@ def dataset_digests(data: Dataset) -> dict[str, Any]:
         "software": data.manifest["software"],
         "geometry": (data.manifest["geometry"] or {}).get("sha256"),
         "arrays": {
-            shard.path.stem: {name: array_sha256(array) for name, array in shard.read().items()}
+            shard.file.rpartition(".")[0]: {name: array_sha256(array) for name, array in shard.read().items()}
             for split in data.splits
             for shard in data.shards(split)
         },

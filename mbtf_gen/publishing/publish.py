@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.data.dataset import Dataset, Shard
+from mbtf_core.data.folder import DataFolder, sidecar_name
 from mbtf_core.data.schema import GEOMETRY_NAME
-from mbtf_core.data.sidecar import sidecar_of
 from mbtf_core.data.verify import verify
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.files.atomic import Stored, write_chunks
@@ -55,13 +55,18 @@ class Publication:
 
     @classmethod
     def prepare(
-        cls, shards: Path, config: PublishConfig, *, with_maps: bool = False, material: Path | None = None
+        cls,
+        shards: str | Path | DataFolder,
+        config: PublishConfig,
+        *,
+        with_maps: bool = False,
+        material: Path | None = None,
     ) -> Publication:
         """Check everything that is published, without writing anything.
 
         Parameters
         ----------
-        shards : Path
+        shards : str, Path or DataFolder
             Folder of shards.
         config : PublishConfig
             What its publishers say.
@@ -88,16 +93,16 @@ class Publication:
             check_pyarrow()
         if config.form == "npz" and data.manifest["array_format"] != "npz":
             raise UsageError(
-                f"{shards} holds shards of another format ({data.manifest['array_format']})",
+                f"{data.folder} holds shards of another format ({data.manifest['array_format']})",
                 where="--form npz",
                 hint="use --form parquet or --form webdataset",
             )
         if (with_maps or material is not None) and "measured" in data.manifest:
-            raise UsageError(f"{shards} holds measured data, without maps", where="--with-maps")
+            raise UsageError(f"{data.folder} holds measured data, without maps", where="--with-maps")
         if material is not None and not with_maps:
             raise UsageError("goes with --with-maps", where="--material")
-        for fault in verify(shards):
-            raise InputError(fault.what, where=shards / fault.file, hint=fault.hint)
+        for fault in verify(data.folder):
+            raise InputError(fault.what, where=data.folder.at(fault.file), hint=fault.hint)
         return cls(data, config, copy_of_material(data, material) if with_maps else None)
 
     @cached_property
@@ -125,8 +130,7 @@ class Publication:
     def size(self) -> int:
         """Bytes that the folder takes at most."""
         shards = sum(int(shard.sidecar["bytes"]) for found in self.shards.values() for shard in found)
-        geometry = self.data.folder / GEOMETRY_NAME
-        surface = geometry.stat().st_size if self.data.manifest["geometry"] is not None else 0
+        surface = self.data.folder.size(GEOMETRY_NAME) or 0
         maps = sum(path.stat().st_size for path in self.copy.files.values()) if self.copy else 0
         # Tar files have a header and up to a block of padding per array.
         return round(1.02 * shards) + surface + maps + _DOCUMENT_BYTES
@@ -134,9 +138,7 @@ class Publication:
     @property
     def depends(self) -> dict[str, Any]:
         """Plain data that determine the content of the folder."""
-        stored = {
-            shard.path.name: shard.sidecar["sha256"] for found in self.shards.values() for shard in found
-        }
+        stored = {shard.file: shard.sidecar["sha256"] for found in self.shards.values() for shard in found}
         options = self.config.model_dump(mode="json", exclude={"version"})
         # A long text would make a long message.
         citation = None if self.config.citation is None else data_sha256(self.config.citation)
@@ -153,15 +155,17 @@ class Publication:
         for found in self.shards.values():
             for shard in found:
                 makers |= self._shard_makers(shard)
-        if self.data.manifest["geometry"] is not None:
-            makers[f"{DATA}/{GEOMETRY_NAME}"] = partial(copy_file, self.data.folder / GEOMETRY_NAME)
+        if (geometry := self.data.manifest["geometry"]) is not None:
+            makers[f"{DATA}/{GEOMETRY_NAME}"] = lambda path: copy_file(
+                self.data.folder.file(GEOMETRY_NAME, geometry["sha256"]), path
+            )
         if self.config.form == "npz":
             for name, content in public_documents(self.data.manifest).items():
                 makers[f"{DATA}/{name}"] = partial(_write, content)
         return makers
 
     def _shard_makers(self, shard: Shard) -> Makers:
-        stem, form = shard.path.stem, self.config.form
+        stem, form = shard.file.rpartition(".")[0], self.config.form
         if form == "parquet":
             facts = {"layout": self.data.layout, "split": shard.sidecar["split"]}
             described = self.data.manifest["arrays"]
@@ -170,8 +174,11 @@ class Publication:
             }
         if form == "webdataset":
             return {f"{DATA}/{stem}.tar": lambda path: write_tar(path, shard.read())}
-        files = (shard.path, sidecar_of(shard.path))
-        return {f"{DATA}/{source.name}": partial(link_or_copy, source) for source in files}
+        sidecar = sidecar_name(shard.file)
+        return {
+            f"{DATA}/{shard.file}": lambda path: link_or_copy(shard.local(), path),
+            f"{DATA}/{sidecar}": lambda path: _write(shard.folder.read(sidecar), path),
+        }
 
     def makers(self) -> Makers:
         """Writers of all files but the card and ``croissant.json``, by name."""

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.config.yaml_file import dump_yaml
-from mbtf_core.data.data_folder import local_copy
 from mbtf_core.data.schema import CONFIG_NAME, MANIFEST_NAME
 from mbtf_core.files.atomic import Stored, checksummed, sync_folder, temporary_of, write_chunks
 from mbtf_core.files.digest import file_sha256
@@ -49,7 +48,7 @@ def link_or_copy(source: Path, path: Path) -> Stored:
     ------
     PartialError : the disk is full or the folder cannot be written
     """
-    temporary, source = temporary_of(path), local_copy(source)
+    temporary = temporary_of(path)
     with contextlib.suppress(OSError):
         temporary.unlink(missing_ok=True)
         os.link(source, temporary)

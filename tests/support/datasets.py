@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.queries import Queries
 from mbtf_core.data.schema import FORMAT_NAME, SCHEMA_VERSION
 from mbtf_core.data.shard_files import read_shard, write_shard
-from mbtf_core.files.atomic import checksummed
+from mbtf_core.files.atomic import checksummed, parse_checksummed
 from mbtf_core.files.digest import file_sha256
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.folder import open_folder
@@ -51,14 +52,15 @@ def write_dataset(folder: Path, *, rows: int = 4, columns: int = 8, **options: A
     config = GeneratorConfig.model_validate({"material": str(heights), **options})
     job = Job.prepare(config)
     plan = RunPlan(reference_plan(job))
-    open_folder(job, folder, lambda job: plan, False)
+    files = DataFolder.open(folder)
+    open_folder(job, files, lambda job: plan, False)
     for number, entry in enumerate(job.shards):
         queries = job.query_plan.draw(entry.split, entry.index, entry.rows)
         truth, rng = formula(queries), np.random.default_rng(number)
         a, b = ((truth * (1 + NOISE * rng.normal(size=truth.shape))).astype(np.float32) for _ in range(2))
         paths = queries.sigma.size * split_spp(config, entry.split)
         made = Estimates(a.reshape(-1, 3), b.reshape(-1, 3), None, paths, 0, 0, 0)
-        store_shard(job, folder, plan, entry, queries, made, 0.1)
+        store_shard(job, files, plan, entry, queries, made, 0.1)
     finish(folder)
     return Dataset.open(folder)
 
@@ -141,3 +143,13 @@ FOREIGN: dict[str, tuple[Callable[[Path, Path, str], object], str]] = {
     ),
     "NaN": (lambda d, o, s: _change(d, s, "spp", _times(np.nan)), "'spp' holds NaN or infinite numbers"),
 }
+
+
+def sidecar_of(shard: Path) -> Path:
+    """The JSON file beside a shard."""
+    return shard.with_suffix(".json")
+
+
+def read_checksummed(path: Path) -> dict[str, Any]:
+    """Content of a checksummed document, which is intact."""
+    return parse_checksummed(path.read_bytes(), path)

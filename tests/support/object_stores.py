@@ -12,8 +12,6 @@ from pathlib import Path
 
 import pytest
 
-from mbtf_core.data.store_folder import close_stores
-
 BUCKET = "bucket"
 
 
@@ -112,7 +110,6 @@ def s3_server(folder: Path) -> Iterator[Proxy]:
             yield proxy
         finally:
             proxy.down = False
-            close_stores()
             s3fs.S3FileSystem.clear_instance_cache()
             running.stop()
             proxy.close()
@@ -131,5 +128,4 @@ def memory_store(folder: Path) -> Iterator[str]:
         try:
             yield "memory://data/x"
         finally:
-            close_stores()
             files.store.clear()

@@ -20,6 +20,7 @@ from support.file_operations import FileOperations, Operation
 from support.paths import ROOT
 from support.small_runs import command, contents, die, ending, generate, in_child, noisy_plane
 
+from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.queries import Queries
 from mbtf_core.data.schema import ShardEntry
 from mbtf_core.data.sidecar import finished_record
@@ -237,7 +238,10 @@ def test_an_interrupted_run_keeps_its_shards(
     # The shard that was rendered, and no other one of those to make.
     assert rendered == 1
     shards = [ShardEntry("train", 0, "train-00000.npz", 40), ShardEntry("test", 0, "test-00000.npz", 30)]
-    assert [bool(finished_record(small.out, shard, small.hash)) for shard in shards] == [True, False]
+    assert [bool(finished_record(DataFolder.open(small.out), shard, small.hash)) for shard in shards] == [
+        True,
+        False,
+    ]
     assert (small.out / "train-00000.npz").read_bytes() == small.expected["train-00000.npz"]
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
     assert generate(line) == 0

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from mbtf_core.errors import PartialError
-from mbtf_core.locks import STALE_SECONDS, Lock, brief_lock, lock_owner, shard_lock, take_lock
+from mbtf_core.locks import brief_lock, lock_owner, shard_lock, take_lock
 
 
 def lock_of(shard: Path) -> Path:
@@ -135,28 +135,19 @@ def test_of_many_that_take_over_at_once_one_gets_it(shard: Path) -> None:
     assert not lock_of(shard).exists()
 
 
-def test_locks_of_other_machines_count_by_age(shard: Path) -> None:
-    text = owner(f"{socket.gethostname()}-other", 1)
-    plant(shard, text, age=STALE_SECONDS - 60)
-    with shard_lock(shard) as held:
-        assert not held
-    plant(shard, text, age=STALE_SECONDS + 60)
-    with shard_lock(shard) as held:
-        assert held
-
-
-@pytest.mark.parametrize(("host", "stale"), [("-other", ""), ("", owner(socket.gethostname(), 2**31 - 1))])
-def test_without_advisory_locks(host: str, stale: str, shard: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Locks of other machines and of living processes stay; half-written and abandoned ones do not."""
+def test_without_advisory_locks(shard: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The file itself is the lock."""
 
     def unsupported(handle: int, operation: int) -> None:
         raise OSError(errno.ENOSYS, "not implemented")
 
     monkeypatch.setattr("fcntl.flock", unsupported)
-    for text, free in ((owner(f"{socket.gethostname()}{host}", os.getppid()), False), (stale, True)):
-        plant(shard, text)
-        with shard_lock(shard) as held:
-            assert held == free
+    with shard_lock(shard) as held:
+        assert held
+        with shard_lock(shard) as second:
+            assert not second
+    with shard_lock(shard) as held:
+        assert held
 
 
 def test_lock_owners_are_named(shard: Path) -> None:
@@ -167,17 +158,6 @@ def test_lock_owners_are_named(shard: Path) -> None:
     for text in ("", "{", '{"host": "oak"}', '{"host": "oak", "process": "x", "since": 0}'):
         plant(shard, text)
         assert lock_owner(shard) is None
-
-
-def test_a_sign_of_life_keeps_other_machines_out(shard: Path) -> None:
-    lock = take_lock(shard)
-    assert lock is not None
-    os.utime(lock_of(shard), (0, 0))
-    Lock.renew()
-    assert time.time() - lock_of(shard).stat().st_mtime < 60
-    lock.release()
-    lock.release()
-    assert not lock_of(shard).exists()
 
 
 def test_a_brief_lock_is_waited_for_but_not_for_ever(shard: Path, monkeypatch: pytest.MonkeyPatch) -> None:

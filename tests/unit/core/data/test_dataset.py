@@ -30,7 +30,7 @@ def test_shuffled_layout(tmp_path: Path, array_format: str) -> None:
     assert data.layout == "shuffled"
     assert data.splits == ["train", "test"]
     assert [s.rows for s in data.shards("train")] == [64, 64, 22]
-    assert [s.path.name for s in data.shards("train")] == [f"train-{i:05d}.{array_format}" for i in range(3)]
+    assert [s.file for s in data.shards("train")] == [f"train-{i:05d}.{array_format}" for i in range(3)]
     arrays = data.load("train")
     assert {a.shape[0] for a in arrays.values()} == {150}
     test = data.load("test")
@@ -79,7 +79,7 @@ def test_a_folder_can_move(tmp_path: Path) -> None:
 @pytest.mark.parametrize("suffix", ["npz", "json"])
 def test_missing_and_unfinished_shards(tmp_path: Path, suffix: str) -> None:
     data = write_dataset(tmp_path / "shards", queries={"train": "100", "test": "10"}, output=OUTPUT)
-    (data.folder / f"train-00001.{suffix}").unlink()
+    data.folder.delete(f"train-00001.{suffix}")
     with pytest.raises(InputError, match=r"train-00001\.npz is missing or unfinished") as caught:
         data.load("train")
     assert "resumes" in caught.value.hint

@@ -48,9 +48,9 @@ def test_the_reader_refuses_other_schemas_and_unfinished_data(tmp_path: Path) ->
     data = write_dataset(tmp_path / "shards", queries=QUERIES)
     read_split = reader()
     for change in ({"schema": SCHEMA_VERSION + 1}, {"complete": False}, {"format": "other"}):
-        (data.folder / "manifest.json").write_text(json.dumps({**data.manifest, **change}))
+        data.folder.write("manifest.json", json.dumps({**data.manifest, **change}).encode())
         with pytest.raises(ValueError, match="no complete data set"):
-            read_split(data.folder, "train")
+            read_split(str(data.folder), "train")
 
 
 def test_every_key_of_manifest_and_sidecar_is_explained(tmp_path: Path) -> None:
@@ -85,7 +85,7 @@ def test_members_lie_where_the_document_says(tmp_path: Path) -> None:
     import zipfile
 
     data = write_dataset(tmp_path / "shards", queries=QUERIES)
-    path = data.shards("train")[0].path
+    path = data.shards("train")[0].local()
     whole = path.read_bytes()
     with zipfile.ZipFile(path) as archive:
         for info in archive.infolist():

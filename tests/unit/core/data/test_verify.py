@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.datasets import edit, write_dataset
+from support.datasets import edit, sidecar_of, write_dataset
 
 from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.schema import ShardEntry
 from mbtf_core.data.shard_files import Arrays, read_shard, write_shard
-from mbtf_core.data.sidecar import finished_record, sidecar_of
+from mbtf_core.data.sidecar import finished_record
 from mbtf_core.data.verify import foreign_files, verify
 from mbtf_core.files.digest import file_sha256
 
@@ -56,7 +57,9 @@ def faults(folder: Path) -> dict[str, str]:
 
 def foreign(folder: Path) -> list[str]:
     dataset = Dataset.open(folder)
-    return foreign_files(folder, [e for split in dataset.splits for e in dataset.entries(split)])
+    return foreign_files(
+        DataFolder.open(folder), [e for split in dataset.splits for e in dataset.entries(split)]
+    )
 
 
 def test_an_intact_set_has_no_fault(copy: Path) -> None:
@@ -74,8 +77,8 @@ def test_every_flipped_byte_is_found(copy: Path) -> None:
         assert list(faults(copy)) == [path.name], position
     wanted = json.loads((copy / "manifest.json").read_text())["config_hash"]
     # On resuming, sidecar and size alone are checked.
-    assert finished_record(copy, entry(copy, 40), wanted)
-    assert finished_record(copy, entry(copy, 39), wanted) is None
+    assert finished_record(DataFolder.open(copy), entry(copy, 40), wanted)
+    assert finished_record(DataFolder.open(copy), entry(copy, 39), wanted) is None
     path.write_bytes(intact)
     assert verify(copy) == []
 
@@ -87,8 +90,8 @@ def test_a_truncated_shard_is_found(copy: Path, kept: int) -> None:
     assert "bytes" in faults(copy)[path.name]
     # Size alone decides whether it counts as finished on resuming.
     manifest = json.loads((copy / "manifest.json").read_text())
-    assert not finished_record(copy, entry(copy, 40), manifest["config_hash"])
-    assert finished_record(copy, entry(copy, 40, 0), manifest["config_hash"])
+    assert not finished_record(DataFolder.open(copy), entry(copy, 40), manifest["config_hash"])
+    assert finished_record(DataFolder.open(copy), entry(copy, 40, 0), manifest["config_hash"])
 
 
 def test_every_flipped_byte_of_the_geometry_is_found(copy: Path) -> None:
@@ -171,7 +174,7 @@ def test_foreign_files_are_found(copy: Path, made: dict[str, Path], tmp_path: Pa
         seed=1,
     )
     for path in (shard(copy), sidecar_of(shard(copy))):
-        shutil.copy(other.folder / path.name, path)
+        path.write_bytes(other.folder.read(path.name))
     assert faults(copy) == {shard(copy).name: "belongs to another data set than manifest.json"}
 
 
@@ -198,7 +201,7 @@ def test_wrong_rows_and_bad_numbers_are_found_behind_a_true_digest(copy: Path) -
 def test_a_broken_sidecar_is_a_fault_not_an_abort(copy: Path, text: str) -> None:
     sidecar_of(shard(copy)).write_text(text)
     assert list(faults(copy)) == [shard(copy).name]
-    assert not finished_record(copy, entry(copy, 40), "any")
+    assert not finished_record(DataFolder.open(copy), entry(copy, 40), "any")
 
 
 def test_headers_are_parsed_in_one_thread(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:

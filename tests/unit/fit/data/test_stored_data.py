@@ -13,13 +13,11 @@ import pytest
 from support.fit_data import parallax, write_data
 from support.object_stores import memory_store
 
-from mbtf_core.data.data_folder import data_folder, prefetch
-from mbtf_core.data.dataset import Dataset
-from mbtf_core.data.store import Store
-from mbtf_core.data.store_folder import StoreFolder, StorePath
+from mbtf_core.data.dataset import Dataset, Shard, ahead
+from mbtf_core.data.folder import DataFolder
+from mbtf_core.data.store import ObjectStore
 from mbtf_core.errors import PartialError
 from mbtf_fit.config import FitConfig, HeldOutSection
-from mbtf_fit.data import streaming
 from mbtf_fit.data.loader import load_training
 from mbtf_fit.data.queries import batch_starts
 from mbtf_fit.data.streaming import StreamedQueries
@@ -39,7 +37,7 @@ def url(tmp_path: Path) -> Iterator[str]:
 def local(tmp_path: Path, url: str) -> Path:
     """A data set of eight shards, and the same one in the store."""
     folder = write_data(tmp_path / "local", parallax, train=8000, test=500, shards=8)
-    store = Store(url)
+    store = ObjectStore(url)
     for path in folder.iterdir():
         store.write(path.name, path.read_bytes())
     return folder
@@ -49,14 +47,15 @@ def local(tmp_path: Path, url: str) -> Path:
 def downloads(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
     """(shard, thread) of every download."""
     found: list[tuple[str, str]] = []
-    original = Store.download
+    original = ObjectStore.read
 
-    def watched(self: Store, name: str, path: Path) -> None:
-        found.append((name, threading.current_thread().name))
-        time.sleep(0.01)
-        original(self, name, path)
+    def watched(self: ObjectStore, name: str) -> bytes:
+        if name.endswith(".npz"):
+            found.append((name, threading.current_thread().name))
+            time.sleep(0.01)
+        return original(self, name)
 
-    monkeypatch.setattr(Store, "download", watched)
+    monkeypatch.setattr(ObjectStore, "read", watched)
     return found
 
 
@@ -98,13 +97,13 @@ def test_shards_are_downloaded_once(url: str, local: Path, downloads: list[tuple
 def test_the_shards_after_the_one_that_is_read_are_downloaded_ahead(
     url: str, local: Path, downloads: list[tuple[str, str]]
 ) -> None:
-    Dataset.open(url).shards("train")[0].read()
+    next(ahead(Dataset.open(url).shards("train"))).read()
     give_up = time.monotonic() + 60.0
     while len(downloads) < 3 and time.monotonic() < give_up:
         time.sleep(0.01)
-    first, *ahead = downloads
-    assert first == ("train-00000.npz", threading.current_thread().name)
-    assert sorted(ahead) == [("train-00001.npz", "prefetch"), ("train-00002.npz", "prefetch")]
+    here = threading.current_thread().name
+    names = [("train-00000.npz", here), ("train-00001.npz", "prefetch"), ("train-00002.npz", "prefetch")]
+    assert sorted(downloads) == names
 
 
 def test_the_shards_of_later_batches_are_announced(
@@ -114,9 +113,9 @@ def test_the_shards_of_later_batches_are_announced(
     training = load_training(Dataset.open(url), HELD_OUT, 0, memory=1.0).training
     assert isinstance(training, StreamedQueries)
     announced: list[str] = []
-    monkeypatch.setattr(streaming, "prefetch", lambda path: announced.append(path.name))
+    monkeypatch.setattr(Shard, "prefetch", lambda shard: announced.append(shard.file))
     starts = list(islice(batch_starts(len(training), 300, 0, 0), 20))
-    expected = [{path.name for path, _ in training.selection.pieces(s, s + 300)} for s in starts]
+    expected = [{shard.file for shard, _ in training.selection.pieces(s, s + 300)} for s in starts]
     for at, start in enumerate(islice(training._announced(iter(starts), 300), 14)):
         assert start == starts[at]
         assert set(announced) == set().union(*expected[: at + 7])
@@ -147,16 +146,16 @@ def test_a_shard_that_another_process_evicts_is_read_again(tmp_path: Path, url: 
 def test_a_shard_that_leaves_the_cache_before_it_is_opened(
     url: str, local: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    original, left = StoreFolder.local, [3]
+    original, left = DataFolder.file, [3]
 
-    def evicted(self: StoreFolder, name: str) -> Path:
-        path = original(self, name)
+    def evicted(self: DataFolder, name: str, sha256: str, size: int | None = None) -> Path:
+        path = original(self, name, sha256, size)
         if left[0]:
             left[0] -= 1
             path.unlink()
         return path
 
-    monkeypatch.setattr(StoreFolder, "local", evicted)
+    monkeypatch.setattr(DataFolder, "file", evicted)
     found = Dataset.open(url).shards("train")[0].read()
     assert left == [0]
     expected = Dataset.open(local).shards("train")[0].read()
@@ -192,14 +191,13 @@ def test_a_lost_store_leaves_a_checkpoint(
 def test_failures_of_the_background_are_left_to_the_reader(
     url: str, local: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = data_folder(url)
-    assert isinstance(folder, StorePath)
+    shard = Dataset.open(url).shards("train")[1]
     with monkeypatch.context() as patch:
-        patch.setattr(Store, "download", _unreachable)
-        prefetch(folder / "train-00001.npz")
+        patch.setattr(ObjectStore, "read", _unreachable)
+        shard.prefetch()
         with pytest.raises(PartialError):
-            Dataset.open(url).shards("train")[1].read()
-    Dataset.open(url).shards("train")[1].read()
+            shard.read()
+    shard.read()
 
 
 def _unreachable(*_: object) -> None:

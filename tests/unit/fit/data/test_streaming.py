@@ -11,7 +11,8 @@ from conftest import RunPython
 from support.fit_data import parallax, write_data
 
 import mbtf_fit.evaluation
-from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.dataset import Dataset, Shard
+from mbtf_core.data.folder import DataFolder
 from mbtf_core.errors import InputError
 from mbtf_core.units import format_size, parse_size
 from mbtf_fit.config import FitConfig, HeldOutSection
@@ -76,11 +77,11 @@ def test_selected_rows_are_found_by_index() -> None:
     for k, rows in enumerate((10_000, 1, 4096, 20_001)):
         chosen = random.random(rows) < (0.9, 0.0, 1.0, 0.01)[k]
         chosen[:5000] &= k != 3
-        selection.add(Path(str(k)), chosen)
+        selection.add(Shard(DataFolder.open("."), str(k), {}), chosen)
         wanted += [(str(k), int(row)) for row in np.flatnonzero(chosen)]
     assert len(selection) == len(wanted)
     for start, stop in ((0, 1), (0, len(wanted)), (8990, 9100), (13_000, len(wanted)), (4096, 8192)):
-        found = [(p.name, int(r)) for p, rows in selection.pieces(start, stop) for r in rows]
+        found = [(p.file, int(r)) for p, rows in selection.pieces(start, stop) for r in rows]
         assert found == wanted[start:stop]
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from support.datasets import read_checksummed
 from support.fit_data import parallax, random_queries, training_queries, write_data
 from support.fuzzing import check_message
 from support.known_surfaces import rough_surface
@@ -18,7 +19,7 @@ from torch import Tensor
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.data.schema import MANIFEST_NAME
 from mbtf_core.errors import InputError
-from mbtf_core.files.atomic import checksummed, read_checksummed
+from mbtf_core.files.atomic import checksummed
 from mbtf_fit import FitConfig, fit
 from mbtf_fit.material.inference import predict
 from mbtf_fit.models.encodings import encode_directions, rotate_to_z

@@ -150,7 +150,7 @@ def test_materials_evaluate_as_the_trainers_predict(
 
     def observed(trainer: Trainer, config: FitConfig, shards: Dataset, *arguments: Any, **more: Any) -> None:
         export(trainer, config, shards, *arguments, **more)
-        predicted[Path(shards.folder).name] = trainer.predict(load_split(shards, "test"))
+        predicted[Path(str(shards.folder)).name] = trainer.predict(load_split(shards, "test"))
 
     monkeypatch.setattr(mbtf_fit.training.joint_fit, "export_fit", observed)
     fit_two(joint_config(steps=40), data, tmp_path)

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from support.datasets import read_checksummed
 from support.fit_data import parallax, write_data
 from support.paths import ROOT
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.lattice import Lattice
-from mbtf_core.files.atomic import read_checksummed, write_checksummed
+from mbtf_core.files.atomic import write_checksummed
 from mbtf_core.images.resample import resample
 from mbtf_fit import FitConfig, fit
 from mbtf_fit.data.loader import load_training, open_data

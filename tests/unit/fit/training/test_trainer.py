@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from itertools import islice
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,8 @@ import pytest
 import torch
 from support.fit_data import make_trainer, parallax, random_queries, train_fully, training_queries
 
+from mbtf_core.data.dataset import Shard
+from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
 from mbtf_fit.config import FitConfig
@@ -201,8 +202,8 @@ def test_divergence_names_the_first_bad_batch() -> None:
     selection = Selection()
     chosen = np.ones(3000, bool)
     chosen[:7] = False
-    selection.add(Path("train-00000.npz"), chosen)
-    selection.add(Path("train-00001.npz"), np.ones(2007, bool))
+    selection.add(Shard(DataFolder.open("."), "train-00000.npz", {}), chosen)
+    selection.add(Shard(DataFolder.open("."), "train-00001.npz", {}), np.ones(2007, bool))
     data.value[4200] = torch.inf
     t = make_trainer(data, LATTICE, steps=40, batch=100, huber_delta=None)
     t.selection = selection

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from mbtf_core.cluster.task import TaskResult
+from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.manifest import plan_digest
 from mbtf_core.errors import InputError, LockedError, PartialError
 from mbtf_core.locks import lock_file_of, take_lock
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.distribute_shards import distribute_shards, render_shard
-from mbtf_gen.generation.folder import open_folder
-from mbtf_gen.generation.summary import read_run_plan
+from mbtf_gen.generation.folder import open_folder, read_run_plan
 from mbtf_gen.job import Job
 from mbtf_gen.planning.run_plan import plan_run
 
@@ -32,7 +32,7 @@ def arguments(tmp_path: Path) -> dict[str, Any]:
     options = {"material": str(tmp_path / "plane.npy"), "queries": queries}
     config = GeneratorConfig.model_validate(options | {"output": {"shard_queries": 100}})
     job = Job.prepare(config)
-    open_folder(job, tmp_path / "out", plan_run, False)
+    open_folder(job, DataFolder.open(tmp_path / "out"), plan_run, False)
     return {
         "config": job.config.model_dump(mode="json"),
         "folder": str(tmp_path / "out"),
@@ -99,7 +99,7 @@ def test_samples_that_are_not_finite_end_the_run(arguments: dict[str, Any], tmp_
     job = Job.prepare(GeneratorConfig.model_validate(arguments["config"]))
     plan = read_run_plan(tmp_path / "out")
     with pytest.raises(PartialError, match="NaN or infinite"):
-        distribute_shards(job, tmp_path / "out", job.shards, plan, FullDisk(1, value))  # type: ignore[arg-type]
+        distribute_shards(job, DataFolder.open(tmp_path / "out"), job.shards, plan, FullDisk(1, value))  # type: ignore[arg-type]
 
 
 def test_a_full_disk_ends_the_run(arguments: dict[str, Any], tmp_path: Path) -> None:
@@ -107,10 +107,22 @@ def test_a_full_disk_ends_the_run(arguments: dict[str, Any], tmp_path: Path) -> 
     job = Job.prepare(config)
     disk = FullDisk()
     with pytest.raises(PartialError, match=r"8 shard\(s\) failed, 103 are left.*no space left \(on node:1\)"):
-        distribute_shards(job, tmp_path / "out", job.shards, read_run_plan(tmp_path / "out"), disk)  # type: ignore[arg-type]
+        distribute_shards(
+            job,
+            DataFolder.open(tmp_path / "out"),
+            job.shards,
+            read_run_plan(tmp_path / "out"),
+            disk,  # type: ignore[arg-type]
+        )
     assert disk.tried == 8
     # Failures that are not in a row do not end it.
     disk = FullDisk(6, render_shard(**arguments))
     with pytest.raises(PartialError, match=r"13 shard\(s\) failed"):
-        distribute_shards(job, tmp_path / "out", job.shards, read_run_plan(tmp_path / "out"), disk)  # type: ignore[arg-type]
+        distribute_shards(
+            job,
+            DataFolder.open(tmp_path / "out"),
+            job.shards,
+            read_run_plan(tmp_path / "out"),
+            disk,  # type: ignore[arg-type]
+        )
     assert disk.tried == 14

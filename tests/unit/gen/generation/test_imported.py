@@ -26,7 +26,7 @@ from mbtf_gen.config.measured import ImportConfig
 from mbtf_gen.generation import import_job
 from mbtf_gen.generation.import_job import Import
 from mbtf_gen.generation.imported import import_measured
-from mbtf_gen.generation.repair import Corruption
+from mbtf_gen.generation.repair import repair
 from mbtf_gen.sampling.slice_directions import slice_directions
 from mbtf_pipeline.compare.dataset_errors import dataset_errors
 
@@ -117,7 +117,7 @@ def test_an_interrupted_import_resumes_with_the_same_bytes(opened: Open, tmp_pat
         import_measured(opened(Images(), queries=queries, seed=1), tmp_path / "part")
     import_measured(opened(Images(), queries=queries, seed=1), tmp_path / "part", overwrite=True)
     with pytest.raises(InputError, match="cannot be generated again"):
-        Corruption(tmp_path / "part")
+        repair(tmp_path / "part")
 
 
 def test_no_noise_is_claimed(opened: Open, tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from mbtf_core.errors import InputError
 from mbtf_fit.cli.app import app as fit_app
 from mbtf_gen.cli.app import app
 from mbtf_gen.generation import repair as repairs
-from mbtf_gen.generation.repair import Corruption, repair
+from mbtf_gen.generation.repair import repair
 from mbtf_gen.job import Job
 from mbtf_gen.planning.effects_plan import reference_plan
 from mbtf_gen.planning.run_plan import RunPlan, plan_run
@@ -100,8 +100,8 @@ def test_faulty_files_are_restored_and_nothing_else(name: str, out: Path) -> Non
     corrupt, shards, documents = CORRUPTIONS[name]
     corrupt(out)
     before = moments(out)
-    planned = Corruption(out)
-    assert {e.file for e in planned.entries} == shards
+    planned = repair(out, dry_run=True)
+    assert set(planned.shards) == shards
     assert set(planned.documents) == documents
     assert moments(out) == before
     done = repair(out)
@@ -149,73 +149,39 @@ def copy_files(source: Path, out: Path, *names: str) -> None:
         shutil.copy(source / name, out)
 
 
-DISAGREEMENTS: dict[str, tuple[tuple[str, ...], str, str, set[str]]] = {
-    # files of the other run: what belongs to this run and to the other one, shards to render for this run
-    "manifest": (("manifest.json",), "config.yaml, 4 shards", "manifest.json", set()),
-    "manifest and configuration": (
+@pytest.mark.parametrize(
+    "files",
+    [
+        ("manifest.json",),
         ("manifest.json", "config.yaml"),
-        "4 shards",
-        "manifest.json, config.yaml",
-        set(),
-    ),
-    "configuration": (("config.yaml",), "manifest.json, 4 shards", "config.yaml", set()),
-    "shard": (
         ("train-00001.npz", "train-00001.json"),
-        "manifest.json, config.yaml, 3 shards",
-        "1 shard",
-        {"train-00001.npz"},
-    ),
-    "everything but shards": (
         ("train-00000.json", "manifest.json"),
-        "config.yaml, 3 shards",
-        "manifest.json, 1 shard",
-        {"train-00000.npz"},
-    ),
-}
-
-
-@pytest.mark.parametrize("name", DISAGREEMENTS)
-def test_files_that_disagree_are_named_and_not_touched(name: str, out: Path, other: Path) -> None:
-    files, mine, theirs, rendered = DISAGREEMENTS[name]
-    this, that = (json.loads((f / "manifest.json").read_text())["config_hash"][:8] for f in (out, other))
+    ],
+)
+def test_files_that_disagree_are_named_and_not_touched(
+    files: tuple[str, ...], out: Path, other: Path
+) -> None:
     copy_files(other, out, *files)
     before = moments(out)
     for dry_run in (False, True):
         with pytest.raises(InputError, match="its files belong to 2 data sets") as caught:
-            Corruption(out).entries if dry_run else repair(out)
-        assert f"{this} ({mine})" in caught.value.what
-        assert f"{that} ({theirs})" in caught.value.what
-        assert caught.value.hint == f"nothing was changed; choose one: mbtf-gen repair {out} --keep NAME"
-    with pytest.raises(InputError, match="--keep 01234567 names no data set"):
-        repair(out, keep="01234567")
+            repair(out, dry_run=dry_run)
+        assert "manifest.json" in caught.value.what
+        assert "train-00001.json" in caught.value.what
     assert generate(["repair", str(out), "-q"]) == 3
     assert moments(out) == before
-    if name == "manifest and configuration":
-        # Nothing knows this run's options any more.
-        with pytest.raises(InputError, match="the material or the configuration has changed"):
-            repair(out, keep=this)
-        assert moments(out) == before
-        return
-    done = repair(out, keep=this)
-    assert set(done.shards) == rendered
-    assert contents(out) == contents(out.parent / "whole")
-    assert verify(out) == []
+    if files != ("manifest.json", "config.yaml"):
+        for name in files:
+            (out / name).unlink()
+        assert repair(out).complete
+        assert contents(out) == contents(out.parent / "whole")
+        assert verify(out) == []
 
 
-def test_the_other_data_set_can_be_kept(out: Path, other: Path) -> None:
-    copy_files(other, out, "manifest.json")
-    that = json.loads((other / "manifest.json").read_text())["config_hash"][:8]
-    assert len(repair(out, keep=that).shards) == 4
-    assert contents(out) == contents(other)
-
-
-def test_a_configuration_alone_is_nothing_to_keep(out: Path, other: Path) -> None:
+def test_the_configuration_of_another_run_is_replaced(out: Path, other: Path) -> None:
     copy_files(other, out, "config.yaml")
-    that = json.loads((other / "manifest.json").read_text())["config_hash"][:8]
-    before = moments(out)
-    with pytest.raises(InputError, match=f"--keep {that} names no data set that can be restored"):
-        repair(out, keep=that)
-    assert moments(out) == before
+    assert repair(out).documents == ["config.yaml"]
+    assert contents(out) == contents(out.parent / "whole")
 
 
 @pytest.mark.parametrize("damage", ["deleted", "flipped"])

@@ -10,13 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.datasets import formula
+from support.datasets import formula, sidecar_of
 from support.formula_runs import FILES, Formula, changed, cheap_plan, contents, left_of, listing
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.geometry import Geometry
 from mbtf_core.data.shard_files import read_shard
-from mbtf_core.data.sidecar import sidecar_of
 from mbtf_core.data.verify import verify
 from mbtf_core.errors import InputError, PartialError
 from mbtf_gen.config.generator import GeneratorConfig

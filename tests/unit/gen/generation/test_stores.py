@@ -13,14 +13,12 @@ import pytest
 from support.object_stores import memory_store
 from support.small_runs import command, contents, generate, noisy_plane
 
-import mbtf_core.data.store_folder
 from mbtf_core.app.console import run
-from mbtf_core.data.data_folder import data_folder, in_store, local_copy
 from mbtf_core.data.dataset import Dataset
-from mbtf_core.data.recover import recover_shards
+from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.schema import ShardEntry
-from mbtf_core.data.store import Store, StoredObject
-from mbtf_core.data.store_folder import StorePath, close_stores
+from mbtf_core.data.sidecar import upload_waiting
+from mbtf_core.data.store import ObjectStore, StoredFile
 from mbtf_core.data.verify import verify
 from mbtf_core.errors import InputError, MbtfError, PartialError
 from mbtf_core.files.atomic import checksummed
@@ -48,7 +46,7 @@ def command_at(folder: Path, url: str, *more: str, **options: Any) -> list[str]:
 
 def downloaded(url: str, folder: Path) -> Path:
     """A local copy of everything in a store."""
-    store = Store(url)
+    store = ObjectStore(url)
     folder.mkdir()
     for name in store.list():
         (folder / name).write_bytes(store.read(name))
@@ -69,41 +67,34 @@ def test_the_bits_are_those_of_a_local_run(tmp_path: Path, url: str, suffix: str
     assert stored.geometry() is not None
 
 
+def waiting(folder: Path) -> list[str]:
+    """Files that are not uploaded."""
+    return [path.name for path in (folder / "cache/mbtf/stores/waiting").glob("*/*")]
+
+
 def test_nothing_stays_on_the_machine_but_the_cache(tmp_path: Path, url: str) -> None:
     assert generate(command_at(tmp_path, url)) == 0
-    folder = data_folder(url)
-    assert in_store(folder)
-    assert not [name for name in os.listdir(folder) if name.endswith(".npz")]
-    close_stores()
-    assert os.listdir(tmp_path / "cache" / "mbtf" / "stores" / "work") == []
+    assert waiting(tmp_path) == []
 
 
-def test_a_path_of_a_store(tmp_path: Path, url: str) -> None:
+def test_a_folder_of_a_store(tmp_path: Path, url: str) -> None:
     assert generate(command_at(tmp_path, url)) == 0
-    folder = data_folder(Path(url))
-    shard = folder / "train-00000.npz"
-    assert isinstance(shard, StorePath)
-    assert isinstance(shard.parent, StorePath)
-    assert (str(folder), f"{shard}", str(shard.parent)) == (url, f"{url}/train-00000.npz", url)
-    assert shard.exists()
-    assert shard.is_file()
-    assert shard.stat().st_size == local_copy(shard).stat().st_size > 0
-    assert shard.with_suffix(".json").read_bytes().startswith(b"{")
-    assert not (folder / "train-00009.npz").exists()
-    with pytest.raises(FileNotFoundError):
-        (folder / "train-00009.npz").stat()
-    assert {path.name for path in folder.iterdir()} == set(Store(url).list())
-    assert [path.name for path in folder.glob("test-*.json")] == ["test-00000.json"]
-    shard.unlink()
-    assert not shard.exists()
-    assert "train-00000.npz" not in Store(url).list()
-    assert data_folder(f"file://{tmp_path}/a%20b") == tmp_path / "a b"
-    assert not in_store(data_folder(tmp_path))
+    folder = DataFolder.open(Path(url))
+    assert (str(folder), folder.at("a")) == (url, f"{url}/a")
+    assert folder.local is None
+    assert folder.names() == sorted(ObjectStore(url).list())
+    shard = Dataset.open(folder).shards("train")[0]
+    assert folder.size(shard.file) == shard.local().stat().st_size > 0
+    assert folder.size("train-00009.npz") is None
+    folder.delete(shard.file)
+    assert not folder.has(shard.file)
+    assert shard.file not in ObjectStore(url).list()
+    assert DataFolder.open(f"file://{tmp_path}/a%20b").local == tmp_path / "a b"
+    assert DataFolder.open(tmp_path).local == tmp_path
 
 
 def test_a_finished_run_renders_nothing(tmp_path: Path, url: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert generate(command_at(tmp_path, url)) == 0
-    close_stores()
     capsys.readouterr()
     assert generate(command_at(tmp_path, url)) == 0
     assert "nothing left to do" in capsys.readouterr().out
@@ -111,27 +102,17 @@ def test_a_finished_run_renders_nothing(tmp_path: Path, url: str, capsys: pytest
 
 def test_a_list_that_lags_behind(tmp_path: Path, url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The data set is not complete before the store shows all of it."""
-    original = Store.list
+    original = ObjectStore.list
 
-    def late(self: Store) -> dict[str, StoredObject]:
+    def late(self: ObjectStore) -> dict[str, StoredFile]:
         return {name: found for name, found in original(self).items() if name != "train-00001.npz"}
 
     with monkeypatch.context() as patch:
-        patch.setattr(Store, "list", late)
+        patch.setattr(ObjectStore, "list", late)
         assert generate(command_at(tmp_path, url)) == 4
-    assert not json.loads(Store(url).read("manifest.json"))["complete"]
+    assert not json.loads(ObjectStore(url).read("manifest.json"))["complete"]
     assert generate(command_at(tmp_path, url)) == 0
     assert generate(command(tmp_path, tmp_path / "local")) == 0
-    assert contents(downloaded(url, tmp_path / "copy")) == contents(tmp_path / "local")
-
-
-def test_slices_and_merge(tmp_path: Path, url: str) -> None:
-    assert generate(command(tmp_path, tmp_path / "local")) == 0
-    assert generate(command_at(tmp_path, url, "--slice", "1/2")) == 0
-    close_stores()
-    assert generate(command_at(tmp_path, url, "--slice", "2/2")) == 0
-    close_stores()
-    assert run(app, ["merge", url, "-q"]) == 0
     assert contents(downloaded(url, tmp_path / "copy")) == contents(tmp_path / "local")
 
 
@@ -140,22 +121,21 @@ def test_the_manifest_of_another_writer_is_adopted(
 ) -> None:
     """Another machine stores its manifest between this one's look at the store and its own."""
     assert generate(command_at(tmp_path, url)) == 0
-    theirs = checksummed({**json.loads(Store(url).read("manifest.json")), "note": "theirs"})
-    for name in Store(url).list():
-        Store(url).delete(name)
-    close_stores()
-    original = Store.write
+    theirs = checksummed({**json.loads(ObjectStore(url).read("manifest.json")), "note": "theirs"})
+    for name in ObjectStore(url).list():
+        ObjectStore(url).delete(name)
+    original = ObjectStore.write
 
-    def late(self: Store, name: str, content: bytes, *, new: bool = False) -> bool:
+    def late(self: ObjectStore, name: str, content: bytes, *, new: bool = False) -> bool:
         if name == "manifest.json" and not self.list():
             original(self, name, theirs)
         return original(self, name, content, new=new)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Store, "write", late)
+        patch.setattr(ObjectStore, "write", late)
         assert generate(command_at(tmp_path, url)) == 0
     assert verify(url) == []
-    assert json.loads(Store(url).read("manifest.json"))["note"] == "theirs"
+    assert json.loads(ObjectStore(url).read("manifest.json"))["note"] == "theirs"
 
 
 @pytest.mark.parametrize("same", [True, False])
@@ -163,11 +143,10 @@ def test_a_shard_without_sidecar_is_replaced(tmp_path: Path, url: str, same: boo
     """A writer was killed between the two; another machine may compute other bits."""
     assert generate(command_at(tmp_path, url)) == 0
     expected = contents(downloaded(url, tmp_path / "before"))
-    store = Store(url)
+    store = ObjectStore(url)
     store.delete("train-00001.json")
     if not same:
         store.write("train-00001.npz", b"other bits")
-    close_stores()
     assert generate(command_at(tmp_path, url)) == 0
     assert contents(downloaded(url, tmp_path / "after")) == expected
 
@@ -177,14 +156,13 @@ def test_the_shard_of_another_writer_is_kept(
 ) -> None:
     """Two writers without slices: the one that comes second adopts what the first has finished."""
     assert generate(command_at(tmp_path, url)) == 0
-    store = Store(url)
+    store = ObjectStore(url)
     shard, sidecar = store.read("train-00001.npz"), store.read("train-00001.json")
     store.delete("train-00001.json")
     store.delete("train-00001.npz")
-    close_stores()
-    original = Store.write
+    original = ObjectStore.write
 
-    def late(self: Store, name: str, content: bytes, *, new: bool = False) -> bool:
+    def late(self: ObjectStore, name: str, content: bytes, *, new: bool = False) -> bool:
         if name == "train-00001.npz":
             original(self, name, shard)
             original(self, "train-00001.json", sidecar)
@@ -192,7 +170,7 @@ def test_the_shard_of_another_writer_is_kept(
         return original(self, name, content, new=new)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Store, "write", late)
+        patch.setattr(ObjectStore, "write", late)
         assert generate(command_at(tmp_path, url)) == 0
     assert store.read("train-00001.json") == sidecar
     assert verify(url) == []
@@ -204,7 +182,7 @@ def test_corruption_is_found_and_repaired(
     assert generate(command_at(tmp_path, url)) == 0
     expected = contents(downloaded(url, tmp_path / "before"))
     Dataset.open(url).load("train")  # the cache has the intact shards
-    store = Store(url)
+    store = ObjectStore(url)
     flipped = bytearray(store.read("train-00001.npz"))
     flipped[-100] ^= 1
     store.write("train-00001.npz", bytes(flipped))
@@ -214,7 +192,6 @@ def test_corruption_is_found_and_repaired(
     store.write("notes.txt", b"mine")
     faulty = {"train-00000.npz", "train-00001.npz", "geometry.exr", "config.yaml"}
     assert {fault.file for fault in verify(url)} == faulty
-    close_stores()
     assert run(app, ["verify", url, "-q"]) == 3
     assert f"mbtf-gen repair {url}" in capsys.readouterr().out
     assert run(app, ["repair", url, "-q"]) == 0
@@ -227,8 +204,7 @@ def test_corruption_is_found_and_repaired(
 def test_a_lost_manifest_is_restored(tmp_path: Path, url: str) -> None:
     assert generate(command_at(tmp_path, url)) == 0
     expected = contents(downloaded(url, tmp_path / "before"))
-    Store(url).delete("manifest.json")
-    close_stores()
+    ObjectStore(url).delete("manifest.json")
     assert run(app, ["repair", url, "-q"]) == 0
     assert contents(downloaded(url, tmp_path / "after")) == expected
 
@@ -247,10 +223,10 @@ def test_another_configuration_is_refused_and_replaced(
 def test_a_folder_of_something_else_is_refused(
     tmp_path: Path, url: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    Store(url).write("thesis.tex", b"text")
+    ObjectStore(url).write("thesis.tex", b"text")
     assert generate(command_at(tmp_path, url)) == 3
     assert f"{url}: is not empty and holds no data set" in capsys.readouterr().err
-    assert set(Store(url).list()) == {"thesis.tex"}
+    assert set(ObjectStore(url).list()) == {"thesis.tex"}
 
 
 def test_missing_data_sets_are_named(url: str) -> None:
@@ -266,7 +242,6 @@ def test_a_url_names_a_bucket() -> None:
 def test_a_cache_that_cannot_be_written(tmp_path: Path, url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert generate(command_at(tmp_path, url)) == 0
     (tmp_path / "file").touch()
-    close_stores()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     with pytest.raises(InputError, match="cannot be created"):
         Dataset.open(url)
@@ -274,7 +249,7 @@ def test_a_cache_that_cannot_be_written(tmp_path: Path, url: str, monkeypatch: p
 
 def test_a_corrupt_shard_is_not_read(tmp_path: Path, url: str) -> None:
     assert generate(command_at(tmp_path, url)) == 0
-    store = Store(url)
+    store = ObjectStore(url)
     flipped = bytearray(store.read("train-00001.npz"))
     flipped[-100] ^= 1
     store.write("train-00001.npz", bytes(flipped))
@@ -284,25 +259,24 @@ def test_a_corrupt_shard_is_not_read(tmp_path: Path, url: str) -> None:
 
 def test_a_digest_names_no_file_elsewhere(tmp_path: Path, url: str) -> None:
     assert generate(command_at(tmp_path, url)) == 0
-    store = Store(url)
+    store = ObjectStore(url)
     record = json.loads(store.read("train-00001.json"))
     store.write("train-00001.json", checksummed(record | {"sha256": f"../{'0' * 61}"}))
-    with pytest.raises(InputError, match=f"{url}/train-00001.npz: has no readable sidecar"):
+    with pytest.raises(InputError, match="sha256"):
         Dataset.open(url).load("train")
 
 
 @pytest.mark.parametrize("error", [PartialError, InputError])
-@pytest.mark.parametrize("ended", [True, False])
 def test_shards_that_could_not_be_uploaded_wait(
-    tmp_path: Path, url: str, monkeypatch: pytest.MonkeyPatch, error: type[MbtfError], ended: bool
+    tmp_path: Path, url: str, monkeypatch: pytest.MonkeyPatch, error: type[MbtfError]
 ) -> None:
     """The connection ends during a run, or the credentials do: what is rendered is kept, and the next run
     uploads it, also in the same process."""
     assert generate(command(tmp_path, tmp_path / "local", train=200)) == 0
     rendered: list[str] = []
-    original, estimate = Store.write, ClosedForm.estimate
+    original, estimate = ObjectStore.write, ClosedForm.estimate
 
-    def cut(self: Store, name: str, content: bytes, *, new: bool = False) -> bool:
+    def cut(self: ObjectStore, name: str, content: bytes, *, new: bool = False) -> bool:
         if name.startswith("train-00001"):
             raise error("the store cannot be reached", where=self.url)
         return original(self, name, content, new=new)
@@ -313,30 +287,25 @@ def test_shards_that_could_not_be_uploaded_wait(
 
     monkeypatch.setattr(ClosedForm, "estimate", counted)
     with monkeypatch.context() as patch:
-        patch.setattr(Store, "write", cut)
+        patch.setattr(ObjectStore, "write", cut)
         # The second one has to leave what the first one left.
         for _ in range(2):
             assert generate(command_at(tmp_path, url, train=200)) == error.exit_code
             assert "train-00001.npz" in {fault.file for fault in verify(url)}
-            if ended:
-                close_stores()
     assert generate(command_at(tmp_path, url, train=200)) == 0
     # Every shard was rendered once.
     assert len(rendered) == 6
     assert contents(downloaded(url, tmp_path / "copy")) == contents(tmp_path / "local")
-    close_stores()
-    assert os.listdir(tmp_path / "cache" / "mbtf" / "stores" / "work") == []
+    assert waiting(tmp_path) == []
 
 
 @pytest.fixture
 def left(tmp_path: Path, url: str, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A shard that a process which has ended could not upload."""
     with monkeypatch.context() as patch:
-        patch.setattr(mbtf_core.data.store_folder.StoreFolder, "send_shard", _unreachable)
+        patch.setattr(ObjectStore, "write", _documents_only)
         assert generate(command_at(tmp_path, url)) == 4
-    found = min(Path(os.fspath(data_folder(url))).glob("*.npz"))
-    close_stores()
-    return found
+    return min(DataFolder.open(url).workspace.glob("*.npz"))
 
 
 def test_damaged_leftovers_are_rendered_again(tmp_path: Path, url: str, left: Path) -> None:
@@ -353,9 +322,9 @@ def test_leftovers_of_another_data_set_are_not_uploaded(url: str, left: Path, ot
     record = json.loads(left.with_suffix(".json").read_bytes())
     entry = ShardEntry(record["split"], record["index"], record["file"], record["rows"])
     record = {"url": url} | record | {other: f"{url}-other" if other == "url" else "0" * 64}
-    sent = recover_shards(data_folder(record["url"]), [entry], record["config_hash"], record["plan"])
+    sent = upload_waiting(DataFolder.open(record["url"]), [entry], record["config_hash"], record["plan"])
     assert sent == ([] if other else [left.name])
-    assert (left.name in Store(record["url"]).list()) == (not other)
+    assert (left.name in ObjectStore(record["url"]).list()) == (not other)
     # It is left to the next writer of its URL.
     assert left.exists() == (other == "url")
 
@@ -363,10 +332,10 @@ def test_leftovers_of_another_data_set_are_not_uploaded(url: str, left: Path, ot
 def test_a_leftover_replaces_the_sidecar_of_a_lost_shard(
     tmp_path: Path, url: str, left: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    store, sidecar = Store(url), f"{left.stem}.json"
+    store, sidecar = ObjectStore(url), f"{left.stem}.json"
     store.write(sidecar, b"of a shard that is gone")
     with monkeypatch.context() as patch:
-        patch.setattr(mbtf_core.data.store_folder.StoreFolder, "send_shard", _unreachable)
+        patch.setattr(ObjectStore, "write", _documents_only)
         assert generate(command_at(tmp_path, url)) == 4
     # A sidecar is never there before its shard, nor does a leftover go before it is uploaded.
     assert sidecar not in store.list()
@@ -378,18 +347,24 @@ def test_a_leftover_replaces_the_sidecar_of_a_lost_shard(
 def test_a_worker_looks_again_for_a_shard_that_it_knows(tmp_path: Path, url: str) -> None:
     """It runs longer than a command, and others may remove what it has stored."""
     assert generate(command_at(tmp_path, url)) == 0
-    record = json.loads(Store(url).read("train-00001.json"))
+    record = json.loads(ObjectStore(url).read("train-00001.json"))
     material = str(tmp_path / "plane.npy")
-    config = json.loads(Store(url).read("manifest.json"))["config"] | {"material": material}
+    config = json.loads(ObjectStore(url).read("manifest.json"))["config"] | {"material": material}
     arguments = {key: record[key] for key in ("config_hash", "plan", "file")}
     assert not render_shard(config, url, **arguments)["rendered"]
-    Store(url).delete("train-00001.npz")
+    ObjectStore(url).delete("train-00001.npz")
     assert render_shard(config, url, **arguments)["rendered"]
     assert verify(url) == []
 
 
-def _unreachable(*_: object) -> None:
-    raise PartialError("the store cannot be reached")
+_write = ObjectStore.write
+
+
+def _documents_only(self: ObjectStore, name: str, content: bytes, *, new: bool = False) -> bool:
+    """The store is reached for documents alone."""
+    if name.startswith(("train", "test")):
+        raise PartialError("the store cannot be reached")
+    return _write(self, name, content, new=new)
 
 
 def test_a_stored_data_set_is_published(tmp_path: Path, url: str) -> None:

@@ -6,7 +6,6 @@ import threading
 
 import pytest
 
-from mbtf_core.locks import Lock
 from mbtf_gen.generation.writer import ShardWriter
 
 
@@ -95,11 +94,3 @@ def test_an_interruption_waits_for_what_was_handed_over() -> None:
     with pytest.raises(KeyboardInterrupt):
         run()
     assert done == ["written", "after"]
-
-
-def test_while_there_is_nothing_to_write_locks_show_signs_of_life(monkeypatch: pytest.MonkeyPatch) -> None:
-    renewed = threading.Event()
-    monkeypatch.setattr("mbtf_gen.generation.writer.RENEW_SECONDS", 0.01)
-    monkeypatch.setattr(Lock, "renew", renewed.set)
-    with ShardWriter():
-        assert renewed.wait(60)

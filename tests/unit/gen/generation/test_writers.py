@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from support.datasets import sidecar_of
 from support.formula_runs import FILES, Formula, changed, cheap_plan, contents, listing
 
 from mbtf_core.data.dataset import Dataset
-from mbtf_core.data.folder import remove_leftovers
+from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.geometry import geometry_record
-from mbtf_core.data.sidecar import sidecar_of
 from mbtf_core.data.verify import verify
 from mbtf_core.errors import InputError, PartialError
 from mbtf_core.files.atomic import checksummed, create_file
@@ -87,9 +87,9 @@ def test_the_unfinished_geometry_of_another_writer_is_left_alone(config: Generat
     unfinished.write_bytes(b"half")
     with shard_lock(out / "manifest.npz") as held:
         assert held
-        remove_leftovers(out)
+        DataFolder.open(out).remove_leftovers()
         assert unfinished.exists()
-    remove_leftovers(out)
+    DataFolder.open(out).remove_leftovers()
     assert not unfinished.exists()
 
 

@@ -164,7 +164,7 @@ def test_unfinished_shards_are_left_out(tmp_path: Path) -> None:
     )
     (tmp_path / "set/train-00001.json").unlink()
     finished = dataset.shards("train", finished_only=True)
-    assert [shard.path.name for shard in finished] == ["train-00000.npz", "train-00002.npz"]
+    assert [shard.file for shard in finished] == ["train-00000.npz", "train-00002.npz"]
     sample = stored_queries(dataset)
     assert (len(sample.u), sample.total) == (60, 100)
     for name in ("train-00000.npz", "train-00002.npz"):

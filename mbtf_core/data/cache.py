@@ -7,6 +7,7 @@ for new ones. A mapped file stays readable after it has been removed.
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import threading
 import time
@@ -14,9 +15,8 @@ from collections import defaultdict, deque
 from collections.abc import Callable
 from pathlib import Path
 
-from mbtf_core.errors import InputError, unwritable
-from mbtf_core.files.atomic import temporary_of
-from mbtf_core.files.digest import file_sha256
+from mbtf_core.errors import InputError
+from mbtf_core.files.atomic import write_chunks
 from mbtf_core.files.folders import make_folder
 
 # Bytes of a cache by default.
@@ -25,7 +25,6 @@ CACHE_BYTES = 20e9
 _KEPT = 4
 # Seconds after which the unfinished file of another process counts as abandoned.
 _ABANDONED_SECONDS = 86400.0
-_UNFINISHED = ".tmp"
 
 
 class FileCache:
@@ -44,63 +43,43 @@ class FileCache:
         self._locks: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
         self._recent: deque[str] = deque(maxlen=_KEPT)
 
-    def path(self, sha256: str, suffix: str) -> Path:
-        """Where a file is, if it is there."""
-        return self.folder / f"{sha256}{suffix}"
-
-    def fetch(self, sha256: str, suffix: str, size: int, download: Callable[[Path], None]) -> Path:
-        """The file with a digest; downloaded and checked if it is missing.
+    def fetch(self, sha256: str, suffix: str, size: int, read: Callable[[], bytes]) -> Path:
+        """The file with a digest; read and checked if it is missing.
 
         Parameters
         ----------
         sha256 : in hexadecimal
         suffix : of its name
         size : in bytes
-        download : writes the file of the path that it is given
+        read : returns the content
 
         Raises
         ------
-        InputError : what was downloaded has another digest
+        InputError : what was read has another digest
         PartialError : the disk is full
-        the errors of `download`
+        the errors of `read`
         """
-        path = self.path(sha256, suffix)
+        path = self.folder / f"{sha256}{suffix}"
         with self._guard:
             lock = self._locks[path.name]
-        # Another thread may be downloading it.
+        # Another thread may be reading it.
         with lock:
             with self._guard:
                 if path.name in self._recent:
                     self._recent.remove(path.name)
                 self._recent.append(path.name)
-            if self._is_whole(path, size):
-                return path
+            with contextlib.suppress(OSError):
+                if path.stat().st_size == size:
+                    # Its age is the time since it was used.
+                    os.utime(path)
+                    return path
             make_folder(self.folder)
             self._make_room(size)
-            part = temporary_of(path)
-            try:
-                download(part)
-                if file_sha256(part) != sha256:
-                    raise InputError("has changed since it was written (SHA-256 differs)")
-                os.replace(part, path)
-            except OSError as error:
-                if isinstance(error, FileNotFoundError):
-                    raise
-                raise unwritable(part, error) from None
-            finally:
-                with contextlib.suppress(OSError):
-                    part.unlink()
+            content = read()
+            if hashlib.sha256(content).hexdigest() != sha256:
+                raise InputError("has changed since it was written (SHA-256 differs)")
+            write_chunks(path, [content])
             return path
-
-    def _is_whole(self, path: Path, size: int) -> bool:
-        try:
-            if path.stat().st_size != size:
-                return False
-            # Its age is the time since it was used.
-            os.utime(path)
-        except OSError:
-            return False
-        return True
 
     def _make_room(self, size: int) -> None:
         """Remove files until `size` bytes more fit."""
@@ -114,7 +93,7 @@ class FileCache:
             total = size + sum(bytes_ for _, bytes_, _ in found)
             now = time.time()
             for used, bytes_, name in sorted(found):
-                if name.endswith(_UNFINISHED):
+                if name.startswith("."):
                     removed = now - used > _ABANDONED_SECONDS
                 else:
                     removed = total > self.limit and name not in self._recent

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from mbtf_core.data.file_cache import FileCache
+from mbtf_core.data.cache import FileCache
 from mbtf_core.errors import InputError, PartialError
 
 
@@ -21,11 +21,11 @@ def content(number: int) -> bytes:
 
 def fetch(cache: FileCache, number: int) -> bool:
     """Whether a file was downloaded."""
-    downloads: list[Path] = []
+    downloads: list[int] = []
 
-    def download(path: Path) -> None:
-        downloads.append(path)
-        path.write_bytes(content(number))
+    def download() -> bytes:
+        downloads.append(number)
+        return content(number)
 
     found = cache.fetch(hashlib.sha256(content(number)).hexdigest(), ".npz", 100, download)
     assert found.read_bytes() == content(number)
@@ -36,7 +36,7 @@ def test_the_least_recently_used_files_make_room(tmp_path: Path) -> None:
     cache = FileCache(tmp_path / "cache", limit=600)
     for number in range(6):
         assert fetch(cache, number)
-        path = cache.path(hashlib.sha256(content(number)).hexdigest(), ".npz")
+        path = cache.folder / f"{hashlib.sha256(content(number)).hexdigest()}.npz"
         os.utime(path, (number, number))
     assert not fetch(cache, 0)
     assert fetch(cache, 6)
@@ -56,7 +56,7 @@ def test_the_files_fetched_last_stay(tmp_path: Path) -> None:
 def test_another_digest_is_refused(tmp_path: Path) -> None:
     cache = FileCache(tmp_path)
     with pytest.raises(InputError, match="SHA-256"):
-        cache.fetch("0" * 64, ".npz", 3, lambda path: path.write_bytes(b"abc") and None)
+        cache.fetch("0" * 64, ".npz", 3, lambda: b"abc")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -78,23 +78,23 @@ def test_unfinished_files_of_others_stay_for_a_day(tmp_path: Path) -> None:
     assert not old.exists()
 
 
-def test_a_full_disk_is_named(tmp_path: Path) -> None:
-    def full(path: Path) -> None:
-        path.write_bytes(b"x")
+def test_a_full_disk_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
+    monkeypatch.setattr(os, "replace", full)
     with pytest.raises(PartialError, match="No space left"):
-        FileCache(tmp_path).fetch("0" * 64, ".npz", 3, full)
+        fetch(FileCache(tmp_path), 1)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_threads_share_a_download(tmp_path: Path) -> None:
     cache, downloads = FileCache(tmp_path), []
 
-    def download(path: Path) -> None:
-        downloads.append(path)
+    def download() -> bytes:
+        downloads.append(1)
         time.sleep(0.05)
-        path.write_bytes(content(1))
+        return content(1)
 
     digest = hashlib.sha256(content(1)).hexdigest()
     threads = [threading.Thread(target=cache.fetch, args=(digest, "", 100, download)) for _ in range(4)]
