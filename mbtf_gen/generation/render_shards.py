@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Generator, Iterable, Mapping, Set
+from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, field
@@ -14,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from mbtf_core.data.folder import DataFolder, sidecar_name
+from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.manifest import plan_digest
 from mbtf_core.data.queries import Queries
 from mbtf_core.data.schema import ShardEntry
@@ -105,7 +104,6 @@ def render_shards(
     entries: Iterable[ShardEntry],
     plan: RunPlan,
     *,
-    corrupt: Set[str] = frozenset(),
     start: float | None = None,
     progress: ProgressCallback | None = None,
 ) -> RenderResult:
@@ -113,7 +111,6 @@ def render_shards(
 
     Parameters
     ----------
-    corrupt : files to render again although they seem finished
     start : when the run began, by ``time.perf_counter``; now by default. Seconds and paths per second count
         from it
     progress : called once per shard
@@ -156,14 +153,12 @@ def render_shards(
     folder.remove_leftovers()
     upload_waiting(folder, job.shards, job.config_hash, plan_digest(plan.to_manifest()))
     estimator: Any = None
-    # A corrupt shard counts as finished once its sidecar has changed.
-    stamps = {file: _stamp(folder, file) for file in corrupt}
     # Shards of other processes are tried again after the own ones: the process that ends last leaves none.
     while pending:
         tried, busy = [*pending.values()], list[ShardEntry]()
         with ExitStack() as stack:
             ahead = stack.enter_context(ThreadPoolExecutor(1, "queries"))
-            claims = stack.enter_context(closing(_claims(job, folder, tried, stamps, ahead, busy, skip)))
+            claims = stack.enter_context(closing(_claims(job, folder, tried, ahead, busy, skip)))
             writer = stack.enter_context(ShardWriter())
             for claim in claims:
                 if estimator is None:
@@ -202,7 +197,6 @@ def _claims(
     job: Job,
     folder: DataFolder,
     entries: Iterable[ShardEntry],
-    stamps: Mapping[str, str | None],
     pool: ThreadPoolExecutor,
     busy: list[ShardEntry],
     skipped: Callable[[ShardEntry, dict[str, Any] | None], None],
@@ -215,21 +209,16 @@ def _claims(
     not claimed, with its sidecar if it is finished.
     """
 
-    def finished(entry: ShardEntry) -> dict[str, Any] | None:
-        if entry.file in stamps and stamps[entry.file] == _stamp(folder, entry.file):
-            return None
-        return finished_record(folder, entry, job.config_hash)
-
     held: deque[_Claim] = deque()
     try:
         for entry in entries:
-            record = finished(entry)
+            record = finished_record(folder, entry, job.config_hash)
             lock = take_lock(folder.workspace / entry.file) if record is None else None
             if record is None and lock is None:
                 busy.append(entry)
             elif lock is not None:
                 # Another process may have finished it since.
-                record = finished(entry)
+                record = finished_record(folder, entry, job.config_hash)
                 if record is None:
                     drawn = pool.submit(job.query_plan.draw, entry.split, entry.index, entry.rows)
                     held.append(_Claim(entry, lock, drawn))
@@ -245,14 +234,6 @@ def _claims(
     finally:
         for claim in held:
             claim.lock.release()
-
-
-def _stamp(folder: DataFolder, file: str) -> str | None:
-    """Identity of a shard's sidecar, which changes when it is written again; None without one."""
-    try:
-        return hashlib.sha256(folder.read(sidecar_name(file))).hexdigest()
-    except InputError:
-        return None
 
 
 def estimate_queries(

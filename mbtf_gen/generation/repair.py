@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from mbtf_core.config.nested import differences, in_short
 from mbtf_core.config.yaml_file import dump_yaml, read_yaml
 from mbtf_core.data.dataset import Dataset
-from mbtf_core.data.folder import DataFolder
+from mbtf_core.data.folder import DataFolder, sidecar_name
 from mbtf_core.data.geometry import encode_geometry, geometry_record
 from mbtf_core.data.manifest import plan_digest
 from mbtf_core.data.schema import CONFIG_NAME, FORMAT_NAME, GEOMETRY_NAME, MANIFEST_NAME, SCHEMA_VERSION
@@ -135,7 +135,7 @@ def repair(
         return RepairResult(str(folder), faults, [e.file for e in entries], documents, foreign)
 
     with brief_lock(folder.workspace / MANIFEST_NAME):
-        # Readers rely on `complete`, and rendering replaces the corrupt shards.
+        # Readers rely on `complete`.
         if MANIFEST_NAME in documents or (entries and whole["complete"]):
             whole |= {"complete": False, "summary": None}
             folder.write(MANIFEST_NAME, checksummed(whole))
@@ -143,8 +143,10 @@ def repair(
             folder.write(CONFIG_NAME, dump_yaml(whole["config"]).encode())
         if GEOMETRY_NAME in documents and geometry is not None:
             folder.write(GEOMETRY_NAME, encode_geometry(geometry))
-    corrupt = {entry.file for entry in entries}
-    result = render_shards(job, folder, entries, plan, corrupt=corrupt, progress=progress)
+        # A shard without its sidecar is unfinished, so that generation renders it.
+        for entry in entries:
+            folder.delete(sidecar_name(entry.file))
+    result = render_shards(job, folder, entries, plan, progress=progress)
     return RepairResult(
         folder=str(folder),
         faults=faults,
