@@ -23,8 +23,8 @@ from typing import Any
 
 import numpy as np
 
-from mbtf_core.cluster.engine import Cluster, open_cluster
-from mbtf_core.cluster.task import Task
+from mbtf_core.run.runner import Cluster, open_cluster
+from mbtf_core.run.task import Task
 from mbtf_core.units import clock
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.dataset.reader import Dataset

@@ -38,7 +38,6 @@ from typing import Annotated, Any
 
 from cyclopts import App, CycloptsError, Parameter, UnusedCliTokensError
 
-from mbtf_core import interruption
 from mbtf_core.completion import CompletedApp, add_completion
 from mbtf_core.errors import (
     EXIT_BAD_INPUT,
@@ -52,6 +51,7 @@ from mbtf_core.errors import (
 )
 from mbtf_core.options import Switch
 from mbtf_core.progress import BarProgress, LineProgress, Progress
+from mbtf_core.run import signals
 
 EXIT_INTERNAL = 1
 _EXIT_BROKEN_PIPE = 141
@@ -244,9 +244,9 @@ def _usage_message(app: App, fault: CycloptsError, tokens: Sequence[str]) -> str
 
 
 def _fail(text: str, code: int, debug: bool, json: bool) -> int:
-    if interruption.exit_code():
+    if signals.interrupted():
         # Libraries turn an interruption into errors of their own.
-        text, code = interruption.message(), interruption.exit_code()
+        text, code = signals.message(), EXIT_INTERRUPTED
     with contextlib.suppress(OSError):
         if debug:
             traceback.print_exc()
@@ -274,7 +274,7 @@ def run(app: App, argv: Sequence[str] | None = None) -> int:
     app : made by :func:`new_app`
     argv : arguments after the program's name; the process's own by default
 
-    Exit codes: 0 done, 2 usage, 3 bad input or machine, 4 partial and resumable, 130 or 143 interrupted by
+    Exit codes: 0 done, 2 usage, 3 bad input or machine, 4 partial and resumable, 130 interrupted by
     SIGINT or SIGTERM, 1 a bug.
     Errors are one or two lines on standard error; ``--debug`` anywhere adds the traceback and the warnings of
     libraries. With ``--json``, a failure prints an object with ``error`` and ``exit_code``, unless the
@@ -290,7 +290,7 @@ def run(app: App, argv: Sequence[str] | None = None) -> int:
             # A terminal that lacks Greek letters or ± shows question marks.
             stream.reconfigure(errors="replace")
     try:
-        with interruption.raising(), _library_warnings(debug):
+        with signals.raising(), _library_warnings(debug):
             if {"-h", "--help"} & set(tokens):
                 _join_lines(app)
             tokens = _command_first(app, _join_negative_pairs(tokens))
@@ -298,7 +298,7 @@ def run(app: App, argv: Sequence[str] | None = None) -> int:
         # None where it was closed before the start.
         if sys.stdout is not None:
             sys.stdout.flush()
-        if interruption.exit_code():
+        if signals.interrupted():
             raise KeyboardInterrupt
         return result if type(result) is int else EXIT_OK
     except MbtfError as error:
@@ -306,7 +306,7 @@ def run(app: App, argv: Sequence[str] | None = None) -> int:
     except CycloptsError as error:
         return _fail(_usage_message(app, error, tokens), EXIT_USAGE, debug, as_json)
     except KeyboardInterrupt:
-        return _fail(interruption.message(), EXIT_INTERRUPTED, debug, as_json)
+        return _fail(signals.message(), EXIT_INTERRUPTED, debug, as_json)
     except BrokenPipeError:
         # The reader of the output has exited (`| head`); Python would fail again when it flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -19,9 +19,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from mbtf_core import interruption
 from mbtf_core.atomic import unwritable
 from mbtf_core.errors import PartialError
+from mbtf_core.run import signals
 
 # Age after which the lock of another machine counts as abandoned, and the interval of renewal.
 STALE_SECONDS = 300.0
@@ -93,7 +93,7 @@ class Lock:
                 lock.path.unlink()
 
 
-interruption.at_end(Lock.abandon)
+signals.at_end(Lock.abandon)
 
 
 @contextlib.contextmanager

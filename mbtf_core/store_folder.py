@@ -28,11 +28,11 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import ClassVar
 
-from mbtf_core import interruption
 from mbtf_core.atomic import unwritable
 from mbtf_core.errors import InputError, MbtfError
 from mbtf_core.file_cache import FileCache
 from mbtf_core.folders import cache_folder, make_folder
+from mbtf_core.run import signals
 from mbtf_core.shard_schema import CONFIG_NAME, GEOMETRY_NAME, MANIFEST_NAME, SPLITS
 from mbtf_core.store import Store, StoredObject
 
@@ -389,4 +389,4 @@ def close_stores() -> None:
     StoreFolder._by_url.clear()
 
 
-interruption.at_end(close_stores)
+signals.at_end(close_stores)

@@ -6,12 +6,11 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from mbtf_core.cluster.engine import Cluster
 from mbtf_core.data_folder import data_folder
 from mbtf_core.errors import PartialError
+from mbtf_core.run.runner import Runner
 from mbtf_core.shard_schema import ShardEntry
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.dataset.distribute_shards import distribute_shards
 from mbtf_gen.dataset.folder import has_dataset, open_folder
 from mbtf_gen.dataset.render_shards import ProgressCallback, render_shards
 from mbtf_gen.dataset.sidecar import finished_record
@@ -38,7 +37,7 @@ def generate(
     slice_count: int = 1,
     planned: Callable[[RunPlan], None] | None = None,
     progress: ProgressCallback | None = None,
-    cluster: Cluster | None = None,
+    runner: Runner | None = None,
 ) -> Summary:
     """Generate a data set, or finish an unfinished one.
 
@@ -61,8 +60,8 @@ def generate(
     progress : callable, optional
         Called after every shard with the paths of this run so far, a note, and the paths that the run is
         expected to trace (None where a target error leaves it open).
-    cluster : Cluster, optional
-        Its workers render the shards, with the same values; this process by default.
+    runner : Runner, optional
+        Renders the shards, with the same values wherever; in this process by default.
 
     Returns
     -------
@@ -94,10 +93,7 @@ def generate(
     entries = unfinished(job, folder, slice_index, slice_count)
     if planned is not None and not plans and entries:
         planned(plan)
-    if cluster is None:
-        result = render_shards(job, folder, entries, plan, start=start, progress=progress)
-    else:
-        result = distribute_shards(job, folder, entries, plan, cluster, start=start, progress=progress)
+    result = render_shards(job, folder, entries, plan, runner or Runner(), start=start, progress=progress)
     seconds = time.perf_counter() - start
     summary = finish(
         folder, paths=result.paths, seconds=seconds, writing=result.writing, waiting=result.waiting

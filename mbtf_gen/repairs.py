@@ -22,6 +22,7 @@ from mbtf_core.data_folder import data_folder, send
 from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError, MbtfError
 from mbtf_core.locks import brief_lock
+from mbtf_core.run.runner import Runner
 from mbtf_core.shard_schema import (
     CONFIG_NAME,
     FORMAT_NAME,
@@ -347,7 +348,9 @@ class Corruption:
                     write_geometry(self.folder / GEOMETRY_NAME, self._geometry)
                     send(self.folder / GEOMETRY_NAME)
         corrupt = {e.file for e in entries}
-        result = render_shards(self.job, self.folder, entries, plan, corrupt=corrupt, progress=progress)
+        result = render_shards(
+            self.job, self.folder, entries, plan, Runner(), corrupt=corrupt, progress=progress
+        )
         return RepairResult(
             folder=str(self.folder),
             faults=self.faults,

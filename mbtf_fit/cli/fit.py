@@ -12,7 +12,6 @@ from cyclopts import Parameter
 
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import InputError, PartialError, UsageError
-from mbtf_core.interruption import keep_on_interruption
 from mbtf_core.options import (
     ClusterOption,
     DryRun,
@@ -23,6 +22,7 @@ from mbtf_core.options import (
     Verbose,
     takes_options,
 )
+from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.units import clock, expectation, format_duration
 from mbtf_fit.cli.page_options import Live, live_view
 from mbtf_fit.config import DECODER_MODELS, DEFAULT_MODEL, FIBER_MODEL, FitConfig, ModelName
@@ -289,8 +289,8 @@ def _fit_many(
     overwrite: bool,
     console: Console,
 ) -> None:
-    from mbtf_core.cluster.engine import open_cluster
-    from mbtf_fit.training.fit_cluster import fit_on_cluster
+    from mbtf_core.run.cluster import open_runner
+    from mbtf_core.run.processes import Processes
     from mbtf_fit.training.fit_many import FitOutcome, find_data, fit_many, name_materials
 
     shards = find_data(many)
@@ -313,21 +313,14 @@ def _fit_many(
     )
     keep_on_interruption(f"finished fits and the last checkpoints are kept in {output}")
     with (
-        open_cluster(cluster, console.note) as workers,
+        open_runner(cluster, console.note, Processes(processes)) as runner,
         console.progress(total=len(shards), label="fitting", unit="data sets") as bar,
     ):
 
         def finished(outcome: FitOutcome) -> None:
             bar.advance(1, f"{outcome.folder.name}: {'failed' if outcome.error else 'done'}")
 
-        if workers is None:
-            outcomes = fit_many(
-                configs, shards, folders, processes=processes, overwrite=overwrite, finished=finished
-            )
-        else:
-            outcomes = fit_on_cluster(
-                configs, shards, folders, workers, overwrite=overwrite, finished=finished
-            )
+        outcomes = fit_many(configs, shards, folders, runner, overwrite=overwrite, finished=finished)
     rows = [_COLUMNS, *(_row(outcome.folder.name, outcome.result) for outcome in outcomes)]
     console.report({"fits": [o.as_dict() for o in outcomes]}, format_table(rows))
     failed = [o for o in outcomes if o.error is not None]

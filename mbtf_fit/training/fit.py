@@ -12,8 +12,8 @@ import torch
 
 from mbtf_core.errors import InputError, PartialError
 from mbtf_core.folders import ELSEWHERE, owned
-from mbtf_core.interruption import stop_on_interruption
 from mbtf_core.lattice import level_of_sigma
+from mbtf_core.run.signals import stop_on_interruption
 from mbtf_core.stats import pooled_variance
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import Partition, load_training, open_data

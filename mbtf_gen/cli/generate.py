@@ -12,8 +12,8 @@ from cyclopts import Parameter
 
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import UsageError
-from mbtf_core.interruption import keep_on_interruption
 from mbtf_core.options import ClusterOption, DataOutput, Options, Overwrite, PathText, takes_options
+from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.units import clock, size_text
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.presets import (
@@ -94,9 +94,9 @@ def generate(
     """
     index, count = _slice(slice)
     job = prepare_job(options, material, quality)
-    from mbtf_core.cluster.engine import open_cluster
     from mbtf_core.data_folder import data_folder, in_store
     from mbtf_core.folders import check_space
+    from mbtf_core.run.cluster import open_runner
     from mbtf_gen.dataset.shard_io import data_bytes
     from mbtf_gen.forecast import announce_shards
     from mbtf_gen.generation import generate, unfinished
@@ -115,7 +115,7 @@ def generate(
     keep_on_interruption(f"the shards that are finished are kept in {output}")
     # Without anything to render, no workers are started.
     with (
-        open_cluster(cluster if left else None, console.note) as workers,
+        open_runner(cluster if left else None, console.note) as runner,
         console.progress(None, "generating", "paths") as bar,
     ):
         summary = generate(
@@ -126,7 +126,7 @@ def generate(
             slice_count=count,
             planned=lambda plan: announce_shards(console, job, plan, left, size),
             progress=bar.update,
-            cluster=workers,
+            runner=runner,
         )
     console.report(asdict(summary), describe(summary))
 

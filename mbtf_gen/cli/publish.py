@@ -6,8 +6,8 @@ from pathlib import Path
 
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import UsageError
-from mbtf_core.interruption import keep_on_interruption
 from mbtf_core.options import Options, Output, Overwrite, PathText, Switch, takes_options
+from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.units import size_text
 from mbtf_gen.config.publish import PublishConfig
 

@@ -11,7 +11,7 @@ from mbtf_core.directions import from_angles
 from mbtf_core.errors import InputError, PartialError
 from mbtf_core.exposure import auto_exposure, brightness, describe_exposure
 from mbtf_core.folders import check_space, owned
-from mbtf_core.interruption import keep_on_interruption
+from mbtf_core.run.signals import keep_on_interruption
 from mbtf_gen.config.pictures import PreviewConfig
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.forecast import announce

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from conftest import RunPython
 
-from mbtf_core.child_process import run_child
 from mbtf_core.errors import EngineError, UsageError
+from mbtf_core.run.child import run_child
 from mbtf_gen.render import llvm
 from mbtf_gen.render import runtime as engine
 
@@ -253,7 +253,7 @@ def test_an_interrupted_parent_leaves_no_child(monkeypatch: pytest.MonkeyPatch) 
             started.append(self)
             raise KeyboardInterrupt
 
-    monkeypatch.setattr("mbtf_core.child_process.subprocess.Popen", Interrupted)
+    monkeypatch.setattr("mbtf_core.run.child.subprocess.Popen", Interrupted)
     with pytest.raises(KeyboardInterrupt):
         run_child(__name__, "hang", timeout=60)
     assert started[0].poll() is not None
