@@ -23,8 +23,9 @@ from typing import Any
 
 import numpy as np
 
-from mbtf_core.run.runner import Cluster, open_cluster
-from mbtf_core.run.task import Task
+from mbtf_core.run.cluster import open_runner
+from mbtf_core.run.runner import Runner
+from mbtf_core.run.task import Item, TaskFunction
 from mbtf_core.units import clock
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.dataset.reader import Dataset
@@ -50,12 +51,12 @@ def wait(seconds: float) -> None:
     time.sleep(seconds)
 
 
-def run_tasks(cluster: Cluster, count: int, function: str, arguments: dict[str, Any]) -> float:
-    """Seconds of some equal tasks."""
-    tasks = [Task(f"task-{i}", function, arguments) for i in range(count)]
+def run_tasks(runner: Runner, count: int, function: TaskFunction, arguments: dict[str, Any]) -> float:
+    """Seconds of some equal items."""
+    items = [Item(f"item-{i}", arguments) for i in range(count)]
 
     def run() -> None:
-        for done in cluster.run(tasks):
+        for done in runner.map(function, items):
             assert not done.error, done.error
 
     return timed(run)
@@ -111,6 +112,9 @@ def projected(figures: dict[str, float], options: argparse.Namespace, workers: i
 
 
 def main() -> int:
+    # Workers know this file by its name.
+    from cluster import wait as wait_on_worker
+
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--tasks", type=int, default=60, help="one-second tasks")
@@ -132,15 +136,14 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         start = time.perf_counter()
-        with open_cluster(f"local:{options.workers}", print) as cluster:
-            assert cluster is not None
+        with open_runner(f"local:{options.workers}", print) as runner:
             figures["seconds of a worker's start"] = round(time.perf_counter() - start, 2)
-            empty = run_tasks(cluster, options.empty, "mbtf_core.units:clock", {"seconds": 0.0})
+            empty = run_tasks(runner, options.empty, clock, {"seconds": 0.0})
             figures["seconds per empty task"] = round(empty / options.empty, 6)
-            each = run_tasks(cluster, options.tasks, "cluster:wait", {"seconds": 1.0})
+            each = run_tasks(runner, options.tasks, wait_on_worker, {"seconds": 1.0})
             ideal = math.ceil(options.tasks / options.workers)
             figures["overhead of one-second tasks"] = round(each / ideal - 1.0, 4)
-            clustered = timed(lambda: generate(config, folder / "cluster", cluster=cluster))
+            clustered = timed(lambda: generate(config, folder / "cluster", runner=runner))
         plain = timed(lambda: generate(config, folder / "plain"))
         seconds = shard_seconds(folder / "cluster")
         figures["data set by one process, s"] = round(plain, 2)

@@ -249,9 +249,14 @@ def test_an_interrupted_parent_leaves_no_child(monkeypatch: pytest.MonkeyPatch) 
     started: list[subprocess.Popen[str]] = []
 
     class Interrupted(subprocess.Popen):  # type: ignore[type-arg]
-        def communicate(self, *arguments, **keywords):  # type: ignore[no-untyped-def]
+        @property
+        def stdin(self):  # type: ignore[no-untyped-def]
             started.append(self)
             raise KeyboardInterrupt
+
+        @stdin.setter
+        def stdin(self, pipe):  # type: ignore[no-untyped-def]
+            self.pipe = pipe
 
     monkeypatch.setattr("mbtf_core.run.child.subprocess.Popen", Interrupted)
     with pytest.raises(KeyboardInterrupt):
