@@ -169,13 +169,22 @@ def at_end(cleanup: Callable[[], None]) -> None:
 @contextlib.contextmanager
 def raising() -> Iterator[None]:
     """Signals raise KeyboardInterrupt in this block; it runs a command."""
+    before = {}
     if not _State.program:
         _State.received, _State.kept = None, ""
+        if threading.current_thread() is threading.main_thread():
+            # None stands for a native handler, which a renderer leaves and which is no longer valid.
+            usual = (signal.SIG_DFL, signal.default_int_handler, None)
+            before = {n: h for n in SIGNALS if (h := signal.getsignal(n)) in usual}
+    for number in before:
+        signal.signal(number, _handle)
     _State.raising = True
     try:
         yield
     finally:
         _State.raising = False
+        for number, handler in before.items():
+            signal.signal(number, signal.default_int_handler if handler is None else handler)
 
 
 def reinstall_handlers() -> None:
