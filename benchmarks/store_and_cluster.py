@@ -35,14 +35,15 @@ import numpy as np
 import torch
 from common import ASSETS, alternate, finish, parser_of, start, timed
 
-from mbtf_core.cluster.engine import Cluster, open_cluster
-from mbtf_core.cluster.task import Task
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.shard_files import row_bytes, write_shard
 from mbtf_core.data.sidecar import finished_record
 from mbtf_core.data.store import ObjectStore
 from mbtf_core.data.verify import verify
 from mbtf_core.files.digest import file_sha256
+from mbtf_core.run.cluster import open_runner
+from mbtf_core.run.runner import Runner
+from mbtf_core.run.task import Item, TaskFunction
 from mbtf_core.units import clock
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import load_training, open_data
@@ -177,12 +178,12 @@ def wait(seconds: float) -> None:
     time.sleep(seconds)
 
 
-def run_tasks(cluster: Cluster, count: int, function: str, arguments: dict[str, Any]) -> float:
+def run_tasks(runner: Runner, count: int, function: TaskFunction, arguments: dict[str, Any]) -> float:
     """Seconds of some equal tasks."""
-    tasks = [Task(f"task-{i}", function, arguments) for i in range(count)]
+    items = [Item(f"item-{i}", arguments) for i in range(count)]
 
     def run() -> None:
-        for done in cluster.run(tasks):
+        for done in runner.map(function, items):
             assert not done.error, done.error
 
     return timed(run)
@@ -244,15 +245,17 @@ def measure_cluster(options: argparse.Namespace) -> int:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         began = time.perf_counter()
-        with open_cluster(f"local:{options.workers}", print) as cluster:
-            assert cluster is not None
+        # Workers import it from this file, which is the main module here.
+        from store_and_cluster import wait as wait_on_worker
+
+        with open_runner(f"local:{options.workers}", print) as runner:
             figures["seconds of a worker's start"] = round(time.perf_counter() - began, 2)
-            empty = run_tasks(cluster, options.empty, "mbtf_core.units:clock", {"seconds": 0.0})
+            empty = run_tasks(runner, options.empty, clock, {"seconds": 0.0})
             figures["seconds per empty task"] = round(empty / options.empty, 6)
-            each = run_tasks(cluster, options.tasks, "store_and_cluster:wait", {"seconds": 1.0})
+            each = run_tasks(runner, options.tasks, wait_on_worker, {"seconds": 1.0})
             ideal = math.ceil(options.tasks / options.workers)
             figures["overhead of one-second tasks"] = round(each / ideal - 1.0, 4)
-            clustered = timed(lambda: generate(config, folder / "cluster", cluster=cluster))
+            clustered = timed(lambda: generate(config, folder / "cluster", runner=runner))
         plain = timed(lambda: generate(config, folder / "plain"))
         seconds = shard_seconds(folder / "cluster")
         figures["data set by one process, s"] = round(plain, 2)

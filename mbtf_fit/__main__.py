@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from mbtf_core.interruption import finish, handle_signals
+from mbtf_core.run.signals import finish, handle_signals
 
 
 def main() -> int:

@@ -7,7 +7,7 @@ import math
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 from mbtf_core.data.lattice import Lattice
@@ -113,24 +113,14 @@ class Job:
         )
         return job
 
-    def portable(self) -> dict[str, Any]:
-        """The configuration as plain data for :meth:`of_portable`: its material has an absolute path, because
-        other processes may have other working folders."""
-        config = self.config.model_dump(mode="json")
-        return {**config, "material": os.path.abspath(self.config.material)}
-
-    @classmethod
-    def of_portable(cls, config: str, config_hash: str) -> Job:
-        """The job of a process, perhaps on another machine, that sent :meth:`portable` as JSON.
-
-        Raises
-        ------
-        InputError : the material cannot be used, or its files differ from those of the sender
-        """
-        job = cls.load(GeneratorConfig.model_validate_json(config))
-        if job.config_hash != config_hash:
-            raise InputError("the material's files differ on this machine", where=job.config.material)
-        return job
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled, it is its configuration and hash: the receiver, perhaps on another machine, loads the
+        material itself."""
+        fields = self.config.model_dump(mode="json", include=set(GeneratorConfig.model_fields))
+        # Other processes may have other working folders.
+        fields["material"] = os.path.abspath(self.config.material)
+        config = GeneratorConfig.model_validate(fields)
+        return received_job, (config.model_dump_json(), config.hash(self.material.digests))
 
     @cached_property
     def lattice(self) -> Lattice:
@@ -188,6 +178,32 @@ class Job:
     def shards(self) -> tuple[ShardEntry, ...]:
         """All shards, the training split first; a UsageError if a split has more than ``MAX_SHARD_FILES``."""
         return tuple(entry for split in SPLITS for entry in _shards(self, split))
+
+
+@lru_cache(maxsize=1)
+def received_job(config: str, config_hash: str) -> Job:
+    """The job of another process, kept for its next task.
+
+    Parameters
+    ----------
+    config : str
+        Options as JSON.
+    config_hash : str
+        Their hash, contents of the input files included.
+
+    Returns
+    -------
+    Job
+
+    Raises
+    ------
+    InputError
+        The material cannot be used, or its files differ from those of the sender.
+    """
+    job = Job.load(GeneratorConfig.model_validate_json(config))
+    if job.config_hash != config_hash:
+        raise InputError("the material's files differ on this machine", where=job.config.material)
+    return job
 
 
 def check_options(config: GeneratorConfig, material: Material) -> None:

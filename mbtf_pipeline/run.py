@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -13,6 +13,8 @@ from mbtf_core.errors import InputError, PartialError
 from mbtf_core.files.atomic import read_json
 from mbtf_core.files.digest import file_sha256
 from mbtf_core.files.folders import check_folder, owned
+from mbtf_core.run.runner import Runner
+from mbtf_core.run.task import Item
 from mbtf_core.units import clock
 from mbtf_fit.config import FitConfig
 from mbtf_gen.config.generator import GeneratorConfig
@@ -41,7 +43,6 @@ from mbtf_pipeline.stages import (
 )
 
 if TYPE_CHECKING:
-    from mbtf_core.cluster.engine import Cluster
     from mbtf_fit.viewer.live import LiveView
 
 GENERATE_STAGE, COMPARE_STAGE, REPORT_STAGE = "generate", "compare", "report"
@@ -119,7 +120,7 @@ class _RecipeRun:
     folder: Path
     console: Console
     live: LiveView | None = None
-    cluster: Cluster | None = None
+    runner: Runner = field(default_factory=Runner)
 
     def stages(self, inputs: Mapping[str, str]) -> list[Stage]:
         """All stages; `inputs` holds the digests of the material's files by role."""
@@ -138,7 +139,7 @@ class _RecipeRun:
             # Data sets of other materials count by what they hold, not by where they lie.
             others = [_manifest_digest(Path(folder)) for folder in config.training.materials]
             fields["training"] = {**fields["training"], "materials": others}
-            remote = self.cluster is not None
+            remote = not self.runner.here
             out.append(Stage(fit_stage(name), (data.stage,), fields, {}, files, run, remote))
         compared = {"record": COMPARISON_SCHEMA, **recipe.compare.model_dump(mode="json")}
         needs = (GENERATE_STAGE, *map(fit_stage, recipe.fit))
@@ -188,20 +189,22 @@ class _RecipeRun:
         ):
             clear(shards)
         with self.console.progress(None, data.stage, "paths") as bar:
-            done = generate(job, shards, progress=bar.update, cluster=self.cluster)
+            done = generate(job, shards, progress=bar.update, runner=self.runner)
         # Workers render at the same time; slices of earlier processes are the time that the data took.
-        return done.shard_seconds if self.cluster is None else 0.0
+        return done.shard_seconds if self.runner.here else 0.0
 
     def _fit(self, name: str, data: DataSet, decision: Decision) -> float:
         from mbtf_fit import fit
-        from mbtf_fit.training.fit_cluster import fit_task
+        from mbtf_fit.training.fit_many import fit_one
 
         config, shards, out = self.recipe.fit[name], self.folder / data.sub, self.folder / FITS / name
         if decision.reason != NOT_RUN or not _unfinished(out, config, shards):
             clear(out)
-        if self.cluster is not None:
+        if not self.runner.here:
             # The worker's checkpoints make the fit resumable; its curve is in its folder.
-            (done,) = self.cluster.run([fit_task(name, config, shards, out, overwrite=False)])
+            arguments = {"config": config, "shards": shards, "folder": out, "overwrite": False}
+            item = Item(name, arguments, gpu=self.runner.takes_gpu(config.device))
+            (done,) = self.runner.map(fit_one, [item])
             if done.error:
                 raise PartialError(done.error, where=fit_stage(name), hint="the same command resumes the run")
             return 0.0
@@ -225,7 +228,7 @@ class _RecipeRun:
         recipe, fits = self.recipe, {name: self.folder / FITS / name for name in self.recipe.fit}
         with self.console.progress(steps(recipe.compare, len(fits)), "compare", "pictures") as bar:
             advance = partial(bar.advance, 1)
-            compare(recipe.compare, recipe.generate, shards, fits, out, advance, self.cluster)
+            compare(recipe.compare, recipe.generate, shards, fits, out, advance, self.runner)
 
     def show(self, stage: str, decision: Decision, stamp: Stamp | None) -> None:
         """Say a stage's state, and show what it has made."""
@@ -305,7 +308,7 @@ def run_recipe(
     console: Console | None = None,
     generated: Callable[[Recipe], Recipe] | None = None,
     live: LiveView | None = None,
-    cluster: Cluster | None = None,
+    runner: Runner | None = None,
 ) -> RunResult:
     """Run a recipe; stages whose inputs have not changed are skipped.
 
@@ -325,8 +328,8 @@ def run_recipe(
         Called once the data are generated; returns the recipe of the other stages.
     live : LiveView, optional
         Shows stages and fits as they come.
-    cluster : Cluster, optional
-        Its workers render shards and reference pictures and train the fits; this process by default.
+    runner : Runner, optional
+        Renders shards and reference pictures and trains the fits; in this process by default.
 
     Returns
     -------
@@ -341,12 +344,12 @@ def run_recipe(
         Another process uses the folder, or the disk is full; the same command resumes the run.
     """
     folder = recipe.folder if folder is None else folder
-    console = console or Console(quiet=True)
+    console, runner = console or Console(quiet=True), runner or Runner()
     inputs = _material_inputs(recipe)
     with owned(folder):
         check_folder(folder, is_run, "run")
         write_run_record(folder, recipe, command)
-        run = _RecipeRun(recipe, folder, console, live, cluster)
+        run = _RecipeRun(recipe, folder, console, live, runner)
         stages = run.stages(inputs)
         results: dict[str, StageResult] = {}
         if generated is not None:
@@ -354,7 +357,7 @@ def run_recipe(
             results = run_stages(folder, stages[:count], force=force, notify=run.show)
             recipe = generated(recipe)
             write_run_record(folder, recipe, command)
-            run = _RecipeRun(recipe, folder, console, live, cluster)
+            run = _RecipeRun(recipe, folder, console, live, runner)
             stages = run.stages(inputs)[count:]
         results |= run_stages(folder, stages, force=force, notify=run.show)
     viewer = folder / VIEWER

@@ -36,7 +36,6 @@ from typing import Annotated, Any
 from cyclopts import App, CycloptsError, Parameter, UnusedCliTokensError
 from pydantic_core import to_jsonable_python
 
-from mbtf_core import interruption
 from mbtf_core.app.options import Switch
 from mbtf_core.app.progress import BarProgress, LineProgress, Progress
 from mbtf_core.errors import (
@@ -48,6 +47,7 @@ from mbtf_core.errors import (
     printable,
     reason,
 )
+from mbtf_core.run import signals
 
 EXIT_INTERNAL = 1
 _EXIT_BROKEN_PIPE = 141
@@ -187,9 +187,9 @@ def _usage_message(app: App, fault: CycloptsError, tokens: Sequence[str]) -> str
 
 
 def _fail(text: str, code: int, debug: bool, json: bool) -> int:
-    if interruption.exit_code():
+    if signals.interrupted():
         # Libraries turn an interruption into errors of their own.
-        text, code = interruption.message(), interruption.exit_code()
+        text, code = signals.message(), EXIT_INTERRUPTED
     with contextlib.suppress(OSError):
         if debug:
             traceback.print_exc()
@@ -217,7 +217,7 @@ def run(app: App, argv: Sequence[str] | None = None) -> int:
     app : made by :func:`new_app`
     argv : arguments after the program's name; the process's own by default
 
-    Exit codes: 0 done, 2 usage, 3 bad input or machine, 4 partial and resumable, 130 or 143 interrupted by
+    Exit codes: 0 done, 2 usage, 3 bad input or machine, 4 partial and resumable, 130 interrupted by
     SIGINT or SIGTERM, 1 a bug.
     Errors are one or two lines on standard error; ``--debug`` anywhere adds the traceback and the warnings of
     libraries. With ``--json``, a failure prints an object with ``error`` and ``exit_code``, unless the
@@ -234,12 +234,12 @@ def run(app: App, argv: Sequence[str] | None = None) -> int:
             # A terminal that lacks Greek letters or ± shows question marks.
             stream.reconfigure(errors="replace")
     try:
-        with interruption.raising(), _library_warnings(debug):
+        with signals.raising(), _library_warnings(debug):
             result = app(tokens)
         # None where it was closed before the start.
         if sys.stdout is not None:
             sys.stdout.flush()
-        if interruption.exit_code():
+        if signals.interrupted():
             raise KeyboardInterrupt
         return result if type(result) is int else EXIT_OK
     except MbtfError as error:
@@ -249,7 +249,7 @@ def run(app: App, argv: Sequence[str] | None = None) -> int:
     except CycloptsError as error:
         return _fail(_usage_message(app, error, tokens), EXIT_USAGE, debug, as_json)
     except KeyboardInterrupt:
-        return _fail(interruption.message(), EXIT_INTERRUPTED, debug, as_json)
+        return _fail(signals.message(), EXIT_INTERRUPTED, debug, as_json)
     except BrokenPipeError:
         # The reader of the output has exited (`| head`); Python would fail again when it flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -12,7 +12,7 @@ from cyclopts import Parameter
 from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.options import Output, Overwrite, Switch
 from mbtf_core.errors import UsageError
-from mbtf_core.interruption import keep_on_interruption
+from mbtf_core.run.signals import keep_on_interruption
 from mbtf_fit.cli.page_options import PAGE_OPTIONS, PageOptions
 
 

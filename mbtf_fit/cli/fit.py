@@ -24,7 +24,7 @@ from mbtf_core.app.options import (
     options_from,
 )
 from mbtf_core.errors import InputError, PartialError, UsageError
-from mbtf_core.interruption import keep_on_interruption
+from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.units import expectation, format_duration
 from mbtf_fit.cli.page_options import Live, live_view
 from mbtf_fit.config import DECODER_MODELS, DEFAULT_MODEL, FIBER_MODEL, FitConfig, ModelName
@@ -284,8 +284,8 @@ def _fit_many(
     overwrite: bool,
     console: Console,
 ) -> None:
-    from mbtf_core.cluster.engine import open_cluster
-    from mbtf_fit.training.fit_cluster import fit_on_cluster
+    from mbtf_core.run.cluster import open_runner
+    from mbtf_core.run.processes import Processes
     from mbtf_fit.training.fit_many import FitOutcome, find_data, fit_many, name_materials
 
     shards = find_data(many)
@@ -308,21 +308,14 @@ def _fit_many(
     )
     keep_on_interruption(f"finished fits and the last checkpoints are kept in {output}")
     with (
-        open_cluster(cluster, console.note) as workers,
+        open_runner(cluster, console.note, Processes(processes)) as runner,
         console.progress(total=len(shards), label="fitting", unit="data sets") as bar,
     ):
 
         def finished(outcome: FitOutcome) -> None:
             bar.advance(1, f"{outcome.folder.name}: {'failed' if outcome.error else 'done'}")
 
-        if workers is None:
-            outcomes = fit_many(
-                configs, shards, folders, processes=processes, overwrite=overwrite, finished=finished
-            )
-        else:
-            outcomes = fit_on_cluster(
-                configs, shards, folders, workers, overwrite=overwrite, finished=finished
-            )
+        outcomes = fit_many(configs, shards, folders, runner, overwrite=overwrite, finished=finished)
     console.report(
         {"fits": [o.as_dict() for o in outcomes]}, fits_table({o.folder.name: o.result for o in outcomes})
     )

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 from mbtf_core.app.console import CONSOLE, Console
-from mbtf_core.interruption import served_until_interruption
+from mbtf_core.run.signals import served_until_interruption
 from mbtf_fit.cli.page_options import PAGE_OPTIONS, PageOptions
 
 

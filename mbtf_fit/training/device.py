@@ -9,12 +9,15 @@ import sys
 import torch
 
 from mbtf_core.errors import EngineError
+from mbtf_core.run.task import worker_threads
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 
 
 def choose_device(name: str) -> torch.device:
-    """The device to train on; ``auto`` is CUDA if available."""
+    """The device to train on; ``auto`` is CUDA if available. A worker trains with its threads."""
+    if (threads := worker_threads()) is not None:
+        torch.set_num_threads(threads)
     available = torch.cuda.is_available()
     if name == "cuda" and not available:
         raise EngineError(

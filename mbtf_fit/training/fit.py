@@ -15,7 +15,7 @@ from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.lattice import level_of_sigma
 from mbtf_core.errors import InputError, PartialError
 from mbtf_core.files.folders import ELSEWHERE, owned
-from mbtf_core.interruption import stop_on_interruption
+from mbtf_core.run.signals import stop_on_interruption
 from mbtf_core.stats import pooled_variance
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import Partition, load_training, open_data

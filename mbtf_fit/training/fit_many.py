@@ -1,23 +1,17 @@
-"""Several data sets fitted by one command, in independent processes."""
+"""Several data sets fitted by one command, each a task."""
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import signal
 from collections import Counter
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
-from multiprocessing.connection import Connection
 from pathlib import Path
-from queue import SimpleQueue
 from typing import Any
 
-from mbtf_core.cluster.children import answer_of_child, kill_children, prepare_child
 from mbtf_core.data.dataset import is_dataset
-from mbtf_core.errors import InputError, MbtfError, UsageError, reason
-from mbtf_core.interruption import SIGNALS, at_end
+from mbtf_core.errors import InputError, UsageError, reason
+from mbtf_core.run.runner import Runner
+from mbtf_core.run.task import Item
 from mbtf_core.suggest import refuse_special
 from mbtf_fit.config import FitConfig
 
@@ -87,72 +81,76 @@ def name_materials(shards: Sequence[Path], out: Path) -> list[Path]:
     return [out / name for name in names]
 
 
-def _work(
-    config: FitConfig, shards: Path, out: Path, overwrite: bool, worker: int, processes: int, pipe: Connection
-) -> None:
-    """One fit, in its own process; sends its result or its error."""
-    # Selects the GPU of the process, so it precedes the import of CUDA.
-    if config.device != "cpu":
-        visible = os.environ.get("CUDA_VISIBLE_DEVICES")
-        devices = visible.split(",") if visible else []
-        os.environ["CUDA_VISIBLE_DEVICES"] = devices[worker % len(devices)] if devices else str(worker)
-    prepare_child()
-    try:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
-        import torch
+def fit_one(config: FitConfig, shards: Path, folder: Path, overwrite: bool) -> dict[str, Any]:
+    """Fit one data set; a task, done when its material is exported.
 
-        from mbtf_fit.training.fit import fit
+    Parameters
+    ----------
+    config : FitConfig
+    shards, folder : Path
+        Data set and material.
+    overwrite : bool
+        Replace a fit of another configuration.
 
-        if processes > 1:
-            torch.set_num_threads(max(1, torch.get_num_threads() // processes))
-        pipe.send((fit(config, shards, out, overwrite=overwrite).as_dict(), None))
-    except MbtfError as error:
-        pipe.send((None, error.message))
-    except KeyboardInterrupt:
-        pipe.send((None, "interrupted; the same command resumes"))
-    except Exception as error:
-        pipe.send((None, f"internal error: {type(error).__name__}: {reason(error)}"))
+    Returns
+    -------
+    dict
+        :meth:`~mbtf_fit.training.fit.FitResult.as_dict`.
+
+    Raises
+    ------
+    InputError
+        The fit cannot use its data.
+    PartialError
+        The disk is full, or another process writes to the folder.
+    """
+    from mbtf_fit.training.fit import fit
+
+    return fit(config, shards, folder, overwrite=overwrite).as_dict()
 
 
 def fit_many(
     configs: Sequence[FitConfig],
     shards: Sequence[Path],
     folders: Sequence[Path],
+    runner: Runner,
     *,
-    processes: int,
     overwrite: bool,
     finished: Callable[[FitOutcome], None],
 ) -> list[FitOutcome]:
-    """Fit every data set with its configuration, at most `processes` at a time; outcomes in the order of the
-    data sets.
+    """Fit every data set with its configuration; outcomes in the order of the data sets.
 
-    Each fit has its own process, so that a failure does not stop the others. With CUDA each worker uses the
-    GPU of its number; on CPUs the workers divide the cores. `finished` is called with each outcome.
+    A failure does not stop the others. A worker that dies leaves a checkpoint, from which the next one
+    resumes.
+
+    Parameters
+    ----------
+    configs, shards, folders : sequence
+        Configuration, data set and material of each fit.
+    runner : Runner
+        Of other processes: each fit has one of its own, or a worker.
+    overwrite : bool
+        Replace fits of other configurations.
+    finished : callable
+        Called with each outcome as it comes.
+
+    Raises
+    ------
+    PartialError
+        The workers cannot be reached any more; finished fits and checkpoints are kept.
     """
-    at_end(kill_children)
-    free: SimpleQueue[int] = SimpleQueue()
-    for worker in range(processes):
-        free.put(worker)
-
-    def run(config: FitConfig, data: Path, folder: Path) -> FitOutcome:
-        worker = free.get()
-        try:
-            result, error = answer_of_child(_work, config, data, folder, overwrite, worker, processes)
-        except ChildProcessError as ended:
-            result, error = None, str(ended)
-        finally:
-            free.put(worker)
-        return FitOutcome(data, folder, result, error)
-
-    with ThreadPoolExecutor(processes) as pool:
-        fits = [pool.submit(run, *pair) for pair in zip(configs, shards, folders, strict=True)]
-        try:
-            for outcome in as_completed(fits):
-                finished(outcome.result())
-        except KeyboardInterrupt:
-            # The children write their checkpoints and exit.
-            for child in multiprocessing.active_children():
-                child.terminate()
-            pool.shutdown(cancel_futures=True)
-            raise
-    return [fit.result() for fit in fits]
+    items = [
+        Item(
+            f"{folder.name}-{i}",
+            {"config": config, "shards": data, "folder": folder, "overwrite": overwrite},
+            gpu=runner.takes_gpu(config.device),
+        )
+        for i, (config, data, folder) in enumerate(zip(configs, shards, folders, strict=True))
+    ]
+    number = {item.name: i for i, item in enumerate(items)}
+    outcomes: dict[int, FitOutcome] = {}
+    for done in runner.map(fit_one, items, independent=True):
+        i = number[done.name]
+        outcomes[i] = FitOutcome(shards[i], folders[i], done.value, done.message or None)
+        finished(outcomes[i])
+    return [outcomes[i] for i in range(len(items))]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.options import DryRun, PathText
 from mbtf_core.errors import EXIT_BAD_INPUT, EXIT_OK, EXIT_PARTIAL
-from mbtf_core.interruption import keep_on_interruption
+from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.units import clock
 from mbtf_gen.cli.generate import describe
 

@@ -22,7 +22,7 @@ from mbtf_core.app.options import (
     options_from,
 )
 from mbtf_core.errors import UsageError
-from mbtf_core.interruption import keep_on_interruption
+from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.units import clock, size_text
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.presets import RESOLUTION, generator_options
@@ -99,9 +99,9 @@ def generate(
     """
     index, count = _slice(slice)
     job = prepare_job(options, material, quality)
-    from mbtf_core.cluster.engine import open_cluster
     from mbtf_core.data.folder import DataFolder
     from mbtf_core.files.folders import check_space
+    from mbtf_core.run.cluster import open_runner
     from mbtf_gen.forecast import announce_shards
     from mbtf_gen.generation.run import generate, unfinished
     from mbtf_gen.job import data_bytes, split_queries
@@ -119,7 +119,7 @@ def generate(
     keep_on_interruption(f"the shards that are finished are kept in {folder}")
     # Without anything to render, no workers are started.
     with (
-        open_cluster(cluster if left else None, console.note) as workers,
+        open_runner(cluster if left else None, console.note) as runner,
         console.progress(None, "generating", "paths") as bar,
     ):
         summary = generate(
@@ -130,7 +130,7 @@ def generate(
             slice_count=count,
             planned=lambda plan: announce_shards(console, job, plan, left, size),
             progress=bar.update,
-            cluster=workers,
+            runner=runner,
         )
     console.report(asdict(summary), describe(summary))
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.options import Options, Output, Overwrite, PathText, Switch, options_from
 from mbtf_core.errors import UsageError
-from mbtf_core.interruption import keep_on_interruption
+from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.units import size_text
 from mbtf_gen.config.publish import PublishConfig
 

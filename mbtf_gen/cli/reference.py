@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.options import ClusterOption, Options, Output, Overwrite, PathText, options_from
 from mbtf_core.errors import PartialError
-from mbtf_core.interruption import keep_on_interruption
+from mbtf_core.run.signals import keep_on_interruption
 from mbtf_gen.cli.generate import resolve_config
-from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.pictures import RENDERING, ReferenceConfig
-
-if TYPE_CHECKING:
-    from mbtf_core.cluster.engine import Cluster
-    from mbtf_core.cluster.task import Task
-    from mbtf_core.pictures.reference import ReferenceImage
 
 
 @options_from(ReferenceConfig, "reference", "exposure", *RENDERING)
@@ -46,21 +39,20 @@ def reference(
         Height map, folder of maps, material.yaml, mesh, or file of yarns or fibers.
     """
     resolved = resolve_config(options, material)
-    from mbtf_core.cluster.engine import open_cluster
     from mbtf_core.data.shard_files import row_bytes
     from mbtf_core.directions import from_angles
     from mbtf_core.exposure import auto_exposure, brightness, describe_exposure
     from mbtf_core.files.folders import check_space, owned
     from mbtf_core.pictures.camera import Camera, PixelKind
     from mbtf_core.pictures.reference import PNG_BYTES, read_value, write_display
+    from mbtf_core.run.cluster import open_runner
+    from mbtf_core.run.task import Item
     from mbtf_core.stats import pooled_relative_error
     from mbtf_gen.forecast import announce
     from mbtf_gen.job import Job
-    from mbtf_gen.pictures.distribute import picture_task
     from mbtf_gen.pictures.folder import PictureFolder
-    from mbtf_gen.pictures.reference import picture_seconds, render_reference
-    from mbtf_gen.planning.effects_plan import reference_plan
-    from mbtf_gen.planning.simulation import build_estimator
+    from mbtf_gen.pictures.reference import picture_seconds
+    from mbtf_gen.pictures.tasks import picture_estimator, render_picture
 
     wanted = resolved.reference
     job = Job.prepare(resolved)
@@ -93,33 +85,32 @@ def reference(
             overwrite=overwrite,
         )
         missing = {key: name for key, name in names.items() if folder.finished(name) is None}
-        options_of: dict[str, dict[str, Any]] = {
-            name: {"kind": one, "spp": wanted.spp, "seed": resolved.seed, "index": cameras.index(camera)}
-            for (camera, one), name in names.items()
-        }
-
-        def rendered(workers: Cluster | None) -> Iterator[tuple[str, ReferenceImage]]:
-            if workers is not None:
-                # Workers know the generator's options alone.
-                fields = job.config.model_dump(mode="json", include=set(GeneratorConfig.model_fields))
-                plain = Job(GeneratorConfig.model_validate(fields), job.material)
-                yield from _of_workers(
-                    workers,
-                    [
-                        picture_task(name, plain, camera, omega_i, **options_of[name])
-                        for (camera, _), name in missing.items()
-                    ],
-                )
-                return
-            paths = sum(camera.rows * camera.columns for camera, _ in missing) * wanted.spp
-            estimator: Any = build_estimator(job, reference_plan(job)) if missing else None
-            announce(console, paths, lambda: picture_seconds(estimator, cameras[0], omega_i, paths), size)
-            for (camera, _), name in missing.items():
-                yield name, render_reference(estimator, camera, omega_i, **options_of[name])
-
+        items = [
+            Item(
+                name,
+                {
+                    "job": job,
+                    "camera": camera,
+                    "omega_i": omega_i,
+                    "kind": one,
+                    "spp": wanted.spp,
+                    "seed": resolved.seed,
+                    "index": cameras.index(camera),
+                },
+            )
+            for (camera, one), name in missing.items()
+        ]
         bar.advance(len(names) - len(missing))
-        with open_cluster(cluster if missing else None, console.note) as workers:
-            for name, image in rendered(workers):
+        with open_runner(cluster if missing else None, console.note) as runner:
+            if runner.here and missing:
+                paths = sum(camera.rows * camera.columns for camera, _ in missing) * wanted.spp
+                estimator = picture_estimator(job)
+                announce(console, paths, lambda: picture_seconds(estimator, cameras[0], omega_i, paths), size)
+            for done in runner.map(render_picture, items):
+                if done.error:
+                    hint = "the same command renders the missing pictures"
+                    raise PartialError(f"picture {done.name} failed: {done.error}", hint=hint)
+                name, image = done.name, done.value
                 noise = pooled_relative_error(image.value_a.reshape(-1, 3), image.value_b.reshape(-1, 3))
                 facts = {"relative_noise": noise.value, "brightness": brightness(image.value)}
                 folder.keep(name, [image.write(folder.path / name)], facts)
@@ -148,12 +139,3 @@ def reference(
     ]
     text = "\n".join([*lines, f"PNG: {describe_exposure(exposure)}"])
     console.report({"pictures": pictures, "exposure": exposure}, text)
-
-
-def _of_workers(cluster: Cluster, tasks: list[Task]) -> Iterator[tuple[str, ReferenceImage]]:
-    """Pictures that workers render, by name, as they come."""
-    for done in cluster.run(tasks):
-        if done.error:
-            hint = "the same command renders the missing pictures"
-            raise PartialError(f"picture {done.task.name} failed: {done.error}", hint=hint)
-        yield done.task.name, done.value

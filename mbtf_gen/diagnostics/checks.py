@@ -370,8 +370,8 @@ def _stored(round_number: int) -> Cases:
 
 def _cuda(round_number: int) -> Cases | None:
     """In a child process, because a driver may abort it. None without a device."""
-    from mbtf_core.child_process import run_child
     from mbtf_core.errors import EngineError
+    from mbtf_core.run.child import run_child
     from mbtf_gen.render.runtime import CUDA_VARIANT, prove
 
     if prove(CUDA_VARIANT).fault:

@@ -1,7 +1,7 @@
 """Diagnosis of the machine: each part is used in a child process, and each failure comes with a hint.
 
 A part fails by aborting or hanging as often as by an exception, therefore in a child process
-(:mod:`mbtf_core.child_process`).
+(:mod:`mbtf_core.run.child`).
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from mbtf_core.child_process import run_child
 from mbtf_core.errors import EXIT_BAD_INPUT, EXIT_OK, EngineError
+from mbtf_core.run.child import run_child
 from mbtf_gen.render.llvm import CACHE_VARIABLE, chosen_llvm, shipped_llvm, use_shipped_llvm
 from mbtf_gen.render.runtime import CPU_VARIANT, CUDA_VARIANT, check_llvm, load_mitsuba, prove
 

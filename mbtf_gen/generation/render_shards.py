@@ -1,14 +1,17 @@
-"""Renders shards to files: locks claim them, threads sample queries ahead and write shards behind."""
+"""Renders shards to files: a task is a shard, done when its sidecar is there.
+
+A lock claims it. In this process, threads sample queries ahead and write shards behind.
+"""
 
 from __future__ import annotations
 
+import os
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Generator, Iterable
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack, closing
+from contextlib import closing
 from dataclasses import asdict, dataclass, field
-from functools import partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,14 +19,16 @@ import numpy as np
 from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.manifest import plan_digest
 from mbtf_core.data.queries import Queries
-from mbtf_core.data.schema import ShardEntry
+from mbtf_core.data.schema import MANIFEST_NAME, ShardEntry
 from mbtf_core.data.shard_files import write_shard
 from mbtf_core.data.sidecar import finished_record, sidecar, upload_waiting
-from mbtf_core.errors import InputError, PartialError
+from mbtf_core.errors import InputError, LockedError, PartialError
 from mbtf_core.files.atomic import Stored
-from mbtf_core.locks import Lock, lock_owner, take_lock
+from mbtf_core.locks import lock_owner, take_lock
+from mbtf_core.run.runner import Runner
+from mbtf_core.run.task import Item, Result
+from mbtf_gen.generation.folder import read_run_plan
 from mbtf_gen.generation.summary import ShardStatistics, refuse_nonfinite
-from mbtf_gen.generation.writer import ShardWriter
 from mbtf_gen.job import Job, most_paths, planned_paths, split_spp, split_target
 from mbtf_gen.planning.adaptive import estimate_shard
 from mbtf_gen.planning.run_plan import RunPlan
@@ -34,13 +39,8 @@ from mbtf_gen.render.estimates import Estimates, Stream
 ProgressCallback = Callable[[float, str, float | None], None]
 
 
-@dataclass(frozen=True)
-class _Claim:
-    """A shard that this process renders, with its lock and its queries, which a thread samples."""
-
-    entry: ShardEntry
-    lock: Lock
-    queries: Future[Queries]
+# Failures in a row of workers after which the other shards are not tried: the disk is full.
+_FAILURES = 8
 
 
 class ExpectedPaths:
@@ -88,7 +88,7 @@ class RenderResult:
     paths : traced; shards : files that were rendered
     seconds : duration since the start of the run
     writing : processor seconds of writing and digesting, parallel to the rendering
-    waiting : seconds that rendering waited for the writer
+    waiting : seconds that this process waited for the writing
     """
 
     paths: int = 0
@@ -98,11 +98,120 @@ class RenderResult:
     waiting: float = 0.0
 
 
+class ShardRun:
+    """What the shards of a run share, built once in each process.
+
+    Pickled, it is its job, its folder and the digest of its plan: a worker reads the plan from the manifest
+    that it sees, and writes into the folder itself.
+
+    Parameters
+    ----------
+    job : Job
+    folder : DataFolder
+        The data set.
+    plan : RunPlan
+        That of its manifest.
+    received : bool
+        Another process sent it, which gives a shard to one worker alone.
+    """
+
+    def __init__(self, job: Job, folder: DataFolder, plan: RunPlan, received: bool = False) -> None:
+        self.job, self.folder, self.plan, self.received = job, folder, plan, received
+        self.digest = plan_digest(plan.to_manifest())
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        local = self.folder.local
+        folder = str(self.folder) if local is None else os.path.abspath(local)
+        return _received_run, (self.job, folder, self.digest)
+
+    @cached_property
+    def estimator(self) -> Any:
+        """Built where a shard is to be rendered."""
+        return build_estimator(self.job, self.plan.effects)
+
+    def finished(self, entry: ShardEntry) -> dict[str, Any] | None:
+        """Sidecar of a finished shard."""
+        record = finished_record(self.folder, entry, self.job.config_hash)
+        if record is None or not self.received or self.folder.local is not None:
+            return record
+        # The store is listed again: the shard may have been removed since this worker saw it there.
+        self.folder.refresh()
+        return finished_record(self.folder, entry, self.job.config_hash)
+
+
+_received: ShardRun | None = None
+
+
+def _received_run(job: Job, folder: str, digest: str) -> ShardRun:
+    """The run of another process, kept for its next shard.
+
+    Raises
+    ------
+    InputError : this machine does not see the folder, or its manifest has another plan
+    """
+    global _received
+    kept = _received is not None and _received.job is job and _received.digest == digest
+    if _received is None or not kept or str(_received.folder) != folder:
+        found = DataFolder.open(folder)
+        if not found.has(MANIFEST_NAME):
+            raise InputError("this machine does not see the data set", where=folder)
+        run = ShardRun(job, found, read_run_plan(found), received=True)
+        if run.digest != digest:
+            raise InputError("the manifest has another plan on this machine", where=folder)
+        _received = run
+    return _received
+
+
+def render_shard(run: ShardRun, entry: ShardEntry) -> Generator[None, None, dict[str, Any]]:
+    """Render one shard into its folder, unless it is finished; a task in three parts.
+
+    Parameters
+    ----------
+    run : ShardRun
+    entry : ShardEntry
+        The shard.
+
+    Returns
+    -------
+    dict
+        ``record`` (the sidecar), ``rendered`` (whether this call rendered it), ``writing`` (processor seconds
+        of writing and digesting).
+
+    Raises
+    ------
+    LockedError
+        Another process writes it.
+    PartialError
+        The disk is full, or the store cannot be reached.
+    """
+    if (record := run.finished(entry)) is not None:
+        return {"record": record, "rendered": False, "writing": 0.0}
+    lock = take_lock(run.folder.workspace / entry.file)
+    if lock is None:
+        raise LockedError("is being written by another process", where=run.folder.at(entry.file))
+    try:
+        # Another process may have finished it since.
+        if (record := run.finished(entry)) is not None:
+            return {"record": record, "rendered": False, "writing": 0.0}
+        queries = run.job.query_plan.draw(entry.split, entry.index, entry.rows)
+        yield
+        began = time.perf_counter()
+        estimates = estimate_queries(run.job, run.plan, run.estimator, entry, queries)
+        seconds = time.perf_counter() - began
+        yield
+        began = time.thread_time()
+        record = store_shard(run.job, run.folder, run.plan, entry, queries, estimates, seconds)
+        return {"record": record, "rendered": True, "writing": time.thread_time() - began}
+    finally:
+        lock.release()
+
+
 def render_shards(
     job: Job,
     folder: DataFolder,
     entries: Iterable[ShardEntry],
     plan: RunPlan,
+    runner: Runner,
     *,
     start: float | None = None,
     progress: ProgressCallback | None = None,
@@ -111,129 +220,71 @@ def render_shards(
 
     Parameters
     ----------
+    runner : maps :func:`render_shard` over the shards
     start : when the run began, by ``time.perf_counter``; now by default. Seconds and paths per second count
         from it
     progress : called once per shard
 
     Raises
     ------
-    PartialError : other processes render some of them, the disk is full, the store cannot be reached, or
-        there are too many non-finite samples; finished shards are kept
+    InputError : a worker cannot read the material or the folder
+    PartialError : other processes render some of them, shards failed, the disk is full, the store or the
+        workers cannot be reached, or there are too many non-finite samples; finished shards are kept
     """
     start = time.perf_counter() if start is None else start
     pending = {entry.file: entry for entry in entries}
-    expected = ExpectedPaths(job)
-    total, own = ShardStatistics(), ShardStatistics()
-    result = RenderResult()
-    records: list[dict[str, Any]] = []
+    result, totals, expected = RenderResult(), ShardStatistics(), ExpectedPaths(job)
     limit = most_paths(job)
-
-    def skip(entry: ShardEntry, record: dict[str, Any] | None) -> None:
-        if record is not None:
-            del pending[entry.file]
-        report(record)
-
-    def report(record: dict[str, Any] | None = None) -> None:
-        for done in [*([] if record is None else [record]), *(records.pop() for _ in range(len(records)))]:
-            total.add(done)
-        if progress is not None:
-            seconds, left = time.perf_counter() - start, expected.paths(pending.values())
-            progress(*progress_of(result.paths, seconds, total, left))
-
-    unsent: list[PartialError | InputError] = []
-
-    def store(entry: ShardEntry, *rendered: Any) -> None:
-        try:
-            records.append(store_shard(job, folder, plan, entry, *rendered))
-        except (PartialError, InputError) as error:
-            # What is rendered meanwhile is still written, and uploaded by the next run.
-            unsent.append(error)
-
+    run = ShardRun(job, folder, plan)
     # Leftovers of killed runs take disk space.
     folder.remove_leftovers()
-    upload_waiting(folder, job.shards, job.config_hash, plan_digest(plan.to_manifest()))
-    estimator: Any = None
-    # Shards of other processes are tried again after the own ones: the process that ends last leaves none.
-    while pending:
-        tried, busy = [*pending.values()], list[ShardEntry]()
-        with ExitStack() as stack:
-            ahead = stack.enter_context(ThreadPoolExecutor(1, "queries"))
-            claims = stack.enter_context(closing(_claims(job, folder, tried, ahead, busy, skip)))
-            writer = stack.enter_context(ShardWriter())
-            for claim in claims:
-                if estimator is None:
-                    estimator = build_estimator(job, plan.effects)
-                began = time.perf_counter()
-                queries, entry = claim.queries.result(), claim.entry
-                estimates = estimate_queries(job, plan, estimator, entry, queries)
-                seconds = time.perf_counter() - began
-                writer.submit(partial(store, entry, queries, estimates, seconds), claim.lock.release)
-                result.paths += estimates.paths
-                expected.add(pending.pop(entry.file), estimates.paths)
-                result.shards.append(entry.file)
-                report()
-                own.add_quarantined(entry.file, _quarantined(estimates))
-                # These shards alone may exceed the limit of the whole data set.
-                refuse_nonfinite(own, limit, folder)
-                if unsent:
+    upload_waiting(folder, job.shards, job.config_hash, run.digest)
+    items = [Item(file, {"run": run, "entry": entry}) for file, entry in pending.items()]
+    where = "" if runner.here else f" on {runner.workers} workers"
+    busy, failed, row = list[str](), list[Result](), 0
+    with closing(runner.map(render_shard, items)) as results:
+        for done in results:
+            if done.locked:
+                busy.append(done.name)
+            elif done.error:
+                failed.append(done)
+                row += 1
+                if row >= (1 if runner.here else max(_FAILURES, 2 * runner.workers)):
                     break
-        if unsent:
-            raise unsent[0]
-        result.writing += writer.busy
-        result.waiting += writer.waited
-        if len(busy) == len(tried):
-            owner = lock_owner(folder.workspace / busy[0].file)
-            who = "" if owner is None else f" ({owner})"
-            raise PartialError(
-                f"{len(busy)} shard(s) are being written by another process, first {busy[0].file}{who}",
-                where=folder,
-                hint="wait for it, then run the same command again",
-            )
+            else:
+                row, entry = 0, pending.pop(done.name)
+                totals.add(done.value["record"])
+                refuse_nonfinite(totals, limit, folder)
+                result.writing += done.value["writing"]
+                result.waiting = done.waited
+                if done.value["rendered"]:
+                    paths = done.value["record"]["paths"]
+                    result.paths += paths
+                    result.shards.append(entry.file)
+                    expected.add(entry, paths)
+            if progress is not None:
+                seconds, left = time.perf_counter() - start, expected.paths(pending.values())
+                progress(*progress_of(result.paths, seconds, totals, left, where))
     result.seconds = time.perf_counter() - start
+    if failed and runner.here:
+        raise PartialError(failed[0].error, hint=failed[0].hint)
+    if failed:
+        first = failed[0]
+        raise PartialError(
+            f"{len(failed)} shard(s) failed, {len(pending)} are left; first {first.name}: {first.error} "
+            f"(on {first.worker})",
+            where=folder,
+            hint=first.hint or "the same command resumes",
+        )
+    if busy:
+        owner = lock_owner(folder.workspace / busy[0])
+        who = "" if owner is None else f" ({owner})"
+        raise PartialError(
+            f"{len(busy)} shard(s) are being written by another process, first {busy[0]}{who}",
+            where=folder,
+            hint="wait for it, then run the same command again",
+        )
     return result
-
-
-def _claims(
-    job: Job,
-    folder: DataFolder,
-    entries: Iterable[ShardEntry],
-    pool: ThreadPoolExecutor,
-    busy: list[ShardEntry],
-    skipped: Callable[[ShardEntry, dict[str, Any] | None], None],
-) -> Generator[_Claim]:
-    """Lock the shards that are not finished, one ahead of the caller, so that their queries are sampled while
-    the previous shard is rendered.
-
-    The caller must have handed a lock over when it asks for the next claim; closing the generator releases
-    the others. Shards that other processes render go to `busy`. `skipped` is called for every shard that is
-    not claimed, with its sidecar if it is finished.
-    """
-
-    held: deque[_Claim] = deque()
-    try:
-        for entry in entries:
-            record = finished_record(folder, entry, job.config_hash)
-            lock = take_lock(folder.workspace / entry.file) if record is None else None
-            if record is None and lock is None:
-                busy.append(entry)
-            elif lock is not None:
-                # Another process may have finished it since.
-                record = finished_record(folder, entry, job.config_hash)
-                if record is None:
-                    drawn = pool.submit(job.query_plan.draw, entry.split, entry.index, entry.rows)
-                    held.append(_Claim(entry, lock, drawn))
-                    if len(held) > 1:
-                        yield held[0]
-                        held.popleft()
-                    continue
-                lock.release()
-            skipped(entry, record)
-        while held:
-            yield held[0]
-            held.popleft()
-    finally:
-        for claim in held:
-            claim.lock.release()
 
 
 def estimate_queries(

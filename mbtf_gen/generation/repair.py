@@ -24,6 +24,7 @@ from mbtf_core.data.verify import INCOMPLETE, Fault, document_faults, foreign_fi
 from mbtf_core.errors import InputError, MbtfError
 from mbtf_core.files.atomic import checksummed
 from mbtf_core.locks import brief_lock
+from mbtf_core.run.runner import Runner
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.folder import check_geometry
 from mbtf_gen.generation.geometry import geometry_of
@@ -146,7 +147,7 @@ def repair(
         # A shard without its sidecar is unfinished, so that generation renders it.
         for entry in entries:
             folder.delete(sidecar_name(entry.file))
-    result = render_shards(job, folder, entries, plan, progress=progress)
+    result = render_shards(job, folder, entries, plan, Runner(), progress=progress)
     return RepairResult(
         folder=str(folder),
         faults=faults,

@@ -6,13 +6,12 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from mbtf_core.cluster.engine import Cluster
 from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.schema import ShardEntry
 from mbtf_core.data.sidecar import finished_record
 from mbtf_core.errors import PartialError
+from mbtf_core.run.runner import Runner
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.generation.distribute_shards import distribute_shards
 from mbtf_gen.generation.folder import has_dataset, open_folder, read_run_plan
 from mbtf_gen.generation.render_shards import ProgressCallback, render_shards
 from mbtf_gen.generation.summary import Summary, finish
@@ -42,7 +41,7 @@ def generate(
     slice_count: int = 1,
     planned: Callable[[RunPlan], None] | None = None,
     progress: ProgressCallback | None = None,
-    cluster: Cluster | None = None,
+    runner: Runner | None = None,
 ) -> Summary:
     """Generate a data set, or finish an unfinished one.
 
@@ -65,8 +64,8 @@ def generate(
     progress : callable, optional
         Called after every shard with the paths of this run so far, a note, and the paths that the run is
         expected to trace (None where a target error leaves it open).
-    cluster : Cluster, optional
-        Its workers render the shards, with the same values; this process by default.
+    runner : Runner, optional
+        Renders the shards, with the same values wherever; in this process by default.
 
     Returns
     -------
@@ -98,10 +97,7 @@ def generate(
     entries = unfinished(job, folder, slice_index, slice_count)
     if planned is not None and not plans and entries:
         planned(plan)
-    if cluster is None:
-        result = render_shards(job, folder, entries, plan, start=start, progress=progress)
-    else:
-        result = distribute_shards(job, folder, entries, plan, cluster, start=start, progress=progress)
+    result = render_shards(job, folder, entries, plan, runner or Runner(), start=start, progress=progress)
     seconds = time.perf_counter() - start
     summary = finish(
         folder, paths=result.paths, seconds=seconds, writing=result.writing, waiting=result.waiting

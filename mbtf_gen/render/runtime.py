@@ -15,10 +15,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.child_process import Outcome, run_child
-from mbtf_core.cluster.task import worker_threads
 from mbtf_core.errors import EngineError, UsageError
 from mbtf_core.files.folders import cache_folder
+from mbtf_core.run.child import Outcome, run_child
+from mbtf_core.run.task import worker_threads
 from mbtf_gen.render.llvm import (
     CACHE_VARIABLE,
     OLDEST_LLVM,

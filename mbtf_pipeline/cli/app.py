@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from mbtf_core.app.console import new_app
 from mbtf_pipeline.cli.cost import cost
-from mbtf_pipeline.cli.emit import emit
 from mbtf_pipeline.cli.list import list_recipes
 from mbtf_pipeline.cli.report import report
 from mbtf_pipeline.cli.run import run
 
 app = new_app("mbtf-pipeline", "Run recipes: generate, fit, compare, report.")
-for command in (run, report, cost, emit):
+for command in (run, report, cost):
     app.command(command)
 app.command(list_recipes, name="list")

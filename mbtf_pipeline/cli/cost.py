@@ -38,9 +38,9 @@ def cost(
     seed
         Root seed of all random numbers.
     """
-    from mbtf_core.cluster.engine import open_cluster
     from mbtf_core.files.folders import owned
-    from mbtf_core.interruption import keep_on_interruption
+    from mbtf_core.run.cluster import open_runner
+    from mbtf_core.run.signals import keep_on_interruption
     from mbtf_core.units import asked_duration, format_duration
     from mbtf_pipeline.cost_study.page import whole_runs, write_page
     from mbtf_pipeline.cost_study.pareto import pareto_front
@@ -57,7 +57,7 @@ def cost(
     seconds = time_of(folder) if time is None else asked_duration(time, "--time")
     keep_on_interruption(f"the measurements are kept in {folder}")
     with (
-        open_cluster(cluster, console.note) as workers,
+        open_runner(cluster, console.note) as runner,
         console.progress(total=100, label="cost", unit="%") as bar,
     ):
         study = run_study(
@@ -77,7 +77,7 @@ def cost(
             ),
             announce=console.note,
             progress=lambda share, note: bar.update(round(100 * share, 1), note),
-            cluster=workers,
+            runner=runner,
         )
     with owned(folder):
         page = write_page(study)

@@ -20,7 +20,7 @@ from mbtf_core.app.options import (
     command_line,
 )
 from mbtf_core.errors import PartialError, UsageError
-from mbtf_core.interruption import keep_on_interruption
+from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.units import clock
 from mbtf_fit.cli.page_options import Live, live_view
 
@@ -84,7 +84,7 @@ def run(
         return _run_library(recipe, output, own, cluster, command, console)
     if quick:
         raise UsageError("only paper recipes have quick sizes", where="--quick", hint="use --quality draft")
-    from mbtf_core.cluster.engine import open_cluster
+    from mbtf_core.run.cluster import open_runner
     from mbtf_pipeline.run import run_recipe
 
     if time is not None:
@@ -97,7 +97,7 @@ def run(
         )
         keep_on_interruption(f"the finished stages are kept in {timed.folder}")
         with (
-            open_cluster(cluster, console.note) as workers,
+            open_runner(cluster, console.note) as runner,
             live_view(timed.recipe.title, live, console) as shown,
         ):
             result = run_recipe(
@@ -108,7 +108,7 @@ def run(
                 console=console,
                 generated=timed.generated,
                 live=shown,
-                cluster=workers,
+                runner=runner,
             )
         return _report(result, console, timed.split.quality)
     from mbtf_pipeline.forecast import forecast_left
@@ -120,11 +120,11 @@ def run(
     if expected is not None:
         console.note(expected.describe())
     with (
-        open_cluster(cluster, console.note) as workers,
+        open_runner(cluster, console.note) as runner,
         live_view(loaded.title, live, console) as shown,
     ):
         result = run_recipe(
-            loaded, output, force=force, command=command, console=console, live=shown, cluster=workers
+            loaded, output, force=force, command=command, console=console, live=shown, runner=runner
         )
     _report(result, console, quality)
 
@@ -163,7 +163,8 @@ def _run_library(
     command: str,
     console: Console,
 ) -> None:
-    from mbtf_core.cluster.engine import open_cluster
+    from mbtf_core.run.cluster import open_runner
+    from mbtf_core.run.processes import Processes
     from mbtf_pipeline.library.recipe import entries, load_library_recipe
     from mbtf_pipeline.library.run import run_library
 
@@ -171,8 +172,8 @@ def _run_library(
     found = entries(library, file)
     folder = output if output is not None else library.folder
     keep_on_interruption(f"the finished stages are kept in {folder}")
-    with open_cluster(cluster, console.note) as workers:
-        done = run_library(library, found, folder, command=command, console=console, cluster=workers)
+    with open_runner(cluster, console.note, Processes()) as runner:
+        done = run_library(library, found, folder, command=command, console=console, runner=runner)
     count = len(found) - len(done.failed)
     data = {"folder": done.folder, "page": done.page, "materials": done.record["materials"]}
     console.report(data, f"{done.page}: {count} of {len(found)} materials")

@@ -35,12 +35,11 @@ from mbtf_pipeline.compare.unmodified_mitsuba import pick_scene, write_agreement
 from mbtf_pipeline.recipe import CompareSection
 
 if TYPE_CHECKING:
-    from mbtf_core.cluster.engine import Cluster
     from mbtf_core.pictures.camera import PixelKind
     from mbtf_core.pictures.reference import ReferenceImage
+    from mbtf_core.run.runner import Runner
     from mbtf_fit import Material
     from mbtf_gen.job import Job
-    from mbtf_gen.render.estimator import Estimator
 
 COMPARISON_NAME = "comparison.json"
 COMPARISON_FORMAT = "mbtf-comparison"
@@ -65,7 +64,7 @@ def compare(
     fits: Mapping[str, Path],
     out: Path,
     progress: Progress,
-    cluster: Cluster | None = None,
+    runner: Runner,
 ) -> None:
     """Render references, evaluate all fits at the same pixels, and measure their errors.
 
@@ -75,7 +74,7 @@ def compare(
     fits : folder of the fitted material by name of the fit
     out : folder for images and records; ``comparison.json`` is written last
     progress : called with a short note after each image
-    cluster : renders the references; this process by default
+    runner : renders the references
 
     Raises
     ------
@@ -86,8 +85,7 @@ def compare(
     from mbtf_core.data.dataset import Dataset
     from mbtf_fit import Material
     from mbtf_gen.job import Job
-    from mbtf_gen.planning.effects_plan import reference_plan
-    from mbtf_gen.planning.simulation import build_estimator
+    from mbtf_gen.pictures.tasks import picture_estimator
 
     if section.st_lpips:
         require()
@@ -97,8 +95,8 @@ def compare(
     materials = {name: Material.load(folder) for name, folder in fits.items()}
     start = time.perf_counter()
     job = Job.load(generate)
-    estimator = build_estimator(job, reference_plan(job))
-    rendered = _render_references(section, job, estimator, progress, cluster)
+    estimator = picture_estimator(job)
+    rendered = _render_references(section, job, progress, runner)
     seconds = time.perf_counter() - start
     # From the query references if there are any, otherwise from the pixel references.
     exposure = auto_exposure(brightness(next(iter(images.values())).value) for _, images in rendered)
@@ -142,36 +140,31 @@ def compare(
 
 
 def _render_references(
-    section: CompareSection,
-    job: Job,
-    estimator: Estimator,
-    progress: Progress,
-    cluster: Cluster | None,
+    section: CompareSection, job: Job, progress: Progress, runner: Runner
 ) -> list[tuple[Scene, dict[PixelKind, ReferenceImage]]]:
     """References by scene and kind."""
-    from mbtf_gen.pictures.distribute import picture_task
-    from mbtf_gen.pictures.reference import render_reference
+    from mbtf_core.run.task import Item
+    from mbtf_gen.pictures.tasks import render_picture
 
-    options = {"spp": section.spp, "seed": section.seed}
-    wanted = [(scene, kind) for scene in scenes(section) for kind in section.kinds]
+    items = []
+    for scene, kind in ((scene, kind) for scene in scenes(section) for kind in section.kinds):
+        arguments = {
+            "job": job,
+            "camera": scene.camera(section.size),
+            "omega_i": from_angles(scene.light.elevation, scene.light.azimuth),
+            "kind": kind,
+            "spp": section.spp,
+            "seed": section.seed,
+            "index": scene.index,
+        }
+        items.append(Item(f"{scene.name}-{kind}", arguments))
     rendered: dict[str, ReferenceImage] = {}
-    tasks = []
-    for scene, kind in wanted:
-        camera = scene.camera(section.size)
-        light = from_angles(scene.light.elevation, scene.light.azimuth)
-        if cluster is None:
-            image = render_reference(estimator, camera, light, kind=kind, index=scene.index, **options)
-            rendered[f"{scene.name}-{kind}"] = image
-            progress(f"reference {scene.name}")
-        else:
-            name = f"{scene.name}-{kind}"
-            tasks.append(picture_task(name, job, camera, light, kind=kind, index=scene.index, **options))
-    for done in cluster.run(tasks) if cluster is not None else ():
+    for done in runner.map(render_picture, items):
         if done.error:
             hint = "the same command resumes the run"
-            raise PartialError(f"picture {done.task.name} failed: {done.error}", hint=hint)
-        rendered[done.task.name] = done.value
-        progress(f"reference {done.task.name}")
+            raise PartialError(f"picture {done.name} failed: {done.error}", hint=hint)
+        rendered[done.name] = done.value
+        progress(f"reference {done.name}")
     return [
         (scene, {kind: rendered[f"{scene.name}-{kind}"] for kind in section.kinds})
         for scene in scenes(section)

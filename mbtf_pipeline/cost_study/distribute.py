@@ -10,15 +10,14 @@ from __future__ import annotations
 import os
 import socket
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.cluster.engine import Cluster
-from mbtf_core.cluster.task import Task, worker_threads
 from mbtf_core.errors import PartialError
-from mbtf_fit.training.fit_cluster import in_folder
+from mbtf_core.run.runner import Runner
+from mbtf_core.run.task import Item, worker_threads
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.cost_study.generator_runs import GeneratorTask
 from mbtf_pipeline.cost_study.measurements import Measurement
@@ -26,11 +25,10 @@ from mbtf_pipeline.cost_study.repeats import FEWEST_SEEDS
 from mbtf_pipeline.cost_study.runs import DataRequest, Run, RunRunner, forecast_seconds
 from mbtf_pipeline.run_folder import machine
 
-_THIS = "mbtf_pipeline.cost_study.distribute"
 _RESUMES = "the same command resumes"
 
 
-def worker_facts(cluster: Cluster, config: GeneratorConfig) -> tuple[dict[str, str], float]:
+def worker_facts(runner: Runner, config: GeneratorConfig) -> tuple[dict[str, str], float]:
     """Record of the workers' machine, and their seconds per path of a training query by a forecast.
 
     Raises
@@ -38,25 +36,22 @@ def worker_facts(cluster: Cluster, config: GeneratorConfig) -> tuple[dict[str, s
     InputError : a worker does not see the material
     PartialError : no worker answered
     """
-    task = Task("forecast", f"{_THIS}:describe_worker", _shared(config))
-    (done,) = cluster.run([task])
+    (done,) = runner.map(describe_worker, [Item("forecast", {"config": config})])
     if done.error:
         raise PartialError(f"the forecast failed: {done.error}", hint=_RESUMES)
     return done.value["machine"], float(done.value["path_seconds"])
 
 
-def describe_worker(config: str, working_folder: str) -> dict[str, Any]:
-    """What :func:`worker_facts` returns; runs on a worker."""
-    with in_folder(working_folder):
-        loaded = GeneratorConfig.model_validate_json(config)
-        found = machine()
-        if (threads := worker_threads()) is not None:
-            found["system"] += f", workers of {threads} thread{'s' * (threads != 1)}"
-        return {"machine": found, "path_seconds": forecast_seconds(loaded) / loaded.queries.spp}
+def describe_worker(config: GeneratorConfig) -> dict[str, Any]:
+    """What :func:`worker_facts` returns; a task."""
+    found = machine()
+    if (threads := worker_threads()) is not None:
+        found["system"] += f", workers of {threads} thread{'s' * (threads != 1)}"
+    return {"machine": found, "path_seconds": forecast_seconds(config) / config.queries.spp}
 
 
 def measure_configurations(
-    cluster: Cluster, config: GeneratorConfig, tasks: Iterable[GeneratorTask], seconds: float, generator: str
+    runner: Runner, config: GeneratorConfig, tasks: Iterable[GeneratorTask], seconds: float, generator: str
 ) -> Iterator[tuple[GeneratorTask, Measurement]]:
     """Measure configurations of the generator for at most so many seconds each of noise and bias.
 
@@ -74,29 +69,27 @@ def measure_configurations(
     ------
     PartialError : a worker failed; finished measurements are kept
     """
-    shared = {**_shared(config), "seconds": seconds}
-    function = f"{_THIS}:measure_configuration"
     by_name: dict[str, GeneratorTask] = {}
 
-    def given() -> Iterator[Task]:
+    def given() -> Iterator[Item]:
         for number, task in enumerate(tasks):
-            by_name[f"configuration-{number}"] = task
-            arguments = {**shared, "task": asdict(task), "command": task.command(generator)}
-            yield Task(f"configuration-{number}", function, arguments)
+            name = f"configuration-{number}"
+            by_name[name] = task
+            command = task.command(generator)
+            yield Item(name, {"config": config, "seconds": seconds, "task": task, "command": command})
 
-    for done in cluster.run(given(), ahead=0):
-        task = by_name[done.task.name]
+    for done in runner.map(measure_configuration, given(), ahead=0):
+        task = by_name[done.name]
         if done.error:
-            raise PartialError(f"{task.label} failed: {done.error}", hint=_RESUMES)
+            raise PartialError(f"{task.label} failed: {done.error}", hint=done.hint or _RESUMES)
         yield task, done.value
 
 
 def measure_configuration(
-    config: str, working_folder: str, seconds: float, task: dict[str, Any], command: str
+    config: GeneratorConfig, seconds: float, task: GeneratorTask, command: str
 ) -> Measurement:
-    """Measure one configuration of the generator; runs on a worker."""
-    with in_folder(working_folder):
-        return GeneratorTask(**task).run(_benchmark(config), seconds, command)
+    """Measure one configuration of the generator; a task."""
+    return task.run(_benchmark(config.model_dump_json()), seconds, command)
 
 
 @lru_cache(maxsize=1)
@@ -115,10 +108,10 @@ class ClusterRunner(RunRunner):
 
     Attributes
     ----------
-    cluster : Cluster
+    runner : Runner
     """
 
-    cluster: Cluster | None = None
+    runner: Runner = field(default_factory=Runner)
     # Expected seconds of runs that have been taken, by name.
     _taken: dict[str, float] = field(default_factory=dict)
     # Test sets that the workers have yet to make, and seconds of one.
@@ -126,7 +119,7 @@ class ClusterRunner(RunRunner):
 
     @property
     def _workers(self) -> int:
-        return max(1, 0 if self.cluster is None else self.cluster.workers)
+        return max(1, self.runner.workers)
 
     def work_left(self, seconds: float) -> float:
         """Seconds of work that the workers can begin and finish in a time."""
@@ -140,26 +133,25 @@ class ClusterRunner(RunRunner):
 
     def measure_all(self, runs: Iterable[tuple[int, Run]]) -> Iterator[tuple[int, Run, Measurement | str]]:
         """As of the base class; a run is taken once a worker is nearly free."""
-        assert self.cluster is not None
         by_name: dict[str, tuple[int, Run]] = {}
 
-        def tasks() -> Iterator[Task]:
+        def items() -> Iterator[Item]:
             for number, run in runs:
                 name = f"run-{number}-{run.data.seed}"
                 by_name[name] = number, run
                 self._taken[name] = self.planned_seconds(run) + self.overhead
                 arguments = {
-                    **_shared(self.config),
-                    "folder": str(self.folder),
+                    "config": self.config,
+                    "folder": self.folder,
                     "command": self.command,
-                    "test": list(self.test),
-                    "run": asdict(run),
+                    "test": self.test,
+                    "run": run,
                 }
-                yield Task(name, f"{_THIS}:measure_run", arguments, gpu=run.fit.get("device") == "cuda")
+                yield Item(name, arguments, gpu=run.fit.get("device") == "cuda")
 
-        for done in self.cluster.run(tasks(), stop_when_fatal=False, ahead=0):
-            number, run = by_name[done.task.name]
-            del self._taken[done.task.name]
+        for done in self.runner.map(measure_run, items(), independent=True, ahead=0):
+            number, run = by_name[done.name]
+            del self._taken[done.name]
             self.progress(run.label)
             if done.error:
                 yield number, run, done.error
@@ -176,24 +168,20 @@ class ClusterRunner(RunRunner):
 
 
 def measure_run(
-    config: str, working_folder: str, folder: str, command: str, test: list[int], run: dict[str, Any]
+    config: GeneratorConfig, folder: Path, command: str, test: tuple[int, int], run: Run
 ) -> dict[str, Any]:
-    """Measure one run; runs on a worker.
+    """Measure one run; a task.
 
     Parameters
     ----------
-    config : str
-        The generator's configuration as JSON.
-    working_folder : str
-        Folder that all paths are relative to.
-    folder : str
+    config : GeneratorConfig
+    folder : Path
         Folder of the study's data and fits, of which this process gets one of its own.
     command : str
         The generator's, with the study's configuration.
-    test : list of int
+    test : (int, int)
         Number of test queries, and paths of each.
-    run : dict
-        Fields of :class:`~mbtf_pipeline.cost_study.runs.Run`.
+    run : Run
 
     Returns
     -------
@@ -204,27 +192,21 @@ def measure_run(
     Raises
     ------
     InputError
-        The fit diverged, or this machine does not see the working folder.
+        The fit diverged.
     PartialError
         The disk is full.
     """
-    with in_folder(working_folder):
-        runner = _runner(config, folder, command, (test[0], test[1]))
-        own = Run(**{**run, "data": DataRequest(**run["data"])})
-        runner.keep_only(own.data)
-        known = own.data.seed in runner.test_sets
-        found = runner.measure(own)
-        seconds = None if known else runner.test_seconds
-        return {"measurement": found, "overhead": runner.overhead, "test_seconds": seconds}
+    runner = _runner(config.model_dump_json(), folder, command, test)
+    runner.keep_only(run.data)
+    known = run.data.seed in runner.test_sets
+    found = runner.measure(run)
+    seconds = None if known else runner.test_seconds
+    return {"measurement": found, "overhead": runner.overhead, "test_seconds": seconds}
 
 
 @lru_cache(maxsize=1)
-def _runner(config: str, folder: str, command: str, test: tuple[int, int]) -> RunRunner:
+def _runner(config: str, folder: Path, command: str, test: tuple[int, int]) -> RunRunner:
     """The runner of a study in this process, with its test sets."""
-    own = Path(folder) / f"{socket.gethostname()}-{os.getpid()}"
+    own = folder / f"{socket.gethostname()}-{os.getpid()}"
     loaded = GeneratorConfig.model_validate_json(config)
     return RunRunner(loaded, own, command, lambda note: None, test=test)
-
-
-def _shared(config: GeneratorConfig) -> dict[str, str]:
-    return {"config": config.model_dump_json(), "working_folder": str(Path.cwd())}

@@ -9,12 +9,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.cluster.engine import Cluster
 from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.data.shard_files import row_bytes
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import read_json, write_json, write_text
 from mbtf_core.files.folders import ELSEWHERE, check_folder, check_space, owned
+from mbtf_core.run.runner import Runner
 from mbtf_core.stats import Estimate, signal_variance
 from mbtf_core.units import expectation
 from mbtf_gen.config.generator import GeneratorConfig
@@ -108,7 +108,7 @@ def run_study(
     command: str = "",
     progress: Callable[[float, str], None] = lambda share, note: None,
     announce: Callable[[str], None] = lambda text: None,
-    cluster: Cluster | None = None,
+    runner: Runner | None = None,
 ) -> Study:
     """Measure what the time allows for the material and generator of a recipe; stored measurements are kept
     and cost no time.
@@ -119,9 +119,10 @@ def run_study(
     seed : of queries, paths and initial weights; the recipe's by default
     progress : called with (share of the time spent, note)
     announce : called with expected time and size as a line, before anything is written
-    cluster : its workers measure configurations and runs, on their machines and with their threads
+    runner : measures configurations and runs; its workers on their machines and with their threads
     """
     start = time.perf_counter()
+    workers = None if runner is None or runner.here else runner
 
     def spent() -> float:
         return time.perf_counter() - start
@@ -133,7 +134,7 @@ def run_study(
     job = Job.prepare(config)
     config, material = job.config, job.material
     with owned(folder):
-        on, per_path = (machine(), None) if cluster is None else worker_facts(cluster, config)
+        on, per_path = (machine(), None) if workers is None else worker_facts(workers, config)
         claim(folder, on)
         benchmark = GeneratorBenchmark(config, material)
         note("reference")
@@ -142,7 +143,7 @@ def run_study(
         store = MeasurementFolder(folder, config.hash(material.digests))
         path = path_seconds(config, store, per_path)
         size = disk_bytes(planned_runs(seconds, config.queries.spp, path))
-        size *= 1 if cluster is None else cluster.workers
+        size *= 1 if workers is None else workers.workers
         check_space(folder, size, "give a shorter --time, or choose another folder with -o")
         announce(expectation(seconds + refine, size))
         description = {
@@ -166,7 +167,7 @@ def run_study(
         found = {task.label: store.get(task, task.command(generator)) for task in tasks}
 
         # Configurations take longer than their share where kernels are compiled; workers start anew.
-        until = 1.2 * GENERATOR * seconds + (0.0 if cluster is None else spent())
+        until = 1.2 * GENERATOR * seconds + (0.0 if workers is None else spent())
 
         def missing() -> Iterator[GeneratorTask]:
             for task in tasks:
@@ -175,10 +176,10 @@ def run_study(
                     yield task
 
         measured: Iterator[tuple[GeneratorTask, Measurement]]
-        if cluster is None:
+        if workers is None:
             measured = ((task, task.run(benchmark, each, task.command(generator))) for task in missing())
         else:
-            measured = measure_configurations(cluster, config, missing(), each, generator)
+            measured = measure_configurations(workers, config, missing(), each, generator)
         for task, measurement in measured:
             found[task.label] = measurement
             store.put(task, measurement)
@@ -188,21 +189,21 @@ def run_study(
             else:
                 study.measurements.append(known)
         options: dict[str, Any] = {"path_seconds": path}
-        if cluster is None:
-            runner = RunRunner(config, folder / WORK, generator, note, **options)
+        if workers is None:
+            runs = RunRunner(config, folder / WORK, generator, note, **options)
         else:
-            runner = ClusterRunner(config, folder / WORK, generator, note, cluster=cluster, **options)
+            runs = ClusterRunner(config, folder / WORK, generator, note, runner=workers, **options)
         try:
             seeds = MOST_SEEDS if refine else FEWEST_SEEDS
             _measure_runs(
                 study,
                 store,
-                runner,
-                lambda again: runner.work_left(seconds + again * refine - spent()),
+                runs,
+                lambda again: runs.work_left(seconds + again * refine - spent()),
                 seeds,
             )
         finally:
-            runner.clear()
+            runs.clear()
     return study
 
 

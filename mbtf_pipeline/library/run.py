@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from mbtf_core.app.console import Console
-from mbtf_core.cluster.children import run_in_children
-from mbtf_core.cluster.engine import Cluster
-from mbtf_core.cluster.task import Task, TaskResult
 from mbtf_core.errors import InputError, MbtfError, printable
 from mbtf_core.files.atomic import read_json, write_json, write_text
 from mbtf_core.files.digest import data_sha256
 from mbtf_core.files.folders import check_folder, owned
+from mbtf_core.run.runner import Runner
+from mbtf_core.run.task import Item, Result
 from mbtf_core.units import format_duration
 from mbtf_fit.config import DECODER_MODELS, SHARED_PRESET, FitConfig
 from mbtf_fit.material.decoder import DECODER_FOLDER
 from mbtf_pipeline.library.budget import Division
 from mbtf_pipeline.library.page import library_page
 from mbtf_pipeline.library.recipe import Entry, LibraryRecipe
-from mbtf_pipeline.library.task import shards_of, summarize
+from mbtf_pipeline.library.task import first_fit, fit_shared, run_material, shards_of, summarize
 from mbtf_pipeline.run_folder import has_record, machine
 
 LIBRARY_NAME = "library.json"
@@ -31,7 +30,6 @@ LIBRARY_SCHEMA = 2
 PAGE = "library.html"
 # Sub-folders of the runs, and of the fits with a shared network.
 MATERIALS, SHARED = "materials", "shared"
-_TASK = "mbtf_pipeline.library.task"
 
 
 @dataclass(frozen=True)
@@ -74,8 +72,8 @@ def run_library(
     folder: Path,
     *,
     command: str,
+    runner: Runner,
     console: Console | None = None,
-    cluster: Cluster | None = None,
 ) -> LibraryResult:
     """Run the recipe of every material, and write the library's page.
 
@@ -90,10 +88,10 @@ def run_library(
         Folder of the library; the runs are in ``materials/NAME``.
     command : str
         Command that the page shows for reproduction.
+    runner : Runner
+        Of other processes, each of which runs a material at a time.
     console : Console, optional
         Receives progress; quiet by default.
-    cluster : Cluster, optional
-        Its workers each run a material at a time; by default one process of this machine after the other.
 
     Returns
     -------
@@ -109,7 +107,7 @@ def run_library(
     console = console or Console(quiet=True)
     with owned(folder):
         check_folder(folder, is_library, "library")
-        run = _LibraryRun(library, folder, command, console, cluster)
+        run = _LibraryRun(library, folder, command, console, runner)
         return run.run(list(found))
 
 
@@ -117,10 +115,10 @@ class _LibraryRun:
     """One call of :func:`run_library`."""
 
     def __init__(
-        self, library: LibraryRecipe, folder: Path, command: str, console: Console, cluster: Cluster | None
+        self, library: LibraryRecipe, folder: Path, command: str, console: Console, runner: Runner
     ) -> None:
         self.library, self.folder, self.command = library, folder, command
-        self.console, self.cluster = console, cluster
+        self.console, self.runner = console, runner
         before = read_json(folder / LIBRARY_NAME) if (folder / LIBRARY_NAME).is_file() else {}
         self.before = {state["name"]: state for state in before.get("materials", [])}
         self.division: dict[str, Any] = before.get("division", {})
@@ -139,13 +137,13 @@ class _LibraryRun:
         self._write()
         left = [entry for entry in found if entry.recipe is not None]
         timed = left if self.library.training is None else self._divided(left, len(found))
-        tasks = [self._task("run_material", entry) for entry in timed]
-        with self.console.progress(len(tasks), "library", "materials") as bar:
-            for done in self._results(tasks):
-                state = self.states[done.task.name]
+        items = [self._item(entry) for entry in timed]
+        with self.console.progress(len(items), "library", "materials") as bar:
+            for done in self.runner.map(run_material, items, independent=True):
+                state = self.states[done.name]
                 self._finish(state, done)
                 self._write()
-                bar.advance(1, f"{done.task.name}: {state['state']}")
+                bar.advance(1, f"{done.name}: {state['state']}")
         if self.library.shared_network is None:
             self.shared = {}
         else:
@@ -158,14 +156,14 @@ class _LibraryRun:
         division = Division(self.division, self.library.training, self.library.first_share, count)
         self.division = division.record
         keys = {entry.name: _digest(entry) for entry in left}
-        tasks = [
-            self._task("first_fit", entry, seconds=division.first)
+        items = [
+            self._item(entry, seconds=division.first)
             for entry in left
             if not division.has_error(entry.name, keys[entry.name])
         ]
-        with self.console.progress(len(tasks), "first fits", "materials") as bar:
-            for done in self._results(tasks):
-                name = done.task.name
+        with self.console.progress(len(items), "first fits", "materials") as bar:
+            for done in self.runner.map(first_fit, items, independent=True):
+                name = done.name
                 if done.error:
                     self.states[name] |= {"state": "failed", "error": done.error}
                     self.console.note(f"{name}: failed: {done.error}")
@@ -197,41 +195,31 @@ class _LibraryRun:
         config = configs[0].model_copy(update={"training": training.model_copy(update=update)})
         runs, folder = self.folder / MATERIALS, self.folder / SHARED
         arguments = {
-            "config": config.model_dump(mode="json"),
+            "config": config,
             "shards": [
-                str(shards_of(entry.recipe, config, runs / entry.name))
+                shards_of(entry.recipe, config, runs / entry.name)
                 for entry, _ in group
                 if entry.recipe is not None
             ],
-            "folders": [str(folder / entry.name) for entry, _ in group],
-            "decoder": str(folder / DECODER_FOLDER),
-            "working_folder": str(Path.cwd()),
+            "folders": [folder / entry.name for entry, _ in group],
+            "decoder": folder / DECODER_FOLDER,
         }
         time = format_duration(self.library.shared_network)
         self.console.note(f"{name}: a shared network of {len(group)} materials, training for {time}")
-        task = Task("shared network", f"{_TASK}:fit_shared", arguments, gpu=config.device == "cuda")
-        for result in self._results([task]):
+        item = Item("shared network", arguments, gpu=config.device == "cuda")
+        for result in self.runner.map(fit_shared, [item], independent=True):
             found = zip(group, result.value or (), strict=not result.error)
             errors = {entry.name: {"fit": fit, **error} for (entry, fit), error in found}
             self.shared = asked | {"fit": name, "errors": errors, "error": result.error}
 
-    def _task(self, function: str, entry: Entry, **arguments: Any) -> Task:
+    def _item(self, entry: Entry, **arguments: Any) -> Item:
         assert entry.recipe is not None
-        shared = {
-            "recipe": entry.recipe.model_dump_json(),
-            "folder": str(self.folder / MATERIALS / entry.name),
-            "working_folder": str(Path.cwd()),
-            "command": self.command,
-        }
+        folder = self.folder / MATERIALS / entry.name
+        shared = {"recipe": entry.recipe, "folder": folder, "command": self.command}
         gpu = any(config.device == "cuda" for config in entry.recipe.fit.values())
-        return Task(entry.name, f"{_TASK}:{function}", shared | arguments, gpu=gpu)
+        return Item(entry.name, shared | arguments, gpu=gpu)
 
-    def _results(self, tasks: Iterable[Task]) -> Iterator[TaskResult]:
-        if self.cluster is not None:
-            return self.cluster.run(tasks, stop_when_fatal=False)
-        return run_in_children(tasks)
-
-    def _finish(self, state: dict[str, Any], done: TaskResult) -> None:
+    def _finish(self, state: dict[str, Any], done: Result) -> None:
         fault = done.error
         if not fault:
             try:

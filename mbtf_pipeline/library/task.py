@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import read_json
 from mbtf_fit.config import FitConfig
-from mbtf_fit.training.fit_cluster import in_folder
 from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.run_folder import COMPARE, SHARDS
 
@@ -21,17 +20,15 @@ if TYPE_CHECKING:
 FIRST = "first"
 
 
-def first_fit(recipe: str, folder: str, working_folder: str, seconds: float, command: str) -> float | None:
-    """Generate the data of a material and fit it for a short time.
+def first_fit(recipe: Recipe, folder: Path, seconds: float, command: str) -> float | None:
+    """Generate the data of a material and fit it for a short time; a task.
 
     Parameters
     ----------
-    recipe : str
-        Resolved recipe as JSON.
-    folder : str
+    recipe : Recipe
+        Resolved recipe.
+    folder : Path
         Folder of the material's run.
-    working_folder : str
-        Folder that all paths are relative to.
     seconds : float
         Training time.
     command : str
@@ -47,39 +44,34 @@ def first_fit(recipe: str, folder: str, working_folder: str, seconds: float, com
     InputError, PartialError
         As :func:`~mbtf_pipeline.run.run_recipe`.
     """
-    with in_folder(working_folder):
-        from mbtf_fit.training.fit import fit
-        from mbtf_fit.training.fit_folder import identity_of
-        from mbtf_pipeline.run import generate_data
+    from mbtf_fit.training.fit import fit
+    from mbtf_fit.training.fit_folder import identity_of
+    from mbtf_pipeline.run import generate_data
 
-        loaded = Recipe.model_validate_json(recipe)
-        run = Path(folder)
-        generate_data(loaded, run, command=command)
-        name, config = next(iter(loaded.fit.items()))
-        shards, out = shards_of(loaded, config, run), run / FIRST / name
-        training = config.training.model_copy(update={"time": seconds, "steps": None})
-        short = config.model_copy(update={"training": training})
-        identity = identity_of(short, _open(shards, config))
-        done = fit(short, shards, out, overwrite=not _holds(out, identity))
-        value = _unexplained(done, shards)["value"]
-        return None if value is None else float(value)
+    generate_data(recipe, folder, command=command)
+    name, config = next(iter(recipe.fit.items()))
+    shards, out = shards_of(recipe, config, folder), folder / FIRST / name
+    training = config.training.model_copy(update={"time": seconds, "steps": None})
+    short = config.model_copy(update={"training": training})
+    identity = identity_of(short, _open(shards, config))
+    done = fit(short, shards, out, overwrite=not _holds(out, identity))
+    value = _unexplained(done, shards)["value"]
+    return None if value is None else float(value)
 
 
 def fit_shared(
-    config: dict[str, Any], shards: list[str], folders: list[str], decoder: str, working_folder: str
+    config: FitConfig, shards: Sequence[Path], folders: Sequence[Path], decoder: Path
 ) -> list[dict[str, Any]]:
-    """Fit several materials with one network.
+    """Fit several materials with one network; a task.
 
     Parameters
     ----------
-    config : dict
-        Resolved options of the fit.
-    shards, folders : list of str
+    config : FitConfig
+        Options of the fit.
+    shards, folders : sequence of Path
         Data set and folder of each material.
-    decoder : str
+    decoder : Path
         Folder of the network.
-    working_folder : str
-        Folder that all paths are relative to.
 
     Returns
     -------
@@ -91,19 +83,17 @@ def fit_shared(
     InputError, PartialError
         As :func:`~mbtf_fit.training.joint_fit.fit_jointly`.
     """
-    with in_folder(working_folder):
-        from mbtf_fit.training.fit_folder import identity_of
-        from mbtf_fit.training.joint_fit import fit_jointly, joint_identity
+    from mbtf_fit.training.fit_folder import identity_of
+    from mbtf_fit.training.joint_fit import fit_jointly, joint_identity
 
-        loaded = FitConfig.model_validate(config)
-        group = [_open(folder, loaded) for folder in shards]
-        identities = {
-            folder: identity_of(loaded, data, group) for folder, data in zip(folders, group, strict=True)
-        }
-        identities[decoder] = joint_identity(identities)
-        same = all(_holds(Path(folder), identity) for folder, identity in identities.items())
-        result = fit_jointly(loaded, shards, folders, decoder, overwrite=not same)
-        return [_unexplained(done, Path(folder)) for done, folder in zip(result.fits, shards, strict=True)]
+    group = [_open(folder, config) for folder in shards]
+    identities = {
+        folder: identity_of(config, data, group) for folder, data in zip(folders, group, strict=True)
+    }
+    identities[decoder] = joint_identity({str(folder): found for folder, found in identities.items()})
+    same = all(_holds(folder, identity) for folder, identity in identities.items())
+    result = fit_jointly(config, shards, folders, decoder, overwrite=not same)
+    return [_unexplained(done, folder) for done, folder in zip(result.fits, shards, strict=True)]
 
 
 def shards_of(recipe: Recipe, config: FitConfig, run: Path) -> Path:
@@ -144,12 +134,12 @@ def _holds(folder: Path, identity: Mapping[str, Any]) -> bool:
         return False
 
 
-def run_material(recipe: str, folder: str, working_folder: str, command: str) -> dict[str, Any]:
-    """Run the recipe of a material.
+def run_material(recipe: Recipe, folder: Path, command: str) -> dict[str, Any]:
+    """Run the recipe of a material; a task.
 
     Parameters
     ----------
-    recipe, folder, working_folder, command
+    recipe, folder, command
         As for :func:`first_fit`.
 
     Returns
@@ -162,11 +152,10 @@ def run_material(recipe: str, folder: str, working_folder: str, command: str) ->
     InputError, PartialError
         As :func:`~mbtf_pipeline.run.run_recipe`.
     """
-    with in_folder(working_folder):
-        from mbtf_pipeline.run import run_recipe
+    from mbtf_pipeline.run import run_recipe
 
-        result = run_recipe(Recipe.model_validate_json(recipe), Path(folder), command=command)
-        return {"seconds": {name: stage.stamp.seconds for name, stage in result.stages.items()}}
+    result = run_recipe(recipe, folder, command=command)
+    return {"seconds": {name: stage.stamp.seconds for name, stage in result.stages.items()}}
 
 
 def summarize(folder: Path) -> dict[str, Any]:

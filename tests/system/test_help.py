@@ -41,7 +41,7 @@ def test_help_answers_without_heavy_modules(program: str, run_python: RunPython)
         *(("mbtf-gen", c) for c in ("plan", "inspect", "verify", "repair", "merge", "preview", "reference")),
         *(("mbtf-gen", c) for c in ("selftest", "doctor", "import", "export", "publish")),
         *(("mbtf-fit", c) for c in ("evaluate", "export", "info", "preview")),
-        *(("mbtf-pipeline", c) for c in ("run", "list", "report", "cost", "emit")),
+        *(("mbtf-pipeline", c) for c in ("run", "list", "report", "cost")),
     ],
 )
 def test_every_command_has_help(program: str, command: str, run_python: RunPython) -> None:

@@ -68,7 +68,6 @@ mbtf_pipeline.layers
 mbtf_pipeline.report
 mbtf_pipeline.run
 mbtf_pipeline.forecast
-mbtf_pipeline.emit
 mbtf_pipeline.cost_study
 mbtf_pipeline.paper_tables
 mbtf_pipeline.library

@@ -31,7 +31,7 @@ APPS: dict[str, App] = {
 CANDIDATES = ("no-such-value", "1.5.5", "-1e300", "1e300", "nan", "{no: such}")
 # Modules of configurations that the commands load when they run.
 MODULES = (
-    "mbtf_core.cluster.config",
+    "mbtf_core.run.workers",
     "mbtf_gen.fibers.cloth_file",
     "mbtf_gen.material.spec",
     "mbtf_gen.meshes.mesh_file",

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from mbtf_core.app.console import Console
 from mbtf_core.files.folders import owned
-from mbtf_core.interruption import keep_on_interruption
+from mbtf_core.run.signals import keep_on_interruption
 
 if TYPE_CHECKING:
     from mbtf_fit.mitsuba_plugin.preview.config import PreviewConfig

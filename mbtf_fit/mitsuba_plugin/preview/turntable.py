@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 
 from mbtf_core.directions import from_angles
-from mbtf_core.interruption import reinstall_handlers
+from mbtf_core.run.signals import reinstall_handlers
 from mbtf_fit.mitsuba_plugin.material_arrays import F32
 from mbtf_fit.mitsuba_plugin.preview.config import TurntableSection
 from mbtf_gen.render.types import BSDF, Scene

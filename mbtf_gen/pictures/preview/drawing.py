@@ -12,9 +12,9 @@ from mbtf_core.directions import from_angles
 from mbtf_core.errors import InputError, PartialError
 from mbtf_core.exposure import auto_exposure, brightness, describe_exposure
 from mbtf_core.files.folders import check_space, owned
-from mbtf_core.interruption import keep_on_interruption
 from mbtf_core.pictures.camera import tiles_camera
 from mbtf_core.pictures.reference import PNG_BYTES, write_display
+from mbtf_core.run.signals import keep_on_interruption
 from mbtf_gen.config.pictures import PreviewConfig
 from mbtf_gen.forecast import announce
 from mbtf_gen.job import Job

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.child_process import run_child
 from mbtf_core.errors import EngineError
 from mbtf_core.exposure import to_display
 from mbtf_core.images.resample import resample
 from mbtf_core.pictures.camera import Camera
+from mbtf_core.run.child import run_child
 from mbtf_gen.geometry.heightfield import HeightGrid, grid_faces, grid_vertices
 from mbtf_gen.material.material import Material
 

@@ -168,14 +168,13 @@ def test_a_first_fit_is_kept_for_the_same_options(two: Path) -> None:
     weights = run_folder / "first" / "neumip" / "weights.safetensors"
     recipe = read_resolved(run_folder)
     generated = recipe.generate.model_copy(update={"material": str(two.parent / "materials" / "rough")})
-    text = recipe.model_copy(update={"generate": generated}).model_dump_json()
-    arguments = {"recipe": text, "folder": str(run_folder), "working_folder": ".", "command": ""}
+    again = recipe.model_copy(update={"generate": generated})
     before = weights.stat().st_mtime_ns
-    error = first_fit(**arguments, seconds=0.4)
+    error = first_fit(again, run_folder, 0.4, "")
     assert error is not None
     assert weights.stat().st_mtime_ns == before
     assert error == division(two)["errors"]["rough"]["error"]
-    first_fit(**arguments, seconds=0.3)
+    first_fit(again, run_folder, 0.3, "")
     assert weights.stat().st_mtime_ns != before
 
 
@@ -196,19 +195,19 @@ def test_first_fits_are_tested_as_all_fits(runs: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr("mbtf_pipeline.run.generate_data", lambda *arguments, **options: None)
     fits = {"neumip": {}, "other": {"model": "neumip", "seed": 3}}
     generate = {"material": "maps", "queries": {"layout": "image"}}
-    recipe = Recipe.model_validate({"name": "a", "generate": generate, "fit": fits}).model_dump_json()
-    error = first_fit(recipe, str(runs / "a"), str(runs), 0.1, "")
+    recipe = Recipe.model_validate({"name": "a", "generate": generate, "fit": fits})
+    error = first_fit(recipe, runs / "a", 0.1, "")
     assert error == pytest.approx(error_on(runs / "a/first/neumip", runs / "a/shards"))
 
 
 def test_materials_join_and_leave_a_shared_network(runs: Path) -> None:
     training = {"steps": 4, "batch": 300, "shared_decoder": True}
-    config = FitConfig.model_validate({"model": "neumip", "training": training}).model_dump(mode="json")
+    config = FitConfig.model_validate({"model": "neumip", "training": training})
     network = runs / "shared/decoder"
 
     def share(names: str) -> int:
-        shards = [f"{name}/shards-shuffled" for name in names]
-        found = fit_shared(config, shards, [f"shared/{name}" for name in names], "shared/decoder", str(runs))
+        shards = [runs / name / "shards-shuffled" for name in names]
+        found = fit_shared(config, shards, [runs / "shared" / name for name in names], network)
         expected = [error_on(runs / "shared" / name, runs / name / "shards") for name in names]
         assert [error["value"] for error in found] == pytest.approx(expected)
         return (network / "weights.safetensors").stat().st_mtime_ns

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from support.paths import ROOT
 from support.scripts import BENCHMARKS, benchmark_module
 
-from mbtf_core.child_process import Outcome
 from mbtf_core.data.lattice import sigma_of_level
 from mbtf_core.errors import InputError
+from mbtf_core.run.child import Outcome
 
 FINEST = 3
 

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from mbtf_core.child_process import Outcome
+from mbtf_core.run.child import Outcome
 from mbtf_gen.diagnostics import doctor
 from mbtf_gen.diagnostics.doctor import Part
 from mbtf_gen.render import llvm

@@ -111,7 +111,8 @@ def test_too_many_nonfinite_samples_fail_the_run(config: GeneratorConfig, engine
     place = "train-00000.npz query 7, direct light; train-00000.npz query 9, interreflection"
     with pytest.raises(PartialError, match=f"6 of 320 samples were NaN or infinite.*{place}"):
         generate(config, out)
-    assert len(contents(out)) == 3
+    # The next one may have been rendered meanwhile.
+    assert len(contents(out)) in (3, 4)
     with pytest.raises(PartialError, match=f"8 of 320 samples.*{place}"):
         generate(config, out)
     with pytest.raises(PartialError, match="8 of 320"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,8 +23,12 @@ from mbtf_core.data.store import ObjectStore, StoredFile
 from mbtf_core.data.verify import verify
 from mbtf_core.errors import InputError, MbtfError, PartialError
 from mbtf_core.files.atomic import checksummed
+from mbtf_core.run.task import exhausted
 from mbtf_gen.cli.app import app
-from mbtf_gen.generation.distribute_shards import render_shard
+from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.generation.folder import read_run_plan
+from mbtf_gen.generation.render_shards import ShardRun, render_shard
+from mbtf_gen.job import Job
 from mbtf_gen.planning.simulation import ClosedForm
 
 
@@ -347,13 +352,18 @@ def test_a_leftover_replaces_the_sidecar_of_a_lost_shard(
 def test_a_worker_looks_again_for_a_shard_that_it_knows(tmp_path: Path, url: str) -> None:
     """It runs longer than a command, and others may remove what it has stored."""
     assert generate(command_at(tmp_path, url)) == 0
-    record = json.loads(ObjectStore(url).read("train-00001.json"))
     material = str(tmp_path / "plane.npy")
     config = json.loads(ObjectStore(url).read("manifest.json"))["config"] | {"material": material}
-    arguments = {key: record[key] for key in ("config_hash", "plan", "file")}
-    assert not render_shard(config, url, **arguments)["rendered"]
+    job, folder = Job.load(GeneratorConfig.model_validate(config)), DataFolder.open(url)
+    sent = pickle.dumps(ShardRun(job, folder, read_run_plan(folder)))
+
+    def rendered() -> bool:
+        (entry,) = (entry for entry in job.shards if entry.file == "train-00001.npz")
+        return bool(exhausted(render_shard(pickle.loads(sent), entry))["rendered"])
+
+    assert not rendered()
     ObjectStore(url).delete("train-00001.npz")
-    assert render_shard(config, url, **arguments)["rendered"]
+    assert rendered()
     assert verify(url) == []
 
 

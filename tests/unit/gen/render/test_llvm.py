@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from conftest import RunPython
 
-from mbtf_core.child_process import run_child
 from mbtf_core.errors import EngineError, UsageError
+from mbtf_core.run.child import run_child
 from mbtf_gen.render import llvm
 from mbtf_gen.render import runtime as engine
 
@@ -249,11 +249,16 @@ def test_an_interrupted_parent_leaves_no_child(monkeypatch: pytest.MonkeyPatch) 
     started: list[subprocess.Popen[str]] = []
 
     class Interrupted(subprocess.Popen):  # type: ignore[type-arg]
-        def communicate(self, *arguments, **keywords):  # type: ignore[no-untyped-def]
+        @property
+        def stdin(self):  # type: ignore[no-untyped-def]
             started.append(self)
             raise KeyboardInterrupt
 
-    monkeypatch.setattr("mbtf_core.child_process.subprocess.Popen", Interrupted)
+        @stdin.setter
+        def stdin(self, pipe):  # type: ignore[no-untyped-def]
+            self.pipe = pipe
+
+    monkeypatch.setattr("mbtf_core.run.child.subprocess.Popen", Interrupted)
     with pytest.raises(KeyboardInterrupt):
         run_child(__name__, "hang", timeout=60)
     assert started[0].poll() is not None

@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 
-from mbtf_core.cluster.task import THREADS_VARIABLE
+from mbtf_core.run.task import THREADS_VARIABLE
 
 SHOWN = """
 from mbtf_gen.render.runtime import load_mitsuba

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import pytest
 from support.fake_runs import FakeRunner, MemoryStore, run
 
-from mbtf_core.cluster.task import Task, TaskResult, run_task
 from mbtf_core.errors import InputError
+from mbtf_core.run.runner import Runner
+from mbtf_core.run.task import Item, Result, packed, run_task
 from mbtf_core.stats import Estimate
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.cost_study import distribute
@@ -27,22 +26,19 @@ RUNS = [run("whole", 3000, "long", 9.0), run("models", 2000, "one"), run("models
 ONE = Estimate(1.0, 0.1, 4)
 
 
-class Workers:
-    """Stands for :class:`mbtf_core.cluster.engine.Cluster`: takes all tasks, and ends the last first."""
+class Workers(Runner):
+    """Takes all items, and ends the last first."""
 
     workers = 2
+    here = False
 
     def __init__(self) -> None:
         self.names: list[str] = []
 
-    def run(
-        self, tasks: Iterable[Task], *, stop_when_fatal: bool = True, ahead: int = 9
-    ) -> Iterator[TaskResult]:
-        for task in reversed(list(tasks)):
-            self.names.append(task.name)
-            # What reaches a worker is plain data.
-            arguments = json.loads(json.dumps(dict(task.arguments)))
-            yield TaskResult(task, **run_task(task.function, arguments, version("mbtf")))
+    def map(self, function: Any, items: Iterable[Item], **options: Any) -> Iterator[Result]:  # type: ignore[override]
+        for item in reversed(list(items)):
+            self.names.append(item.name)
+            yield Result(item.name, **run_task(*packed(function, item)))
 
 
 @pytest.fixture
@@ -71,7 +67,7 @@ def measured(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[tuple[str,
 
 def cluster_runner(folder: Path, **options: Any) -> tuple[ClusterRunner, Workers]:
     workers: Any = Workers()
-    return ClusterRunner(CONFIG, folder, "mbtf-gen m", lambda note: None, cluster=workers, **options), workers
+    return ClusterRunner(CONFIG, folder, "mbtf-gen m", lambda note: None, runner=workers, **options), workers
 
 
 def test_workers_measure_the_runs_of_one_process(measured: list[tuple[str, int]], tmp_path: Path) -> None:

@@ -11,8 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mbtf_core.cluster.task import Task, TaskResult
 from mbtf_core.errors import InputError
+from mbtf_core.run.runner import Runner
+from mbtf_core.run.task import Item, Result
+from mbtf_core.units import format_duration
 from mbtf_fit.config import SHARED_PRESET
 from mbtf_pipeline.library import run as library_run
 from mbtf_pipeline.library.recipe import entries, load_library_recipe
@@ -22,7 +24,7 @@ from mbtf_pipeline.library.task import summarize
 BASE = "library: [a, b]\nbase: {fit: {relief: {}}, generate: {queries: {train: 10/texel}}}\n"
 
 
-class Runs:
+class Runs(Runner):
     """In place of processes: records the calls, their arguments, and what the record says before each."""
 
     def __init__(self, out: Path) -> None:
@@ -33,17 +35,18 @@ class Runs:
         self.interrupted_at = 0
         self.errors: dict[str, str] = {}
 
-    def __call__(self, tasks: Iterable[Task]) -> Iterator[TaskResult]:
-        for task in tasks:
+    def map(self, function: Any, items: Iterable[Item], **options: Any) -> Iterator[Result]:  # type: ignore[override]
+        assert options["independent"]
+        for task in items:
             self.seen.append({m["name"]: m["state"] for m in self.record()["materials"]})
-            self.calls.append((task.function.rpartition(":")[2], task.name))
+            self.calls.append((function.__name__, task.name))
             self.arguments[self.calls[-1]] = task.arguments
             self.gpus.add(task.gpu)
             if len(self.calls) - 1 == self.interrupted_at:
                 raise KeyboardInterrupt
             error = self.errors.get(task.name, "")
             value = getattr(self, self.calls[-1][0])(task.arguments)
-            yield TaskResult(task, None if error else value, error)
+            yield Result(task.name, None if error else value, error)
 
     def first_fit(self, arguments: Any) -> float:
         return 0.1
@@ -53,11 +56,6 @@ class Runs:
 
     def fit_shared(self, arguments: Any) -> list[dict[str, Any]]:
         return [{"value": 0.1 * k, "error": 0.01, "n": 9} for k in range(len(arguments["folders"]))]
-
-    def run(self, tasks: Iterable[Task], *, stop_when_fatal: bool = True) -> Iterator[TaskResult]:
-        """As those of a cluster."""
-        assert not stop_when_fatal
-        return self(tasks)
 
     def record(self) -> dict[str, Any]:
         found: dict[str, Any] = json.loads((self.out / "library.json").read_text())
@@ -70,17 +68,16 @@ def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Runs:
         (tmp_path / name).mkdir()
         np.save(tmp_path / name / "height.npy", np.zeros((4, 4), np.float32))
     found = Runs(tmp_path / "out")
-    monkeypatch.setattr(library_run, "run_in_children", found)
     monkeypatch.setattr(library_run, "summarize", lambda folder: {"fits": {}, "reference": "none.png"})
     return found
 
 
-def again(runs: Runs, options: str = "", base: str = BASE, cluster: Any = None) -> LibraryResult:
+def again(runs: Runs, options: str = "", base: str = BASE) -> LibraryResult:
     file = runs.out.parent / "library.yaml"
     file.write_text(f"name: test\n{options}{base}")
     library = load_library_recipe(file, [])
     runs.calls, runs.seen, runs.arguments = [("", "")], [], {}
-    return run_library(library, entries(library, file), runs.out, command="", cluster=cluster)
+    return run_library(library, entries(library, file), runs.out, command="", runner=runs)
 
 
 def test_earlier_results_stay_until_their_run_ends(runs: Runs) -> None:
@@ -124,9 +121,9 @@ def test_paths_are_relative_to_the_page(runs: Runs) -> None:
     assert [m["path"] for m in runs.record()["materials"]] == ["../a", "../b"]
 
 
-def test_workers_go_on_after_a_failure(runs: Runs) -> None:
+def test_the_others_go_on_after_a_failure(runs: Runs) -> None:
     runs.errors = {"a": "no memory"}
-    assert again(runs, "training: 10s\n", cluster=runs).failed == runs.errors
+    assert again(runs, "training: 10s\n").failed == runs.errors
     assert runs.calls[1:] == [("first_fit", "a"), ("first_fit", "b"), ("run_material", "b")]
 
 
@@ -163,8 +160,8 @@ def test_fits_of_a_material_share_its_time_and_missing_ones_keep_theirs(runs: Ru
     again(runs, "training: 9s\nmaterials: {a: {fit: {neumip: {}}}, gone: gone}\n")
     assert runs.arguments["first_fit", "a"]["seconds"] == pytest.approx(0.2 * 3.0)
     for name, expected in (("a", ["1.2s"] * 2), ("b", ["2.4s"])):
-        fits = json.loads(runs.arguments["run_material", name]["recipe"])["fit"]
-        assert [fit["training"]["time"] for fit in fits.values()] == expected
+        fits = runs.arguments["run_material", name]["recipe"].fit
+        assert [format_duration(fit.training.time) for fit in fits.values()] == expected
 
 
 def test_paths_that_are_no_text_are_shown(runs: Runs) -> None:
@@ -194,12 +191,12 @@ def test_the_most_fits_that_differ_in_time_alone_share_a_network(runs: Runs) -> 
     times = "a: {fit: {relief: {training: {time: 3s}}}}, b: {fit: {relief: {training: {steps: 7}}}}"
     again(runs, f"shared_network: 5s\nmaterials: {{{named}, {times}}}\n")
     found = runs.arguments["fit_shared", "shared network"]
-    assert found["shards"] == [str(runs.out / "materials" / name / "shards") for name in "abc"]
-    assert found["folders"] == [str(runs.out / "shared" / name) for name in "abc"]
-    training = found["config"]["training"]
-    assert (training["time"], training["steps"], training["shared_decoder"]) == ("5s", None, True)
+    assert found["shards"] == [runs.out / "materials" / name / "shards" for name in "abc"]
+    assert found["folders"] == [runs.out / "shared" / name for name in "abc"]
+    training = found["config"].training
+    assert (training.time, training.steps, training.shared_decoder) == (5.0, None, True)
     preset = SHARED_PRESET["training"]
-    assert {key: training[key] for key in preset} == preset
+    assert {key: training.model_dump(mode="json")[key] for key in preset} == preset
     errors = runs.record()["shared"]["errors"]
     assert {name: (error["fit"], error["value"]) for name, error in errors.items()} == {
         **{"a": ("relief", 0.0), "b": ("relief", 0.1), "c": ("mine", 0.2)}
@@ -211,7 +208,7 @@ def test_failures_and_batches_of_shared_networks(runs: Runs) -> None:
     runs.errors = {"c": "no memory"}
     again(runs, options)
     found = runs.arguments["fit_shared", "shared network"]
-    assert [Path(folder).name for folder in found["folders"]] == ["a", "b"]
-    assert found["config"]["training"]["batch"] == 32768
+    assert [folder.name for folder in found["folders"]] == ["a", "b"]
+    assert found["config"].training.batch == 32768
     runs.errors = {"shared network": "no memory"}
     assert again(runs, options).shared_error == "no memory"

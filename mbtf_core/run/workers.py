@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from pathlib import Path
 from typing import Any, Literal
@@ -11,9 +10,14 @@ from pydantic import Field, PositiveInt
 
 from mbtf_core.config.settings import Settings, resolve
 from mbtf_core.errors import UsageError
+from mbtf_core.run.task import available_cores
 from mbtf_core.units import Duration, Size
 
 Engine = Literal["local", "slurm", "pbs", "sge", "lsf", "oar", "htcondor"]
+# Module that prepares a worker of Dask.
+PRELOAD = "mbtf_core.run.task"
+# A renderer's memory is not Dask's to spill; what exceeds the limit is restarted.
+MEMORY = {"target": False, "spill": False, "pause": False}
 # Cores that one renderer uses well.
 _CORES_EACH = 4
 
@@ -42,7 +46,7 @@ class ClusterConfig(Settings):
 
 def local_config(workers: int | None = None) -> ClusterConfig:
     """Workers on this machine that share its cores; by default one per four cores, and at least two."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = available_cores()
     count = max(2, cores // _CORES_EACH) if workers is None else workers
     return ClusterConfig(workers=count, threads=max(1, cores // count))
 

@@ -7,29 +7,24 @@ neither a dead worker nor a dead command loses or doubles anything: the same com
 from __future__ import annotations
 
 import contextlib
-import inspect
 import logging
-import re
-import shutil
-import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from importlib.metadata import version
 from typing import Any
 from uuid import uuid4
 
-from mbtf_core.cluster.config import ClusterConfig, read_cluster
-from mbtf_core.cluster.task import GPUS_VARIABLE, THREADS_VARIABLE, Task, TaskResult, run_task
 from mbtf_core.errors import InputError, PartialError, UsageError, reason
-from mbtf_core.suggest import suggest_name
+from mbtf_core.run.batch_jobs import submitted_jobs
+from mbtf_core.run.runner import Runner
+from mbtf_core.run.task import GPUS_VARIABLE, THREADS_VARIABLE, Item, Result, TaskFunction, packed, run_task
+from mbtf_core.run.workers import MEMORY, PRELOAD, ClusterConfig, read_cluster
 from mbtf_core.units import format_duration
 
 # Tasks that the scheduler knows at a time, beyond those that run.
 _AHEAD = 256
-# Version of this package, which workers must have.
-_VERSION = version("mbtf")
 # Seconds between two looks at the workers.
 _LOOK_SECONDS = 2.0
 # The same until the first one has started.
@@ -39,27 +34,12 @@ _PAUSE_SECONDS, _LOCKED_SECONDS = 10.0, 420.0
 # Seconds in which a scheduler must answer.
 _CONNECT_SECONDS = 30.0
 _RESUMES = "the same command goes on with the rest"
-_PRELOAD = "mbtf_core.cluster.task"
-# Class of dask-jobqueue, and the command that submits a job.
-_SYSTEMS = {
-    "slurm": ("SLURMCluster", "sbatch"),
-    "pbs": ("PBSCluster", "qsub"),
-    "sge": ("SGECluster", "qsub"),
-    "lsf": ("LSFCluster", "bsub"),
-    "oar": ("OARCluster", "oarsub"),
-    "htcondor": ("HTCondorCluster", "condor_submit"),
-}
-# A renderer's memory is not Dask's to spill; what exceeds the limit is restarted.
-_MEMORY = {"target": False, "spill": False, "pause": False}
 
 
-class Cluster:
-    """Workers that run tasks; made by :func:`open_cluster`.
+class DaskRunner(Runner):
+    """Runs items on workers of Dask; made by :func:`open_workers`."""
 
-    Attributes
-    ----------
-    workers : number of workers, as last seen
-    """
+    here = False
 
     def __init__(
         self,
@@ -120,55 +100,40 @@ class Cluster:
             if before and not self.workers and not self._ended.is_set():
                 self._note("cluster: no worker is left; waiting for new ones")
 
-    def run(
-        self, tasks: Iterable[Task], *, stop_when_fatal: bool = True, ahead: int = _AHEAD
-    ) -> Generator[TaskResult]:
-        """Run tasks; yields each result as it comes, in no particular order.
+    def map(
+        self,
+        function: TaskFunction,
+        items: Iterable[Item],
+        *,
+        independent: bool = False,
+        ahead: int | None = None,
+    ) -> Generator[Result]:
+        """As of the base class, in no particular order.
 
-        Parameters
-        ----------
-        tasks : iterable of Task
-            Read as workers become free.
-        stop_when_fatal : bool
-            Whether a failure that concerns files or options concerns all tasks.
-        ahead : int
-            Tasks that are read before workers are free for them, beyond two for each worker.
-
-        Yields
-        ------
-        TaskResult
-            A task that failed for a reason that another attempt may not meet has been tried again: if its
-            worker died, at once; if another process works on its files, until locks of dead processes on
-            other machines have ended.
-
-        Raises
-        ------
-        InputError
-            A task failed for a reason that concerns all of them; the others are canceled.
-        PartialError
-            The scheduler cannot be reached any more.
+        An item that failed for a reason that another attempt may not meet has been tried again: if its worker
+        died, at once; if another process works on its files, until locks of dead processes on other machines
+        have ended.
         """
         from distributed import as_completed
 
-        run, waiting = uuid4().hex[:8], iter(tasks)
-        pending: dict[str, Task] = {}
+        run, waiting = uuid4().hex[:8], iter(items)
+        most = _AHEAD if ahead is None else ahead
+        pending: dict[str, Item] = {}
         done = as_completed(loop=self._client.loop)
-        locked: deque[tuple[float, Task]] = deque()
+        locked: deque[tuple[float, Item]] = deque()
         since: dict[str, float] = {}
 
-        def submit(task: Task) -> None:
-            key = f"{task.name}-{run}-{uuid4().hex[:4]}"
-            pending[key] = task
+        def submit(item: Item) -> None:
+            key = f"{item.name}-{run}-{uuid4().hex[:4]}"
+            pending[key] = item
             done.add(
                 self._client.submit(
                     run_task,
-                    task.function,
-                    dict(task.arguments),
-                    _VERSION,
+                    *packed(function, item),
                     key=key,
                     pure=False,
                     retries=self._config.retries,
-                    resources={"GPU": 1} if task.gpu and self._gpus else None,
+                    resources={"GPU": 1} if item.gpu and self._gpus else None,
                 )
             )
 
@@ -177,19 +142,19 @@ class Cluster:
                 while locked and (locked[0][0] <= time.monotonic() or not pending):
                     time.sleep(max(0.0, locked[0][0] - time.monotonic()))
                     submit(locked.popleft()[1])
-                while len(pending) < ahead + 2 * self.workers and (task := next(waiting, None)) is not None:
-                    submit(task)
+                while len(pending) < most + 2 * self.workers and (item := next(waiting, None)) is not None:
+                    submit(item)
                 if not pending:
                     return
                 future = next(done)
-                task = pending.pop(future.key)
-                result = _result(task, future)
-                if result.fatal and stop_when_fatal:
+                item = pending.pop(future.key)
+                result = _result(item, future)
+                if result.fatal and not independent:
                     hint = result.hint or "files must lie at the same place on every machine"
-                    raise InputError(result.error, where=f"{task.name} on {result.worker}", hint=hint)
+                    raise InputError(result.error, where=f"{item.name} on {result.worker}", hint=hint)
                 now = time.monotonic()
-                if result.locked and now - since.setdefault(task.name, now) < _LOCKED_SECONDS:
-                    locked.append((now + _PAUSE_SECONDS, task))
+                if result.locked and now - since.setdefault(item.name, now) < _LOCKED_SECONDS:
+                    locked.append((now + _PAUSE_SECONDS, item))
                     continue
                 yield result
         except (OSError, TimeoutError) as error:
@@ -200,7 +165,7 @@ class Cluster:
                 self._client.cancel(list(done.futures))
 
 
-def _result(task: Task, future: Any) -> TaskResult:
+def _result(item: Item, future: Any) -> Result:
     from distributed import KilledWorker
 
     if future.status == "cancelled":
@@ -208,38 +173,15 @@ def _result(task: Task, future: Any) -> TaskResult:
     error = future.exception()
     if isinstance(error, KilledWorker):
         text = "its worker died each time: out of memory, killed, or crashed"
-        return TaskResult(task, error=text)
+        return Result(item.name, error=text)
     if error is not None:
-        return TaskResult(task, error=f"{type(error).__name__}: {reason(error)}")
-    return TaskResult(task, **future.result())
+        return Result(item.name, error=f"{type(error).__name__}: {reason(error)}")
+    return Result(item.name, **future.result())
 
 
 @contextlib.contextmanager
-def open_cluster(where: str | None, note: Callable[[str], None]) -> Iterator[Cluster | None]:
-    """Workers for the tasks of a block.
-
-    Parameters
-    ----------
-    where : str or None
-        ``local``, ``local:4``, a YAML file of :class:`~mbtf_core.cluster.config.ClusterConfig`, or the
-        address of a scheduler; None yields None.
-    note : callable
-        Receives lines for the user.
-
-    Yields
-    ------
-    Cluster or None
-
-    Raises
-    ------
-    UsageError
-        Dask is not installed, or `where` is none of these.
-    InputError
-        The batch system or the scheduler cannot be used.
-    """
-    if where is None:
-        yield None
-        return
+def open_workers(where: str, note: Callable[[str], None]) -> Iterator[DaskRunner]:
+    """Workers for the tasks of a block; see :func:`~mbtf_core.run.runner.open_runner`."""
     found = read_cluster(where)
     address = found if isinstance(found, str) else None
     # Of workers that the user has started, only retries and times are ours.
@@ -260,7 +202,7 @@ def open_cluster(where: str | None, note: Callable[[str], None]) -> Iterator[Clu
         "distributed.worker.multiprocessing-method": "spawn",
         # Workers take a task when they have a free thread.
         "distributed.scheduler.worker-saturation": 1.0,
-        **{f"distributed.worker.memory.{name}": value for name, value in _MEMORY.items()},
+        **{f"distributed.worker.memory.{name}": value for name, value in MEMORY.items()},
         "distributed.logging.distributed": "critical",
         "distributed.comm.timeouts.connect": f"{_CONNECT_SECONDS}s",
     }
@@ -272,7 +214,7 @@ def open_cluster(where: str | None, note: Callable[[str], None]) -> Iterator[Clu
         try:
             started = stack.enter_context(_started(config, refused)) if address is None else address
             client = stack.enter_context(Client(started, timeout=_CONNECT_SECONDS, set_as_default=False))
-            cluster = Cluster(client, config, note, refused)
+            cluster = DaskRunner(client, config, note, refused)
             stack.callback(cluster.close)
         except (OSError, ValueError, TypeError, ImportError, RuntimeError) as error:
             own = version("distributed")
@@ -299,7 +241,7 @@ def open_cluster(where: str | None, note: Callable[[str], None]) -> Iterator[Clu
         yield cluster
 
 
-def _describe(name: str, client: Any, cluster: Cluster) -> str:
+def _describe(name: str, client: Any, cluster: DaskRunner) -> str:
     """What a command says of its workers."""
     text = f"cluster: {name}, {cluster.workers} worker{'s' * (cluster.workers != 1)} so far"
     if name == "local":
@@ -316,7 +258,7 @@ def _started(config: ClusterConfig, refused: list[str]) -> Any:
     be submitted."""
     environment = {THREADS_VARIABLE: str(config.threads), "OMP_NUM_THREADS": str(config.threads)}
     if config.engine != "local":
-        return _jobs(config, environment, refused)
+        return submitted_jobs(config, environment, refused)
     from distributed import LocalCluster
     from distributed.system import MEMORY_LIMIT
 
@@ -331,83 +273,7 @@ def _started(config: ClusterConfig, refused: list[str]) -> Any:
         host="127.0.0.1",
         env={**environment, **gpus},
         resources={"GPU": config.gpus} if config.gpus else {},
-        preload=[_PRELOAD],
+        preload=[PRELOAD],
         silence_logs=logging.CRITICAL,
         **config.options,
     )
-
-
-@contextlib.contextmanager
-def _jobs(config: ClusterConfig, environment: Mapping[str, str], refused: list[str]) -> Iterator[Any]:
-    """Workers as jobs of a batch system, canceled when the block ends."""
-    handler = signal.getsignal(signal.SIGINT)
-    import dask_jobqueue
-
-    # Its import lets Ctrl-C end the program as if all were done.
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGINT, handler)
-
-    name, command = _SYSTEMS[config.engine]
-    if shutil.which(command) is None:
-        raise OSError(f"this machine has no command {command}")
-    hours, rest = divmod(int(config.walltime), 3600)
-    # One task at a time, which has the threads.
-    extra = ["--nthreads", "1", "--preload", _PRELOAD]
-    if config.gpus:
-        extra += ["--resources", f"GPU={config.gpus}"]
-    # Workers end before the batch system ends them, one after the other.
-    extra += ["--lifetime", f"{max(60, int(0.9 * config.walltime))}s", "--lifetime-stagger", "60s"]
-    memory = {f"DASK_DISTRIBUTED__WORKER__MEMORY__{key.upper()}": str(v) for key, v in _MEMORY.items()}
-    own = dict(config.options)
-    exports = [f"export {key}={value}" for key, value in {**environment, **memory}.items()]
-    options: dict[str, Any] = {
-        "cores": config.threads,
-        "processes": 1,
-        "memory": f"{int(config.memory or 2e9 * config.threads)}B",
-        "walltime": f"{hours:02d}:{rest // 60:02d}:{rest % 60:02d}",
-        # What a site needs comes on top.
-        "worker_extra_args": [*extra, *own.pop("worker_extra_args", [])],
-        "job_script_prologue": [*own.pop("job_script_prologue", []), *exports],
-        "log_directory": "worker-logs",
-        **own,
-    }
-    system = getattr(dask_jobqueue, name)
-    try:
-        cluster = system(job_cls=_reporting(system.job_cls, refused), **options)
-    except (TypeError, ValueError) as error:
-        # Its text goes on with all the options.
-        unknown = re.search(r"unexpected keyword argument '(\w+)'", str(error))
-        if unknown is None:
-            raise
-        raise ValueError(_no_option(unknown[1], system)) from None
-    try:
-        # Unlike scale(), this replaces workers that have ended.
-        cluster.adapt(minimum=config.workers, maximum=config.workers)
-        yield cluster
-    finally:
-        # Jobs that were never submitted cannot be closed.
-        with contextlib.suppress(Exception):
-            cluster.close()
-
-
-def _no_option(given: str, system: Any) -> str:
-    """What is said of an option that a class of dask-jobqueue does not have."""
-    classes = {*system.__mro__, *system.job_cls.__mro__}
-    known = {name for cls in classes for name in inspect.signature(cls.__init__).parameters}
-    parts = f"options: {system.__name__} has no option '{given}'", suggest_name(given, sorted(known))
-    return "; ".join(filter(None, parts))
-
-
-def _reporting(job: Any, refused: list[str]) -> Any:
-    """A class of jobs that also reports why one cannot be submitted."""
-
-    class Reporting(job):
-        async def start(self) -> None:
-            try:
-                await super().start()
-            except Exception as error:
-                # dask-jobqueue appends what the command has printed.
-                refused.append(reason(str(error).rpartition("stderr:")[2], 300))
-                raise
-
-    return Reporting

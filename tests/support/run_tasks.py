@@ -1,13 +1,16 @@
-"""Tasks for tests of clusters; workers import them by name."""
+"""Tasks for tests of runners; workers import them."""
 
 from __future__ import annotations
 
 import os
 import signal
+import threading
 import time
+from collections.abc import Generator
 from pathlib import Path
 
 from mbtf_core.errors import InputError, LockedError, PartialError
+from mbtf_core.run.task import worker_threads
 
 
 def double(x: int) -> int:
@@ -20,10 +23,11 @@ def fail(kind: str) -> None:
     if kind == "input":
         raise InputError("is not there", where="map.png")
     if kind == "partial":
-        raise PartialError("the disk is full")
+        raise PartialError("the disk is full", hint="make room")
     if kind == "bug":
         raise ZeroDivisionError("a bug")
-    os.kill(os.getpid(), signal.SIGKILL)
+    if kind != "none":
+        os.kill(os.getpid(), signal.SIGKILL)
 
 
 def _called(marks: str) -> int:
@@ -72,8 +76,6 @@ def alone() -> bool:
 
 def threads() -> tuple[int | None, str | None]:
     """Threads that the worker states."""
-    from mbtf_core.cluster.task import worker_threads
-
     return worker_threads(), os.environ.get("OMP_NUM_THREADS")
 
 
@@ -83,3 +85,22 @@ def wait_long(mark: str) -> None:
     part.write_text(str(os.getpid()))
     part.rename(mark)
     time.sleep(600.0)
+
+
+def in_parts(x: int, folder: str) -> Generator[None, None, int]:
+    """Three parts, which write their thread and whether the previous item is behind them."""
+    if x == 1:
+        return -1
+    (Path(folder) / f"first-{x}").write_text(threading.current_thread().name)
+    try:
+        yield
+        (Path(folder) / f"second-{x}").write_text(threading.current_thread().name)
+        if x == 3:
+            raise PartialError("the disk is full")
+        if x == 5:
+            raise KeyboardInterrupt
+        yield
+        (Path(folder) / f"third-{x}").write_text(threading.current_thread().name)
+        return x
+    finally:
+        (Path(folder) / f"closed-{x}").touch()

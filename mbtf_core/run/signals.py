@@ -18,13 +18,13 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import NoReturn
 
+from mbtf_core.errors import EXIT_INTERRUPTED
+
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 # Seconds from the signal to a note on standard error, and from there to the end of the process.
 _NOTE_SECONDS, _GRACE_SECONDS = 1.5, 10.0
 # A terminal and a wrapper such as `uv run` may both send the signal of one Ctrl-C.
 _ECHO_SECONDS = 0.5
-# From an interruption that Python dropped to the next one; the finalizer has ended by then.
-_AGAIN_SECONDS = 0.01
 
 
 class _State:
@@ -33,40 +33,46 @@ class _State:
     Attributes
     ----------
     program : it runs one of our programs, so that a signal may end it; not so in notebooks and tests
+    silent : messages are its parent's
     raising : a signal raises KeyboardInterrupt, which :func:`mbtf_core.app.console.run` handles
-    received, since : the first signal, or 0, and its time
-    dropped : its exception was raised where Python drops exceptions, and is to be raised again
+    received : time of the first signal; None before
+    stop : the event that the first signal sets in place of an exception
     kept : what an interruption leaves, for the message
     cleanups : called before the process ends without unwinding
     code : exit code of the program's command once it has ended
     """
 
     program = False
+    silent = False
     raising = False
-    received = 0
-    since = 0.0
-    dropped = False
+    received: float | None = None
+    stop: threading.Event | None = None
     kept = ""
-    code: int | None = None
     cleanups: list[Callable[[], None]] = []  # noqa: RUF012
+    code: int | None = None
 
 
-def handle_signals() -> None:
-    """Prepare a new process of a program for signals; precedes all slow imports."""
-    _State.program = True
+def handle_signals(silent: bool = False) -> None:
+    """Prepare a new process of a program for signals; precedes all slow imports.
+
+    Parameters
+    ----------
+    silent : bool
+        Leave messages to the parent of this process.
+    """
+    _State.program, _State.silent = True, silent
     for number in SIGNALS:
         # `nohup` and shells without job control have it ignored.
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _handle)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
-    sys.unraisablehook = _raise_again
     # Called last: after threads are joined and all other exit functions have run.
     atexit.register(_skip_unloading)
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
     # Native code delays Python's handlers, but not these bytes.
     signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
-    threading.Thread(target=_watch, args=(reader,), name="interruption", daemon=True).start()
+    threading.Thread(target=_watch, args=(reader,), name="signals", daemon=True).start()
 
 
 def _skip_unloading() -> None:
@@ -86,33 +92,22 @@ def _flush() -> None:
 
 
 def _handle(number: int, frame: FrameType | None) -> None:
-    now = time.monotonic()
-    again = _State.received != 0 and not _State.dropped
-    _State.dropped = False
-    if again and now - _State.since < _ECHO_SECONDS:
+    """The one handler of both signals."""
+    again = _State.received is not None
+    if _State.received is not None and time.monotonic() - _State.received < _ECHO_SECONDS:
         return
-    _note(number)
+    _note()
+    if _State.stop is not None and not _State.stop.is_set():
+        _State.stop.set()
+        return
     if _State.program and (again or not _State.raising or _importing(frame)):
         _end_process()
     raise KeyboardInterrupt
 
 
-def _raise_again(unraisable: sys.UnraisableHookArgs) -> None:
-    """Raise an interruption again that arrived in a finalizer or in a callback of a weak reference."""
-    if unraisable.exc_type is not KeyboardInterrupt or not _State.received:
-        sys.__unraisablehook__(unraisable)
-        return
-    main = threading.main_thread().ident
-    assert main is not None
-    _State.dropped = True
-    again = threading.Timer(_AGAIN_SECONDS, signal.pthread_kill, (main, _State.received))
-    again.daemon = True
-    again.start()
-
-
-def _note(number: int) -> None:
-    if not _State.received:
-        _State.received, _State.since = number, time.monotonic()
+def _note() -> None:
+    if _State.received is None:
+        _State.received = time.monotonic()
 
 
 def _importing(frame: FrameType | None) -> bool:
@@ -125,14 +120,19 @@ def _importing(frame: FrameType | None) -> bool:
 
 
 def _watch(reader: int) -> None:
-    while (number := os.read(reader, 1)[0]) not in SIGNALS:
+    while os.read(reader, 1)[0] not in SIGNALS:
         pass
     time.sleep(_NOTE_SECONDS)
-    with contextlib.suppress(OSError):
-        os.write(2, b"stopping after the current step; a second signal stops at once\n")
+    _say("stopping after the current step; a second signal stops at once\n")
     time.sleep(_GRACE_SECONDS)
-    _note(number)
+    _note()
     _end_process()
+
+
+def _say(text: str) -> None:
+    if not _State.silent:
+        with contextlib.suppress(OSError):
+            os.write(2, text.encode())
 
 
 def _end_process() -> NoReturn:
@@ -140,14 +140,13 @@ def _end_process() -> NoReturn:
         cleanup()
     # A progress bar hides the cursor.
     start = "\x1b[?25h\n" if os.isatty(2) else ""
-    with contextlib.suppress(OSError):
-        os.write(2, f"{start}error: {message()}\n".encode())
-    os._exit(exit_code())
+    _say(f"{start}error: {message()}\n")
+    os._exit(EXIT_INTERRUPTED)
 
 
-def exit_code() -> int:
-    """Exit code of the signal that was received: 130 or 143 as in shells; 0 without one."""
-    return 128 + _State.received if _State.received else 0
+def interrupted() -> bool:
+    """Whether a signal was received."""
+    return _State.received is not None
 
 
 def message() -> str:
@@ -172,10 +171,11 @@ def raising() -> Iterator[None]:
     """Signals raise KeyboardInterrupt in this block; it runs a command."""
     before = {}
     if not _State.program:
-        _State.received, _State.kept = 0, ""
+        _State.received, _State.kept = None, ""
         if threading.current_thread() is threading.main_thread():
+            # None stands for a native handler, which a renderer leaves and which is no longer valid.
             usual = (signal.SIG_DFL, signal.default_int_handler, None)
-            before = {n: signal.getsignal(n) for n in SIGNALS if signal.getsignal(n) in usual}
+            before = {n: h for n in SIGNALS if (h := signal.getsignal(n)) in usual}
     for number in before:
         signal.signal(number, _handle)
     _State.raising = True
@@ -184,7 +184,6 @@ def raising() -> Iterator[None]:
     finally:
         _State.raising = False
         for number, handler in before.items():
-            # None stands for a native handler, which a renderer leaves and which is no longer valid.
             signal.signal(number, signal.default_int_handler if handler is None else handler)
 
 
@@ -206,23 +205,16 @@ def stop_on_interruption() -> Iterator[threading.Event]:
     if threading.current_thread() is not threading.main_thread():
         yield stop
         return
+    if not _State.program:
+        _State.received = None
     before = {n: h for n in SIGNALS if callable(h := signal.getsignal(n))}
-    first = 0.0
-
-    def handle(number: int, frame: FrameType | None) -> None:
-        nonlocal first
-        if not stop.is_set():
-            first = time.monotonic()
-            stop.set()
-            _note(number)
-        elif time.monotonic() - first >= _ECHO_SECONDS:
-            before[signal.Signals(number)](number, frame)
-
     for number in before:
-        signal.signal(number, handle)
+        signal.signal(number, _handle)
+    _State.stop = stop
     try:
         yield stop
     finally:
+        _State.stop = None
         for number, handler in before.items():
             signal.signal(number, handler)
 
@@ -235,13 +227,13 @@ def served_until_interruption() -> Iterator[None]:
         yield
         while not stop.wait(0.5):
             pass
-    _State.received = 0
+    _State.received = None
 
 
 def finish(code: int) -> int:
     """Last act of a program: the exit code of its command. After an interruption it ends the process, whose
     threads may still work; else exit functions run, and a signal can no longer change the code."""
-    if _State.received:
+    if _State.received is not None:
         _flush()
         os._exit(code)
     _State.code = code

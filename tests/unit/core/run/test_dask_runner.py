@@ -12,47 +12,21 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from support import run_tasks
 
-from mbtf_core.cluster import engine, task
-from mbtf_core.cluster.config import ClusterConfig
-from mbtf_core.cluster.engine import Cluster, open_cluster
-from mbtf_core.cluster.task import Task, run_task
 from mbtf_core.errors import InputError, PartialError, UsageError
-
-TASKS = "support.cluster_tasks"
+from mbtf_core.run import dask_runner, task
+from mbtf_core.run.cluster import open_runner
+from mbtf_core.run.runner import Runner
+from mbtf_core.run.task import Item, packed, run_task
+from mbtf_core.run.workers import ClusterConfig
 
 
 @pytest.fixture(scope="module")
-def cluster() -> Iterator[Cluster]:
+def cluster() -> Iterator[Runner]:
     pytest.importorskip("distributed", reason="no Dask; to enable: pip install 'mbtf[cluster]'")
-    with open_cluster("local:2", lambda line: None) as opened:
-        assert opened is not None
+    with open_runner("local:2", lambda line: None) as opened:
         yield opened
-
-
-def test_every_task_has_its_result(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(engine, "_AHEAD", 3)
-    tasks = (Task(f"double-{x}", f"{TASKS}:double", {"x": x}) for x in range(40))
-    found = {done.task.arguments["x"]: done.value for done in cluster.run(tasks)}
-    assert found == {x: 2 * x for x in range(40)}
-
-
-def test_failures_are_one_line_and_leave_the_others(cluster: Cluster) -> None:
-    kinds = ("partial", "bug")
-    tasks = [Task(kind, f"{TASKS}:fail", {"kind": kind}) for kind in kinds]
-    tasks.append(Task("double", f"{TASKS}:double", {"x": 4}))
-    found = {done.task.name: done for done in cluster.run(tasks)}
-    assert found["double"].value == 8
-    assert found["partial"].error == "the disk is full"
-    assert found["bug"].error == "ZeroDivisionError: a bug"
-
-
-def test_bad_input_ends_the_run_unless_the_tasks_are_independent(cluster: Cluster) -> None:
-    tasks = [Task("bad", f"{TASKS}:fail", {"kind": "input"})]
-    with pytest.raises(InputError, match=r"bad on .*map.png: is not there"):
-        list(cluster.run(tasks))
-    (done,) = cluster.run(tasks, stop_when_fatal=False)
-    assert done.error == "map.png: is not there"
 
 
 def test_a_batch_system_that_refuses_the_jobs_is_no_wait(
@@ -67,7 +41,7 @@ def test_a_batch_system_that_refuses_the_jobs_is_no_wait(
     file.write_text("engine: slurm\nworkers: 1\nstart_timeout: 30s\noptions: {interface: lo}\n")
     with (
         pytest.raises(InputError, match=r"refuses the jobs \(sbatch: error: invalid partition\)"),
-        open_cluster(str(file), lambda line: None),
+        open_runner(str(file), lambda line: None),
     ):
         pass
     assert "Traceback" not in capfd.readouterr().err
@@ -81,11 +55,11 @@ def test_an_interruption_while_waiting_for_jobs_is_one(tmp_path: Path) -> None:
     (tmp_path / "site.yaml").write_text("engine: slurm\nworkers: 1\noptions: {interface: lo}\n")
     program = (
         "import os, signal\n"
-        "from mbtf_core.cluster.engine import open_cluster\n"
+        "from mbtf_core.run.cluster import open_runner\n"
         "def note(line): signal.setitimer(signal.ITIMER_REAL, 0.5)\n"
         "signal.signal(signal.SIGALRM, lambda *_: os.kill(os.getpid(), signal.SIGINT))\n"
         "try:\n"
-        "    with open_cluster('site.yaml', note): pass\n"
+        "    with open_runner('site.yaml', note): pass\n"
         "except KeyboardInterrupt: print('interrupted')\n"
     )
     environment = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
@@ -95,84 +69,89 @@ def test_an_interruption_while_waiting_for_jobs_is_one(tmp_path: Path) -> None:
     assert done.stdout == "interrupted\n", done.stderr
 
 
-def test_a_task_is_run_again_when_its_worker_dies(cluster: Cluster, tmp_path: Path) -> None:
+def test_a_task_is_run_again_when_its_worker_dies(cluster: Runner, tmp_path: Path) -> None:
     arguments = {"marks": str(tmp_path), "times": 2}
-    (done,) = cluster.run([Task("dies", f"{TASKS}:die_at_first", arguments)])
+    (done,) = cluster.map(run_tasks.die_at_first, [Item("dies", arguments)])
     assert (done.value, done.error) == (3, "")
 
 
-def test_a_task_is_run_again_when_it_fails_by_a_bug(cluster: Cluster, tmp_path: Path) -> None:
+def test_a_task_is_run_again_when_it_fails_by_a_bug(cluster: Runner, tmp_path: Path) -> None:
     arguments = {"marks": str(tmp_path), "times": 2}
-    (done,) = cluster.run([Task("flaky", f"{TASKS}:fail_at_first", arguments)])
+    (done,) = cluster.map(run_tasks.fail_at_first, [Item("flaky", arguments)])
     assert (done.value, done.error) == (3, "")
 
 
 def test_tasks_whose_files_are_locked_are_tried_later(
-    cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    cluster: Runner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(engine, "_PAUSE_SECONDS", 0.2)
+    monkeypatch.setattr(dask_runner, "_PAUSE_SECONDS", 0.2)
     arguments = {"marks": str(tmp_path), "times": 3}
-    (done,) = cluster.run([Task("locked", f"{TASKS}:locked_at_first", arguments)])
+    (done,) = cluster.map(run_tasks.locked_at_first, [Item("locked", arguments)])
     assert (done.value, done.error) == (4, "")
-    monkeypatch.setattr(engine, "_LOCKED_SECONDS", 0.5)
-    (done,) = cluster.run([Task("for ever", f"{TASKS}:locked_at_first", arguments | {"times": 1000})])
+    monkeypatch.setattr(dask_runner, "_LOCKED_SECONDS", 0.5)
+    (done,) = cluster.map(run_tasks.locked_at_first, [Item("for ever", arguments | {"times": 1000})])
     assert done.error == "folder: is being written by another process"
 
 
-def test_workers_that_die_each_time_are_reported(cluster: Cluster) -> None:
-    (done,) = cluster.run([Task("deadly", f"{TASKS}:fail", {"kind": "kill"})])
+def test_workers_that_die_each_time_are_reported(cluster: Runner) -> None:
+    (done,) = cluster.map(run_tasks.fail, [Item("deadly", {"kind": "kill"})])
     assert "died each time" in done.error
-    (after,) = cluster.run([Task("after", f"{TASKS}:double", {"x": 1})])
+    (after,) = cluster.map(run_tasks.double, [Item("after", {"x": 1})])
     assert after.value == 2
 
 
-def test_workers_state_their_threads(cluster: Cluster) -> None:
-    (done,) = cluster.run([Task("threads", f"{TASKS}:threads")])
+def test_workers_state_their_threads(cluster: Runner) -> None:
+    (done,) = cluster.map(run_tasks.threads, [Item("threads")])
     stated, environment = done.value
     assert stated is not None
     assert environment == str(stated)
 
 
-def test_tasks_for_gpus_run_where_none_is_stated(cluster: Cluster) -> None:
-    (done,) = cluster.run([Task("gpu", f"{TASKS}:double", {"x": 3}, gpu=True)])
+def test_tasks_for_gpus_run_where_none_is_stated(cluster: Runner) -> None:
+    (done,) = cluster.map(run_tasks.double, [Item("gpu", {"x": 3}, gpu=True)])
     assert done.value == 6
 
 
 def test_other_versions_are_refused() -> None:
-    found = run_task(f"{TASKS}:double", {"x": 1}, "0.0.0")
+    call, _, folder = packed(run_tasks.double, Item("x", {"x": 1}))
+    found = run_task(call, "0.0.0", folder)
     assert found["fatal"]
     assert "version" in found["error"]
     assert "version" in found["hint"]
 
 
+def test_a_working_folder_that_a_worker_does_not_see_is_named() -> None:
+    call, version, _ = packed(run_tasks.fail, Item("x", {"kind": "input"}))
+    assert "working folder /nowhere" in run_task(call, version, "/nowhere")["hint"]
+
+
 def test_without_dask_one_line_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(UsageError, match=r"mbtf\[cluster\]"), open_cluster("local", lambda line: None):
+    with pytest.raises(UsageError, match=r"mbtf\[cluster\]"), open_runner("local", lambda line: None):
         pass
 
 
 def test_a_scheduler_that_is_not_there_is_bad_input(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(engine, "_CONNECT_SECONDS", 1.0)
+    monkeypatch.setattr(dask_runner, "_CONNECT_SECONDS", 1.0)
     pytest.importorskip("distributed")
     with (
         pytest.raises(InputError, match=r"tcp://127\.0\.0\.1:9") as caught,
-        open_cluster("tcp://127.0.0.1:9", lambda line: None),
+        open_runner("tcp://127.0.0.1:9", lambda line: None),
     ):
         pass
     assert "dask scheduler" in caught.value.hint
 
 
 def test_a_scheduler_that_ends_leaves_resumable_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(engine, "_CONNECT_SECONDS", 1.0)
+    monkeypatch.setattr(dask_runner, "_CONNECT_SECONDS", 1.0)
     distributed = pytest.importorskip("distributed")
     with (
         distributed.LocalCluster(
             n_workers=1, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0"
         ) as started,
-        open_cluster(started.scheduler_address, lambda line: None) as opened,
+        open_runner(started.scheduler_address, lambda line: None) as opened,
     ):
-        assert opened is not None
-        results = opened.run(Task(f"x{i}", f"{TASKS}:double", {"x": i}) for i in range(10**6))
+        results = opened.map(run_tasks.double, (Item(f"x{i}", {"x": i}) for i in range(10**6)))
         next(results)
         started.close()
         with pytest.raises(PartialError, match="the cluster is lost"):
@@ -185,10 +164,9 @@ def test_a_worker_with_several_threads_runs_one_task_at_a_time() -> None:
         distributed.LocalCluster(
             n_workers=1, threads_per_worker=4, processes=True, dashboard_address="127.0.0.1:0"
         ) as started,
-        open_cluster(started.scheduler_address, lambda line: None) as opened,
+        open_runner(started.scheduler_address, lambda line: None) as opened,
     ):
-        assert opened is not None
-        found = list(opened.run(Task(f"x{i}", f"{TASKS}:alone") for i in range(16)))
+        found = list(opened.map(run_tasks.alone, (Item(f"x{i}") for i in range(16))))
         assert [done.value for done in found] == 16 * [True]
 
 
@@ -215,7 +193,7 @@ def test_jobs_of_batch_systems(monkeypatch: pytest.MonkeyPatch) -> None:
             walltime=7200,
             options=own,  # type: ignore[arg-type]
         )
-        with engine._started(config, []):
+        with dask_runner._started(config, []):
             pass
     for script in scripts:
         lines = script.splitlines()
@@ -223,7 +201,7 @@ def test_jobs_of_batch_systems(monkeypatch: pytest.MonkeyPatch) -> None:
         assert "export DASK_DISTRIBUTED__WORKER__MEMORY__PAUSE=False" in lines
         for words in (
             "--nthreads 1",
-            "--preload mbtf_core.cluster.task",
+            "--preload mbtf_core.run.task",
             "--resources GPU=1",
             "--lifetime 6480s",
             "--local-directory /scratch",
@@ -237,7 +215,7 @@ def test_a_batch_system_that_is_not_there() -> None:
     pytest.importorskip("dask_jobqueue")
     with (
         pytest.raises(OSError, match="no command bsub"),
-        engine._started(ClusterConfig(engine="lsf"), []),
+        dask_runner._started(ClusterConfig(engine="lsf"), []),
     ):
         pass
 
@@ -249,7 +227,7 @@ def test_unknown_options_of_a_batch_system_are_named(tmp_path: Path, monkeypatch
     file.write_text("engine: slurm\noptions: {qeue: short}\n")
     with (
         pytest.raises(InputError, match="has no option 'qeue'; did you mean 'queue'"),
-        open_cluster(str(file), lambda line: None),
+        open_runner(str(file), lambda line: None),
     ):
         pass
 

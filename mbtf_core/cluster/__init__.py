@@ -1,1 +1,0 @@
-"""Tasks on many processes and machines, run by Dask."""

@@ -1,0 +1,163 @@
+"""What runs tasks: the runner of this process, and what the others have in common.
+
+All runners give the same values. What a task has finished is kept, whichever process dies.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import inspect
+import time
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+from mbtf_core.errors import MbtfError
+from mbtf_core.run.task import Item, Result, TaskFunction, failure
+
+
+class Runner:
+    """Maps a task over items; here, in this process, one after the other.
+
+    Attributes
+    ----------
+    workers : number of workers, as last seen
+    here : items run in this process
+    """
+
+    workers = 1
+    here = True
+
+    def takes_gpu(self, device: str) -> bool:
+        """Whether an item for a device, ``cpu``, ``cuda`` or ``auto``, takes a GPU of its worker."""
+        return device == "cuda"
+
+    def map(
+        self,
+        function: TaskFunction,
+        items: Iterable[Item],
+        *,
+        independent: bool = False,
+        ahead: int | None = None,
+    ) -> Generator[Result]:
+        """Call a function for every item; yields each result as it comes.
+
+        Parameters
+        ----------
+        function : callable
+            Of a module; see :mod:`mbtf_core.run.task`.
+        items : iterable of Item
+            Read as workers become free.
+        independent : bool
+            A failure that concerns files or options says nothing about the other items.
+        ahead : int, optional
+            Items that are read before workers are free for them, beyond two for each worker.
+
+        Yields
+        ------
+        Result
+
+        Raises
+        ------
+        InputError
+            An item failed for a reason that concerns all of them; the others are canceled.
+        PartialError
+            The workers cannot be reached any more.
+        """
+        waiting = iter(items)
+        with contextlib.closing(_Overlap(function)) as overlap:
+            while True:
+                progress = False
+                locked: list[tuple[Item, Result]] = []
+                for item, value in overlap.run(waiting):
+                    if not isinstance(value, MbtfError):
+                        result = Result(item.name, value, waited=overlap.waited)
+                    elif (found := failure(value))["fatal"] and not independent:
+                        raise value
+                    else:
+                        result = Result(item.name, **found, waited=overlap.waited)
+                    if result.locked:
+                        locked.append((item, result))
+                        continue
+                    progress = True
+                    yield result
+                if not progress:
+                    break
+                # Another process may have finished some by now.
+                waiting = iter([item for item, _ in locked])
+        for _, result in locked:
+            yield result
+
+
+class _Overlap:
+    """Calls a function for items in this process. The first and last part of a generator run in threads, one
+    item ahead and one behind."""
+
+    def __init__(self, function: TaskFunction) -> None:
+        self._function = function
+        self._before = ThreadPoolExecutor(1, "ahead")
+        self._after = ThreadPoolExecutor(1, "behind")
+        self._open: list[Generator[None, None, Any]] = []
+        # Seconds that this thread has waited for the others.
+        self.waited = 0.0
+
+    def close(self) -> None:
+        """Wait for the threads, which finish what they do, and close the other items."""
+        for pool in (self._before, self._after):
+            pool.shutdown(cancel_futures=pool is self._before)
+        for parts in self._open:
+            parts.close()
+
+    def run(self, items: Iterator[Item]) -> Iterator[tuple[Item, Any]]:
+        """Items and their values or errors, in the order in which they end."""
+        begun: deque[tuple[Item, Any, Future[Any]]] = deque()
+        ending: deque[tuple[Item, Any, Future[Any]]] = deque()
+        while True:
+            while len(begun) < 2 and (item := next(items, None)) is not None:
+                if not inspect.isgeneratorfunction(self._function):
+                    yield item, _tried(self._function, **item.arguments)
+                    continue
+                parts = self._function(**item.arguments)
+                self._open.append(parts)
+                begun.append((item, parts, self._before.submit(_part, parts)))
+            if not begun and not ending:
+                return
+            # One is behind at most: more would take memory.
+            while ending and (not begun or len(ending) > 1 or ending[0][2].done()):
+                item, parts, last = ending.popleft()
+                began = time.perf_counter()
+                _, value = last.result()
+                self.waited += time.perf_counter() - began
+                self._open.remove(parts)
+                yield item, value
+            if not begun:
+                continue
+            item, parts, first = begun.popleft()
+            done, value = first.result()
+            if not done:
+                done, value = _part(parts)
+            if done:
+                self._open.remove(parts)
+                yield item, value
+            else:
+                ending.append((item, parts, self._after.submit(_part, parts)))
+
+
+def _tried(function: Callable[..., Any], **arguments: Any) -> Any:
+    """Value of a function, or its error."""
+    try:
+        return function(**arguments)
+    except MbtfError as error:
+        return error
+
+
+def _part(parts: Generator[None, None, Any]) -> tuple[bool, Any]:
+    """Run the next part of a generator: whether it has ended, and its value or error then."""
+    try:
+        next(parts)
+    except StopIteration as end:
+        return True, end.value
+    except MbtfError as error:
+        return True, error
+    return False, None
