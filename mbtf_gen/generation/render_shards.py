@@ -8,7 +8,6 @@ from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, field
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,6 @@ from mbtf_core.errors import InputError, PartialError
 from mbtf_core.files.atomic import Stored
 from mbtf_core.locks import Lock, lock_owner, take_lock
 from mbtf_gen.generation.summary import ShardStatistics, refuse_nonfinite
-from mbtf_gen.generation.writer import ShardWriter
 from mbtf_gen.job import Job, most_paths, planned_paths, split_spp, split_target
 from mbtf_gen.planning.adaptive import estimate_shard
 from mbtf_gen.planning.run_plan import RunPlan
@@ -32,6 +30,8 @@ from mbtf_gen.render.estimates import Estimates, Stream
 
 # Called with the paths so far, a note, and the paths expected in all (None: not known yet).
 ProgressCallback = Callable[[float, str, float | None], None]
+# Shards that are being written or wait for it while others are rendered.
+_WAITING = 2
 
 
 @dataclass(frozen=True)
@@ -142,12 +142,25 @@ def render_shards(
 
     unsent: list[PartialError | InputError] = []
 
-    def store(entry: ShardEntry, *rendered: Any) -> None:
+    def store(claim: _Claim, *rendered: Any) -> None:
+        began = time.thread_time()
         try:
-            records.append(store_shard(job, folder, plan, entry, *rendered))
+            records.append(store_shard(job, folder, plan, claim.entry, *rendered))
         except (PartialError, InputError) as error:
             # What is rendered meanwhile is still written, and uploaded by the next run.
             unsent.append(error)
+        finally:
+            claim.lock.release()
+            result.writing += time.thread_time() - began
+
+    writes: deque[Future[None]] = deque()
+
+    def wait_for_writes(most: int) -> None:
+        """Wait until at most so many shards are not written yet."""
+        began = time.perf_counter()
+        while len(writes) > most:
+            writes.popleft().result()
+        result.waiting += time.perf_counter() - began
 
     # Leftovers of killed runs take disk space.
     folder.remove_leftovers()
@@ -159,7 +172,8 @@ def render_shards(
         with ExitStack() as stack:
             ahead = stack.enter_context(ThreadPoolExecutor(1, "queries"))
             claims = stack.enter_context(closing(_claims(job, folder, tried, ahead, busy, skip)))
-            writer = stack.enter_context(ShardWriter())
+            # Its exit waits, also after an interruption, so that no rendered shard is lost.
+            writer = stack.enter_context(ThreadPoolExecutor(1, "shard writer"))
             for claim in claims:
                 if estimator is None:
                     estimator = build_estimator(job, plan.effects)
@@ -167,7 +181,8 @@ def render_shards(
                 queries, entry = claim.queries.result(), claim.entry
                 estimates = estimate_queries(job, plan, estimator, entry, queries)
                 seconds = time.perf_counter() - began
-                writer.submit(partial(store, entry, queries, estimates, seconds), claim.lock.release)
+                writes.append(writer.submit(store, claim, queries, estimates, seconds))
+                wait_for_writes(_WAITING)
                 result.paths += estimates.paths
                 expected.add(pending.pop(entry.file), estimates.paths)
                 result.shards.append(entry.file)
@@ -177,10 +192,9 @@ def render_shards(
                 refuse_nonfinite(own, limit, folder)
                 if unsent:
                     break
+            wait_for_writes(0)
         if unsent:
             raise unsent[0]
-        result.writing += writer.busy
-        result.waiting += writer.waited
         if len(busy) == len(tried):
             owner = lock_owner(folder.workspace / busy[0].file)
             who = "" if owner is None else f" ({owner})"
