@@ -55,7 +55,8 @@ class Lock:
             # A file that cannot be removed is harmless without the system's lock.
             with contextlib.suppress(OSError):
                 os.unlink(self._lock.lock_file)
-            self._lock.release()
+            with contextlib.suppress(OSError):
+                self._lock.release()
 
 
 def lock_file_of(path: Path) -> Path:

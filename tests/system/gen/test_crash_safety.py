@@ -281,7 +281,7 @@ def test_a_full_disk_ends_in_one_message_and_more_room_repairs_it(suffix: str, t
         pytest.skip("no file system can be mounted here")
     # The noise of the fixtures does not reach another program: values of a plane, all alike.
     # The disk has room when the run starts.
-    start = "import sys; from mbtf_core import folders; folders.check_space = lambda *a: None; "
+    start = "import sys; from mbtf_core.files import folders; folders.check_space = lambda *a: None; "
     start += "from mbtf_gen.__main__ import main; sys.exit(main())"
     program = [sys.executable, "-c", start, *command(tmp_path, tmp_path / "full/out", train=1500)]
     program += ["--format", suffix]

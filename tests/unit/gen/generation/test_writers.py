@@ -184,11 +184,11 @@ def test_a_shard_finished_before_its_lock_is_not_rendered(
     engine.estimated.clear()
     take = render_shards.take_lock
 
-    def late(path: Path, stale: float) -> Any:
+    def late(path: Path) -> Any:
         if path.name == FILES[1]:
             for name in (path.name, sidecar_of(path).name):
                 shutil.copy(whole / name, out / name)
-        return take(path, stale)
+        return take(path)
 
     monkeypatch.setattr(render_shards, "take_lock", late)
     assert generate(config, out).complete
