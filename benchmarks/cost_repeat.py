@@ -32,8 +32,8 @@ from error_per_second import independent_points
 
 from mbtf_core.errors import MbtfError
 from mbtf_core.stats import Estimate
-from mbtf_gen.material.load import load_material
-from mbtf_gen.render.runtime import load_mitsuba
+from mbtf_gen.engine.runtime import load_mitsuba
+from mbtf_gen.tile.loading import load_material
 from mbtf_pipeline.cost_study.generator_benchmark import GeneratorBenchmark
 from mbtf_pipeline.cost_study.generator_runs import UNIFORM, generator_tasks
 from mbtf_pipeline.cost_study.measurements import Measurement

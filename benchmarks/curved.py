@@ -42,7 +42,7 @@ from curved_meshes import F64, Surface, displaced, load_object, refined
 from numpy.typing import NDArray
 
 from mbtf_core.exposure import auto_exposure, brightness, to_display
-from mbtf_gen.render.runtime import load_mitsuba
+from mbtf_gen.engine.runtime import load_mitsuba
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT.parent / "shared" / "data"
@@ -263,11 +263,11 @@ def compare(mi: Any, scene: Scene, folder: Path, size: int, spp: int) -> tuple[d
     """Figures of a scene, and its two pictures."""
     from mbtf_gen.config.generator import GeneratorConfig
     from mbtf_gen.job import Job
-    from mbtf_gen.material.load import load_material
     from mbtf_gen.planning.effects_plan import reference_plan
     from mbtf_gen.planning.simulation import build_estimator
     from mbtf_gen.render.bsdf.plugin import bsdf_of
     from mbtf_gen.render.scene import register_plugins
+    from mbtf_gen.tile.loading import load_material
 
     register_plugins()
     material = load_material(ROOT / "assets" / scene.material)

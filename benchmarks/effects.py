@@ -33,14 +33,14 @@ import numpy as np
 
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
-from mbtf_gen.material.load import load_material
-from mbtf_gen.material.material import Material
 from mbtf_gen.planning.effects import EffectsPlan, without
 from mbtf_gen.planning.effects_plan import plan_effects
 from mbtf_gen.planning.pilot import PILOT_ROULETTE, measured, relative_change
 from mbtf_gen.planning.run_plan import SMALL_RUN
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream
+from mbtf_gen.tile.heightfield_tile import Material
+from mbtf_gen.tile.loading import load_material
 
 ASSETS = Path(__file__).parents[1] / "assets"
 # Ratio of the times, auto over all, that the surfaces are held to: at least 20 times faster, or never slower

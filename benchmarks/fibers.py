@@ -29,10 +29,10 @@ from pathlib import Path
 
 import numpy as np
 
-from mbtf_gen.fibers.tile import FiberTile
-from mbtf_gen.material.load import load_material
-from mbtf_gen.render.runtime import load_mitsuba
+from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
+from mbtf_gen.tile.fiber_tile import FiberTile
+from mbtf_gen.tile.loading import load_material
 
 RATIO_BAR, MEMORY_BAR_GIB, START_BAR_SECONDS = 0.5, 2.0, 30.0
 MILLION = 1_000_000

@@ -29,8 +29,8 @@ from mbtf_fit import fit
 from mbtf_fit.config import FitConfig
 from mbtf_fit.presets import best_options
 from mbtf_gen.config.presets import as_assignments
+from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.generation import generate
-from mbtf_gen.render.runtime import load_mitsuba
 
 STEPS = (200, 800, 3000)
 DEFAULT = FitConfig().training.noise_regularization

@@ -33,7 +33,7 @@ from mbtf_fit.config import FitConfig
 from mbtf_fit.presets import best_options
 from mbtf_fit.training.forecast import PERSISTENCE, PILOT_SECONDS, extrapolated
 from mbtf_gen.config.presets import Quality, as_assignments
-from mbtf_gen.render.runtime import load_mitsuba
+from mbtf_gen.engine.runtime import load_mitsuba
 
 ASSETS = ("cliff_rock", "insulation_foam", "straight_wool", "turtle_shell", "twisted_wool")
 # Largest factors between forecast and run, either way.

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from mbtf_core.errors import InputError
 from mbtf_core.shard_schema import Layout
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.render.runtime import CPU_VARIANT, CUDA_VARIANT
+from mbtf_gen.engine.runtime import CPU_VARIANT, CUDA_VARIANT
 
 if TYPE_CHECKING:
     from mbtf_gen.sampling.query_sampler import Queries
@@ -98,7 +98,7 @@ def selftest(sizes: str) -> Answers:
     """State of every check of ``mbtf-gen selftest``, or why it could not run."""
     from mbtf_gen.diagnostics.checks import all_checks
     from mbtf_gen.diagnostics.selftest import run_checks
-    from mbtf_gen.render.runtime import load_mitsuba
+    from mbtf_gen.engine.runtime import load_mitsuba
 
     load_mitsuba()
     for finding in run_checks(all_checks(), Sizes.read(sizes).selftest):

@@ -29,8 +29,8 @@ from mbtf_core.units import parse_duration
 from mbtf_fit.presets import best_options
 from mbtf_gen.config.generator import count_queries
 from mbtf_gen.config.presets import Quality
+from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.generation import Job
-from mbtf_gen.render.runtime import load_mitsuba
 from mbtf_pipeline.cost_study.runs import DataRequest, Run, RunRunner
 from mbtf_pipeline.run_folder import machine
 

@@ -180,7 +180,7 @@ def energies(material: Path, shards: Path, evaluator: Any) -> list[dict[str, flo
 def gloss(source: Path, config: dict[str, Any]) -> dict[str, float]:
     """Share of what the material's maps reflect that is specular, and their median roughness; 1 for
     Lambert."""
-    from mbtf_gen.material.load import load_material
+    from mbtf_gen.tile.loading import load_material
 
     maps = load_material(source, config["geometry"]["make_tileable"])
     if maps.roughness is None:
@@ -228,7 +228,7 @@ def deviation(evaluator: Any, stored: Any) -> float:
 
 def measure(source: Path, shards: Path, folder: Path) -> dict[str, Any]:
     """All figures of one material; the kernel cache is empty."""
-    from mbtf_gen.render.runtime import load_mitsuba
+    from mbtf_gen.engine.runtime import load_mitsuba
 
     mi = load_mitsuba()
     import drjit as dr

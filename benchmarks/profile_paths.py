@@ -22,7 +22,7 @@ from throughput import DEPTH, LIGHT_WIDTH, MESH, rocky
 
 from mbtf_core.errors import MbtfError
 from mbtf_core.lattice import Lattice
-from mbtf_gen.render.runtime import load_mitsuba
+from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
 
 

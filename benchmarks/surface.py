@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_gen.render.runtime import load_mitsuba
+from mbtf_gen.engine.runtime import load_mitsuba
 
 ROUGHNESSES = (0.02, 0.1, 0.3, 0.5, 1.0)
 COSINES = (1.0, 0.5, 0.2, 0.05)
@@ -103,12 +103,12 @@ def surfaces(mi: Any) -> dict[str, dict[str, Any]]:
 
 def costs(mi: Any, runs: int, count: int, spp: int) -> dict[str, float]:
     """Processor seconds per million paths."""
-    from mbtf_gen.geometry.heightfield import HeightGrid
     from mbtf_gen.render.estimator import Estimator, Stream
     from mbtf_gen.render.path_tracer import Transport
     from mbtf_gen.render.scene import build_tile
     from mbtf_gen.sampling.light_kernel import LightKernel
     from mbtf_gen.sampling.query_sampler import Queries
+    from mbtf_gen.tile.heights.grid import HeightGrid
 
     rng = np.random.default_rng(3)
 

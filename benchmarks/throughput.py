@@ -36,13 +36,13 @@ from numpy.typing import NDArray
 from mbtf_core.errors import MbtfError
 from mbtf_core.lattice import Lattice
 from mbtf_gen.config.generator import Tracer
-from mbtf_gen.material.load import load_material
-from mbtf_gen.material.material import Material
-from mbtf_gen.render.runtime import load_mitsuba
+from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
+from mbtf_gen.tile.heightfield_tile import Material
+from mbtf_gen.tile.loading import load_material
 
 if TYPE_CHECKING:
-    from mbtf_gen.geometry.heightfield import HeightGrid
+    from mbtf_gen.tile.heights.grid import HeightGrid
 
 MESH = 512
 DEPTH = 6
@@ -120,9 +120,9 @@ def stock_run(material: Material, grid: HeightGrid, count: int, spp: int) -> Run
     import drjit as dr
     import mitsuba as mi
 
-    from mbtf_gen.geometry.heightfield import mesh_of_grid
     from mbtf_gen.render.bsdf.plugin import bsdf_of
     from mbtf_gen.render.scene import unit_of
+    from mbtf_gen.tile.heights.grid import mesh_of_grid
 
     unit = unit_of(grid.aspect)
     columns = max(1, round((count / grid.aspect) ** 0.5))

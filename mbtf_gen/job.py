@@ -14,13 +14,13 @@ from mbtf_core.errors import InputError, UsageError
 from mbtf_core.lattice import Lattice
 from mbtf_core.shard_schema import SPLITS, ShardEntry, Split
 from mbtf_gen.config.generator import GeneratorConfig, GeometrySection, count_queries
-from mbtf_gen.geometry.heightfield import HeightGrid
-from mbtf_gen.material.checks import displacement_fault
-from mbtf_gen.material.latest import latest_material
-from mbtf_gen.material.material import Material
 from mbtf_gen.render.estimates import TARGET_PILOT_SPP, Target
 from mbtf_gen.sampling.query_sampler import F32, Mixture, QueryPlan
 from mbtf_gen.sampling.slice_directions import UBO2003_COUNT, UBO2003_LOWEST, slice_directions
+from mbtf_gen.tile.heightfield_tile import Material
+from mbtf_gen.tile.heights.grid import HeightGrid
+from mbtf_gen.tile.latest import latest_material
+from mbtf_gen.tile.maps.checks import displacement_fault
 
 log = logging.getLogger(__name__)
 

@@ -24,8 +24,8 @@ from PIL import Image, ImageDraw, ImageFont
 from mbtf_core.directions import from_angles
 from mbtf_core.exposure import auto_exposure, brightness, to_display
 from mbtf_gen.dataset.shard_io import read_exr
+from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.pictures.camera import Camera
-from mbtf_gen.render.runtime import load_mitsuba
 
 ROOT = Path(__file__).parents[2]
 MATERIAL = ROOT / "out" / "quickstart" / "fits" / "relief"

@@ -23,8 +23,7 @@ from mbtf_fit.mitsuba_plugin.lobes import LobeTextures, Mixture
 from mbtf_fit.mitsuba_plugin.material_arrays import StoredMaterial, read_material
 from mbtf_fit.mitsuba_plugin.names import BSDF_NAME, footprints_provided, refuse_unknown
 from mbtf_fit.mitsuba_plugin.network import Arithmetic
-from mbtf_gen.pictures.camera import pixel_sigma
-from mbtf_gen.render.types import (
+from mbtf_gen.engine.types import (
     BSDFContext,
     BSDFSample3f,
     Color3f,
@@ -36,6 +35,7 @@ from mbtf_gen.render.types import (
     SurfaceInteraction3f,
     Vector3f,
 )
+from mbtf_gen.pictures.camera import pixel_sigma
 
 # Largest deviation from the conformance values, as a share of max(value, their mean), that loading accepts.
 TOLERANCE = {"unrolled": 1e-4, "cooperative": 1e-4, "half": 1e-2}

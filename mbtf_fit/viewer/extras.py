@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_fit.viewer.content import encode
+from mbtf_fit.viewer.shape import read_shape
 from mbtf_fit.viewer.textures import pack
 from mbtf_gen.images.environment import read_environment
 from mbtf_gen.images.resample import resample
-from mbtf_gen.meshes.shape import read_shape
 from mbtf_gen.pictures.camera import Camera
 from mbtf_gen.pictures.reference import read_references
 
@@ -21,7 +21,7 @@ _ENVIRONMENT_ROWS, _PICTURE_SIZE = 64, 512
 
 
 def mesh_content(path: Path) -> dict[str, Any]:
-    """A mesh with texture coordinates (:func:`~mbtf_gen.meshes.shape.read_shape`) as JSON of a page."""
+    """A mesh with texture coordinates (:func:`~mbtf_fit.viewer.shape.read_shape`) as JSON of a page."""
     shape = read_shape(path)
     arrays = {
         "positions": shape.positions,

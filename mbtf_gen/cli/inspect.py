@@ -46,15 +46,15 @@ def inspect(
     resolved = resolve_config(options, material)
     _check_new(write, "--write", (".yaml", ".yml"), overwrite)
     _check_new(export, "--export", (".exr",), overwrite)
-    from mbtf_gen.fibers.inspect import fiber_text
     from mbtf_gen.images.exr import write_channels
     from mbtf_gen.job import check_options
-    from mbtf_gen.material.choices import write_material_file
-    from mbtf_gen.material.cloth import inspect_cloth
-    from mbtf_gen.material.inspect import inspect_material, inspection_text
-    from mbtf_gen.material.load import load_material
-    from mbtf_gen.material.mesh import inspect_mesh, mesh_text
-    from mbtf_gen.meshes.tile import MeshTile
+    from mbtf_gen.tile.choices import write_material_file
+    from mbtf_gen.tile.cloth_material import inspect_cloth
+    from mbtf_gen.tile.fiber_inspection import fiber_text
+    from mbtf_gen.tile.inspection import inspect_material, inspection_text
+    from mbtf_gen.tile.loading import load_material
+    from mbtf_gen.tile.mesh_material import inspect_mesh, mesh_text
+    from mbtf_gen.tile.mesh_tile import MeshTile
 
     geometry = resolved.geometry
     height, finest = geometry.height_scale, resolved.queries.finest
@@ -78,7 +78,7 @@ def inspect(
         write_channels(export, {"Y": loaded.grid(height, geometry.mesh).z.astype("float32")})
         outputs["exported"] = export
     if loaded.bsdf is not None:
-        from mbtf_gen.render.runtime import load_mitsuba
+        from mbtf_gen.engine.runtime import load_mitsuba
 
         load_mitsuba()
         from mbtf_gen.render.scene import build_tile

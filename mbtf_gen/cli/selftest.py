@@ -31,7 +31,7 @@ def selftest(*, report: Path | None = None, time: Time = "2min", console: Consol
     from mbtf_gen.diagnostics.checks import all_checks
     from mbtf_gen.diagnostics.report import as_html, as_json, as_text
     from mbtf_gen.diagnostics.selftest import exit_code, run_checks
-    from mbtf_gen.render.runtime import load_mitsuba
+    from mbtf_gen.engine.runtime import load_mitsuba
 
     console.note(expectation(seconds, 0 if report is None else REPORT_BYTES))
     load_mitsuba()

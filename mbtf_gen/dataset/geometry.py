@@ -23,12 +23,12 @@ from mbtf_core.atomic import write_chunks
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import Lattice
 from mbtf_core.shard_schema import GEOMETRY, GEOMETRY_NAME, ArraySpec
-from mbtf_gen.geometry.heightfield import HeightGrid
-from mbtf_gen.geometry.slopes import height_slopes
 from mbtf_gen.images.resample import resample
 from mbtf_gen.job import Job
 from mbtf_gen.planning.effects import EffectsPlan
 from mbtf_gen.planning.simulation import shading_slopes
+from mbtf_gen.tile.heights.grid import HeightGrid
+from mbtf_gen.tile.heights.slopes import height_slopes
 
 F32 = NDArray[np.float32]
 

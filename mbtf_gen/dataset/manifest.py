@@ -16,11 +16,11 @@ from mbtf_core.digest import data_sha256
 from mbtf_core.lattice import sigma_of_level
 from mbtf_core.shard_schema import ARRAYS, CONVENTIONS, FORMAT_NAME, LEADING_AXES, SCHEMA_VERSION, SPLITS
 from mbtf_gen.config.effects_request import EFFECTS
-from mbtf_gen.fibers.tile import FiberTile
 from mbtf_gen.job import Job, split_queries, split_spp
 from mbtf_gen.planning.effects import EffectsPlan
 from mbtf_gen.planning.run_plan import RunPlan
 from mbtf_gen.planning.sample_allocation import Allocation
+from mbtf_gen.tile.fiber_tile import FiberTile
 
 CHECK_HINT = "check the data set with: mbtf-gen verify"
 

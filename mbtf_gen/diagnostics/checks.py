@@ -16,11 +16,11 @@ from mbtf_core.directions import from_angles, normalize
 from mbtf_core.stats import Estimate, mean_estimate, mean_of_halves
 from mbtf_gen.diagnostics.closed_forms import Groove, Wall, mirror
 from mbtf_gen.diagnostics.selftest import Case, Check
-from mbtf_gen.fibers.curves import Curve
-from mbtf_gen.fibers.tile import FiberTile
-from mbtf_gen.geometry.heightfield import HeightGrid
 from mbtf_gen.sampling.light_kernel import LightKernel
 from mbtf_gen.sampling.query_sampler import Queries
+from mbtf_gen.tile.fiber_tile import FiberTile
+from mbtf_gen.tile.fibers.curves import Curve
+from mbtf_gen.tile.heights.grid import HeightGrid
 
 F64 = NDArray[np.float64]
 Cases = Mapping[str, Case]
@@ -128,7 +128,7 @@ def _estimates(
     variant: str | None = None,
 ) -> Any:
     """Estimates of M; each round has its own random numbers."""
-    from mbtf_gen.render.runtime import CPU_VARIANT, load_mitsuba
+    from mbtf_gen.engine.runtime import CPU_VARIANT, load_mitsuba
 
     load_mitsuba(variant or CPU_VARIANT)
     from mbtf_gen.render.estimates import Stream
@@ -178,7 +178,7 @@ def _lambert(round_number: int) -> Cases:
 
 def _irradiance(round_number: int) -> Cases:
     """Irradiance by sampling the light: E[L ω_z / density]."""
-    from mbtf_gen.render.runtime import load_mitsuba
+    from mbtf_gen.engine.runtime import load_mitsuba
 
     mi = load_mitsuba()
     import drjit as dr
@@ -260,7 +260,7 @@ def _furnace(round_number: int) -> Cases:
 
 
 def _fibers(round_number: int) -> Cases:
-    from mbtf_gen.render.runtime import load_mitsuba
+    from mbtf_gen.engine.runtime import load_mitsuba
 
     load_mitsuba()
     rng, s, out = np.random.default_rng(5), np.arange(8) / 8, {}
@@ -372,7 +372,7 @@ def _cuda(round_number: int) -> Cases | None:
     """In a child process, because a driver may abort it. None without a device."""
     from mbtf_core.child_process import run_child
     from mbtf_core.errors import EngineError
-    from mbtf_gen.render.runtime import CUDA_VARIANT, prove
+    from mbtf_gen.engine.runtime import CUDA_VARIANT, prove
 
     if prove(CUDA_VARIANT).fault:
         return None
@@ -384,6 +384,6 @@ def _cuda(round_number: int) -> Cases | None:
 
 def groove_on_cuda() -> Iterator[dict[str, Any]]:
     """Child process of the CUDA check."""
-    from mbtf_gen.render.runtime import CUDA_VARIANT
+    from mbtf_gen.engine.runtime import CUDA_VARIANT
 
     yield {name: (c.off, c.error) for name, c in _groove(0, CUDA_VARIANT).items()}

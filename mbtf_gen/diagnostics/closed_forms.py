@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mbtf_gen.geometry.heightfield import HeightGrid
 from mbtf_gen.sampling.light_kernel import LightKernel
+from mbtf_gen.tile.heights.grid import HeightGrid
 
 F64 = NDArray[np.float64]
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_gen.geometry.heightfield import HeightGrid
-from mbtf_gen.geometry.slopes import height_slopes
 from mbtf_gen.sampling.light_kernel import LightKernel
+from mbtf_gen.tile.heights.grid import HeightGrid
+from mbtf_gen.tile.heights.slopes import height_slopes
 
 F64 = NDArray[np.float64]
 

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_gen.geometry.slopes import height_slopes, residual_slopes
+from mbtf_gen.engine.runtime import CPU_VARIANT
 from mbtf_gen.images.resample import resample
 from mbtf_gen.job import Job
 from mbtf_gen.planning.effects import EffectsPlan
 from mbtf_gen.render.estimates import Estimates, Stream
-from mbtf_gen.render.runtime import CPU_VARIANT
 from mbtf_gen.sampling.query_sampler import Queries
+from mbtf_gen.tile.heights.slopes import height_slopes, residual_slopes
 
 # Effects that change the tile: its shape or its surface.
 _TILE_EFFECTS = frozenset(
@@ -66,7 +66,7 @@ def build_estimator(
     """
     if plan.closed_form:
         return ClosedForm(np.asarray(job.material.base_color, np.float64).reshape(-1, 3)[0])
-    from mbtf_gen.render.runtime import load_mitsuba
+    from mbtf_gen.engine.runtime import load_mitsuba
 
     load_mitsuba(variant)
     from mbtf_gen.render.bsdf.plugin import bsdf_of

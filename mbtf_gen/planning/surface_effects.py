@@ -9,14 +9,14 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_gen.fibers.tile import FiberTile
-from mbtf_gen.geometry.slope_statistics import triangle_slopes
 from mbtf_gen.images.resample import resample
 from mbtf_gen.job import Job
-from mbtf_gen.meshes.tile import MeshTile
 from mbtf_gen.planning.bounds import DisplacementBounds
 from mbtf_gen.planning.effects import Effect
 from mbtf_gen.planning.simulation import normal_map_slopes
+from mbtf_gen.tile.fiber_tile import FiberTile
+from mbtf_gen.tile.heights.statistics import triangle_slopes
+from mbtf_gen.tile.mesh_tile import MeshTile
 
 # Next-event estimation alone has no more variance than both techniques if the narrowest lobe of the surface,
 # about 2α wide, is at least this many times wider than the light's.

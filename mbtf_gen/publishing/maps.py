@@ -12,7 +12,7 @@ from mbtf_core.config_file import dump_yaml
 from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError
 from mbtf_gen.dataset.reader import Dataset
-from mbtf_gen.material.load import described, load_material
+from mbtf_gen.tile.loading import described, load_material
 
 MATERIAL_FILE = "material.yaml"
 _MESH_TEXT = (".gltf", ".obj")

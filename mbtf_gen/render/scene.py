@@ -15,17 +15,16 @@ import mitsuba as mi
 
 from mbtf_core.errors import InputError, reason
 from mbtf_gen.config.generator import Tracer
-from mbtf_gen.fibers.tile import FiberTile
-from mbtf_gen.geometry.heightfield import HeightGrid
-from mbtf_gen.meshes.tile import MeshTile
+from mbtf_gen.engine.types import BSDF
 from mbtf_gen.render.bsdf.plugin import PartSurface, SurfaceBSDF, surface_of
-from mbtf_gen.render.curve_tracer import CurveGeometry
 from mbtf_gen.render.directional_light import SmoothedDirectional
-from mbtf_gen.render.geometry import TileGeometry
-from mbtf_gen.render.heightfield_tracer import HeightfieldGeometry
-from mbtf_gen.render.mesh_tracer import MeshGeometry, MeshTileGeometry
 from mbtf_gen.render.sensor import QuerySensor
-from mbtf_gen.render.types import BSDF
+from mbtf_gen.tile.fiber_tile import FiberTile
+from mbtf_gen.tile.heights.grid import HeightGrid
+from mbtf_gen.tile.mesh_tile import MeshTile
+from mbtf_gen.tile.tracers.heightfield_tracer import HeightfieldGeometry
+from mbtf_gen.tile.tracers.mesh_tracer import MeshGeometry
+from mbtf_gen.tile.tracers.protocol import TileGeometry
 
 LONG_SIDE = 32.0
 # Rays start this far above the reference plane, in units: more than the rounding of the highest vertex.
@@ -93,7 +92,7 @@ def build_tile(
     unit = unit_of(shape.aspect)
     if isinstance(shape, MeshTile) and isinstance(bsdf, Sequence):
         parts = PartSurface([mi.load_dict(dict(part)).surface for part in bsdf])
-        return Tile(shape.aspect, unit, MeshTileGeometry.of_tile(shape, unit), parts)
+        return Tile(shape.aspect, unit, shape.trace(unit), parts)
     if isinstance(bsdf, Mapping):
         try:
             bsdf = mi.load_dict(dict(bsdf))
@@ -102,10 +101,8 @@ def build_tile(
             raise InputError(f"Mitsuba rejects the BSDF '{bsdf.get('type')}' ({text})") from None
     surface = surface_of(bsdf)
     geometry: TileGeometry
-    if isinstance(shape, FiberTile):
-        geometry = CurveGeometry.of_fibers(shape, unit)
-    elif isinstance(shape, MeshTile):
-        geometry = MeshTileGeometry.of_tile(shape, unit)
+    if isinstance(shape, FiberTile | MeshTile):
+        geometry = shape.trace(unit)
     elif tracer == "mesh":
         geometry = MeshGeometry.of_grid(shape, unit)
     else:

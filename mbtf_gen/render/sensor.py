@@ -13,8 +13,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mbtf_gen.render.memory import padded
-from mbtf_gen.render.types import Float, Mask, Point2f, Properties, Ray3f, Spectrum, UInt32, Vector3f
+from mbtf_gen.engine.memory import padded
+from mbtf_gen.engine.types import Float, Mask, Point2f, Properties, Ray3f, Spectrum, UInt32, Vector3f
 from mbtf_gen.sampling.query_sampler import Queries
 
 

@@ -29,9 +29,9 @@ from mbtf_pipeline.compare.pictures import PICTURES, write_picture
 
 if TYPE_CHECKING:
     from mbtf_gen.config.generator import GeneratorConfig
-    from mbtf_gen.fibers.tile import FiberTile
     from mbtf_gen.job import Job
-    from mbtf_gen.material.material import Material
+    from mbtf_gen.tile.fiber_tile import FiberTile
+    from mbtf_gen.tile.heightfield_tile import Material
     from mbtf_pipeline.recipe import CompareSection, SceneDirection, SceneView
 
 F64 = NDArray[np.float64]
@@ -278,7 +278,7 @@ def _mitsuba_scene(job: Job, camera: Camera, omega_i: F64, folder: Path) -> dict
 
 def _mitsuba_tile(job: Job, unit: float, folder: Path) -> dict[str, Any]:
     """Shapes of one period of the mesh or of the fibers, centered, with `unit` scene units per tile width."""
-    from mbtf_gen.meshes.tile import MeshTile
+    from mbtf_gen.tile.mesh_tile import MeshTile
 
     fibers, aspect = job.material.shape, job.material.aspect
     if isinstance(fibers, MeshTile):
@@ -293,7 +293,7 @@ def _mitsuba_tile(job: Job, unit: float, folder: Path) -> dict[str, Any]:
             }
             for number in np.unique(fibers.yarn)
         }
-    from mbtf_gen.geometry.heightfield import tile_mesh
+    from mbtf_gen.tile.heights.grid import tile_mesh
 
     mesh = tile_mesh(job.grid)
     mesh.apply_translation([-0.5, -0.5 * aspect, 0.0])

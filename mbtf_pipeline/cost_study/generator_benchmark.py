@@ -22,13 +22,13 @@ from mbtf_core.nested import deep_merge, nested
 from mbtf_core.stats import Estimate, mean_estimate
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job, split_spp, split_target
-from mbtf_gen.material.material import Material
 from mbtf_gen.planning.adaptive import estimate_shard
 from mbtf_gen.planning.effects_plan import plan_effects
 from mbtf_gen.planning.run_plan import allocate
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Stream
 from mbtf_gen.sampling.query_sampler import Queries
+from mbtf_gen.tile.heightfield_tile import Material
 from mbtf_pipeline.cost_study.measurements import HALF_WIDTH, NORMAL
 
 # Queries of one batch of the reference, and paths of each there and in the configuration.

@@ -11,13 +11,13 @@ import numpy as np
 from mbtf_core.color import linear_to_srgb
 from mbtf_core.errors import MbtfError
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.fibers.inspect import fiber_text
-from mbtf_gen.material.cloth import inspect_cloth
-from mbtf_gen.material.inspect import USES, inspect_material, inspection_text
-from mbtf_gen.material.latest import latest_material
-from mbtf_gen.material.material import MAPS
-from mbtf_gen.material.mesh import inspect_mesh, mesh_text
-from mbtf_gen.meshes.tile import MeshTile
+from mbtf_gen.tile.cloth_material import inspect_cloth
+from mbtf_gen.tile.fiber_inspection import fiber_text
+from mbtf_gen.tile.heightfield_tile import MAPS
+from mbtf_gen.tile.inspection import USES, inspect_material, inspection_text
+from mbtf_gen.tile.latest import latest_material
+from mbtf_gen.tile.mesh_material import inspect_mesh, mesh_text
+from mbtf_gen.tile.mesh_tile import MeshTile
 from mbtf_pipeline.report.embed import U8, Pixels, jpeg_uri, shrink
 
 # Largest width and height of a thumbnail, pixels, and its JPEG quality.

@@ -10,9 +10,9 @@ import pytest
 
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation import Job
-from mbtf_gen.material.material import Material
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.sampling.query_sampler import Queries
+from mbtf_gen.tile.heightfield_tile import Material
 from mbtf_pipeline.cost_study.generator_benchmark import GeneratorBenchmark
 
 NOISE = 0.8  # standard deviation of one path, relative to the value

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_gen.geometry.heightfield import HeightGrid, tile_mesh
 from mbtf_gen.sampling.query_sampler import Queries
+from mbtf_gen.tile.heights.grid import HeightGrid, tile_mesh
 from support.scenes import mi, queries, rocks
 
 # After support.scenes, which loads Mitsuba.

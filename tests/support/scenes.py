@@ -9,17 +9,17 @@ import pytest
 from numpy.typing import ArrayLike, NDArray
 
 from mbtf_gen.config.generator import Tracer
-from mbtf_gen.render.runtime import load_mitsuba
+from mbtf_gen.engine.runtime import load_mitsuba
 from support.paths import ROOT
 
 mi = load_mitsuba()
 
-from mbtf_gen.geometry.heightfield import HeightGrid  # noqa: E402
 from mbtf_gen.render.estimator import Estimates, Estimator, Stream  # noqa: E402
 from mbtf_gen.render.path_tracer import Transport  # noqa: E402
 from mbtf_gen.render.scene import build_tile, register_plugins  # noqa: E402
 from mbtf_gen.sampling.light_kernel import LightKernel  # noqa: E402
 from mbtf_gen.sampling.query_sampler import Queries  # noqa: E402
+from mbtf_gen.tile.heights.grid import HeightGrid  # noqa: E402
 
 register_plugins()
 
@@ -56,7 +56,7 @@ def real_heights(name: str, resolution: int = 96) -> HeightGrid:
 
     The test is skipped, by name, where the set is not there.
     """
-    from mbtf_gen.material.load import load_material
+    from mbtf_gen.tile.loading import load_material
 
     root = ROOT
     folder = root / "assets" / name

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from mbtf_core.child_process import run_child
 from mbtf_core.errors import EngineError
 from mbtf_core.exposure import to_display
-from mbtf_gen.geometry.heightfield import HeightGrid, grid_faces, grid_vertices
 from mbtf_gen.images.resample import resample
-from mbtf_gen.material.material import Material
 from mbtf_gen.pictures.camera import Camera
+from mbtf_gen.tile.heightfield_tile import Material
+from mbtf_gen.tile.heights.grid import HeightGrid, grid_faces, grid_vertices
 
 # Largest number of cells along each side of all tiles together, and of texels across the texture.
 MOST_CELLS = 1024
@@ -65,7 +65,7 @@ def tiled_mesh(
     Parameters
     ----------
     exposure : of the texture, in EV
-    height, mesh : as :meth:`~mbtf_gen.material.material.Material.grid` takes them
+    height, mesh : as :meth:`~mbtf_gen.tile.heightfield_tile.Material.grid` takes them
     """
     grid = material.grid(height, mesh)
     most = MOST_CELLS // tiles

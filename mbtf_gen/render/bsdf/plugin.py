@@ -15,10 +15,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_gen.fibers.tile import FiberTile
-from mbtf_gen.meshes.tile import MeshTile
-from mbtf_gen.render.bsdf.surface import Surface, SurfaceParts
-from mbtf_gen.render.types import (
+from mbtf_gen.engine.types import (
     BSDF,
     BSDFSample3f,
     Float,
@@ -29,9 +26,12 @@ from mbtf_gen.render.types import (
     SurfaceInteraction3f,
     Vector3f,
 )
+from mbtf_gen.render.bsdf.surface import Surface, SurfaceParts
+from mbtf_gen.tile.fiber_tile import FiberTile
+from mbtf_gen.tile.mesh_tile import MeshTile
 
 if TYPE_CHECKING:
-    from mbtf_gen.material.material import Material
+    from mbtf_gen.tile.heightfield_tile import Material
 
 # Parameters of ``mbtf_surface``, textures or numbers: those that have defaults, and those that add a term.
 DEFAULTS = {

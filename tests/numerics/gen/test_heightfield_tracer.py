@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from support.scenes import HeightGrid, build_tile, lambert, mi, rocks
 
 from mbtf_gen.config.generator import Tracer
-from mbtf_gen.geometry.heightfield import mesh_of_grid
-from mbtf_gen.render.heightfield_tracer import HeightfieldGeometry
 from mbtf_gen.sampling.rng import sequence
+from mbtf_gen.tile.heights.grid import mesh_of_grid
+from mbtf_gen.tile.tracers.heightfield_tracer import HeightfieldGeometry
 
 N = 200_000
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from support.scenes import build_tile, lambert, mi, rocks
 
 from mbtf_gen.config.generator import Tracer
-from mbtf_gen.geometry.heightfield import HeightGrid
 from mbtf_gen.render.scene import CLEARANCE
+from mbtf_gen.tile.heights.grid import HeightGrid
 
 RAYS = 10_000_000
 RESOLUTION = 64

@@ -17,6 +17,7 @@ from mbtf_core.stats import mean_estimate, noise_free_mse, t_test
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.dataset.summary import finish
+from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.generation import generate
 from mbtf_gen.job import Job, split_spp, split_target
 from mbtf_gen.planning.adaptive import estimate_shard
@@ -25,7 +26,6 @@ from mbtf_gen.planning.run_plan import plan_run
 from mbtf_gen.planning.sample_allocation import Allocation, fit_allocation
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream, Target
-from mbtf_gen.render.runtime import load_mitsuba
 from mbtf_gen.sampling.query_sampler import Mixture, Queries, QueryPlan
 
 load_mitsuba()

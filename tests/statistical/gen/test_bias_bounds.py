@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
-from mbtf_gen.material.material import Material
 from mbtf_gen.planning import effects_plan as planning
 from mbtf_gen.planning.bounds import displacement_bounds
 from mbtf_gen.planning.effects import Effect, EffectsPlan, without
@@ -21,6 +20,7 @@ from mbtf_gen.planning.simulation import build_estimator, normal_map_slopes
 from mbtf_gen.planning.surface_effects import analyze
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.sampling.light_kernel import LightKernel
+from mbtf_gen.tile.heightfield_tile import Material
 
 QUERIES = 8192
 

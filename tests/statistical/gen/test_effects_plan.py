@@ -15,12 +15,12 @@ from mbtf_core.stats import Estimate, mean_of_halves
 from mbtf_gen.config.effects_request import DISPLACEMENT_EFFECTS
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
-from mbtf_gen.material.material import Material
 from mbtf_gen.planning.effects import EffectsPlan, without
 from mbtf_gen.planning.effects_plan import plan_effects
 from mbtf_gen.planning.pilot import pilot_queries, relative_change
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream
+from mbtf_gen.tile.heightfield_tile import Material
 
 QUERIES, SPP = 16384, 8
 

@@ -16,17 +16,17 @@ from mbtf_core.atomic import write_checksummed
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.dataset import render_shards
 from mbtf_gen.dataset.reader import Dataset
+from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.generation import generate
 from mbtf_gen.job import Job
-from mbtf_gen.material.material import Material
 from mbtf_gen.planning.effects import EffectsPlan, without
 from mbtf_gen.planning.effects_plan import plan_effects
 from mbtf_gen.planning.pilot import pilot_queries
 from mbtf_gen.planning.run_plan import RunPlan
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream
-from mbtf_gen.render.runtime import load_mitsuba
 from mbtf_gen.sampling.query_sampler import Queries
+from mbtf_gen.tile.heightfield_tile import Material
 
 load_mitsuba()
 

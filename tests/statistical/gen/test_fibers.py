@@ -26,9 +26,9 @@ from support.scenes import (
 )
 
 from mbtf_core.stats import Estimate, mean_of_halves
-from mbtf_gen.fibers.cloth_file import FiberEntry
-from mbtf_gen.fibers.curves import Curve
-from mbtf_gen.fibers.tile import FiberScattering, FiberTile
+from mbtf_gen.tile.fiber_tile import FiberScattering, FiberTile
+from mbtf_gen.tile.fibers.cloth_file import FiberEntry
+from mbtf_gen.tile.fibers.curves import Curve
 
 WHITE = (1.0, 1.0, 1.0)
 GRAY = (0.8, 0.6, 0.3)

@@ -25,10 +25,10 @@ from support.scenes import (
 )
 
 from mbtf_core.stats import mean_of_halves
-from mbtf_gen.geometry.heightfield import tile_mesh
-from mbtf_gen.material.load import load_material
-from mbtf_gen.meshes.tile import MeshPart, MeshTile
 from mbtf_gen.render.bsdf.plugin import part_bsdfs
+from mbtf_gen.tile.heights.grid import tile_mesh
+from mbtf_gen.tile.loading import load_material
+from mbtf_gen.tile.mesh_tile import MeshPart, MeshTile
 
 UP = np.array([0.0, 0.0, 1.0])
 

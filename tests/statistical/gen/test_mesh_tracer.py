@@ -23,13 +23,13 @@ from support.scenes import (
 from mbtf_core.errors import InputError
 from mbtf_core.stats import aggregate_test, elevation_groups
 from mbtf_gen.config.generator import GeneratorConfig, Tracer
-from mbtf_gen.geometry.heightfield import HeightGrid
 from mbtf_gen.job import Job
 from mbtf_gen.planning.effects_plan import reference_plan
 from mbtf_gen.planning.simulation import build_estimator
-from mbtf_gen.render.geometry import Vertex
-from mbtf_gen.render.heightfield_tracer import HeightfieldGeometry
-from mbtf_gen.render.mesh_tracer import MeshGeometry
+from mbtf_gen.tile.heights.grid import HeightGrid
+from mbtf_gen.tile.tracers.heightfield_tracer import HeightfieldGeometry
+from mbtf_gen.tile.tracers.mesh_tracer import MeshGeometry
+from mbtf_gen.tile.tracers.protocol import Vertex
 
 WHITE = lambert(1.0)
 SURFACES: dict[str, dict[str, Any]] = {

@@ -22,9 +22,9 @@ from support.scenes import (
 )
 
 from mbtf_core.lattice import Lattice, texel_centers
-from mbtf_gen.geometry.heightfield import tile_mesh
 from mbtf_gen.pictures.camera import Camera
 from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
+from mbtf_gen.tile.heights.grid import tile_mesh
 
 ROWS, COLUMNS = 4, 8
 ASPECT = ROWS / COLUMNS
@@ -36,8 +36,8 @@ def color_map() -> NDArray[np.float32]:
 
 
 def textured(pixels: NDArray[np.float32]) -> dict[str, Any]:
-    from mbtf_gen.material.material import Material
     from mbtf_gen.render.bsdf.plugin import bsdf_of
+    from mbtf_gen.tile.heightfield_tile import Material
 
     return bsdf_of(
         Material(height=np.zeros(pixels.shape[:2]), height_scale=1.0, height_bits=None, base_color=pixels)

@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 from support.paths import ROOT
 
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.geometry.heightfield import HeightGrid
-from mbtf_gen.geometry.slopes import height_slopes, residual_slopes
 from mbtf_gen.job import Job
-from mbtf_gen.material.load import load_material
-from mbtf_gen.material.material import Material
 from mbtf_gen.planning.effects_plan import plan_effects, reference_plan
 from mbtf_gen.planning.pilot import pilot_queries, relative_change
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Stream
+from mbtf_gen.tile.heightfield_tile import Material
+from mbtf_gen.tile.heights.grid import HeightGrid
+from mbtf_gen.tile.heights.slopes import height_slopes, residual_slopes
+from mbtf_gen.tile.loading import load_material
 
 
 def fractal(n: int, exponent: float, seed: int = 5) -> NDArray[np.float64]:

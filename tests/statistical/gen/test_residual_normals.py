@@ -9,14 +9,14 @@ import pytest
 from support.paths import ROOT
 
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.geometry.slopes import height_slopes
 from mbtf_gen.job import Job
-from mbtf_gen.material.load import load_material
-from mbtf_gen.material.material import Material
 from mbtf_gen.planning.effects_plan import reference_plan
 from mbtf_gen.planning.pilot import pilot_queries, relative_change
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream
+from mbtf_gen.tile.heightfield_tile import Material
+from mbtf_gen.tile.heights.slopes import height_slopes
+from mbtf_gen.tile.loading import load_material
 
 SPP = 16
 

@@ -13,9 +13,9 @@ from PIL import Image
 from mbtf_core.errors import UsageError
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
-from mbtf_gen.material.load import load_material
-from mbtf_gen.material.material import Material
 from mbtf_gen.pictures.camera import Camera
+from mbtf_gen.tile.heightfield_tile import Material
+from mbtf_gen.tile.loading import load_material
 from mbtf_pipeline.compare import unmodified_mitsuba
 from mbtf_pipeline.compare.unmodified_mitsuba import agreement, compare_with_mitsuba
 from mbtf_pipeline.recipe import CompareSection

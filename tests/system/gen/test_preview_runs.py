@@ -16,9 +16,9 @@ from mbtf_core.color import srgb_to_linear
 from mbtf_core.directions import from_angles
 from mbtf_core.lattice import level_of_sigma
 from mbtf_gen.dataset.reader import Dataset
-from mbtf_gen.material.load import load_material
 from mbtf_gen.pictures.camera import tiles_camera
 from mbtf_gen.pictures.preview.mesh import draw, tiled_mesh
+from mbtf_gen.tile.loading import load_material
 
 # Quadrants of the map: top left, top right, bottom left, bottom right.
 QUADRANTS = {"red": (1, 0, 0), "green": (0, 1, 0), "blue": (0, 0, 1), "white": (1, 1, 1)}

@@ -17,13 +17,13 @@ from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.dataset.shard_io import row_bytes
 from mbtf_gen.forecast import forecast
 from mbtf_gen.job import Job, split_target
-from mbtf_gen.material.material import Material
 from mbtf_gen.planning import sample_allocation
 from mbtf_gen.planning.effects_plan import plan_effects
 from mbtf_gen.planning.pilot import pilot_queries
 from mbtf_gen.planning.run_plan import RunPlan, allocate
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.sampling.query_sampler import Queries
+from mbtf_gen.tile.heightfield_tile import Material
 
 RATE = 1e6
 

@@ -27,8 +27,8 @@ from mbtf_gen.dataset.geometry import (
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.images.exr import encode_parts
 from mbtf_gen.job import Job
-from mbtf_gen.material.load import load_material
 from mbtf_gen.planning.effects_plan import reference_plan
+from mbtf_gen.tile.loading import load_material
 
 F64 = NDArray[np.float64]
 SQUARE = (64, 64)

@@ -10,7 +10,7 @@ import pytest
 from mbtf_core.child_process import Outcome
 from mbtf_gen.diagnostics import doctor
 from mbtf_gen.diagnostics.doctor import Part
-from mbtf_gen.render import llvm
+from mbtf_gen.engine import llvm
 
 
 @pytest.mark.parametrize("required", [True, False])

@@ -16,13 +16,13 @@ from mbtf_core.errors import EngineError, InputError
 from mbtf_core.lattice import level_of_sigma, texel_centers
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
-from mbtf_gen.material.material import Material
 from mbtf_gen.pictures.camera import Camera, tiles_camera
 from mbtf_gen.pictures.preview import mesh
 from mbtf_gen.pictures.preview.mesh import MOST_CELLS, draw, tiled_mesh
 from mbtf_gen.pictures.preview.plots import level_histogram, query_figure, write_plots
 from mbtf_gen.pictures.preview.sample import QuerySample, sampled_queries, stored_queries
 from mbtf_gen.sampling.query_sampler import Mixture
+from mbtf_gen.tile.heightfield_tile import Material
 
 LIGHT = from_angles(35, 150)
 

@@ -13,9 +13,9 @@ from mbtf_core.errors import UsageError
 from mbtf_gen.config.effects_request import DISPLACEMENT_EFFECTS, EFFECTS, EffectsRequest
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
-from mbtf_gen.material.material import Material
 from mbtf_gen.planning.effects import Effect, EffectsPlan
 from mbtf_gen.planning.effects_plan import plan_effects, reference_plan
+from mbtf_gen.tile.heightfield_tile import Material
 
 HEIGHTS = np.array([[0.0, 0.1], [0.05, 0.02]])
 LAMBERT = Material(height=HEIGHTS, height_scale=1.0, height_bits=None, base_color=np.full(3, 0.5))

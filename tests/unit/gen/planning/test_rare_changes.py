@@ -7,9 +7,9 @@ import pytest
 
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
-from mbtf_gen.material.material import Material
 from mbtf_gen.planning.effects_plan import plan_effects
 from mbtf_gen.planning.pilot import measured
+from mbtf_gen.tile.heightfield_tile import Material
 
 # Root mean square change at 131 072 points of the bump below, without its shadows.
 TRUE_CHANGE = 0.0087

@@ -13,11 +13,11 @@ from conftest import RunPython
 
 from mbtf_core.child_process import run_child
 from mbtf_core.errors import EngineError, UsageError
-from mbtf_gen.render import llvm
-from mbtf_gen.render import runtime as engine
+from mbtf_gen.engine import llvm
+from mbtf_gen.engine import runtime as engine
 
 LOAD = """
-from mbtf_gen.render.runtime import load_mitsuba
+from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_core.errors import MbtfError
 try:
     print(load_mitsuba().variant())

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from mbtf_core.directions import from_angles
-from mbtf_gen.geometry.heightfield import HeightGrid
-from mbtf_gen.render.runtime import load_mitsuba
+from mbtf_gen.engine.runtime import load_mitsuba
+from mbtf_gen.tile.heights.grid import HeightGrid
 from mbtf_pipeline.compare.offsets import _regression, read_offset, towards_view, traced_offset
 from mbtf_pipeline.compare.pictures import write_channels
 from mbtf_pipeline.recipe import SceneView
