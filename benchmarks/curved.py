@@ -263,16 +263,16 @@ def compare(mi: Any, scene: Scene, folder: Path, size: int, spp: int) -> tuple[d
     """Figures of a scene, and its two pictures."""
     from mbtf_gen.config.generator import GeneratorConfig
     from mbtf_gen.job import Job
-    from mbtf_gen.planning.effects_plan import reference_plan
+    from mbtf_gen.planning.effects_planner import reference_plan
     from mbtf_gen.planning.simulation import build_estimator
-    from mbtf_gen.render.bsdf.plugin import bsdf_of
     from mbtf_gen.render.scene import register_plugins
     from mbtf_gen.tile.loading import load_material
 
     register_plugins()
     material = load_material(ROOT / "assets" / scene.material)
     # The mesh that the data were made with.
-    grid = material.grid(None, MESH)
+    grid = material.at(None, MESH).grid
+    assert grid is not None
     rough = load_object(DATA / "objects" / scene.file if scene.file else None, scene.tiles)
     base = refined(rough, SMOOTH)
     bsdf = mi.load_dict({"type": "mbtf", "material": str(folder)})
@@ -282,12 +282,12 @@ def compare(mi: Any, scene: Scene, folder: Path, size: int, spp: int) -> tuple[d
     found = halves(mi, fitted, "mbtf_path", spp)
     facing = shrunk(covered & (cosine >= LOWEST), MARGIN)
     config = GeneratorConfig.model_validate({"material": scene.material, "geometry": {"mesh": MESH}})
-    job = Job(config, material)
+    job = Job.of(config, material)
     alone, error = fit_alone(mi, fitted, bsdf, build_estimator(job, reference_plan(job)), facing)
     stretch, low = hard_places(mi, fitted, size)
     del fitted
     fine = displaced(rough, grid)
-    surface = mi.load_dict(bsdf_of(material))
+    surface = mi.load_dict(material.surface())
     real = scene_of(mi, scene, mesh_of(mi, fine, surface, smooth=False, aspect=grid.aspect), size, "gaussian")
     met, _ = seen(mi, real, size, 1)
     area = seen(mi, real, size, 4)[0].sum() / 16

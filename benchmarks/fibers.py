@@ -43,13 +43,12 @@ def our_run(material: Path, count: int, spp: int):  # type: ignore[no-untyped-de
     """A function of the run's number that traces `count` queries."""
     from mbtf_gen.render.estimator import Estimator, Stream
     from mbtf_gen.render.path_tracer import Transport
-    from mbtf_gen.render.scene import build_tile
+    from mbtf_gen.render.scene import build_scene
     from mbtf_gen.sampling.light_kernel import LightKernel
 
     loaded = load_material(material)
-    assert isinstance(loaded.shape, FiberTile)
     transport = Transport(bsdf_sampling=False)
-    estimator = Estimator(build_tile(loaded.shape, loaded.shape.bsdf()), LightKernel(1.0), transport)
+    estimator = Estimator(build_scene(loaded, loaded.surface()), LightKernel(1.0), transport)
     plan = QueryPlan(loaded.lattice(), Mixture(1.0, 0.0), 0.1, "shuffled", 0, count)
 
     def run(number: int) -> float:
@@ -70,7 +69,7 @@ def mitsuba_run(material: Path, count: int, spp: int):  # type: ignore[no-untype
 
     from mbtf_gen.render.scene import unit_of
 
-    fibers = load_material(material).shape
+    fibers = load_material(material)
     assert isinstance(fibers, FiberTile)
     unit = unit_of(fibers.aspect)
     runs, _ = fibers.runs()
@@ -98,7 +97,7 @@ def mitsuba_run(material: Path, count: int, spp: int):  # type: ignore[no-untype
                     },
                 },
                 "light": {"type": "directional", "direction": [-0.5, -0.5, -0.707]},
-                "curves": {"type": "bsplinecurve", "filename": str(file), "bsdf": fibers.bsdf()},
+                "curves": {"type": "bsplinecurve", "filename": str(file), "bsdf": fibers.surface()},
             }
         )
 

@@ -45,7 +45,7 @@ def generated(name: str, quality: Quality, resolution: int, shards: Path) -> dic
     from mbtf_gen.forecast import forecast
     from mbtf_gen.generation import generate
     from mbtf_gen.job import Job
-    from mbtf_gen.planning.effects_plan import plan_effects
+    from mbtf_gen.planning.effects_planner import plan_effects
     from mbtf_gen.planning.run_plan import allocate
 
     config = generator_config(name, quality, resolution)

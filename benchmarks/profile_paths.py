@@ -37,15 +37,14 @@ def main() -> int:
     except MbtfError as error:
         print(f"error: {error.message}", file=sys.stderr)
         return error.exit_code
-    from mbtf_gen.render.bsdf.plugin import bsdf_of
     from mbtf_gen.render.estimator import Estimator, Stream
     from mbtf_gen.render.path_tracer import Transport
-    from mbtf_gen.render.scene import build_tile
+    from mbtf_gen.render.scene import build_scene
     from mbtf_gen.sampling.light_kernel import LightKernel
 
     material = rocky()
-    grid = material.grid(None, MESH)
-    tile = build_tile(grid, bsdf_of(material))
+    grid = material.at(None, MESH).grid
+    tile = build_scene(grid, material.surface())
     bare: dict[str, Any] = {"shadowing": False, "interreflection": False, "bsdf_sampling": False}
     steps = {
         "plane": Transport(1, displacement=False, **bare),

@@ -32,7 +32,7 @@ from mbtf_fit import Material
 from mbtf_gen.job import Job
 from mbtf_gen.pictures.camera import Camera
 from mbtf_gen.pictures.reference import render_reference, write_png
-from mbtf_gen.planning.effects_plan import reference_plan
+from mbtf_gen.planning.effects_planner import reference_plan
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_pipeline.compare.contrast import contrast, phase_contrasts, picture_blocks
 from mbtf_pipeline.recipe import FIELD_OF_VIEW

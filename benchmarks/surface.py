@@ -105,7 +105,7 @@ def costs(mi: Any, runs: int, count: int, spp: int) -> dict[str, float]:
     """Processor seconds per million paths."""
     from mbtf_gen.render.estimator import Estimator, Stream
     from mbtf_gen.render.path_tracer import Transport
-    from mbtf_gen.render.scene import build_tile
+    from mbtf_gen.render.scene import build_scene
     from mbtf_gen.sampling.light_kernel import LightKernel
     from mbtf_gen.sampling.query_sampler import Queries
     from mbtf_gen.tile.heights.grid import HeightGrid
@@ -121,7 +121,7 @@ def costs(mi: Any, runs: int, count: int, spp: int) -> dict[str, float]:
     grid = HeightGrid.from_map(relief(), 0.15)
     transport = Transport(max_depth=6)
     traced = {
-        name: Estimator(build_tile(grid, bsdf), LightKernel(1.0), transport)
+        name: Estimator(build_scene(grid, bsdf), LightKernel(1.0), transport)
         for name, bsdf in surfaces(mi).items()
     }
     seconds: dict[str, list[float]] = {name: [] for name in traced}

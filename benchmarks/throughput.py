@@ -26,6 +26,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -35,10 +36,10 @@ from numpy.typing import NDArray
 
 from mbtf_core.errors import MbtfError
 from mbtf_core.lattice import Lattice
-from mbtf_gen.config.generator import Tracer
 from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
-from mbtf_gen.tile.heightfield_tile import Material
+from mbtf_gen.tile.heightfield_tile import HeightFieldTile
+from mbtf_gen.tile.heights.grid import Tracer
 from mbtf_gen.tile.loading import load_material
 
 if TYPE_CHECKING:
@@ -66,36 +67,33 @@ def noise(rng: np.random.Generator, cutoff: float) -> NDArray[np.float64]:
     return (h - h.min()) / np.ptp(h)
 
 
-def rocky() -> Material:
+def rocky() -> HeightFieldTile:
     """Terraces with rough flanks, 0.12 tile widths deep; color and roughness follow them."""
     rng = np.random.default_rng(1)
     coarse, fine = noise(rng, 24.0), noise(rng, 200.0)
     h = 0.7 * np.floor(6.0 * coarse) / 6.0 + 0.2 * coarse + 0.1 * fine
     h = (h - h.min()) / np.ptp(h)
     color = np.stack([0.15 + 0.5 * h, 0.12 + 0.4 * fine, 0.1 + 0.3 * coarse], axis=-1).astype(np.float32)
-    return Material(
+    return HeightFieldTile(
         height=h,
         height_scale=0.12,
-        height_bits=None,
-        base_color=color,
-        roughness=0.3 + 0.5 * fine,
-        metallic=0.0,
-        specular=0.5,
+        maps={"base_color": color, "roughness": 0.3 + 0.5 * fine, "metallic": 0.0, "specular": 0.5},
     )
 
 
 def our_run(
-    material: Material, grid: HeightGrid, count: int, spp: int, tracer: Tracer = "heightfield"
+    material: HeightFieldTile, grid: HeightGrid, count: int, spp: int, tracer: Tracer = "heightfield"
 ) -> Run:
     """A function of the run's number that traces `count` queries."""
-    from mbtf_gen.render.bsdf.plugin import bsdf_of
     from mbtf_gen.render.estimator import Estimator, Stream
     from mbtf_gen.render.path_tracer import Transport
-    from mbtf_gen.render.scene import build_tile
+    from mbtf_gen.render.scene import build_scene
     from mbtf_gen.sampling.light_kernel import LightKernel
 
     estimator = Estimator(
-        build_tile(grid, bsdf_of(material), tracer), LightKernel(LIGHT_WIDTH), Transport(DEPTH, ROULETTE)
+        build_scene(replace(grid, tracer=tracer), material.surface()),
+        LightKernel(LIGHT_WIDTH),
+        Transport(DEPTH, ROULETTE),
     )
     lattice = Lattice.for_map(*grid.z.shape)
     # Levels log-uniform, as a reader of "all levels" expects; the generator's default favors fine ones,
@@ -115,12 +113,11 @@ def our_run(
     return run
 
 
-def stock_run(material: Material, grid: HeightGrid, count: int, spp: int) -> Run:
+def stock_run(material: HeightFieldTile, grid: HeightGrid, count: int, spp: int) -> Run:
     """The same for ``mi.render`` and a picture of `count` pixels."""
     import drjit as dr
     import mitsuba as mi
 
-    from mbtf_gen.render.bsdf.plugin import bsdf_of
     from mbtf_gen.render.scene import unit_of
     from mbtf_gen.tile.heights.grid import mesh_of_grid
 
@@ -153,7 +150,7 @@ def stock_run(material: Material, grid: HeightGrid, count: int, spp: int) -> Run
                 },
             },
             "light": {"type": "directional", "direction": [-0.5, -0.5, -0.707]},
-            "tile": mesh_of_grid(grid, unit, (0, 0), mi.load_dict(bsdf_of(material))),
+            "tile": mesh_of_grid(grid, unit, (0, 0), mi.load_dict(material.surface())),
         }
     )
 
@@ -208,7 +205,7 @@ def main() -> int:
         return error.exit_code
     import drjit as dr
 
-    grid = material.grid(arguments.height_scale, MESH)
+    grid = material.at(arguments.height_scale, MESH).grid
     makers: dict[str, Any] = {"ours": our_run, "mesh": partial(our_run, tracer="mesh"), "stock": stock_run}
     runs = {name: make(material, grid, arguments.queries, arguments.spp) for name, make in makers.items()}
     seconds: dict[str, list[float]] = {name: [] for name in runs}

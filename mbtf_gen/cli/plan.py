@@ -16,7 +16,8 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.presets import QualityOption
 
 if TYPE_CHECKING:
-    from mbtf_gen.planning.effects import Effect, EffectsPlan
+    from mbtf_gen.effects.effect import Decision
+    from mbtf_gen.effects.plan import EffectsPlan
 
 # Columns of the table before the explanation, and its width.
 _NAME, _BOUND, _WIDTH = 24, 24, 108
@@ -45,7 +46,7 @@ def plan(
         Measure the bias of omitting each simulated effect by a pilot run, and forecast the run.
     """
     from mbtf_gen.job import split_target
-    from mbtf_gen.planning.effects_plan import plan_effects
+    from mbtf_gen.planning.effects_planner import plan_effects
 
     job = prepare_job(options, material, quality)
     found = plan_effects(job)
@@ -64,14 +65,14 @@ def plan(
 
 def table(plan: EffectsPlan) -> str:
     """The plan as a table, a line or two per effect."""
-    from mbtf_gen.config.effects_request import EFFECTS
+    from mbtf_gen.effects.catalog import EFFECTS
 
     before = _NAME + 5 + _BOUND
     lines = [f"{'effect':<{_NAME}}{'':5}{'bias bound if omitted':<{_BOUND}}reason"]
     for e in plan.effects:
         first, *rest = textwrap.wrap(e.explanation, _WIDTH - before) or [""]
         state = "on" if e.on else "off"
-        lines.append(f"{EFFECTS[e.name]:<{_NAME}}{state:<5}{bound_text(e):<{_BOUND}}{first}")
+        lines.append(f"{EFFECTS[e.name].description:<{_NAME}}{state:<5}{bound_text(e):<{_BOUND}}{first}")
         lines += [" " * before + more for more in rest]
     bound = plan.bias_bound
     share = "0 %" if bound == 0 else f"at most {_percent(bound)}"
@@ -83,7 +84,7 @@ def table(plan: EffectsPlan) -> str:
     return "\n".join(lines)
 
 
-def bound_text(effect: Effect) -> str:
+def bound_text(effect: Decision) -> str:
     """The bias bound of leaving an effect out, with its error or as an upper bound."""
     if effect.bias_bound is None:
         return "-"

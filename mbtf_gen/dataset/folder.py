@@ -84,7 +84,7 @@ def open_folder(job: Job, folder: Path, plan: Callable[[Job], RunPlan], overwrit
     elif present:
         _check_same(job, folder)
         if (folder / CONFIG_NAME).exists() and (
-            job.material.shape is not None or (folder / GEOMETRY_NAME).exists()
+            job.material.grid is None or (folder / GEOMETRY_NAME).exists()
         ):
             return
     # Planning takes long: it comes before any change, and outside the lock.

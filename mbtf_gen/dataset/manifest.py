@@ -15,12 +15,11 @@ from mbtf_core.config_file import check_document, dump_yaml
 from mbtf_core.digest import data_sha256
 from mbtf_core.lattice import sigma_of_level
 from mbtf_core.shard_schema import ARRAYS, CONVENTIONS, FORMAT_NAME, LEADING_AXES, SCHEMA_VERSION, SPLITS
-from mbtf_gen.config.effects_request import EFFECTS
+from mbtf_gen.effects.catalog import EFFECTS
+from mbtf_gen.effects.plan import EffectsPlan
 from mbtf_gen.job import Job, split_queries, split_spp
-from mbtf_gen.planning.effects import EffectsPlan
 from mbtf_gen.planning.run_plan import RunPlan
 from mbtf_gen.planning.sample_allocation import Allocation
-from mbtf_gen.tile.fiber_tile import FiberTile
 
 CHECK_HINT = "check the data set with: mbtf-gen verify"
 
@@ -69,20 +68,6 @@ def stored_plan(manifest: Mapping[str, Any], path: Path) -> RunPlan:
     return RunPlan(found.effects, found.allocation)
 
 
-def _shape(job: Job) -> dict[str, Any]:
-    """What the tile is made of: heights or fibers."""
-    material, scale = job.material, job.config.geometry.height_scale
-    if isinstance(material.shape, FiberTile):
-        return {"fibers": len(material.shape.curves), "segments": material.shape.segments}
-    if material.shape is not None:
-        return {"triangles": len(material.shape.faces)}
-    return {
-        "maps_shape": list(material.height.shape),
-        "mesh_shape": list(job.grid.z.shape),
-        "height_scale": material.height_scale if scale is None else scale,
-    }
-
-
 def build_manifest(job: Job, plan: RunPlan, geometry: Mapping[str, Any] | None) -> dict[str, Any]:
     """Manifest of a data set without shards (``complete`` is false); `geometry` is its key of that name."""
     config, material, lattice = job.config, job.material, job.lattice
@@ -99,8 +84,8 @@ def build_manifest(job: Job, plan: RunPlan, geometry: Mapping[str, Any] | None) 
         "conventions": CONVENTIONS,
         "tile": {
             "aspect": lattice.aspect,
-            **_shape(job),
-            "displacement_range": job.displacement_range,
+            **job.material.properties(),
+            "displacement_range": job.material.thickness,
         },
         "levels": {
             "finest": lattice.finest,

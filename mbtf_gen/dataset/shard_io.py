@@ -50,7 +50,7 @@ def row_bytes(holes: bool) -> int:
 def data_bytes(job: Job, entries: Iterable[ShardEntry]) -> int:
     """Bytes of some shards of a job."""
     queries = sum(entry.rows * row_queries(job, entry.split) for entry in entries)
-    return queries * row_bytes(job.material.opacity is not None)
+    return queries * row_bytes(job.material.transmits)
 
 
 def check_arrays(

@@ -18,11 +18,11 @@ from mbtf_core.data_folder import data_folder, send
 from mbtf_core.errors import PartialError
 from mbtf_core.locks import brief_lock
 from mbtf_core.shard_schema import MANIFEST_NAME
-from mbtf_gen.config.effects_request import EFFECTS
 from mbtf_gen.dataset.folder import read_manifest, remove_leftovers
 from mbtf_gen.dataset.manifest import CHECK_HINT, software_versions, stored_plan
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.dataset.sidecar import finished_record, sidecar_of
+from mbtf_gen.effects.catalog import EFFECTS
 from mbtf_gen.planning.run_plan import RunPlan
 from mbtf_gen.render.estimates import BadSample, TargetReached
 
@@ -272,7 +272,7 @@ def finish(
         lost=totals.counts["lost_rays"],
         capped=totals.counts["capped_rays"],
         nonfinite=totals.counts["nonfinite_samples"],
-        effects=[EFFECTS[e.name] for e in effects if e.on],
+        effects=[EFFECTS[e.name].description for e in effects if e.on],
         measured=measured,
         **sums,
     )

@@ -134,9 +134,9 @@ def _estimates(
     from mbtf_gen.render.estimates import Stream
     from mbtf_gen.render.estimator import Estimator
     from mbtf_gen.render.path_tracer import Transport
-    from mbtf_gen.render.scene import build_tile
+    from mbtf_gen.render.scene import build_scene
 
-    estimator = Estimator(build_tile(shape, bsdf), light, Transport(max_depth=1 if direct else 0), launch)
+    estimator = Estimator(build_scene(shape, bsdf), light, Transport(max_depth=1 if direct else 0), launch)
     return estimator.estimate(queries, spp, Stream(17, "test", round_number))
 
 
@@ -274,7 +274,7 @@ def _fibers(round_number: int) -> Cases:
     for elevation in (90.0, 20.0, 3.0):
         n = 1000
         q = _queries(_positions(n, round_number), 4.0, _UP, from_angles(elevation, 40), n)
-        e = _estimates(felt, felt.bsdf(), None, q, 16, round_number)
+        e = _estimates(felt, felt.surface(), None, q, 16, round_number)
         total = 0.5 * (e.value_a.astype(np.float64) + e.value_b)[:, 0] + e.transmittance
         out[f"view {elevation:g}°"] = _off(mean_estimate(total), 1.0)
     return out

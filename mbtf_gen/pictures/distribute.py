@@ -14,7 +14,7 @@ from mbtf_core.cluster.task import Task
 from mbtf_gen.job import Job
 from mbtf_gen.pictures.camera import Camera, PixelKind
 from mbtf_gen.pictures.reference import ReferenceImage, render_reference
-from mbtf_gen.planning.effects_plan import reference_plan
+from mbtf_gen.planning.effects_planner import reference_plan
 from mbtf_gen.planning.simulation import build_estimator
 
 

@@ -31,7 +31,7 @@ from mbtf_gen.engine.types import (
     Vector3f,
 )
 from mbtf_gen.render.directional_light import DirectionalLight
-from mbtf_gen.render.scene import Tile
+from mbtf_gen.render.scene import TileScene
 from mbtf_gen.sampling.sobol import SobolSampler
 from mbtf_gen.tile.tracers.protocol import Vertex
 
@@ -151,7 +151,7 @@ class PathTracer:
 
     Attributes
     ----------
-    tile : Tile
+    tile : TileScene
         Geometry and reflection.
     transport : Transport
         Effects that are simulated.
@@ -162,7 +162,7 @@ class PathTracer:
         opaque and of width 1, so that different numbers share the compiled kernel.
     """
 
-    tile: Tile
+    tile: TileScene
     transport: Transport
     light: DirectionalLight
     limit: UInt32

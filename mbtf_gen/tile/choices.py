@@ -6,7 +6,7 @@ import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from mbtf_core.atomic import write_text
 from mbtf_core.config_file import dump_yaml
@@ -14,10 +14,11 @@ from mbtf_core.errors import UsageError
 from mbtf_core.folders import make_folder
 from mbtf_core.shard_schema import Tiling
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.tile.heightfield_tile import Material
+from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 from mbtf_gen.tile.loading import described
 from mbtf_gen.tile.maps.material_file import MAX_SCALE, MaterialFile
 from mbtf_gen.tile.maps.tiling import broken
+from mbtf_gen.tile.protocol import Tile
 
 _GIVEN, _FILE = "given", "as in the material file"
 
@@ -30,7 +31,7 @@ class Choice:
     reason: str
 
 
-def choose(spec: MaterialFile, material: Material, config: GeneratorConfig) -> dict[str, Choice]:
+def choose(spec: MaterialFile, material: HeightFieldTile, config: GeneratorConfig) -> dict[str, Choice]:
     """Choices by key of a material file: given ones, else those of the file, else what the maps show.
 
     Parameters
@@ -63,7 +64,7 @@ def choose(spec: MaterialFile, material: Material, config: GeneratorConfig) -> d
     return out
 
 
-def _height_scale(spec: MaterialFile, material: Material, given: float | None) -> Choice:
+def _height_scale(spec: MaterialFile, material: HeightFieldTile, given: float | None) -> Choice:
     if given is not None:
         return Choice(given, _GIVEN)
     if spec.height.scale is not None:
@@ -76,7 +77,7 @@ def _height_scale(spec: MaterialFile, material: Material, given: float | None) -
     return Choice(default, "the default; no normal map suggests one")
 
 
-def _tiling(spec: MaterialFile, material: Material, given: Tiling | None) -> Choice:
+def _tiling(spec: MaterialFile, material: HeightFieldTile, given: Tiling | None) -> Choice:
     if given is not None:
         return Choice(given, _GIVEN)
     if spec.make_tileable is not None:
@@ -89,7 +90,7 @@ def _tiling(spec: MaterialFile, material: Material, given: Tiling | None) -> Cho
     return Choice("blend", f"the heights do not tile along {' and '.join(axes)}")
 
 
-def write_material_file(path: Path, material: Material, config: GeneratorConfig) -> dict[str, Choice]:
+def write_material_file(path: Path, material: Tile, config: GeneratorConfig) -> dict[str, Choice]:
     """Write a material file with :func:`choose`'s choices; its file names are relative to it.
 
     Parameters
@@ -110,7 +111,8 @@ def write_material_file(path: Path, material: Material, config: GeneratorConfig)
     spec, folder, _ = described(Path(config.material))
     if not isinstance(spec, MaterialFile):
         raise UsageError("is for height maps, not for fibers and triangles", where="--write")
-    choices = choose(spec, material, config)
+    # The tile of a material file is a height field.
+    choices = choose(spec, cast(HeightFieldTile, material), config)
     make_folder(path.parent)
     source, target = folder.resolve(), path.parent.resolve()
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 
+from mbtf_core.digest import data_sha256, file_sha256
 from mbtf_core.errors import InputError
 from mbtf_gen.tile.fiber_tile import FiberScattering, FiberTile
 from mbtf_gen.tile.fibers.cloth_file import ClothFile, YarnEntry
@@ -32,8 +33,8 @@ _MOST_PERIODS = 16
 MOST_SEGMENTS = 4_000_000
 
 
-def fiber_tile(spec: ClothFile, folder: Path) -> FiberTile:
-    """Fibers of a cloth.
+def cloth_tile(spec: ClothFile, folder: Path) -> FiberTile:
+    """The tile of a cloth.
 
     Parameters
     ----------
@@ -51,6 +52,30 @@ def fiber_tile(spec: ClothFile, folder: Path) -> FiberTile:
     InputError
         A file is unreadable, its curves do not tile, or there are too many fibers.
     """
+    tile = _fibers(spec, folder)
+    files = {key: folder / name for key in ("pattern", "curves") if (name := getattr(spec, key)) is not None}
+    digests = {role: file_sha256(path) for role, path in files.items()}
+    # What the defaults stand for changes the data as well.
+    settings = spec.model_dump(mode="json", exclude={"pattern", "curves"})
+    settings["scattering"] = asdict(tile.scattering)
+    settings["yarns"] = [asdict(YARNS[entry.type]) for entry in (spec.yarn, spec.weft) if entry is not None]
+    digests["settings"] = data_sha256(settings)
+    kind = next(key for key in ("weave", "knit", "pattern", "curves") if getattr(spec, key) is not None)
+    named = f" of {files[kind].name}" if kind in files else ""
+    note = (
+        f"fibers: {len(tile.curves):,} with {tile.segments:,} segments ({kind}{named}), "
+        f"{tile.thickness:.3g} tile widths thick"
+    )
+    warnings: tuple[str, ...] = ()
+    if kind == "curves" and (loose := loose_ends(tile)):
+        what = f"{loose} ends at the border have no partner on the opposite side"
+        warnings = (f"{files[kind]}: {what}: the tile has a seam; check 'period'",)
+    return replace(
+        tile, files=files, digests=digests, warnings=warnings, notes=(note,), resolution=spec.resolution
+    )
+
+
+def _fibers(spec: ClothFile, folder: Path) -> FiberTile:
     rng = np.random.default_rng(spec.seed)
     if spec.curves is not None:
         return _of_curves(spec, folder / spec.curves)

@@ -1,21 +1,16 @@
-"""Statistics of a material for ``mbtf-gen inspect``, as data and as text."""
+"""The statistics of a height field, which :meth:`HeightFieldTile.inspect` collects, as text for people."""
 
 from __future__ import annotations
 
-import math
 import textwrap
-from dataclasses import asdict
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mbtf_gen.images.read import LUMINANCE
-from mbtf_gen.tile.heightfield_tile import MAPS, Material, layers_above
-from mbtf_gen.tile.heights.grid import HeightGrid
-from mbtf_gen.tile.heights.statistics import detail_size, repeats, rms_slope, slope_angles
-from mbtf_gen.tile.maps.checks import CONVENTION_NAMES, displacement_fault, signed
-from mbtf_gen.tile.maps.tiling import broken
+from mbtf_gen.tile.maps.checks import CONVENTION_NAMES, signed
+from mbtf_gen.tile.maps.material_file import ROLES, layers_above
 
 # Luminance from charcoal to fresh snow; outside, a color map is probably not albedo.
 ALBEDO_RANGE = (0.02, 0.95)
@@ -27,139 +22,12 @@ _MANY = 4096
 _WIDTH = 100
 
 # What each map does to the simulation.
-USES = {
-    "height": "displaces the mesh",
-    "base_color": "reflectance",
-    "roughness": "width of the specular lobe",
-    "metallic": "fraction of metal",
-    "specular": "strength of the dielectric lobe",
-    "clearcoat": "weight of the clear coat",
-    "clearcoat_roughness": "roughness of the clear coat",
-    "sheen": "weight of the sheen",
-    "sheen_color": "color of the sheen",
-    "sheen_roughness": "roughness of the sheen",
-    "normal": "slopes that the mesh lacks",
-    "opacity": "holes",
-}
+USES = {"height": "displaces the mesh", **{name: role.use for name, role in ROLES.items()}}
 _KINDS = {1: "gray", 2: "gray+alpha", 3: "RGB", 4: "RGBA"}
 
 
-def inspect_material(
-    material: Material,
-    height: float | None = None,
-    mesh: int | None = None,
-    finest: int | None = None,
-    max_displacement: float = math.inf,
-) -> dict[str, Any]:
-    """Collect the statistics of a material.
-
-    Parameters
-    ----------
-    material : Material
-    height, mesh : float or None, int or None
-        As in :meth:`mbtf_gen.tile.heightfield_tile.Material.grid`.
-    finest : int or None
-        As in :meth:`mbtf_gen.tile.heightfield_tile.Material.lattice`.
-    max_displacement : float
-        Largest displacement range that generation accepts, in tile widths.
-
-    Returns
-    -------
-    dict
-        Plain data; ``oddities`` lists unusual properties in words.
-    """
-    grid = material.grid(height, mesh)
-    median, high, steepest = slope_angles(grid)
-    whole = rms_slope(material.grid(height, material.height.shape[1]))
-    constants = {role: getattr(material, role) for role in MAPS if role not in ("height", "normal")}
-    if material.bsdf is not None:
-        del constants["base_color"]
-    found: dict[str, Any] = {
-        "aspect": material.aspect,
-        "make_tileable": material.tile,
-        "resolution": material.lattice(finest).shape()[1],
-        "maps": {role: {**asdict(f), "file": str(f.file)} for role, f in material.facts.items()},
-        "constants": {
-            role: np.asarray(value).tolist()
-            for role, value in constants.items()
-            if value is not None and np.ndim(value) < 2
-        },
-        "surface": material.bsdf["type"] if material.bsdf else "diffuse" if material.is_lambert else "glossy",
-        "geometry": {
-            "height_scale": material.height_scale if height is None else height,
-            "height_scale_from": material.height_source(height),
-            "map": list(material.height.shape),
-            "mesh": list(grid.z.shape),
-            "displacement_range": abs(grid.displacement_range),
-            "slope_median_deg": median,
-            "slope_p99_deg": high,
-            "slope_max_deg": steepest,
-            "slope_kept": rms_slope(grid) / whole if whole > 0 else 1.0,
-        },
-        "heights": {
-            "codes": None if material.codes is None else asdict(material.codes),
-            "distinct": len(np.unique(material.height)),
-            "detail_texels": detail_size(material.height),
-            "repeats": [repeats(material.height, axis) for axis in (1, 0)],
-        },
-        "tiling": [{**asdict(s), "ratio": s.ratio, "tiles": not broken(s)} for s in material.seams],
-        "albedo": _albedo(material),
-        "normal": _normal(material),
-        "opacity": _opacity(material),
-        "unused": material.unused,
-        "warnings": [*material.warnings_at(height), *_refusal(material, grid, max_displacement)],
-        "notes": list(material.notes),
-    }
-    return {**found, "oddities": _oddities(found)}
-
-
-def _refusal(material: Material, grid: HeightGrid, limit: float) -> list[str]:
-    """The warning that generation will refuse the material."""
-    fault = displacement_fault(abs(grid.displacement_range), limit)
-    return [] if fault is None else [f"{material.files['height']}: generation refuses it: {'; '.join(fault)}"]
-
-
-def _albedo(material: Material) -> dict[str, Any] | None:
-    if material.bsdf is not None:
-        return None
-    color = np.asarray(material.base_color, np.float64)
-    luminance = color @ np.asarray(LUMINANCE)
-    low, high = ALBEDO_RANGE
-    return {
-        "min": float(luminance.min()),
-        "median": float(np.median(luminance)),
-        "max": float(luminance.max()),
-        "mean_rgb": color.reshape(-1, 3).mean(axis=0).tolist(),
-        "share_above": float(np.mean(luminance > high)),
-        "share_below": float(np.mean(luminance < low)),
-    }
-
-
-def _normal(material: Material) -> dict[str, Any] | None:
-    if material.normal is None:
-        return None
-    tilt = np.degrees(np.arccos(np.clip(material.normal[..., 2], -1.0, 1.0)))
-    median, high = (float(p) for p in np.percentile(tilt, (50, 99)))
-    out: dict[str, Any] = {"tilt_median_deg": median, "tilt_p99_deg": high}
-    fit = material.normal_fit
-    if fit is not None:
-        sign = 1.0 if material.normal_convention == "gl" else -1.0
-        out |= {**asdict(fit), "correlation_v": sign * fit.correlation_v}
-        out["suggested_height_scale"] = fit.scale if fit.fits else None
-    return {**out, "convention": material.normal_convention}
-
-
-def _opacity(material: Material) -> dict[str, Any] | None:
-    if material.opacity is None:
-        return None
-    opacity = np.asarray(material.opacity)
-    return {
-        "holes": float(np.mean(opacity < 0.5)),
-        "partly": float(np.mean((opacity > 0.02) & (opacity < 0.98))),
-    }
-
-
-def _oddities(found: dict[str, Any]) -> list[str]:
+def oddities(found: Mapping[str, Any]) -> list[str]:
+    """Unusual properties in words."""
     out = []
     file, distinct, geometry = found["maps"]["height"], found["heights"]["distinct"], found["geometry"]
     if file["bits"] is None and 1 < distinct <= 256 and file["rows"] * file["columns"] > _MANY:
@@ -180,8 +48,8 @@ def _oddities(found: dict[str, Any]) -> list[str]:
     return out
 
 
-def inspection_text(found: dict[str, Any], name: str) -> str:
-    """The data of :func:`inspect_material` as text for people."""
+def inspection_text(found: Mapping[str, Any], name: str) -> str:
+    """The data of :func:`inspect` as text for people."""
     surface = found["surface"] + layers_above({*found["maps"], *found["constants"]})
     lines = [
         f"{name}: tile 1 x {found['aspect']:g}, surface {surface}, make-tileable {found['make_tileable']}, "
@@ -216,7 +84,7 @@ def _wrapped(head: str, text: str) -> list[str]:
     return textwrap.wrap(text, _WIDTH, initial_indent=head, subsequent_indent=" " * len(head))
 
 
-def _maps(found: dict[str, Any]) -> list[str]:
+def _maps(found: Mapping[str, Any]) -> list[str]:
     rows = [["map", "file", "size", "kind", "use"]]
     for role, facts in found["maps"].items():
         if role.startswith("bsdf"):
@@ -236,7 +104,7 @@ def _maps(found: dict[str, Any]) -> list[str]:
     return [" ".join(cells).rstrip() for cells in padded]
 
 
-def _unused(found: dict[str, Any]) -> list[str]:
+def _unused(found: Mapping[str, Any]) -> list[str]:
     """Images of the folder that are not used, those of one reason together."""
     reasons: dict[str, list[str]] = {}
     for name, why in found["unused"].items():
@@ -248,7 +116,7 @@ def _unused(found: dict[str, Any]) -> list[str]:
     return out
 
 
-def _geometry(found: dict[str, Any]) -> list[str]:
+def _geometry(found: Mapping[str, Any]) -> list[str]:
     g, h, file = found["geometry"], found["heights"], found["maps"]["height"]
     u, v = h["repeats"]
     out = [
@@ -275,7 +143,7 @@ def _geometry(found: dict[str, Any]) -> list[str]:
     return out
 
 
-def _color(found: dict[str, Any]) -> list[str]:
+def _color(found: Mapping[str, Any]) -> list[str]:
     out = []
     if (a := found["albedo"]) is not None:
         mean = " ".join(f"{c:.2f}" for c in a["mean_rgb"])
@@ -286,7 +154,7 @@ def _color(found: dict[str, Any]) -> list[str]:
     return out
 
 
-def _normals(found: dict[str, Any]) -> list[str]:
+def _normals(found: Mapping[str, Any]) -> list[str]:
     n = found["normal"]
     if n is None:
         return []

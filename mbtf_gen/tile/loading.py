@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import contextlib
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from mbtf_core.config_file import build, read_yaml
+from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError
 from mbtf_core.shard_schema import Tiling
 from mbtf_core.suggest import suggest_path
 from mbtf_gen.images.read import SUFFIXES, is_image
-from mbtf_gen.tile.cloth_material import cloth_material
+from mbtf_gen.tile.assembly import assemble, retiled
+from mbtf_gen.tile.cloth import cloth_tile
 from mbtf_gen.tile.fibers.cloth_file import CLOTH_KEYS, CURVE_FILES, ClothFile
-from mbtf_gen.tile.heightfield_tile import Material, assemble, retiled
 from mbtf_gen.tile.maps.discovery import FoundMaps, find_maps, unpack
 from mbtf_gen.tile.maps.material_file import MaterialFile
-from mbtf_gen.tile.mesh_file import MESH_FILES, MeshFile
-from mbtf_gen.tile.mesh_material import mesh_material
+from mbtf_gen.tile.mesh_file import MESH_FILES, MeshFile, read_mesh
+from mbtf_gen.tile.protocol import Tile
 
 Described = MaterialFile | ClothFile | MeshFile
 
@@ -25,8 +28,12 @@ MEASURED_FILES = (".btf", ".h5", ".hdf5")
 
 _YAML = ("material.yaml", "material.yml")
 
+# Bytes of the maps up to which the latest tile is kept: a training process has no use for larger ones.
+_KEPT_BYTES = 1 << 28
+_kept: tuple[Any, Tile] | None = None
 
-def load_material(path: str | Path, tile: Tiling | None = None) -> Material:
+
+def load_material(path: str | Path, tiling: Tiling | None = None) -> Tile:
     """Load a material.
 
     Parameters
@@ -35,14 +42,14 @@ def load_material(path: str | Path, tile: Tiling | None = None) -> Material:
         A height map, a ``material.yaml``, a folder that contains one or maps with customary names, a mesh
         (``.glb``, ``.gltf``, ``.ply``, ``.obj``), or a file of yarns or fibers (``.pyp``, ``.bcc``,
         ``.curves``). Other maps beside a height map are ignored.
-    tile : {"none", "mirror", "blend"} or None
+    tiling : {"none", "mirror", "blend"} or None
         Method for maps that do not tile. ``mirror``: 2 × 2 mirrored copies, a tile of twice the width;
         ``blend``: the edges blended over an eighth of the tile (:mod:`mbtf_gen.tile.maps.blending`); None:
         that of the material file, else ``none``.
 
     Returns
     -------
-    Material
+    Tile
 
     Raises
     ------
@@ -50,17 +57,53 @@ def load_material(path: str | Path, tile: Tiling | None = None) -> Material:
         A file is missing, unreadable or ambiguous, a value is out of range, or aspects differ.
     """
     spec, folder, found = described(Path(path))
-    return material_of(spec, folder, found, spec.tiling(tile))
+    return _load(spec, folder, found, spec.tiling(tiling))
 
 
-def material_of(spec: Described, folder: Path, found: FoundMaps, tile: Tiling) -> Material:
-    """The material that :func:`described` found."""
+def latest_material(path: str | Path, tiling: Tiling | None = None) -> Tile:
+    """:func:`load_material`; maps are not decoded again while the contents of folder and files are the same.
+
+    Parameters
+    ----------
+    path, tiling : as for ``load_material``
+
+    Returns
+    -------
+    Tile
+        Not to be changed: the next call may return it again.
+
+    Raises
+    ------
+    InputError
+        As ``load_material``.
+    """
+    global _kept
+    spec, folder, found = described(Path(path))
+    method = spec.tiling(tiling)
+    # Loading adds notes to `found`.
+    asked = (spec, folder, replace(found, notes=[*found.notes]), method)
+    if _kept is not None and _kept[0] == asked and _unchanged(_kept[1]):
+        return _kept[1]
+    tile = _load(spec, folder, found, method)
+    _kept = (asked, tile) if tile.nbytes <= _KEPT_BYTES else None
+    return tile
+
+
+def _unchanged(tile: Tile) -> bool:
+    """Whether its files have the contents that it was loaded from."""
+    try:
+        return all(file_sha256(path) == tile.digests[role] for role, path in tile.files.items())
+    except OSError:
+        return False
+
+
+def _load(spec: Described, folder: Path, found: FoundMaps, tiling: Tiling) -> Tile:
     if isinstance(spec, ClothFile):
-        return cloth_material(spec, folder)
+        return cloth_tile(spec, folder)
     if isinstance(spec, MeshFile):
-        return mesh_material(spec, folder)
-    material = assemble(spec, folder, found, tile)
-    return material if tile == "none" else retiled(material, tile)
+        return read_mesh(spec, folder)
+    tile = assemble(spec, folder, found, tiling)
+    return tile if tiling == "none" else retiled(tile, tiling)
 
 
 def described(path: Path) -> tuple[Described, Path, FoundMaps]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,6 +12,7 @@ from pydantic import Field
 
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.config_file import FileName, Settings
+from mbtf_core.digest import data_sha256, file_sha256
 from mbtf_core.errors import InputError, reason
 from mbtf_core.shard_schema import Tiling
 from mbtf_gen.config.generator import Resolution
@@ -88,7 +90,23 @@ def read_mesh(spec: MeshFile, folder: Path) -> MeshTile:
             hint="check 'period'",
         )
     placed = (vertices - (low[0], low[1], high[2])) / width
-    return MeshTile(height / width, placed, faces, uv, part, parts)
+    tile = MeshTile(height / width, placed, faces, uv, part, parts)
+    _, seam = tile.open_edges()
+    what = f"{seam} edges at the border have no partner on the opposite side"
+    return replace(
+        tile,
+        files={"mesh": path},
+        digests={
+            "mesh": file_sha256(path),
+            "settings": data_sha256(spec.model_dump(mode="json", exclude={"mesh"})),
+        },
+        warnings=(f"{path}: {what}: the tile may have a seam; check 'period'",) if seam else (),
+        notes=(
+            f"mesh: {len(tile.faces):,} triangles in {len(tile.parts)} parts of {path.name}, "
+            f"{tile.thickness:.3g} tile widths thick",
+        ),
+        resolution=spec.resolution,
+    )
 
 
 def _shapes(path: Path) -> list[tuple[str, Any]]:

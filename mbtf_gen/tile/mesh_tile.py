@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_gen.config.generator import GeometrySection
+from mbtf_gen.tile.protocol import Tile
+from mbtf_gen.tile.reflectance import reflectance
 from mbtf_gen.tile.tracers.protocol import TileGeometry
 
 F64 = NDArray[np.float64]
@@ -37,7 +41,7 @@ class MeshPart:
 
 
 @dataclass(frozen=True)
-class MeshTile:
+class MeshTile(Tile):
     """Triangles of one period, in tile widths.
 
     Attributes
@@ -55,6 +59,8 @@ class MeshTile:
     parts : sequence of MeshPart
         Their reflectance.
     """
+
+    kind = "mesh"
 
     aspect: float
     vertices: F64
@@ -84,8 +90,8 @@ class MeshTile:
                 shifts.append(np.tile([*(k * size), 0.0], (len(inside), 1)))
         return np.concatenate(faces), np.concatenate(shifts)
 
-    def trace(self, unit: float) -> TileGeometry:
-        """The triangles as rays meet them, with `unit` scene units per tile width."""
+    def trace(self, unit: float, below: bool = False) -> TileGeometry:
+        """The triangles as rays meet them."""
         from mbtf_gen.tile.tracers.mesh_tracer import MeshTileGeometry
 
         number, shift = self.copies()
@@ -112,3 +118,64 @@ class MeshTile:
         alone = self.vertices[ends[index[count == 1]]][:, :, :2] / size
         on_border = (np.abs(alone - np.rint(alone)) < _SAME).all(axis=1).any(axis=1)
         return len(alone), int(on_border.sum())
+
+    def surface(
+        self, on: Collection[str] = (), slopes: NDArray[np.float64] | None = None
+    ) -> list[dict[str, Any]]:
+        """Mitsuba dictionaries of the parts."""
+        return [reflectance(part.base_color, part.roughness, part.metallic) for part in self.parts]
+
+    @property
+    def base_color(self) -> F64:
+        """Mean (3,) over the parts of their mean colors."""
+        colors = [np.asarray(p.base_color).reshape(-1, 3).mean(axis=0) for p in self.parts]
+        return np.asarray(np.mean(colors, axis=0))
+
+    def properties(self) -> dict[str, Any]:
+        """Number of triangles, for the manifest."""
+        return {"triangles": len(self.faces)}
+
+    def inspect(self, options: GeometrySection, finest: int | None = None) -> dict[str, Any]:
+        """Statistics as plain data; lengths are in tile widths."""
+        self.configured(options)
+        edges, seam = self.open_edges()
+        return {
+            "resolution": self.lattice(finest).shape()[1],
+            "aspect": self.aspect,
+            "triangles": len(self.faces),
+            "thickness": self.thickness,
+            "open_edges": edges,
+            "open_edges_at_the_border": seam,
+            "parts": [
+                {
+                    "name": part.name,
+                    "triangles": int(np.count_nonzero(self.part == number)),
+                    "base_color": np.asarray(part.base_color).reshape(-1, 3).mean(axis=0).tolist(),
+                    "roughness": None if part.roughness is None else float(np.mean(part.roughness)),
+                    "metallic": None if part.metallic is None else float(np.mean(part.metallic)),
+                }
+                for number, part in enumerate(self.parts)
+            ],
+            "warnings": list(self.warnings),
+            "notes": list(self.notes),
+        }
+
+    def describe(self, found: Mapping[str, Any], name: str) -> str:
+        """The data of :meth:`inspect` as text for people."""
+        edges = found["open_edges"]
+        closed = f"{edges} open edges" if edges else "closed: every edge has two triangles"
+        lines = [
+            f"{name}: tile 1 x {found['aspect']:.4g}, triangles, resolution {found['resolution']}",
+            "",
+            f"mesh     {found['triangles']:,} triangles, {found['thickness']:.3g} tile widths thick; "
+            f"{closed}",
+        ]
+        for part in found["parts"]:
+            color = " ".join(f"{c:.2f}" for c in part["base_color"])
+            gloss = "Lambert" if part["roughness"] is None else f"mean roughness {part['roughness']:.2f}"
+            metal = f", metallic {part['metallic']:.2f}" if part["metallic"] else ""
+            lines.append(
+                f"part     {part['name']}: {part['triangles']:,} triangles, mean color {color}, "
+                f"{gloss}{metal}"
+            )
+        return "\n".join([*lines, *(f"warning  {text}" for text in found["warnings"])])

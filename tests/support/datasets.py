@@ -21,7 +21,7 @@ from mbtf_gen.dataset.render_shards import store_shard
 from mbtf_gen.dataset.shard_io import read_shard, write_shard
 from mbtf_gen.dataset.summary import finish
 from mbtf_gen.job import Job, split_spp
-from mbtf_gen.planning.effects_plan import reference_plan
+from mbtf_gen.planning.effects_planner import reference_plan
 from mbtf_gen.planning.run_plan import RunPlan
 from mbtf_gen.render.estimates import Estimates
 from mbtf_gen.sampling.query_sampler import Queries

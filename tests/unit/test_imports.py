@@ -29,12 +29,13 @@ ORDER = """
 mbtf_core
 mbtf_gen.images
 mbtf_gen.geometry
-mbtf_gen.tile.heights
 mbtf_gen.sampling
-mbtf_gen.config
-mbtf_gen.measured
 mbtf_gen.engine
 mbtf_gen.tile.tracers
+mbtf_gen.tile.heights
+mbtf_gen.effects
+mbtf_gen.config
+mbtf_gen.measured
 mbtf_gen.tile.fibers
 mbtf_gen.tile.maps
 mbtf_gen.tile
@@ -154,7 +155,7 @@ def test_imports_run_downwards() -> None:
         ("mbtf_gen.render.a", "import torch.nn", True),
         ("mbtf_gen.cli.a", "def f():\n    from mbtf_fit import training", True),
         ("mbtf_gen.render.a", "import mitsuba", False),
-        ("mbtf_gen.render.a", "from mbtf_gen.planning.effects import Effect", True),
+        ("mbtf_gen.render.a", "from mbtf_gen.planning.pilot import Pilot", True),
         (
             "mbtf_gen.config.a",
             "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import mbtf_gen.job",

@@ -9,10 +9,18 @@ its border meets surface on both sides.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
+from mbtf_core.errors import InputError
+from mbtf_gen.tile.tracers.protocol import TileGeometry
+
+Tracer = Literal["heightfield", "mesh"]
+
+# Cells of a grid that Mitsuba traces. Each takes about 300 bytes, with Mitsuba's and Embree's own data.
+MOST_CELLS = 1 << 24
 
 
 @dataclass(frozen=True)
@@ -25,10 +33,13 @@ class HeightGrid:
         Heights ≤ 0 in tile widths, maximum 0; row 0 is the side ``v → 1``.
     aspect : float
         H/W of the tile.
+    tracer : {"heightfield", "mesh"}
+        How rays find the surface: cell by cell, or by Mitsuba as triangles.
     """
 
     z: NDArray[np.float64]
     aspect: float
+    tracer: Tracer = "heightfield"
 
     @classmethod
     def from_map(cls, heights: NDArray[np.float64], scale: float, aspect: float | None = None) -> HeightGrid:
@@ -43,6 +54,29 @@ class HeightGrid:
     def displacement_range(self) -> float:
         """Largest height difference in tile widths."""
         return float(self.z.max() - self.z.min())
+
+    def trace(self, unit: float, below: bool = False) -> TileGeometry:
+        """The surface as rays meet it, see :meth:`mbtf_gen.tile.protocol.Tile.trace`.
+
+        Raises
+        ------
+        InputError
+            Mitsuba would trace too many triangles.
+        """
+        if self.tracer == "heightfield":
+            from mbtf_gen.tile.tracers.heightfield_tracer import HeightfieldGeometry
+
+            return HeightfieldGeometry.of(self, unit, below)
+        if self.z.size > MOST_CELLS:
+            raise InputError(
+                f"a mesh of {self.z.size:,} cells is too large for triangles; at most {MOST_CELLS:,} are",
+                where="geometry.tracer",
+                hint="reduce --mesh, or use --tracer heightfield",
+            )
+        from mbtf_gen.tile.tracers.mesh_tracer import MeshGeometry
+
+        vertices = grid_vertices(self, (1, 1))
+        return MeshGeometry.of_cells(vertices, grid_faces(*vertices.shape[:2]), self.aspect, unit)
 
 
 def grid_vertices(grid: HeightGrid, apron: tuple[int, int] = (0, 0)) -> NDArray[np.float64]:

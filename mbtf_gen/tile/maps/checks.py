@@ -69,16 +69,6 @@ def seam_warning(path: Path, seams: Sequence[Seam], factor: float) -> str | None
     )
 
 
-def displacement_fault(found: float, limit: float) -> tuple[str, str] | None:
-    """Fault and hint of a displacement range above the accepted one, both in tile widths."""
-    if found <= limit:
-        return None
-    return (
-        f"the displacement range is {found:.4g} tile widths; at most {limit:g} are accepted",
-        "set a smaller --height-scale, or raise geometry.max_displacement",
-    )
-
-
 def orientation_warning(fit: NormalFit, normal: Path, height: Path) -> str | None:
     """The warning that the normal map matches the heights only when turned, mirrored or inverted."""
     if not fit.misfit:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Container, Sequence
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
@@ -90,13 +91,55 @@ class NormalEntry(_Entry):
     )
 
 
-# Keys that a BSDF replaces.
-_REFLECTANCE = (
-    *("base_color", "roughness", "metallic", "specular", "clearcoat", "clearcoat_roughness"),
-    *("sheen", "sheen_color", "sheen_roughness"),
-)
-# Keys that require another key.
-_GOES_WITH = {"clearcoat_roughness": "clearcoat", "sheen_color": "sheen", "sheen_roughness": "sheen"}
+@dataclass(frozen=True)
+class Role:
+    """What a map, or a constant in its place, does to the simulation.
+
+    Attributes
+    ----------
+    use : in words
+    effect : the effect that needs it; empty for the base layer. The weight of an effect has its name
+    default : value where the effect is there and the map is not
+    layer : of a layer's weight, the layer in words
+    lobe : width in radians of the lobe of a roughness
+    """
+
+    use: str
+    effect: str = ""
+    default: float | None = None
+    layer: str = ""
+    lobe: Callable[[float], float] | None = None
+
+
+def _ggx(roughness: float) -> float:
+    """A lobe of GGX is about 2α wide."""
+    return 2.0 * roughness**2
+
+
+def _fibers(roughness: float) -> float:
+    """The fibers of sheen lean by less than about √α."""
+    return roughness
+
+
+# What each map of a material does, by role, in the order of the file.
+ROLES = {
+    "base_color": Role("reflectance"),
+    "roughness": Role("width of the specular lobe", lobe=_ggx),
+    "metallic": Role("fraction of metal", "metallic"),
+    "specular": Role("strength of the dielectric lobe", "specular"),
+    "clearcoat": Role("weight of the clear coat", "clearcoat", layer="a clear coat"),
+    "clearcoat_roughness": Role("roughness of the clear coat", "clearcoat", 0.1, lobe=_ggx),
+    "sheen": Role("weight of the sheen", "sheen", layer="a sheen"),
+    "sheen_color": Role("color of the sheen", "sheen"),
+    "sheen_roughness": Role("roughness of the sheen", "sheen", 0.3, lobe=_fibers),
+    "normal": Role("slopes that the mesh lacks", "normal"),
+    "opacity": Role("holes", "opacity"),
+}
+# Effects of maps that a BSDF does not replace, and those of how the surface reflects.
+_BESIDE = ("normal", "opacity")
+REFLECTING = tuple(dict.fromkeys(r.effect for r in ROLES.values() if r.effect not in ("", *_BESIDE)))
+# Defaults of a glossy surface, once one of them is given.
+LOBES = {"roughness": 0.5, "metallic": 0.0, "specular": 0.5}
 
 
 class MaterialFile(Settings):
@@ -131,12 +174,14 @@ class MaterialFile(Settings):
 
     @model_validator(mode="after")
     def _bsdf_alone(self) -> MaterialFile:
-        given = [n for n in _REFLECTANCE if getattr(self, n) is not None]
+        given = [
+            n for n, role in ROLES.items() if role.effect not in _BESIDE and getattr(self, n) is not None
+        ]
         if self.bsdf is not None and given:
             raise ValueError(f"'bsdf' replaces {', '.join(given)}; give one or the other")
-        for name, other in _GOES_WITH.items():
-            if getattr(self, name) is not None and getattr(self, other) is None:
-                raise ValueError(f"'{name}' goes with '{other}'")
+        for name, role in ROLES.items():
+            if role.effect and getattr(self, name) is not None and getattr(self, role.effect) is None:
+                raise ValueError(f"'{name}' goes with '{role.effect}'")
         if self.bsdf is not None and not isinstance(self.bsdf.get("type"), str):
             raise ValueError("'bsdf' needs a 'type', such as diffuse")
         return self
@@ -144,3 +189,9 @@ class MaterialFile(Settings):
     def tiling(self, given: Tiling | None) -> Tiling:
         """Method for maps that do not tile: the given one, else that of the file, else ``none``."""
         return given or self.make_tileable or "none"
+
+
+def layers_above(given: Container[str]) -> str:
+    """``" under a clear coat and a sheen"``, as far as they are among the given roles."""
+    texts = [role.layer for name, role in ROLES.items() if role.layer and name in given]
+    return f" under {' and '.join(texts)}" if texts else ""

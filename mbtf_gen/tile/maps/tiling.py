@@ -97,7 +97,7 @@ def retile(maps: Mapping[str, Any], tile: Literal["mirror", "blend"]) -> dict[st
     if tile == "blend":
         return blend_maps(maps)
     out = {role: mirror(value) if np.ndim(value) >= 2 else value for role, value in maps.items()}
-    if maps["normal"] is not None:
+    if maps.get("normal") is not None:
         out["normal"] = mirror_normals(maps["normal"])
     out["height"] = 0.5 * out["height"]
     return out

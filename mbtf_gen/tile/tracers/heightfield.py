@@ -6,21 +6,37 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Self
+from typing import Protocol, Self
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from mbtf_gen.engine.memory import padded
 from mbtf_gen.engine.types import Float, Int32, Mask, Normal3f, Point3f, Ray3f, SurfaceInteraction3f, Vector3f
 from mbtf_gen.geometry.height_planes import logarithms, node_table
-from mbtf_gen.tile.heights.grid import HeightGrid
 from mbtf_gen.tile.tracers.protocol import Vertex
 
 # Ray offset relative to the largest coordinate: a few units in the last place of float32. An offset four
 # times as large made points on a tile of aspect 64 too bright by 0.1 %.
 _RELATIVE_OFFSET = 5.0e-7
+
+
+class Heights(Protocol):
+    """Heights of a tile, as :class:`~mbtf_gen.tile.heights.grid.HeightGrid` holds them."""
+
+    @property
+    def z(self) -> NDArray[np.float64]:
+        """(H, W) heights ≤ 0 in tile widths; row 0 is the side ``v → 1``."""
+
+    @property
+    def aspect(self) -> float:
+        """H/W of the tile."""
+
+    @property
+    def displacement_range(self) -> float:
+        """Largest height difference in tile widths."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +80,7 @@ class HeightField:
     powers: bool
 
     @classmethod
-    def of(cls, grid: HeightGrid, unit: float, two_sided: bool) -> Self:
+    def of(cls, grid: Heights, unit: float, two_sided: bool) -> Self:
         """Height field of a grid; `unit` is the number of scene units per tile width. Rays may be below the
         surface if it is `two_sided`, as behind an opacity mask."""
         # Row 0 of a map is the side y → max.

@@ -11,7 +11,6 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.errors import InputError
 from mbtf_gen.engine.memory import padded
 from mbtf_gen.engine.types import (
     Mask,
@@ -23,15 +22,12 @@ from mbtf_gen.engine.types import (
     UInt32,
     Vector3f,
 )
-from mbtf_gen.tile.heights.grid import HeightGrid, grid_faces, grid_vertices
 from mbtf_gen.tile.tracers.heightfield import surface_interaction
 from mbtf_gen.tile.tracers.periodic_scene import OVERLAP, PeriodicScene
 from mbtf_gen.tile.tracers.protocol import Vertex
 
 # Distance at which scattered rays start, relative to the largest coordinate.
 _OFFSET = 5.0e-7
-# Each cell takes about 300 bytes, with Mitsuba's and Embree's own data.
-MOST_CELLS = 1 << 24
 
 
 @dataclass(frozen=True)
@@ -48,20 +44,23 @@ class MeshGeometry(PeriodicScene):
     open = False
 
     @classmethod
-    def of_grid(cls, grid: HeightGrid, unit: float) -> MeshGeometry:
-        """The triangles of a height grid: those that the height-field tracer follows."""
-        if grid.z.size > MOST_CELLS:
-            raise InputError(
-                f"a mesh of {grid.z.size:,} cells is too large for triangles; at most {MOST_CELLS:,} are",
-                where="geometry.tracer",
-                hint="reduce --mesh, or use --tracer heightfield",
-            )
-        # One more cell on each side: rays along the seam meet triangles on either side of it.
-        vertices = (grid_vertices(grid, (1, 1)) - (0.5, 0.5 * grid.aspect, 0.0)) * unit
-        rows, columns = grid.z.shape
-        low = (0.5 * unit * (1.0 / columns - 1.0), 0.5 * unit * grid.aspect * (1.0 / rows - 1.0))
-        faces = grid_faces(*vertices.shape[:2])
-        return cls(**_triangles(vertices.reshape(-1, 3), faces, low, (unit, unit * grid.aspect)))
+    def of_cells(
+        cls, vertices: NDArray[np.float64], faces: NDArray[np.uint32], aspect: float, unit: float
+    ) -> MeshGeometry:
+        """The triangles of a height grid, those that the height-field tracer follows.
+
+        Parameters
+        ----------
+        vertices : (rows + 3, columns + 3, 3) positions in tile widths of one period, with one more cell on
+            each side: rays along the seam meet triangles on either side of it
+        faces : (m, 3) vertices of each triangle
+        aspect : H/W of the tile
+        unit : scene units per tile width
+        """
+        rows, columns = (size - 3 for size in vertices.shape[:2])
+        placed = (vertices - (0.5, 0.5 * aspect, 0.0)) * unit
+        low = (0.5 * unit * (1.0 / columns - 1.0), 0.5 * unit * aspect * (1.0 / rows - 1.0))
+        return cls(**_triangles(placed.reshape(-1, 3), faces, low, (unit, unit * aspect)))
 
     def vertex(self, si: SurfaceInteraction3f) -> Vertex:
         """Position and normal."""

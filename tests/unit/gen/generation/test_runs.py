@@ -23,10 +23,10 @@ from mbtf_gen.dataset.shard_io import read_shard
 from mbtf_gen.dataset.sidecar import sidecar_of
 from mbtf_gen.dataset.summary import finish
 from mbtf_gen.dataset.verify import verify
+from mbtf_gen.effects.plan import EffectsPlan
 from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.generation import generate, unfinished
 from mbtf_gen.job import Job, split_queries
-from mbtf_gen.planning.effects import EffectsPlan
 from mbtf_gen.planning.run_plan import RunPlan
 
 load_mitsuba()

@@ -25,11 +25,11 @@ from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.dataset.sidecar import sidecar_of
 from mbtf_gen.dataset.summary import finish
 from mbtf_gen.dataset.verify import verify
+from mbtf_gen.effects.plan import without
 from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.generation import generate
 from mbtf_gen.job import Job
-from mbtf_gen.planning.effects import without
-from mbtf_gen.planning.effects_plan import reference_plan
+from mbtf_gen.planning.effects_planner import reference_plan
 from mbtf_gen.planning.run_plan import RunPlan
 
 load_mitsuba()

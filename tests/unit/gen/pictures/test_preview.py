@@ -22,16 +22,15 @@ from mbtf_gen.pictures.preview.mesh import MOST_CELLS, draw, tiled_mesh
 from mbtf_gen.pictures.preview.plots import level_histogram, query_figure, write_plots
 from mbtf_gen.pictures.preview.sample import QuerySample, sampled_queries, stored_queries
 from mbtf_gen.sampling.query_sampler import Mixture
-from mbtf_gen.tile.heightfield_tile import Material
+from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 
 LIGHT = from_angles(35, 150)
 
 
-def material(rows: int = 4, columns: int = 8, **options: Any) -> Material:
+def material(rows: int = 4, columns: int = 8, **options: Any) -> HeightFieldTile:
     rng = np.random.default_rng(1)
     color = rng.uniform(0.1, 0.9, (rows, columns, 3)).astype(np.float32)
-    given = {"height": 0.1 * rng.random((rows, columns)), "base_color": color, **options}
-    return Material(height_scale=1.0, height_bits=None, **given)
+    return HeightFieldTile(0.1 * rng.random((rows, columns)), maps={"base_color": color, **options})
 
 
 @pytest.mark.parametrize("aspect", [0.5, 1.0, 3.0])
@@ -74,7 +73,7 @@ def test_the_block_is_the_repeated_tile(tiles: int) -> None:
     assert not block.hole.any()
     # Brighter texels are shown brighter; row 0 stays on top.
     shown = block.texture.astype(float).mean(axis=-1).ravel()
-    assert np.corrcoef(shown, np.asarray(m.base_color).mean(axis=-1).ravel())[0, 1] > 0.95
+    assert np.corrcoef(shown, np.asarray(m.maps["base_color"]).mean(axis=-1).ravel())[0, 1] > 0.95
 
 
 def test_holes_are_cut_where_little_is_left() -> None:
@@ -92,15 +91,15 @@ def test_holes_are_cut_where_little_is_left() -> None:
 def test_a_large_mesh_is_coarsened() -> None:
     m = material()
     for tiles, wide in ((1, MOST_CELLS), (4, MOST_CELLS // 4)):
-        block = tiled_mesh(m, tiles, 0.0, mesh=4000)
+        block = tiled_mesh(m.at(mesh=4000), tiles, 0.0)
         assert block.cells == (wide // 2, wide)
-    tall = tiled_mesh(material(8, 4), 2, 0.0, mesh=2000)
+    tall = tiled_mesh(material(8, 4).at(mesh=2000), 2, 0.0)
     assert tall.cells == (MOST_CELLS // 2, MOST_CELLS // 4)
 
 
 def sample_of(count: int, seed: int = 0, **options: Any) -> QuerySample:
     config = GeneratorConfig.model_validate({"material": "m", "queries": {"train": str(count), **options}})
-    job = Job(config, material())
+    job = Job.of(config, material())
     return sampled_queries(job)
 
 

@@ -80,8 +80,8 @@ def test_materials_load_without_a_warning(name: str) -> None:
     assert set(material.files) == {"height", "base_color", "roughness"}
     assert material.height_scale == 1
     # Wool and rock refract more than the customary 1.5 (s = 0.5), none of them much.
-    assert isinstance(material.specular, float)
-    assert 0.5 < material.specular < 0.6 if MATERIALS[name] else material.specular == 0.5
+    assert isinstance(material.maps["specular"], float)
+    assert 0.5 < material.maps["specular"] < 0.6 if MATERIALS[name] else material.maps["specular"] == 0.5
 
 
 def test_materials_differ_in_color() -> None:

@@ -98,8 +98,8 @@ class TestWrite:
         written(maps, "--resolution", "16")
         sections = {"geometry": {"height_scale": 0.5, "make_tileable": "none"}, "queries": {"resolution": 32}}
         job = job_of(maps, **sections)
-        assert (job.material.tile, job.lattice.finest) == ("none", 5)
-        assert job.grid.displacement_range == pytest.approx(0.5 * np.ptp(job.material.height))
+        assert (job.material.tiling, job.lattice.finest) == ("none", 5)
+        assert job.material.grid.displacement_range == pytest.approx(0.5 * np.ptp(job.material.height))
 
     @pytest.mark.parametrize(
         ("key", "value"), [("make_tileable", "mirror"), ("resolution", 32), ("height", {"scale": 0.2})]
@@ -183,7 +183,7 @@ class TestWarning:
 
     @pytest.mark.parametrize("factor", [STORED / 1.45, STORED * 1.45])
     def test_close(self, maps: Path, factor: float) -> None:
-        assert not any("suggest" in w for w in load_material(maps).warnings_at(factor))
+        assert not any("suggest" in w for w in load_material(maps).at(factor).warnings_in_use())
 
     def test_the_material_file(self, maps: Path, caplog: pytest.LogCaptureFixture) -> None:
         text = f"height: {{file: height.png, scale: {STORED}}}\nnormal: normal.png\nmake_tileable: blend\n"
@@ -203,12 +203,12 @@ class TestExport:
         assert run(app, ["inspect", str(tmp_path), "--export", str(out), *flags]) == 0
         mesh = int(flags[1]) if flags[:1] == ("--mesh",) else None
         scale = float(flags[1]) if flags[:1] == ("--height-scale",) else None
-        expected, found = load_material(tmp_path).grid(scale, mesh), load_material(out).grid()
+        expected, found = load_material(tmp_path).at(scale, mesh).grid, load_material(out).grid
         assert np.array_equal(found.z, expected.z.astype(np.float32))
         assert found.z.max() == 0.0
         assert found.aspect == expected.aspect
 
     def test_with_choices(self, maps: Path) -> None:
         written(maps, "--export", str(maps.parent / "z.exr"))
-        expected = job_of(maps).grid.z.astype(np.float32)
-        assert np.array_equal(load_material(maps.parent / "z.exr").grid().z, expected)
+        expected = job_of(maps).material.grid.z.astype(np.float32)
+        assert np.array_equal(load_material(maps.parent / "z.exr").grid.z, expected)

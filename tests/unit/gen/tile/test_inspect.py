@@ -11,6 +11,7 @@ from support.height_maps import Floats, fractal, normals_of, save_heights, save_
 
 from mbtf_core.console import run
 from mbtf_gen.cli.app import app
+from mbtf_gen.config.generator import GeometrySection
 from mbtf_gen.tile.heights.grid import HeightGrid
 from mbtf_gen.tile.heights.statistics import (
     autocorrelation,
@@ -20,7 +21,7 @@ from mbtf_gen.tile.heights.statistics import (
     slope_angles,
     triangle_slopes,
 )
-from mbtf_gen.tile.inspection import USES, inspect_material, inspection_text
+from mbtf_gen.tile.inspection import USES, inspection_text
 from mbtf_gen.tile.loading import load_material
 from mbtf_gen.tile.maps.material_file import MaterialFile
 
@@ -93,7 +94,7 @@ def folder(tmp_path: Path) -> Path:
 
 class TestNumbers:
     def test_by_hand(self, folder: Path) -> None:
-        found = inspect_material(load_material(folder), height=0.2, mesh=48)
+        found = load_material(folder).inspect(GeometrySection(height_scale=0.2, mesh=48))
         assert found["aspect"] == 0.5
         assert found["surface"] == "glossy"
         assert found["geometry"]["mesh"] == [24, 48]
@@ -115,21 +116,21 @@ class TestNumbers:
     def test_floats_that_were_integers(self, tmp_path: Path) -> None:
         for name, height in (("a", fractal(96, 96)), ("b", np.rint(fractal(96, 96) * 200) / 200)):
             np.save(tmp_path / f"{name}.npy", 0.1 * height)
-            oddities = inspect_material(load_material(tmp_path / f"{name}.npy"))["oddities"]
+            oddities = load_material(tmp_path / f"{name}.npy").inspect(GeometrySection())["oddities"]
             assert any("distinct values" in o for o in oddities) == (name == "b")
 
     @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (5, 1), (2, 3)])
     def test_tiny_maps(self, tmp_path: Path, shape: tuple[int, int]) -> None:
         save_heights(tmp_path / "height.png", np.random.default_rng(0).random(shape), 8)
         save_normals(tmp_path / "normal.png", np.full((*shape, 3), (0.0, 0.0, 1.0)))
-        found = inspect_material(load_material(tmp_path))
+        found = load_material(tmp_path).inspect(GeometrySection())
         assert found["maps"]["height"]["columns"] == shape[1]
         assert found["normal"] is not None
         assert "nothing to compare" in inspection_text(found, "tiny")
 
     def test_a_flat_map_has_no_slopes(self, tmp_path: Path) -> None:
         np.save(tmp_path / "h.npy", np.zeros((4, 4)))
-        found = inspect_material(load_material(tmp_path / "h.npy"))
+        found = load_material(tmp_path / "h.npy").inspect(GeometrySection())
         assert "displacement range 0 tile widths" in inspection_text(found, "flat")
         assert found["geometry"]["slope_max_deg"] == 0.0
         assert found["geometry"]["slope_kept"] == 1.0
@@ -140,7 +141,7 @@ class TestNumbers:
 
 class TestText:
     def test_heading_and_figures(self, folder: Path) -> None:
-        text = inspection_text(inspect_material(load_material(folder)), "rock")
+        text = inspection_text(load_material(folder).inspect(GeometrySection()), "rock")
         assert text.startswith("rock: tile 1 x 0.5, surface glossy, make-tileable none, resolution 64\n")
         for part in (
             "displaces the mesh",
@@ -154,7 +155,7 @@ class TestText:
     def test_misfits_and_seams_are_shouted(self, folder: Path) -> None:
         height: Floats = fractal(48, 96)[:, ::-1]
         save_heights(folder / "height.png", height * np.linspace(0.1, 1, 96))
-        text = inspection_text(inspect_material(load_material(folder)), "rock")
+        text = inspection_text(load_material(folder).inspect(GeometrySection()), "rock")
         assert "DOES NOT FIT; fits with the height map mirrored left to right" in text
         assert "along u DOES NOT TILE" in text
 
@@ -165,7 +166,7 @@ class TestText:
         for value in ("0.5", "metallic.npy"):
             text = "height: height.png\n" + "".join(f"{name}: {value}\n" for name in shares)
             (folder / "material.yaml").write_text(text)
-            text = inspection_text(inspect_material(load_material(folder)), "rock")
+            text = inspection_text(load_material(folder).inspect(GeometrySection()), "rock")
             for name in shares:
                 assert USES[name] in text
         assert "surface glossy under a clear coat" in text
@@ -174,14 +175,14 @@ class TestText:
         (folder / "material.yaml").write_text("height: height.png\nclearcoat: 1\n")
         material = load_material(folder)
         assert any(n.startswith("surface: Lambert under a clear coat, because") for n in material.notes)
-        lines = inspection_text(inspect_material(material), "rock").splitlines()
+        lines = inspection_text(material.inspect(GeometrySection()), "rock").splitlines()
         assert "surface diffuse under a clear coat" in lines[0]
         assert any(line.startswith("clearcoat_roughness constant 0.1") for line in lines)
 
     def test_maps_that_are_not_used_are_shown(self, folder: Path) -> None:
         for name in ("orm.png", "gloss.png", "ao.png", "view.png"):
             save_heights(folder / name, fractal(48, 96))
-        text = inspection_text(inspect_material(load_material(folder)), "rock")
+        text = inspection_text(load_material(folder).inspect(GeometrySection()), "rock")
         for name in (
             "orm.png: name its channels",
             "gloss.png: in a",
@@ -195,21 +196,21 @@ class TestText:
         save_normals(folder / "normal.png", normals_of(fractal(48, 96), 0.01))
 
         def warned(height: float | None = None) -> bool:
-            warnings = inspect_material(load_material(folder), height)["warnings"]
+            warnings = load_material(folder).inspect(GeometrySection(height_scale=height))["warnings"]
             return any("; 0.05 is in use, 5 times as much" in warning for warning in warnings)
 
         assert warned()
         assert warned(0.05)
         assert not warned(0.012)
         save_heights(folder / "height.png", fractal(48, 96) / 50)
-        (warning,) = (w for w in load_material(folder).warnings_at() if "suggest" in w)
+        (warning,) = (w for w in load_material(folder).warnings_in_use() if "suggest" in w)
         assert "in use, 0.1 times as much" in warning
         save_heights(folder / "height.png", fractal(48, 96))
         (folder / "material.yaml").write_text("height: {file: height.png, scale: 0.05}\nnormal: normal.png\n")
         assert warned()
         (folder / "material.yaml").unlink()
         save_normals(folder / "normal.png", normals_of(fractal(48, 96), 0.04))
-        assert not any("slopes suggest" in w for w in load_material(folder).warnings_at())
+        assert not any("slopes suggest" in w for w in load_material(folder).warnings_in_use())
 
 
 class TestCommand:

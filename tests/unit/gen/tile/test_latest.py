@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from mbtf_core.errors import InputError
-from mbtf_gen.tile import latest
-from mbtf_gen.tile.latest import latest_material
+from mbtf_gen.tile import loading
+from mbtf_gen.tile.loading import latest_material
 
 
 def write_png(path: Path, codes: NDArray[np.uint8]) -> None:
@@ -42,10 +42,10 @@ def test_a_changed_folder_is_loaded_again(folder: Path) -> None:
     write_png(path, np.full((8, 8), 200, np.uint8))
     os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
     second = latest_material(folder)
-    before, after = (np.asarray(m.roughness, np.float64).mean() for m in (first, second))
+    before, after = (np.asarray(m.maps["roughness"], np.float64).mean() for m in (first, second))
     assert after > before
     write_png(folder / "metallic.png", np.full((8, 8), 255, np.uint8))
-    assert np.mean(latest_material(folder).metallic) == 1.0 != np.mean(second.metallic)
+    assert np.mean(latest_material(folder).maps["metallic"]) == 1.0 != np.mean(second.maps["metallic"])
     (folder / "material.yaml").write_text("height: {file: height.png, scale: 0.3}\n", encoding="utf-8")
     assert latest_material(folder).height_scale == 0.3
     (folder / "height.png").unlink()
@@ -54,5 +54,5 @@ def test_a_changed_folder_is_loaded_again(folder: Path) -> None:
 
 
 def test_large_materials_are_not_kept(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(latest, "_KEPT_BYTES", 100)
+    monkeypatch.setattr(loading, "_KEPT_BYTES", 100)
     assert latest_material(folder) is not latest_material(folder)

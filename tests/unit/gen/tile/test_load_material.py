@@ -92,7 +92,7 @@ class TestBareFile:
         assert (material.height_scale, material.height_bits) == (1.0, None)
         assert material.aspect == pytest.approx(6 / 9)
         assert material.is_lambert
-        assert np.array_equal(material.base_color, np.full(3, 0.5))
+        assert np.array_equal(material.maps["base_color"], np.full(3, 0.5))
         assert material.warnings == ()
         assert any("Lambert, because no roughness" in note for note in material.notes)
 
@@ -120,38 +120,38 @@ class TestBareFile:
     @pytest.mark.parametrize("shape", [(1, 1), (1, 7), (5, 1), (3, 10)])
     def test_any_shape_and_constant_heights(self, tmp_path: Path, shape: tuple[int, int]) -> None:
         material = load_material(npy(tmp_path / "h.npy", np.full(shape, 0.25)))
-        assert material.grid().z.shape == shape
-        assert material.grid().displacement_range == 0.0
+        assert material.grid.z.shape == shape
+        assert material.grid.displacement_range == 0.0
         assert material.aspect == shape[0] / shape[1]
 
     def test_a_large_displacement_at_the_default_scale_warns(self, tmp_path: Path) -> None:
         material = load_material(npy(tmp_path / "h.npy", np.array([[0.0, 0.6]])))
-        (warning,) = material.warnings_at()
+        (warning,) = material.warnings_in_use()
         assert "the displacement range is 0.6 tile widths; check --height-scale" in warning
-        assert material.warnings_at(1.0) == ()
-        assert load_material(npy(tmp_path / "h.npy", np.array([[0.0, 0.5]]))).warnings_at() == ()
+        assert material.at(1.0).warnings_in_use() == ()
+        assert load_material(npy(tmp_path / "h.npy", np.array([[0.0, 0.5]]))).warnings_in_use() == ()
         yaml = tmp_path / "m.yaml"
         yaml.write_text("height: {file: h.npy, scale: 2}\n")
-        assert load_material(yaml).warnings_at() == ()
+        assert load_material(yaml).warnings_in_use() == ()
 
 
 class TestGrid:
     def test_default_mesh_follows_the_map_up_to_a_limit(self, tmp_path: Path) -> None:
-        assert load_material(npy(tmp_path / "a.npy", rng().random((30, 20)))).grid().z.shape == (30, 20)
+        assert load_material(npy(tmp_path / "a.npy", rng().random((30, 20)))).grid.z.shape == (30, 20)
         wide = load_material(npy(tmp_path / "b.npy", rng().random((100, 1000))))
-        assert wide.grid().z.shape == (51, 512)
-        assert wide.grid().aspect == 0.1
+        assert wide.grid.z.shape == (51, 512)
+        assert wide.grid.aspect == 0.1
 
     def test_heights_touch_the_reference_plane_from_below(self, tmp_path: Path) -> None:
         heights = rng().random((8, 8))
         material = load_material(npy(tmp_path / "h.npy", heights))
-        grid = material.grid(height=0.3)
+        grid = material.at(height_scale=0.3).grid
         assert grid.z == pytest.approx(0.3 * (heights - heights.max()))
-        assert material.grid(height=-0.3).z.max() == 0.0
-        coarse = material.grid(mesh=4)
+        assert material.at(height_scale=-0.3).grid.z.max() == 0.0
+        coarse = material.at(mesh=4).grid
         expected = heights.reshape(4, 2, 4, 2).mean(axis=(1, 3))
         assert coarse.z == pytest.approx(expected - expected.max())
-        assert material.grid(mesh=16).z.shape == (16, 16)
+        assert material.at(mesh=16).grid.z.shape == (16, 16)
 
 
 class TestFolder:
@@ -159,9 +159,9 @@ class TestFolder:
         material = load_material(folder)
         assert set(material.files) == {"height", "base_color", "roughness", "metallic", "normal", "opacity"}
         assert not material.is_lambert
-        assert material.base_color.shape == (16, 32, 3)
-        assert np.shape(material.roughness) == (4, 8)
-        assert material.specular == 0.5
+        assert material.maps["base_color"].shape == (16, 32, 3)
+        assert np.shape(material.maps["roughness"]) == (4, 8)
+        assert material.maps["specular"] == 0.5
         assert any("default specular 0.5" in note for note in material.notes)
         assert any("rock_ao.png is not used" in note for note in material.notes)
         assert any(note.startswith("opacity: ") for note in material.notes)
@@ -170,23 +170,23 @@ class TestFolder:
         from PIL import Image as Pillow
 
         stored = np.asarray(Pillow.open(folder / "Rock_BaseColor.png")) / 255.0
-        assert load_material(folder).base_color == pytest.approx(srgb_to_linear(stored), abs=1e-6)
+        assert load_material(folder).maps["base_color"] == pytest.approx(srgb_to_linear(stored), abs=1e-6)
         (folder / "Rock_BaseColor.png").unlink()
         linear = npy(folder / "color.npy", rng().random((4, 8, 3)))
-        assert load_material(folder).base_color == pytest.approx(np.load(linear), abs=1e-7)
+        assert load_material(folder).maps["base_color"] == pytest.approx(np.load(linear), abs=1e-7)
         linear.unlink()
         png(folder / "albedo.png", np.full((8, 16), 255, np.uint8))
-        assert np.array_equal(load_material(folder).base_color, np.ones((8, 16, 3)))
+        assert np.array_equal(load_material(folder).maps["base_color"], np.ones((8, 16, 3)))
 
     def test_normals_point_up_and_dx_is_turned(self, folder: Path) -> None:
         tilted = np.full((8, 16, 3), (128, 200, 230), np.uint8)
         png(folder / "rockNormalGL.png", tilted)
-        gl = load_material(folder).normal
+        gl = load_material(folder).maps["normal"]
         assert gl is not None
         assert np.linalg.norm(gl, axis=-1) == pytest.approx(1.0, abs=1e-6)
         assert gl[0, 0, 1] > 0.5
         (folder / "rockNormalGL.png").rename(folder / "rockNormalDX.png")
-        dx = load_material(folder).normal
+        dx = load_material(folder).maps["normal"]
         assert dx is not None
         assert dx * [1, -1, 1] == pytest.approx(gl)
         png(folder / "rockNormalGL.png", codes(8, 16, 3))
@@ -196,13 +196,13 @@ class TestFolder:
         png(folder / "rock-rough.png", np.full((1, 1), 51, np.uint8))
         png(folder / "Rock_BaseColor.png", np.full((1, 1, 3), 255, np.uint8))
         material = load_material(folder)
-        assert material.roughness == pytest.approx(0.2)
-        assert material.base_color == pytest.approx(np.ones(3))
+        assert material.maps["roughness"] == pytest.approx(0.2)
+        assert material.maps["base_color"] == pytest.approx(np.ones(3))
 
     def test_rounded_sizes_are_no_other_aspect(self, tmp_path: Path) -> None:
         npy(tmp_path / "height.npy", np.zeros((683, 1024)))
         png(tmp_path / "rough.png", codes(1365, 2048))
-        assert np.shape(load_material(tmp_path).roughness) == (1365, 2048)
+        assert np.shape(load_material(tmp_path).maps["roughness"]) == (1365, 2048)
         png(tmp_path / "rough.png", codes(1362, 2048))
         with pytest.raises(InputError, match="one aspect"):
             load_material(tmp_path)
@@ -245,13 +245,17 @@ class TestYaml:
         for source in (path, folder, path.relative_to(tmp_path)):
             material = load_material(source)
             assert material.height_scale == 0.2
-            assert material.base_color == pytest.approx(srgb_to_linear([0.5, 0.25, 1.0]))
-            assert np.shape(material.roughness) == (4, 8)
-            assert (material.metallic, material.specular, material.opacity) == (1.0, 0.25, 0.75)
+            assert material.maps["base_color"] == pytest.approx(srgb_to_linear([0.5, 0.25, 1.0]))
+            assert np.shape(material.maps["roughness"]) == (4, 8)
+            assert (material.maps["metallic"], material.maps["specular"], material.maps["opacity"]) == (
+                1.0,
+                0.25,
+                0.75,
+            )
 
     def test_gray_shorthand(self, folder: Path) -> None:
         material = load_material(self.write(folder, "height: rock_height.npy\nbase_color: 0.8\n"))
-        assert np.array_equal(material.base_color, np.full(3, 0.8))
+        assert np.array_equal(material.maps["base_color"], np.full(3, 0.8))
         assert material.is_lambert
 
     def test_bsdf_is_passed_on(self, folder: Path) -> None:

@@ -37,7 +37,7 @@ end_header
 
 
 def shape_of(path: Path) -> MeshTile:
-    shape = load_material(path).shape
+    shape = load_material(path)
     assert isinstance(shape, MeshTile)
     return shape
 

@@ -23,12 +23,12 @@ def plane_below() -> object:
     load_mitsuba()
     from mbtf_gen.render.estimator import Estimator
     from mbtf_gen.render.path_tracer import Transport
-    from mbtf_gen.render.scene import build_tile
+    from mbtf_gen.render.scene import build_scene
 
     heights = np.full((64, 32), -DEPTH)
     heights[60, 2] = 0.0
     grid = HeightGrid.from_map(heights, 1.0, 2.0)
-    tile = build_tile(grid, {"type": "diffuse"})
+    tile = build_scene(grid, {"type": "diffuse"})
     return Estimator(tile, None, Transport())
 
 

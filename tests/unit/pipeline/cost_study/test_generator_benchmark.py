@@ -13,7 +13,7 @@ from support.fake_benchmark import NOISE, SHIFT, FakeEstimator, fake_benchmark
 from mbtf_core.errors import InputError
 from mbtf_core.stats import Estimate
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.planning.effects_plan import plan_effects
+from mbtf_gen.planning.effects_planner import plan_effects
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.sampling.query_sampler import Queries
 from mbtf_pipeline.cost_study import generator_benchmark as module

@@ -28,7 +28,7 @@ def write(tmp_path: Path, text: str) -> Path:
 
 
 def fibers(tmp_path: Path, text: str) -> Any:
-    found = load_material(write(tmp_path, text)).shape
+    found = load_material(write(tmp_path, text))
     assert found is not None
     return found
 
@@ -143,7 +143,7 @@ def test_a_thick_cloth_is_refused_as_steep_heights_are(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["basket_weave", "twill_silk", "stockinette"])
 def test_the_documented_figures_are_those_of_the_assets(name: str) -> None:
-    found = load_material(ASSETS / name).shape
+    found = load_material(ASSETS / name)
     assert isinstance(found, FiberTile)
     page = (ASSETS.parent / "docs/reference/assets.md").read_text(encoding="utf-8")
     row = f"| `{name}` | {len(found.curves):,} | {found.segments:,} | {found.thickness:.3f} |"
@@ -152,7 +152,7 @@ def test_the_documented_figures_are_those_of_the_assets(name: str) -> None:
 
 def test_fibers_are_the_same_on_every_machine() -> None:
     """Shards of one data set may come from several."""
-    found = load_material(ASSETS / "basket_weave").shape
+    found = load_material(ASSETS / "basket_weave")
     assert isinstance(found, FiberTile)
     points = np.concatenate([curve.control for curve in found.curves])
     assert points.sum() == pytest.approx(GOLDEN, abs=1e-6)

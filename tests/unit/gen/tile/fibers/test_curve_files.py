@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from support.paths import ROOT
 
 from mbtf_core.errors import InputError, MbtfError
+from mbtf_gen.tile.fiber_tile import FiberTile
 from mbtf_gen.tile.fibers.cloth_file import CURVE_FILES
 from mbtf_gen.tile.fibers.curve_files import read_curves
 from mbtf_gen.tile.fibers.yarn_pattern import read_pattern
@@ -85,9 +86,9 @@ def test_real_patterns_are_read_as_they_are(name: str) -> None:
         length = np.linalg.norm(step, axis=1)
         assert length.max() < 4.0 * np.median(length)
     material = load_material(path)
-    assert material.shape is not None
+    assert isinstance(material, FiberTile)
     assert material.aspect == pytest.approx(pattern.aspect)
-    assert max(curve.heights()[1] for curve in material.shape.curves) == pytest.approx(0.0, abs=1e-12)
+    assert max(curve.heights()[1] for curve in material.curves) == pytest.approx(0.0, abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -215,5 +216,5 @@ def test_altered_files_load_or_are_refused(
     path.write_text(f"{CURVE_FILES[kind]}: a{kind}\nyarn: {{fibers: 1, flyaways: 0}}\n")
     with contextlib.suppress(MbtfError):
         material = load_material(path)
-        assert material.shape is not None
-        assert np.isfinite(material.shape.thickness)
+        assert isinstance(material, FiberTile)
+        assert np.isfinite(material.thickness)

@@ -86,7 +86,7 @@ class TestPacked:
         for name in ("height", "orm"):
             np.save(tmp_path / f"{name}.npy", 0.1 * np.random.default_rng(0).random((4, 4)))
         material = load_material(tmp_path)
-        assert any("orm.npy: is not used" in w for w in material.warnings_at(0.1))
+        assert any("orm.npy: is not used" in w for w in material.at(0.1).warnings_in_use())
         assert list(material.unused) == ["orm.npy"]
 
 

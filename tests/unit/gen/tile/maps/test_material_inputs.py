@@ -10,7 +10,7 @@ from support.image_files import exr, png, rng
 
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError
-from mbtf_gen.tile.heightfield_tile import Material
+from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 from mbtf_gen.tile.loading import load_material
 
 
@@ -77,7 +77,7 @@ class TestLayers:
         path = write(tmp_path, "height: {file: all.exr, channel: extra.Y}\nbase_color: all.exr\n")
         material = load_material(path)
         assert np.array_equal(material.height, stored["e"])
-        assert np.array_equal(material.base_color, np.stack([stored[c] for c in "RGB"], axis=-1))
+        assert np.array_equal(material.maps["base_color"], np.stack([stored[c] for c in "RGB"], axis=-1))
         assert not any("height: channels" in note for note in material.notes)
         other = load_material(
             write(tmp_path, "height: {file: all.exr, channel: displacement}\nbase_color: all.exr\n")
@@ -99,8 +99,8 @@ class TestScalars:
                 "metallic: {file: rock_arm.png, channel: B}\n",
             )
         )
-        assert np.array_equal(np.rint(255 * np.asarray(material.roughness)), codes[..., 1])
-        assert np.array_equal(np.rint(255 * np.asarray(material.metallic)), codes[..., 2])
+        assert np.array_equal(np.rint(255 * np.asarray(material.maps["roughness"])), codes[..., 1])
+        assert np.array_equal(np.rint(255 * np.asarray(material.maps["metallic"])), codes[..., 2])
 
     def test_gloss_is_inverted_roughness(self, heights: Path) -> None:
         codes = rng().integers(0, 65536, (8, 16, 1))
@@ -114,7 +114,7 @@ class TestScalars:
         for option, expected in texts.items():
             text = f"height: height.npy\nroughness: {{file: gloss.png, {option}}}\n"
             material = load_material(write(heights, text))
-            assert material.roughness == pytest.approx(expected)
+            assert material.maps["roughness"] == pytest.approx(expected)
             digests.add(material.digests["settings"])
         assert len(digests) == 3
 
@@ -125,7 +125,7 @@ class TestScalars:
 
 
 class TestColor:
-    def color(self, folder: Path, option: str, *chunks: tuple[bytes, bytes]) -> Material:
+    def color(self, folder: Path, option: str, *chunks: tuple[bytes, bytes]) -> HeightFieldTile:
         self.codes = rng().integers(0, 256, (8, 16, 3))
         png(folder / "c.png", self.codes, 2, 8, extra=chunks)
         return load_material(write(folder, f"height: height.npy\nbase_color: {{file: c.png{option}}}\n"))
@@ -142,7 +142,7 @@ class TestColor:
             material = self.color(heights, option, *chunks)
             expected = self.codes / 255
             expected = np.asarray(srgb_to_linear(expected)) if bent else expected
-            assert np.abs(material.base_color - expected).max() < 1e-6, (option, chunks)
+            assert np.abs(material.maps["base_color"] - expected).max() < 1e-6, (option, chunks)
             assert material.facts["base_color"].colorspace == ("srgb" if bent else "linear")
             assert material.warnings == ()
             assert any(("read as sRGB" if bent else "read as linear") in note for note in material.notes)
@@ -161,7 +161,7 @@ class TestNormals:
         n /= np.linalg.norm(n, axis=-1, keepdims=True)
         for stored in (n, (n + 1) / 2):
             np.save(heights / "normal.npy", stored)
-            normal = load_material(heights).normal
+            normal = load_material(heights).maps["normal"]
             assert normal == pytest.approx(n, abs=1e-6)
 
     def test_normals_that_point_down(self, heights: Path) -> None:
@@ -178,7 +178,7 @@ def test_orientation_is_ignored_with_a_warning(heights: Path) -> None:
     for name in ("rough.jpg", "metallic.png"):
         Pillow.fromarray(np.full((8, 16), 100, np.uint8)).save(heights / name, exif=exif)
     material = load_material(heights)
-    assert np.shape(material.roughness) == np.shape(material.metallic) == (8, 16)
+    assert np.shape(material.maps["roughness"]) == np.shape(material.maps["metallic"]) == (8, 16)
     assert len([w for w in material.warnings if "EXIF orientation (6) is ignored" in w]) == 2
 
 
@@ -199,9 +199,9 @@ def test_sizes_that_are_neither_square_nor_powers_of_two(tmp_path: Path) -> None
     np.save(tmp_path / "rough.npy", rng().random((7, 10)).repeat(2, 0).repeat(3, 1)[:14, :21])
     material = load_material(tmp_path)
     assert material.aspect == pytest.approx(2 / 3)
-    assert material.grid().z.shape == (30, 45)
-    assert material.grid(mesh=20).z.shape == (13, 20)
-    assert np.shape(material.roughness) == (14, 21)
+    assert material.grid.z.shape == (30, 45)
+    assert material.at(mesh=20).grid.z.shape == (13, 20)
+    assert np.shape(material.maps["roughness"]) == (14, 21)
 
 
 class TestNearMisses:

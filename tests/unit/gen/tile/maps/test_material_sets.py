@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from support.paths import SHARED
 
-from mbtf_gen.tile.inspection import inspect_material, inspection_text
+from mbtf_gen.config.generator import GeometrySection
+from mbtf_gen.tile.inspection import inspection_text
 from mbtf_gen.tile.loading import load_material
 
 MATERIALS = SHARED / "data/materials"
@@ -44,7 +45,7 @@ def folder_of(name: str) -> Path:
 
 @cache
 def inspected(folder: Path) -> dict[str, Any]:
-    return inspect_material(load_material(folder))
+    return load_material(folder).inspect(GeometrySection())
 
 
 @pytest.mark.parametrize("name", SETS)

@@ -147,8 +147,8 @@ class TestMaterial:
         assert ("DirectX" if dx else "OpenGL") in note
         assert "u +1.00, v +1.00" in note
         assert note.endswith("suggested --height-scale 0.05")
-        assert material.normal is not None
-        assert np.abs(material.normal - normals_of(fractal(96, 96), 0.05)).max() < 0.02
+        assert "normal" in material.maps
+        assert np.abs(material.maps["normal"] - normals_of(fractal(96, 96), 0.05)).max() < 0.02
 
     @pytest.mark.parametrize(("name", "dx"), [("normal_gl.png", True), ("normal_dx.png", False)])
     def test_a_name_that_is_wrong(self, tmp_path: Path, name: str, dx: bool) -> None:

@@ -10,7 +10,7 @@ from support.height_maps import Floats, fractal, normals_of, save_heights, save_
 
 from mbtf_core.errors import InputError
 from mbtf_core.shard_schema import Tiling
-from mbtf_gen.tile.heightfield_tile import Material
+from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 from mbtf_gen.tile.loading import load_material
 from mbtf_gen.tile.maps.normal_map import fit_normals
 from mbtf_gen.tile.maps.tiling import broken, mirror, mirror_normals, seams
@@ -98,19 +98,24 @@ class TestMaterial:
     def test_mirror_treats_all_maps_alike(self, folder: Path) -> None:
         plain, mirrored = load_material(folder), load_material(folder, "mirror")
         assert mirrored.height.shape == (144, 192)
-        for numbers in (mirrored.roughness, mirrored.clearcoat, mirrored.clearcoat_roughness, mirrored.sheen):
+        for numbers in (
+            mirrored.maps["roughness"],
+            mirrored.maps["clearcoat"],
+            mirrored.maps["clearcoat_roughness"],
+            mirrored.maps["sheen"],
+        ):
             assert np.shape(numbers) == (72, 96)
-        assert np.shape(mirrored.sheen_color) == (144, 192, 3)
-        assert mirrored.base_color.shape == (144, 192, 3)
-        assert np.shape(mirrored.opacity) == (144, 192)
-        assert mirrored.metallic == 0.0
+        assert np.shape(mirrored.maps["sheen_color"]) == (144, 192, 3)
+        assert mirrored.maps["base_color"].shape == (144, 192, 3)
+        assert np.shape(mirrored.maps["opacity"]) == (144, 192)
+        assert mirrored.maps["metallic"] == 0.0
         # The same heights: the tile is twice as wide, so heights in tile widths are half.
         assert mirrored.grid(0.3, 192).displacement_range == pytest.approx(
             0.5 * plain.grid(0.3, 96).displacement_range
         )
         assert mirrored.aspect == plain.aspect
-        assert mirrored.normal is not None
-        found = fit_normals(mirrored.height, mirrored.normal)
+        assert "normal" in mirrored.maps
+        found = fit_normals(mirrored.height, mirrored.maps["normal"])
         assert found is not None
         assert found.convention == "gl"
         assert min(found.correlation_u, found.correlation_v) > 0.97
@@ -135,7 +140,7 @@ class TestMaterial:
         (folder / "material.yaml").write_text(
             "height: height.png\nbsdf: {type: diffuse, reflectance: {type: bitmap, filename: rough.png}}\n"
         )
-        assert isinstance(load_material(folder), Material)
+        assert isinstance(load_material(folder), HeightFieldTile)
         with pytest.raises(InputError, match="textures of its bsdf"):
             load_material(folder, "mirror")
 
@@ -155,4 +160,4 @@ def test_jobs_use_it(tmp_path: Path) -> None:
     assert GeneratorConfig.model_validate({"material": "m"}).geometry.make_tileable is None
     job = Job.prepare(GeneratorConfig.model_validate(config))
     assert job.material.height.shape == (96, 96)
-    assert job.material.tile == "mirror"
+    assert job.material.tiling == "mirror"

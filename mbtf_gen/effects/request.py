@@ -1,4 +1,4 @@
-"""Names of the light transport effects, and the user's request for them (``--effects``)."""
+"""The user's request for effects (``--effects``)."""
 
 from __future__ import annotations
 
@@ -6,23 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from mbtf_core.errors import UsageError
-
-# Effects by name, with their descriptions.
-EFFECTS: dict[str, str] = {
-    "parallax": "parallax and masking",
-    "shadowing": "shadowing",
-    "interreflection": "interreflection",
-    "specular": "specular lobe",
-    "metallic": "metallic",
-    "clearcoat": "clearcoat",
-    "sheen": "sheen",
-    "transmission": "fiber transmission",
-    "normal": "normal map",
-    "opacity": "opacity",
-    "bsdf_sampling": "BSDF sampling of light",
-}
-# Effects of displaced surfaces only.
-DISPLACEMENT_EFFECTS = ("parallax", "shadowing", "interreflection")
+from mbtf_gen.effects.catalog import EFFECTS
 
 
 @dataclass(frozen=True)
@@ -31,6 +15,11 @@ class EffectsRequest:
 
     base: Literal["auto", "all", "none"]
     forced: dict[str, bool]
+
+    @property
+    def auto(self) -> frozenset[str]:
+        """Effects that are left to the plan."""
+        return frozenset(EFFECTS.keys() - self.forced.keys()) if self.base == "auto" else frozenset()
 
     @classmethod
     def parse(cls, text: str) -> EffectsRequest:

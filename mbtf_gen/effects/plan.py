@@ -8,45 +8,12 @@ leaving out all of them (Minkowski's inequality), so a tolerance can be divided 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 from mbtf_core.errors import UsageError
-from mbtf_gen.config.effects_request import DISPLACEMENT_EFFECTS, EFFECTS, EffectsRequest
-
-Reason = Literal["exact", "bound", "pilot", "forced"]
-
-
-@dataclass(frozen=True)
-class Effect:
-    """The decision on one effect.
-
-    Attributes
-    ----------
-    name : str
-        A key of ``EFFECTS``.
-    on : bool
-        Whether the effect is simulated.
-    explanation : str
-        Why, in words.
-    bias_bound : float or None
-        Root mean square change of M without the effect, relative to the mean of M: an upper bound where the
-        effect is off, an estimate where it is on. None where it is unknown.
-    reason : {"exact", "bound", "pilot", "forced"}
-        What the decision rests on: the material and the options alone, a bound from theory, a pilot or an
-        estimate on the maps, or the user's request.
-    present : bool
-        Whether the effect can be switched. If not, the material lacks it or requires it.
-    error : float
-        Standard error of a measured bias bound.
-    """
-
-    name: str
-    on: bool
-    explanation: str
-    bias_bound: float | None = None
-    reason: Reason = "exact"
-    present: bool = True
-    error: float = 0.0
+from mbtf_gen.effects.catalog import EFFECTS
+from mbtf_gen.effects.effect import Decision
+from mbtf_gen.effects.request import EffectsRequest
 
 
 @dataclass(frozen=True)
@@ -55,7 +22,7 @@ class EffectsPlan:
 
     Attributes
     ----------
-    effects : tuple of Effect
+    effects : tuple of Decision
         One decision per effect.
     max_depth : int
         Surface interactions of a path at most; 0 means no limit.
@@ -71,7 +38,7 @@ class EffectsPlan:
         Whether M is known without tracing.
     """
 
-    effects: tuple[Effect, ...]
+    effects: tuple[Decision, ...]
     max_depth: int = 0
     cap_bias_bound: float = 0.0
     roulette_depth: int = 1
@@ -79,7 +46,7 @@ class EffectsPlan:
     tolerance: float = 0.0
     closed_form: bool = False
 
-    def __getitem__(self, name: str) -> Effect:
+    def __getitem__(self, name: str) -> Decision:
         return next(e for e in self.effects if e.name == name)
 
     def on(self, name: str) -> bool:
@@ -102,7 +69,7 @@ class EffectsPlan:
         return {**vars(self), "bias_bound": self.bias_bound, "effects": effects}
 
 
-def decide(request: EffectsRequest, effect: Effect) -> Effect:
+def decide(request: EffectsRequest, effect: Decision) -> Decision:
     """The effect, switched where the user requests it.
 
     Raises
@@ -124,7 +91,7 @@ def decide(request: EffectsRequest, effect: Effect) -> Effect:
     return replace(effect, on=on, explanation=explanation, reason="forced")
 
 
-def consistent(decided: dict[str, Effect], request: EffectsRequest) -> dict[str, Effect]:
+def consistent(decided: dict[str, Decision], request: EffectsRequest) -> dict[str, Decision]:
     """Decisions by name, where effects that need the displaced surface are off without it.
 
     Raises
@@ -134,11 +101,11 @@ def consistent(decided: dict[str, Effect], request: EffectsRequest) -> dict[str,
     out = dict(decided)
     if out["parallax"].on:
         return out
-    needed = EFFECTS["parallax"]
-    for name in DISPLACEMENT_EFFECTS[1:]:
-        if out[name].on:
+    needed = EFFECTS["parallax"].description
+    for name, effect in EFFECTS.items():
+        if effect.displaced and name != "parallax" and out[name].on:
             if request.forced.get(name):
-                raise UsageError(f"'{EFFECTS[name]}' needs '{needed}'", where=f"--effects +{name}")
+                raise UsageError(f"'{effect.description}' needs '{needed}'", where=f"--effects +{name}")
             out[name] = replace(out[name], on=False, explanation=f"needs {needed}")
     return out
 
