@@ -87,9 +87,9 @@ class TestWrite:
         flagged = job_of(maps, geometry=geometry, queries={"resolution": 16})
         written(maps, "--resolution", "16")
         plain = job_of(maps)
-        assert np.array_equal(plain.grid.z, flagged.grid.z)
+        assert np.array_equal(plain.material.grid.z, flagged.material.grid.z)
         for role in ("base_color", "normal"):
-            assert np.array_equal(getattr(plain.material, role), getattr(flagged.material, role))
+            assert np.array_equal(plain.material.maps[role], flagged.material.maps[role])
         assert plain.lattice == flagged.lattice
         assert plain.config.geometry == flagged.config.geometry
         assert plain.config.queries == flagged.config.queries

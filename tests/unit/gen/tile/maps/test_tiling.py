@@ -110,9 +110,7 @@ class TestMaterial:
         assert np.shape(mirrored.maps["opacity"]) == (144, 192)
         assert mirrored.maps["metallic"] == 0.0
         # The same heights: the tile is twice as wide, so heights in tile widths are half.
-        assert mirrored.grid(0.3, 192).displacement_range == pytest.approx(
-            0.5 * plain.grid(0.3, 96).displacement_range
-        )
+        assert mirrored.at(0.3, 192).thickness == pytest.approx(0.5 * plain.at(0.3, 96).thickness)
         assert mirrored.aspect == plain.aspect
         assert "normal" in mirrored.maps
         found = fit_normals(mirrored.height, mirrored.maps["normal"])
@@ -126,7 +124,7 @@ class TestMaterial:
         plain, blended = load_material(folder), load_material(folder, "blend")
         names = "height roughness base_color opacity normal clearcoat sheen sheen_color"
         for name in names.split():
-            before, after = getattr(plain, name), getattr(blended, name)
+            before, after = plain.images[name], blended.images[name]
             assert np.shape(after) == np.shape(before)
             rows, columns = np.shape(before)[:2]
             assert np.abs(after - before)[rows // 2, columns // 2].max() < 1e-6
@@ -145,7 +143,7 @@ class TestMaterial:
             load_material(folder, "mirror")
 
     def test_size_is_bounded(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("mbtf_gen.tile.heightfield_tile.MAX_PIXELS", 4 * 72 * 96 - 1)
+        monkeypatch.setattr("mbtf_gen.tile.assembly.MAX_PIXELS", 4 * 72 * 96 - 1)
         with pytest.raises(InputError, match="more than 27,647 pixels"):
             load_material(folder, "mirror")
         assert load_material(folder, "blend").height.shape == (72, 96)
