@@ -24,6 +24,7 @@ from mbtf_core.directions import from_angles
 from mbtf_core.errors import UsageError
 from mbtf_core.stats import Estimate, mean_estimate
 from mbtf_gen.pictures.camera import PIXEL_SIGMA, Camera
+from mbtf_gen.tile.maps.material_file import ROLES
 from mbtf_pipeline.compare.pictures import PICTURES, write_picture
 
 if TYPE_CHECKING:
@@ -47,18 +48,7 @@ MEAN_TOLERANCE, RMS_TOLERANCE = 0.005, 0.02
 # two.
 MAX_STANDARD_ERRORS = 3.0
 # Properties that a Lambertian surface does not have.
-_NOT_LAMBERTIAN = (
-    "roughness",
-    "metallic",
-    "specular",
-    "clearcoat",
-    "clearcoat_roughness",
-    "sheen",
-    "sheen_color",
-    "sheen_roughness",
-    "normal",
-    "opacity",
-)
+_NOT_LAMBERTIAN = tuple(role for role in ROLES if role != "base_color")
 
 
 Verdict = Literal["agree", "differ", "inconclusive"]

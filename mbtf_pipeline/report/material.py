@@ -65,7 +65,7 @@ def material_section(config: GeneratorConfig, inputs: Mapping[str, str]) -> dict
 def _thumbnail(role: str, value: Pixels) -> U8:
     """A thumbnail: colors as sRGB, normals from [-1, 1], heights from their range, other maps as stored."""
     small: Pixels = shrink(value, -(-max(value.shape[:2]) // _SIZE)).astype(np.float64)
-    if role in ("base_color", "sheen_color"):
+    if role.endswith("color"):
         small = linear_to_srgb(np.clip(small, 0.0, 1.0))
     elif role == "normal":
         small = 0.5 + 0.5 * small

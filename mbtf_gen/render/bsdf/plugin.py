@@ -7,6 +7,7 @@ makes the same surface usable in any Mitsuba scene.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields
 from typing import Any
 
 import drjit as dr
@@ -23,17 +24,10 @@ from mbtf_gen.engine.types import (
     SurfaceInteraction3f,
     Vector3f,
 )
-from mbtf_gen.render.bsdf.surface import Surface, SurfaceParts
+from mbtf_gen.render.bsdf.surface import DEFAULTS, Surface, SurfaceParts
 
-# Parameters of ``mbtf_surface``, textures or numbers: those that have defaults, and those that add a term.
-DEFAULTS = {
-    "base_color": 0.5,
-    "roughness": 0.5,
-    "clearcoat_roughness": 0.1,
-    "sheen_color": 1.0,
-    "sheen_roughness": 0.3,
-}
-TERMS = ("specular", "metallic", "clearcoat", "sheen", "slopes", "opacity")
+# Parameters of ``mbtf_surface`` that add a term.
+TERMS = tuple(part.name for part in fields(SurfaceParts) if part.name != "diffuse")
 
 
 class SurfaceBSDF(mi.BSDF):

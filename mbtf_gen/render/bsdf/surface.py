@@ -127,6 +127,16 @@ class SurfaceParts:
     opacity: bool = False
 
 
+# Values of textures that no term needs, or that a term may lack.
+DEFAULTS = {
+    "base_color": 0.5,
+    "roughness": 0.5,
+    "clearcoat_roughness": 0.1,
+    "sheen_color": 1.0,
+    "sheen_roughness": 0.3,
+}
+
+
 class Surface:
     """Reflection of a tile: its textures and the terms of the BSDF.
 

@@ -25,8 +25,6 @@ _SIGNED = -0.05
 # Largest component of a normal in any encoding, with rounding.
 _LONGEST = 1.5
 _NORMALS = "its pixels are (n+1)/2, or the components of n themselves in a float image"
-# Names of color maps in messages.
-_COLORS = {"base_color": "base color", "sheen_color": "sheen's color"}
 # Fraction of normals pointing into the surface above which a warning is given.
 _STRAY = 1e-4
 _FileEntry = HeightEntry | ColorEntry | ShareEntry | NormalEntry
@@ -143,7 +141,9 @@ class MapLoader:
         image = self.image(role, entry)
         pixels = image.pixels
         if pixels.shape[2] in (2, 4) and np.any(pixels[..., -1] != 1.0):
-            self.warnings.append(f"{image.path}: the alpha channel of the {_COLORS[role]} is not used")
+            self.warnings.append(
+                f"{image.path}: the alpha channel of the {role.replace('_', ' ')} is not used"
+            )
         rgb = pixels[..., :3] if pixels.shape[2] > 2 else np.repeat(pixels[..., :1], 3, axis=2)
         rgb = self._within(role, rgb, np.any((rgb < -_ROUNDING) | (rgb > 1 + _ROUNDING), axis=-1))
         space = self._color_space(role, image, entry)
@@ -166,7 +166,7 @@ class MapLoader:
                 f"{'sRGB' if space == 'srgb' else 'linear'}; convert it to sRGB"
             )
         shown = "sRGB" if space == "srgb" else "linear"
-        self.notes.append(f"{_COLORS[role]}: {image.path.name} read as {shown} ({why})")
+        self.notes.append(f"{role.replace('_', ' ')}: {image.path.name} read as {shown} ({why})")
         return space
 
     def normals(self, entry: NormalEntry) -> NDArray[np.float32]:
