@@ -45,9 +45,7 @@ COLOR = np.array([0.7, 0.5, 0.2])
 
 
 def lambert(height: NDArray[np.float64], scale: float, **more: Any) -> HeightFieldTile:
-    return HeightFieldTile(
-        height=height, height_scale=scale, maps={"base_color": np.array([0.7, 0.5, 0.2]), **more}
-    )
+    return HeightFieldTile(height=height, height_scale=scale).with_maps(base_color=COLOR, **more)
 
 
 def estimates(job: Job, plan: EffectsPlan, spp: int = 8) -> Estimates:

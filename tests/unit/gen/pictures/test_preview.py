@@ -19,7 +19,7 @@ from mbtf_gen.job import Job
 from mbtf_gen.pictures.camera import Camera, tiles_camera
 from mbtf_gen.pictures.preview import mesh
 from mbtf_gen.pictures.preview.mesh import MOST_CELLS, draw, tiled_mesh
-from mbtf_gen.pictures.preview.plots import level_histogram, query_figure, write_plots
+from mbtf_gen.pictures.preview.plots import level_histogram
 from mbtf_gen.pictures.preview.sample import QuerySample, sampled_queries, stored_queries
 from mbtf_gen.sampling.query_sampler import Mixture
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
@@ -170,41 +170,6 @@ def test_unfinished_shards_are_left_out(tmp_path: Path) -> None:
         (tmp_path / "set" / name).unlink()
     with pytest.raises(InputError, match="no finished train shard"):
         stored_queries(dataset)
-
-
-@pytest.mark.parametrize("count", [1, 300, 9000])
-def test_plots_show_the_queries(count: int, tmp_path: Path) -> None:
-    sample = sample_of(count, min_cos=0.5)
-    position, level, light, view, *bars = query_figure(sample, "title").axes
-    assert len(bars) == (3 if count == 9000 else 0)
-    assert position.get_aspect() == 0.5
-    assert f"k = {sample.finest} " in level.get_xlabel()
-    for axes, points in ((position, sample.u), (light, sample.omega_i[:, :2]), (view, sample.omega_o[:, :2])):
-        collection = axes.collections[0]
-        if count < 4000:
-            np.testing.assert_array_equal(np.asarray(collection.get_offsets(), np.float32), points)
-        else:
-            ratio = np.ma.filled(collection.get_array(), np.nan)
-            assert np.nanmean(ratio) == pytest.approx(1.0, abs=0.05)
-            assert np.nanmax(ratio) < 2
-    for axes in (light, view):
-        radii = [np.hypot(*line.get_data()) for line in axes.lines]
-        np.testing.assert_allclose(radii[0], 1.0)
-        np.testing.assert_allclose(radii[1], np.sqrt(0.75))
-    edges, found, stated = level_histogram(sample)
-    for patch, values in zip(level.patches, (found, stated), strict=True):
-        data = patch.get_data()
-        np.testing.assert_array_equal(data.values, values)
-        np.testing.assert_array_equal(data.edges, edges)
-    write_plots(tmp_path / "plots.png", sample, "title")
-    assert (tmp_path / "plots.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_queries_outside_the_disk_stand_out() -> None:
-    sample = sample_of(9000, min_cos=0.5)
-    wrong = replace(sample, min_cos=0.8)
-    ratio = np.ma.filled(query_figure(wrong, "").axes[2].collections[0].get_array(), np.nan)
-    assert np.nansum(ratio == 2.0) > 20
 
 
 def test_a_crash_while_drawing_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pydantic import TypeAdapter
 
 from mbtf_core.errors import UsageError
 from mbtf_gen.config.generator import GeneratorConfig
@@ -112,12 +111,6 @@ def test_effects_that_the_material_lacks_cannot_be_forced_on(name: str) -> None:
 def test_unknown_words_are_refused(text: str) -> None:
     with pytest.raises(UsageError, match="is not an effect"):
         EffectsRequest.parse(text)
-
-
-def test_a_plan_survives_the_manifest() -> None:
-    plan = reference_plan(job_of(LAMBERT, "-bsdf_sampling"))
-    assert [e.name for e in plan.effects] == list(EFFECTS)
-    assert TypeAdapter(EffectsPlan).validate_python(plan.to_manifest()) == plan
 
 
 def test_bias_bounds_add_up_over_what_is_off() -> None:

@@ -77,11 +77,6 @@ class TestWrite:
             "resolution": 8,
         }
 
-    def test_maps_that_tile_and_have_no_normals(self, tmp_path: Path) -> None:
-        save_heights(tmp_path / "height.png", fractal(64, 64))
-        content = written(tmp_path)
-        assert content == {"height": {"file": "height.png", "scale": 0.05}, "make_tileable": "none"}
-
     def test_the_other_commands_need_no_flags(self, maps: Path) -> None:
         geometry = {"height_scale": STORED, "make_tileable": "blend"}
         flagged = job_of(maps, geometry=geometry, queries={"resolution": 16})
@@ -147,20 +142,6 @@ class TestWrite:
             assert "exists already: --overwrite replaces it" in capsys.readouterr().err.replace("\n  ", ": ")
             assert path.read_bytes() == before
 
-    @pytest.mark.parametrize("words", [("--write", "material.json"), ("--export", "heights.png")])
-    def test_other_suffixes_are_refused(self, maps: Path, words: tuple[str, str]) -> None:
-        assert run(app, ["inspect", str(maps), words[0], str(maps / words[1])]) == 2
-        assert not (maps / words[1]).exists()
-
-    def test_json(self, maps: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        written(maps, "--json", "--resolution", "16")
-        found = json.loads(capsys.readouterr().out)
-        assert found["written"]["file"] == str(maps / "material.yaml")
-        choices = found["written"]["choices"]
-        assert choices["height.scale"]["value"] == found["geometry"]["height_scale"] == STORED
-        assert choices["resolution"] == {"value": 16, "reason": "given"}
-        assert (found["make_tileable"], found["resolution"]) == ("blend", 16)
-
 
 class TestWarning:
     """The height scale in use is in the header of every run, and the warning where it is far off."""
@@ -180,18 +161,6 @@ class TestWarning:
         assert f"its slopes suggest --height-scale 0.012; {factor:g} is in use" in warning
         header = next(r.getMessage() for r in caplog.records if r.getMessage().startswith("mesh: "))
         assert f"height scale {factor:g} ({source})" in header
-
-    @pytest.mark.parametrize("factor", [STORED / 1.45, STORED * 1.45])
-    def test_close(self, maps: Path, factor: float) -> None:
-        assert not any("suggest" in w for w in load_material(maps).at(factor).warnings_in_use())
-
-    def test_the_material_file(self, maps: Path, caplog: pytest.LogCaptureFixture) -> None:
-        text = f"height: {{file: height.png, scale: {STORED}}}\nnormal: normal.png\nmake_tileable: blend\n"
-        (maps / "material.yaml").write_text(text)
-        with caplog.at_level(logging.INFO):
-            Job.prepare(GeneratorConfig.model_validate({"material": str(maps)}))
-        assert not [r for r in caplog.records if r.levelno == logging.WARNING]
-        assert any("height scale 0.012 (material file)" in r.getMessage() for r in caplog.records)
 
 
 class TestExport:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.height_maps import Floats, fractal, normals_of, save_heights, save_normals
+from support.height_maps import fractal, normals_of, save_heights, save_normals
 
 from mbtf_core.console import run
 from mbtf_gen.cli.app import app
@@ -21,9 +21,8 @@ from mbtf_gen.tile.heights.statistics import (
     slope_angles,
     triangle_slopes,
 )
-from mbtf_gen.tile.inspection import USES, inspection_text
+from mbtf_gen.tile.inspection import inspection_text
 from mbtf_gen.tile.loading import load_material
-from mbtf_gen.tile.maps.material_file import MaterialFile
 
 
 class TestSlopes:
@@ -152,46 +151,6 @@ class TestText:
         ):
             assert part in text
 
-    def test_misfits_and_seams_are_shouted(self, folder: Path) -> None:
-        height: Floats = fractal(48, 96)[:, ::-1]
-        save_heights(folder / "height.png", height * np.linspace(0.1, 1, 96))
-        text = inspection_text(load_material(folder).inspect(GeometrySection()), "rock")
-        assert "DOES NOT FIT; fits with the height map mirrored left to right" in text
-        assert "along u DOES NOT TILE" in text
-
-    def test_every_entry_of_a_material_file(self, folder: Path) -> None:
-        """Each as a map and as a constant, but the heights, normals and BSDF, which are no numbers."""
-        assert set(USES) == set(MaterialFile.model_fields) - {"bsdf", "make_tileable", "resolution"}
-        shares = sorted(set(USES) - {"height", "normal"})
-        for value in ("0.5", "metallic.npy"):
-            text = "height: height.png\n" + "".join(f"{name}: {value}\n" for name in shares)
-            (folder / "material.yaml").write_text(text)
-            text = inspection_text(load_material(folder).inspect(GeometrySection()), "rock")
-            for name in shares:
-                assert USES[name] in text
-        assert "surface glossy under a clear coat" in text
-
-    def test_a_coat_alone_lies_on_lambert(self, folder: Path) -> None:
-        (folder / "material.yaml").write_text("height: height.png\nclearcoat: 1\n")
-        material = load_material(folder)
-        assert any(n.startswith("surface: Lambert under a clear coat, because") for n in material.notes)
-        lines = inspection_text(material.inspect(GeometrySection()), "rock").splitlines()
-        assert "surface diffuse under a clear coat" in lines[0]
-        assert any(line.startswith("clearcoat_roughness constant 0.1") for line in lines)
-
-    def test_maps_that_are_not_used_are_shown(self, folder: Path) -> None:
-        for name in ("orm.png", "gloss.png", "ao.png", "view.png"):
-            save_heights(folder / name, fractal(48, 96))
-        text = inspection_text(load_material(folder).inspect(GeometrySection()), "rock")
-        for name in (
-            "orm.png: name its channels",
-            "gloss.png: in a",
-            "ao.png: the simulation",
-            "view.png: its name",
-        ):
-            assert f"not used   {name}" in text
-        assert "orm.png: is not used, and its map is missing" in text
-
     def test_a_height_scale_far_from_the_suggested_one(self, folder: Path) -> None:
         save_normals(folder / "normal.png", normals_of(fractal(48, 96), 0.01))
 
@@ -214,17 +173,6 @@ class TestText:
 
 
 class TestCommand:
-    def test_json(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        assert run(app, ["inspect", str(folder), *["--json", "--height-scale", "0.3", "--mesh", "10"]]) == 0
-        found = json.loads(capsys.readouterr().out)
-        assert found["material"] == str(folder)
-        assert found["geometry"]["height_scale"] == 0.3
-        assert found["geometry"]["mesh"] == [5, 10]
-        assert found["maps"]["height"]["bits"] == 16
-
-        assert run(app, ["inspect", str(folder), "--make-tileable", "mirror"]) == 0
-        assert "make-tileable mirror" in capsys.readouterr().out
-
     def test_a_displacement_that_generation_refuses(
         self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
@@ -239,8 +187,3 @@ class TestCommand:
         assert warned()
         assert not warned("--height-scale", "0.4")
         assert not warned("--set", "geometry.max_displacement=300")
-
-    def test_a_missing_material_is_refused(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        assert run(app, ["inspect", str(folder.parent / "rok")]) == 3
-        assert f"did you mean '{folder}'" in capsys.readouterr().err
-        assert run(app, ["inspect"]) == 2

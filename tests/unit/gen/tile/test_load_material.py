@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError
 from mbtf_gen.tile.loading import load_material
-from mbtf_gen.tile.maps.discovery import normal_convention, role_of, tokens
+from mbtf_gen.tile.maps.discovery import normal_convention, role_of
 
 
 def rng() -> np.random.Generator:
@@ -68,10 +68,6 @@ ROLES: dict[str | None, str] = {
 
 
 class TestNames:
-    def test_tokens(self) -> None:
-        assert tokens("Bricks102_1K-JPG_NormalGL.jpg") == ["bricks", "102", "1", "k", "jpg", "normal", "gl"]
-        assert tokens("Fabric_Knitted_006_ambientOcclusion.png")[-2:] == ["ambient", "occlusion"]
-
     @pytest.mark.parametrize("role", ROLES)
     def test_roles(self, role: str | None) -> None:
         assert {name: role_of(name) for name in ROLES[role].split()} == dict.fromkeys(
@@ -108,14 +104,6 @@ class TestBareFile:
         assert np.abs(material.height - ramp / 255).max() <= 0.5 / 255 * (1 + 1e-9)
         assert not np.array_equal(material.height, ramp / 255)
         assert "8-bit heights with 11 distinct values" in material.warnings[0]
-
-    def test_other_maps_of_the_folder_are_noted(self, folder: Path) -> None:
-        material = load_material(folder / "rock_height.npy")
-        assert material.is_lambert
-        assert set(material.files) == {"height"}
-        hint = material.notes[0]
-        assert "Rock_BaseColor.png" in hint
-        assert str(folder) in hint
 
     @pytest.mark.parametrize("shape", [(1, 1), (1, 7), (5, 1), (3, 10)])
     def test_any_shape_and_constant_heights(self, tmp_path: Path, shape: tuple[int, int]) -> None:
@@ -155,17 +143,6 @@ class TestGrid:
 
 
 class TestFolder:
-    def test_every_map_is_found(self, folder: Path) -> None:
-        material = load_material(folder)
-        assert set(material.files) == {"height", "base_color", "roughness", "metallic", "normal", "opacity"}
-        assert not material.is_lambert
-        assert material.maps["base_color"].shape == (16, 32, 3)
-        assert np.shape(material.maps["roughness"]) == (4, 8)
-        assert material.maps["specular"] == 0.5
-        assert any("default specular 0.5" in note for note in material.notes)
-        assert any("rock_ao.png is not used" in note for note in material.notes)
-        assert any(note.startswith("opacity: ") for note in material.notes)
-
     def test_colors_become_linear(self, folder: Path) -> None:
         from PIL import Image as Pillow
 

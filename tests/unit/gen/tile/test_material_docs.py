@@ -2,23 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 from support.paths import ROOT
 
 from mbtf_gen.tile.loading import load_material
-from mbtf_gen.tile.maps.discovery import UNUSED, WORDS, role_of
 
 DOCUMENT = (ROOT / "docs/reference/material-yaml.md").read_text()
-
-
-def test_every_word_is_documented() -> None:
-    for role, words in WORDS.items():
-        row = next(line for line in DOCUMENT.splitlines() if line.startswith(f"| {role} |"))
-        assert re.findall(r"`([^`]+)`", row) == list(words)
-        assert [role_of(f"rock_{word}.png") for word in words] == [role] * len(words)
-    assert [word for word in UNUSED if f"`{word}`" not in DOCUMENT] == []
 
 
 def test_the_example_is_valid(tmp_path: Path) -> None:

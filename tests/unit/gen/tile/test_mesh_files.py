@@ -11,9 +11,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mbtf_core.errors import InputError, MbtfError, UsageError
-from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.job import Job
+from mbtf_core.errors import InputError, MbtfError
 from mbtf_gen.tile.loading import load_material
 from mbtf_gen.tile.mesh_tile import MeshTile
 
@@ -134,15 +132,6 @@ def test_altered_files_load_or_are_refused(
     path.write_bytes(whole[:start] + data.draw(st.binary(max_size=8)) + whole[start + length :])
     with contextlib.suppress(MbtfError):
         assert np.isfinite(shape_of(path).thickness)
-
-
-def test_options_of_height_maps_are_refused(tmp_path: Path) -> None:
-    bumps().export(tmp_path / "a.ply")
-    for geometry in ({"height_scale": 0.5}, {"mesh": 8}, {"tracer": "mesh"}, {"make_tileable": "blend"}):
-        with pytest.raises(UsageError):
-            Job.load(
-                GeneratorConfig.model_validate({"material": str(tmp_path / "a.ply"), "geometry": geometry})
-            )
 
 
 def test_the_material_file_replaces_the_reflectance(tmp_path: Path) -> None:

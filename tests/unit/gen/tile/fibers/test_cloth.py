@@ -141,15 +141,6 @@ def test_a_thick_cloth_is_refused_as_steep_heights_are(tmp_path: Path) -> None:
         Job.load(GeneratorConfig.model_validate(described))
 
 
-@pytest.mark.parametrize("name", ["basket_weave", "twill_silk", "stockinette"])
-def test_the_documented_figures_are_those_of_the_assets(name: str) -> None:
-    found = load_material(ASSETS / name)
-    assert isinstance(found, FiberTile)
-    page = (ASSETS.parent / "docs/reference/assets.md").read_text(encoding="utf-8")
-    row = f"| `{name}` | {len(found.curves):,} | {found.segments:,} | {found.thickness:.3f} |"
-    assert row in page
-
-
 def test_fibers_are_the_same_on_every_machine() -> None:
     """Shards of one data set may come from several."""
     found = load_material(ASSETS / "basket_weave")

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.paths import ROOT
 
 from mbtf_core.errors import InputError, MbtfError
 from mbtf_gen.tile.fiber_tile import FiberTile
@@ -19,7 +18,6 @@ from mbtf_gen.tile.fibers.curve_files import read_curves
 from mbtf_gen.tile.fibers.yarn_pattern import read_pattern
 from mbtf_gen.tile.loading import load_material
 
-PATTERNS = ROOT.parent / "shared" / "data" / "yarn"
 PYP = """*pattern
 0.004 0.002 0.0003 1
 *Q
@@ -67,28 +65,6 @@ def test_a_pattern_has_the_yarns_of_its_edges(tmp_path: Path) -> None:
     (yarn,) = pattern.yarns
     assert yarn.shift.tolist() == [1, 0]
     assert yarn.points[:, 0] == pytest.approx([0.125, 0.375, 0.625, 0.875])
-
-
-@pytest.mark.parametrize("name", ["basket_9", "satin_9", "stock_9"])
-def test_real_patterns_are_read_as_they_are(name: str) -> None:
-    path = PATTERNS / f"{name}.pyp"
-    if not path.exists():
-        pytest.skip(f"{path.name} is not beside the project")
-    pattern = read_pattern(path)
-    # Each vertex lies on one yarn; yarns have no jumps where they cross the border.
-    for yarn in pattern.yarns:
-        step = np.diff(
-            np.concatenate(
-                [yarn.points, yarn.points[:1] + np.append(yarn.shift, 0) * (1, pattern.aspect, 0)]
-            ),
-            axis=0,
-        )
-        length = np.linalg.norm(step, axis=1)
-        assert length.max() < 4.0 * np.median(length)
-    material = load_material(path)
-    assert isinstance(material, FiberTile)
-    assert material.aspect == pytest.approx(pattern.aspect)
-    assert max(curve.heights()[1] for curve in material.curves) == pytest.approx(0.0, abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -175,25 +151,6 @@ def test_text_has_control_points_and_radii(tmp_path: Path) -> None:
 def test_damaged_curves_are_refused(tmp_path: Path, name: str, data: str, says: str) -> None:
     path = tmp_path / name
     path.write_text(data)
-    assert says in fails(path)
-
-
-@pytest.mark.parametrize(
-    ("changes", "cut", "says"),
-    [
-        ({"magic": b"XCC"}, 0, "not a .bcc"),
-        ({"spline": b"1"}, 0, "Catmull-Rom"),
-        ({"points": 10**9}, 0, "not those of"),
-        ({"curves": 10**9}, 0, "not those of"),
-        ({}, 4, "not those of"),
-    ],
-)
-def test_damaged_bcc_files_are_refused(
-    tmp_path: Path, changes: dict[str, object], cut: int, says: str
-) -> None:
-    data = bcc([(np.random.default_rng(0).random((6, 3)), False)], **changes)
-    path = tmp_path / "a.bcc"
-    path.write_bytes(data[: len(data) - cut])
     assert says in fails(path)
 
 

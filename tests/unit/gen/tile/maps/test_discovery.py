@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from mbtf_core.errors import InputError
-from mbtf_gen.tile.loading import load_material
-from mbtf_gen.tile.maps.discovery import find_maps, role_of
+from mbtf_gen.tile.maps.discovery import find_maps
 
 
 def fill(folder: Path, *names: str) -> Path:
@@ -54,11 +52,6 @@ class TestSharedWords:
 
 
 class TestPacked:
-    @pytest.mark.parametrize("name", ["chair_metallicRoughness", "a-metallic-roughness", "RoughnessMetallic"])
-    def test_two_words_are_one_map(self, name: str) -> None:
-        assert role_of(f"{name}.png") is None
-        assert role_of(f"{name}_normal.png") == "normal"
-
     @pytest.mark.parametrize(
         ("name", "roughness", "metallic"),
         [("x_orm", "G", "B"), ("x_ARM", "G", "B"), ("x_rma", "R", "G"), ("x_metallicRoughness", "G", "B")],
@@ -81,29 +74,3 @@ class TestPacked:
         (warning,) = find_maps(fill(tmp_path, "height.png", "gloss.png")).warnings
         assert "roughness: {file: gloss.png, invert: true}" in warning
         assert find_maps(fill(tmp_path, "rough.png")).warnings == []
-
-    def test_the_material_warns(self, tmp_path: Path) -> None:
-        for name in ("height", "orm"):
-            np.save(tmp_path / f"{name}.npy", 0.1 * np.random.default_rng(0).random((4, 4)))
-        material = load_material(tmp_path)
-        assert any("orm.npy: is not used" in w for w in material.at(0.1).warnings_in_use())
-        assert list(material.unused) == ["orm.npy"]
-
-
-class TestOtherPlaces:
-    def test_an_archive_is_to_be_unpacked(self, tmp_path: Path) -> None:
-        with pytest.raises(InputError, match="contains no image") as caught:
-            find_maps(fill(tmp_path, "Rock.zip", "LICENSE.txt"))
-        assert caught.value.hint == "unpack Rock.zip and give its folder"
-        with pytest.raises(InputError, match=r"'\.zip' is not a height map") as caught:
-            load_material(tmp_path / "Rock.zip")
-        assert caught.value.hint == "unpack Rock.zip and give its folder"
-
-    @pytest.mark.parametrize("beside", [(), ("preview.png", "Rock.zip")])
-    def test_maps_one_folder_below(self, tmp_path: Path, beside: tuple[str, ...]) -> None:
-        fill(tmp_path, *beside)
-        fill(tmp_path / "licences", "readme.png")
-        fill(tmp_path / "textures", "rock_height.png")
-        with pytest.raises(InputError) as caught:
-            find_maps(tmp_path)
-        assert caught.value.hint == f"did you mean '{tmp_path / 'textures'}'?"

@@ -118,11 +118,6 @@ class TestScalars:
             digests.add(material.digests["settings"])
         assert len(digests) == 3
 
-    @pytest.mark.parametrize("option", ["channel: G", "invert: true", "colorspace: srgb"])
-    def test_options_of_files_do_not_fit_numbers(self, heights: Path, option: str) -> None:
-        with pytest.raises(InputError, match=r"material\.yaml:2: .*goe?s? with 'file'"):
-            load_material(write(heights, f"height: height.npy\nroughness: {{value: 0.5, {option}}}\n"))
-
 
 class TestColor:
     def color(self, folder: Path, option: str, *chunks: tuple[bytes, bytes]) -> HeightFieldTile:
@@ -182,17 +177,6 @@ def test_orientation_is_ignored_with_a_warning(heights: Path) -> None:
     assert len([w for w in material.warnings if "EXIF orientation (6) is ignored" in w]) == 2
 
 
-def test_a_map_of_turned_size_is_suspected(heights: Path) -> None:
-    png(heights / "rough.png", rng().integers(0, 256, (16, 8, 1)), 0, 8)
-    with pytest.raises(InputError, match="one aspect") as caught:
-        load_material(heights)
-    assert "turned by 90 degrees" in caught.value.hint
-    png(heights / "rough.png", rng().integers(0, 256, (16, 16, 1)), 0, 8)
-    with pytest.raises(InputError, match="one aspect") as caught:
-        load_material(heights)
-    assert caught.value.hint == ""
-
-
 def test_sizes_that_are_neither_square_nor_powers_of_two(tmp_path: Path) -> None:
     np.save(tmp_path / "height.npy", 0.01 * rng().random((30, 45)))
     np.save(tmp_path / "albedo.npy", rng().random((20, 30, 3)))
@@ -202,29 +186,3 @@ def test_sizes_that_are_neither_square_nor_powers_of_two(tmp_path: Path) -> None
     assert material.grid.z.shape == (30, 45)
     assert material.at(mesh=20).grid.z.shape == (13, 20)
     assert np.shape(material.maps["roughness"]) == (14, 21)
-
-
-class TestNearMisses:
-    def test_material(self, heights: Path) -> None:
-        with pytest.raises(InputError, match="no such file or folder") as caught:
-            load_material(heights / "heihgt.npy")
-        assert caught.value.hint == f"did you mean '{heights / 'height.npy'}'?"
-        with pytest.raises(InputError) as caught:
-            load_material(heights / "height.exr")
-        assert "height.npy" in caught.value.hint
-        with pytest.raises(InputError) as caught:
-            load_material(heights.parent / f"{heights.name}x" / "height.npy")
-        assert caught.value.hint == f"did you mean '{heights}'?"
-        with pytest.raises(InputError) as caught:
-            load_material(heights / "something-else")
-        assert caught.value.hint == ""
-
-    def test_file_in_a_material_file(self, heights: Path) -> None:
-        png(heights / "Rock_Roughness.png", np.zeros((8, 16, 1)), 0, 8)
-        (heights / "Rock_Roughness.txt").write_text("notes")
-        with pytest.raises(InputError, match=r"rock_roughnes\.png: no such file") as caught:
-            load_material(write(heights, "height: height.npy\nroughness: rock_roughnes.png\n"))
-        assert caught.value.hint == f"did you mean '{heights / 'Rock_Roughness.png'}'?"
-        with pytest.raises(InputError, match="named in the bsdf") as caught:
-            load_material(write(heights, "height: height.npy\nbsdf: {type: diffuse, filename: heigt.npy}\n"))
-        assert "height.npy" in caught.value.hint

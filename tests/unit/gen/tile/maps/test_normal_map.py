@@ -166,18 +166,6 @@ class TestMaterial:
         assert "read as OpenGL" in material.warnings[0]
         assert material.normal_convention == "gl"
 
-    def test_ridges_have_no_second_correlation(self, tmp_path: Path) -> None:
-        ridges = np.tile(fractal(96, 96)[:1], (96, 1))
-        save_heights(tmp_path / "height.png", ridges)
-        save_normals(tmp_path / "normal_dx.png", normals_of(ridges, 0.05))
-        material = load_material(tmp_path)
-        assert material.warnings == ()
-        assert material.normal_convention == "dx"
-        assert any(
-            "DirectX, by its name; correlation of the slopes u +1.00, v undefined" in n
-            for n in material.notes
-        )
-
     def test_turned_and_inverted_heights_warn(self, tmp_path: Path) -> None:
         folder = self.folder(tmp_path, np.rot90(fractal(96, 96), -1), "normal.png", dx=False)
         (warning,) = load_material(folder).warnings
