@@ -16,7 +16,7 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.presets import QualityOption
 
 if TYPE_CHECKING:
-    from mbtf_gen.effects.effect import Decision
+    from mbtf_gen.effects.effect import EffectDecision
     from mbtf_gen.effects.plan import EffectsPlan
 
 # Columns of the table before the explanation, and its width.
@@ -84,7 +84,7 @@ def table(plan: EffectsPlan) -> str:
     return "\n".join(lines)
 
 
-def bound_text(effect: Decision) -> str:
+def bound_text(effect: EffectDecision) -> str:
     """The bias bound of leaving an effect out, with its error or as an upper bound."""
     if effect.bias_bound is None:
         return "-"

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_gen.effects.effect import Decision, Effect, Scene
+from mbtf_gen.effects.effect import EffectDecision, Effect, PlanScene
 from mbtf_gen.images.resample import resample
 from mbtf_gen.sampling.light_kernel import LightKernel
 
@@ -27,7 +27,7 @@ FAINT_CAUTION = 2.0
 WIDER = 4.0
 
 
-class Layer(Effect):
+class ReflectionLayer(Effect):
     """A term of how the surface reflects, whose weight is the map of its name.
 
     Attributes
@@ -42,15 +42,15 @@ class Layer(Effect):
     text: ClassVar[str]
     unit: ClassVar[float] = 1.0
 
-    def absent(self, scene: Scene) -> str:
+    def absent(self, scene: PlanScene) -> str:
         """Why the material has no such layer."""
         return "no map"
 
-    def weight(self, scene: Scene) -> float:
+    def weight(self, scene: PlanScene) -> float:
         """Largest weight; 0 without a map."""
         return float(np.max(scene.tile.maps.get(self.name, 0.0)))
 
-    def propose(self, scene: Scene) -> Decision:
+    def propose(self, scene: PlanScene) -> EffectDecision:
         """On where the weight is positive somewhere; a faint layer's bias is measured."""
         if scene.tile.bsdf_type is not None:
             text = f"the material's own BSDF '{scene.tile.bsdf_type}', not analyzed"
@@ -69,19 +69,19 @@ class Layer(Effect):
         return self.decision(True, text, bound, "pilot")
 
 
-class Specular(Layer):
+class Specular(ReflectionLayer):
     """The dielectric lobe; that of an own BSDF cannot be switched."""
 
     name, description = "specular", "specular lobe"
     # A specular of 1/4 (F0 = 2 %) is the smallest that reflects everything at grazing angles.
     scale, text, unit = 4.0, "F0 up to {:.2g} %", 8.0
 
-    def absent(self, scene: Scene) -> str:
+    def absent(self, scene: PlanScene) -> str:
         """Lambert, or specular 0."""
         lambert = "specular" not in scene.tile.maps
         return "Lambert: no roughness, metallic or specular" if lambert else "specular is 0 everywhere"
 
-    def propose(self, scene: Scene) -> Decision:
+    def propose(self, scene: PlanScene) -> EffectDecision:
         """As any layer, but on where the material has its own BSDF."""
         found = super().propose(scene)
         if scene.tile.bsdf_type is None:
@@ -89,31 +89,31 @@ class Specular(Layer):
         return self.decision(True, found.explanation, present=False)
 
 
-class Metallic(Layer):
+class Metallic(ReflectionLayer):
     """Metal in place of the base layer."""
 
     name, description = "metallic", "metallic"
     scale, text = math.inf, "metallic up to {:.2g}"
 
-    def absent(self, scene: Scene) -> str:
+    def absent(self, scene: PlanScene) -> str:
         """No metal."""
         return "no metal anywhere"
 
 
-class Clearcoat(Layer):
+class Clearcoat(ReflectionLayer):
     """The clear coat above the base layer."""
 
     name, description = "clearcoat", "clearcoat"
     text, unit = "covers up to {:.2g} %", 100.0
 
 
-class Sheen(Layer):
+class Sheen(ReflectionLayer):
     """The sheen above all."""
 
     name, description = "sheen", "sheen"
     text = "weight up to {:.2g}"
 
-    def weight(self, scene: Scene) -> float:
+    def weight(self, scene: PlanScene) -> float:
         """Largest weight times the largest channel of its color."""
         return super().weight(scene) * float(np.max(scene.tile.maps.get("sheen_color", 1.0)))
 
@@ -123,7 +123,7 @@ class NormalMap(Effect):
 
     name, description, stage, alters_tile = "normal", "normal map", "maps", True
 
-    def propose(self, scene: Scene) -> Decision:
+    def propose(self, scene: PlanScene) -> EffectDecision:
         """On where the map adds slopes, with the bound of a Lambert surface."""
         if scene.mapped is None:
             text = "off in the configuration" if "normal" in scene.tile.maps else "no map"
@@ -144,7 +144,7 @@ class Opacity(Effect):
 
     name, description, stage, alters_tile = "opacity", "opacity", "maps", True
 
-    def propose(self, scene: Scene) -> Decision:
+    def propose(self, scene: PlanScene) -> EffectDecision:
         """On where rays can pass, with the bound of a Lambert surface."""
         tile = scene.tile
         if tile.grid is None:
@@ -175,7 +175,7 @@ class BsdfSampling(Effect):
     name, description, stage = "bsdf_sampling", "BSDF sampling of light", "transport"
     switch = "bsdf_sampling"
 
-    def propose(self, scene: Scene) -> Decision:
+    def propose(self, scene: PlanScene) -> EffectDecision:
         """On where the surface has lobes about as narrow as the light's."""
         width, found = np.radians(scene.light_width), scene.tile.narrowest_lobe()
         if width == 0.0:
@@ -193,7 +193,7 @@ class BsdfSampling(Effect):
             return self.decision(False, f"{text}: sampling the light suffices", 0.0)
         return self.decision(True, text)
 
-    def reference(self, scene: Scene) -> Decision:
+    def reference(self, scene: PlanScene) -> EffectDecision:
         """Always on."""
         return self.decision(True, "reference")
 
@@ -204,18 +204,18 @@ class Displacement(Effect):
     stage = "transport"
     displaced = True
 
-    def reference(self, scene: Scene) -> Decision:
+    def reference(self, scene: PlanScene) -> EffectDecision:
         """On unless the tile is flat."""
         return self.decision(not scene.flat, "flat" if scene.flat else scene.tile.kind)
 
-    def propose(self, scene: Scene) -> Decision:
+    def propose(self, scene: PlanScene) -> EffectDecision:
         """Off without a displaced surface."""
         if scene.undisplaced is None:
             return self.on_displaced(scene)
         text, reason = scene.undisplaced
         return self.decision(False, text, 0.0, reason)
 
-    def on_displaced(self, scene: Scene) -> Decision:
+    def on_displaced(self, scene: PlanScene) -> EffectDecision:
         """The decision for a displaced surface."""
         raise NotImplementedError
 
@@ -226,7 +226,7 @@ class Parallax(Displacement):
     name, description, alters_tile = "parallax", "parallax and masking", True
     switch = "displacement"
 
-    def on_displaced(self, scene: Scene) -> Decision:
+    def on_displaced(self, scene: PlanScene) -> EffectDecision:
         """Off where the sum of the bounds of all effects of displacement is small enough."""
         thickness, bounds = 100.0 * scene.tile.thickness, scene.bounds
         if scene.tile.grid is None:
@@ -249,7 +249,7 @@ class Shadowing(Displacement):
     name, description, order = "shadowing", "shadowing", 1
     switch = "shadowing"
 
-    def on_displaced(self, scene: Scene) -> Decision:
+    def on_displaced(self, scene: PlanScene) -> EffectDecision:
         """Off where the bound takes at most half of what is left."""
         if scene.tile.grid is None:
             return self.decision(True, scene.tile.kind)
@@ -275,12 +275,12 @@ class Transmission(Effect):
     name, description, stage, alters_tile = "transmission", "fiber transmission", "transport", True
     order = 2
 
-    def propose(self, scene: Scene) -> Decision:
+    def propose(self, scene: PlanScene) -> EffectDecision:
         """Off where a pilot with and without it shows little change."""
         found = self.reference(scene)
         if not found.present or self.name not in scene.auto or not scene.pilots:
             return found
-        many = Decision("interreflection", True, scene.tile.kind)
+        many = EffectDecision("interreflection", True, scene.tile.kind)
         change = scene.change_without(self.name, {self.name: found, many.name: many})
         upper = change.bound()
         if upper > scene.left:
@@ -288,7 +288,7 @@ class Transmission(Effect):
         scene.left -= upper
         return self.decision(False, found.explanation, upper, "pilot")
 
-    def reference(self, scene: Scene) -> Decision:
+    def reference(self, scene: PlanScene) -> EffectDecision:
         """On for fibers."""
         if not scene.tile.scatters:
             return self.decision(False, "no fibers", 0.0, present=False)
@@ -301,7 +301,7 @@ class Interreflection(Displacement):
     name, description, order = "interreflection", "interreflection", 3
     switch = "interreflection"
 
-    def on_displaced(self, scene: Scene) -> Decision:
+    def on_displaced(self, scene: PlanScene) -> EffectDecision:
         """Off, or with a cap on interactions, where pilots without and with them show little change."""
         if scene.max_depth == 1:
             return self.decision(False, "max_depth 1", None, "forced")
@@ -340,7 +340,7 @@ class Interreflection(Displacement):
         return self.decision(True, text, change.rms, "pilot")
 
 
-def bounce_bound(scene: Scene) -> float:
+def bounce_bound(scene: PlanScene) -> float:
     """Upper bound of interreflection between gentle slopes. A facet of slope s sees others only within
     2·atan(s) of its plane, a share sin² of its cosine-weighted hemisphere. No facet receives more than 1/E,
     with E the irradiance of a unit lobe on the plane. Bright texels may be rare, so the bound includes the

@@ -18,7 +18,7 @@ Stage = Literal["reflection", "maps", "transport"]
 
 
 @dataclass(frozen=True)
-class Decision:
+class EffectDecision:
     """The decision on one effect.
 
     Attributes
@@ -83,7 +83,7 @@ class TileFacts(Protocol):
         """(width in radians, what it is of) of the narrowest lobe."""
 
 
-class Change(Protocol):
+class MeasuredChange(Protocol):
     """What a pilot measured, see :class:`mbtf_gen.planning.pilot.Change`."""
 
     @property
@@ -94,7 +94,7 @@ class Change(Protocol):
         """Upper bound of the root mean square change."""
 
 
-class Scene(Protocol):
+class PlanScene(Protocol):
     """A run while it is planned: facts about it, what is decided so far, and pilots.
 
     Attributes
@@ -147,13 +147,13 @@ class Scene(Protocol):
     def is_on(self, name: str) -> bool:
         """Whether an effect that is decided already is simulated."""
 
-    def change_without(self, name: str, proposals: Mapping[str, Decision]) -> Change:
+    def change_without(self, name: str, proposals: Mapping[str, EffectDecision]) -> MeasuredChange:
         """Change when an effect is left out of the decisions so far and `proposals`, by a pilot."""
 
-    def change_of_layer(self, name: str, strength: float) -> Change:
+    def change_of_layer(self, name: str, strength: float) -> MeasuredChange:
         """Change when a layer is left out whose strength is scaled to one, by a pilot."""
 
-    def capped(self, proposals: Mapping[str, Decision]) -> Any:
+    def capped(self, proposals: Mapping[str, EffectDecision]) -> Any:
         """Function from a limit of surface interactions to the change under it, by pilots."""
 
 
@@ -186,10 +186,10 @@ class Effect(ABC):
     order: ClassVar[int] = 0
 
     @abstractmethod
-    def propose(self, scene: Scene) -> Decision:
+    def propose(self, scene: PlanScene) -> EffectDecision:
         """Whether to simulate the effect, before the user's request counts."""
 
-    def reference(self, scene: Scene) -> Decision:
+    def reference(self, scene: PlanScene) -> EffectDecision:
         """The same for reference pictures, which simulate all that the material has."""
         return self.propose(scene)
 
@@ -201,6 +201,6 @@ class Effect(ABC):
         reason: Reason = "exact",
         *,
         present: bool = True,
-    ) -> Decision:
+    ) -> EffectDecision:
         """A decision on this effect."""
-        return Decision(self.name, on, explanation, bias_bound, reason, present)
+        return EffectDecision(self.name, on, explanation, bias_bound, reason, present)

@@ -12,7 +12,7 @@ from typing import Any
 
 from mbtf_core.errors import UsageError
 from mbtf_gen.effects.catalog import EFFECTS
-from mbtf_gen.effects.effect import Decision
+from mbtf_gen.effects.effect import EffectDecision
 from mbtf_gen.effects.request import EffectsRequest
 
 
@@ -22,7 +22,7 @@ class EffectsPlan:
 
     Attributes
     ----------
-    effects : tuple of Decision
+    effects : tuple of EffectDecision
         One decision per effect.
     max_depth : int
         Surface interactions of a path at most; 0 means no limit.
@@ -38,7 +38,7 @@ class EffectsPlan:
         Whether M is known without tracing.
     """
 
-    effects: tuple[Decision, ...]
+    effects: tuple[EffectDecision, ...]
     max_depth: int = 0
     cap_bias_bound: float = 0.0
     roulette_depth: int = 1
@@ -46,7 +46,7 @@ class EffectsPlan:
     tolerance: float = 0.0
     closed_form: bool = False
 
-    def __getitem__(self, name: str) -> Decision:
+    def __getitem__(self, name: str) -> EffectDecision:
         return next(e for e in self.effects if e.name == name)
 
     def on(self, name: str) -> bool:
@@ -69,7 +69,7 @@ class EffectsPlan:
         return {**vars(self), "bias_bound": self.bias_bound, "effects": effects}
 
 
-def decide(request: EffectsRequest, effect: Decision) -> Decision:
+def decide(request: EffectsRequest, effect: EffectDecision) -> EffectDecision:
     """The effect, switched where the user requests it.
 
     Raises
@@ -91,7 +91,7 @@ def decide(request: EffectsRequest, effect: Decision) -> Decision:
     return replace(effect, on=on, explanation=explanation, reason="forced")
 
 
-def consistent(decided: dict[str, Decision], request: EffectsRequest) -> dict[str, Decision]:
+def consistent(decided: dict[str, EffectDecision], request: EffectsRequest) -> dict[str, EffectDecision]:
     """Decisions by name, where effects that need the displaced surface are off without it.
 
     Raises

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mbtf_gen.effects.bounds import POINTS, DisplacementBounds, displacement_bounds
 from mbtf_gen.effects.catalog import EFFECTS
-from mbtf_gen.effects.effect import Decision, Reason, Stage
+from mbtf_gen.effects.effect import EffectDecision, Reason, Stage
 from mbtf_gen.effects.plan import EffectsPlan, consistent, decide, without
 from mbtf_gen.effects.request import EffectsRequest
 from mbtf_gen.job import Job
@@ -71,7 +71,7 @@ def reference_plan(job: Job) -> EffectsPlan:
 
 @dataclass
 class PlannedScene:
-    """A run while it is planned, see :class:`mbtf_gen.effects.effect.Scene`.
+    """A run while it is planned, see :class:`mbtf_gen.effects.effect.PlanScene`.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ class PlannedScene:
     request: EffectsRequest
     pilots: bool
     auto: frozenset[str]
-    decided: dict[str, Decision] = field(default_factory=dict)
+    decided: dict[str, EffectDecision] = field(default_factory=dict)
     bounds: DisplacementBounds | None = None
     undisplaced: tuple[str, Reason] | None = None
     cap_bound: float = 0.0
@@ -148,14 +148,14 @@ class PlannedScene:
         off = (decision.bias_bound or 0.0 for decision in self.decided.values() if not decision.on)
         self.left = self.job.config.effects.tolerance - sum(off)
 
-    def plan(self, proposals: Mapping[str, Decision] | None = None) -> EffectsPlan:
+    def plan(self, proposals: Mapping[str, EffectDecision] | None = None) -> EffectsPlan:
         """The plan of the decisions so far, and of proposals in place of some."""
         extra = {name: decide(self.request, decision) for name, decision in (proposals or {}).items()}
         decided = consistent({**self.decided, **extra}, self.request)
         effects = tuple(decided[name] for name in EFFECTS)
         return EffectsPlan(effects, self.cap, self.cap_bound, self.job.config.transport.roulette_depth)
 
-    def change_without(self, name: str, proposals: Mapping[str, Decision]) -> Change:
+    def change_without(self, name: str, proposals: Mapping[str, EffectDecision]) -> Change:
         """Change when an effect is left out, by a pilot."""
         plan = self.plan(proposals)
         return Pilot(self.job, plan).changed(without(plan, name))
@@ -167,7 +167,7 @@ class PlannedScene:
         plan = reference_plan(job)
         return Pilot(job, plan).changed(without(plan, name))
 
-    def capped(self, proposals: Mapping[str, Decision]) -> Callable[[int], Change]:
+    def capped(self, proposals: Mapping[str, EffectDecision]) -> Callable[[int], Change]:
         """Change under a limit of surface interactions, by pilots with one kernel."""
         return Pilot(self.job, self.plan(proposals)).limited
 

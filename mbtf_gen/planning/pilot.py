@@ -9,7 +9,7 @@ import numpy as np
 
 from mbtf_gen.effects.bounds import CAUTION, FEW, NONE_OF
 from mbtf_gen.effects.catalog import EFFECTS
-from mbtf_gen.effects.effect import Decision
+from mbtf_gen.effects.effect import EffectDecision
 from mbtf_gen.effects.plan import EffectsPlan, without
 from mbtf_gen.job import Job
 from mbtf_gen.planning.simulation import build_estimator
@@ -141,7 +141,7 @@ def measured(job: Job, plan: EffectsPlan) -> EffectsPlan:
         return plan
     pilot = Pilot(job, plan)
 
-    def measure(effect: Decision) -> Decision:
+    def measure(effect: EffectDecision) -> EffectDecision:
         if not effect.on or not effect.present:
             return effect
         cut = without(plan, effect.name)

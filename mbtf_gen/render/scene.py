@@ -33,7 +33,7 @@ def register_plugins() -> None:
     mi.register_emitter("mbtf_directional", lambda props: SmoothedDirectional(props))
 
 
-class Shape(Protocol):
+class TracedShape(Protocol):
     """A tile, or the heights of one."""
 
     @property
@@ -71,7 +71,9 @@ def unit_of(aspect: float) -> float:
     return LONG_SIDE / max(1.0, aspect)
 
 
-def build_scene(shape: Shape, bsdf: Mapping[str, Any] | BSDF | Sequence[Mapping[str, Any]]) -> TileScene:
+def build_scene(
+    shape: TracedShape, bsdf: Mapping[str, Any] | BSDF | Sequence[Mapping[str, Any]]
+) -> TileScene:
     """Build the scene of a tile.
 
     Parameters

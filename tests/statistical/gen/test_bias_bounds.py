@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.effects.bounds import displacement_bounds
 from mbtf_gen.effects.catalog import bounce_bound
-from mbtf_gen.effects.effect import Decision
+from mbtf_gen.effects.effect import EffectDecision
 from mbtf_gen.effects.plan import EffectsPlan, without
 from mbtf_gen.effects.request import EffectsRequest
 from mbtf_gen.job import Job
@@ -114,7 +114,7 @@ def test_bias_bounds_equal_the_rendered_change(shape: tuple[int, int]) -> None:
 
 
 def test_the_bias_bound_sums_the_cap_and_what_is_off() -> None:
-    effects = (Decision("parallax", True, "", 0.5), Decision("shadowing", False, "", 0.001))
+    effects = (EffectDecision("parallax", True, "", 0.5), EffectDecision("shadowing", False, "", 0.001))
     assert EffectsPlan(effects, max_depth=2, cap_bias_bound=0.002).bias_bound == pytest.approx(0.003)
 
 

@@ -11,7 +11,7 @@ import pytest
 from mbtf_core.errors import UsageError
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.effects.catalog import EFFECTS
-from mbtf_gen.effects.effect import Decision
+from mbtf_gen.effects.effect import EffectDecision
 from mbtf_gen.effects.plan import EffectsPlan
 from mbtf_gen.effects.request import EffectsRequest
 from mbtf_gen.job import Job
@@ -115,9 +115,9 @@ def test_unknown_words_are_refused(text: str) -> None:
 
 def test_bias_bounds_add_up_over_what_is_off() -> None:
     effects = (
-        Decision("parallax", True, "", 0.5),
-        Decision("shadowing", False, "", 0.001),
-        Decision("bsdf_sampling", False, "", 0.002),
+        EffectDecision("parallax", True, "", 0.5),
+        EffectDecision("shadowing", False, "", 0.001),
+        EffectDecision("bsdf_sampling", False, "", 0.002),
     )
     assert EffectsPlan(effects).bias_bound == pytest.approx(0.003)
 
