@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_gen.effects.effect import EffectDecision, Effect, PlanScene
+from mbtf_gen.effects.effect import Effect, EffectDecision, PlanScene
 from mbtf_gen.images.resample import resample
 from mbtf_gen.sampling.light_kernel import LightKernel
 
