@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, Protocol
 
@@ -153,7 +153,7 @@ class PlanScene(Protocol):
     def change_of_layer(self, name: str, strength: float) -> MeasuredChange:
         """Change when a layer is left out whose strength is scaled to one, by a pilot."""
 
-    def capped(self, proposals: Mapping[str, EffectDecision]) -> Any:
+    def capped(self, proposals: Mapping[str, EffectDecision]) -> Callable[[int], MeasuredChange]:
         """Function from a limit of surface interactions to the change under it, by pilots."""
 
 
