@@ -36,10 +36,10 @@ from numpy.typing import NDArray
 
 from mbtf_core.errors import MbtfError
 from mbtf_core.lattice import Lattice
+from mbtf_gen.config.values import Tracer
 from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
-from mbtf_gen.tile.heights.grid import Tracer
 from mbtf_gen.tile.loading import load_material
 
 if TYPE_CHECKING:

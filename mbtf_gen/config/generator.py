@@ -17,10 +17,9 @@ from mbtf_core.errors import UsageError
 from mbtf_core.lattice import MAX_LEVEL
 from mbtf_core.options import Flag
 from mbtf_core.shard_schema import SCHEMA_VERSION, ArrayFormat, Layout, SliceDirections, Tiling
+from mbtf_gen.config.values import NormalMode, Tracer
 from mbtf_gen.effects.request import EffectsRequest
 from mbtf_gen.sampling.light_kernel import MAX_WIDTH_DEG, MIN_WIDTH_DEG
-from mbtf_gen.tile.heights.grid import Tracer
-from mbtf_gen.tile.heights.slopes import NormalMode
 
 # Largest height scale.
 MAX_SCALE = 100

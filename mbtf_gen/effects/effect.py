@@ -10,8 +10,6 @@ from typing import Any, ClassVar, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_gen.effects.bounds import DisplacementBounds
-
 F64 = NDArray[np.float64]
 Reason = Literal["exact", "bound", "pilot", "forced"]
 Stage = Literal["reflection", "maps", "transport"]
@@ -48,6 +46,24 @@ class EffectDecision:
     reason: Reason = "exact"
     present: bool = True
     error: float = 0.0
+
+
+@dataclass(frozen=True)
+class DisplacementBounds:
+    """Bias bounds of leaving out effects of a displaced Lambert surface, relative to the mean value.
+
+    Attributes
+    ----------
+    parallax : the plane, shaded with the mesh's slopes and without shadows, replaces the displaced tile
+    shadowing : no shadows on the displaced tile
+    normal : shading without the given residual slopes
+    opacity : surface and occluders opaque everywhere
+    """
+
+    parallax: float
+    shadowing: float
+    normal: float
+    opacity: float
 
 
 class TileFacts(Protocol):

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_gen.effects.bounds import POINTS, DisplacementBounds, displacement_bounds
 from mbtf_gen.effects.catalog import EFFECTS
-from mbtf_gen.effects.effect import EffectDecision, Reason, Stage
+from mbtf_gen.effects.effect import DisplacementBounds, EffectDecision, Reason, Stage
 from mbtf_gen.effects.plan import EffectsPlan, consistent, decide, without
 from mbtf_gen.effects.request import EffectsRequest
 from mbtf_gen.job import Job
+from mbtf_gen.planning.bounds import POINTS, displacement_bounds
 from mbtf_gen.planning.pilot import Change, Pilot, pilot_queries
 from mbtf_gen.sampling.light_kernel import LightKernel
 from mbtf_gen.tile.heights.statistics import triangle_slopes

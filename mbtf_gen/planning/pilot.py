@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from mbtf_gen.effects.bounds import CAUTION, FEW, NONE_OF
 from mbtf_gen.effects.catalog import EFFECTS
 from mbtf_gen.effects.effect import EffectDecision
 from mbtf_gen.effects.plan import EffectsPlan, without
 from mbtf_gen.job import Job
+from mbtf_gen.planning.bounds import CAUTION, FEW, NONE_OF
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.sampling.query_sampler import Queries

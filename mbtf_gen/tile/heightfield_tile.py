@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import Lattice
 from mbtf_gen.config.generator import GeometrySection
+from mbtf_gen.config.values import NormalMode, Tracer
 from mbtf_gen.images.read import LUMINANCE
 from mbtf_gen.images.resample import resample
-from mbtf_gen.tile.heights.grid import HeightGrid, Tracer, tile_mesh
-from mbtf_gen.tile.heights.slopes import NormalMode, residual_slopes
+from mbtf_gen.tile.heights.grid import HeightGrid, tile_mesh
+from mbtf_gen.tile.heights.slopes import residual_slopes
 from mbtf_gen.tile.heights.statistics import detail_size, repeats, rms_slope, slope_angles
 from mbtf_gen.tile.inspection import ALBEDO_RANGE, inspection_text, oddities
 from mbtf_gen.tile.maps.checks import suggestion_warning

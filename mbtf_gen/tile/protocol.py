@@ -15,8 +15,8 @@ from mbtf_core.errors import InputError, UsageError
 from mbtf_core.lattice import Lattice
 from mbtf_core.shard_schema import Tiling
 from mbtf_gen.config.generator import GeometrySection
+from mbtf_gen.config.values import NormalMode
 from mbtf_gen.tile.heights.grid import HeightGrid
-from mbtf_gen.tile.heights.slopes import NormalMode
 from mbtf_gen.tile.maps.map_loader import Color
 from mbtf_gen.tile.maps.material_file import REFLECTING
 from mbtf_gen.tile.tracers.protocol import TileGeometry

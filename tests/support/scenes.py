@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
+from mbtf_gen.config.values import Tracer
 from mbtf_gen.engine.runtime import load_mitsuba
-from mbtf_gen.tile.heights.grid import Tracer
 from support.paths import ROOT
 
 mi = load_mitsuba()

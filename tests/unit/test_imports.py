@@ -31,11 +31,11 @@ mbtf_gen.images
 mbtf_gen.geometry
 mbtf_gen.sampling
 mbtf_gen.engine
-mbtf_gen.tile.tracers
-mbtf_gen.tile.heights
 mbtf_gen.effects
 mbtf_gen.config
 mbtf_gen.measured
+mbtf_gen.tile.tracers
+mbtf_gen.tile.heights
 mbtf_gen.tile.fibers
 mbtf_gen.tile.maps
 mbtf_gen.tile

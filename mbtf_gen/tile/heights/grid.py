@@ -9,15 +9,14 @@ its border meets surface on both sides.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
+from mbtf_gen.config.values import Tracer
 from mbtf_gen.tile.tracers.protocol import TileGeometry
-
-Tracer = Literal["heightfield", "mesh"]
 
 # Cells of a grid that Mitsuba traces. Each takes about 300 bytes, with Mitsuba's and Embree's own data.
 MOST_CELLS = 1 << 24

@@ -5,15 +5,14 @@ Slopes are rises per length along x = u and y = a·v, both in tile widths; row 0
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_gen.config.values import NormalMode
 from mbtf_gen.images.resample import resample
 from mbtf_gen.tile.heights.grid import HeightGrid
-
-NormalMode = Literal["residual", "absolute", "off"]
 
 # Smallest z, a slope of 20, that 8-bit maps resolve.
 _SMALLEST_Z = 0.05

@@ -10,8 +10,9 @@ import pytest
 from numpy.typing import NDArray
 from support.scenes import build_scene, lambert, mi, rocks
 
+from mbtf_gen.config.values import Tracer
 from mbtf_gen.render.scene import CLEARANCE
-from mbtf_gen.tile.heights.grid import HeightGrid, Tracer
+from mbtf_gen.tile.heights.grid import HeightGrid
 
 RAYS = 10_000_000
 RESOLUTION = 64

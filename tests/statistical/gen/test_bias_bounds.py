@@ -10,13 +10,13 @@ import pytest
 from numpy.typing import NDArray
 
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.effects.bounds import displacement_bounds
 from mbtf_gen.effects.catalog import bounce_bound
 from mbtf_gen.effects.effect import EffectDecision
 from mbtf_gen.effects.plan import EffectsPlan, without
 from mbtf_gen.effects.request import EffectsRequest
 from mbtf_gen.job import Job
 from mbtf_gen.planning import effects_planner
+from mbtf_gen.planning.bounds import displacement_bounds
 from mbtf_gen.planning.effects_planner import PlannedScene, plan_effects
 from mbtf_gen.planning.pilot import Change, pilot_queries, relative_change
 from mbtf_gen.planning.simulation import build_estimator
