@@ -59,7 +59,7 @@ def reference(
     from mbtf_gen.pictures.distribute import picture_task
     from mbtf_gen.pictures.folder import PictureFolder
     from mbtf_gen.pictures.reference import picture_seconds, render_reference
-    from mbtf_gen.planning.effects_plan import reference_plan
+    from mbtf_gen.planning.effects_planner import reference_plan
     from mbtf_gen.planning.simulation import build_estimator
 
     wanted = resolved.reference
@@ -75,7 +75,7 @@ def reference(
         camera.queries(omega_i)  # refuses a view of the horizon before anything is written
     kinds: tuple[PixelKind, ...] = ("query", "pixel") if wanted.kind == "both" else (wanted.kind,)
     names = {(camera, one): f"{one}-tiles{camera.tiles_across:g}" for camera in cameras for one in kinds}
-    size = len(names) * wanted.size**2 * (row_bytes(job.material.opacity is not None) + PNG_BYTES)
+    size = len(names) * wanted.size**2 * (row_bytes(job.material.transmits) + PNG_BYTES)
     check_space(output, size, "reduce --size, or choose another folder with -o")
     pictures: list[dict[str, Any]] = []
     bright: list[float] = []
@@ -102,7 +102,7 @@ def reference(
             if workers is not None:
                 # Workers know the generator's options alone.
                 fields = job.config.model_dump(mode="json", include=set(GeneratorConfig.model_fields))
-                plain = Job(GeneratorConfig.model_validate(fields), job.material)
+                plain = Job.of(GeneratorConfig.model_validate(fields), job.material)
                 yield from _of_workers(
                     workers,
                     [

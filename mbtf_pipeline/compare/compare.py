@@ -86,7 +86,7 @@ def compare(
     from mbtf_core.data.dataset import Dataset
     from mbtf_fit import Material
     from mbtf_gen.job import Job
-    from mbtf_gen.planning.effects_plan import reference_plan
+    from mbtf_gen.planning.effects_planner import reference_plan
     from mbtf_gen.planning.simulation import build_estimator
 
     if section.st_lpips:
