@@ -28,29 +28,28 @@ import numpy as np
 from common import ASSETS, finish, parser_of, start
 
 from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.effects.plan import EffectsPlan, without
 from mbtf_gen.job import Job
-from mbtf_gen.material.load import load_material
-from mbtf_gen.material.material import Material
-from mbtf_gen.planning.effects import EffectsPlan, without
-from mbtf_gen.planning.effects_plan import plan_effects
+from mbtf_gen.planning.effects_planner import plan_effects
 from mbtf_gen.planning.pilot import PILOT_ROULETTE, measured, relative_change
 from mbtf_gen.planning.run_plan import SMALL_RUN
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream
+from mbtf_gen.tile.loading import load_material
+from mbtf_gen.tile.protocol import Tile
 
 # Ratio of the times, auto over all, that the surfaces are held to: at least 20 times faster, or never slower
 # beyond 3 %.
 THRESHOLDS = {"flat Lambert": 0.05, "black": 0.05, "dark (albedo 0.05)": 1.0, "mid-gray": 1.03}
 
 
-def surfaces() -> dict[str, Material]:
+def surfaces() -> dict[str, Tile]:
     """Lambert surfaces on the relief of the turtle shell."""
     relief = load_material(ASSETS / "turtle_shell")
+    removed = dict.fromkeys(relief.maps)
 
-    def lambert(albedo: float, scale: float = relief.height_scale) -> Material:
-        return Material(
-            height=relief.height, height_scale=scale, height_bits=None, base_color=np.full(3, albedo)
-        )
+    def lambert(albedo: float, scale: float | None = None) -> Tile:
+        return relief.at(scale).with_maps(**removed | {"base_color": np.full(3, albedo)})
 
     return {
         "flat Lambert": lambert(0.5, 0.0),
@@ -60,12 +59,10 @@ def surfaces() -> dict[str, Material]:
     }
 
 
-def run(
-    material: Material, mode: str, queries: int, spp: int, seed: int
-) -> tuple[float, EffectsPlan, Estimates]:
+def run(material: Tile, mode: str, queries: int, spp: int, seed: int) -> tuple[float, EffectsPlan, Estimates]:
     """Seconds of planning and tracing, the plan, and the values."""
     config = GeneratorConfig.model_validate({"material": "benchmark", "effects": {"mode": mode}})
-    job = Job(config, material)
+    job = Job.of(config, material)
     chosen = job.query_plan.draw("train", 0, queries)
     start = time.perf_counter()
     # Pilots where a run of this size takes them.
@@ -74,7 +71,7 @@ def run(
     return time.perf_counter() - start, plan, found
 
 
-def compare(name: str, material: Material, queries: int, spp: int, rounds: int) -> dict[str, Any]:
+def compare(name: str, material: Tile, queries: int, spp: int, rounds: int) -> dict[str, Any]:
     """Both modes in turn; the first round of each compiles kernels and is not counted."""
     seconds: dict[str, list[float]] = {"auto": [], "all": []}
     values: dict[str, Estimates] = {}
@@ -138,9 +135,9 @@ def verdict(stated: float, low: float, high: float) -> str:
     return "holds" if high <= stated else "not refuted"
 
 
-def biases_of(name: str, material: Material, queries: int, spp: int) -> list[dict[str, Any]]:
+def biases_of(name: str, material: Tile, queries: int, spp: int) -> list[dict[str, Any]]:
     """Stated and measured biases of one material, printed as they come."""
-    job = Job(GeneratorConfig.model_validate({"material": "benchmark"}), material)
+    job = Job.of(GeneratorConfig.model_validate({"material": "benchmark"}), material)
     plan = plan_effects(job)
 
     def values(plan: EffectsPlan, limit: int | None = None, fewer: int = 1) -> Estimates:
@@ -204,7 +201,7 @@ def biases_of(name: str, material: Material, queries: int, spp: int) -> list[dic
     return rows
 
 
-def biases(cases: dict[str, Material], queries: int, spp: int) -> int:
+def biases(cases: dict[str, Tile], queries: int, spp: int) -> int:
     """Compare bounds with measured biases; 1 where a bound is wrong."""
     print(f"{'material':<16} {'effect':<16} {'':<8} {'plan states':<18} measured (two standard errors)")
     rows = [row for name, material in cases.items() for row in biases_of(name, material, queries, spp)]

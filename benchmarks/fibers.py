@@ -27,10 +27,10 @@ from pathlib import Path
 import numpy as np
 from common import ASSETS, alternate, finish, parser_of, start
 
-from mbtf_gen.fibers.tile import FiberTile
-from mbtf_gen.material.load import load_material
-from mbtf_gen.render.runtime import load_mitsuba
+from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
+from mbtf_gen.tile.fiber_tile import FiberTile
+from mbtf_gen.tile.loading import load_material
 
 LEAST_RATIO = 0.5
 MOST = {"gib": 2.0, "start_seconds": 30.0}
@@ -42,13 +42,12 @@ def generator_run(material: Path, count: int, spp: int) -> Callable[[int], None]
     """A function of the run's number that traces `count` queries."""
     from mbtf_gen.render.estimator import Estimator, Stream
     from mbtf_gen.render.path_tracer import Transport
-    from mbtf_gen.render.scene import build_tile
+    from mbtf_gen.render.scene import build_scene
     from mbtf_gen.sampling.light_kernel import LightKernel
 
     loaded = load_material(material)
-    assert isinstance(loaded.shape, FiberTile)
     transport = Transport(bsdf_sampling=False)
-    estimator = Estimator(build_tile(loaded.shape, loaded.shape.bsdf()), LightKernel(1.0), transport)
+    estimator = Estimator(build_scene(loaded, loaded.surface()), LightKernel(1.0), transport)
     plan = QueryPlan(loaded.lattice(), Mixture(1.0, 0.0), 0.1, "shuffled", 0, count)
 
     def run(number: int) -> None:
@@ -67,7 +66,7 @@ def mitsuba_run(material: Path, count: int, spp: int) -> Callable[[int], None]:
 
     from mbtf_gen.render.scene import unit_of
 
-    fibers = load_material(material).shape
+    fibers = load_material(material)
     assert isinstance(fibers, FiberTile)
     unit = unit_of(fibers.aspect)
     runs, _ = fibers.runs()
@@ -95,7 +94,7 @@ def mitsuba_run(material: Path, count: int, spp: int) -> Callable[[int], None]:
                     },
                 },
                 "light": {"type": "directional", "direction": [-0.5, -0.5, -0.707]},
-                "curves": {"type": "bsplinecurve", "filename": str(file), "bsdf": fibers.bsdf()},
+                "curves": {"type": "bsplinecurve", "filename": str(file), "bsdf": fibers.surface()},
             }
         )
 

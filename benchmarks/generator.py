@@ -27,6 +27,7 @@ import argparse
 import statistics
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,14 +37,14 @@ from common import alternate, finish, parser_of, start
 from numpy.typing import NDArray
 
 from mbtf_core.data.lattice import Lattice
-from mbtf_gen.config.generator import Tracer
-from mbtf_gen.material.load import load_material
-from mbtf_gen.material.material import Material
-from mbtf_gen.render.runtime import load_mitsuba
+from mbtf_gen.config.values import Tracer
+from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
+from mbtf_gen.tile.heightfield_tile import HeightFieldTile, Tile
+from mbtf_gen.tile.loading import load_material
 
 if TYPE_CHECKING:
-    from mbtf_gen.geometry.heightfield import HeightGrid
+    from mbtf_gen.tile.heights.grid import HeightGrid
 
 MESH = 512
 DEPTH = 6
@@ -66,21 +67,17 @@ def noise(rng: np.random.Generator, cutoff: float) -> NDArray[np.float64]:
     return (h - h.min()) / np.ptp(h)
 
 
-def rocky() -> Material:
+def rocky() -> HeightFieldTile:
     """Terraces with rough flanks, 0.12 tile widths deep; color and roughness follow them."""
     rng = np.random.default_rng(1)
     coarse, fine = noise(rng, 24.0), noise(rng, 200.0)
     h = 0.7 * np.floor(6.0 * coarse) / 6.0 + 0.2 * coarse + 0.1 * fine
     h = (h - h.min()) / np.ptp(h)
     color = np.stack([0.15 + 0.5 * h, 0.12 + 0.4 * fine, 0.1 + 0.3 * coarse], axis=-1).astype(np.float32)
-    return Material(
+    return HeightFieldTile(
         height=h,
         height_scale=0.12,
-        height_bits=None,
-        base_color=color,
-        roughness=0.3 + 0.5 * fine,
-        metallic=0.0,
-        specular=0.5,
+        maps={"base_color": color, "roughness": 0.3 + 0.5 * fine, "metallic": 0.0, "specular": 0.5},
     )
 
 
@@ -91,17 +88,16 @@ def query_plan(grid: HeightGrid, count: int) -> QueryPlan:
 
 
 def generator_run(
-    material: Material, grid: HeightGrid, count: int, spp: int, tracer: Tracer = "heightfield"
+    material: Tile, grid: HeightGrid, count: int, spp: int, tracer: Tracer = "heightfield"
 ) -> Run:
     """A function of the run's number that traces `count` queries."""
-    from mbtf_gen.render.bsdf.plugin import bsdf_of
     from mbtf_gen.render.estimator import Estimator, Stream
     from mbtf_gen.render.path_tracer import Transport
-    from mbtf_gen.render.scene import build_tile
+    from mbtf_gen.render.scene import build_scene
     from mbtf_gen.sampling.light_kernel import LightKernel
 
     light, transport = LightKernel(LIGHT_WIDTH), Transport(DEPTH, ROULETTE)
-    estimator = Estimator(build_tile(grid, bsdf_of(material), tracer), light, transport)
+    estimator = Estimator(build_scene(replace(grid, tracer=tracer), material.surface()), light, transport)
     plan = query_plan(grid, count)
 
     def run(number: int) -> tuple[float, float]:
@@ -117,14 +113,13 @@ def generator_run(
     return run
 
 
-def mitsuba_run(material: Material, grid: HeightGrid, count: int, spp: int) -> Run:
+def mitsuba_run(material: Tile, grid: HeightGrid, count: int, spp: int) -> Run:
     """The same for ``mi.render`` and a picture of `count` pixels."""
     import drjit as dr
     import mitsuba as mi
 
-    from mbtf_gen.geometry.heightfield import mesh_of_grid
-    from mbtf_gen.render.bsdf.plugin import bsdf_of
     from mbtf_gen.render.scene import unit_of
+    from mbtf_gen.tile.heights.grid import mesh_of_grid
 
     unit = unit_of(grid.aspect)
     columns = max(1, round((count / grid.aspect) ** 0.5))
@@ -155,7 +150,7 @@ def mitsuba_run(material: Material, grid: HeightGrid, count: int, spp: int) -> R
                 },
             },
             "light": {"type": "directional", "direction": [-0.5, -0.5, -0.707]},
-            "tile": mesh_of_grid(grid, unit, (0, 0), mi.load_dict(bsdf_of(material))),
+            "tile": mesh_of_grid(grid, unit, (0, 0), mi.load_dict(material.surface())),
         }
     )
 
@@ -192,11 +187,12 @@ def spread(seconds: list[float], paths: int) -> dict[str, float]:
     }
 
 
-def measure_speed(material: Material, arguments: argparse.Namespace) -> int:
+def measure_speed(material: Tile, arguments: argparse.Namespace) -> int:
     """Paths per second in the three ways."""
     import drjit as dr
 
-    grid = material.grid(arguments.height_scale, MESH)
+    grid = material.at(arguments.height_scale, MESH).grid
+    assert grid is not None
     makers: dict[str, Any] = {
         "generator": generator_run,
         "mesh": partial(generator_run, tracer="mesh"),
@@ -238,16 +234,16 @@ def measure_speed(material: Material, arguments: argparse.Namespace) -> int:
     return finish(report, THRESHOLDS, met if cores == CORES else None)
 
 
-def measure_steps(material: Material, arguments: argparse.Namespace) -> int:
+def measure_steps(material: Tile, arguments: argparse.Namespace) -> int:
     """Time per path with one step of light transport after the other."""
-    from mbtf_gen.render.bsdf.plugin import bsdf_of
     from mbtf_gen.render.estimator import Estimator, Stream
     from mbtf_gen.render.path_tracer import Transport
-    from mbtf_gen.render.scene import build_tile
+    from mbtf_gen.render.scene import build_scene
     from mbtf_gen.sampling.light_kernel import LightKernel
 
-    grid = material.grid(arguments.height_scale, MESH)
-    tile, light = build_tile(grid, bsdf_of(material)), LightKernel(LIGHT_WIDTH)
+    grid = material.at(arguments.height_scale, MESH).grid
+    assert grid is not None
+    tile, light = build_scene(grid, material.surface()), LightKernel(LIGHT_WIDTH)
     bare: dict[str, Any] = {"shadowing": False, "interreflection": False, "bsdf_sampling": False}
     steps = {
         "plane": Transport(1, displacement=False, **bare),

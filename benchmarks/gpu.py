@@ -296,7 +296,7 @@ def has_device() -> bool:
     """Whether PyTorch or Mitsuba finds a CUDA device. Where only one does, the other's steps fail."""
     import torch
 
-    from mbtf_gen.render.runtime import CUDA_VARIANT, prove
+    from mbtf_gen.engine.runtime import CUDA_VARIANT, prove
 
     return torch.cuda.is_available() or not prove(CUDA_VARIANT).fault
 

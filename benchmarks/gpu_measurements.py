@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from mbtf_core.data.schema import Layout
 from mbtf_core.errors import InputError
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.render.runtime import CPU_VARIANT, CUDA_VARIANT
+from mbtf_gen.engine.runtime import CPU_VARIANT, CUDA_VARIANT
 
 if TYPE_CHECKING:
     from mbtf_core.data.queries import Queries
@@ -96,13 +96,14 @@ def save_finite(path: str | Path, **arrays: Any) -> None:
 
 def selftest(sizes: str) -> Answers:
     """State of every check of ``mbtf-gen selftest``, or why it could not run."""
-    from mbtf_gen.diagnostics.checks import all_checks
-    from mbtf_gen.diagnostics.selftest import run_checks
-    from mbtf_gen.render.runtime import load_mitsuba
+    from mbtf_gen.diagnostics.selftest import all_checks, run_checks
+    from mbtf_gen.engine.runtime import load_mitsuba
 
     load_mitsuba()
-    for finding in run_checks(all_checks(), Sizes.read(sizes).selftest):
-        yield {finding.check.name: finding.fault or finding.state}
+    checks = all_checks()
+    run_checks(checks, Sizes.read(sizes).selftest)
+    for check in checks:
+        yield {check.name: check.fault or check.state}
 
 
 def generate_data(sizes: str, layout: Layout, folder: str) -> Answers:

@@ -36,7 +36,7 @@ from mbtf_core.data.lattice import Lattice  # noqa: E402
 from mbtf_core.directions import from_angles  # noqa: E402
 from mbtf_core.pictures.camera import Camera  # noqa: E402
 from mbtf_fit.config import ModelName  # noqa: E402
-from mbtf_gen.render.runtime import load_mitsuba  # noqa: E402
+from mbtf_gen.engine.runtime import load_mitsuba  # noqa: E402
 
 # Least ratio of PyTorch's time to the plugin's, most seconds of a first run, most deviation from conformance.
 FASTER, COMPILE, DEVIATION = 3.0, 10.0, 1e-4

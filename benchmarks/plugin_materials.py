@@ -143,7 +143,7 @@ def energies(material: Path, shards: Path, evaluator: Any) -> list[dict[str, flo
     from mbtf_core.data.queries import Queries
     from mbtf_gen.config.generator import GeneratorConfig
     from mbtf_gen.job import Job
-    from mbtf_gen.planning.effects_plan import reference_plan
+    from mbtf_gen.planning.effects_planner import reference_plan
     from mbtf_gen.planning.simulation import build_estimator
     from mbtf_gen.render.estimator import Stream
 
@@ -184,15 +184,18 @@ def energies(material: Path, shards: Path, evaluator: Any) -> list[dict[str, flo
 def gloss(source: Path, config: dict[str, Any]) -> dict[str, float]:
     """Share of what the material's maps reflect that is specular, and their median roughness; 1 for
     Lambert."""
-    from mbtf_gen.material.load import load_material
+    from mbtf_gen.tile.loading import load_material
 
-    maps = load_material(source, config["geometry"]["make_tileable"])
-    if maps.roughness is None:
+    maps = load_material(source, config["geometry"]["make_tileable"]).maps
+    if "roughness" not in maps:
         return {"specular_share": 0.0, "roughness": 1.0}
-    color = float(np.mean(maps.base_color @ np.array([0.2126, 0.7152, 0.0722])))
-    metal = 0.0 if maps.metallic is None else float(np.mean(maps.metallic))
+    color = float(np.mean(maps["base_color"] @ np.array([0.2126, 0.7152, 0.0722])))
+    metal = float(np.mean(maps.get("metallic", 0.0)))
     specular, diffuse = (1 - metal) * FRESNEL + metal * color, (1 - metal) * (1 - FRESNEL) * color
-    return {"specular_share": specular / (specular + diffuse), "roughness": float(np.median(maps.roughness))}
+    return {
+        "specular_share": specular / (specular + diffuse),
+        "roughness": float(np.median(maps["roughness"])),
+    }
 
 
 def is_glossy(row: dict[str, Any]) -> bool:
@@ -225,7 +228,7 @@ def plane_scene(mi: Any, bsdf: Any) -> Any:
 
 def measure(source: Path, shards: Path, folder: Path) -> dict[str, Any]:
     """All figures of one material; the kernel cache is empty."""
-    from mbtf_gen.render.runtime import load_mitsuba
+    from mbtf_gen.engine.runtime import load_mitsuba
 
     mi = load_mitsuba()
     import drjit as dr

@@ -46,6 +46,7 @@ from mbtf_fit.viewer.page import write_page
 F32 = NDArray[np.float32]
 SIZE, SECONDS, FRAMES_PER_SECOND = 5.0, 2.0, 30.0
 _TRAINING = {"steps": 0, "batch": 1, "seconds": 0.0, "device": "cpu", "threads": 1, "errors": {}}
+_BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 _FLAGS = (
     "--headless",
     "--no-sandbox",
@@ -121,10 +122,8 @@ def open_browser(size: tuple[int, int]) -> Any:
     from selenium import webdriver
     from selenium.webdriver.chrome.service import Service
 
-    from mbtf_gen.diagnostics.doctor import BROWSERS
-
     options = webdriver.ChromeOptions()
-    found = next((path for name in BROWSERS if (path := shutil.which(name))), None)
+    found = next((path for name in _BROWSERS if (path := shutil.which(name))), None)
     driver = shutil.which("chromedriver")
     if found is None or driver is None:
         print("no Chromium with chromedriver: nothing to measure")

@@ -18,7 +18,7 @@ _PUBLIC = {
     "MbtfError": "mbtf_core.errors",
     "Queries": "mbtf_gen.sampling.query_sampler",
     "generate": "mbtf_gen.generation.run",
-    "load_material": "mbtf_gen.material.load",
+    "load_material": "mbtf_gen.tile.loading",
     "render_reference": "mbtf_gen.pictures.reference",
     "repair": "mbtf_gen.generation.repair",
     "verify": "mbtf_core.data.verify",

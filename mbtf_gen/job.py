@@ -14,14 +14,12 @@ from mbtf_core.data.lattice import Lattice
 from mbtf_core.data.schema import SPLITS, ShardEntry, Split
 from mbtf_core.data.shard_files import row_bytes
 from mbtf_core.errors import InputError, UsageError
-from mbtf_gen.config.generator import GeneratorConfig, GeometrySection, count_queries
-from mbtf_gen.geometry.heightfield import HeightGrid
-from mbtf_gen.material.checks import displacement_fault
-from mbtf_gen.material.latest import latest_material
-from mbtf_gen.material.material import Material
+from mbtf_gen.config.generator import GeneratorConfig, count_queries
 from mbtf_gen.render.estimates import TARGET_PILOT_SPP, Target
 from mbtf_gen.sampling.query_sampler import F32, Mixture, QueryPlan
 from mbtf_gen.sampling.slice_directions import UBO2003_COUNT, UBO2003_LOWEST, slice_directions
+from mbtf_gen.tile.loading import latest_material
+from mbtf_gen.tile.protocol import Tile
 
 log = logging.getLogger(__name__)
 
@@ -37,12 +35,12 @@ class Job:
     ----------
     config : GeneratorConfig
         All options.
-    material : Material
-        The maps that ``config.material`` names, loaded.
+    material : Tile
+        What ``config.material`` names, loaded, under the options of the geometry.
     """
 
     config: GeneratorConfig
-    material: Material
+    material: Tile
 
     @classmethod
     def load(cls, config: GeneratorConfig) -> Job:
@@ -65,17 +63,17 @@ class Job:
         return cls.of(config, latest_material(config.material, config.geometry.make_tileable))
 
     @classmethod
-    def of(cls, config: GeneratorConfig, material: Material) -> Job:
+    def of(cls, config: GeneratorConfig, material: Tile) -> Job:
         """The job of a loaded material, whose height scale, tiling and resolution replace unset ones; a
         UsageError where options are for another kind of material."""
         geometry, queries = config.geometry, config.queries
-        check_options(config, material)
-        scale = material.height_scale if geometry.height_scale is None else geometry.height_scale
+        tile = material.configured(geometry)
+        found = {"height_scale": tile.height_scale, "make_tileable": tile.tiling}
         own = {
-            "geometry": geometry.model_copy(update={"height_scale": scale, "make_tileable": material.tile}),
-            "queries": queries.model_copy(update={"resolution": queries.resolution or material.resolution}),
+            "geometry": geometry.model_copy(update=found),
+            "queries": queries.model_copy(update={"resolution": queries.resolution or tile.resolution}),
         }
-        return cls(config.model_copy(update=own), material)
+        return cls(config.model_copy(update=own), tile)
 
     @classmethod
     def prepare(cls, config: GeneratorConfig) -> Job:
@@ -95,22 +93,13 @@ class Job:
         InputError
             The material cannot be used.
         """
-        job, given = cls.load(config), config.geometry.height_scale
+        job = cls.load(config)
         for note in job.material.notes:
             log.info(note)
-        for warning in job.material.warnings_at(given):
+        for warning in job.material.warnings_in_use():
             log.warning(warning)
-        if job.material.shape is not None:
-            return job
-        rows, columns = job.grid.z.shape
-        log.info(
-            "mesh: %d x %d cells, height scale %.4g (%s), displacement range %.4g tile widths",
-            columns,
-            rows,
-            job.material.height_scale if given is None else given,
-            job.material.height_source(given),
-            job.grid.displacement_range,
-        )
+        if (text := job.material.summary()) is not None:
+            log.info(text)
         return job
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -131,23 +120,6 @@ class Job:
     def config_hash(self) -> str:
         """SHA-256 of the options and of the contents of the input files, hexadecimal."""
         return self.config.hash(self.material.digests)
-
-    @cached_property
-    def grid(self) -> HeightGrid:
-        """Heights of the mesh, in tile widths, a plane for fibers and triangles; an InputError where their
-        range exceeds the limit."""
-        geometry = self.config.geometry
-        grid = self.material.grid(geometry.height_scale, geometry.mesh)
-        fault = displacement_fault(grid.displacement_range, geometry.max_displacement)
-        if fault is not None:
-            raise InputError(fault[0], where=self.material.files.get("height"), hint=fault[1])
-        return grid
-
-    @property
-    def displacement_range(self) -> float:
-        """Largest height difference of the surface, or the thickness of other shapes, in tile widths."""
-        shape = self.material.shape
-        return self.grid.displacement_range if shape is None else shape.thickness
 
     @cached_property
     def slice_directions(self) -> F32 | None:
@@ -206,35 +178,11 @@ def received_job(config: str, config_hash: str) -> Job:
     return job
 
 
-def check_options(config: GeneratorConfig, material: Material) -> None:
-    """Refuse options of height maps for fibers and triangles, and shapes that are too thick.
-
-    Raises
-    ------
-    UsageError, InputError : so it is
-    """
-    geometry, shape = config.geometry, material.shape
-    if shape is None:
-        return
-    given = {
-        # A finished job states the scale 1.
-        "--height-scale": geometry.height_scale not in (None, 1.0),
-        "--mesh": geometry.mesh is not None,
-        "--tracer": geometry.tracer != GeometrySection.model_fields["tracer"].default,
-    }
-    for flag, refused in given.items():
-        if refused:
-            raise UsageError("is for height maps, not for fibers and triangles", where=flag)
-    fault = displacement_fault(shape.thickness, geometry.max_displacement)
-    if fault is not None:
-        raise InputError(fault[0], where=config.material, hint=fault[1])
-
-
 def limit_resolution(job: Job) -> Job:
     """A job whose resolution is that of a preset: the material's own overrides it, and maps of lower
     resolution have no finer detail."""
     own, preset = job.material.resolution, job.config.queries.resolution
-    highest = own or 1 << Lattice.for_map(*job.material.height.shape).finest
+    highest = 1 << job.material.lattice().finest
     if preset is None or (own is None and preset <= highest):
         return job
     queries = job.config.queries.model_copy(update={"resolution": highest})
@@ -336,4 +284,4 @@ def most_paths(job: Job) -> int:
 def data_bytes(job: Job, entries: Iterable[ShardEntry]) -> int:
     """Bytes of some shards of a job."""
     queries = sum(entry.rows * row_queries(job, entry.split) for entry in entries)
-    return queries * row_bytes(job.material.opacity is not None)
+    return queries * row_bytes(job.material.transmits)

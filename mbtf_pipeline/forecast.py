@@ -79,7 +79,7 @@ class RunForecaster:
     def speed(self) -> tuple[float, float]:
         """Seconds of starting the generator, and of a path."""
         from mbtf_gen.forecast import forecast
-        from mbtf_gen.planning.effects_plan import plan_effects
+        from mbtf_gen.planning.effects_planner import plan_effects
         from mbtf_gen.planning.run_plan import allocate
 
         job = Job.of(self.recipe.generate, self.material)
@@ -127,7 +127,7 @@ class RunForecaster:
             start=_START + (start if paths else 0.0),
             generating=paths * path,
             training=sum(timed),
-            evaluating=len(fits) * (FIT_SECONDS + queries * query_seconds(self.material.opacity is not None)),
+            evaluating=len(fits) * (FIT_SECONDS + queries * query_seconds(self.material.transmits)),
             comparing=comparing,
             bytes=size,
             by_steps=tuple(name for name, fit in fits.items() if fit.training.steps is not None),

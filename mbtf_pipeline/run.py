@@ -280,7 +280,7 @@ def _unfinished(out: Path, config: FitConfig, shards: Path) -> bool:
 
 
 def _material_inputs(recipe: Recipe) -> dict[str, str]:
-    from mbtf_gen.material.latest import latest_material
+    from mbtf_gen.tile.loading import latest_material
 
     return dict(latest_material(recipe.generate.material).digests)
 

@@ -18,8 +18,7 @@ from PIL import Image
 from selenium import webdriver
 from selenium.webdriver.chrome.service import Service
 
-from mbtf_gen.diagnostics.doctor import BROWSERS
-
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "out" / "quickstart" / "viewer.html"
 SIZE, FRAMES, SECONDS = (1200, 760), 12, 900.0

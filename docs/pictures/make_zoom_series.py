@@ -25,7 +25,7 @@ from mbtf_core.data.shard_files import read_exr
 from mbtf_core.directions import from_angles
 from mbtf_core.exposure import auto_exposure, brightness, to_display
 from mbtf_core.pictures.camera import Camera
-from mbtf_gen.render.runtime import load_mitsuba
+from mbtf_gen.engine.runtime import load_mitsuba
 
 ROOT = Path(__file__).parents[2]
 MATERIAL = ROOT / "out" / "quickstart" / "fits" / "relief"

@@ -24,7 +24,7 @@ from mbtf_fit.mitsuba_plugin.lobes import LobeTextures, Mixture
 from mbtf_fit.mitsuba_plugin.material_arrays import StoredMaterial, read_material
 from mbtf_fit.mitsuba_plugin.names import BSDF_NAME, footprints_provided, refuse_unknown
 from mbtf_fit.mitsuba_plugin.network import Arithmetic
-from mbtf_gen.render.types import (
+from mbtf_gen.engine.types import (
     BSDFContext,
     BSDFSample3f,
     Color3f,

@@ -26,7 +26,7 @@ from mbtf_fit.mitsuba_plugin.network import (
 )
 from mbtf_fit.mitsuba_plugin.textures import Textures
 from mbtf_fit.models.constants import GRAZING, IRRADIANCE_SCALE, LEAST_COSINE, OFFSET_SCALE, STATISTICS
-from mbtf_gen.render.types import Color3f, Float, Point2f, UInt32, Vector3f
+from mbtf_gen.engine.types import Color3f, Float, Point2f, UInt32, Vector3f
 
 
 class CalibrationFactors:

@@ -17,7 +17,7 @@ import mitsuba as mi
 from mbtf_core.errors import UsageError
 from mbtf_fit.mitsuba_plugin.bsdf import check_scene
 from mbtf_fit.mitsuba_plugin.names import INTEGRATOR_NAME, footprints_provided, refuse_unknown
-from mbtf_gen.render.types import (
+from mbtf_gen.engine.types import (
     DirectionSample3f,
     Float,
     Mask,

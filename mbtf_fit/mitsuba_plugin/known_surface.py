@@ -21,10 +21,10 @@ from mbtf_fit.models.constants import (
     MAX_CROSSINGS,
     PLACES,
 )
-from mbtf_gen.geometry.heightfield import HeightGrid
-from mbtf_gen.render.heightfield import HeightField
-from mbtf_gen.render.heightfield_tracer import closest_height
-from mbtf_gen.render.types import Float, Normal3f, Point2f, Vector3f
+from mbtf_gen.engine.types import Float, Normal3f, Point2f, Vector3f
+from mbtf_gen.tile.heights.grid import HeightGrid
+from mbtf_gen.tile.tracers.heightfield import HeightField
+from mbtf_gen.tile.tracers.heightfield_tracer import closest_height
 
 
 class KnownSurface:

@@ -17,7 +17,7 @@ import numpy as np
 from mbtf_fit.mitsuba_plugin.evaluator import Evaluator
 from mbtf_fit.mitsuba_plugin.lobes import BANDS, CHANNELS, Lobe, Mixture, band_of, mixture_of
 from mbtf_fit.mitsuba_plugin.material_arrays import F32
-from mbtf_gen.render.types import Float, UInt32, Vector3f
+from mbtf_gen.engine.types import Float, UInt32, Vector3f
 
 # Finest level with lobes, samples per texel, iterations.
 FINEST = 6

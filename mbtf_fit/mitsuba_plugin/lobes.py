@@ -20,8 +20,8 @@ import drjit as dr
 import mitsuba as mi
 
 from mbtf_fit.mitsuba_plugin.textures import Textures, in_image
+from mbtf_gen.engine.types import Float, Point2f, UInt32, Vector3f
 from mbtf_gen.render.bsdf.microfacet import visible_normal
-from mbtf_gen.render.types import Float, Point2f, UInt32, Vector3f
 
 # Numbers per texel: L (11, 21, 22), s0 (x, y), the lobe's weight in each band of the view's cosine.
 CHANNELS = 8

@@ -7,8 +7,8 @@ from contextvars import ContextVar
 
 from mbtf_core.errors import UsageError
 from mbtf_core.suggest import suggest_name
-from mbtf_gen.render.runtime import CPU_VARIANT, CUDA_VARIANT
-from mbtf_gen.render.types import Properties
+from mbtf_gen.engine.runtime import CPU_VARIANT, CUDA_VARIANT
+from mbtf_gen.engine.types import Properties
 
 BSDF_NAME = "mbtf"
 INTEGRATOR_NAME = "mbtf_path"

@@ -21,7 +21,7 @@ from drjit import nn
 from mbtf_fit.config import EncodingSection, NetworkSection
 from mbtf_fit.mitsuba_plugin.material_arrays import Layers
 from mbtf_fit.models.constants import GATE, LEAK, RGB_OF_YUV
-from mbtf_gen.render.types import Color3f, Float, Point2f, Vector3f
+from mbtf_gen.engine.types import Color3f, Float, Point2f, Vector3f
 
 Arithmetic = Literal["unrolled", "cooperative", "half"]
 # Most weights of unrolled networks: larger ones take too long to compile.

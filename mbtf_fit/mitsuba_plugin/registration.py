@@ -10,8 +10,8 @@ from typing import Any
 
 from mbtf_core.errors import EngineError, MbtfError, UsageError
 from mbtf_fit.mitsuba_plugin.names import BSDF_NAME, INTEGRATOR_NAME, VARIANTS
-from mbtf_gen.render.runtime import CPU_VARIANT, load_mitsuba, refuse_old_llvm
-from mbtf_gen.render.types import Properties, Scene
+from mbtf_gen.engine.runtime import CPU_VARIANT, load_mitsuba, refuse_old_llvm
+from mbtf_gen.engine.types import Properties, Scene
 
 _log = logging.getLogger(__name__)
 # The variant whose classes the plugins derive from.

@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from mbtf_fit.mitsuba_plugin.material_arrays import F32
-from mbtf_gen.render.types import Float, Point2f, UInt32
+from mbtf_gen.engine.types import Float, Point2f, UInt32
 
 # Channels that one gather reads.
 GROUP = 4

@@ -1,9 +1,9 @@
 """Rays and horizons of a periodic height field, outside of a renderer.
 
-The surface is that of :mod:`mbtf_gen.render.heightfield_tracer`: vertices on texel centers, two triangles per
-cell, which meet where ``x + y = 1`` (x and y from 0 to 1 across the cell, along u and v). A line through the
-reference plane meets it at a single height, the only number that is stored: with ω towards the viewer, the
-intersection lies at ``x + z/ω_z · ω_xy``, z ≤ 0.
+The surface is that of :mod:`mbtf_gen.tile.tracers.heightfield_tracer`: vertices on texel centers, two
+triangles per cell, which meet where ``x + y = 1`` (x and y from 0 to 1 across the cell, along u and v). A
+line through the reference plane meets it at a single height, the only number that is stored: with ω towards
+the viewer, the intersection lies at ``x + z/ω_z · ω_xy``, z ≤ 0.
 
 Where the compiled kernel is missing, :func:`trace_reference` follows the rays cell by cell in PyTorch.
 """

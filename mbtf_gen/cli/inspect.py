@@ -51,47 +51,36 @@ def inspect(
     _check_new(write, "--write", (".yaml", ".yml"), overwrite)
     _check_new(export, "--export", (".exr",), overwrite)
     from mbtf_core.images.exr import write_channels
-    from mbtf_gen.fibers.inspect import fiber_text
-    from mbtf_gen.job import check_options
-    from mbtf_gen.material.choices import write_material_file
-    from mbtf_gen.material.cloth import inspect_cloth
-    from mbtf_gen.material.inspect import inspect_material, inspection_text
-    from mbtf_gen.material.load import load_material
-    from mbtf_gen.material.mesh import inspect_mesh, mesh_text
-    from mbtf_gen.meshes.tile import MeshTile
+    from mbtf_gen.tile.choices import write_material_file
+    from mbtf_gen.tile.loading import load_material
 
-    geometry = resolved.geometry
-    height, finest = geometry.height_scale, resolved.queries.finest
+    geometry, finest = resolved.geometry, resolved.queries.finest
     loaded = load_material(resolved.material, geometry.make_tileable)
-    if loaded.shape is not None:
-        check_options(resolved, loaded)
-        if write is not None or export is not None:
-            raise UsageError("is for height maps", where="--export" if write is None else "--write")
-        mesh = isinstance(loaded.shape, MeshTile)
-        found = {"material": resolved.material, **(inspect_mesh if mesh else inspect_cloth)(loaded, finest)}
-        console.report(found, (mesh_text if mesh else fiber_text)(found, resolved.material))
-        return
     outputs: dict[str, Any] = {}
     if write is not None:
         choices = write_material_file(write, loaded, resolved)
         outputs["written"] = {"file": write, "choices": {name: asdict(c) for name, c in choices.items()}}
         # What follows describes the material as other commands will use it.
-        loaded, height, finest = replace(load_material(write), unused=loaded.unused), None, None
+        loaded, finest = replace(load_material(write), unused=loaded.unused), None
+        geometry = geometry.model_copy(update={"height_scale": None})
     if export is not None:
+        grid = loaded.configured(geometry).grid
+        if grid is None:
+            raise UsageError("is for height maps", where="--export")
         make_folder(export.parent)
-        write_channels(export, {"Y": loaded.grid(height, geometry.mesh).z.astype("float32")})
+        write_channels(export, {"Y": grid.z.astype("float32")})
         outputs["exported"] = export
-    if loaded.bsdf is not None:
-        from mbtf_gen.render.runtime import load_mitsuba
+    if loaded.bsdf_type is not None:
+        from mbtf_gen.engine.runtime import load_mitsuba
 
         load_mitsuba()
-        from mbtf_gen.render.scene import build_tile
+        from mbtf_gen.render.scene import load_surface
 
         # Mitsuba refuses what it does not know.
-        build_tile(loaded.grid(mesh=1), loaded.bsdf)
-    described = inspect_material(loaded, height, geometry.mesh, finest, geometry.max_displacement)
+        load_surface(loaded.surface(()))
+    described = loaded.inspect(geometry, finest)
     found = {"material": resolved.material, **described, **outputs}
-    console.report(found, inspection_text(found, resolved.material))
+    console.report(found, loaded.describe(found, resolved.material))
 
 
 def _check_new(path: Path | None, flag: str, suffixes: tuple[str, ...], overwrite: bool) -> None:

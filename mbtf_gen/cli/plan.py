@@ -34,7 +34,7 @@ def plan(
         Measure the bias of omitting each simulated effect by a pilot run, and forecast the run.
     """
     from mbtf_gen.job import split_target
-    from mbtf_gen.planning.effects_plan import plan_effects
+    from mbtf_gen.planning.effects_planner import plan_effects
     from mbtf_gen.planning.plan_table import plan_table
 
     job = prepare_job(options, material, quality)

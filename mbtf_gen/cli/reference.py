@@ -67,7 +67,7 @@ def reference(
         camera.queries(omega_i)  # refuses a view of the horizon before anything is written
     kinds: tuple[PixelKind, ...] = ("query", "pixel") if wanted.kind == "both" else (wanted.kind,)
     names = {(camera, one): f"{one}-tiles{camera.tiles_across:g}" for camera in cameras for one in kinds}
-    size = len(names) * wanted.size**2 * (row_bytes(job.material.opacity is not None) + PNG_BYTES)
+    size = len(names) * wanted.size**2 * (row_bytes(job.material.transmits) + PNG_BYTES)
     check_space(output, size, "reduce --size, or choose another folder with -o")
     pictures: list[dict[str, Any]] = []
     bright: list[float] = []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
@@ -18,6 +18,11 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Positive = Annotated[float, Field(gt=0, le=1e6)]
 # A linear color: three numbers, or one for gray.
 Rgb = Annotated[tuple[Share, Share, Share], BeforeValidator(_gray)]
+
+# How rays find a height field: cell by cell, or as triangles by Mitsuba.
+Tracer = Literal["heightfield", "mesh"]
+# How a normal map and the slopes of the mesh add up.
+NormalMode = Literal["residual", "absolute", "off"]
 
 
 def no_tiling(given: Tiling | None) -> Tiling:

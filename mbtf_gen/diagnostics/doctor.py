@@ -6,7 +6,6 @@ A part fails by aborting or hanging as often as by an exception, therefore in a 
 
 from __future__ import annotations
 
-import contextlib
 import os
 import platform
 import shutil
@@ -16,22 +15,20 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
+from importlib import import_module
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from mbtf_core.errors import EXIT_BAD_INPUT, EXIT_OK, EngineError
 from mbtf_core.run.child import run_child
-from mbtf_gen.render.llvm import CACHE_VARIABLE, chosen_llvm, shipped_llvm, use_shipped_llvm
-from mbtf_gen.render.runtime import CPU_VARIANT, CUDA_VARIANT, check_llvm, load_mitsuba, prove
+from mbtf_gen.engine.llvm import CACHE_VARIABLE, chosen_llvm, shipped_llvm, use_shipped_llvm
+from mbtf_gen.engine.runtime import CPU_VARIANT, CUDA_VARIANT, check_llvm, load_mitsuba, prove
 
 Found = dict[Literal["found"], str]
 
-# Names of the browser that the tests of the report drive.
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 # Seconds; first starts from a slow network disk take tens of them.
 _TIMEOUT = 180.0
-# Bytes below which free disk and memory are reported: the demo needs about half as much.
-_LITTLE_DISK, _LITTLE_MEMORY = 1e9, 2e9
 _REINSTALL = "install again: pip install --force-reinstall"
 
 
@@ -65,7 +62,7 @@ class Probe(NamedTuple):
 def diagnose() -> list[Part]:
     """Test every part, several at a time. It takes seconds and never raises."""
     use_shipped_llvm()
-    tests = [_python, _disk, _memory, _llvm, _cuda, _browser, *(partial(probe, name) for name in PROBES)]
+    tests = [_python, _llvm, _cuda, *(partial(probe, name) for name in PROBES)]
     with ThreadPoolExecutor(max_workers=min(4, os.cpu_count() or 1)) as pool:
         return list(pool.map(lambda test: test(), tests))
 
@@ -88,12 +85,10 @@ def as_text(parts: Sequence[Part]) -> str:
         lines.append(f"{part.state:<7} {part.name:<{width}}  {part.found}")
         if part.hint:
             lines.append(f"{'':<7} {'':<{width}}  → {part.hint}")
-    if exit_code(parts) != EXIT_OK:
-        closing = "a required part does not work: see the hints (→) above"
-    elif any(p.state == "failed" for p in parts):
-        closing = "every required part works; some optional ones do not (→)"
-    else:
-        closing = "everything works"
+    works = exit_code(parts) == EXIT_OK
+    closing = (
+        "every required part works" if works else "a required part does not work: see the hints (→) above"
+    )
     return "\n".join([*lines, "", closing])
 
 
@@ -107,49 +102,9 @@ def probe(name: str) -> Part:
 
 
 def _python() -> Part:
-    found = f"{platform.python_version()} on {platform.platform(terse=True)}, {sys.executable}"
-    return Part("Python", "ok", True, found)
-
-
-def _disk() -> Part:
-    folders = {str(Path.cwd()): "", tempfile.gettempdir(): " (temporary files)"}
-    free = {folder: shutil.disk_usage(folder).free for folder in folders}
-    found = ", ".join(f"{free[folder] / 1e9:.1f} GB free in {folder}{use}" for folder, use in folders.items())
-    if min(free.values()) < _LITTLE_DISK:
-        return Part("Disk", "failed", False, found, "free some, or write elsewhere with -o")
-    return Part("Disk", "ok", False, found)
-
-
-def _memory() -> Part:
-    """Memory that is free, by the system and by the limit of a container."""
-    try:
-        pages = (line.split() for line in Path("/proc/meminfo").read_text().splitlines())
-        sizes = {words[0]: 1024.0 * int(words[1]) for words in pages}
-        free, total = sizes["MemAvailable:"], sizes["MemTotal:"]
-    except (OSError, ValueError, KeyError, IndexError):
-        return Part("Memory", "absent", False, "this system does not state it")
-    found = f"{free / 1e9:.1f} GB free of {total / 1e9:.1f} GB"
-    with contextlib.suppress(OSError, ValueError):
-        limit = float(Path("/sys/fs/cgroup/memory.max").read_text())
-        free, found = min(free, limit), f"{found}, limited to {limit / 1e9:.1f} GB"
-    if free < _LITTLE_MEMORY:
-        return Part("Memory", "failed", False, found, "end other programs, or fit with --memory")
-    return Part("Memory", "ok", False, found)
-
-
-def _browser() -> Part:
-    browser = next((path for name in BROWSERS if (path := shutil.which(name))), None)
-    driver = shutil.which("chromedriver")
-    missing = [name for name, path in (("chromium", browser), ("chromedriver", driver)) if path is None]
-    if not missing:
-        return Part("Browser", "ok", False, f"{browser} with {driver}")
-    return Part(
-        "Browser",
-        "absent",
-        False,
-        f"no {' and no '.join(missing)}; only tests of the report need them",
-        "on Debian: apt install chromium chromium-driver",
-    )
+    free = shutil.disk_usage(Path.cwd()).free
+    found = f"{platform.python_version()} on {platform.platform(terse=True)}, {sys.executable}; "
+    return Part("Python", "ok", True, f"{found}{free / 1e9:.1f} GB free in {Path.cwd()}")
 
 
 def _llvm() -> Part:
@@ -157,12 +112,11 @@ def _llvm() -> Part:
     # Tested again: a cached result does not show the state of today.
     outcome = prove(CPU_VARIANT)
     if not outcome.fault:
-        version, shipped = ".".join(str(n) for n in outcome.answers["llvm"]), shipped_llvm()
-        if library is None:
-            origin = "of the system"
-        else:
-            origin = "of the installation" if library == str(shipped) else "set by the user"
-        found = f"{version} {origin}, ran test kernels, {library or 'found by Dr.Jit'}"
+        numbers = ".".join(str(n) for n in outcome.answers["llvm"])
+        origin = "set by the user"
+        if library is None or library == str(shipped_llvm()):
+            origin = "of the system" if library is None else "of the installation"
+        found = f"{numbers} {origin}, ran test kernels, {library or 'found by Dr.Jit'}"
         return Part("LLVM", "ok", True, found)
     try:
         check_llvm()
@@ -183,88 +137,38 @@ def _cuda() -> Part:
 
 
 def use_mitsuba() -> Iterator[Found]:
-    """Mitsuba renders a sphere."""
-    from importlib.metadata import version
-
+    """Mitsuba renders a sphere: a convex body of albedo 0.5 under constant radiance 1 has radiance 0.5."""
     mi = load_mitsuba(CPU_VARIANT)
     import drjit as dr
 
     look_at = mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0])
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": "path"},
-            "light": {"type": "constant"},
-            "shape": {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": 0.5}},
-            "sensor": {
-                "type": "orthographic",
-                "to_world": look_at.scale([0.5, 0.5, 1]),
-                "film": {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}},
-            },
-        }
-    )
-    mean = float(dr.mean(mi.render(scene, spp=16).array)[0])
-    # A convex body of albedo 0.5 under a constant light of radiance 1.
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "path"},
+        "light": {"type": "constant"},
+        "shape": {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": 0.5}},
+        "sensor": {"type": "orthographic", "to_world": look_at.scale([0.5, 0.5, 1]), "film": film},
+    }
+    mean = float(dr.mean(mi.render(mi.load_dict(scene), spp=16).array)[0])
     if not abs(mean - 0.5) < 0.01:
         raise EngineError(f"a test image has the mean {mean:.3f} instead of 0.5")
-    yield {"found": f"{version('mitsuba')} with Dr.Jit {version('drjit')}, rendered a test image"}
-
-
-def use_threads() -> Iterator[Found]:
-    """A sum over many lanes is right."""
-    mi = load_mitsuba(CPU_VARIANT)
-    import drjit as dr
-
-    count = 1 << 22
-    total = dr.sum(dr.select(dr.arange(mi.UInt32, count) % 2 == 0, mi.UInt32(1), 0))[0]
-    if total != count // 2:
-        raise EngineError("a parallel sum is wrong")
-    processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    yield {"found": f"{dr.thread_count()} render threads on {processors} processors{_processor_quota()}"}
-
-
-def _processor_quota() -> str:
-    """Processor time that a container may use, in processors; empty without such a limit."""
-    try:
-        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
-        return f", limited to the time of {int(quota) / int(period):g}"
-    except (OSError, ValueError):
-        return ""
+    yield {
+        "found": f"{version('mitsuba')} with Dr.Jit {version('drjit')}, rendered a test image with "
+        f"{dr.thread_count()} threads"
+    }
 
 
 def use_torch() -> Iterator[Found]:
-    """PyTorch takes a training step."""
+    """PyTorch takes a derivative."""
     # By name: this package does not depend on PyTorch, but the fitter in the same installation does.
-    from importlib import import_module
-
     torch: Any = import_module("torch")
     device = "cuda" if torch.cuda.is_available() else "cpu"
     weight = torch.zeros(1, device=device, requires_grad=True)
-    optimizer = torch.optim.SGD([weight], lr=0.25)
-    loss = (weight - 1).square().sum()
-    loss.backward()
-    optimizer.step()
-    if abs(weight.item() - 0.5) > 1e-6:
-        raise EngineError(f"a training step gave {weight.item()} instead of 0.5")
-    yield {"found": f"{torch.__version__} on {device}, took a training step"}
-
-
-def use_openexr() -> Iterator[Found]:
-    """OpenEXR writes and reads an image."""
-    from importlib.metadata import version
-
-    import numpy as np
-    import OpenEXR
-
-    image = np.linspace(0, 1, 12, dtype=np.float32).reshape(3, 4)
-    with tempfile.TemporaryDirectory(prefix="mbtf-doctor-") as folder:
-        path = str(Path(folder, "test.exr"))
-        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-        OpenEXR.File(header, {"Y": image}).write(path)
-        with OpenEXR.File(path, separate_channels=True) as file:
-            if not np.array_equal(file.channels()["Y"].pixels, image):
-                raise EngineError("an image came back changed")
-    yield {"found": f"{version('OpenEXR')}, wrote an image and read it back"}
+    (weight - 1).square().sum().backward()
+    if weight.grad.item() != -2.0:
+        raise EngineError(f"a derivative is {weight.grad.item()} instead of -2")
+    yield {"found": f"{torch.__version__} on {device}, took a derivative"}
 
 
 def use_drawing() -> Iterator[Found]:
@@ -283,23 +187,16 @@ def use_drawing() -> Iterator[Found]:
 
 def use_kernel_cache() -> Iterator[Found]:
     """The folder of compiled kernels is writable."""
-    folder = os.environ.get(CACHE_VARIABLE) or str(Path("~/.drjit").expanduser())
-    Path(folder).mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(dir=folder, prefix=".doctor-") as stream:
-        stream.write(b"mbtf")
-        stream.flush()
-    sizes = [entry.stat().st_size for entry in os.scandir(folder)]
+    folder = Path(os.environ.get(CACHE_VARIABLE) or "~/.drjit").expanduser()
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile(dir=folder, prefix=".doctor-"):
+        sizes = [entry.stat().st_size for entry in os.scandir(folder)]
     yield {"found": f"{folder}, {len(sizes)} files, {sum(sizes) / 2**10:.0f} KiB"}
 
 
 PROBES = {
     "Mitsuba": Probe(use_mitsuba, f"see LLVM; if that works, {_REINSTALL} mitsuba==3.9.1"),
-    "Threads": Probe(use_threads, "see LLVM"),
     "PyTorch": Probe(use_torch, f"{_REINSTALL} torch==2.13.0"),
-    "OpenEXR": Probe(
-        use_openexr,
-        f"{_REINSTALL} OpenEXR; make sure that the temporary folder ({tempfile.gettempdir()}) can be written",
-    ),
     "Drawing": Probe(
         use_drawing,
         "only 3D pictures need it; install OpenGL (software rendering is enough), on Debian: "

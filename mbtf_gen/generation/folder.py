@@ -68,7 +68,7 @@ def open_folder(job: Job, folder: DataFolder, plan: Callable[[Job], RunPlan], ov
         _check_format(folder)
     elif present:
         _check_same(job, folder)
-        if folder.has(CONFIG_NAME) and (job.material.shape is not None or folder.has(GEOMETRY_NAME)):
+        if folder.has(CONFIG_NAME) and (job.material.grid is None or folder.has(GEOMETRY_NAME)):
             return
     # Planning takes long: it comes before any change, and outside the lock.
     content = b""

@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 from mbtf_core.data.geometry import FINEST_LEVEL, GLOSSY, Geometry
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.images.resample import resample
-from mbtf_gen.geometry.slopes import height_slopes
+from mbtf_gen.effects.plan import EffectsPlan
 from mbtf_gen.job import Job
-from mbtf_gen.planning.effects import EffectsPlan
 from mbtf_gen.planning.simulation import shading_slopes
+from mbtf_gen.tile.heights.slopes import height_slopes
 
 F32 = NDArray[np.float32]
 
@@ -34,8 +34,8 @@ def geometry_of(job: Job, plan: EffectsPlan) -> Geometry | None:
     Geometry or None
         None for fibers, which have neither heights nor slopes.
     """
-    material, grid = job.material, job.grid
-    if material.shape is not None:
+    material, grid = job.material, job.material.grid
+    if grid is None:
         return None
     shape = Lattice(min(job.lattice.finest + 1, FINEST_LEVEL), grid.aspect).shape()
     x, y = np.moveaxis(_slopes(job, plan), -1, 0)
@@ -45,22 +45,23 @@ def geometry_of(job: Job, plan: EffectsPlan) -> Geometry | None:
         np.stack([_means(s, shape) for s in (x, y)], axis=-1),
         np.stack([_means(a * b, shape) for a, b in ((x, x), (x, y), (y, y))], axis=-1),
     )
-    if material.bsdf is not None:
+    if material.bsdf_type is not None:
         return geometry
     maps: dict[str, Any] = {"base_color": _means(material.base_color, shape)}
     if plan.on("specular") or plan.on("metallic"):
-        weights = {name: getattr(material, name) if plan.on(name) else 0.0 for name in GLOSSY[1:]}
-        shares = {"roughness": material.roughness, **weights}
+        weights = {name: material.maps[name] if plan.on(name) else 0.0 for name in GLOSSY[1:]}
+        shares = {"roughness": material.maps["roughness"], **weights}
         maps |= {name: _means(share, shape) for name, share in shares.items()}
-    if material.opacity is not None and plan.on("opacity"):
-        maps["opacity"] = _means(material.opacity, shape)
+    if "opacity" in material.maps and plan.on("opacity"):
+        maps["opacity"] = _means(material.maps["opacity"], shape)
     return replace(geometry, **maps)
 
 
 def _slopes(job: Job, plan: EffectsPlan) -> NDArray[np.float64]:
     """Slopes (h, w, 2) of the shading normal, at the finest resolution of those that add up."""
     added = shading_slopes(job, plan)
-    mesh = height_slopes(job.grid) if plan.on("parallax") else None
+    grid = job.material.grid
+    mesh = height_slopes(grid) if grid is not None and plan.on("parallax") else None
     terms = [slopes for slopes in (added, mesh) if slopes is not None]
     if not terms:
         return np.zeros((1, 1, 2))

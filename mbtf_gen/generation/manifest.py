@@ -13,10 +13,9 @@ from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.data.lattice import sigma_of_level
 from mbtf_core.data.manifest import CHECK_HINT, software_versions
 from mbtf_core.data.schema import ARRAYS, CONVENTIONS, FORMAT_NAME, LEADING_AXES, SCHEMA_VERSION, SPLITS
-from mbtf_gen.config.effects_request import EFFECTS
-from mbtf_gen.fibers.tile import FiberTile
+from mbtf_gen.effects.catalog import EFFECTS
+from mbtf_gen.effects.plan import EffectsPlan
 from mbtf_gen.job import Job, split_queries, split_spp
-from mbtf_gen.planning.effects import EffectsPlan
 from mbtf_gen.planning.run_plan import RunPlan
 from mbtf_gen.planning.sample_allocation import Allocation
 
@@ -42,20 +41,6 @@ def stored_plan(manifest: Mapping[str, Any], path: object) -> RunPlan:
     return RunPlan(found.effects, found.allocation)
 
 
-def _shape(job: Job) -> dict[str, Any]:
-    """What the tile is made of: heights or fibers."""
-    material, scale = job.material, job.config.geometry.height_scale
-    if isinstance(material.shape, FiberTile):
-        return {"fibers": len(material.shape.curves), "segments": material.shape.segments}
-    if material.shape is not None:
-        return {"triangles": len(material.shape.faces)}
-    return {
-        "maps_shape": list(material.height.shape),
-        "mesh_shape": list(job.grid.z.shape),
-        "height_scale": material.height_scale if scale is None else scale,
-    }
-
-
 def build_manifest(job: Job, plan: RunPlan, geometry: Mapping[str, Any] | None) -> dict[str, Any]:
     """Manifest of a data set without shards (``complete`` is false); `geometry` is its key of that name."""
     config, material, lattice = job.config, job.material, job.lattice
@@ -72,8 +57,8 @@ def build_manifest(job: Job, plan: RunPlan, geometry: Mapping[str, Any] | None) 
         "conventions": CONVENTIONS,
         "tile": {
             "aspect": lattice.aspect,
-            **_shape(job),
-            "displacement_range": job.displacement_range,
+            **job.material.properties(),
+            "displacement_range": job.material.thickness,
         },
         "levels": {
             "finest": lattice.finest,

@@ -21,7 +21,7 @@ from mbtf_core.data.sidecar import finished_record
 from mbtf_core.errors import PartialError
 from mbtf_core.files.atomic import checksummed
 from mbtf_core.locks import brief_lock
-from mbtf_gen.config.effects_request import EFFECTS
+from mbtf_gen.effects.catalog import EFFECTS
 from mbtf_gen.generation.manifest import stored_plan
 from mbtf_gen.render.estimates import BadSample, TargetReached
 
@@ -270,7 +270,7 @@ def finish(
         lost=totals.counts["lost_rays"],
         capped=totals.counts["capped_rays"],
         nonfinite=totals.counts["nonfinite_samples"],
-        effects=[EFFECTS[e.name] for e in effects if e.on],
+        effects=[EFFECTS[e.name].description for e in effects if e.on],
         measured=measured,
         **sums,
     )

@@ -7,14 +7,13 @@ it bounds the bias for any mixture of levels.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_gen.geometry.heightfield import HeightGrid
-from mbtf_gen.geometry.slopes import height_slopes
+from mbtf_gen.effects.effect import DisplacementBounds
 from mbtf_gen.sampling.light_kernel import LightKernel
+from mbtf_gen.tile.heights.grid import HeightGrid
+from mbtf_gen.tile.heights.slopes import height_slopes
 
 F64 = NDArray[np.float64]
 
@@ -28,24 +27,6 @@ FEW = 8
 NONE_OF = 3.0
 # Steps after which a marched ray is assumed to be unoccluded.
 MAX_STEPS = 4096
-
-
-@dataclass(frozen=True)
-class DisplacementBounds:
-    """Bias bounds of leaving out effects of a displaced Lambert surface, relative to the mean value.
-
-    Attributes
-    ----------
-    parallax : the plane, shaded with the mesh's slopes and without shadows, replaces the displaced tile
-    shadowing : no shadows on the displaced tile
-    normal : shading without the given residual slopes
-    opacity : surface and occluders opaque everywhere
-    """
-
-    parallax: float
-    shadowing: float
-    normal: float
-    opacity: float
 
 
 class _Field:

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from mbtf_core.data.queries import Queries
-from mbtf_gen.config.effects_request import EFFECTS
+from mbtf_gen.effects.catalog import EFFECTS
+from mbtf_gen.effects.effect import EffectDecision
+from mbtf_gen.effects.plan import EffectsPlan, without
 from mbtf_gen.job import Job
 from mbtf_gen.planning.bounds import CAUTION, FEW, NONE_OF
-from mbtf_gen.planning.effects import Effect, EffectsPlan, without
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream
 
@@ -140,11 +141,15 @@ def measured(job: Job, plan: EffectsPlan) -> EffectsPlan:
         return plan
     pilot = Pilot(job, plan)
 
-    def measure(effect: Effect) -> Effect:
+    def measure(effect: EffectDecision) -> EffectDecision:
         if not effect.on or not effect.present:
             return effect
         cut = without(plan, effect.name)
-        removed = [EFFECTS[name] for name in EFFECTS if name in plan.names_on - cut.names_on - {effect.name}]
+        removed = [
+            e.description
+            for name, e in EFFECTS.items()
+            if name in plan.names_on - cut.names_on - {effect.name}
+        ]
         listed = " and ".join([", ".join(removed[:-1]), *removed[-1:]]).removeprefix(" and ")
         text = f"; the bound includes {listed}" if removed else ""
         change = pilot.changed(cut)

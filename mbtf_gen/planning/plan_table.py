@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import textwrap
 
-from mbtf_gen.config.effects_request import EFFECTS
-from mbtf_gen.planning.effects import Effect, EffectsPlan
+from mbtf_gen.effects.catalog import EFFECTS
+from mbtf_gen.effects.effect import EffectDecision
+from mbtf_gen.effects.plan import EffectsPlan
 
 # Columns of the table before the explanation, and its width.
 _NAME, _BOUND, _WIDTH = 24, 24, 108
@@ -19,7 +20,7 @@ def plan_table(plan: EffectsPlan) -> str:
     for e in plan.effects:
         first, *rest = textwrap.wrap(e.explanation, _WIDTH - before) or [""]
         state = "on" if e.on else "off"
-        lines.append(f"{EFFECTS[e.name]:<{_NAME}}{state:<5}{_bound_text(e):<{_BOUND}}{first}")
+        lines.append(f"{EFFECTS[e.name].description:<{_NAME}}{state:<5}{_bound_text(e):<{_BOUND}}{first}")
         lines += [" " * before + more for more in rest]
     bound = plan.bias_bound
     share = "0 %" if bound == 0 else f"at most {_percent(bound)}"
@@ -31,7 +32,7 @@ def plan_table(plan: EffectsPlan) -> str:
     return "\n".join(lines)
 
 
-def _bound_text(effect: Effect) -> str:
+def _bound_text(effect: EffectDecision) -> str:
     """The bias bound of leaving an effect out, with its error or as an upper bound."""
     if effect.bias_bound is None:
         return "-"

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from mbtf_gen.effects.plan import EffectsPlan
 from mbtf_gen.job import Job, planned_paths
-from mbtf_gen.planning.effects import EffectsPlan
-from mbtf_gen.planning.effects_plan import plan_effects
+from mbtf_gen.planning.effects_planner import plan_effects
 from mbtf_gen.planning.sample_allocation import Allocation, measure_allocation
 
 # Runs of fewer paths end before a pilot has paid for itself.

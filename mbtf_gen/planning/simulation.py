@@ -9,16 +9,12 @@ from numpy.typing import NDArray
 
 from mbtf_core.data.queries import Queries
 from mbtf_core.images.resample import resample
-from mbtf_gen.geometry.slopes import height_slopes, residual_slopes
+from mbtf_gen.effects.catalog import EFFECTS
+from mbtf_gen.effects.plan import EffectsPlan
+from mbtf_gen.engine.runtime import CPU_VARIANT
 from mbtf_gen.job import Job
-from mbtf_gen.planning.effects import EffectsPlan
 from mbtf_gen.render.estimates import Estimates, Stream
-from mbtf_gen.render.runtime import CPU_VARIANT
-
-# Effects that change the tile: its shape or its surface.
-_TILE_EFFECTS = frozenset(
-    {"parallax", "specular", "metallic", "clearcoat", "sheen", "transmission", "normal", "opacity"}
-)
+from mbtf_gen.tile.heights.slopes import height_slopes
 
 
 class ClosedForm:
@@ -66,52 +62,36 @@ def build_estimator(
     """
     if plan.closed_form:
         return ClosedForm(np.asarray(job.material.base_color, np.float64).reshape(-1, 3)[0])
-    from mbtf_gen.render.runtime import load_mitsuba
+    from mbtf_gen.engine.runtime import load_mitsuba
 
     load_mitsuba(variant)
-    from mbtf_gen.render.bsdf.plugin import bsdf_of
     from mbtf_gen.render.estimator import Estimator
     from mbtf_gen.render.path_tracer import Transport
-    from mbtf_gen.render.scene import build_tile
+    from mbtf_gen.render.scene import build_scene
     from mbtf_gen.sampling.light_kernel import LightKernel
 
     tiles = {} if tiles is None else tiles
-    key = plan.names_on & _TILE_EFFECTS
+    key = frozenset(name for name in plan.names_on if EFFECTS[name].alters_tile)
     if key not in tiles:
-        tiles[key] = build_tile(
-            job.material.shape or job.grid,
-            bsdf_of(job.material, key, shading_slopes(job, plan)),
-            job.config.geometry.tracer,
-        )
+        tiles[key] = build_scene(job.material, job.material.surface(key, shading_slopes(job, plan)))
     transport = Transport(
         plan.max_depth,
         plan.roulette_depth,
         job.config.transport.max_crossings,
-        displacement=plan.on("parallax"),
-        shadowing=plan.on("shadowing"),
-        interreflection=plan.on("interreflection"),
-        bsdf_sampling=plan.on("bsdf_sampling"),
+        **{effect.switch: plan.on(name) for name, effect in EFFECTS.items() if effect.switch},
     )
     return Estimator(tiles[key], LightKernel(job.config.light.width), transport)
-
-
-def normal_map_slopes(job: Job) -> tuple[NDArray[np.float64], float] | None:
-    """Slopes (h, w, 2) that the normal map adds to the mesh, and the share of the mesh's own slopes that the
-    map repeats; None without a map or where the options switch it off."""
-    material, mode = job.material, job.config.effects.normal
-    if material.normal is None or material.bsdf is not None or mode == "off":
-        return None
-    return residual_slopes(material.normal, job.grid, mode)
 
 
 def shading_slopes(job: Job, plan: EffectsPlan) -> NDArray[np.float64] | None:
     """Slopes (h, w, 2) that shading adds to the geometry's: those of the normal map, and those of the heights
     where they are not displaced."""
-    mapped = normal_map_slopes(job) if plan.on("normal") else None
+    tile = job.material
+    mapped = tile.normal_slopes(job.config.effects.normal) if plan.on("normal") else None
     residual = None if mapped is None else mapped[0]
-    if plan.on("parallax") or job.displacement_range == 0.0:
+    if plan.on("parallax") or tile.grid is None or tile.thickness == 0.0:
         return residual
-    slopes = height_slopes(job.grid)
+    slopes = height_slopes(tile.grid)
     if residual is None:
         return slopes
     return residual + np.asarray(resample(slopes, *residual.shape[:2]), np.float64)

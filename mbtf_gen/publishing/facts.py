@@ -10,8 +10,8 @@ from typing import Any
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.shard_files import Arrays
-from mbtf_gen.config.effects_request import EFFECTS
 from mbtf_gen.config.publish import PublishConfig
+from mbtf_gen.effects.catalog import EFFECTS
 
 # Upper ends of the size categories of data hubs.
 _SIZES = (
@@ -120,7 +120,7 @@ class Facts:
         plan = self.manifest.get("effects") or {"effects": []}
         return [
             (
-                EFFECTS.get(e["name"], e["name"]),
+                EFFECTS[e["name"]].description if e["name"] in EFFECTS else e["name"],
                 "simulated" if e["on"] else "left out" if e["present"] else "not present",
                 bound_text(e["bias_bound"], e["error"]) if e["present"] else "",
                 e["explanation"],

@@ -12,7 +12,7 @@ from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.errors import InputError
 from mbtf_core.files.digest import file_sha256
-from mbtf_gen.material.load import described, load_material
+from mbtf_gen.tile.loading import described, load_material
 
 MATERIAL_FILE = "material.yaml"
 _MESH_TEXT = (".gltf", ".obj")

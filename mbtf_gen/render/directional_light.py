@@ -20,8 +20,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbtf_gen.render.memory import padded
-from mbtf_gen.render.types import (
+from mbtf_gen.engine.memory import padded
+from mbtf_gen.engine.types import (
     DirectionSample3f,
     Float,
     Mask,

@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from mbtf_core.data.queries import Queries
 from mbtf_core.directions import check_unit
 from mbtf_core.errors import PartialError
+from mbtf_gen.engine.memory import padded
+from mbtf_gen.engine.types import Color3f, Float, Float64, Point2f, Ray3f, UInt32
 from mbtf_gen.render.directional_light import DirectionalLight
 from mbtf_gen.render.estimates import MOST_LOCATED, BadSample, Estimates, Stream
-from mbtf_gen.render.memory import padded
 from mbtf_gen.render.path_tracer import PathTracer, Transport
-from mbtf_gen.render.scene import CLEARANCE, Tile
-from mbtf_gen.render.types import Color3f, Float, Float64, Point2f, Ray3f, UInt32
+from mbtf_gen.render.scene import CLEARANCE, TileScene
 from mbtf_gen.sampling.light_kernel import LightKernel
 from mbtf_gen.sampling.rng import Purpose, sequence, stream_key, stream_number
 from mbtf_gen.sampling.sobol import SobolSampler
@@ -51,8 +51,8 @@ class Estimator:
 
     Parameters
     ----------
-    tile : Tile
-        The displaced tile, see :func:`~mbtf_gen.render.scene.build_tile`.
+    tile : TileScene
+        The displaced tile, see :func:`~mbtf_gen.render.scene.build_scene`.
     light : LightKernel or None
         Smoothed directional light; None for constant radiance 1, from below as well where rays can pass
         through the tile (white furnace).
@@ -68,7 +68,7 @@ class Estimator:
     """
 
     def __init__(
-        self, tile: Tile, light: LightKernel | None, transport: Transport, launch: int = LAUNCH_PATHS
+        self, tile: TileScene, light: LightKernel | None, transport: Transport, launch: int = LAUNCH_PATHS
     ) -> None:
         self.tile = tile
         self.light = light

@@ -21,10 +21,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mbtf_gen.render.directional_light import DirectionalLight
-from mbtf_gen.render.geometry import Vertex
-from mbtf_gen.render.scene import Tile
-from mbtf_gen.render.types import (
+from mbtf_gen.engine.types import (
     Float,
     Mask,
     Ray3f,
@@ -33,7 +30,10 @@ from mbtf_gen.render.types import (
     UInt32,
     Vector3f,
 )
+from mbtf_gen.render.directional_light import DirectionalLight
+from mbtf_gen.render.scene import TileScene
 from mbtf_gen.sampling.sobol import SobolSampler
+from mbtf_gen.tile.tracers.protocol import Vertex
 
 NO_LIMIT = 0xFFFFFFFF
 
@@ -151,7 +151,7 @@ class PathTracer:
 
     Attributes
     ----------
-    tile : Tile
+    tile : TileScene
         Geometry and reflection.
     transport : Transport
         Effects that are simulated.
@@ -162,7 +162,7 @@ class PathTracer:
         opaque and of width 1, so that different numbers share the compiled kernel.
     """
 
-    tile: Tile
+    tile: TileScene
     transport: Transport
     light: DirectionalLight
     limit: UInt32

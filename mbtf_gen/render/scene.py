@@ -9,23 +9,16 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import mitsuba as mi
 
 from mbtf_core.errors import InputError, reason
-from mbtf_gen.config.generator import Tracer
-from mbtf_gen.fibers.tile import FiberTile
-from mbtf_gen.geometry.heightfield import HeightGrid
-from mbtf_gen.meshes.tile import MeshTile
+from mbtf_gen.engine.types import BSDF
 from mbtf_gen.render.bsdf.plugin import PartSurface, SurfaceBSDF, surface_of
-from mbtf_gen.render.curve_tracer import CurveGeometry
 from mbtf_gen.render.directional_light import SmoothedDirectional
-from mbtf_gen.render.geometry import TileGeometry
-from mbtf_gen.render.heightfield_tracer import HeightfieldGeometry
-from mbtf_gen.render.mesh_tracer import MeshGeometry, MeshTileGeometry
 from mbtf_gen.render.sensor import QuerySensor
-from mbtf_gen.render.types import BSDF
+from mbtf_gen.tile.tracers.protocol import TileGeometry
 
 LONG_SIDE = 32.0
 # Rays start this far above the reference plane, in units: more than the rounding of the highest vertex.
@@ -40,8 +33,19 @@ def register_plugins() -> None:
     mi.register_emitter("mbtf_directional", lambda props: SmoothedDirectional(props))
 
 
+class TracedShape(Protocol):
+    """A tile, or the heights of one."""
+
+    @property
+    def aspect(self) -> float:
+        """H/W of the tile."""
+
+    def trace(self, unit: float, below: bool = False) -> TileGeometry:
+        """The surface as rays meet it, see :meth:`mbtf_gen.tile.protocol.Tile.trace`."""
+
+
 @dataclass(frozen=True)
-class Tile:
+class TileScene:
     """A periodic tile as a scene.
 
     Attributes
@@ -52,7 +56,7 @@ class Tile:
         Scene units per tile width.
     geometry : TileGeometry
         Geometry in scene units.
-    surface : Surface or MitsubaSurface
+    surface : Surface, PartSurface or MitsubaSurface
         Reflection, see :mod:`mbtf_gen.render.bsdf.surface`.
     """
 
@@ -67,47 +71,42 @@ def unit_of(aspect: float) -> float:
     return LONG_SIDE / max(1.0, aspect)
 
 
-def build_tile(
-    shape: HeightGrid | FiberTile | MeshTile,
-    bsdf: Mapping[str, Any] | BSDF | Sequence[Mapping[str, Any]],
-    tracer: Tracer = "heightfield",
-) -> Tile:
+def build_scene(
+    shape: TracedShape, bsdf: Mapping[str, Any] | BSDF | Sequence[Mapping[str, Any]]
+) -> TileScene:
     """Build the scene of a tile.
 
     Parameters
     ----------
-    shape : HeightGrid, FiberTile or MeshTile
-        Heights, fibers or triangles, in tile widths.
+    shape : Tile or HeightGrid
+        The shape, in tile widths.
     bsdf : mapping, mitsuba.BSDF or sequence of mapping
         A Mitsuba dictionary, or a loaded BSDF; one dictionary per part of a mesh.
-    tracer : str
-        Of heights. ``heightfield``: rays follow the grid's cells. ``mesh``: Mitsuba traces the grid's
-        triangles.
+
+    Returns
+    -------
+    TileScene
 
     Raises
     ------
     InputError
         Mitsuba rejects the BSDF.
     """
+    surface, unit = load_surface(bsdf), unit_of(shape.aspect)
+    return TileScene(shape.aspect, unit, shape.trace(unit, surface.transmits), surface)
+
+
+def load_surface(bsdf: Mapping[str, Any] | BSDF | Sequence[Mapping[str, Any]]) -> Any:
+    """Surface, PartSurface or MitsubaSurface of what :func:`build_scene` takes; errors as there."""
     register_plugins()
-    unit = unit_of(shape.aspect)
-    if isinstance(shape, MeshTile) and isinstance(bsdf, Sequence):
-        parts = PartSurface([mi.load_dict(dict(part)).surface for part in bsdf])
-        return Tile(shape.aspect, unit, MeshTileGeometry.of_tile(shape, unit), parts)
-    if isinstance(bsdf, Mapping):
-        try:
-            bsdf = mi.load_dict(dict(bsdf))
-        except Exception as error:  # whatever the plugins raise about their parameters
-            text = re.sub(r"\[\w+\.cpp:\d+\]\s*", "", reason(error, 250))
-            raise InputError(f"Mitsuba rejects the BSDF '{bsdf.get('type')}' ({text})") from None
-    surface = surface_of(bsdf)
-    geometry: TileGeometry
-    if isinstance(shape, FiberTile):
-        geometry = CurveGeometry.of_fibers(shape, unit)
-    elif isinstance(shape, MeshTile):
-        geometry = MeshTileGeometry.of_tile(shape, unit)
-    elif tracer == "mesh":
-        geometry = MeshGeometry.of_grid(shape, unit)
-    else:
-        geometry = HeightfieldGeometry.of(shape, unit, surface.transmits)
-    return Tile(shape.aspect, unit, geometry, surface)
+    if isinstance(bsdf, Sequence):
+        return PartSurface([_loaded(part).surface for part in bsdf])
+    return surface_of(_loaded(bsdf) if isinstance(bsdf, Mapping) else bsdf)
+
+
+def _loaded(bsdf: Mapping[str, Any]) -> BSDF:
+    try:
+        return mi.load_dict(dict(bsdf))
+    except Exception as error:  # whatever the plugins raise about their parameters
+        text = re.sub(r"\[\w+\.cpp:\d+\]\s*", "", reason(error, 250))
+        raise InputError(f"Mitsuba rejects the BSDF '{bsdf.get('type')}' ({text})") from None

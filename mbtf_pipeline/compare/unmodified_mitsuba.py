@@ -11,7 +11,6 @@ Opacity is ignored, because shadow rays of Mitsuba do not pass through masked su
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import tempfile
 from dataclasses import dataclass
@@ -25,13 +24,13 @@ from mbtf_core.directions import from_angles
 from mbtf_core.errors import UsageError
 from mbtf_core.pictures.camera import PIXEL_SIGMA, Camera
 from mbtf_core.stats import Estimate, mean_estimate
+from mbtf_gen.tile.maps.material_file import ROLES
 from mbtf_pipeline.compare.pictures import PICTURES, write_picture
 
 if TYPE_CHECKING:
     from mbtf_gen.config.generator import GeneratorConfig
-    from mbtf_gen.fibers.tile import FiberTile
     from mbtf_gen.job import Job
-    from mbtf_gen.material.material import Material
+    from mbtf_gen.tile.protocol import Tile
     from mbtf_pipeline.recipe import CompareSection, SceneDirection, SceneView
 
 F64 = NDArray[np.float64]
@@ -49,18 +48,7 @@ MEAN_TOLERANCE, RMS_TOLERANCE = 0.005, 0.02
 # two.
 MAX_STANDARD_ERRORS = 3.0
 # Properties that a Lambertian surface does not have.
-_NOT_LAMBERTIAN = (
-    "roughness",
-    "metallic",
-    "specular",
-    "clearcoat",
-    "clearcoat_roughness",
-    "sheen",
-    "sheen_color",
-    "sheen_roughness",
-    "normal",
-    "opacity",
-)
+_NOT_LAMBERTIAN = tuple(role for role in ROLES if role != "base_color")
 
 
 Verdict = Literal["agree", "differ", "inconclusive"]
@@ -142,7 +130,7 @@ def pick_scene(section: CompareSection) -> tuple[SceneView, SceneDirection, floa
 
 
 def write_agreement(
-    section: CompareSection, generate: GeneratorConfig, material: Material, exposure: float, out: Path
+    section: CompareSection, generate: GeneratorConfig, material: Tile, exposure: float, out: Path
 ) -> dict[str, Any]:
     """Compare with unmodified Mitsuba and write the images below `out`; returns plain data."""
     view, light, tiles_across = pick_scene(section)
@@ -163,13 +151,13 @@ def write_agreement(
 
 
 def compare_with_mitsuba(
-    section: CompareSection, generate: GeneratorConfig, material: Material
+    section: CompareSection, generate: GeneratorConfig, material: Tile
 ) -> dict[str, Agreement]:
     """Render one scene with mbtf and with Mitsuba: the ``base color`` alone, and the ``full`` surface."""
     from mbtf_gen.config.generator import LightSection
     from mbtf_gen.job import Job
     from mbtf_gen.pictures.reference import render_reference
-    from mbtf_gen.planning.effects_plan import reference_plan
+    from mbtf_gen.planning.effects_planner import reference_plan
     from mbtf_gen.planning.simulation import build_estimator
 
     view, light, tiles_across = pick_scene(section)
@@ -178,7 +166,7 @@ def compare_with_mitsuba(
     omega_i = from_angles(light.elevation, light.azimuth)
     out = {}
     for surface, variant in _surfaces(material).items():
-        job = Job(config, variant)
+        job = Job.of(config, variant)
         estimator = build_estimator(job, reference_plan(job))
         image = render_reference(
             estimator, camera, omega_i, kind="pixel", spp=section.spp, seed=section.seed, index=0
@@ -189,18 +177,17 @@ def compare_with_mitsuba(
     return out
 
 
-def _surfaces(material: Material) -> dict[str, Material]:
+def _surfaces(material: Tile) -> dict[str, Tile]:
     """The material as a Lambertian surface of its base color, and as it is but without opacity."""
-    if material.bsdf is not None:
+    if material.bsdf_type is not None:
         return {"full": material}
-    removed: dict[str, Any] = dict.fromkeys(_NOT_LAMBERTIAN)
-    lambertian = dataclasses.replace(material, **removed)
-    full = dataclasses.replace(material, opacity=None)
+    lambertian = material.with_maps(**dict.fromkeys(_NOT_LAMBERTIAN))
+    full = material.with_maps(opacity=None)
     return {"base color": lambertian, **({} if _is_lambertian(full) else {"full": full})}
 
 
-def _is_lambertian(material: Material) -> bool:
-    return all(getattr(material, name) is None for name in _NOT_LAMBERTIAN)
+def _is_lambertian(material: Tile) -> bool:
+    return not material.maps.keys() & set(_NOT_LAMBERTIAN)
 
 
 def render_with_mitsuba(job: Job, camera: Camera, omega_i: F64, spp: int, seed: int) -> tuple[F64, F64]:
@@ -223,10 +210,10 @@ def _mitsuba_scene(job: Job, camera: Camera, omega_i: F64, folder: Path) -> dict
 
     aspect = job.material.aspect
     unit = LONG_SIDE / max(1.0, aspect)
-    tile = _mitsuba_tile(job, unit, folder)
+    tile = job.material.mitsuba_shapes(unit, folder, _mitsuba_bsdf(job))
     # Surfaces within this distance affect a pixel at the edge by visibility, shadowing or interreflection.
     slope = math.tan(math.radians(LOWEST_LIGHT))
-    reach = 0.75 * camera.tiles_across + 2.0 * job.displacement_range / slope + 1.0
+    reach = 0.75 * camera.tiles_across + 2.0 * job.material.thickness / slope + 1.0
     columns, rows = (math.ceil(reach / side) for side in (1.0, aspect))
     shift = mi.ScalarTransform4f().translate
     # The camera looks at the central tile.
@@ -276,64 +263,15 @@ def _mitsuba_scene(job: Job, camera: Camera, omega_i: F64, folder: Path) -> dict
     }
 
 
-def _mitsuba_tile(job: Job, unit: float, folder: Path) -> dict[str, Any]:
-    """Shapes of one period of the mesh or of the fibers, centered, with `unit` scene units per tile width."""
-    from mbtf_gen.meshes.tile import MeshTile
-
-    fibers, aspect = job.material.shape, job.material.aspect
-    if isinstance(fibers, MeshTile):
-        raise UsageError("compares height maps and fibers, not meshes", where="compare.unmodified_mitsuba")
-    if fibers is not None:
-        # One shape per color: Mitsuba's own texture coordinates run around the fiber.
-        return {
-            f"color_{number}": {
-                "type": "bsplinecurve",
-                "filename": str(_write_curves(fibers, number, unit, folder)),
-                "bsdf": dataclasses.replace(fibers, colors=fibers.colors[[number]]).bsdf(),
-            }
-            for number in np.unique(fibers.yarn)
-        }
-    from mbtf_gen.geometry.heightfield import tile_mesh
-
-    mesh = tile_mesh(job.grid)
-    mesh.apply_translation([-0.5, -0.5 * aspect, 0.0])
-    mesh.apply_scale(unit)
-    file = folder / "tile.ply"
-    file.write_bytes(mesh.export(file_type="ply", vertex_normal=False))
-    mesh = {
-        "type": "ply",
-        "filename": str(file),
-        "face_normals": True,
-        "flip_tex_coords": True,
-        "bsdf": _mitsuba_bsdf(job),
-    }
-    return {"tile": mesh}
-
-
-def _write_curves(fibers: FiberTile, color: int, unit: float, folder: Path) -> Path:
-    """Text file of the fibers of one color, in scene units, centered."""
-    file = folder / f"color_{color}.txt"
-    with file.open("w") as text:
-        for number in np.flatnonzero(fibers.yarn == color):
-            points = fibers.curves[int(number)].unrolled() - (0.5, 0.5 * fibers.aspect, 0.0, 0.0)
-            np.savetxt(text, points * unit, fmt="%.9g")
-            text.write("\n")
-    return file
-
-
 def _mitsuba_bsdf(job: Job) -> dict[str, Any]:
     """``diffuse`` with the base color for a Lambertian material, otherwise our BSDF."""
     import mitsuba as mi
 
-    from mbtf_gen.planning.simulation import normal_map_slopes
-    from mbtf_gen.render.bsdf.plugin import bsdf_of
-
     material = job.material
-    if material.bsdf is not None or not _is_lambertian(material):
-        mapped = normal_map_slopes(job)
-        found = bsdf_of(material, slopes=None if mapped is None else mapped[0])
-        assert isinstance(found, dict)
-        return found
+    if material.bsdf_type is not None or not _is_lambertian(material):
+        mapped = material.normal_slopes()
+        found = material.surface(slopes=None if mapped is None else mapped[0])
+        return found if isinstance(found, dict) else {}
     base = np.asarray(material.base_color, np.float32)
     if base.ndim == 1:
         return {"type": "diffuse", "reflectance": {"type": "rgb", "value": [float(c) for c in base]}}

@@ -23,12 +23,12 @@ from mbtf_core.data.queries import Queries
 from mbtf_core.stats import Estimate, mean_estimate
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job, split_spp, split_target
-from mbtf_gen.material.material import Material
 from mbtf_gen.planning.adaptive import estimate_shard
-from mbtf_gen.planning.effects_plan import plan_effects
+from mbtf_gen.planning.effects_planner import plan_effects
 from mbtf_gen.planning.run_plan import allocate
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Stream
+from mbtf_gen.tile.protocol import Tile
 from mbtf_pipeline.cost_study.measurements import HALF_WIDTH, NORMAL
 
 # Queries of one batch of the reference, and paths of each there and in the configuration.
@@ -89,19 +89,19 @@ class GeneratorBenchmark:
     config : the recipe's generator; its finest level is fixed, so that all configurations have equal queries
     """
 
-    def __init__(self, config: GeneratorConfig, material: Material) -> None:
+    def __init__(self, config: GeneratorConfig, material: Tile) -> None:
         self.config, self.material = config, material
         self._references: dict[str, Reference] = {}
 
     def job(self, changes: dict[str, Any]) -> Job:
         """The job with options changed, by dotted name."""
         fixed = {
-            "queries.resolution": 1 << Job(self.config, self.material).lattice.finest,
+            "queries.resolution": 1 << Job.of(self.config, self.material).lattice.finest,
             "queries.layout": "shuffled",
             "output.shard_queries": SHARD,
         }
         data = deep_merge(self.config.model_dump(mode="json"), nested({**fixed, **changes}))
-        return Job(GeneratorConfig.model_validate(data), self.material)
+        return Job.of(GeneratorConfig.model_validate(data), self.material)
 
     def reference(self, changes: dict[str, Any]) -> Reference:
         """The reference with these options."""

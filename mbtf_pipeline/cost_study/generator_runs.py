@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-from mbtf_gen.planning.effects_plan import plan_effects
+from mbtf_gen.planning.effects_planner import plan_effects
 from mbtf_pipeline.cost_study.generator_benchmark import GeneratorBenchmark
 from mbtf_pipeline.cost_study.measurements import Configuration, Measurement
 
@@ -58,11 +58,13 @@ def generator_tasks(benchmark: GeneratorBenchmark) -> Iterator[GeneratorTask]:
     modes |= {f"without {e.name}": f"all,-{e.name}" for e in everything.effects if e.on and e.present}
     for name, mode in modes.items():
         yield GeneratorTask("effects", "", name, {**UNIFORM, "effects.mode": mode})
-    own = benchmark.job({}).grid.z.shape[1]
-    sizes = sorted({max(8, min(FINEST_MESH, round(factor * own))) for factor in MESH_FACTORS} | {own})
-    for cells in sizes:
-        changes, against = {**UNIFORM, "geometry.mesh": cells}, {"geometry.mesh": sizes[-1]}
-        yield GeneratorTask("mesh", "", f"{cells} cells", changes, against)
+    grid = benchmark.job({}).material.grid
+    if grid is not None:
+        own = grid.z.shape[1]
+        sizes = sorted({max(8, min(FINEST_MESH, round(factor * own))) for factor in MESH_FACTORS} | {own})
+        for cells in sizes:
+            changes, against = {**UNIFORM, "geometry.mesh": cells}, {"geometry.mesh": sizes[-1]}
+            yield GeneratorTask("mesh", "", f"{cells} cells", changes, against)
     for depth in DEPTHS:
         name = f"{depth} interaction{'s' * (depth > 1)}" if depth else "no limit"
         changes = {**UNIFORM, "transport.max_depth": depth, "effects.mode": "all"}

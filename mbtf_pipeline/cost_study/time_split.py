@@ -195,7 +195,7 @@ class TimedRun:
         start, path = forecaster.speed
         job = Job.of(recipe.generate, forecaster.material)
         own = split_queries(job, "train")
-        evaluating = fits * query_seconds(job.material.opacity is not None)
+        evaluating = fits * query_seconds(job.material.transmits)
         query = recipe.generate.queries.spp * path + evaluating
         fixed = whole.seconds - own * query - whole.training
         left = self._left() - fixed

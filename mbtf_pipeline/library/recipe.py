@@ -204,7 +204,7 @@ def _entry(library: LibraryRecipe, name: str, file: Path, layer: Layer, path: Pa
 
 def _model_for(file: Path) -> str:
     """The model that is best for a material; that of heights traces them."""
-    from mbtf_gen.material.load import described
-    from mbtf_gen.material.spec import MaterialFile
+    from mbtf_gen.tile.loading import described
+    from mbtf_gen.tile.maps.material_file import MaterialFile
 
     return DEFAULT_MODEL if isinstance(described(file)[0], MaterialFile) else FIBER_MODEL

@@ -11,13 +11,8 @@ import numpy as np
 from mbtf_core.color import linear_to_srgb
 from mbtf_core.errors import MbtfError
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.fibers.inspect import fiber_text
-from mbtf_gen.material.cloth import inspect_cloth
-from mbtf_gen.material.inspect import USES, inspect_material, inspection_text
-from mbtf_gen.material.latest import latest_material
-from mbtf_gen.material.material import MAPS
-from mbtf_gen.material.mesh import inspect_mesh, mesh_text
-from mbtf_gen.meshes.tile import MeshTile
+from mbtf_gen.tile.inspection import USES
+from mbtf_gen.tile.loading import latest_material
 from mbtf_pipeline.report.embed import U8, Pixels, jpeg_uri, shrink
 
 # Largest width and height of a thumbnail, pixels, and its JPEG quality.
@@ -43,29 +38,21 @@ def material_section(config: GeneratorConfig, inputs: Mapping[str, str]) -> dict
     geometry = config.geometry
     try:
         material = latest_material(config.material, geometry.make_tileable)
-        if material.shape is None:
-            found = inspect_material(material, geometry.height_scale, geometry.mesh)
-            text = inspection_text(found, config.material)
-        elif isinstance(material.shape, MeshTile):
-            found = inspect_mesh(material)
-            text = mesh_text(found, config.material)
-        else:
-            found = inspect_cloth(material)
-            text = fiber_text(found, config.material)
+        found = material.inspect(geometry)
+        text = material.describe(found, config.material)
     except (MbtfError, OSError) as error:
         return nothing | {"missing": f"The material cannot be read any more: {error}"}
     if material.digests != inputs:
         return nothing | {"missing": f"{config.material} has changed since the data set was generated."}
     maps = []
-    for role in MAPS:
-        value = getattr(material, role)
-        if role not in material.facts or value is None or np.ndim(value) < 2:
+    for role, facts in found.get("maps", {}).items():
+        value = material.images.get(role)
+        if value is None or np.ndim(value) < 2:
             continue
-        facts = material.facts[role]
-        name, title = Path(facts.file).name, role.replace("_", " ").capitalize()
-        lines = [name, f"{facts.columns} × {facts.rows}, {USES[role]}"]
+        name, title = Path(facts["file"]).name, role.replace("_", " ").capitalize()
+        lines = [name, f"{facts['columns']} × {facts['rows']}, {USES[role]}"]
         if role == "height":
-            lines.append(f"{facts.low:.4g} (black) to {facts.high:.4g} (white)")
+            lines.append(f"{facts['low']:.4g} (black) to {facts['high']:.4g} (white)")
         image = jpeg_uri(_thumbnail(role, np.asarray(value)), _QUALITY)
         alt = f"{title}: {name}"
         maps.append({"label": title, "lines": lines, "image": image, "alt": alt, "file": ""})
@@ -78,7 +65,7 @@ def material_section(config: GeneratorConfig, inputs: Mapping[str, str]) -> dict
 def _thumbnail(role: str, value: Pixels) -> U8:
     """A thumbnail: colors as sRGB, normals from [-1, 1], heights from their range, other maps as stored."""
     small: Pixels = shrink(value, -(-max(value.shape[:2]) // _SIZE)).astype(np.float64)
-    if role in ("base_color", "sheen_color"):
+    if role.endswith("color"):
         small = linear_to_srgb(np.clip(small, 0.0, 1.0))
     elif role == "normal":
         small = 0.5 + 0.5 * small

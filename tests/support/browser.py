@@ -10,8 +10,7 @@ from typing import Any
 
 import pytest
 
-from mbtf_gen.diagnostics.doctor import BROWSERS
-
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 _FLAGS = (
     "--headless",
     "--no-sandbox",

@@ -23,7 +23,7 @@ from mbtf_gen.generation.folder import open_folder
 from mbtf_gen.generation.render_shards import store_shard
 from mbtf_gen.generation.summary import finish
 from mbtf_gen.job import Job, split_spp
-from mbtf_gen.planning.effects_plan import reference_plan
+from mbtf_gen.planning.effects_planner import reference_plan
 from mbtf_gen.planning.run_plan import RunPlan
 from mbtf_gen.render.estimates import Estimates
 

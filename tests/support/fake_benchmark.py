@@ -11,8 +11,8 @@ import pytest
 from mbtf_core.data.queries import Queries
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.run import Job
-from mbtf_gen.material.material import Material
 from mbtf_gen.render.estimates import Estimates, Stream
+from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 from mbtf_pipeline.cost_study.generator_benchmark import GeneratorBenchmark
 
 NOISE = 0.8  # standard deviation of one path, relative to the value
@@ -53,5 +53,5 @@ def fake_benchmark(monkeypatch: pytest.MonkeyPatch) -> GeneratorBenchmark:
     monkeypatch.setattr(f"{module}.plan_effects", lambda job: plan.effects)
     monkeypatch.setattr(f"{module}.allocate", lambda job, effects: plan)
     heights = np.random.default_rng(0).random((8, 8))
-    material = Material(heights, height_scale=0.1, height_bits=None, base_color=np.array([0.5, 0.5, 0.5]))
+    material = HeightFieldTile(heights, height_scale=0.1, maps={"base_color": np.array([0.5, 0.5, 0.5])})
     return GeneratorBenchmark(GeneratorConfig(material="heights.npy"), material)

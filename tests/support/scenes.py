@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
-from mbtf_gen.config.generator import Tracer
-from mbtf_gen.render.runtime import load_mitsuba
+from mbtf_gen.config.values import Tracer
+from mbtf_gen.engine.runtime import load_mitsuba
 from support.paths import ROOT
 
 mi = load_mitsuba()
 
 from mbtf_core.data.queries import Queries  # noqa: E402
-from mbtf_gen.geometry.heightfield import HeightGrid  # noqa: E402
 from mbtf_gen.render.estimator import Estimates, Estimator, Stream  # noqa: E402
 from mbtf_gen.render.path_tracer import Transport  # noqa: E402
-from mbtf_gen.render.scene import build_tile, register_plugins  # noqa: E402
+from mbtf_gen.render.scene import build_scene, register_plugins  # noqa: E402
 from mbtf_gen.sampling.light_kernel import LightKernel  # noqa: E402
+from mbtf_gen.tile.heights.grid import HeightGrid  # noqa: E402
 
 register_plugins()
 
@@ -56,7 +57,7 @@ def real_heights(name: str, resolution: int = 96) -> HeightGrid:
 
     The test is skipped, by name, where the set is not there.
     """
-    from mbtf_gen.material.load import load_material
+    from mbtf_gen.tile.loading import load_material
 
     root = ROOT
     folder = root / "assets" / name
@@ -66,7 +67,7 @@ def real_heights(name: str, resolution: int = 96) -> HeightGrid:
         height = 0.15
         if not folder.exists():
             pytest.skip(f"{name} is not beside the project")
-    return load_material(folder).grid(height, resolution)
+    return load_material(folder).at(height, resolution).grid
 
 
 def queries(u: ArrayLike, sigma: ArrayLike, omega_i: ArrayLike, omega_o: ArrayLike, n: int) -> Queries:
@@ -95,7 +96,7 @@ def estimate(
     tracer: Tracer = "heightfield",
 ) -> Estimates:
     """Both halves of M at the queries."""
-    estimator = Estimator(build_tile(grid, bsdf, tracer), light, transport or Transport())
+    estimator = Estimator(build_scene(replace(grid, tracer=tracer), bsdf), light, transport or Transport())
     return estimator.estimate(q, spp, Stream(seed, "test", 0))
 
 

@@ -36,11 +36,15 @@ mbtf_core.stats
 mbtf_core.cluster
 mbtf_gen.geometry
 mbtf_gen.sampling
+mbtf_gen.engine
+mbtf_gen.effects
 mbtf_gen.config
-mbtf_gen.fibers
-mbtf_gen.meshes
 mbtf_gen.measured
-mbtf_gen.material
+mbtf_gen.tile.tracers
+mbtf_gen.tile.heights
+mbtf_gen.tile.fibers
+mbtf_gen.tile.maps
+mbtf_gen.tile
 mbtf_gen.render
 mbtf_gen.job
 mbtf_gen.planning
@@ -134,7 +138,7 @@ def test_imports_run_downwards() -> None:
         ("mbtf_gen.render.a", "import torch.nn", True),
         ("mbtf_gen.cli.a", "def f():\n    from mbtf_fit import training", True),
         ("mbtf_gen.render.a", "import mitsuba", False),
-        ("mbtf_gen.render.a", "from mbtf_gen.planning.effects import Effect", True),
+        ("mbtf_gen.render.a", "from mbtf_gen.planning.pilot import Pilot", True),
         (
             "mbtf_gen.config.a",
             "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import mbtf_gen.job",

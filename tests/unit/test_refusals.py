@@ -32,9 +32,9 @@ CANDIDATES = ("no-such-value", "1.5.5", "-1e300", "1e300", "nan", "{no: such}")
 # Modules of configurations that the commands load when they run.
 MODULES = (
     "mbtf_core.run.workers",
-    "mbtf_gen.fibers.cloth_file",
-    "mbtf_gen.material.spec",
-    "mbtf_gen.meshes.mesh_file",
+    "mbtf_gen.tile.fibers.cloth_file",
+    "mbtf_gen.tile.maps.material_file",
+    "mbtf_gen.tile.mesh_file",
     "mbtf_pipeline.library.recipe",
     "mbtf_pipeline.paper_tables.recipe",
     "mbtf_pipeline.recipe",

@@ -46,9 +46,9 @@ def _draw(
     from mbtf_fit.material.format import read_description
     from mbtf_fit.mitsuba_plugin import load_scene
     from mbtf_fit.mitsuba_plugin.preview.animation import find_encoder, write_gif, write_mp4
+    from mbtf_gen.engine.runtime import load_mitsuba
     from mbtf_gen.forecast import announce
     from mbtf_gen.pictures.folder import PictureFolder
-    from mbtf_gen.render.runtime import load_mitsuba
 
     encoder = find_encoder() if mp4 else ""
     sheet, turn, asked = config.sheet, config.turntable, config.exposure

@@ -22,7 +22,7 @@ from mbtf_core.directions import from_angles
 from mbtf_core.run.signals import reinstall_handlers
 from mbtf_fit.mitsuba_plugin.material_arrays import F32
 from mbtf_fit.mitsuba_plugin.preview.config import TurntableSection
-from mbtf_gen.render.types import BSDF, Scene
+from mbtf_gen.engine.types import BSDF, Scene
 
 # Latitude beyond which the projection continues with constant scale.
 STEEPEST = np.radians(84.0)

@@ -1,4 +1,4 @@
-/* Rays and horizons of a periodic height field: the traversal of mbtf_gen/render/heightfield_tracer.py, one ray
+/* Rays and horizons of a periodic height field: the traversal of mbtf_gen/tile/tracers/heightfield_tracer.py, one ray
  * after the other. Lengths are in tile widths.
  */
 #include "kernel.h"

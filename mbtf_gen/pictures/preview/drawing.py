@@ -23,7 +23,7 @@ from mbtf_gen.pictures.preview import mesh
 from mbtf_gen.pictures.preview.plots import level_histogram, write_plots
 from mbtf_gen.pictures.preview.sample import sampled_queries, stored_queries
 from mbtf_gen.pictures.reference import picture_seconds, render_reference
-from mbtf_gen.planning.effects_plan import reference_plan
+from mbtf_gen.planning.effects_planner import reference_plan
 from mbtf_gen.planning.simulation import build_estimator
 
 
@@ -70,7 +70,7 @@ class PreviewPictures:
             view.azimuth,
             tiles=options.tiles,
             aspect=job.material.aspect,
-            displacement_range=job.displacement_range,
+            displacement_range=job.material.thickness,
             columns=options.size,
         )
         self.camera.queries(self.omega_i, job.material.aspect)  # refuses a view of the horizon
@@ -94,7 +94,7 @@ class PreviewPictures:
         if self.job is not None:
             # The mesh has the exposure of the path-traced picture.
             makers = {"beauty": self._beauty, "mesh": self._mesh, **makers}
-            if self.job.material.shape is not None:
+            if self.job.material.grid is None:
                 del makers["mesh"], stages["mesh"]
             inputs |= self.job.material.digests
         if self.dataset is not None:
@@ -142,19 +142,19 @@ class PreviewPictures:
                 hint="the other pictures are finished; mbtf-gen doctor names the missing package, "
                 "then the same command draws it",
             )
-        if interactive and self.job is not None and self.job.material.shape is not None:
+        if not interactive or self.job is None:
+            return
+        tiled = mesh.tiled_mesh(self.job.material, self.config.preview.tiles, self.exposure)
+        if tiled is None:
             self.console.note("only height maps are shown in a window")
-        elif interactive and self.job is not None:
+        else:
             self.console.note("the mesh is shown in a window: close it to continue")
-            mesh.show(self._tiled_mesh(self.job), self.camera, self.omega_i)
-
-    def _tiled_mesh(self, job: Job) -> mesh.TiledMesh:
-        geometry, tiles = self.config.geometry, self.config.preview.tiles
-        return mesh.tiled_mesh(job.material, tiles, self.exposure, geometry.height_scale, geometry.mesh)
+            mesh.show(tiled, self.camera, self.omega_i)
 
     def _mesh(self, file: Path) -> dict[str, Any]:
         assert self.job is not None
-        drawn = self._tiled_mesh(self.job)
+        drawn = mesh.tiled_mesh(self.job.material, self.config.preview.tiles, self.exposure)
+        assert drawn is not None
         if fault := mesh.draw(drawn, self.camera, self.omega_i, file):
             return {"fault": fault}
         tiles, (rows, columns) = self.config.preview.tiles, drawn.cells

@@ -19,8 +19,8 @@ from mbtf_core.exposure import to_display
 from mbtf_core.images.resample import resample
 from mbtf_core.pictures.camera import Camera
 from mbtf_core.run.child import run_child
-from mbtf_gen.geometry.heightfield import HeightGrid, grid_faces, grid_vertices
-from mbtf_gen.material.material import Material
+from mbtf_gen.tile.heights.grid import HeightGrid, grid_faces, grid_vertices
+from mbtf_gen.tile.protocol import Tile
 
 # Largest number of cells along each side of all tiles together, and of texels across the texture.
 MOST_CELLS = 1024
@@ -57,25 +57,18 @@ class TiledMesh:
     cells: tuple[int, int]
 
 
-def tiled_mesh(
-    material: Material, tiles: int, exposure: float, height: float | None = None, mesh: int | None = None
-) -> TiledMesh:
-    """Mesh of `tiles` × `tiles` tiles of a material: the mesh that is traced, or a coarser one.
-
-    Parameters
-    ----------
-    exposure : of the texture, in EV
-    height, mesh : as :meth:`~mbtf_gen.material.material.Material.grid` takes them
-    """
-    grid = material.grid(height, mesh)
+def tiled_mesh(material: Tile, tiles: int, exposure: float) -> TiledMesh | None:
+    """Mesh of `tiles` × `tiles` tiles of a height field: the mesh that is traced, or a coarser one; None for
+    other tiles. The texture has an `exposure` in EV."""
     most = MOST_CELLS // tiles
-    if max(grid.z.shape) > most:
-        grid = material.grid(height, max(1, min(most, int(most / material.aspect))))
+    grid = material.coarser_grid(most)
+    if grid is None:
+        return None
     repeated = HeightGrid(np.tile(grid.z, (tiles, tiles)), grid.aspect)
     points = grid_vertices(repeated) * (tiles, tiles, 1)
     hole = np.zeros(repeated.z.shape, np.bool_)
-    if material.opacity is not None:
-        opacity = resample(np.atleast_2d(np.asarray(material.opacity, np.float64)), *grid.z.shape)
+    if "opacity" in material.maps:
+        opacity = resample(np.atleast_2d(np.asarray(material.maps["opacity"], np.float64)), *grid.z.shape)
         # A cell lies between its vertex and the next ones, around the period.
         below = np.roll(opacity, -1, axis=0)
         cells = 0.25 * (opacity + below + np.roll(opacity, -1, axis=1) + np.roll(below, -1, axis=1))

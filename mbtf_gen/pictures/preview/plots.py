@@ -66,41 +66,21 @@ def _bins(count: int) -> int:
     return int(np.clip(np.sqrt(count / _PER_BIN), _FEWEST, _MOST))
 
 
-def _points(axes: Any, x: Any, y: Any) -> None:
-    axes.scatter(x, y, s=4 if len(x) > 500 else 16, color=_INK, linewidths=0)
-
-
-def _relative(axes: Any, x: Any, y: Any, edges: Any, share: NDArray[np.float64], region: str) -> None:
-    """Histogram relative to a uniform distribution, which has the fraction `share` of its queries per bin."""
-    counts, _, _ = np.histogram2d(x, y, edges)
-    # Bins that hardly overlap the region are left out; bins outside of it must be empty.
-    full = share > 0.25 * share.max()
-    ratio = np.where(full, counts / (len(x) * np.where(full, share, 1.0)), np.nan)
-    ratio[(share == 0) & (counts > 0)] = 2.0
-    shown = axes.pcolormesh(*edges, np.minimum(ratio, 2.0).T, vmin=0.0, vmax=2.0, cmap="RdBu_r")
-    axes.figure.colorbar(shown, ax=axes, label=f"density relative to uniform over {region}", shrink=0.85)
-
-
-def _disk_share(edges: NDArray[np.float64], radius: float) -> NDArray[np.float64]:
-    """Fraction of a disk around 0 in each bin of a square grid, from 16 × 16 points per bin."""
-    step = (np.arange(16) + 0.5) / 16
-    x = (edges[:-1, None] + step * np.diff(edges)[:, None]).ravel()
-    inside = (x[:, None] ** 2 + x[None, :] ** 2 <= radius**2).astype(np.float64)
-    bins = len(edges) - 1
-    share: NDArray[np.float64] = inside.reshape(bins, 16, bins, 16).sum(axis=(1, 3))
-    return share / share.sum()
+def _spread(axes: Any, x: Any, y: Any, bins: tuple[int, int], extent: Any) -> None:
+    """Points, or a histogram of many."""
+    if len(x) < _SCATTER:
+        axes.scatter(x, y, s=4 if len(x) > 500 else 16, color=_INK, linewidths=0)
+        return
+    *_, shown = axes.hist2d(x, y, bins, extent, density=True, cmap="Blues", cmin=1e-12)
+    shown.set_clim(vmin=0.0)
+    axes.figure.colorbar(shown, ax=axes, label="density", shrink=0.85)
 
 
 def _positions(axes: Any, sample: QuerySample) -> None:
     u, v = sample.u.T
     axes.set(title="positions", xlabel="u", ylabel="v", xlim=(0, 1), ylim=(0, 1), aspect=sample.aspect)
-    if len(u) < _SCATTER:
-        _points(axes, u, v)
-        return
     columns = _bins(round(len(u) * max(1.0, 1.0 / sample.aspect)))
-    rows = max(1, round(sample.aspect * columns))
-    share = np.full((columns, rows), 1.0 / (columns * rows))
-    _relative(axes, u, v, (np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1)), share, "the tile")
+    _spread(axes, u, v, (columns, max(1, round(sample.aspect * columns))), ((0, 1), (0, 1)))
 
 
 def _levels(axes: Any, sample: QuerySample) -> None:
@@ -117,11 +97,7 @@ def _directions(axes: Any, omega: NDArray[np.float32], min_cos: float, title: st
     x, y = omega[:, 0], omega[:, 1]
     radius = float(np.sqrt(1.0 - min_cos**2))
     axes.set(title=title, xlabel="x", ylabel="y", xlim=(-1.05, 1.05), ylim=(-1.05, 1.05), aspect="equal")
-    if len(x) < _SCATTER:
-        _points(axes, x, y)
-    else:
-        edges = np.linspace(-1.0, 1.0, _bins(len(x)) + 1)
-        _relative(axes, x, y, (edges, edges), _disk_share(edges, radius), "the disk")
+    _spread(axes, x, y, (_bins(len(x)),) * 2, ((-1, 1), (-1, 1)))
     angle = np.linspace(0.0, 2.0 * np.pi, 361)
     ring = np.stack([np.cos(angle), np.sin(angle)])
     axes.plot(*ring, color="0.6", linewidth=1.0, label="horizon")

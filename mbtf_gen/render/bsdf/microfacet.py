@@ -12,7 +12,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from mbtf_gen.render.types import Color3f, Float, Mask, Normal3f, Point2f, UInt32, Vector3f
+from mbtf_gen.engine.types import Color3f, Float, Mask, Normal3f, Point2f, UInt32, Vector3f
 
 # Lobes of smaller α are narrower than any light kernel and are treated as mirrors.
 MIRROR_ALPHA = 1.0e-5

@@ -1,24 +1,19 @@
 """Surfaces as Mitsuba BSDFs: the project's own, ``mbtf_surface``, and Mitsuba's in the project's loop.
 
 The generator's loop calls a :class:`~mbtf_gen.render.bsdf.surface.Surface` directly; the registered plugin
-makes the same surface usable in any Mitsuba scene. Maps are bilinear, periodic, and linear. Row 0 of an image
-is the side ``v → 1``, because of the mesh's texture coordinates.
+makes the same surface usable in any Mitsuba scene.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
-from numpy.typing import NDArray
 
-from mbtf_gen.fibers.tile import FiberTile
-from mbtf_gen.meshes.tile import MeshTile
-from mbtf_gen.render.bsdf.surface import Surface, SurfaceParts
-from mbtf_gen.render.types import (
+from mbtf_gen.engine.types import (
     BSDF,
     BSDFSample3f,
     Float,
@@ -29,26 +24,10 @@ from mbtf_gen.render.types import (
     SurfaceInteraction3f,
     Vector3f,
 )
+from mbtf_gen.render.bsdf.surface import DEFAULTS, Surface, SurfaceParts
 
-if TYPE_CHECKING:
-    from mbtf_gen.material.material import Material
-
-# Parameters of ``mbtf_surface``, textures or numbers: those that have defaults, and those that add a term.
-DEFAULTS = {
-    "base_color": 0.5,
-    "roughness": 0.5,
-    "clearcoat_roughness": 0.1,
-    "sheen_color": 1.0,
-    "sheen_roughness": 0.3,
-}
-TERMS = ("specular", "metallic", "clearcoat", "sheen", "slopes", "opacity")
-# Parameters of each effect of how a surface reflects.
-REFLECTION = {
-    "specular": ("specular",),
-    "metallic": ("metallic",),
-    "clearcoat": ("clearcoat", "clearcoat_roughness"),
-    "sheen": ("sheen", "sheen_color", "sheen_roughness"),
-}
+# Parameters of ``mbtf_surface`` that add a term.
+TERMS = tuple(part.name for part in fields(SurfaceParts) if part.name != "diffuse")
 
 
 class SurfaceBSDF(mi.BSDF):
@@ -179,66 +158,3 @@ class MitsubaSurfacePoint:
 def surface_of(bsdf: BSDF) -> Surface | MitsubaSurface:
     """Interface of the generator's loop to a loaded BSDF."""
     return bsdf.surface if isinstance(bsdf, SurfaceBSDF) else MitsubaSurface(bsdf)
-
-
-def _parameter(value: Any, color: bool) -> Any:
-    """Plugin parameter of a number or a color, or a bilinear periodic bitmap of an (H, W) or (H, W, 3) array
-    of linear values."""
-    array = np.asarray(value, np.float64)
-    if array.ndim < 2:
-        constant = {"type": "rgb", "value": [float(c) for c in np.broadcast_to(array, 3)]}
-        return constant if color else float(array)
-    pixels = np.ascontiguousarray(array if array.ndim == 3 else array[..., None], np.float32)
-    return {
-        "type": "bitmap",
-        "bitmap": mi.Bitmap(pixels),
-        "raw": True,
-        "filter_type": "bilinear",
-        "wrap_mode": "repeat",
-    }
-
-
-def reflectance(base_color: Any, roughness: Any = None, metallic: Any = None) -> dict[str, Any]:
-    """Mitsuba dictionary of a Lambert surface, or of a glossy one where the roughness is given; maps have
-    row 0 at ``v → 1``."""
-    out = {"type": "mbtf_surface", "base_color": _parameter(base_color, True)}
-    if roughness is None:
-        return out
-    metals = metallic is not None and np.any(np.asarray(metallic) > 0)
-    given = {"roughness": roughness, "specular": 0.5, **({"metallic": metallic} if metals else {})}
-    return out | {name: _parameter(value, False) for name, value in given.items()}
-
-
-def part_bsdfs(tile: MeshTile) -> list[dict[str, Any]]:
-    """Mitsuba dictionaries of the parts of a mesh."""
-    return [reflectance(part.base_color, part.roughness, part.metallic) for part in tile.parts]
-
-
-def bsdf_of(
-    material: Material,
-    on: Collection[str] = (*REFLECTION, "transmission"),
-    slopes: NDArray[np.float64] | None = None,
-) -> dict[str, Any] | list[dict[str, Any]]:
-    """Mitsuba dictionary of a material's BSDF; one per part of a mesh.
-
-    Parameters
-    ----------
-    on : names of the effects that are simulated; all but opacity by default
-    slopes : (h, w, 2) slopes added to the mesh's
-    """
-    if isinstance(material.shape, FiberTile):
-        return material.shape.bsdf(transmission="transmission" in on)
-    if isinstance(material.shape, MeshTile):
-        return part_bsdfs(material.shape)
-    if material.bsdf is not None:
-        return dict(material.bsdf)
-    names = ["base_color", "roughness"]
-    for effect, group in {**REFLECTION, "opacity": ("opacity",)}.items():
-        weight = getattr(material, effect)
-        if effect in on and weight is not None and (effect != "metallic" or np.any(np.asarray(weight) > 0)):
-            names += group
-    given = {name: getattr(material, name) for name in names}
-    if slopes is not None:
-        given["slopes"] = np.concatenate([slopes, np.zeros_like(slopes[..., :1])], axis=-1)
-    parameters = {n: _parameter(v, n.endswith("color")) for n, v in given.items() if v is not None}
-    return {"type": "mbtf_surface", **parameters}

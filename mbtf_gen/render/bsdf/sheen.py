@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_gen.render.types import Float, Vector3f
+from mbtf_gen.engine.types import Float, Vector3f
 
 F64 = NDArray[np.float64]
 

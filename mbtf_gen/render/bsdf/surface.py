@@ -28,6 +28,16 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mbtf_gen.engine.types import (
+    Color3f,
+    Float,
+    Mask,
+    Normal3f,
+    Point2f,
+    SurfaceInteraction3f,
+    Texture,
+    Vector3f,
+)
 from mbtf_gen.render.bsdf.microfacet import (
     MIRROR_ALPHA,
     EnergyTables,
@@ -42,16 +52,6 @@ from mbtf_gen.render.bsdf.microfacet import (
     visible_normal,
 )
 from mbtf_gen.render.bsdf.sheen import SheenTables, sheen_value
-from mbtf_gen.render.types import (
-    Color3f,
-    Float,
-    Mask,
-    Normal3f,
-    Point2f,
-    SurfaceInteraction3f,
-    Texture,
-    Vector3f,
-)
 
 CLEARCOAT_REFLECTANCE = 0.04
 # Smallest cosine between shading normal and viewer; shading normals below it are bent towards the viewer.
@@ -125,6 +125,16 @@ class SurfaceParts:
     sheen: bool = False
     slopes: bool = False
     opacity: bool = False
+
+
+# Values of textures that no term needs, or that a term may lack.
+DEFAULTS = {
+    "base_color": 0.5,
+    "roughness": 0.5,
+    "clearcoat_roughness": 0.1,
+    "sheen_color": 1.0,
+    "sheen_roughness": 0.3,
+}
 
 
 class Surface:

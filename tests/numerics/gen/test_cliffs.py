@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.closed_forms import Wall
 from support.scenes import (
     DIRECT,
     HeightGrid,
@@ -18,7 +19,6 @@ from support.scenes import (
 from support.surfaces import towards
 
 from mbtf_core.stats import Estimate, mean_estimate, mean_of_halves, t_test
-from mbtf_gen.diagnostics.closed_forms import Wall
 
 
 def binary(rows: int, columns: int, slope: float, seed: int = 0) -> HeightGrid:

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.scenes import HeightGrid, build_tile, lambert, mi, rocks
+from support.scenes import HeightGrid, build_scene, lambert, mi, rocks
 
-from mbtf_gen.config.generator import Tracer
-from mbtf_gen.geometry.heightfield import mesh_of_grid
-from mbtf_gen.render.heightfield_tracer import HeightfieldGeometry
+from mbtf_gen.config.values import Tracer
 from mbtf_gen.sampling.rng import sequence
+from mbtf_gen.tile.heights.grid import mesh_of_grid
+from mbtf_gen.tile.tracers.heightfield_tracer import HeightfieldGeometry
 
 N = 200_000
 
@@ -56,7 +57,7 @@ def ray_of(o: NDArray, d: NDArray) -> mi.Ray3f:
 @pytest.mark.parametrize("grid", GRIDS, ids=NAMES)
 def test_hits_and_shadows_are_those_of_many_tiles(grid: HeightGrid, tracer: Tracer) -> None:
     rng = np.random.default_rng(0)
-    tile = build_tile(grid, lambert(0.5), tracer)
+    tile = build_scene(replace(grid, tracer=tracer), lambert(0.5))
     rows, columns = grid.z.shape
     around = round(5 / grid.aspect)
     mesh = mesh_of_grid(grid, tile.unit, (around * rows, around * columns), mi.load_dict(lambert(0.5)))
@@ -134,7 +135,7 @@ def test_grazing_rays_and_rays_that_bounced_meet_what_many_tiles_have(tracer: Tr
     """First hits of rays down to a cosine of 1e-3, and second hits of rays that leave those points in random
     directions. A few may differ, because Embree has large coordinates at grazing angles."""
     grid, around = HeightGrid(rocks(16).z * 0.15, 1.0), 26
-    tile = build_tile(grid, lambert(0.5), tracer)
+    tile = build_scene(replace(grid, tracer=tracer), lambert(0.5))
     n = N // 2
     mesh = mesh_of_grid(grid, tile.unit, (around * 16, around * 16), mi.load_dict(lambert(0.5)))
     scene = mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "mesh": mesh})
@@ -220,7 +221,7 @@ def test_borders_are_counted_through_holes() -> None:
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_rays_that_are_not_finite_end(bad: float, tracer: Tracer) -> None:
     """They read no memory outside the table, and every kernel terminates."""
-    field = build_tile(rocks(16), lambert(0.5), tracer).geometry
+    field = build_scene(replace(rocks(16), tracer=tracer), lambert(0.5)).geometry
     for place in range(6):
         o, d = np.array([[0.0, 0.0, 0.1]]), np.array([[0.3, 0.4, -0.5]])
         (o if place < 3 else d)[0, place % 3] = bad

@@ -20,8 +20,8 @@ from support.surfaces import point, vectors
 
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
-from mbtf_gen.planning.effects_plan import reference_plan
-from mbtf_gen.planning.simulation import build_estimator, normal_map_slopes
+from mbtf_gen.planning.effects_planner import reference_plan
+from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.bsdf.surface import SurfaceParts
 from mbtf_gen.render.estimates import Stream
 
@@ -233,17 +233,17 @@ def test_heights_of_the_mesh(folder: Path, columns: int, scale: float) -> None:
     """Dequantized, resampled, scaled; the maximum that touches the reference plane is the mesh's own."""
     job = job_of(folder / "matte.yaml", columns, scale=scale)
     expected = mesh(dequantized(stored(folder), 1 / 255), columns, scale)
-    np.testing.assert_allclose(job.grid.z, expected, atol=2e-7 * abs(scale))
-    assert np.abs(job.grid.z - mesh(stored(folder), columns, scale)).max() > 1e-4
+    np.testing.assert_allclose(job.material.grid.z, expected, atol=2e-7 * abs(scale))
+    assert np.abs(job.material.grid.z - mesh(stored(folder), columns, scale)).max() > 1e-4
 
 
 @pytest.mark.parametrize("columns", [8, 12, 40])
 def test_slopes_that_shading_adds(folder: Path, columns: int) -> None:
     job = job_of(folder / "matte.yaml", columns)
-    found = normal_map_slopes(job)
+    found = job.material.normal_slopes(job.config.effects.normal)
     assert found is not None
     assert found[1] > 0.1
-    np.testing.assert_allclose(found[0], residual(normals(folder), job.grid.z), atol=1e-5)
+    np.testing.assert_allclose(found[0], residual(normals(folder), job.material.grid.z), atol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["matte", "glossy"])

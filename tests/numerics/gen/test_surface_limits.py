@@ -12,9 +12,9 @@ from support.scenes import DIRECT, direction, estimate, flat, mi, queries
 from support.surfaces import point, towards, vectors
 
 from mbtf_core.errors import PartialError
-from mbtf_gen.geometry.heightfield import HeightGrid
 from mbtf_gen.render.bsdf.surface import SurfaceParts
 from mbtf_gen.sampling.light_kernel import LightKernel
+from mbtf_gen.tile.heights.grid import HeightGrid
 
 Array = NDArray[np.float64]
 GOLD = np.array([0.9, 0.6, 0.3])

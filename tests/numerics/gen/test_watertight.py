@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.scenes import build_tile, lambert, mi, rocks
+from support.scenes import build_scene, lambert, mi, rocks
 
-from mbtf_gen.config.generator import Tracer
-from mbtf_gen.geometry.heightfield import HeightGrid
+from mbtf_gen.config.values import Tracer
 from mbtf_gen.render.scene import CLEARANCE
+from mbtf_gen.tile.heights.grid import HeightGrid
 
 RAYS = 10_000_000
 RESOLUTION = 64
@@ -21,7 +23,7 @@ def faults(
 ) -> tuple[int, int]:
     """Rays through uv (n, 2) of the reference plane along `direction` (n, 3) that hit nothing, and those that
     hit the surface from below."""
-    tile = build_tile(grid, lambert(0.5), tracer)
+    tile = build_scene(replace(grid, tracer=tracer), lambert(0.5))
     plane = np.column_stack([(uv - 0.5) * (1.0, grid.aspect) * tile.unit, np.zeros(len(uv))])
     origin = plane - direction * (CLEARANCE / -direction[:, 2:])
     missed, turned = 0, 0

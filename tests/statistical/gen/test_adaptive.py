@@ -17,16 +17,16 @@ from mbtf_core.data.lattice import Lattice
 from mbtf_core.data.queries import Queries
 from mbtf_core.stats import mean_estimate, noise_free_mse, t_test
 from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.generation.run import generate
 from mbtf_gen.generation.summary import finish
 from mbtf_gen.job import Job, split_spp, split_target
 from mbtf_gen.planning.adaptive import estimate_shard
-from mbtf_gen.planning.effects_plan import plan_effects
+from mbtf_gen.planning.effects_planner import plan_effects
 from mbtf_gen.planning.run_plan import plan_run
 from mbtf_gen.planning.sample_allocation import Allocation, fit_allocation
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream, Target
-from mbtf_gen.render.runtime import load_mitsuba
 from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
 
 load_mitsuba()

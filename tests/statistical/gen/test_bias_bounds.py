@@ -10,17 +10,19 @@ import pytest
 from numpy.typing import NDArray
 
 from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.effects.catalog import bounce_bound
+from mbtf_gen.effects.effect import EffectDecision
+from mbtf_gen.effects.plan import EffectsPlan, without
+from mbtf_gen.effects.request import EffectsRequest
 from mbtf_gen.job import Job
-from mbtf_gen.material.material import Material
-from mbtf_gen.planning import effects_plan as planning
+from mbtf_gen.planning import effects_planner
 from mbtf_gen.planning.bounds import displacement_bounds
-from mbtf_gen.planning.effects import Effect, EffectsPlan, without
-from mbtf_gen.planning.effects_plan import plan_effects
+from mbtf_gen.planning.effects_planner import PlannedScene, plan_effects
 from mbtf_gen.planning.pilot import Change, pilot_queries, relative_change
-from mbtf_gen.planning.simulation import build_estimator, normal_map_slopes
-from mbtf_gen.planning.surface_effects import analyze
+from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.sampling.light_kernel import LightKernel
+from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 
 QUERIES = 8192
 
@@ -33,16 +35,17 @@ def waves(rows: int, columns: int) -> NDArray[np.float64]:
     return (h - h.min()) / np.ptp(h)
 
 
-def job_of(stuff: Material, mode: str = "auto", **options: dict[str, Any]) -> Job:
+def job_of(stuff: HeightFieldTile, mode: str = "auto", **options: dict[str, Any]) -> Job:
     sections: dict[str, Any] = {"queries": {"min_cos": 0.4}, "transport": {"max_depth": 1}, **options}
     effects = {"mode": mode, **sections.pop("effects", {})}
-    return Job(GeneratorConfig.model_validate({"material": "m", "effects": effects, **sections}), stuff)
+    return Job.of(GeneratorConfig.model_validate({"material": "m", "effects": effects, **sections}), stuff)
 
 
-def lambert(height: NDArray[np.float64], scale: float, **more: Any) -> Material:
-    return Material(
-        height=height, height_scale=scale, height_bits=None, base_color=np.array([0.7, 0.5, 0.2]), **more
-    )
+COLOR = np.array([0.7, 0.5, 0.2])
+
+
+def lambert(height: NDArray[np.float64], scale: float, **more: Any) -> HeightFieldTile:
+    return HeightFieldTile(height=height, height_scale=scale).with_maps(base_color=COLOR, **more)
 
 
 def estimates(job: Job, plan: EffectsPlan, spp: int = 8) -> Estimates:
@@ -76,7 +79,7 @@ def test_a_plane_with_slopes_lacks_nothing_but_parallax(shape: tuple[int, int], 
     assert upper < 0.25 * bare
 
 
-def finest_job(stuff: Material, mode: str) -> Job:
+def finest_job(stuff: HeightFieldTile, mode: str) -> Job:
     """A job with footprints far smaller than a cell, for which bounds are estimated."""
     queries = {"min_cos": 0.3, "resolution": 512, "mixture": {"log_uniform": 0.0, "finest": 1.0}}
     return job_of(stuff, mode, queries=queries, light={"width": 0.0})
@@ -87,19 +90,19 @@ def test_bias_bounds_equal_the_rendered_change(shape: tuple[int, int]) -> None:
     """They are tight at points, under a delta light, with direct light only."""
     rng = np.random.default_rng(4)
     base = np.repeat(np.repeat(0.1 + 0.8 * rng.random((8, 8)), shape[0] // 8, 0), shape[1] // 8, 1)
-    stuff = replace(
-        lambert(waves(*shape), 0.25, normal=tilted(*shape)),
-        base_color=np.repeat(base[..., None], 3, axis=-1).astype(np.float32),
-    )
+    color = np.repeat(base[..., None], 3, axis=-1).astype(np.float32)
+    stuff = lambert(waves(*shape), 0.25, normal=tilted(*shape)).with_maps(base_color=color)
     job = finest_job(stuff, "all")
     plan = plan_effects(job)
     queries = pilot_queries(job, QUERIES)
-    mapped = normal_map_slopes(job)
+    mapped = job.material.normal_slopes()
     assert mapped is not None
     light_and_view = (w.astype(np.float64) for w in (queries.omega_i, queries.omega_o))
-    bounds = displacement_bounds(job.grid, *light_and_view, LightKernel(0.0), base[..., None], mapped[0])
+    bounds = displacement_bounds(
+        job.material.grid, *light_and_view, LightKernel(0.0), base[..., None], mapped[0]
+    )
     # The plane's slopes alone: the bound of parallax ignores the normal map.
-    plain = finest_job(replace(stuff, normal=None), "all")
+    plain = finest_job(stuff.with_maps(normal=None), "all")
     bare = plan_effects(plain)
     full = estimates(plain, bare)
     assert bounds.opacity == 0.0
@@ -111,7 +114,7 @@ def test_bias_bounds_equal_the_rendered_change(shape: tuple[int, int]) -> None:
 
 
 def test_the_bias_bound_sums_the_cap_and_what_is_off() -> None:
-    effects = (Effect("parallax", True, "", 0.5), Effect("shadowing", False, "", 0.001))
+    effects = (EffectDecision("parallax", True, "", 0.5), EffectDecision("shadowing", False, "", 0.001))
     assert EffectsPlan(effects, max_depth=2, cap_bias_bound=0.002).bias_bound == pytest.approx(0.003)
 
 
@@ -162,7 +165,7 @@ def test_on_a_plane_the_bias_bound_of_holes_is_exact() -> None:
     """M is opacity times ρ/π: a hundredth of the tile, twice as bright, transmits a share p."""
     opacity, base = np.ones((10, 10)), np.full((10, 10, 3), 0.4)
     opacity[3, 4], base[3, 4] = 0.7, 0.8
-    stuff = replace(lambert(np.zeros((10, 10)), 1.0, opacity=opacity), base_color=base)
+    stuff = lambert(np.zeros((10, 10)), 1.0, opacity=opacity).with_maps(base_color=base)
     mean = (0.4 * 99 + 0.8 * 0.7) / 100
     assert plan_effects(job_of(stuff))["opacity"].bias_bound == pytest.approx(0.3 * 0.8 / 10 / mean)
 
@@ -185,7 +188,7 @@ class Rare:
 
 def test_rare_large_changes_keep_an_effect_on(monkeypatch: pytest.MonkeyPatch) -> None:
     """Three of eight thousand queries change, so the bound must allow for nine."""
-    monkeypatch.setattr(planning, "Pilot", Rare)
+    monkeypatch.setattr(effects_planner, "Pilot", Rare)
     job = job_of(lambert(waves(32, 32), 0.3), transport={"max_depth": 0})
     assert Rare().limited(1).upper < job.config.effects.tolerance
     plan = plan_effects(job)
@@ -235,8 +238,8 @@ def test_the_bounce_bound_is_above_that_of_grooves(slope: float, share: float) -
     z = np.tile(slope * np.array([0.0, 1.0, 2.0, 1.0]) / columns, (columns, columns // 4))
     base = np.zeros((1, columns, 3))
     base[:, : round(share * columns)] = 0.9
-    stuff = replace(lambert(z, 1.0), base_color=base)
+    stuff = replace(lambert(z, 1.0), maps={"base_color": base})
     job = job_of(stuff, queries={"min_cos": 0.99}, light={"width": 0.0}, geometry={"mesh": columns})
-    bound = planning._bounce_bound(analyze(job, False))
+    bound = bounce_bound(PlannedScene(job, EffectsRequest("auto", {}), False, frozenset()))
     seen = 0.9 * (1 - np.cos(np.arctan(slope)))
     assert bound > seen / np.sqrt(share)

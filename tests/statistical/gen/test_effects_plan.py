@@ -12,17 +12,19 @@ from numpy.typing import NDArray
 from support.scenes import rocks
 
 from mbtf_core.stats import Estimate, mean_of_halves
-from mbtf_gen.config.effects_request import DISPLACEMENT_EFFECTS
 from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.effects.catalog import EFFECTS
+from mbtf_gen.effects.plan import EffectsPlan, without
 from mbtf_gen.job import Job
-from mbtf_gen.material.material import Material
-from mbtf_gen.planning.effects import EffectsPlan, without
-from mbtf_gen.planning.effects_plan import plan_effects
+from mbtf_gen.planning.effects_planner import plan_effects
 from mbtf_gen.planning.pilot import pilot_queries, relative_change
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream
+from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 
 QUERIES, SPP = 16384, 8
+
+DISPLACEMENT_EFFECTS = [name for name, effect in EFFECTS.items() if effect.displaced]
 
 
 def pattern() -> NDArray[np.float32]:
@@ -41,17 +43,17 @@ def bumps(strength: float) -> NDArray[np.float32]:
 ROCKS = rocks(64, 1.0).z
 
 
-def material(relief: float, albedo: Any = 0.5, **more: Any) -> Material:
+def material(relief: float, albedo: Any = 0.5, **more: Any) -> HeightFieldTile:
     color = np.full(3, albedo) if np.ndim(albedo) == 0 else albedo
-    return Material(height=ROCKS, height_scale=relief, height_bits=None, base_color=color, **more)
+    return HeightFieldTile(height=ROCKS, height_scale=relief, maps={"base_color": color, **more})
 
 
 def job_of(
-    stuff: Material, mode: str = "auto", min_cos: float = 0.1, width: float = 1.0, depth: int = 0
+    stuff: HeightFieldTile, mode: str = "auto", min_cos: float = 0.1, width: float = 1.0, depth: int = 0
 ) -> Job:
     sections = {"effects": {"mode": mode}, "light": {"width": width}, "transport": {"max_depth": depth}}
     sections["queries"] = {"min_cos": min_cos, "resolution": 64}
-    return Job(GeneratorConfig.model_validate({"material": "m", **sections}), stuff)
+    return Job.of(GeneratorConfig.model_validate({"material": "m", **sections}), stuff)
 
 
 def estimates(job: Job, plan: EffectsPlan, seed: int = 1) -> Estimates:
@@ -68,7 +70,7 @@ def difference(x: Estimates, y: Estimates) -> Estimate:
 
 
 GLOSS: dict[str, Any] = {"roughness": 0.4, "specular": 0.5, "metallic": 0.0}
-SCENES: dict[str, tuple[Material, dict[str, Any]]] = {
+SCENES: dict[str, tuple[HeightFieldTile, dict[str, Any]]] = {
     "dark relief": (material(0.15, 0.05), {}),
     "gray relief": (material(0.15, 0.5), {}),
     "white relief": (material(0.15, 0.95), {}),
@@ -179,5 +181,5 @@ def test_light_is_sampled_both_ways_only_where_it_helps() -> None:
     # Medians, because a few queries with highlights of highlights dominate the variance.
     scatter = [float(np.median(np.abs(e.value_a - e.value_b))) for e in (one, two)]
     assert scatter[0] < 1.1 * scatter[1]
-    mirror = replace(SCENES["glossy relief"][0], roughness=0.05)
+    mirror = SCENES["glossy relief"][0].with_maps(roughness=0.05)
     assert plan_effects(job_of(mirror)).on("bsdf_sampling")

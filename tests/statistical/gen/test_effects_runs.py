@@ -16,17 +16,17 @@ from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.queries import Queries
 from mbtf_core.files.atomic import write_checksummed
 from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.effects.plan import EffectsPlan, without
+from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.generation import render_shards
 from mbtf_gen.generation.run import generate
 from mbtf_gen.job import Job
-from mbtf_gen.material.material import Material
-from mbtf_gen.planning.effects import EffectsPlan, without
-from mbtf_gen.planning.effects_plan import plan_effects
+from mbtf_gen.planning.effects_planner import plan_effects
 from mbtf_gen.planning.pilot import pilot_queries
 from mbtf_gen.planning.run_plan import RunPlan
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream
-from mbtf_gen.render.runtime import load_mitsuba
+from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 
 load_mitsuba()
 
@@ -40,14 +40,16 @@ def noise(rows: int, columns: int) -> NDArray[np.float64]:
     return (h - h.min()) / np.ptp(h)
 
 
-def lambert(height: NDArray[np.float64], scale: float, color: Any = (0.5, 0.5, 0.5), **more: Any) -> Material:
+def lambert(
+    height: NDArray[np.float64], scale: float, color: Any = (0.5, 0.5, 0.5), **more: Any
+) -> HeightFieldTile:
     base = np.asarray(color, np.float64)
-    return Material(height=height, height_scale=scale, height_bits=None, base_color=base, **more)
+    return HeightFieldTile(height=height, height_scale=scale, maps={"base_color": base, **more})
 
 
-def job_of(stuff: Material, mode: str = "auto", **options: Any) -> Job:
+def job_of(stuff: HeightFieldTile, mode: str = "auto", **options: Any) -> Job:
     data = {"material": "m", "effects": {"mode": mode}, **options}
-    return Job(GeneratorConfig.model_validate(data), stuff)
+    return Job.of(GeneratorConfig.model_validate(data), stuff)
 
 
 OPACITY = np.where(np.random.default_rng(2).random((8, 8)) < 0.4, 0.2, 1.0)

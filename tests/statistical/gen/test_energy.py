@@ -21,8 +21,8 @@ from support.scenes import (
 )
 
 from mbtf_core.stats import Estimate, mean_of_halves, t_test
-from mbtf_gen.geometry.heightfield import HeightGrid
 from mbtf_gen.sampling.light_kernel import LightKernel
+from mbtf_gen.tile.heights.grid import HeightGrid
 
 ROUGH = {"type": "roughconductor", "alpha": 0.4, "distribution": "ggx", "material": "none"}
 PAIRS = [((40, 0), (70, 120)), ((15, 30), (60, 250)), ((25, 200), (12, 90))]

@@ -14,7 +14,7 @@ from support.scenes import (
     LightKernel,
     Stream,
     Transport,
-    build_tile,
+    build_scene,
     direction,
     flat,
     lambert,
@@ -28,7 +28,7 @@ from mbtf_gen.render.estimates import MOST_LOCATED
 
 
 def estimator(launch: int = 1 << 20, **options: Any) -> Estimator:
-    return Estimator(build_tile(rocks(32), lambert(0.8)), LightKernel(5.0), Transport(**options), launch)
+    return Estimator(build_scene(rocks(32), lambert(0.8)), LightKernel(5.0), Transport(**options), launch)
 
 
 def same_query(n: int) -> Any:
@@ -64,11 +64,11 @@ def test_values_differ_between_streams_and_are_uncorrelated() -> None:
 def test_launches_of_any_size_share_their_kernels() -> None:
     """Compiling takes seconds and a launch tenths of a second, so kernels must not depend on the launch."""
     surface = {"type": "mbtf_surface", "roughness": 0.3, "specular": 0.5, "metallic": 0.4, "clearcoat": 0.3}
-    e = Estimator(build_tile(rocks(32), surface), LightKernel(5.0), Transport())
+    e = Estimator(build_scene(rocks(32), surface), LightKernel(5.0), Transport())
     e.estimate(same_query(300), 8, Stream(0, "train", 0))
     # Another number of queries, of another relief, with other limits on the paths.
     # (Reliefs whose sides are no powers of two have kernels of their own.)
-    other = Estimator(build_tile(rocks(64, 0.1), surface), LightKernel(2.0), Transport(7, 2))
+    other = Estimator(build_scene(rocks(64, 0.1), surface), LightKernel(2.0), Transport(7, 2))
     before = dr.flag(dr.JitFlag.KernelHistory)
     dr.set_flag(dr.JitFlag.KernelHistory, True)
     try:
@@ -107,7 +107,7 @@ class Faulty(mi.BSDF):  # type: ignore[misc]
 @pytest.mark.parametrize("bad", [np.inf, np.nan])
 def test_nonfinite_samples_are_resampled_and_counted(bad: float) -> None:
     n, spp = 500, 8
-    tile = build_tile(flat(), Faulty(mi.Properties(), bad))
+    tile = build_scene(flat(), Faulty(mi.Properties(), bad))
     e = Estimator(tile, LightKernel(0.0), Transport(max_depth=1))
     values = e.estimate(same_query(n), spp, Stream(0, "train", 0))
     # One in twenty, and of those one in twenty again; none is left in the values.
@@ -119,7 +119,7 @@ def test_nonfinite_samples_are_located() -> None:
     """The facet of a groove towards u = 0 has a faulty stripe: queries on it fail directly, those on the
     other facet by light reflected from the stripe."""
     groove = HeightGrid(np.tile([0.0, -0.4], (2, 1)), 1.0)
-    e = Estimator(build_tile(groove, Faulty(mi.Properties(), np.nan, 1.0)), LightKernel(0.0), Transport())
+    e = Estimator(build_scene(groove, Faulty(mi.Properties(), np.nan, 1.0)), LightKernel(0.0), Transport())
     n = 500
     u = np.array([[0.5, 0.5]] * n + [[0.08, 0.5]] * n)
     for effect, first in (("interreflection", 0), ("direct light", n)):

@@ -16,7 +16,7 @@ from support.scenes import (
     LightKernel,
     Stream,
     Transport,
-    build_tile,
+    build_scene,
     direction,
     directional,
     lambert,
@@ -26,9 +26,9 @@ from support.scenes import (
 )
 
 from mbtf_core.stats import Estimate, mean_of_halves
-from mbtf_gen.fibers.cloth_file import FiberEntry
-from mbtf_gen.fibers.curves import Curve
-from mbtf_gen.fibers.tile import FiberScattering, FiberTile
+from mbtf_gen.tile.fiber_tile import FiberScattering, FiberTile
+from mbtf_gen.tile.fibers.cloth_file import FiberEntry
+from mbtf_gen.tile.fibers.curves import Curve
 
 WHITE = (1.0, 1.0, 1.0)
 GRAY = (0.8, 0.6, 0.3)
@@ -67,7 +67,7 @@ def cylinder(radius: float) -> FiberTile:
 def traced(
     tile: FiberTile, light: LightKernel | None, transport: Transport | None = None, bsdf: Any = None
 ) -> Estimator:
-    return Estimator(build_tile(tile, bsdf or tile.bsdf()), light, transport or Transport())
+    return Estimator(build_scene(tile, bsdf or tile.surface()), light, transport or Transport())
 
 
 def mean_value(
@@ -129,7 +129,7 @@ def test_one_straight_fiber_is_the_integral_of_its_scattering_function() -> None
     measured = mean_of_halves(e.value_a.mean(axis=1), e.value_b.mean(axis=1))
     # Rays hit the fiber at the offset h in [-1, 1] from its axis, seen along ω_o across x. Frames: x around
     # the fiber, y along it, z the normal.
-    bsdf = mi.load_dict(tile.bsdf())
+    bsdf = mi.load_dict(tile.surface())
     h = (np.arange(4000) + 0.5) / 2000 - 1.0
     across = np.array([0.0, *omega_o[1:]]) / np.hypot(*omega_o[1:])
     side = np.cross(ALONG_X, across)
@@ -151,7 +151,7 @@ def test_one_straight_fiber_is_the_integral_of_its_scattering_function() -> None
 def test_opaque_fibers_reflect_by_fresnel_alone() -> None:
     """Seen at right angles to a fiber, the offset from its axis is uniform."""
     tile = replace(cylinder(0.05), scattering=FiberScattering(0.3, 0.3, 0.0, 1.7))
-    estimator = traced(tile, None, bsdf=tile.bsdf(transmission=False))
+    estimator = traced(tile, None, bsdf=tile.surface(()))
     e = estimator.estimate(tile_mean_queries(UP, UP, 2000), 64, Stream(5, "test", 0))
     offset = (np.arange(20_000) + 0.5) / 20_000
     cosine = np.sqrt(1.0 - offset**2)
@@ -227,7 +227,7 @@ def test_fibers_agree_with_instances_in_unmodified_mitsuba(tmp_path: Path) -> No
         shapes[f"color_{k}"] = {
             "type": "bsplinecurve",
             "filename": write_curves(tmp_path / f"{k}.txt", curves, unit),
-            "bsdf": replace(tile, colors=tile.colors[[k]]).bsdf(),
+            "bsdf": replace(tile, colors=tile.colors[[k]]).surface(),
         }
     omega_i = direction(50, 25)
     shift = mi.ScalarTransform4f().translate

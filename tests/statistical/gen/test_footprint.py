@@ -8,7 +8,17 @@ import drjit as dr
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.scenes import Estimator, LightKernel, Stream, Transport, build_tile, direction, flat, mi, queries
+from support.scenes import (
+    Estimator,
+    LightKernel,
+    Stream,
+    Transport,
+    build_scene,
+    direction,
+    flat,
+    mi,
+    queries,
+)
 
 from mbtf_core.pictures.camera import Camera
 from mbtf_core.stats import mean_of_halves, t_test
@@ -50,7 +60,7 @@ def test_query_rays_pass_the_reference_plane_at_their_point(aspect: float) -> No
 def test_camera_rays_fill_the_pixel_that_its_query_states(aspect: float) -> None:
     camera = Camera(elevation=35, azimuth=20, tiles_across=0.4, rows=9, columns=11, field_of_view=2.0)
     q = camera.queries(np.array([0, 0, 1.0]), aspect)
-    tile = build_tile(flat(aspect), {"type": "diffuse"})
+    tile = build_scene(flat(aspect), {"type": "diffuse"})
     source = _camera_rays(camera, Estimator(tile, LightKernel(0.0), Transport()))
     source.set_queries(q.flat(), 40)
     pixel = 50
@@ -80,7 +90,7 @@ def test_positions_in_the_footprint_do_not_follow_light_directions(azimuth: floa
     pixels = np.zeros((64, 64, 3), np.float32)
     pixels[..., 0], pixels[..., 1] = ramp[None, :], ramp[::-1, None]
     bsdf = {"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True}}
-    estimator = Estimator(build_tile(flat(), bsdf), LightKernel(30.0), Transport())
+    estimator = Estimator(build_scene(flat(), bsdf), LightKernel(30.0), Transport())
     q = queries([0.5, 0.5], 0.1, direction(40, azimuth), direction(60, 10), 4000)
     e = estimator.estimate(q, 32, Stream(2, "test", 0))
     for channel in (0, 1):

@@ -13,7 +13,7 @@ from support.scenes import HeightGrid, LightKernel, direction, directional, flat
 from mbtf_core.stats import aggregate_test, elevation_groups, mean_of_halves
 from mbtf_gen.render.estimator import Estimator, Stream
 from mbtf_gen.render.path_tracer import Transport
-from mbtf_gen.render.scene import Tile, build_tile
+from mbtf_gen.render.scene import TileScene, build_scene
 
 N = 8000
 PLANE = Transport(displacement=False, shadowing=False, interreflection=False)
@@ -26,15 +26,20 @@ def half_open(share: float = 0.0) -> np.ndarray[Any, Any]:
     return opacity
 
 
-def sheet(grid: HeightGrid, opacity: Any, albedo: float = 0.6) -> Tile:
+def sheet(grid: HeightGrid, opacity: Any, albedo: float = 0.6) -> TileScene:
     pixels = np.ascontiguousarray(np.asarray(opacity, np.float32))[..., None]
     texture = {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True, "filter_type": "nearest"}
     color = {"type": "rgb", "value": [albedo] * 3}
-    return build_tile(grid, {"type": "mbtf_surface", "base_color": color, "opacity": texture})
+    return build_scene(grid, {"type": "mbtf_surface", "base_color": color, "opacity": texture})
 
 
 def run(
-    tile: Tile, transport: Transport, sigma: float = 4.0, u: Any = (0.5, 0.5), spp: int = 8, **options: Any
+    tile: TileScene,
+    transport: Transport,
+    sigma: float = 4.0,
+    u: Any = (0.5, 0.5),
+    spp: int = 8,
+    **options: Any,
 ) -> Any:
     q = queries(u, sigma, direction(50, 20), direction(60, 200), N)
     return Estimator(tile, LightKernel(2.0), transport).estimate(q, spp, Stream(5, "test", 0), **options)
@@ -84,7 +89,7 @@ def test_resampled_paths_have_consistent_transmittance() -> None:
     pixels = np.full((1, 20, 3), 0.5, np.float32)
     pixels[:, :2] = np.nan
     color = {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True, "filter_type": "nearest"}
-    tile = build_tile(flat(), {"type": "mbtf_surface", "base_color": color, "opacity": 0.5})
+    tile = build_scene(flat(), {"type": "mbtf_surface", "base_color": color, "opacity": 0.5})
     q = queries((0.5, 0.5), 4.0, direction(50, 20), direction(60, 200), n)
     e = Estimator(tile, LightKernel(2.0), PLANE).estimate(q, 2, Stream(5, "test", 0))
     assert e.transmittance is not None
@@ -99,7 +104,7 @@ def test_resampled_paths_have_consistent_transmittance() -> None:
 def test_an_opaque_map_changes_nothing() -> None:
     """Opacity decisions use no dimension of a path's sequence."""
     closed = sheet(rocks(), np.ones((4, 4)))
-    plain = build_tile(rocks(), {"type": "mbtf_surface", "base_color": {"type": "rgb", "value": [0.6] * 3}})
+    plain = build_scene(rocks(), {"type": "mbtf_surface", "base_color": {"type": "rgb", "value": [0.6] * 3}})
     a, b = run(closed, Transport()), run(plain, Transport())
     assert (a.value_a == b.value_a).all()
     assert (a.value_b == b.value_b).all()
@@ -119,7 +124,7 @@ def test_mitsuba_agrees_on_a_height_field_with_an_opacity_mask(depth: int, tmp_p
     q = random_queries(4096, 0.02, omega_i)
     mask = {"type": "mask", "opacity": opacity, "bsdf": {"type": "diffuse", "reflectance": color}}
     a, b = mitsuba_halves(block(grid, mask, tmp_path), directional(omega_i), q, 1.0, depth + 1, "volpath")
-    tile = build_tile(grid, {"type": "mbtf_surface", "base_color": color, "opacity": opacity})
+    tile = build_scene(grid, {"type": "mbtf_surface", "base_color": color, "opacity": opacity})
     transport = Transport(max_depth=depth, roulette_depth=1000)
     ours = Estimator(tile, LightKernel(0.0), transport).estimate(q, SPP, Stream(5, "test", 0))
     result = aggregate_test(
@@ -144,7 +149,7 @@ def test_transmittance_agrees_with_mitsuba(tmp_path: Path) -> None:
     a, b = mitsuba_halves(
         block(grid, mask, tmp_path), {"type": "constant", "radiance": black}, q, 1.0, 30, "path", floor
     )
-    tile = build_tile(grid, {"type": "mbtf_surface", "base_color": black, "opacity": opacity})
+    tile = build_scene(grid, {"type": "mbtf_surface", "base_color": black, "opacity": opacity})
     ours = Estimator(tile, LightKernel(0.0), Transport(max_depth=1)).estimate(q, SPP, Stream(5, "test", 0))
     seen = mean_of_halves(a[:, 0] - ours.transmittance, b[:, 0] - ours.transmittance)
     error = np.sqrt(2 * np.mean(a[:, 0] * (1 - a[:, 0])) / SPP / len(a))

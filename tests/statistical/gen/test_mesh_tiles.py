@@ -15,7 +15,7 @@ from support.scenes import (
     LightKernel,
     Stream,
     Transport,
-    build_tile,
+    build_scene,
     direction,
     estimate,
     lambert,
@@ -25,10 +25,9 @@ from support.scenes import (
 )
 
 from mbtf_core.stats import mean_of_halves
-from mbtf_gen.geometry.heightfield import tile_mesh
-from mbtf_gen.material.load import load_material
-from mbtf_gen.meshes.tile import MeshPart, MeshTile
-from mbtf_gen.render.bsdf.plugin import part_bsdfs
+from mbtf_gen.tile.heights.grid import tile_mesh
+from mbtf_gen.tile.loading import load_material
+from mbtf_gen.tile.mesh_tile import MeshPart, MeshTile
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -53,7 +52,7 @@ def tile_of(plates: list[NDArray[np.float64]], colors: list[float], aspect: floa
 
 
 def traced(tile: MeshTile, light: LightKernel | None, q: Any, spp: int = 16) -> Any:
-    estimator = Estimator(build_tile(tile, part_bsdfs(tile)), light, Transport())
+    estimator = Estimator(build_scene(tile, tile.surface()), light, Transport())
     return estimator.estimate(q, spp, Stream(1, "test", 0))
 
 
@@ -88,7 +87,7 @@ def test_a_height_field_as_a_file_of_triangles_gives_its_values(tmp_path: Path) 
     grid = rocks(32, 0.15)
     tile_mesh(grid).export(tmp_path / "rocks.ply")
     (tmp_path / "material.yaml").write_text("mesh: rocks.ply\nperiod: [1, 1]\nbase_color: 0.6\n")
-    shape = load_material(tmp_path).shape
+    shape = load_material(tmp_path)
     assert isinstance(shape, MeshTile)
     assert shape.open_edges() == (0, 0)
     omega_i, omega_o = direction(35, 50), direction(25, -100)
@@ -146,7 +145,7 @@ def test_textures_are_the_right_way_round(tmp_path: Path) -> None:
         visual=trimesh.visual.TextureVisuals(uv=corners[:, :2] / 2, material=material),
     )
     mesh.export(tmp_path / "plate.glb")
-    shape = load_material(tmp_path / "plate.glb").shape
+    shape = load_material(tmp_path / "plate.glb")
     assert isinstance(shape, MeshTile)
     assert (shape.aspect, shape.thickness) == (1.0, 0.0)
     u = np.array([[0.25, 0.75], [0.75, 0.75], [0.25, 0.25], [0.75, 0.25]])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -10,7 +11,7 @@ import pytest
 from support.mitsuba_blocks import SPP, random_queries
 from support.scenes import (
     LightKernel,
-    build_tile,
+    build_scene,
     direction,
     estimate,
     lambert,
@@ -22,14 +23,14 @@ from support.scenes import (
 
 from mbtf_core.errors import InputError
 from mbtf_core.stats import aggregate_test, elevation_groups
-from mbtf_gen.config.generator import GeneratorConfig, Tracer
-from mbtf_gen.geometry.heightfield import HeightGrid
+from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
-from mbtf_gen.planning.effects_plan import reference_plan
+from mbtf_gen.planning.effects_planner import reference_plan
 from mbtf_gen.planning.simulation import build_estimator
-from mbtf_gen.render.geometry import Vertex
-from mbtf_gen.render.heightfield_tracer import HeightfieldGeometry
-from mbtf_gen.render.mesh_tracer import MeshGeometry
+from mbtf_gen.tile.heights.grid import HeightGrid, Tracer
+from mbtf_gen.tile.tracers.heightfield_tracer import HeightfieldGeometry
+from mbtf_gen.tile.tracers.mesh_tracer import MeshGeometry
+from mbtf_gen.tile.tracers.protocol import Vertex
 
 WHITE = lambert(1.0)
 SURFACES: dict[str, dict[str, Any]] = {
@@ -73,7 +74,7 @@ def test_a_white_mesh_returns_all_light() -> None:
 def test_shifts_by_periods_change_nothing() -> None:
     """Hits of rays whose origins lie in other periods."""
     grid = HeightGrid(rocks().z, 0.5)
-    tile = build_tile(grid, lambert(0.5), "mesh")
+    tile = build_scene(replace(grid, tracer="mesh"), lambert(0.5))
     rng = np.random.default_rng(0)
     n = 20_000
     o = np.column_stack([(rng.random((n, 2)) - 0.5) * (tile.unit, 0.5 * tile.unit), np.full(n, 0.1)])
@@ -104,7 +105,7 @@ def test_rays_that_leave_points_on_the_border_do_not_meet_their_own_triangle() -
     d = np.stack([sine * np.cos(phi), sine * np.sin(phi), np.sqrt(1.0 - sine**2)])
     found = []
     for tracer in ("heightfield", "mesh"):
-        tile = build_tile(HeightGrid(z, 1.0), lambert(0.5), cast(Tracer, tracer))
+        tile = build_scene(replace(HeightGrid(z, 1.0), tracer=cast(Tracer, tracer)), lambert(0.5))
         edge = 0.5 * tile.unit * (1.0 - 1.0 / 16.0)
         floor = -0.02 * tile.unit
         up = mi.Normal3f(0, 0, 1)
@@ -131,4 +132,4 @@ def test_a_job_is_traced_as_its_options_say(tmp_path: Path, tracer: Tracer) -> N
 def test_a_mesh_too_large_for_memory_is_refused() -> None:
     cells = np.lib.stride_tricks.as_strided(np.zeros(1), (1 << 12, 1 << 13), (0, 0))
     with pytest.raises(InputError, match="--tracer heightfield"):
-        build_tile(HeightGrid(cells, 0.5), lambert(0.5), "mesh")
+        build_scene(replace(HeightGrid(cells, 0.5), tracer="mesh"), lambert(0.5))

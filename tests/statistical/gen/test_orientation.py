@@ -12,7 +12,7 @@ from support.scenes import (
     HeightGrid,
     LightKernel,
     Transport,
-    build_tile,
+    build_scene,
     direction,
     estimate,
     flat,
@@ -23,8 +23,8 @@ from support.scenes import (
 
 from mbtf_core.data.lattice import Lattice, texel_centers
 from mbtf_core.pictures.camera import Camera
-from mbtf_gen.geometry.heightfield import tile_mesh
 from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
+from mbtf_gen.tile.heights.grid import tile_mesh
 
 ROWS, COLUMNS = 4, 8
 ASPECT = ROWS / COLUMNS
@@ -36,12 +36,9 @@ def color_map() -> NDArray[np.float32]:
 
 
 def textured(pixels: NDArray[np.float32]) -> dict[str, Any]:
-    from mbtf_gen.material.material import Material
-    from mbtf_gen.render.bsdf.plugin import bsdf_of
+    from mbtf_gen.tile.reflectance import reflectance
 
-    return bsdf_of(
-        Material(height=np.zeros(pixels.shape[:2]), height_scale=1.0, height_bits=None, base_color=pixels)
-    )
+    return reflectance(pixels)
 
 
 def test_color_at_texel_centers_is_the_texel() -> None:
@@ -65,7 +62,7 @@ def test_vertices_sit_on_texel_centers() -> None:
     grid = HeightGrid.from_map(heights, 0.3)
     assert grid.z.max() == 0
     assert grid.displacement_range == pytest.approx(0.3 * np.ptp(heights))
-    tile = build_tile(grid, lambert(0.5))
+    tile = build_scene(grid, lambert(0.5))
     u = texel_centers(ROWS, COLUMNS).reshape(-1, 2)
     origin = np.column_stack(
         [(u[:, 0] - 0.5) * tile.unit, (u[:, 1] - 0.5) * ASPECT * tile.unit, np.full(len(u), 1.0)]
@@ -144,7 +141,7 @@ def test_pixel_kind_and_query_kind_agree_from_above() -> None:
     from mbtf_gen.pictures.reference import render_reference
     from mbtf_gen.render.estimator import Estimator
 
-    estimator = Estimator(build_tile(rocks(32), textured(color_map())), LightKernel(1.0), Transport())
+    estimator = Estimator(build_scene(rocks(32), textured(color_map())), LightKernel(1.0), Transport())
     camera = Camera(90.0, -90.0, 1.5, rows=40, columns=40, field_of_view=1.0)
     pair = [
         render_reference(estimator, camera, direction(50, 20), kind=k, spp=64) for k in ("query", "pixel")

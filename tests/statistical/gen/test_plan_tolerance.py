@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 from support.paths import ROOT
 
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.geometry.heightfield import HeightGrid
-from mbtf_gen.geometry.slopes import height_slopes, residual_slopes
 from mbtf_gen.job import Job
-from mbtf_gen.material.load import load_material
-from mbtf_gen.material.material import Material
-from mbtf_gen.planning.effects_plan import plan_effects, reference_plan
+from mbtf_gen.planning.effects_planner import plan_effects, reference_plan
 from mbtf_gen.planning.pilot import pilot_queries, relative_change
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Stream
+from mbtf_gen.tile.heightfield_tile import HeightFieldTile
+from mbtf_gen.tile.heights.grid import HeightGrid
+from mbtf_gen.tile.heights.slopes import height_slopes, residual_slopes
+from mbtf_gen.tile.loading import load_material
 
 
 def fractal(n: int, exponent: float, seed: int = 5) -> NDArray[np.float64]:
@@ -30,14 +30,14 @@ def fractal(n: int, exponent: float, seed: int = 5) -> NDArray[np.float64]:
     return (h - h.min()) / np.ptp(h)
 
 
-def stuff(height: NDArray[np.float64], scale: float, color: Any = 0.5, **more: Any) -> Material:
+def stuff(height: NDArray[np.float64], scale: float, color: Any = 0.5, **more: Any) -> HeightFieldTile:
     base = np.full(3, color) if np.ndim(color) == 0 else np.asarray(color)
-    return Material(height=height, height_scale=scale, height_bits=None, base_color=base, **more)
+    return HeightFieldTile(height=height, height_scale=scale, maps={"base_color": base, **more})
 
 
-def job_of(material: Material, mode: str = "auto", **options: Any) -> Job:
+def job_of(material: HeightFieldTile, mode: str = "auto", **options: Any) -> Job:
     effects = {"mode": mode, **options.pop("effects", {})}
-    return Job(GeneratorConfig.model_validate({"material": "m", "effects": effects, **options}), material)
+    return Job.of(GeneratorConfig.model_validate({"material": "m", "effects": effects, **options}), material)
 
 
 def normals(slope: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -51,27 +51,27 @@ def ripples(strength: float) -> NDArray[np.float32]:
     return normals(np.stack([slope, 0 * slope], axis=-1))
 
 
-def scratches() -> Material:
+def scratches() -> HeightFieldTile:
     """Grooves one vertex wide, which a grid thinned by two does not have."""
     h = np.zeros((512, 512))
     h[:, 1::32] = -1
     return stuff(h, 0.004, 0.3)
 
 
-def checks() -> Material:
+def checks() -> HeightFieldTile:
     """Red and green of equal luminance on a faint displacement."""
     red = np.random.default_rng(4).random((256, 256)) < 0.5
     return stuff(fractal(64, 3.0), 4e-4, np.where(red[..., None], [0.8, 0.1, 0.1], [0.1, 0.8, 0.1]))
 
 
-def bright_veil() -> Material:
+def bright_veil() -> HeightFieldTile:
     """Bright texels transmit a little light."""
     opacity, base = np.ones((64, 64)), np.full((64, 64, 3), 0.005)
     opacity[:, :2], base[:, :2] = 254 / 255, 0.9
     return stuff(np.zeros((4, 4)), 1.0, base, opacity=opacity)
 
 
-SCENES: dict[str, tuple[Material, dict[str, Any], int]] = {
+SCENES: dict[str, tuple[HeightFieldTile, dict[str, Any], int]] = {
     # Bounds for Lambert do not hold under a clearcoat: the error was 0.4 with them.
     "clearcoat": (
         stuff(fractal(64, 3.0), 2e-5, normal=ripples(0.003), clearcoat=1.0, clearcoat_roughness=0.1),

@@ -9,30 +9,30 @@ import pytest
 from support.paths import ROOT
 
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.geometry.slopes import height_slopes
 from mbtf_gen.job import Job
-from mbtf_gen.material.load import load_material
-from mbtf_gen.material.material import Material
-from mbtf_gen.planning.effects_plan import reference_plan
+from mbtf_gen.planning.effects_planner import reference_plan
 from mbtf_gen.planning.pilot import pilot_queries, relative_change
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream
+from mbtf_gen.tile.heightfield_tile import HeightFieldTile
+from mbtf_gen.tile.heights.slopes import height_slopes
+from mbtf_gen.tile.loading import load_material
 
 SPP = 16
 
 
-def lambert(material: Material) -> Material:
-    return replace(material, roughness=None, metallic=None, specular=None, normal=None)
+def lambert(material: HeightFieldTile) -> HeightFieldTile:
+    return material.with_maps(roughness=None, metallic=None, specular=None, normal=None)
 
 
-def normals_of(material: Material) -> np.ndarray[tuple[int, int, int], np.dtype[np.float32]]:
+def normals_of(material: HeightFieldTile) -> np.ndarray[tuple[int, int, int], np.dtype[np.float32]]:
     """The normal map that the heights would have, at their own resolution."""
-    slopes = height_slopes(material.grid(mesh=material.height.shape[1]))
+    slopes = height_slopes(material.at(mesh=material.height.shape[1]).grid)
     n = np.concatenate([-slopes, np.ones_like(slopes[..., :1])], axis=-1)
     return (n / np.linalg.norm(n, axis=-1, keepdims=True)).astype(np.float32)
 
 
-def estimates(material: Material, mesh: int, normal: str) -> Estimates:
+def estimates(material: HeightFieldTile, mesh: int, normal: str) -> Estimates:
     config = GeneratorConfig.model_validate(
         {
             "material": "m",
@@ -43,7 +43,7 @@ def estimates(material: Material, mesh: int, normal: str) -> Estimates:
             "transport": {"max_depth": 1},
         }
     )
-    job = Job(config, material)
+    job = Job.of(config, material)
     plan = reference_plan(job)
     assert plan.on("normal") == (normal != "off")
     found: Estimates = build_estimator(job, plan).estimate(
@@ -63,7 +63,7 @@ def test_a_coarse_mesh_with_the_residual_comes_closer_to_the_fine_one(name: str)
     # Reliefs gentle enough for slopes to stand for displacement.
     plain = replace(plain, height_scale=0.3 * plain.height_scale)
     fine = plain.height.shape[1]
-    mapped = replace(plain, normal=normals_of(plain))
+    mapped = plain.with_maps(normal=normals_of(plain))
     full = estimates(mapped, fine, "off")
     without = relative_change(full, estimates(mapped, fine // 16, "off"))[0]
     residual, upper = relative_change(full, estimates(mapped, fine // 16, "residual"))

@@ -10,7 +10,7 @@ from support.scenes import (
     DIRECT,
     HeightGrid,
     LightKernel,
-    build_tile,
+    build_scene,
     direction,
     estimate,
     flat,
@@ -67,7 +67,7 @@ def test_rays_below_the_surface_meet_it_from_below() -> None:
 @pytest.mark.parametrize("cap", [0, 5, 100])
 def test_endless_rays_end_at_the_cap(cap: int) -> None:
     """A level ray inside a trough is capped, a shadow ray occluded."""
-    tile = build_tile(TROUGH, lambert(0.5))
+    tile = build_scene(TROUGH, lambert(0.5))
     z = -0.9 * tile.unit
     ray = mi.Ray3f(mi.Point3f([0.0, 0.5], 0.0, z), mi.Vector3f(0.0, [1.0, -1.0], 0.0))
     si, crossings, capped, _ = tile.geometry.closest_hit(ray, mi.Bool(True), cap)
@@ -81,7 +81,7 @@ def test_endless_rays_end_at_the_cap(cap: int) -> None:
 
 
 def test_rays_that_leave_upwards_are_neither_capped_nor_occluded() -> None:
-    tile = build_tile(TROUGH, lambert(0.5))
+    tile = build_scene(TROUGH, lambert(0.5))
     ray = mi.Ray3f(mi.Point3f(0.0, 0.0, -0.1 * tile.unit), mi.Vector3f(0.0, [1.0, -0.6], [0.1, 0.8]))
     blocked, crossings, capped, _ = tile.geometry.occluded(ray, mi.Bool(True), 4096)
     assert not np.any(np.array(blocked | capped))

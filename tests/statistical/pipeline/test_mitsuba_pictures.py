@@ -14,8 +14,8 @@ from mbtf_core.errors import UsageError
 from mbtf_core.pictures.camera import Camera
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
-from mbtf_gen.material.load import load_material
-from mbtf_gen.material.material import Material
+from mbtf_gen.tile.heightfield_tile import HeightFieldTile
+from mbtf_gen.tile.loading import load_material
 from mbtf_pipeline.compare import unmodified_mitsuba
 from mbtf_pipeline.compare.unmodified_mitsuba import agreement, compare_with_mitsuba
 from mbtf_pipeline.recipe import CompareSection
@@ -25,7 +25,7 @@ SECTION = CompareSection.model_validate({**SCENE, "tiles_across": [0.6], "size":
 
 
 @pytest.fixture(scope="module")
-def glossy(tmp_path_factory: pytest.TempPathFactory) -> Material:
+def glossy(tmp_path_factory: pytest.TempPathFactory) -> HeightFieldTile:
     """A 2:1 height field with a colored, glossy surface and no symmetry."""
     folder = tmp_path_factory.mktemp("material")
     random = np.random.default_rng(5)
@@ -42,7 +42,7 @@ def config(material: Path | str) -> GeneratorConfig:
     return GeneratorConfig.model_validate({"material": str(material), "geometry": {"mesh": 32}})
 
 
-def test_mitsuba_agrees_with_and_without_gloss(glossy: Material) -> None:
+def test_mitsuba_agrees_with_and_without_gloss(glossy: HeightFieldTile) -> None:
     found = compare_with_mitsuba(SECTION, config("unused"), glossy)
     assert list(found) == ["base color", "full"]
     for f in found.values():
@@ -55,7 +55,7 @@ def test_mitsuba_agrees_with_and_without_gloss(glossy: Material) -> None:
     assert agreement((bare, bare), (full, full)).verdict == "differ"
 
 
-def test_a_shifted_image_differs(glossy: Material, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_shifted_image_differs(glossy: HeightFieldTile, monkeypatch: pytest.MonkeyPatch) -> None:
     """The camera of Mitsuba is shifted by a texel, which preserves the mean."""
     real = unmodified_mitsuba.render_with_mitsuba
 

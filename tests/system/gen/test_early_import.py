@@ -7,7 +7,7 @@ from conftest import RunPython
 
 EARLY = """
 import drjit.llvm
-from mbtf_gen.render.runtime import load_mitsuba
+from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_core.errors import EngineError
 try:
     mi = load_mitsuba()

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
-from support.commands import Done, finished, run_named, start
+from support.commands import Done, run_named
 from support.datasets import write_dataset
 
 from mbtf_core.color import srgb_to_linear
@@ -17,8 +16,8 @@ from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.lattice import level_of_sigma
 from mbtf_core.directions import from_angles
 from mbtf_core.pictures.camera import tiles_camera
-from mbtf_gen.material.load import load_material
 from mbtf_gen.pictures.preview.mesh import draw, tiled_mesh
+from mbtf_gen.tile.loading import load_material
 
 # Quadrants of the map: top left, top right, bottom left, bottom right.
 QUADRANTS = {"red": (1, 0, 0), "green": (0, 1, 0), "blue": (0, 0, 1), "white": (1, 1, 1)}
@@ -125,19 +124,6 @@ def test_colors_lie_in_the_quadrants_of_the_map(batch: dict[str, Done], work: Pa
 
 
 @pytest.mark.usefixtures("drawing")
-def test_no_picture_is_blank(batch: dict[str, Done], work: Path) -> None:
-    for name in ("tilted", "two"):
-        files = "config.yaml pictures.json mesh.png beauty.png queries.png"
-        assert {p.name for p in (work / name).iterdir()} == set(files.split())
-        for file in ("mesh", "beauty", "queries"):
-            assert np.ptp(pixels(work / name / f"{file}.png")) > 0.5, (name, file)
-    # A flat gray tile is a gray quadrangle before the background, and a gray plane.
-    mesh, beauty = (pixels(work / "flat" / f"{n}.png") for n in ("mesh", "beauty"))
-    assert mesh[36, 48].max() < mesh[0, 0].min() - 0.03
-    assert 0.3 < beauty.mean() < 0.99
-
-
-@pytest.mark.usefixtures("drawing")
 def test_the_same_command_keeps_and_another_is_refused(batch: dict[str, Done], work: Path) -> None:
     assert [p["kept"] for p in batch["tilted"].result()["pictures"]] == [False] * 3
     assert [p["kept"] for p in batch["again"].result()["pictures"]] == [True] * 3
@@ -183,25 +169,6 @@ def test_queries_can_be_seen_without_their_material(batch: dict[str, Done], work
     assert not (work / "lonely-pictures/mesh.png").exists()
 
 
-@pytest.mark.parametrize(
-    ("name", "says"),
-    [
-        ("settled", "--min-cos: data holds a data set"),
-        ("settled too", "--set: data holds a data set"),
-        ("block", "--tiles: 'preview.tiles'"),
-        ("horizon", "shows the horizon"),
-        ("below", "--light: 'preview.light.elevation'"),
-    ],
-)
-def test_invalid_inputs_are_named_before_anything_is_written(
-    name: str, says: str, batch: dict[str, Done], work: Path
-) -> None:
-    done = batch[name]
-    assert (done.code, done.out) == (2, "")
-    assert says in done.err
-    assert not (work / "nowhere").exists()
-
-
 @pytest.mark.usefixtures("drawing")
 def test_a_preview_without_drawing_is_partial_and_resumes(
     work: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -223,15 +190,3 @@ def test_a_preview_without_drawing_is_partial_and_resumes(
     assert run(app, line) == 0
     out, _ = capsys.readouterr()
     assert [text.endswith("(kept)") for text in out.splitlines()[:-1]] == [False, True, True]
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="other systems always have a display")
-def test_a_window_without_a_display_is_one_line(work: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    done = finished(start(["preview", "maps", "-o", "nowhere", "--interactive"], work))
-    assert done.code == 3
-    assert done.err == (
-        "error: --interactive: there is no display\n  leave it out: the pictures are written as files\n"
-    )
-    assert not (work / "nowhere").exists()

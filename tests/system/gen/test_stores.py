@@ -39,7 +39,6 @@ ObjectStore.write = stopped
 if program == "mbtf-gen":
     from mbtf_gen.cli.app import app
 else:
-    from mbtf_fit.cli.app import app
 sys.exit(run(app, line))
 """
 

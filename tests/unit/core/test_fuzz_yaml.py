@@ -17,7 +17,7 @@ from mbtf_core.config.yaml_file import read_yaml
 from mbtf_core.errors import InputError
 from mbtf_fit.config import FitConfig
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.material.load import load_material
+from mbtf_gen.tile.loading import load_material
 from mbtf_pipeline.recipe import load_recipe
 
 MATERIAL = """\

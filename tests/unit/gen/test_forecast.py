@@ -18,12 +18,12 @@ from mbtf_gen import forecast as module
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.forecast import forecast
 from mbtf_gen.job import Job, split_target
-from mbtf_gen.material.material import Material
 from mbtf_gen.planning import sample_allocation
-from mbtf_gen.planning.effects_plan import plan_effects
+from mbtf_gen.planning.effects_planner import plan_effects
 from mbtf_gen.planning.pilot import pilot_queries
 from mbtf_gen.planning.run_plan import RunPlan, allocate
 from mbtf_gen.render.estimates import Estimates, Stream
+from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 
 RATE = 1e6
 
@@ -59,8 +59,8 @@ class Fake:
 
 def job_of(**queries: Any) -> Job:
     heights = np.random.default_rng(0).random((16, 16))
-    material = Material(heights, height_scale=0.1, height_bits=None, base_color=np.array([0.5, 0.5, 0.5]))
-    return Job(GeneratorConfig.model_validate({"material": "m", "queries": queries}), material)
+    material = HeightFieldTile(heights, height_scale=0.1, maps={"base_color": np.array([0.5, 0.5, 0.5])})
+    return Job.of(GeneratorConfig.model_validate({"material": "m", "queries": queries}), material)
 
 
 @pytest.mark.parametrize("options", [{}, {"layout": "image"}, {"layout": "image", "patch_size": 12}])

@@ -65,8 +65,8 @@ def test_the_limit_of_the_displacement_range_can_be_raised(tmp_path: Path) -> No
     with pytest.raises(InputError, match=r"200 tile widths; at most 100"):
         Job.prepare(config())
     raised = Job.prepare(config(max_displacement=300.0))
-    assert raised.grid.displacement_range == 200.0
-    assert Job.prepare(config(height_scale=0.4)).grid.displacement_range == 80.0
+    assert raised.material.thickness == 200.0
+    assert Job.prepare(config(height_scale=0.4)).material.thickness == 80.0
     # The limit does not change the data.
     assert raised.config_hash == Job.of(config(), raised.material).config_hash
 

@@ -11,8 +11,8 @@ import pytest
 from mbtf_core.config.settings import resolve
 from mbtf_core.errors import UsageError
 from mbtf_gen.config.generator import GeneratorConfig, count_queries, parse_count
-from mbtf_gen.material.load import load_material
 from mbtf_gen.sampling.light_kernel import MIN_WIDTH_DEG, LightKernel
+from mbtf_gen.tile.loading import load_material
 
 
 def test_counts() -> None:

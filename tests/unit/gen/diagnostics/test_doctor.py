@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
 from mbtf_core.run.child import Outcome
 from mbtf_gen.diagnostics import doctor
 from mbtf_gen.diagnostics.doctor import Part
-from mbtf_gen.render import llvm
+from mbtf_gen.engine import llvm
 
 
 @pytest.mark.parametrize("required", [True, False])
@@ -21,38 +20,11 @@ def test_only_required_parts_fail_the_diagnosis(required: bool) -> None:
     assert "                → unset it" in doctor.as_text(checks).splitlines()
 
 
-def test_disk_and_memory_are_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.chdir(tmp_path)
-    disk, memory = doctor._disk(), doctor._memory()
-    assert f"GB free in {tmp_path}" in disk.found
-    assert "GB free of" in memory.found
-    monkeypatch.setattr(doctor.shutil, "disk_usage", lambda folder: SimpleNamespace(free=2e8))
-    monkeypatch.setattr(doctor, "_LITTLE_MEMORY", 1e18)
-    for part in (doctor._disk(), doctor._memory()):
-        assert part.state == "failed"
-        assert not part.required
-        assert part.hint
-    assert "0.2 GB free" in doctor._disk().found
-
-
-@pytest.mark.parametrize("missing", [(), ("chromedriver",), ("chromium", "chromedriver")])
-def test_the_browser_of_the_tests_is_optional(
-    missing: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    there = {"chromium", "chromedriver"} - {*missing}
-    monkeypatch.setattr(doctor.shutil, "which", lambda name: f"/bin/{name}" if name in there else None)
-    part = doctor._browser()
-    assert part.state == ("absent" if missing else "ok")
-    assert all(f"no {name}" in part.found for name in missing)
-    assert ("apt install chromium chromium-driver" in part.hint) is bool(missing)
-    assert doctor.exit_code([part]) == 0
-
-
 def test_a_broken_llvm_is_a_finding_not_a_crash(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     fake = tmp_path / "libLLVM.so"
     fake.write_text("no library\n")
     monkeypatch.setenv(llvm.VARIABLE, str(fake))
-    found = {c.name: c for c in (doctor._llvm(), doctor.probe("Mitsuba"), doctor.probe("Threads"))}
+    found = {c.name: c for c in (doctor._llvm(), doctor.probe("Mitsuba"))}
     assert {c.state for c in found.values()} == {"failed"}
     assert str(fake) in found["LLVM"].found
     assert "unset" in found["LLVM"].hint

@@ -20,8 +20,8 @@ from mbtf_core.images.exr import encode_parts
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.geometry import geometry_of
 from mbtf_gen.job import Job
-from mbtf_gen.material.load import load_material
-from mbtf_gen.planning.effects_plan import reference_plan
+from mbtf_gen.planning.effects_planner import reference_plan
+from mbtf_gen.tile.loading import load_material
 
 F64 = NDArray[np.float64]
 SQUARE = (64, 64)
@@ -40,7 +40,8 @@ def job_of(folder: Path, heights: F64, finest: int = 3, effects: str = "auto", *
         }
     )
     material = load_material(config.material, tile)
-    return Job.of(config, replace(material, **maps))
+    bsdf = maps.pop("bsdf", None)
+    return Job.of(config, replace(material.with_maps(**maps), bsdf=bsdf))
 
 
 def made(job: Job) -> Geometry:

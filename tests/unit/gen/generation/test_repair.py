@@ -22,7 +22,7 @@ from mbtf_gen.cli.app import app
 from mbtf_gen.generation import repair as repairs
 from mbtf_gen.generation.repair import repair
 from mbtf_gen.job import Job
-from mbtf_gen.planning.effects_plan import reference_plan
+from mbtf_gen.planning.effects_planner import reference_plan
 from mbtf_gen.planning.run_plan import RunPlan, plan_run
 from mbtf_gen.planning.simulation import ClosedForm
 
@@ -267,7 +267,7 @@ def test_a_manifest_is_not_restored_with_another_plan(out: Path, monkeypatch: py
         config = job.config.model_copy(
             update={"effects": job.config.effects.model_copy(update={"mode": "all"})}
         )
-        return RunPlan(reference_plan(repairs.Job(config, job.material)))
+        return RunPlan(reference_plan(repairs.Job.of(config, job.material)))
 
     monkeypatch.setattr(repairs, "plan_run", other_plan)
     with pytest.raises(InputError, match="plans the run differently"):

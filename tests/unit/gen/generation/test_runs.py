@@ -19,6 +19,8 @@ from mbtf_core.data.shard_files import read_shard
 from mbtf_core.data.verify import verify
 from mbtf_core.errors import InputError, PartialError
 from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.effects.plan import EffectsPlan
+from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.generation import folder, render_shards
 from mbtf_gen.generation import repair as repairs
 from mbtf_gen.generation import run as generation
@@ -26,9 +28,7 @@ from mbtf_gen.generation.geometry import geometry_of
 from mbtf_gen.generation.run import generate, unfinished
 from mbtf_gen.generation.summary import finish
 from mbtf_gen.job import Job, split_queries
-from mbtf_gen.planning.effects import EffectsPlan
 from mbtf_gen.planning.run_plan import RunPlan
-from mbtf_gen.render.runtime import load_mitsuba
 
 load_mitsuba()
 

@@ -17,21 +17,20 @@ from mbtf_core.pictures.camera import Camera, tiles_camera
 from mbtf_core.run.child import run_child
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
-from mbtf_gen.material.material import Material
 from mbtf_gen.pictures.preview import mesh
 from mbtf_gen.pictures.preview.mesh import MOST_CELLS, draw, tiled_mesh
-from mbtf_gen.pictures.preview.plots import level_histogram, query_figure, write_plots
+from mbtf_gen.pictures.preview.plots import level_histogram
 from mbtf_gen.pictures.preview.sample import QuerySample, sampled_queries, stored_queries
 from mbtf_gen.sampling.query_sampler import Mixture
+from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 
 LIGHT = from_angles(35, 150)
 
 
-def material(rows: int = 4, columns: int = 8, **options: Any) -> Material:
+def material(rows: int = 4, columns: int = 8, **options: Any) -> HeightFieldTile:
     rng = np.random.default_rng(1)
     color = rng.uniform(0.1, 0.9, (rows, columns, 3)).astype(np.float32)
-    given = {"height": 0.1 * rng.random((rows, columns)), "base_color": color, **options}
-    return Material(height_scale=1.0, height_bits=None, **given)
+    return HeightFieldTile(0.1 * rng.random((rows, columns)), maps={"base_color": color, **options})
 
 
 @pytest.mark.parametrize("aspect", [0.5, 1.0, 3.0])
@@ -74,7 +73,7 @@ def test_the_block_is_the_repeated_tile(tiles: int) -> None:
     assert not block.hole.any()
     # Brighter texels are shown brighter; row 0 stays on top.
     shown = block.texture.astype(float).mean(axis=-1).ravel()
-    assert np.corrcoef(shown, np.asarray(m.base_color).mean(axis=-1).ravel())[0, 1] > 0.95
+    assert np.corrcoef(shown, np.asarray(m.maps["base_color"]).mean(axis=-1).ravel())[0, 1] > 0.95
 
 
 def test_holes_are_cut_where_little_is_left() -> None:
@@ -92,15 +91,15 @@ def test_holes_are_cut_where_little_is_left() -> None:
 def test_a_large_mesh_is_coarsened() -> None:
     m = material()
     for tiles, wide in ((1, MOST_CELLS), (4, MOST_CELLS // 4)):
-        block = tiled_mesh(m, tiles, 0.0, mesh=4000)
+        block = tiled_mesh(m.at(mesh=4000), tiles, 0.0)
         assert block.cells == (wide // 2, wide)
-    tall = tiled_mesh(material(8, 4), 2, 0.0, mesh=2000)
+    tall = tiled_mesh(material(8, 4).at(mesh=2000), 2, 0.0)
     assert tall.cells == (MOST_CELLS // 2, MOST_CELLS // 4)
 
 
 def sample_of(count: int, seed: int = 0, **options: Any) -> QuerySample:
     config = GeneratorConfig.model_validate({"material": "m", "queries": {"train": str(count), **options}})
-    job = Job(config, material())
+    job = Job.of(config, material())
     return sampled_queries(job)
 
 
@@ -171,41 +170,6 @@ def test_unfinished_shards_are_left_out(tmp_path: Path) -> None:
         (tmp_path / "set" / name).unlink()
     with pytest.raises(InputError, match="no finished train shard"):
         stored_queries(dataset)
-
-
-@pytest.mark.parametrize("count", [1, 300, 9000])
-def test_plots_show_the_queries(count: int, tmp_path: Path) -> None:
-    sample = sample_of(count, min_cos=0.5)
-    position, level, light, view, *bars = query_figure(sample, "title").axes
-    assert len(bars) == (3 if count == 9000 else 0)
-    assert position.get_aspect() == 0.5
-    assert f"k = {sample.finest} " in level.get_xlabel()
-    for axes, points in ((position, sample.u), (light, sample.omega_i[:, :2]), (view, sample.omega_o[:, :2])):
-        collection = axes.collections[0]
-        if count < 4000:
-            np.testing.assert_array_equal(np.asarray(collection.get_offsets(), np.float32), points)
-        else:
-            ratio = np.ma.filled(collection.get_array(), np.nan)
-            assert np.nanmean(ratio) == pytest.approx(1.0, abs=0.05)
-            assert np.nanmax(ratio) < 2
-    for axes in (light, view):
-        radii = [np.hypot(*line.get_data()) for line in axes.lines]
-        np.testing.assert_allclose(radii[0], 1.0)
-        np.testing.assert_allclose(radii[1], np.sqrt(0.75))
-    edges, found, stated = level_histogram(sample)
-    for patch, values in zip(level.patches, (found, stated), strict=True):
-        data = patch.get_data()
-        np.testing.assert_array_equal(data.values, values)
-        np.testing.assert_array_equal(data.edges, edges)
-    write_plots(tmp_path / "plots.png", sample, "title")
-    assert (tmp_path / "plots.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_queries_outside_the_disk_stand_out() -> None:
-    sample = sample_of(9000, min_cos=0.5)
-    wrong = replace(sample, min_cos=0.8)
-    ratio = np.ma.filled(query_figure(wrong, "").axes[2].collections[0].get_array(), np.nan)
-    assert np.nansum(ratio == 2.0) > 20
 
 
 def test_a_crash_while_drawing_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,9 +7,9 @@ import pytest
 
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
-from mbtf_gen.material.material import Material
-from mbtf_gen.planning.effects_plan import plan_effects
+from mbtf_gen.planning.effects_planner import plan_effects
 from mbtf_gen.planning.pilot import measured
+from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 
 # Root mean square change at 131 072 points of the bump below, without its shadows.
 TRUE_CHANGE = 0.0087
@@ -20,10 +20,8 @@ def one_bump(cells: int = 64) -> Job:
     height = np.zeros((cells, cells))
     height[cells // 2, cells // 2] = 1.0
     config = {"material": "m", "queries": {"min_cos": 0.6, "resolution": cells}}
-    material = Material(
-        height=height, height_scale=1.28 / cells, height_bits=None, base_color=np.full(3, 0.5)
-    )
-    return Job(GeneratorConfig.model_validate(config), material)
+    material = HeightFieldTile(height=height, height_scale=1.28 / cells, maps={"base_color": np.full(3, 0.5)})
+    return Job.of(GeneratorConfig.model_validate(config), material)
 
 
 @pytest.mark.parametrize("cells", [64, 128])

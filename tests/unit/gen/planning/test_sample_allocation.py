@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from conftest import RunPython
 from numpy.typing import NDArray
-from pydantic import TypeAdapter
 
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.data.queries import Queries
@@ -188,10 +187,6 @@ def test_counts_do_not_depend_on_the_processors_features(fitted: Allocation, run
     left, again = counted(found)
     assert len(left) < len(found)
     assert again == digest
-
-
-def test_an_allocation_survives_the_manifest(fitted: Allocation) -> None:
-    assert TypeAdapter(Allocation).validate_json(json.dumps(asdict(fitted))) == fitted
 
 
 def test_no_noise_and_little_noise() -> None:

@@ -23,9 +23,9 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.publish import PublishConfig
 from mbtf_gen.generation import render_shards
 from mbtf_gen.generation import run as generation
-from mbtf_gen.material.load import load_material
 from mbtf_gen.publishing.digests import dataset_digests, digest_faults
 from mbtf_gen.publishing.publish import Publication
+from mbtf_gen.tile.loading import load_material
 
 CONFIG = PublishConfig(license="CC0-1.0", form="webdataset")
 

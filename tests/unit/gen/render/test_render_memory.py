@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from conftest import RunPython
 
-from mbtf_gen.render.memory import padded
+from mbtf_gen.engine.memory import padded
 
 # Numbers at the end of readable memory.
 CODE = """
 import ctypes, mmap, sys
 import numpy as np
-from mbtf_gen.render.memory import padded
-from mbtf_gen.render.runtime import load_mitsuba
+from mbtf_gen.engine.memory import padded
+from mbtf_gen.engine.runtime import load_mitsuba
 mi = load_mitsuba()
 import drjit as dr
 half, n = 1 << 19, 1601

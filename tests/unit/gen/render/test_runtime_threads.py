@@ -9,7 +9,7 @@ import sys
 from mbtf_core.run.task import THREADS_VARIABLE
 
 SHOWN = """
-from mbtf_gen.render.runtime import load_mitsuba
+from mbtf_gen.engine.runtime import load_mitsuba
 load_mitsuba()
 import drjit
 print(drjit.thread_count())

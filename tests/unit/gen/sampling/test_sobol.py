@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from support.chi_square import uniformity
 
 from mbtf_core.stats import holm, mean_estimate, t_test
-from mbtf_gen.render.runtime import load_mitsuba
+from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.sampling.rng import Purpose, sequence, stream_key, stream_number
 
 mi = load_mitsuba()

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from mbtf_core.directions import from_angles
-from mbtf_gen.geometry.heightfield import HeightGrid
-from mbtf_gen.render.runtime import load_mitsuba
+from mbtf_gen.engine.runtime import load_mitsuba
+from mbtf_gen.tile.heights.grid import HeightGrid
 from mbtf_pipeline.compare.offsets import _regression, read_offset, towards_view, traced_offset
 from mbtf_pipeline.compare.pictures import write_channels
 from mbtf_pipeline.recipe import SceneView
@@ -23,12 +23,12 @@ def plane_below() -> object:
     load_mitsuba()
     from mbtf_gen.render.estimator import Estimator
     from mbtf_gen.render.path_tracer import Transport
-    from mbtf_gen.render.scene import build_tile
+    from mbtf_gen.render.scene import build_scene
 
     heights = np.full((64, 32), -DEPTH)
     heights[60, 2] = 0.0
     grid = HeightGrid.from_map(heights, 1.0, 2.0)
-    tile = build_tile(grid, {"type": "diffuse"})
+    tile = build_scene(grid, {"type": "diffuse"})
     return Estimator(tile, None, Transport())
 
 

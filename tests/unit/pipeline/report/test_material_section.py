@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.material.load import load_material
+from mbtf_gen.tile.loading import load_material
 from mbtf_pipeline.report.material import material_section
 
 

@@ -125,7 +125,7 @@ def test_few_glossy_texels_are_enough(tmp_path: Path) -> None:
 
 def test_rough_conductors_of_mitsuba(tmp_path: Path) -> None:
     """Another implementation of GGX: its reflectance does not rise to white at grazing angles."""
-    from mbtf_gen.render.runtime import load_mitsuba
+    from mbtf_gen.engine.runtime import load_mitsuba
 
     mi = load_mitsuba()
     color, alphas = np.array([0.8, 0.5, 0.3]), np.array([0.06, 0.15, 0.3, 0.5])

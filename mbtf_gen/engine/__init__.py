@@ -1,0 +1,1 @@
+"""Mitsuba and Dr.Jit: loading them, their types, their memory."""

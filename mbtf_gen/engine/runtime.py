@@ -1,0 +1,243 @@
+"""Loading of Mitsuba: checks that its compiler works on this machine, imports it, sets the variant.
+
+A broken or old LLVM aborts the process at some kernel. Therefore test kernels run in a child process first,
+once per library, and the result is cached. Modules that import ``drjit`` or ``mitsuba`` at the top must be
+imported after :func:`load_mitsuba`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+import tempfile
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from mbtf_core.errors import EngineError, UsageError
+from mbtf_core.files.folders import cache_folder
+from mbtf_core.run.child import Outcome, run_child
+from mbtf_core.run.task import worker_threads
+from mbtf_gen.engine.llvm import (
+    CACHE_VARIABLE,
+    OLDEST_LLVM,
+    VARIABLE,
+    chosen_llvm,
+    has_version,
+    shipped_llvm,
+    use_shipped_llvm,
+)
+
+CPU_VARIANT = "llvm_ad_rgb"
+CUDA_VARIANT = "cuda_ad_rgb"
+# Seconds; a first start from a slow network disk takes tens of them.
+_PROOF_TIMEOUT = 180.0
+
+_working: set[str] = set()
+
+
+def load_mitsuba(variant: str = CPU_VARIANT) -> Any:
+    """Import Mitsuba and set a variant.
+
+    Sets ``DRJIT_LIBLLVM_PATH`` and ``DRJIT_CACHE_DIR`` where they are unset.
+
+    Parameters
+    ----------
+    variant : str
+        ``llvm_ad_rgb``, ``cuda_ad_rgb``, or ``auto``: CUDA where it works, else LLVM.
+
+    Returns
+    -------
+    module
+        ``mitsuba``.
+
+    Raises
+    ------
+    UsageError
+        The variant does not exist.
+    EngineError
+        Mitsuba, its LLVM or the CUDA device cannot be used here; says why and what to do.
+    """
+    if variant == "auto":
+        variant = CUDA_VARIANT if not prove(CUDA_VARIANT).fault else CPU_VARIANT
+    if variant not in (CPU_VARIANT, CUDA_VARIANT):
+        raise UsageError(f"no variant '{variant}'", hint=f"choose {CPU_VARIANT}, {CUDA_VARIANT} or auto")
+    if variant not in _working:
+        if variant == CPU_VARIANT:
+            check_llvm()
+        elif fault := prove(variant).fault:
+            raise EngineError(f"no usable CUDA device ({fault})", hint=f"use the CPU: variant {CPU_VARIANT}")
+    try:
+        import mitsuba
+
+        if mitsuba.variant() != variant:
+            mitsuba.set_variant(variant)
+    except ImportError as error:
+        raise _mitsuba_error(" ".join(str(error).split())) from None
+    if variant == CPU_VARIANT:
+        refuse_old_llvm()
+        if variant not in _working:
+            limit_threads()
+    _working.add(variant)
+    return mitsuba
+
+
+def limit_threads() -> None:
+    """Render with the threads of this worker; with all processors elsewhere."""
+    if (threads := worker_threads()) is not None:
+        import drjit
+
+        drjit.set_thread_count(threads)
+
+
+def refuse_old_llvm() -> None:
+    """Refuse to run with an LLVM that is too old: some kernel would abort the process.
+
+    Dr.Jit has bound to such an LLVM where a program imports ``mitsuba`` or ``drjit`` before
+    :func:`load_mitsuba` or ``mbtf_fit.mitsuba_plugin.register("llvm_ad_rgb")`` and the system's LLVM is old.
+
+    Raises
+    ------
+    EngineError
+        Dr.Jit uses an LLVM older than `OLDEST_LLVM`.
+    """
+    import drjit
+
+    major = int(drjit.detail.llvm_version()[0])
+    if major < OLDEST_LLVM:
+        raise EngineError(
+            f"Dr.Jit was imported first and uses LLVM {major}, which is too old",
+            hint='call mbtf_fit.mitsuba_plugin.register("llvm_ad_rgb") before importing mitsuba or drjit',
+        )
+
+
+def prove(variant: str) -> Outcome:
+    """Compile and run test kernels of `variant` in a child process, without the disk cache.
+
+    The answers contain ``llvm`` (version) for the CPU variant.
+    """
+    use_shipped_llvm()
+    with tempfile.TemporaryDirectory(prefix="mbtf-proof-") as folder:
+        return run_child(
+            __name__, "_proof", variant, timeout=_PROOF_TIMEOUT, environment={CACHE_VARIABLE: folder}
+        )
+
+
+def check_llvm() -> None:
+    """Test the LLVM that Dr.Jit will use, unless an earlier run on this machine did.
+
+    Raises
+    ------
+    EngineError
+        The library is missing, broken or too old.
+    """
+    use_shipped_llvm()
+    library = chosen_llvm()
+    passed = _proof_file(library)
+    if passed is not None and passed.exists():
+        return
+    fault = prove(CPU_VARIANT).fault
+    if "No module named" in fault:
+        raise _mitsuba_error(fault)
+    if fault:
+        raise _llvm_error(library, fault)
+    if passed is not None:
+        with suppress(OSError):  # without a writable cache the next process tests it again
+            passed.parent.mkdir(parents=True, exist_ok=True)
+            passed.touch()
+
+
+def _proof_file(library: str | None) -> Path | None:
+    """File that exists once the test passed: of this library file, this Dr.Jit, this machine's name."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    if library is None or not Path(library).is_file():
+        return None
+    try:
+        drjit = version("drjit")
+    except PackageNotFoundError:
+        return None
+    real = Path(library).resolve()
+    state = real.stat()
+    key = f"{real}|{state.st_size}|{state.st_mtime_ns}|{drjit}|{platform.node()}"
+    return cache_folder() / f"llvm-proof-{hashlib.sha256(key.encode()).hexdigest()[:16]}"
+
+
+def _llvm_error(library: str | None, fault: str) -> EngineError:
+    if library is None:
+        return EngineError(
+            f"no usable LLVM library was found ({fault})",
+            hint="reinstall into a virtual environment (pip install --target loses it), "
+            f"or set {VARIABLE} to a libLLVM of version {OLDEST_LLVM} or newer",
+        )
+    shipped = shipped_llvm()
+    if shipped is not None and library == str(shipped):
+        return EngineError(
+            f"the LLVM that came with the installation cannot be used: {fault}",
+            where=library,
+            hint="install it again: pip install --force-reinstall karellen-llvm-core",
+        )
+    use = "unset it to use the LLVM of the installation" if shipped else "pip install karellen-llvm-core"
+    return EngineError(fault, where=f"{VARIABLE}={library}", hint=f"{use}, or name a newer libLLVM")
+
+
+def _mitsuba_error(fault: str) -> EngineError:
+    return EngineError(
+        f"Mitsuba cannot be loaded ({fault})",
+        hint="install it again: pip install --force-reinstall mitsuba==3.9.1",
+    )
+
+
+def _proof(variant: str) -> Iterator[dict[str, Any]]:
+    """Child process of :func:`prove`."""
+    use_shipped_llvm()
+    library = chosen_llvm()
+    needed = f"LLVM {OLDEST_LLVM} or newer is needed"
+    if variant == CPU_VARIANT and library is not None:
+        try:
+            new = has_version(library)
+        except OSError as error:
+            raise EngineError(f"cannot be loaded ({str(error).removeprefix(f'{library}: ')})") from None
+        if not new:
+            raise EngineError(f"is older than LLVM {OLDEST_LLVM}, or not LLVM at all; {needed}")
+    import drjit as dr
+    import mitsuba as mi
+
+    try:
+        mi.set_variant(variant)
+    except ImportError:
+        if variant == CUDA_VARIANT:
+            raise EngineError("no driver or no device was found") from None
+        raise
+    if variant == CPU_VARIANT:
+        found = dr.detail.llvm_version()
+        yield {"llvm": found}
+        if found[0] < OLDEST_LLVM:
+            raise EngineError(f"is LLVM {found[0]}; {needed}")
+    _exercise(mi, dr)
+
+
+def _exercise(mi: Any, dr: Any) -> None:
+    """Run kernels of the kinds that rendering uses: arithmetic, a symbolic loop, random numbers, a ray."""
+    n = 4096
+    index = dr.arange(mi.UInt32, n)
+    x = mi.Float(index) / n
+    if dr.sum(dr.minimum(mi.Float(index), 3) + dr.maximum(-x, 0))[0] != 3 * n - 6:
+        raise EngineError("a test kernel computed a wrong minimum")
+    generator = mi.PCG32(initstate=1, initseq=index)
+
+    def add(i: Any, total: Any, state: Any) -> Any:
+        return i + 1, total + state.next_float32(), state
+
+    _, total, _ = dr.while_loop(
+        (mi.UInt32(0), mi.Float(0), generator), lambda i, total, state: i < 8 + index % 8, add
+    )
+    mean = dr.sum(total)[0] / dr.sum(mi.Float(8 + index % 8))[0]
+    # 47104 uniform numbers: six standard deviations of their mean are 0.008.
+    if not abs(mean - 0.5) < 0.008:
+        raise EngineError("a test kernel drew wrong random numbers")
+    scene = mi.load_dict({"type": "scene", "shape": {"type": "rectangle"}})
+    hit = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, 0.25, 1 + x), mi.Vector3f(0, 0, -1)))
+    if not dr.all(dr.abs(hit.t - (1 + x)) < 1e-5)[0]:
+        raise EngineError("a test ray missed its target")

@@ -1,1 +1,0 @@
-"""Materials: which maps make one up, how they are read and checked, and what they hold."""

@@ -1,0 +1,232 @@
+"""Cloth → fibers: the tile that a :class:`~mbtf_gen.tile.fibers.cloth_file.ClothFile` describes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+
+from mbtf_core.errors import InputError
+from mbtf_core.files.digest import data_sha256, file_sha256
+from mbtf_gen.tile.fiber_tile import FiberScattering, FiberTile
+from mbtf_gen.tile.fibers.cloth_file import ClothFile, YarnEntry
+from mbtf_gen.tile.fibers.curve_files import read_curves
+from mbtf_gen.tile.fibers.curves import F64, Curve
+from mbtf_gen.tile.fibers.weave import knitted_lines, parse_draft, woven_lines
+from mbtf_gen.tile.fibers.yarn import CrossSection, YarnModel, count_segments, fibers_of
+from mbtf_gen.tile.fibers.yarn_pattern import read_pattern
+from mbtf_gen.tile.fibers.yarn_sets import YARNS, roughness_of
+
+# Defaults that depend on the structure.
+_WOVEN_WIDTH, _WOVEN_HEIGHT, _KNITTED_WIDTH = 0.95, 0.6, 0.45
+# Radius of the fibers of a .bcc file, which has none, over the width of the period.
+_CURVE_RADIUS = 0.002
+# Distance in tile widths within which ends of curves count as the same place.
+_AT_BORDER = 2e-3
+# Crossings of one tile, each of some hundred fiber segments.
+_MOST_CROSSINGS = 1 << 16
+# Periods that one fiber may reach over.
+_MOST_PERIODS = 16
+# Spline segments of one period: they take two gigabytes.
+MOST_SEGMENTS = 4_000_000
+
+
+def cloth_tile(spec: ClothFile, folder: Path) -> FiberTile:
+    """The tile of a cloth.
+
+    Parameters
+    ----------
+    spec : ClothFile
+        What to make.
+    folder : Path
+        Folder that its file names are relative to.
+
+    Returns
+    -------
+    FiberTile
+
+    Raises
+    ------
+    InputError
+        A file is unreadable, its curves do not tile, or there are too many fibers.
+    """
+    tile = _fibers(spec, folder)
+    files = {key: folder / name for key in ("pattern", "curves") if (name := getattr(spec, key)) is not None}
+    digests = {role: file_sha256(path) for role, path in files.items()}
+    # What the defaults stand for changes the data as well.
+    settings = spec.model_dump(mode="json", exclude={"pattern", "curves"})
+    settings["scattering"] = asdict(tile.scattering)
+    settings["yarns"] = [asdict(YARNS[entry.type]) for entry in (spec.yarn, spec.weft) if entry is not None]
+    digests["settings"] = data_sha256(settings)
+    kind = next(key for key in ("weave", "knit", "pattern", "curves") if getattr(spec, key) is not None)
+    named = f" of {files[kind].name}" if kind in files else ""
+    note = (
+        f"fibers: {len(tile.curves):,} with {tile.segments:,} segments ({kind}{named}), "
+        f"{tile.thickness:.3g} tile widths thick"
+    )
+    warnings: tuple[str, ...] = ()
+    if kind == "curves" and (loose := loose_ends(tile)):
+        what = f"{loose} ends at the border have no partner on the opposite side"
+        warnings = (f"{files[kind]}: {what}: the tile has a seam; check 'period'",)
+    return replace(
+        tile, files=files, digests=digests, warnings=warnings, notes=(note,), resolution=spec.resolution
+    )
+
+
+def _fibers(spec: ClothFile, folder: Path) -> FiberTile:
+    rng = np.random.default_rng(spec.seed)
+    if spec.curves is not None:
+        return _of_curves(spec, folder / spec.curves)
+    if spec.pattern is not None:
+        aspect, yarns = _of_pattern(spec, folder / spec.pattern)
+    elif spec.knit is not None:
+        aspect, yarns = _knitted(spec)
+    else:
+        aspect, yarns = _woven(spec)
+    total = sum(count_segments(line, section, _model(entry)) for line, section, entry, _ in yarns)
+    if not total <= MOST_SEGMENTS:
+        raise InputError(
+            f"would have {total:.2g} fiber segments, more than {MOST_SEGMENTS:,}",
+            where=folder,
+            hint="take fewer repeats or fibers, or wider yarns",
+        )
+    curves: list[Curve] = []
+    kind: list[int] = []
+    for line, section, entry, color in yarns:
+        fibers = fibers_of(line, section, _model(entry), rng)
+        curves += fibers
+        kind += [color] * len(fibers)
+    colors = [spec.yarn.color] if spec.weft is None else [spec.yarn.color, spec.weft.color]
+    tile = FiberTile.settled(aspect, curves, np.array(kind), np.array(colors), _scattering(spec))
+    return _checked(tile, folder)
+
+
+_Yarn = tuple[Curve, CrossSection, YarnEntry, int]
+
+
+def _woven(spec: ClothFile) -> tuple[float, list[_Yarn]]:
+    draft = parse_draft(spec.weave or "")
+    if draft.size * spec.repeat**2 > _MOST_CROSSINGS:
+        raise InputError(f"would have more than {_MOST_CROSSINGS:,} crossings", hint="take fewer repeats")
+    draft = np.tile(draft, (spec.repeat, spec.repeat))
+    rows, columns = draft.shape
+    warp, weft = spec.yarn, spec.weft or spec.yarn
+    sections = [_section(entry, 1.0 / columns, _WOVEN_WIDTH, _WOVEN_HEIGHT, True) for entry in (warp, weft)]
+    # Square crossings: yarns of both sets are equally far apart.
+    aspect = rows / columns
+    lines = woven_lines(draft, aspect, sum(section.height for section in sections))
+    yarns = [(line, sections[0], warp, 0) for line in lines[0]]
+    return aspect, yarns + [(line, sections[1], weft, 0 if spec.weft is None else 1) for line in lines[1]]
+
+
+def _knitted(spec: ClothFile) -> tuple[float, list[_Yarn]]:
+    knit = spec.knit
+    assert knit is not None
+    aspect = knit.aspect * knit.rows / knit.stitches
+    section = _section(spec.yarn, 0.5 / knit.stitches, _KNITTED_WIDTH, 1.0, False)
+    lines = knitted_lines(knit.stitches, knit.rows, aspect)
+    return aspect, [(line, section, spec.yarn, 0) for line in lines]
+
+
+def _of_pattern(spec: ClothFile, path: Path) -> tuple[float, list[_Yarn]]:
+    pattern = read_pattern(path)
+    section = _section(spec.yarn, 2.0 * pattern.radius, 1.0, 1.0, False)
+    period = np.array([1.0, pattern.aspect, 0.0])
+    lines = [Curve.through(yarn.points, 0.0, np.append(yarn.shift, 0) * period) for yarn in pattern.yarns]
+    return pattern.aspect, [(line, section, spec.yarn, 0) for line in lines]
+
+
+def _checked(tile: FiberTile, where: Path) -> FiberTile:
+    """The tile, unless fibers are thicker than a period or reach over many: tracing would never end."""
+    size = np.array([1.0, tile.aspect])
+    for curve in tile.curves:
+        points = curve.unrolled()
+        reach = np.ptp(points[:, :2], axis=0) + 2.0 * points[:, 3].max()
+        if not (reach <= _MOST_PERIODS * size).all():
+            raise InputError(
+                f"a fiber reaches over {np.max(reach / size):.3g} periods, more than {_MOST_PERIODS}",
+                where=where,
+                hint="check radii, widths and the period",
+            )
+    return tile
+
+
+def _section(entry: YarnEntry, space: float, width: float, height: float, flat: bool) -> CrossSection:
+    half = 0.5 * space * (entry.width or width)
+    return CrossSection(half, half * (entry.height or height), flat)
+
+
+def _model(entry: YarnEntry) -> YarnModel:
+    model = YARNS[entry.type]
+    return replace(
+        model,
+        fibers=entry.fibers or model.fibers,
+        fiber_radius=model.fiber_radius * entry.radius,
+        loops=model.loops * entry.flyaways,
+        hairs=model.hairs * entry.flyaways,
+    )
+
+
+def _scattering(spec: ClothFile) -> FiberScattering:
+    fiber, (along, around) = spec.fiber, roughness_of(spec.yarn.type)
+    return FiberScattering(
+        along if fiber.roughness is None else fiber.roughness,
+        around if fiber.azimuthal_roughness is None else fiber.azimuthal_roughness,
+        fiber.scale_tilt,
+        fiber.ior,
+    )
+
+
+def _of_curves(spec: ClothFile, path: Path) -> FiberTile:
+    curves = read_curves(path)
+    low, high = _bounds(curves)
+    width, height = spec.period or (high[0] - low[0], high[1] - low[1])
+    if not (width > 0 and height > 0):
+        raise InputError("its curves have no extent along x or y", where=path, hint="give their 'period'")
+    if ((high - low)[:2] > 3.0 * np.array([width, height])).any():
+        raise InputError(
+            f"its curves reach over {high[0] - low[0]:.4g} x {high[1] - low[1]:.4g}, more than three periods",
+            where=path,
+            hint="check 'period'",
+        )
+    radius = _CURVE_RADIUS * spec.yarn.radius
+    out = []
+    for curve in curves:
+        control = curve.control.copy()
+        control[:, :3] = (control[:, :3] - low) / width
+        control[:, 3] = np.where(control[:, 3] > 0, control[:, 3] / width * spec.yarn.radius, radius)
+        out.append(replace(curve, control=control))
+    kind = np.zeros(len(out), int)
+    colors = np.array([spec.yarn.color])
+    return _checked(FiberTile.settled(height / width, out, kind, colors, _scattering(spec)), path)
+
+
+def _bounds(curves: Sequence[Curve]) -> tuple[F64, F64]:
+    points = np.concatenate([curve.at(np.arange(len(curve.windows()) + 1.0))[0][:, :3] for curve in curves])
+    return points.min(axis=0), points.max(axis=0)
+
+
+def loose_ends(tile: FiberTile) -> int:
+    """Number of curves' ends on the tile's border that no end on the opposite side continues."""
+    ends = [c.at(np.array([0.0, len(c.windows())])) for c in tile.curves if c.shift is None]
+    if not ends:
+        return 0
+    from scipy.spatial import cKDTree
+
+    end, slope = (np.concatenate([both[k] for both in ends]) for k in (0, 1))
+    loose = 0
+    for axis, size in enumerate((1.0, tile.aspect)):
+        # A curve crosses the border that it runs towards.
+        crossing = np.abs(slope[:, axis]) >= np.abs(slope[:, 1 - axis])
+        low, high = (end[crossing & (np.abs(end[:, axis] - side) < _AT_BORDER)] for side in (0.0, size))
+        if not len(low) or not len(high):
+            loose += len(low) + len(high)
+            continue
+        other, box = 1 - axis, [(1.0, tile.aspect)[1 - axis], 0.0]
+        places = [np.column_stack([side[:, other] % box[0], side[:, 2]]) for side in (low, high)]
+        near, index = cKDTree(places[1], boxsize=box).query(places[0], distance_upper_bound=_AT_BORDER)
+        # Each end continues at most one of the other side.
+        loose += len(low) + len(high) - 2 * len(np.unique(index[np.isfinite(near)]))
+    return loose

@@ -1,0 +1,237 @@
+"""A tile of fibers, as it is traced."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbtf_gen.config.generator import GeometrySection
+from mbtf_gen.tile.fibers.curves import F64, Curve, copies
+from mbtf_gen.tile.protocol import REFLECTION, Tile
+from mbtf_gen.tile.tracers.protocol import TileGeometry
+
+# Coefficients of σ_a from the color of many fibers, of a polynomial in the azimuthal roughness: Chiang et al.
+# 2016, "A practical and controllable hair and fur model for production path tracing", equation 9.
+_ABSORPTION = (5.969, -0.215, 2.532, -10.73, 5.574, 0.245)
+# σ_a of fibers without transmission. Light inside a fiber travels 1.5 radii at least, so e⁻¹⁵⁰ of it is left.
+_OPAQUE = 100.0
+
+
+@dataclass(frozen=True)
+class FiberScattering:
+    """How fibers scatter light: Chiang et al. 2016, in Mitsuba's ``hair``.
+
+    Attributes
+    ----------
+    roughness : float
+        Longitudinal roughness β_M in [0, 1].
+    azimuthal_roughness : float
+        Azimuthal roughness β_N in [0, 1].
+    scale_tilt : float
+        Tilt of the cuticle scales in degrees.
+    ior : float
+        Index of refraction.
+    """
+
+    roughness: float = 0.3
+    azimuthal_roughness: float = 0.3
+    scale_tilt: float = 0.0
+    ior: float = 1.55
+
+    @property
+    def narrowest(self) -> float:
+        """Standard deviation of the narrowest lobe, along or around the fiber, in radians (Chiang et al.
+        2016, equations 7 and 8). Along the fiber, the transmitted lobe is half as wide as the reflected
+        one."""
+        b, n = self.roughness, self.azimuthal_roughness
+        along = 0.5 * (0.726 * b + 0.812 * b**2 + 3.7 * b**20)
+        # Of a logistic distribution.
+        scale = np.sqrt(np.pi / 8.0) * (0.265 * n + 1.194 * n**2 + 5.372 * n**22)
+        return float(min(along, scale * np.pi / np.sqrt(3.0)))
+
+
+@dataclass(frozen=True)
+class FiberTile(Tile):
+    """Fibers of one period.
+
+    Attributes
+    ----------
+    aspect : float
+        H/W of the tile.
+    curves : sequence of Curve
+        Fibers in tile widths; the highest touches the reference plane z = 0.
+    yarn : (n,) int array
+        Color of each fiber.
+    colors : (k, 3) float64 array
+        Colors of masses of fibers, linear Rec.709 in [0, 1].
+    scattering : FiberScattering
+        The same for all fibers.
+    """
+
+    kind = "fibers"
+
+    aspect: float
+    curves: Sequence[Curve]
+    yarn: NDArray[np.int_]
+    colors: F64
+    scattering: FiberScattering = FiberScattering()
+
+    @classmethod
+    def settled(
+        cls,
+        aspect: float,
+        curves: Sequence[Curve],
+        yarn: NDArray[np.int_],
+        colors: F64,
+        scattering: FiberScattering = FiberScattering(),
+    ) -> FiberTile:
+        """The tile with its fibers moved up or down until the highest touches the reference plane."""
+        top = max(curve.heights()[1] for curve in curves)
+        down = np.array([0.0, 0.0, -top])
+        return cls(aspect, [curve.moved(down) for curve in curves], yarn, colors, scattering)
+
+    @cached_property
+    def thickness(self) -> float:
+        """Height of the fibers' slab, in tile widths."""
+        return -min(curve.heights()[0] for curve in self.curves)
+
+    @property
+    def segments(self) -> int:
+        """Number of spline segments of one period."""
+        return sum(len(curve.unrolled()) - 3 for curve in self.curves)
+
+    def runs(self) -> tuple[list[F64], NDArray[np.int_]]:
+        """Runs of control points (m, 4) that reach into the box [0, 1] x [0, aspect], with their fibers."""
+        found = [(run, k) for k, curve in enumerate(self.curves) for run in copies(curve, (1.0, self.aspect))]
+        return [run for run, _ in found], np.array([k for _, k in found])
+
+    def trace(self, unit: float, below: bool = False) -> TileGeometry:
+        """The fibers as rays meet them."""
+        from mbtf_gen.tile.tracers.curve_tracer import CurveGeometry
+
+        runs, fiber = self.runs()
+        u = (self.yarn[fiber] + 0.5) / len(self.colors)
+        return CurveGeometry.of_runs(runs, u, self.aspect, self.thickness, unit)
+
+    def mitsuba_shapes(self, unit: float, folder: Path, bsdf: Mapping[str, Any]) -> dict[str, Any]:
+        """One shape per color: Mitsuba's own texture coordinates run around the fiber."""
+        out: dict[str, Any] = {}
+        for color in np.unique(self.yarn):
+            file = folder / f"color_{color}.txt"
+            with file.open("w") as text:
+                for number in np.flatnonzero(self.yarn == color):
+                    points = self.curves[int(number)].unrolled() - (0.5, 0.5 * self.aspect, 0.0, 0.0)
+                    np.savetxt(text, points * unit, fmt="%.9g")
+                    text.write("\n")
+            own = replace(self, colors=self.colors[[color]]).surface()
+            out[f"color_{color}"] = {"type": "bsplinecurve", "filename": str(file), "bsdf": own}
+        return out
+
+    def surface(
+        self, on: Collection[str] = REFLECTION, slopes: NDArray[np.float64] | None = None
+    ) -> dict[str, Any]:
+        """Mitsuba dictionary of the scattering of all colors: σ_a is a texture along u. Without the effect
+        ``transmission``, fibers absorb all light that enters them."""
+        import mitsuba as mi
+
+        s = self.scattering
+        sigma_a = absorption(self.colors, s.azimuthal_roughness)
+        pixels = np.asarray(sigma_a if "transmission" in on else np.full_like(sigma_a, _OPAQUE), np.float32)[
+            None
+        ]
+        return {
+            "type": "hair",
+            "sigma_a": {
+                "type": "bitmap",
+                "bitmap": mi.Bitmap(np.ascontiguousarray(pixels)),
+                "raw": True,
+                "filter_type": "nearest",
+                "wrap_mode": "clamp",
+            },
+            "longitudinal_roughness": s.roughness,
+            "azimuthal_roughness": s.azimuthal_roughness,
+            "scale_tilt": s.scale_tilt,
+            "int_ior": s.ior,
+        }
+
+    @property
+    def base_color(self) -> F64:
+        """Mean (3,) of the colors."""
+        return np.asarray(self.colors.mean(axis=0))
+
+    @property
+    def bsdf_type(self) -> str:
+        """``hair``."""
+        return "hair"
+
+    @property
+    def scatters(self) -> bool:
+        """Light passes through fibers."""
+        return True
+
+    def narrowest_lobe(self) -> tuple[float, str]:
+        """That of :attr:`FiberScattering.narrowest`."""
+        return self.scattering.narrowest, "narrowest lobe of the fibers"
+
+    def properties(self) -> dict[str, Any]:
+        """Numbers of fibers and segments, for the manifest."""
+        return {"fibers": len(self.curves), "segments": self.segments}
+
+    def inspect(self, options: GeometrySection, finest: int | None = None) -> dict[str, Any]:
+        """Statistics as plain data; lengths are in tile widths."""
+        self.configured(options)
+        radii = np.concatenate([curve.control[:, 3] for curve in self.curves])
+        slopes = [curve.at(np.arange(4 * len(curve.windows())) / 4.0)[1] for curve in self.curves]
+        length = sum(float(np.linalg.norm(slope[:, :3], axis=1).sum()) / 4.0 for slope in slopes)
+        volume = np.pi * float(np.mean(radii**2)) * length / (self.aspect * self.thickness)
+        return {
+            "resolution": self.lattice(finest).shape()[1],
+            "aspect": self.aspect,
+            "fibers": {
+                "count": len(self.curves),
+                "segments": self.segments,
+                "thickness": self.thickness,
+                "radius": [float(radii.min()), float(radii.max())],
+                "length": length,
+                "share_of_volume": volume,
+            },
+            "colors": self.colors.tolist(),
+            "scattering": asdict(self.scattering),
+            "warnings": list(self.warnings),
+            "notes": list(self.notes),
+        }
+
+    def describe(self, found: Mapping[str, Any], name: str) -> str:
+        """The data of :meth:`inspect` as text for people."""
+        f, s = found["fibers"], found["scattering"]
+        low, high = f["radius"]
+        radius = f"{low:.3g}" if low == high else f"{low:.3g} .. {high:.3g}"
+        colors = "; ".join(" ".join(f"{c:.2f}" for c in color) for color in found["colors"])
+        return "\n".join(
+            [
+                f"{name}: tile 1 x {found['aspect']:.4g}, fibers, resolution {found['resolution']}",
+                "",
+                f"fibers      {f['count']:,} of {f['segments']:,} segments, radius {radius}, together "
+                f"{f['length']:.3g} tile widths long",
+                f"cloth       {f['thickness']:.3g} tile widths thick, "
+                f"{f['share_of_volume']:.0%} of it fibers",
+                f"color       {colors}",
+                f"scattering  roughness {s['roughness']:g} along and {s['azimuthal_roughness']:g} around the "
+                f"fiber, scales tilted by {s['scale_tilt']:g}°, index of refraction {s['ior']:g}",
+                *(f"warning     {text}" for text in found["warnings"]),
+            ]
+        )
+
+
+def absorption(color: F64, azimuthal_roughness: float) -> F64:
+    """Absorption σ_a, per fiber radius, with which a mass of fibers has a color (Chiang et al. 2016, equation
+    9)."""
+    b = azimuthal_roughness
+    powers = np.array([1.0, b, b**2, b**3, b**4, b**5])
+    return np.asarray((np.log(np.clip(color, 1e-3, 1.0)) / (powers @ _ABSORPTION)) ** 2)

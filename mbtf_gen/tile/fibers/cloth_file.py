@@ -1,0 +1,115 @@
+"""Schema of a ``material.yaml`` that describes cloth: a weave, a knit, or a file of yarns or fibers."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from mbtf_core.config.settings import FileName, Settings
+from mbtf_core.data.schema import Tiling
+from mbtf_gen.config.generator import Resolution
+from mbtf_gen.config.values import Positive, Rgb, no_tiling
+from mbtf_gen.tile.fibers.yarn_sets import YarnName
+
+# Files that can be given in place of a material file, by suffix, with the key that names them there.
+CURVE_FILES = {".pyp": "pattern", ".bcc": "curves", ".curves": "curves"}
+# Exactly one of them describes the cloth.
+CLOTH_KEYS = {"weave", "knit", "pattern", "curves"}
+
+
+class YarnEntry(Settings):
+    """One kind of yarn."""
+
+    type: YarnName = Field("cotton2", description="published yarn: its plies, fibers, twist and flyaways")
+    color: Rgb = Field((0.7, 0.7, 0.7), description="color of a mass of its fibers, linear")
+    width: Positive | None = Field(
+        None,
+        description="width over the distance of neighboring yarns, default 0.95 woven and 0.45 knitted; over "
+        "that of the file for a pattern, default 1",
+    )
+    height: Annotated[float, Field(gt=0, le=4)] | None = Field(
+        None, description="height over width; default 0.6 woven, else 1"
+    )
+    fibers: Annotated[int, Field(ge=1, le=100_000)] | None = Field(
+        None, description="fibers of a ply; default: those of the type"
+    )
+    radius: Annotated[float, Field(gt=0, le=100)] = Field(
+        1.0, description="factor on the radius of the fibers of the type"
+    )
+    flyaways: Annotated[float, Field(ge=0, le=100)] = Field(
+        1.0, description="factor on the number of loops and hairs of the type"
+    )
+
+
+class FiberEntry(Settings):
+    """How fibers scatter light."""
+
+    # Mitsuba loses light and overflows below.
+    roughness: Annotated[float, Field(ge=0.08, le=1)] | None = Field(
+        None, description="longitudinal roughness; default: that of the yarn's material"
+    )
+    azimuthal_roughness: Annotated[float, Field(ge=0.02, le=1)] | None = Field(
+        None, description="azimuthal roughness; default: that of the yarn's material"
+    )
+    scale_tilt: Annotated[float, Field(ge=-10, le=10)] = Field(
+        0.0, description="tilt of the scales in degrees"
+    )
+    ior: Annotated[float, Field(ge=1.1, le=2)] = Field(1.55, description="index of refraction")
+
+
+class KnitEntry(Settings):
+    """A stockinette."""
+
+    stitches: Annotated[int, Field(ge=1, le=256)] = Field(4, description="stitches across the tile")
+    rows: Annotated[int, Field(ge=1, le=256)] = Field(4, description="rows up the tile")
+    # Loops of other shapes pass through one another.
+    aspect: Annotated[float, Field(ge=0.72, le=0.85)] = Field(
+        0.8, description="height of a stitch over its width"
+    )
+
+
+class ClothFile(Settings):
+    """Content of a ``material.yaml`` of cloth; file names are relative to its folder."""
+
+    weave: str | None = Field(
+        None,
+        max_length=100_000,
+        description="plain, basket n, twill over/under, satin n/step, or rows of X (warp above) and . (weft)",
+    )
+    knit: KnitEntry | None = Field(None, description="a stockinette")
+    pattern: FileName | None = Field(None, description="a periodic yarn pattern (.pyp)")
+    curves: FileName | None = Field(None, description="fibers as curves: .bcc, or Mitsuba's text (.curves)")
+    repeat: Annotated[int, Field(ge=1, le=64)] = Field(
+        1, description="repeats of a weave along each side of the tile, with other fibers each"
+    )
+    period: tuple[Positive, Positive] | None = Field(
+        None,
+        description="width and height of one period of `curves`, in the file's units; default: its bounds",
+    )
+    yarn: YarnEntry = Field(YarnEntry(), description="the yarns")
+    weft: YarnEntry | None = Field(None, description="the wefts of a weave, where they differ")
+    fiber: FiberEntry = Field(FiberEntry(), description="how fibers scatter light")
+    seed: Annotated[int, Field(ge=0, lt=1 << 32)] = Field(0, description="random numbers of the fibers")
+    resolution: Resolution = Field(128, description="texels across at the finest level, a power of two")
+
+    @model_validator(mode="after")
+    def _one(self) -> ClothFile:
+        given = [key for key in sorted(CLOTH_KEYS) if getattr(self, key) is not None]
+        if len(given) != 1:
+            raise ValueError(
+                f"needs one of weave, knit, pattern, curves, not {' and '.join(given) or 'none'}"
+            )
+        unused = {"width", "height", "fibers", "flyaways"} & self.yarn.model_fields_set
+        if self.curves is not None and unused:
+            raise ValueError(f"'yarn.{min(unused)}' does not apply to 'curves', which are fibers")
+        if self.curves is not None and "seed" in self.model_fields_set:
+            raise ValueError("'seed' does not apply to 'curves', which are fibers")
+        for key, owner in (("repeat", "weave"), ("weft", "weave"), ("period", "curves")):
+            if key in self.model_fields_set and given != [owner]:
+                raise ValueError(f"'{key}' goes with '{owner}'")
+        return self
+
+    def tiling(self, given: Tiling | None) -> Tiling:
+        """Method for maps that do not tile, which these are not."""
+        return no_tiling(given)

@@ -1,0 +1,260 @@
+"""Yarns → plies → fibers: the procedural model of Zhao, Luan and Bala 2016, "Fitting procedural yarn models
+for realistic cloth rendering" (ACM TOG 35(4)), sections 3.2 and 5.1.
+
+Plies are twisted around the yarn's center line, at the distance ``R_ply``. Their cross-sections are ellipses
+with the short axis towards the center. Fibers are twisted around the center of their ply. Their distances R
+from it, in [0, 1], have the density ``p(R) = (1 - 2ε) ((e - e^R)/(e - 1))^β + ε`` over the disk (equation 1).
+A fiber migrates: while it turns by θ, its distance is
+``R_min R + (1 - R_min) R/2 (cos(s θ + φ) + 1)`` (equation 3). Flyaways are loops, one swing of a fiber that
+is pulled out, and hairs, arcs that leave the ply (equation 11).
+
+Everything closes over the tile: the turns of plies, fibers and swings per period are rounded to whole
+numbers.
+"""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import dataclass
+
+import numpy as np
+
+from mbtf_gen.tile.fibers.curves import F64, LEAST_POINTS, Curve, closed_frames, level_frames
+
+# Points of a fiber per turn around its ply, and per segment of the center line.
+_PER_TURN, _PER_SEGMENT = 12, 2
+# Points of a hair.
+_HAIR_POINTS = 8
+
+Spread = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class YarnModel:
+    """Statistics of a yarn. Lengths are in centimeters.
+
+    Attributes
+    ----------
+    plies, fibers : int
+        Plies of the yarn, fibers of a ply.
+    fiber_radius : float
+        Radius of a fiber.
+    beta, epsilon : float
+        Distribution of the fibers over a ply's cross-section.
+    pitch, ply_pitch : float
+        Length of one turn of fibers around their ply, and of plies around the yarn; negative: clockwise.
+    migration, swing : float
+        R_min and s of the migration.
+    long_axis, short_axis : float
+        Half axes of a ply's cross-section.
+    ply_distance : float
+        Distance of a ply's center from that of the yarn.
+    loops, hairs : float
+        Flyaways per centimeter of a ply.
+    loop_reach, hair_start, hair_rise, hair_length, hair_turn : (float, float)
+        Mean and standard deviation of the distance of a loop from the ply's center, of that of a hair's
+        start, of how much further its end is, of its length along the ply, and of the angle in radians around
+        it.
+    """
+
+    plies: int
+    fibers: int
+    fiber_radius: float
+    beta: float
+    epsilon: float
+    pitch: float
+    ply_pitch: float
+    migration: float
+    swing: float
+    long_axis: float
+    short_axis: float
+    ply_distance: float
+    loops: float
+    hairs: float
+    loop_reach: Spread
+    hair_start: Spread
+    hair_rise: Spread
+    hair_length: Spread
+    hair_turn: Spread
+
+    @property
+    def radius(self) -> float:
+        """Half of the yarn's thickness, without flyaways."""
+        return self.ply_distance + self.short_axis if self.plies > 1 else self.long_axis
+
+
+@dataclass(frozen=True)
+class CrossSection:
+    """Half axes of a yarn in tile widths: along the cloth and perpendicular to it.
+
+    A yarn that is `flat` keeps its axes parallel to the reference plane; its center line must be nowhere
+    vertical. Otherwise the axes follow the center line without turning.
+    """
+
+    width: float
+    height: float
+    flat: bool
+
+
+def fibers_of(line: Curve, section: CrossSection, model: YarnModel, rng: np.random.Generator) -> list[Curve]:
+    """Fibers of a yarn.
+
+    Parameters
+    ----------
+    line : Curve
+        Closed center line; its radii are not used.
+    section : CrossSection
+        Size of the yarn, which also scales its pitches and its fibers.
+    model : YarnModel
+        Statistics.
+    rng : numpy.random.Generator
+        Random numbers.
+
+    Returns
+    -------
+    list of Curve
+        Of each ply, its fibers and then its hairs.
+    """
+    assert line.shift is not None
+    length, scale, turns, ply_turns = _turns(line, section, model)
+    n = _points(line, turns, ply_turns)
+    s = np.arange(n) / n
+    frame = _Frame(line, s, section, model)
+    radius = model.fiber_radius * scale
+    out = []
+    for ply in range(model.plies):
+        around = 2.0 * np.pi * (ply_turns * s + ply / model.plies)
+        distance, phase = _disk(rng, model)
+        start = 2.0 * np.pi * rng.random(model.fibers)
+        pulled = _pulled(rng, model, length / scale)
+        swings = max(1, round(model.swing * abs(turns)))
+        for k in range(model.fibers):
+            angle = 2.0 * np.pi * turns * s + phase[k]
+            swing = 2.0 * np.pi * swings * s + start[k]
+            reach = 0.5 * (1.0 + model.migration + (1.0 - model.migration) * np.cos(swing)) * distance[k]
+            if k in pulled:
+                reach = reach * _loop(swing, pulled[k] / distance[k])
+            points = frame.points(around, reach * np.cos(angle), reach * np.sin(angle))
+            out.append(Curve.through(points, radius, line.shift))
+        out += _hairs(rng, model, frame, (ply_turns, ply / model.plies), length / scale, radius)
+    return out
+
+
+def count_segments(line: Curve, section: CrossSection, model: YarnModel) -> float:
+    """Number of spline segments of :func:`fibers_of`."""
+    length, scale, turns, ply_turns = _turns(line, section, model)
+    hairs = model.hairs * length / scale * (_HAIR_POINTS - 3)
+    return model.plies * (model.fibers * _points(line, turns, ply_turns) + hairs)
+
+
+def _turns(line: Curve, section: CrossSection, model: YarnModel) -> tuple[float, float, int, int]:
+    """(length of a center line, tile widths per centimeter, turns of fibers, turns of plies)."""
+    segments = len(line.control)
+    fine = np.arange(16 * segments) / 16.0
+    length = float(np.linalg.norm(line.at(fine)[1][:, :3], axis=1).mean() * segments)
+    scale = 0.5 * (section.width + section.height) / model.radius
+    ply_turns = _whole(length / (scale * model.ply_pitch)) if model.plies > 1 else 0
+    return length, scale, _whole(length / (scale * model.pitch)), ply_turns
+
+
+def _points(line: Curve, turns: int, ply_turns: int) -> int:
+    """Points of a fiber."""
+    return max(
+        _PER_SEGMENT * len(line.control), _PER_TURN * max(abs(turns + ply_turns), abs(turns)), LEAST_POINTS
+    )
+
+
+def _whole(turns: float) -> int:
+    """Nearest whole number of turns, at least one, with its sign."""
+    return int(np.sign(turns)) * max(1, round(abs(turns)))
+
+
+class _Frame:
+    """Positions around a center line at parameters s in [0, 1)."""
+
+    def __init__(self, line: Curve, s: F64, section: CrossSection, model: YarnModel) -> None:
+        at, slope = line.at(s * len(line.control))
+        tangent = slope[:, :3] / np.linalg.norm(slope[:, :3], axis=1)[:, None]
+        frames = level_frames if section.flat else closed_frames
+        self.center, (self.side, self.up) = at[:, :3], frames(tangent)
+        self.s, self.line, self.shift, self.model = s, line, line.shift, model
+        self.scale = np.array([section.width, section.height]) / model.radius
+
+    def points(self, around: F64, radial: F64, tangential: F64) -> F64:
+        """Points (n, 3) at coordinates in a ply's cross-section, in half axes; the ply's center lies at the
+        angle `around` the yarn."""
+        model = self.model
+        c, s = np.cos(around), np.sin(around)
+        out = (model.ply_distance if model.plies > 1 else 0.0) + model.short_axis * radial
+        across = model.long_axis * tangential
+        x, y = (out * c - across * s) * self.scale[0], (out * s + across * c) * self.scale[1]
+        return np.asarray(self.center + x[:, None] * self.side + y[:, None] * self.up)
+
+    def between(self, s: F64) -> _Frame:
+        """The frame at other parameters, which may go on beyond the period."""
+        other = copy(self)
+        turns = np.floor(s)
+        at = (s - turns) * len(self.s)
+        low = at.astype(int)
+        share = (at - low)[:, None]
+
+        def mixed(values: F64) -> F64:
+            return np.asarray((1.0 - share) * values[low] + share * values[(low + 1) % len(values)])
+
+        other.s = s
+        other.center = (
+            self.line.at((s - turns) * len(self.line.control))[0][:, :3] + turns[:, None] * self.shift
+        )
+        other.side, other.up = mixed(self.side), mixed(self.up)
+        return other
+
+
+def _disk(rng: np.random.Generator, model: YarnModel) -> tuple[F64, F64]:
+    """(distances in [0, 1], angles) of a ply's fibers, by rejection sampling (algorithm 2)."""
+    found = np.zeros((0, 2))
+    while len(found) < model.fibers:
+        xy = 2.0 * rng.random((4 * model.fibers, 2)) - 1.0
+        distance = np.hypot(*xy.T)
+        base = np.maximum((np.e - np.exp(distance)) / (np.e - 1.0), 0.0)
+        density = (1.0 - 2.0 * model.epsilon) * base**model.beta + model.epsilon
+        found = np.concatenate([found, xy[(distance < 1.0) & (rng.random(len(xy)) < density)]])
+    x, y = found[: model.fibers].T
+    return np.hypot(x, y), np.arctan2(y, x)
+
+
+def _pulled(rng: np.random.Generator, model: YarnModel, length: float) -> dict[int, float]:
+    """Fibers of a ply that have a loop, with its reach in half axes."""
+    count = min(int(model.loops * length), model.fibers)
+    chosen = rng.choice(model.fibers, count, replace=False)
+    reach = rng.normal(*model.loop_reach, count) / model.long_axis
+    return {int(k): max(float(r), 1.0) for k, r in zip(chosen, reach, strict=True)}
+
+
+def _loop(swing: F64, factor: float) -> F64:
+    """Factors on the distances of a fiber: its first whole swing in the period is pulled out."""
+    through = np.clip((swing - swing[0]) / (2.0 * np.pi), 0.0, 1.0)
+    return np.asarray(1.0 + (max(factor, 1.0) - 1.0) * 0.5 * (1.0 - np.cos(2.0 * np.pi * through)))
+
+
+def _hairs(
+    rng: np.random.Generator,
+    model: YarnModel,
+    frame: _Frame,
+    ply: tuple[int, float],
+    length: float,
+    radius: float,
+) -> list[Curve]:
+    """Hairs of a ply, given by its turns and its phase in turns, of a length in centimeters."""
+    out = []
+    t = np.linspace(0.0, 1.0, _HAIR_POINTS)
+    for _ in range(int(model.hairs * length)):
+        begin, angle = rng.random(), 2.0 * np.pi * rng.random()
+        spreads = (model.hair_start, model.hair_rise, model.hair_length, model.hair_turn)
+        first, rise, along, turn = (rng.normal(*spread) for spread in spreads)
+        s = begin + t * along / length
+        reach = np.abs(first + rise * t) / model.long_axis
+        turned = angle + turn * t
+        around = 2.0 * np.pi * (ply[0] * s + ply[1])
+        points = frame.between(s).points(around, reach * np.cos(turned), reach * np.sin(turned))
+        out.append(Curve(np.column_stack([points, np.full(len(points), radius)])))
+    return out

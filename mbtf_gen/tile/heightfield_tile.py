@@ -1,0 +1,347 @@
+"""A displaced plane: a height map, and maps or constants of its reflectance."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbtf_core.data.lattice import Lattice
+from mbtf_core.errors import InputError
+from mbtf_core.images.read import LUMINANCE
+from mbtf_core.images.resample import resample
+from mbtf_gen.config.generator import GeometrySection
+from mbtf_gen.config.values import NormalMode, Tracer
+from mbtf_gen.tile.heights.grid import HeightGrid, tile_mesh
+from mbtf_gen.tile.heights.slopes import residual_slopes
+from mbtf_gen.tile.heights.statistics import detail_size, repeats, rms_slope, slope_angles
+from mbtf_gen.tile.inspection import ALBEDO_RANGE, inspection_text, oddities
+from mbtf_gen.tile.maps.checks import suggestion_warning
+from mbtf_gen.tile.maps.discovery import Convention
+from mbtf_gen.tile.maps.map_loader import Color, MapFacts
+from mbtf_gen.tile.maps.material_file import LOBES, REFLECTING, ROLES
+from mbtf_gen.tile.maps.normal_map import NormalFit
+from mbtf_gen.tile.maps.quantization import Codes
+from mbtf_gen.tile.maps.tiling import Seam, broken
+from mbtf_gen.tile.protocol import REFLECTION, Tile, displacement_fault
+from mbtf_gen.tile.reflectance import plugin_dictionary
+from mbtf_gen.tile.tracers.protocol import TileGeometry
+
+# Displacement range, in tile widths, above which a default height scale is probably wrong.
+_STEEP = 0.5
+# Default limit of the mesh cells across the tile.
+DEFAULT_MESH = 512
+# Order of the maps in descriptions and in what makes them tileable.
+MAPS = ("height", *ROLES)
+
+
+@dataclass(frozen=True)
+class HeightFieldTile(Tile):
+    """A displaced plane with maps, as :func:`~mbtf_gen.tile.loading.load_tile` returns it.
+
+    All maps have row 0 at ``v → 1``; their resolutions may differ.
+
+    Attributes
+    ----------
+    height : (H, W) float64 array
+        Stored heights: code / largest code of integer images, unchanged numbers of float images. Quantized
+        heights are smoothed within half a level; heights of a mirrored tile are halved.
+    maps : dict
+        Colors are linear Rec.709, (h, w, 3) or (3,); shares are (h, w) or one number, both in [0, 1];
+        ``normal`` holds unit vectors (h, w, 3), x along u and y along v (OpenGL). Roles that a material lacks
+        are missing. Without roughness, metallic and specular the surface is Lambert.
+    height_bits : int or None
+        8 or 16; None for floats.
+    height_from : {"default", "material file", "given"}
+        Where the height scale comes from.
+    mesh : int or None
+        Cells across the tile; by default the width of the map, at most 512. Coarser grids average the map
+        (box filter), finer grids interpolate it (cubic).
+    tracer : {"heightfield", "mesh"}
+        How rays find the surface: cell by cell, or by Mitsuba as triangles.
+    max_displacement : float
+        Largest accepted displacement range, in tile widths.
+    bsdf : dict or None
+        Mitsuba dictionary that replaces the reflectance maps.
+    facts : dict of str to MapFacts
+        Content of the file of each role.
+    codes : Codes or None
+        Distribution of integer height codes; None for floats.
+    seams : tuple of Seam
+        Seams of the heights before any tiling method.
+    normal_fit : NormalFit or None
+        Comparison of the normal map with the heights; None without a map, or where either is flat.
+    normal_convention : {"gl", "dx"} or None
+        Convention that the normal map was read in; None without a map.
+    """
+
+    kind = "displaced"
+
+    height: NDArray[np.float64]
+    height_bits: int | None = None
+    height_from: Literal["default", "material file", "given"] = "default"
+    mesh: int | None = None
+    tracer: Tracer = "heightfield"
+    max_displacement: float = math.inf
+    bsdf: dict[str, Any] | None = None
+    facts: dict[str, MapFacts] = field(default_factory=dict)
+    codes: Codes | None = None
+    seams: tuple[Seam, ...] = ()
+    normal_fit: NormalFit | None = None
+    normal_convention: Convention | None = None
+
+    @property
+    def aspect(self) -> float:
+        """Height of the tile over its width, H/W of the maps."""
+        return self.height.shape[0] / self.height.shape[1]
+
+    @cached_property
+    def grid(self) -> HeightGrid:
+        """The heights, resampled to the grid of the mesh; an InputError where their range is too large."""
+        columns = min(self.height.shape[1], DEFAULT_MESH) if self.mesh is None else self.mesh
+        rows = max(1, round(self.aspect * columns))
+        heights = resample(self.height, rows, columns, "cubic").astype(np.float64)
+        grid = replace(HeightGrid.from_map(heights, self.height_scale, self.aspect), tracer=self.tracer)
+        if fault := displacement_fault(grid.displacement_range, self.max_displacement):
+            raise InputError(fault[0], where=self.files.get("height"), hint=fault[1])
+        return grid
+
+    def coarser_grid(self, most: int) -> HeightGrid:
+        """:attr:`grid`, or a coarser one of at most so many cells along each side."""
+        if max(self.grid.z.shape) <= most:
+            return self.grid
+        return self.at(mesh=max(1, min(most, int(most / self.aspect)))).grid
+
+    @property
+    def thickness(self) -> float:
+        """Largest height difference of the grid, in tile widths."""
+        return self.grid.displacement_range
+
+    def at(self, height_scale: float | None = None, mesh: int | None = None) -> Self:
+        """The tile at another height scale and resolution of the mesh; None keeps the present ones."""
+        given: dict[str, Any] = {} if mesh is None else {"mesh": mesh}
+        if height_scale is not None:
+            given |= {"height_scale": height_scale, "height_from": "given"}
+        return replace(self, **given)
+
+    def configured(self, options: GeometrySection) -> Self:
+        """The tile under the options of the geometry, whose range is checked once its grid is used."""
+        found = self.at(options.height_scale, options.mesh)
+        return replace(found, tracer=options.tracer, max_displacement=options.max_displacement)
+
+    def trace(self, unit: float, below: bool = False) -> TileGeometry:
+        """The heights as rays meet them."""
+        return self.grid.trace(unit, below)
+
+    def mitsuba_shapes(self, unit: float, folder: Path, bsdf: Mapping[str, Any]) -> dict[str, Any]:
+        """The triangles of the grid, from a file."""
+        mesh = tile_mesh(self.grid)
+        mesh.apply_translation([-0.5, -0.5 * self.aspect, 0.0])
+        mesh.apply_scale(unit)
+        file = folder / "tile.ply"
+        file.write_bytes(mesh.export(file_type="ply", vertex_normal=False))
+        flat = {"face_normals": True, "flip_tex_coords": True}
+        return {"tile": {"type": "ply", "filename": str(file), **flat, "bsdf": dict(bsdf)}}
+
+    def lattice(self, finest: int | None = None) -> Lattice:
+        """Texel grids of the levels up to `finest`; by default up to the material's own resolution, else to
+        that of the map."""
+        if finest is None and self.resolution is not None:
+            finest = self.resolution.bit_length() - 1
+        rows, columns = self.height.shape
+        return Lattice.for_map(rows, columns, finest)
+
+    def surface(
+        self, on: Collection[str] = REFLECTION, slopes: NDArray[np.float64] | None = None
+    ) -> dict[str, Any]:
+        """Mitsuba dictionary of the reflectance, of all effects but opacity by default."""
+        if self.bsdf is not None:
+            return dict(self.bsdf)
+        names = ["base_color", "roughness"]
+        for effect in (*REFLECTING, "opacity"):
+            weight = self.maps.get(effect)
+            if (
+                effect in on
+                and weight is not None
+                and (effect != "metallic" or np.any(np.asarray(weight) > 0))
+            ):
+                names += [name for name, role in ROLES.items() if role.effect == effect]
+        maps = {name: self.maps[name] for name in names if name in self.maps}
+        if slopes is not None:
+            maps["slopes"] = np.concatenate([slopes, np.zeros_like(slopes[..., :1])], axis=-1)
+        return plugin_dictionary(maps)
+
+    @property
+    def base_color(self) -> Color:
+        """(h, w, 3) or (3,) linear color."""
+        return np.asarray(self.maps["base_color"])
+
+    @property
+    def images(self) -> dict[str, Any]:
+        """Maps and constants by role, heights included."""
+        return {"height": self.height, **self.maps}
+
+    def with_maps(self, **maps: Any) -> Self:
+        """The tile with some maps or constants replaced, and without those that are None."""
+        given = {**self.maps, **maps}
+        return replace(self, maps={name: value for name, value in given.items() if value is not None})
+
+    def normal_slopes(self, mode: NormalMode = "residual") -> tuple[NDArray[np.float64], float] | None:
+        """Slopes that the normal map adds, see :func:`~mbtf_gen.tile.heights.slopes.residual_slopes`."""
+        if "normal" not in self.maps or self.bsdf is not None or mode == "off":
+            return None
+        return residual_slopes(self.maps["normal"], self.grid, mode)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the maps and of the heights."""
+        return sum(np.asarray(values).nbytes for values in (self.height, *self.maps.values()))
+
+    @property
+    def bsdf_type(self) -> str | None:
+        """Type of the BSDF that replaces the maps; None without one."""
+        return None if self.bsdf is None else str(self.bsdf["type"])
+
+    @property
+    def is_lambert(self) -> bool:
+        """Whether the base layer is Lambert because no roughness, metallic or specular is given."""
+        return self.bsdf is None and not self.maps.keys() & LOBES.keys()
+
+    @property
+    def transmits(self) -> bool:
+        """Whether there is an opacity mask."""
+        return "opacity" in self.maps
+
+    def narrowest_lobe(self) -> tuple[float, str] | None:
+        """(width in radians, what it is of) of the narrowest lobe; None where a BSDF replaces the maps."""
+        if self.bsdf is not None:
+            return None
+        widths = [
+            role.lobe(float(np.min(np.asarray(self.maps[name]))))
+            for name, role in ROLES.items()
+            if role.lobe is not None and name in self.maps
+        ]
+        return min([2.0, *widths]), "narrowest lobe"
+
+    def properties(self) -> dict[str, Any]:
+        """Sizes of map and mesh, and the height scale, for the manifest."""
+        return {
+            "maps_shape": list(self.height.shape),
+            "mesh_shape": list(self.grid.z.shape),
+            "height_scale": self.height_scale,
+        }
+
+    def inspect(self, options: GeometrySection, finest: int | None = None) -> dict[str, Any]:
+        """Statistics of the heights and of each map; ``oddities`` lists unusual properties in words."""
+        return self.at(options.height_scale, options.mesh)._statistics(finest, options.max_displacement)
+
+    def _statistics(self, finest: int | None, max_displacement: float) -> dict[str, Any]:
+        fault = displacement_fault(self.thickness, max_displacement)
+        refused = [f"{self.files['height']}: generation refuses it: {'; '.join(fault)}"] if fault else []
+        grid = self.grid
+        median, high, steepest = slope_angles(grid)
+        whole = rms_slope(self.at(mesh=self.height.shape[1]).grid)
+        constants = {role: value for role, value in self.maps.items() if np.ndim(value) < 2}
+        if self.bsdf is not None:
+            del constants["base_color"]
+        found: dict[str, Any] = {
+            "aspect": self.aspect,
+            "make_tileable": self.tiling,
+            "resolution": self.lattice(finest).shape()[1],
+            "maps": {role: {**asdict(f), "file": str(f.file)} for role, f in self.facts.items()},
+            "constants": {role: np.asarray(value).tolist() for role, value in constants.items()},
+            "surface": self.bsdf["type"] if self.bsdf else "diffuse" if self.is_lambert else "glossy",
+            "geometry": {
+                "height_scale": self.height_scale,
+                "height_scale_from": self.height_from,
+                "map": list(self.height.shape),
+                "mesh": list(grid.z.shape),
+                "displacement_range": abs(grid.displacement_range),
+                "slope_median_deg": median,
+                "slope_p99_deg": high,
+                "slope_max_deg": steepest,
+                "slope_kept": rms_slope(grid) / whole if whole > 0 else 1.0,
+            },
+            "heights": {
+                "codes": None if self.codes is None else asdict(self.codes),
+                "distinct": len(np.unique(self.height)),
+                "detail_texels": detail_size(self.height),
+                "repeats": [repeats(self.height, axis) for axis in (1, 0)],
+            },
+            "tiling": [{**asdict(s), "ratio": s.ratio, "tiles": not broken(s)} for s in self.seams],
+            "albedo": self._albedo(),
+            "normal": self._normal(),
+            "opacity": self._opacity(),
+            "unused": self.unused,
+            "warnings": [*self.warnings_in_use(), *refused],
+            "notes": list(self.notes),
+        }
+        return {**found, "oddities": oddities(found)}
+
+    def _albedo(self) -> dict[str, Any] | None:
+        if self.bsdf is not None:
+            return None
+        color = np.asarray(self.base_color, np.float64)
+        luminance = color @ np.asarray(LUMINANCE)
+        low, high = ALBEDO_RANGE
+        return {
+            "min": float(luminance.min()),
+            "median": float(np.median(luminance)),
+            "max": float(luminance.max()),
+            "mean_rgb": color.reshape(-1, 3).mean(axis=0).tolist(),
+            "share_above": float(np.mean(luminance > high)),
+            "share_below": float(np.mean(luminance < low)),
+        }
+
+    def _normal(self) -> dict[str, Any] | None:
+        if "normal" not in self.maps:
+            return None
+        tilt = np.degrees(np.arccos(np.clip(self.maps["normal"][..., 2], -1.0, 1.0)))
+        median, high = (float(p) for p in np.percentile(tilt, (50, 99)))
+        out: dict[str, Any] = {"tilt_median_deg": median, "tilt_p99_deg": high}
+        fit = self.normal_fit
+        if fit is not None:
+            sign = 1.0 if self.normal_convention == "gl" else -1.0
+            out |= {**asdict(fit), "correlation_v": sign * fit.correlation_v}
+            out["suggested_height_scale"] = fit.scale if fit.fits else None
+        return {**out, "convention": self.normal_convention}
+
+    def _opacity(self) -> dict[str, Any] | None:
+        if "opacity" not in self.maps:
+            return None
+        opacity = np.asarray(self.maps["opacity"])
+        return {
+            "holes": float(np.mean(opacity < 0.5)),
+            "partly": float(np.mean((opacity > 0.02) & (opacity < 0.98))),
+        }
+
+    def describe(self, found: Mapping[str, Any], name: str) -> str:
+        """The data of :meth:`inspect` as text for people."""
+        return inspection_text(found, name)
+
+    def summary(self) -> str:
+        """Mesh, height scale and displacement range."""
+        rows, columns = self.grid.z.shape
+        return (
+            f"mesh: {columns} x {rows} cells, height scale {self.height_scale:.4g} ({self.height_from}), "
+            f"displacement range {self.thickness:.4g} tile widths"
+        )
+
+    def warnings_in_use(self) -> tuple[str, ...]:
+        """Warnings, those of the height scale in use included."""
+        path, extent = self.files["height"], float(np.ptp(self.height))
+        text = None
+        if extent == 0:
+            text = f"{path}: its heights are constant: the tile is flat"
+        elif "normal" in self.files:
+            text = suggestion_warning(self.files["normal"], self.normal_fit, self.height_scale)
+        extent *= abs(self.height_scale)
+        if text is None and self.height_from == "default" and extent > _STEEP:
+            text = f"{path}: the displacement range is {extent:.4g} tile widths; check --height-scale"
+        return self.warnings if text is None else (*self.warnings, text)

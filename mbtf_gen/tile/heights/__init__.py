@@ -1,0 +1,1 @@
+"""Height grids: triangles, slopes, statistics."""

@@ -1,0 +1,1 @@
+"""The maps of a material: recognized, read, checked, made tileable."""

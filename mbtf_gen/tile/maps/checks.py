@@ -1,0 +1,139 @@
+"""Consistency checks of a material's maps, as messages: heights, tiling, normals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mbtf_core.errors import InputError
+from mbtf_core.images.read import Image
+from mbtf_gen.tile.maps.discovery import Convention
+from mbtf_gen.tile.maps.normal_map import NormalFit
+from mbtf_gen.tile.maps.quantization import Codes
+from mbtf_gen.tile.maps.tiling import Seam, broken
+
+CONVENTION_NAMES: dict[Convention, str] = {"gl": "OpenGL", "dx": "DirectX"}
+# Mean spread of the channels, relative to the largest number, beyond which an image is a color picture.
+_COLORED = 0.02
+# Levels, and codes between them, that 8-bit heights in a 16-bit file have.
+_FEW_LEVELS, _FAR_APART = 1024, 16.0
+# Ratio of a height scale to the one that the normal map suggests, above which a warning is given.
+_FAR_OFF = 1.5
+
+
+def refuse_color(image: Image) -> None:
+    """Refuse a color image as a height map: channels that differ by more than 2 % on average."""
+    if image.pixels.shape[2] < 3:
+        return
+    rgb = image.pixels[..., :3].astype(np.float64)
+    largest = float(np.abs(rgb).max())
+    if largest == 0 or float(np.mean(np.ptp(rgb, axis=-1))) <= _COLORED * largest:
+        return
+    red, green, blue = rgb.mean(axis=(0, 1))
+    normals = abs(red - 0.5) < 0.1 and abs(green - 0.5) < 0.1 and blue > 0.7
+    raise InputError(
+        f"is colored{' like a normal map' if normals else ''}; a height map is gray",
+        where=image.path,
+        hint="if one of its channels stores the heights, name it in a material.yaml: "
+        f"height: {{file: {image.path.name}, channel: R}}",
+    )
+
+
+def coarse_step(codes: Codes, bits: int) -> float | None:
+    """Quantization step of the heights in codes; None where it is too fine to show as terraces."""
+    hidden = codes.levels <= _FEW_LEVELS and codes.spacing >= _FAR_APART
+    return codes.rounding if bits == 8 or hidden else None
+
+
+def level_warning(path: Path, codes: Codes, bits: int, step: float, smoothed: bool) -> str:
+    """The warning that heights have few levels."""
+    apart = f" {codes.spacing:.4g} codes apart" if codes.spacing > 1 else ""
+    within = f"smoothed within {'half a code' if step == 1 else f'{step / 2:.3g} codes'}"
+    done = within if smoothed else "not smoothed (dequantize: false)"
+    return f"{path}: {bits}-bit heights with {codes.levels} distinct values{apart}; {done}"
+
+
+def seam_warning(path: Path, seams: Sequence[Seam], factor: float) -> str | None:
+    """The warning that heights do not tile; `factor` takes stored heights to tile widths."""
+    bad = [s for s in seams if broken(s)]
+    if not bad:
+        return None
+    worst = max(bad, key=lambda s: s.ratio)
+    return (
+        f"{path}: does not tile along {' and '.join(s.axis for s in bad)}: the seam is a step of "
+        f"{abs(factor) * worst.step:.2g} tile widths, {worst.ratio:.3g} times the interior's 99th "
+        "percentile; --make-tileable mirror or --make-tileable blend closes it"
+    )
+
+
+def orientation_warning(fit: NormalFit, normal: Path, height: Path) -> str | None:
+    """The warning that the normal map matches the heights only when turned, mirrored or inverted."""
+    if not fit.misfit:
+        return None
+    found = f"correlation of their slopes {fit.best:.2f}, against {fit.as_is:.2f} as given"
+    if not fit.turn:
+        return (
+            f"{normal}: fits the heights only upside down ({found}); "
+            "if dark is high, give a negative --height-scale"
+        )
+    which, other = (height, normal) if fit.image == "height" else (normal, height)
+    return f"{which}: fits {other.name} only when {fit.turn} ({found}); turn it, or one of the two is wrong"
+
+
+def choose_convention(
+    fit: NormalFit | None, named: Convention | None, asked: Convention | None, path: Path
+) -> tuple[Convention, str, str | None]:
+    """(convention, its source, warning or None) of a normal map.
+
+    The material file takes precedence over the data, the data over the file name; the default is OpenGL.
+    """
+    claim = asked or named
+    shown = None if fit is None else fit.convention
+    chosen: Convention = asked or shown or named or "gl"
+    if asked and asked != shown:
+        how = "as configured"
+    elif shown:
+        how = "as the heights' slopes show"
+    else:
+        how = "by its name" if named else "assumed: the heights do not decide"
+    if fit is None or shown is None or claim is None or claim == shown:
+        return chosen, how, None
+    warning = (
+        f"{path}: the {'convention in the material file' if asked else 'name'} implies "
+        f"{CONVENTION_NAMES[claim]}, the heights' slopes imply {CONVENTION_NAMES[shown]} "
+        f"(correlation {fit.as_is:.2f} against {min(fit.gl, fit.dx):.2f}); "
+        f"read as {CONVENTION_NAMES[chosen]}"
+    )
+    return chosen, how, warning
+
+
+def signed(correlation: float) -> str:
+    """A correlation as text; NaN, where either has no slopes, as ``undefined``."""
+    return "undefined" if math.isnan(correlation) else f"{correlation:+.2f}"
+
+
+def suggestion_warning(path: Path, fit: NormalFit | None, factor: float) -> str | None:
+    """The warning that the height scale in use is over 1.5 times, or under 1/1.5 of, the one that the normal
+    map suggests."""
+    if fit is None or not fit.fits or fit.scale == 0:
+        return None
+    ratio = factor / fit.scale
+    if 1 / _FAR_OFF <= ratio <= _FAR_OFF:
+        return None
+    return (
+        f"{path}: its slopes suggest --height-scale {fit.scale:.3g}; {factor:.3g} is in use, "
+        f"{ratio:{'.0f' if abs(ratio) >= 10 else '.2g'}} times as much"
+    )
+
+
+def normal_note(path: Path, fit: NormalFit | None, convention: Convention, how: str) -> str:
+    """Convention of a normal map, its correlation with the heights, and the height scale it suggests."""
+    text = f"normal map: {path.name}, {CONVENTION_NAMES[convention]}, {how}"
+    if fit is None:
+        return text
+    v = fit.correlation_v if convention == "gl" else -fit.correlation_v
+    text += f"; correlation of the slopes u {signed(fit.correlation_u)}, v {signed(v)}"
+    return f"{text}; suggested --height-scale {fit.scale:.3g}" if fit.fits else text

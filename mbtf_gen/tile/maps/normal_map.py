@@ -1,0 +1,192 @@
+"""Comparison of a normal map with its height map: convention, orientation, scale.
+
+A normal map usually repeats the slopes of its height map. We compare the slopes of the normals,
+``t = (-n_x/n_z, -n_y/n_z)``, with those of the heights, ``s = (∂h/∂u, ∂h/∂y)``, y = a·v. Their correlation
+over all texels and both components, ``Σ s·t / √(Σ s² Σ t²)``, is near 1 where they agree. We evaluate it for
+all likely errors: one image turned or mirrored (the eight symmetries of a square), an inverted green channel
+(DirectX), inverted heights.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbtf_core.images.resample import resample
+from mbtf_gen.tile.heights.grid import HeightGrid
+from mbtf_gen.tile.heights.slopes import height_slopes, normal_slopes
+from mbtf_gen.tile.maps.discovery import Convention
+
+Array = NDArray[np.floating[Any]]
+Turned = Literal["height", "normal"] | None
+
+# Rotations and mirrorings of an image, as displayed.
+SYMMETRIES: dict[str, Callable[[Array], Array]] = {
+    "turned by 90 degrees counter-clockwise": lambda a: np.rot90(a, 1),
+    "turned by 180 degrees": lambda a: np.rot90(a, 2),
+    "turned by 90 degrees clockwise": lambda a: np.rot90(a, 3),
+    "mirrored left to right": lambda a: np.flip(a, 1),
+    "mirrored top to bottom": lambda a: np.flip(a, 0),
+    "transposed": lambda a: np.swapaxes(a, 0, 1),
+    "transposed along the other diagonal": lambda a: np.swapaxes(np.rot90(a, 2), 0, 1),
+}
+# Texels across, at most, that orientations are compared at, and that the scale is fitted at.
+_COMPARED, _FITTED = 512, 2048
+# The data decide where a correlation exceeds the first number and its rival by the second; of n texels, no
+# less than chance allows (multiples of 1/√n).
+_CLEAR, _AHEAD = (0.3, 8.0), (0.1, 4.0)
+# Correlations so close are one.
+_TIE = 1e-6
+_FLATTEST = 0.1
+_SMALLEST = 4
+
+
+@dataclass(frozen=True)
+class NormalFit:
+    """Result of :func:`fit_normals`.
+
+    Attributes
+    ----------
+    correlation_u, correlation_v : float
+        Correlation of the slopes along u and along v, of the unchanged images in the OpenGL convention; NaN
+        where either has no slopes.
+    gl, dx : float
+        Correlation over both components of the unchanged images, in the OpenGL and the DirectX convention.
+    convention : {"gl", "dx"} or None
+        The convention with the clearly larger correlation; None if the data do not decide.
+    fits : bool
+        Whether the unchanged images clearly match.
+    misfit : bool
+        Whether they clearly match only after one is rotated or mirrored, or the heights are inverted.
+    image : {"height", "normal"} or None
+        Image to be rotated or mirrored for the best match. With None, a misfit means inverted heights.
+    turn : str
+        How it is to be rotated or mirrored: a key of :data:`SYMMETRIES`, or empty.
+    best : float
+        Correlation of the best match.
+    scale : float
+        Height scale in tile widths (signed) whose slopes fit the normals of the unchanged images best in the
+        better convention (least squares).
+    """
+
+    correlation_u: float
+    correlation_v: float
+    gl: float
+    dx: float
+    convention: Convention | None
+    fits: bool
+    misfit: bool
+    image: Turned
+    turn: str
+    best: float
+    scale: float
+
+    @property
+    def as_is(self) -> float:
+        """Correlation of the images as they are, in the better of the two conventions."""
+        return max(self.gl, self.dx)
+
+
+def slopes_of_heights(height: Array) -> Array:
+    """Slopes (2, H-2, W-2) of heights (H, W) along u and y = a·v, in stored heights per tile width. The
+    outermost texels are left out: heights need not tile."""
+    grid = HeightGrid(np.asarray(height, np.float64), height.shape[0] / height.shape[1])
+    return np.moveaxis(height_slopes(grid)[1:-1, 1:-1], -1, 0)
+
+
+def slopes_of_normals(normal: Array) -> Array:
+    """Slopes (2, H-2, W-2) along u and y that normals (H, W, 3) claim, their mean removed."""
+    slopes = np.moveaxis(normal_slopes(normal[1:-1, 1:-1], _FLATTEST), -1, 0)
+    return slopes - slopes.mean(axis=(1, 2), keepdims=True)
+
+
+def fit_normals(height: Array, normal: Array) -> NormalFit | None:
+    """Compare a normal map with the heights of the same tile.
+
+    Parameters
+    ----------
+    height : (H, W) array
+        Stored heights.
+    normal : (h, w, 3) array
+        Unit vectors, y along v (OpenGL). Both maps are box-filtered to the coarser resolution.
+
+    Returns
+    -------
+    NormalFit or None
+        None if heights or normals are flat, or have fewer than 4 texels along a side.
+    """
+    fitted = _common(height, normal, _FITTED)
+    if min(fitted[0].shape) < _SMALLEST:
+        return None
+    s, t = slopes_of_heights(fitted[0]), slopes_of_normals(fitted[1])
+    if not _energy(s) > 0 or not _energy(t) > 1e-9 * t.size:
+        return None
+    h, n = _common(height, normal, _COMPARED)
+    guesses = _guesses(h, n)
+    gl, dx, highest = guesses[0][0], guesses[1][0], max(score for score, _, _ in guesses)
+    # Symmetric tiles match in several ways: of the best ones, the most likely.
+    best, image, turn = next(guess for guess in guesses if guess[0] >= highest - _TIE)
+    here = max(gl, dx)
+    clear, ahead = (max(low, factor / math.sqrt(h.size)) for low, factor in (_CLEAR, _AHEAD))
+    misfit = highest >= clear and highest - here >= ahead
+    fits = here >= clear and not misfit
+    better: Convention = "gl" if gl >= dx else "dx"
+    sign = np.array([1.0, 1.0 if better == "gl" else -1.0])[:, None, None]
+    return NormalFit(
+        correlation_u=_correlation(s[0], t[0]),
+        correlation_v=_correlation(s[1], t[1]),
+        gl=gl,
+        dx=dx,
+        convention=better if fits and abs(gl - dx) >= ahead else None,
+        fits=fits,
+        misfit=misfit,
+        image=image,
+        turn=turn,
+        best=best,
+        scale=float((s * t * sign).sum() / _energy(s)),
+    )
+
+
+def _common(height: Array, normal: Array, limit: int) -> tuple[Array, Array]:
+    """Both at the coarser of their resolutions, of at most `limit` texels along a side."""
+    rows, columns = (min(height.shape[axis], normal.shape[axis]) for axis in (0, 1))
+    shrink = max(1.0, max(rows, columns) / limit)
+    size = max(1, round(rows / shrink)), max(1, round(columns / shrink))
+    return resample(height, *size), resample(normal, *size)
+
+
+def _energy(slopes: Array) -> float:
+    return float((slopes * slopes).sum())
+
+
+def _correlation(s: Array, t: Array) -> float:
+    norm = math.sqrt(_energy(s) * _energy(t))
+    return float((s * t).sum()) / norm if norm > 0 else float("nan")
+
+
+def _guesses(height: Array, normal: Array) -> list[tuple[float, Turned, str]]:
+    """Every candidate (correlation, image to turn, how), the more likely ones first.
+
+    The first two are the unchanged images in the OpenGL and the DirectX convention; then inverted heights.
+    """
+    s, t = slopes_of_heights(height), slopes_of_normals(normal)
+    norm = math.sqrt(_energy(s) * _energy(t))
+
+    def scores(a: Array, b: Array) -> tuple[float, float]:
+        along_u, along_v = float((a[0] * b[0]).sum()), float((a[1] * b[1]).sum())
+        return (along_u + along_v) / norm, (along_u - along_v) / norm
+
+    gl, dx = scores(s, t)
+    out: list[tuple[float, Turned, str]] = [(score, None, "") for score in (gl, dx, -gl, -dx)]
+    for turn, move in SYMMETRIES.items():
+        if move(height).shape != height.shape:
+            continue
+        # Pixels are turned, their vectors are not; slopes of turned heights follow.
+        out += [(score, "height", turn) for score in scores(slopes_of_heights(move(height)), t)]
+        out += [(score, "normal", turn) for score in scores(s, np.stack([move(t[0]), move(t[1])]))]
+    return out

@@ -1,0 +1,1 @@
+"""How rays find the surface of a tile: height fields, triangles, fibers."""

@@ -1,0 +1,160 @@
+"""Cloth as a material: its file, its options, its place in a job."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.paths import ASSETS
+
+from mbtf_core.errors import InputError, MbtfError, UsageError
+from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.job import Job
+from mbtf_gen.tile.fiber_tile import FiberScattering, FiberTile, absorption
+from mbtf_gen.tile.loading import load_material
+
+# Sum of all control points and radii of the basket weave.
+GOLDEN = 31350.997477935016
+
+WEAVE = "weave: plain\nyarn: {type: silk1, fibers: 3}\n"
+
+
+def write(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "cloth.yaml"
+    path.write_text(text)
+    return path
+
+
+def fibers(tmp_path: Path, text: str) -> Any:
+    found = load_material(write(tmp_path, text))
+    assert found is not None
+    return found
+
+
+def test_a_weave_has_the_yarns_of_its_draft(tmp_path: Path) -> None:
+    found = fibers(
+        tmp_path,
+        "weave: |\n  X..\n  .X.\nyarn: {fibers: 5, flyaways: 0}\n"
+        "weft: {color: 0.2, fibers: 5, flyaways: 0}\n",
+    )
+    assert found.aspect == pytest.approx(2 / 3)
+    # Four plies of five fibers in three warps and two wefts.
+    assert len(found.curves) == 4 * 5 * 5
+    assert np.bincount(found.yarn).tolist() == [60, 40]
+    assert found.colors[1].tolist() == [0.2, 0.2, 0.2]
+    assert max(curve.heights()[1] for curve in found.curves) == pytest.approx(0.0, abs=1e-12)
+    repeated = fibers(tmp_path, "weave: plain\nrepeat: 3\nyarn: {fibers: 2, flyaways: 0}\n")
+    assert len(repeated.curves) == 12 * 4 * 2
+
+
+def test_every_option_changes_the_digest(tmp_path: Path) -> None:
+    texts = [
+        WEAVE,
+        WEAVE.replace("plain", "basket 2"),
+        WEAVE.replace("silk1", "silk2"),
+        WEAVE + "repeat: 2\n",
+        WEAVE + "seed: 1\n",
+        WEAVE + "weft: {type: silk1, fibers: 3}\n",
+        WEAVE + "fiber: {roughness: 0.5}\n",
+        WEAVE + "fiber: {azimuthal_roughness: 0.5}\n",
+        WEAVE + "fiber: {scale_tilt: 1}\n",
+        WEAVE + "fiber: {ior: 1.4}\n",
+        WEAVE + "resolution: 64\n",
+        *(
+            WEAVE.replace("fibers: 3", change)
+            for change in ("fibers: 4", "fibers: 3, color: 0.1", "fibers: 3, width: 0.5")
+        ),
+        *(WEAVE.replace("fibers: 3", f"fibers: 3, {c}") for c in ("height: 0.9", "flyaways: 2", "radius: 2")),
+    ]
+    digests = {str(load_material(write(tmp_path, text)).digests) for text in texts}
+    assert len(digests) == len(texts)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("weave: plain\nknit: {}\n", "one of"),
+        ("yarn: {}\nweave: tweed\n", "not a weave"),
+        ("knit: {}\nrepeat: 2\n", "goes with"),
+        ("weave: plain\nyarn: {type: nylon}\n", "type"),
+        ("weave: plain\nheight: h.exr\n", "height"),
+        ("pattern: missing.pyp\n", "cannot be read"),
+        ("weave: basket 64\nrepeat: 64\n", "crossings"),
+        ("weave: basket 9\nyarn: {fibers: 90000}\n", "segments"),
+        ("weave: plain\nyarn: {width: 0.00001}\n", "segments"),
+        ("weave: plain\nyarn: {flyaways: 100, width: 0.001}\n", "segments"),
+        ("weave: plain\nyarn: {width: 1000000}\n", "periods"),
+        ("weave: plain\nfiber: {roughness: 0.01}\n", "roughness"),
+        ("knit: {aspect: 0.5}\n", "aspect"),
+        ("curves: a.curves\nyarn: {flyaways: 2}\n", "flyaways"),
+        ("curves: a.curves\nseed: 2\n", "seed"),
+    ],
+)
+def test_faults_are_one_line(tmp_path: Path, text: str, says: str) -> None:
+    with pytest.raises(InputError) as error:
+        load_material(write(tmp_path, text))
+    assert says in str(error.value)
+    assert "\n" not in error.value.what
+
+
+@pytest.mark.parametrize(
+    "geometry", [{"height_scale": 0.5}, {"mesh": 1}, {"tracer": "mesh"}, {"make_tileable": "mirror"}]
+)
+def test_options_of_height_maps_are_refused(tmp_path: Path, geometry: dict[str, Any]) -> None:
+    path = write(tmp_path, WEAVE)
+    with pytest.raises(UsageError):
+        Job.load(GeneratorConfig.model_validate({"material": str(path), "geometry": geometry}))
+
+
+def test_white_absorbs_nothing_and_darker_colors_more() -> None:
+    color = np.array([1.0, 0.9, 0.5, 0.1, 0.0])
+    found = absorption(color, 0.3)
+    assert found[0] == 0.0
+    assert (np.diff(found) > 0).all()
+    # Chiang et al. 2016, equation 9, at β_N = 0.3: the polynomial is 5.888.
+    assert found[2] == pytest.approx((np.log(0.5) / 5.888) ** 2, rel=1e-3)
+
+
+def test_curves_that_do_not_repeat_are_noted(tmp_path: Path) -> None:
+    (tmp_path / "a.curves").write_text("".join(f"{x / 4} 0.5 0 .02\n" for x in range(-1, 6)))
+    (tmp_path / "b.curves").write_text("".join(f"{x / 4} {0.5 + 0.1 * x} 0 .02\n" for x in range(-1, 6)))
+    for name, count in (("a", 0), ("b", 1)):
+        path = write(tmp_path, f"curves: {name}.curves\nperiod: [1, 1]\n")
+        assert len(load_material(path).warnings) == count
+
+
+def test_neighbors_do_not_hide_a_seam(tmp_path: Path) -> None:
+    rows = [
+        "".join(f"{x / 4} {y + 0.1 * x} 0 .001\n" for x in range(-1, 6)) + "\n" for y in (0.2, 0.2015, 0.203)
+    ]
+    (tmp_path / "a.curves").write_text("".join(rows))
+    found = load_material(write(tmp_path, "curves: a.curves\nperiod: [1, 1]\n"))
+    assert "6 ends" in found.warnings[0]
+
+
+def test_a_thick_cloth_is_refused_as_steep_heights_are(tmp_path: Path) -> None:
+    path = write(tmp_path, WEAVE)
+    described = {"material": str(path), "geometry": {"max_displacement": 0.01}}
+    with pytest.raises(InputError, match="displacement"):
+        Job.load(GeneratorConfig.model_validate(described))
+
+
+def test_fibers_are_the_same_on_every_machine() -> None:
+    """Shards of one data set may come from several."""
+    found = load_material(ASSETS / "basket_weave")
+    assert isinstance(found, FiberTile)
+    points = np.concatenate([curve.control for curve in found.curves])
+    assert points.sum() == pytest.approx(GOLDEN, abs=1e-6)
+
+
+def test_narrow_lobes_are_found_along_and_around_the_fiber() -> None:
+    assert FiberScattering(0.72, 0.6).narrowest == pytest.approx(np.radians(27.0), rel=0.02)
+    assert FiberScattering(0.72, 0.02).narrowest < np.radians(1.0)
+
+
+def test_curves_that_reach_too_far_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.curves").write_text("".join(f"{x} 0.5 0 .02\n" for x in range(9)))
+    with pytest.raises(MbtfError, match="period"):
+        load_material(write(tmp_path, "curves: a.curves\nperiod: [1, 1]\n"))

@@ -1,0 +1,177 @@
+"""Files of yarns and fibers: what is read, and that nothing else raises but one clear line."""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mbtf_core.errors import InputError, MbtfError
+from mbtf_gen.tile.fiber_tile import FiberTile
+from mbtf_gen.tile.fibers.cloth_file import CURVE_FILES
+from mbtf_gen.tile.fibers.curve_files import read_curves
+from mbtf_gen.tile.fibers.yarn_pattern import read_pattern
+from mbtf_gen.tile.loading import load_material
+
+PYP = """*pattern
+0.004 0.002 0.0003 1
+*Q
+0.0005 0.0005 0 0
+0.0015 0.0005 0.0002 0
+0.0025 0.0005 0 0
+0.0035 0.0005 -0.0002 0
+*E
+0 1 0 0
+1 2 0 0
+2 3 0 0
+3 0 1 0
+"""
+CURVES = "0 0 0 .1\n1 0 0 .1\n2 0 0 .1\n3 0 0 .1\n\n\n0 1 0 .2\n1 1 0 .2\n2 1 0 .2\n3 1 0 .2\n4 1 0 .2\n"
+
+
+def bcc(lines: list[tuple[np.ndarray, bool]], up: int = 2, **changes: object) -> bytes:
+    fields: dict[str, object] = {
+        "magic": b"BCC",
+        "sizes": 0x44,
+        "kind": b"C",
+        "spline": b"0",
+        "dimensions": 3,
+    }
+    fields |= {"up": up, "curves": len(lines), "points": sum(len(p) for p, _ in lines)} | changes
+    header = struct.pack("<3sBccBBQQ40s", *fields.values(), b"test")
+    body = b"".join(
+        struct.pack("<i", -len(p) if closed else len(p)) + p.astype("<f4").tobytes() for p, closed in lines
+    )
+    return header + body
+
+
+def fails(path: Path, read: object = read_curves) -> str:
+    with pytest.raises(InputError) as error:
+        read(path)  # type: ignore[operator]
+    assert "\n" not in error.value.what
+    return error.value.what
+
+
+def test_a_pattern_has_the_yarns_of_its_edges(tmp_path: Path) -> None:
+    path = tmp_path / "a.pyp"
+    path.write_text(PYP)
+    pattern = read_pattern(path)
+    assert (pattern.aspect, pattern.radius, pattern.width) == pytest.approx((0.5, 0.075, 0.004))
+    (yarn,) = pattern.yarns
+    assert yarn.shift.tolist() == [1, 0]
+    assert yarn.points[:, 0] == pytest.approx([0.125, 0.375, 0.625, 0.875])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("0.004 0.002", "-0.004 0.002", "positive"),
+        ("*E", "*F", "'*E'"),
+        ("0.0015 0.0005 0.0002 0", "0.0015 nan 0.0002 0", "line 5"),
+        ("0.0015 0.0005 0.0002 0", "0.0015 0.0005", "line 5"),
+        ("3 0 1 0", "3 9 1 0", "beyond"),
+        ("3 0 1 0", "3 2 1 0", "closed yarns"),
+        ("3 0 1 0\n", "", "closed yarns"),
+        ("1 2 0 0", "1 2.5 0 0", "indices"),
+        ("*pattern", "", "*pattern"),
+        ("3 0 1 0", "3 0 100000000 0", "indices"),
+        ("3 0 1 0", "3 0 1e300 0", "indices"),
+        ("3 0 1 0", "3 0 90 0", "periods"),
+        ("0.0005 0.0005 0 0", "0.0005 1e200 0 0", "periods"),
+        ("0.0015 0.0005 0.0002 0", "0.0005 0.0005 0 0", "same place"),
+    ],
+)
+def test_damaged_patterns_are_refused(tmp_path: Path, old: str, new: str, says: str) -> None:
+    path = tmp_path / "a.pyp"
+    assert PYP.count(old)
+    path.write_text(PYP.replace(old, new, 1))
+    assert says in fails(path, read_pattern)
+
+
+def test_a_bcc_has_open_and_closed_curves_through_its_points(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    points, ring = rng.random((6, 3)), rng.random((5, 3))
+    path = tmp_path / "a.bcc"
+    for up in (2, 1):
+        path.write_bytes(bcc([(points, False), (ring, True)], up))
+        first, second = read_curves(path)
+        order = [0, 1, 2] if up == 2 else [2, 0, 1]
+        assert first.shift is None
+        assert second.shift is not None
+        at = first.at(np.arange(6.0))[0][:, :3]
+        assert np.abs(at - points[:, order]).max() < 1e-6
+        at = second.at(np.arange(6.0))[0][:, :3]
+        assert np.abs(at - ring[:, order][[0, 1, 2, 3, 4, 0]]).max() < 1e-6
+
+
+def test_the_deviation_from_catmull_rom_curves_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", logger="mbtf_gen")
+    path = tmp_path / "a.bcc"
+    found = []
+    for count in (8, 16):
+        t = 2.0 * np.pi * np.arange(count) / count
+        path.write_bytes(bcc([(np.column_stack([np.cos(t), np.sin(t), 0.0 * t]), True)]))
+        read_curves(path)
+        (told,) = (m for m in caplog.messages if "at most " in m)
+        caplog.clear()
+        found.append(float(told.split("at most ")[1].split()[0]))
+    # Of the unit circle, both curves miss the middles in fourth order of the distance of the points.
+    halfway = [(9.0 * np.cos(np.pi / n) - np.cos(3.0 * np.pi / n)) / 8.0 for n in (8, 16)]
+    assert found[0] == pytest.approx(abs(1.0 - halfway[0]), rel=0.6)
+    assert 10.0 < found[0] / found[1] < 22.0
+
+
+def test_text_has_control_points_and_radii(tmp_path: Path) -> None:
+    path = tmp_path / "a.curves"
+    path.write_text(CURVES)
+    first, second = read_curves(path)
+    assert (len(first.control), len(second.control)) == (4, 5)
+    assert second.control[4].tolist() == [4, 1, 0, 0.2]
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "says"),
+    [
+        ("a.curves", CURVES.replace("2 0 0 .1", "2 0 0"), "line 3"),
+        ("a.curves", CURVES.replace("2 0 0 .1", "2 0 x .1"), "line 3"),
+        ("a.curves", CURVES.replace("2 0 0 .1", "2 0 inf .1"), "finite"),
+        ("a.curves", CURVES.replace("2 0 0 .1", "2 0 0 0"), "radius"),
+        ("a.curves", CURVES.replace("3 0 0 .1\n", ""), "fewer than 4"),
+        ("a.curves", "", "no curves"),
+        ("a.bcc", "BCC", "too short"),
+    ],
+)
+def test_damaged_curves_are_refused(tmp_path: Path, name: str, data: str, says: str) -> None:
+    path = tmp_path / name
+    path.write_text(data)
+    assert says in fails(path)
+
+
+@settings(max_examples=150, deadline=None)
+@given(data=st.data(), kind=st.sampled_from([".pyp", ".curves", ".bcc"]))
+def test_altered_files_load_or_are_refused(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject, kind: str
+) -> None:
+    whole = {
+        ".pyp": PYP.encode(),
+        ".curves": CURVES.encode(),
+        ".bcc": bcc([(np.random.default_rng(0).random((6, 3)), False)]),
+    }[kind]
+    start = data.draw(st.integers(0, len(whole) - 1))
+    length = data.draw(st.integers(0, 8))
+    changed = whole[:start] + data.draw(st.binary(max_size=8)) + whole[start + length :]
+    folder = tmp_path_factory.mktemp("fuzz")
+    (folder / f"a{kind}").write_bytes(changed)
+    path = folder / "cloth.yaml"
+    path.write_text(f"{CURVE_FILES[kind]}: a{kind}\nyarn: {{fibers: 1, flyaways: 0}}\n")
+    with contextlib.suppress(MbtfError):
+        material = load_material(path)
+        assert isinstance(material, FiberTile)
+        assert np.isfinite(material.thickness)

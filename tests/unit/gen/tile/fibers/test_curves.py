@@ -1,0 +1,90 @@
+"""Uniform cubic B-splines that repeat with the tile."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.interpolate import BSpline
+
+from mbtf_gen.tile.fibers.curves import Curve, closed_frames, copies, interpolating, level_frames
+
+SHIFT = np.array([1.0, 0.0, 0.0])
+
+
+def wavy(n: int = 12, seed: int = 0, shift: np.ndarray = SHIFT) -> Curve:
+    """A closed curve that leaves the tile on several sides."""
+    rng = np.random.default_rng(seed)
+    points = np.column_stack([np.zeros(n), 0.9 + 0.3 * rng.random(n), 0.1 * rng.random(n)])
+    return Curve.through(points + np.arange(n)[:, None] / n * shift, 0.01, shift)
+
+
+def test_a_closed_curve_passes_through_its_points_and_repeats_after_its_shift() -> None:
+    rng = np.random.default_rng(1)
+    points = np.column_stack([np.arange(9) / 9, rng.random((9, 2))])
+    curve = Curve.through(points, 0.02, SHIFT)
+    at, _ = curve.at(np.arange(10.0))
+    expected = np.concatenate([points, points[:1] + SHIFT])
+    # The knot between two segments lies on the point of the second of their four control points.
+    assert np.abs(at[:, :3] - expected).max() < 1e-12
+    assert np.abs(at[:, 3] - 0.02).max() < 1e-12
+
+
+def test_positions_and_derivatives_are_those_of_the_b_spline() -> None:
+    control = np.random.default_rng(2).random((7, 4))
+    spline = BSpline(np.arange(-3.0, 8.0), control, 3)
+    t = np.linspace(0.0, 4.0, 41)
+    at, slope = Curve(control).at(t)
+    assert np.abs(at - spline(t)).max() < 1e-12
+    assert np.abs(slope - spline.derivative()(t)).max() < 1e-11
+
+
+def test_straight_lines_are_kept() -> None:
+    points = np.arange(5)[:, None] / 5 * SHIFT
+    assert np.abs(interpolating(points, SHIFT) - points).max() < 1e-15
+
+
+@pytest.mark.parametrize("kind", ["closed", "two periods", "diagonal", "open"])
+@pytest.mark.parametrize("aspect", [1.0, 0.6])
+def test_copies_cover_the_box_exactly(aspect: float, kind: str) -> None:
+    shift = {"two periods": np.array([2.0, 0, 0]), "diagonal": np.array([1.0, aspect, 0.0])}.get(kind, SHIFT)
+    curve = wavy(shift=shift)
+    if kind == "open":
+        curve = Curve(curve.unrolled())
+    runs = list(copies(curve, (1.0, aspect)))
+    segments = np.concatenate(
+        [np.lib.stride_tricks.sliding_window_view(run, 4, axis=0).transpose(0, 2, 1) for run in runs]
+    )
+    middles = np.einsum("k,mkc->mc", [1 / 48, 23 / 48, 23 / 48, 1 / 48], segments)
+    # Every point of the endless curve that lies in the box is the middle of exactly one segment there.
+    position = curve.at(np.arange(12) + 0.5)[0][:, :3]
+    for i in range(-3, 4):
+        for j in range(-4, 5):
+            moved = position + np.array([i, j * aspect, 0.0])
+            inside = (moved[:, 0] > 0) & (moved[:, 0] < 1) & (moved[:, 1] > 0) & (moved[:, 1] < aspect)
+            for point in moved[inside]:
+                assert np.count_nonzero(np.abs(middles[:, :3] - point).max(axis=1) < 1e-12) == 1
+    # No segment is listed that stays outside.
+    low = segments[:, :, :2].min(axis=1) - segments[:, :, 3].max(axis=1)[:, None]
+    high = segments[:, :, :2].max(axis=1) + segments[:, :, 3].max(axis=1)[:, None]
+    assert (high >= 0).all()
+    assert (low <= (1.0, aspect)).all()
+
+
+def test_frames_close_and_turn_little() -> None:
+    curve = wavy(64)
+    slope = curve.at(np.arange(64.0))[1][:, :3]
+    tangent = slope / np.linalg.norm(slope, axis=1)[:, None]
+    for normal, binormal in (closed_frames(tangent), level_frames(tangent)):
+        frame = np.stack([tangent, normal, binormal], axis=1)
+        assert np.abs(frame @ frame.transpose(0, 2, 1) - np.eye(3)).max() < 1e-12
+        assert np.abs(np.linalg.det(frame) - 1.0).max() < 1e-12
+        # The step from the last frame to the first is no larger than the others.
+        step = np.linalg.norm(np.roll(normal, -1, axis=0) - normal, axis=1)
+        assert step[-1] <= 1.5 * step[:-1].max()
+
+
+def test_heights_bound_the_tube() -> None:
+    t = 2.0 * np.pi * np.arange(16) / 16
+    ring = Curve.through(np.column_stack([0.1 * np.cos(t), np.zeros(16), 0.1 * np.sin(t)]), 0.02, np.zeros(3))
+    low, high = ring.heights()
+    assert (low, high) == pytest.approx((-0.12, 0.12), abs=1e-4)

@@ -1,0 +1,81 @@
+"""Drafts, and the center lines of woven and knitted yarns."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mbtf_core.errors import InputError
+from mbtf_gen.tile.fibers.curves import Curve
+from mbtf_gen.tile.fibers.weave import knitted_lines, parse_draft, woven_lines
+
+
+def rows(text: str) -> list[str]:
+    return ["".join("X" if c else "." for c in row) for row in parse_draft(text)]
+
+
+def test_named_drafts_are_those_of_textbooks() -> None:
+    assert rows("plain") == ["X.", ".X"]
+    assert rows("basket 2") == ["XX..", "XX..", "..XX", "..XX"]
+    # 3/1 twill: each warp above three wefts, the steps on a diagonal.
+    assert rows("twill 3/1") == ["XXX.", "XX.X", "X.XX", ".XXX"]
+    # Five-harness satin: one weft above in each row and each column, no two of them adjacent.
+    satin = parse_draft("satin 5/2")
+    below = [int(np.flatnonzero(~row)[0]) for row in satin]
+    assert sorted(below) == [0, 1, 2, 3, 4]
+    assert all(abs(a - b) not in (1, 4) for a, b in zip(below, np.roll(below, -1), strict=True))
+    assert rows("X.X\n.X.") == ["X.X", ".X."]
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "basket", "basket 0", "twill 3", "satin 5/1", "satin 6/2", "X.\nX", "X#", "basket 5000", "plain 3"],
+)
+def test_other_texts_are_refused_in_one_line(text: str) -> None:
+    with pytest.raises(InputError) as error:
+        parse_draft(text)
+    assert "\n" not in error.value.what
+
+
+def height_at(line: Curve, axis: int, position: float) -> float:
+    at = line.at(np.linspace(0.0, len(line.control), 4001))[0]
+    return float(at[np.argmin(np.abs(at[:, axis] - position)), 2])
+
+
+def test_the_yarn_of_the_draft_lies_above_at_each_crossing() -> None:
+    draft = parse_draft("X..X\nXX..\n.XX.\n..XX\nX.X.")
+    warps, wefts = woven_lines(draft, 1.25, 0.1)
+    for row in range(5):
+        # Row 0 is the side v → 1.
+        y = 1.25 * (1.0 - (row + 0.5) / 5)
+        for column in range(4):
+            x = (column + 0.5) / 4
+            warp, weft = height_at(warps[column], 1, y), height_at(wefts[4 - row], 0, x)
+            assert warp - weft == pytest.approx(0.1 if draft[row, column] else -0.1, abs=1e-4)
+
+
+def distances(a: Curve, b: Curve, period: tuple[float, float]) -> float:
+    """Least distance of two center lines and their copies."""
+    p, q = (c.at(np.linspace(0.0, len(c.control), 600, endpoint=False))[0][:, :3] for c in (a, b))
+    gap = p[:, None] - q[None]
+    gap[..., 0] -= np.round(gap[..., 0] / period[0]) * period[0]
+    gap[..., 1] -= np.round(gap[..., 1] / period[1]) * period[1]
+    return float(np.linalg.norm(gap, axis=-1).min())
+
+
+def test_loops_of_a_knit_interlock_without_touching() -> None:
+    lines = knitted_lines(3, 3, 0.8)
+    assert all(distances(a, b, (1.0, 0.8)) > 0.06 for a in lines for b in lines if a is not b)
+    # The head of each loop lies behind its own legs' neighbors and before the row above: where two rows
+    # overlap, each is above the other as often as below.
+    a, b = (
+        line.at(np.linspace(0.0, len(line.control), 3000, endpoint=False))[0][:, :3] for line in lines[:2]
+    )
+    above = []
+    for point in a:
+        gap = b[:, :2] - point[:2]
+        gap[:, 0] -= np.round(gap[:, 0])
+        near = np.argmin(np.hypot(*gap.T))
+        if np.hypot(*gap[near]) < 0.004:
+            above.append(point[2] > b[near, 2])
+    assert 0.2 < np.mean(above) < 0.8

@@ -1,0 +1,86 @@
+"""Slopes of heights and normal maps, and the residual of a normal map that the mesh lacks."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mbtf_gen.tile.heights.grid import HeightGrid
+from mbtf_gen.tile.heights.slopes import carried_share, height_slopes, normal_slopes, residual_slopes
+
+F64 = NDArray[np.float64]
+
+
+def waves(rows: int, columns: int, amplitude: float = 0.01, along: int = 3, up: int = 2) -> tuple[F64, F64]:
+    """Heights of a sum of sines with row 0 at y = aspect, and their slopes by the derivative."""
+    aspect = rows / columns
+    x = ((np.arange(columns) + 0.5) / columns)[None, :]
+    y = (aspect * (1 - (np.arange(rows) + 0.5) / rows))[:, None]
+    kx, ky = 2 * np.pi * along, 2 * np.pi * up / aspect
+    z = amplitude * (np.sin(kx * x) + np.sin(ky * y + 0.3))
+    slopes = np.stack(
+        np.broadcast_arrays(amplitude * kx * np.cos(kx * x), amplitude * ky * np.cos(ky * y + 0.3)), axis=-1
+    )
+    return z, slopes
+
+
+def normals(slopes: F64) -> NDArray[np.float32]:
+    n = np.concatenate([-slopes, np.ones_like(slopes[..., :1])], axis=-1)
+    return (n / np.linalg.norm(n, axis=-1, keepdims=True)).astype(np.float32)
+
+
+@pytest.mark.parametrize("shape", [(128, 128), (64, 128), (96, 64)])
+def test_slopes_of_heights_are_the_derivative(shape: tuple[int, int]) -> None:
+    z, slopes = waves(*shape)
+    found = height_slopes(HeightGrid.from_map(z, 1.0))
+    np.testing.assert_allclose(found, slopes, atol=0.02 * np.abs(slopes).max())
+
+
+def test_slopes_of_normals_are_those_they_were_made_of() -> None:
+    _, slopes = waves(32, 32, 0.05)
+    np.testing.assert_allclose(normal_slopes(normals(slopes)), slopes, atol=1e-5)
+
+
+@pytest.mark.parametrize("factor", [0.3, 1.0])
+def test_a_map_that_repeats_the_heights_leaves_what_they_lack(factor: float) -> None:
+    """The mesh carries a share of the map's slopes; mesh and residual together give all of them, once."""
+    z, slopes = waves(128, 128)
+    grid = HeightGrid.from_map(z, factor)
+    residual, share = residual_slopes(normals(slopes), grid)
+    assert share == pytest.approx(1 / factor, rel=0.01)
+    np.testing.assert_allclose(height_slopes(grid) + residual, slopes, atol=0.01)
+
+
+def test_exaggerated_heights_leave_no_residual() -> None:
+    z, slopes = waves(128, 128)
+    residual, share = residual_slopes(normals(slopes), HeightGrid.from_map(z, 5.0))
+    assert share == pytest.approx(0.2, rel=0.01)
+    np.testing.assert_allclose(residual, 0.0, atol=0.02)
+
+
+def test_detail_that_the_mesh_lacks_is_added_in_full() -> None:
+    z, slopes = waves(128, 128)
+    _, detail = waves(128, 128, 0.002, along=11, up=9)
+    residual, _ = residual_slopes(normals(slopes + detail), HeightGrid.from_map(z, 1.0))
+    np.testing.assert_allclose(residual, detail, atol=0.01)
+
+
+def test_a_plane_takes_the_whole_map() -> None:
+    _, slopes = waves(64, 64)
+    residual, share = residual_slopes(normals(slopes), HeightGrid(np.zeros((64, 64)), 1.0))
+    np.testing.assert_allclose(residual, slopes, atol=1e-5)
+    assert share == 0.0
+
+
+def test_absolute_puts_the_map_in_place_of_the_mesh() -> None:
+    z, _ = waves(64, 64)
+    _, other = waves(64, 64, 0.003, along=5, up=4)
+    grid = HeightGrid.from_map(z, 1.0)
+    residual, _ = residual_slopes(normals(other), grid, "absolute")
+    np.testing.assert_allclose(height_slopes(grid) + residual, other, atol=1e-5)
+
+
+def test_a_map_against_the_heights_is_not_subtracted() -> None:
+    _, slopes = waves(64, 64)
+    assert carried_share(-slopes, slopes) == 0.0

@@ -1,0 +1,188 @@
+"""What users bring: packed and layered maps, encodings, color where gray is wanted, names slightly wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.image_files import exr, png, rng
+
+from mbtf_core.color import srgb_to_linear
+from mbtf_core.errors import InputError
+from mbtf_gen.tile.heightfield_tile import HeightFieldTile
+from mbtf_gen.tile.loading import load_material
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "material.yaml"
+    path.write_text(text)
+    return path
+
+
+@pytest.fixture
+def heights(tmp_path: Path) -> Path:
+    np.save(tmp_path / "height.npy", 0.1 * rng().random((8, 16)))
+    return tmp_path
+
+
+class TestHeights:
+    def test_color_is_refused_with_the_way_out(self, tmp_path: Path) -> None:
+        codes = rng().integers(0, 256, (8, 8, 3))
+        path = png(tmp_path / "height.png", codes, 2, 8)
+        with pytest.raises(InputError, match=r"height\.png: is colored; a height map is gray") as caught:
+            load_material(path)
+        assert "channel: R" in caught.value.hint
+        text = "height: {file: height.png, channel: G, dequantize: false}\n"
+        material = load_material(write(tmp_path, text))
+        assert np.array_equal(np.rint(material.height * 255), codes[..., 1])
+
+    def test_a_normal_map_is_recognized(self, tmp_path: Path) -> None:
+        codes = np.clip(rng().normal((128, 128, 250), (40, 40, 5), (8, 8, 3)), 0, 255)
+        with pytest.raises(InputError, match="colored like a normal map"):
+            load_material(png(tmp_path / "height.png", codes, 2, 8))
+
+    def test_gray_in_four_channels(self, tmp_path: Path) -> None:
+        gray = rng().integers(0, 65536, (8, 16, 1))
+        codes = np.concatenate([gray, gray, gray, np.full_like(gray, 65535)], axis=2)
+        material = load_material(png(tmp_path / "height.png", codes, 6, 16))
+        assert np.array_equal(material.height, gray[..., 0] / 65535)
+        assert material.warnings == ()
+
+    def test_srgb_when_asked_for(self, tmp_path: Path) -> None:
+        codes = rng().integers(0, 65536, (8, 16, 1))
+        png(tmp_path / "h.png", codes, 0, 16)
+        plain = load_material(write(tmp_path, "height: h.png\n"))
+        bent = load_material(write(tmp_path, "height: {file: h.png, colorspace: srgb}\n"))
+        assert np.array_equal(plain.height, codes[..., 0] / 65535)
+        assert bent.height == pytest.approx(srgb_to_linear(codes[..., 0] / 65535))
+        assert bent.digests["settings"] != plain.digests["settings"]
+
+
+class TestLayers:
+    def layered(self, folder: Path) -> dict[str, np.ndarray]:
+        one = {n: rng().random((6, 9)).astype(np.float32) + i for i, n in enumerate(["d", "e"])}
+        color = {c: rng().random((6, 9)).astype(np.float32) for c in "RGB"}
+        exr(folder / "all.exr", {**color, "displacement.Y": one["d"], "extra.Y": one["e"]})
+        return {**one, **color}
+
+    def test_names_of_layers_decide(self, tmp_path: Path) -> None:
+        stored = self.layered(tmp_path)
+        material = load_material(tmp_path / "all.exr")
+        assert np.array_equal(material.height, stored["d"])
+        assert any("displacement.Y of all.exr" in note for note in material.notes)
+
+    def test_the_option_decides(self, tmp_path: Path) -> None:
+        stored = self.layered(tmp_path)
+        path = write(tmp_path, "height: {file: all.exr, channel: extra.Y}\nbase_color: all.exr\n")
+        material = load_material(path)
+        assert np.array_equal(material.height, stored["e"])
+        assert np.array_equal(material.maps["base_color"], np.stack([stored[c] for c in "RGB"], axis=-1))
+        assert not any("height: channels" in note for note in material.notes)
+        other = load_material(
+            write(tmp_path, "height: {file: all.exr, channel: displacement}\nbase_color: all.exr\n")
+        )
+        assert other.digests["settings"] != material.digests["settings"]
+        with pytest.raises(InputError, match="no channel or layer 'extr'") as caught:
+            load_material(write(tmp_path, "height: {file: all.exr, channel: extr}\n"))
+        assert "'extra'" in caught.value.hint
+
+
+class TestScalars:
+    def test_packed_channels(self, heights: Path) -> None:
+        codes = rng().integers(0, 256, (8, 16, 3))
+        png(heights / "rock_arm.png", codes, 2, 8)
+        material = load_material(
+            write(
+                heights,
+                "height: height.npy\nroughness: {file: rock_arm.png, channel: G}\n"
+                "metallic: {file: rock_arm.png, channel: B}\n",
+            )
+        )
+        assert np.array_equal(np.rint(255 * np.asarray(material.maps["roughness"])), codes[..., 1])
+        assert np.array_equal(np.rint(255 * np.asarray(material.maps["metallic"])), codes[..., 2])
+
+    def test_gloss_is_inverted_roughness(self, heights: Path) -> None:
+        codes = rng().integers(0, 65536, (8, 16, 1))
+        png(heights / "gloss.png", codes, 0, 16)
+        texts = {
+            "invert: true": 1 - codes[..., 0] / 65535,
+            "colorspace: srgb": srgb_to_linear(codes[..., 0] / 65535),
+            "invert: false": codes[..., 0] / 65535,
+        }
+        digests = set()
+        for option, expected in texts.items():
+            text = f"height: height.npy\nroughness: {{file: gloss.png, {option}}}\n"
+            material = load_material(write(heights, text))
+            assert material.maps["roughness"] == pytest.approx(expected)
+            digests.add(material.digests["settings"])
+        assert len(digests) == 3
+
+
+class TestColor:
+    def color(self, folder: Path, option: str, *chunks: tuple[bytes, bytes]) -> HeightFieldTile:
+        self.codes = rng().integers(0, 256, (8, 16, 3))
+        png(folder / "c.png", self.codes, 2, 8, extra=chunks)
+        return load_material(write(folder, f"height: height.npy\nbase_color: {{file: c.png{option}}}\n"))
+
+    def test_integers_are_srgb_by_default(self, heights: Path) -> None:
+        linear_chunk = (b"gAMA", (100000).to_bytes(4, "big"))
+        cases = {
+            ("", ()): True,
+            (", colorspace: linear", ()): False,
+            ("", (linear_chunk,)): False,
+            (", colorspace: srgb", (linear_chunk,)): True,
+        }
+        for (option, chunks), bent in cases.items():
+            material = self.color(heights, option, *chunks)
+            expected = self.codes / 255
+            expected = np.asarray(srgb_to_linear(expected)) if bent else expected
+            assert np.abs(material.maps["base_color"] - expected).max() < 1e-6, (option, chunks)
+            assert material.facts["base_color"].colorspace == ("srgb" if bent else "linear")
+            assert material.warnings == ()
+            assert any(("read as sRGB" if bent else "read as linear") in note for note in material.notes)
+
+    def test_other_gammas_warn_and_are_not_applied(self, heights: Path) -> None:
+        odd = (b"gAMA", (55556).to_bytes(4, "big"))
+        material = self.color(heights, "", odd)
+        (warning,) = material.warnings
+        assert "gamma of 0.55556 is not applied, it is read as sRGB" in warning
+        assert self.color(heights, ", colorspace: linear", odd).warnings == ()
+
+
+class TestNormals:
+    def test_signed_floats(self, heights: Path) -> None:
+        n = rng().normal((0, 0, 5), 1, (8, 16, 3))
+        n /= np.linalg.norm(n, axis=-1, keepdims=True)
+        for stored in (n, (n + 1) / 2):
+            np.save(heights / "normal.npy", stored)
+            normal = load_material(heights).maps["normal"]
+            assert normal == pytest.approx(n, abs=1e-6)
+
+    def test_normals_that_point_down(self, heights: Path) -> None:
+        codes = np.full((8, 16, 3), 100)
+        png(heights / "normal.png", codes, 2, 8)
+        assert any("100.00% of its normals point into" in w for w in load_material(heights).warnings)
+
+
+def test_orientation_is_ignored_with_a_warning(heights: Path) -> None:
+    from PIL import Image as Pillow
+
+    exif = Pillow.Exif()
+    exif[0x0112] = 6
+    for name in ("rough.jpg", "metallic.png"):
+        Pillow.fromarray(np.full((8, 16), 100, np.uint8)).save(heights / name, exif=exif)
+    material = load_material(heights)
+    assert np.shape(material.maps["roughness"]) == np.shape(material.maps["metallic"]) == (8, 16)
+    assert len([w for w in material.warnings if "EXIF orientation (6) is ignored" in w]) == 2
+
+
+def test_sizes_that_are_neither_square_nor_powers_of_two(tmp_path: Path) -> None:
+    np.save(tmp_path / "height.npy", 0.01 * rng().random((30, 45)))
+    np.save(tmp_path / "albedo.npy", rng().random((20, 30, 3)))
+    np.save(tmp_path / "rough.npy", rng().random((7, 10)).repeat(2, 0).repeat(3, 1)[:14, :21])
+    material = load_material(tmp_path)
+    assert material.aspect == pytest.approx(2 / 3)
+    assert material.grid.z.shape == (30, 45)
+    assert material.at(mesh=20).grid.z.shape == (13, 20)
+    assert np.shape(material.maps["roughness"]) == (14, 21)

@@ -1,0 +1,177 @@
+"""A normal map is compared with its heights: convention, orientation and scale, or no finding."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.height_maps import Floats, fractal, normals_of, save_heights, save_normals
+from support.paths import ROOT
+
+from mbtf_core.images.read import gray, read_image
+from mbtf_gen.tile.loading import load_material
+from mbtf_gen.tile.maps.normal_map import SYMMETRIES, NormalFit, fit_normals
+
+# What undoes each symmetry.
+UNDO = {
+    **{turn: turn for turn in SYMMETRIES},
+    "turned by 90 degrees counter-clockwise": "turned by 90 degrees clockwise",
+    "turned by 90 degrees clockwise": "turned by 90 degrees counter-clockwise",
+}
+ASSET = ROOT / "assets/turtle_shell/height.exr"
+
+
+def height_map(kind: str) -> Floats:
+    if kind == "fractal":
+        return fractal(96, 96)
+    return np.asarray(gray(read_image(ASSET))[0], np.float64)
+
+
+def fit(height: Floats, normal: Floats) -> NormalFit:
+    found = fit_normals(height, normal)
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("kind", ["fractal", "asset"])
+@pytest.mark.parametrize("green", [1, -1])
+def test_convention_and_scale(kind: str, green: int) -> None:
+    height = height_map(kind)
+    found = fit(height, normals_of(height, 0.07) * [1, green, 1])
+    assert found.fits
+    assert not found.misfit
+    assert found.convention == ("gl" if green == 1 else "dx")
+    assert found.scale == pytest.approx(0.07, rel=1e-3)
+    assert found.correlation_u == pytest.approx(1.0, abs=1e-3)
+    assert found.correlation_v == pytest.approx(green, abs=1e-3)
+    assert found.as_is == pytest.approx(1.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["fractal", "asset"])
+@pytest.mark.parametrize("turn", SYMMETRIES)
+@pytest.mark.parametrize("green", [1, -1])
+def test_turned_heights(kind: str, turn: str, green: int) -> None:
+    height = height_map(kind)
+    moved = SYMMETRIES[turn](height)
+    found = fit(moved, normals_of(height, 0.05) * [1, green, 1])
+    assert found.misfit
+    assert not found.fits
+    assert found.convention is None
+    assert (found.image, found.turn) == ("height", UNDO[turn])
+    assert found.best > 0.99
+    assert found.best - found.as_is > 0.1
+
+
+@pytest.mark.parametrize("turn", [t for t in SYMMETRIES if "mirrored top" not in t])
+def test_turned_pixels_of_the_normal_map(turn: str) -> None:
+    """Turned as an image, vectors and all left as they were."""
+    height = fractal(96, 96)
+    found = fit(height, np.ascontiguousarray(SYMMETRIES[turn](normals_of(height, 0.05))))
+    assert found.misfit
+    assert (found.image, found.turn) == ("normal", UNDO[turn])
+
+
+def test_heights_upside_down() -> None:
+    height = fractal(64, 128)
+    found = fit(1 - height, normals_of(height, 0.05))
+    assert found.misfit
+    assert found.turn == ""
+
+
+@pytest.mark.parametrize("shape", [(64, 128), (96, 48)])
+def test_tiles_that_are_not_square(shape: tuple[int, int]) -> None:
+    height = fractal(*shape)
+    found = fit(height, normals_of(height, 0.05))
+    assert found.fits
+    assert found.scale == pytest.approx(0.05, rel=1e-3)
+    assert fit(np.flip(height, 1), normals_of(height, 0.05)).turn == "mirrored left to right"
+
+
+def test_other_resolutions() -> None:
+    height = fractal(128, 128, 3.0)
+    found = fit(height, normals_of(fractal(128, 128, 3.0), 0.05).reshape(64, 2, 64, 2, 3).mean(axis=(1, 3)))
+    assert found.fits
+    assert found.convention == "gl"
+    assert found.scale == pytest.approx(0.05, rel=0.05)
+
+
+class TestNoFinding:
+    def test_flat(self) -> None:
+        up = np.zeros((32, 32, 3))
+        up[..., 2] = 1
+        assert fit_normals(fractal(32, 32), up) is None
+        assert fit_normals(np.zeros((32, 32)), normals_of(fractal(32, 32), 0.1)) is None
+
+    @pytest.mark.parametrize("size", [4, 8, 16, 64])
+    def test_chance(self, size: int) -> None:
+        """Unrelated noise never counts as a fit or a misfit."""
+        for seed in range(20):
+            a, b = (fractal(size, size, 0.0, 100 * seed + k) for k in range(2))
+            found = fit(a, normals_of(b, 0.1))
+            assert not found.fits
+            assert not found.misfit
+            assert found.convention is None
+
+    def test_ridges_have_no_convention(self) -> None:
+        """Slopes along u only: the green channel is empty."""
+        ridges = np.tile(fractal(64, 64)[:1], (64, 1))
+        found = fit(ridges, normals_of(ridges, 0.05))
+        assert found.fits
+        assert found.convention is None
+
+    def test_symmetric_tiles_fit_as_they_are(self) -> None:
+        """Rounding decides between equal correlations; it must not say that something is turned."""
+        for size in range(24, 48):
+            x = (np.arange(size) + 0.5) / size * 2 * np.pi
+            waves = np.cos(x)[:, None] + np.cos(x) + 0.3 * np.cos(3 * x)[:, None] * np.cos(3 * x)
+            found = fit(waves, normals_of(waves, 0.05))
+            assert found.fits
+            assert found.turn == ""
+
+
+class TestMaterial:
+    """Notes and warnings of a loaded material."""
+
+    def folder(self, tmp_path: Path, height: Floats, name: str, *, dx: bool) -> Path:
+        save_heights(tmp_path / "height.png", height)
+        save_normals(tmp_path / name, normals_of(fractal(96, 96), 0.05), dx=dx)
+        return tmp_path
+
+    @pytest.mark.parametrize("dx", [False, True])
+    def test_detected_without_a_name(self, tmp_path: Path, dx: bool) -> None:
+        material = load_material(self.folder(tmp_path, fractal(96, 96), "normal.png", dx=dx))
+        assert material.normal_convention == ("dx" if dx else "gl")
+        assert material.warnings == ()
+        note = next(n for n in material.notes if n.startswith("normal map: normal.png"))
+        assert ("DirectX" if dx else "OpenGL") in note
+        assert "u +1.00, v +1.00" in note
+        assert note.endswith("suggested --height-scale 0.05")
+        assert "normal" in material.maps
+        assert np.abs(material.maps["normal"] - normals_of(fractal(96, 96), 0.05)).max() < 0.02
+
+    @pytest.mark.parametrize(("name", "dx"), [("normal_gl.png", True), ("normal_dx.png", False)])
+    def test_a_name_that_is_wrong(self, tmp_path: Path, name: str, dx: bool) -> None:
+        material = load_material(self.folder(tmp_path, fractal(96, 96), name, dx=dx))
+        (warning,) = material.warnings
+        assert "the name implies" in warning
+        assert f"read as {'DirectX' if dx else 'OpenGL'}" in warning
+        assert material.normal_convention == ("dx" if dx else "gl")
+
+    def test_a_convention_that_is_asked_for_and_wrong(self, tmp_path: Path) -> None:
+        folder = self.folder(tmp_path, fractal(96, 96), "n.png", dx=True)
+        (folder / "material.yaml").write_text("height: height.png\nnormal: {file: n.png, convention: gl}\n")
+        material = load_material(folder)
+        assert "the material file implies OpenGL, the heights' slopes imply DirectX" in material.warnings[0]
+        assert "read as OpenGL" in material.warnings[0]
+        assert material.normal_convention == "gl"
+
+    def test_turned_and_inverted_heights_warn(self, tmp_path: Path) -> None:
+        folder = self.folder(tmp_path, np.rot90(fractal(96, 96), -1), "normal.png", dx=False)
+        (warning,) = load_material(folder).warnings
+        assert "height.png: fits normal.png only when turned by 90 degrees counter-clockwise" in warning
+        assert "correlation of their slopes 1.00, against" in warning
+        save_heights(folder / "height.png", 1 - fractal(96, 96))
+        (warning,) = load_material(folder).warnings
+        assert "upside down" in warning
+        assert "negative --height-scale" in warning

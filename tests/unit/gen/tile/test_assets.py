@@ -1,0 +1,118 @@
+"""The own materials: the script makes exactly the stored files, and they are what a tile must be."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+import pytest
+from conftest import RunPython
+from numpy.typing import NDArray
+from PIL import Image
+from support.paths import ASSETS
+
+from mbtf_core.color import srgb_to_linear
+from mbtf_gen import load_material
+
+# Material → does it state a constant beside its maps?
+MATERIALS = {
+    "twisted_wool": True,
+    "straight_wool": True,
+    "turtle_shell": False,
+    "cliff_rock": True,
+    "insulation_foam": False,
+}
+MAPS = ("height.exr", "base_color.png", "roughness.png")
+
+
+def pixels(path: Path) -> NDArray[Any]:
+    if path.suffix == ".exr":
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            (channel,) = file.channels().values()
+            return np.array(channel.pixels)
+    with Image.open(path) as image:
+        return np.asarray(image)
+
+
+@pytest.fixture(scope="module", params=list(MATERIALS))
+def material(request: pytest.FixtureRequest) -> dict[str, NDArray[Any]]:
+    return {name: pixels(ASSETS / request.param / name) for name in MAPS}
+
+
+# NumPy picks its loops by the processor; without them it computes as on the oldest one.
+@pytest.mark.parametrize("features", ["", "AVX512F AVX512_SKX AVX512_ICL AVX2 FMA3 X86_V4 X86_V3"])
+def test_the_script_makes_the_stored_files(features: str, tmp_path: Path, run_python: RunPython) -> None:
+    done = run_python(
+        "-W", "ignore", str(ASSETS / "make_assets.py"), str(tmp_path), NPY_DISABLE_CPU_FEATURES=features
+    )
+    assert done.returncode == 0, done.stderr
+    made = {p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*") if p.is_file()}
+    constants = {f"{material}/material.yaml" for material, stated in MATERIALS.items() if stated}
+    assert made == {f"{material}/{name}" for material in MATERIALS for name in MAPS} | constants
+    for name in sorted(constants):
+        assert (tmp_path / name).read_bytes() == (ASSETS / name).read_bytes()
+    for name in sorted(made - constants):
+        new, stored = pixels(tmp_path / name), pixels(ASSETS / name)
+        assert new.dtype == stored.dtype
+        assert np.array_equal(new, stored), name
+
+
+def test_maps_have_the_stated_form(material: dict[str, NDArray[Any]]) -> None:
+    height, color, roughness = (material[name] for name in MAPS)
+    assert (height.shape, height.dtype) == ((256, 256), np.float32)
+    assert (color.shape, color.dtype) == ((256, 256, 3), np.uint8)
+    assert (roughness.shape, roughness.dtype) == ((256, 256), np.uint8)
+    # Heights in tile widths, the highest point at 0, on a grid that float32 holds exactly.
+    assert height.max() == 0
+    assert 0.03 < -height.min() < 0.3
+    assert np.array_equal(height * 2**14, np.round(height * 2**14))
+    # No mirror, no perfect white: a specular lobe comes on top of the base color.
+    assert roughness.min() > 0.2 * 255
+    assert srgb_to_linear(color / 255).max() < 0.9
+
+
+@pytest.mark.parametrize("name", MATERIALS)
+def test_materials_load_without_a_warning(name: str) -> None:
+    material = load_material(ASSETS / name)
+    assert material.warnings == ()
+    assert set(material.files) == {"height", "base_color", "roughness"}
+    assert material.height_scale == 1
+    # Wool and rock refract more than the customary 1.5 (s = 0.5), none of them much.
+    assert isinstance(material.maps["specular"], float)
+    assert 0.5 < material.maps["specular"] < 0.6 if MATERIALS[name] else material.maps["specular"] == 0.5
+
+
+def test_materials_differ_in_color() -> None:
+    """Mean linear colors differ by more than a tenth of the brighter one in some channel."""
+    means = [srgb_to_linear(pixels(ASSETS / m / "base_color.png") / 255).mean((0, 1)) for m in MATERIALS]
+    for i, one in enumerate(means):
+        for other in means[:i]:
+            assert np.abs(one - other).max() > 0.1 * max(one.max(), other.max())
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_tiles_have_no_seam(material: dict[str, NDArray[Any]], axis: int) -> None:
+    for name, image in material.items():
+        values = np.moveaxis(np.asarray(image, np.float64), axis, 0)
+        steps = np.abs(values - np.roll(values, 1, axis=0)).reshape(len(values), -1).mean(1)
+        # Step 0 leads from the last line to the first; the largest step inside the tile sets the measure.
+        assert steps[0] <= 1.05 * steps[1:].max(), name
+
+
+def test_orientation_can_be_recognized(material: dict[str, NDArray[Any]]) -> None:
+    """No flip or quarter turn, shifted anyhow, looks like the tile itself in both height and color."""
+    images = [np.asarray(material["height.exr"], np.float64), material["base_color.png"].mean(2)]
+    images = [(image - image.mean()) / image.std() for image in images]
+    spectra = [np.fft.rfft2(image) for image in images]
+    for turn in range(4):
+        for flip in (False, True):
+            if turn == 0 and not flip:
+                continue
+            correlation = np.inf
+            for image, spectrum in zip(images, spectra, strict=True):
+                other = np.rot90(image[:, ::-1] if flip else image, turn)
+                over_shifts = np.fft.irfft2(spectrum * np.fft.rfft2(other).conj(), image.shape) / image.size
+                correlation = min(correlation, float(over_shifts.max()))
+            assert correlation < 0.8, (turn, flip)

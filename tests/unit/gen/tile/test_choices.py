@@ -1,0 +1,183 @@
+"""``mbtf-gen inspect --write``: a material file after which no command needs the flags; ``--export``."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.height_maps import fractal, normals_of, save_heights, save_normals
+
+from mbtf_core.app.console import run
+from mbtf_core.config.yaml_file import read_yaml
+from mbtf_gen.cli.app import app
+from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.job import Job
+from mbtf_gen.tile.loading import load_material
+
+# Height scale of the normal map, and the one that it suggests: 8-bit normals of gentle slopes are rounded.
+SCALE = 0.0123
+STORED = 0.012
+
+
+@pytest.fixture
+def maps(tmp_path: Path) -> Path:
+    """Maps that do not tile, with a DirectX normal map: three quarters of a periodic tile."""
+    out = tmp_path / "maps"
+    out.mkdir()
+    height = fractal(128, 128)
+    save_heights(out / "height.png", height[:96, :96])
+    # The cut tile is three quarters as wide: heights in its widths are 4/3 as high.
+    save_normals(out / "normal.png", normals_of(height, 0.75 * SCALE)[:96, :96], dx=True)
+    np.save(out / "color.npy", np.full((96, 96, 3), 120, np.uint8))
+    return out
+
+
+def job_of(material: Path, **sections: Any) -> Job:
+    return Job.load(GeneratorConfig.model_validate({"material": str(material), **sections}))
+
+
+def written(folder: Path, *flags: str, file: str = "material.yaml") -> dict[str, Any]:
+    assert run(app, ["inspect", str(folder), "--write", str(folder / file), *flags]) == 0
+    return dict(read_yaml(folder / file))
+
+
+class TestWrite:
+    def test_what_the_maps_show(self, maps: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        assert written(maps) == {
+            "height": {"file": "height.png", "scale": STORED},
+            "base_color": {"file": "color.npy", "colorspace": "srgb"},
+            "normal": {"file": "normal.png", "convention": "dx"},
+            "make_tileable": "blend",
+        }
+        text = " ".join(capsys.readouterr().out.split())
+        assert "height.scale 0.012 (suggested by the normal map; the default would be 0.05)" in text
+        assert "make_tileable blend (the heights do not tile along u and v)" in text
+        assert "DOES NOT TILE" in text
+        assert "before make-tileable blend" in text
+        assert "does not tile" not in text.partition("warnings")[2]
+
+    def test_what_was_given(self, maps: Path) -> None:
+        flags = ["--height-scale", "0.3", "--make-tileable", "mirror", "--resolution", "16"]
+        content = written(maps, *flags)
+        assert (content["height"]["scale"], content["make_tileable"]) == (0.3, "mirror")
+        assert content["resolution"] == 16
+
+    def test_what_the_material_file_says(self, maps: Path) -> None:
+        text = "height: {file: height.png, scale: 0.2}\nmake_tileable: none\nresolution: 8\nroughness: 0.4\n"
+        (maps / "material.yaml").write_text(text)
+        content = written(maps, "--overwrite")
+        assert content == {
+            "height": {"file": "height.png", "scale": 0.2},
+            "roughness": {"value": 0.4},
+            "make_tileable": "none",
+            "resolution": 8,
+        }
+
+    def test_the_other_commands_need_no_flags(self, maps: Path) -> None:
+        geometry = {"height_scale": STORED, "make_tileable": "blend"}
+        flagged = job_of(maps, geometry=geometry, queries={"resolution": 16})
+        written(maps, "--resolution", "16")
+        plain = job_of(maps)
+        assert np.array_equal(plain.material.grid.z, flagged.material.grid.z)
+        for role in ("base_color", "normal"):
+            assert np.array_equal(plain.material.maps[role], flagged.material.maps[role])
+        assert plain.lattice == flagged.lattice
+        assert plain.config.geometry == flagged.config.geometry
+        assert plain.config.queries == flagged.config.queries
+
+    def test_flags_override_the_file(self, maps: Path) -> None:
+        written(maps, "--resolution", "16")
+        sections = {"geometry": {"height_scale": 0.5, "make_tileable": "none"}, "queries": {"resolution": 32}}
+        job = job_of(maps, **sections)
+        assert (job.material.tiling, job.lattice.finest) == ("none", 5)
+        assert job.material.grid.displacement_range == pytest.approx(0.5 * np.ptp(job.material.height))
+
+    @pytest.mark.parametrize(
+        ("key", "value"), [("make_tileable", "mirror"), ("resolution", 32), ("height", {"scale": 0.2})]
+    )
+    def test_the_hash_covers_the_file(self, maps: Path, key: str, value: Any) -> None:
+        content = written(maps, "--resolution", "16")
+        before, digests = job_of(maps).config_hash, load_material(maps).digests
+        assert job_of(maps).config_hash == before
+        content[key] = {**content[key], **value} if isinstance(value, dict) else value
+        (maps / "material.yaml").write_text(json.dumps(content))
+        assert job_of(maps).config_hash != before
+        # Recipes know the material by its digests.
+        assert load_material(maps).digests["settings"] != digests["settings"]
+
+    def test_names_are_relative_to_the_file(self, maps: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        (maps.parent / "link").symlink_to(maps.parent)
+        monkeypatch.chdir(maps)
+        for place, name in (("../other/rock.yaml", "../maps"), ("../link/rock.yaml", "maps")):
+            assert run(app, ["inspect", ".", "--write", place]) == 0
+            assert read_yaml(Path(place))["height"]["file"] == f"{name}/height.png"
+            assert load_material(place).resolution is None
+
+    def test_a_bsdf_keeps_its_textures(self, maps: Path) -> None:
+        text = (
+            "height: height.png\n"
+            "bsdf: {type: diffuse, reflectance: {type: bitmap, filename: height.png, raw: true}}\n"
+        )
+        (maps / "material.yaml").write_text(text)
+        content = written(maps, file="../rock.yaml")
+        assert content["bsdf"]["reflectance"] == {
+            "type": "bitmap",
+            "filename": "maps/height.png",
+            "raw": True,
+        }
+        # The seams stay: the textures could not follow.
+        assert content["make_tileable"] == "none"
+
+    def test_an_existing_file_is_kept(self, maps: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        (maps / "material.yaml").write_text("height: height.png\n")
+        for flag in ("--write", "--export"):
+            path = maps / ("material.yaml" if flag == "--write" else "z.exr")
+            path.touch()
+            before = path.read_bytes()
+            assert run(app, ["inspect", str(maps), flag, str(path)]) == 3
+            assert "exists already: --overwrite replaces it" in capsys.readouterr().err.replace("\n  ", ": ")
+            assert path.read_bytes() == before
+
+
+class TestWarning:
+    """The height scale in use is in the header of every run, and the warning where it is far off."""
+
+    @pytest.mark.parametrize(
+        ("given", "factor", "source"), [(None, 0.05, "default"), (0.3, 0.3, "given"), (-0.1, -0.1, "given")]
+    )
+    def test_far_off(
+        self, maps: Path, given: float | None, factor: float, source: str, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        config = GeneratorConfig.model_validate(
+            {"material": str(maps), "geometry": {"height_scale": given, "make_tileable": "mirror"}}
+        )
+        with caplog.at_level(logging.INFO):
+            Job.prepare(config)
+        (warning,) = (r.getMessage() for r in caplog.records if r.levelno == logging.WARNING)
+        assert f"its slopes suggest --height-scale 0.012; {factor:g} is in use" in warning
+        header = next(r.getMessage() for r in caplog.records if r.getMessage().startswith("mesh: "))
+        assert f"height scale {factor:g} ({source})" in header
+
+
+class TestExport:
+    @pytest.mark.parametrize("flags", [(), ("--mesh", "40"), ("--height-scale", "-0.2")])
+    def test_read_back_it_is_the_same_grid(self, tmp_path: Path, flags: tuple[str, ...]) -> None:
+        """8-bit heights, dequantized and resampled."""
+        save_heights(tmp_path / "height.png", fractal(48, 96), 8)
+        out = tmp_path / "out" / "heights.exr"
+        assert run(app, ["inspect", str(tmp_path), "--export", str(out), *flags]) == 0
+        mesh = int(flags[1]) if flags[:1] == ("--mesh",) else None
+        scale = float(flags[1]) if flags[:1] == ("--height-scale",) else None
+        expected, found = load_material(tmp_path).at(scale, mesh).grid, load_material(out).grid
+        assert np.array_equal(found.z, expected.z.astype(np.float32))
+        assert found.z.max() == 0.0
+        assert found.aspect == expected.aspect
+
+    def test_with_choices(self, maps: Path) -> None:
+        written(maps, "--export", str(maps.parent / "z.exr"))
+        expected = job_of(maps).material.grid.z.astype(np.float32)
+        assert np.array_equal(load_material(maps.parent / "z.exr").grid.z, expected)

@@ -1,0 +1,189 @@
+"""``mbtf-gen inspect``: numbers that can be checked by hand, and their text."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.height_maps import fractal, normals_of, save_heights, save_normals
+
+from mbtf_core.app.console import run
+from mbtf_gen.cli.app import app
+from mbtf_gen.config.generator import GeometrySection
+from mbtf_gen.tile.heights.grid import HeightGrid
+from mbtf_gen.tile.heights.statistics import (
+    autocorrelation,
+    detail_size,
+    repeats,
+    rms_slope,
+    slope_angles,
+    triangle_slopes,
+)
+from mbtf_gen.tile.inspection import inspection_text
+from mbtf_gen.tile.loading import load_material
+
+
+class TestSlopes:
+    @pytest.mark.parametrize("aspect", [1.0, 0.5])
+    def test_slopes_are_those_of_the_mesh(self, aspect: float) -> None:
+        """Against the triangles that are rendered."""
+        from mbtf_gen.tile.heights.grid import tile_mesh
+
+        grid = HeightGrid.from_map(fractal(int(12 * aspect), 12), 0.2, aspect)
+        normals = tile_mesh(grid).face_normals
+        expected = np.hypot(normals[:, 0], normals[:, 1]) / normals[:, 2]
+        assert np.sort(triangle_slopes(grid)) == pytest.approx(np.sort(expected))
+        assert rms_slope(grid) == pytest.approx(np.sqrt(np.mean(expected**2)))
+
+    def test_a_roof(self) -> None:
+        """Both flanks of a ridge along v rise by as much as they are wide."""
+        roof = np.tile(np.abs(np.arange(16) - 8.0) / 16, (4, 1))
+        median, high, steepest = slope_angles(HeightGrid.from_map(roof, 1.0, 0.25))
+        assert (median, high, steepest) == pytest.approx((45.0, 45.0, 45.0))
+
+    def test_percentiles(self) -> None:
+        """A gentle flank over seven eighths of the tile, a steep one over the last."""
+        gentle = np.arange(57) / 56 * 0.1
+        steep = 0.1 - np.arange(1, 8) / 8 * 0.1
+        saw = np.tile(np.concatenate([gentle, steep]), (4, 1))
+        median, high, steepest = slope_angles(HeightGrid.from_map(saw, 1.0, 1 / 16))
+        expected = np.degrees(np.arctan([0.1 * 64 / 56, 0.1 * 8, 0.1 * 8]))
+        assert (median, high, steepest) == pytest.approx(tuple(expected))
+
+    def test_repeats(self) -> None:
+        cell = fractal(16, 16)
+        assert [repeats(np.tile(cell, (3, 5)), axis) for axis in (1, 0)] == [5, 3]
+        assert [repeats(fractal(64, 64), axis) for axis in (1, 0)] == [1, 1]
+        assert repeats(np.zeros((8, 8)), 0) == 1
+        # A ripple on a swell repeats as often as the swell.
+        x = np.arange(96) / 96 * 2 * np.pi
+        assert repeats(np.tile(np.cos(x) + 0.5 * np.cos(16 * x), (4, 1)), 1) == 1
+        assert repeats(np.tile(np.cos(2 * x), (4, 1)), 1) == 2
+
+    def test_detail(self) -> None:
+        noise = np.random.default_rng(0).normal(size=(128, 128))
+        assert detail_size(noise) < 1.0
+        assert detail_size(noise.repeat(4, 0).repeat(4, 1)) == pytest.approx(2.0, abs=0.3)
+        x = np.cos(np.arange(96) / 96 * 2 * np.pi)
+        assert detail_size(np.tile(x, (96, 1))) == pytest.approx(96 / 6, abs=0.1)
+        assert autocorrelation(np.tile(x, (4, 1)), 1)[48] == pytest.approx(-1.0)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    out = tmp_path / "rock"
+    out.mkdir()
+    height = fractal(48, 96)
+    save_heights(out / "height.png", height)
+    save_normals(out / "normal.png", normals_of(height, 0.1))
+    color = np.full((48, 96, 3), 0.5)
+    color[:12] = 0.97
+    color[12:18] = 0.01
+    np.save(out / "albedo.npy", color)
+    opacity = np.ones((48, 96))
+    opacity[:, :24] = 0.0
+    np.save(out / "opacity.npy", opacity)
+    metallic = np.zeros((48, 96))
+    metallic[:, 50:] = 1.0
+    np.save(out / "metallic.npy", metallic)
+    return out
+
+
+class TestNumbers:
+    def test_by_hand(self, folder: Path) -> None:
+        found = load_material(folder).inspect(GeometrySection(height_scale=0.2, mesh=48))
+        assert found["aspect"] == 0.5
+        assert found["surface"] == "glossy"
+        assert found["geometry"]["mesh"] == [24, 48]
+        assert found["geometry"]["height_scale"] == 0.2
+        assert found["geometry"]["displacement_range"] <= 0.2
+        assert 0.3 < found["geometry"]["slope_kept"] < 0.95
+        assert found["albedo"]["share_above"] == 0.25
+        assert found["albedo"]["share_below"] == 0.125
+        assert found["albedo"]["median"] == pytest.approx(0.5)
+        assert (found["albedo"]["min"], found["albedo"]["max"]) == pytest.approx((0.01, 0.97))
+        assert found["opacity"] == {"holes": 0.25, "partly": 0.0}
+        assert found["normal"]["suggested_height_scale"] == pytest.approx(0.1, rel=0.01)
+        assert found["constants"] == {"roughness": 0.5, "specular": 0.5}
+        assert [t["tiles"] for t in found["tiling"]] == [True, True]
+        texts = "\n".join(found["oddities"])
+        for part in ("the mesh keeps", "--mesh 96 keeps all", "25.00% of the albedo lies above 0.95"):
+            assert part in texts
+
+    def test_floats_that_were_integers(self, tmp_path: Path) -> None:
+        for name, height in (("a", fractal(96, 96)), ("b", np.rint(fractal(96, 96) * 200) / 200)):
+            np.save(tmp_path / f"{name}.npy", 0.1 * height)
+            oddities = load_material(tmp_path / f"{name}.npy").inspect(GeometrySection())["oddities"]
+            assert any("distinct values" in o for o in oddities) == (name == "b")
+
+    @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (5, 1), (2, 3)])
+    def test_tiny_maps(self, tmp_path: Path, shape: tuple[int, int]) -> None:
+        save_heights(tmp_path / "height.png", np.random.default_rng(0).random(shape), 8)
+        save_normals(tmp_path / "normal.png", np.full((*shape, 3), (0.0, 0.0, 1.0)))
+        found = load_material(tmp_path).inspect(GeometrySection())
+        assert found["maps"]["height"]["columns"] == shape[1]
+        assert found["normal"] is not None
+        assert "nothing to compare" in inspection_text(found, "tiny")
+
+    def test_a_flat_map_has_no_slopes(self, tmp_path: Path) -> None:
+        np.save(tmp_path / "h.npy", np.zeros((4, 4)))
+        found = load_material(tmp_path / "h.npy").inspect(GeometrySection())
+        assert "displacement range 0 tile widths" in inspection_text(found, "flat")
+        assert found["geometry"]["slope_max_deg"] == 0.0
+        assert found["geometry"]["slope_kept"] == 1.0
+        assert found["oddities"] == []
+        assert found["tiling"] == []
+        assert any("heights are constant" in w for w in found["warnings"])
+
+
+class TestText:
+    def test_heading_and_figures(self, folder: Path) -> None:
+        text = inspection_text(load_material(folder).inspect(GeometrySection()), "rock")
+        assert text.startswith("rock: tile 1 x 0.5, surface glossy, make-tileable none, resolution 64\n")
+        for part in (
+            "displaces the mesh",
+            "slopes     median",
+            "OpenGL",
+            "suggests the height scale 0.1",
+            "holes 25.0%",
+        ):
+            assert part in text
+
+    def test_a_height_scale_far_from_the_suggested_one(self, folder: Path) -> None:
+        save_normals(folder / "normal.png", normals_of(fractal(48, 96), 0.01))
+
+        def warned(height: float | None = None) -> bool:
+            warnings = load_material(folder).inspect(GeometrySection(height_scale=height))["warnings"]
+            return any("; 0.05 is in use, 5 times as much" in warning for warning in warnings)
+
+        assert warned()
+        assert warned(0.05)
+        assert not warned(0.012)
+        save_heights(folder / "height.png", fractal(48, 96) / 50)
+        (warning,) = (w for w in load_material(folder).warnings_in_use() if "suggest" in w)
+        assert "in use, 0.1 times as much" in warning
+        save_heights(folder / "height.png", fractal(48, 96))
+        (folder / "material.yaml").write_text("height: {file: height.png, scale: 0.05}\nnormal: normal.png\n")
+        assert warned()
+        (folder / "material.yaml").unlink()
+        save_normals(folder / "normal.png", normals_of(fractal(48, 96), 0.04))
+        assert not any("slopes suggest" in w for w in load_material(folder).warnings_in_use())
+
+
+class TestCommand:
+    def test_a_displacement_that_generation_refuses(
+        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        np.save(tmp_path / "tall.npy", np.linspace(0.0, 200.0, 32).reshape(4, 8))
+        refused = "tall.npy: generation refuses it: the displacement range is 200 tile widths; at most 100"
+
+        def warned(*options: str) -> bool:
+            assert run(app, ["inspect", str(tmp_path / "tall.npy"), "--json", *options]) == 0
+            warnings = json.loads(capsys.readouterr().out)["warnings"]
+            return any(refused in warning for warning in warnings)
+
+        assert warned()
+        assert not warned("--height-scale", "0.4")
+        assert not warned("--set", "geometry.max_displacement=300")

@@ -1,0 +1,326 @@
+"""Materials from bare files, folders and YAML: what is found, what is assumed, what is refused."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mbtf_core.color import srgb_to_linear
+from mbtf_core.errors import InputError
+from mbtf_gen.tile.loading import load_material
+from mbtf_gen.tile.maps.discovery import normal_convention, role_of
+
+
+def rng() -> np.random.Generator:
+    """A generator that gives the same numbers in every test."""
+    return np.random.default_rng(3)
+
+
+def png(path: Path, codes: NDArray[Any]) -> Path:
+    from PIL import Image as Pillow
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Pillow.fromarray(codes).save(path)
+    return path
+
+
+def codes(rows: int, columns: int, *channels: int) -> NDArray[np.uint8]:
+    return rng().integers(0, 256, (rows, columns, *channels)).astype(np.uint8)
+
+
+def npy(path: Path, numbers: NDArray[Any]) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.save(path, numbers)
+    return path
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A complete set of maps at three resolutions, 2:1."""
+    out = tmp_path / "rock"
+    npy(out / "rock_height.npy", rng().random((8, 16)))
+    png(out / "Rock_BaseColor.png", codes(16, 32, 3))
+    png(out / "rock-rough.png", codes(4, 8))
+    png(out / "rock.metallic.png", codes(8, 16))
+    png(out / "rockNormalGL.png", np.full((8, 16, 3), (128, 128, 255), np.uint8))
+    png(out / "rock_opacity.png", codes(8, 16))
+    png(out / "rock_ao.png", codes(8, 16))
+    (out / "LICENSE.txt").write_text("CC0")
+    return out
+
+
+# Role → names of files that have it.
+ROLES: dict[str | None, str] = {
+    "height": "height.png Bricks102_1K-JPG_Displacement.jpg metal_plate_disp_1k.png BUMP.tif",
+    "base_color": "Fabric_Knitted_006_basecolor.jpg base_color.png woodBaseColor.png albedo.jpg "
+    "Bricks102_1K-JPG_Color.jpg bark_col_2k.jpg arm_chair_diff.png",
+    "roughness": "metal_plate_rough_1k.png",
+    "metallic": "metal_plate_metal_1k.png Metalness.png",
+    "normal": "metal_plate_nor_gl_1k.png NormalDX.png rock_normaldx.png",
+    "opacity": "color_mask.png Fabric_Knitted_006_opacity.jpg",
+    None: "rock_ao.png ambientOcclusion.png rock_arm_1k.png Rock023.png colorful.png",
+}
+
+
+class TestNames:
+    @pytest.mark.parametrize("role", ROLES)
+    def test_roles(self, role: str | None) -> None:
+        assert {name: role_of(name) for name in ROLES[role].split()} == dict.fromkeys(
+            ROLES[role].split(), role
+        )
+
+    def test_normal_conventions(self) -> None:
+        assert normal_convention("metal_plate_nor_gl_1k.png") == "gl"
+        assert normal_convention("Rock_NormalDX.png") == "dx"
+        assert normal_convention("normal.png") is None
+
+
+class TestBareFile:
+    def test_float_heights_are_tile_widths(self, tmp_path: Path) -> None:
+        heights = rng().random((6, 9))
+        material = load_material(npy(tmp_path / "h.npy", heights))
+        assert np.array_equal(material.height, heights)
+        assert (material.height_scale, material.height_bits) == (1.0, None)
+        assert material.aspect == pytest.approx(6 / 9)
+        assert material.is_lambert
+        assert np.array_equal(material.maps["base_color"], np.full(3, 0.5))
+        assert material.warnings == ()
+        assert any("Lambert, because no roughness" in note for note in material.notes)
+
+    def test_integer_heights_are_shares_of_a_stated_range(self, tmp_path: Path) -> None:
+        numbers = rng().integers(0, 65536, (6, 9)).astype(np.uint16)
+        material = load_material(png(tmp_path / "h.png", numbers))
+        assert np.array_equal(material.height, numbers / 65535)
+        assert (material.height_scale, material.height_bits) == (0.05, 16)
+
+    def test_eight_bits_are_smoothed_within_half_a_code_with_a_warning(self, tmp_path: Path) -> None:
+        ramp = np.rint(np.tile(100 + 5 * np.sin(np.arange(64) / 64 * 2 * np.pi), (64, 1))).astype(np.uint8)
+        material = load_material(png(tmp_path / "h.png", ramp))
+        assert np.abs(material.height - ramp / 255).max() <= 0.5 / 255 * (1 + 1e-9)
+        assert not np.array_equal(material.height, ramp / 255)
+        assert "8-bit heights with 11 distinct values" in material.warnings[0]
+
+    @pytest.mark.parametrize("shape", [(1, 1), (1, 7), (5, 1), (3, 10)])
+    def test_any_shape_and_constant_heights(self, tmp_path: Path, shape: tuple[int, int]) -> None:
+        material = load_material(npy(tmp_path / "h.npy", np.full(shape, 0.25)))
+        assert material.grid.z.shape == shape
+        assert material.grid.displacement_range == 0.0
+        assert material.aspect == shape[0] / shape[1]
+
+    def test_a_large_displacement_at_the_default_scale_warns(self, tmp_path: Path) -> None:
+        material = load_material(npy(tmp_path / "h.npy", np.array([[0.0, 0.6]])))
+        (warning,) = material.warnings_in_use()
+        assert "the displacement range is 0.6 tile widths; check --height-scale" in warning
+        assert material.at(1.0).warnings_in_use() == ()
+        assert load_material(npy(tmp_path / "h.npy", np.array([[0.0, 0.5]]))).warnings_in_use() == ()
+        yaml = tmp_path / "m.yaml"
+        yaml.write_text("height: {file: h.npy, scale: 2}\n")
+        assert load_material(yaml).warnings_in_use() == ()
+
+
+class TestGrid:
+    def test_default_mesh_follows_the_map_up_to_a_limit(self, tmp_path: Path) -> None:
+        assert load_material(npy(tmp_path / "a.npy", rng().random((30, 20)))).grid.z.shape == (30, 20)
+        wide = load_material(npy(tmp_path / "b.npy", rng().random((100, 1000))))
+        assert wide.grid.z.shape == (51, 512)
+        assert wide.grid.aspect == 0.1
+
+    def test_heights_touch_the_reference_plane_from_below(self, tmp_path: Path) -> None:
+        heights = rng().random((8, 8))
+        material = load_material(npy(tmp_path / "h.npy", heights))
+        grid = material.at(height_scale=0.3).grid
+        assert grid.z == pytest.approx(0.3 * (heights - heights.max()))
+        assert material.at(height_scale=-0.3).grid.z.max() == 0.0
+        coarse = material.at(mesh=4).grid
+        expected = heights.reshape(4, 2, 4, 2).mean(axis=(1, 3))
+        assert coarse.z == pytest.approx(expected - expected.max())
+        assert material.at(mesh=16).grid.z.shape == (16, 16)
+
+
+class TestFolder:
+    def test_colors_become_linear(self, folder: Path) -> None:
+        from PIL import Image as Pillow
+
+        stored = np.asarray(Pillow.open(folder / "Rock_BaseColor.png")) / 255.0
+        assert load_material(folder).maps["base_color"] == pytest.approx(srgb_to_linear(stored), abs=1e-6)
+        (folder / "Rock_BaseColor.png").unlink()
+        linear = npy(folder / "color.npy", rng().random((4, 8, 3)))
+        assert load_material(folder).maps["base_color"] == pytest.approx(np.load(linear), abs=1e-7)
+        linear.unlink()
+        png(folder / "albedo.png", np.full((8, 16), 255, np.uint8))
+        assert np.array_equal(load_material(folder).maps["base_color"], np.ones((8, 16, 3)))
+
+    def test_normals_point_up_and_dx_is_turned(self, folder: Path) -> None:
+        tilted = np.full((8, 16, 3), (128, 200, 230), np.uint8)
+        png(folder / "rockNormalGL.png", tilted)
+        gl = load_material(folder).maps["normal"]
+        assert gl is not None
+        assert np.linalg.norm(gl, axis=-1) == pytest.approx(1.0, abs=1e-6)
+        assert gl[0, 0, 1] > 0.5
+        (folder / "rockNormalGL.png").rename(folder / "rockNormalDX.png")
+        dx = load_material(folder).maps["normal"]
+        assert dx is not None
+        assert dx * [1, -1, 1] == pytest.approx(gl)
+        png(folder / "rockNormalGL.png", codes(8, 16, 3))
+        assert load_material(folder).files["normal"].name == "rockNormalGL.png"
+
+    def test_single_pixels_are_constants_of_any_aspect(self, folder: Path) -> None:
+        png(folder / "rock-rough.png", np.full((1, 1), 51, np.uint8))
+        png(folder / "Rock_BaseColor.png", np.full((1, 1, 3), 255, np.uint8))
+        material = load_material(folder)
+        assert material.maps["roughness"] == pytest.approx(0.2)
+        assert material.maps["base_color"] == pytest.approx(np.ones(3))
+
+    def test_rounded_sizes_are_no_other_aspect(self, tmp_path: Path) -> None:
+        npy(tmp_path / "height.npy", np.zeros((683, 1024)))
+        png(tmp_path / "rough.png", codes(1365, 2048))
+        assert np.shape(load_material(tmp_path).maps["roughness"]) == (1365, 2048)
+        png(tmp_path / "rough.png", codes(1362, 2048))
+        with pytest.raises(InputError, match="one aspect"):
+            load_material(tmp_path)
+
+    def test_numbers_out_of_range_are_counted_and_placed(self, folder: Path) -> None:
+        (folder / "rock-rough.png").unlink()
+        rough = np.full((4, 8), 0.5)
+        rough[1, 6], rough[3, 2] = -0.1, 1.5
+        npy(folder / "rough.npy", rough)
+        with pytest.raises(InputError, match=r"rough\.npy: 2 pixels, the first at column 6, row 1, are"):
+            load_material(folder)
+        (folder / "rough.npy").unlink()
+        (folder / "Rock_BaseColor.png").unlink()
+        color = np.full((4, 8, 3), 0.5)
+        color[2, 7, 1] = 1.2
+        npy(folder / "color.npy", color)
+        with pytest.raises(InputError, match=r"color\.npy: 1 pixel, at column 7, row 2, is outside"):
+            load_material(folder)
+
+
+class TestYaml:
+    def write(self, folder: Path, text: str) -> Path:
+        path = folder / "material.yaml"
+        path.write_text(text)
+        return path
+
+    def test_files_are_relative_to_the_yaml(
+        self, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.chdir(tmp_path)
+        path = self.write(
+            folder,
+            "height: {file: rock_height.npy, scale: 0.2}\n"
+            "base_color: {value: [0.5, 0.25, 1.0], colorspace: srgb}\n"
+            "roughness: rock-rough.png\n"
+            "metallic: 1\n"
+            "specular: {value: 0.25}\n"
+            "opacity: 0.75\n",
+        )
+        for source in (path, folder, path.relative_to(tmp_path)):
+            material = load_material(source)
+            assert material.height_scale == 0.2
+            assert material.maps["base_color"] == pytest.approx(srgb_to_linear([0.5, 0.25, 1.0]))
+            assert np.shape(material.maps["roughness"]) == (4, 8)
+            assert (material.maps["metallic"], material.maps["specular"], material.maps["opacity"]) == (
+                1.0,
+                0.25,
+                0.75,
+            )
+
+    def test_gray_shorthand(self, folder: Path) -> None:
+        material = load_material(self.write(folder, "height: rock_height.npy\nbase_color: 0.8\n"))
+        assert np.array_equal(material.maps["base_color"], np.full(3, 0.8))
+        assert material.is_lambert
+
+    def test_bsdf_is_passed_on(self, folder: Path) -> None:
+        path = self.write(
+            folder,
+            "height: rock_height.npy\n"
+            "bsdf:\n  type: roughconductor\n  alpha: 0.2\n"
+            "  nested: {flag: true, n: 3, filename: rock_ao.png}\n",
+        )
+        material = load_material(path)
+        assert material.bsdf == {
+            "type": "roughconductor",
+            "alpha": 0.2,
+            "nested": {"flag": True, "n": 3, "filename": str(folder / "rock_ao.png")},
+        }
+        assert type(material.bsdf["alpha"]) is float
+        assert not material.is_lambert
+        assert "bsdf.0" in material.digests
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            (
+                "height: rock_height.npy\nroughnes: 0.5\n",
+                r"material\.yaml:2: unknown key 'roughnes'.*\n.*'roughness'",
+            ),
+            (
+                "height:\n  file: rock_height.npy\n  scal: 2\n",
+                r"material\.yaml:3: unknown key 'height\.scal'.*\n.*'scale'",
+            ),
+            ("roughness: 0.5\n", "key 'height' is missing"),
+            (
+                "height: rock_height.npy\nroughness: 1.5\n",
+                r"material\.yaml:2: .*roughness.*equal to 1",
+            ),
+            ("height: rock_height.npy\nbase_color: [0.1, 0.2]\n", r"material\.yaml:2: .*base_color"),
+            ("height: rock_height.npy\nbase_color: [0.1, 0.2, 1.2]\n", r"less than or equal to 1"),
+            ("height: rock_height.npy\nmetallic: {}\n", "either 'file' or 'value'"),
+            ("height: rock_height.npy\nmetallic: {file: a.png, value: 1}\n", "either 'file' or 'value'"),
+            ("height: rock_height.npy\nroughness: gone.png\n", r"gone\.png: no such file"),
+            ("height: rock_height.npy\nbsdf: {alpha: 1}\n", "needs a 'type'"),
+            ("height: rock_height.npy\nmetallic: 1\nbsdf: {type: diffuse}\n", "replaces metallic"),
+            ("height: rock_height.npy\nbsdf: {type: diffuse, filename: no.png}\n", r"no\.png: no such file"),
+            ("height: [\n", "not valid YAML"),
+            ("", "key 'height' is missing"),
+        ],
+    )
+    def test_invalid_inputs_are_named(self, folder: Path, text: str, message: str) -> None:
+        with pytest.raises(InputError, match=message):
+            load_material(self.write(folder, text))
+
+
+class TestDigests:
+    def test_they_cover_contents_and_not_names(self, folder: Path, tmp_path: Path) -> None:
+        moved = tmp_path / "elsewhere"
+        shutil.copytree(folder, moved)
+        (moved / "rock_height.npy").rename(moved / "cliff-displacement.npy")
+        assert load_material(moved).digests == load_material(folder).digests
+        numbers = np.load(moved / "cliff-displacement.npy")
+        numbers[3, 3] += 1e-9
+        np.save(moved / "cliff-displacement.npy", numbers)
+        one, other = load_material(moved).digests, load_material(folder).digests
+        assert {role for role in one if one[role] != other[role]} == {"height"}
+
+    def test_settings_of_the_yaml_count_and_its_layout_does_not(self, folder: Path) -> None:
+        path = folder / "material.yaml"
+
+        def digests(text: str) -> dict[str, str]:
+            path.write_text(text)
+            return load_material(path).digests
+
+        base = digests("height: rock_height.npy\nroughness: 0.5\n")
+        same = "# remark\nroughness: {value: 0.5}\nheight: {file: rock_height.npy, scale: 1}\n"
+        assert digests(same) == base
+        for text in (
+            "height: rock_height.npy\nroughness: 0.6\n",
+            "height: rock_height.npy\nmetallic: 0.5\n",
+            "height: {file: rock_height.npy, scale: 0.5}\nroughness: 0.5\n",
+            "height: rock_height.npy\nbsdf: {type: diffuse}\n",
+        ):
+            assert digests(text)["settings"] != base["settings"]
+
+    def test_a_bare_file_and_the_same_in_yaml_agree(self, folder: Path) -> None:
+        path = folder / "material.yaml"
+        path.write_text("height: rock_height.npy\n")
+        assert load_material(path).digests == load_material(folder / "rock_height.npy").digests
+
+    def test_the_convention_of_normals_counts(self, folder: Path) -> None:
+        before = load_material(folder).digests["settings"]
+        (folder / "rockNormalGL.png").rename(folder / "rockNormalDX.png")
+        assert load_material(folder).digests["settings"] != before

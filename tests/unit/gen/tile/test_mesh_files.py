@@ -1,0 +1,146 @@
+"""Mesh files: what is read, and that nothing else raises but one clear line."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mbtf_core.errors import InputError, MbtfError
+from mbtf_gen.tile.loading import load_material
+from mbtf_gen.tile.mesh_tile import MeshTile
+
+OBJ = "v 0 0 0\nv 2 0 0\nv 2 1 0.1\nv 0 1 0\nf 1 2 3\nf 1 3 4\n"
+PLY = """ply
+format ascii 1.0
+element vertex 4
+property float x
+property float y
+property float z
+element face 2
+property list uchar int vertex_indices
+end_header
+0 0 0
+2 0 0
+2 1 0.1
+0 1 0
+3 0 1 2
+3 0 2 3
+"""
+
+
+def shape_of(path: Path) -> MeshTile:
+    shape = load_material(path)
+    assert isinstance(shape, MeshTile)
+    return shape
+
+
+def bumps(period: float = 1.0) -> trimesh.Trimesh:
+    """A wavy sheet that tiles."""
+    n = 9
+    x, y = np.meshgrid(np.linspace(0, period, n), np.linspace(0, period, n))
+    z = 0.1 * np.sin(2 * np.pi * x / period) * np.cos(2 * np.pi * y / period)
+    index = np.arange(n * n).reshape(n, n)
+    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
+    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    return trimesh.Trimesh(np.stack([x, y, z], axis=-1).reshape(-1, 3), faces, process=False)
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".ply", ".glb"])
+def test_files_hold_the_same_tile(tmp_path: Path, suffix: str) -> None:
+    mesh = bumps(2.5)
+    if suffix == ".glb":
+        # glTF has y up.
+        mesh.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0]))
+    mesh.export(tmp_path / f"a{suffix}")
+    shape = shape_of(tmp_path / f"a{suffix}")
+    assert (shape.aspect, shape.thickness) == pytest.approx((1.0, 0.08), rel=1e-5)
+    assert len(shape.faces) == 128
+    assert shape.vertices[:, 2].max() == pytest.approx(0.0, abs=1e-9)
+    # Opposite borders fit.
+    assert shape.open_edges() == (0, 0)
+    assert load_material(tmp_path / f"a{suffix}").warnings == ()
+
+
+def test_a_period_that_does_not_fit_is_noted(tmp_path: Path) -> None:
+    bumps().export(tmp_path / "a.ply")
+    path = tmp_path / "m.yaml"
+    path.write_text("mesh: a.ply\nperiod: [1.1, 1]\n")
+    assert shape_of(path).open_edges()[0] > 0
+    path.write_text("mesh: a.ply\nperiod: [0.3, 1]\n")
+    with pytest.raises(InputError, match="periods"):
+        load_material(path)
+
+
+def test_copies_cover_what_reaches_over_the_border(tmp_path: Path) -> None:
+    mesh = bumps()
+    mesh.apply_translation([0.3, 0.2, 0])
+    mesh.export(tmp_path / "a.ply")
+    shape = shape_of(tmp_path / "a.ply")
+    number, shift = shape.copies()
+    corners = shape.vertices[shape.faces[number], :2] + shift[:, None, :2]
+    # The triangles' areas within the box add up to the box.
+    assert (corners.max(axis=1) >= -1e-6).all()
+    assert (corners.min(axis=1) <= 1 + 1e-6).all()
+    inside = np.random.default_rng(0).random((500, 2))
+    a, b, c = (corners[None, :, k] for k in range(3))
+    p = inside[:, None]
+
+    def side(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        (x, y), (dx, dy) = np.moveaxis(p - u, -1, 0), np.moveaxis(v - u, -1, 0)
+        return dx * y - dy * x
+
+    hits = ((side(a, b) > 0) & (side(b, c) > 0) & (side(c, a) > 0)).sum(axis=1)
+    assert (hits == 1).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "says"),
+    [
+        ("a.obj", OBJ.replace("2 1 0.1", "2 nan 0.1"), "finite"),
+        ("a.obj", "v 0 0 0\n", "no triangles"),
+        ("a.obj", OBJ.replace("v 2 1 0.1", "v 2 0 0").replace("v 0 1 0", "v 1 0 0"), "area"),
+        ("a.ply", PLY.replace("element vertex 4", "element vertex 1000000000"), ""),
+        ("a.ply", PLY[:120], ""),
+        ("a.ply", PLY.replace("3 0 2 3", "3 0 2 9"), ""),
+        ("a.glb", "glTF", ""),
+        ("a.ply", "", ""),
+    ],
+)
+def test_damaged_files_are_refused(tmp_path: Path, name: str, text: str, says: str) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError) as error:
+        load_material(tmp_path / name)
+    assert says in error.value.what
+    assert "\n" not in error.value.what
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.data(), kind=st.sampled_from([".ply", ".obj", ".glb"]))
+def test_altered_files_load_or_are_refused(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject, kind: str
+) -> None:
+    whole = bumps().export(file_type="glb") if kind == ".glb" else (PLY if kind == ".ply" else OBJ).encode()
+    start = data.draw(st.integers(0, min(len(whole), 2000) - 1))
+    length = data.draw(st.integers(0, 8))
+    path = tmp_path_factory.mktemp("fuzz") / f"a{kind}"
+    path.write_bytes(whole[:start] + data.draw(st.binary(max_size=8)) + whole[start + length :])
+    with contextlib.suppress(MbtfError):
+        assert np.isfinite(shape_of(path).thickness)
+
+
+def test_the_material_file_replaces_the_reflectance(tmp_path: Path) -> None:
+    bumps().export(tmp_path / "a.ply")
+    path = tmp_path / "m.yaml"
+    path.write_text("mesh: a.ply\nbase_color: [0.1, 0.2, 0.3]\nroughness: 0.4\n")
+    (part,) = shape_of(path).parts
+    assert np.asarray(part.base_color).tolist() == [0.1, 0.2, 0.3]
+    assert (part.roughness, part.metallic) == (0.4, 0.0)
+    digests = load_material(path).digests
+    path.write_text("mesh: a.ply\nbase_color: [0.1, 0.2, 0.3]\nroughness: 0.5\n")
+    assert load_material(path).digests != digests
