@@ -34,9 +34,9 @@ from mbtf_core.errors import MbtfError
 from mbtf_core.stats import Estimate
 from mbtf_gen.material.load import load_material
 from mbtf_gen.render.runtime import load_mitsuba
-from mbtf_pipeline.cost_study.generator_benchmark import GeneratorBenchmark
-from mbtf_pipeline.cost_study.generator_runs import UNIFORM, generator_tasks
-from mbtf_pipeline.cost_study.measurements import Measurement
+from mbtf_pipeline.cost.generator_benchmark import GeneratorBenchmark
+from mbtf_pipeline.cost.generator_runs import UNIFORM, generator_tasks
+from mbtf_pipeline.cost.measurements import Measurement
 from mbtf_pipeline.recipe import load_recipe
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -31,7 +31,7 @@ from mbtf_gen.config.generator import count_queries
 from mbtf_gen.config.presets import Quality
 from mbtf_gen.generation import Job
 from mbtf_gen.render.runtime import load_mitsuba
-from mbtf_pipeline.cost_study.runs import DataRequest, Run, RunRunner
+from mbtf_pipeline.cost.runs import DataRequest, Run, RunRunner
 from mbtf_pipeline.run_folder import machine
 
 SIZES = ((25, 7), (40, 12), (64, 16), (96, 24))

@@ -25,8 +25,8 @@ from typing import Any
 
 from mbtf_core.errors import MbtfError
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_pipeline.cost_study.measurements import SCHEMA
-from mbtf_pipeline.cost_study.runs import DataRequest, Run, RunRunner
+from mbtf_pipeline.cost.measurements import SCHEMA
+from mbtf_pipeline.cost.runs import DataRequest, Run, RunRunner
 from mbtf_pipeline.report.plots import Cloud, scatter
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -33,7 +33,7 @@ from mbtf_core.nested import deep_merge
 from mbtf_fit import FitConfig, fit
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.generation import generate
-from mbtf_pipeline.paper_tables.published import mse_ratio
+from mbtf_pipeline.papers.published import mse_ratio
 
 RESOLUTION = 128
 # Paths per test query.

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from PIL import Image, ImageDraw, ImageFont
 
-from mbtf_pipeline.cost_study.fit_runs import PRESET
+from mbtf_pipeline.cost.fit_runs import PRESET
 
 HERE = Path(__file__).parent
 OUT = HERE / "cost"

@@ -73,8 +73,8 @@ def emit(
     if "k8s" in to and image is None:
         raise UsageError("is missing", where="--image", hint="name the container image with the programs")
     from mbtf_core.units import asked_duration, clock, parse_size
-    from mbtf_pipeline.library.recipe import is_library_recipe
-    from mbtf_pipeline.paper_tables.recipe import is_paper_recipe
+    from mbtf_pipeline.library.entries import is_library_recipe
+    from mbtf_pipeline.papers.plan import is_paper_recipe
 
     if is_paper_recipe(recipe) or is_library_recipe(recipe):
         raise UsageError("has several runs", where=recipe, hint=f"use mbtf-pipeline run {recipe}")

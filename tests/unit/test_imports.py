@@ -66,9 +66,10 @@ mbtf_pipeline.layers
 mbtf_pipeline.report
 mbtf_pipeline.run
 mbtf_pipeline.forecast
+mbtf_pipeline.time_split
 mbtf_pipeline.emit
-mbtf_pipeline.cost_study
-mbtf_pipeline.paper_tables
+mbtf_pipeline.cost
+mbtf_pipeline.papers
 mbtf_pipeline.library
 mbtf_pipeline.cli
 mbtf_pipeline

@@ -239,16 +239,16 @@ def test_a_cost_study_measures_reports_and_resumes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two configurations of the generator, then a third one and a run of two seeds."""
-    from mbtf_pipeline.cost_study import study
-    from mbtf_pipeline.cost_study.fit_runs import planned_runs
-    from mbtf_pipeline.cost_study.generator_runs import generator_tasks
+    from mbtf_pipeline.cost import study
+    from mbtf_pipeline.cost.fit_runs import planned_runs
+    from mbtf_pipeline.cost.generator_runs import generator_tasks
 
     some, runs = 2, 0
     monkeypatch.setattr(study, "generator_tasks", lambda benchmark: islice(generator_tasks(benchmark), some))
     monkeypatch.setattr(study, "planned_runs", lambda *arguments: planned_runs(30.0, *arguments[1:])[:runs])
     monkeypatch.setattr(study, "_CONFIGURATIONS", 1000)
-    monkeypatch.setattr("mbtf_pipeline.cost_study.fit_runs.SHORTEST", 2.0)
-    monkeypatch.setattr("mbtf_pipeline.cost_study.runs.TEST", (4096, 8))
+    monkeypatch.setattr("mbtf_pipeline.cost.fit_runs.SHORTEST", 2.0)
+    monkeypatch.setattr("mbtf_pipeline.cost.runs.TEST", (4096, 8))
     out = tmp_path / "study"
     # Long enough never to decide what is measured.
     command = ["cost", str(RECIPE), "--time", "1h", "-o", str(out), "--json", "--quiet"]

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from support.paths import ROOT
 
-from mbtf_pipeline.paper_tables.recipe import is_paper_recipe, load_paper_recipe
+from mbtf_pipeline.papers.plan import is_paper_recipe, load_paper_recipe
 from mbtf_pipeline.recipe import load_recipe
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mbtf_core.errors import InputError, UsageError
-from mbtf_pipeline.library.recipe import entries, is_library_recipe, load_library_recipe
+from mbtf_pipeline.library.entries import entries, is_library_recipe, load_library_recipe
 
 BASE = "base: {generate: {queries: {train: 10/texel}}}\n"
 

@@ -15,7 +15,7 @@ from mbtf_core.cluster.task import Task, TaskResult
 from mbtf_core.errors import InputError
 from mbtf_fit.config import SHARED_PRESET
 from mbtf_pipeline.library import run as library_run
-from mbtf_pipeline.library.recipe import entries, load_library_recipe
+from mbtf_pipeline.library.entries import entries, load_library_recipe
 from mbtf_pipeline.library.run import LibraryResult, run_library
 from mbtf_pipeline.library.task import summarize
 
