@@ -33,8 +33,11 @@ from mbtf_core.nested import deep_merge
 from mbtf_fit import FitConfig, fit
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.generation import generate
+from mbtf_pipeline.papers.plan import load_paper_recipe
 from mbtf_pipeline.papers.published import mse_ratio
 
+# Recipe with the published errors.
+PAPER = Path(__file__).parents[1] / "pipelines" / "paper_methods.yaml"
 RESOLUTION = 128
 # Paths per test query.
 TEST_SPP = 256
@@ -133,7 +136,8 @@ def compared(name: str, folder: Path, time: str, seed: int) -> dict[str, Any]:
     ratio, bar = ratio_of(fits["relief"], fits["neumip"])
     extent = Dataset.open(data).manifest["tile"]["displacement_range"]
     limit = THRESHOLDS["displaced" if extent >= DISPLACED else "any"]
-    published = mse_ratio(name, "neumip", "neumip-baseline")
+    paper = load_paper_recipe(PAPER, [])
+    published = mse_ratio(paper.published, name, "neumip", "neumip-baseline")
     over_baseline = {}
     if published is not None:
         plain = train("neumip-baseline", BASELINE, data, folder / name, time, seed)

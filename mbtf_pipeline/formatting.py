@@ -80,7 +80,7 @@ def width(tiles_across: float) -> str:
     return f"{tiles_across:g} tile{'' if tiles_across == 1 else 's'} across"
 
 
-def levels(found: list[float], finest: int) -> str:
+def levels_text(found: list[float], finest: int) -> str:
     """Range of levels in an image, and whether the data contain them."""
     low, high = (f"{level:.1f}" for level in found)
     text = f"level {low}" if low == high else f"level {low}–{high}"

@@ -12,6 +12,7 @@ from pydantic import Field
 from mbtf_core.config_file import Settings, read_yaml, resolve
 from mbtf_core.errors import InputError
 from mbtf_pipeline.layers import Layer, MaterialLayer, compose
+from mbtf_pipeline.papers.published import Published
 from mbtf_pipeline.recipe import Name, Recipe
 
 # Sub-folder of the runs.
@@ -32,6 +33,7 @@ class PaperRecipe(Settings):
     base: Layer = Field(description="options of all runs")
     quick: Layer = Field(Layer(), description="overrides the base with --quick")
     variants: dict[Name, Layer] = Field({}, description="name → options; run for every material")
+    published: list[Published] = Field([], description="published numbers, shown beside measured ones")
 
     def folder(self, quick: bool) -> Path:
         """Default folder of all runs, relative to the current folder."""

@@ -1,18 +1,29 @@
-"""Finished runs of a paper recipe."""
+"""Finished runs of a paper recipe, and what its tables share."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from mbtf_core.atomic import read_json
 from mbtf_core.lattice import Lattice
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.compare.compare import COMPARISON_NAME
-from mbtf_pipeline.formatting import estimate
+from mbtf_pipeline.compare.pictures import with_ending
+from mbtf_pipeline.formatting import estimate, is_significant
+from mbtf_pipeline.report.embed import jpeg_uri, map_uri
 from mbtf_pipeline.run_folder import COMPARE, SHARDS
+from mbtf_pipeline.tables import Column, Thumbnail
+
+_QUALITY = 86
+MATERIAL = Column("material", "material", lambda run, *_: run.title)
+METHOD = Column("method", "method", lambda run, fit, *_: fit)
 
 
 @dataclass(frozen=True)
@@ -91,3 +102,32 @@ class FinishedRun:
 def each_fit(runs: Sequence[FinishedRun]) -> Iterator[tuple[FinishedRun, str]]:
     """All (run, fit)."""
     return ((run, fit) for run in runs for fit in run.fits)
+
+
+def preview(path: Path, label: str, *lines: str) -> Thumbnail:
+    """An image of the comparison (path without suffix) at its exposure."""
+    from PIL import Image
+
+    with Image.open(with_ending(path, ".png")) as image:
+        return Thumbnail(jpeg_uri(np.asarray(image.convert("RGB")), _QUALITY), label, lines)
+
+
+def signed_map(values: NDArray[np.floating], scale: float, label: str, *lines: str) -> Thumbnail:
+    """A signed map (rows, columns), saturated at ± `scale`."""
+    return Thumbnail(map_uri((values / scale).astype(np.float64), "signed", 256), label, lines)
+
+
+def mean_of(estimates: Sequence[Estimate]) -> Estimate:
+    """Mean of independent estimates."""
+    n = len(estimates)
+    error = math.sqrt(sum(e.error**2 for e in estimates)) / n
+    return Estimate(sum(e.value for e in estimates) / n, error, sum(e.n for e in estimates))
+
+
+def ratio_of(upper: Estimate, lower: Estimate) -> Estimate:
+    """Ratio of two independent estimates; undefined unless the lower one is significantly positive."""
+    n = min(upper.n, lower.n)
+    if lower.value <= 0 or not is_significant(lower):
+        return Estimate(math.nan, math.inf, n)
+    value = upper.value / lower.value
+    return Estimate(value, math.hypot(upper.error, value * lower.error) / lower.value, n)

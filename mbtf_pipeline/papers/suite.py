@@ -13,27 +13,23 @@ from mbtf_core.errors import InputError
 from mbtf_core.folders import check_folder, owned
 from mbtf_pipeline.compare.metrics import DEFINITIONS
 from mbtf_pipeline.compare.st_lpips import weights_file
-from mbtf_pipeline.papers.ablations import ablations
-from mbtf_pipeline.papers.cells import Table
-from mbtf_pipeline.papers.independence import independence
-from mbtf_pipeline.papers.levels import levels
-from mbtf_pipeline.papers.methods import methods
-from mbtf_pipeline.papers.offsets import offsets
+from mbtf_pipeline.papers.checks import independence, offsets, timing, weights
+from mbtf_pipeline.papers.errors import ablations, levels, methods, zooms
 from mbtf_pipeline.papers.plan import RUNS, PaperRecipe, Planned
+from mbtf_pipeline.papers.published import Published
 from mbtf_pipeline.papers.runs import FinishedRun
-from mbtf_pipeline.papers.sizes import timing, weights
-from mbtf_pipeline.papers.zooms import zooms
 from mbtf_pipeline.report.plots import ERROR_BAR_NOTE
 from mbtf_pipeline.report.report import render
 from mbtf_pipeline.run import generate_data, run_recipe, slices_folder
 from mbtf_pipeline.run_folder import has_record, machine
+from mbtf_pipeline.tables import Table
 
 PAPER_NAME = "paper.json"
 PAPER_FORMAT = "mbtf-paper"
-PAPER_SCHEMA = 2
+PAPER_SCHEMA = 3
 PAGE = "paper.html"
 TABLES = "tables"
-_MAKERS: dict[str, Callable[[Sequence[FinishedRun]], list[Table]]] = {
+_MAKERS: dict[str, Callable[[Sequence[FinishedRun], Sequence[Published]], list[Table]]] = {
     "methods": methods,
     "levels": levels,
     "weights": weights,
@@ -122,6 +118,7 @@ def run_paper(
         "size": "quick" if quick else "full",
         "command": command,
         "tables": list(paper.tables),
+        "published": [one.model_dump(mode="json") for one in paper.published],
         "skipped": dict(missing),
         "machine": machine(),
         "planned": len(planned),
@@ -174,7 +171,8 @@ def _write_page(folder: Path, record: Mapping[str, Any]) -> tuple[Path, list[Pat
     if not record["runs"]:
         raise InputError("contains no finished run", where=folder, hint="run the recipe again: it resumes")
     runs = [FinishedRun.read(r["material"], r["variant"], folder / RUNS / r["name"]) for r in record["runs"]]
-    tables = [table for name in record["tables"] for table in _MAKERS[name](runs)]
+    published = [Published.model_validate(one) for one in record["published"]]
+    tables = [table for name in record["tables"] for table in _MAKERS[name](runs, published)]
     (folder / TABLES).mkdir(exist_ok=True)
     files = [folder / TABLES / f"{table.key}.csv" for table in tables]
     for file, table in zip(files, tables, strict=True):

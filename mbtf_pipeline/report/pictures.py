@@ -17,7 +17,7 @@ from mbtf_pipeline.formatting import (
     direction,
     estimate,
     estimate_text,
-    levels,
+    levels_text,
     short_direction,
     width,
 )
@@ -135,7 +135,7 @@ class _Sheet:
         self._metrics = available_metrics(comparison["pictures"], comparison["fits"])
 
     def _title(self, picture: Mapping[str, Any]) -> str:
-        return f"{width(picture['tiles_across'])}, {levels(picture['levels'], self._finest)}"
+        return f"{width(picture['tiles_across'])}, {levels_text(picture['levels'], self._finest)}"
 
     def block(self, number: int, picture: Mapping[str, Any]) -> dict[str, Any]:
         """Figures of one scene: rows of four, references in the first column."""

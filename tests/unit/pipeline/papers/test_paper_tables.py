@@ -11,19 +11,17 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from support.paths import ROOT
 
 from mbtf_core.stats import Estimate
-from mbtf_pipeline.compare.perceptual_metrics import PERCEPTUAL_METRICS
-from mbtf_pipeline.papers import published
-from mbtf_pipeline.papers.ablations import ablations
-from mbtf_pipeline.papers.cells import Column, Table, mean_of, perceptual_cell, psnr_cell, ratio_of
-from mbtf_pipeline.papers.independence import independence
-from mbtf_pipeline.papers.levels import levels
-from mbtf_pipeline.papers.methods import methods
-from mbtf_pipeline.papers.runs import FinishedRun
-from mbtf_pipeline.papers.sizes import timing, weights
-from mbtf_pipeline.papers.zooms import zooms
+from mbtf_pipeline.papers.checks import independence, timing, weights
+from mbtf_pipeline.papers.errors import ablations, levels, methods, zooms
+from mbtf_pipeline.papers.plan import load_paper_recipe
+from mbtf_pipeline.papers.published import level_ratios, mse_ratio
+from mbtf_pipeline.papers.runs import FinishedRun, mean_of, ratio_of
+from mbtf_pipeline.tables import Column, Shown, Table
 
+PUBLISHED = load_paper_recipe(ROOT / "pipelines" / "paper_methods.yaml", []).published
 MSE = {"neumip-baseline": 4e-4, "neumip": 2e-4}
 
 
@@ -78,7 +76,7 @@ def csv_of(table: Table) -> list[dict[str, str]]:
 
 
 def test_methods_mark_insignificant_and_missing_numbers(tmp_path: Path) -> None:
-    table, ratios = methods([make(tmp_path)])
+    table, ratios = methods([make(tmp_path)], PUBLISHED)
     first, second = rows_of(table)
     assert first["MSE [10⁻³/sr²]"] == "0.4000 ± 0.0010"
     assert second["MSE − MSE of the first method [10⁻³/sr²]"] == "not significant (−0.2 ± 0.3)"
@@ -95,20 +93,20 @@ def test_methods_mark_insignificant_and_missing_numbers(tmp_path: Path) -> None:
 
 
 def test_published_numbers_match_the_papers() -> None:
-    found = published.mse_ratio("insulation_foam", "rainer2020", "neumip")
+    found = mse_ratio(PUBLISHED, "insulation_foam", "rainer2020", "neumip")
     assert found == (pytest.approx(21.75 / 3.90), "Kuznetsov et al. 2021")
-    assert published.mse_ratio("insulation_foam", "hierarchical", "neumip") is None
-    assert published.mse_ratio("tree_bark", "neumip", "neumip-baseline") is None
-    decibels = published.mse_ratio("turtle_shell", "hierarchical", "neumip")
+    assert mse_ratio(PUBLISHED, "insulation_foam", "hierarchical", "neumip") is None
+    assert mse_ratio(PUBLISHED, "tree_bark", "neumip", "neumip-baseline") is None
+    decibels = mse_ratio(PUBLISHED, "turtle_shell", "hierarchical", "neumip")
     assert decibels is not None
     assert -10 * math.log10(decibels[0]) == pytest.approx(32.18 - 30.79)
-    zooms = published.level_ratios("twisted_wool", "neumip")
+    zooms = level_ratios(PUBLISHED, "twisted_wool", "neumip")
     assert zooms is not None
     assert [round(3.98 * ratio, 2) for ratio in zooms[0]] == [3.98, 2.1, 1.47, 1.07, 0.74, 1.16, 1.17, 1.08]
 
 
 def test_levels_start_at_the_coarsest_and_zooms_at_the_finest(tmp_path: Path) -> None:
-    table, relative = levels([make(tmp_path, "twisted_wool")])
+    table, relative = levels([make(tmp_path, "twisted_wool")], PUBLISHED)
     assert csv_of(table)[0]["mse_level_0"] == "0.0001"
     assert csv_of(table)[0]["mse_level_1"] == "0.0004"
     assert "<svg" in table.plots[0]["svg"]
@@ -122,7 +120,7 @@ def test_levels_start_at_the_coarsest_and_zooms_at_the_finest(tmp_path: Path) ->
 
 def test_ablations_compare_with_the_first_row(tmp_path: Path) -> None:
     runs = [make(tmp_path, variant="architecture"), make(tmp_path, variant="queries-100")]
-    rows = csv_of(ablations(runs)[0])
+    rows = csv_of(ablations(runs, PUBLISHED)[0])
     assert [r["variant"] for r in rows] == ["neumip-baseline", "neumip"] * 2
     assert rows[0]["turtle_shell_minus_first"] == ""
     # Paired on the same data, otherwise from two independent errors.
@@ -137,10 +135,10 @@ def test_sizes_and_times(tmp_path: Path) -> None:
     times = {"device": "cpu", "queries": 7, "evaluate_ms": 9.0, "stage1_ms": 5.0, "stage2_ms": 2.0}
     times |= {"lights_ms": {"1": 7.0, "16": 37.0}, "parts_ms": {"pyramid": 4.0}}
     run = make(tmp_path, timing={"neumip": [times]})
-    (row,) = rows_of(timing([run])[0])
+    (row,) = rows_of(timing([run], PUBLISHED)[0])
     assert row["offset texture"] == "–"
     assert (row["pyramid"], row["1 light"], row["16 lights"]) == ("4.0", "7.0", "37.0")
-    counted = rows_of(weights([run])[0])
+    counted = rows_of(weights([run], PUBLISHED)[0])
     assert counted[1]["all networks"] == "3,254"
     assert counted[1]["published"].startswith("3332; 3254")
 
@@ -149,7 +147,7 @@ def test_zooms_have_one_row_per_span_and_fit(tmp_path: Path) -> None:
     run = make(tmp_path)
     far = record(tmp_path, 8.0)["pictures"]
     run.comparison["pictures"] = run.pictures + far
-    table = zooms([run])[0]
+    table = zooms([run], PUBLISHED)[0]
     assert [(r["tiles_across"], r["method"]) for r in csv_of(table)] == [
         (s, f) for s in ("1", "8") for f in MSE
     ]
@@ -158,7 +156,7 @@ def test_zooms_have_one_row_per_span_and_fit(tmp_path: Path) -> None:
 
 def test_unmodified_mitsuba_agrees_or_differs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        "mbtf_pipeline.papers.independence.read_picture", lambda path: np.zeros((4, 4, 3), np.float32)
+        "mbtf_pipeline.papers.checks.read_picture", lambda path: np.zeros((4, 4, 3), np.float32)
     )
     direction = {"elevation": 85, "azimuth": 0}
     files = {"mbtf": "reference", "mitsuba": "neumip"}
@@ -167,26 +165,31 @@ def test_unmodified_mitsuba_agrees_or_differs(tmp_path: Path, monkeypatch: pytes
         for s, square in (("base color", 1e-5), ("full", 4e-2))
     ]
     check = {"view": direction, "light": direction, "surfaces": surfaces}
-    table = independence([make(tmp_path, unmodified_mitsuba=check)])[0]
+    table = independence([make(tmp_path, unmodified_mitsuba=check)], PUBLISHED)[0]
     same, other = rows_of(table)
     rms = "RMS difference, noise-free [% of the mean]"
     assert (same["verdict"], same[rms]) == ("agree", "below 1.6 %")
     assert (other["verdict"], other[rms]) == ("differ", "20.00 ± 0.03 %")
     # The verdict changes at the detection limit.
     surfaces[0]["square"] = number(0.0, 1e-3)
-    seen = float(csv_of(independence([make(tmp_path, unmodified_mitsuba=check)])[0])[0]["rms_detectable"])
+    seen = float(
+        csv_of(independence([make(tmp_path, unmodified_mitsuba=check)], PUBLISHED)[0])[0]["rms_detectable"]
+    )
     for factor, verdict in ((0.99, "agree"), (1.01, "differ")):
         surfaces[0]["square"] = number((factor * seen) ** 2, 1e-3)
-        assert rows_of(independence([make(tmp_path, unmodified_mitsuba=check)])[0])[0]["verdict"] == verdict
+        assert (
+            rows_of(independence([make(tmp_path, unmodified_mitsuba=check)], PUBLISHED)[0])[0]["verdict"]
+            == verdict
+        )
     # A single block of pixels has no error bar and is inconclusive.
     surfaces[0] |= {key: {"value": 0.4, "error": None, "n": 1} for key in ("mean", "square")}
-    row = rows_of(independence([make(tmp_path, unmodified_mitsuba=check)])[0])[0]
+    row = rows_of(independence([make(tmp_path, unmodified_mitsuba=check)], PUBLISHED)[0])[0]
     assert (row["verdict"], row[rms]) == ("inconclusive", "–")
 
 
 def test_cells_are_printed_and_exported() -> None:
     columns = [Column("a", "a", factor=100.0), Column("b", "b"), Column("c", "c")]
-    seen = perceptual_cell(PERCEPTUAL_METRICS[2], 0.97, 0.9)
+    seen = Shown("0.970, within noise", 0.97, 0.9, "noise")
     table = Table("t", "", "", columns, [[Estimate(0.5, 0.01, 9), None, seen], ["x", 1200, None]])
     assert table.for_page()["rows"] == [["50.0 ± 1.0", "–", "0.970, within noise"], ["x", "1,200", "–"]]
     assert table.csv().splitlines() == ["a,a_se,b,c,c_noise", "0.5,0.01,,0.97,0.9", "x,,1200,,"]
@@ -198,4 +201,3 @@ def test_means_and_ratios_have_error_bars() -> None:
     ratio = ratio_of(Estimate(2.0, 0.2, 10), Estimate(4.0, 0.4, 10))
     assert (ratio.value, ratio.error) == (0.5, pytest.approx(0.5 * math.hypot(0.1, 0.1)))
     assert math.isnan(ratio_of(Estimate(2.0, 0.2, 10), Estimate(0.4, 0.4, 10)).value)
-    assert math.isinf(psnr_cell(Estimate(-1.0, 0.1, 9), 1.0).value)

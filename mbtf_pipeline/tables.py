@@ -7,19 +7,10 @@ import io
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
-from mbtf_core.stats import Estimate, psnr
-from mbtf_pipeline.compare.perceptual_metrics import PerceptualMetric
-from mbtf_pipeline.compare.pictures import with_ending
-from mbtf_pipeline.formatting import decibel, estimate_text, is_significant, signed
-from mbtf_pipeline.report.embed import jpeg_uri, map_uri
-
-_QUALITY = 86
+from mbtf_core.stats import Estimate
+from mbtf_pipeline.formatting import estimate_text, signed
 
 
 class Shown(NamedTuple):
@@ -30,17 +21,6 @@ class Shown(NamedTuple):
     value: float
     second: float | None
     suffix: str
-
-
-def psnr_cell(mse: Estimate, peak: float) -> Shown:
-    """A PSNR in dB, from a noise-free MSE and the peak, both in units of 1/sr."""
-    found = psnr(mse, peak)
-    return Shown(decibel(found, mse), found.value, found.error, "se")
-
-
-def perceptual_cell(metric: PerceptualMetric, value: float, noise: float | None) -> Shown:
-    """Value of a perceptual metric, and its value for noise alone."""
-    return Shown(metric.text(value, noise, with_noise=False), value, noise, "noise")
 
 
 Cell = Estimate | Shown | float | int | str | None
@@ -92,10 +72,6 @@ def _number(x: float | str | None) -> str:
     return "" if x is None else str(x)
 
 
-MATERIAL = Column("material", "material", lambda run, *_: run.title)
-METHOD = Column("method", "method", lambda run, fit, *_: fit)
-
-
 def rows_of(columns: Sequence[Column], items: Iterable[Sequence[Any]]) -> list[list[Cell]]:
     """One row per item; an item holds the arguments of the columns' functions."""
     return [[column.cell(*item) for column in columns] for item in items]
@@ -107,19 +83,6 @@ class Thumbnail(NamedTuple):
     image: str
     label: str
     lines: Sequence[str] = ()
-
-
-def preview(path: Path, label: str, *lines: str) -> Thumbnail:
-    """An image of the comparison (path without suffix) at its exposure."""
-    from PIL import Image
-
-    with Image.open(with_ending(path, ".png")) as image:
-        return Thumbnail(jpeg_uri(np.asarray(image.convert("RGB")), _QUALITY), label, lines)
-
-
-def signed_map(values: NDArray[np.floating], scale: float, label: str, *lines: str) -> Thumbnail:
-    """A signed map (rows, columns), saturated at ± `scale`."""
-    return Thumbnail(map_uri((values / scale).astype(np.float64), "signed", 256), label, lines)
 
 
 @dataclass(frozen=True)
@@ -149,19 +112,3 @@ class Table:
         writer.writeheader()
         writer.writerows({key: x for cell in row for key, x in cell.items()} for row in rows)
         return stream.getvalue()
-
-
-def mean_of(estimates: Sequence[Estimate]) -> Estimate:
-    """Mean of independent estimates."""
-    n = len(estimates)
-    error = math.sqrt(sum(e.error**2 for e in estimates)) / n
-    return Estimate(sum(e.value for e in estimates) / n, error, sum(e.n for e in estimates))
-
-
-def ratio_of(upper: Estimate, lower: Estimate) -> Estimate:
-    """Ratio of two independent estimates; undefined unless the lower one is significantly positive."""
-    n = min(upper.n, lower.n)
-    if lower.value <= 0 or not is_significant(lower):
-        return Estimate(math.nan, math.inf, n)
-    value = upper.value / lower.value
-    return Estimate(value, math.hypot(upper.error, value * lower.error) / lower.value, n)
