@@ -42,7 +42,6 @@ def error_context(comparison: Mapping[str, Any], min_cos: float) -> dict[str, An
         "group_tables": [_group_table(tests, min_cos, *grouping) for grouping in _GROUPINGS],
         "picture_table": _pictures_table(comparison),
         "contrast_table": _contrast_table(comparison),
-        "phase_table": _phase_table(comparison),
         "definitions": [(_TERMS[k], v) for k, v in comparison["definitions"].items()],
     }
 
@@ -169,17 +168,3 @@ def _contrast_table(comparison: Mapping[str, Any]) -> dict[str, Any]:
     heads = [f"{name}, {kind} reference" for kind in comparison["kinds"] for name in names]
     title = "Contrast relative to the reference (1 is right)"
     return {"title": title, "head": ["view", "light", "tiles across", "fit", *heads], "rows": rows}
-
-
-def _phase_table(comparison: Mapping[str, Any]) -> dict[str, Any]:
-    """One row per level and fit: contrast of luminance at places between texels."""
-    levels = sorted({row["level"] for row in comparison["phases"]})
-    phases = list(dict.fromkeys(row["phase"] for row in comparison["phases"]))
-    found = {(row["level"], row["phase"]): row["fits"] for row in comparison["phases"]}
-    rows = [
-        [str(level), fit, *(_relative(found[level, phase][fit]) for phase in phases)]
-        for level in levels
-        for fit in comparison["fits"]
-    ]
-    title = "Contrast at places of the texels, relative to path-traced values there (1 is right)"
-    return {"title": title, "head": ["level", "fit", *phases], "rows": rows}

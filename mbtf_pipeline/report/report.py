@@ -21,12 +21,11 @@ from mbtf_pipeline.report.material import material_section
 from mbtf_pipeline.report.offsets import offset_section
 from mbtf_pipeline.report.pictures import picture_section
 from mbtf_pipeline.report.plots import ERROR_BAR_NOTE
-from mbtf_pipeline.report.times import provenance, time_context
-from mbtf_pipeline.report.training import read_training, training_context
+from mbtf_pipeline.report.times import provenance, read_training, time_context, training_context
 from mbtf_pipeline.run_folder import COMPARE, FITS, REPORT, RUN_NAME, SHARDS
 
 # Raised when the report or the viewer's page changes; part of the stage's key.
-LAYOUT = 9
+LAYOUT = 10
 
 _TABLE = """
 {%- set below = t.head[-1] == "command" %}
@@ -101,7 +100,7 @@ def write_report(folder: Path, recipe: Recipe, stages: Sequence[str]) -> None:
         "provenance": provenance(folder, manifest, fit_folders, run["machine"]),
         **error_context(comparison, float(manifest["config"]["queries"]["min_cos"])),
         **training_context(histories),
-        **time_context(folder, stages, manifest, comparison, histories),
+        **time_context(folder, stages, manifest, comparison),
         "exposure": describe_exposure(gallery.exposure),
         "stops": EXPOSURE_STOPS,
     }

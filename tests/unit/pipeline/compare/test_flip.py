@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mbtf_pipeline.compare.flip import flip
+from mbtf_pipeline.compare.perceptual_metrics import flip
 
 Color = tuple[float, float, float]
 

@@ -11,8 +11,8 @@ import pytest
 from mbtf_core.errors import EngineError
 from mbtf_core.exposure import to_display
 from mbtf_pipeline.compare import st_lpips as perceptual
-from mbtf_pipeline.compare.ssim import ssim, to_srgb
-from mbtf_pipeline.compare.st_lpips import st_lpips, weights_file
+from mbtf_pipeline.compare.perceptual_metrics import ssim
+from mbtf_pipeline.compare.st_lpips import st_lpips, to_srgb, weights_file
 
 F64 = np.ndarray
 needs_weights = pytest.mark.skipif(
