@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -28,6 +26,7 @@ from mbtf_pipeline.cost.pareto import extrapolation, pareto_front
 from mbtf_pipeline.cost.study import STUDY_NAME, Study
 from mbtf_pipeline.formatting import is_significant
 from mbtf_pipeline.report.report import render
+from mbtf_pipeline.tables import Cell, Column, Table, rows_of
 
 CSV_NAME, PAGE_NAME = "cost.csv", "cost.html"
 _DETAILS = (
@@ -40,28 +39,23 @@ _DETAILS = (
     "bytes",
     "seeds",
 )
-COLUMNS = (
-    "study",
-    "series",
-    "name",
-    *(f"{name}{suffix}" for name in ESTIMATES for suffix in ("", "_se")),
-    *_DETAILS,
-    "command",
-)
+
+
+def _column(name: str) -> Column:
+    """A column of the CSV file: a field of a measurement, or one of its details."""
+
+    def cell(m: Measurement) -> Cell:
+        return m.details.get(name) if name in _DETAILS else getattr(m, name)
+
+    return Column(name, name, cell)
+
+
+_CSV = [_column(name) for name in ("study", "series", "name", *ESTIMATES, *_DETAILS, "command")]
 
 
 def to_csv(found: Sequence[Measurement]) -> str:
     """One row per configuration; ``_se`` are standard errors, empty cells were not measured."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    for m in found:
-        estimates = [getattr(m, name) or Estimate(math.nan, math.nan, 0) for name in ESTIMATES]
-        numbers = [x for e in estimates for x in (e.value, e.error)]
-        numbers += [m.details.get(name, math.nan) for name in _DETAILS]
-        cells = [f"{x:.6g}" if math.isfinite(x) else "" for x in numbers]
-        writer.writerow([m.study, m.series, m.name, *cells, m.command])
-    return stream.getvalue()
+    return Table("cost", "", "", _CSV, rows_of(_CSV, ([m] for m in found))).csv()
 
 
 def _percent(e: Estimate | None) -> str:
@@ -72,39 +66,37 @@ def _percent(e: Estimate | None) -> str:
     return f"{e.scaled(100.0)} %" if is_significant(e) else f"< {100 * 2 * max(e.error, e.value):.2g} %"
 
 
-# Columns of both tables: title, and text of a measurement.
-_Columns = dict[str, Callable[[Measurement], str]]
-_GENERATOR: _Columns = {
-    "configuration": lambda m: m.title,
-    "seconds per million queries": lambda m: f"{m.seconds}",
-    "bias": lambda m: _percent(m.bias),
-    "noise": lambda m: _percent(m.noise),
-    "error": lambda m: _percent(m.error),
-    "command": lambda m: m.command,
-}
-_RUNS: _Columns = {
-    "run": lambda m: m.title,
-    "queries × paths": lambda m: f"{m.details['queries'] / 1e6:.2f} M × {m.details['spp']:g}",
-    "generating, s": lambda m: f"{m.details['generation_seconds']:.1f}",
-    "training, s": lambda m: f"{m.details['training_seconds']:.1f}",
-    "total, s": lambda m: f"{m.details['total_seconds']:.1f}",
-    "unexplained variance": lambda m: f"{m.error}" if math.isfinite(m.error.value) else "–",
-    "seeds": lambda m: f"{m.details['seeds']:g}",
-    "1080p, ms": lambda m: f"{m.details['evaluation_ms_1080p']:.0f}",
-    "MB": lambda m: f"{m.details['bytes'] / 1e6:.2f}",
-    "command": lambda m: m.command,
-}
+def _of(title: str, text: Callable[[Measurement], str]) -> Column:
+    return Column(title, "", text)
 
 
-def _table(columns: _Columns, found: Sequence[Measurement]) -> dict[str, Any]:
-    return {"head": list(columns), "rows": [[text(m) for text in columns.values()] for m in found]}
+_GENERATOR = [
+    _of("configuration", lambda m: m.title),
+    _of("seconds per million queries", lambda m: f"{m.seconds}"),
+    _of("bias", lambda m: _percent(m.bias)),
+    _of("noise", lambda m: _percent(m.noise)),
+    _of("error", lambda m: _percent(m.error)),
+    _of("command", lambda m: m.command),
+]
+_RUNS = [
+    _of("run", lambda m: m.title),
+    _of("queries × paths", lambda m: f"{m.details['queries'] / 1e6:.2f} M × {m.details['spp']:g}"),
+    _of("generating, s", lambda m: f"{m.details['generation_seconds']:.1f}"),
+    _of("training, s", lambda m: f"{m.details['training_seconds']:.1f}"),
+    _of("total, s", lambda m: f"{m.details['total_seconds']:.1f}"),
+    _of("unexplained variance", lambda m: f"{m.error}" if math.isfinite(m.error.value) else "–"),
+    _of("seeds", lambda m: f"{m.details['seeds']:g}"),
+    _of("1080p, ms", lambda m: f"{m.details['evaluation_ms_1080p']:.0f}"),
+    _of("MB", lambda m: f"{m.details['bytes'] / 1e6:.2f}"),
+    _of("command", lambda m: m.command),
+]
 
 
 class _Section(NamedTuple):
     title: str
     text: str
     figures: Figures
-    columns: _Columns = _GENERATOR
+    columns: Sequence[Column] = tuple(_GENERATOR)
 
 
 _SECTIONS = {
@@ -146,6 +138,10 @@ _SECTIONS = {
 }
 
 
+def _table(columns: Sequence[Column], found: Sequence[Measurement]) -> dict[str, Any]:
+    return Table("", "", "", columns, rows_of(columns, ([m] for m in found))).for_page()
+
+
 def whole_runs(found: Sequence[Measurement]) -> list[Measurement]:
     """The runs of all comparisons, by their total time."""
     return [
@@ -158,7 +154,7 @@ def whole_runs(found: Sequence[Measurement]) -> list[Measurement]:
 def _sections(study: Study) -> list[dict[str, Any]]:
     runs = whole_runs(study.measurements)
     front = pareto_front(runs)
-    columns = {**_RUNS, "run": lambda m: m.label}
+    columns = [_of("run", lambda m: m.label), *_RUNS[1:]]
     front_section = _Section("All runs", _front_text(front), front_figures, columns)
     shown = {name: [m for m in study.measurements if m.study == name] for name in _SECTIONS}
     shown["front"] = runs

@@ -22,7 +22,7 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.cost import study as module
 from mbtf_pipeline.cost.generator_runs import GeneratorTask
 from mbtf_pipeline.cost.measurements import Measurement, MeasurementFolder
-from mbtf_pipeline.cost.page import COLUMNS, to_csv
+from mbtf_pipeline.cost.page import to_csv
 from mbtf_pipeline.cost.pareto import extrapolation, pareto_front
 from mbtf_pipeline.cost.runs import Run
 from mbtf_pipeline.recipe import load_recipe
@@ -76,7 +76,6 @@ def test_measurements_come_back_and_damaged_ones_are_repeated(tmp_path: Path) ->
 
 def test_the_csv_holds_every_number_with_its_error() -> None:
     rows = list(csv.DictReader(io.StringIO(to_csv([point(10, 0.5, bytes=3e5), point(20, math.nan)]))))
-    assert tuple(rows[0]) == COLUMNS
     assert (rows[0]["seconds"], rows[0]["error"], rows[0]["error_se"]) == ("10", "0.5", "0.01")
     assert (rows[0]["bytes"], rows[0]["bias"], rows[1]["error"]) == ("300000", "", "")
 
