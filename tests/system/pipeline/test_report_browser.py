@@ -269,19 +269,6 @@ def test_every_control_has_an_accessible_name(page: Page, stage: Any) -> None:
     assert page.js(code) == []
 
 
-def test_errors_of_scripts_reach_the_log(page: Page) -> None:
-    page.collect()
-    before = len(page.errors)
-    page.js("setTimeout(() => { throw new Error('planted'); }, 0)")
-
-    def found() -> bool:
-        page.collect()
-        return any("planted" in e for e in page.errors[before:])
-
-    page.until(found, "the planted error")
-    del page.errors[before:]
-
-
 def test_images_are_visible_without_scripts(page: Page) -> None:
     driver = page.driver
     driver.switch_to.new_window("window")

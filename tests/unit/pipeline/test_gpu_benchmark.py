@@ -14,7 +14,6 @@ from support.paths import ROOT
 from support.scripts import BENCHMARKS, benchmark_module
 
 from mbtf_core.child_process import Outcome
-from mbtf_core.errors import InputError
 from mbtf_core.lattice import sigma_of_level
 
 FINEST = 3
@@ -126,35 +125,6 @@ def test_a_wrong_result_is_caught(
     assert named in failed(comparison.checks)
     assert gpu.report(comparison) == 1
     assert '"met": false' in capsys.readouterr().out.splitlines()[-1]
-
-
-def test_a_crash_is_one_line_and_the_rest_runs(
-    gpu: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    whole, run = Fake(gpu), Fake(gpu, "estimate", "the process was ended by SIGABRT")
-    for one, folder in ((whole, "whole"), (run, "crashed")):
-        (tmp_path / folder).mkdir()
-        comparison = compared(gpu, one, tmp_path / folder)
-    assert run.calls == whole.calls
-    assert failed(comparison.checks) == ["estimator on the device cuda"]
-    assert gpu.report(comparison) == 1
-    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("FAILED")]
-    assert len(lines) == 1
-    assert "ended by SIGABRT" in lines[0]
-
-
-def test_numbers_that_are_not_finite_end_a_measurement(gpu: Any, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="1 of 3 numbers of value_a are not finite"):
-        sys.modules["gpu_measurements"].save_finite(tmp_path / "a.npz", value_a=np.array([1, np.nan, 2]))
-
-
-def test_without_a_device_nothing_is_measured(
-    gpu: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(gpu, "has_device", lambda: False)
-    monkeypatch.setattr(sys, "argv", ["gpu.py"])
-    assert gpu.main() == 0
-    assert capsys.readouterr().out.splitlines()[0] == "no CUDA device: nothing to measure"
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import pytest
 
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.compare.perceptual_metrics import PERCEPTUAL_METRICS, available_metrics
-from mbtf_pipeline.formatting import data_errors, decibel, estimate_text, levels
+from mbtf_pipeline.formatting import data_errors, decibel, estimate_text, levels_text
 
 
 @pytest.mark.parametrize("value", [0.03, -0.03, 0.0])
@@ -51,5 +51,5 @@ def test_perceptual_differences_that_noise_explains() -> None:
 
 
 def test_levels_finer_than_the_data_are_marked() -> None:
-    assert levels([3.0, 3.0], 7) == "level 3.0"
-    assert levels([6.0, 8.5], 7) == "level 6.0–8.5 (finest level of the data: 7)"
+    assert levels_text([3.0, 3.0], 7) == "level 3.0"
+    assert levels_text([6.0, 8.5], 7) == "level 6.0–8.5 (finest level of the data: 7)"

@@ -15,7 +15,6 @@ from mbtf_pipeline.stages import (
     Decision,
     Stage,
     StageResult,
-    decide,
     read_stamp,
     run_again,
     run_stages,
@@ -158,13 +157,6 @@ def test_an_unreadable_stamp_is_ignored(pipeline: Pipeline) -> None:
         path.write_text(text)
         pipeline.run()
         assert pipeline.ran == ["report"]
-
-
-def test_deciding_changes_nothing(pipeline: Pipeline) -> None:
-    pipeline.config["compare"] = {"option": 2}
-    before = sorted(p.read_text() for p in pipeline.folder.rglob("*") if p.is_file())
-    assert decide(pipeline.folder, pipeline.stage("compare")).runs
-    assert sorted(p.read_text() for p in pipeline.folder.rglob("*") if p.is_file()) == before
 
 
 def test_running_one_stage_again(pipeline: Pipeline) -> None:

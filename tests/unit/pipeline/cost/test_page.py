@@ -14,7 +14,7 @@ from mbtf_core.stats import Estimate
 from mbtf_pipeline.cost.measurements import Measurement
 from mbtf_pipeline.cost.page import write_page
 from mbtf_pipeline.cost.study import Study
-from mbtf_pipeline.report.plots import Cloud, _legend_above, scatter
+from mbtf_pipeline.report.plots import Cloud, scatter
 
 DESCRIPTION = {
     "name": "a study", "machine": {"system": "a machine"}, "date": "today", "time": 600.0,
@@ -41,19 +41,6 @@ def test_plots_name_their_axes_and_error_bars(tmp_path: Path) -> None:
     with Image.open(tmp_path / "a.png") as picture:
         # An opaque white background.
         assert picture.convert("RGBA").getpixel((1, 1)) == (255, 255, 255, 255)
-
-
-def test_a_legend_of_long_names_is_no_wider_than_the_figure() -> None:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7, 4), layout="constrained")
-    axes = figure.add_subplot()
-    _legend_above(figure, [(axes.plot([0])[0], f"a name of some length, number {n}") for n in range(6)])
-    (legend,) = figure.legends
-    extent = legend.get_window_extent(FigureCanvasAgg(figure).get_renderer())
-    assert extent.width <= figure.bbox.width
-    assert len(legend.get_texts()) == 6
 
 
 def test_an_undefined_error_is_shown_as_such(tmp_path: Path) -> None:

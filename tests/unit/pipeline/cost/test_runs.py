@@ -19,14 +19,10 @@ from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.cost import runs as module
-from mbtf_pipeline.cost.fit_runs import GENERATOR, RUN_SHARES, SHORTEST, planned_runs, round_down
+from mbtf_pipeline.cost.fit_runs import GENERATOR, RUN_SHARES, SHORTEST, planned_runs
 from mbtf_pipeline.cost.runs import DataRequest, Run, RunRunner
 
 FIT = {"model": "neumip", "training": {"time": "5s"}}
-
-
-def test_counts_keep_two_digits() -> None:
-    assert [round_down(n) for n in (1234567, 99.9, 7, 0.2)] == [1200000, 99, 7, 1]
 
 
 @pytest.mark.parametrize("seconds", [300.0, 600.0, 3600.0])
