@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import math
 from collections import Counter
 from collections.abc import Mapping
@@ -13,6 +11,7 @@ from typing import Any
 
 from mbtf_core.units import clock
 from mbtf_pipeline.formatting import estimate, estimate_text
+from mbtf_pipeline.report.embed import file_uri
 from mbtf_pipeline.report.report import render
 from mbtf_pipeline.run_folder import REPORT, VIEWER
 
@@ -109,7 +108,7 @@ def _times(seconds: Mapping[str, float]) -> str:
 
 
 def _thumbnail(path: Path) -> str | None:
-    """A picture as a small ``data:`` URI; None where it is missing or damaged."""
+    """A small picture; None where it is missing or damaged."""
     try:
         return _small(path, path.stat().st_mtime_ns)
     except OSError:
@@ -118,12 +117,5 @@ def _thumbnail(path: Path) -> str | None:
 
 @lru_cache(maxsize=4096)
 def _small(path: Path, changed: int) -> str:
-    """A picture of a date as a small ``data:`` URI."""
-    from PIL import Image
-
-    with Image.open(path) as image:
-        small = image.convert("RGB")
-        small.thumbnail((_SIZE, _SIZE))
-    stream = io.BytesIO()
-    small.save(stream, format="JPEG", quality=85)
-    return f"data:image/jpeg;base64,{base64.b64encode(stream.getvalue()).decode()}"
+    """A picture of a date."""
+    return file_uri(path, _SIZE)

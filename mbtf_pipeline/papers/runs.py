@@ -17,11 +17,10 @@ from mbtf_core.stats import Estimate
 from mbtf_pipeline.compare.compare import COMPARISON_NAME
 from mbtf_pipeline.compare.pictures import with_ending
 from mbtf_pipeline.formatting import estimate, is_significant
-from mbtf_pipeline.report.embed import jpeg_uri, map_uri
+from mbtf_pipeline.report.embed import file_uri, map_uri
 from mbtf_pipeline.run_folder import COMPARE, SHARDS
 from mbtf_pipeline.tables import Column, Thumbnail
 
-_QUALITY = 86
 MATERIAL = Column("material", "material", lambda run, *_: run.title)
 METHOD = Column("method", "method", lambda run, fit, *_: fit)
 
@@ -106,10 +105,7 @@ def each_fit(runs: Sequence[FinishedRun]) -> Iterator[tuple[FinishedRun, str]]:
 
 def preview(path: Path, label: str, *lines: str) -> Thumbnail:
     """An image of the comparison (path without suffix) at its exposure."""
-    from PIL import Image
-
-    with Image.open(with_ending(path, ".png")) as image:
-        return Thumbnail(jpeg_uri(np.asarray(image.convert("RGB")), _QUALITY), label, lines)
+    return Thumbnail(file_uri(with_ending(path, ".png")), label, lines)
 
 
 def signed_map(values: NDArray[np.floating], scale: float, label: str, *lines: str) -> Thumbnail:

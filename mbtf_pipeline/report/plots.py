@@ -204,7 +204,8 @@ def _scatter(clouds: Sequence[Cloud], x: str, y: str, front: Sequence[tuple[floa
     axes.set_xlim(left / (right / left) ** 0.06, right * (right / left) ** 0.2)
     for axis in (axes.xaxis, axes.yaxis):
         _plain_ticks(axis)
-    _legend_above(axes.figure, handles)
+    marks, names = zip(*handles, strict=True)
+    axes.figure.legend(marks, names, ncols=2, loc="outside upper left", frameon=False, fontsize=8.5)
     return axes.figure
 
 
@@ -253,20 +254,6 @@ def points(
         if axes.get_legend_handles_labels()[0]:
             axes.legend(frameon=False)
         return _svg(axes.figure, label)
-
-
-def _legend_above(figure: Any, handles: Sequence[tuple[Any, str]]) -> None:
-    """Legend above the plot, in as many columns as fit."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    renderer = FigureCanvasAgg(figure).get_renderer()
-    marks, names = zip(*handles, strict=True)
-    options = {"loc": "outside upper left", "frameon": False, "fontsize": 8.5}
-    for columns in (4, 3, 2, 1):
-        legend = figure.legend(marks, names, ncols=columns, **options)
-        if columns == 1 or legend.get_window_extent(renderer).width <= figure.bbox.width:
-            return
-        legend.remove()
 
 
 def _plain_ticks(axis: Any) -> None:
