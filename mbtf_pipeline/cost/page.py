@@ -45,7 +45,11 @@ def _column(name: str) -> Column:
     """A column of the CSV file: a field of a measurement, or one of its details."""
 
     def cell(m: Measurement) -> Cell:
-        return m.details.get(name) if name in _DETAILS else getattr(m, name)
+        if name in _DETAILS:
+            return m.details.get(name)
+        found: Cell = getattr(m, name)
+        # A number that was not measured has an error column all the same.
+        return Estimate(math.nan, math.nan, 0) if found is None else found
 
     return Column(name, name, cell)
 
