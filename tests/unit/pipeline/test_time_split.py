@@ -91,12 +91,6 @@ def test_the_best_preset_that_fits_is_scaled_to_the_time(fake: Machine, one: Pat
     assert seconds_of(found) == pytest.approx(0.96 * seconds, rel=0.02)
 
 
-def test_longer_training_gets_the_larger_network(fake: Machine, one: Path) -> None:
-    found = timed(one, 1500.0, "generate.queries.resolution=64")
-    assert found.split.training_each > 300.0
-    assert found.recipe.fit["neumip"].network.width == 64
-
-
 def test_less_than_a_draft_is_a_smaller_draft(fake: Machine, one: Path) -> None:
     fake.path *= 8.0
     found = timed(one, 90.0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -101,24 +100,6 @@ def test_a_run_measures_time_and_error(clock: Any, tmp_path: Path, study: str, s
     # Mean squares of 0.1 and 0.9 over the variance of a quarter.
     assert found.error.value == pytest.approx((0.01 + 0.81) / 2 / (0.25 * 1000 / 999), rel=1e-5)
     assert 0 < found.error.error < 0.1 * found.error.value
-
-
-def test_the_expected_time_learns_from_earlier_runs(clock: Any, tmp_path: Path) -> None:
-    one = runner(tmp_path, path_seconds=1e-3)
-    run = Run("whole", "", "", DataRequest(1000, 4), FIT)
-    before = one.expected_seconds(run)
-    assert 4 + 5 < before < 4 + 5 + 5
-    one.measure(run)
-    # 7 + 6 seconds and 5 evaluations of half a second, of which 5 are planned where the data exist.
-    assert one.expected_seconds(run) == pytest.approx(5 + (7 + 6 + 2.5 - 9))
-    one.forget(run.data)
-    assert one.expected_seconds(run) == pytest.approx(7 + 6 + 2.5)
-    # A seed without a test set takes the time of another one's.
-    one.test_sets, one.test_seconds = {2: one.test_set(2)}, 3.0
-    other = replace(run, data=replace(run.data, seed=2))
-    assert one.expected_seconds(run) == one.expected_seconds(other) + 3.0
-    # Fits that count steps have no planned time.
-    assert one.expected_seconds(replace(run, fit={"training": {"steps": 3, "time": None}})) < 7 + 6 + 2.5
 
 
 def test_seeds_change_data_and_fit(clock: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,7 +18,6 @@ from mbtf_core import folders
 from mbtf_core.atomic import write_json
 from mbtf_core.errors import InputError
 from mbtf_core.stats import Estimate
-from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.cost import study as module
 from mbtf_pipeline.cost.generator_runs import GeneratorTask
 from mbtf_pipeline.cost.measurements import Measurement, MeasurementFolder
@@ -100,15 +99,6 @@ def test_folders_of_something_else_are_refused(tmp_path: Path) -> None:
         else:
             with pytest.raises(InputError, match=message):
                 module.claim(folder, machine())
-
-
-def test_studies_vary_paths_whatever_the_recipe_sets() -> None:
-    queries = {"target_error": "5%", "layout": "image", "patch_size": 8, "spp": 6}
-    config = GeneratorConfig.model_validate({"material": "m", "seed": 3, "queries": queries})
-    found = module.study_config(config, None)
-    assert found.queries.target_error is None
-    assert (found.queries.layout, found.queries.spp, found.seed) == ("shuffled", 6, 3)
-    assert module.study_config(config, 7).seed == 7
 
 
 RUNS = [run("whole", 3000, "long", 7200.0), run("whole", 2000, "short", 60.0), run("models", 1000, "m", 30.0)]
@@ -204,13 +194,3 @@ def test_a_refused_study_leaves_the_folder_as_it_was(
     with pytest.raises(InputError, match="reflects nothing"):
         module.run_study(recipe, folder, seconds=60.0, seed=5)
     assert content() == before
-
-
-def test_the_forecast_of_the_generator_is_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    found = [2e-6]
-    monkeypatch.setattr(module, "forecast_seconds", lambda config: found.pop())
-    config = GeneratorConfig.model_validate({"material": "m", "queries": {"spp": 4}})
-    store = MeasurementFolder(tmp_path, "abc")
-    assert module.path_seconds(config, store) == 5e-7
-    module.keep_path_seconds(store, 5e-7)
-    assert module.path_seconds(config, store) == 5e-7

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from mbtf_core.cluster.task import Task, TaskResult
-from mbtf_core.errors import InputError
 from mbtf_fit.config import SHARED_PRESET
 from mbtf_pipeline.library import run as library_run
 from mbtf_pipeline.library.entries import entries, load_library_recipe
@@ -102,27 +101,11 @@ def test_each_first_fit_is_recorded_as_it_comes(runs: Runs) -> None:
     assert runs.calls[1:] == [("first_fit", "b"), ("run_material", "a"), ("run_material", "b")]
 
 
-def test_workers_go_on_after_a_failure(runs: Runs) -> None:
-    runs.errors = {"a": "no memory"}
-    assert again(runs, "training: 10s\n", cluster=runs).failed == runs.errors
-    assert runs.calls[1:] == [("first_fit", "a"), ("first_fit", "b"), ("run_material", "b")]
-
-
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
 def test_fits_on_a_gpu_take_one_of_their_worker(runs: Runs, device: str) -> None:
     options = "training: 10s\nshared_network: 5s\n"
     again(runs, options, BASE.replace("relief: {}", f"relief: {{device: {device}}}"))
     assert runs.gpus == {device == "cuda"}
-
-
-def test_a_run_whose_files_are_damaged_fails_alone(runs: Runs, monkeypatch: pytest.MonkeyPatch) -> None:
-    def summarize(folder: Path) -> dict[str, Any]:
-        if folder.name == "a":
-            raise InputError("no such file", where="comparison.json")
-        return {"fits": {}, "reference": "none.png"}
-
-    monkeypatch.setattr(library_run, "summarize", summarize)
-    assert again(runs).failed == {"a": "comparison.json: no such file"}
 
 
 def test_only_other_options_of_data_or_fits_need_first_fits(runs: Runs) -> None:

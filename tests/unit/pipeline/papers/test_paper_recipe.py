@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 from support.paths import ROOT
 
-from mbtf_core.console import run
 from mbtf_core.errors import InputError
-from mbtf_pipeline.cli.app import app
-from mbtf_pipeline.papers.plan import Planned, is_paper_recipe, load_paper_recipe, plan
+from mbtf_pipeline.papers.plan import Planned, load_paper_recipe, plan
 from mbtf_pipeline.papers.suite import run_paper
 
 PIPELINES = ROOT / "pipelines"
@@ -115,18 +113,6 @@ def test_a_fit_of_other_materials_needs_some(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="learns from other materials alone, but there are none"):
         run_paper(paper, found, missing, tmp_path / "out", quick=False, command="")
     assert not (tmp_path / "out" / "runs").exists()
-
-
-def test_paper_recipes_are_distinguished(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert SHIPPED
-    ordinary = tmp_path / "without-fit.yaml"
-    ordinary.write_text("name: r\ngenerate: {material: m}\n")
-    files = (SHIPPED[0], PIPELINES / "ci.yaml", ordinary, tmp_path)
-    assert [is_paper_recipe(p) for p in files] == [True, False, False, False]
-    assert run(app, ["run", str(PIPELINES / "ci.yaml"), "--quick"]) == 2
-    assert "only paper recipes have quick sizes" in capsys.readouterr().err
-    assert run(app, ["run", str(SHIPPED[0]), "--quality", "draft"]) == 2
-    assert "a paper recipe has sizes and times of its own" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=[p.stem for p in SHIPPED])
