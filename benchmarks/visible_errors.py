@@ -28,8 +28,8 @@ import numpy as np
 from mbtf_core.atomic import read_json
 from mbtf_core.console import Console
 from mbtf_fit.formatting import VISIBILITY
+from mbtf_pipeline.compare.image_files import read_picture
 from mbtf_pipeline.compare.perceptual_metrics import flip
-from mbtf_pipeline.compare.pictures import read_picture
 from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.run import run_recipe
 from mbtf_pipeline.run_folder import COMPARE, machine

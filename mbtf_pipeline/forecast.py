@@ -11,7 +11,7 @@ from mbtf_core.folders import check_folder, check_space
 from mbtf_core.forecast import is_long
 from mbtf_core.units import clock, expectation
 from mbtf_gen.job import Job, planned_paths, split_queries
-from mbtf_pipeline.compare.pictures import scenes
+from mbtf_pipeline.compare.image_files import scenes
 from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.run import COMPARE_STAGE, data_sets, fit_stage, survey
 from mbtf_pipeline.run_folder import is_run

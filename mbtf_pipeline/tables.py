@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from mbtf_core.stats import Estimate
-from mbtf_pipeline.formatting import estimate_text, signed
+from mbtf_pipeline.number_text import estimate_text, signed
 
 
 class Shown(NamedTuple):

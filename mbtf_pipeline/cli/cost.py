@@ -42,7 +42,7 @@ def cost(
     from mbtf_core.folders import owned
     from mbtf_core.interruption import keep_on_interruption
     from mbtf_core.units import asked_duration, format_duration
-    from mbtf_pipeline.cost.page import whole_runs, write_page
+    from mbtf_pipeline.cost.cost_page import whole_runs, write_page
     from mbtf_pipeline.cost.pareto import pareto_front
     from mbtf_pipeline.cost.study import run_study, time_of
     from mbtf_pipeline.library.entries import is_library_recipe

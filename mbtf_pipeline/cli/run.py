@@ -182,7 +182,7 @@ def _run_library(
 
 
 def _report(result: RunResult, console: Console, quality: Quality | None) -> None:
-    from mbtf_pipeline.formatting import estimate
+    from mbtf_pipeline.number_text import estimate
 
     tests = {fit: record["splits"]["test"] for fit, record in result.comparison["test"].items()}
     ran = {name: stage.stamp.seconds for name, stage in result.stages.items() if stage.ran}

@@ -19,16 +19,16 @@ from mbtf_core.stats import Estimate
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.compare.contrast import contrast, picture_blocks
 from mbtf_pipeline.compare.dataset_errors import dataset_errors
-from mbtf_pipeline.compare.metrics import DEFINITIONS, image_errors, reference_difference
-from mbtf_pipeline.compare.offsets import write_offsets
-from mbtf_pipeline.compare.perceptual_metrics import perceptual_scores
-from mbtf_pipeline.compare.pictures import (
+from mbtf_pipeline.compare.image_files import (
     PICTURES,
     Scene,
     scenes,
     write_map,
     write_picture,
 )
+from mbtf_pipeline.compare.metrics import DEFINITIONS, image_errors, reference_difference
+from mbtf_pipeline.compare.offsets import write_offsets
+from mbtf_pipeline.compare.perceptual_metrics import perceptual_scores
 from mbtf_pipeline.compare.st_lpips import require
 from mbtf_pipeline.compare.timing import measure_timing, timed
 from mbtf_pipeline.compare.unmodified_mitsuba import pick_scene, write_agreement

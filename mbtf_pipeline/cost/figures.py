@@ -12,7 +12,7 @@ from mbtf_core.stats import Estimate
 from mbtf_pipeline.cost.fit_runs import PRESET
 from mbtf_pipeline.cost.measurements import COMPARISONS, Measurement
 from mbtf_pipeline.cost.pareto import pareto_front
-from mbtf_pipeline.formatting import is_significant
+from mbtf_pipeline.number_text import is_significant
 from mbtf_pipeline.report.plots import Cloud, scatter
 
 NOISE_AXIS = "RMS error relative to the mean value"

@@ -21,7 +21,7 @@ from mbtf_fit.config import DECODER_MODELS, SHARED_PRESET, FitConfig
 from mbtf_fit.material.decoder import DECODER_FOLDER
 from mbtf_pipeline.library.budget import Division
 from mbtf_pipeline.library.entries import Entry, LibraryRecipe
-from mbtf_pipeline.library.page import library_page
+from mbtf_pipeline.library.library_page import library_page
 from mbtf_pipeline.library.task import shards_of, summarize
 from mbtf_pipeline.run_folder import has_record, machine
 

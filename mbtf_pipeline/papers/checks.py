@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mbtf_core.stats import Estimate
-from mbtf_pipeline.compare.pictures import read_picture
+from mbtf_pipeline.compare.image_files import read_picture
 from mbtf_pipeline.compare.unmodified_mitsuba import (
     MAX_STANDARD_ERRORS,
     MEAN_TOLERANCE,
@@ -17,10 +17,10 @@ from mbtf_pipeline.compare.unmodified_mitsuba import (
     RMS_TOLERANCE,
     verdict,
 )
-from mbtf_pipeline.formatting import direction, estimate, is_significant
+from mbtf_pipeline.number_text import direction, estimate, is_significant
 from mbtf_pipeline.papers.published import Published, network_weights
 from mbtf_pipeline.papers.runs import MATERIAL, METHOD, FinishedRun, each_fit, preview, signed_map
-from mbtf_pipeline.report.offsets import displacements
+from mbtf_pipeline.report.offset_images import displacements
 from mbtf_pipeline.run_folder import COMPARE
 from mbtf_pipeline.tables import Cell, Column, Table, Thumbnail, rows_of
 

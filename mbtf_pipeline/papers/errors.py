@@ -9,7 +9,7 @@ from typing import Any
 
 from mbtf_core.stats import Estimate, psnr
 from mbtf_pipeline.compare.perceptual_metrics import PERCEPTUAL_METRICS, PerceptualMetric
-from mbtf_pipeline.formatting import decibel, estimate, levels_text, signed
+from mbtf_pipeline.number_text import decibel, estimate, levels_text, signed
 from mbtf_pipeline.papers.published import Published, level_ratios, mse_ratio
 from mbtf_pipeline.papers.runs import MATERIAL, METHOD, FinishedRun, each_fit, mean_of, preview, ratio_of
 from mbtf_pipeline.report.plots import points

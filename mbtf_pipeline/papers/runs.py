@@ -15,8 +15,8 @@ from mbtf_core.atomic import read_json
 from mbtf_core.lattice import Lattice
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.compare.compare import COMPARISON_NAME
-from mbtf_pipeline.compare.pictures import with_ending
-from mbtf_pipeline.formatting import estimate, is_significant
+from mbtf_pipeline.compare.image_files import with_ending
+from mbtf_pipeline.number_text import estimate, is_significant
 from mbtf_pipeline.report.embed import file_uri, map_uri
 from mbtf_pipeline.run_folder import COMPARE, SHARDS
 from mbtf_pipeline.tables import Column, Thumbnail

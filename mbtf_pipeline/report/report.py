@@ -11,15 +11,15 @@ from mbtf_core.atomic import read_json, write_text
 from mbtf_core.config_file import check_schema
 from mbtf_core.exposure import describe_exposure
 from mbtf_pipeline.compare.compare import COMPARISON_NAME, COMPARISON_SCHEMA
-from mbtf_pipeline.formatting import NOT_SIGNIFICANT
+from mbtf_pipeline.number_text import NOT_SIGNIFICANT
 from mbtf_pipeline.recipe import RECIPE_NAME, Recipe
 from mbtf_pipeline.report.embed import ENCODINGS, Gallery, encode
 from mbtf_pipeline.report.error_maps import palette
 from mbtf_pipeline.report.errors import error_context
+from mbtf_pipeline.report.image_sheet import picture_section
 from mbtf_pipeline.report.linear_images import EXPOSURE_STOPS
 from mbtf_pipeline.report.material import material_section
-from mbtf_pipeline.report.offsets import offset_section
-from mbtf_pipeline.report.pictures import picture_section
+from mbtf_pipeline.report.offset_images import offset_section
 from mbtf_pipeline.report.plots import ERROR_BAR_NOTE
 from mbtf_pipeline.report.times import provenance, read_training, time_context, training_context
 from mbtf_pipeline.run_folder import COMPARE, FITS, REPORT, RUN_NAME, SHARDS

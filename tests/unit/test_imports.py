@@ -60,7 +60,7 @@ mbtf_fit.shaders
 mbtf_fit.mitsuba_plugin
 mbtf_fit.cli
 mbtf_fit
-mbtf_pipeline.recipe mbtf_pipeline.stages mbtf_pipeline.presets mbtf_pipeline.run_folder mbtf_pipeline.formatting mbtf_pipeline.tables
+mbtf_pipeline.recipe mbtf_pipeline.stages mbtf_pipeline.presets mbtf_pipeline.run_folder mbtf_pipeline.number_text mbtf_pipeline.tables
 mbtf_pipeline.compare
 mbtf_pipeline.layers
 mbtf_pipeline.report

@@ -19,7 +19,7 @@ from support.paths import ROOT
 from mbtf_core.console import run
 from mbtf_core.directions import from_angles
 from mbtf_pipeline.cli.app import app
-from mbtf_pipeline.compare.pictures import read_picture
+from mbtf_pipeline.compare.image_files import read_picture
 from mbtf_pipeline.recipe import load_recipe
 from mbtf_pipeline.run import run_recipe
 

@@ -17,7 +17,7 @@ from support.paths import ROOT
 from mbtf_core.console import run
 from mbtf_core.exposure import to_display
 from mbtf_pipeline.cli.app import app
-from mbtf_pipeline.compare.pictures import read_picture
+from mbtf_pipeline.compare.image_files import read_picture
 
 # Seconds to wait for the browser.
 TIMEOUT = 120

@@ -19,9 +19,9 @@ from mbtf_core.atomic import write_json
 from mbtf_core.errors import InputError
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.cost import study as module
+from mbtf_pipeline.cost.cost_page import to_csv
 from mbtf_pipeline.cost.generator_runs import GeneratorTask
 from mbtf_pipeline.cost.measurements import Measurement, MeasurementFolder
-from mbtf_pipeline.cost.page import to_csv
 from mbtf_pipeline.cost.pareto import extrapolation, pareto_front
 from mbtf_pipeline.cost.runs import Run
 from mbtf_pipeline.recipe import load_recipe

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.units import clock
-from mbtf_pipeline.library.page import library_page
+from mbtf_pipeline.library.library_page import library_page
 
 
 def material(name: str, state: str, value: float = 0.1, **more: Any) -> dict[str, Any]:

@@ -10,9 +10,9 @@ from urllib.parse import quote
 
 import numpy as np
 
+from mbtf_pipeline.compare.image_files import read_halves, read_map, read_picture
 from mbtf_pipeline.compare.perceptual_metrics import available_metrics
-from mbtf_pipeline.compare.pictures import read_halves, read_map, read_picture
-from mbtf_pipeline.formatting import (
+from mbtf_pipeline.number_text import (
     decibel,
     direction,
     estimate,

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.units import clock
-from mbtf_pipeline.formatting import estimate, estimate_text
+from mbtf_pipeline.number_text import estimate, estimate_text
 from mbtf_pipeline.report.embed import file_uri
 from mbtf_pipeline.report.report import render
 from mbtf_pipeline.run_folder import REPORT, VIEWER

@@ -11,8 +11,8 @@ from typing import Any
 from PIL import Image
 
 from mbtf_core.stats import Estimate
+from mbtf_pipeline.cost.cost_page import write_page
 from mbtf_pipeline.cost.measurements import Measurement
-from mbtf_pipeline.cost.page import write_page
 from mbtf_pipeline.cost.study import Study
 from mbtf_pipeline.report.plots import Cloud, scatter
 
