@@ -33,6 +33,9 @@ class PaperRecipe(Settings):
     base: Layer = Field(description="options of all runs")
     quick: Layer = Field(Layer(), description="overrides the base with --quick")
     variants: dict[Name, Layer] = Field({}, description="name → options; run for every material")
+    learn_from_others: list[Name] = Field(
+        [], description="fits that also learn from the slices of all other materials"
+    )
     published: list[Published] = Field([], description="published numbers, shown beside measured ones")
 
     def folder(self, quick: bool) -> Path:

@@ -129,7 +129,8 @@ def run_paper(
         write_json(folder / PAPER_NAME, record)
         for name, where in missing.items():
             console.note(f"{name}: skipped, {where} does not exist")
-        planned = [_with_other_materials(one, planned, folder) for one in planned]
+        learners = paper.learn_from_others
+        planned = [_with_other_materials(one, planned, learners, folder) for one in planned]
         for one in planned:
             if any(config.training.materials for config in one.recipe.fit.values()):
                 console.note(f"{one.name}: data")
@@ -143,12 +144,14 @@ def run_paper(
     return PaperResult(folder, page, tables, record)
 
 
-def _with_other_materials(one: Planned, planned: Sequence[Planned], folder: Path) -> Planned:
-    """A recipe whose fits of ``rainer2020`` also learn from the slices of all other materials."""
+def _with_other_materials(
+    one: Planned, planned: Sequence[Planned], learners: Sequence[str], folder: Path
+) -> Planned:
+    """A recipe of which these fits also learn from the slices of all other materials."""
     others = [p for p in planned if p.material != one.material and p.variant == one.variant]
     fits = dict(one.recipe.fit)
     for name, config in fits.items():
-        if config.model == "rainer2020" and not config.training.materials:
+        if name in learners and not config.training.materials:
             if not (others or config.training.own_material):
                 raise InputError(
                     f"the fit '{name}' of {one.name} learns from other materials alone, but there are none",
