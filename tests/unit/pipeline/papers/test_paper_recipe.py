@@ -103,7 +103,8 @@ def test_errors_name_the_key(tmp_path: Path, change: tuple[str, str], key: str) 
 def test_a_fit_of_other_materials_needs_some(tmp_path: Path) -> None:
     """Before anything is generated."""
     text = (
-        "name: lonely\ntables: [methods]\nlearn_from_others: [rainer2020]\nmaterials:\n  here: maps/height.npy\n"
+        "name: lonely\ntables: [methods]\nlearn_from_others: [rainer2020]\n"
+        "materials:\n  here: maps/height.npy\n"
         "base:\n  generate: {queries: {train: 4/texel, resolution: 4}}\n"
         "  fit:\n    rainer2020: {training: {own_material: false}}\n"
     )
