@@ -69,8 +69,9 @@ class FitForecast:
 
     def describe(self) -> str:
         """One or two lines."""
+        error = f" ± {clock(self.seconds_se)}" if self.seconds_se else ""
         text = (
-            f"forecast: {clock(self.seconds)} ± {clock(self.seconds_se)} of training, {self.steps} steps at "
+            f"forecast: {clock(self.seconds)}{error} of training, {self.steps} steps at "
             f"{self.queries_per_second / 1e6:.2f} M queries/s, after {self.loading:.0f} s of loading; "
             f"{self.bytes / 1e6:.2f} MB"
         )
