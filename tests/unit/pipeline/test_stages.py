@@ -99,6 +99,15 @@ def test_changed_options_run_later_stages(pipeline: Pipeline, stage: str, expect
     assert pipeline.ran == []
 
 
+def test_what_an_earlier_command_made_anew_runs_later_stages(pipeline: Pipeline) -> None:
+    """It ran the first stage alone, or was interrupted between two stages."""
+    pipeline.config["generate"] = {"option": 2}
+    run_stages(pipeline.folder, pipeline.stages()[:1])
+    pipeline.run()
+    assert pipeline.ran == ["fit a", "fit b", "compare", "report"]
+    assert pipeline.decisions["fit a"].reason == "inputs changed: generate"
+
+
 def test_a_changed_input_file_runs_everything(pipeline: Pipeline) -> None:
     pipeline.inputs = {"height": "digest 2"}
     pipeline.run()
