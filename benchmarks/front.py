@@ -30,7 +30,8 @@ from mbtf_core.config.nested import deep_merge
 from mbtf_core.data.dataset import Dataset
 from mbtf_fit import FitConfig, fit
 from mbtf_gen.generation.run import generate
-from mbtf_pipeline.paper_tables.published import mse_ratio
+from mbtf_pipeline.papers.plan import load_paper_recipe
+from mbtf_pipeline.papers.published import mse_ratio
 
 RESOLUTION = 128
 # Paths per test query.
@@ -75,6 +76,9 @@ THRESHOLDS = {"displaced": 0.6, "any": 1.0}
 STANDARD_ERRORS = 2.0
 # Displacement range in tile widths from which a material counts as displaced.
 DISPLACED = 0.01
+
+# Recipe with the published errors.
+PAPER = Path(__file__).parents[1] / "pipelines" / "paper_methods.yaml"
 
 
 def shards(name: str, folder: Path) -> Path:
@@ -131,7 +135,7 @@ def compared(name: str, folder: Path, times: list[str], seed: int) -> dict[str, 
     extent = Dataset.open(data).manifest["tile"]["displacement_range"]
     limit = THRESHOLDS["displaced" if extent >= DISPLACED else "any"]
     found = {"material": name, "displacement_range": extent, "fits": front, "ratio": ratio, "error": error}
-    published = mse_ratio(name, "neumip", "neumip-baseline")
+    published = mse_ratio(load_paper_recipe(PAPER, []).published, name, "neumip", "neumip-baseline")
     if published is not None:
         plain = fits_of({"neumip-baseline": BASELINE}, times[-1])["neumip-baseline"]
         ratios = {label: ratio_of(one, plain) for label, one in fits.items()}

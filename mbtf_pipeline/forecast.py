@@ -8,23 +8,21 @@ from functools import cached_property
 from pathlib import Path
 
 from mbtf_core.files.folders import check_folder, check_space
+from mbtf_core.forecast import is_long
 from mbtf_core.units import clock, expectation
 from mbtf_gen.job import Job, planned_paths, split_queries
-from mbtf_pipeline.compare.pictures import scenes
+from mbtf_pipeline.compare.image_files import scenes
 from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.run import COMPARE_STAGE, data_sets, fit_stage, survey
 from mbtf_pipeline.run_folder import is_run
 from mbtf_pipeline.stages import STAMPS
 
-# Seconds of loading the programs; of comparison and report besides their pictures; of each pixel of a fit's
-# pictures (benchmarks/quality.py, two processor cores).
-_START, _COMPARE, _PIXEL = 2.5, 4.0, 1.5e-6
-# Bytes of a pixel of a reference and of a fit's picture.
+# Seconds of loading the programs, and of comparison and report besides the paths of their images.
+_START, _COMPARE = 2.5, 5.0
+# Bytes of a pixel of a reference and of a fit's image.
 _REFERENCE_BYTES, _FIT_BYTES = 70, 30
-# Seconds of a path where no pilot was run: those of a slow machine.
-_SLOW_PATH = 2e-6
-# A run of more takes long, or much space.
-_LONG, _LARGE = 60.0, 1e9
+# Seconds of starting and of a path where no pilot was run: those of a slow machine.
+_SLOW = (0.0, 2e-6)
 
 
 @dataclass(frozen=True)
@@ -97,66 +95,36 @@ class RunForecaster:
         stages : names of the stages that will run; all by default
         speed : as :attr:`speed`, which is measured by default
         """
-        from mbtf_fit.training.forecast import FIT_SECONDS, fit_bytes, query_seconds
+        from mbtf_fit.training.forecast import evaluation_seconds, fit_bytes
+        from mbtf_gen.job import data_bytes
 
         start, path = self.speed if speed is None else speed
-
-        def runs(stage: str) -> bool:
-            return stages is None or stage in stages
-
         paths = size = queries = 0
         for data in data_sets(recipe):
             job = Job.of(data.config, self.material)
             queries = split_queries(job, "train")
-            if runs(data.stage):
-                from mbtf_gen.job import data_bytes
-
+            if stages is None or data.stage in stages:
                 paths += planned_paths(job, job.shards)
                 size += data_bytes(job, job.shards)
-        fits = {name: fit for name, fit in recipe.fit.items() if runs(fit_stage(name))}
+        fits = {name: fit for name, fit in recipe.fit.items() if stages is None or fit_stage(name) in stages}
         size += sum(fit_bytes(fit, job.lattice) for fit in fits.values())
         comparing = 0.0
         compare = recipe.compare
-        if runs(COMPARE_STAGE):
+        if stages is None or COMPARE_STAGE in stages:
             pixels = len(list(scenes(compare))) * compare.size**2
             traced = pixels * len(compare.kinds)
-            comparing = _COMPARE + traced * compare.spp * path + _PIXEL * pixels * len(recipe.fit)
+            comparing = _COMPARE + traced * compare.spp * path
             size += traced * _REFERENCE_BYTES + pixels * len(recipe.fit) * _FIT_BYTES
         timed = [fit.training.time for fit in fits.values() if fit.training.steps is None]
         return RunForecast(
             start=_START + (start if paths else 0.0),
             generating=paths * path,
             training=sum(timed),
-            evaluating=len(fits) * (FIT_SECONDS + queries * query_seconds(self.material.transmits)),
+            evaluating=len(fits) * evaluation_seconds(queries),
             comparing=comparing,
             bytes=size,
             by_steps=tuple(name for name, fit in fits.items() if fit.training.steps is not None),
         )
-
-
-def forecast_run(recipe: Recipe) -> RunForecast:
-    """Forecast of a whole run; a run that is short and small on any machine is that of a slow one.
-
-    Parameters
-    ----------
-    recipe : Recipe
-
-    Returns
-    -------
-    RunForecast
-
-    Raises
-    ------
-    InputError
-        The material cannot be used.
-    """
-    forecaster = RunForecaster(recipe)
-    expected = forecaster.of(recipe, None, (0.0, _SLOW_PATH))
-    return expected if _is_short(expected) else forecaster.of(recipe)
-
-
-def _is_short(expected: RunForecast) -> bool:
-    return expected.seconds < _LONG and expected.bytes < _LARGE
 
 
 def forecast_left(recipe: Recipe, folder: Path) -> RunForecast | None:
@@ -172,9 +140,7 @@ def forecast_left(recipe: Recipe, folder: Path) -> RunForecast | None:
     if (folder / STAMPS).exists():
         stages = [name for name, decision in survey(recipe, folder).items() if decision.runs]
     forecaster = RunForecaster(recipe)
-    expected = forecaster.of(recipe, stages, (0.0, _SLOW_PATH))
+    expected = forecaster.of(recipe, stages, _SLOW)
     hint = "reduce generate.queries with --set or --quality, or choose another folder with -o"
     check_space(folder, expected.bytes, hint)
-    if _is_short(expected):
-        return None
-    return forecaster.of(recipe, stages)
+    return forecaster.of(recipe, stages) if is_long(expected.seconds, expected.bytes) else None

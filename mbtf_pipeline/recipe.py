@@ -190,7 +190,8 @@ def load_recipe(
     UsageError
         An assignment is invalid.
     """
-    path = _find(path)
+    if path.is_dir():
+        raise InputError("is a folder, not a recipe", where=path, hint="give a YAML file in it")
     recipe = resolve(Recipe, file=path, presets=presets, assignments=assignments)
     assigned = any(a.partition("=")[0].strip() == "generate.material" for a in assignments)
     written = Path(recipe.generate.material)
@@ -201,7 +202,8 @@ def load_recipe(
         raise InputError(
             f"material '{written}' does not exist",
             where="--set generate.material" if assigned else f"{path}:{line}" if line else path,
-            hint=_material_hint(path, material, assigned),
+            hint=f"searched for {os.path.abspath(material)}"
+            + ("" if assigned else f"; edit 'generate.material' in {path}"),
         )
     generate = recipe.generate.model_copy(update={"material": os.path.normpath(material)})
     return recipe.model_copy(update={"generate": generate})
@@ -213,29 +215,6 @@ def fit_names(recipe: Mapping[str, Any]) -> list[str]:
     if not isinstance(fits, Mapping) or _is_single(fits):
         return ["fit"]
     return [f"fit.{name}" for name in fits]
-
-
-# Published materials that are not part of the project, by name of their folder.
-_PUBLISHED = {"rock_cliff": "ambientCG Rock023 (CC0, https://ambientcg.com/view?id=Rock023)"}
-
-
-def _material_hint(path: Path, material: Path, assigned: bool) -> str:
-    """What to do about a missing material."""
-    searched = f"searched for {os.path.abspath(material)}"
-    source = _PUBLISHED.get(material.name)
-    if source is None:
-        return searched if assigned else f"{searched}; edit 'generate.material' in {path}"
-    edit = "" if assigned else f", edit 'generate.material' in {path}"
-    return (
-        f"{searched}; its maps are {source}: copy them there{edit}, or set their folder with "
-        "--set generate.material=FOLDER"
-    )
-
-
-def _find(path: Path) -> Path:
-    if path.is_dir():
-        raise InputError("is a folder, not a recipe", where=path, hint="give a YAML file in it")
-    return path
 
 
 def write_recipe(recipe: Recipe, folder: Path) -> None:

@@ -61,8 +61,8 @@ def fit(
     """Fit a material to a data set: mbtf-fit shards/ -o material/
 
     The same command again resumes an unfinished fit. --time is that of training. --dry-run forecasts time,
-    error and size by two short fits on this machine. With --many, the output folder holds one folder per
-    material.
+    size and a bound of the error by a short fit on this machine. With --many, the output folder holds one
+    folder per material.
 
     Parameters
     ----------
@@ -117,13 +117,13 @@ def fit(
         )
         return
     from mbtf_core.files.folders import check_space
+    from mbtf_core.forecast import is_long
     from mbtf_fit.data.loader import open_data
     from mbtf_fit.material.format import DESCRIPTION_NAME
-    from mbtf_fit.material.transmittance_fit import has_transmittance
     from mbtf_fit.models.registry import MODELS
     from mbtf_fit.native import missing_reason
     from mbtf_fit.training.fit import fit
-    from mbtf_fit.training.forecast import FIT_SECONDS, fit_bytes, query_seconds, training_seconds
+    from mbtf_fit.training.forecast import evaluation_seconds, fit_bytes, training_seconds
 
     finished = not overwrite and (output / DESCRIPTION_NAME).exists()
     partition = None
@@ -139,8 +139,8 @@ def fit(
         )
         seconds, partition = training_seconds(resolved, data_folder)
         queries = int(data.manifest["splits"]["train"].get("queries", 0))
-        seconds += FIT_SECONDS + queries * query_seconds(has_transmittance(data))
-        if seconds >= 60.0 or size >= 1e9:
+        seconds += evaluation_seconds(queries)
+        if is_long(seconds, size):
             console.note(expectation(seconds, size))
     if missing := missing_reason():
         console.note(f"note: training runs in PyTorch, not in the compiled kernel ({missing})")

@@ -1,4 +1,4 @@
-"""Forecast of a fit: time, error and size, extrapolated from two short fits of the same data."""
+"""Forecast of a fit: time, size, and an upper bound of its error, from a short fit of the same data."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ import torch
 
 from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.lattice import Lattice
+from mbtf_core.forecast import pilot_seconds
+from mbtf_core.stats import Estimate
 from mbtf_core.units import clock
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import Partition, load_training, open_data
@@ -20,81 +22,66 @@ from mbtf_fit.models.relief import Relief
 from mbtf_fit.surface.known import surface_bytes
 from mbtf_fit.training.device import choose_device, keep_freed_memory
 from mbtf_fit.training.fit import prepare_trainer
+from mbtf_fit.training.trainer import Trainer
 from mbtf_fit.training.validation import validation_error, validation_set, validation_subset
 
-# Training times of the two pilot fits in seconds; each runs the whole schedule.
-PILOT_SECONDS = (4.0, 8.0)
-# Each doubling of the time improves the logarithm of the error by this share of the improvement before. Least
-# squares over fits of 60 s with quality options on draft data of eleven materials.
-PERSISTENCE = 0.45
-# Seconds of a fit besides training (loading, calibration, evaluation), of each query of its data, and of each
-# query's transmittance, on two processor cores (benchmarks/quality.py).
-FIT_SECONDS, _QUERY_SECONDS, _TRANSMITTANCE_SECONDS = 4.0, 1.1e-6, 0.4e-6
+# Seconds of the pilot of a forecast, and of one that only times steps.
+PILOT_SECONDS, _STEPS_PILOT = 8.0, 2.0
+# Pieces of the training time whose rates give its error.
+_PIECES = 4
+# Seconds of a fit besides training (loading, calibration, evaluation), and of each query of its data.
+_FIT_SECONDS, _QUERY_SECONDS = 4.0, 1.1e-6
 # Fits of fewer queries in all steps take less than a minute at a third of a million queries per second.
 LONG_FIT = 20_000_000
-# Seconds of the pilot of a fit by steps.
-_STEPS_PILOT = 2.0
 # Most queries of the validation subset.
 _SUBSET = 1 << 17
 
 
-def query_seconds(transmittance: bool) -> float:
-    """Seconds of loading and evaluating a query of data with or without a transmittance."""
-    return _QUERY_SECONDS + (_TRANSMITTANCE_SECONDS if transmittance else 0.0)
+def evaluation_seconds(queries: float) -> float:
+    """Seconds of a fit besides training, for so many queries of data."""
+    return _FIT_SECONDS + _QUERY_SECONDS * queries
 
 
 @dataclass(frozen=True)
 class FitForecast:
-    """Expected cost and error of a fit.
+    """Expected cost of a fit.
 
     Attributes
     ----------
-    seconds : of training; loading : of reading the data
-    steps : in that time
+    seconds, seconds_se : of training, and the standard error
+    loading : seconds of reading the data
+    steps : in the time of training
     queries_per_second : training throughput
-    validation_set : the set of queries that the errors are of, in words
-    unexplained : expected unexplained variance; None where there are no queries, or constant values
-    at_most : that after the longer pilot
-    pilots : that after each pilot; empty where there is none
+    validation_set : the set of queries that the error is of, in words
+    unexplained, unexplained_se : unexplained variance after the pilot, above that of a longer fit, and its
+        standard error; None where there are no queries, or constant values
     bytes : of the material's numbers
-    pilot_seconds : time of the forecast, loading included
     """
 
     seconds: float
+    seconds_se: float
     loading: float
     steps: int
     queries_per_second: float
     validation_set: str
     unexplained: float | None
-    at_most: float | None
-    pilots: tuple[float, ...]
+    unexplained_se: float | None
     bytes: int
-    pilot_seconds: float
 
     def describe(self) -> str:
-        """Two lines."""
+        """One or two lines."""
+        error = f" ± {clock(self.seconds_se)}" if self.seconds_se else ""
         text = (
-            f"forecast: {clock(self.seconds)} of training, {self.steps} steps at "
+            f"forecast: {clock(self.seconds)}{error} of training, {self.steps} steps at "
             f"{self.queries_per_second / 1e6:.2f} M queries/s, after {self.loading:.0f} s of loading; "
             f"{self.bytes / 1e6:.2f} MB"
         )
-        if self.unexplained is not None:
-            text += (
-                f"\nexpected unexplained variance of {self.validation_set}: about {self.unexplained:.2f}, "
-                f"and {self.at_most:.2f} after {clock(PILOT_SECONDS[1])}"
-            )
-        return text
-
-
-def extrapolated(
-    short: float, long: float, doublings: float, *, apart: float = 1.0, persistence: float = PERSISTENCE
-) -> float:
-    """Error after so many doublings of the longer fit's time, from the errors of two fits that are `apart`
-    doublings apart. Each doubling improves the logarithm of the error by `persistence` of the improvement
-    before. Never above the longer fit's error."""
-    improvement = max(0.0, math.log(short / long)) if min(short, long) > 0 else 0.0
-    ratio = persistence**apart / (1.0 - persistence**apart)
-    return long * math.exp(-improvement * ratio * (1.0 - persistence ** max(doublings, 0.0)))
+        if self.unexplained is None:
+            return text
+        return (
+            f"{text}\nunexplained variance of {self.validation_set} after {clock(PILOT_SECONDS)}: "
+            f"{self.unexplained:.2f} ± {self.unexplained_se:.2f}; longer training reduces it"
+        )
 
 
 def fit_bytes(config: FitConfig, lattice: Lattice) -> int:
@@ -118,44 +105,64 @@ def training_seconds(config: FitConfig, shards: str | Path | DataFolder) -> tupl
     keep_freed_memory()
     partition = load_training(data, config.held_out, config.seed, config.data.memory)
     trainer = prepare_trainer(config, data, partition, choose_device(config.device))
-    trainer.train(_STEPS_PILOT)
-    return steps * trainer.progress.seconds / trainer.progress.step, partition
+    return steps * _step_seconds(trainer, _STEPS_PILOT).value, partition
 
 
 def forecast_fit(config: FitConfig, shards: str | Path | DataFolder) -> FitForecast:
-    """Forecast the fit of a configuration by two pilot fits; nothing is written."""
+    """Forecast the fit of a configuration by a short one, which runs the whole schedule; nothing is written.
+
+    Parameters
+    ----------
+    config : FitConfig
+    shards : str, Path or DataFolder
+        Data set.
+
+    Returns
+    -------
+    FitForecast
+
+    Raises
+    ------
+    InputError
+        The data set cannot be read, or suits another model.
+    """
     began = time.perf_counter()
-    device = choose_device(config.device)
     data = open_data(shards, MODELS[config.model].layout, config.model, config.data.cache)
     keep_freed_memory()
     partition = load_training(data, config.held_out, config.seed, config.data.memory)
     name, queries = validation_set(data, partition)
     loading = time.perf_counter() - began
-    errors: list[float] = []
-    for seconds in PILOT_SECONDS:
-        training = config.training.model_copy(update={"time": seconds, "steps": None})
-        pilot = config.model_copy(update={"training": training})
-        trainer = prepare_trainer(pilot, data, partition, device)
-        while not trainer.train(math.inf):
-            pass
-        subset = validation_subset(trainer.model.positions, queries, _SUBSET)
-        if len(subset):
-            errors.append(validation_error(trainer, subset).value)
-    if not all(map(math.isfinite, errors)):
-        errors.clear()
-    rate = trainer.progress.step / trainer.progress.seconds
+    training = config.training.model_copy(update={"time": PILOT_SECONDS, "steps": None})
+    pilot = config.model_copy(update={"training": training})
+    trainer = prepare_trainer(pilot, data, partition, choose_device(config.device))
+    each = _step_seconds(trainer, PILOT_SECONDS)
+    while not trainer.train(math.inf):
+        pass
+    error = None
+    if len(subset := validation_subset(trainer.model.positions, queries, _SUBSET)):
+        found = validation_error(trainer, subset)
+        error = found if math.isfinite(found.value) else None
     steps = config.training.steps
-    total = config.training.time if steps is None else steps / rate
-    doublings = math.log2(total / PILOT_SECONDS[1])
+    total = Estimate(config.training.time, 0.0, 1) if steps is None else each.scaled(steps)
     return FitForecast(
-        seconds=total,
+        seconds=total.value,
+        seconds_se=total.error,
         loading=loading,
-        steps=round(total * rate) if steps is None else steps,
-        queries_per_second=rate * trainer.batch,
+        steps=round(total.value / each.value) if steps is None else steps,
+        queries_per_second=trainer.batch / each.value,
         validation_set=SPLIT_NAMES[name],
-        unexplained=extrapolated(errors[0], errors[1], doublings) if errors else None,
-        at_most=errors[-1] if errors else None,
-        pilots=tuple(errors),
+        unexplained=None if error is None else error.value,
+        unexplained_se=None if error is None else error.error,
         bytes=sum(tensor.nbytes for tensor in trainer.model.weights().values()),
-        pilot_seconds=time.perf_counter() - began,
     )
+
+
+def _step_seconds(trainer: Trainer, seconds: float) -> Estimate:
+    """Seconds of a training step, from pieces of a training time."""
+
+    def piece(number: int) -> int:
+        before = trainer.progress.step
+        trainer.train(seconds / _PIECES)
+        return max(1, trainer.progress.step - before)
+
+    return pilot_seconds(piece, seconds * (1.0 - 1.5 / _PIECES))

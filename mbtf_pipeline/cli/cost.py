@@ -42,11 +42,11 @@ def cost(
     from mbtf_core.run.cluster import open_runner
     from mbtf_core.run.signals import keep_on_interruption
     from mbtf_core.units import asked_duration, format_duration
-    from mbtf_pipeline.cost_study.page import whole_runs, write_page
-    from mbtf_pipeline.cost_study.pareto import pareto_front
-    from mbtf_pipeline.cost_study.study import run_study, time_of
-    from mbtf_pipeline.library.recipe import is_library_recipe
-    from mbtf_pipeline.paper_tables.recipe import is_paper_recipe
+    from mbtf_pipeline.cost.cost_page import whole_runs, write_page
+    from mbtf_pipeline.cost.pareto import pareto_front
+    from mbtf_pipeline.cost.study import run_study, time_of
+    from mbtf_pipeline.library.entries import is_library_recipe
+    from mbtf_pipeline.papers.plan import is_paper_recipe
     from mbtf_pipeline.recipe import load_recipe
 
     if is_library_recipe(recipe) or is_paper_recipe(recipe):

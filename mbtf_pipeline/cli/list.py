@@ -35,8 +35,8 @@ def list_recipes(
 
 
 def _entry(path: Path, verbose: bool) -> dict[str, Any]:
-    from mbtf_pipeline.library.recipe import is_library_recipe, load_library_recipe
-    from mbtf_pipeline.paper_tables.recipe import is_paper_recipe, load_paper_recipe
+    from mbtf_pipeline.library.entries import is_library_recipe, load_library_recipe
+    from mbtf_pipeline.papers.plan import is_paper_recipe, load_paper_recipe
     from mbtf_pipeline.recipe import load_recipe
 
     entry: dict[str, Any] = {

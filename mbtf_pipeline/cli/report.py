@@ -33,7 +33,7 @@ def report(
     from mbtf_core.exposure import describe_exposure
     from mbtf_pipeline.library.run import is_library
     from mbtf_pipeline.library.run import write_again as write_library
-    from mbtf_pipeline.paper_tables.suite import is_paper, write_again
+    from mbtf_pipeline.papers.suite import is_paper, write_again
     from mbtf_pipeline.run import rerender
 
     used = None

@@ -59,8 +59,8 @@ def run(
     """
     # Python itself has run for about a second.
     began = clocks.perf_counter() - 1.0
-    from mbtf_pipeline.library.recipe import is_library_recipe
-    from mbtf_pipeline.paper_tables.recipe import is_paper_recipe
+    from mbtf_pipeline.library.entries import is_library_recipe
+    from mbtf_pipeline.papers.plan import is_paper_recipe
 
     given = {"quality": quality, "time": time, "quick": quick, "output": output, "set": assignments}
     command = command_line("mbtf-pipeline", "run", recipe, **given)
@@ -89,7 +89,7 @@ def run(
 
     if time is not None:
         from mbtf_core.units import asked_duration
-        from mbtf_pipeline.cost_study.time_split import TimedRun
+        from mbtf_pipeline.time_split import TimedRun
 
         seconds = asked_duration(time, "--time")
         timed = TimedRun(
@@ -138,8 +138,8 @@ def _run_paper(
     command: str,
     console: Console,
 ) -> None:
-    from mbtf_pipeline.paper_tables.recipe import load_paper_recipe, plan
-    from mbtf_pipeline.paper_tables.suite import run_paper
+    from mbtf_pipeline.papers.plan import load_paper_recipe, plan
+    from mbtf_pipeline.papers.suite import run_paper
 
     paper = load_paper_recipe(file, assignments)
     planned, missing = plan(paper, file, quick)
@@ -165,7 +165,7 @@ def _run_library(
 ) -> None:
     from mbtf_core.run.cluster import open_runner
     from mbtf_core.run.processes import Processes
-    from mbtf_pipeline.library.recipe import entries, load_library_recipe
+    from mbtf_pipeline.library.entries import entries, load_library_recipe
     from mbtf_pipeline.library.run import run_library
 
     library = load_library_recipe(file, assignments)
@@ -191,7 +191,7 @@ def _run_library(
 
 
 def _report(result: RunResult, console: Console, quality: Quality | None) -> None:
-    from mbtf_pipeline.formatting import estimate
+    from mbtf_pipeline.number_text import estimate
 
     tests = {fit: record["splits"]["test"] for fit, record in result.comparison["test"].items()}
     ran = {name: stage.stamp.seconds for name, stage in result.stages.items() if stage.ran}

@@ -17,18 +17,18 @@ from mbtf_core.exposure import auto_exposure, brightness, white_of
 from mbtf_core.files.atomic import write_json
 from mbtf_core.stats import Estimate
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_pipeline.compare.contrast import contrast, phase_contrasts, picture_blocks
+from mbtf_pipeline.compare.contrast import contrast, picture_blocks
 from mbtf_pipeline.compare.dataset_errors import dataset_errors
-from mbtf_pipeline.compare.metrics import DEFINITIONS, image_errors, reference_difference
-from mbtf_pipeline.compare.offsets import write_offsets
-from mbtf_pipeline.compare.perceptual_metrics import perceptual_scores
-from mbtf_pipeline.compare.pictures import (
+from mbtf_pipeline.compare.image_files import (
     PICTURES,
     Scene,
     scenes,
     write_map,
     write_picture,
 )
+from mbtf_pipeline.compare.metrics import DEFINITIONS, image_errors, reference_difference
+from mbtf_pipeline.compare.offsets import write_offsets
+from mbtf_pipeline.compare.perceptual_metrics import perceptual_scores
 from mbtf_pipeline.compare.st_lpips import require
 from mbtf_pipeline.compare.timing import measure_timing, timed
 from mbtf_pipeline.compare.unmodified_mitsuba import pick_scene, write_agreement
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 COMPARISON_NAME = "comparison.json"
 COMPARISON_FORMAT = "mbtf-comparison"
 # Raised when the record or its files change; part of the stage's key.
-COMPARISON_SCHEMA = 9
+COMPARISON_SCHEMA = 10
 
 F32 = NDArray[np.float32]
 Progress = Callable[[str], None]
@@ -106,8 +106,6 @@ def compare(
         for scene, images in rendered
     ]
     data = Dataset.open(shards)
-    first = next(scenes(section))
-    light, view = (from_angles(d.elevation, d.azimuth) for d in (first.light, first.view))
     record: dict[str, Any] = {
         "format": COMPARISON_FORMAT,
         "schema": COMPARISON_SCHEMA,
@@ -122,7 +120,6 @@ def compare(
         "definitions": DEFINITIONS,
         "pictures": pictures,
         "test": dataset_errors(materials, data),
-        "phases": phase_contrasts(estimator, materials, data.lattice, light, view, section.seed),
         "offsets": write_offsets(estimator, materials, section.offset_views, data.lattice, out),
         "seconds": {"references": round(seconds, 3)},
     }

@@ -1,4 +1,4 @@
-"""Contrast of luminance and chroma beside a reference, and how it depends on the position between texels.
+"""Contrast of luminance and chroma of an image beside its reference.
 
 A fit can have a small squared error and still look too smooth, or lose its colors. With the luminance L of a
 value and the means over the reference, chroma is what a value has besides its share of the mean color:
@@ -6,27 +6,18 @@ value and the means over the reference, chroma is what a value has besides its s
     d = (R, G, B) - L · mean(R, G, B) / mean(L).
 
 Contrasts are standard deviations over positions. Those of the reference, and correlations with it, use the
-product of its independent halves, so noise biases neither. The contrast of textures also depends on where
-queries fall between texels: bilinear texels hold less detail at their corners than at their centers.
+product of its independent halves, so noise biases neither.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mbtf_core.data.lattice import Lattice, sigma_of_level
-from mbtf_core.data.queries import Queries
 from mbtf_core.images.read import LUMINANCE
 from mbtf_core.stats import Estimate
-from mbtf_gen.render.estimates import Stream
-
-if TYPE_CHECKING:
-    from mbtf_fit import Material
-    from mbtf_gen.render.estimator import Estimator
 
 F64 = NDArray[np.float64]
 
@@ -34,13 +25,6 @@ F64 = NDArray[np.float64]
 COLORED = 0.05
 # Blocks along each axis of a picture that the jackknife leaves out: neighboring pixels are correlated.
 BLOCKS = 8
-# Positions in a texel, in texels from its corner along both axes.
-PHASES: dict[str, float] = {"centers": 0.5, "quarters": 0.25, "corners": 0.0}
-# Queries of each phase, paths of each, and levels below the finest.
-_PHASE_QUERIES, _PHASE_PATHS, _PHASE_LEVELS = 1024, 256, (0, 2)
-# Random numbers beyond those of pictures.
-_FIRST_STREAM = 1 << 27
-
 DEFINITION = (
     "standard deviation over pixels of luminance L, and of chroma d = RGB - L mean(RGB) / mean(L), over that "
     "of the reference without its noise; correlation of chroma with the reference's. – where the chroma of "
@@ -88,69 +72,6 @@ def picture_blocks(rows: int, columns: int) -> NDArray[np.int64]:
     """Block (rows · columns) of each pixel of a picture."""
     along = [np.arange(n) * BLOCKS // n for n in (rows, columns)]
     return np.asarray(along[0][:, None] * BLOCKS + along[1], np.int64).reshape(-1)
-
-
-def phase_queries(
-    lattice: Lattice,
-    level: int,
-    phase: float,
-    omega_i: Sequence[float] | F64,
-    omega_o: Sequence[float] | F64,
-    most: int,
-    seed: int = 0,
-) -> Queries:
-    """Queries at one place in each of at most so many texels of a level, with the footprint of the level.
-
-    Parameters
-    ----------
-    phase : place in the texel along both axes, in texels from its corner; see :data:`PHASES`
-    omega_i, omega_o : unit vectors towards light and viewer
-    most : largest number of queries; texels are then chosen at random, without repetition
-    """
-    rows, columns = lattice.shape(level)
-    chosen = np.random.default_rng(seed).permutation(rows * columns)[:most]
-    u = np.stack([(chosen % columns + phase) / columns, (chosen // columns + phase) / rows], 1)
-    n = len(chosen)
-    directions = [np.tile(np.asarray(w, np.float32), (n, 1)) for w in (omega_i, omega_o)]
-    sigma = np.full(n, sigma_of_level(level), np.float32)
-    return Queries(u.astype(np.float32), sigma, *directions)
-
-
-def phase_contrasts(
-    estimator: Estimator,
-    materials: Mapping[str, Material],
-    lattice: Lattice,
-    omega_i: F64,
-    omega_o: F64,
-    seed: int,
-) -> list[dict[str, Any]]:
-    """Contrast of luminance of fits at places between texels, relative to path-traced values there.
-
-    Parameters
-    ----------
-    materials : fitted materials by name
-    omega_i, omega_o : unit vectors towards light and viewer
-
-    Returns
-    -------
-    list of dict
-        One of each level and phase: ``level``, ``phase``, and ``fits`` with an estimate by name.
-    """
-    out = []
-    for level in sorted({max(0, lattice.finest - below) for below in _PHASE_LEVELS}):
-        for number, (phase, place) in enumerate(PHASES.items()):
-            queries = phase_queries(lattice, level, place, omega_i, omega_o, _PHASE_QUERIES)
-            stream = Stream(seed, "reference", _FIRST_STREAM + len(PHASES) * level + number)
-            found = estimator.estimate(queries, _PHASE_PATHS, stream)
-            arrays = queries.u, queries.sigma, queries.omega_i, queries.omega_o
-            # Texels are in random order, so every 32nd one is a random subset.
-            blocks = np.arange(len(queries.sigma)) % 32
-            fits = {}
-            for name, material in materials.items():
-                one = contrast(material.evaluate(*arrays), found.value_a, found.value_b, blocks)["luminance"]
-                fits[name] = None if one is None else one.as_dict()
-            out.append({"level": level, "phase": phase, "fits": fits})
-    return out
 
 
 def _moments(signals: Sequence[F64], blocks: NDArray[np.int64]) -> F64:

@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike
 
 from mbtf_core.stats import Estimate, mean_estimate, noise_free_mse, psnr
 from mbtf_pipeline.compare.contrast import DEFINITION as CONTRAST_DEFINITION
-from mbtf_pipeline.compare.flip import DEFINITION as FLIP_DEFINITION
-from mbtf_pipeline.compare.ssim import DEFINITION as SSIM_DEFINITION
+from mbtf_pipeline.compare.perceptual_metrics import FLIP_DEFINITION, SSIM_DEFINITION
 from mbtf_pipeline.compare.st_lpips import DEFINITION as ST_LPIPS_DEFINITION
 
 # Floor of the relative error's denominator, as a fraction of the image's mean value.

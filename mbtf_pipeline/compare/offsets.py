@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from mbtf_core.data.lattice import Lattice, texel_centers
 from mbtf_core.directions import from_angles
-from mbtf_pipeline.compare.pictures import write_channels
+from mbtf_pipeline.compare.image_files import write_channels
 from mbtf_pipeline.recipe import SceneView
 
 if TYPE_CHECKING:

@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
+from mbtf_core.color import linear_to_srgb
 from mbtf_core.errors import EngineError
-from mbtf_pipeline.compare.ssim import to_srgb
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -33,6 +33,12 @@ DEFINITION = (
     "ST-LPIPS (Ghildyal and Liu 2022, network alex) of the images in sRGB, with values above white "
     "clipped; 0 means equal. It includes the reference noise; its two estimates, compared, give a baseline."
 )
+
+
+def to_srgb(image: ArrayLike, white: float) -> NDArray[np.float64]:
+    """sRGB in [0, 1] of linear values (..., 3) in 1/sr, clipped at `white`."""
+    linear = np.clip(np.asarray(image, np.float64) / white, 0.0, 1.0)
+    return np.asarray(linear_to_srgb(linear), np.float64)
 
 
 def weights_file() -> Path | None:

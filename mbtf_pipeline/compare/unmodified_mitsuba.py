@@ -25,7 +25,7 @@ from mbtf_core.errors import UsageError
 from mbtf_core.pictures.camera import PIXEL_SIGMA, Camera
 from mbtf_core.stats import Estimate, mean_estimate
 from mbtf_gen.tile.maps.material_file import ROLES
-from mbtf_pipeline.compare.pictures import PICTURES, write_picture
+from mbtf_pipeline.compare.image_files import PICTURES, write_picture
 
 if TYPE_CHECKING:
     from mbtf_gen.config.generator import GeneratorConfig

@@ -6,6 +6,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,8 @@ _YAML = (".yaml", ".yml")
 # Records of folders that the programs have written, and keys of recipes.
 _RECORDS = {"library.json", "run.json", "manifest.json", "fit.json"}
 _RECIPE_KEYS = {"library", "generate"}
-# Characters of a name besides its number, and those that it does not begin with.
-_LONGEST, _PUNCTUATION = 90, "._+-"
+# Characters of a name besides its number.
+_LONGEST = 90
 
 
 def find_materials(path: Path) -> list[Path]:
@@ -121,29 +122,24 @@ def name_materials(paths: Sequence[Path], taken: Collection[str] = ()) -> list[s
     UsageError
         A material is listed twice.
     """
-    for path, count in Counter(os.path.realpath(path) for path in paths).items():
-        if count > 1:
-            raise UsageError("is listed twice", where=path, hint="list each material once in 'library'")
+    for real, listed in Counter(os.path.realpath(path) for path in paths).items():
+        if listed > 1:
+            raise UsageError("is listed twice", where=real, hint="list each material once in 'library'")
     plain = [_name(path.stem if path.suffix.lower() in _SUFFIXES else path.name) for path in paths]
-    often = Counter([*plain, *taken])
-    wanted = [
-        name if often[name] == 1 else f"{_name(path.parent.name)}-{name}"[-_LONGEST:].lstrip(_PUNCTUATION)
-        for name, path in zip(plain, paths, strict=True)
-    ]
+    often, used = Counter([*plain, *taken]), {*taken}
     names: list[str] = []
-    used, asked = {*taken}, {*wanted}
-    for name in wanted:
-        number = 1
-        own = name
-        # A number is no other material's name.
-        while own in used or (number > 1 and own in asked):
-            number += 1
-            own = f"{name}-{number}"
+    for name, path in zip(plain, paths, strict=True):
+        base = name if often[name] == 1 else _name(f"{path.parent.name}-{name}")
+        own = base
+        for number in count(2):
+            if own not in used:
+                break
+            own = f"{base}-{number}"
         names.append(own)
         used.add(own)
     return names
 
 
 def _name(text: str) -> str:
-    cleaned = re.sub(r"[^A-Za-z0-9._+-]+", "_", text).lstrip(_PUNCTUATION)
-    return cleaned[:_LONGEST] or "material"
+    """A text as a name of a folder; the end of a long one."""
+    return re.sub(r"[^A-Za-z0-9._+-]+", "_", text)[-_LONGEST:].lstrip("._+-") or "material"

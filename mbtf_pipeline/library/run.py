@@ -19,8 +19,8 @@ from mbtf_core.units import format_duration
 from mbtf_fit.config import DECODER_MODELS, SHARED_PRESET, FitConfig
 from mbtf_fit.material.decoder import DECODER_FOLDER
 from mbtf_pipeline.library.budget import Division
-from mbtf_pipeline.library.page import library_page
-from mbtf_pipeline.library.recipe import Entry, LibraryRecipe
+from mbtf_pipeline.library.entries import Entry, LibraryRecipe
+from mbtf_pipeline.library.library_page import library_page
 from mbtf_pipeline.library.task import first_fit, fit_shared, run_material, shards_of, summarize
 from mbtf_pipeline.run_folder import has_record, machine
 
@@ -83,7 +83,7 @@ def run_library(
     ----------
     library : LibraryRecipe
     found : sequence of Entry
-        From :func:`~mbtf_pipeline.library.recipe.entries`.
+        From :func:`~mbtf_pipeline.library.entries.entries`.
     folder : Path
         Folder of the library; the runs are in ``materials/NAME``.
     command : str

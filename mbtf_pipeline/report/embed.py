@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,8 @@ from mbtf_pipeline.report.linear_images import Coding, pack
 U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
 Pixels = NDArray[np.floating]
+# Quality of images of files.
+_QUALITY = 86
 
 
 def shrink(values: Pixels, factor: int) -> Pixels:
@@ -79,6 +82,22 @@ def jpeg_uri(display: U8, quality: int) -> str:
     from PIL import Image
 
     return _data_uri(Image.fromarray(display), "jpeg", quality=quality, subsampling=0)
+
+
+def file_uri(path: Path, most: int | None = None) -> str:
+    """``data:`` URI of an image file as JPEG, shrunk to so many pixels along a side at most.
+
+    Raises
+    ------
+    OSError : missing or corrupt
+    """
+    from PIL import Image
+
+    with Image.open(path) as image:
+        small = image.convert("RGB")
+    if most is not None:
+        small.thumbnail((most, most))
+    return jpeg_uri(np.asarray(small), _QUALITY)
 
 
 def map_uri(values: Pixels, name: Palette, shades: int) -> str:

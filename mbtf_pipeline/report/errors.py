@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from statistics import median_high
 from typing import Any
 
 from mbtf_core.exposure import describe_exposure
 from mbtf_fit.formatting import SPLIT_NAMES
 from mbtf_pipeline.compare.perceptual_metrics import available_metrics
-from mbtf_pipeline.formatting import data_errors, decibel, estimate, estimate_text, short_direction
+from mbtf_pipeline.number_text import data_errors, decibel, estimate, estimate_text, short_direction
 from mbtf_pipeline.report.plots import points
 
 UNEXPLAINED = "unexplained variance"
@@ -42,7 +42,6 @@ def error_context(comparison: Mapping[str, Any], min_cos: float) -> dict[str, An
         "group_tables": [_group_table(tests, min_cos, *grouping) for grouping in _GROUPINGS],
         "picture_table": _pictures_table(comparison),
         "contrast_table": _contrast_table(comparison),
-        "phase_table": _phase_table(comparison),
         "definitions": [(_TERMS[k], v) for k, v in comparison["definitions"].items()],
     }
 
@@ -127,59 +126,48 @@ def _group_table(
     return {"title": f"{title}, test split", "head": [head, "queries", *heads], "rows": rows}
 
 
-def _pictures_table(comparison: Mapping[str, Any]) -> dict[str, Any]:
-    """One row per image and fit, with errors against each kind of reference."""
-    kinds = comparison["kinds"]
-    metrics = available_metrics(comparison["pictures"], comparison["fits"])
+# Of each image and fit: cells that follow its view, light, width and name.
+_Cells = Callable[[Mapping[str, Any], Mapping[str, Any]], list[str]]
+
+
+def _image_table(
+    comparison: Mapping[str, Any], title: str, heads: list[str], cells: _Cells
+) -> dict[str, Any]:
+    """One row per image and fit; `cells` gets the records of the image and of the fit."""
     rows = []
     for picture in comparison["pictures"]:
-        noise = picture["references"][kinds[0]]
+        where = [*(short_direction(picture[d]) for d in ("view", "light")), f"{picture['tiles_across']:g}"]
         for fit in comparison["fits"]:
-            record = picture["fits"][fit]
-            row = [short_direction(picture[d]) for d in ("view", "light")]
-            row += [f"{picture['tiles_across']:g}", fit]
-            for kind in kinds:
-                errors = {name: estimate(e) for name, e in record["errors"][kind].items()}
-                row += [estimate_text(errors["mse"], 1e3), decibel(errors["psnr"], errors["mse"])]
-                row.append(estimate_text(errors["relative_mse"]))
-            rows.append(row + [m.text(m.of(record), m.of(noise)) for m in metrics])
-    names = ("MSE [10⁻³/sr²]", "PSNR", "relative MSE")
-    heads = [f"{name}, {kind} reference" for kind in kinds for name in names]
-    heads += [m.title for m in metrics]
-    title = f"Images at {describe_exposure(comparison['exposure'])}; white is the peak of the PSNR"
+            rows.append([*where, fit, *cells(picture, picture["fits"][fit])])
     return {"title": title, "head": ["view", "light", "tiles across", "fit", *heads], "rows": rows}
 
 
-def _relative(record: Mapping[str, Any] | None) -> str:
-    return "–" if record is None else estimate_text(estimate(record))
+def _pictures_table(comparison: Mapping[str, Any]) -> dict[str, Any]:
+    """Errors of every image against each kind of reference."""
+    kinds = comparison["kinds"]
+    metrics = available_metrics(comparison["pictures"], comparison["fits"])
+
+    def cells(picture: Mapping[str, Any], record: Mapping[str, Any]) -> list[str]:
+        row, noise = [], picture["references"][kinds[0]]
+        for kind in kinds:
+            errors = {name: estimate(e) for name, e in record["errors"][kind].items()}
+            row += [estimate_text(errors["mse"], 1e3), decibel(errors["psnr"], errors["mse"])]
+            row.append(estimate_text(errors["relative_mse"]))
+        return row + [m.text(m.of(record), m.of(noise)) for m in metrics]
+
+    names = ("MSE [10⁻³/sr²]", "PSNR", "relative MSE")
+    heads = [f"{name}, {kind} reference" for kind in kinds for name in names]
+    title = f"Images at {describe_exposure(comparison['exposure'])}; white is the peak of the PSNR"
+    return _image_table(comparison, title, [*heads, *(m.title for m in metrics)], cells)
 
 
 def _contrast_table(comparison: Mapping[str, Any]) -> dict[str, Any]:
-    """One row per image and fit: contrast relative to each kind of reference."""
-    rows = []
-    for picture in comparison["pictures"]:
-        for fit in comparison["fits"]:
-            row = [short_direction(picture[d]) for d in ("view", "light")]
-            row += [f"{picture['tiles_across']:g}", fit]
-            for kind in comparison["kinds"]:
-                found = picture["fits"][fit]["contrast"][kind]
-                row += [_relative(found[name]) for name in ("luminance", "chroma", "correlation")]
-            rows.append(row)
-    names = ("luminance", "chroma", "correlation of chroma")
-    heads = [f"{name}, {kind} reference" for kind in comparison["kinds"] for name in names]
-    title = "Contrast relative to the reference (1 is right)"
-    return {"title": title, "head": ["view", "light", "tiles across", "fit", *heads], "rows": rows}
+    """Contrast of every image relative to each kind of reference."""
+    names = {"luminance": "luminance", "chroma": "chroma", "correlation": "correlation of chroma"}
 
+    def cells(picture: Mapping[str, Any], record: Mapping[str, Any]) -> list[str]:
+        found = [record["contrast"][kind][name] for kind in comparison["kinds"] for name in names]
+        return ["–" if one is None else estimate_text(estimate(one)) for one in found]
 
-def _phase_table(comparison: Mapping[str, Any]) -> dict[str, Any]:
-    """One row per level and fit: contrast of luminance at places between texels."""
-    levels = sorted({row["level"] for row in comparison["phases"]})
-    phases = list(dict.fromkeys(row["phase"] for row in comparison["phases"]))
-    found = {(row["level"], row["phase"]): row["fits"] for row in comparison["phases"]}
-    rows = [
-        [str(level), fit, *(_relative(found[level, phase][fit]) for phase in phases)]
-        for level in levels
-        for fit in comparison["fits"]
-    ]
-    title = "Contrast at places of the texels, relative to path-traced values there (1 is right)"
-    return {"title": title, "head": ["level", "fit", *phases], "rows": rows}
+    heads = [f"{name}, {kind} reference" for kind in comparison["kinds"] for name in names.values()]
+    return _image_table(comparison, "Contrast relative to the reference (1 is right)", heads, cells)

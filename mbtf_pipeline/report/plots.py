@@ -8,7 +8,6 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -29,18 +28,7 @@ ERROR_BAR_NOTE = (
     "and at twice the largest."
 )
 _WIDTH, _HEIGHT = 5.6, 3.3
-# Half the side of a marker and half the width of a line, in pixels.
-_MARKER, _LINE = 5.0, 1.5
 _LABEL_SIZE = 7.5
-# Candidate offsets of a label from its point, in points; their signs give the alignment.
-_OFFSETS = (
-    *((7, 0), (5, 6), (5, -6), (-7, 0), (-5, 6), (-5, -6)),
-    *((0, 9), (0, -9), (8, 16), (8, -16), (-8, 16), (-8, -16)),
-)
-# Distance in pixels to the left and right edges: text may be wider at another resolution.
-_EDGE = 16.0
-# An obstacle: both ends in data coordinates, and half its width in pixels.
-Obstacle = tuple[tuple[float, float], tuple[float, float], float]
 
 
 def color(index: int) -> str:
@@ -189,8 +177,6 @@ def scatter(
 def _scatter(clouds: Sequence[Cloud], x: str, y: str, front: Sequence[tuple[float, float]]) -> Any:
     axes = _axes(x, y, "xy", 7.2, 4.2)
     floor = _limits([v for cloud in clouds for v in cloud.y])[0]
-    labels: list[tuple[float, float, str, str]] = []
-    obstacles: list[Obstacle] = []
     handles = []
     for index, cloud in enumerate(clouds):
         xs, ys = np.asarray(cloud.x, float), np.maximum(np.asarray(cloud.y, float), floor)
@@ -200,27 +186,26 @@ def _scatter(clouds: Sequence[Cloud], x: str, y: str, front: Sequence[tuple[floa
         handles.append((drawn.lines[0], cloud.name))
         if cloud.joined:
             axes.plot(xs, ys, color=color(index), linewidth=0.8, alpha=0.5)
-        for x0, y0, dx, dy, text in zip(xs, ys, x_error, y_error, cloud.labels, strict=True):
-            obstacles.append(((x0, y0), (x0, y0), _MARKER))
-            obstacles.append(((x0 - dx, y0), (x0 + dx, y0), _LINE))
-            obstacles.append(((x0, y0 - dy), (x0, y0 + dy), _LINE))
-            if text:
-                labels.append((x0, y0, text, color(index)))
+        for x0, y0, text in zip(xs, ys, cloud.labels, strict=True):
+            # The front descends to the right, so that it leaves this corner free.
+            note = axes.annotate(
+                text, (x0, y0), (6, 5), textcoords="offset points", fontsize=_LABEL_SIZE, color=color(index)
+            )
+            # Otherwise constrained layout would shrink the axes for the label.
+            note.set_in_layout(False)
     if front:
         drawn = axes.step(*np.asarray(front, float).T, where="post", color=_INK, lw=1.3, ls=(0, (4, 2)))
         handles.append((drawn[0], "Pareto front"))
-        for (x0, y0), (x1, y1) in pairwise(front):
-            obstacles += [((x0, y0), (x1, y0), _LINE), ((x1, y0), (x1, y1), _LINE)]
     axes.margins(y=0.1)
-    # Space for labels on either side.
+    # Space for labels on the right.
     left, right = axes.get_xlim()
     if right < 1.01 * left:  # A single time: the limits differ by rounding alone.
         left, right = left / 1.5, right * 1.5
     axes.set_xlim(left / (right / left) ** 0.06, right * (right / left) ** 0.2)
     for axis in (axes.xaxis, axes.yaxis):
         _plain_ticks(axis)
-    _legend_above(axes.figure, handles)
-    place_labels(axes, labels, obstacles)
+    marks, names = zip(*handles, strict=True)
+    axes.figure.legend(marks, names, ncols=2, loc="outside upper left", frameon=False, fontsize=8.5)
     return axes.figure
 
 
@@ -241,45 +226,6 @@ def _error_bars(
         linewidth=1.1,
         **more,
     )
-
-
-def place_labels(
-    axes: Any, labels: Sequence[tuple[float, float, str, str]], obstacles: Sequence[Obstacle]
-) -> None:
-    """Write every label (x, y, text, color) at the candidate offset with the least overlap."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.transforms import Bbox
-
-    renderer = FigureCanvasAgg(axes.figure).get_renderer()
-    axes.figure.draw_without_rendering()
-    occupied = []
-    for first, second, half_width in obstacles:
-        ends = axes.transData.transform((first, second))
-        occupied.append(Bbox([ends.min(axis=0), ends.max(axis=0)]).padded(half_width))
-    frame = axes.get_window_extent(renderer).padded(-_EDGE, 0.0)
-    for x, y, text, color in labels:
-        note = axes.annotate(
-            text, (x, y), (0, 0), textcoords="offset points", fontsize=_LABEL_SIZE, color=color
-        )
-
-        def box_at(offset: tuple[int, int], note: Any = note) -> Any:
-            note.xyann = offset
-            horizontal, vertical = (int(np.sign(o)) for o in offset)
-            note.set(ha=("center", "left", "right")[horizontal], va=("center", "bottom", "top")[vertical])
-            return note.get_window_extent(renderer)
-
-        def overlap(offset: tuple[int, int]) -> float:
-            box = box_at(offset)
-            outside = box.width * box.height - _area(Bbox.intersection(box, frame))
-            return round(outside + sum(_area(Bbox.intersection(box, other)) for other in occupied), 6)
-
-        occupied.append(box_at(min(_OFFSETS, key=overlap)))
-        # Otherwise constrained layout would shrink the axes for the label.
-        note.set_in_layout(False)
-
-
-def _area(box: Any) -> float:
-    return 0.0 if box is None else float(box.width * box.height)
 
 
 def points(
@@ -308,20 +254,6 @@ def points(
         if axes.get_legend_handles_labels()[0]:
             axes.legend(frameon=False)
         return _svg(axes.figure, label)
-
-
-def _legend_above(figure: Any, handles: Sequence[tuple[Any, str]]) -> None:
-    """Legend above the plot, in as many columns as fit."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    renderer = FigureCanvasAgg(figure).get_renderer()
-    marks, names = zip(*handles, strict=True)
-    options = {"loc": "outside upper left", "frameon": False, "fontsize": 8.5}
-    for columns in (4, 3, 2, 1):
-        legend = figure.legend(marks, names, ncols=columns, **options)
-        if columns == 1 or legend.get_window_extent(renderer).width <= figure.bbox.width:
-            return
-        legend.remove()
 
 
 def _plain_ticks(axis: Any) -> None:

@@ -11,22 +11,21 @@ from mbtf_core.config.settings import check_schema
 from mbtf_core.exposure import describe_exposure
 from mbtf_core.files.atomic import read_json, write_text
 from mbtf_pipeline.compare.compare import COMPARISON_NAME, COMPARISON_SCHEMA
-from mbtf_pipeline.formatting import NOT_SIGNIFICANT
+from mbtf_pipeline.number_text import NOT_SIGNIFICANT
 from mbtf_pipeline.recipe import RECIPE_NAME, Recipe
 from mbtf_pipeline.report.embed import ENCODINGS, Gallery, encode
 from mbtf_pipeline.report.error_maps import palette
 from mbtf_pipeline.report.errors import error_context
+from mbtf_pipeline.report.image_sheet import picture_section
 from mbtf_pipeline.report.linear_images import EXPOSURE_STOPS
 from mbtf_pipeline.report.material import material_section
-from mbtf_pipeline.report.offsets import offset_section
-from mbtf_pipeline.report.pictures import picture_section
+from mbtf_pipeline.report.offset_images import offset_section
 from mbtf_pipeline.report.plots import ERROR_BAR_NOTE
-from mbtf_pipeline.report.times import provenance, time_context
-from mbtf_pipeline.report.training import read_training, training_context
+from mbtf_pipeline.report.times import provenance, read_training, time_context, training_context
 from mbtf_pipeline.run_folder import COMPARE, FITS, REPORT, RUN_NAME, SHARDS
 
 # Raised when the report or the viewer's page changes; part of the stage's key.
-LAYOUT = 9
+LAYOUT = 10
 
 _TABLE = """
 {%- set below = t.head[-1] == "command" %}
@@ -101,7 +100,7 @@ def write_report(folder: Path, recipe: Recipe, stages: Sequence[str]) -> None:
         "provenance": provenance(folder, manifest, fit_folders, run["machine"]),
         **error_context(comparison, float(manifest["config"]["queries"]["min_cos"])),
         **training_context(histories),
-        **time_context(folder, stages, manifest, comparison, histories),
+        **time_context(folder, stages, manifest, comparison),
         "exposure": describe_exposure(gallery.exposure),
         "stops": EXPOSURE_STOPS,
     }

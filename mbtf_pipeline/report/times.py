@@ -1,22 +1,80 @@
-"""Times of the report: seconds per stage, error over time, and software versions."""
+"""Training and times of the report: curves of every fit, seconds per stage, software versions."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mbtf_core.stats import Estimate
-from mbtf_pipeline.formatting import estimate, estimate_text
 from mbtf_pipeline.report.plots import Line, bars, curves
-from mbtf_pipeline.report.training import TrainingHistory
 from mbtf_pipeline.run_folder import FITS
 from mbtf_pipeline.stages import read_stamp
 
-# Fractions of the training time at which the error is listed.
-_FRACTIONS = (0.1, 0.25, 0.5, 1.0)
+
+@dataclass(frozen=True)
+class TrainingHistory:
+    """Loss and error over training time.
+
+    Attributes
+    ----------
+    training : of the material's description: steps, batch, seconds, device and threads
+    records : one per validation, from ``mbtf_fit.read_history``
+    """
+
+    training: Mapping[str, Any]
+    records: list[dict[str, Any]]
+
+    @property
+    def rate(self) -> float:
+        """Mean number of queries per second, in millions."""
+        samples = self.training["steps"] * self.training["batch"]
+        return float(samples / max(self.training["seconds"], 1e-9) / 1e6)
+
+    def columns(self, *keys: str) -> list[list[float]]:
+        """Values of the records in which all of them are finite, by key."""
+        rows = [[r.get(key) for key in keys] for r in self.records]
+        finite = [row for row in rows if all(x is not None and math.isfinite(x) for x in row)]
+        return [list(column) for column in zip(*finite, strict=True)]
+
+    @property
+    def unexplained(self) -> list[list[float]]:
+        """Seconds, unexplained variance of the validation queries, and its standard error; or empty."""
+        return self.columns("seconds", "unexplained", "unexplained_error")
+
+
+def read_training(folder: Path) -> TrainingHistory:
+    """History of the fit in a folder.
+
+    Raises
+    ------
+    InputError : the folder contains no material
+    """
+    from mbtf_fit import Material, read_history
+
+    return TrainingHistory(Material.load(folder).description["training"], read_history(folder))
+
+
+def training_context(histories: Mapping[str, TrainingHistory]) -> dict[str, Any]:
+    """Template data about training; one history per fit."""
+    loss = [Line(name, *c) for name, h in histories.items() if (c := h.columns("seconds", "loss"))]
+    errors = [Line(name, *c) for name, h in histories.items() if (c := h.unexplained)]
+    plots = []
+    if loss:
+        svg = curves(loss, "seconds of training", "training loss", "training loss over seconds")
+        plots.append({"title": "Training loss, including noise", "svg": svg})
+    if errors:
+        svg = curves(errors, "seconds of training", "unexplained variance", "error over seconds")
+        plots.append({"title": "Validation error, noise-free", "svg": svg})
+    lines = [
+        "{}: {steps:,} steps of {batch:,} queries in {seconds:.0f} s on {device}, {threads} threads "
+        "({:.2f} M queries/s)".format(name, h.rate, **h.training)
+        for name, h in histories.items()
+    ]
+    return {"training_plots": plots, "training_lines": lines}
 
 
 def time_context(
@@ -24,7 +82,6 @@ def time_context(
     stages: Sequence[str],
     manifest: Mapping[str, Any],
     comparison: Mapping[str, Any],
-    histories: Mapping[str, TrainingHistory],
 ) -> dict[str, Any]:
     """Template data about time.
 
@@ -38,18 +95,7 @@ def time_context(
     total = sum(s for _, s in seconds)
     svg = bars(seconds, "seconds", "seconds per stage")
     plots = [{"title": f"Seconds per stage, {total:.0f} in total", "svg": svg}]
-    generation = float(manifest["summary"]["shard_seconds"])
-    lines = [
-        Line(name, [generation + seconds for seconds in found[0]], *found[1:])
-        for name, h in histories.items()
-        if (found := h.unexplained)
-    ]
-    if lines:
-        axes = ("seconds of generation and training", "unexplained variance")
-        svg = curves(lines, *axes, "error over total time", scales="xy")
-        plots.append({"title": "Error over total time", "svg": svg})
-    tables = [_generation(manifest), _fits(histories), _comparison(comparison)]
-    return {"time_plots": plots, "time_tables": tables}
+    return {"time_plots": plots, "time_tables": [_generation(manifest), _comparison(comparison)]}
 
 
 def _generation(manifest: Mapping[str, Any]) -> dict[str, Any]:
@@ -68,54 +114,15 @@ def _generation(manifest: Mapping[str, Any]) -> dict[str, Any]:
     return {"title": "Generate", "head": list(row), "rows": [list(row.values())]}
 
 
-def _at(history: TrainingHistory, fraction: float) -> str:
-    """Validation error nearest to a fraction of the training time."""
-    if not history.unexplained:
-        return "–"
-    wanted = fraction * history.training["seconds"]
-    rows = zip(*history.unexplained, strict=True)
-    seconds, value, error = min(rows, key=lambda row: abs(row[0] - wanted))
-    return f"{estimate_text(Estimate(value, error, 0))} at {seconds:.0f} s"
-
-
-def _fits(histories: Mapping[str, TrainingHistory]) -> dict[str, Any]:
-    return {
-        "title": "Fit: unexplained variance over training time",
-        "head": ["fit", "seconds", "queries", "rate", *(f"after {f:.0%}" for f in _FRACTIONS)],
-        "rows": [
-            [
-                name,
-                f"{h.training['seconds']:.1f}",
-                f"{h.samples / 1e6:.1f} M",
-                f"{h.rate:.2f} M/s",
-                *(_at(h, fraction) for fraction in _FRACTIONS),
-            ]
-            for name, h in histories.items()
-        ],
-    }
-
-
 def _comparison(comparison: Mapping[str, Any]) -> dict[str, Any]:
-    pictures = comparison["pictures"]
-    pixels = comparison["size"] ** 2
-    seconds = comparison["seconds"]["references"]
-    paths = pixels * comparison["spp"] * len(pictures) * len(comparison["kinds"])
-    noise = [estimate(r["noise"]).value for p in pictures for r in p["references"].values()]
-    rows = [
-        [
-            "references",
-            f"{seconds:.1f}",
-            f"{paths / max(seconds, 1e-9) / 1e6:.2f} M paths/s",
-            f"noise per pixel {np.median(noise):.1%} of the mean",
-        ]
-    ]
+    """Seconds of an image: references by the whole stage, fits by their median."""
+    count = len(comparison["pictures"])
+    rows = [["references", f"{comparison['seconds']['references'] / count:.1f}"]]
     for fit in comparison["fits"]:
-        times = [p["fits"][fit]["seconds"] for p in pictures]
+        times = [p["fits"][fit]["seconds"] for p in comparison["pictures"]]
         # Robust against images that another process slowed down.
-        typical = float(np.median(times))
-        rate = f"{pixels / max(typical, 1e-9) / 1e6:.2f} M queries/s"
-        rows.append([fit, f"{sum(times):.2f}", rate, f"median {1e3 * typical:.0f} ms per image"])
-    return {"title": "Compare", "head": ["", "seconds", "rate", ""], "rows": rows}
+        rows.append([fit, f"{np.median(times):.3g}"])
+    return {"title": "Compare", "head": ["", "seconds per image"], "rows": rows}
 
 
 def provenance(

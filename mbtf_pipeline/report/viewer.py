@@ -15,7 +15,7 @@ from mbtf_fit.viewer.content import material_content
 from mbtf_fit.viewer.extras import picture_content, tiles_text
 from mbtf_fit.viewer.page import write_page
 from mbtf_pipeline.compare.compare import COMPARISON_NAME
-from mbtf_pipeline.compare.pictures import read_picture
+from mbtf_pipeline.compare.image_files import read_picture
 from mbtf_pipeline.run_folder import COMPARE, FITS, VIEWER
 
 # Path-traced pictures in a page.

@@ -9,8 +9,8 @@ import numpy as np
 
 from mbtf_core.errors import InputError
 from mbtf_core.stats import Estimate
-from mbtf_pipeline.cost_study.measurements import Measurement
-from mbtf_pipeline.cost_study.runs import DataRequest, Run
+from mbtf_pipeline.cost.measurements import Measurement
+from mbtf_pipeline.cost.runs import DataRequest, Run
 
 # Unexplained variance by comparison, its relative deviation over seeds, and that of the test set.
 TRUE = {"whole": 0.05, "models": 0.1, "data": 0.2}
@@ -23,7 +23,7 @@ def run(study: str = "whole", queries: int = 1000, name: str = "a run", seconds:
 
 
 class FakeRunner:
-    """Stands for :class:`mbtf_pipeline.cost_study.runs.RunRunner`: errors of normal seed deviation around the
+    """Stands for :class:`mbtf_pipeline.cost.runs.RunRunner`: errors of normal seed deviation around the
     truth, those of each seed shifted by the error of its test set."""
 
     def __init__(self, seeds: float = SEEDS, test: float = TEST, study_seed: int = 0) -> None:
@@ -80,7 +80,7 @@ class FakeRunner:
 
 
 class MemoryStore:
-    """Stands for :class:`mbtf_pipeline.cost_study.measurements.MeasurementFolder`."""
+    """Stands for :class:`mbtf_pipeline.cost.measurements.MeasurementFolder`."""
 
     def __init__(self) -> None:
         self.found: dict[str, Measurement] = {}

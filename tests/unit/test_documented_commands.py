@@ -18,7 +18,7 @@ from mbtf_core.errors import MbtfError
 from mbtf_fit.cli.app import app as fit
 from mbtf_gen.cli.app import app as generate
 from mbtf_pipeline.cli.app import app as pipeline
-from mbtf_pipeline.paper_tables.recipe import is_paper_recipe, load_paper_recipe
+from mbtf_pipeline.papers.plan import is_paper_recipe, load_paper_recipe
 from mbtf_pipeline.recipe import Recipe
 
 APPS = {"mbtf-gen": generate, "mbtf-fit": fit, "mbtf-pipeline": pipeline}

@@ -66,14 +66,15 @@ mbtf_fit.shaders
 mbtf_fit.mitsuba_plugin
 mbtf_fit.cli
 mbtf_fit
-mbtf_pipeline.recipe mbtf_pipeline.stages mbtf_pipeline.presets mbtf_pipeline.run_folder mbtf_pipeline.formatting
+mbtf_pipeline.recipe mbtf_pipeline.stages mbtf_pipeline.presets mbtf_pipeline.run_folder mbtf_pipeline.number_text mbtf_pipeline.tables
 mbtf_pipeline.compare
 mbtf_pipeline.layers
 mbtf_pipeline.report
 mbtf_pipeline.run
 mbtf_pipeline.forecast
-mbtf_pipeline.cost_study
-mbtf_pipeline.paper_tables
+mbtf_pipeline.time_split
+mbtf_pipeline.cost
+mbtf_pipeline.papers
 mbtf_pipeline.library
 mbtf_pipeline.cli
 mbtf_pipeline

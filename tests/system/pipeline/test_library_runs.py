@@ -221,9 +221,3 @@ def test_materials_join_and_leave_a_shared_network(runs: Path) -> None:
     # As after a kill between the claims of the network's folder and those of the materials.
     edit(network / "fit.json", lambda record: record.update(config_hash="another"))
     assert share("ab") != left
-
-
-def test_options_of_single_runs_are_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for option in (["--quick"], ["--time", "1min"], ["--quality", "draft"]):
-        assert run(app, ["run", str(folder / "library.yaml"), *option]) == 2
-        assert "library of materials" in capsys.readouterr().err

@@ -17,7 +17,7 @@ from support.paths import ROOT
 from mbtf_core.app.console import run
 from mbtf_core.exposure import to_display
 from mbtf_pipeline.cli.app import app
-from mbtf_pipeline.compare.pictures import read_picture
+from mbtf_pipeline.compare.image_files import read_picture
 
 # Seconds to wait for the browser.
 TIMEOUT = 120
@@ -267,19 +267,6 @@ def test_every_control_has_an_accessible_name(page: Page, stage: Any) -> None:
             .filter(e => e.checkVisibility() && !named(e)).map(e => e.outerHTML.slice(0, 120));
     """
     assert page.js(code) == []
-
-
-def test_errors_of_scripts_reach_the_log(page: Page) -> None:
-    page.collect()
-    before = len(page.errors)
-    page.js("setTimeout(() => { throw new Error('planted'); }, 0)")
-
-    def found() -> bool:
-        page.collect()
-        return any("planted" in e for e in page.errors[before:])
-
-    page.until(found, "the planted error")
-    del page.errors[before:]
 
 
 def test_images_are_visible_without_scripts(page: Page) -> None:

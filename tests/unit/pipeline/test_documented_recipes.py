@@ -7,8 +7,8 @@ from pathlib import Path
 
 from support.paths import ROOT
 
-from mbtf_pipeline.library.recipe import is_library_recipe, load_library_recipe
-from mbtf_pipeline.paper_tables.recipe import is_paper_recipe, load_paper_recipe
+from mbtf_pipeline.library.entries import is_library_recipe, load_library_recipe
+from mbtf_pipeline.papers.plan import is_paper_recipe, load_paper_recipe
 from mbtf_pipeline.recipe import load_recipe
 
 

@@ -1,21 +1,15 @@
-"""`benchmarks/gpu.py` without a GPU: its comparisons, faults, and the CPU against itself."""
+"""Comparisons of `benchmarks/gpu.py`: noise passes, wrong values are caught."""
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.paths import ROOT
 from support.scripts import BENCHMARKS, benchmark_module
 
 from mbtf_core.data.lattice import sigma_of_level
-from mbtf_core.errors import InputError
-from mbtf_core.run.child import Outcome
 
 FINEST = 3
 
@@ -61,121 +55,3 @@ def test_exchanged_queries_of_one_level_are_caught(gpu: Any) -> None:
         other[f"value_{half}"][chosen] = other[f"value_{half}"][np.roll(chosen, 1)]
     checks = gpu.compare_estimates(halves(0), other, FINEST)
     assert failed(checks) == ["estimator: values of level 2, relative squared"]
-
-
-class Fake:
-    """Plausible answers without work; `edit` changes those of one function on the second device."""
-
-    def __init__(self, gpu: Any, edit: str = "", fault: str = "") -> None:
-        self.gpu, self.edit, self.fault = gpu, edit, fault
-        self.calls: list[str] = []
-
-    def __call__(self, function: str, arguments: tuple[str, ...], environment: Mapping[str, str]) -> Outcome:
-        self.calls.append(function)
-        wrong = function == self.edit and arguments[0] == "cuda"
-        if wrong and self.fault:
-            return Outcome({}, self.fault, 1.0)
-        factor = 1.2 if wrong else 1.0
-        answers: dict[str, Any] = {"deviation": 0.5 if wrong else 1e-6}
-        if function == "selftest":
-            answers = {"V-groove": "ok", "CUDA": "absent" if self.edit == function else "ok"}
-        elif function in ("estimate", "render"):
-            arrays = halves(len(arguments[0]))
-            scaled = {name: a * factor for name, a in arrays.items() if name != "sigma"}
-            np.savez(arguments[-1], **scaled, sigma=arrays["sigma"])
-            answers = {"seconds": 1.0}
-        elif function == "train":
-            data = halves(0)
-            out = Path(arguments[-1])
-            out.mkdir()
-            truth = 0.2 + np.random.default_rng(7).random((4000, 3))
-            prediction = truth + 0.1 * factor * np.random.default_rng(1).standard_normal(truth.shape)
-            np.savez(out / self.gpu.PREDICTIONS, prediction=prediction, **data)
-        return Outcome(answers, "", 1.0)
-
-
-def compared(gpu: Any, run: Any, folder: Path) -> Any:
-    sizes = gpu.Sizes("nothing", resolution=1 << FINEST)
-    comparison = gpu.Comparison(run, "cpu", "cuda", sizes, folder)
-    comparison.all()
-    return comparison
-
-
-def test_equal_results_pass(gpu: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    comparison = compared(gpu, Fake(gpu), tmp_path)
-    assert failed(comparison.checks) == []
-    assert gpu.report(comparison) == 0
-    assert '"met": true' in capsys.readouterr().out.splitlines()[-1]
-
-
-@pytest.mark.parametrize(
-    ("function", "named"),
-    [
-        ("selftest", "selftest: CUDA"),
-        ("estimate", "estimator: mean value, relative"),
-        ("render", "picture of relief: mean value, relative"),
-        ("train", "error of relief, begun, by the device cuda, relative"),
-        ("infer", "conformance of hierarchical on the device cuda, PyTorch"),
-        ("evaluate_plugin", "conformance of relief on the device cuda, half"),
-    ],
-)
-def test_a_wrong_result_is_caught(
-    gpu: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], function: str, named: str
-) -> None:
-    comparison = compared(gpu, Fake(gpu, function), tmp_path)
-    assert named in failed(comparison.checks)
-    assert gpu.report(comparison) == 1
-    assert '"met": false' in capsys.readouterr().out.splitlines()[-1]
-
-
-def test_a_crash_is_one_line_and_the_rest_runs(
-    gpu: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    whole, run = Fake(gpu), Fake(gpu, "estimate", "the process was ended by SIGABRT")
-    for one, folder in ((whole, "whole"), (run, "crashed")):
-        (tmp_path / folder).mkdir()
-        comparison = compared(gpu, one, tmp_path / folder)
-    assert run.calls == whole.calls
-    assert failed(comparison.checks) == ["estimator on the device cuda"]
-    assert gpu.report(comparison) == 1
-    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("FAILED")]
-    assert len(lines) == 1
-    assert "ended by SIGABRT" in lines[0]
-
-
-def test_numbers_that_are_not_finite_end_a_measurement(gpu: Any, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="1 of 3 numbers of value_a are not finite"):
-        sys.modules["gpu_measurements"].save_finite(tmp_path / "a.npz", value_a=np.array([1, np.nan, 2]))
-
-
-def test_without_a_device_nothing_is_measured(
-    gpu: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(gpu, "has_device", lambda: False)
-    monkeypatch.setattr(sys, "argv", ["gpu.py"])
-    assert gpu.main() == 0
-    assert capsys.readouterr().out.splitlines()[0] == "no CUDA device: nothing to measure"
-
-
-@pytest.mark.slow
-def test_the_cpu_agrees_with_itself(gpu: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """The measurements themselves, in this process, of one model."""
-    measurements = sys.modules["gpu_measurements"]
-    monkeypatch.setattr(gpu, "models", lambda layout: ["relief"] if layout == "shuffled" else [])
-
-    def here(function: str, arguments: tuple[str, ...], environment: Mapping[str, str]) -> Outcome:
-        answers: dict[str, Any] = {}
-        if function != "selftest":
-            for found in getattr(measurements, function)(*arguments):
-                answers |= found
-        return Outcome(answers, "", 0.0)
-
-    sizes = gpu.Sizes(
-        str(ROOT / "assets" / "cliff_rock"), resolution=8, train=20, test=256, spp=4, images=1,
-        steps=5, batch=256, rows=9, columns=16,
-    )  # fmt: skip
-    comparison = gpu.Comparison(here, "cpu", "cpu", sizes, tmp_path)
-    comparison.all()
-    assert failed(comparison.checks) == []
-    assert len(comparison.checks) == 1 + FINEST + 1 + 4 + 8 + 2
-    assert comparison.figures["estimator on the device cpu"]["paths_per_second"] > 0

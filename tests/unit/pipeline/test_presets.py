@@ -11,7 +11,7 @@ import pytest
 from support.paths import ROOT
 
 from mbtf_core.app.options import Quality
-from mbtf_core.config.settings import explicit_options, resolve
+from mbtf_core.config.settings import resolve
 from mbtf_fit.config import FitConfig
 from mbtf_fit.presets import FITTER, best_at, best_options, fitter_options
 from mbtf_gen.config.generator import GeneratorConfig, count_queries
@@ -90,16 +90,6 @@ def test_longer_training_gets_a_larger_network() -> None:
     assert quality_options(path, "high")["fit.neumip.network.width"] == 64
 
 
-def test_options_of_a_fit_file_are_kept(tmp_path: Path) -> None:
-    file = tmp_path / "fit.yaml"
-    file.write_text("network: {channels: 5}\ntraining: {blur: {initial_sigma: 4}}\n")
-    given = {"model": "neumip", **explicit_options(file, ["seed=3"])}
-    expected = {"training.texture_weight_decay": 1.0, **FITTER["draft"]}
-    assert fitter_options("draft", {"": given})[""] == expected
-    given = {"model": "neumip", **explicit_options(None, ["model=hierarchical"])}
-    assert fitter_options("high", {"": given})[""] == FITTER["high"]
-
-
 def test_explicit_options_override_the_preset(tmp_path: Path) -> None:
     path = ROOT / "pipelines" / "quickstart.yaml"
     given = ["generate.queries.train=5/texel"]
@@ -127,18 +117,6 @@ def test_a_section_overrides_the_preset_value_by_value(section: str, single: str
     found, expected = (preset_recipe(path, "draft", [text]) for text in (section, single))
     assert found == expected
     assert found.fit["neumip"].training.time == 12
-
-
-def test_a_section_replaces_the_fits_of_the_file(tmp_path: Path) -> None:
-    np.save(tmp_path / "height.npy", np.zeros((8, 8)))
-    path = tmp_path / "recipe.yaml"
-    path.write_text("name: r\ngenerate: {material: height.npy}\nfit: {neumip: {seed: 3}, hierarchical: {}}\n")
-    fits = preset_recipe(path, "draft", ["fit={neumip-baseline: {}}"]).fit
-    assert list(fits) == ["neumip-baseline"]
-    assert fits["neumip-baseline"].network.width == best_at("draft")["network.width"]
-    assert preset_recipe(path, "draft", ["fit={model: neumip}"]).fit["neumip"].seed == 0
-    generate = preset_recipe(path, "draft", ["generate.queries={spp: 8}"]).generate
-    assert (generate.queries.spp, generate.queries.train) == (8, GENERATOR["draft"]["queries.train"])
 
 
 def test_a_preset_sets_the_resolution_unless_told(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Contrast of luminance and chroma: closed forms, noise, error bars, places between texels."""
+"""Contrast of luminance and chroma: closed forms, noise, error bars."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mbtf_core.data.lattice import Lattice
 from mbtf_core.images.read import LUMINANCE
 from mbtf_core.stats import Estimate
-from mbtf_pipeline.compare.contrast import PHASES, contrast, phase_contrasts, phase_queries, picture_blocks
+from mbtf_pipeline.compare.contrast import contrast, picture_blocks
 
 SIZE = 128
 # Mean color, and a color of luminance 0.
@@ -74,51 +73,6 @@ def test_error_bars_cover_the_truth() -> None:
         deviations.append((one.value - truth) / one.error)
     assert 0.6 < np.std(deviations) < 1.5
     assert abs(np.mean(deviations)) < 0.7
-
-
-def test_queries_fall_on_their_places_and_the_footprint_is_the_level() -> None:
-    lattice = Lattice(5, 0.75)
-    for name, place in PHASES.items():
-        queries = phase_queries(lattice, 4, place, [0, 0, 1], [0, 0, 1], 100)
-        texels = queries.u * np.array([16, 12])
-        np.testing.assert_allclose((texels - place + 0.5) % 1, 0.5, atol=1e-5, err_msg=name)
-        assert len(np.unique(np.round(texels - place), axis=0)) == 100
-        assert float(queries.sigma[0]) == pytest.approx(0.5 / 16)
-    assert len(phase_queries(lattice, 2, 0.5, [0, 0, 1], [0, 0, 1], 100).sigma) == 12
-
-
-class Bilinear:
-    """A fit that reads one wave per four texels of level 3 linearly between texel centers."""
-
-    def evaluate(self, u: NDArray[Any], *_: NDArray[Any]) -> NDArray[np.float64]:
-        centers = (np.arange(-1, 9) + 0.5) / 8
-        wave = np.interp(u[:, 0], centers, np.sin(4 * np.pi * centers + 0.3))
-        return np.asarray((1 + 0.5 * wave)[:, None] * MEAN)
-
-
-class Exact:
-    """Path-traced values of the same wave."""
-
-    def estimate(self, queries: Any, *_: Any) -> Any:
-        value = (1 + 0.5 * np.sin(4 * np.pi * queries.u[:, 0] + 0.3))[:, None] * MEAN
-
-        class Found:
-            value_a = value_b = value
-
-        return Found
-
-
-def test_linear_interpolation_loses_contrast_between_texels() -> None:
-    """At corners the mean of two centers, cos(π/4) of the wave; at centers all of it."""
-    estimator: Any = Exact()
-    fits: Any = {"fit": Bilinear()}
-    up = np.array([0.0, 0.0, 1.0])
-    found = phase_contrasts(estimator, fits, Lattice(3), up, up, 0)
-    by_place = {row["phase"]: row["fits"]["fit"]["value"] for row in found if row["level"] == 3}
-    assert by_place["centers"] == pytest.approx(1.0, abs=1e-5)
-    assert by_place["corners"] == pytest.approx(np.cos(np.pi / 4), abs=1e-5)
-    assert by_place["corners"] < by_place["quarters"] < by_place["centers"]
-    assert sorted({row["level"] for row in found}) == [1, 3]
 
 
 def test_estimates_have_as_many_units_as_blocks() -> None:

@@ -30,10 +30,6 @@ def test_no_fit_starves() -> None:
     assert times["worse"] > times["bad"] > times["good"]
 
 
-def test_errors_above_that_of_the_mean_value_claim_no_more_time() -> None:
-    assert divide(400.0, {"a": 0.2, "b": 9.0}) == divide(400.0, {"a": 0.2, "b": 1.0})
-
-
 def test_undefined_errors_count_as_the_mean() -> None:
     times = divide(300.0, {"a": 0.1, "b": 0.1, "constant": None})
     assert set(times.values()) == {100.0}
@@ -76,12 +72,3 @@ def test_changed_options_divide_the_times_that_they_had() -> None:
     later = division.times([("a", "other"), ("b", "other"), ("c", "k")])
     assert later["c"] == times["c"]
     assert later["a"] == later["b"] == pytest.approx((times["a"] + times["b"]) / 2, abs=0.01)
-
-
-@pytest.mark.parametrize(("training", "first_share"), [(60.0, 0.2), (30.0, 0.4)])
-def test_another_training_time_divides_anew(training: float, first_share: float) -> None:
-    division = Division({}, 30.0, 0.2, count=2)
-    known(division, {"a": 0.1, "b": 0.2})
-    again = Division(division.record, training, first_share, count=2)
-    assert not again.has_error("a", "k")
-    assert again.first == pytest.approx(6.0)

@@ -5,13 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import pytest
-from PIL import Image
-
 from mbtf_core.units import clock
-from mbtf_pipeline.library import page
-from mbtf_pipeline.library.page import library_page
+from mbtf_pipeline.library.library_page import library_page
 
 
 def material(name: str, state: str, value: float = 0.1, **more: Any) -> dict[str, Any]:
@@ -47,11 +42,6 @@ def test_failures_come_after_errors_and_show_nothing_of_earlier_runs(tmp_path: P
     assert "&lt;b&gt;&amp;" in shown
 
 
-def test_an_error_of_an_earlier_command_is_not_shown_once_done(tmp_path: Path) -> None:
-    assert "no memory" in library_page(record(material("a", "failed", error="no memory")), tmp_path)
-    assert "no memory" not in library_page(record(material("a", "done", error="no memory")), tmp_path)
-
-
 def test_first_fits_and_shared_networks(tmp_path: Path) -> None:
     division = {"errors": {"a": {"key": "k", "error": 0.301}}, "times": {"a": {"key": "k", "seconds": 1.5}}}
     errors: dict[str, dict[str, Any]] = {"a": {"value": 0.2, "error": 0.01, "n": 100}}
@@ -67,20 +57,3 @@ def test_first_fits_and_shared_networks(tmp_path: Path) -> None:
     assert again.index("<b>other") < again.index("with the shared network 0.20")
     failed = library_page(record(material("a", "done"), shared=shared | {"error": "too few"}), tmp_path)
     assert "No shared network</b>: too few" in failed
-
-
-def test_the_training_time_includes_that_of_added_materials(tmp_path: Path) -> None:
-    found = record(material("a", "done"), material("added", "done"), training=60.0, division={"each": 60.0})
-    assert f"train for {clock(120.0)}" in library_page(found, tmp_path)
-
-
-def test_pictures_are_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "a").mkdir()
-    for value, name in enumerate(("fit", "reference")):
-        Image.fromarray(np.full((4, 4, 3), 200 * value, np.uint8)).save(tmp_path / "a" / f"{name}.png")
-    page._small.cache_clear()
-    first = library_page(record(material("a", "done")), tmp_path)
-    assert first.count("data:image/jpeg") == 2
-    assert f'src="{page._thumbnail(tmp_path / "a" / "reference.png")}" alt="a: path-traced"' in first
-    monkeypatch.setattr(Image, "open", lambda path: pytest.fail(f"{path} is read again"))
-    assert library_page(record(material("a", "done")), tmp_path) == first

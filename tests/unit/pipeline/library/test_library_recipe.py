@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mbtf_core.errors import InputError, UsageError
-from mbtf_pipeline.library.recipe import entries, is_library_recipe, load_library_recipe
+from mbtf_pipeline.library.entries import entries, is_library_recipe, load_library_recipe
 
 BASE = "base: {generate: {queries: {train: 10/texel}}}\n"
 
@@ -100,16 +100,6 @@ def test_equal_names_are_numbered(tmp_path: Path) -> None:
     assert sorted(load(tmp_path, "library: [u]\n" + BASE)) == [
         *("u-material", "u-material-2", "u-oak_dark", "u-oak_dark-2")
     ]
-
-
-def test_names_are_short_and_of_one_material(tmp_path: Path) -> None:
-    long = "n" * 95
-    for path in (f"{'p' * 95}/{long}", f"{'q' * 95}/{long}", "q/decoder", "q/wool", "other"):
-        material(tmp_path / "u" / path)
-    # Another material has the name of one in the folder; the network of several lies in `decoder`.
-    found = load(tmp_path, "library: [u]\nmaterials: {wool: u/other, q-wool: u/q/wool}\n" + BASE)
-    assert list(found) == ["other", long[:90], "q-decoder", "q-wool-2", f"{long[:90]}-2", "wool", "q-wool"]
-    assert not any(error for _, error in found.values())
 
 
 def test_a_file_and_what_it_names_are_one_material(tmp_path: Path) -> None:

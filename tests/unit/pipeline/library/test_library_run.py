@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,15 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mbtf_core.errors import InputError
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item, Result
 from mbtf_core.units import format_duration
 from mbtf_fit.config import SHARED_PRESET
 from mbtf_pipeline.library import run as library_run
-from mbtf_pipeline.library.recipe import entries, load_library_recipe
+from mbtf_pipeline.library.entries import entries, load_library_recipe
 from mbtf_pipeline.library.run import LibraryResult, run_library
-from mbtf_pipeline.library.task import summarize
 
 BASE = "library: [a, b]\nbase: {fit: {relief: {}}, generate: {queries: {train: 10/texel}}}\n"
 
@@ -101,26 +98,6 @@ def test_each_first_fit_is_recorded_as_it_comes(runs: Runs) -> None:
     assert runs.calls[1:] == [("first_fit", "b"), ("run_material", "a"), ("run_material", "b")]
 
 
-def test_a_summary_has_test_errors_and_the_first_pictures(tmp_path: Path) -> None:
-    (tmp_path / "compare").mkdir()
-    pictures = [
-        {"references": {"query": {"file": f"{k}-r"}}, "fits": {f: {"file": f"{k}-{f}"} for f in "xy"}}
-        for k in "12"
-    ]
-    errors = {f: {"splits": {s: {"unexplained": f + s} for s in ("training", "test")}} for f in "xy"}
-    comparison = {"pictures": pictures, "test": errors}
-    (tmp_path / "compare" / "comparison.json").write_text(json.dumps(comparison))
-    assert summarize(tmp_path) == {
-        "fits": {f: {"unexplained": f"{f}test", "picture": f"compare/1-{f}.png"} for f in "xy"},
-        "reference": "compare/1-r.png",
-    }
-
-
-def test_paths_are_relative_to_the_page(runs: Runs) -> None:
-    again(runs)
-    assert [m["path"] for m in runs.record()["materials"]] == ["../a", "../b"]
-
-
 def test_the_others_go_on_after_a_failure(runs: Runs) -> None:
     runs.errors = {"a": "no memory"}
     assert again(runs, "training: 10s\n").failed == runs.errors
@@ -132,16 +109,6 @@ def test_fits_on_a_gpu_take_one_of_their_worker(runs: Runs, device: str) -> None
     options = "training: 10s\nshared_network: 5s\n"
     again(runs, options, BASE.replace("relief: {}", f"relief: {{device: {device}}}"))
     assert runs.gpus == {device == "cuda"}
-
-
-def test_a_run_whose_files_are_damaged_fails_alone(runs: Runs, monkeypatch: pytest.MonkeyPatch) -> None:
-    def summarize(folder: Path) -> dict[str, Any]:
-        if folder.name == "a":
-            raise InputError("no such file", where="comparison.json")
-        return {"fits": {}, "reference": "none.png"}
-
-    monkeypatch.setattr(library_run, "summarize", summarize)
-    assert again(runs).failed == {"a": "comparison.json: no such file"}
 
 
 def test_only_other_options_of_data_or_fits_need_first_fits(runs: Runs) -> None:
@@ -162,16 +129,6 @@ def test_fits_of_a_material_share_its_time_and_missing_ones_keep_theirs(runs: Ru
     for name, expected in (("a", ["1.2s"] * 2), ("b", ["2.4s"])):
         fits = runs.arguments["run_material", name]["recipe"].fit
         assert [format_duration(fit.training.time) for fit in fits.values()] == expected
-
-
-def test_paths_that_are_no_text_are_shown(runs: Runs) -> None:
-    folder = Path(os.fsdecode(os.fsencode(runs.out.parent / "more") + b"/w\xffol"))
-    folder.mkdir(parents=True)
-    np.save(folder / "height.npy", np.zeros((4, 4), np.float32))
-    done = again(runs, base=BASE.replace("[a, b]", "[a, more]"))
-    assert list(done.failed) == ["w_ol"]
-    assert "not UTF-8" in done.failed["w_ol"]
-    assert r"more/w\udcffol" in done.page.read_text()
 
 
 def test_a_shared_network_takes_two_fits_of_the_same_options(runs: Runs) -> None:

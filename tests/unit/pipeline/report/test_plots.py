@@ -1,4 +1,4 @@
-"""Plots are self-contained SVG elements in the page's text color, with unique ids and readable labels."""
+"""Plots are self-contained SVG elements in the page's text color, with unique ids and named axes."""
 
 from __future__ import annotations
 
@@ -7,10 +7,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
-from mbtf_pipeline.report.plots import Line, bars, curves, place_labels, points
+from mbtf_pipeline.report.plots import Line, bars, curves, points
 
 SECONDS = list(np.linspace(2, 60, 30))
 ERROR = [0.3 + 1 / s for s in SECONDS]
@@ -64,26 +62,6 @@ def test_ids_are_unique_and_plots_are_reproducible() -> None:
     ids = [set(re.findall(r'\bid="([^"]+)"', svg)) for svg in (first, other)]
     assert ids[0]
     assert not ids[0] & ids[1]
-
-
-def test_labels_overlap_neither_each_other_nor_points_nor_lines() -> None:
-    figure = Figure(figsize=(7, 4))
-    axes = figure.add_subplot()
-    spots = [(0.5, 0.5), (0.52, 0.5), (0.54, 0.51), (0.95, 0.5)]
-    axes.set(xlim=(0, 1), ylim=(0, 1))
-    line = ((0.4, 0.5), (0.6, 0.5))
-    obstacles = [(*line, 1.5), *((spot, spot, 5.0) for spot in spots)]
-    place_labels(axes, [(*s, "a label of some length", "k") for s in spots], obstacles)
-    renderer = FigureCanvasAgg(figure).get_renderer()
-    boxes = [t.get_window_extent(renderer) for t in axes.texts]
-    assert len(boxes) == len(spots)
-    for number, box in enumerate(boxes):
-        assert not any(box.overlaps(other) for other in boxes[:number])
-        assert not any(box.contains(*axes.transData.transform(s)) for s in spots)
-        # Text may be wider at another resolution.
-        assert box.x1 <= axes.get_window_extent(renderer).x1 - 0.02 * box.width
-        (x0, y), (x1, _) = (axes.transData.transform(end) for end in line)
-        assert not (box.x0 < x1 and box.x1 > x0 and box.y0 < y < box.y1)
 
 
 def test_an_error_bar_larger_than_its_value_does_not_stretch_the_axis() -> None:

@@ -8,8 +8,6 @@ import pytest
 
 from mbtf_pipeline.compare import timing
 from mbtf_pipeline.report.errors import error_context, group_label
-from mbtf_pipeline.report.times import _comparison, _fits
-from mbtf_pipeline.report.training import TrainingHistory
 
 
 @pytest.mark.parametrize(
@@ -42,9 +40,7 @@ def test_both_errors_of_a_group_are_significant_or_neither() -> None:
         "white": 1.0,
         "definitions": {},
     }
-    shown = {"a": number(1.1, 0.01)}
-    phases = [{"level": 3, "phase": phase, "fits": shown} for phase in ("centers", "corners")]
-    record |= {"pictures": [picture], "test": test, "phases": phases}
+    record |= {"pictures": [picture], "test": test}
     context = error_context(record, 0.3)
     levels, cosines = (table["rows"] for table in context["group_tables"])
     assert levels[0] == ["0", "50", "not significant (11 ± 6 %)", "not significant (0.20 ± 0.09)"]
@@ -53,26 +49,6 @@ def test_both_errors_of_a_group_are_significant_or_neither() -> None:
     assert context["facts"][0]["value"] == "20.0 ± 1.0 %"
     # Of a gray material there is no chroma.
     assert context["contrast_table"]["rows"][0][3:] == ["a", "0.95 ± 0.02", "–", "–"]
-    assert context["phase_table"]["rows"] == [["3", "a", "1.100 ± 0.010", "1.100 ± 0.010"]]
-
-
-def test_errors_over_training_time_have_error_bars() -> None:
-    rows = [(10.0, 0.5, 0.01), (50.0, 0.4, 0.03), (90.0, 0.039, 0.069)]
-    records = [{"seconds": s, "loss": 1.0, "unexplained": v, "unexplained_error": e} for s, v, e in rows]
-    # Records without a validation are skipped.
-    training = {"steps": 1000, "batch": 4096, "seconds": 100.0}
-    history = TrainingHistory(training, [*records, {"seconds": 95.0, "loss": 1.0}])
-    cells = _fits({"a": history})["rows"][0]
-    assert cells[-4] == "0.500 ± 0.010 at 10 s"
-    assert cells[-1] == "not significant (0.04 ± 0.07) at 90 s"
-
-
-def test_one_slow_image_does_not_change_the_rate() -> None:
-    references = {"query": {"noise": number(0.1, 0.01)}}
-    pictures = [{"fits": {"a": {"seconds": s}}, "references": references} for s in (0.04, 3.07, 0.04)]
-    record = {"size": 200, "spp": 4, "fits": ["a"], "kinds": ["query"], "pictures": pictures}
-    row = _comparison(record | {"seconds": {"references": 1.0}})["rows"][1]
-    assert row == ["a", "3.15", "1.00 M queries/s", "median 40 ms per image"]
 
 
 def test_the_warm_up_and_an_outlier_do_not_count(monkeypatch: pytest.MonkeyPatch) -> None:

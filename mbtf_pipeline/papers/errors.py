@@ -1,0 +1,301 @@
+"""Tables of errors: methods, levels of detail, ablations, zooms."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from itertools import combinations
+from typing import Any
+
+from mbtf_core.stats import Estimate, psnr
+from mbtf_pipeline.compare.perceptual_metrics import PERCEPTUAL_METRICS, PerceptualMetric
+from mbtf_pipeline.number_text import decibel, estimate, levels_text, signed
+from mbtf_pipeline.papers.published import Published, level_ratios, mse_ratio
+from mbtf_pipeline.papers.runs import MATERIAL, METHOD, FinishedRun, each_fit, mean_of, preview, ratio_of
+from mbtf_pipeline.report.plots import points
+from mbtf_pipeline.tables import Cell, Column, Shown, Table, Thumbnail, rows_of
+
+# Records of images.
+Pictures = Sequence[dict[str, Any]]
+_KINDS = {"query": "M at each pixel’s footprint", "pixel": "filtered pixels"}
+
+
+def _metric_column(metric: PerceptualMetric) -> Column:
+    """Mean of a metric over the images given as a third argument, by default over all."""
+
+    def mean(run: FinishedRun, fit: str, pictures: Pictures | None = None) -> Shown | None:
+        chosen = pictures or run.pictures
+        values = [metric.of(p["fits"][fit]) for p in chosen]
+        noises = [metric.of(p["references"][run.kind]) for p in chosen]
+        known, quiet = ([x for x in found if x is not None] for found in (values, noises))
+        if len(known) < len(chosen):
+            return None
+        value = sum(known) / len(known)
+        noise = sum(quiet) / len(quiet) if len(quiet) == len(chosen) else None
+        return Shown(metric.text(value, noise, with_noise=False), value, noise, "noise")
+
+    return Column(metric.title, metric.key.replace(".", "_"), mean)
+
+
+_METRICS = [_metric_column(m) for m in PERCEPTUAL_METRICS]
+
+
+def _picture_error(
+    run: FinishedRun, fit: str, key: str, pictures: Pictures | None = None, kind: str = ""
+) -> Estimate:
+    """Mean over images of ``mse`` or ``relative_mse``."""
+    errors = [p["fits"][fit]["errors"][kind or run.kind] for p in pictures or run.pictures]
+    return mean_of([estimate(e[key]) for e in errors])
+
+
+def _psnr(run: FinishedRun, mse: Estimate) -> Shown:
+    """PSNR in dB of a noise-free MSE, with white as peak."""
+    found = psnr(mse, run.comparison["white"])
+    return Shown(decibel(found, mse), found.value, found.error, "se")
+
+
+_METHODS_TEXT = (
+    "Unexplained variance and MSE are measured on the same test queries of each material, which are not used "
+    "for training. The other metrics are means over the same path-traced images. MSE, relative MSE and PSNR "
+    "are noise-free; FLIP, SSIM and ST-LPIPS include the noise of the reference. Differences are paired: "
+    "they use the same queries."
+)
+_RATIOS_TEXT = (
+    "A ratio below 1 means that the method is better than the one it is divided by. Published numbers belong "
+    "to other data: another material of the same name or kind, other light, other training. The errors of "
+    "the two MSEs are taken as independent, which overestimates the error bars."
+)
+_METHODS = [
+    MATERIAL,
+    METHOD,
+    Column("unexplained variance [%]", "unexplained", FinishedRun.unexplained, 100.0),
+    Column("MSE [10⁻³/sr²]", "mse", FinishedRun.mse, 1e3),
+    Column("MSE − MSE of the first method [10⁻³/sr²]", "mse_minus_first", FinishedRun.minus_first, 1e3),
+    Column("PSNR of images", "psnr", lambda run, fit: _psnr(run, _picture_error(run, fit, "mse"))),
+    Column("relative MSE of images", "relative_mse", lambda r, fit: _picture_error(r, fit, "relative_mse")),
+    *_METRICS,
+    Column("training [s]", "training_seconds", FinishedRun.seconds, digits=".0f"),
+    Column("network weights", "network_weights", lambda run, fit: run.fit(fit)["network_weights"]),
+]
+
+
+def methods(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[Table]:
+    """Errors of every method on every material, and ratios of MSE beside published ones."""
+    rows = rows_of(_METHODS, each_fit(runs))
+    images = [(run.title, _last_image(run)) for run in runs]
+    errors = Table("methods", "Comparison of methods", _METHODS_TEXT, _METHODS, rows, images=images)
+    columns = [
+        MATERIAL,
+        METHOD,
+        Column("relative to", "relative_to"),
+        Column("MSE ratio, measured here", "measured"),
+        Column("MSE ratio, published for another material of the same name or kind", "published"),
+        Column("source", "source"),
+    ]
+    ratios: list[list[Cell]] = []
+    for run in runs:
+        for base, fit in combinations(run.fits, 2):
+            known = mse_ratio(published, run.material, fit, base) or (None, None)
+            ratios.append([run.title, fit, base, ratio_of(run.mse(fit), run.mse(base)), *known])
+    return [errors, Table("ratios", "MSE ratios beside published ones", _RATIOS_TEXT, columns, ratios)]
+
+
+def _last_image(run: FinishedRun) -> list[Thumbnail]:
+    """The last image of a run: reference and fits."""
+    shown = run.pictures[-1]
+    row = [preview(run.file(shown["references"][run.kind]["file"]), "reference")]
+    for fit in run.fits:
+        record = shown["fits"][fit]
+        found = record["errors"][run.kind]["psnr"]["value"]
+        line = "" if found is None else signed(f"{found:.1f} dB")
+        row.append(preview(run.file(record["file"]), fit, line))
+    return row
+
+
+_LEVELS_TEXT = (
+    "MSE in 10⁻³/sr² of test queries by the level nearest to their footprint. Level 0 is the whole tile, the "
+    "last level the finest. The true value of a query is the integral over its own footprint. The plot shows "
+    "unexplained variance, averaged over materials so that bright ones do not dominate."
+)
+_LEVEL_RATIOS_TEXT = (
+    "MSE divided by the MSE at the finest level (zoom 0). Published ratios belong to another material with "
+    "the same name. The errors at two levels are taken as independent."
+)
+
+
+def levels(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[Table]:
+    """MSE at every level, and relative to the finest, beside published ratios."""
+    names = sorted({int(level) for run in runs for level in run.test(run.fits[0])["levels"]})
+
+    def column(level: int) -> Column:
+        return Column(f"level {level}", f"mse_level_{level}", lambda r, f: _at(r, f, level, "mse"), 1e3)
+
+    columns = [MATERIAL, METHOD, *map(column, names)]
+    fits = dict.fromkeys(fit for _, fit in each_fit(runs))
+    svg = points(
+        [str(n) for n in names],
+        {fit: [_mean_at(runs, fit, n) for n in names] for fit in fits},
+        "level of detail",
+        "unexplained variance",
+        "unexplained variance by level of detail",
+    )
+    plots = [{"title": f"Mean over {len(runs)} materials", "svg": svg}]
+    title = f"Errors at {len(names)} levels of detail"
+    errors = Table("levels", title, _LEVELS_TEXT, columns, rows_of(columns, each_fit(runs)), plots)
+    return [errors, _level_ratios(runs, names[::-1], published)]
+
+
+def _at(run: FinishedRun, fit: str, level: int, key: str) -> Estimate | None:
+    group = run.test(fit)["levels"].get(str(level))
+    return None if group is None or group[key]["value"] is None else estimate(group[key])
+
+
+def _mean_at(runs: Sequence[FinishedRun], fit: str, level: int) -> tuple[float, float] | None:
+    found = [_at(run, fit, level, "unexplained") for run in runs if fit in run.fits]
+    known = [e for e in found if e is not None]
+    mean = mean_of(known) if known else None
+    return None if mean is None else (mean.value, mean.error)
+
+
+def _level_ratios(
+    runs: Sequence[FinishedRun], finest_first: list[int], published: Sequence[Published]
+) -> Table:
+    zooms = [Column(f"zoom {k}", f"ratio_zoom_{k}") for k in range(len(finest_first))]
+    rows: list[list[Cell]] = []
+    for run, fit in each_fit(runs):
+        first, *others = (_at(run, fit, n, "mse") for n in finest_first)
+        if first is None:
+            continue
+        cells = [None if e is None else ratio_of(e, first) for e in others]
+        rows.append([run.title, fit, "measured here", 1.0, *cells])
+        known = level_ratios(published, run.material, fit)
+        if known is not None:
+            ratios = [*known[0], *[None] * len(finest_first)][: len(finest_first)]
+            rows.append([run.title, fit, f"published, {known[1]}", *ratios])
+    columns = [MATERIAL, METHOD, Column("source", "source"), *zooms]
+    return Table("level_ratios", "Errors relative to the finest level", _LEVEL_RATIOS_TEXT, columns, rows)
+
+
+_ABLATIONS_TEXT = (
+    "The first row is the baseline; every other row changes one option. Differences are of MSE on the same "
+    "test queries. They are paired for fits on the same data. For fits on other data, the two errors are "
+    "taken as independent, so the error bars are wider."
+)
+# The runs of one variant, by material.
+_Variant = dict[str, FinishedRun]
+
+
+def ablations(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[Table]:
+    """Every fit of every variant against the first fit of the first variant, per material."""
+
+    def of_any(get: Callable[[FinishedRun, str], Cell]) -> Callable[[_Variant, str], Cell]:
+        return lambda own, fit: get(next(iter(own.values())), fit)
+
+    def label(run: FinishedRun, fit: str) -> str:
+        return fit if len(run.fits) > 1 or not run.variant else run.variant
+
+    def density(run: FinishedRun, fit: str) -> float:
+        return float(run.manifest["splits"]["train"]["queries"] / run.texels)
+
+    columns = [
+        Column("variant", "variant", of_any(label)),
+        Column("network weights", "network_weights", of_any(lambda r, fit: r.fit(fit)["network_weights"])),
+        Column("texture values", "texels", of_any(lambda r, fit: r.fit(fit)["texels"])),
+        Column("queries per texel", "queries_per_texel", of_any(density), digits=".0f"),
+    ]
+    for material in dict.fromkeys(run.material for run in runs):
+        columns += _ablation_columns(next(run for run in runs if run.material == material))
+    # All fits of the first variant, then of the next.
+    items = [
+        ({run.material: run for run in runs if run.variant == variant and fit in run.fits}, fit)
+        for variant, fit in dict.fromkeys((run.variant, fit) for run, fit in each_fit(runs))
+    ]
+    return [Table("ablations", "Ablations", _ABLATIONS_TEXT, columns, rows_of(columns, items))]
+
+
+def _ablation_columns(first: FinishedRun) -> list[Column]:
+    """Columns of the material whose baseline is the first fit of this run."""
+
+    def column(title: str, key: str, get: Callable[[FinishedRun, str], Cell], *look: Any) -> Column:
+        def cell(own: _Variant, fit: str) -> Cell:
+            return get(own[first.material], fit) if first.material in own else None
+
+        return Column(f"{first.title}: {title}", f"{first.material}_{key}", cell, *look)
+
+    def difference(run: FinishedRun, fit: str) -> Cell:
+        if run is first:
+            return run.minus_first(fit)
+        mse, base = run.mse(fit), first.mse(first.fits[0])
+        return Estimate(mse.value - base.value, math.hypot(mse.error, base.error), min(mse.n, base.n))
+
+    return [
+        column("unexplained variance [%]", "unexplained", FinishedRun.unexplained, 100.0),
+        column("MSE − MSE of the first [10⁻³/sr²]", "minus_first", difference, 1e3),
+        column("training [s]", "seconds", FinishedRun.seconds, 1.0, ".0f"),
+    ]
+
+
+_ZOOMS_TEXT = (
+    "The same view and light from near to far. The fits approximate M at the footprint of each pixel. The "
+    "filtered pixel is what a camera sees; the two differ for anisotropic footprints. All images of one "
+    "material share one exposure."
+)
+
+
+def zooms(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[Table]:
+    """Errors for every field of view and kind of reference, averaged over views and lights."""
+
+    def level(run: FinishedRun, fit: str, shown: Pictures) -> str:
+        return levels_text(shown[0]["levels"], run.comparison["finest"])
+
+    columns = [
+        MATERIAL,
+        Column("tiles across", "tiles_across", lambda *item: float(item[-1][0]["tiles_across"]), digits="g"),
+        Column("level", "level", level),
+        METHOD,
+    ]
+    for kind in dict.fromkeys(kind for run in runs for kind in run.comparison["kinds"]):
+        columns += _zoom_errors(kind)
+    columns += _METRICS
+    items = [
+        (run, fit, [p for p in run.pictures if p["tiles_across"] == width])
+        for run in runs
+        for width in _widths(run)
+        for fit in run.fits
+    ]
+    rows, images = rows_of(columns, items), [row for run in runs for row in _zoom_images(run)]
+    return [Table("zooms", "Materials at several zooms", _ZOOMS_TEXT, columns, rows, images=images)]
+
+
+def _zoom_errors(kind: str) -> list[Column]:
+    """MSE and PSNR against one kind of reference, where a run has it."""
+
+    def mse(run: FinishedRun, fit: str, shown: Pictures) -> Estimate | None:
+        return _picture_error(run, fit, "mse", shown, kind) if kind in run.comparison["kinds"] else None
+
+    def psnr_of(run: FinishedRun, fit: str, shown: Pictures) -> Shown | None:
+        found = mse(run, fit, shown)
+        return None if found is None else _psnr(run, found)
+
+    return [
+        Column(f"MSE against {_KINDS[kind]} [10⁻³/sr²]", f"mse_{kind}", mse, 1e3),
+        Column(f"PSNR against {_KINDS[kind]}", f"psnr_{kind}", psnr_of),
+    ]
+
+
+def _widths(run: FinishedRun) -> list[float]:
+    return list(dict.fromkeys(p["tiles_across"] for p in run.pictures))
+
+
+def _zoom_images(run: FinishedRun) -> list[tuple[str, list[Thumbnail]]]:
+    """Rows of a run: each kind of reference, then each fit, from near to far."""
+    shown = [next(p for p in run.pictures if p["tiles_across"] == width) for width in _widths(run)]
+    sources = [(f"reference, {_KINDS[kind]}", "references", kind) for kind in run.comparison["kinds"]]
+    sources += [(fit, "fits", fit) for fit in run.fits]
+    return [
+        (
+            f"{run.title}: {title}",
+            [preview(run.file(p[group][name]["file"]), f"{p['tiles_across']:g} tiles across") for p in shown],
+        )
+        for title, group, name in sources
+    ]

@@ -1,0 +1,114 @@
+"""Tables whose columns know how to compute, print and export their cells."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from mbtf_core.stats import Estimate
+from mbtf_pipeline.number_text import estimate_text, signed
+
+
+class Shown(NamedTuple):
+    """A number with a text of its own, and a second number for the column with this suffix of the CSV file:
+    ``se`` for a standard error, ``noise`` for the value of noise alone."""
+
+    text: str
+    value: float
+    second: float | None
+    suffix: str
+
+
+Cell = Estimate | Shown | float | int | str | None
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column.
+
+    Attributes
+    ----------
+    title : on the page, with its unit
+    key : in the CSV file, whose numbers are not scaled
+    cell : computes the cell of a row from the row's items
+    factor : from the stored number to the one on the page
+    digits : format of plain numbers on the page
+    """
+
+    title: str
+    key: str
+    cell: Callable[..., Cell] = lambda *_: None
+    factor: float = 1.0
+    digits: str = ".3g"
+
+    def text(self, cell: Cell) -> str:
+        """A cell on the page."""
+        if cell is None:
+            return "–"
+        if isinstance(cell, str):
+            return cell
+        if isinstance(cell, Shown):
+            return cell.text
+        if isinstance(cell, Estimate):
+            return estimate_text(cell, self.factor)
+        return f"{cell:,}" if isinstance(cell, int) else signed(f"{self.factor * cell:{self.digits}}")
+
+    def numbers(self, cell: Cell) -> dict[str, str]:
+        """A cell in the CSV file, by key."""
+        if isinstance(cell, Shown):
+            return {self.key: _number(cell.value), f"{self.key}_{cell.suffix}": _number(cell.second)}
+        if isinstance(cell, Estimate):
+            return {self.key: _number(cell.value), f"{self.key}_se": _number(cell.error)}
+        return {self.key: _number(cell)}
+
+
+def _number(x: float | str | None) -> str:
+    if isinstance(x, float):
+        return f"{x:.6g}" if math.isfinite(x) else ""
+    return "" if x is None else str(x)
+
+
+def rows_of(columns: Sequence[Column], items: Iterable[Sequence[Any]]) -> list[list[Cell]]:
+    """One row per item; an item holds the arguments of the columns' functions."""
+    return [[column.cell(*item) for column in columns] for item in items]
+
+
+class Thumbnail(NamedTuple):
+    """An image below a table: ``data:`` URI, label, and lines of its caption."""
+
+    image: str
+    label: str
+    lines: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table with a title, a text above it, plots, and titled rows of images."""
+
+    key: str
+    title: str
+    text: str
+    columns: Sequence[Column]
+    rows: Sequence[Sequence[Cell]]
+    plots: Sequence[Mapping[str, str]] = ()
+    images: Sequence[tuple[str, Sequence[Thumbnail]]] = ()
+
+    def for_page(self) -> dict[str, Any]:
+        """Head and rows as text."""
+        rows = [[c.text(x) for c, x in zip(self.columns, row, strict=True)] for row in self.rows]
+        return {"head": [c.title for c in self.columns], "rows": rows}
+
+    def csv(self) -> str:
+        """All numbers as CSV, with columns for standard errors and noise; unknown numbers are empty."""
+        rows = [[c.numbers(x) for c, x in zip(self.columns, row, strict=True)] for row in self.rows]
+        # Numbers precede their errors.
+        names = [sorted({c.key}.union(*(row[k] for row in rows))) for k, c in enumerate(self.columns)]
+        stream = io.StringIO()
+        writer = csv.DictWriter(stream, [key for keys in names for key in keys], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows({key: x for cell in row for key, x in cell.items()} for row in rows)
+        return stream.getvalue()

@@ -1,0 +1,85 @@
+"""The page of a cost study and its plots."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from mbtf_core.stats import Estimate
+from mbtf_pipeline.cost.cost_page import write_page
+from mbtf_pipeline.cost.measurements import Measurement
+from mbtf_pipeline.cost.study import Study
+from mbtf_pipeline.report.plots import Cloud, scatter
+
+DESCRIPTION = {
+    "name": "a study", "machine": {"system": "a machine"}, "date": "today", "time": 600.0,
+    "material": "rock", "command": "mbtf-pipeline cost rock",
+}  # fmt: skip
+
+
+def measured(study: str, seconds: float, error: float, series: str = "neumip") -> Measurement:
+    """A run as a study reports it."""
+    details = {
+        "queries": 1e6, "spp": 4.0, "generation_seconds": 3.0, "training_seconds": seconds,
+        "total_seconds": seconds + 4.0, "evaluation_ms_1080p": 250.0, "bytes": 1e6, "seeds": 2.0,
+    }  # fmt: skip
+    estimates = Estimate(seconds, 0.0, 1), Estimate(error, 0.01, 9)
+    command = "mbtf-gen a && mbtf-fit b"
+    return Measurement(study, series, f"{seconds:g} s", command, *estimates, details=details)
+
+
+def test_plots_name_their_axes_and_error_bars(tmp_path: Path) -> None:
+    cloud: Any = Cloud("series", [1.0, 10.0], [0.5, 0.1], [0.1, 0.0], [0.02, 0.5], ["first", "second"])
+    svg = scatter([cloud], "seconds", "error", "a plot", front=[(1.0, 0.5)], png=tmp_path / "a.png")
+    for text in ("seconds", "error", "series", "first", "second", "Pareto front"):
+        assert text in svg
+    with Image.open(tmp_path / "a.png") as picture:
+        # An opaque white background.
+        assert picture.convert("RGBA").getpixel((1, 1)) == (255, 255, 255, 255)
+
+
+def test_an_undefined_error_is_shown_as_such(tmp_path: Path) -> None:
+    """Test values whose variance is not significant leave no unexplained variance."""
+    page = write_page(Study(tmp_path, DESCRIPTION, [measured("models", 10.0, math.nan)])).read_text()
+    assert not re.search(r"\b(nan|inf)\b", page)
+    assert "No unexplained variance of test queries could be measured" in page
+    # Without repeats the error bars of runs are too narrow, and the page warns of it.
+    assert "are too narrow" in page
+    summary = json.loads((tmp_path / "study.json").read_text())["summary"]
+    assert summary["seed_deviation"] is None
+
+
+def test_the_page_shows_the_front_with_commands_and_what_is_biased(tmp_path: Path) -> None:
+    def limited(name: str, bias: Estimate) -> Measurement:
+        noise = Estimate(0.5, 0.01, 9)
+        estimates = Estimate(1.0, 0.1, 4), noise, bias, noise
+        return Measurement("interactions", "", name, "mbtf-gen c", *estimates)
+
+    found = [
+        measured("models", 10.0, 0.3), measured("models", 20.0, 0.2), measured("models", 20.0, 0.4, "other"),
+        limited("1 interactions", Estimate(0.05, 0.004, 9)),
+        limited("2 interactions", Estimate(0.002, 0.003, 9)), limited("no limit", Estimate(0.0, 0.0, 9)),
+    ]  # fmt: skip
+    study = Study(tmp_path, DESCRIPTION, found, deviation=Estimate(0.04, 0.01, 9))
+    page = write_page(study).read_text()
+    pictures = {"front", "models", "models_evaluation", "interactions"}
+    assert {p.stem for p in tmp_path.glob("*.png")} == pictures
+    front = page.split('id="front"')[1].split("</section>")[0]
+    # Two of the three runs, each with a command that one click selects.
+    command = "<code>mbtf-gen a &amp;&amp; mbtf-fit b</code></td></tr>"
+    # In a row of its own, so that the table fits narrow windows.
+    assert front.count(f"<tr class=command><td class=command colspan=9>{command}") == 2
+    assert "<th>command</th>" not in page
+    assert "<details>" not in front
+    section = page.split('id="interactions"')[1].split("</section>")[0]
+    # A significant bias with its error, one below its limit, and that of the reference itself.
+    for cell in ("<td>5.0 ± 0.4 %</td>", "<td>&lt; 0.6 %</td>", "<td>0 %</td>"):
+        assert cell in section
+    assert "at most 0.6 % of the mean value" in section
+    assert "one run is 4.0 ± 1.0 %" in page
+    assert not re.search(r"\bnan\b", page)

@@ -1,0 +1,128 @@
+"""Cost studies of the generator: seconds, bias and noise are found where they are known."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from support.fake_benchmark import NOISE, SHIFT, FakeEstimator, fake_benchmark
+
+from mbtf_core.data.queries import Queries
+from mbtf_core.errors import InputError
+from mbtf_core.stats import Estimate
+from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.planning.effects_planner import plan_effects
+from mbtf_gen.render.estimates import Estimates, Stream
+from mbtf_pipeline.cost import generator_benchmark as module
+from mbtf_pipeline.cost.generator_benchmark import GeneratorBenchmark
+from mbtf_pipeline.cost.generator_runs import PATHS, TARGETS, GeneratorTask, generator_tasks
+from mbtf_pipeline.cost.measurements import Measurement
+from mbtf_pipeline.cost.study import _check_variation
+
+
+@pytest.fixture
+def benchmark(monkeypatch: pytest.MonkeyPatch) -> GeneratorBenchmark:
+    return fake_benchmark(monkeypatch)
+
+
+def measure(benchmark: GeneratorBenchmark, changes: dict[str, Any], *against: Any) -> Measurement:
+    return GeneratorTask("paths", "", "", changes, *against).run(benchmark, 0.0)
+
+
+@pytest.mark.parametrize("spp", [4, 64])
+def test_bias_and_noise_are_separated(benchmark: GeneratorBenchmark, spp: int) -> None:
+    found = measure(benchmark, {"transport.max_depth": 1, "queries.spp": spp})
+    # Relative to the mean value 0.25: the bias is the shift times the values, the noise that of spp paths.
+    bias = SHIFT * math.sqrt(np.mean((0.2 + 0.1 * np.linspace(0, 1, 10001)) ** 2)) / 0.25
+    noise = NOISE / math.sqrt(spp)
+    assert found.bias is not None
+    for estimate, truth in ((found.bias, bias), (found.noise, noise), (found.error, math.hypot(bias, noise))):
+        assert abs(estimate.value - truth) < 4 * estimate.error
+        assert estimate.error < 0.05 * truth
+    assert found.seconds.value > 0
+
+
+def test_an_unbiased_configuration_shows_no_bias(benchmark: GeneratorBenchmark) -> None:
+    found = measure(benchmark, {"transport.max_depth": 3})
+    assert found.bias is not None
+    assert found.bias.value == 0.0
+    assert measure(benchmark, {"queries.spp": 8}, None).bias is None
+
+
+def test_error_bars_agree_with_other_seeds(benchmark: GeneratorBenchmark) -> None:
+    """Differences of seeds over their error bars; a bar too narrow by a factor 2 gives a deviation of 2."""
+    changes = {"transport.max_depth": 1, "queries.spp": 8}
+    configs = [benchmark.config.model_copy(update={"seed": seed}) for seed in (*range(6), 0)]
+    runs = [GeneratorBenchmark(config, benchmark.material) for config in configs]
+    *found, again = (measure(run, changes) for run in runs)
+    assert (again.noise, again.bias) == (found[0].noise, found[0].bias)
+    for part in ("noise", "bias", "error"):
+        estimates: list[Estimate] = [getattr(one, part) for one in found]
+        spread = np.std([e.value for e in estimates], ddof=1)
+        assert 0.4 < spread / np.mean([e.error for e in estimates]) < 1.9
+
+
+def test_every_configuration_is_one_that_the_generator_takes(benchmark: GeneratorBenchmark) -> None:
+    tasks = list(generator_tasks(benchmark))
+    for task in tasks:
+        job = benchmark.job(task.changes)
+        plan_effects(job, pilots=False)
+        # The command sets what was measured, and nothing else.
+        words = task.command("mbtf-gen m").split()
+        given = dict(w.split("=") for w, flag in zip(words[1:], words, strict=False) if flag == "--set")
+        assert given == {name: str(value) for name, value in task.changes.items()}
+    names = {task.name for task in tasks if task.study == "effects"}
+    assert {"auto", "all", "without shadowing", "without interreflection"} <= names
+    assert sum(task.study == "paths" for task in tasks) == len(PATHS) + len(PATHS[1::2]) + len(TARGETS)
+    assert len({task.label for task in tasks}) == len({str((t.study, t.key)) for t in tasks}) == len(tasks)
+    # All queries have equally many paths, except where allocations are compared.
+    uniform = [t for t in tasks if t.study != "paths" or t.series == "uniform"]
+    assert {benchmark.job(t.changes).config.queries.allocation for t in uniform} == {"uniform"}
+
+
+def test_closed_forms_fit_into_memory(benchmark: GeneratorBenchmark, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They take no paths, so that paths alone would not limit the queries of a batch."""
+    sizes: list[int] = []
+
+    def estimate(self: Any, queries: Queries, spp: Any, stream: Stream, **_: Any) -> Estimates:
+        sizes.append(len(queries.sigma))
+        zero = np.zeros((sizes[-1], 3), np.float32)
+        return Estimates(zero, zero, None, 0, 0, 0, 0)
+
+    monkeypatch.setattr(FakeEstimator, "estimate", estimate)
+    variance, _ = benchmark._noise(benchmark.job({"queries.spp": 2}), 0.0, 0.25)
+    assert variance.value == 0
+    assert max(sizes) == 1 << 18
+
+
+@pytest.mark.parametrize(
+    ("factor", "spread", "message"),
+    [(0.0, 0.0, "reflects nothing"), (1.0, 0.0, "reflects the same everywhere"), (1.0, 0.02, None)],
+)
+def test_materials_without_anything_to_learn_are_refused(
+    monkeypatch: pytest.MonkeyPatch, factor: float, spread: float, message: str | None
+) -> None:
+    """Noise does not count; values that vary by a fiftieth of their mean do."""
+
+    class Even(FakeEstimator):
+        def estimate(self, queries: Queries, spp: Any, stream: Stream, **_: Any) -> Estimates:
+            found = super().estimate(queries, spp, stream)
+            truth = 0.2 + 0.1 * queries.u[:, :1]
+            own = 0.25 * (1 + spread * np.sign(queries.u[:, :1] - 0.5))
+            a, b = (
+                (factor * (0.1 * (v - truth) + own)).astype(np.float32)
+                for v in (found.value_a, found.value_b)
+            )
+            return replace(found, value_a=a, value_b=b)
+
+    benchmark = fake_benchmark(monkeypatch)
+    assert isinstance(benchmark.config, GeneratorConfig)
+    monkeypatch.setattr(module, "build_estimator", lambda job, plan: Even(job))
+    if message is None:
+        _check_variation(benchmark)
+        return
+    with pytest.raises(InputError, match=message):
+        _check_variation(benchmark)

@@ -1,0 +1,143 @@
+"""Runs with other seeds: means with honest error bars, as many as needed, none measured twice."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from support.fake_runs import TRUE, FakeRunner, MemoryStore, run
+
+from mbtf_core.stats import Estimate
+from mbtf_pipeline.cost.measurements import HALF_WIDTH, NORMAL
+from mbtf_pipeline.cost.repeats import MOST_SEEDS, combined, measure_runs, seed_deviation
+from mbtf_pipeline.cost.runs import Run
+
+RUNS = [run("whole", 3000, "long", 9.0), run("whole", 3000, "short", 4.0)]
+RUNS += [run("models", 2000, "one"), run("models", 2000, "two")]
+RUNS += [run("data", 1000 + n, f"{n}") for n in range(8)]
+
+
+def repeat(store: MemoryStore, runner: FakeRunner, seeds: int = 2, most: int = 10**6) -> Any:
+    def fits(run: Run) -> bool:
+        return len(runner.measured) < most
+
+    return measure_runs(RUNS, store, runner, fits, seeds)  # type: ignore[arg-type]
+
+
+def test_every_run_gets_two_seeds_before_the_next_one() -> None:
+    runner = FakeRunner()
+    found = repeat(MemoryStore(), runner)
+    assert [len(group) for group in found[0]] == [2] * len(RUNS)
+    assert [(r.name, r.data.seed) for r in runner.measured[:3]] == [("long", 0), ("long", 1), ("short", 0)]
+    # Data that runs share are generated once for each seed, and removed at the end.
+    assert len(runner.generated) == len(set(runner.generated)) == 2 * 10
+    assert not runner.stored
+
+
+def test_nothing_is_measured_twice() -> None:
+    store = MemoryStore()
+    first = FakeRunner(0.2)
+    some = repeat(store, first, most=5)
+    assert len(first.measured) == 5
+    assert [len(group) for group in some[0]] == [2, 2, 1] + 9 * [0]
+    second = FakeRunner(0.2, study_seed=1)
+    found = repeat(store, second)
+    assert len(second.measured) == 2 * len(RUNS) - 5
+    assert not {(r.study, str(r.key)) for r in first.measured} & {
+        (r.study, str(r.key)) for r in second.measured
+    }
+    assert found[0][0] == some[0][0]
+    third = FakeRunner()
+    assert repeat(store, third)[0] == found[0]
+    assert not third.measured
+    # Further seeds of an earlier refinement count without further time.
+    repeat(store, third, seeds=MOST_SEEDS)
+    refined = repeat(store, FakeRunner(), most=0)
+    assert max(len(group) for group in refined[0]) > 2
+
+
+def test_refining_stops_where_the_intervals_are_narrow() -> None:
+    runner = FakeRunner()
+    found = repeat(MemoryStore(), runner, seeds=MOST_SEEDS)
+    deviation = seed_deviation(found[0])
+    assert deviation is not None
+    for group in found[0]:
+        narrow = NORMAL * combined(group, deviation).error.relative_error <= 1.2 * HALF_WIDTH
+        assert narrow or len(group) == MOST_SEEDS
+        assert 2 <= len(group) <= MOST_SEEDS
+    # About the number that the deviation asks for.
+    needed = (deviation.value * NORMAL / HALF_WIDTH) ** 2
+    assert 0.8 * needed < np.mean([len(group) for group in found[0]]) < 2.5 * needed
+    assert not runner.stored
+
+
+@pytest.mark.parametrize(("seeds", "test"), [(0.01, 0.02), (0.03, 0.01)])
+def test_no_more_seeds_where_the_intervals_are_narrow(seeds: float, test: float) -> None:
+    found = repeat(MemoryStore(), FakeRunner(seeds, test), seeds=MOST_SEEDS)
+    assert {len(group) for group in found[0]} == {2}
+
+
+def test_a_run_that_fails_leaves_the_others() -> None:
+    runner = FakeRunner()
+    runner.failing = {"one", "3"}
+    found = repeat(MemoryStore(), runner)
+    assert [len(group) for group in found[0]] == [2, 2, 0, 2, 2, 2, 2, 0, 2, 2, 2, 2]
+    assert found[1] == {
+        2: "models and sizes: neumip, one: training diverged at step 7",
+        7: "queries or paths: neumip, 3: training diverged at step 7",
+    }
+    # A failed run is not tried with another seed.
+    assert sum(r.name in runner.failing for r in runner.measured) == 2
+
+
+@pytest.mark.parametrize(("deviation", "test"), [(0.1, 0.02), (0.03, 0.05)])
+def test_error_bars_are_honest(deviation: float, test: float) -> None:
+    """Studies with other seeds: the difference from the truth over the error bar has mean 0 and deviation 1.
+    An error bar too narrow by a factor 2 gives a deviation of 2."""
+    deviations = []
+    for seed in range(60):
+        runner = FakeRunner(deviation, test, study_seed=seed)
+        found = repeat(MemoryStore(), runner)
+        pooled = seed_deviation(found[0])
+        for one, group in zip(RUNS, found[0], strict=True):
+            error = combined(group, pooled).error
+            deviations.append((error.value - TRUE[one.study]) / error.error)
+    # All runs of a seed share the error of its test set, so there are fewer independent values.
+    assert abs(np.mean(deviations)) < 4 / math.sqrt(60)
+    assert 0.8 < np.std(deviations) < 1.2
+    assert 0.9 < np.mean(np.abs(deviations) < NORMAL) < 0.99
+
+
+def test_the_seed_deviation_is_pooled_and_unbiased() -> None:
+    random = np.random.default_rng(3)
+    variances = []
+    for _ in range(400):
+        groups = [
+            [measured(level * (1 + 0.05 * random.normal())) for _ in range(n)]
+            for level, n in ((0.5, 2), (0.1, 2), (0.02, 3))
+        ]
+        found = seed_deviation(groups)
+        assert found is not None
+        assert found.n == 4
+        variances.append(found.value**2)
+    assert np.mean(variances) == pytest.approx(0.05**2, rel=0.12)
+    assert seed_deviation([[measured(0.5)], []]) is None
+
+
+def measured(error: float, **details: float) -> Any:
+    found = FakeRunner(0.0, 0.0).measure(run())
+    return type(found)(**{**vars(found), "error": Estimate(error, 0.01 * error, 9), "details": details})
+
+
+def test_a_mean_has_the_error_of_its_seeds_and_test_sets() -> None:
+    group = [measured(e, total_seconds=t) for e, t in ((0.2, 4.0), (0.3, 6.0))]
+    found = combined(group, Estimate(0.1, 0.02, 9))
+    assert found.error.value == pytest.approx(0.25)
+    assert found.error.error == pytest.approx(0.1 * 0.25 / math.sqrt(2))
+    assert found.seconds.value == 5.0
+    assert found.details == {"total_seconds": 5.0, "seeds": 2.0}
+    # Without repeats it is the test set's.
+    assert combined(group[:1], None).error.error == pytest.approx(0.002)
+    assert combined(group, Estimate(1e-4, 1e-5, 9)).error.error == pytest.approx(math.hypot(0.002, 0.003) / 2)

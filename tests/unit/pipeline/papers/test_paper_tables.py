@@ -1,0 +1,203 @@
+"""Tables of paper recipes: measured and published numbers, and marks for insignificant ones."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from support.paths import ROOT
+
+from mbtf_core.stats import Estimate
+from mbtf_pipeline.papers.checks import independence, timing, weights
+from mbtf_pipeline.papers.errors import ablations, levels, methods, zooms
+from mbtf_pipeline.papers.plan import load_paper_recipe
+from mbtf_pipeline.papers.published import level_ratios, mse_ratio
+from mbtf_pipeline.papers.runs import FinishedRun, mean_of, ratio_of
+from mbtf_pipeline.tables import Column, Shown, Table
+
+PUBLISHED = load_paper_recipe(ROOT / "pipelines" / "paper_methods.yaml", []).published
+MSE = {"neumip-baseline": 4e-4, "neumip": 2e-4}
+
+
+def number(value: float, error: float) -> dict[str, Any]:
+    return {"value": value, "error": error, "n": 100}
+
+
+def errors(mse: float, error: float = 1e-6) -> dict[str, Any]:
+    return {"unexplained": number(1e3 * mse, 1e3 * error), "mse": number(mse, error)}
+
+
+def record(folder: Path, tiles_across: float = 1.0) -> dict[str, Any]:
+    """A comparison of two fits with one image, including its files."""
+    for name in ("reference", *MSE):
+        (folder / "compare").mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", (4, 4), (90, 80, 70)).save(folder / "compare" / f"{name}.png")
+    relative = {"psnr": number(30, 1), "relative_mse": number(0.1, 0.01)}
+    metrics = {"flip": {"ldr": 0.2, "hdr": 0.3}, "ssim": 0.9, "st_lpips": None}
+    fits = {
+        fit: {"file": fit, "errors": {"query": {"mse": number(mse, 1e-6), **relative}}, **metrics}
+        for fit, mse in MSE.items()
+    }
+    noise = {"file": "reference", "flip": {"ldr": 0.1, "hdr": 0.35}, "ssim": 0.95, "st_lpips": None}
+    picture = {"levels": [2.0, 2.0], "references": {"query": noise}, "fits": fits}
+    picture["tiles_across"] = tiles_across
+    sizes = {"networks": {"decoder": 1678, "offset_network": 1576}, "texels": 700, "network_weights": 3254}
+    test = {
+        fit: {
+            "splits": {"test": {**errors(mse), "levels": {"0": errors(mse / 4), "1": errors(mse)}}},
+            **{"training_seconds": 12.0, "model": fit, **sizes},
+        }
+        for fit, mse in MSE.items()
+    }
+    test["neumip"]["mse_minus_first"] = number(-2e-4, 3e-4)
+    common = {"fits": list(MSE), "kinds": ["query"], "white": 0.2, "finest": 1, "offsets": []}
+    return common | {"pictures": [picture], "test": test}
+
+
+def make(folder: Path, material: str = "turtle_shell", variant: str = "", **more: Any) -> FinishedRun:
+    manifest = {"splits": {"train": {"queries": 1600}}, "levels": {"finest": 1}, "tile": {"aspect": 1.0}}
+    return FinishedRun(material, variant, folder, record(folder) | more, manifest)
+
+
+def rows_of(table: Table) -> list[dict[str, str]]:
+    """Rows of the page by column title."""
+    shown = table.for_page()
+    return [dict(zip(shown["head"], row, strict=True)) for row in shown["rows"]]
+
+
+def csv_of(table: Table) -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO(table.csv())))
+
+
+def test_methods_mark_insignificant_and_missing_numbers(tmp_path: Path) -> None:
+    table, ratios = methods([make(tmp_path)], PUBLISHED)
+    first, second = rows_of(table)
+    assert first["MSE [10⁻³/sr²]"] == "0.4000 ± 0.0010"
+    assert second["MSE − MSE of the first method [10⁻³/sr²]"] == "not significant (−0.2 ± 0.3)"
+    assert second["HDR-FLIP"] == "0.300, within noise"
+    assert second["LDR-FLIP"] == "0.200"
+    assert second["ST-LPIPS"] == "–"
+    # PSNR of the mean MSE over the images, with white as peak.
+    assert float(csv_of(table)[0]["psnr"]) == pytest.approx(10 * math.log10(0.04 / 4e-4), rel=1e-4)
+    assert csv_of(table)[1]["mse_minus_first_se"] == "0.0003"
+    (measured,) = rows_of(ratios)
+    assert measured["MSE ratio, measured here"] == "0.500 ± 0.003"
+    assert float(csv_of(ratios)[0]["published"]) == pytest.approx(1.31 / 3.35, rel=1e-4)
+    assert measured["source"] == "Kuznetsov et al. 2021"
+
+
+def test_published_numbers_match_the_papers() -> None:
+    found = mse_ratio(PUBLISHED, "insulation_foam", "rainer2020", "neumip")
+    assert found == (pytest.approx(21.75 / 3.90), "Kuznetsov et al. 2021")
+    assert mse_ratio(PUBLISHED, "insulation_foam", "hierarchical", "neumip") is None
+    assert mse_ratio(PUBLISHED, "tree_bark", "neumip", "neumip-baseline") is None
+    decibels = mse_ratio(PUBLISHED, "turtle_shell", "hierarchical", "neumip")
+    assert decibels is not None
+    assert -10 * math.log10(decibels[0]) == pytest.approx(32.18 - 30.79)
+    zooms = level_ratios(PUBLISHED, "twisted_wool", "neumip")
+    assert zooms is not None
+    assert [round(3.98 * ratio, 2) for ratio in zooms[0]] == [3.98, 2.1, 1.47, 1.07, 0.74, 1.16, 1.17, 1.08]
+
+
+def test_levels_start_at_the_coarsest_and_zooms_at_the_finest(tmp_path: Path) -> None:
+    table, relative = levels([make(tmp_path, "twisted_wool")], PUBLISHED)
+    assert csv_of(table)[0]["mse_level_0"] == "0.0001"
+    assert csv_of(table)[0]["mse_level_1"] == "0.0004"
+    assert "<svg" in table.plots[0]["svg"]
+    rows = csv_of(relative)
+    assert [r["source"] for r in rows] == ["measured here"] * 2 + [
+        "published, Kuznetsov et al. 2021, Table 3"
+    ]
+    assert float(rows[0]["ratio_zoom_1"]) == pytest.approx(0.25)
+    assert float(rows[2]["ratio_zoom_1"]) == pytest.approx(2.10 / 3.98, rel=1e-4)
+
+
+def test_ablations_compare_with_the_first_row(tmp_path: Path) -> None:
+    runs = [make(tmp_path, variant="architecture"), make(tmp_path, variant="queries-100")]
+    rows = csv_of(ablations(runs, PUBLISHED)[0])
+    assert [r["variant"] for r in rows] == ["neumip-baseline", "neumip"] * 2
+    assert rows[0]["turtle_shell_minus_first"] == ""
+    # Paired on the same data, otherwise from two independent errors.
+    less = "turtle_shell_minus_first"
+    assert (rows[1][less], rows[1][f"{less}_se"]) == ("-0.0002", "0.0003")
+    assert float(rows[3][less]) == pytest.approx(-2e-4)
+    assert float(rows[3][f"{less}_se"]) == pytest.approx(math.hypot(1e-6, 1e-6), rel=1e-3)
+    assert rows[0]["queries_per_texel"] == "400"
+
+
+def test_sizes_and_times(tmp_path: Path) -> None:
+    times = {"device": "cpu", "queries": 7, "evaluate_ms": 9.0, "stage1_ms": 5.0, "stage2_ms": 2.0}
+    times |= {"lights_ms": {"1": 7.0, "16": 37.0}, "parts_ms": {"pyramid": 4.0}}
+    run = make(tmp_path, timing={"neumip": [times]})
+    (row,) = rows_of(timing([run], PUBLISHED)[0])
+    assert row["offset texture"] == "–"
+    assert (row["pyramid"], row["1 light"], row["16 lights"]) == ("4.0", "7.0", "37.0")
+    counted = rows_of(weights([run], PUBLISHED)[0])
+    assert counted[1]["all networks"] == "3,254"
+    assert counted[1]["published"].startswith("3332; 3254")
+
+
+def test_zooms_have_one_row_per_span_and_fit(tmp_path: Path) -> None:
+    run = make(tmp_path)
+    far = record(tmp_path, 8.0)["pictures"]
+    run.comparison["pictures"] = run.pictures + far
+    table = zooms([run], PUBLISHED)[0]
+    assert [(r["tiles_across"], r["method"]) for r in csv_of(table)] == [
+        (s, f) for s in ("1", "8") for f in MSE
+    ]
+    assert [len(row) for _, row in table.images] == [2, 2, 2]
+
+
+def test_unmodified_mitsuba_agrees_or_differs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        "mbtf_pipeline.papers.checks.read_picture", lambda path: np.zeros((4, 4, 3), np.float32)
+    )
+    direction = {"elevation": 85, "azimuth": 0}
+    files = {"mbtf": "reference", "mitsuba": "neumip"}
+    surfaces = [
+        {"surface": s, "mean": number(1e-3, 1e-3), "square": number(square, 1.2e-4), "files": files}
+        for s, square in (("base color", 1e-5), ("full", 4e-2))
+    ]
+    check = {"view": direction, "light": direction, "surfaces": surfaces}
+    table = independence([make(tmp_path, unmodified_mitsuba=check)], PUBLISHED)[0]
+    same, other = rows_of(table)
+    rms = "RMS difference, noise-free [% of the mean]"
+    assert (same["verdict"], same[rms]) == ("agree", "below 1.6 %")
+    assert (other["verdict"], other[rms]) == ("differ", "20.00 ± 0.03 %")
+    # The verdict changes at the detection limit.
+    surfaces[0]["square"] = number(0.0, 1e-3)
+    seen = float(
+        csv_of(independence([make(tmp_path, unmodified_mitsuba=check)], PUBLISHED)[0])[0]["rms_detectable"]
+    )
+    for factor, verdict in ((0.99, "agree"), (1.01, "differ")):
+        surfaces[0]["square"] = number((factor * seen) ** 2, 1e-3)
+        assert (
+            rows_of(independence([make(tmp_path, unmodified_mitsuba=check)], PUBLISHED)[0])[0]["verdict"]
+            == verdict
+        )
+    # A single block of pixels has no error bar and is inconclusive.
+    surfaces[0] |= {key: {"value": 0.4, "error": None, "n": 1} for key in ("mean", "square")}
+    row = rows_of(independence([make(tmp_path, unmodified_mitsuba=check)], PUBLISHED)[0])[0]
+    assert (row["verdict"], row[rms]) == ("inconclusive", "–")
+
+
+def test_cells_are_printed_and_exported() -> None:
+    columns = [Column("a", "a", factor=100.0), Column("b", "b"), Column("c", "c")]
+    seen = Shown("0.970, within noise", 0.97, 0.9, "noise")
+    table = Table("t", "", "", columns, [[Estimate(0.5, 0.01, 9), None, seen], ["x", 1200, None]])
+    assert table.for_page()["rows"] == [["50.0 ± 1.0", "–", "0.970, within noise"], ["x", "1,200", "–"]]
+    assert table.csv().splitlines() == ["a,a_se,b,c,c_noise", "0.5,0.01,,0.97,0.9", "x,,1200,,"]
+
+
+def test_means_and_ratios_have_error_bars() -> None:
+    mean = mean_of([Estimate(1.0, 0.3, 10), Estimate(3.0, 0.4, 10)])
+    assert (mean.value, mean.error) == (2.0, pytest.approx(0.25))
+    ratio = ratio_of(Estimate(2.0, 0.2, 10), Estimate(4.0, 0.4, 10))
+    assert (ratio.value, ratio.error) == (0.5, pytest.approx(0.5 * math.hypot(0.1, 0.1)))
+    assert math.isnan(ratio_of(Estimate(2.0, 0.2, 10), Estimate(0.4, 0.4, 10)).value)

@@ -1,0 +1,55 @@
+"""Values that do not differ significantly from zero are marked and printed with their error bars."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from mbtf_core.stats import Estimate
+from mbtf_pipeline.compare.perceptual_metrics import PERCEPTUAL_METRICS, available_metrics
+from mbtf_pipeline.number_text import data_errors, decibel, estimate_text, levels_text
+
+
+@pytest.mark.parametrize("value", [0.03, -0.03, 0.0])
+def test_values_within_two_error_bars_are_marked(value: float) -> None:
+    text = estimate_text(Estimate(value, 0.02, 100))
+    assert text.startswith("not significant (")
+    assert "± 0.02" in text
+
+
+def test_other_values_are_printed_as_they_are() -> None:
+    assert estimate_text(Estimate(0.123, 0.004, 100), 100.0, " %") == "12.3 ± 0.4 %"
+    assert estimate_text(Estimate(-0.123, 0.004, 100)) == "−0.123 ± 0.004"
+    assert estimate_text(Estimate(math.nan, math.inf, 1)) == "undefined"
+
+
+def test_both_errors_of_the_same_queries_are_marked_or_neither() -> None:
+    close, clear = {"value": 0.1, "error": 0.051, "n": 9}, {"value": 1e-4, "error": 4.9e-5, "n": 9}
+    for unexplained, mse in ((close, clear), (clear, close), (close, close)):
+        texts = data_errors({"unexplained": unexplained, "mse": mse})
+        assert all(text.startswith("not significant (") for text in texts)
+    assert data_errors({"unexplained": clear, "mse": clear}) == ("0.010 ± 0.005 %", "0.10 ± 0.05")
+
+
+def test_psnr_of_an_insignificant_error_is_marked() -> None:
+    mse, psnr = Estimate(1e-4, 1e-6, 9), Estimate(40.0, 0.2, 9)
+    assert decibel(psnr, mse) == "40.0 ± 0.2 dB"
+    assert decibel(Estimate(-3.0, 0.2, 9), mse) == "−3.0 ± 0.2 dB"
+    assert decibel(psnr, Estimate(1e-4, 1e-4, 9)) == "MSE not significant (40.0 ± 0.2 dB)"
+    assert decibel(Estimate(math.inf, math.inf, 9), Estimate(-1e-4, 1e-6, 9)) == "MSE not significant"
+
+
+def test_perceptual_differences_that_noise_explains() -> None:
+    _, hdr, ssim, learned = PERCEPTUAL_METRICS
+    assert [hdr.text(value, 0.1) for value in (0.09, 0.2)] == ["0.090, within noise (0.100)", "0.200"]
+    # A larger SSIM is a smaller difference.
+    assert [ssim.text(value, 0.9) for value in (0.93, 0.8)] == ["0.930, within noise (0.900)", "0.800"]
+    record = {"flip": {"hdr": 0.2}, "ssim": 0.8, "st_lpips": None}
+    assert (hdr.of(record), learned.text(learned.of(record), None)) == (0.2, "–")
+    assert [m.title for m in available_metrics([{"fits": {"a": record}}], ["a"])] == ["HDR-FLIP", "SSIM"]
+
+
+def test_levels_finer_than_the_data_are_marked() -> None:
+    assert levels_text([3.0, 3.0], 7) == "level 3.0"
+    assert levels_text([6.0, 8.5], 7) == "level 6.0–8.5 (finest level of the data: 7)"

@@ -1,0 +1,187 @@
+"""A total time takes the best preset that fits, counts everything, and is kept by the same command."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from support.paths import ROOT
+
+from mbtf_core.data.lattice import Lattice
+from mbtf_core.errors import InputError, UsageError
+from mbtf_gen.config.generator import count_queries
+from mbtf_gen.config.presets import GENERATOR
+from mbtf_pipeline import time_split as module
+from mbtf_pipeline.forecast import RunForecaster
+from mbtf_pipeline.presets import preset_recipe
+from mbtf_pipeline.time_split import TimedRun
+
+FILE = ROOT / "pipelines" / "quickstart.yaml"
+# One fit, at the resolution of each preset.
+ONE = """\
+name: one
+generate: {material: maps/height.npy, geometry: {height_scale: 0.1}}
+fit: {model: neumip}
+"""
+START, PATH = 4.5, 4e-7
+
+
+class Machine:
+    """Time passes only where a test says so."""
+
+    def __init__(self) -> None:
+        self.now, self.path = 0.0, PATH
+        self.free = 1e15
+        self.pilots = 0
+
+
+@pytest.fixture
+def fake(monkeypatch: pytest.MonkeyPatch) -> Machine:
+    made = Machine()
+
+    def speed(self: RunForecaster) -> tuple[float, float]:
+        made.pilots += 1
+        return START, made.path
+
+    monkeypatch.setattr(RunForecaster, "speed", property(speed))
+    monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: made.now))
+    monkeypatch.setattr(module.shutil, "disk_usage", lambda path: SimpleNamespace(free=made.free))
+    return made
+
+
+@pytest.fixture
+def one(tmp_path: Path) -> Path:
+    (tmp_path / "maps").mkdir()
+    np.save(tmp_path / "maps" / "height.npy", np.random.default_rng(0).random((512, 512)))
+    (tmp_path / "one.yaml").write_text(ONE)
+    return tmp_path / "one.yaml"
+
+
+def timed(file: Path, seconds: float, *assignments: str, **options: Any) -> TimedRun:
+    """In a folder beside the recipe."""
+    options = {"progress": lambda note: None, "folder": file.parent / "run", **options}
+    return TimedRun(file, seconds, command="command", assignments=assignments, **options)
+
+
+def seconds_of(run: TimedRun) -> float:
+    """Forecast of the run as it was split."""
+    return RunForecaster(run.recipe).of(run.recipe).seconds
+
+
+@pytest.mark.parametrize("seconds", [100.0, 300.0, 900.0, 7200.0])
+def test_the_best_preset_that_fits_is_scaled_to_the_time(fake: Machine, one: Path, seconds: float) -> None:
+    found = timed(one, seconds)
+    stated = {}
+    for name in module.PRESETS:
+        recipe = preset_recipe(one, name)
+        stated[name] = RunForecaster(recipe).of(recipe).seconds
+    fitting = [name for name in module.PRESETS if stated[name] <= 0.96 * seconds]
+    assert found.split.quality == (fitting or ["draft"])[-1]
+    # Neither fewer queries nor less training than the preset: never worse.
+    preset = preset_recipe(one, found.split.quality)
+    lattice = Lattice.for_map(512, 512, preset.generate.queries.finest)
+    assert found.split.queries >= count_queries(preset.generate.queries.train, lattice.texels())
+    assert found.recipe.fit["neumip"].training.time >= preset.fit["neumip"].training.time
+    assert found.recipe.fit["neumip"].network.width >= preset.fit["neumip"].network.width
+    assert found.recipe.generate.queries.resolution == preset.generate.queries.resolution
+    # Everything is counted: starting, generating, loading, training, evaluation, comparison.
+    assert seconds_of(found) == pytest.approx(0.96 * seconds, rel=0.02)
+
+
+def test_less_than_a_draft_is_a_smaller_draft(fake: Machine, one: Path) -> None:
+    fake.path *= 8.0
+    found = timed(one, 90.0)
+    assert found.split.quality == "draft"
+    assert found.split.scale < 1.0
+    assert found.split.queries < 400 * 128**2
+    assert found.split.training_each < 12.0
+    assert seconds_of(found) == pytest.approx(0.96 * 90.0, rel=0.02)
+
+
+def test_training_is_shortened_when_generating_overran(fake: Machine, one: Path) -> None:
+    found = timed(one, 120.0)
+    planned = found.recipe
+    before = planned.fit["neumip"].training.time
+    fake.now = found.split.generating + 15.0
+    after = found.generated(planned).fit["neumip"].training.time
+    # The starting time, which the forecast counts although the clock has not run, is what it gains.
+    assert before - 15.0 <= after <= before - 15.0 + 3.0
+    assert after == pytest.approx(0.96 * 120.0 - fake.now - found.split.after, abs=0.1)
+    # The same command resumes with the same time, however late.
+    fake.now = 1e4
+    again = timed(one, 120.0)
+    assert again.generated(again.recipe).fit["neumip"].training.time == after
+    fake.now = 0.0
+    notes: list[str] = []
+    late = timed(one, 120.0, folder=one.parent / "late", progress=notes.append)
+    fake.now = 500.0
+    # No less than the preset's: never worse.
+    assert late.generated(late.recipe).fit["neumip"].training.time == 12.0
+    assert "the run will be about" in notes[-1]
+
+
+@pytest.mark.parametrize("scarce", ["disk", "memory", "preset"])
+def test_queries_are_limited_and_the_rest_is_training(fake: Machine, one: Path, scarce: str) -> None:
+    """Where paths cost nothing, any time would fill the disk."""
+    fake.path = 1e-12
+    assignments = ["generate.queries.resolution=128"]
+    most = 1600.0 * 128**2
+    if scarce == "disk":
+        fake.free = 4 * 68 * 7e6
+    elif scarce == "memory":
+        assignments.append("fit.data.memory=476MB")
+    if scarce != "preset":
+        most = 7e6
+    found = timed(one, 1000.0, *assignments, quality="draft")
+    assert 0.9 * most < found.split.queries <= most
+    assert found.split.training_each > 900.0
+
+
+def test_a_preset_that_does_not_fit_on_the_disk_is_not_chosen(fake: Machine, one: Path) -> None:
+    fake.path = 1e-12
+    fake.free = 5e9
+    assert timed(one, 1200.0).split.quality == "standard"
+    fake.free = 1e5
+    with pytest.raises(InputError, match="are free"):
+        timed(one, 1000.0, folder=one.parent / "full")
+    assert not (one.parent / "full").exists()
+
+
+def test_a_given_preset_is_kept_and_fits_share_the_training(fake: Machine, one: Path) -> None:
+    notes: list[str] = []
+    found = timed(FILE, 300.0, folder=one.parent / "run", quality="draft", progress=notes.append)
+    assert found.split.quality == "draft"
+    assert len(found.recipe.fit) == 2
+    assert all(fit.training.steps is None for fit in found.recipe.fit.values())
+    assert {fit.training.time for fit in found.recipe.fit.values()} == {found.split.training_each}
+    assert found.recipe.generate.queries.test == GENERATOR["draft"]["queries.test"]
+    assert found.recipe.generate.light == preset_recipe(FILE, None).generate.light
+    assert len(notes) == 1
+    assert "preset draft with" in notes[0]
+
+
+def test_the_same_command_resumes_with_the_same_split(fake: Machine, one: Path) -> None:
+    first = timed(one, 200.0)
+    fake.path *= 1.5
+    assert timed(one, 200.0).split == first.split
+    # Another time, or a damaged record, is split anew.
+    assert timed(one, 190.0).split != first.split
+    again = timed(one, 200.0)
+    assert again.split.training_each < first.split.training_each
+    (one.parent / "run" / module.SPLIT_NAME).write_text('{"key": 1}')
+    assert timed(one, 200.0).split == again.split
+
+
+def test_what_cannot_be_split_is_refused(fake: Machine, one: Path) -> None:
+    with pytest.raises(UsageError, match="too short"):
+        timed(one, 5.0)
+    with pytest.raises(UsageError, match="layout"):
+        timed(one, 100.0, "fit.model=hierarchical")
+    assert not (one.parent / "run").exists()
+    (one.parent / "run").mkdir()
+    (one.parent / "run" / "file").write_text("")
+    with pytest.raises(InputError, match="holds no run"):
+        timed(one, 100.0)
