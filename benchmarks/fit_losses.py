@@ -26,7 +26,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mbtf_fit.config import TrainingSection
+from mbtf_fit.sections import TrainingSection
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.noise import NoiseModel

@@ -23,7 +23,8 @@ from rock_cliff_128 import MODELS as TRAINED
 
 from mbtf_core.directions import from_projected_disk
 from mbtf_core.lattice import Lattice
-from mbtf_fit.models.registry import MODELS, build_model
+from mbtf_fit.config import build_model
+from mbtf_fit.models.registry import MODELS
 
 # Places that are read at a time.
 PLACES = 1 << 15

@@ -34,8 +34,8 @@ from numpy.typing import NDArray
 from mbtf_core.lattice import Lattice
 from mbtf_fit.config import FitConfig
 from mbtf_fit.material.material import Material, export
-from mbtf_fit.models.constants import PLACES
-from mbtf_fit.models.registry import build_model
+from mbtf_fit.ops.constants import PLACES
+from mbtf_fit.config import build_model
 from mbtf_fit.models.relief import Relief
 from mbtf_fit.presets import best_options
 from mbtf_fit.surface.known import KnownSurface

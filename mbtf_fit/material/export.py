@@ -15,8 +15,7 @@ from mbtf_core.atomic import write_text, write_through
 from mbtf_core.errors import InputError
 from mbtf_fit.material.material import Material, conformance_values, describe_model
 from mbtf_fit.material.transmittance import FORMULA
-from mbtf_fit.models.constants import DIELECTRIC, LIGHT_WIDTH
-from mbtf_fit.models.registry import build_model
+from mbtf_fit.ops.constants import DIELECTRIC, LIGHT_WIDTH
 
 TEXTURES_NAME, LAYERS_NAME = "textures.exr", "layers.json"
 FORMAT_NAME = "mbtf-layers"
@@ -71,8 +70,7 @@ def to_half(material: Material) -> tuple[Material, HalfError]:
     ------
     InputError : a number is beyond half precision
     """
-    model = build_model(material.config.model, material.lattice, **material.config.network.model_dump())
-    model.requires_grad_(False)
+    model = material.model.empty_copy()
     model.load_weights({name: _round_to_half(name, t) for name, t in material.model.weights().items()})
     transmittance = material.transmittance
     if transmittance is not None:

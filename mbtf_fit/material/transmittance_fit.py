@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from mbtf_core.lattice import Lattice, level_of_sigma
 from mbtf_core.stats import Estimate, mean_estimate
 from mbtf_fit.material.transmittance import COEFFICIENTS, Transmittance, basis, corners
-from mbtf_fit.models.lookup import add_up
+from mbtf_fit.textures.lookup import add_up
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.dataset.shard_io import Arrays, check_values, read_shard
 

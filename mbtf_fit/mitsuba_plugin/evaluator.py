@@ -25,7 +25,7 @@ from mbtf_fit.mitsuba_plugin.network import (
     to_value,
 )
 from mbtf_fit.mitsuba_plugin.textures import Textures
-from mbtf_fit.models.constants import GRAZING, IRRADIANCE_SCALE, LEAST_COSINE, OFFSET_SCALE, STATISTICS
+from mbtf_fit.ops.constants import GRAZING, IRRADIANCE_SCALE, LEAST_COSINE, OFFSET_SCALE, STATISTICS
 from mbtf_gen.render.types import Color3f, Float, Point2f, UInt32, Vector3f
 
 

@@ -33,7 +33,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mbtf_fit.config import Correction, LossKind, TrainingSection
+from mbtf_fit.sections import Correction, LossKind, TrainingSection
 from mbtf_fit.objective.noise import NoiseModel
 
 if TYPE_CHECKING:

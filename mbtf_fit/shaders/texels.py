@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_fit.material.material import Material
-from mbtf_fit.models.constants import AZIMUTHS, HEIGHTS, HORIZONS, MAPS
+from mbtf_fit.ops.constants import AZIMUTHS, HEIGHTS, HORIZONS, MAPS
 from mbtf_fit.viewer.shader import NODE_SHIFT
 from mbtf_gen.geometry.height_planes import node_table
 

@@ -15,7 +15,8 @@ import torch
 from mbtf_core.digest import data_sha256
 from mbtf_core.errors import InputError
 from mbtf_core.folders import owned
-from mbtf_fit.config import DataSection, FitConfig
+from mbtf_fit.config import FitConfig
+from mbtf_fit.sections import DataSection
 from mbtf_fit.data.loader import Partition, load_training, open_data
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.material.decoder import DECODER_NAME, Decoder, write_decoder

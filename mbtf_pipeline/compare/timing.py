@@ -109,7 +109,7 @@ def measure_timing(material: Material, pixels: int, device: str) -> dict[str, An
 
 def _parts(material: Material) -> dict[str, Callable[..., Any]]:
     """Parts of stage 1, evaluated once for each position that the model reads."""
-    from mbtf_fit.models.encodings import encode_position
+    from mbtf_fit.pytorch.encodings import encode_position
 
     model = material.model
     around = model.positions

@@ -47,7 +47,7 @@ mbtf_gen.cli
 mbtf_gen
 mbtf_fit.config mbtf_fit.presets mbtf_fit.formatting
 mbtf_fit.data
-mbtf_fit.native.library mbtf_fit.models.constants mbtf_fit.models.lookup
+mbtf_fit.native.library mbtf_fit.ops.constants mbtf_fit.textures.lookup
 mbtf_fit.surface
 mbtf_fit.models
 mbtf_fit.objective

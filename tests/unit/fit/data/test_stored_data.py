@@ -17,7 +17,8 @@ from mbtf_core.data_folder import data_folder, prefetch
 from mbtf_core.errors import PartialError
 from mbtf_core.store import Store
 from mbtf_core.store_folder import StoreFolder, StorePath
-from mbtf_fit.config import FitConfig, HeldOutSection
+from mbtf_fit.config import FitConfig
+from mbtf_fit.sections import HeldOutSection
 from mbtf_fit.data import streaming
 from mbtf_fit.data.loader import load_training
 from mbtf_fit.data.queries import batch_starts

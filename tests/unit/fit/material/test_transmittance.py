@@ -14,7 +14,8 @@ from support.plugin_materials import write_material
 
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import Lattice
-from mbtf_fit.config import FitConfig, HeldOutSection
+from mbtf_fit.config import FitConfig
+from mbtf_fit.sections import HeldOutSection
 from mbtf_fit.data.loader import load_training
 from mbtf_fit.data.streaming import Selection
 from mbtf_fit.evaluation import evaluate

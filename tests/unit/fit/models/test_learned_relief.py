@@ -14,9 +14,9 @@ from mbtf_core.lattice import Lattice
 from mbtf_fit import FitConfig
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.models import learned_relief
-from mbtf_fit.models.constants import HEIGHT_SCALE
+from mbtf_fit.ops.constants import HEIGHT_SCALE
 from mbtf_fit.models.learned_relief import FILTERED, FILTERED_LEAST, TRACED, LearnedRelief
-from mbtf_fit.models.registry import build_model
+from mbtf_fit.config import build_model
 from mbtf_fit.native import library
 from mbtf_fit.native.gradients import NativeGradients
 from mbtf_fit.native.model import NativeModel, supports

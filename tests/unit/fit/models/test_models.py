@@ -10,14 +10,15 @@ import torch
 from mbtf_core.config_file import resolve
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.lattice import Lattice
-from mbtf_fit.config import EncodingSection, FitConfig, OutputTransform
-from mbtf_fit.models.constants import direction_size, position_size
-from mbtf_fit.models.encodings import encode_direction, encode_position
+from mbtf_fit.config import FitConfig
+from mbtf_fit.sections import EncodingSection, OutputTransform
+from mbtf_fit.ops.constants import direction_size, position_size
+from mbtf_fit.pytorch.encodings import encode_direction, encode_position
 from mbtf_fit.models.hierarchical import Hierarchical
-from mbtf_fit.models.interface import NeuralMaterial
-from mbtf_fit.models.mlp import Mlp, initialize_layers
+from mbtf_fit.pytorch.material import NeuralMaterial
+from mbtf_fit.pytorch.mlp import Mlp, initialize_layers
 from mbtf_fit.models.outputs import start_of, to_value
-from mbtf_fit.models.registry import build_model
+from mbtf_fit.config import build_model
 
 F64 = torch.float64
 

@@ -21,8 +21,8 @@ from mbtf_core.lattice import Lattice
 from mbtf_core.shard_schema import MANIFEST_NAME
 from mbtf_fit import FitConfig, fit
 from mbtf_fit.material.inference import predict
-from mbtf_fit.models.encodings import encode_directions, rotate_to_z
-from mbtf_fit.models.registry import build_model
+from mbtf_fit.pytorch.encodings import encode_directions, rotate_to_z
+from mbtf_fit.config import build_model
 from mbtf_fit.models.relief import Relief
 from mbtf_fit.native import library
 from mbtf_fit.native.gradients import NativeGradients

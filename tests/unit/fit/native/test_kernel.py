@@ -13,11 +13,12 @@ from support.fit_data import make_trainer, parallax, random_queries, train_fully
 from torch import Tensor
 
 from mbtf_core.lattice import Lattice
-from mbtf_fit.config import FitConfig, NetworkSection
+from mbtf_fit.config import FitConfig
+from mbtf_fit.sections import NetworkSection
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.material.inference import evaluate_in_chunks, predict
 from mbtf_fit.models.neumip import Neumip
-from mbtf_fit.models.registry import build_model
+from mbtf_fit.config import build_model
 from mbtf_fit.native import library
 from mbtf_fit.native.blur import Blur
 from mbtf_fit.native.gradients import NativeGradients, query_pointers

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from torch import Tensor
 
 from mbtf_core.lattice import Lattice
-from mbtf_fit.config import TrainingSection
+from mbtf_fit.sections import TrainingSection
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.objective.losses import Curve, FourthRoot, Log, Objective
 from mbtf_fit.objective.noise import NoiseModel

@@ -15,7 +15,7 @@ from support.scenes import mi
 from torch import Tensor
 
 from mbtf_core.lattice import Lattice
-from mbtf_fit.models.lookup import lookup
+from mbtf_fit.textures.lookup import lookup
 from mbtf_fit.native import library
 from mbtf_fit.surface import hints, known
 from mbtf_fit.surface.hints import compute_hints

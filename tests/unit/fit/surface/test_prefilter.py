@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from mbtf_core.lattice import Lattice, sigma_of_level
-from mbtf_fit.models.lookup import Packing, lookup
+from mbtf_fit.textures.lookup import Packing, lookup
 from mbtf_fit.surface.prefilter import prefilter, prefiltered_levels
 
 

@@ -17,7 +17,8 @@ from mbtf_fit.data.slices import SliceBatch, TrainingSlices
 from mbtf_fit.models.hierarchical import Hierarchical
 from mbtf_fit.models.neumip import KNOTS, Neumip
 from mbtf_fit.models.rainer import Rainer2019
-from mbtf_fit.models.registry import MODELS, build_model
+from mbtf_fit.config import build_model
+from mbtf_fit.models.registry import MODELS
 from mbtf_fit.models.relief import Relief
 from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.noise import NoiseModel

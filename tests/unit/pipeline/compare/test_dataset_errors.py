@@ -13,7 +13,7 @@ from support.fit_data import parallax, write_data
 
 from mbtf_core.console import Console
 from mbtf_core.lattice import Lattice
-from mbtf_fit.models.registry import build_model
+from mbtf_fit.config import build_model
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_pipeline.compare import timing
 from mbtf_pipeline.compare.dataset_errors import dataset_errors
