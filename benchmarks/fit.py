@@ -39,15 +39,14 @@ from torch import Tensor, nn
 
 from mbtf_core.directions import from_projected_disk
 from mbtf_core.lattice import Lattice, sigma_of_level
-from mbtf_fit.config import FitConfig
+from mbtf_fit.config import FitConfig, build_model
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.material.inference import predict
-from mbtf_fit.textures.blur import NEGLIGIBLE, annealed_sigma
 from mbtf_fit.models.neumip import Neumip
-from mbtf_fit.config import build_model
 from mbtf_fit.native import library
 from mbtf_fit.objective.noise import NoiseModel
 from mbtf_fit.objective.parallel import MAX_KERNEL_THREADS, MAX_THREADS, Workers
+from mbtf_fit.textures.blur import NEGLIGIBLE, annealed_sigma
 from mbtf_fit.training.device import keep_freed_memory
 from mbtf_fit.training.trainer import BETAS, Trainer
 

@@ -26,10 +26,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mbtf_fit.sections import TrainingSection
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.noise import NoiseModel
+from mbtf_fit.sections import TrainingSection
 
 KINDS = ("relative", "squared", "linear", "log", "fourth-root")
 CORRECTIONS = ("none", "second-order", "linear")

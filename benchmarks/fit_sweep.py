@@ -36,9 +36,9 @@ from rock_cliff_128 import RECIPE, make_shards
 from mbtf_core.errors import MbtfError
 from mbtf_core.lattice import Lattice
 from mbtf_fit import FitConfig, Material, fit, read_history
+from mbtf_fit.config import build_model
 from mbtf_fit.data.loader import Partition, load_split, load_training, open_data
 from mbtf_fit.evaluation import split_errors
-from mbtf_fit.config import build_model
 from mbtf_fit.objective.noise import NoiseModel
 from mbtf_fit.objective.parallel import MAX_KERNEL_THREADS, MAX_THREADS, Workers
 from mbtf_fit.training.trainer import Trainer

@@ -80,9 +80,8 @@ def random_material(folder: Path, levels: int, model: ModelName, network: dict[s
     """Export an untrained model of the paper's size."""
     import torch
 
-    from mbtf_fit.config import FitConfig
+    from mbtf_fit.config import FitConfig, build_model
     from mbtf_fit.material.material import export
-    from mbtf_fit.config import build_model
     from mbtf_fit.models.relief import Relief
     from mbtf_fit.surface.known import KnownSurface
 

@@ -32,11 +32,10 @@ import torch
 from numpy.typing import NDArray
 
 from mbtf_core.lattice import Lattice
-from mbtf_fit.config import FitConfig
+from mbtf_fit.config import FitConfig, build_model
 from mbtf_fit.material.material import Material, export
-from mbtf_fit.ops.constants import PLACES
-from mbtf_fit.config import build_model
 from mbtf_fit.models.relief import Relief
+from mbtf_fit.ops.constants import PLACES
 from mbtf_fit.presets import best_options
 from mbtf_fit.surface.known import KnownSurface
 from mbtf_fit.viewer.content import material_content

@@ -107,7 +107,9 @@ class FitConfig(Settings):
         for key in SPECIAL:
             if key in MODELS[self.model].takes:
                 continue
-            given, default = ({k: v for k, v in d.items() if f"{k}.".startswith(f"{key}.")} for d in (mine, usual))
+            given, default = (
+                {k: v for k, v in d.items() if f"{k}.".startswith(f"{key}.")} for d in (mine, usual)
+            )
             if given != default:
                 others = with_option(key)
                 raise ValueError(f"{self.model} has no option {key}, which {_listed(others)}")

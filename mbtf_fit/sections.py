@@ -1,4 +1,5 @@
-"""Sections of the fitter's options, which do not depend on the model: network, training, data, held-out queries."""
+"""Sections of the fitter's options, which do not depend on the model: network, training, data, held-out
+queries."""
 
 from __future__ import annotations
 

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
 from mbtf_core.shard_schema import Layout, Split
-from mbtf_fit.sections import HeldOutSection
 from mbtf_fit.data.images import TrainingImages, nearest_shapes, philox, strides
 from mbtf_fit.data.queries import QUERY_BYTES, ShardQueries, TrainingQueries, mean_value, needed
 from mbtf_fit.data.slices import TrainingSlices
 from mbtf_fit.data.streaming import Selection, StreamedQueries
+from mbtf_fit.sections import HeldOutSection
 from mbtf_gen.dataset.reader import Dataset, Shard
 
 # Training queries that are kept with both halves, as a sample of all.

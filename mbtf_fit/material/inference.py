@@ -11,10 +11,10 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from mbtf_fit.pytorch.material import NeuralMaterial
 from mbtf_fit.native import kernel
 from mbtf_fit.native.library import QueryPointers
 from mbtf_fit.native.model import NativeModel, supports
+from mbtf_fit.pytorch.material import NeuralMaterial
 
 # Queries per chunk: bounds memory and keeps activations in the cache.
 _CHUNK = 1 << 15
@@ -50,8 +50,8 @@ def predict(
     *,
     hints: Tensor | None = None,
 ) -> NDArray[np.float32]:
-    """Values (n, 3) of a material in 1/sr, clamped at 0. `hints` (n, 7) of its surface are computed where they
-    are not given."""
+    """Values (n, 3) of a material in 1/sr, clamped at 0. `hints` (n, 7) of its surface are computed where
+    they are not given."""
     found = kernel()
     if found is not None and supports(model):
         return _predict_natively(NativeModel(found, model), hints, u, sigma, omega_i, omega_o)
@@ -62,9 +62,7 @@ def predict(
     )
 
 
-def _predict_natively(
-    native: NativeModel, hints: Tensor | None, *arrays: ArrayLike
-) -> NDArray[np.float32]:
+def _predict_natively(native: NativeModel, hints: Tensor | None, *arrays: ArrayLike) -> NDArray[np.float32]:
     inputs = [np.ascontiguousarray(a, np.float32) for a in arrays]
     n = len(inputs[1])
     shapes = [(n, 2), (n,), (n, 3), (n, 3)]

@@ -13,7 +13,6 @@ from mbtf_core.config_file import build
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import Lattice
 from mbtf_fit.config import FitConfig
-from mbtf_fit.sections import NetworkSection
 from mbtf_fit.material.format import (
     DEFAULT_MIN_COS,
     DESCRIPTION_NAME,
@@ -38,6 +37,7 @@ from mbtf_fit.ops.constants import (
     hint_size,
     position_size,
 )
+from mbtf_fit.sections import NetworkSection
 
 F32 = NDArray[np.float32]
 # (weight (outputs, inputs), bias (outputs,)) of each layer.

@@ -23,7 +23,8 @@ With ``network.decoder: mlp`` the neighborhood is the query alone.
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 from mbtf_core.lattice import Lattice
 from mbtf_fit.models.model import PYRAMID, Model
@@ -48,7 +49,7 @@ class Hierarchical(Model):
     name = "hierarchical"
     description = "a decoder of Inception modules over a neighborhood (Xue et al. 2024)"
     layout = "image"
-    defaults = {
+    defaults: ClassVar[Mapping[str, Any]] = {
         "network": {
             "decoder": "inception",
             "output_transform": "fourth-root",

@@ -20,7 +20,7 @@ horizons, which take longer to filter, follow less often.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from mbtf_fit.models.model import PYRAMID, Preparation
 from mbtf_fit.models.relief import Relief
@@ -49,7 +49,7 @@ class LearnedRelief(Relief):
 
     name = "neumip+"
     description = "learns the heights that it traces"
-    defaults = {
+    defaults: ClassVar[Mapping[str, Any]] = {
         "network": {
             "offset": "none",
             "channels": 12,

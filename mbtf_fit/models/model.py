@@ -29,7 +29,13 @@ SPECIAL = (
 # Those of a network that decodes a pyramid of textures.
 PYRAMID = (
     *("network.channels", "network.width", "network.layers", "network.activation", "network.output_channels"),
-    *("network.output_transform", "network.oversampling", "network.blending", "network.encoding", "init_from"),
+    *(
+        "network.output_transform",
+        "network.oversampling",
+        "network.blending",
+        "network.encoding",
+        "init_from",
+    ),
 )
 SHARED = ("decoder", "training.shared_decoder")
 
@@ -92,7 +98,8 @@ class Model:
         raise NotImplementedError
 
     def prepare(self, given: Preparation) -> Any:
-        """Called once the parameters are initialized: know a surface, build an encoder; returns the queries."""
+        """Called once the parameters are initialized: know a surface, build an encoder; returns the
+        queries."""
         return given.queries
 
     def init_from(self, source: NeuralMaterial) -> None:

@@ -21,7 +21,8 @@ Deviations from the paper:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 from mbtf_core.lattice import Lattice
 from mbtf_fit.models.model import PYRAMID, SHARED, Model
@@ -47,7 +48,7 @@ class Neumip(Model):
 
     name = "neumip"
     description = "NeuMIP with the neural offset (Kuznetsov et al. 2021)"
-    takes = (*PYRAMID, *SHARED, "network.offset")
+    takes: ClassVar[Sequence[str]] = (*PYRAMID, *SHARED, "network.offset")
 
     @classmethod
     def operations(cls, lattice: Lattice, network: NetworkSection) -> list[Operation]:
@@ -80,7 +81,7 @@ class NeumipBaseline(Neumip):
 
     name = "neumip-baseline"
     description = "NeuMIP without its offset"
-    defaults = {"network": {"offset": "none"}}
+    defaults: ClassVar[Mapping[str, Any]] = {"network": {"offset": "none"}}
     takes = PYRAMID
 
 
@@ -109,9 +110,7 @@ def neural_offset(u: str, network: NetworkSection) -> tuple[str, list[Operation]
 
 def pyramid(u: str, network: NetworkSection) -> Operation:
     """The features at a position and level."""
-    return Lookup(
-        "features", u, "level", "pyramid", network.channels, network.blending, network.oversampling
-    )
+    return Lookup("features", u, "level", "pyramid", network.channels, network.blending, network.oversampling)
 
 
 def encode_position(u: str, encoding: EncodingSection) -> tuple[list[Operation], Sequence[str]]:

@@ -20,7 +20,8 @@ average over the samples, and another network.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import Lattice
@@ -63,11 +64,16 @@ class Rainer2019(Model):
     description = "encodes angular slices (Rainer et al. 2019)"
     layout = "slices"
     # 8 latents; the texture has six channels more.
-    defaults = {
+    defaults: ClassVar[Mapping[str, Any]] = {
         "network": {"offset": "none", "channels": 8, "width": 106, "layers": 5},
         "training": {"learning_rate": 3e-3},
     }
-    takes = ("network.channels", "network.width", "network.layers", "network.activation")
+    takes: ClassVar[Sequence[str]] = (
+        "network.channels",
+        "network.width",
+        "network.layers",
+        "network.activation",
+    )
     calibrates = False
 
     @classmethod
@@ -188,7 +194,7 @@ class Rainer2020(Rainer2019):
     name = "rainer2020"
     description = "encodes angular slices, with one network for many materials (Rainer et al. 2020)"
     # 32 latents; the texture has six channels more.
-    defaults = {
+    defaults: ClassVar[Mapping[str, Any]] = {
         "network": {"offset": "none", "channels": 32, "width": 106, "layers": 5},
         "training": {"learning_rate": 3e-3},
     }

@@ -21,9 +21,9 @@ def _find() -> dict[str, type[Model]]:
         if entry.name == __name__:
             continue
         for item in vars(importlib.import_module(entry.name)).values():
-            if isinstance(item, type) and issubclass(item, Model) and item.__module__ == entry.name:
-                if "name" in vars(item):
-                    found[item.name] = item
+            own = isinstance(item, type) and issubclass(item, Model) and item.__module__ == entry.name
+            if own and "name" in vars(item):
+                found[item.name] = item
     return found
 
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import Lattice
@@ -42,7 +42,7 @@ class Relief(Model):
 
     name = "relief"
     description = "traces the heights of the data's geometry"
-    defaults: Mapping[str, Any] = {
+    defaults: ClassVar[Mapping[str, Any]] = {
         "network": {
             "offset": "none",
             "channels": 8,
@@ -54,7 +54,7 @@ class Relief(Model):
     }
     takes = (*PYRAMID, *SHARED, *(f"network.relief.{n}" for n in ("places", "hints", "frame", "gate")))
     # Texture of learned heights, in models that have one.
-    learned: str | None = None
+    learned: ClassVar[str | None] = None
 
     @classmethod
     def operations(cls, lattice: Lattice, network: NetworkSection) -> list[Operation]:

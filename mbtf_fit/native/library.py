@@ -89,8 +89,7 @@ class GradientSums(ctypes.Structure):
     """``mbtf_gradients``"""
 
     _fields_ = tuple(
-        (name, _POINTER)
-        for name in ("pyramid", "offset_texture", "decoder", "offset", "depth_weights")
+        (name, _POINTER) for name in ("pyramid", "offset_texture", "decoder", "offset", "depth_weights")
     )
 
 

@@ -25,8 +25,8 @@ from mbtf_fit.textures.feature_textures import FeatureTextures
 
 
 def pattern_of(material: NeuralMaterial) -> Pattern | None:
-    """The operations of a material as the kernel sees them; None if it cannot evaluate them: they have another
-    form, are too large, or lie on another device."""
+    """The operations of a material as the kernel sees them; None if it cannot evaluate them: they have
+    another form, are too large, or lie on another device."""
     found = match(material.operations)
     return found if found is not None and _fits(material) else None
 
@@ -70,13 +70,14 @@ def share(n: int, part: int, parts: int, *, whole: bool = False) -> tuple[int, i
 
 
 class NativeModel:
-    """A material whose operations the kernel knows; :meth:`refresh` copies its current weights. Its `description`
-    is what the C functions take; the networks of a `frozen` one are not trained.
+    """A material whose operations the kernel knows; :meth:`refresh` copies its current weights. Its
+    `description` is what the C functions take; the networks of a `frozen` one are not trained.
 
     Attributes
     ----------
     pattern : the operations as the kernel sees them
-    textures, networks : those that it reads: the features, then what moves lookups; the decoder, then the offset
+    textures, networks : those that it reads: the features, then what moves lookups; the decoder, then the
+    offset
         network
     """
 

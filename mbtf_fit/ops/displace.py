@@ -38,14 +38,14 @@ class Offset(Operation):
 class Trace(Operation):
     """Intersections of view rays with a periodic height field (relief mapping: Policarpo et al., I3D 2005).
 
-    Rays start at the places ``x_j = u + 2^-l / 2 · (o_j,x ⊥a + o_j,y a) / (1, aspect)`` of the footprint, where a
-    is the unit vector of the view's azimuth, (1, 0) of a vertical view, and ⊥a = (-a_y, a_x). z_j is the height
-    of the first point, from above, of the line ``x_j + t ω_o`` on the surface; its uv is
-    ``x_j + z_j / ω_o,z · ω_o,xy / (1, aspect)``. The output is the mean of z_j.
+    Rays start at the places ``x_j = u + 2^-l / 2 · (o_j,x ⊥a + o_j,y a) / (1, aspect)`` of the footprint,
+    where a is the unit vector of the view's azimuth, (1, 0) of a vertical view, and ⊥a = (-a_y, a_x). z_j is
+    the height of the first point, from above, of the line ``x_j + t ω_o`` on the surface; its uv is ``x_j +
+    z_j / ω_o,z · ω_o,xy / (1, aspect)``. The output is the mean of z_j.
 
     The heights are those of vertices at texel centers, linear on the two triangles of each cell, which meet
-    where ``x + y = 1`` (x along u, y along v, from 0 to 1). A ray that crosses the border of the grid more often
-    than `crossings` times stops there.
+    where ``x + y = 1`` (x along u, y along v, from 0 to 1). A ray that crosses the border of the grid more
+    often than `crossings` times stops there.
 
     Attributes
     ----------

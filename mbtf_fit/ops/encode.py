@@ -23,8 +23,8 @@ class HalfVector(Operation):
 class Rotate(Operation):
     """A direction, rotated by the shortest rotation that takes an axis to z (3).
 
-    ``(ω_xy - a_xy (ω_z + t / (1 + a_z)), a_z ω_z + t)``, ``t = a_xy · ω_xy``. About the half vector, the light
-    becomes the difference vector (Rusinkiewicz, EGSR 1998), in a frame that is continuous everywhere.
+    ``(ω_xy - a_xy (ω_z + t / (1 + a_z)), a_z ω_z + t)``, ``t = a_xy · ω_xy``. About the half vector, the
+    light becomes the difference vector (Rusinkiewicz, EGSR 1998), in a frame that is continuous everywhere.
 
     Attributes
     ----------
@@ -61,12 +61,12 @@ class Position(Operation):
 
 @dataclass(frozen=True)
 class Frequencies(Operation):
-    """Sines of doubling frequencies, then cosines (NeRF: Mildenhall et al., ECCV 2020; for materials: Xue et al.
-    2024).
+    """Sines of doubling frequencies, then cosines (NeRF: Mildenhall et al., ECCV 2020; for materials: Xue et
+    al. 2024).
 
-    ``sin(f_k x)`` with ``f_k = 2^k`` or ``2^k π``, k = 0..bands-1 of the first coordinate, then of the next; then
-    the cosines likewise. With a level, each is averaged over the footprint of a :class:`Position`, that is
-    multiplied by ``exp(-(f_k s)²/2)``, ``s = 2^-l / (1, aspect)`` (mip-NeRF: Barron et al., ICCV 2021).
+    ``sin(f_k x)`` with ``f_k = 2^k`` or ``2^k π``, k = 0..bands-1 of the first coordinate, then of the next;
+    then the cosines likewise. With a level, each is averaged over the footprint of a :class:`Position`, that
+    is multiplied by ``exp(-(f_k s)²/2)``, ``s = 2^-l / (1, aspect)`` (mip-NeRF: Barron et al., ICCV 2021).
 
     Attributes
     ----------

@@ -13,9 +13,9 @@ from mbtf_fit.ops.operation import Operation, TextureName, Value
 class Lookup(Operation):
     """Bilinear lookup in periodic textures (NeuMIP, sections 4.1 and 4.2).
 
-    At the fractional level l, ``(1 - frac(l)) T_⌊l⌋(u) + frac(l) T_⌊l⌋+1(u)``; or both terms side by side, that
-    of the even level first (Quartesan et al. 2022). Without a level the texture is that of the finest level
-    alone. Row 0 is the side ``v → 1``, texel centers are at ``((i+½)/W, 1-(j+½)/H)``.
+    At the fractional level l, ``(1 - frac(l)) T_⌊l⌋(u) + frac(l) T_⌊l⌋+1(u)``; or both terms side by side,
+    that of the even level first (Quartesan et al. 2022). Without a level the texture is that of the finest
+    level alone. Row 0 is the side ``v → 1``, texel centers are at ``((i+½)/W, 1-(j+½)/H)``.
 
     Attributes
     ----------

@@ -15,8 +15,8 @@ Activation = Literal["relu", "leaky-relu", "sine"]
 class Network(Operation):
     """Fully connected layers ``x → W x + b``, an activation after each but the last.
 
-    Activations: ``max(0, x)``, ``max(0.01 x, x)``, ``sin x``. Tensors: ``weights.0.weight`` (outputs, inputs),
-    ``weights.0.bias``, ``weights.1.weight``, …
+    Activations: ``max(0, x)``, ``max(0.01 x, x)``, ``sin x``. Tensors: ``weights.0.weight`` (outputs,
+    inputs), ``weights.0.bias``, ``weights.1.weight``, …
 
     Attributes
     ----------
@@ -43,12 +43,12 @@ class Network(Operation):
 @dataclass(frozen=True)
 class Inception(Operation):
     """1×1 convolution, Inception modules, 1×1 convolution over a :class:`~mbtf_fit.ops.lookup.Neighborhood`
-    (Xue et al. 2024; Szegedy et al., CVPR 2015), an activation after all convolutions but the last; the output
-    is that of the middle.
+    (Xue et al. 2024; Szegedy et al., CVPR 2015), an activation after all convolutions but the last; the
+    output is that of the middle.
 
-    A module joins ``one(x)``, ``three(before3(x))``, ``five(before5(x))`` and ``pooled(3×3 maximum of x)``; there
-    is no padding. Tensors: ``weights.first.weight`` (outputs, inputs, 1, 1), ``weights.0.one.weight``, …,
-    ``weights.last.bias``.
+    A module joins ``one(x)``, ``three(before3(x))``, ``five(before5(x))`` and ``pooled(3×3 maximum of x)``;
+    there is no padding. Tensors: ``weights.first.weight`` (outputs, inputs, 1, 1), ``weights.0.one.weight``,
+    …, ``weights.last.bias``.
 
     Attributes
     ----------

@@ -6,14 +6,13 @@ An operation computes one or two named values from others. Every list starts fro
 - ``level`` (1): fractional level of the footprint, ``clamp(-log2(2σ), 0, k)``;
 - ``omega_i``, ``omega_o`` (3): unit vectors towards light and viewer, z > 0;
 
-and its last value is M(u, σ, ω_i, ω_o) in 1/sr, which readers clamp at 0. ``name[a:b]`` names the numbers a to
-b - 1 of a value. What does not depend on ``omega_i`` is stage 1, which is computed once for all lights.
+and its last value is M(u, σ, ω_i, ω_o) in 1/sr, which readers clamp at 0. ``name[a:b]`` names the numbers a
+to b - 1 of a value. What does not depend on ``omega_i`` is stage 1, which is computed once for all lights.
 
-An operation is a frozen dataclass. Its fields say what it reads: :data:`Value` a value, :data:`Values` several
-values that are concatenated, :data:`TensorName` a tensor of the material, :data:`TextureName` the tensors
-``name.0``, ``name.1``, … of a texture's levels, :data:`NetworkName` the tensors of a network. The name of an
-operation in files, and its keys there, are those of the dataclass.
-"""
+An operation is a frozen dataclass. Its fields say what it reads: :data:`Value` a value, :data:`Values`
+several values that are concatenated, :data:`TensorName` a tensor of the material, :data:`TextureName` the
+tensors ``name.0``, ``name.1``, … of a texture's levels, :data:`NetworkName` the tensors of a network. The
+name of an operation in files, and its keys there, are those of the dataclass."""
 
 from __future__ import annotations
 
@@ -74,12 +73,12 @@ class Operation:
 
     def value_fields(self) -> list[str]:
         """Names of the fields that name values."""
-        return _fields_of(type(self), "value")
+        return _fields_of(self.kind(), "value")
 
     def named(self, kind: str) -> list[str]:
         """What fields of a kind name: ``value``, ``tensor``, ``texture`` or ``network``."""
         out: list[str] = []
-        for name in _fields_of(type(self), kind):
+        for name in _fields_of(self.kind(), kind):
             found = getattr(self, name)
             out += [] if found is None else [found] if isinstance(found, str) else found
         return out
@@ -88,7 +87,10 @@ class Operation:
         """Plain data; optional fields that are None are left out."""
         given = {f.name: getattr(self, f.name) for f in fields(self) if f.default is not None}
         given |= {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
-        return {"operation": self.kind(), **{f.name: _plain(given[f.name]) for f in fields(self) if f.name in given}}
+        return {
+            "operation": self.kind(),
+            **{f.name: _plain(given[f.name]) for f in fields(self) if f.name in given},
+        }
 
     def stored(self) -> Operation:
         """The operation as a material stores it, without what only training needs."""
@@ -96,7 +98,8 @@ class Operation:
 
 
 @cache
-def _fields_of(cls: type[Operation], kind: str) -> list[str]:
+def _fields_of(operation: str, kind: str) -> list[str]:
+    cls = _KINDS[operation]
     hints = get_type_hints(cls, include_extras=True)
     return [f.name for f in fields(cls) if kind in _marks(hints[f.name])]
 
@@ -199,7 +202,9 @@ def stages(operations: Sequence[Operation]) -> tuple[list[Operation], list[Opera
     return [o for o in operations if o.output not in lit], [o for o in operations if o.output in lit]
 
 
-def needed_for(operations: Sequence[Operation], wanted: Sequence[str], given: Sequence[str]) -> list[Operation]:
+def needed_for(
+    operations: Sequence[Operation], wanted: Sequence[str], given: Sequence[str]
+) -> list[Operation]:
     """The operations that these values need, where other values are given already."""
     missing, out = set(wanted) - set(given), []
     for operation in reversed(operations):

@@ -15,16 +15,16 @@ class Shade(Operation):
 
     Maps and horizons are read at the level ``l + finer``. Maps hold slopes s (2), the mean q of their squared
     length, base color b (3); of glossy surfaces besides α² and metallic m. The normal is
-    ``n = (-s_x, -s_y, 1) / ‖·‖``. Horizons hold, for equidistant azimuths from +u towards +v, the mean h of the
-    horizon's elevation in the first half of the channels, the mean of its square in the second half, both linear
-    between azimuths; v is their variance. The light is visible from the share
+    ``n = (-s_x, -s_y, 1) / ‖·‖``. Horizons hold, for equidistant azimuths from +u towards +v, the mean h of
+    the horizon's elevation in the first half of the channels, the mean of its square in the second half,
+    both linear between azimuths; v is their variance. The light is visible from the share
 
         V = Φ((asin ω_i,z - h) / √max(v + (light_blur · light_width)², least_variance)).
 
-    Irradiance: ``e = V max(0, n·ω_i) / ω_i,z``, 1 on the reference plane. Core, in 1/sr: ``e b/π``, or of a glossy
-    surface ``e ((1-m) b/π + GGX)`` with ``F0 = (1-m) dielectric + m b`` and
-    ``α² = clamp(α² + max(0, q - ‖s‖²) + light_width², alpha2)`` (LEAN mapping: Olano and Baker 2010; GGX: Walter
-    et al. 2007; Fresnel: Schlick 1994), the cosines of light and view at least `least_light` and `least_view`.
+    Irradiance: ``e = V max(0, n·ω_i) / ω_i,z``, 1 on the reference plane. Core, in 1/sr: ``e b/π``, or of a
+    glossy surface ``e ((1-m) b/π + GGX)`` with ``F0 = (1-m) dielectric + m b`` and ``α² = clamp(α² + max(0,
+    q - ‖s‖²) + light_width², alpha2)`` (LEAN mapping: Olano and Baker 2010; GGX: Walter et al. 2007;
+    Fresnel: Schlick 1994), the cosines of light and view at least `least_light` and `least_view`.
 
     Attributes
     ----------
@@ -55,10 +55,11 @@ class Shade(Operation):
 
 @dataclass(frozen=True)
 class Lobe(Operation):
-    """A diffuse and a GGX lobe (Walter et al. 2007; Fresnel: Schlick 1994) under a unit irradiance of the plane.
+    """A diffuse and a GGX lobe (Walter et al. 2007; Fresnel: Schlick 1994) under a unit irradiance of the
+    plane.
 
-    ``M = max(0, n·ω_i) / ω_i,z · (b/π + GGX(F0, α²))`` with the normal ``n = (-s_x, -s_y, 1) / ‖·‖``; cosines of
-    light and view in the lobe are at least `least_light` and `least_view`.
+    ``M = max(0, n·ω_i) / ω_i,z · (b/π + GGX(F0, α²))`` with the normal ``n = (-s_x, -s_y, 1) / ‖·‖``;
+    cosines of light and view in the lobe are at least `least_light` and `least_view`.
 
     Attributes
     ----------

@@ -16,8 +16,9 @@ Function = Literal["identity", "exp", "expm1", "log1p", "softplus", "sigmoid", "
 class Transform(Operation):
     """A function of each number: ``factor · f(scale · x / divisor)``.
 
-    ``expm1`` is exp(x) - 1, ``log1p`` log(1 + x), ``softplus`` log(1 + exp(x)), ``sigmoid`` 1 / (1 + exp(-x)),
-    ``fourth-root`` the inverse x|x|³ of the fourth root. Where the divisor is 0, its quotient is 0.
+    ``expm1`` is exp(x) - 1, ``log1p`` log(1 + x), ``softplus`` log(1 + exp(x)), ``sigmoid`` 1 / (1 +
+    exp(-x)), ``fourth-root`` the inverse x|x|³ of the fourth root. Where the divisor is 0, its quotient is
+    0.
 
     Attributes
     ----------
@@ -99,8 +100,8 @@ class DivideByCosine(Operation):
 class Calibrate(Operation):
     """Calibration factors (3) of an elevation (:mod:`mbtf_fit.training.calibration`).
 
-    ``factors[table]`` at the level l and the cosine ω_z: linear between levels, and between knots at the cosines
-    0, 1/(knots-1), …, 1.
+    ``factors[table]`` at the level l and the cosine ω_z: linear between levels, and between knots at the
+    cosines 0, 1/(knots-1), …, 1.
 
     Attributes
     ----------

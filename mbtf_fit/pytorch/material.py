@@ -76,18 +76,15 @@ class NeuralMaterial(nn.Module):
             inputs = sum(_size(r, sizes) for r in op.x)
             self.add_module(op.weights, Mlp(op.widths(inputs), op.activation))
         elif isinstance(op, ops.Inception):
-            given = (sum(_size(r, sizes) for r in part) for part in (op.features, op.shared))
-            self.add_module(
-                op.weights, InceptionDecoder(*given, op.width, op.modules, op.outputs, op.activation)
-            )
+            features, shared = (sum(_size(r, sizes) for r in part) for part in (op.features, op.shared))
+            layers = op.width, op.modules, op.outputs, op.activation
+            self.add_module(op.weights, InceptionDecoder(features, shared, *layers))
         elif isinstance(op, ops.Displace):
             weights = torch.full((lattice.finest + 1,), FIRST_WEIGHT)
             self.register_parameter(op.weights, nn.Parameter(weights))
             if op.learned is not None:
                 self._learned.add(op.learned)
-                self.add_module(
-                    op.learned, FeatureTextures(lattice, [lattice.finest], 1, moves_lookups=True)
-                )
+                self.add_module(op.learned, FeatureTextures(lattice, [lattice.finest], 1, moves_lookups=True))
 
     @property
     def operations(self) -> list[ops.Operation]:
@@ -177,8 +174,8 @@ class NeuralMaterial(nn.Module):
         return self.run([self.operations[-1].output], given)[0]
 
     def offset(self, u: Tensor, omega_o: Tensor) -> Tensor:
-        """Displacement of the lookup at the finest footprint, (n, 2) in tile widths: the neural offset, or that
-        of the surface point that is seen; zero for a model without."""
+        """Displacement of the lookup at the finest footprint, (n, 2) in tile widths: the neural offset, or
+        that of the surface point that is seen; zero for a model without."""
         if self.tracing is not None:
             height = self.known.tracer.trace(u, omega_o)[:, None]
             return height * omega_o[:, :2] / omega_o[:, 2:]
@@ -291,7 +288,9 @@ class NeuralMaterial(nn.Module):
 
     def empty_copy(self) -> NeuralMaterial:
         """A material with the same operations as a material stores them, not initialized, for evaluation."""
-        return NeuralMaterial(self.lattice, [op.stored() for op in self._own], self.name).requires_grad_(False)
+        return NeuralMaterial(self.lattice, [op.stored() for op in self._own], self.name).requires_grad_(
+            False
+        )
 
     def weights(self) -> dict[str, Tensor]:
         """All tensors by name, with the current blur: one tensor (rows, columns, channels) per level of a
@@ -353,10 +352,7 @@ def _behind(operations: Sequence[ops.Operation], reference: str) -> set[str]:
 def _scalars(operations: Sequence[ops.Operation]) -> list[str]:
     """Tensors () of a list: units of values."""
     named = {
-        name
-        for op in operations
-        if isinstance(op, ops.Transform | ops.Gate)
-        for name in op.named("tensor")
+        name for op in operations if isinstance(op, ops.Transform | ops.Gate) for name in op.named("tensor")
     }
     return sorted(named)
 

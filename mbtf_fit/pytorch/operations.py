@@ -1,8 +1,7 @@
 """The operations in PyTorch: one function each, with the equations of :mod:`mbtf_fit.ops`.
 
-Arrays are (queries, numbers); levels are (queries,). Behind a :class:`~mbtf_fit.ops.lookup.Neighborhood` there
-are more rows, those of each query one after the other.
-"""
+Arrays are (queries, numbers); levels are (queries,). Behind a :class:`~mbtf_fit.ops.lookup.Neighborhood`
+there are more rows, those of each query one after the other."""
 
 from __future__ import annotations
 
@@ -133,9 +132,7 @@ def learned_heights(x: Tensor) -> Tensor:
 
 
 @PYTORCH.implements(ops.Shade)
-def _shade(
-    op: ops.Shade, run: Run, hits: Tensor, level: Tensor, omega_i: Tensor, omega_o: Tensor
-) -> Tensor:
+def _shade(op: ops.Shade, run: Run, hits: Tensor, level: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
     return run.material.known.shading(op, hits, level, omega_i, omega_o)
 
 
@@ -194,9 +191,7 @@ def _network(op: ops.Network, run: Run, x: Sequence[Tensor]) -> Tensor:
 
 
 @PYTORCH.implements(ops.Inception)
-def _inception(
-    op: ops.Inception, run: Run, features: Sequence[Tensor], shared: Sequence[Tensor]
-) -> Tensor:
+def _inception(op: ops.Inception, run: Run, features: Sequence[Tensor], shared: Sequence[Tensor]) -> Tensor:
     directions = torch.cat([*shared], 1)
     x = torch.cat([*features], 1)
     size = math.isqrt(len(x) // max(1, len(directions)))

@@ -20,8 +20,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mbtf_fit.ops.constants import MAX_CROSSINGS
 from mbtf_fit.native.library import Heightfield, kernel
+from mbtf_fit.ops.constants import MAX_CROSSINGS
 from mbtf_fit.surface.copies import DeviceCopies
 from mbtf_gen.geometry.height_planes import node_table
 

@@ -8,12 +8,12 @@ from concurrent.futures import ThreadPoolExecutor
 import torch
 from torch import Tensor
 
+from mbtf_fit.native.library import MAX_LEVELS, MAX_PLACES, QueryPointers, Surface, Textures, kernel
 from mbtf_fit.ops.constants import HINTS
 from mbtf_fit.ops.displace import Trace
 from mbtf_fit.ops.shade import Shade
-from mbtf_fit.textures.lookup import Packing
-from mbtf_fit.native.library import MAX_LEVELS, MAX_PLACES, QueryPointers, Surface, Textures, kernel
 from mbtf_fit.surface.known import KnownSurface
+from mbtf_fit.textures.lookup import Packing
 
 # Queries per task of a thread; in PyTorch, queries at once, which bounds the memory of the lookups.
 _TASK, _CHUNK = 1 << 14, 1 << 17

@@ -41,10 +41,10 @@ from mbtf_fit.ops.constants import (
 )
 from mbtf_fit.ops.displace import Trace
 from mbtf_fit.ops.shade import Shade
-from mbtf_fit.textures.lookup import Packing, lookup
 from mbtf_fit.surface.copies import DeviceCopies
 from mbtf_fit.surface.heightfield import HeightfieldTracer
 from mbtf_fit.surface.prefilter import prefiltered_levels
+from mbtf_fit.textures.lookup import Packing, lookup
 from mbtf_gen.images.resample import resample
 
 if TYPE_CHECKING:
@@ -187,9 +187,7 @@ class KnownSurface:
     def _horizon_copies(self) -> DeviceCopies:
         return DeviceCopies(self.horizon_table[0])
 
-    def intersections(
-        self, trace: Trace, u: Tensor, level: Tensor, omega_o: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def intersections(self, trace: Trace, u: Tensor, level: Tensor, omega_o: Tensor) -> tuple[Tensor, Tensor]:
         """Mean height (n, 1), and uv (n, 2·places), of the intersections of the places' view rays; levels
         (n,)."""
         sigma = 0.5 * torch.exp2(-level)[:, None]
@@ -204,9 +202,7 @@ class KnownSurface:
             total = total + z
         return total / len(trace.places), torch.cat(hits, 1)
 
-    def shading(
-        self, shade: Shade, hits: Tensor, level: Tensor, omega_i: Tensor, omega_o: Tensor
-    ) -> Tensor:
+    def shading(self, shade: Shade, hits: Tensor, level: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
         """Irradiance, normal (x, y) and core (RGB) (n, 6): means over the intersections (n, 2·places)."""
         finer = level + shade.finer
         parts = [self._shade(shade, hit, finer, omega_i, omega_o) for hit in hits.split(2, 1)]
@@ -247,7 +243,9 @@ class KnownSurface:
         square = torch.lerp(both.gather(1, index + count), both.gather(1, after + count), weight)
         variance = (square - mean.square()).clamp_min(0.0) + (op.light_blur * self.light_width) ** 2
         elevation = omega_i[:, 2:].clamp(0.0, 1.0).asin()
-        return 0.5 + 0.5 * torch.erf((elevation - mean) / (2.0 * variance.clamp_min(op.least_variance)).sqrt())
+        return 0.5 + 0.5 * torch.erf(
+            (elevation - mean) / (2.0 * variance.clamp_min(op.least_variance)).sqrt()
+        )
 
 
 def _azimuth(omega: Tensor) -> Tensor:

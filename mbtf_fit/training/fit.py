@@ -23,10 +23,10 @@ from mbtf_fit.material.decoder import Decoder
 from mbtf_fit.material.format import DESCRIPTION_NAME
 from mbtf_fit.material.material import Material, export
 from mbtf_fit.material.transmittance_fit import evaluate_transmittance, fit_transmittance
-from mbtf_fit.pytorch.material import NeuralMaterial
 from mbtf_fit.models.model import Model, Preparation
 from mbtf_fit.models.registry import MODELS, material_of
 from mbtf_fit.objective.noise import NoiseModel, typical_value
+from mbtf_fit.pytorch.material import NeuralMaterial
 from mbtf_fit.training.checkpoint import CHECKPOINT_NAME, read_checkpoint, write_checkpoint
 from mbtf_fit.training.convergence import MarginalCost, marginal_cost_of
 from mbtf_fit.training.device import choose_device, keep_freed_memory

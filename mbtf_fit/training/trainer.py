@@ -16,14 +16,11 @@ from torch import Tensor
 
 from mbtf_core.errors import InputError
 from mbtf_fit.config import FitConfig
-from mbtf_fit.sections import TrainingSection
 from mbtf_fit.data.images import TrainingImages
 from mbtf_fit.data.queries import ShardQueries, TrainingQueries
 from mbtf_fit.data.slices import SharedSlices, TrainingSlices
 from mbtf_fit.data.streaming import Selection, StreamedQueries
 from mbtf_fit.material.inference import predict
-from mbtf_fit.textures.blur import annealed_sigma
-from mbtf_fit.pytorch.material import NeuralMaterial
 from mbtf_fit.models.model import Model
 from mbtf_fit.models.registry import MODELS
 from mbtf_fit.native import kernel
@@ -33,6 +30,9 @@ from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.noise import NoiseModel
 from mbtf_fit.objective.parallel import MAX_KERNEL_THREADS, MAX_THREADS, Batch, Workers
 from mbtf_fit.objective.regularization import WeightDecay
+from mbtf_fit.pytorch.material import NeuralMaterial
+from mbtf_fit.sections import TrainingSection
+from mbtf_fit.textures.blur import annealed_sigma
 from mbtf_fit.training.calibration import fit_calibration
 from mbtf_fit.training.loop import Progress, TrainingLoop, health_of
 
@@ -91,9 +91,7 @@ class Trainer(TrainingLoop):
         self.weight_decay = WeightDecay.of(config.training, noise.ratio, len(queries))
         found = kernel()
         self._stepper = (
-            NativeStepper(found, model, self.optimizer)
-            if found is not None and supports(model)
-            else None
+            NativeStepper(found, model, self.optimizer) if found is not None and supports(model) else None
         )
 
     @property

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
-from mbtf_fit.sections import NetworkSection
 from mbtf_fit.material.material import Material
 from mbtf_fit.ops.constants import (
     ALPHA2,
@@ -37,6 +36,7 @@ from mbtf_fit.ops.constants import (
     RGB_OF_YUV,
     STATISTICS,
 )
+from mbtf_fit.sections import NetworkSection
 
 F32 = NDArray[np.float32]
 # Where the generated code stands in material.glsl.

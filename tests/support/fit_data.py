@@ -14,9 +14,8 @@ from mbtf_core.atomic import checksummed
 from mbtf_core.directions import from_projected_disk
 from mbtf_core.lattice import Lattice, sigma_of_level
 from mbtf_core.shard_schema import FORMAT_NAME, GEOMETRY_NAME, MANIFEST_NAME, SCHEMA_VERSION
-from mbtf_fit.config import FitConfig
+from mbtf_fit.config import FitConfig, build_model
 from mbtf_fit.data.queries import TrainingQueries
-from mbtf_fit.config import build_model
 from mbtf_fit.objective.noise import NoiseModel, typical_value
 from mbtf_fit.training.trainer import Trainer
 from mbtf_gen.dataset.geometry import Geometry, geometry_record, write_geometry

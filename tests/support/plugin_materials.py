@@ -13,10 +13,9 @@ from safetensors.numpy import load_file, save_file
 
 from mbtf_core.digest import file_sha256
 from mbtf_core.lattice import Lattice
-from mbtf_fit.config import FitConfig
+from mbtf_fit.config import FitConfig, build_model
 from mbtf_fit.material.material import Material, export
 from mbtf_fit.material.transmittance import Transmittance
-from mbtf_fit.config import build_model
 from mbtf_fit.models.relief import Relief
 from mbtf_fit.surface.known import KnownSurface
 

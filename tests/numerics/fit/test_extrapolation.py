@@ -11,12 +11,11 @@ from support.fit_data import make_trainer, parallax, random_queries, train_fully
 from support.surfaces import towards
 
 from mbtf_core.lattice import Lattice
-from mbtf_fit.config import FitConfig
+from mbtf_fit.config import FitConfig, build_model
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.material.material import Material, export
-from mbtf_fit.ops.constants import GRAZING
 from mbtf_fit.models.neumip import Neumip
-from mbtf_fit.config import build_model
+from mbtf_fit.ops.constants import GRAZING
 
 LATTICE = Lattice(3)
 # Lowest cosine of the directions that are trained on.

@@ -15,13 +15,13 @@ from support.image_data import random_images, write_images
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import Lattice, sigma_of_level
 from mbtf_fit import FitConfig, Material, evaluate, fit
-from mbtf_fit.sections import HeldOutSection
+from mbtf_fit.config import build_model
 from mbtf_fit.data.images import Patches, TrainingImages, nearest_shapes, strides
 from mbtf_fit.data.loader import Partition, in_region, load_split, load_training
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.evaluation import evaluate_splits
 from mbtf_fit.models.hierarchical import Hierarchical
-from mbtf_fit.config import build_model
+from mbtf_fit.sections import HeldOutSection
 from mbtf_fit.training.fit import prepare_trainer
 from mbtf_fit.training.trainer import BETAS
 from mbtf_gen.dataset.reader import Dataset

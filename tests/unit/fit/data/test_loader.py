@@ -12,9 +12,9 @@ from support.fit_data import constant, parallax, write_data
 from support.image_data import write_images
 
 from mbtf_core.errors import InputError
-from mbtf_fit.sections import HeldOutSection
 from mbtf_fit.data.loader import Partition, in_region, load_split, load_training
 from mbtf_fit.data.queries import ShardQueries, batch_starts
+from mbtf_fit.sections import HeldOutSection
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.dataset.shard_io import read_shard
 

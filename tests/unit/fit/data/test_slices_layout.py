@@ -10,9 +10,9 @@ import torch
 from support.slice_data import write_slices
 
 from mbtf_core.errors import InputError
-from mbtf_fit.sections import HeldOutSection
 from mbtf_fit.data.loader import load_training
 from mbtf_fit.data.slices import DECODED, SharedSlices, TrainingSlices
+from mbtf_fit.sections import HeldOutSection
 from mbtf_gen.dataset.reader import Dataset
 
 

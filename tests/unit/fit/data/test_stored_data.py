@@ -18,11 +18,11 @@ from mbtf_core.errors import PartialError
 from mbtf_core.store import Store
 from mbtf_core.store_folder import StoreFolder, StorePath
 from mbtf_fit.config import FitConfig
-from mbtf_fit.sections import HeldOutSection
 from mbtf_fit.data import streaming
 from mbtf_fit.data.loader import load_training
 from mbtf_fit.data.queries import batch_starts
 from mbtf_fit.data.streaming import StreamedQueries
+from mbtf_fit.sections import HeldOutSection
 from mbtf_fit.training.checkpoint import CHECKPOINT_NAME
 from mbtf_fit.training.fit import fit
 from mbtf_gen.dataset.reader import Dataset

@@ -14,10 +14,10 @@ import mbtf_fit.evaluation
 from mbtf_core.errors import InputError
 from mbtf_core.units import format_size, parse_size
 from mbtf_fit.config import FitConfig
-from mbtf_fit.sections import HeldOutSection
 from mbtf_fit.data.loader import Partition, load_training
 from mbtf_fit.data.streaming import Selection, StreamedQueries
 from mbtf_fit.evaluation import Predict, SplitErrors
+from mbtf_fit.sections import HeldOutSection
 from mbtf_fit.training.fit import fit
 from mbtf_gen.dataset.reader import Dataset
 

@@ -12,17 +12,17 @@ from torch import Tensor
 
 from mbtf_core.lattice import Lattice
 from mbtf_fit import FitConfig
+from mbtf_fit.config import build_model
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.models import learned_relief
-from mbtf_fit.ops.constants import HEIGHT_SCALE
 from mbtf_fit.models.learned_relief import FILTERED, FILTERED_LEAST, TRACED, LearnedRelief
-from mbtf_fit.config import build_model
 from mbtf_fit.native import library
 from mbtf_fit.native.gradients import NativeGradients
 from mbtf_fit.native.model import NativeModel, supports
 from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.noise import NoiseModel
 from mbtf_fit.objective.parallel import Workers
+from mbtf_fit.ops.constants import HEIGHT_SCALE
 
 LATTICE, FINE = Lattice(4, 0.5), Lattice(7, 0.5)
 

@@ -6,19 +6,18 @@ from typing import Any, get_args
 
 import pytest
 import torch
+from mbtf_fit.models.outputs import start_of, to_value
 
 from mbtf_core.config_file import resolve
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.lattice import Lattice
-from mbtf_fit.config import FitConfig
-from mbtf_fit.sections import EncodingSection, OutputTransform
+from mbtf_fit.config import FitConfig, build_model
+from mbtf_fit.models.hierarchical import Hierarchical
 from mbtf_fit.ops.constants import direction_size, position_size
 from mbtf_fit.pytorch.encodings import encode_direction, encode_position
-from mbtf_fit.models.hierarchical import Hierarchical
 from mbtf_fit.pytorch.material import NeuralMaterial
 from mbtf_fit.pytorch.mlp import Mlp, initialize_layers
-from mbtf_fit.models.outputs import start_of, to_value
-from mbtf_fit.config import build_model
+from mbtf_fit.sections import EncodingSection, OutputTransform
 
 F64 = torch.float64
 

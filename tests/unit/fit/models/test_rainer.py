@@ -14,12 +14,11 @@ from support.slice_data import spots, write_slices
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.lattice import Lattice
 from mbtf_fit import fit
-from mbtf_fit.config import FitConfig
+from mbtf_fit.config import FitConfig, build_model
 from mbtf_fit.data.loader import load_training
 from mbtf_fit.data.slices import SharedSlices, TrainingSlices
 from mbtf_fit.material.material import Material
 from mbtf_fit.models.rainer import Rainer2019, Rainer2020
-from mbtf_fit.config import build_model
 from mbtf_fit.training.checkpoint import read_checkpoint, write_checkpoint
 from mbtf_fit.training.fit import prepare_trainer, shared_slices
 from mbtf_fit.training.fit_folder import identity_of

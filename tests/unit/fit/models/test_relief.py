@@ -20,9 +20,8 @@ from mbtf_core.errors import InputError
 from mbtf_core.lattice import Lattice
 from mbtf_core.shard_schema import MANIFEST_NAME
 from mbtf_fit import FitConfig, fit
-from mbtf_fit.material.inference import predict
-from mbtf_fit.pytorch.encodings import encode_directions, rotate_to_z
 from mbtf_fit.config import build_model
+from mbtf_fit.material.inference import predict
 from mbtf_fit.models.relief import Relief
 from mbtf_fit.native import library
 from mbtf_fit.native.gradients import NativeGradients
@@ -30,6 +29,7 @@ from mbtf_fit.native.model import NativeModel, supports
 from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.noise import NoiseModel
 from mbtf_fit.objective.parallel import Workers
+from mbtf_fit.pytorch.encodings import encode_directions, rotate_to_z
 
 LATTICE = Lattice(3, 0.5)
 VARIANTS: dict[str, dict[str, Any]] = {

@@ -13,12 +13,10 @@ from support.fit_data import make_trainer, parallax, random_queries, train_fully
 from torch import Tensor
 
 from mbtf_core.lattice import Lattice
-from mbtf_fit.config import FitConfig
-from mbtf_fit.sections import NetworkSection
+from mbtf_fit.config import FitConfig, build_model
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.material.inference import evaluate_in_chunks, predict
 from mbtf_fit.models.neumip import Neumip
-from mbtf_fit.config import build_model
 from mbtf_fit.native import library
 from mbtf_fit.native.blur import Blur
 from mbtf_fit.native.gradients import NativeGradients, query_pointers
@@ -28,6 +26,7 @@ from mbtf_fit.native.stepper import adam
 from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.noise import NoiseModel
 from mbtf_fit.objective.parallel import Workers
+from mbtf_fit.sections import NetworkSection
 
 KERNEL = library.kernel()
 needs_kernel = pytest.mark.skipif(KERNEL is None, reason=f"compiled kernel: {library.missing_reason()}")

@@ -13,12 +13,12 @@ from support.plugin_materials import write_material
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import Lattice, level_of_sigma
 from mbtf_fit import FitConfig, fit
-from mbtf_fit.sections import HeldOutSection
+from mbtf_fit.config import build_model
 from mbtf_fit.data.loader import in_region
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.material.inference import evaluate_in_chunks, predict
 from mbtf_fit.models.neumip import KNOTS, Neumip, interpolate_factors
-from mbtf_fit.config import build_model
+from mbtf_fit.sections import HeldOutSection
 from mbtf_fit.training.calibration import fit_calibration
 
 F32 = np.ndarray

@@ -10,14 +10,13 @@ from support.known_surfaces import rough_surface
 from torch import Tensor
 
 from mbtf_core.lattice import Lattice
-from mbtf_fit.config import FitConfig
+from mbtf_fit.config import FitConfig, build_model
 from mbtf_fit.data.images import Patches
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.data.slices import SliceBatch, TrainingSlices
 from mbtf_fit.models.hierarchical import Hierarchical
 from mbtf_fit.models.neumip import KNOTS, Neumip
 from mbtf_fit.models.rainer import Rainer2019
-from mbtf_fit.config import build_model
 from mbtf_fit.models.registry import MODELS
 from mbtf_fit.models.relief import Relief
 from mbtf_fit.objective.losses import Objective

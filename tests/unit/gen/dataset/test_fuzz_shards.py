@@ -15,8 +15,8 @@ from support.fuzzing import altered, damaged, examples, loads_or_refuses
 
 from mbtf_core.errors import InputError
 from mbtf_core.shard_schema import MANIFEST_NAME
-from mbtf_fit.sections import HeldOutSection
 from mbtf_fit.data.loader import load_split, load_training, open_data
+from mbtf_fit.sections import HeldOutSection
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.dataset.shard_io import read_shard, write_exr, write_npz
 from mbtf_gen.dataset.summary import finish
