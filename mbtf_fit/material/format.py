@@ -152,8 +152,8 @@ def check_conformance(
 
 MATERIAL_CONVENTIONS = {
     "operations": "each computes named values from others, and from u, omega_i, omega_o and "
-    "level = clamp(-log2(2 sigma), 0, finest); name[a:b] are the numbers a to b - 1; the last value is the answer "
-    "in 1/sr",
+    "level = clamp(-log2(2 sigma), 0, finest); name[a:b] are the numbers a to b - 1; the last value is the "
+    "answer in 1/sr",
     "textures": "weights of a texture are (rows, columns, channels); row 0 is the side v -> 1; texel centers "
     "at ((i+1/2)/W, 1-(j+1/2)/H); bilinear between them, wrapped in both directions",
     "blending": "features are (1-frac(l)) * level floor(l) + frac(l) * level floor(l)+1",

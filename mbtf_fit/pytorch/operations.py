@@ -8,19 +8,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
+from mbtf_core.lattice import Lattice
 from mbtf_fit import ops
 from mbtf_fit.ops.constants import FIRST_DEPTH, HEIGHT_SCALE, LEAST_FACING
 from mbtf_fit.pytorch.encodings import frequencies, rotate_to_z, stereographic
-from mbtf_fit.surface.known import ggx
+from mbtf_fit.surface.known import KnownSurface, ggx
+from mbtf_fit.textures.feature_textures import FeatureTextures
 from mbtf_fit.textures.lookup import coarse_level, lookup
-
-if TYPE_CHECKING:
-    from mbtf_fit.pytorch.material import NeuralMaterial
 
 # Of each function its code, and the x whose value is 1; 0 for expm1.
 FUNCTIONS: dict[str, tuple[Callable[[Tensor], Tensor], float]] = {
@@ -36,11 +35,26 @@ FUNCTIONS: dict[str, tuple[Callable[[Tensor], Tensor], float]] = {
 }
 
 
+class Tensors(Protocol):
+    """What operations read of a material: texel grids, surface, and tensors by name."""
+
+    lattice: Lattice
+
+    @property
+    def known(self) -> KnownSurface: ...
+
+    def texture(self, name: str) -> FeatureTextures: ...
+
+    def number(self, name: str) -> Tensor: ...
+
+    def get_submodule(self, target: str) -> torch.nn.Module: ...
+
+
 @dataclass(frozen=True)
 class Run:
     """One evaluation: of a material, and (rows, columns) of positions per query where they are given."""
 
-    material: NeuralMaterial
+    material: Tensors
     grid: tuple[int, int] | None = None
 
     @property

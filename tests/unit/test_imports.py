@@ -45,11 +45,15 @@ mbtf_gen.publishing
 mbtf_gen.diagnostics
 mbtf_gen.cli
 mbtf_gen
-mbtf_fit.config mbtf_fit.presets mbtf_fit.formatting
+mbtf_fit.sections mbtf_fit.formatting
 mbtf_fit.data
-mbtf_fit.native.library mbtf_fit.ops.constants mbtf_fit.textures.lookup
+mbtf_fit.ops
+mbtf_fit.native.library
+mbtf_fit.textures
 mbtf_fit.surface
+mbtf_fit.pytorch
 mbtf_fit.models
+mbtf_fit.config mbtf_fit.presets
 mbtf_fit.objective
 mbtf_fit.native
 mbtf_fit.material

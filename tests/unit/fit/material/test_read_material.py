@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from support.paths import ROOT
 from support.plugin_materials import write_material
+from support.read_material import read_material
 
 from mbtf_fit.models.registry import MODELS
 
@@ -29,15 +28,6 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
 }
 
 
-def reader() -> Any:
-    spec = importlib.util.spec_from_file_location("read_material", ROOT / "examples" / "read_material.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.mark.parametrize("glossy", [True, False])
 @pytest.mark.parametrize("case", CASES)
 def test_the_reader_gives_the_conformance_values(case: str, glossy: bool, tmp_path: Path) -> None:
@@ -50,6 +40,6 @@ def test_the_reader_gives_the_conformance_values(case: str, glossy: bool, tmp_pa
     material = write_material(tmp_path, model=model, finest=3, **options)
     expected = material.conformance["rgb"]
     queries = [material.conformance[name] for name in ("u", "sigma", "omega_i", "omega_o")]
-    found = reader().Material(tmp_path).evaluate(*queries)
+    found = read_material.Material(tmp_path).evaluate(*queries)
     assert expected.std() > 0
     np.testing.assert_array_less(abs(found - expected), 1e-4 * np.maximum(1.0, expected))
