@@ -31,7 +31,7 @@ from mbtf_gen.render.types import Color3f, Float, Point2f, UInt32, Vector3f
 
 class CalibrationFactors:
     """Calibration tables (2, levels, knots, 3) of a material, by light and by view; the formula is that of
-    :mod:`mbtf_fit.models.calibration_factors`."""
+    :class:`mbtf_fit.ops.Calibrate`."""
 
     def __init__(self, tables: F32) -> None:
         _, self._levels, self._knots, _ = tables.shape
