@@ -39,15 +39,14 @@ from torch import Tensor, nn
 
 from mbtf_core.data.lattice import Lattice, sigma_of_level
 from mbtf_core.directions import from_projected_disk
-from mbtf_fit.config import FitConfig, ModelName
+from mbtf_fit.config import FitConfig, ModelName, build_model
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.material.inference import predict
-from mbtf_fit.models.blur import NEGLIGIBLE, annealed_sigma
-from mbtf_fit.models.neumip import Neumip
-from mbtf_fit.models.registry import build_model
 from mbtf_fit.native import library
 from mbtf_fit.objective.noise import NoiseModel
 from mbtf_fit.objective.parallel import MAX_KERNEL_THREADS, MAX_THREADS, Workers
+from mbtf_fit.pytorch.material import NeuralMaterial
+from mbtf_fit.textures.blur import NEGLIGIBLE, annealed_sigma
 from mbtf_fit.training.device import keep_freed_memory
 from mbtf_fit.training.trainer import BETAS, Trainer
 
@@ -130,7 +129,7 @@ class Plain(nn.Module):
         self.seconds: dict[str, float] = defaultdict(float)
         self._mark = 0.0
 
-    def take(self, model: Neumip) -> None:
+    def take(self, model: NeuralMaterial) -> None:
         """Take over the weights of the fitter's model."""
         weights = model.weights()
         with torch.no_grad():
@@ -229,7 +228,9 @@ class Plainly:
 class Ours:
     """The fitter's trainer, taken to any moment: one call, one step."""
 
-    def __init__(self, model: Neumip, config: FitConfig, queries: TrainingQueries, kernel: bool) -> None:
+    def __init__(
+        self, model: NeuralMaterial, config: FitConfig, queries: TrainingQueries, kernel: bool
+    ) -> None:
         use_kernel(kernel)
         unit = float(queries.value.mean())
         self.trainer = Trainer(config, model, queries, NoiseModel.silent(unit, model.lattice))
@@ -259,9 +260,8 @@ def measure_speed(arguments: argparse.Namespace) -> int:
     batches = [queries.slice(k * n, (k + 1) * n) for k in range(len(MOMENTS))]
     unit = float(queries.value.mean())
 
-    def fresh() -> Neumip:
+    def fresh() -> NeuralMaterial:
         model = build_model("neumip", lattice)
-        assert isinstance(model, Neumip)
         model.initialize(torch.Generator().manual_seed(0), unit)
         return model
 

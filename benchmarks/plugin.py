@@ -75,15 +75,13 @@ def random_material(folder: Path, levels: int, model: ModelName, network: dict[s
     """Export an untrained model of the paper's size."""
     import torch
 
-    from mbtf_fit.config import FitConfig
+    from mbtf_fit.config import FitConfig, build_model
     from mbtf_fit.material.material import export
-    from mbtf_fit.models.registry import build_model
-    from mbtf_fit.models.relief import Relief
     from mbtf_fit.surface.known import KnownSurface
 
     lattice = Lattice(levels)
     built = build_model(model, lattice, **network)
-    if isinstance(built, Relief):
+    if built.tracing is not None:
         built.know(KnownSurface.of(random_surface(lattice), lattice, 1.0))
     built.initialize(torch.Generator().manual_seed(0), 0.2)
     training = {"steps": 0, "batch": 1, "seconds": 0.0, "device": "cpu", "threads": 1, "errors": {}}

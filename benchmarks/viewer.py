@@ -33,11 +33,9 @@ from numpy.typing import NDArray
 from mbtf_core.data.geometry import Geometry
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.images.resample import resample
-from mbtf_fit.config import FitConfig
+from mbtf_fit.config import FitConfig, build_model
 from mbtf_fit.material.material import Material, export
-from mbtf_fit.models.constants import PLACES
-from mbtf_fit.models.registry import build_model
-from mbtf_fit.models.relief import Relief
+from mbtf_fit.ops.constants import PLACES
 from mbtf_fit.presets import best_options
 from mbtf_fit.surface.known import KnownSurface
 from mbtf_fit.viewer.content import material_content
@@ -67,7 +65,7 @@ def random_material(folder: Path, model: str, paper: bool) -> Path:
     random, lattice = np.random.default_rng(0), Lattice(8, 1.0)
     network: dict[str, Any] = {}
     if not paper:
-        for key, value in best_options(30.0, model).items():  # type: ignore[arg-type]
+        for key, value in best_options(30.0, model).items():
             section = network
             *path, last = key.split(".")[1:]
             if key.startswith("network."):
@@ -77,7 +75,7 @@ def random_material(folder: Path, model: str, paper: bool) -> Path:
     config = FitConfig.model_validate({"model": model, "network": network})
     built = build_model(config.model, lattice, **config.network.model_dump())
     built.initialize(torch.Generator().manual_seed(0), 0.2)
-    if isinstance(built, Relief):
+    if built.tracing is not None:
         heights = np.float32(-0.12) * smooth((256, 256, 1), random)[..., 0]
         maps = smooth((512, 512, 6), random)
         moments = np.stack([maps[..., 0] ** 2, maps[..., 0] * maps[..., 1], maps[..., 1] ** 2], -1)

@@ -29,7 +29,7 @@ from mbtf_fit.material.storage import read_tensors, write_tensors
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from mbtf_fit.models.interface import NeuralMaterial
+    from mbtf_fit.pytorch.material import NeuralMaterial
 
 FORMAT_NAME = "mbtf-decoder"
 SCHEMA_VERSION = 1

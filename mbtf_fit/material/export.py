@@ -15,12 +15,12 @@ from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import write_text, write_through
 from mbtf_fit.material.material import Material, conformance_values, describe_model
 from mbtf_fit.material.transmittance import FORMULA
-from mbtf_fit.models.constants import DIELECTRIC, LIGHT_WIDTH
-from mbtf_fit.models.registry import build_model
+from mbtf_fit.ops import Inception, Network
+from mbtf_fit.ops.constants import DIELECTRIC, LIGHT_WIDTH
 
 TEXTURES_NAME, LAYERS_NAME = "textures.exr", "layers.json"
 FORMAT_NAME = "mbtf-layers"
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 # Name of the parts of the transmittance, before the level.
 TRANSMITTANCE_PART = "transmittance."
 
@@ -71,8 +71,7 @@ def to_half(material: Material) -> tuple[Material, HalfError]:
     ------
     InputError : a number is beyond half precision
     """
-    model = build_model(material.config.model, material.lattice, **material.config.network.model_dump())
-    model.requires_grad_(False)
+    model = material.model.empty_copy()
     model.load_weights({name: _round_to_half(name, t) for name, t in material.model.weights().items()})
     transmittance = material.transmittance
     if transmittance is not None:
@@ -150,7 +149,10 @@ def _layers(material: Material, half: bool) -> dict[str, list[dict[str, Any]]]:
     """Network → its layers in order, each with name, shape, activation, weight and bias."""
     weights = material.model.weights()
     out: dict[str, list[dict[str, Any]]] = {}
-    for network in ("offset_network", "decoder"):
+    for op in material.model.operations:
+        if not isinstance(op, Network | Inception):
+            continue
+        network = op.weights
         names = [n for n in weights if n.startswith(f"{network}.") and n.endswith(".weight")]
         for name in names:
             weight, layer = weights[name].cpu(), name.removesuffix(".weight")
@@ -162,7 +164,7 @@ def _layers(material: Material, half: bool) -> dict[str, list[dict[str, Any]]]:
                     "inputs": weight.shape[1],
                     "outputs": weight.shape[0],
                     **({} if dense else {"size": weight.shape[2]}),
-                    "activation": "none" if name == names[-1] else material.config.network.activation,
+                    "activation": "none" if name == names[-1] else op.activation,
                     "weight": _numbers(weight, half),
                     "bias": _numbers(weights[f"{layer}.bias"].cpu(), half),
                 }
@@ -178,7 +180,7 @@ def _surface_numbers(material: Material, half: bool) -> dict[str, Any]:
 
 
 def write_layers(material: Material, path: Path, *, half: bool = False) -> None:
-    """Write everything but the textures: layers, formulas and conventions as text, shapes, and the
+    """Write everything but the textures: layers, operations, conventions as text, shapes, and the
     conformance queries with their expected values, that of the transmittance included.
 
     Parameters

@@ -21,7 +21,7 @@ from mbtf_core.files.digest import file_sha256
 from mbtf_core.suggest import suggest_path
 
 FORMAT_NAME = "mbtf-material"
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 DESCRIPTION_NAME = "material.json"
 WEIGHTS_NAME = "weights.safetensors"
 # Smallest cosine of the directions in data that do not state one.
@@ -31,7 +31,7 @@ CONFORMANCE_COUNT = 256
 CONFORMANCE = {"u": (2,), "sigma": (), "omega_i": (3,), "omega_o": (3,), "rgb": (3,)}
 QUERY = tuple(CONFORMANCE)[:-1]
 # Hint for a damaged material.
-_AGAIN = "copy the folder again, or fit again"
+AGAIN = "copy the folder again, or fit again"
 
 
 class _File(BaseModel):
@@ -73,6 +73,7 @@ class _Description(BaseModel):
 
     model: str
     config: dict[str, Any]
+    operations: list[dict[str, Any]]
     weights: _Weights
     levels: _Levels
     tile: _Tile
@@ -98,11 +99,11 @@ def read_description(folder: Path) -> tuple[dict[str, Any], Path]:
             where=folder,
             hint="make a material with: mbtf-fit SHARDS -o FOLDER",
         )
-    description = read_json(path, _AGAIN)
+    description = read_json(path, AGAIN)
     if description.get("format") != FORMAT_NAME:
-        raise InputError(f"does not describe a material ({FORMAT_NAME})", where=path, hint=_AGAIN)
+        raise InputError(f"does not describe a material ({FORMAT_NAME})", where=path, hint=AGAIN)
     check_schema(description, SCHEMA_VERSION, path, "fit it again with this version of mbtf-fit")
-    check_document(_Description, description, path, _AGAIN)
+    check_document(_Description, description, path, AGAIN)
     return description, check_digest(folder / WEIGHTS_NAME, description["weights"])
 
 
@@ -114,12 +115,12 @@ def check_digest(path: Path, stated: Mapping[str, Any], by: str = DESCRIPTION_NA
     InputError : it is missing or corrupt
     """
     if not path.is_file():
-        raise InputError(f"no such file, but {by} names it", where=path, hint=_AGAIN)
+        raise InputError(f"no such file, but {by} names it", where=path, hint=AGAIN)
     if file_sha256(path) != stated["sha256"]:
         raise InputError(
             f"is damaged, or of another material (its SHA-256 is not that in {by})",
             where=path,
-            hint=_AGAIN,
+            hint=AGAIN,
         )
     return path
 
@@ -150,12 +151,13 @@ def check_conformance(
 
 
 MATERIAL_CONVENTIONS = {
+    "operations": "each computes named values from others, and from u, omega_i, omega_o and "
+    "level = clamp(-log2(2 sigma), 0, finest); name[a:b] are the numbers a to b - 1; the last value is the "
+    "answer in 1/sr",
     "textures": "weights of a texture are (rows, columns, channels); row 0 is the side v -> 1; texel centers "
     "at ((i+1/2)/W, 1-(j+1/2)/H); bilinear between them, wrapped in both directions",
-    "blending": "level l = clamp(-log2(2 sigma), 0, k); features are (1-frac(l)) * level floor(l) + "
-    "frac(l) * level floor(l)+1",
-    "networks": "x -> weight x + bias, after every layer but the last the activation that config.network "
-    "names: relu, leaky-relu (slope 0.01 below 0) or sine; weight is (outputs, inputs), of a convolution "
-    "(outputs, inputs, rows, columns)",
+    "blending": "features are (1-frac(l)) * level floor(l) + frac(l) * level floor(l)+1",
+    "networks": "x -> weight x + bias; weight is (outputs, inputs), of a convolution (outputs, inputs, rows, "
+    "columns)",
     "clamp": "values below 0 are set to 0",
 }

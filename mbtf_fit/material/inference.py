@@ -11,13 +11,10 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from mbtf_fit.models.interface import NeuralMaterial
-from mbtf_fit.models.neumip import Neumip
-from mbtf_fit.models.relief import Relief
-from mbtf_fit.native import Kernel, kernel
+from mbtf_fit.native import kernel
 from mbtf_fit.native.library import QueryPointers
-from mbtf_fit.native.model import NativeModel, supports, supports_patches
-from mbtf_fit.native.patches import evaluate as evaluate_hierarchical
+from mbtf_fit.native.model import NativeModel, supports
+from mbtf_fit.pytorch.material import NeuralMaterial
 
 # Queries per chunk: bounds memory and keeps activations in the cache.
 _CHUNK = 1 << 15
@@ -53,13 +50,11 @@ def predict(
     *,
     hints: Tensor | None = None,
 ) -> NDArray[np.float32]:
-    """Values (n, 3) of a model in 1/sr, clamped at 0. `hints` (n, 7) of `relief` are computed where they are
-    not given."""
+    """Values (n, 3) of a material in 1/sr, clamped at 0. `hints` (n, 7) of its surface are computed where
+    they are not given."""
     found = kernel()
     if found is not None and supports(model):
-        return _predict_natively(found, model, hints, u, sigma, omega_i, omega_o)
-    if found is not None and supports_patches(model):
-        return _predict_patches(found, model, u, sigma, omega_i, omega_o)
+        return _predict_natively(NativeModel(found, model), hints, u, sigma, omega_i, omega_o)
     device = next(model.parameters()).device
     arrays = (u, sigma, omega_i, omega_o, *([] if hints is None else [hints.cpu()]))
     return evaluate_in_chunks(
@@ -67,37 +62,16 @@ def predict(
     )
 
 
-def _predict_patches(found: Kernel, model: NeuralMaterial, *arrays: ArrayLike) -> NDArray[np.float32]:
-    native = NativeModel(found, model)
-    inputs = [np.asarray(a, np.float32) for a in arrays]
-    n = len(inputs[1])
-
-    def evaluate(start: int, stop: int) -> NDArray[np.float32]:
-        part = (a[start:stop] for a in inputs)
-        return evaluate_in_chunks(partial(evaluate_hierarchical, native), device, 3, *part, chunk=chunk)
-
-    # Positions take less memory than PyTorch's activations.
-    device, chunk = torch.device("cpu"), max(1, 8 * _CHUNK // model.positions)
-    count = max(1, min(torch.get_num_threads(), n // chunk))
-    edges = [n * k // count for k in range(count + 1)]
-    with ThreadPoolExecutor(count) as pool:
-        return np.concatenate(list(pool.map(evaluate, edges[:-1], edges[1:])))
-
-
-def _predict_natively(
-    found: Kernel, model: NeuralMaterial, hints: Tensor | None, *arrays: ArrayLike
-) -> NDArray[np.float32]:
-    assert isinstance(model, Neumip)
+def _predict_natively(native: NativeModel, hints: Tensor | None, *arrays: ArrayLike) -> NDArray[np.float32]:
     inputs = [np.ascontiguousarray(a, np.float32) for a in arrays]
     n = len(inputs[1])
     shapes = [(n, 2), (n,), (n, 3), (n, 3)]
     if [a.shape for a in inputs] != shapes:
         raise ValueError(f"queries of the shapes {[a.shape for a in inputs]}, not {shapes}")
-    native = NativeModel(found, model)
     out = np.empty((n, 3), np.float32)
     read = list(inputs)
-    if isinstance(model, Relief):
-        given = model.hints(*map(torch.from_numpy, inputs)) if hints is None else hints
+    if native.pattern.displace is not None:
+        given = native.material.hints(*map(torch.from_numpy, inputs)) if hints is None else hints
         read.append(np.ascontiguousarray(given.numpy()))
 
     def evaluate(start: int, stop: int) -> None:
@@ -109,6 +83,15 @@ def _predict_natively(
     edges = [n * k // count for k in range(count + 1)]
     with ThreadPoolExecutor(count) as pool:
         list(pool.map(evaluate, edges[:-1], edges[1:]))
-    if model.calibration is not None:
-        out *= evaluate_in_chunks(model.calibration_factors, torch.device("cpu"), 3, *inputs[1:])
+    if native.pattern.factors:
+        out *= evaluate_in_chunks(partial(_factors, native), torch.device("cpu"), 3, *inputs[1:])
     return out
+
+
+def _factors(native: NativeModel, sigma: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
+    """Product (n, 3) of the calibration factors."""
+    given = {"level": native.material.level(sigma), "omega_i": omega_i, "omega_o": omega_o}
+    first, *rest = native.material.run(native.pattern.factors, given)
+    for factors in rest:
+        first = first * factors
+    return first

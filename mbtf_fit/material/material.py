@@ -20,6 +20,7 @@ from mbtf_core.files.atomic import write_json
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.material.format import (
+    AGAIN,
     CONFORMANCE_COUNT,
     DESCRIPTION_NAME,
     FORMAT_NAME,
@@ -39,8 +40,8 @@ from mbtf_fit.material.transmittance import (
     read_transmittance,
     write_transmittance,
 )
-from mbtf_fit.models.interface import NeuralMaterial
-from mbtf_fit.models.registry import build_model
+from mbtf_fit.ops import read_operations
+from mbtf_fit.pytorch.material import NeuralMaterial
 
 
 def conformance_queries(lattice: Lattice) -> dict[str, NDArray[np.float32]]:
@@ -112,7 +113,10 @@ class Material:
         number = 2 if description["weights"].get("dtype") == "float16" else 4
         if number * lattice.texels() * config.network.channels > weights.stat().st_size:
             raise InputError("is too small for the levels that material.json describes", where=weights)
-        model = build_model(config.model, lattice, **config.network.model_dump())
+        try:
+            model = NeuralMaterial(lattice, read_operations(description["operations"]), config.model)
+        except ValueError as error:
+            raise InputError(str(error), where=weights.with_name(DESCRIPTION_NAME), hint=AGAIN) from None
         tensors, _ = read_tensors(weights)
         conformance = check_conformance(tensors, description, weights)
         model.load_weights({n: t for n, t in tensors.items() if not n.startswith("conformance.")})
@@ -196,11 +200,11 @@ def conformance_values(
 
 
 def describe_model(model: NeuralMaterial) -> dict[str, Any]:
-    """Formulas, conventions and shapes of a model, for readers of its tensors."""
+    """Operations, conventions and shapes of a material, for readers of its tensors."""
     lattice = model.lattice
     return {
         "model": model.name,
-        "formula": model.formula(),
+        "operations": [op.as_json() for op in model.stored_operations()],
         "conventions": CONVENTIONS | MATERIAL_CONVENTIONS,
         "tile": {"aspect": lattice.aspect},
         "levels": {

@@ -25,13 +25,13 @@ from mbtf_fit.mitsuba_plugin.network import (
     to_value,
 )
 from mbtf_fit.mitsuba_plugin.textures import Textures
-from mbtf_fit.models.constants import GRAZING, IRRADIANCE_SCALE, LEAST_COSINE, OFFSET_SCALE, STATISTICS
+from mbtf_fit.ops.constants import GRAZING, IRRADIANCE_SCALE, LEAST_COSINE, OFFSET_SCALE, STATISTICS
 from mbtf_gen.engine.types import Color3f, Float, Point2f, UInt32, Vector3f
 
 
 class CalibrationFactors:
     """Calibration tables (2, levels, knots, 3) of a material, by light and by view; the formula is that of
-    :mod:`mbtf_fit.models.calibration_factors`."""
+    :class:`mbtf_fit.ops.Calibrate`."""
 
     def __init__(self, tables: F32) -> None:
         _, self._levels, self._knots, _ = tables.shape

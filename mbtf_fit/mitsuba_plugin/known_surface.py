@@ -11,7 +11,7 @@ import numpy as np
 from mbtf_core.data.lattice import Lattice
 from mbtf_fit.mitsuba_plugin.material_arrays import F32, StoredSurface
 from mbtf_fit.mitsuba_plugin.textures import GROUP, Textures
-from mbtf_fit.models.constants import (
+from mbtf_fit.ops.constants import (
     ALPHA2,
     GLOSSY_CHANNELS,
     LEAST_LIGHT,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mbtf_core.config.settings import build
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
-from mbtf_fit.config import SLICE_MODELS, TRACING_MODELS, FitConfig, NetworkSection
+from mbtf_fit.config import FitConfig
 from mbtf_fit.material.format import (
     DEFAULT_MIN_COS,
     DESCRIPTION_NAME,
@@ -22,7 +22,8 @@ from mbtf_fit.material.format import (
 )
 from mbtf_fit.material.storage import read_tensors
 from mbtf_fit.material.transmittance import read_transmittance
-from mbtf_fit.models.constants import (
+from mbtf_fit.ops import read_operations
+from mbtf_fit.ops.constants import (
     AZIMUTHS,
     DIELECTRIC,
     DIFFUSE_CHANNELS,
@@ -36,6 +37,7 @@ from mbtf_fit.models.constants import (
     hint_size,
     position_size,
 )
+from mbtf_fit.sections import NetworkSection
 
 F32 = NDArray[np.float32]
 # (weight (outputs, inputs), bias (outputs,)) of each layer.
@@ -148,10 +150,12 @@ def read_material(folder: str | Path) -> StoredMaterial:
     features = channels * (2 if network.blending == "concatenate" else 1)
     inputs = features + position_size(network.encoding) + directions_size(network.encoding)
     outputs = network.output_channels
-    if config.model in SLICE_MODELS:
+    kinds = {op.kind() for op in read_operations(description["operations"])}
+    sliced = "standardize" in kinds
+    if sliced:
         inputs -= STATISTICS
     surface = None
-    if config.model in TRACING_MODELS:
+    if "trace" in kinds:
         inputs, outputs = inputs + hint_size(network), outputs + network.relief.gate
         surface = _surface(reader, lattice)
     return StoredMaterial(
@@ -159,7 +163,7 @@ def read_material(folder: str | Path) -> StoredMaterial:
         lattice,
         description["data"].get("min_cos", DEFAULT_MIN_COS),
         network,
-        config.model in SLICE_MODELS,
+        sliced,
         pyramid,
         reader.layers("decoder", inputs, outputs),
         offset_texture,

@@ -18,9 +18,9 @@ import drjit as dr
 import mitsuba as mi
 from drjit import nn
 
-from mbtf_fit.config import EncodingSection, NetworkSection
 from mbtf_fit.mitsuba_plugin.material_arrays import Layers
-from mbtf_fit.models.constants import GATE, LEAK, RGB_OF_YUV
+from mbtf_fit.ops.constants import GATE, LEAK, RGB_OF_YUV
+from mbtf_fit.sections import EncodingSection, NetworkSection
 from mbtf_gen.engine.types import Color3f, Float, Point2f, Vector3f
 
 Arithmetic = Literal["unrolled", "cooperative", "half"]

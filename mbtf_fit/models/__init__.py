@@ -1,1 +1,2 @@
-"""Neural material models: textures, networks, encodings, and the three architectures."""
+"""Models: one file each, found by :mod:`mbtf_fit.models.registry`. No file imports PyTorch before it
+trains."""

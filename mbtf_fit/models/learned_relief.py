@@ -20,18 +20,16 @@ horizons, which take longer to filter, follow less often.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, ClassVar
 
-import torch
-from torch import Tensor, nn
-
-from mbtf_core.data.geometry import Geometry
-from mbtf_core.data.lattice import Lattice
-from mbtf_fit.config import NetworkSection
-from mbtf_fit.models.constants import FIRST_DEPTH, HEIGHT_SCALE, LEAST_FACING
-from mbtf_fit.models.lookup import lookup
+from mbtf_fit.models.model import PYRAMID, Preparation
 from mbtf_fit.models.relief import Relief
-from mbtf_fit.models.textures import FeatureTextures
-from mbtf_fit.surface.known import KnownSurface
+from mbtf_fit.ops.constants import FIRST_DEPTH, HEIGHT_SCALE
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from mbtf_fit.pytorch.material import NeuralMaterial
 
 # Steps of training after which rays are traced to the current heights.
 TRACED = 10
@@ -42,90 +40,100 @@ FILTERED, FILTERED_TEXELS, FILTERED_LEAST = 40, 1 << 14, 8
 
 
 class LearnedRelief(Relief):
-    """A model that learns the heights of the surface.
+    """A model that learns the heights of the surface; a material stores the surface alone.
 
     Attributes
     ----------
-    heights : FeatureTextures
-        The learned numbers x, one channel at the finest level. A material stores the surface alone.
-    light_width : float
-        RMS angle per axis of the data's light kernel, in degrees.
+    light_width : RMS angle per axis of the data's light kernel, in degrees
     """
 
     name = "neumip+"
+    description = "learns the heights that it traces"
+    defaults: ClassVar[Mapping[str, Any]] = {
+        "network": {
+            "offset": "none",
+            "channels": 12,
+            "encoding": {"direction_xyz": True, "half_vector": True},
+            # Without the reflectance of the surface there is no single scattering to scale.
+            "relief": {"gate": False},
+        },
+        "training": {"texture_weight_decay": 1.0, "blur": {"min_sigma": 0.8, "offset_sigma": 2.0}},
+    }
+    takes = (*PYRAMID, *(f"network.relief.{name}" for name in ("hints", "frame", "gate")))
+    learned = "heights"
 
-    def __init__(self, lattice: Lattice, network: NetworkSection) -> None:
-        super().__init__(lattice, network)
-        self.heights = FeatureTextures(lattice, [lattice.finest], 1, moves_lookups=True)
+    def __init__(self, material: NeuralMaterial) -> None:
+        super().__init__(material)
         self.light_width = 0.0
-        # Part of the budget in which normals and horizons were filtered.
+        # Part of the budget in which normals and horizons were filtered, and the heights that they are of.
         self._part = 0
-        self._filtered = torch.zeros(lattice.shape())
+        self._filtered: Tensor | None = None
 
-    def initialize(self, generator: torch.Generator, unit: float) -> None:
-        super().initialize(generator, unit)
-        nn.init.zeros_(self.heights.texels)
+    def prepare(self, given: Preparation) -> Any:
+        self.light_width = given.light_width
         self.follow(0, 0.0)
+        return given.queries
+
+    def precompute(self, queries: Any, memory: float) -> Any:
+        return queries
+
+    def before_step(self, step: int, fraction: float, sigmas: Mapping[str, float], batch: Any) -> Any:
+        self.follow(step, sigmas["heights"], fraction)
+        return super().before_step(step, fraction, sigmas, batch)
 
     def follow(self, step: int, sigma: float, fraction: float = 0.0) -> None:
         """Let rays and hints see the learned heights, blurred by `sigma` texels, where it is their turn
         before a step of training, after a fraction of its budget."""
-        interval = FILTERED * max(1, self.heights.packing.texels // FILTERED_TEXELS)
+        import torch
+
+        from mbtf_fit.pytorch.operations import learned_heights
+
+        heights = self.material.texture("heights")
+        interval = FILTERED * max(1, heights.packing.texels // FILTERED_TEXELS)
         part = int(FILTERED_LEAST * fraction)
         filtered = step % interval == 0 or part != self._part
         self._part = part
         with torch.no_grad():
             # Above the reference plane a texel would have a gradient without an effect.
-            self.heights.texels.clamp_(max=FIRST_DEPTH / HEIGHT_SCALE)
+            heights.texels.clamp_(max=FIRST_DEPTH / HEIGHT_SCALE)
             if not (filtered or step % TRACED == 0):
                 return
-            x = self.heights.blurred(sigma).view(self.lattice.shape())
-            self._see((HEIGHT_SCALE * x - FIRST_DEPTH).clamp_max(0.0).cpu(), filtered=filtered)
+            x = heights.blurred(sigma).view(self.material.lattice.shape())
+            self._see(learned_heights(x).cpu(), filtered=filtered)
 
     def _see(self, heights: Tensor, *, filtered: bool) -> None:
+        from mbtf_core.data.geometry import Geometry
+        from mbtf_fit.surface.known import KnownSurface
+
+        material = self.material
         if not filtered:
-            self.know(self.known.with_heights(heights))
+            material.know(material.known.with_heights(heights))
             return
         self._filtered = heights
-        geometry = Geometry.of_heights(heights.numpy(), self.lattice.aspect)
-        self.know(KnownSurface.of(geometry, self.lattice, self.light_width))
+        geometry = Geometry.of_heights(heights.numpy(), material.lattice.aspect)
+        material.know(KnownSurface.of(geometry, material.lattice, self.light_width))
 
-    def surface_state(self) -> dict[str, Tensor]:
+    def init_from(self, source: NeuralMaterial) -> None:
+        """Start from the heights of another material of this model."""
+        import torch
+
+        if source.name != self.name:
+            return
+        found, texels = source.known.heights, self.material.texture("heights").texels
+        with torch.no_grad():
+            texels.copy_(((found + FIRST_DEPTH) / HEIGHT_SCALE).reshape(texels.shape))
+        self._see(found, filtered=True)
+
+    def state(self) -> dict[str, Tensor]:
         """Heights (H, W) that rays see, those that normals and horizons were filtered from, and in which part
         of the budget."""
-        part = torch.tensor(self._part)
-        return {"heights": self.known.heights, "filtered": self._filtered, "part": part}
+        import torch
 
-    def restore_surface(self, state: Mapping[str, Tensor]) -> None:
-        """Inverse of :meth:`surface_state`."""
+        assert self._filtered is not None
+        part = torch.tensor(self._part)
+        return {"heights": self.material.known.heights, "filtered": self._filtered, "part": part}
+
+    def restore(self, state: Mapping[str, Tensor]) -> None:
         self._see(state["filtered"], filtered=True)
         self._see(state["heights"], filtered=False)
         self._part = int(state["part"])
-
-    def start_from(self, heights: Tensor) -> None:
-        """Start from heights (H, W) of another material."""
-        with torch.no_grad():
-            self.heights.texels.copy_(
-                ((heights + FIRST_DEPTH) / HEIGHT_SCALE).reshape(self.heights.texels.shape)
-            )
-        self._see(heights, filtered=True)
-
-    def displaced(self, u: Tensor, level: Tensor, height: Tensor, omega_o: Tensor) -> Tensor:
-        moved = super().displaced(u, level, height, omega_o)
-        if not torch.is_grad_enabled():
-            return moved
-        aspect = u.new_tensor([1.0, self.lattice.aspect])
-        slope = omega_o[:, :2] / omega_o[:, 2:]
-        hit = (u + height * slope / aspect).detach().requires_grad_()
-        still = lookup(self.heights.table.detach(), self.heights.packing, hit)
-        (gradient,) = torch.autograd.grad(still.sum(), hit)
-        x = self.heights(hit.detach())
-        facing = 1.0 - HEIGHT_SCALE * (gradient / aspect * slope).sum(1, keepdim=True)
-        # Of value 0.
-        rise = HEIGHT_SCALE * (x - x.detach()) / facing.clamp_min(LEAST_FACING)
-        along = omega_o[:, :2] / omega_o[:, 2:].clamp_min(LEAST_FACING)
-        weight = self.depth_weight(level)[:, None].detach()
-        return moved + weight * rise * along / aspect
-
-    def stored_textures(self) -> dict[str, FeatureTextures]:
-        return {name: t for name, t in super().stored_textures().items() if t is not self.heights}

@@ -21,106 +21,128 @@ Deviations from the paper:
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 from mbtf_core.data.lattice import Lattice
-from mbtf_core.errors import InputError
-from mbtf_fit.config import NetworkSection
-from mbtf_fit.models.interface import NeuralMaterial
-
-# Knots of the cosine in a fitted table: 0, 1/16, ..., 1.
-KNOTS = 17
-
-
-def interpolate_factors(table: Tensor, level: Tensor, cosine: Tensor) -> Tensor:
-    """Calibration factors (n, 3) of a table (levels, knots, 3) at fractional levels (n,) and cosines (n,):
-    bilinear between levels and knots, which are equidistant in [0, 1]."""
-    last = max(1, table.shape[0] - 1)
-    # An image whose rows are levels, in the coordinates of grid_sample: corners at -1 and 1.
-    position = torch.stack([2.0 * cosine - 1.0, (2.0 / last) * level - 1.0], -1)
-    found = torch.nn.functional.grid_sample(
-        table.permute(2, 0, 1)[None], position[None, :, None], padding_mode="border", align_corners=True
-    )
-    return found[0, :, :, 0].T
+from mbtf_fit.models.model import PYRAMID, SHARED, Model
+from mbtf_fit.ops import (
+    Frequencies,
+    Gate,
+    HalfVector,
+    Lookup,
+    Matrix,
+    Network,
+    Offset,
+    Operation,
+    Position,
+    Rotate,
+    Transform,
+)
+from mbtf_fit.ops.constants import GATE
+from mbtf_fit.sections import EncodingSection, NetworkSection
 
 
-class Neumip(NeuralMaterial):
-    """NeuMIP with the neural offset.
-
-    ``u' = u + r / max(ω_o,z, 0.6) · ω_o,xy`` with ``r = F_off(T_off(u), ω_o,xy)``; T_off is one texture of
-    the finest level.
-
-    Attributes
-    ----------
-    calibration : (2, levels, knots, 3) factors by elevation of light and of view
-        (:mod:`mbtf_fit.training.calibration`); None without calibration
-    """
+class Neumip(Model):
+    """NeuMIP with the neural offset."""
 
     name = "neumip"
+    description = "NeuMIP with the neural offset (Kuznetsov et al. 2021)"
+    takes: ClassVar[Sequence[str]] = (*PYRAMID, *SHARED, "network.offset")
 
-    def __init__(self, lattice: Lattice, network: NetworkSection) -> None:
-        super().__init__(lattice, network)
-        self.calibration: Tensor | None
-        self.register_buffer("calibration", None)
-
-    def stage1(self, u: Tensor, sigma: Tensor, omega_o: Tensor) -> Tensor:
-        features = self.features(u, sigma, omega_o)
-        if self.calibration is None:
-            return features
-        level = self.level(sigma)
-        by_view = interpolate_factors(self.calibration[1], level, omega_o[:, 2])
-        return torch.cat([features, by_view, level[:, None]], 1)
-
-    def stage2(self, features: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
-        if self.calibration is None:
-            return self.decode(features, omega_i, omega_o)
-        features, by_view, level = features.tensor_split([-4, -1], 1)
-        value = self.decode(features, omega_i, omega_o)
-        return value * by_view * interpolate_factors(self.calibration[0], level[:, 0], omega_i[:, 2])
-
-    def decode(self, features: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
-        """Value (n, 3) in 1/sr of :meth:`features`, without calibration."""
-        return self.to_value(self.decoder(torch.cat([features, self.directions(omega_i, omega_o)], 1)))
-
-    def calibration_factors(self, sigma: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
-        """Product (n, 3) of both calibration factors; 1 without calibration."""
-        if self.calibration is None:
-            return torch.ones_like(omega_i)
-        level = self.level(sigma)
-        by_light, by_view = (
-            interpolate_factors(table, level, omega[:, 2])
-            for table, omega in zip(self.calibration, (omega_i, omega_o), strict=True)
-        )
-        return by_light * by_view
-
-    def load_weights(self, tensors: dict[str, Tensor]) -> None:
-        name = "calibration"
-        calibration = tensors.get(name)
-        if calibration is not None:
-            # Of any number of knots.
-            shape = (2, self.lattice.finest + 1, calibration.shape[2] if calibration.ndim == 4 else 0, 3)
-            if calibration.shape != shape or shape[2] < 2:
-                raise InputError(f"the weights do not fit the model {self.name}: '{name}'")
-        self.calibration = None if calibration is None else calibration.float().clone()
-        super().load_weights(tensors)
-
-    def formula(self) -> dict[str, str]:
-        out = super().formula()
-        if self.calibration is None:
-            return out
-        knots = self.calibration.shape[2]
-        out["calibration"] = (
-            "G_i * G_o, where G_i is calibration[0] at the level l and the cosine omega_i.z, G_o is "
-            "calibration[1] at l and omega_o.z, a factor per color; calibration is (2, levels, "
-            f"{knots} knots, 3), the knots are the cosines 0, 1/{knots - 1}, ..., 1; linear between knots "
-            "and between levels"
-        )
-        out["value"] = f"calibration * {out['value']}"
-        return out
+    @classmethod
+    def operations(cls, lattice: Lattice, network: NetworkSection) -> list[Operation]:
+        # u' = u + r / max(ω_o,z, 0.6) · ω_o,xy  with  r = F_off(T_off(u), ω_o,xy)      (section 4.3)
+        moved, offset = neural_offset("u", network)
+        encoded, position = encode_position("u", network.encoding)
+        light_and_view, directions = encode_directions(network.encoding)
+        return [
+            *offset,
+            # P(u', σ): bilinear in a level, linear between the two nearest levels        (section 4.2)
+            pyramid(moved, network),
+            *encoded,
+            *light_and_view,
+            # x = F(P(u', σ), ω_i,xy, ω_o,xy): 4 layers of 25 units                       (section 4.1)
+            Network(
+                "x",
+                ("features", *position, *directions),
+                weights="decoder",
+                hidden=hidden_layers(network),
+                outputs=network.output_channels,
+                activation=network.activation,
+            ),
+            # M = exp(x) - 1                                                              (section 5)
+            *color("x", network),
+        ]
 
 
 class NeumipBaseline(Neumip):
     """NeuMIP without the neural offset."""
 
     name = "neumip-baseline"
+    description = "NeuMIP without its offset"
+    defaults: ClassVar[Mapping[str, Any]] = {"network": {"offset": "none"}}
+    takes = PYRAMID
+
+
+def hidden_layers(network: NetworkSection) -> tuple[int, ...]:
+    """Units of the layers between of each fully connected network."""
+    return (network.width,) * (network.layers - 1)
+
+
+def neural_offset(u: str, network: NetworkSection) -> tuple[str, list[Operation]]:
+    """Name of the position at which the pyramid is read, and the operations that compute it from `u`."""
+    if network.offset == "none":
+        return u, []
+    return "moved", [
+        Lookup("offset_features", u, None, "offset_texture", network.channels),
+        Network(
+            "r",
+            ("offset_features", "omega_o[0:2]"),
+            weights="offset_network",
+            hidden=hidden_layers(network),
+            outputs=1 if network.offset == "depth" else 2,
+            activation=network.activation,
+        ),
+        Offset("moved", u, "r", "omega_o"),
+    ]
+
+
+def pyramid(u: str, network: NetworkSection) -> Operation:
+    """The features at a position and level."""
+    return Lookup("features", u, "level", "pyramid", network.channels, network.blending, network.oversampling)
+
+
+def encode_position(u: str, encoding: EncodingSection) -> tuple[list[Operation], Sequence[str]]:
+    """Operations that encode a position, and names of their results; none without bands."""
+    if encoding.position == 0:
+        return [], []
+    level = "level" if encoding.footprint_filtered else None
+    options = encoding.position, encoding.pi, encoding.raw, encoding.band_attenuation
+    return [Position("p", u), Frequencies("position", "p", level, *options)], ["position"]
+
+
+def encode_directions(encoding: EncodingSection) -> tuple[list[Operation], Sequence[str]]:
+    """Operations that encode light and view, and names of their results."""
+    names = ["omega_i", "omega_o"] if encoding.direction_xyz else ["omega_i[0:2]", "omega_o[0:2]"]
+    out: list[Operation] = []
+    if encoding.direction:
+        options = encoding.direction, encoding.direction_pi, encoding.raw, encoding.band_attenuation
+        encoded = zip(("light", "view"), names, strict=True)
+        out = [Frequencies(name, omega, None, *options) for name, omega in encoded]
+        names = ["light", "view"]
+    if encoding.half_vector:
+        out += [HalfVector("half", "omega_i", "omega_o"), Rotate("difference", "half", "omega_i")]
+        names = [*names, "half", "difference"]
+    return out, names
+
+
+def color(x: str, network: NetworkSection, name: str = "value") -> list[Operation]:
+    """Value in 1/sr of three outputs, or of six: YUV and a gate per color, as in the published code."""
+    if network.output_channels == 3:
+        return [Transform(name, x, network.output_transform, factor="unit")]
+    return [
+        Matrix("rgb", f"{x}[0:3]"),
+        Transform("ungated", "rgb", network.output_transform, factor="unit"),
+        Gate(name, f"{x}[3:6]", "ungated", floor=GATE),
+    ]

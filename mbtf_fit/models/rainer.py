@@ -20,18 +20,31 @@ average over the samples, and another network.
 
 from __future__ import annotations
 
-from typing import ClassVar
-
-import torch
-from torch import Tensor, nn
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from mbtf_core.data.lattice import Lattice
-from mbtf_core.data.schema import Layout
-from mbtf_fit.config import NetworkSection
-from mbtf_fit.data.slices import SliceBatch, TrainingSlices
-from mbtf_fit.models.constants import LEAST_COSINE, STATISTICS
-from mbtf_fit.models.interface import NeuralMaterial
-from mbtf_fit.models.mlp import Mlp, initialize_layers
+from mbtf_core.errors import InputError
+from mbtf_fit.models.model import Model, Preparation, generator_of
+from mbtf_fit.models.neumip import hidden_layers
+from mbtf_fit.ops import (
+    DivideByCosine,
+    Lookup,
+    Network,
+    Operation,
+    Standardize,
+    Stereographic,
+    Transform,
+)
+from mbtf_fit.ops.constants import LEAST_COSINE, STATISTICS
+from mbtf_fit.sections import NetworkSection
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
+    from mbtf_fit.data.slices import SliceBatch, TrainingSlices
+    from mbtf_fit.pytorch.material import NeuralMaterial
+    from mbtf_fit.pytorch.slice_encoders import SetEncoder, SliceEncoder
 
 # Least standard deviation of a slice's logarithms.
 LEAST_DEVIATION = 1e-3
@@ -39,63 +52,7 @@ LEAST_DEVIATION = 1e-3
 _AT_ONCE = 1 << 19
 
 
-def stereographic(omega: Tensor) -> Tensor:
-    """Directions (n, 3) projected from the nadir: (x, y) / (1 + z)."""
-    return omega[..., :2] / (1.0 + omega[..., 2:])
-
-
-class SliceEncoder(nn.Module):
-    """Encoder of whole slices at fixed directions: normalized values (items, D, 3) → latents (items, k).
-
-    Parameters
-    ----------
-    pairs : D
-    width : units of both hidden layers
-    latents : k
-    """
-
-    def __init__(self, pairs: int, width: int, latents: int) -> None:
-        super().__init__()
-        self.network = Mlp([3 * pairs, width, width, latents])
-
-    def initialize(self, generator: torch.Generator) -> None:
-        """Initialize all parameters at random."""
-        initialize_layers(self.network, generator)
-
-    def forward(self, values: Tensor, pairs: Tensor) -> Tensor:
-        """Latents; `pairs`, the directions (D, 4), are the same for all slices and are not read."""
-        out: Tensor = self.network(values.flatten(1))
-        return out
-
-
-class SetEncoder(nn.Module):
-    """Encoder of any number of samples: of each, with its directions; their mean; the latents from it.
-
-    Parameters
-    ----------
-    width : units of the hidden layers
-    latents : per texel
-    """
-
-    def __init__(self, width: int, latents: int) -> None:
-        super().__init__()
-        self.each = Mlp([3 + 4, width, width])
-        self.joined = Mlp([width, width, latents])
-
-    def initialize(self, generator: torch.Generator) -> None:
-        """Initialize all parameters at random."""
-        initialize_layers(self.each, generator)
-        initialize_layers(self.joined, generator)
-
-    def forward(self, values: Tensor, pairs: Tensor) -> Tensor:
-        """Latents (items, k) of normalized values (items, D, 3) at directions (D, 4)."""
-        items, count, _ = values.shape
-        samples = torch.cat([values, pairs.expand(items, -1, -1)], 2).flatten(0, 1)
-        found: Tensor = self.joined(self.each(samples).view(items, count, -1).mean(1))
-        return found
-
-
-class Rainer2019(NeuralMaterial):
+class Rainer2019(Model):
     """Latents from an encoder, trained for one material.
 
     Attributes
@@ -104,44 +61,94 @@ class Rainer2019(NeuralMaterial):
     """
 
     name = "rainer2019"
-    layout: ClassVar[Layout] = "slices"
-
-    def __init__(self, lattice: Lattice, network: NetworkSection) -> None:
-        super().__init__(lattice, network)
-        self.encoder: SliceEncoder | SetEncoder | None = None
+    description = "encodes angular slices (Rainer et al. 2019)"
+    layout = "slices"
+    # 8 latents; the texture has six channels more.
+    defaults: ClassVar[Mapping[str, Any]] = {
+        "network": {"offset": "none", "channels": 8, "width": 106, "layers": 5},
+        "training": {"learning_rate": 3e-3},
+    }
+    takes: ClassVar[Sequence[str]] = (
+        "network.channels",
+        "network.width",
+        "network.layers",
+        "network.activation",
+    )
+    calibrates = False
 
     @classmethod
-    def texture_channels(cls, network: NetworkSection) -> int:
-        return network.channels + STATISTICS
+    def operations(cls, lattice: Lattice, network: NetworkSection) -> list[Operation]:
+        latents = network.channels
+        m, d, end = latents, latents + 3, latents + STATISTICS
+        return [
+            # Latents, then mean m and standard deviation d of each color.
+            Lookup("texture", "u", "level", "pyramid", end),
+            Stereographic("light", "omega_i"),
+            Stereographic("view", "omega_o"),
+            # x = F(latents, light, view)
+            Network(
+                "x",
+                (f"texture[0:{latents}]", "light", "view"),
+                weights="decoder",
+                hidden=hidden_layers(network),
+                outputs=3,
+                activation=network.activation,
+            ),
+            # M = unit · (exp(m + d x) - 1) / ω_i,z
+            Standardize("logarithm", "x", f"texture[{m}:{d}]", f"texture[{d}:{end}]"),
+            Transform("radiance", "logarithm", "expm1", factor="unit"),
+            DivideByCosine("value", "radiance", "omega_i", LEAST_COSINE),
+        ]
 
-    def prepare(self, pairs: int, generator: torch.Generator) -> None:
-        """Create the encoder of slices at so many pairs of light and view."""
-        self.encoder = SliceEncoder(pairs, self.network.width, self.network.channels)
-        self.encoder.initialize(generator)
+    def __init__(self, material: NeuralMaterial) -> None:
+        super().__init__(material)
+        self.encoder: SliceEncoder | SetEncoder | None = None
+        texture = material.operations[0]
+        assert isinstance(texture, Lookup)
+        self.latents = texture.channels - STATISTICS
+
+    def _encoder(self, pairs: int) -> SliceEncoder | SetEncoder:
+        """An encoder of slices at so many pairs of light and view."""
+        from mbtf_fit.pytorch.slice_encoders import SliceEncoder
+
+        return SliceEncoder(pairs, self._width(), self.latents)
+
+    def _width(self) -> int:
+        """Units of the encoder's layers: those of the decoder."""
+        return next(op.hidden[0] for op in self.material.operations if isinstance(op, Network))
+
+    def prepare(self, given: Preparation) -> Any:
+        queries = given.queries
+        self.encoder = self._encoder(len(queries.omega_i))
+        self.encoder.initialize(generator_of(given.seed + 1))
+        self.encoder.to(queries.values.device)
+        return shared_slices(given)
 
     def trained(self) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
         assert self.encoder is not None
-        return [], [*self.decoder.parameters(), *self.encoder.parameters()]
+        (decoder,) = self.material.networks().values()
+        return [], [*decoder.parameters(), *self.encoder.parameters()]
 
-    def _layers(self) -> dict[str, nn.Parameter]:
-        return {name: p for name, p in super()._layers().items() if not name.startswith("encoder.")}
+    def parameters(self) -> dict[str, Tensor]:
+        assert self.encoder is not None
+        return {f"encoder.{name}": p for name, p in self.encoder.named_parameters()}
 
-    def directions(self, omega_i: Tensor, omega_o: Tensor) -> Tensor:
-        return torch.cat([stereographic(omega_i), stereographic(omega_o)], 1)
-
-    def stage1(self, u: Tensor, sigma: Tensor, omega_o: Tensor) -> Tensor:
-        return self.features(u, sigma, omega_o)
-
-    def stage2(self, features: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
-        latents, mean, deviation = features.tensor_split([-6, -3], 1)
-        x = self.decoder(torch.cat([latents, self.directions(omega_i, omega_o)], 1))
-        return self.unit * torch.expm1(mean + deviation * x) / omega_i[:, 2:].clamp_min(LEAST_COSINE)
+    def predict(self, batch: SliceBatch) -> tuple[Tensor, Any]:
+        """Values (items · K, 3) of the pairs that a batch decodes."""
+        features = self.encoded(batch)
+        pair = batch.chosen.flatten()
+        repeated = features.repeat_interleave(batch.chosen.shape[1], 0)
+        value = self.material.stage2({"texture": repeated}, batch.omega_i[pair], batch.omega_o[pair])
+        return value, batch.queries()
 
     def normalized(self, values: Tensor, omega_i: Tensor) -> tuple[Tensor, Tensor]:
         """Logarithms (items, D, 3) of slices with mean 0 and variance 1 per item and color, and both (items,
         6)."""
+        import torch
+
         # Black data have no unit.
-        unit = torch.where(self.unit > 0, self.unit, torch.ones_like(self.unit))
+        unit = self.material.number("unit")
+        unit = torch.where(unit > 0, unit, torch.ones_like(unit))
         apparent = (values * omega_i[:, 2:]).clamp_min(0.0) / unit
         logarithm = torch.log1p(apparent)
         mean = logarithm.mean(1, keepdim=True)
@@ -150,24 +157,25 @@ class Rainer2019(NeuralMaterial):
 
     def encode(self, values: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
         """Texture values (items, channels) of slices (items, D, 3)."""
+        import torch
+
+        from mbtf_fit.pytorch.encodings import stereographic
+
         assert self.encoder is not None
         normalized, statistics = self.normalized(values, omega_i)
-        pairs = self.directions(omega_i, omega_o)
+        pairs = torch.cat([stereographic(omega_i), stereographic(omega_o)], 1)
         return torch.cat([self.encoder(normalized, pairs), statistics], 1)
 
     def encoded(self, batch: SliceBatch) -> Tensor:
         """Texture values (items, channels) of a batch."""
         return self.encode(batch.values, batch.omega_i, batch.omega_o)
 
-    def reconstruct(self, batch: SliceBatch) -> Tensor:
-        """Values (items · K, 3) of the pairs that a batch decodes."""
-        features = self.encoded(batch)
-        pair = batch.chosen.flatten()
-        repeated = features.repeat_interleave(batch.chosen.shape[1], 0)
-        return self.stage2(repeated, batch.omega_i[pair], batch.omega_o[pair])
-
-    def write_textures(self, slices: TrainingSlices) -> None:
+    def write_textures(self, queries: Any) -> bool:
         """Encode all slices, and average them for the coarser levels."""
+        import torch
+
+        slices: TrainingSlices = getattr(queries, "own", queries)
+        pyramid = self.material.texture("pyramid")
         with torch.no_grad():
             step = max(1, _AT_ONCE // slices.values.shape[1])
             parts = [
@@ -175,29 +183,49 @@ class Rainer2019(NeuralMaterial):
                 for a in range(0, len(slices.values), step)
             ]
             finest = torch.cat(parts)
-            self.pyramid.texels[-len(finest) :] = finest
-        self.pyramid.average_coarser(self.lattice.finest)
-
-    def formula(self) -> dict[str, str]:
-        return {
-            "features": "the textures pyramid.0 ... pyramid.k (level 0 to k) at u, blended by level: "
-            "latents, then mean m (RGB) and standard deviation d (RGB)",
-            "light, view": "(x, y) / (1 + z) of omega_i, of omega_o",
-            "x": "decoder(latents, light, view)",
-            "value": f"unit * (exp(m + d * x) - 1) / max(omega_i.z, {LEAST_COSINE})",
-        }
+            pyramid.texels[-len(finest) :] = finest
+        pyramid.average_coarser(self.material.lattice.finest)
+        return True
 
 
 class Rainer2020(Rainer2019):
     """Latents from an encoder of any set of samples, trained for many materials."""
 
     name = "rainer2020"
+    description = "encodes angular slices, with one network for many materials (Rainer et al. 2020)"
+    # 32 latents; the texture has six channels more.
+    defaults: ClassVar[Mapping[str, Any]] = {
+        "network": {"offset": "none", "channels": 32, "width": 106, "layers": 5},
+        "training": {"learning_rate": 3e-3},
+    }
+    takes = (*Rainer2019.takes, "training.materials", "training.own_material")
 
-    def prepare(self, pairs: int, generator: torch.Generator) -> None:
-        self.encoder = SetEncoder(self.network.width, self.network.channels)
-        self.encoder.initialize(generator)
+    def _encoder(self, pairs: int) -> SliceEncoder | SetEncoder:
+        from mbtf_fit.pytorch.slice_encoders import SetEncoder
+
+        return SetEncoder(self._width(), self.latents)
 
     def encoded(self, batch: SliceBatch) -> Tensor:
         """Texture values, from a random part of the slices."""
         read = batch.read
         return self.encode(batch.values[:, read], batch.omega_i[read], batch.omega_o[read])
+
+
+def shared_slices(given: Preparation) -> Any:
+    """The slices that a network learns: those of one material, or of several, all in units of the first."""
+    from mbtf_fit.data.slices import SharedSlices
+
+    own, training = given.queries, given.training
+    if not (training.materials or training.own_material):
+        raise InputError(
+            "there is nothing to learn from without the material itself",
+            where="training.own_material",
+            hint="add folders of slices of other materials: training.materials",
+        )
+    if not training.materials:
+        return own
+    learned = [own] if training.own_material else []
+    for folder in training.materials:
+        slices, typical = given.load(folder)
+        learned.append(slices.scaled(given.unit / typical if typical > 0 else 1.0))
+    return SharedSlices(own, learned)

@@ -1,24 +1,47 @@
-"""Models by name."""
+"""The models of this folder by name: every file is read, so that a new model is one new file."""
 
 from __future__ import annotations
 
-from typing import Any
+import importlib
+import pkgutil
+from typing import TYPE_CHECKING, Any
 
+import mbtf_fit.models
 from mbtf_core.data.lattice import Lattice
-from mbtf_fit.config import FitConfig
-from mbtf_fit.models.hierarchical import Hierarchical
-from mbtf_fit.models.interface import NeuralMaterial
-from mbtf_fit.models.learned_relief import LearnedRelief
-from mbtf_fit.models.neumip import Neumip, NeumipBaseline
-from mbtf_fit.models.rainer import Rainer2019, Rainer2020
-from mbtf_fit.models.relief import Relief
+from mbtf_fit.models.model import Model
+from mbtf_fit.sections import NetworkSection
 
-MODELS: dict[str, type[NeuralMaterial]] = {
-    m.name: m for m in (NeumipBaseline, Neumip, LearnedRelief, Relief, Hierarchical, Rainer2019, Rainer2020)
-}
+if TYPE_CHECKING:
+    from mbtf_fit.pytorch.material import NeuralMaterial
 
 
-def build_model(name: str, lattice: Lattice, **network: Any) -> NeuralMaterial:
-    """An uninitialized model; `network` are keys of the configuration's section, by default the model's."""
-    config = FitConfig.model_validate({"model": name, "network": network})
-    return MODELS[name](lattice, config.network)
+def _find() -> dict[str, type[Model]]:
+    found: dict[str, type[Model]] = {}
+    for entry in pkgutil.iter_modules(mbtf_fit.models.__path__, "mbtf_fit.models."):
+        if entry.name == __name__:
+            continue
+        for item in vars(importlib.import_module(entry.name)).values():
+            own = isinstance(item, type) and issubclass(item, Model) and item.__module__ == entry.name
+            if own and "name" in vars(item):
+                found[item.name] = item
+    return found
+
+
+MODELS = _find()
+
+
+def material_of(name: str, lattice: Lattice, network: NetworkSection) -> NeuralMaterial:
+    """An uninitialized material of a model and an architecture."""
+    from mbtf_fit.pytorch.material import NeuralMaterial
+
+    return NeuralMaterial(lattice, MODELS[name].operations(lattice, network), name)
+
+
+def with_option(option: str) -> list[str]:
+    """Names of the models that take an option of :data:`mbtf_fit.models.model.SPECIAL`."""
+    return [name for name, model in MODELS.items() if option in model.takes]
+
+
+def defaults_of(name: str) -> dict[str, Any]:
+    """Options of a model that differ from the general defaults, nested."""
+    return dict(MODELS[name].defaults) if name in MODELS else {}

@@ -3,9 +3,9 @@
 NeuMIP's decoder and pyramid of learned textures (:mod:`mbtf_fit.models.neumip`), without the offset network.
 The view ray is intersected with the stored heights instead (relief mapping: Policarpo, Oliveira and Comba,
 I3D 2005). The textures are read at ``u' = u + w_l · z/ω_o,z · ω_o,xy``, where z is the height of the
-intersection and w_l a learned weight of the level. The decoder sees :mod:`hints <mbtf_fit.surface.known>` of
-the known surface besides features and directions (shadow and highlight hints: Zeng et al., SIGGRAPH 2023;
-difference vector: Rusinkiewicz, EGSR 1998), and the value is the sum of its own part and of the known
+intersection and w_l a learned weight of the level. The decoder sees hints of the known surface
+(:mod:`mbtf_fit.ops.shade`) besides features and directions (shadow and highlight hints: Zeng et al., SIGGRAPH
+2023; difference vector: Rusinkiewicz, EGSR 1998), and the value is the sum of its own part and of the known
 surface's single scattering, scaled by a learned gate:
 
     M = 2 σ(g) · core + unit · (exp(x) - 1),    σ(g) = 1 / (1 + exp(-g)).
@@ -13,155 +13,135 @@ surface's single scattering, scaled by a learned gate:
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor, nn
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, ClassVar
 
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
-from mbtf_fit.config import NetworkSection
-from mbtf_fit.models.constants import IRRADIANCE_SCALE, hint_size
-from mbtf_fit.models.encodings import rotate_to_z
-from mbtf_fit.models.lookup import coarse_level
-from mbtf_fit.models.neumip import Neumip
-from mbtf_fit.models.outputs import output_formula
-from mbtf_fit.surface.formulas import surface_formula
-from mbtf_fit.surface.hints import compute_hints
-from mbtf_fit.surface.known import KnownSurface
+from mbtf_fit.models.model import PYRAMID, SHARED, Model, Preparation
+from mbtf_fit.models.neumip import color, encode_directions, encode_position, hidden_layers, pyramid
+from mbtf_fit.ops import Displace, Gate, Network, Operation, Rotate, Shade, Trace, Transform
+from mbtf_fit.ops.constants import (
+    DIELECTRIC,
+    HEIGHTS,
+    HORIZONS,
+    IRRADIANCE_SCALE,
+    LIGHT_WIDTH,
+    MAPS,
+    PLACES,
+)
+from mbtf_fit.sections import NetworkSection
 
-# Weight of the displacement at all levels before training.
-FIRST_WEIGHT = 0.9
+# Bytes of a training query in memory, and of its hints.
+QUERY_BYTES, HINT_BYTES = 48, 28
 
 
-class Relief(Neumip):
-    """A model that knows heights and maps of the surface.
-
-    Attributes
-    ----------
-    surface : KnownSurface or None
-        None until :meth:`know` or :meth:`load_weights`.
-    depth_weights : (levels,) parameter
-        Weight of the traced displacement at each level.
-    """
+class Relief(Model):
+    """A model that knows heights and maps of the surface."""
 
     name = "relief"
-
-    def __init__(self, lattice: Lattice, network: NetworkSection) -> None:
-        super().__init__(lattice, network)
-        self.surface: KnownSurface | None = None
-        self.depth_weights = nn.Parameter(torch.full((lattice.finest + 1,), FIRST_WEIGHT))
+    description = "traces the heights of the data's geometry"
+    defaults: ClassVar[Mapping[str, Any]] = {
+        "network": {
+            "offset": "none",
+            "channels": 8,
+            "oversampling": 2,
+            "encoding": {"direction_xyz": True, "half_vector": True},
+        },
+        # Oversampled texels see a quarter of the queries each: with a decay of 1, glossy materials overfit.
+        "training": {"texture_weight_decay": 2.0, "blur": {"min_sigma": 1.6}},
+    }
+    takes = (*PYRAMID, *SHARED, *(f"network.relief.{n}" for n in ("places", "hints", "frame", "gate")))
+    # Texture of learned heights, in models that have one.
+    learned: ClassVar[str | None] = None
 
     @classmethod
-    def hint_size(cls, network: NetworkSection) -> int:
-        return hint_size(network)
+    def operations(cls, lattice: Lattice, network: NetworkSection) -> list[Operation]:
+        relief = network.relief
+        encoded, position = encode_position("u", network.encoding)
+        light_and_view, directions = encode_directions(network.encoding)
+        hints, known = surface_inputs(network)
+        core = "surface[3:6]"
+        outputs = network.output_channels
+        return [
+            # z: where the view ray meets the heights; its hints there.
+            *known_surface(relief.places),
+            # u' = u + w_l z / ω_o,z · ω_o,xy
+            Displace("moved", "u", "z", "level", "omega_o", "depth_weights", cls.learned),
+            pyramid("moved", network),
+            *encoded,
+            *light_and_view,
+            *hints,
+            # (x, g) = F(features, directions, hints)
+            Network(
+                "x",
+                ("features", *position, *directions, *known),
+                weights="decoder",
+                hidden=hidden_layers(network),
+                outputs=outputs + relief.gate,
+                activation=network.activation,
+            ),
+            # unit · (exp(x) - 1)
+            *color(f"x[0:{outputs}]" if relief.gate and outputs == 3 else "x", network, "own"),
+            # M = 2 σ(g) core + …
+            *(
+                [Gate("value", f"x[{outputs}:{outputs + 1}]", core, "own", scale=2.0, unit="unit")]
+                if relief.gate
+                else []
+            ),
+        ]
 
-    @classmethod
-    def gate_size(cls, network: NetworkSection) -> int:
-        return int(network.relief.gate)
+    def prepare(self, given: Preparation) -> Any:
+        from mbtf_fit.surface.known import KnownSurface
 
-    def know(self, surface: KnownSurface) -> None:
-        """Set heights and maps of the surface."""
-        self.surface = surface
+        geometry = given.data.geometry()
+        if geometry is None:
+            raise InputError(
+                f"the data set has no geometry, which {self.name} traces",
+                where=given.data.folder,
+                hint="fit a model that learns heights: --model neumip+",
+            )
+        self.material.know(KnownSurface.of(geometry, given.data.lattice, given.light_width))
+        return given.queries
 
-    @property
-    def known(self) -> KnownSurface:
-        """Heights and maps of the surface."""
-        assert self.surface is not None, "the model has no surface yet"
-        return self.surface
+    def precompute(self, queries: Any, memory: float) -> Any:
+        if not hasattr(queries, "hints") or len(queries) * (QUERY_BYTES + HINT_BYTES) > memory:
+            return queries
+        return self._with_hints(queries)
 
-    def hints(self, u: Tensor, sigma: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
-        """Hints (n, 7) of queries."""
-        with torch.no_grad():
-            return compute_hints(self.known, u, sigma, omega_i, omega_o, self.network.relief.places)
+    def before_step(self, step: int, fraction: float, sigmas: Mapping[str, float], batch: Any) -> Any:
+        return self._with_hints(batch) if batch.hints is None else batch
 
-    def forward(
-        self, u: Tensor, sigma: Tensor, omega_i: Tensor, omega_o: Tensor, hints: Tensor | None = None
-    ) -> Tensor:
-        """Value (n, 3) in 1/sr; `hints` (n, 7) are computed where they are not given."""
-        if hints is None:
-            hints = self.hints(u, sigma, omega_i, omega_o)
-        level = self.level(sigma)
-        features = self.read(self.displaced(u, level, hints[:, :1], omega_o), level)
-        value = self._value(features, hints, omega_i, omega_o)
-        return value * self.calibration_factors(sigma, omega_i, omega_o)
+    def _with_hints(self, queries: Any) -> Any:
+        found = self.material.hints(queries.u, queries.sigma, queries.omega_i, queries.omega_o)
+        return replace(queries, hints=found)
 
-    def displaced(self, u: Tensor, level: Tensor, height: Tensor, omega_o: Tensor) -> Tensor:
-        """Positions (n, 2) at which the learned textures are read, for heights (n, 1) of intersections."""
-        slope = height * omega_o[:, :2] / omega_o[:, 2:]
-        return u + self.depth_weight(level)[:, None] * slope / u.new_tensor([1.0, self.lattice.aspect])
+    def predict(self, batch: Any) -> tuple[Any, Any]:
+        at = (batch.u, batch.sigma, batch.omega_i, batch.omega_o)
+        return self.material(*at, hints=batch.hints), batch
 
-    def depth_weight(self, level: Tensor) -> Tensor:
-        """Weight (n,) of the displacement at fractional levels (n,)."""
-        coarse, finer = coarse_level(level, self.lattice.finest + 1)
-        index = coarse.long()
-        weights = self.depth_weights
-        return torch.lerp(weights[index], weights[(index + 1).clamp_max(len(weights) - 1)], finer)
 
-    def features(self, u: Tensor, sigma: Tensor, omega_o: Tensor) -> Tensor:
-        """Learned features, level, and uv of the intersections of all places."""
-        level = self.level(sigma)
-        height, hits = self.known.intersections(u, level, omega_o, self.network.relief.places)
-        learned = self.read(self.displaced(u, level, height, omega_o), level)
-        return torch.cat([learned, level[:, None], hits], 1)
+def known_surface(places: int) -> tuple[Trace, Shade]:
+    """The operations that trace and shade the surface of a material, for 1, 2 or 4 places of a footprint."""
+    offsets, finer = PLACES[places]
+    trace = Trace("z", "hits", "u", "level", "omega_o", HEIGHTS, offsets)
+    tensors = MAPS, HORIZONS, LIGHT_WIDTH, DIELECTRIC
+    return trace, Shade("surface", "hits", "level", "omega_i", "omega_o", *tensors, finer)
 
-    def decode(self, features: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
-        places = self.network.relief.places
-        learned, level, hits = features.tensor_split([-1 - 2 * places, -2 * places], 1)
-        shading = self.known.shading(hits, level[:, 0], omega_i, omega_o, places)
-        return self._value(learned, torch.cat([level, shading], 1), omega_i, omega_o)
 
-    def _value(self, features: Tensor, hints: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
-        """Value (n, 3) of learned features and hints (n, 7), whose first column is not used."""
-        relief = self.network.relief
-        irradiance, slope, core = hints[:, 1:2], hints[:, 2:4], hints[:, 4:7]
-        # Black data have no unit: their value is 0.
-        core, unit = torch.where(self.unit > 0, core, 0.0), torch.where(self.unit > 0, self.unit, 1.0)
-        inputs = [features, self.directions(omega_i, omega_o)]
-        if relief.hints:
-            inputs += [torch.log1p(IRRADIANCE_SCALE * irradiance), slope, torch.log1p(core / unit)]
-        if relief.frame:
-            upright = (1.0 - slope.square().sum(1, keepdim=True)).clamp_min(0.0).sqrt()
-            normal = torch.cat([slope, upright], 1)
-            inputs += [rotate_to_z(normal, omega) for omega in (omega_i, omega_o)]
-        out = self.decoder(torch.cat(inputs, 1))
-        if not relief.gate:
-            return self.to_value(out)
-        return self.to_value(out[:, :-1]) + 2.0 * torch.sigmoid(out[:, -1:]) * core
-
-    def offset(self, u: Tensor, omega_o: Tensor) -> Tensor:
-        """Displacement (n, 2) of the surface point that is seen at the finest footprint, in tile widths."""
-        height = self.known.tracer.trace(u, omega_o)[:, None]
-        return height * omega_o[:, :2] / omega_o[:, 2:]
-
-    def weights(self) -> dict[str, Tensor]:
-        return super().weights() | self.known.tensors()
-
-    def load_weights(self, tensors: dict[str, Tensor]) -> None:
-        known = {name: tensor for name, tensor in tensors.items() if name.startswith("surface.")}
-        try:
-            self.surface = KnownSurface.from_tensors(known, self.lattice)
-        except (KeyError, ValueError) as error:
-            raise InputError(f"the weights do not fit the model {self.name}: {error}") from None
-        super().load_weights(tensors)
-
-    def formula(self) -> dict[str, str]:
-        out = super().formula()
-        relief, known = self.network.relief, surface_formula(self.known, self.network.relief.places)
-        position = (
-            "u' = u + w * z / omega_o.z * (omega_o.x, omega_o.y) / (1, aspect), w = depth_weights at l, "
-            "linear between levels,"
-        )
-        out["features"] = out["features"].replace(" at u,", f" at {position}")
-        inputs = ["features", "light, view"]
-        if relief.hints:
-            inputs.append(f"log(1 + {IRRADIANCE_SCALE:g} e), n.x, n.y, log(1 + core / unit)")
-        if relief.frame:
-            inputs.append("rotate(n, omega_i), rotate(n, omega_o)")
-        out["x"] = f"decoder({', '.join(inputs)})"
-        if relief.gate:
-            out["x"] += " without its last output, g"
-            out["own"] = output_formula(self.network.output_transform, self.network.output_channels)
-            value = "own + 2 / (1 + exp(-g)) * core"
-            out["value"] = value if self.calibration is None else f"calibration * ({value})"
-        if not self.unit:
-            out["value"] = "0"
-        return known | out
+def surface_inputs(network: NetworkSection) -> tuple[list[Operation], list[str]]:
+    """Operations on hints (irradiance, normal, core), and the inputs of the decoder that they give."""
+    out: list[Operation] = []
+    names: list[str] = []
+    if network.relief.hints:
+        out += [
+            Transform("log_irradiance", "surface[0:1]", "log1p", scale=IRRADIANCE_SCALE),
+            Transform("log_core", "surface[3:6]", "log1p", divisor="unit"),
+        ]
+        names += ["log_irradiance", "surface[1:3]", "log_core"]
+    if network.relief.frame:
+        axis = "surface[1:3]"
+        out += [Rotate("light_there", axis, "omega_i"), Rotate("view_there", axis, "omega_o")]
+        names += ["light_there", "view_there"]
+    return out, names

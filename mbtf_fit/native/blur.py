@@ -1,4 +1,4 @@
-"""Blur of packed textures by the kernel, equal to :func:`mbtf_fit.models.blur.blur_texture`."""
+"""Blur of packed textures by the kernel, equal to :func:`mbtf_fit.textures.blur.blur_texture`."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mbtf_fit.models.blur import NEGLIGIBLE, gaussian_taps
-from mbtf_fit.models.textures import FeatureTextures
 from mbtf_fit.native.library import Kernel
 from mbtf_fit.native.model import share
+from mbtf_fit.textures.blur import NEGLIGIBLE, gaussian_taps
+from mbtf_fit.textures.feature_textures import FeatureTextures
 
 if TYPE_CHECKING:
     from mbtf_fit.objective.parallel import Workers

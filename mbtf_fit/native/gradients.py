@@ -15,9 +15,8 @@ import torch
 from torch import Tensor
 
 from mbtf_fit.data.queries import TrainingQueries
-from mbtf_fit.models.relief import Relief
 from mbtf_fit.native.library import MAX_LEVELS, GradientSums, QuadraticLoss, QueryPointers
-from mbtf_fit.native.model import NativeModel, aligned, network_weights, networks, pointers, share
+from mbtf_fit.native.model import NativeModel, aligned, pointers, share
 from mbtf_fit.objective.losses import Objective, Quadratic
 from mbtf_fit.objective.parallel import Workers
 
@@ -47,10 +46,11 @@ class Sums:
 
     def __init__(self, native: NativeModel) -> None:
         lanes = int(native.kernel.library.mbtf_lanes())
-        textures = native.model.textures()
-        self.textures = [aligned(t.packing.texels * (-(-t.texels.shape[1] // 8) * 8)) for t in textures]
+        self.textures = [
+            aligned(t.packing.texels * (-(-t.texels.shape[1] // 8) * 8)) for t in native.textures
+        ]
         self.networks = [
-            aligned(lanes * sum(w.numel() for w in weights)) for weights in network_weights(native.model)
+            aligned(lanes * sum(w.numel() for w in weights)) for weights in native.network_weights()
         ]
         addresses = [t.data_ptr() for t in self.textures], [t.data_ptr() for t in self.networks]
         texture, network = ([*a, 0][:2] for a in addresses)
@@ -86,8 +86,8 @@ class CollectedGradients:
 
     def __init__(self, native: NativeModel) -> None:
         self.native = native
-        self.textures = [torch.empty_like(t.texels) for t in native.model.textures()]
-        self.networks = [[torch.empty_like(w) for w in n] for n in network_weights(native.model)]
+        self.textures = [torch.empty_like(t.texels) for t in native.textures]
+        self.networks = [[torch.empty_like(w) for w in n] for n in native.network_weights()]
 
     def collect(self, sums: Sequence[Sums], workers: Workers) -> None:
         """Move the threads' sums to the gradients."""
@@ -113,7 +113,7 @@ class CollectedGradients:
         found: dict[Tensor, Tensor] = {}
         if self.native.frozen:
             return found
-        for network, gradients in zip(networks(self.native.model), self.networks, strict=True):
+        for network, gradients in zip(self.native.networks, self.networks, strict=True):
             found.update(zip(network.parameters(), gradients, strict=True))
         return found
 
@@ -135,9 +135,9 @@ class NativeGradients(CollectedGradients):
         self.depth_weights = torch.zeros(MAX_LEVELS)
 
     def weights(self) -> dict[Tensor, Tensor]:
-        found, model = super().weights(), self.native.model
-        if isinstance(model, Relief):
-            found[model.depth_weights] = self.depth_weights[: len(model.depth_weights)].contiguous()
+        found, weights = super().weights(), self.native.depth_weights
+        if weights is not None:
+            found[weights] = self.depth_weights[: len(weights)].contiguous()
         return found
 
     def compute(self, objective: Objective, batch: TrainingQueries, workers: Workers) -> Tensor:

@@ -19,7 +19,7 @@ MAX_CHANNELS, MAX_WIDTH, MAX_LAYERS, MAX_LEVELS, MAX_PLACES = 64, 128, 16, 16, 4
 
 _I32, _I64, _F32, _POINTER = ctypes.c_int32, ctypes.c_int64, ctypes.c_float, ctypes.c_void_p
 # Version of what the functions mean, where sizes of structures do not show it; as in src/kernel.h.
-INTERFACE = 1
+INTERFACE = 2
 
 
 class Network(ctypes.Structure):
@@ -39,15 +39,6 @@ class Textures(ctypes.Structure):
     )
 
 
-class Inception(ctypes.Structure):
-    """``mbtf_inception``"""
-
-    _fields_ = (
-        *((name, _I32) for name in ("modules", "width", "one", "before3", "three", "before5", "five")),
-        ("packed", _POINTER),
-    )
-
-
 class Model(ctypes.Structure):
     """``mbtf_model``"""
 
@@ -58,18 +49,6 @@ class Model(ctypes.Structure):
         *((name, _F32) for name in ("irradiance_scale", "height_scale", "least_facing")),
         *((name, _I32) for name in ("coordinates", "half_vector", "hints", "frame", "gate")),
         ("depth_weights", _POINTER),
-        ("inception", Inception),
-        *((name, _I32) for name in ("fourth_root", "bands", "inputs")),
-    )
-
-
-class PatchPointers(ctypes.Structure):
-    """``mbtf_patches``"""
-
-    _fields_ = (
-        ("items", _I64),
-        *((name, _I32) for name in ("rows", "columns")),
-        *((name, _POINTER) for name in ("u", "sigma", "omega_o", "factors", "inputs")),
     )
 
 
@@ -110,8 +89,7 @@ class GradientSums(ctypes.Structure):
     """``mbtf_gradients``"""
 
     _fields_ = tuple(
-        (name, _POINTER)
-        for name in ("pyramid", "offset_texture", "decoder", "offset", "depth_weights", "inception")
+        (name, _POINTER) for name in ("pyramid", "offset_texture", "decoder", "offset", "depth_weights")
     )
 
 
@@ -151,14 +129,6 @@ _PROTOTYPES = {
     "mbtf_backward": "vipppppp",
     "mbtf_learn": "dippppfpppp",
     "mbtf_collect_weights": "vpplp",
-    "mbtf_inception_floats": "lp",
-    "mbtf_pack_inception": "vippp",
-    "mbtf_collect_inception": "vpplp",
-    "mbtf_patch_state_floats": "lpiil",
-    "mbtf_patch_scratch_floats": "lpiil",
-    "mbtf_patch_forward": "vippliipp",
-    "mbtf_patch_backward": "vipplppppp",
-    "mbtf_patch_learn": "dipplppfppppp",
     "mbtf_collect": "vipllllp",
     "mbtf_adam": "viplpppp",
     "mbtf_blur_down": "vipllplllpp",

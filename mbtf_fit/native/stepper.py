@@ -10,43 +10,37 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from mbtf_fit.data.images import Patches
 from mbtf_fit.data.queries import TrainingQueries
-from mbtf_fit.models.hierarchical import Hierarchical
-from mbtf_fit.models.interface import NeuralMaterial
 from mbtf_fit.native.blur import Blur
 from mbtf_fit.native.gradients import NativeGradients
 from mbtf_fit.native.library import AdamStep, Kernel
 from mbtf_fit.native.model import NativeModel, share
-from mbtf_fit.native.patches import PatchGradients
 from mbtf_fit.objective.losses import Objective
-from mbtf_fit.objective.parallel import Batch, Workers
+from mbtf_fit.objective.parallel import Workers
+from mbtf_fit.pytorch.material import NeuralMaterial
 
 # Parameters with fewer numbers are updated by one thread.
 _SMALL = 1 << 14
 
 
 class NativeStepper:
-    """Training steps of one model that the kernel supports."""
+    """Training steps of a material that the kernel supports."""
 
     def __init__(self, kernel: Kernel, model: NeuralMaterial, optimizer: torch.optim.Adam) -> None:
         self.kernel = kernel
-        self.model = model
         self.optimizer = optimizer
         self._native = NativeModel(kernel, model)
-        self._gradients: PatchGradients | NativeGradients
-        if isinstance(model, Hierarchical):
-            self._gradients = PatchGradients(self._native)
-        else:
-            self._gradients = NativeGradients(self._native)
+        self._gradients = NativeGradients(self._native)
         # Memory for the blur of each texture and of its gradient.
         self._tables, self._between, self._blurred = (
-            [torch.empty_like(texture.texels) for texture in model.textures()] for _ in range(3)
+            [torch.empty_like(texture.texels) for texture in self._native.textures] for _ in range(3)
         )
 
-    def step(self, objective: Objective, batch: Batch, sigmas: Sequence[float], workers: Workers) -> Tensor:
+    def step(
+        self, objective: Objective, batch: TrainingQueries, sigmas: Sequence[float], workers: Workers
+    ) -> Tensor:
         """One step on a batch, textures blurred by `sigmas` texels of the finest level; its mean loss."""
-        textures = self.model.textures()
+        textures = self._native.textures
         blurs = [Blur(self.kernel, t, sigma) for t, sigma in zip(textures, sigmas, strict=True)]
         for texture, blur, between, table in zip(textures, blurs, self._between, self._tables, strict=True):
             if blur.idle:
@@ -54,12 +48,7 @@ class NativeStepper:
             else:
                 blur.apply(texture.texels.detach(), between, table, workers)
                 texture.read(table)
-        if isinstance(self._gradients, PatchGradients):
-            assert isinstance(batch, Patches)
-            loss = self._gradients.compute(objective, batch, workers)
-        else:
-            assert isinstance(batch, TrainingQueries)
-            loss = self._gradients.compute(objective, batch, workers)
+        loss = self._gradients.compute(objective, batch, workers)
         found: dict[Tensor, Tensor] = {}
         for k, (texture, blur) in enumerate(zip(textures, blurs, strict=True)):
             gradient = self._gradients.textures[k]

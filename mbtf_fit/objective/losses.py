@@ -33,8 +33,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mbtf_fit.config import Correction, LossKind, TrainingSection
 from mbtf_fit.objective.noise import NoiseModel
+from mbtf_fit.sections import Correction, LossKind, TrainingSection
 
 if TYPE_CHECKING:
     from mbtf_fit.data.images import Patches

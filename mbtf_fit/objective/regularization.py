@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import torch
 
-from mbtf_fit.config import TrainingSection
-from mbtf_fit.models.interface import NeuralMaterial
+from mbtf_fit.pytorch.material import NeuralMaterial
+from mbtf_fit.sections import TrainingSection
 
 # Noise-to-signal ratio above which the decay of texels grows. Below it the decay of weights falls
 # quadratically, so that few but clean queries are fitted without bias.

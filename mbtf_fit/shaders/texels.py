@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mbtf_core.height_planes import node_table
 from mbtf_fit.material.material import Material
-from mbtf_fit.models.constants import AZIMUTHS, HEIGHTS, HORIZONS, MAPS
+from mbtf_fit.ops.constants import AZIMUTHS, HEIGHTS, HORIZONS, MAPS
 from mbtf_fit.viewer.shader import NODE_SHIFT
 
 F32 = NDArray[np.float32]

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mbtf_core.height_planes import node_table
-from mbtf_fit.models.constants import MAX_CROSSINGS
 from mbtf_fit.native.library import Heightfield, kernel
+from mbtf_fit.ops.constants import MAX_CROSSINGS
 from mbtf_fit.surface.copies import DeviceCopies
 
 # Rays, and vertices, per task of a thread.

@@ -8,18 +8,12 @@ from concurrent.futures import ThreadPoolExecutor
 import torch
 from torch import Tensor
 
-from mbtf_fit.models.constants import (
-    ALPHA2,
-    HINTS,
-    LEAST_LIGHT,
-    LEAST_VIEW,
-    LIGHT_BLUR,
-    MAX_CROSSINGS,
-    PLACES,
-)
-from mbtf_fit.models.lookup import Packing
-from mbtf_fit.native.library import MAX_LEVELS, QueryPointers, Surface, Textures, kernel
+from mbtf_fit.native.library import MAX_LEVELS, MAX_PLACES, QueryPointers, Surface, Textures, kernel
+from mbtf_fit.ops.constants import HINTS
+from mbtf_fit.ops.displace import Trace
+from mbtf_fit.ops.shade import Shade
 from mbtf_fit.surface.known import KnownSurface
+from mbtf_fit.textures.lookup import Packing
 
 # Queries per task of a thread; in PyTorch, queries at once, which bounds the memory of the lookups.
 _TASK, _CHUNK = 1 << 14, 1 << 17
@@ -35,49 +29,57 @@ def describe_textures(table: Tensor, packing: Packing, into: Textures) -> None:
 
 
 def compute_hints(
-    surface: KnownSurface, u: Tensor, sigma: Tensor, omega_i: Tensor, omega_o: Tensor, places: int
+    surface: KnownSurface,
+    trace: Trace,
+    shade: Shade,
+    u: Tensor,
+    sigma: Tensor,
+    omega_i: Tensor,
+    omega_o: Tensor,
 ) -> Tensor:
-    """Hints of queries.
+    """Results of both operations for queries.
 
     Parameters
     ----------
     surface : KnownSurface
+    trace, shade : the operations
     u, sigma, omega_i, omega_o : (n, 2), (n,), (n, 3), (n, 3) tensors
         Position in uv, footprint in tile widths, light and view.
-    places : int
-        Places of the footprint that are traced: 1, 2 or 4.
 
     Returns
     -------
     (n, 7) tensor
-        As :meth:`KnownSurface.hints <mbtf_fit.surface.known.KnownSurface.hints>`.
+        Height, irradiance, normal (x, y), core (RGB).
     """
     found = kernel()
-    finest = surface.lattice.finest
-    if found is None or u.device.type != "cpu" or finest + 2 > MAX_LEVELS:
+    finest, places = surface.lattice.finest, len(trace.places)
+    if found is None or u.device.type != "cpu" or finest + 2 > MAX_LEVELS or places > MAX_PLACES:
         level = (-torch.log2(2.0 * sigma)).clamp(0.0, float(finest))
-        chunks = [slice(start, start + _CHUNK) for start in range(0, len(u), _CHUNK)]
-        parts = [surface.hints(u[c], level[c], omega_i[c], omega_o[c], places) for c in chunks]
+        parts = []
+        for start in range(0, len(u), _CHUNK):
+            c = slice(start, start + _CHUNK)
+            height, hits = surface.intersections(trace, u[c], level[c], omega_o[c])
+            seen = surface.shading(shade, hits, level[c], omega_i[c], omega_o[c])
+            parts.append(torch.cat([height, seen], 1))
         return torch.cat(parts)
     arrays = [a.detach().float().contiguous() for a in (u, sigma, omega_i, omega_o)]
     out = torch.empty(len(u), HINTS)
     description = Surface(heightfield=surface.tracer.description)
     describe_textures(*surface.map_table, description.maps)
     describe_textures(*surface.horizon_table, description.horizons)
-    offsets, description.finer = PLACES[places]
-    description.places = places
-    description.offsets[: 2 * places] = [x for offset in offsets for x in offset]
-    description.light_width, description.light_blur = surface.light_width, LIGHT_BLUR
+    description.places, description.finer = places, shade.finer
+    description.offsets[: 2 * places] = [x for offset in trace.places for x in offset]
+    description.light_width, description.light_blur = surface.light_width, shade.light_blur
     description.dielectric = surface.dielectric
-    description.least_light, description.least_view = LEAST_LIGHT, LEAST_VIEW
-    description.alpha2[:] = ALPHA2
+    description.least_light, description.least_view = shade.least_light, shade.least_view
+    description.alpha2[:] = shade.alpha2
 
     def task(start: int) -> None:
         addresses = (a.data_ptr() + 4 * start * a.stride(0) for a in arrays)
         queries = QueryPointers(min(_TASK, len(u) - start), *addresses)
         to = out.data_ptr() + 4 * start * HINTS
         found.library.mbtf_hints(
-            ctypes.byref(description), ctypes.byref(queries), float(finest), MAX_CROSSINGS, to
+            ctypes.byref(description), ctypes.byref(queries), float(finest), trace.crossings, to
         )
 
     with ThreadPoolExecutor(max(1, torch.get_num_threads())) as pool:

@@ -30,26 +30,22 @@ from torch import Tensor
 
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.images.resample import resample
-from mbtf_fit.models.constants import (
-    ALPHA2,
+from mbtf_fit.ops.constants import (
     AZIMUTHS,
     DIELECTRIC,
     DIFFUSE_CHANNELS,
     GLOSSY_CHANNELS,
     HEIGHTS,
     HORIZONS,
-    LEAST_LIGHT,
-    LEAST_VARIANCE,
-    LEAST_VIEW,
-    LIGHT_BLUR,
     LIGHT_WIDTH,
     MAPS,
-    PLACES,
 )
-from mbtf_fit.models.lookup import Packing, lookup
+from mbtf_fit.ops.displace import Trace
+from mbtf_fit.ops.shade import Shade
 from mbtf_fit.surface.copies import DeviceCopies
 from mbtf_fit.surface.heightfield import HeightfieldTracer
 from mbtf_fit.surface.prefilter import prefiltered_levels
+from mbtf_fit.textures.lookup import Packing, lookup
 
 if TYPE_CHECKING:
     from mbtf_core.data.geometry import Geometry
@@ -191,69 +187,48 @@ class KnownSurface:
     def _horizon_copies(self) -> DeviceCopies:
         return DeviceCopies(self.horizon_table[0])
 
-    def hints(self, u: Tensor, level: Tensor, omega_i: Tensor, omega_o: Tensor, places: int = 1) -> Tensor:
-        """Hints of queries, in PyTorch.
-
-        Parameters
-        ----------
-        u : (n, 2) tensor
-            Positions, uv.
-        level : (n,) tensor
-            Fractional levels of the footprints, in [0, k].
-        omega_i, omega_o : (n, 3) tensor
-            Unit vectors towards light and viewer, z > 0.
-        places : int
-            Places of the footprint, 1, 2 or 4.
-
-        Returns
-        -------
-        (n, 7) tensor
-            Height, irradiance, normal (x, y), core (RGB).
-        """
-        height, hits = self.intersections(u, level, omega_o, places)
-        return torch.cat([height, self.shading(hits, level, omega_i, omega_o, places)], 1)
-
-    def intersections(self, u: Tensor, level: Tensor, omega_o: Tensor, places: int) -> tuple[Tensor, Tensor]:
-        """Mean height (n, 1), and uv (n, 2·places), of the intersections of the places' view rays."""
+    def intersections(self, trace: Trace, u: Tensor, level: Tensor, omega_o: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean height (n, 1), and uv (n, 2·places), of the intersections of the places' view rays; levels
+        (n,)."""
         sigma = 0.5 * torch.exp2(-level)[:, None]
         aspect = u.new_tensor([1.0, self.lattice.aspect])
         total, hits = u.new_zeros(len(u), 1), []
         along = _azimuth(omega_o)
         across = torch.stack([-along[:, 1], along[:, 0]], 1)
-        for x, y in PLACES[places][0]:
+        for x, y in trace.places:
             at = u + sigma * (x * across + y * along) / aspect
             z = self.tracer.trace(at, omega_o)[:, None]
             hits.append(at + z / omega_o[:, 2:] * omega_o[:, :2] / aspect)
             total = total + z
-        return total / places, torch.cat(hits, 1)
+        return total / len(trace.places), torch.cat(hits, 1)
 
-    def shading(self, hits: Tensor, level: Tensor, omega_i: Tensor, omega_o: Tensor, places: int) -> Tensor:
-        """Hints (n, 6) but the height: means over the intersections (n, 2·places)."""
-        finer = PLACES[places][1]
-        parts = [self._shade(hit, level + finer, omega_i, omega_o) for hit in hits.split(2, 1)]
+    def shading(self, shade: Shade, hits: Tensor, level: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
+        """Irradiance, normal (x, y) and core (RGB) (n, 6): means over the intersections (n, 2·places)."""
+        finer = level + shade.finer
+        parts = [self._shade(shade, hit, finer, omega_i, omega_o) for hit in hits.split(2, 1)]
         return torch.stack(parts).mean(0)
 
-    def _shade(self, hit: Tensor, level: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
+    def _shade(self, op: Shade, hit: Tensor, level: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
         """Irradiance, normal and core (n, 6) at surface points."""
         maps = lookup(self._map_copies.on(hit.device), self.map_table[1], hit, level)
         slopes, square, base = maps[:, :2], maps[:, 2:3], maps[:, 3:6]
         normal = torch.nn.functional.normalize(torch.cat([-slopes, torch.ones_like(slopes[:, :1])], 1), dim=1)
         light = (normal * omega_i).sum(1, keepdim=True)
-        visibility = self.visibility(hit, level, omega_i)
+        visibility = self.visibility(op, hit, level, omega_i)
         irradiance = visibility * light.clamp_min(0.0) / omega_i[:, 2:]
         value = base / math.pi
         if self.glossy:
             metallic = maps[:, 7:8]
             variance = (square - slopes.square().sum(1, keepdim=True)).clamp_min(0.0)
-            alpha2 = (maps[:, 6:7] + variance + self.light_width**2).clamp(*ALPHA2)
+            alpha2 = (maps[:, 6:7] + variance + self.light_width**2).clamp(*op.alpha2)
             f0 = torch.lerp(base.new_tensor(self.dielectric), base, metallic)
-            light = light.clamp_min(LEAST_LIGHT)
-            view = (normal * omega_o).sum(1, keepdim=True).clamp_min(LEAST_VIEW)
+            light = light.clamp_min(op.least_light)
+            view = (normal * omega_o).sum(1, keepdim=True).clamp_min(op.least_view)
             lobe = ggx(f0, alpha2, normal, light, view, omega_i, omega_o)
             value = (1.0 - metallic) * value + lobe
         return torch.cat([irradiance, normal[:, :2], irradiance * value], 1)
 
-    def visibility(self, hit: Tensor, level: Tensor, omega_i: Tensor) -> Tensor:
+    def visibility(self, op: Shade, hit: Tensor, level: Tensor, omega_i: Tensor) -> Tensor:
         """Share (n, 1) of footprints at surface points from which the light is visible."""
         both = lookup(self._horizon_copies.on(hit.device), self.horizon_table[1], hit, level)
         count = both.shape[1] // 2
@@ -266,9 +241,11 @@ class KnownSurface:
         after = (index + 1) % count
         mean = torch.lerp(both.gather(1, index), both.gather(1, after), weight)
         square = torch.lerp(both.gather(1, index + count), both.gather(1, after + count), weight)
-        variance = (square - mean.square()).clamp_min(0.0) + (LIGHT_BLUR * self.light_width) ** 2
+        variance = (square - mean.square()).clamp_min(0.0) + (op.light_blur * self.light_width) ** 2
         elevation = omega_i[:, 2:].clamp(0.0, 1.0).asin()
-        return 0.5 + 0.5 * torch.erf((elevation - mean) / (2.0 * variance.clamp_min(LEAST_VARIANCE)).sqrt())
+        return 0.5 + 0.5 * torch.erf(
+            (elevation - mean) / (2.0 * variance.clamp_min(op.least_variance)).sqrt()
+        )
 
 
 def _azimuth(omega: Tensor) -> Tensor:

@@ -28,11 +28,11 @@ from torch import Tensor
 
 from mbtf_core.data.lattice import Lattice, sigma_of_level
 from mbtf_core.directions import from_projected_disk
-from mbtf_fit.config import HeldOutSection
 from mbtf_fit.data.loader import in_region
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.data.streaming import StreamedQueries
-from mbtf_fit.models.neumip import KNOTS
+from mbtf_fit.ops.constants import KNOTS
+from mbtf_fit.sections import HeldOutSection
 
 # Most training queries that are used, and queries per block.
 MAX_QUERIES = 1 << 21

@@ -13,24 +13,26 @@ from torch import Tensor
 
 from mbtf_core.errors import InputError
 from mbtf_fit.material.storage import read_tensors, write_tensors
-from mbtf_fit.models.learned_relief import LearnedRelief
 from mbtf_fit.training.loop import Progress
 from mbtf_fit.training.trainer import Trainer
 
 CHECKPOINT_NAME = "checkpoint.safetensors"
-_SURFACE = "surface."
+_STATE = "state."
 _MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 
 
 def state_tensors(trainer: Trainer) -> dict[str, Tensor]:
-    """Parameters, optimizer state and traced surface by name."""
-    tensors = {f"model.{name}": p.detach() for name, p in trainer.model.named_parameters()}
-    for name, p in trainer.model.named_parameters():
+    """Parameters, optimizer state and state of the model by name."""
+    parameters = _parameters(trainer)
+    tensors = {f"model.{name}": p.detach() for name, p in parameters.items()}
+    for name, p in parameters.items():
         for key, value in trainer.optimizer.state.get(p, {}).items():
             tensors[f"adam.{key}.{name}"] = value
-    if isinstance(trainer.model, LearnedRelief):
-        tensors |= {f"{_SURFACE}{name}": t for name, t in trainer.model.surface_state().items()}
-    return tensors
+    return tensors | {f"{_STATE}{name}": t for name, t in trainer.hooks.state().items()}
+
+
+def _parameters(trainer: Trainer) -> dict[str, Tensor]:
+    return {**dict(trainer.model.named_parameters()), **trainer.hooks.parameters()}
 
 
 def write_checkpoint(trainer: Trainer, path: Path) -> None:
@@ -77,18 +79,16 @@ def read_joint_checkpoint(trainers: Sequence[Trainer], path: Path) -> Progress:
 
 
 def _load(trainer: Trainer, tensors: Mapping[str, Tensor]) -> None:
-    """Set parameters, optimizer state and surface of a trainer."""
+    """Set parameters, optimizer state and the model's own state of a trainer."""
     with torch.no_grad():
-        for name, p in trainer.model.named_parameters():
+        for name, p in _parameters(trainer).items():
             p.copy_(tensors[f"model.{name}"])
             trainer.optimizer.state[p] = {
                 key: tensors[f"adam.{key}.{name}"].to(p.device)
                 for key in _MOMENTS
                 if f"adam.{key}.{name}" in tensors
             }
-    if isinstance(trainer.model, LearnedRelief):
-        surface = {k.removeprefix(_SURFACE): t for k, t in tensors.items() if k.startswith(_SURFACE)}
-        trainer.model.restore_surface(surface)
+    trainer.hooks.restore({k.removeprefix(_STATE): t for k, t in tensors.items() if k.startswith(_STATE)})
 
 
 def _progress(data: Mapping[str, Any]) -> Progress:

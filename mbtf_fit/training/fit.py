@@ -20,19 +20,15 @@ from mbtf_core.stats import pooled_variance
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import Partition, load_training, open_data
 from mbtf_fit.data.queries import ShardQueries, mean_value
-from mbtf_fit.data.slices import SharedSlices, TrainingSlices
 from mbtf_fit.evaluation import evaluate_splits
 from mbtf_fit.material.decoder import Decoder
 from mbtf_fit.material.format import DESCRIPTION_NAME
 from mbtf_fit.material.material import Material, export
 from mbtf_fit.material.transmittance_fit import evaluate_transmittance, fit_transmittance
-from mbtf_fit.models.interface import NeuralMaterial
-from mbtf_fit.models.learned_relief import LearnedRelief
-from mbtf_fit.models.rainer import Rainer2019
-from mbtf_fit.models.registry import MODELS, build_model
-from mbtf_fit.models.relief import Relief
+from mbtf_fit.models.model import Model, Preparation
+from mbtf_fit.models.registry import MODELS, material_of
 from mbtf_fit.objective.noise import NoiseModel, typical_value
-from mbtf_fit.surface.known import KnownSurface
+from mbtf_fit.pytorch.material import NeuralMaterial
 from mbtf_fit.training.checkpoint import CHECKPOINT_NAME, read_checkpoint, write_checkpoint
 from mbtf_fit.training.convergence import MarginalCost, marginal_cost_of
 from mbtf_fit.training.device import choose_device, keep_freed_memory
@@ -293,80 +289,39 @@ def prepare_trainer(
 ) -> Trainer:
     """A trainer at its first step, for the model and the data of a configuration; with the networks of the
     model `shared`, if there is one."""
-    model = build_model(config.model, data.lattice, **config.network.model_dump())
-    if isinstance(model, LearnedRelief):
-        model.light_width = _light_width(data)
-    elif isinstance(model, Relief):
-        model.know(_known_surface(config, data))
+    model = material_of(config.model, data.lattice, config.network)
     unit = typical_value(mean_value(partition.sample.value_a, partition.sample.value_b))
     model.initialize(torch.Generator().manual_seed(config.seed), unit)
+
+    def load(folder: str) -> tuple[TrainingData, float]:
+        other = open_data(folder, MODELS[config.model].layout, config.model, config.data.cache)
+        part = load_training(other, config.held_out, config.seed)
+        typical = typical_value(mean_value(part.sample.value_a, part.sample.value_b))
+        return part.training.to(device), typical
+
+    hooks, training = MODELS[config.model](model), partition.training.to(device)
+    training = hooks.prepare(Preparation(data, training, config.training, unit, config.seed, load))
     if config.init_from is not None:
-        _initialize_from(model, config.init_from)
+        _initialize_from(hooks, config.init_from)
     if config.decoder is not None:
         Decoder.find(config.decoder).load(model)
     noise = NoiseModel.silent(unit, data.lattice)
     # A single value does not tell its noise; none is assumed.
     if data.estimates == 2:
         noise = NoiseModel.of(partition.sample, data.lattice, unit)
-    training: TrainingData = partition.training.to(device)
-    if isinstance(model, Rainer2019):
-        assert isinstance(training, TrainingSlices)
-        generator = torch.Generator().manual_seed(config.seed + 1)
-        model.prepare(len(training.omega_i), generator)
-        training = shared_slices(config, training, unit, device)
     model = model.to(device)
     if shared is not None:
         model.share_networks(shared)
-    return Trainer(config, model, training, noise, partition.selection)
+    return Trainer(config, model, training, noise, partition.selection, hooks)
 
 
-def shared_slices(
-    config: FitConfig, own: TrainingSlices, unit: float, device: torch.device
-) -> TrainingSlices | SharedSlices:
-    """The slices that a network learns: those of one material, or of several, all in units of the first."""
-    if not (config.training.materials or config.training.own_material):
-        raise InputError(
-            "there is nothing to learn from without the material itself",
-            where="training.own_material",
-            hint="add folders of slices of other materials: training.materials",
-        )
-    if not config.training.materials:
-        return own
-    learned = [own] if config.training.own_material else []
-    for folder in config.training.materials:
-        data = open_data(folder, "slices", config.model, config.data.cache)
-        partition = load_training(data, config.held_out, config.seed)
-        assert isinstance(partition.training, TrainingSlices)
-        typical = typical_value(mean_value(partition.sample.value_a, partition.sample.value_b))
-        learned.append(partition.training.to(device).scaled(unit / typical if typical > 0 else 1.0))
-    return SharedSlices(own, learned)
-
-
-def _known_surface(config: FitConfig, data: Dataset) -> KnownSurface:
-    """Heights and maps of a data set's surface, filtered for its levels."""
-    geometry = data.geometry()
-    if geometry is None:
-        raise InputError(
-            f"the data set has no geometry, which {config.model} traces",
-            where=data.folder,
-            hint="fit a model that learns heights: --model neumip+",
-        )
-    return KnownSurface.of(geometry, data.lattice, _light_width(data))
-
-
-def _light_width(data: Dataset) -> float:
-    """RMS angle per axis of the light kernel, in degrees; 0 where the data set does not say."""
-    config: Any = data.manifest.get("config") or {}
-    return float((config.get("light") or {}).get("width") or 0.0)
-
-
-def _initialize_from(model: NeuralMaterial, folder: str | Path) -> None:
+def _initialize_from(hooks: Model, folder: str | Path) -> None:
     """Copy textures and offset of a material into a model of like levels, channels, width and offset.
 
     A step of the hierarchical model takes several times as long as a step of ``neumip``. Both share textures
     and offset, which ``neumip`` learns sooner.
     """
-    source = Material.load(folder).model
+    model, source = hooks.material, Material.load(folder).model
     given, mine = source.weights(), model.weights()
     names = [name for name in mine if name.partition(".")[0] in _SHARED]
     names += [_DEPTH_WEIGHTS] if _DEPTH_WEIGHTS in mine and _DEPTH_WEIGHTS in given else []
@@ -379,8 +334,7 @@ def _initialize_from(model: NeuralMaterial, folder: str | Path) -> None:
                 "network.offset and network.oversampling",
             )
     model.load_weights({**mine, **{name: given[name] for name in names}})
-    if isinstance(model, LearnedRelief) and isinstance(source, LearnedRelief):
-        model.start_from(source.known.heights)
+    hooks.init_from(source)
 
 
 def _resume(trainer: Trainer, out: Path) -> bool:

@@ -17,8 +17,7 @@ from mbtf_core.units import clock
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import Partition, load_training, open_data
 from mbtf_fit.formatting import SPLIT_NAMES
-from mbtf_fit.models.registry import MODELS, build_model
-from mbtf_fit.models.relief import Relief
+from mbtf_fit.models.registry import MODELS, material_of
 from mbtf_fit.surface.known import surface_bytes
 from mbtf_fit.training.device import choose_device, keep_freed_memory
 from mbtf_fit.training.fit import prepare_trainer
@@ -88,8 +87,8 @@ def fit_bytes(config: FitConfig, lattice: Lattice) -> int:
     """Bytes that a fit writes at most: a checkpoint of weights and two moments, while it replaces another,
     and the known surface."""
     with torch.device("meta"):
-        model = build_model(config.model, lattice, **config.network.model_dump())
-    surface = surface_bytes(lattice) if isinstance(model, Relief) else 0
+        model = material_of(config.model, lattice, config.network)
+    surface = surface_bytes(lattice) if model.tracing is not None else 0
     return 6 * sum(p.nbytes for p in model.parameters()) + surface
 
 

@@ -16,12 +16,13 @@ from mbtf_core.data.dataset import Dataset
 from mbtf_core.errors import InputError
 from mbtf_core.files.digest import data_sha256
 from mbtf_core.files.folders import owned
-from mbtf_fit.config import DataSection, FitConfig
+from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import Partition, load_training, open_data
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.material.decoder import DECODER_NAME, Decoder, write_decoder
 from mbtf_fit.material.format import DESCRIPTION_NAME
 from mbtf_fit.models.registry import MODELS
+from mbtf_fit.sections import DataSection
 from mbtf_fit.training.checkpoint import CHECKPOINT_NAME
 from mbtf_fit.training.device import choose_device, keep_freed_memory
 from mbtf_fit.training.fit import (

@@ -39,7 +39,7 @@ class JointTrainer(TrainingLoop):
         Options of the fit; the budget is that of all materials together.
     trainers : dict
         Name → trainer of each material, at its first step. The models share their networks already
-        (:meth:`NeuralMaterial.share_networks <mbtf_fit.models.interface.NeuralMaterial.share_networks>`).
+        (:meth:`NeuralMaterial.share_networks <mbtf_fit.pytorch.material.NeuralMaterial.share_networks>`).
     """
 
     def __init__(self, config: FitConfig, trainers: dict[str, Trainer]) -> None:

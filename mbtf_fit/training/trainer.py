@@ -15,26 +15,24 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mbtf_core.errors import InputError
-from mbtf_fit.config import FitConfig, TrainingSection
+from mbtf_fit.config import FitConfig
 from mbtf_fit.data.images import TrainingImages
-from mbtf_fit.data.queries import HINT_BYTES, QUERY_BYTES, ShardQueries, TrainingQueries
-from mbtf_fit.data.slices import SharedSlices, SliceBatch, TrainingSlices
+from mbtf_fit.data.queries import ShardQueries, TrainingQueries
+from mbtf_fit.data.slices import SharedSlices, TrainingSlices
 from mbtf_fit.data.streaming import Selection, StreamedQueries
 from mbtf_fit.material.inference import predict
-from mbtf_fit.models.blur import annealed_sigma
-from mbtf_fit.models.hierarchical import Hierarchical
-from mbtf_fit.models.interface import NeuralMaterial
-from mbtf_fit.models.learned_relief import LearnedRelief
-from mbtf_fit.models.neumip import Neumip
-from mbtf_fit.models.rainer import Rainer2019
-from mbtf_fit.models.relief import Relief
+from mbtf_fit.models.model import Model
+from mbtf_fit.models.registry import MODELS
 from mbtf_fit.native import kernel
-from mbtf_fit.native.model import supports, supports_patches
+from mbtf_fit.native.model import supports
 from mbtf_fit.native.stepper import NativeStepper
 from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.noise import NoiseModel
 from mbtf_fit.objective.parallel import MAX_KERNEL_THREADS, MAX_THREADS, Batch, Workers
 from mbtf_fit.objective.regularization import WeightDecay
+from mbtf_fit.pytorch.material import NeuralMaterial
+from mbtf_fit.sections import TrainingSection
+from mbtf_fit.textures.blur import annealed_sigma
 from mbtf_fit.training.calibration import fit_calibration
 from mbtf_fit.training.loop import Progress, TrainingLoop, health_of
 
@@ -56,21 +54,6 @@ def learning_rate_factor(training: TrainingSection, step: int, fraction: float) 
     return rise * fall
 
 
-def _hints(model: Relief, queries: TrainingQueries) -> Tensor:
-    return model.hints(queries.u, queries.sigma, queries.omega_i, queries.omega_o)
-
-
-def _with_hints(model: NeuralMaterial, queries: TrainingData, memory: float) -> TrainingData:
-    """The queries with the hints of a surface that stays as it is, where they fit in so many bytes. Otherwise
-    each batch gets its own."""
-    fits = len(queries) * (QUERY_BYTES + HINT_BYTES) <= memory
-    still = isinstance(model, Relief) and not isinstance(model, LearnedRelief)
-    if not (still and isinstance(queries, TrainingQueries) and fits):
-        return queries
-    assert isinstance(model, Relief)
-    return replace(queries, hints=_hints(model, queries))
-
-
 class Trainer(TrainingLoop):
     """Training of one model on one set of queries.
 
@@ -80,6 +63,7 @@ class Trainer(TrainingLoop):
     queries : on the device
     noise : model of their noise
     selection : rows of the shards that the queries are, to name a bad batch
+    hooks : the model of the material, prepared; by default that of the configuration
     """
 
     def __init__(
@@ -89,25 +73,25 @@ class Trainer(TrainingLoop):
         queries: TrainingData,
         noise: NoiseModel,
         selection: Selection | None = None,
+        hooks: Model | None = None,
     ) -> None:
         self.config = config
         self.model = model
+        self.hooks = MODELS[config.model](model) if hooks is None else hooks
         if isinstance(queries, TrainingImages):
             queries = replace(queries, patch_size=config.training.patch_size)
-        self.queries = _with_hints(model, queries, config.data.memory)
+        self.queries: TrainingData = self.hooks.precompute(queries, config.data.memory)
         self.selection = selection
         self.device = next(model.parameters()).device
         self.progress = Progress()
         self.batch = min(config.training.batch, len(queries))
-        texels, weights = model.trained()
+        texels, weights = self.hooks.trained()
         self.optimizer = torch.optim.Adam([{"params": texels}, {"params": weights}], betas=BETAS, fused=True)
         self.loss = Objective(config.training, noise)
         self.weight_decay = WeightDecay.of(config.training, noise.ratio, len(queries))
         found = kernel()
         self._stepper = (
-            NativeStepper(found, model, self.optimizer)
-            if found is not None and (supports(model) or supports_patches(model))
-            else None
+            NativeStepper(found, model, self.optimizer) if found is not None and supports(model) else None
         )
 
     @property
@@ -134,10 +118,11 @@ class Trainer(TrainingLoop):
 
     def _parameters(self) -> Iterator[Tensor]:
         yield from self.model.parameters()
+        yield from self.hooks.parameters().values()
 
     def health(self) -> Tensor:
         """A number that is finite if all network weights are."""
-        return health_of(self.model.trained()[1], self.device)
+        return health_of(self.hooks.trained()[1], self.device)
 
     def _stop_at(self, step: int) -> NoReturn:
         self.stop_at(step, step)
@@ -161,24 +146,12 @@ class Trainer(TrainingLoop):
             max(sigma, blur.offset_sigma if t.moves_lookups else blur.min_sigma) for t in model.textures()
         ]
 
-    def _follow_heights(self) -> None:
-        if isinstance(self.model, LearnedRelief):
-            sigma = self._sigmas()[self.model.textures().index(self.model.heights)]
-            self.model.follow(self.progress.step, sigma, self.fraction)
-
     def _tables(self) -> list[Tensor]:
         """The textures with the current blur."""
         return [t.blurred(sigma) for t, sigma in zip(self.model.textures(), self._sigmas(), strict=True)]
 
     def _loss(self, batch: Batch) -> Tensor:
-        if isinstance(batch, SliceBatch):
-            assert isinstance(self.model, Rainer2019)
-            return self.loss(self.model.reconstruct(batch), batch.queries())
-        evaluate = self.model.evaluate_patches if isinstance(self.model, Hierarchical) else self.model
-        arrays = [batch.u, batch.sigma, batch.omega_i, batch.omega_o]
-        if isinstance(batch, TrainingQueries) and batch.hints is not None:
-            arrays.append(batch.hints)
-        return self.loss(evaluate(*arrays), batch)
+        return self.loss(*self.hooks.predict(batch))
 
     def _step(self, batch: Batch, workers: Workers) -> Tensor:
         training = self.config.training
@@ -187,30 +160,29 @@ class Trainer(TrainingLoop):
         for group, rate in zip(self.optimizer.param_groups, rates, strict=True):
             group["lr"] = rate
         self.weight_decay.apply(self.model, *rates)
-        self._follow_heights()
+        sigmas = self._sigmas()
+        named = {
+            name: sigma
+            for name, module in self.model.named_children()
+            for texture, sigma in zip(self.model.textures(), sigmas, strict=True)
+            if module is texture
+        }
+        batch = self.hooks.before_step(self.progress.step, self.fraction, named, batch)
         self.loss.fraction = self.fraction
-        if isinstance(self.model, Relief) and isinstance(batch, TrainingQueries) and batch.hints is None:
-            batch = replace(batch, hints=_hints(self.model, batch))
-        if isinstance(batch, SliceBatch):
-            weights = self.model.trained()[1]
-            loss, gradients = workers.gradients(self._loss, batch, weights)
-            for p, g in zip(weights, gradients, strict=True):
-                p.grad = g
-            self.optimizer.step()
-            return loss
         if self._stepper is not None:
-            return self._stepper.step(self.loss, batch, self._sigmas(), workers)
-        texels, weights = self.model.parameter_groups()
-        weights = [p for p in weights if p.requires_grad]
+            assert isinstance(batch, TrainingQueries)
+            return self._stepper.step(self.loss, batch, sigmas, workers)
+        texels, weights = self.hooks.trained()
         # Lookups read detached tables; their gradients pass through the blur once, for the whole batch.
-        tables = self._tables()
+        tables = self._tables() if texels else []
         leaves = [t.detach().requires_grad_() for t in tables]
-        for texture, leaf in zip(self.model.textures(), leaves, strict=True):
+        for texture, leaf in zip(self.model.textures() if texels else [], leaves, strict=True):
             texture.read(leaf)
         loss, gradients = workers.gradients(self._loss, batch, [*leaves, *weights])
         by_table, by_weight = gradients[: len(leaves)], gradients[len(leaves) :]
-        for p, g in zip(texels, torch.autograd.grad(tables, texels, by_table), strict=True):
-            p.grad = g
+        if texels:
+            for p, g in zip(texels, torch.autograd.grad(tables, texels, by_table), strict=True):
+                p.grad = g
         for p, g in zip(weights, by_weight, strict=True):
             # Gradients of convolutions have the channels last in memory, which PyTorch's fused Adam does not
             # support on CPUs: it would mix up the weights.
@@ -225,10 +197,7 @@ class Trainer(TrainingLoop):
 
     def _read_blurred(self) -> None:
         """Let lookups read the textures with the current blur, or those that the encoder writes."""
-        if isinstance(self.model, Rainer2019):
-            assert isinstance(self.queries, TrainingSlices | SharedSlices)
-            own = self.queries.own if isinstance(self.queries, SharedSlices) else self.queries
-            self.model.write_textures(own)
+        if self.hooks.write_textures(self.queries):
             return
         with torch.no_grad():
             for texture, table in zip(self.model.textures(), self._tables(), strict=True):
@@ -238,26 +207,26 @@ class Trainer(TrainingLoop):
         """Fit the calibration factors (:mod:`~mbtf_fit.training.calibration`), if the configuration asks for
         them and the model has some."""
         model = self.model
-        if not (self.config.training.energy_calibration and isinstance(model, Neumip)):
+        if not (self.config.training.energy_calibration and self.hooks.calibrates):
             return
         assert isinstance(self.queries, TrainingQueries | StreamedQueries)
         self._read_blurred()
-        model.calibration = None
+        model.calibrate(None)
         found = fit_calibration(
             partial(predict, model), model.lattice, self.queries, self.config.held_out, self.loss.bound
         )
-        model.calibration = torch.from_numpy(found).to(self.device)
+        model.calibrate(torch.from_numpy(found).to(self.device))
 
     def fill_levels(self, coarsest: float) -> None:
         """Give levels of the pyramid below the fractional level of the data's largest footprint the averages
         of the next finer one. Measured BTFs have one footprint: their coarser levels would keep their initial
         noise."""
-        self.model.pyramid.average_coarser(math.floor(coarsest + _SAME_LEVEL))
+        self.model.textures()[0].average_coarser(math.floor(coarsest + _SAME_LEVEL))
 
     def coverage(self) -> dict[int, float]:
         """Level → fraction of the pyramid's texels that have received gradients."""
-        pyramid = self.model.pyramid
-        if isinstance(self.model, Rainer2019):
+        pyramid = self.model.textures()[0]
+        if not self.hooks.trained()[0]:
             return dict.fromkeys(range(self.model.lattice.finest + 1), 1.0)
         moment = self.optimizer.state.get(pyramid.texels, {}).get("exp_avg_sq")
         return {

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from mbtf_fit.material.format import DEFAULT_MIN_COS, QUERY
 from mbtf_fit.material.material import Material, conformance_values
-from mbtf_fit.models.constants import AZIMUTHS, HEIGHTS, HORIZONS, MAPS
-from mbtf_fit.models.registry import build_model
+from mbtf_fit.ops.constants import AZIMUTHS, HEIGHTS, HORIZONS, MAPS
 from mbtf_fit.viewer.shader import NODE_SHIFT, ShaderSource, node_blocks
 from mbtf_fit.viewer.textures import F32, PackedTexture, pack
 
@@ -113,8 +112,7 @@ def as_read(material: Material, packed: dict[str, PackedTexture]) -> Material:
         elif name != "transmittance":
             for level, texels in enumerate(texture.levels):
                 weights[f"{name}.{level}"] = torch.from_numpy(_moments(name, texels))
-    model = build_model(material.config.model, material.lattice, **material.config.network.model_dump())
-    model.requires_grad_(False)
+    model = material.model.empty_copy()
     model.load_weights(weights)
     transmittance = material.transmittance
     if transmittance is not None:

@@ -13,7 +13,6 @@ from mbtf_core.errors import InputError
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.material.format import QUERY
 from mbtf_fit.material.material import Material, conformance_queries, conformance_values
-from mbtf_fit.models.registry import build_model
 from mbtf_fit.training.fit import Observer
 from mbtf_fit.training.trainer import Trainer
 from mbtf_fit.training.validation import errors_by_level, finite
@@ -112,8 +111,7 @@ def snapshot(trainer: Trainer, name: str) -> dict[str, Any]:
     """
     config, lattice, progress = trainer.config, trainer.model.lattice, trainer.progress
     queries = conformance_queries(lattice)
-    model = build_model(config.model, lattice, **config.network.model_dump())
-    model.requires_grad_(False)
+    model = trainer.model.empty_copy()
     model.load_weights({key: tensor.cpu() for key, tensor in trainer.model.weights().items()})
     queries["rgb"] = conformance_values(model, {key: queries[key] for key in QUERY})
     training = {"steps": progress.step, "seconds": round(progress.seconds, 1)}

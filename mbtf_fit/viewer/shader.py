@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
-from mbtf_fit.config import NetworkSection
 from mbtf_fit.material.material import Material
-from mbtf_fit.models.constants import (
+from mbtf_fit.ops.constants import (
     ALPHA2,
     AZIMUTHS,
     DIELECTRIC,
@@ -37,6 +36,7 @@ from mbtf_fit.models.constants import (
     RGB_OF_YUV,
     STATISTICS,
 )
+from mbtf_fit.sections import NetworkSection
 
 F32 = NDArray[np.float32]
 # Where the generated code stands in material.glsl.
@@ -112,7 +112,7 @@ def _encoded(
     network: NetworkSection,
     spreads: Sequence[str] | None = None,
 ) -> list[str]:
-    """Expressions of encoded coordinates (mbtf_fit.models.encodings)."""
+    """Expressions of encoded coordinates (mbtf_fit.pytorch.encodings)."""
     if not bands:
         return list(coordinates)
     options = network.encoding
@@ -309,7 +309,7 @@ class ShaderSource:
         unit = float(self._tensors["unit"])
         body = ["  return vec3(0.0);"]
         if unit > 0:
-            sliced = self._material.config.model.startswith("rainer")
+            sliced = any(op.kind() == "standardize" for op in self._material.model.operations)
             body = self._slices(unit) if sliced else self._decoder(unit)
         return [
             "vec3 decode(Seen seen, vec3 omega_i, vec3 omega_o, vec3 half_vector, vec3 known, vec3 core) {",

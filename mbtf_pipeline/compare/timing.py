@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from mbtf_fit import Material
+    from mbtf_fit.ops import Operation
 
 # Numbers of lights per view.
 LIGHTS = (1, 4, 16)
@@ -93,7 +94,7 @@ def measure_timing(material: Material, pixels: int, device: str) -> dict[str, An
     u, sigma, _, view = chunks[0]
     with torch.no_grad():
         features = model.stage1(u, sigma, view)
-    second = milliseconds(lambda u, s, i, o: model.stage2(features[: len(u)], i, o))
+    second = milliseconds(lambda u, s, i, o: model.stage2(_first(features, len(u), len(view)), i, o))
     parts = {name: milliseconds(part) for name, part in _parts(material).items()}
     return {
         "device": device,
@@ -107,25 +108,35 @@ def measure_timing(material: Material, pixels: int, device: str) -> dict[str, An
     }
 
 
+def _first(values: dict[str, Tensor], count: int, of: int) -> dict[str, Tensor]:
+    """Values of the first queries."""
+    return {name: value[: count * (len(value) // of)] for name, value in values.items()}
+
+
 def _parts(material: Material) -> dict[str, Callable[..., Any]]:
-    """Parts of stage 1, evaluated once for each position that the model reads."""
-    from mbtf_fit.models.encodings import encode_position
+    """Lookups, networks and encodings of stage 1, evaluated once for each position that the model reads."""
+    from mbtf_fit.ops import Frequencies, Lookup, Network, sizes_of, stages
+    from mbtf_fit.ops.operation import parse
 
     model = material.model
-    around = model.positions
+    around, sizes = model.positions, sizes_of(model.operations)
 
-    def spread(a: Tensor) -> Tensor:
-        return a.repeat_interleave(around, 0) if around > 1 else a
+    def part(op: Operation) -> Callable[..., Any]:
+        def evaluate(u: Tensor, sigma: Tensor, omega_i: Tensor, omega_o: Tensor) -> Any:
+            at = u.repeat_interleave(around, 0)
+            given = {"level": model.level(sigma).repeat_interleave(around)}
+            for name in {parse(reference)[0] for reference in op.inputs()} - {"level"}:
+                given[name] = at if sizes[name] == 2 else u.new_zeros(len(at), sizes[name])
+            return model.run([op.output], given)
+
+        return evaluate
 
     out: dict[str, Callable[..., Any]] = {}
-    if model.network.offset != "none":
-        inputs = model.network.channels + 2
-        out["offset texture"] = lambda u, s, i, o: model.offset_texture(spread(u))
-        out["offset network"] = lambda u, s, i, o: model.offset_network(u.new_zeros(len(u) * around, inputs))
-    out["pyramid"] = lambda u, s, i, o: model.read(spread(u), model.level(spread(s)))
-    encoding = model.network.encoding
-    if encoding.position:
-        out["encoding"] = lambda u, s, i, o: encode_position(
-            spread(u), model.level(spread(s)), model.lattice.aspect, encoding
-        )
+    for op in stages(model.operations)[0]:
+        if isinstance(op, Lookup):
+            out[op.textures.replace("_", " ")] = part(op)
+        elif isinstance(op, Network):
+            out[op.weights.replace("_", " ")] = part(op)
+        elif isinstance(op, Frequencies) and op.x == "p":
+            out["encoding"] = part(op)
     return out

@@ -16,9 +16,8 @@ from mbtf_core.data.schema import FORMAT_NAME, GEOMETRY_NAME, MANIFEST_NAME, SCH
 from mbtf_core.data.shard_files import write_shard
 from mbtf_core.directions import from_projected_disk
 from mbtf_core.files.atomic import checksummed
-from mbtf_fit.config import FitConfig
+from mbtf_fit.config import FitConfig, build_model
 from mbtf_fit.data.queries import TrainingQueries
-from mbtf_fit.models.registry import build_model
 from mbtf_fit.objective.noise import NoiseModel, typical_value
 from mbtf_fit.training.trainer import Trainer
 

@@ -7,11 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.data.schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION
 from mbtf_core.data.shard_files import write_shard
 from mbtf_core.files.atomic import checksummed
+from mbtf_fit.models.registry import MODELS
+from mbtf_fit.pytorch.material import NeuralMaterial
 from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
 from mbtf_gen.sampling.slice_directions import slice_directions
 
@@ -88,3 +91,12 @@ def write_slices(
         manifest["arrays"] = {"transmittance": {}}
     (folder / MANIFEST_NAME).write_bytes(checksummed(manifest))
     return folder
+
+
+def prepared(material: NeuralMaterial, name: str, pairs: int, device: torch.device) -> Any:
+    """The model of a material, with an encoder of slices at so many pairs."""
+    model: Any = MODELS[name](material)
+    model.encoder = model._encoder(pairs)
+    model.encoder.initialize(torch.Generator().manual_seed(0))
+    model.encoder.to(device)
+    return model

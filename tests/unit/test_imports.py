@@ -55,9 +55,17 @@ mbtf_gen.publishing
 mbtf_gen.diagnostics
 mbtf_gen.cli
 mbtf_gen
-mbtf_fit.config mbtf_fit.presets mbtf_fit.formatting
+mbtf_fit.sections mbtf_fit.formatting
 mbtf_fit.data
-mbtf_fit.native mbtf_fit.surface mbtf_fit.models mbtf_fit.objective
+mbtf_fit.ops
+mbtf_fit.native.library
+mbtf_fit.textures
+mbtf_fit.surface
+mbtf_fit.pytorch
+mbtf_fit.models
+mbtf_fit.config mbtf_fit.presets
+mbtf_fit.objective
+mbtf_fit.native
 mbtf_fit.material
 mbtf_fit.evaluation
 mbtf_fit.training

@@ -154,7 +154,7 @@ class LobeFitter:
         """
         lights, own = _LIGHTS if self.material.model.positions == 1 else _FEW_LIGHTS
         least = least_cosine(self.material)
-        moves = self.material.model.network.offset != "none"
+        moves = any(op.kind() == "offset" for op in self.material.model.operations)
         views = steep_views(_VIEWS, _SINES[moves])
         at = followed(self.material, u, views)
         omega_i = direction_pairs(_VIEWS * lights, least)[0]

@@ -19,7 +19,7 @@ from torch import Tensor
 from mbtf_core.errors import UsageError
 from mbtf_fit.material.interchange.brdf import Pairs, affine
 from mbtf_fit.material.material import Material
-from mbtf_fit.models.constants import DIELECTRIC, GLOSSY_CHANNELS, HEIGHTS, MAPS
+from mbtf_fit.ops.constants import DIELECTRIC, GLOSSY_CHANNELS, HEIGHTS, MAPS
 
 F64 = NDArray[np.float64]
 # Least roughness: smaller lobes are narrower than those that data are made with.

@@ -32,8 +32,6 @@ static int64_t state_floats(const mbtf_model *m) {
     return BLOCK * (8 + network_rows(&m->decoder) + (m->offset.layers ? network_rows(&m->offset) : 0));
 }
 
-#include "patches.h"
-
 #define JOIN_(a, b) a##b
 #define JOIN(a, b) JOIN_(a, b)
 #define NAME(x) JOIN(x, SUFFIX)
@@ -198,94 +196,6 @@ EXPORT void mbtf_collect_weights(const mbtf_network *net, float *const *sums, in
         collect_sums(sums, at, threads, count, gradients[k]);
         at += LANES * count;
     }
-}
-
-/* Those of an Inception decoder, likewise. */
-EXPORT void mbtf_collect_inception(const mbtf_inception *d, float *const *sums, int64_t threads,
-                                   float *const *gradients) {
-    convolution list[MAX_CONVOLUTIONS];
-    const int count = convolutions(d, list);
-    for (int k = 0; k < count; k++) {
-        const int64_t weights = (int64_t)list[k].outputs * columns_of(&list[k]);
-        collect_sums(sums, LANES * list[k].sums, threads, weights, gradients[2 * k]);
-        collect_sums(sums, LANES * (list[k].sums + weights), threads, list[k].outputs, gradients[2 * k + 1]);
-    }
-}
-
-EXPORT int64_t mbtf_inception_floats(const mbtf_inception *d) {
-    convolution list[MAX_CONVOLUTIONS];
-    const convolution *last = &list[convolutions(d, list) - 1];
-    return last->packed + packed_layer(last->inputs, last->outputs);
-}
-
-/* `parameters`: weight (outputs, inputs, size, size) and bias of each convolution. */
-EXPORT void mbtf_pack_inception(int32_t variant, const mbtf_inception *d, const float *const *parameters,
-                                float *packed) {
-    convolution list[MAX_CONVOLUTIONS];
-    const int count = convolutions(d, list), most = VARIANTS[variant]->tile_outputs;
-    for (int k = 0; k < count; k++) {
-        const convolution *c = &list[k];
-        const int taps = c->size * c->size;
-        const float *w = parameters[2 * k];
-        const int64_t columns = columns_of(c);
-        float *to = packed + c->packed, *transposed = packed + c->transposed;
-        pack_matrix(w, columns, taps, taps, parameters[2 * k + 1], c->outputs, c->inputs, most, to);
-        pack_matrix(w, taps, columns, taps, NULL, c->inputs, c->outputs, most, transposed);
-    }
-}
-
-EXPORT int64_t mbtf_patch_state_floats(const mbtf_model *m, int32_t rows, int32_t columns, int64_t items) {
-    const patch_layout l = layout_of(m, rows, columns, items);
-    return l.flat_floats + l.blocks * l.block_floats;
-}
-
-EXPORT int64_t mbtf_patch_scratch_floats(const mbtf_model *m, int32_t rows, int32_t columns, int64_t items) {
-    const patch_layout l = layout_of(m, rows, columns, items);
-    return l.scratch_floats;
-}
-
-/* Values (items, rows, columns, 3) of patches without their margins, `group` items at a time. `state` keeps those
- * of all groups where `keep`, of one group otherwise. */
-EXPORT void mbtf_patch_forward(int32_t variant, const mbtf_model *m, const mbtf_patches *p, int64_t group,
-                               int32_t clamp, int32_t keep, float *state, float *out) {
-    const int64_t floats = keep ? mbtf_patch_state_floats(m, p->rows, p->columns, group) : 0;
-    for (int64_t first = 0; first < p->items; first += group, state += floats) {
-        const mbtf_patches part = part_of(m, p, first, group);
-        VARIANTS[variant]->patch_forward(m, &part, clamp, keep, state, out + first * values_of(m, p));
-    }
-}
-
-/* Gradients after a forward that kept its state; those by `inputs` (items, m->inputs) where there are modules. */
-EXPORT void mbtf_patch_backward(int32_t variant, const mbtf_model *m, const mbtf_patches *p, int64_t group,
-                                float *state, const float *by_value, float *by_inputs, float *scratch,
-                                const mbtf_gradients *to) {
-    const int64_t floats = mbtf_patch_state_floats(m, p->rows, p->columns, group);
-    for (int64_t first = 0; first < p->items; first += group, state += floats) {
-        const mbtf_patches part = part_of(m, p, first, group);
-        VARIANTS[variant]->patch_backward(m, &part, state, by_value + first * values_of(m, p),
-                                          by_inputs + first * m->inputs, scratch, to);
-    }
-}
-
-/* Both at once with a quadratic loss, as in mbtf_learn. `out` has room for the values of two groups. */
-EXPORT double mbtf_patch_learn(int32_t variant, const mbtf_model *m, const mbtf_patches *p, int64_t group,
-                               const float *targets, const mbtf_loss *loss, float share, float *state,
-                               float *out, float *by_inputs, float *scratch, const mbtf_gradients *to) {
-    const int64_t values = values_of(m, p);
-    double sum = 0.0;
-    const mbtf_variant *v = VARIANTS[variant];
-    for (int64_t first = 0; first < p->items; first += group) {
-        const mbtf_patches part = part_of(m, p, first, group);
-        const float *target = targets + first * values;
-        float *by_value = out + group * values;
-        v->patch_forward(m, &part, 0, 1, state, out);
-        for (int64_t at = 0; at < part.items * values; at += 3 * BLOCK) {
-            const int64_t left = part.items * values - at, n = left < 3 * BLOCK ? left : 3 * BLOCK;
-            sum += v->loss(loss, out + at, target + at, n, share, by_value + at);
-        }
-        v->patch_backward(m, &part, state, by_value, by_inputs + first * m->inputs, scratch, to);
-    }
-    return sum;
 }
 
 EXPORT void mbtf_collect(int32_t variant, float *const *sums, int64_t threads, int64_t channels, int64_t from,

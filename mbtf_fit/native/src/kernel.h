@@ -10,7 +10,7 @@
 #include <stdint.h>
 
 /* Version of what the functions mean; raised where sizes of structures do not show a change. */
-#define INTERFACE 1
+#define INTERFACE 2
 #define BLOCK 128
 #define MAX_CHANNELS 64
 #define MAX_WIDTH 128
@@ -38,15 +38,8 @@ typedef struct {
     const float *table;
 } mbtf_textures;
 
-/* An Inception decoder behind its first layer: modules, channels between them, and channels of the branches; the
- * maximum has the rest. Packed by mbtf_pack_inception. */
-typedef struct {
-    int32_t modules, width, one, before3, three, before5, five;
-    const float *packed;
-} mbtf_inception;
-
-/* neumip, neumip-baseline where offset.layers is 0, or relief where depth_weights (a number per level) are
- * given. Where height_scale is not 0, the offset texture holds learned heights over height_scale, in one
+/* Operations that mbtf_fit/native/pattern.py matches: a neural offset unless offset.layers is 0, or traced heights
+ * where depth_weights (a number per level) are given. Where height_scale is not 0, the offset texture holds learned heights over height_scale, in one
  * channel. The decoder sees so many coordinates of light and of view: 2 (x, y) or 3; then, where they are not 0,
  * half vector and difference vector, hints, light and view about the known normal. With `gate`, its last output
  * is that of the gate. */
@@ -56,19 +49,7 @@ typedef struct {
     float unit, offset_scale, grazing, aspect, irradiance_scale, height_scale, least_facing;
     int32_t coordinates, half_vector, hints, frame, gate;
     const float *depth_weights;
-    mbtf_inception inception;
-    int32_t fourth_root, bands, inputs;
 } mbtf_model;
-
-/* Patches of positions that share footprint and view: u (items, rows, columns, 2), sigma (items), omega_o
- * (items, 3), factors of the position's encoding (items, 2 bands). `inputs` (items, m->inputs) are those of the
- * decoder that an item's positions share: with modules what light and view add to its first layer, else light
- * and view encoded. */
-typedef struct {
-    int64_t items;
-    int32_t rows, columns;
-    const float *u, *sigma, *omega_o, *factors, *inputs;
-} mbtf_patches;
 
 /* A periodic height field: nodes and logarithms as in mbtf_core/height_planes.py; heights z (rows,
  * columns) at most 0, row index along +y. */
@@ -99,7 +80,7 @@ typedef struct {
 /* Sums that one thread adds to. Texture rows are padded to a multiple of 8 floats, weights are LANES
  * partial sums each, depth weights are single numbers. */
 typedef struct {
-    float *pyramid, *offset_texture, *decoder, *offset, *depth_weights, *inception;
+    float *pyramid, *offset_texture, *decoder, *offset, *depth_weights;
 } mbtf_gradients;
 
 /* Loss of a prediction p on a value t that the kernel takes by itself, the mean over queries and colors of

@@ -13,10 +13,10 @@ from support.fit_data import F32, random_queries, write_data
 
 from mbtf_core.data.lattice import Lattice
 from mbtf_fit import FitConfig, fit
+from mbtf_fit.config import build_model
 from mbtf_fit.data.queries import TrainingQueries
-from mbtf_fit.models.interface import NeuralMaterial
-from mbtf_fit.models.registry import build_model
 from mbtf_fit.objective.noise import NoiseModel
+from mbtf_fit.pytorch.material import NeuralMaterial
 from mbtf_fit.training.trainer import Trainer
 
 LATTICE = Lattice(2)

@@ -118,7 +118,7 @@ def test_command_lines_that_cannot_share_a_network(materials: Path, data: Path, 
     assert "leave out --processes" in fails(2, *words, "--processes", "2", *out)
     assert "takes two data sets at least" in fails(3, "--many", a, "--shared-decoder", *out)
     message = fails(2, *words, "--model", "hierarchical", *out)
-    assert "hierarchical does not share its network: choose the model relief or neumip" in message
+    assert "hierarchical has no option training.shared_decoder, which neumip and relief have" in message
     message = fails(2, a, "--decoder", str(materials), "--shared-decoder", *out)
     assert "--shared-decoder requires --many" in message
     message = fails(2, *words, "--decoder", str(materials), *out)

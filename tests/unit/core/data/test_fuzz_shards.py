@@ -18,8 +18,8 @@ from mbtf_core.data.schema import MANIFEST_NAME
 from mbtf_core.data.shard_files import read_shard, write_exr, write_npz
 from mbtf_core.data.verify import verify
 from mbtf_core.errors import InputError
-from mbtf_fit.config import HeldOutSection
 from mbtf_fit.data.loader import load_split, load_training, open_data
+from mbtf_fit.sections import HeldOutSection
 from mbtf_gen.generation.summary import finish
 
 TRAILING = {"u": 2, "omega_i": 3, "omega_o": 3, "value_a": 3, "value_b": 3}

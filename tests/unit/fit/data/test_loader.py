@@ -14,9 +14,9 @@ from support.image_data import write_images
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.shard_files import read_shard
 from mbtf_core.errors import InputError
-from mbtf_fit.config import HeldOutSection
 from mbtf_fit.data.loader import Partition, in_region, load_split, load_training
 from mbtf_fit.data.queries import ShardQueries, batch_starts
+from mbtf_fit.sections import HeldOutSection
 
 HELD_OUT = HeldOutSection(queries=0.1, radius=0.3)
 

@@ -17,10 +17,11 @@ from mbtf_core.data.dataset import Dataset, Shard, ahead
 from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.store import ObjectStore
 from mbtf_core.errors import PartialError
-from mbtf_fit.config import FitConfig, HeldOutSection
+from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import load_training
 from mbtf_fit.data.queries import batch_starts
 from mbtf_fit.data.streaming import StreamedQueries
+from mbtf_fit.sections import HeldOutSection
 from mbtf_fit.training.checkpoint import CHECKPOINT_NAME
 from mbtf_fit.training.fit import fit
 

@@ -15,10 +15,11 @@ from mbtf_core.data.dataset import Dataset, Shard
 from mbtf_core.data.folder import DataFolder
 from mbtf_core.errors import InputError
 from mbtf_core.units import format_size, parse_size
-from mbtf_fit.config import FitConfig, HeldOutSection
+from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import Partition, load_training
 from mbtf_fit.data.streaming import Selection, StreamedQueries
 from mbtf_fit.evaluation import Predict, SplitErrors
+from mbtf_fit.sections import HeldOutSection
 from mbtf_fit.training.fit import fit
 
 HELD_OUT = HeldOutSection(queries=0.1, radius=0.3)

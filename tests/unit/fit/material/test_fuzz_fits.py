@@ -69,7 +69,7 @@ def test_an_altered_description(data: st.DataObject, whole: Path, folder: Path) 
 def described(whole: Path) -> str:
     """The description without what differs from run to run."""
     found = json.loads((whole / DESCRIPTION).read_text())
-    del found["conventions"], found["formula"]
+    del found["conventions"]
     return json.dumps(found)
 
 

@@ -16,7 +16,7 @@ from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.data.shard_files import read_shard, write_shard
 from mbtf_core.errors import InputError
-from mbtf_fit.config import FitConfig, HeldOutSection
+from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import load_training
 from mbtf_fit.data.streaming import Selection
 from mbtf_fit.evaluation import evaluate
@@ -24,6 +24,7 @@ from mbtf_fit.formatting import describe_transmittance
 from mbtf_fit.material.format import read_description
 from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME, Transmittance, read_transmittance
 from mbtf_fit.material.transmittance_fit import evaluate_transmittance, fit_transmittance
+from mbtf_fit.sections import HeldOutSection
 from mbtf_fit.training.fit import fit
 
 

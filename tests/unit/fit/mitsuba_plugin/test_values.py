@@ -163,7 +163,7 @@ def test_vertical_light_has_the_azimuth_0(tmp_path: Path) -> None:
         queries["omega_i"] = np.tile(np.float32([x, y, 1.0]), (n, 1))
         u, light = (torch.from_numpy(queries[name]) for name in ("u", "omega_i"))
         found += [plugin.evaluate(*queries.values()), material.evaluate(*queries.values())]
-        visible.append(material.model.known.visibility(u, level, light).numpy())
+        visible.append(material.model.known.visibility(material.model.tracing[1], u, level, light).numpy())
     assert np.ptp(visible[0]) > 0.3
     for shares in visible[1:]:
         np.testing.assert_allclose(shares, visible[0], atol=1e-6)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from mbtf_core.data.lattice import Lattice, texel_centers
-from mbtf_fit.models.lookup import Packing, lookup, lookup_reference
+from mbtf_fit.textures.lookup import Packing, lookup, lookup_reference
 
 F64 = torch.float64
 

@@ -10,16 +10,14 @@ import torch
 from mbtf_core.config.settings import resolve
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError, UsageError
-from mbtf_fit.config import EncodingSection, FitConfig, OutputTransform
-from mbtf_fit.models.constants import direction_size, position_size
-from mbtf_fit.models.encodings import encode_direction, encode_position
-from mbtf_fit.models.hierarchical import Hierarchical
-from mbtf_fit.models.interface import NeuralMaterial
-from mbtf_fit.models.mlp import Mlp, initialize_layers
-from mbtf_fit.models.outputs import start_of, to_value
-from mbtf_fit.models.registry import build_model
+from mbtf_fit.config import FitConfig, build_model
+from mbtf_fit.ops import read_operations
+from mbtf_fit.pytorch.material import NeuralMaterial
+from mbtf_fit.pytorch.mlp import Mlp, initialize_layers
+from mbtf_fit.pytorch.operations import FUNCTIONS
+from mbtf_fit.sections import OutputTransform
 
-F64 = torch.float64
+F64, LATTICE = torch.float64, Lattice(3)
 
 
 def of(model: str, **network: Any) -> tuple[str, dict[str, Any]]:
@@ -61,9 +59,19 @@ def random_model(variant: str, aspect: float = 1.0, finest: int = 3) -> NeuralMa
     for name, parameter in model.named_parameters():
         if "bias" in name:
             torch.nn.init.normal_(parameter, 0.5, 0.2)
-    if model.network.offset != "none":
-        torch.nn.init.normal_(model.offset_texture.texels)
+    for texture in model.textures():
+        if texture.moves_lookups:
+            torch.nn.init.normal_(texture.texels)
     return model
+
+
+def encoded(
+    value: str, u: torch.Tensor, level: torch.Tensor, aspect: float = 1.0, **options: Any
+) -> torch.Tensor:
+    """The encoded ``position`` or ``light`` of a model with these options."""
+    model = build_model("neumip", Lattice(5, aspect), encoding=options).double()
+    (found,) = model.run([value], {"u": u, "omega_i": u, "level": level})
+    return found
 
 
 def arguments(n: int) -> tuple[torch.Tensor, ...]:
@@ -100,9 +108,9 @@ def test_unset_options_are_the_models_own() -> None:
 @pytest.mark.parametrize(
     ("assignments", "words"),
     [
-        (["model=neumip-baseline", "network.offset=depth"], "has no offset"),
-        (["model=neumip", "network.relief.places=4"], "has no options network.relief"),
-        (["network.decoder=inception"], "it needs the model hierarchical"),
+        (["model=neumip-baseline", "network.offset=depth"], "has no option network.offset"),
+        (["model=neumip", "network.relief.places=4"], "has no option network.relief.places"),
+        (["network.decoder=inception"], "has no option network.decoder, which hierarchical has"),
     ],
 )
 def test_options_that_contradict_the_model_are_refused(assignments: list[str], words: str) -> None:
@@ -158,7 +166,8 @@ def test_the_offset_is_a_length_in_tile_widths(variant: str, aspect: float) -> N
     model = random_model(variant, aspect)
     u, sigma, _, omega_o = arguments(50)
     moved = u + model.offset(u, omega_o) / torch.tensor([1.0, aspect], dtype=F64)
-    torch.testing.assert_close(model.stage1(u, sigma, omega_o), model.read(moved, model.level(sigma)))
+    (wanted,) = model.run(["features"], {"moved": moved, "level": model.level(sigma)})
+    torch.testing.assert_close(model.stage1(u, sigma, omega_o)["features"], wanted)
 
 
 @variants
@@ -174,7 +183,7 @@ def test_stage_one_does_not_depend_on_the_light(variant: str) -> None:
 @variants
 def test_the_tile_repeats(variant: str) -> None:
     model = random_model(variant)
-    if not model.network.encoding.pi:
+    if VARIANTS[variant][1].get("encoding", {}).get("pi") is False:
         pytest.skip("sin(2^k p) does not repeat with the tile")
     u, *rest = arguments(20)
     shift = torch.randint(-3, 4, u.shape).double()
@@ -225,69 +234,71 @@ def test_concatenated_levels_are_two_weighted_lookups() -> None:
     u, level = torch.rand(2, 2, dtype=F64), torch.tensor([1.25, 2.25], dtype=F64)
     one, two, three = (model.pyramid(u, torch.full((2,), s, dtype=F64)) for s in (1.0, 2.0, 3.0))
     expected = [torch.cat([0.25 * two[0], 0.75 * one[0]]), torch.cat([0.75 * two[1], 0.25 * three[1]])]
-    torch.testing.assert_close(model.read(u, level), torch.stack(expected))
+    (found,) = model.run(["features"], {"moved": u, "level": level})
+    torch.testing.assert_close(found, torch.stack(expected))
 
 
 @pytest.mark.parametrize("output", get_args(OutputTransform))
 def test_training_starts_from_the_datas_brightness(output: Any) -> None:
-    at = torch.tensor([start_of(output, 3)] * 4, dtype=F64)
-    value = to_value(at, torch.tensor(0.3, dtype=F64), output)
+    model = build_model("neumip", LATTICE, output_transform=output).requires_grad_(False)
+    model.initialize(torch.Generator().manual_seed(0), 0.3)
+    start = list(model.decoder.parameters())[-1]
+    (value,) = model.run(["value"], {"x": start[None]})
     torch.testing.assert_close(value, torch.full_like(value, 0.0 if output == "expm1" else 0.3))
 
 
 def test_six_outputs_are_luma_chroma_and_a_gate() -> None:
-    unit = torch.tensor(2.0, dtype=F64)
+    def value(x: torch.Tensor, transform: str) -> torch.Tensor:
+        model = build_model("neumip", LATTICE, output_channels=6, output_transform=transform).double()
+        model.unit.fill_(2.0)
+        return model.run(["value"], {"x": x})[0]
+
     gray = torch.tensor([[0.7, 0.0, 0.0, 0.0, 20.0, -20.0]], dtype=F64)
     brightness = 2.0 * torch.expm1(torch.tensor(0.7, dtype=F64))
     expected = brightness * torch.tensor([[0.6, 1.1, 0.1]], dtype=F64)
-    torch.testing.assert_close(to_value(gray, unit, "expm1"), expected)
+    torch.testing.assert_close(value(gray, "expm1"), expected)
     red = torch.tensor([[0.0, 0.0, 1.0, 9.0, 9.0, 9.0]], dtype=F64)
-    r, g, b = to_value(red, unit, "identity")[0]
+    r, g, b = value(red, "identity")[0]
     assert r > 0 > g
     assert b == 0
 
 
 def test_encodings_are_sines_and_cosines_of_doubling_frequencies() -> None:
-    options = EncodingSection(position=2, direction=1)
     pi = torch.pi
     u = torch.tensor([[0.75, -0.75]], dtype=F64)  # p = 0.5, -0.5
     expected = [(k * p, f) for f in (torch.sin, torch.cos) for p in (0.5, -0.5) for k in (pi, 2 * pi)]
     level = torch.zeros(1, dtype=F64)
-    found = encode_position(u, level, 1.0, options)[0]
+    found = encoded("position", u, level, position=2)[0]
     torch.testing.assert_close(found, torch.stack([f(torch.tensor(x, dtype=F64)) for x, f in expected]))
     omega = torch.tensor([[0.6, 0.0, 0.8]], dtype=F64)
-    kept = EncodingSection(direction=1, direction_pi=False, raw=True, direction_xyz=True)
-    s, c = omega.sin(), omega.cos()
-    torch.testing.assert_close(encode_direction(omega, kept), torch.cat([omega, s, c], 1))
-    for e in (options, kept, EncodingSection(), EncodingSection(position=3, raw=True)):
-        assert encode_position(u, level, 1.0, e).shape[1] == position_size(e)
-        assert encode_direction(omega, e).shape[1] == direction_size(e)
+    found = encoded("light", omega, level, direction=1, direction_pi=False, raw=True, direction_xyz=True)
+    torch.testing.assert_close(found, torch.cat([omega, omega.sin(), omega.cos()], 1))
 
 
 def test_attenuated_bands_have_equal_slopes() -> None:
-    options = EncodingSection(position=6, direction=4, direction_pi=False, band_attenuation=True)
-    h = 1e-6
+    options = {"position": 6, "direction": 4, "direction_pi": False, "band_attenuation": True}
+    h, none = 1e-6, torch.zeros(1, dtype=F64)
     up, tilt = torch.tensor([[0.0, 0.0, 1.0]], dtype=F64), torch.tensor([[h, h, 0.0]], dtype=F64)
-    rise = encode_direction(up + tilt, options) - encode_direction(up, options)
+    rise = encoded("light", up + tilt, none, **options) - encoded("light", up, none, **options)
     torch.testing.assert_close(rise[:, :8] / h, torch.ones(1, 8, dtype=F64))
     u, level = torch.full((2, 2), 0.5, dtype=F64), torch.zeros(2, dtype=F64)
     u[1] += h
-    below, above = encode_position(u, level, 1.0, options)
+    below, above = encoded("position", u, level, **options)
     torch.testing.assert_close((above - below)[:12] / h, torch.full((12,), 2 * torch.pi, dtype=F64))
 
 
 def test_filtered_encodings_are_means_over_the_footprint() -> None:
     """Footprints are Gaussians of ``2^-level / 2`` tile widths; raw coordinates keep their own mean."""
-    options = EncodingSection(position=4, raw=True)
+    options = {"position": 4, "raw": True}
     aspect, u = 0.5, torch.tensor([[0.3, 0.6]], dtype=F64)
     z = torch.linspace(-8, 8, 8001, dtype=F64)
     weights = torch.exp(-0.5 * z**2)
     for level in (0.0, 1.5, 4.0):
         at = torch.full((1,), level, dtype=F64)
         sigma = 0.5 * 2.0**-level / torch.tensor([1.0, aspect], dtype=F64)
-        around = encode_position(u + z[:, None] * sigma, at, aspect, options)
+        around = encoded("position", u + z[:, None] * sigma, at.expand(len(z)), aspect, **options)
         expected = (weights[:, None] * around).sum(0) / weights.sum()
-        found = encode_position(u, at, aspect, options.model_copy(update={"footprint_filtered": True}))[0]
+        found = encoded("position", u, at, aspect, **options, footprint_filtered=True)[0]
         torch.testing.assert_close(found[2:], expected[2:], atol=1e-9, rtol=0)
         torch.testing.assert_close(found[:2], 2 * u[0] - 1)
 
@@ -300,17 +311,15 @@ def test_initial_parameters_have_the_stated_distributions(variant: str) -> None:
     model.initialize(torch.Generator().manual_seed(0), 0.2)
     assert float(model.unit) == pytest.approx(0.2)
     assert float(model.pyramid.texels.std()) == pytest.approx(0.1, rel=0.05)
-    if model.network.offset != "none":
-        assert not model.offset_texture.texels.any()
+    assert not any(t.texels.any() for t in model.textures() if t.moves_lookups)
     weights = model.weights()
     for network in ("decoder", "offset_network"):
         mine = [key for key in weights if key.startswith(network)]
         for key in mine:
             tensor, last = weights[key], key in mine[-2:]
             if key.endswith(".bias"):
-                start = (
-                    start_of(model.network.output_transform, 3)[0] if last and network == "decoder" else 0.0
-                )
+                transform = FitConfig.model_validate({"model": name, "network": options}).network
+                start = FUNCTIONS[transform.output_transform][1] if last and network == "decoder" else 0.0
                 assert float(tensor[0]) == pytest.approx(start)
                 assert not tensor[3 if last else 0 :].any()
             else:
@@ -320,21 +329,22 @@ def test_initial_parameters_have_the_stated_distributions(variant: str) -> None:
 
 
 @variants
-def test_the_formula_names_what_the_export_holds(variant: str) -> None:
+def test_the_operations_name_what_the_export_holds(variant: str) -> None:
     model = random_model(variant)
-    text = " ".join(model.formula().values())
-    for name in {key.split(".")[0] for key in model.weights()}:
-        assert name in text
+    kinds = ("tensor", "texture", "network")
+    named = {name for op in model.stored_operations() for kind in kinds for name in op.named(kind)}
+    assert {key.split(".")[0] for key in model.weights()} == named
+    assert read_operations([op.as_json() for op in model.operations]) == model.operations
 
 
 def test_hierarchical_sees_nine_by_nine_texels_of_the_nearest_level() -> None:
     model = build_model("hierarchical", Lattice(4, 0.5)).double()
-    assert isinstance(model, Hierarchical)
     assert model.positions == 81
     u = torch.tensor([[0.3, 0.7]], dtype=F64)
     for level, (rows, columns) in ((2.4, (2, 4)), (2.6, (4, 8)), (9.0, (8, 16))):
         sigma = torch.tensor([0.5 * 2.0**-level], dtype=F64)
-        places = model.neighborhood(u, sigma)[0]
+        (grid,) = model.run(["grid"], {"u": u, "level": model.level(sigma)})
+        places = grid.view(9, 9, 2)
         torch.testing.assert_close(places[4, 4], u[0])
         torch.testing.assert_close(places[4, 5] - places[4, 4], torch.tensor([1 / columns, 0.0], dtype=F64))
         torch.testing.assert_close(places[5, 4] - places[4, 4], torch.tensor([0.0, -1 / rows], dtype=F64))
@@ -342,13 +352,12 @@ def test_hierarchical_sees_nine_by_nine_texels_of_the_nearest_level() -> None:
 
 def test_hierarchical_depends_on_its_neighborhood_alone() -> None:
     model = random_model("hierarchical")
-    assert isinstance(model, Hierarchical)
-    features = model.stage1(*(a[:1] for a in (*arguments(1)[:2], directions(1)))).detach().requires_grad_()
+    values = model.stage1(*(a[:1] for a in (*arguments(1)[:2], directions(1))))
+    features = values["features"].detach().requires_grad_()
     light, view = directions(1), directions(1)
-    model.stage2(features, light, view).sum().backward()
+    model.stage2({**values, "features": features}, light, view).sum().backward()
     assert features.grad is not None
-    assert features.shape[1:3] == (9, 9)
-    touched = features.grad.abs().sum((0, 3)) > 0
+    touched = features.grad.view(9, 9, -1).abs().sum(2) > 0
     assert touched[[0, 0, 4, 8, 8], [0, 8, 4, 0, 8]].float().mean() > 0.5
     assert touched.float().mean() > 0.8
 

@@ -9,20 +9,23 @@ import numpy as np
 import pytest
 import torch
 from support.fit_data import constant
+from support.slice_data import prepared as prepared_model
 from support.slice_data import spots, write_slices
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError, UsageError
 from mbtf_fit import fit
-from mbtf_fit.config import FitConfig
+from mbtf_fit.config import FitConfig, build_model
 from mbtf_fit.data.loader import load_training
+from mbtf_fit.data.queries import mean_value
 from mbtf_fit.data.slices import SharedSlices, TrainingSlices
 from mbtf_fit.material.material import Material
-from mbtf_fit.models.rainer import Rainer2019, Rainer2020
-from mbtf_fit.models.registry import build_model
+from mbtf_fit.models.model import Preparation
+from mbtf_fit.models.rainer import Rainer2019, shared_slices
+from mbtf_fit.objective.noise import typical_value
 from mbtf_fit.training.checkpoint import read_checkpoint, write_checkpoint
-from mbtf_fit.training.fit import prepare_trainer, shared_slices
+from mbtf_fit.training.fit import prepare_trainer
 from mbtf_fit.training.fit_folder import identity_of
 from mbtf_gen.sampling.slice_directions import direction_pairs, slice_directions
 
@@ -36,11 +39,10 @@ def config(name: str, **training: Any) -> FitConfig:
 
 def prepared(name: str, finest: int = 2, lights: int = 6) -> tuple[Rainer2019, TrainingSlices]:
     """An initialized model, and random slices."""
-    model = build_model(name, Lattice(finest))
-    assert isinstance(model, Rainer2019)
+    material = build_model(name, Lattice(finest))
     generator = torch.Generator().manual_seed(0)
-    model.initialize(generator, 0.1)
-    model.prepare(lights**2, generator)
+    material.initialize(generator, 0.1)
+    model = prepared_model(material, name, lights**2, torch.device("cpu"))
     light, view = map(torch.from_numpy, direction_pairs(slice_directions("spiral", lights, 0.2)))
     values = 0.2 * torch.rand(4**finest, lights**2, 3, generator=generator)
     return model, TrainingSlices(values, light, view, 0.5 * 2.0**-finest)
@@ -52,8 +54,8 @@ def prepared(name: str, finest: int = 2, lights: int = 6) -> tuple[Rainer2019, T
 def test_sizes_are_the_published_ones(name: str, weights: int, channels: int) -> None:
     """Kuznetsov et al. 2021 count them."""
     model, _ = prepared(name)
-    assert sum(p.numel() for p in model.parameter_groups()[1]) == weights
-    assert model.pyramid.texels.shape[1] == channels
+    assert sum(p.numel() for p in model.material.parameter_groups()[1]) == weights
+    assert model.material.pyramid.texels.shape[1] == channels
     assert sum(p.numel() for p in model.trained()[1]) > weights
 
 
@@ -63,12 +65,12 @@ def test_the_normalization_is_undone(name: str) -> None:
     model, slices = prepared(name)
     normalized, statistics = model.normalized(slices.values, slices.omega_i)
     assert normalized.mean(1).abs().max() < 1e-5
-    features = torch.cat([torch.zeros(16, model.network.channels), statistics], 1)
+    features = torch.cat([torch.zeros(16, model.latents), statistics], 1)
     for pair in (0, 7, 35):
         x = normalized[:, pair]
-        model.decoder.forward = lambda _, x=x: x  # type: ignore[method-assign, misc]
+        model.material.decoder.forward = lambda _, x=x: x  # type: ignore[method-assign, misc]
         light, view = (omega[pair].expand(16, 3) for omega in (slices.omega_i, slices.omega_o))
-        value = model.stage2(features, light, view)
+        value = model.material.stage2({"texture": features}, light, view)
         torch.testing.assert_close(value, slices.values[:, pair], rtol=1e-4, atol=1e-6)
 
 
@@ -81,7 +83,7 @@ def test_constant_and_black_slices_need_no_decoder() -> None:
         model.write_textures(same)
         u, sigma = torch.rand(50, 2), torch.full((50,), 0.125)
         light = slices.omega_i[:36].repeat(2, 1)[:50]
-        found = model(u, sigma, light, light)
+        found = model.material(u, sigma, light, light)
         torch.testing.assert_close(found * light[:, 2:], torch.full((50, 3), value), atol=0.01, rtol=0.02)
 
 
@@ -89,7 +91,7 @@ def test_constant_and_black_slices_need_no_decoder() -> None:
 def test_coarser_levels_are_averages(name: str) -> None:
     model, slices = prepared(name)
     model.write_textures(slices)
-    levels = model.pyramid.export()
+    levels = model.material.pyramid.export()
     torch.testing.assert_close(levels["0"][0, 0], levels["2"].mean((0, 1)), rtol=1e-4, atol=1e-6)
     torch.testing.assert_close(levels["1"][1, 0], levels["2"][2:, :2].mean((0, 1)), rtol=1e-4, atol=1e-6)
     encoded = model.encode(slices.values[9:10], slices.omega_i, slices.omega_o)
@@ -98,7 +100,6 @@ def test_coarser_levels_are_averages(name: str) -> None:
 
 def test_the_encoder_of_2020_takes_any_set_of_samples() -> None:
     model, slices = prepared("rainer2020")
-    assert isinstance(model, Rainer2020)
     order = torch.randperm(36)
     whole = model.encode(slices.values, slices.omega_i, slices.omega_o)
     mixed = model.encode(slices.values[:, order], slices.omega_i[order], slices.omega_o[order])
@@ -133,7 +134,7 @@ def test_a_fit_resumes_where_it_stopped(tmp_path: Path) -> None:
     write_checkpoint(first, tmp_path / "state")
     read_checkpoint(second, tmp_path / "state")
     assert second.train(1e3)
-    for a, b in zip(whole.model.trained()[1], second.model.trained()[1], strict=True):
+    for a, b in zip(whole.hooks.trained()[1], second.hooks.trained()[1], strict=True):
         assert torch.equal(a, b)
 
 
@@ -173,7 +174,13 @@ def test_the_network_learns_others_in_units_of_its_own_material(tmp_path: Path) 
     assert isinstance(found, TrainingSlices)
     for own_material, count in ((False, 1), (True, 2)):
         options = config("rainer2020", materials=[str(other)], own_material=own_material)
-        shared = shared_slices(options, found, 0.02, torch.device("cpu"))
+        found_other = load_training(Dataset.open(other), options.held_out, 0)
+        typical = typical_value(mean_value(found_other.sample.value_a, found_other.sample.value_b))
+        loaded = found_other.training, typical
+        given = Preparation(
+            Dataset.open(own), found, options.training, 0.02, 0, lambda _, loaded=loaded: loaded
+        )
+        shared = shared_slices(given)
         assert isinstance(shared, SharedSlices)
         assert shared.own is found
         assert len(shared.learned) == count
@@ -206,11 +213,11 @@ def test_slices_of_cloth_have_a_transmittance(tmp_path: Path) -> None:
 
 
 def test_options_of_other_models_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="cannot be initialized from a material"):
+    with pytest.raises(ValueError, match="has no option init_from"):
         FitConfig.model_validate({"model": "rainer2019", "init_from": "material"})
-    with pytest.raises(ValueError, match=r"training\.materials and training\.own_material are options"):
+    with pytest.raises(ValueError, match=r"has no option training\.materials, which rainer2020"):
         config("rainer2019", materials=["x"])
-    with pytest.raises(ValueError, match="has no offset, oversampling"):
+    with pytest.raises(ValueError, match=r"has no option network\.offset"):
         FitConfig.model_validate({"model": "rainer2020", "network": {"offset": "depth"}})
     with pytest.raises(InputError, match="nothing to learn from"):
         fit(config("rainer2020", own_material=False), write_slices(tmp_path / "data"), tmp_path / "fit")

@@ -21,16 +21,17 @@ from mbtf_core.data.schema import MANIFEST_NAME
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import checksummed
 from mbtf_fit import FitConfig, fit
+from mbtf_fit.config import build_model
 from mbtf_fit.material.inference import predict
-from mbtf_fit.models.encodings import encode_directions, rotate_to_z
-from mbtf_fit.models.registry import build_model
-from mbtf_fit.models.relief import Relief
+from mbtf_fit.models.relief import known_surface
 from mbtf_fit.native import library
 from mbtf_fit.native.gradients import NativeGradients
 from mbtf_fit.native.model import NativeModel, supports
 from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.noise import NoiseModel
 from mbtf_fit.objective.parallel import Workers
+from mbtf_fit.pytorch.encodings import rotate_to_z
+from mbtf_fit.pytorch.material import NeuralMaterial
 
 LATTICE = Lattice(3, 0.5)
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -47,10 +48,9 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 
 
-def model_of(name: str) -> Relief:
+def model_of(name: str) -> NeuralMaterial:
     """A model with random parameters on a rough surface."""
     model = build_model("relief", LATTICE, **VARIANTS[name])
-    assert isinstance(model, Relief)
     model.know(rough_surface(LATTICE))
     generator = torch.Generator().manual_seed(0)
     model.initialize(generator, 0.1)
@@ -60,7 +60,7 @@ def model_of(name: str) -> Relief:
     return model
 
 
-def batch_of(model: Relief, n: int = 700) -> Any:
+def batch_of(model: NeuralMaterial, n: int = 700) -> Any:
     arrays = random_queries(np.random.default_rng(0), n, LATTICE)
     arrays["u"] = (5 * arrays["u"] - 2).astype(np.float32)
     batch = training_queries(arrays, parallax(*arrays.values()))
@@ -98,7 +98,7 @@ def test_kernel_and_pytorch_agree(name: str) -> None:
 @pytest.mark.parametrize("name", VARIANTS)
 def test_two_stages_are_the_whole(name: str) -> None:
     model = model_of(name)
-    model.calibration = 0.5 + torch.rand(2, 4, 5, 3)
+    model.calibrate(0.5 + torch.rand(2, 4, 5, 3))
     batch = batch_of(model, 200)
     features = model.stage1(batch.u, batch.sigma, batch.omega_o)
     staged = model.stage2(features, batch.omega_i, batch.omega_o)
@@ -113,11 +113,12 @@ def test_depth_weights_move_the_lookup() -> None:
     level, height = model.level(batch.sigma), batch.hints[:, :1]
     with torch.no_grad():
         model.depth_weights.zero_()
-        still = model.displaced(batch.u, level, height, batch.omega_o)
+        given = {"u": batch.u, "level": level, "z": height, "omega_o": batch.omega_o}
+        (still,) = model.run(["moved"], given)
         model.depth_weights.fill_(1.0)
-        moved = model.displaced(batch.u, level, height, batch.omega_o)
+        (moved,) = model.run(["moved"], given)
     torch.testing.assert_close(still, batch.u)
-    hits = model.known.intersections(batch.u, level, batch.omega_o, 1)[1]
+    hits = model.known.intersections(known_surface(1)[0], batch.u, level, batch.omega_o)[1]
     torch.testing.assert_close(moved, hits, atol=1e-5, rtol=1e-5)
 
 
@@ -149,9 +150,8 @@ def test_the_difference_vector_is_the_light_about_the_half_vector() -> None:
     random = np.random.default_rng(0)
     arrays = random_queries(random, 100, LATTICE)
     light, view = (torch.from_numpy(arrays[k]) for k in ("omega_i", "omega_o"))
-    options = FitConfig().network.encoding
-    found = encode_directions(light, view, options)
-    half, difference = found[:, 6:9], found[:, 9:]
+    model = build_model("relief", LATTICE)
+    half, difference = model.run(["half", "difference"], {"omega_i": light, "omega_o": view})
     torch.testing.assert_close(half, torch.nn.functional.normalize(light + view, dim=1))
     up = torch.tensor([0.0, 0.0, 1.0]).expand_as(half)
     # Rodrigues' rotation about the horizontal axis h × z.
@@ -163,7 +163,8 @@ def test_the_difference_vector_is_the_light_about_the_half_vector() -> None:
     torch.testing.assert_close(difference, wanted, atol=2e-5, rtol=1e-4)
     torch.testing.assert_close(rotate_to_z(half, half), up, atol=1e-5, rtol=0)
     # The view lies opposite, whichever of both is the light.
-    opposite = encode_directions(view, light, options)[:, 9:] * torch.tensor([-1.0, -1.0, 1.0])
+    (opposite,) = model.run(["difference"], {"omega_i": view, "omega_o": light})
+    opposite = opposite * torch.tensor([-1.0, -1.0, 1.0])
     torch.testing.assert_close(opposite, difference, atol=2e-5, rtol=1e-4)
 
 

@@ -12,10 +12,10 @@ from pydantic import ValidationError
 from torch import Tensor
 
 from mbtf_core.data.lattice import Lattice
-from mbtf_fit.config import TrainingSection
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.objective.losses import Curve, FourthRoot, Log, Objective
 from mbtf_fit.objective.noise import NoiseModel
+from mbtf_fit.sections import TrainingSection
 
 KINDS = ("relative", "squared", "linear", "log", "fourth-root")
 SCALE = 0.5

@@ -10,11 +10,11 @@ import torch
 from support.fit_data import make_trainer, parallax, random_queries, training_queries, write_data
 
 from mbtf_core.data.lattice import Lattice
-from mbtf_fit.config import FitConfig, ModelName, TrainingSection
+from mbtf_fit.config import FitConfig, ModelName, build_model
 from mbtf_fit.data.loader import load_training, open_data
-from mbtf_fit.models.registry import build_model
 from mbtf_fit.objective.noise import NoiseModel
 from mbtf_fit.objective.regularization import WeightDecay
+from mbtf_fit.sections import TrainingSection
 from mbtf_fit.training.fit import prepare_trainer
 
 LATTICE = Lattice(3)

@@ -15,11 +15,12 @@ from support.scenes import mi
 from torch import Tensor
 
 from mbtf_core.data.lattice import Lattice
-from mbtf_fit.models.lookup import lookup
+from mbtf_fit.models.relief import known_surface
 from mbtf_fit.native import library
 from mbtf_fit.surface import hints, known
 from mbtf_fit.surface.hints import compute_hints
 from mbtf_fit.surface.known import KnownSurface
+from mbtf_fit.textures.lookup import lookup
 
 LATTICE = Lattice(3)
 needs_kernel = pytest.mark.skipif(library.kernel() is None, reason=library.missing_reason() or "kernel")
@@ -38,6 +39,10 @@ def compiled(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) ->
     return bool(request.param)
 
 
+def hints_of(known: KnownSurface, *queries: Tensor, places: int) -> Tensor:
+    return compute_hints(known, *known_surface(places), *queries)
+
+
 def surface(**options: Any) -> KnownSurface:
     """A flat tile under a delta light."""
     return KnownSurface.of(geometry(LATTICE, np.zeros((8, 8), np.float32), **options), LATTICE, 0.0)
@@ -45,14 +50,14 @@ def surface(**options: Any) -> KnownSurface:
 
 @pytest.mark.parametrize("places", [1, 2, 4])
 def test_a_flat_lambert_tile(places: int) -> None:
-    found = compute_hints(surface(), *queries(500), places)
+    found = hints_of(surface(), *queries(500), places=places)
     wanted = torch.tensor([0.0, 1.0, 0.0, 0.0, *(c / math.pi for c in (0.5, 0.4, 0.3))])
     torch.testing.assert_close(found, wanted.expand(500, 7), atol=1e-5, rtol=1e-5)
 
 
 def test_a_tilted_facet_gets_its_cosine() -> None:
     u, sigma, light, view = queries(500)
-    found = compute_hints(surface(slope=(0.5, -0.2)), u, sigma, light, view, 1)
+    found = hints_of(surface(slope=(0.5, -0.2)), u, sigma, light, view, places=1)
     normal = torch.tensor([-0.5, 0.2, 1.0]) / math.sqrt(1 + 0.5**2 + 0.2**2)
     wanted = (light @ normal).clamp_min(0) / light[:, 2]
     torch.testing.assert_close(found[:, 1], wanted, atol=1e-4, rtol=1e-4)
@@ -68,7 +73,7 @@ def test_the_lobe_is_that_of_unmodified_mitsuba(roughness: float, metallic: floa
     known = surface(color=color, roughness=roughness, metallic=metallic)
     u, sigma, light, _ = queries(300)
     up = torch.tensor([[0.0, 0.0, 1.0]]).expand(300, 3)
-    found = compute_hints(known, u, sigma, light, up, 1)
+    found = hints_of(known, u, sigma, light, up, places=1)
     description = {"type": "roughconductor", "alpha": roughness**2, "distribution": "ggx", "material": "none"}
     conductor = mi.load_dict(description)
     interaction = mi.SurfaceInteraction3f()
@@ -82,7 +87,7 @@ def test_the_lobe_is_that_of_unmodified_mitsuba(roughness: float, metallic: floa
     if not metallic:
         wanted += np.array(color) / np.pi
     np.testing.assert_allclose(found[:, 4:], wanted, rtol=2e-3)
-    exchanged = compute_hints(known, u, sigma, up, light, 1)
+    exchanged = hints_of(known, u, sigma, up, light, places=1)
     torch.testing.assert_close(exchanged[:, 4:], found[:, 4:], rtol=1e-4, atol=1e-6)
 
 
@@ -91,7 +96,7 @@ def test_footprints_beyond_the_levels_are_clamped(size: float, compiled: bool) -
     known = rough_surface(LATTICE)
     u, _, light, view = queries(200)
     found, wanted = (
-        compute_hints(known, u, torch.full((200,), s), light, view, 4)
+        hints_of(known, u, torch.full((200,), s), light, view, places=4)
         for s in (size, 0.5 if size > 0.1 else 0.5 * 2.0**-LATTICE.finest)
     )
     torch.testing.assert_close(found, wanted, atol=0, rtol=0)
@@ -107,7 +112,7 @@ def test_a_smooth_mirror_of_facets_keeps_the_energy() -> None:
     view = torch.tensor([[0.0, 0.0, 1.0]]).expand(len(light), 3)
     white = surface(color=(1.0, 1.0, 1.0), roughness=0.3, metallic=1.0)
     u, sigma = torch.full((len(light), 2), 0.3), torch.full((len(light),), 0.1)
-    core = compute_hints(white, u, sigma, light, view, 1)[:, 4].numpy()
+    core = hints_of(white, u, sigma, light, view, places=1)[:, 4].numpy()
     # ∫ f cos dω: means over cosine and azimuth times 2π.
     assert 2 * np.pi * (core * c).mean() == pytest.approx(0.99, abs=0.01)
 
@@ -121,9 +126,11 @@ def test_kernel_and_pytorch_agree(glossy: bool, aspect: float, places: int) -> N
     known = rough_surface(lattice, glossy=glossy)
     u, sigma, light, view = queries(3000, lattice)
     u, sigma = 5 * u - 2, 1.5 * sigma
-    found = compute_hints(known, u, sigma, light, view, places)
+    found = hints_of(known, u, sigma, light, view, places=places)
     level = (-torch.log2(2 * sigma)).clamp(0, 3)
-    wanted = known.hints(u, level, light, view, places)
+    trace, shade = known_surface(places)
+    height, hits = known.intersections(trace, u, level, view)
+    wanted = torch.cat([height, known.shading(shade, hits, level, light, view)], 1)
     scale = wanted.abs().mean(0)
     assert float(((found - wanted).abs() / (scale + wanted.abs())).quantile(0.999)) < 1e-4
 
@@ -152,7 +159,7 @@ def test_visibility_is_the_normal_distribution_of_the_horizon(
     light[:, 2] = max(1e-4, math.sin(elevation))
     u, sigma, _, view = queries(4)
     # Irradiance of a flat tile: the visible share.
-    found = compute_hints(known, u, sigma, light, view, 1)[:, 1]
+    found = hints_of(known, u, sigma, light, view, places=1)[:, 1]
     torch.testing.assert_close(found, torch.tensor([wanted, 0.0, 0.0, 0.0]), atol=2e-4, rtol=0)
 
 
@@ -175,7 +182,7 @@ def test_visibility_is_that_of_shadow_rays(level: float) -> None:
     above = at - z[:, None] / to_light[:, 2:] * to_light[:, :2]
     lit = (known.tracer.trace(above, to_light) - z).abs() < 1e-4
     wanted = lit.view(n, samples).float().mean(1)
-    found = known.visibility(u, torch.full((n,), level), light)[:, 0]
+    found = known.visibility(known_surface(1)[1], u, torch.full((n,), level), light)[:, 0]
     assert 0.2 < wanted.mean() < 0.8
     assert float(found.mean()) == pytest.approx(float(wanted.mean()), abs=0.05)
     assert float((found - wanted).square().mean()) < 0.25 * float(wanted.var())
@@ -186,7 +193,7 @@ def test_a_surface_survives_its_tensors() -> None:
     again = KnownSurface.from_tensors(known.tensors(), LATTICE)
     arrays = queries(200)
     torch.testing.assert_close(
-        compute_hints(again, *arrays, 4), compute_hints(known, *arrays, 4), atol=0, rtol=0
+        hints_of(again, *arrays, places=4), hints_of(known, *arrays, places=4), atol=0, rtol=0
     )
 
 
@@ -194,9 +201,9 @@ def test_parts_are_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     """PyTorch computes hints part by part, which bounds memory."""
     monkeypatch.setattr(hints, "kernel", lambda: None)
     surface, arrays = rough_surface(LATTICE), queries(250)
-    whole = compute_hints(surface, *arrays, 1)
+    whole = hints_of(surface, *arrays, places=1)
     monkeypatch.setattr(hints, "_CHUNK", 100)
-    torch.testing.assert_close(compute_hints(surface, *arrays, 1), whole, atol=1e-6, rtol=1e-5)
+    torch.testing.assert_close(hints_of(surface, *arrays, places=1), whole, atol=1e-6, rtol=1e-5)
 
 
 def test_maps_are_read_where_the_queries_are(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -209,5 +216,5 @@ def test_maps_are_read_where_the_queries_are(monkeypatch: pytest.MonkeyPatch) ->
 
     monkeypatch.setattr(known, "lookup", recorded)
     u, sigma, light, view = (a.to("meta") for a in queries(10))
-    assert rough_surface(LATTICE).shading(u, sigma, light, view, 1).shape == (10, 6)
+    assert rough_surface(LATTICE).shading(known_surface(1)[1], u, sigma, light, view).shape == (10, 6)
     assert devices == ["meta", "meta"]

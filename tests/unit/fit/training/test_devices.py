@@ -7,20 +7,18 @@ import pytest
 import torch
 from support.fit_data import random_queries
 from support.known_surfaces import rough_surface
+from support.slice_data import prepared
 from torch import Tensor
 
 from mbtf_core.data.lattice import Lattice
-from mbtf_fit.config import FitConfig
+from mbtf_fit.config import FitConfig, build_model
 from mbtf_fit.data.images import Patches
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.data.slices import SliceBatch, TrainingSlices
-from mbtf_fit.models.hierarchical import Hierarchical
-from mbtf_fit.models.neumip import KNOTS, Neumip
-from mbtf_fit.models.rainer import Rainer2019
-from mbtf_fit.models.registry import MODELS, build_model
-from mbtf_fit.models.relief import Relief
+from mbtf_fit.models.registry import MODELS
 from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.noise import NoiseModel
+from mbtf_fit.ops.constants import KNOTS
 from mbtf_fit.surface import heightfield
 from mbtf_fit.surface.copies import DeviceCopies
 from mbtf_gen.sampling.slice_directions import slice_directions
@@ -53,19 +51,18 @@ def batch(model: str, margin: int, n: int = 12) -> TrainingQueries | Patches:
 @pytest.mark.parametrize("name", [name for name in MODELS if MODELS[name].layout != "slices"])
 def test_loss_and_gradients_stay_on_the_device(name: str) -> None:
     model = build_model(name, LATTICE)
-    if isinstance(model, Relief):
+    if model.tracing is not None:
         model.know(rough_surface(LATTICE))
     model.initialize(torch.Generator().manual_seed(0), 0.1)
     model.to(META)
-    if isinstance(model, Neumip):
-        model.calibration = torch.ones(2, LATTICE.finest + 1, KNOTS, 3, device=META)
+    if MODELS[name].calibrates:
+        model.calibrate(torch.ones(2, LATTICE.finest + 1, KNOTS, 3, device=META))
     for texture in model.textures():
         texture.read(texture.blurred(1.5))
     queries = batch(name, model.margin)
-    evaluate = model.evaluate_patches if isinstance(model, Hierarchical) else model
     config = FitConfig.model_validate({"model": name})
     objective = Objective(config.training, NoiseModel.silent(0.1, LATTICE))
-    loss = objective(evaluate(queries.u, queries.sigma, queries.omega_i, queries.omega_o), queries)
+    loss = objective(*MODELS[name](model).predict(queries))
     texels, weights = model.parameter_groups()
     gradients = torch.autograd.grad(loss, [*texels, *weights])
     assert {g.device for g in gradients} == {META}
@@ -73,22 +70,20 @@ def test_loss_and_gradients_stay_on_the_device(name: str) -> None:
 
 @pytest.mark.parametrize("name", [name for name in MODELS if MODELS[name].layout == "slices"])
 def test_slices_stay_on_the_device(name: str) -> None:
-    model = build_model(name, LATTICE)
-    assert isinstance(model, Rainer2019)
-    model.initialize(torch.Generator().manual_seed(0), 0.1)
-    model.prepare(9, torch.Generator().manual_seed(0))
-    model.to(META)
+    material = build_model(name, LATTICE)
+    material.initialize(torch.Generator().manual_seed(0), 0.1)
+    model = prepared(material.to(META), name, 9, META)
     omega = torch.from_numpy(slice_directions("spiral", 9, 0.2)).to(META)
     slices = TrainingSlices(torch.ones(LATTICE.texels(), 9, 3, device=META), omega, omega, 0.1)
     chosen, read = torch.zeros(4, 9, dtype=torch.int64, device=META), torch.arange(9, device=META)
     batch = SliceBatch(slices.values[:4], omega, omega, chosen, read, 0.1)
     config = FitConfig.model_validate({"model": name})
     objective = Objective(config.training, NoiseModel.silent(0.1, LATTICE))
-    loss = objective(model.reconstruct(batch), batch.queries())
+    loss = objective(*model.predict(batch))
     gradients = torch.autograd.grad(loss, model.trained()[1])
     assert {g.device for g in gradients} == {META}
     model.write_textures(slices)
-    assert model.pyramid.texels.device == META
+    assert material.pyramid.texels.device == META
 
 
 def test_a_tensor_is_copied_once_per_device() -> None:

@@ -11,9 +11,10 @@ from support.fit_data import constant, parallax, write_data
 import mbtf_fit.training.forecast as module
 import mbtf_fit.training.validation as validation
 from mbtf_fit import fit
-from mbtf_fit.config import FitConfig, HeldOutSection
+from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import load_training, open_data
 from mbtf_fit.data.queries import ShardQueries
+from mbtf_fit.sections import HeldOutSection
 from mbtf_fit.training.forecast import forecast_fit
 from mbtf_fit.training.validation import validation_set, validation_subset
 

@@ -19,7 +19,6 @@ from mbtf_core.files.atomic import write_checksummed
 from mbtf_core.images.resample import resample
 from mbtf_fit import FitConfig, fit
 from mbtf_fit.data.loader import load_training, open_data
-from mbtf_fit.models.learned_relief import LearnedRelief
 from mbtf_fit.native import library
 from mbtf_fit.training.checkpoint import read_checkpoint, write_checkpoint
 from mbtf_fit.training.fit import prepare_trainer
@@ -71,17 +70,15 @@ def test_measured_data_have_neither_geometry_nor_configuration(shards: Path, tmp
     manifest = read_checksummed(folder / "manifest.json")
     write_checksummed(folder / "manifest.json", {**manifest, "geometry": None, "config": None})
     result = fit(config(4), folder, tmp_path / "m")
-    assert isinstance(result.material.model, LearnedRelief)
+    assert result.material.model.tracing is not None
 
 
 def test_a_fit_starts_from_the_heights_of_another(shards: Path, tmp_path: Path) -> None:
     first = fit(config(60), shards, tmp_path / "a").material.model
-    assert isinstance(first, LearnedRelief)
     options = config(4, init_from=str(tmp_path / "a"))
     data = open_data(shards, "shuffled", options.model)
     partition = load_training(data, options.held_out, options.seed)
     second = prepare_trainer(options, data, partition, torch.device("cpu")).model
-    assert isinstance(second, LearnedRelief)
     assert float(first.known.heights.std()) > 1e-6
     assert torch.equal(second.known.heights, first.known.heights)
 
@@ -111,7 +108,6 @@ def test_a_depth_is_learned(tmp_path: Path) -> None:
     result = fit(config(300, training={"batch": 2000}), shards, tmp_path / "m")
     assert result.errors["test"]["unexplained"]["value"] < 0.02
     model = result.material.model
-    assert isinstance(model, LearnedRelief)
     depth = -model.known.heights * model.depth_weights[-1].detach()
     assert float(depth.mean()) == pytest.approx(0.05, abs=0.01)
 
@@ -128,7 +124,6 @@ def test_rendered_rock_shows_its_heights(tmp_path: Path) -> None:
     errors = {model: r.errors["test"]["unexplained"]["value"] for model, r in results.items()}
     model = results["neumip+"].material.model
     geometry = Dataset.open(tmp_path / "data").geometry()
-    assert isinstance(model, LearnedRelief)
     assert geometry is not None
     heights = np.asarray(resample(geometry.heights, *Lattice(5).shape()))
     found = np.corrcoef(model.known.heights.numpy().ravel(), heights.ravel())[0, 1]

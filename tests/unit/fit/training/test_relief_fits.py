@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,11 @@ from support.known_surfaces import geometry, rough_heights
 from support.paths import ROOT
 from torch import Tensor
 
-import mbtf_fit.training.trainer
 from mbtf_core.data.lattice import Lattice
 from mbtf_fit import FitConfig, Material, fit
+from mbtf_fit.models.relief import Relief
 from mbtf_fit.native import library
+from mbtf_fit.pytorch.material import NeuralMaterial
 from mbtf_fit.training.fit import FitResult
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.run import generate
@@ -58,13 +60,17 @@ def test_hints_of_the_data_and_of_batches_give_one_fit(
 ) -> None:
     """In memory; computed for each batch, as they do not fit; of queries that are streamed."""
     sizes: list[int] = []
-    compute = mbtf_fit.training.trainer._hints
+    compute = NeuralMaterial.hints
 
-    def counted(model: Any, queries: Any) -> Tensor:
-        sizes.append(len(queries))
-        return compute(model, queries)
+    def counted(material: NeuralMaterial, u: Tensor, *rest: Tensor) -> Tensor:
+        sizes.append(len(u))
+        return compute(material, u, *rest)
 
-    monkeypatch.setattr(mbtf_fit.training.trainer, "_hints", counted)
+    def with_hints(self: Relief, queries: Any) -> Any:
+        found = counted(self.material, queries.u, queries.sigma, queries.omega_i, queries.omega_o)
+        return replace(queries, hints=found)
+
+    monkeypatch.setattr(Relief, "_with_hints", with_hints)
     found = {}
     for memory in ("1GB", "180kB", "1kB"):
         sizes.clear()

@@ -14,7 +14,7 @@ from support.fit_data import parallax, write_data
 from mbtf_core.app.console import Console
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.lattice import Lattice
-from mbtf_fit.models.registry import build_model
+from mbtf_fit.config import build_model
 from mbtf_pipeline.compare import timing
 from mbtf_pipeline.compare.dataset_errors import dataset_errors
 from mbtf_pipeline.compare.timing import LIGHTS, measure_timing

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import conv2d, linear, max_pool2d
 
-from mbtf_fit.models.mlp import ACTIVATIONS, Activation
+from mbtf_fit.pytorch.mlp import ACTIVATIONS, Activation
 
 # Rows and columns that an Inception module crops at each border.
 REACH = 2

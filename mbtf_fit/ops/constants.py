@@ -1,10 +1,10 @@
-"""Constants of the models, shared by the PyTorch models, the C kernel and the Mitsuba plugin."""
+"""Constants of the operations, most of them defaults of their fields."""
 
 from __future__ import annotations
 
 import math
 
-from mbtf_fit.config import EncodingSection, NetworkSection
+from mbtf_fit.sections import EncodingSection, NetworkSection
 
 # Slope of leaky-relu below zero.
 LEAK = 0.01
@@ -47,6 +47,8 @@ HEIGHT_SCALE, FIRST_DEPTH, LEAST_FACING = 0.25, 0.04, 0.3
 # Of the models `rainer2019` and `rainer2020`: channels besides the latents, mean and standard deviation of
 # each color; smallest cosine of the light that values are divided by.
 STATISTICS, LEAST_COSINE = 6, 0.01
+# Knots of the cosine in a fitted table of calibration factors: 0, 1/16, ..., 1.
+KNOTS = 17
 # Tensors of the surface in a material, before the level.
 HEIGHTS, MAPS, HORIZONS = "surface.heights", "surface.maps", "surface.horizons"
 LIGHT_WIDTH, DIELECTRIC = "surface.light_width", "surface.dielectric"

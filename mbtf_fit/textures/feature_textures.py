@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from mbtf_core.data.lattice import Lattice
-from mbtf_fit.models.blur import blur_texture
-from mbtf_fit.models.lookup import Packing, lookup
+from mbtf_fit.textures.blur import blur_texture
+from mbtf_fit.textures.lookup import Packing, lookup
 
 
 class FeatureTextures(nn.Module):
@@ -89,5 +89,5 @@ class FeatureTextures(nn.Module):
             self.texels.copy_(torch.cat(parts))
 
     def forward(self, u: Tensor, level: Tensor | None = None) -> Tensor:
-        """Features (n, channels) at uv positions `u` (n, 2); see :func:`~mbtf_fit.models.lookup.lookup`."""
+        """Features (n, channels) at uv positions `u` (n, 2); see :func:`~mbtf_fit.textures.lookup.lookup`."""
         return lookup(self.table, self.packing, u, level)

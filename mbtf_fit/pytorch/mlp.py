@@ -10,7 +10,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from mbtf_fit.models.constants import LEAK
+from mbtf_fit.ops.constants import LEAK
 
 Activation = Literal["relu", "leaky-relu", "sine"]
 ACTIVATIONS: dict[Activation, Callable[[Tensor], Tensor]] = {

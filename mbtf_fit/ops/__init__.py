@@ -1,0 +1,41 @@
+"""Operations, of which models are lists (:mod:`mbtf_fit.ops.operation`). Nothing here needs PyTorch."""
+
+from __future__ import annotations
+
+from mbtf_fit.ops.backend import Backend
+from mbtf_fit.ops.displace import Displace, Offset, Trace
+from mbtf_fit.ops.encode import Frequencies, HalfVector, Position, Rotate, Stereographic
+from mbtf_fit.ops.lookup import Lookup, Neighborhood
+from mbtf_fit.ops.network import Inception, Network
+from mbtf_fit.ops.operation import Operation, read_operations, sizes_of, stages
+from mbtf_fit.ops.shade import Lobe, Shade
+from mbtf_fit.ops.value import Calibrate, DivideByCosine, Gate, Matrix, Product, Standardize, Transform
+
+__all__ = [
+    "Backend",
+    "Calibrate",
+    "Displace",
+    "DivideByCosine",
+    "Frequencies",
+    "Gate",
+    "HalfVector",
+    "Inception",
+    "Lobe",
+    "Lookup",
+    "Matrix",
+    "Neighborhood",
+    "Network",
+    "Offset",
+    "Operation",
+    "Position",
+    "Product",
+    "Rotate",
+    "Shade",
+    "Standardize",
+    "Stereographic",
+    "Trace",
+    "Transform",
+    "read_operations",
+    "sizes_of",
+    "stages",
+]

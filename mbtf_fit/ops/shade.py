@@ -1,0 +1,82 @@
+r"""Shading by what is known of a surface: filtered maps, horizons, reflectance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from mbtf_fit.ops.constants import ALPHA2, LEAST_LIGHT, LEAST_VARIANCE, LEAST_VIEW, LIGHT_BLUR
+from mbtf_fit.ops.operation import Operation, TensorName, TextureName, Value
+
+
+@dataclass(frozen=True)
+class Shade(Operation):
+    r"""Hints of the known surface (6): irradiance e, normal (x, y) and core (RGB), means over intersections.
+
+    Maps and horizons are read at the level ``l + finer``. Maps hold slopes s (2), the mean q of their squared
+    length, base color b (3); of glossy surfaces besides α² and metallic m. The normal is
+    ``n = (-s_x, -s_y, 1) / ‖·‖``. Horizons hold, for equidistant azimuths from +u towards +v, the mean h of
+    the horizon's elevation in the first half of the channels, the mean of its square in the second half,
+    both linear between azimuths; v is their variance. The light is visible from the share
+
+        V = Φ((asin ω_i,z - h) / √max(v + (light_blur · light_width)², least_variance)).
+
+    Irradiance: ``e = V max(0, n·ω_i) / ω_i,z``, 1 on the reference plane. Core, in 1/sr: ``e b/π``, or of a
+    glossy surface ``e ((1-m) b/π + GGX)`` with ``F0 = (1-m) dielectric + m b`` and ``α² = clamp(α² + max(0,
+    q - ‖s‖²) + light_width², alpha2)`` (LEAN mapping: Olano and Baker 2010; GGX: Walter et al. 2007;
+    Fresnel: Schlick 1994), the cosines of light and view at least `least_light` and `least_view`.
+
+    Attributes
+    ----------
+    hits, level, omega_i, omega_o : uv of intersections (2 each), fractional level (1), directions (3)
+    maps, horizons : textures by level
+    light_width, dielectric : tensors (): RMS angle per axis of the light in radians; F0 of what is no metal
+    finer : levels
+    """
+
+    hits: Value
+    level: Value
+    omega_i: Value
+    omega_o: Value
+    maps: TextureName
+    horizons: TextureName
+    light_width: TensorName
+    dielectric: TensorName
+    finer: float = 0.0
+    light_blur: float = LIGHT_BLUR
+    least_light: float = LEAST_LIGHT
+    least_view: float = LEAST_VIEW
+    least_variance: float = LEAST_VARIANCE
+    alpha2: tuple[float, float] = ALPHA2
+
+    def size(self, sizes: Sequence[int]) -> int:
+        return 6
+
+
+@dataclass(frozen=True)
+class Lobe(Operation):
+    """A diffuse and a GGX lobe (Walter et al. 2007; Fresnel: Schlick 1994) under a unit irradiance of the
+    plane.
+
+    ``M = max(0, n·ω_i) / ω_i,z · (b/π + GGX(F0, α²))`` with the normal ``n = (-s_x, -s_y, 1) / ‖·‖``;
+    cosines of light and view in the lobe are at least `least_light` and `least_view`.
+
+    Attributes
+    ----------
+    base_color, specular, alpha2, slopes : b (3), F0 (1 or 3), squared roughness α² (1), slopes s (2)
+    omega_i, omega_o : directions (3)
+    least_alpha2 : bound of α² from below
+    """
+
+    base_color: Value
+    specular: Value
+    alpha2: Value
+    slopes: Value
+    omega_i: Value
+    omega_o: Value
+    least_alpha2: float = ALPHA2[0]
+    least_light: float = LEAST_LIGHT
+    least_view: float = LEAST_VIEW
+
+    def size(self, sizes: Sequence[int]) -> int:
+        return 3

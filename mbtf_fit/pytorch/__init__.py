@@ -1,0 +1,1 @@
+"""PyTorch executes operations: the reference that all other back ends are tested against, differentiable."""

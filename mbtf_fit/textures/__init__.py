@@ -1,0 +1,1 @@
+"""Periodic textures in PyTorch: lookups, blur, pyramids of parameters."""
