@@ -11,9 +11,9 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from mbtf_fit.backends.cpu.model import NativeModel, supports
 from mbtf_fit.native import kernel
 from mbtf_fit.native.library import QueryPointers
-from mbtf_fit.native.model import NativeModel, supports
 from mbtf_fit.pytorch.material import NeuralMaterial
 
 # Queries per chunk: bounds memory and keeps activations in the cache.

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mbtf_core.errors import InputError
+from mbtf_fit.backends.cpu.model import supports
+from mbtf_fit.backends.cpu.stepper import NativeStepper
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.images import TrainingImages
 from mbtf_fit.data.queries import ShardQueries, TrainingQueries
@@ -24,8 +26,6 @@ from mbtf_fit.material.inference import predict
 from mbtf_fit.models.model import Model
 from mbtf_fit.models.registry import MODELS
 from mbtf_fit.native import kernel
-from mbtf_fit.native.model import supports
-from mbtf_fit.native.stepper import NativeStepper
 from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.noise import NoiseModel
 from mbtf_fit.objective.parallel import MAX_KERNEL_THREADS, MAX_THREADS, Batch, Workers

@@ -38,7 +38,7 @@ typedef struct {
     const float *table;
 } mbtf_textures;
 
-/* Operations that mbtf_fit/native/pattern.py matches: a neural offset unless offset.layers is 0, or traced heights
+/* Operations that mbtf_fit/backends/cpu/pattern.py matches: a neural offset unless offset.layers is 0, or traced heights
  * where depth_weights (a number per level) are given. Where height_scale is not 0, the offset texture holds learned heights over height_scale, in one
  * channel. The decoder sees so many coordinates of light and of view: 2 (x, y) or 3; then, where they are not 0,
  * half vector and difference vector, hints, light and view about the known normal. With `gate`, its last output

@@ -14,13 +14,13 @@ from torch import Tensor
 
 from mbtf_core.data.lattice import Lattice
 from mbtf_fit import FitConfig
+from mbtf_fit.backends.cpu.gradients import NativeGradients
+from mbtf_fit.backends.cpu.model import NativeModel, supports
 from mbtf_fit.config import build_model
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.models import learned_relief
 from mbtf_fit.models.learned_relief import FILTERED, FILTERED_LEAST, TRACED, LearnedRelief
 from mbtf_fit.native import library
-from mbtf_fit.native.gradients import NativeGradients
-from mbtf_fit.native.model import NativeModel, supports
 from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.noise import NoiseModel
 from mbtf_fit.objective.parallel import Workers

@@ -21,12 +21,12 @@ from mbtf_core.data.schema import MANIFEST_NAME
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import checksummed
 from mbtf_fit import FitConfig, fit
+from mbtf_fit.backends.cpu.gradients import NativeGradients
+from mbtf_fit.backends.cpu.model import NativeModel, supports
 from mbtf_fit.config import build_model
 from mbtf_fit.material.inference import predict
 from mbtf_fit.models.relief import known_surface
 from mbtf_fit.native import library
-from mbtf_fit.native.gradients import NativeGradients
-from mbtf_fit.native.model import NativeModel, supports
 from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.noise import NoiseModel
 from mbtf_fit.objective.parallel import Workers

@@ -13,15 +13,15 @@ from support.fit_data import make_trainer, parallax, random_queries, train_fully
 from torch import Tensor
 
 from mbtf_core.data.lattice import Lattice
+from mbtf_fit.backends.cpu.blur import Blur
+from mbtf_fit.backends.cpu.gradients import NativeGradients, query_pointers
+from mbtf_fit.backends.cpu.model import NativeModel, supports
+from mbtf_fit.backends.cpu.stepper import adam
 from mbtf_fit.config import FitConfig, build_model
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.material.inference import evaluate_in_chunks, predict
 from mbtf_fit.native import library
-from mbtf_fit.native.blur import Blur
-from mbtf_fit.native.gradients import NativeGradients, query_pointers
 from mbtf_fit.native.library import Kernel, variants
-from mbtf_fit.native.model import NativeModel, supports
-from mbtf_fit.native.stepper import adam
 from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.noise import NoiseModel
 from mbtf_fit.objective.parallel import Workers
@@ -211,7 +211,7 @@ def test_outputs_of_any_size_give_finite_values(variant: str) -> None:
 @needs_kernel
 @pytest.mark.parametrize("kind", ["log", "fourth-root"])
 def test_other_losses_go_through_pytorch_in_pieces(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mbtf_fit.native.gradients._PIECE_BYTES", 1)
+    monkeypatch.setattr("mbtf_fit.backends.cpu.gradients._PIECE_BYTES", 1)
     model, batch = random_model("neumip", LATTICE), random_batch(1500)
     loss = objective(losses=[{"kind": kind, "weight": 1.0}, {"kind": "relative", "weight": 0.5}])
     assert loss.quadratic() is None

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from mbtf_fit.backends.cpu.pattern import Pattern, match
 from mbtf_fit.native.library import (
     MAX_CHANNELS,
     MAX_LAYERS,
@@ -18,7 +19,6 @@ from mbtf_fit.native.library import (
     Network,
     QueryPointers,
 )
-from mbtf_fit.native.pattern import Pattern, match
 from mbtf_fit.ops.constants import HEIGHT_SCALE, LEAST_FACING
 from mbtf_fit.pytorch.material import NeuralMaterial
 from mbtf_fit.textures.feature_textures import FeatureTextures

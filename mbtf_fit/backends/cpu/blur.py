@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mbtf_fit.backends.cpu.model import share
 from mbtf_fit.native.library import Kernel
-from mbtf_fit.native.model import share
 from mbtf_fit.textures.blur import NEGLIGIBLE, gaussian_taps
 from mbtf_fit.textures.feature_textures import FeatureTextures
 

@@ -14,9 +14,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from mbtf_fit.backends.cpu.model import NativeModel, aligned, pointers, share
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.native.library import MAX_LEVELS, GradientSums, QuadraticLoss, QueryPointers
-from mbtf_fit.native.model import NativeModel, aligned, pointers, share
 from mbtf_fit.objective.losses import Objective, Quadratic
 from mbtf_fit.objective.parallel import Workers
 

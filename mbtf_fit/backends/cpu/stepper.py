@@ -10,11 +10,11 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
+from mbtf_fit.backends.cpu.blur import Blur
+from mbtf_fit.backends.cpu.gradients import NativeGradients
+from mbtf_fit.backends.cpu.model import NativeModel, share
 from mbtf_fit.data.queries import TrainingQueries
-from mbtf_fit.native.blur import Blur
-from mbtf_fit.native.gradients import NativeGradients
 from mbtf_fit.native.library import AdamStep, Kernel
-from mbtf_fit.native.model import NativeModel, share
 from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.parallel import Workers
 from mbtf_fit.pytorch.material import NeuralMaterial

@@ -1,0 +1,1 @@
+"""Back ends: each implements the operations of models in its own language."""

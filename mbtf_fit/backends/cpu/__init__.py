@@ -1,0 +1,1 @@
+"""The compiled kernel: fits and evaluates lists of operations that match its fused pattern."""

@@ -1,1 +1,0 @@
-"""The displaced tile: heights on a grid, its triangles, slopes and their statistics."""
