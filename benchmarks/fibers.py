@@ -28,7 +28,7 @@ import numpy as np
 from common import ASSETS, alternate, finish, parser_of, start
 
 from mbtf_gen.engine.runtime import load_mitsuba
-from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
+from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan
 from mbtf_gen.tile.fiber_tile import FiberTile
 from mbtf_gen.tile.loading import load_material
 
@@ -48,7 +48,7 @@ def generator_run(material: Path, count: int, spp: int) -> Callable[[int], None]
     loaded = load_material(material)
     transport = Transport(bsdf_sampling=False)
     estimator = Estimator(build_scene(loaded, loaded.surface()), LightKernel(1.0), transport)
-    plan = QueryPlan(loaded.lattice(), Mixture(1.0, 0.0), 0.1, "shuffled", 0, count)
+    plan = QueryPlan(loaded.lattice(), LevelMixture(1.0, 0.0), 0.1, "shuffled", 0, count)
 
     def run(number: int) -> None:
         queries = plan.draw("train", number, count)

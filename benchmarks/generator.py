@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 from mbtf_core.data.lattice import Lattice
 from mbtf_gen.config.values import Tracer
 from mbtf_gen.engine.runtime import load_mitsuba
-from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
+from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile, Tile
 from mbtf_gen.tile.loading import load_material
 
@@ -84,7 +84,7 @@ def rocky() -> HeightFieldTile:
 def query_plan(grid: HeightGrid, count: int) -> QueryPlan:
     """Levels log-uniform; the generator's default favors fine ones, which are faster."""
     lattice = Lattice.for_map(*grid.z.shape)
-    return QueryPlan(lattice, Mixture(1.0, 0.0), 0.1, "shuffled", 0, count)
+    return QueryPlan(lattice, LevelMixture(1.0, 0.0), 0.1, "shuffled", 0, count)
 
 
 def generator_run(

@@ -33,7 +33,7 @@ from common import ASSETS, finish, parser_of, start
 from gpu_measurements import PREDICTIONS, Sizes
 from numpy.typing import NDArray
 
-from mbtf_core.run.child import Outcome, run_child
+from mbtf_core.run.child import ChildResult, run_child
 from mbtf_core.stats import Estimate, level_groups, mean_estimate, mse_difference, noise_free_mse
 from mbtf_gen.diagnostics.selftest import STANDARD_ERRORS
 
@@ -53,7 +53,7 @@ NO_KERNEL = {"MBTF_KERNEL": "off"}
 TIMEOUT = 1800.0
 
 # Calls a function of `gpu_measurements` with texts, in another environment.
-Run = Callable[[str, tuple[str, ...], Mapping[str, str]], Outcome]
+Run = Callable[[str, tuple[str, ...], Mapping[str, str]], ChildResult]
 Arrays = Mapping[str, NDArray[np.float32]]
 
 
@@ -301,7 +301,7 @@ def has_device() -> bool:
     return torch.cuda.is_available() or not prove(CUDA_VARIANT).fault
 
 
-def in_child(function: str, arguments: tuple[str, ...], environment: Mapping[str, str]) -> Outcome:
+def in_child(function: str, arguments: tuple[str, ...], environment: Mapping[str, str]) -> ChildResult:
     """Run a measurement in a process of its own."""
     return run_child("gpu_measurements", function, *arguments, timeout=TIMEOUT, environment=environment)
 

@@ -33,7 +33,7 @@ _children: set[subprocess.Popen[bytes]] = set()
 
 
 @dataclass(frozen=True)
-class Outcome:
+class ChildResult:
     """How a child ended.
 
     Attributes
@@ -55,7 +55,7 @@ def run_child(
     timeout: float | None = None,
     environment: Mapping[str, str] | None = None,
     trial: bool = True,
-) -> Outcome:
+) -> ChildResult:
     """Call ``module.function(*arguments)`` in a fresh interpreter.
 
     Parameters
@@ -74,7 +74,7 @@ def run_child(
 
     Returns
     -------
-    Outcome
+    ChildResult
 
     Raises
     ------
@@ -131,7 +131,7 @@ def run_child(
         lines = [line.strip() for line in noise.read().decode(errors="replace").splitlines() if line.strip()]
     if fault is None:
         fault = f"the process was {_ending(child.returncode)}" + (f" ({lines[-1][:200]})" if lines else "")
-    return Outcome(answers, fault, time.monotonic() - start)
+    return ChildResult(answers, fault, time.monotonic() - start)
 
 
 def _ending(code: int) -> str:

@@ -11,7 +11,7 @@ from mbtf_fit.mitsuba_plugin.preview.config import PreviewConfig
 
 
 @options_from(PreviewConfig)
-class PreviewOptions(Options[PreviewConfig]):
+class MaterialPreviewOptions(Options[PreviewConfig]):
     """Options of ``mbtf-fit preview``."""
 
 
@@ -20,7 +20,7 @@ def preview(
     /,
     *,
     output: Output = Path("preview"),
-    options: PreviewOptions = PreviewOptions(),  # noqa: B008
+    options: MaterialPreviewOptions = MaterialPreviewOptions(),  # noqa: B008
     sheet_only: Switch = False,
     mp4: Switch = False,
     overwrite: Overwrite = False,

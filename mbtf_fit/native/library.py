@@ -22,13 +22,13 @@ _I32, _I64, _F32, _POINTER = ctypes.c_int32, ctypes.c_int64, ctypes.c_float, cty
 INTERFACE = 2
 
 
-class Network(ctypes.Structure):
+class NetworkStruct(ctypes.Structure):
     """``mbtf_network``"""
 
     _fields_ = (("layers", _I32), ("wanted", _I32), ("widths", _I32 * (MAX_LAYERS + 1)), ("packed", _POINTER))
 
 
-class Textures(ctypes.Structure):
+class TexturesStruct(ctypes.Structure):
     """``mbtf_textures``"""
 
     _fields_ = (
@@ -39,12 +39,12 @@ class Textures(ctypes.Structure):
     )
 
 
-class Model(ctypes.Structure):
+class ModelStruct(ctypes.Structure):
     """``mbtf_model``"""
 
     _fields_ = (
-        *((name, Textures) for name in ("pyramid", "offset_texture")),
-        *((name, Network) for name in ("decoder", "offset")),
+        *((name, TexturesStruct) for name in ("pyramid", "offset_texture")),
+        *((name, NetworkStruct) for name in ("decoder", "offset")),
         *((name, _F32) for name in ("unit", "offset_scale", "grazing", "aspect")),
         *((name, _F32) for name in ("irradiance_scale", "height_scale", "least_facing")),
         *((name, _I32) for name in ("coordinates", "half_vector", "hints", "frame", "gate")),
@@ -71,12 +71,12 @@ class Heightfield(ctypes.Structure):
     )
 
 
-class Surface(ctypes.Structure):
+class SurfaceStruct(ctypes.Structure):
     """``mbtf_surface``"""
 
     _fields_ = (
         ("heightfield", Heightfield),
-        *((name, Textures) for name in ("maps", "horizons")),
+        *((name, TexturesStruct) for name in ("maps", "horizons")),
         ("places", _I32),
         ("offsets", _F32 * (2 * MAX_PLACES)),
         *((name, _F32) for name in ("finer", "light_width", "light_blur", "dielectric")),
@@ -173,7 +173,7 @@ def open_library(path: Path) -> Any:
         except AttributeError:
             raise OSError(f"it lacks {name}") from None
         function.restype, *function.argtypes = (_TYPES[letter] for letter in letters)
-    if library.mbtf_layout() != ctypes.sizeof(Model) + 4096 * ctypes.sizeof(QueryPointers) + INTERFACE:
+    if library.mbtf_layout() != ctypes.sizeof(ModelStruct) + 4096 * ctypes.sizeof(QueryPointers) + INTERFACE:
         raise OSError("it was built from other sources")
     return library
 

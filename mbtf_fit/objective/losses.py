@@ -48,7 +48,7 @@ _ROOT_FLOOR = 1e-2
 _LOG_START = -0.5
 
 
-class Curve:
+class LossCurve:
     """An increasing function f of values in units of s, defined for all real numbers: here f(x) = x."""
 
     def value(self, x: Tensor) -> Tensor:
@@ -64,7 +64,7 @@ class Curve:
         return torch.zeros_like(x)
 
 
-class Log(Curve):
+class Log(LossCurve):
     """log(1 + x)."""
 
     def value(self, x: Tensor) -> Tensor:
@@ -78,7 +78,7 @@ class Log(Curve):
         return torch.where(x > _LOG_START, -self.slope(x).square(), 0.0)
 
 
-class FourthRoot(Curve):
+class FourthRoot(LossCurve):
     """(x + 0.01)^¼."""
 
     def value(self, x: Tensor) -> Tensor:
@@ -127,7 +127,7 @@ def absolute_gradient(error: Tensor, noise: Tensor | None) -> Tensor:
 class CurveTerm:
     """One term: a curve, and the measure of differences along it."""
 
-    curve: Curve
+    curve: LossCurve
     measure: Measure
 
     def __call__(
@@ -157,8 +157,8 @@ def relative(
 Term = Callable[[Tensor, Tensor, Tensor, Tensor | None, Correction], Tensor]
 _TERMS: dict[LossKind, Term] = {
     "relative": relative,
-    "squared": CurveTerm(Curve(), squared),
-    "linear": CurveTerm(Curve(), absolute),
+    "squared": CurveTerm(LossCurve(), squared),
+    "linear": CurveTerm(LossCurve(), absolute),
     "log": CurveTerm(Log(), squared),
     "fourth-root": CurveTerm(FourthRoot(), absolute),
     "gradient": CurveTerm(FourthRoot(), absolute_gradient),

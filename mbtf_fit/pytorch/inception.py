@@ -35,7 +35,7 @@ class Convolution(nn.Conv2d):
         return conv2d(x.permute(0, 3, 1, 2), self.weight, self.bias).permute(0, 2, 3, 1)
 
 
-class Inception(nn.Module):
+class InceptionModule(nn.Module):
     """One module, `width` → `width` channels.
 
     The branches have 7 (1×1), 3 then 12 (3×3), 5 then 3 (5×5) and 3 (maximum) of the paper's 25 channels, and
@@ -81,7 +81,7 @@ class InceptionDecoder(nn.Module):
         self.features = features
         self.activation: Activation = activation
         self.first = Convolution(features + directions, width, 1)
-        self.modules_ = nn.ModuleList(Inception(width, activation) for _ in range(modules))
+        self.modules_ = nn.ModuleList(InceptionModule(width, activation) for _ in range(modules))
         self.last = Convolution(width, outputs, 1)
 
     @property

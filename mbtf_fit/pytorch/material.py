@@ -14,7 +14,7 @@ from mbtf_fit.ops.operation import needed_for, output_names, parse, sizes_of
 from mbtf_fit.ops.value import calibrated
 from mbtf_fit.pytorch.inception import InceptionDecoder
 from mbtf_fit.pytorch.mlp import Mlp, initialize_layers
-from mbtf_fit.pytorch.operations import FUNCTIONS, PYTORCH, Run, displacement
+from mbtf_fit.pytorch.operations import FUNCTIONS, PYTORCH, Execution, displacement
 from mbtf_fit.surface.hints import compute_hints
 from mbtf_fit.surface.known import KnownSurface
 from mbtf_fit.textures.feature_textures import FeatureTextures
@@ -129,7 +129,7 @@ class NeuralMaterial(nn.Module):
         key = tuple(wanted), frozenset(given)
         if key not in self._plans:
             self._plans[key] = needed_for(self.operations, wanted, [*given])
-        run, values = Run(self, grid), dict(given)
+        run, values = Execution(self, grid), dict(given)
         for op in self._plans[key]:
             arguments = [_argument(getattr(op, name), values) for name in op.value_fields()]
             if not isinstance(op, ops.Inception):

@@ -51,7 +51,7 @@ class Tensors(Protocol):
 
 
 @dataclass(frozen=True)
-class Run:
+class Execution:
     """One evaluation: of a material, and (rows, columns) of positions per query where they are given."""
 
     material: Tensors
@@ -66,13 +66,13 @@ class Run:
 PYTORCH: ops.Backend[Callable[..., Tensor | tuple[Tensor, ...]]] = ops.Backend("PyTorch")
 
 
-def _per_width(run: Run, like: Tensor) -> Tensor:
+def _per_width(run: Execution, like: Tensor) -> Tensor:
     """(1, aspect)"""
     return like.new_tensor([1.0, run.aspect])
 
 
 @PYTORCH.implements(ops.Lookup)
-def _lookup(op: ops.Lookup, run: Run, u: Tensor, level: Tensor | None) -> Tensor:
+def _lookup(op: ops.Lookup, run: Execution, u: Tensor, level: Tensor | None) -> Tensor:
     textures = run.material.texture(op.textures)
     if op.blending == "blend" or level is None:
         return textures(u, level)
@@ -85,7 +85,7 @@ def _lookup(op: ops.Lookup, run: Run, u: Tensor, level: Tensor | None) -> Tensor
 
 
 @PYTORCH.implements(ops.Neighborhood)
-def _neighborhood(op: ops.Neighborhood, run: Run, u: Tensor, level: Tensor) -> Tensor:
+def _neighborhood(op: ops.Neighborhood, run: Execution, u: Tensor, level: Tensor) -> Tensor:
     lattice = run.material.lattice
     shapes = u.new_tensor([lattice.shape(s) for s in range(lattice.finest + 1)])
     rows, columns = shapes[(level + 0.5).floor().long()].unbind(1)
@@ -98,7 +98,7 @@ def _neighborhood(op: ops.Neighborhood, run: Run, u: Tensor, level: Tensor) -> T
 
 
 @PYTORCH.implements(ops.Offset)
-def _offset(op: ops.Offset, run: Run, u: Tensor, r: Tensor, omega_o: Tensor) -> Tensor:
+def _offset(op: ops.Offset, run: Execution, u: Tensor, r: Tensor, omega_o: Tensor) -> Tensor:
     return u + displacement(op, r, omega_o) / _per_width(run, u)
 
 
@@ -109,12 +109,14 @@ def displacement(op: ops.Offset, r: Tensor, omega_o: Tensor) -> Tensor:
 
 
 @PYTORCH.implements(ops.Trace)
-def _trace(op: ops.Trace, run: Run, u: Tensor, level: Tensor, omega_o: Tensor) -> tuple[Tensor, ...]:
+def _trace(op: ops.Trace, run: Execution, u: Tensor, level: Tensor, omega_o: Tensor) -> tuple[Tensor, ...]:
     return run.material.known.intersections(op, u, level, omega_o)
 
 
 @PYTORCH.implements(ops.Displace)
-def _displace(op: ops.Displace, run: Run, u: Tensor, z: Tensor, level: Tensor, omega_o: Tensor) -> Tensor:
+def _displace(
+    op: ops.Displace, run: Execution, u: Tensor, z: Tensor, level: Tensor, omega_o: Tensor
+) -> Tensor:
     weights, aspect = run.material.number(op.weights), _per_width(run, u)
     coarse, finer = coarse_level(level, len(weights))
     index = coarse.long()
@@ -128,7 +130,7 @@ def _displace(op: ops.Displace, run: Run, u: Tensor, z: Tensor, level: Tensor, o
     return moved + weight.detach() * _rise(op.learned, run, u, z, omega_o) * along / aspect
 
 
-def _rise(learned: str, run: Run, u: Tensor, z: Tensor, omega_o: Tensor) -> Tensor:
+def _rise(learned: str, run: Execution, u: Tensor, z: Tensor, omega_o: Tensor) -> Tensor:
     """Rise (n, 1) of intersections with learned heights by the implicit function theorem."""
     textures, aspect = run.material.texture(learned), _per_width(run, u)
     slope = omega_o[:, :2] / omega_o[:, 2:]
@@ -146,14 +148,16 @@ def learned_heights(x: Tensor) -> Tensor:
 
 
 @PYTORCH.implements(ops.Shade)
-def _shade(op: ops.Shade, run: Run, hits: Tensor, level: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
+def _shade(
+    op: ops.Shade, run: Execution, hits: Tensor, level: Tensor, omega_i: Tensor, omega_o: Tensor
+) -> Tensor:
     return run.material.known.shading(op, hits, level, omega_i, omega_o)
 
 
 @PYTORCH.implements(ops.Lobe)
 def _lobe(
     op: ops.Lobe,
-    run: Run,
+    run: Execution,
     base_color: Tensor,
     specular: Tensor,
     alpha2: Tensor,
@@ -170,12 +174,12 @@ def _lobe(
 
 
 @PYTORCH.implements(ops.HalfVector)
-def _half_vector(op: ops.HalfVector, run: Run, omega_i: Tensor, omega_o: Tensor) -> Tensor:
+def _half_vector(op: ops.HalfVector, run: Execution, omega_i: Tensor, omega_o: Tensor) -> Tensor:
     return torch.nn.functional.normalize(omega_i + omega_o, dim=1)
 
 
 @PYTORCH.implements(ops.Rotate)
-def _rotate(op: ops.Rotate, run: Run, axis: Tensor, omega: Tensor) -> Tensor:
+def _rotate(op: ops.Rotate, run: Execution, axis: Tensor, omega: Tensor) -> Tensor:
     if axis.shape[1] == 2:
         upright = (1.0 - axis.square().sum(1, keepdim=True)).clamp_min(0.0).sqrt()
         axis = torch.cat([axis, upright], 1)
@@ -183,29 +187,31 @@ def _rotate(op: ops.Rotate, run: Run, axis: Tensor, omega: Tensor) -> Tensor:
 
 
 @PYTORCH.implements(ops.Stereographic)
-def _stereographic(op: ops.Stereographic, run: Run, omega: Tensor) -> Tensor:
+def _stereographic(op: ops.Stereographic, run: Execution, omega: Tensor) -> Tensor:
     return stereographic(omega)
 
 
 @PYTORCH.implements(ops.Position)
-def _position(op: ops.Position, run: Run, u: Tensor) -> Tensor:
+def _position(op: ops.Position, run: Execution, u: Tensor) -> Tensor:
     return 2.0 * (u - u.floor()) - 1.0
 
 
 @PYTORCH.implements(ops.Frequencies)
-def _frequencies(op: ops.Frequencies, run: Run, x: Tensor, level: Tensor | None) -> Tensor:
+def _frequencies(op: ops.Frequencies, run: Execution, x: Tensor, level: Tensor | None) -> Tensor:
     spread = None if level is None else torch.exp2(-level)[..., None] / _per_width(run, x)
     return frequencies(x, op, spread)
 
 
 @PYTORCH.implements(ops.Network)
-def _network(op: ops.Network, run: Run, x: Sequence[Tensor]) -> Tensor:
+def _network(op: ops.Network, run: Execution, x: Sequence[Tensor]) -> Tensor:
     out: Tensor = run.material.get_submodule(op.weights)(torch.cat([*x], 1))
     return out
 
 
 @PYTORCH.implements(ops.Inception)
-def _inception(op: ops.Inception, run: Run, features: Sequence[Tensor], shared: Sequence[Tensor]) -> Tensor:
+def _inception(
+    op: ops.Inception, run: Execution, features: Sequence[Tensor], shared: Sequence[Tensor]
+) -> Tensor:
     directions = torch.cat([*shared], 1)
     x = torch.cat([*features], 1)
     size = math.isqrt(len(x) // max(1, len(directions)))
@@ -215,7 +221,7 @@ def _inception(op: ops.Inception, run: Run, features: Sequence[Tensor], shared: 
 
 
 @PYTORCH.implements(ops.Transform)
-def _transform(op: ops.Transform, run: Run, x: Tensor) -> Tensor:
+def _transform(op: ops.Transform, run: Execution, x: Tensor) -> Tensor:
     if op.divisor is not None:
         divisor = run.material.number(op.divisor)
         x = torch.where(divisor > 0, x / torch.where(divisor > 0, divisor, 1.0), 0.0)
@@ -224,12 +230,12 @@ def _transform(op: ops.Transform, run: Run, x: Tensor) -> Tensor:
 
 
 @PYTORCH.implements(ops.Matrix)
-def _matrix(op: ops.Matrix, run: Run, x: Tensor) -> Tensor:
+def _matrix(op: ops.Matrix, run: Execution, x: Tensor) -> Tensor:
     return x @ x.new_tensor(op.rows).T
 
 
 @PYTORCH.implements(ops.Gate)
-def _gate(op: ops.Gate, run: Run, gate: Tensor, x: Tensor, plus: Tensor | None) -> Tensor:
+def _gate(op: ops.Gate, run: Execution, gate: Tensor, x: Tensor, plus: Tensor | None) -> Tensor:
     share = torch.sigmoid(gate)
     share = op.floor + share if op.scale == 1.0 else op.floor + op.scale * share
     value = share * x
@@ -239,17 +245,17 @@ def _gate(op: ops.Gate, run: Run, gate: Tensor, x: Tensor, plus: Tensor | None) 
 
 
 @PYTORCH.implements(ops.Standardize)
-def _standardize(op: ops.Standardize, run: Run, x: Tensor, mean: Tensor, deviation: Tensor) -> Tensor:
+def _standardize(op: ops.Standardize, run: Execution, x: Tensor, mean: Tensor, deviation: Tensor) -> Tensor:
     return mean + deviation * x
 
 
 @PYTORCH.implements(ops.DivideByCosine)
-def _divide_by_cosine(op: ops.DivideByCosine, run: Run, x: Tensor, omega: Tensor) -> Tensor:
+def _divide_by_cosine(op: ops.DivideByCosine, run: Execution, x: Tensor, omega: Tensor) -> Tensor:
     return x / omega[:, 2:].clamp_min(op.least)
 
 
 @PYTORCH.implements(ops.Calibrate)
-def _calibrate(op: ops.Calibrate, run: Run, level: Tensor, omega: Tensor) -> Tensor:
+def _calibrate(op: ops.Calibrate, run: Execution, level: Tensor, omega: Tensor) -> Tensor:
     return interpolate_factors(run.material.number(op.factors)[op.table], level, omega[:, 2])
 
 
@@ -266,7 +272,7 @@ def interpolate_factors(table: Tensor, level: Tensor, cosine: Tensor) -> Tensor:
 
 
 @PYTORCH.implements(ops.Product)
-def _product(op: ops.Product, run: Run, x: Sequence[Tensor]) -> Tensor:
+def _product(op: ops.Product, run: Execution, x: Sequence[Tensor]) -> Tensor:
     first, *rest = x
     for factor in rest:
         first = first * factor

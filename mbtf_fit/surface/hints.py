@@ -8,7 +8,14 @@ from concurrent.futures import ThreadPoolExecutor
 import torch
 from torch import Tensor
 
-from mbtf_fit.native.library import MAX_LEVELS, MAX_PLACES, QueryPointers, Surface, Textures, kernel
+from mbtf_fit.native.library import (
+    MAX_LEVELS,
+    MAX_PLACES,
+    QueryPointers,
+    SurfaceStruct,
+    TexturesStruct,
+    kernel,
+)
 from mbtf_fit.ops.constants import HINTS
 from mbtf_fit.ops.displace import Trace
 from mbtf_fit.ops.shade import Shade
@@ -19,7 +26,7 @@ from mbtf_fit.textures.lookup import Packing
 _TASK, _CHUNK = 1 << 14, 1 << 17
 
 
-def describe_textures(table: Tensor, packing: Packing, into: Textures) -> None:
+def describe_textures(table: Tensor, packing: Packing, into: TexturesStruct) -> None:
     """Fill the kernel's description of textures; it has the address of the table, which must outlive it."""
     into.levels, into.channels = len(packing.shapes), table.shape[1]
     into.rows[: len(packing.shapes)] = [rows for rows, _ in packing.shapes]
@@ -64,7 +71,7 @@ def compute_hints(
         return torch.cat(parts)
     arrays = [a.detach().float().contiguous() for a in (u, sigma, omega_i, omega_o)]
     out = torch.empty(len(u), HINTS)
-    description = Surface(heightfield=surface.tracer.description)
+    description = SurfaceStruct(heightfield=surface.tracer.description)
     describe_textures(*surface.map_table, description.maps)
     describe_textures(*surface.horizon_table, description.horizons)
     description.places, description.finer = places, shade.finer

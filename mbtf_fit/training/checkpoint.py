@@ -13,7 +13,7 @@ from torch import Tensor
 
 from mbtf_core.errors import InputError
 from mbtf_fit.material.storage import read_tensors, write_tensors
-from mbtf_fit.training.loop import Progress
+from mbtf_fit.training.loop import TrainingProgress
 from mbtf_fit.training.trainer import Trainer
 
 CHECKPOINT_NAME = "checkpoint.safetensors"
@@ -66,7 +66,7 @@ def read_checkpoint(trainer: Trainer, path: Path) -> None:
         trainer.progress = _progress(progress)
 
 
-def read_joint_checkpoint(trainers: Sequence[Trainer], path: Path) -> Progress:
+def read_joint_checkpoint(trainers: Sequence[Trainer], path: Path) -> TrainingProgress:
     """Load a checkpoint of trainers that share networks; returns their progress."""
     with _refused(path):
         tensors, progress = read_tensors(path)
@@ -91,8 +91,8 @@ def _load(trainer: Trainer, tensors: Mapping[str, Tensor]) -> None:
     trainer.hooks.restore({k.removeprefix(_STATE): t for k, t in tensors.items() if k.startswith(_STATE)})
 
 
-def _progress(data: Mapping[str, Any]) -> Progress:
-    return Progress(int(data["step"]), float(data["seconds"]), float(data["loss"]))
+def _progress(data: Mapping[str, Any]) -> TrainingProgress:
+    return TrainingProgress(int(data["step"]), float(data["seconds"]), float(data["loss"]))
 
 
 @contextlib.contextmanager

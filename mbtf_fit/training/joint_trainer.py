@@ -17,7 +17,7 @@ from mbtf_core.errors import InputError
 from mbtf_fit.config import FitConfig
 from mbtf_fit.objective.parallel import Workers
 from mbtf_fit.training.checkpoint import read_joint_checkpoint, write_joint_checkpoint
-from mbtf_fit.training.loop import Progress, TrainingLoop
+from mbtf_fit.training.loop import TrainingLoop, TrainingProgress
 from mbtf_fit.training.trainer import Trainer
 
 
@@ -47,7 +47,7 @@ class JointTrainer(TrainingLoop):
         self.names: Sequence[str] = list(trainers)
         self.trainers: Sequence[Trainer] = list(trainers.values())
         self.device = self.trainers[0].device
-        self.progress = Progress()
+        self.progress = TrainingProgress()
         self._link()
         decay = shared_decay([trainer.weight_decay.weights for trainer in self.trainers])
         for trainer in self.trainers:

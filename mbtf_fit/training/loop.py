@@ -18,7 +18,7 @@ from mbtf_fit.objective.parallel import Workers
 
 
 @dataclass
-class Progress:
+class TrainingProgress:
     """Progress of training: steps done, seconds spent in them over all runs, mean loss of the last steps."""
 
     step: int = 0
@@ -38,7 +38,7 @@ class TrainingLoop(ABC):
 
     config: FitConfig
     device: torch.device
-    progress: Progress
+    progress: TrainingProgress
 
     @property
     def fraction(self) -> float:

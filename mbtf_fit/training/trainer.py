@@ -34,7 +34,7 @@ from mbtf_fit.pytorch.material import NeuralMaterial
 from mbtf_fit.sections import TrainingSection
 from mbtf_fit.textures.blur import annealed_sigma
 from mbtf_fit.training.calibration import fit_calibration
-from mbtf_fit.training.loop import Progress, TrainingLoop, health_of
+from mbtf_fit.training.loop import TrainingLoop, TrainingProgress, health_of
 
 TrainingData = TrainingQueries | TrainingImages | TrainingSlices | SharedSlices | StreamedQueries
 # Decay rates of Adam's moments.
@@ -83,7 +83,7 @@ class Trainer(TrainingLoop):
         self.queries: TrainingData = self.hooks.precompute(queries, config.data.memory)
         self.selection = selection
         self.device = next(model.parameters()).device
-        self.progress = Progress()
+        self.progress = TrainingProgress()
         self.batch = min(config.training.batch, len(queries))
         texels, weights = self.hooks.trained()
         self.optimizer = torch.optim.Adam([{"params": texels}, {"params": weights}], betas=BETAS, fused=True)

@@ -17,7 +17,7 @@ from typing import Any
 
 from mbtf_core.errors import EngineError, UsageError
 from mbtf_core.files.folders import cache_folder
-from mbtf_core.run.child import Outcome, run_child
+from mbtf_core.run.child import ChildResult, run_child
 from mbtf_core.run.task import worker_threads
 from mbtf_gen.engine.llvm import (
     CACHE_VARIABLE,
@@ -112,7 +112,7 @@ def refuse_old_llvm() -> None:
         )
 
 
-def prove(variant: str) -> Outcome:
+def prove(variant: str) -> ChildResult:
     """Compile and run test kernels of `variant` in a child process, without the disk cache.
 
     The answers contain ``llvm`` (version) for the CPU variant.

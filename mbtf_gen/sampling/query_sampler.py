@@ -25,7 +25,7 @@ F32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
-class Mixture:
+class LevelMixture:
     """Mixture distribution of the fractional level; weights are normalized to sum 1.
 
     Attributes
@@ -86,7 +86,7 @@ class QueryPlan:
     """
 
     lattice: Lattice
-    mixture: Mixture
+    mixture: LevelMixture
     min_cos: float
     layout: Layout
     root: int

@@ -55,7 +55,7 @@ Verdict = Literal["agree", "differ", "inconclusive"]
 
 
 @dataclass(frozen=True)
-class Agreement:
+class MitsubaAgreement:
     """Comparison of one scene rendered by mbtf and by unmodified Mitsuba.
 
     Attributes
@@ -85,7 +85,7 @@ def verdict(mean: Estimate, square: Estimate) -> Verdict:
     return "agree" if pixels_agree and means_agree else "differ"
 
 
-def agreement(mbtf: tuple[F64, F64], mitsuba: tuple[F64, F64], margin: int = 0) -> Agreement:
+def agreement(mbtf: tuple[F64, F64], mitsuba: tuple[F64, F64], margin: int = 0) -> MitsubaAgreement:
     """Compare two renderings (rows, columns, 3), each given as two independent halves.
 
     Parameters
@@ -99,7 +99,7 @@ def agreement(mbtf: tuple[F64, F64], mitsuba: tuple[F64, F64], margin: int = 0) 
     scale = 1.0 / max(mean, 1e-30)
     difference = mean_estimate((a1 + b1 - a2 - b2) / 2.0).scaled(scale)
     square = mean_estimate((a1 - a2) * (b1 - b2)).scaled(scale**2)
-    return Agreement(difference, square, (mbtf[0] + mbtf[1]) / 2, (mitsuba[0] + mitsuba[1]) / 2)
+    return MitsubaAgreement(difference, square, (mbtf[0] + mbtf[1]) / 2, (mitsuba[0] + mitsuba[1]) / 2)
 
 
 def _blocks(picture: F64) -> F64:
@@ -152,7 +152,7 @@ def write_agreement(
 
 def compare_with_mitsuba(
     section: CompareSection, generate: GeneratorConfig, material: Tile
-) -> dict[str, Agreement]:
+) -> dict[str, MitsubaAgreement]:
     """Render one scene with mbtf and with Mitsuba: the ``base color`` alone, and the ``full`` surface."""
     from mbtf_gen.config.generator import LightSection
     from mbtf_gen.job import Job

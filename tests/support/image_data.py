@@ -12,7 +12,7 @@ from mbtf_core.data.lattice import Lattice, sigma_of_level, texel_centers
 from mbtf_core.data.schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION
 from mbtf_core.data.shard_files import write_shard
 from mbtf_core.files.atomic import checksummed
-from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
+from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan
 
 from .datasets import write_sidecar
 from .fit_data import F32, Function, random_directions
@@ -63,7 +63,7 @@ def write_images(
         for index, items in enumerate(counts):
             queries = random_images(random, items, lattice)
             if patch_size is not None:
-                plan = QueryPlan(lattice, Mixture(1, 0), 0.1, "image", seed, items, patch_size)
+                plan = QueryPlan(lattice, LevelMixture(1, 0), 0.1, "image", seed, items, patch_size)
                 queries = {name: getattr(plan.draw(split, index, items), name) for name in queries}
             shape = queries["sigma"].shape
             flat = {name: a.reshape(-1, *a.shape[3:]) for name, a in queries.items()}

@@ -15,7 +15,7 @@ from mbtf_core.data.shard_files import write_shard
 from mbtf_core.files.atomic import checksummed
 from mbtf_fit.models.registry import MODELS
 from mbtf_fit.pytorch.material import NeuralMaterial
-from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
+from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan
 from mbtf_gen.sampling.slice_directions import slice_directions
 
 from .datasets import write_sidecar
@@ -52,7 +52,7 @@ def write_slices(
     folder.mkdir(parents=True)
     lattice = Lattice(finest, aspect)
     directions = slice_directions("spiral", lights, 0.2)
-    plan = QueryPlan(lattice, Mixture(0.6, 0.4), 0.2, "slices", seed, rows, None, directions)
+    plan = QueryPlan(lattice, LevelMixture(0.6, 0.4), 0.2, "slices", seed, rows, None, directions)
     random = np.random.default_rng(seed)
     config_hash = f"{function.__name__}-{seed}-{noise}-{lights}"
     splits: dict[str, Any] = {}

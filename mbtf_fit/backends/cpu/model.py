@@ -15,8 +15,8 @@ from mbtf_fit.native.library import (
     MAX_LEVELS,
     MAX_WIDTH,
     Kernel,
-    Model,
-    Network,
+    ModelStruct,
+    NetworkStruct,
     QueryPointers,
 )
 from mbtf_fit.ops.constants import HEIGHT_SCALE, LEAST_FACING
@@ -89,7 +89,7 @@ class NativeModel:
         self.textures = _textures(material, pattern)
         names = [pattern.decoder, *([] if pattern.offset_network is None else [pattern.offset_network])]
         self.networks = [material.get_submodule(op.weights) for op in names]
-        self.description = d = Model()
+        self.description = d = ModelStruct()
         d.aspect = material.lattice.aspect
         d.coordinates, d.half_vector = pattern.coordinates, pattern.half_vector
         d.irradiance_scale = pattern.irradiance_scale
@@ -98,7 +98,7 @@ class NativeModel:
             d.offset_scale, d.grazing = pattern.offset.scale, pattern.offset.grazing
         if pattern.displace is not None and pattern.displace.learned is not None:
             d.height_scale, d.least_facing = HEIGHT_SCALE, LEAST_FACING
-        self._packed: list[tuple[Network, Tensor]] = []
+        self._packed: list[tuple[NetworkStruct, Tensor]] = []
         for weights, target in zip(self.network_weights(), (d.decoder, d.offset), strict=False):
             widths = [weights[0].shape[1], *(len(w) for w in weights[::2])]
             target.layers, target.wanted = len(weights) // 2, self.textures[0].texels.shape[1]

@@ -14,7 +14,7 @@ from mbtf_core.data.lattice import level_of_sigma
 from mbtf_core.data.queries import Queries
 from mbtf_core.errors import InputError
 from mbtf_gen.job import Job, split_queries
-from mbtf_gen.sampling.query_sampler import Mixture
+from mbtf_gen.sampling.query_sampler import LevelMixture
 
 # Shards are read until there are this many queries.
 MAX_QUERIES = 1 << 20
@@ -38,7 +38,7 @@ class QuerySample:
     omega_i: NDArray[np.float32]
     omega_o: NDArray[np.float32]
     total: int
-    mixture: Mixture
+    mixture: LevelMixture
     finest: int
     min_cos: float
     aspect: float
@@ -70,7 +70,7 @@ def stored_queries(dataset: Dataset) -> QuerySample:
     return QuerySample(
         *_columns(Queries(**shard.read(names)) for shard in shards),
         int(manifest["splits"]["train"]["queries"]),
-        Mixture(**manifest["levels"]["mixture"]),
+        LevelMixture(**manifest["levels"]["mixture"]),
         dataset.lattice.finest,
         float(manifest["config"]["queries"]["min_cos"]),
         dataset.lattice.aspect,

@@ -27,7 +27,7 @@ from mbtf_gen.planning.run_plan import plan_run
 from mbtf_gen.planning.sample_allocation import Allocation, fit_allocation
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream, Target
-from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
+from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan
 
 load_mitsuba()
 
@@ -62,7 +62,7 @@ class FewBrightPaths:
 
 @pytest.fixture(scope="module")
 def skewed() -> tuple[Queries, Allocation]:
-    q = QueryPlan(Lattice(4), Mixture(0.6, 0.4), 0.1, "shuffled", 0, N).draw("train", 0, N)
+    q = QueryPlan(Lattice(4), LevelMixture(0.6, 0.4), 0.1, "shuffled", 0, N).draw("train", 0, N)
     pilot = FewBrightPaths().estimate(q, 16, Stream(0, "pilot", 1))
     return q, fit_allocation(q, pilot, 16, 4)
 

@@ -23,7 +23,7 @@ from support.scenes import (
 
 from mbtf_core.data.lattice import Lattice, texel_centers
 from mbtf_core.pictures.camera import Camera
-from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
+from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan
 from mbtf_gen.tile.heights.grid import tile_mesh
 
 ROWS, COLUMNS = 4, 8
@@ -102,7 +102,7 @@ def test_sunk_texture_is_seen_displaced(azimuth: float, axis: int, sign: int) ->
 
 
 def test_image_layout_walks_texels_in_row_order() -> None:
-    plan = QueryPlan(Lattice(3, 0.5), Mixture(1, 0), 0.1, "image", 5, 4)
+    plan = QueryPlan(Lattice(3, 0.5), LevelMixture(1, 0), 0.1, "image", 5, 4)
     q = plan.draw("train", 0, 3)
     assert q.lead == (3, 4, 8)
     centers = texel_centers(4, 8)

@@ -11,15 +11,17 @@ from support.chi_square import Cap, chi_square_test, uniformity
 from mbtf_core.data.lattice import Lattice, level_of_sigma
 from mbtf_core.data.queries import Queries
 from mbtf_core.stats import holm
-from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
+from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan
 
 ROWS = 1 << 16
 MIN_COS = 0.15
 LATTICE = Lattice(7, 0.75)
 
 
-def draw(layout: str = "shuffled", mixture: Mixture | None = None, lattice: Lattice = LATTICE) -> Queries:
-    plan = QueryPlan(lattice, mixture or Mixture(0.6, 0.4), MIN_COS, layout, 8, ROWS)  # type: ignore[arg-type]
+def draw(
+    layout: str = "shuffled", mixture: LevelMixture | None = None, lattice: Lattice = LATTICE
+) -> Queries:
+    plan = QueryPlan(lattice, mixture or LevelMixture(0.6, 0.4), MIN_COS, layout, 8, ROWS)  # type: ignore[arg-type]
     return plan.draw("train", 1, ROWS)
 
 
@@ -37,7 +39,7 @@ def test_directions_are_uniform_on_the_projected_disk(name: str, sampled: Querie
     assert result.p_value > 1e-3, str(result)
 
 
-def coordinates(q: Queries, mixture: Mixture) -> dict[str, NDArray[np.float64]]:
+def coordinates(q: Queries, mixture: LevelMixture) -> dict[str, NDArray[np.float64]]:
     """Each query variable as a number that is uniform in [0, 1)."""
     span = 1 - MIN_COS**2
     level = level_of_sigma(q.sigma)
@@ -51,7 +53,7 @@ def coordinates(q: Queries, mixture: Mixture) -> dict[str, NDArray[np.float64]]:
 
 
 def test_all_variables_are_uniform_and_pairwise_independent(sampled: Queries) -> None:
-    x = coordinates(sampled, Mixture(0.6, 0.4))
+    x = coordinates(sampled, LevelMixture(0.6, 0.4))
     names = list(x)
     assert len(names) == 7
     pairs = [(a, b) for n, a in enumerate(names) for b in names[:n]]
@@ -61,7 +63,7 @@ def test_all_variables_are_uniform_and_pairwise_independent(sampled: Queries) ->
 
 @pytest.mark.parametrize("weights", [(1.0, 0.0), (0.0, 1.0), (0.6, 0.4), (1.0, 3.0)])
 def test_levels_follow_the_mixture(weights: tuple[float, float]) -> None:
-    mixture = Mixture(*weights)
+    mixture = LevelMixture(*weights)
     q = draw(mixture=mixture)
     cumulative = np.sort(coordinates(q, mixture)["level"])
     # Stratified along each part of the mixture: far closer than the scatter of random draws …
@@ -74,7 +76,7 @@ def test_levels_follow_the_mixture(weights: tuple[float, float]) -> None:
 
 
 def test_log_uniform_footprints_have_equal_shares_per_octave() -> None:
-    q = draw(mixture=Mixture(1.0, 0.0))
+    q = draw(mixture=LevelMixture(1.0, 0.0))
     octave = np.clip(np.floor(level_of_sigma(q.sigma)), 0, LATTICE.finest - 1).astype(int)
     np.testing.assert_allclose(np.bincount(octave) / ROWS, 1 / LATTICE.finest, atol=2 / ROWS)
 
@@ -87,6 +89,6 @@ def test_positions_are_uniform_within_their_texels(sampled: Queries) -> None:
 
 def test_images_have_stratified_levels() -> None:
     lattice = Lattice(1, 1.0)
-    q = draw("image", Mixture(1.0, 0.0), lattice)
+    q = draw("image", LevelMixture(1.0, 0.0), lattice)
     level = np.sort(level_of_sigma(q.sigma[:, 0, 0]))
     assert np.abs(level - (np.arange(ROWS) + 0.5) / ROWS).max() < 1.5 / ROWS

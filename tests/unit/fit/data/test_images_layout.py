@@ -24,7 +24,7 @@ from mbtf_fit.evaluation import evaluate_splits
 from mbtf_fit.sections import HeldOutSection
 from mbtf_fit.training.fit import prepare_trainer
 from mbtf_fit.training.trainer import BETAS
-from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
+from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan
 
 HELD_OUT = HeldOutSection(queries=0.1, radius=0.3)
 
@@ -172,7 +172,9 @@ def test_batches_take_every_image_and_resume_anywhere() -> None:
 
 def small_images(lattice: Lattice, size: int, count: int) -> TrainingImages:
     """Images of limited size, as the generator draws them."""
-    q = QueryPlan(lattice, Mixture(1, 0), 0.2, "image", 3, count, patch_size=size).draw("train", 0, count)
+    q = QueryPlan(lattice, LevelMixture(1, 0), 0.2, "image", 3, count, patch_size=size).draw(
+        "train", 0, count
+    )
     return numbered(vars(q), np.ones((count, 2), np.int64), nearest_shapes(lattice, q.sigma[:, 0, 0]))
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from mbtf_core.data.lattice import Lattice
 from mbtf_fit.data.queries import TrainingQueries
-from mbtf_fit.objective.losses import Curve, FourthRoot, Log, Objective
+from mbtf_fit.objective.losses import FourthRoot, Log, LossCurve, Objective
 from mbtf_fit.objective.noise import NoiseModel
 from mbtf_fit.sections import TrainingSection
 
@@ -97,7 +97,7 @@ def test_an_outlier_has_the_gradient_of_the_bound() -> None:
 
 
 @pytest.mark.parametrize("curve", [Log(), FourthRoot()], ids=["log", "fourth-root"])
-def test_slopes_and_curvatures_are_derivatives(curve: Curve) -> None:
+def test_slopes_and_curvatures_are_derivatives(curve: LossCurve) -> None:
     x = torch.tensor([-3.0, -0.6, -0.2, 0.0003, 0.1, 1.0, 30.0], dtype=torch.float64, requires_grad=True)
     value = curve.value(x)
     (slope,) = torch.autograd.grad(value.sum(), x)

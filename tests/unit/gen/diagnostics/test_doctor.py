@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from mbtf_core.run.child import Outcome
+from mbtf_core.run.child import ChildResult
 from mbtf_gen.diagnostics import doctor
 from mbtf_gen.diagnostics.doctor import Part
 from mbtf_gen.engine import llvm
@@ -33,7 +33,7 @@ def test_a_broken_llvm_is_a_finding_not_a_crash(monkeypatch: pytest.MonkeyPatch,
 
 def test_an_abort_of_the_drawing_library_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
     fault = "the process was ended by SIGSEGV"
-    monkeypatch.setattr(doctor, "run_child", lambda *a, **k: Outcome({}, fault, 0.1))
+    monkeypatch.setattr(doctor, "run_child", lambda *a, **k: ChildResult({}, fault, 0.1))
     check = doctor.probe("Drawing")
     assert (check.state, check.required, check.found) == ("failed", False, fault)
     assert "OpenGL" in check.hint

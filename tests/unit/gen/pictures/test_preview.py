@@ -21,7 +21,7 @@ from mbtf_gen.pictures.preview import mesh
 from mbtf_gen.pictures.preview.mesh import MOST_CELLS, draw, tiled_mesh
 from mbtf_gen.pictures.preview.plots import level_histogram
 from mbtf_gen.pictures.preview.sample import QuerySample, sampled_queries, stored_queries
-from mbtf_gen.sampling.query_sampler import Mixture
+from mbtf_gen.sampling.query_sampler import LevelMixture
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 
 LIGHT = from_angles(35, 150)
@@ -106,7 +106,7 @@ def sample_of(count: int, seed: int = 0, **options: Any) -> QuerySample:
 @pytest.mark.parametrize("weights", [(0.6, 0.4), (1.0, 0.0), (0.0, 1.0)])
 @pytest.mark.parametrize("finest", [1, 2, 5])
 def test_the_stated_density_is_that_of_the_levels(weights: tuple[float, float], finest: int) -> None:
-    mixture = Mixture(*weights)
+    mixture = LevelMixture(*weights)
     at = np.linspace(-1, finest + 1, 20_001)
     density = mixture.density(at, finest)
     assert np.trapezoid(density, at) == pytest.approx(1.0, abs=2e-3)
@@ -125,7 +125,7 @@ def test_the_histogram_of_levels_follows_the_mixture() -> None:
     assert np.sum(found * np.diff(edges)) == pytest.approx(1.0)
     # Levels are stratified: the counts are those stated to within one per bin, or two at a weight's edge.
     np.testing.assert_allclose(found, stated, atol=2 / (20_000 * 0.125))
-    other = replace(sample_of(20_000), mixture=Mixture(1.0, 0.0))
+    other = replace(sample_of(20_000), mixture=LevelMixture(1.0, 0.0))
     assert np.abs(level_histogram(other)[1] - level_histogram(other)[2]).max() > 0.1
     # Few queries fill whole levels only.
     edges, found, stated = level_histogram(sample_of(300))
@@ -153,7 +153,7 @@ def test_stored_queries_are_those_that_the_configuration_samples(layout: str, tm
         np.testing.assert_array_equal(sample.omega_o, data["omega_o"][one])
         np.testing.assert_array_equal(sample.level, level_of_sigma(data["sigma"][one]))
         assert sample.total == len(sample.u)
-        assert (sample.mixture, sample.finest) == (Mixture(0.6, 0.4), 3)
+        assert (sample.mixture, sample.finest) == (LevelMixture(0.6, 0.4), 3)
         assert (sample.min_cos, sample.aspect) == (0.1, 0.5)
 
 

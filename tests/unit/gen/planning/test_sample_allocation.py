@@ -22,13 +22,13 @@ from mbtf_gen.planning.sample_allocation import (
     fit_log_linear,
 )
 from mbtf_gen.render.estimates import Estimates
-from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
+from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan
 
 SPP = 16
 
 
 def some_queries(n: int = 20_000, shard: int = 0) -> Queries:
-    return QueryPlan(Lattice(6), Mixture(0.6, 0.4), 0.1, "shuffled", 0, n).draw("train", shard, n)
+    return QueryPlan(Lattice(6), LevelMixture(0.6, 0.4), 0.1, "shuffled", 0, n).draw("train", shard, n)
 
 
 def deviation(q: Queries) -> NDArray[np.float64]:
@@ -156,10 +156,10 @@ from mbtf_gen.planning.adaptive import round_up, needed_paths
 from mbtf_gen.planning.sample_allocation import Allocation
 from mbtf_gen.render.estimates import Estimates
 from mbtf_core.data.lattice import Lattice
-from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
+from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan
 n = 20000
 allocation = TypeAdapter(Allocation).validate_json(sys.argv[1])
-q = QueryPlan(Lattice(6), Mixture(0.6, 0.4), 0.1, "shuffled", 0, n).draw("train", 3, n)
+q = QueryPlan(Lattice(6), LevelMixture(0.6, 0.4), 0.1, "shuffled", 0, n).draw("train", 3, n)
 rng = np.random.Generator(np.random.Philox(5))
 a, b, v = (0.3 * rng.random((n, k), dtype=np.float32) for k in (3, 3, 1))
 pilot = Estimates(a, b, None, 0, 0, 0, 0, path_variance=v[:, 0])

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.data.queries import Queries
-from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
+from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan
 
 # Draws of every kind, and the elementary functions in double precision, where the last bit shows; prints
 # NumPy's features in use and the digest of all bits.
@@ -21,10 +21,10 @@ import hashlib, json
 import numpy as np
 from mbtf_gen.sampling.exact_math import exp2, sincos_turns
 from mbtf_core.data.lattice import Lattice
-from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
+from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan
 h = hashlib.sha256()
 for layout, lattice, rows in (("shuffled", Lattice(5, 0.75), 5000), ("image", Lattice(4, 1.0), 7)):
-    plan = QueryPlan(lattice, Mixture(0.6, 0.4), 0.1, layout, 11, rows)
+    plan = QueryPlan(lattice, LevelMixture(0.6, 0.4), 0.1, layout, 11, rows)
     for split, shard in (("train", 0), ("train", 3), ("test", 1)):
         q = plan.draw(split, shard, rows)
         for array in (q.u, q.sigma, q.omega_i, q.omega_o):
@@ -77,7 +77,7 @@ def texels(lattice: Lattice, u: NDArray[np.float32]) -> NDArray[np.int64]:
 
 
 def plan(lattice: Lattice, shard_rows: int, layout: str = "shuffled", root: int = 5) -> QueryPlan:
-    return QueryPlan(lattice, Mixture(0.6, 0.4), 0.2, layout, root, shard_rows)  # type: ignore[arg-type]
+    return QueryPlan(lattice, LevelMixture(0.6, 0.4), 0.2, layout, root, shard_rows)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("lattice", LATTICES, ids=lambda k: "x".join(map(str, k.shape())))
@@ -116,7 +116,7 @@ def test_images_hold_every_texel_in_order_under_one_light_and_view(lattice: Latt
 
 @pytest.mark.parametrize("lattice", LATTICES, ids=lambda k: "x".join(map(str, k.shape())))
 def test_patches_are_grids_of_the_level_nearest_to_their_footprint(lattice: Lattice) -> None:
-    q = QueryPlan(lattice, Mixture(1, 0), 0.2, "image", 5, 40, patch_size=5).draw("train", 1, 40)
+    q = QueryPlan(lattice, LevelMixture(1, 0), 0.2, "image", 5, 40, patch_size=5).draw("train", 1, 40)
     assert q.lead == (40, 5, 5)
     assert ((q.u >= 0) & (q.u < 1)).all()
     for item in range(40):
@@ -131,7 +131,7 @@ def test_patches_are_grids_of_the_level_nearest_to_their_footprint(lattice: Latt
     # They begin anywhere.
     assert len(np.unique(q.u[:, 0, 0])) == 80
     assert np.ptp(q.u[:, 0, 0], axis=0).min() > 0.7
-    other = QueryPlan(lattice, Mixture(1, 0), 0.2, "image", 5, 40, patch_size=5).draw("train", 2, 40)
+    other = QueryPlan(lattice, LevelMixture(1, 0), 0.2, "image", 5, 40, patch_size=5).draw("train", 2, 40)
     assert not equal(q, other)
 
 
@@ -182,6 +182,6 @@ def test_level_zero_alone_has_one_footprint() -> None:
 
 
 def test_mixture_weights_are_normalized_and_not_all_zero() -> None:
-    assert (Mixture(3.0, 1.0).log_uniform, Mixture(3.0, 1.0).finest) == (0.75, 0.25)
+    assert (LevelMixture(3.0, 1.0).log_uniform, LevelMixture(3.0, 1.0).finest) == (0.75, 0.25)
     with pytest.raises(ValueError, match="zero"):
-        Mixture(0.0, 0.0)
+        LevelMixture(0.0, 0.0)

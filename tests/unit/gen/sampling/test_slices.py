@@ -8,7 +8,7 @@ from support.datasets import write_dataset
 
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import UsageError
-from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
+from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan
 from mbtf_gen.sampling.slice_directions import direction_pairs, slice_directions
 
 
@@ -52,7 +52,7 @@ def test_pairs_combine_every_light_with_every_view() -> None:
 def test_every_texel_has_one_slice_at_its_center(aspect: float) -> None:
     lattice = Lattice(3, aspect)
     directions = slice_directions("spiral", 4, 0.2)
-    plan = QueryPlan(lattice, Mixture(1, 0), 0.2, "slices", 3, 10, None, directions)
+    plan = QueryPlan(lattice, LevelMixture(1, 0), 0.2, "slices", 3, 10, None, directions)
     count = lattice.texels()
     shards = [plan.draw("train", s, min(10, count - 10 * s)) for s in range(-(-count // 10))]
     u = np.concatenate([q.u for q in shards])
@@ -71,8 +71,8 @@ def test_every_texel_has_one_slice_at_its_center(aspect: float) -> None:
 
 def test_test_queries_are_those_of_the_shuffled_layout() -> None:
     directions = slice_directions("spiral", 4, 0.2)
-    plan = QueryPlan(Lattice(3), Mixture(0.6, 0.4), 0.2, "slices", 3, 10, None, directions)
-    shuffled = QueryPlan(Lattice(3), Mixture(0.6, 0.4), 0.2, "shuffled", 3, 10)
+    plan = QueryPlan(Lattice(3), LevelMixture(0.6, 0.4), 0.2, "slices", 3, 10, None, directions)
+    shuffled = QueryPlan(Lattice(3), LevelMixture(0.6, 0.4), 0.2, "shuffled", 3, 10)
     for found, expected in zip(
         vars(plan.draw("test", 2, 10)).values(), vars(shuffled.draw("test", 2, 10)).values(), strict=True
     ):
