@@ -30,7 +30,7 @@ def publish(
 ) -> None:
     """Write a folder to share: mbtf-gen publish shards/ --license CC-BY-4.0 -o card/
 
-    It holds a data card with pictures, the data, croissant.json, and the recipe that makes the data again.
+    It holds a data card with a picture, the data, croissant.json, and the recipe that makes the data again.
 
     Parameters
     ----------
@@ -54,14 +54,14 @@ def publish(
     data = DataFolder.open(shards)
     if data.local is not None and data.local.resolve() in (output.resolve(), *output.resolve().parents):
         raise UsageError("is the data set, or inside it", where=f"-o {output}", hint="choose another folder")
-    from mbtf_gen.publishing.publish import Publication
+    from mbtf_gen.publishing.publication import Publication
 
     publication = Publication.prepare(
         data, config, with_maps=with_maps, material=None if material is None else Path(material)
     )
     console.note(f"{data} -> {output}: {config.form}, at most {size_text(publication.size)}")
     keep_on_interruption(f"the finished files are kept in {output}")
-    with console.progress(len(publication.makers()), "publishing", "files") as bar:
+    with console.progress(len(publication.makers), "publishing", "files") as bar:
         files = publication.write(output, overwrite=overwrite, progress=bar.advance)
     size = sum(stored.bytes for stored in files.values())
     recipe = "no recipe: measured data" if publication.facts.measured else "with a recipe"

@@ -26,9 +26,11 @@ from mbtf_core.files.folders import (
 )
 
 RECORD_NAME = "publish.json"
-FORMAT_NAME = "mbtf-publication"
-_VERSION = 1
-DATA, PICTURES, RECIPE = "data", "pictures", "recipe"
+DATA, RECIPE = "data", "recipe"
+_FORMAT, _VERSION = "mbtf-publication", 1
+
+# Name of a file in the folder → what writes it to a given path, atomically.
+Makers = dict[str, Callable[[Path], Stored]]
 
 
 def _inside(name: str) -> str:
@@ -99,7 +101,7 @@ class PublishFolder:
         existing = path / RECORD_NAME
         if check_folder(path, lambda folder: (folder / RECORD_NAME).exists(), "published data set"):
             old = read_json(existing, ELSEWHERE)
-            if [old.get(key) for key in ("format", "version")] != [FORMAT_NAME, _VERSION]:
+            if [old.get(key) for key in ("format", "version")] != [_FORMAT, _VERSION]:
                 raise InputError("is not a record of this version", where=existing, hint=ELSEWHERE)
             check_document(_Record, old, existing, ELSEWHERE)
             if not overwrite and old["hash"] != data_sha256(depends):
@@ -113,31 +115,14 @@ class PublishFolder:
             for name in (*old["listed"], RECORD_NAME):
                 remove_file(path / name)
         make_folder(path)
-        record = {
-            "format": FORMAT_NAME,
-            "version": _VERSION,
-            "hash": data_sha256(depends),
-            "depends": dict(depends),
-            "listed": sorted(listed),
-            "files": {},
-        }
-        claimed = cls(path, record)
+        record = {"hash": data_sha256(depends), "depends": dict(depends), "listed": sorted(listed)}
+        claimed = cls(path, {"format": _FORMAT, "version": _VERSION, **record, "files": {}})
         # The record first: it claims the folder, even if the run is killed right after.
-        claimed._save()
+        write_json(existing, claimed.record)
         return claimed
 
-    def _save(self) -> None:
-        write_json(self.path / RECORD_NAME, self.record)
-
-    def finished(self, name: str) -> Stored | None:
-        """Size and digest of a finished file that exists with its full size, or None."""
-        entry, path = self.record["files"].get(name), self.path / name
-        if entry is None or not path.is_file() or path.stat().st_size != entry["bytes"]:
-            return None
-        return Stored(entry["bytes"], entry["sha256"])
-
-    def add(self, name: str, write: Callable[[Path], Stored]) -> Stored:
-        """Write a file unless it is finished; its size and digest.
+    def add(self, name: str, write: Callable[[Path], Stored]) -> None:
+        """Write a file unless it is finished and has its full size.
 
         Parameters
         ----------
@@ -146,13 +131,13 @@ class PublishFolder:
         write : callable
             Writes the file of a given path, atomically.
         """
-        stored = self.finished(name)
-        if stored is None:
-            make_folder((self.path / name).parent)
-            stored = write(self.path / name)
-            self.record["files"][name] = {"bytes": stored.bytes, "sha256": stored.sha256}
-            self._save()
-        return stored
+        entry, path = self.record["files"].get(name), self.path / name
+        if entry is not None and path.is_file() and path.stat().st_size == entry["bytes"]:
+            return
+        make_folder(path.parent)
+        stored = write(path)
+        self.record["files"][name] = {"bytes": stored.bytes, "sha256": stored.sha256}
+        write_json(self.path / RECORD_NAME, self.record)
 
     @property
     def files(self) -> dict[str, Stored]:

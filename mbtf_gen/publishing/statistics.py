@@ -1,179 +1,75 @@
-"""Statistics of a data set for its card, in one pass over the shards.
+"""The numbers of a card: mean and noise of each split, with standard errors.
 
-Error bars count what is independent: queries of the shuffled layout, images of the image layout, positions of
-the slices layout.
+They are those of evenly spaced rows of all shards, about a million queries at most. Independent units are
+queries of the shuffled layout, images of the image layout, positions of the slices layout.
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mbtf_core.data.dataset import Dataset
-from mbtf_core.data.lattice import level_of_sigma
+from mbtf_core.data.dataset import Shard
 from mbtf_core.data.shard_files import Arrays
-from mbtf_core.stats.estimate import Estimate
+from mbtf_core.stats.estimate import Estimate, mean_estimate
+from mbtf_core.stats.paired import pooled_relative_error
 from mbtf_gen.measured.exported import mean_of
 
-F64 = NDArray[np.float64]
-
-# Histogram of values: decades, and bins of a decade.
-LOWEST_DECADE, HIGHEST_DECADE, PER_DECADE = -8, 6, 40
-# Rows of shards that are averaged at once.
-_BLOCK_VALUES = 1 << 20
+# Queries that are averaged at most.
+_QUERIES = 1 << 20
 
 
-class Moments:
-    """First and second moments of several quantities over independent units."""
-
-    def __init__(self, quantities: int) -> None:
-        self.n = 0
-        self.first = np.zeros(quantities)
-        self.second = np.zeros((quantities, quantities))
-
-    def add(self, units: F64) -> None:
-        """Add units (n, quantities)."""
-        self.n += len(units)
-        self.first += units.sum(axis=0)
-        self.second += units.T @ units
-
-    def mean(self, quantity: int) -> Estimate:
-        """Mean of a quantity with its standard error."""
-        gradient = np.zeros(len(self.first))
-        gradient[quantity] = 1.0
-        return Estimate(float(self.first[quantity]) / max(self.n, 1), self._error(gradient), self.n)
-
-    def root_ratio(self, square: int, other: int) -> Estimate:
-        """√(mean of `square`) ÷ mean of `other`, with its error to first order."""
-        a, b = (float(self.first[k]) / max(self.n, 1) for k in (square, other))
-        if a <= 0 or b <= 0:
-            return Estimate(0.0, 0.0 if a == 0 else math.inf, self.n)
-        gradient = np.zeros(len(self.first))
-        gradient[square], gradient[other] = 0.5 / (math.sqrt(a) * b), -math.sqrt(a) / b**2
-        return Estimate(math.sqrt(a) / b, self._error(gradient), self.n)
-
-    def _error(self, gradient: F64) -> float:
-        """Standard error of a function of the means with this gradient (delta method)."""
-        if self.n < 2:
-            return math.inf
-        mean = self.first / self.n
-        covariance = (self.second / self.n - np.outer(mean, mean)) / (self.n - 1)
-        return math.sqrt(max(0.0, float(gradient @ covariance @ gradient)))
-
-
-# Quantities of the moments: the three channels, their mean, and the mean of the variances of their estimates.
-_VALUE, _VARIANCE = 3, 4
-
-
-@dataclass
+@dataclass(frozen=True)
 class SplitStatistics:
     """Statistics of a split.
 
     Attributes
     ----------
-    estimates : int
-        Values per query: 2, or 1 of measured data, whose noise is unknown.
     queries : int
-        Number of queries.
-    overall : Moments
-        Of all units.
-    levels : dict of int to Moments
-        Of the units whose footprint is nearest to a level.
-    level_queries : dict of int to int
-        Queries of these levels.
-    histogram : (bins, 3) int array
-        Positive values per channel, in logarithmic bins.
-    not_positive : (3,) int array
-        Values per channel that are 0 or negative.
-    lowest, highest : float
-        Smallest and largest value of any channel, 1/sr.
+        Number of queries of the whole split.
+    mean : tuple of Estimate
+        Mean value of each color channel, in 1/sr.
+    noise : Estimate or None
+        RMS noise of the value of one query over the RMS value; None of measured data, whose noise is unknown.
     """
 
-    estimates: int = 2
-    queries: int = 0
-    overall: Moments = field(default_factory=lambda: Moments(5))
-    levels: dict[int, Moments] = field(default_factory=dict)
-    level_queries: dict[int, int] = field(default_factory=dict)
-    histogram: NDArray[np.int64] = field(
-        default_factory=lambda: np.zeros(((HIGHEST_DECADE - LOWEST_DECADE) * PER_DECADE, 3), np.int64)
-    )
-    not_positive: NDArray[np.int64] = field(default_factory=lambda: np.zeros(3, np.int64))
-    lowest: float = math.inf
-    highest: float = -math.inf
-
-    def add(self, arrays: Arrays, finest: int) -> None:
-        """Add rows of a shard."""
-        value = mean_of(arrays).astype(np.float64)
-        variance = np.zeros(value.shape[:-1])
-        if self.estimates == 2:
-            difference = arrays["value_a"].astype(np.float64) - arrays["value_b"]
-            variance = (difference**2).mean(axis=-1) / 4
-        quantities = np.concatenate(
-            [value, value.mean(axis=-1, keepdims=True), variance[..., None]], axis=-1
-        ).reshape(len(value), -1, 5)
-        units = quantities.mean(axis=1)
-        self.overall.add(units)
-        one = arrays["sigma"].reshape(len(value), -1)
-        nearest = np.clip(np.rint(level_of_sigma(one[:, 0])), 0, finest).astype(int)
-        for level in np.unique(nearest):
-            found = nearest == level
-            self.levels.setdefault(int(level), Moments(5)).add(units[found])
-            count = int(found.sum()) * one.shape[1]
-            self.level_queries[int(level)] = self.level_queries.get(int(level), 0) + count
-        self.queries += one.size
-        self.lowest, self.highest = (
-            min(self.lowest, float(value.min())),
-            max(self.highest, float(value.max())),
-        )
-        edges = len(self.histogram)
-        for channel in range(3):
-            numbers = value[..., channel].reshape(-1)
-            positive = numbers[numbers > 0]
-            self.not_positive[channel] += numbers.size - positive.size
-            index = np.floor((np.log10(positive) - LOWEST_DECADE) * PER_DECADE).astype(np.int64)
-            self.histogram[:, channel] += np.bincount(np.clip(index, 0, edges - 1), minlength=edges)
-
-    def mean(self, channel: int = _VALUE) -> Estimate:
-        """Mean value of a channel, or of all three, in 1/sr."""
-        return self.overall.mean(channel)
-
-    def noise(self, level: int | None = None) -> Estimate | None:
-        """Pooled noise relative to the mean, √(mean variance) ÷ mean value, of one level or of all; None of
-        measured data."""
-        if self.estimates == 1:
-            return None
-        return (self.overall if level is None else self.levels[level]).root_ratio(_VARIANCE, _VALUE)
-
-    def quantile(self, share: float) -> float:
-        """Value below which a share of the values of all channels lies, to 6 %."""
-        counts = self.histogram.sum(axis=1)
-        wanted = share * (counts.sum() + self.not_positive.sum()) - self.not_positive.sum()
-        if wanted <= 0:
-            return min(self.lowest, 0.0)
-        index = int(np.searchsorted(np.cumsum(counts), wanted))
-        middle = LOWEST_DECADE + (min(index, len(counts) - 1) + 0.5) / PER_DECADE
-        return float(np.clip(10.0**middle, self.lowest, self.highest))
+    queries: int
+    mean: tuple[Estimate, ...]
+    noise: Estimate | None
 
 
-def blocks(arrays: Arrays) -> list[Arrays]:
-    """Consecutive rows of a shard, few enough to compute with in memory."""
-    total = len(arrays["sigma"])
-    rows = max(1, _BLOCK_VALUES // max(1, arrays["sigma"][:1].size))
-    return [{n: a[start : start + rows] for n, a in arrays.items()} for start in range(0, total, rows)]
-
-
-def split_statistics(data: Dataset, split: str) -> SplitStatistics:
-    """Statistics of a split.
+def sample(shards: Sequence[Shard]) -> Arrays:
+    """Evenly spaced rows of shards, about a million queries at most.
 
     Parameters
     ----------
-    data : Dataset
-        A complete data set.
-    split : str
-        ``train`` or ``test``.
+    shards : sequence of Shard
+        At least one.
+
+    Returns
+    -------
+    dict of str to float32 array
+
+    Raises
+    ------
+    InputError
+        A shard cannot be read.
+    """
+    queries = sum(shard.rows for shard in shards) * int(np.prod(shards[0].image, dtype=int))
+    step = -(-queries // _QUERIES)
+    parts = [{name: np.array(a[::step]) for name, a in shard.read().items()} for shard in shards]
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def split_statistics(shards: Sequence[Shard]) -> SplitStatistics:
+    """Statistics of the shards of a split.
+
+    Parameters
+    ----------
+    shards : sequence of Shard
+        At least one.
 
     Returns
     -------
@@ -184,8 +80,8 @@ def split_statistics(data: Dataset, split: str) -> SplitStatistics:
     InputError
         A shard cannot be read.
     """
-    found = SplitStatistics(data.estimates)
-    for shard in data.shards(split):
-        for arrays in blocks(shard.read()):
-            found.add(arrays, data.lattice.finest)
-    return found
+    arrays = sample(shards)
+    value = mean_of(arrays)
+    noise = pooled_relative_error(arrays["value_a"], arrays["value_b"]) if "value_b" in arrays else None
+    queries = sum(shard.rows for shard in shards) * int(np.prod(shards[0].image, dtype=int))
+    return SplitStatistics(queries, tuple(mean_estimate(value[..., c]) for c in range(3)), noise)

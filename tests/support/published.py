@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_gen.config.publish import PublishConfig
-from mbtf_gen.publishing.publish import Publication
+from mbtf_gen.publishing.publication import Publication
 
 from .datasets import write_dataset
 

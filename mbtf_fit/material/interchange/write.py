@@ -10,7 +10,7 @@ from typing import Any
 
 from mbtf_core.files.atomic import write_text
 from mbtf_fit.material.interchange.agreement import Agreement, fit_color
-from mbtf_fit.material.interchange.documents import WRITERS, Source
+from mbtf_fit.material.interchange.documents import WRITERS, Source, check_library
 from mbtf_fit.material.interchange.images import write_maps
 from mbtf_fit.material.interchange.lobes import fit_lobes
 from mbtf_fit.material.interchange.maps import Maps, knows_surface, level_of, surface_maps
@@ -80,9 +80,13 @@ def write_interchange(
     ------
     UsageError
         The material has no such level.
+    EngineError
+        A library is not installed.
     PartialError
         The folder cannot be written.
     """
+    for name in formats:
+        check_library(name)
     level = level_of(material, level)
     maps = surface_maps(material, level) if knows_surface(material) else fit_lobes(material, level, advance)
     maps, agreement = fit_color(material, maps)

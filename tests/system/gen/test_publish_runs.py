@@ -66,7 +66,7 @@ def test_a_published_folder_is_complete(work: Path, done: dict[str, Done]) -> No
     expected = (
         "README.md croissant.json data/manifest.json data/geometry.exr recipe/remake.sh recipe/config.yaml"
     )
-    assert {*expected.split(), "recipe/material/height.npy", "pictures/brdf.png"} <= files
+    assert {*expected.split(), "recipe/material/height.npy", "contact_sheet.png"} <= files
     card = (work / "card/README.md").read_text()
     assert "# wool\n" in card
     assert "@misc{a,\n  title = {b}\n}" in card

@@ -5,14 +5,13 @@ from __future__ import annotations
 import pytest
 
 from mbtf_core.files.atomic import write_chunks
-from mbtf_gen.publishing import publish
+from mbtf_gen.publishing import publication
 
 
 @pytest.fixture(autouse=True)
 def no_pictures(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
     if "draws" not in request.fixturenames:
-        makers = {"tile.png": lambda path: write_chunks(path, [b"a picture"])}
-        monkeypatch.setattr(publish, "picture_makers", lambda *_: makers)
+        monkeypatch.setattr(publication, "write_picture", lambda _, path: write_chunks(path, [b"a picture"]))
 
 
 @pytest.fixture

@@ -55,7 +55,7 @@ def test_files_have_their_digests(tmp_path: Path) -> None:
         "data/train-00000.parquet",
         "data/geometry.exr",
         "recipe/config.yaml",
-        "pictures/tile.png",
+        "contact_sheet.png",
     } <= set(files)
     for name, file in files.items():
         content = (card / name).read_bytes()

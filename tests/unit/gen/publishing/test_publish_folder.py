@@ -14,9 +14,8 @@ from support.published import contents, publish, small
 from mbtf_core.errors import EngineError, InputError, PartialError, UsageError
 from mbtf_core.files.atomic import Stored
 from mbtf_gen.config.publish import PublishConfig
-from mbtf_gen.publishing import parquet
-from mbtf_gen.publishing import publish as module
-from mbtf_gen.publishing.publish import Publication
+from mbtf_gen.publishing import publication as module
+from mbtf_gen.publishing.publication import Publication
 
 CONFIG = PublishConfig(license="CC0-1.0", form="webdataset")
 
@@ -151,13 +150,11 @@ def test_the_announced_size_is_enough(shards: Path, tmp_path: Path) -> None:
     assert sum(map(len, contents(tmp_path / "card").values())) < publication.size
 
 
-def test_without_pyarrow_one_line_says_so(shards: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import sys
-
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
-    with pytest.raises(EngineError, match="pyarrow is not installed"):
-        parquet.check_pyarrow()
+def test_without_a_library_one_line_says_so(shards: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module.importlib.util, "find_spec", lambda name: None if name == "pyarrow" else name)
+    with pytest.raises(EngineError, match="pyarrow is not installed") as raised:
+        Publication.prepare(shards, PublishConfig(license="CC0-1.0"))
+    assert raised.value.hint == "pip install 'mbtf[publish]'"
 
 
 def test_shards_of_exr_are_not_npz(tmp_path: Path) -> None:

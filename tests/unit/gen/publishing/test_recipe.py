@@ -24,7 +24,7 @@ from mbtf_gen.config.publish import PublishConfig
 from mbtf_gen.generation import render_shards
 from mbtf_gen.generation import run as generation
 from mbtf_gen.publishing.digests import dataset_digests, digest_faults
-from mbtf_gen.publishing.publish import Publication
+from mbtf_gen.publishing.publication import Publication
 from mbtf_gen.tile.loading import load_material
 
 CONFIG = PublishConfig(license="CC0-1.0", form="webdataset")
@@ -183,7 +183,7 @@ def test_a_mesh_of_several_files_is_refused(tmp_path: Path) -> None:
     data = small(tmp_path / "data")
     material = load_material(tmp_path / "tile.obj")
     edit(tmp_path / "data/manifest.json", lambda m: m.update(inputs=dict(material.digests)))
-    from mbtf_gen.publishing.maps import copy_of_material
+    from mbtf_gen.publishing.material_copy import copy_of_material
 
     data = Dataset.open(data.folder)
     with pytest.raises(InputError, match="names other files, which the digests do not cover"):

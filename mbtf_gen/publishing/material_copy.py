@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.errors import InputError
 from mbtf_core.files.digest import file_sha256
 from mbtf_gen.tile.loading import described, load_material
 
 MATERIAL_FILE = "material.yaml"
-_MESH_TEXT = (".gltf", ".obj")
+# Keys of material files that name a file.
+_NAMES = ("file", "filename", "mesh", "pattern", "curves")
 
 
 @dataclass
@@ -33,10 +32,39 @@ class MaterialCopy:
     document: dict[str, Any] = field(default_factory=dict)
     files: dict[str, Path] = field(default_factory=dict)
 
-    @property
-    def text(self) -> str:
-        """Its ``material.yaml``."""
-        return dump_yaml(self.document)
+    def renamed(self, node: dict[str, Any], folder: Path) -> dict[str, Any]:
+        """A material file with the names of the copy, whose own names are relative to a folder."""
+        out: dict[str, Any] = {}
+        for key, value in node.items():
+            if isinstance(value, dict):
+                out[key] = self.renamed(value, folder)
+            else:
+                named = key in _NAMES and isinstance(value, str)
+                out[key] = self.add(folder / value) if named else value
+        return out
+
+    def add(self, source: Path) -> str:
+        """Add a file under its own name; under a numbered one where another file has that.
+
+        Raises
+        ------
+        InputError
+            It is a mesh that consists of several files.
+        """
+        if _has_companions(source):
+            raise InputError(
+                "names other files, which the digests do not cover",
+                where=source,
+                hint="leave out --with-maps; a .glb holds everything in one file",
+            )
+        name, number = source.name, 1
+        while name == MATERIAL_FILE or (
+            name in self.files and file_sha256(self.files[name]) != file_sha256(source)
+        ):
+            number += 1
+            name = f"{number}-{source.name}"
+        self.files[name] = source
+        return name
 
 
 def copy_of_material(data: Dataset, moved: Path | None) -> MaterialCopy:
@@ -69,11 +97,7 @@ def copy_of_material(data: Dataset, moved: Path | None) -> MaterialCopy:
     if material.digests != data.manifest["inputs"]:
         raise InputError("has changed since the data set was made", where=path, hint=hint)
     copy = MaterialCopy()
-
-    def named(name: str) -> str:
-        return _add(copy.files, folder / name)
-
-    copy.document = _renamed(spec.model_dump(mode="json", exclude_unset=True), named)
+    copy.document = copy.renamed(spec.model_dump(mode="json", exclude_unset=True), folder)
     return copy
 
 
@@ -88,47 +112,12 @@ def check_copy(data: Dataset, folder: Path) -> None:
         )
 
 
-# Keys of material files that name a file.
-_NAMES = ("file", "filename", "mesh", "pattern", "curves")
-
-
-def _renamed(node: dict[str, Any], named: Callable[[str], str]) -> dict[str, Any]:
-    """A material file with other file names."""
-    out: dict[str, Any] = {}
-    for key, value in node.items():
-        if isinstance(value, dict):
-            out[key] = _renamed(value, named)
-        elif key in _NAMES and isinstance(value, str):
-            out[key] = named(value)
-        else:
-            out[key] = value
-    return out
-
-
-def _add(files: dict[str, Path], source: Path) -> str:
-    """Add a file under its own name; under a numbered one where another file has that."""
-    _refuse_companions(source)
-    name, number = source.name, 1
-    while name == MATERIAL_FILE or (name in files and file_sha256(files[name]) != file_sha256(source)):
-        number += 1
-        name = f"{number}-{source.name}"
-    files[name] = source
-    return name
-
-
-def _refuse_companions(path: Path) -> None:
-    """An InputError for a mesh that consists of several files."""
-    if path.suffix.lower() not in _MESH_TEXT:
-        return
+def _has_companions(path: Path) -> bool:
+    """Whether a mesh consists of several files."""
     if path.suffix.lower() == ".obj":
-        several = any(line.startswith(b"mtllib") for line in path.read_bytes().splitlines())
-    else:
+        return any(line.startswith(b"mtllib") for line in path.read_bytes().splitlines())
+    if path.suffix.lower() == ".gltf":
         document = json.loads(path.read_bytes())
         parts = [*document.get("buffers", []), *document.get("images", [])]
-        several = any(not str(part.get("uri", "data:")).startswith("data:") for part in parts)
-    if several:
-        raise InputError(
-            "names other files, which the digests do not cover",
-            where=path,
-            hint="leave out --with-maps; a .glb holds everything in one file",
-        )
+        return any(not str(part.get("uri", "data:")).startswith("data:") for part in parts)
+    return False

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import importlib.util
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -12,27 +13,26 @@ from mbtf_core.data.dataset import Dataset, Shard
 from mbtf_core.data.folder import DataFolder, sidecar_name
 from mbtf_core.data.schema import GEOMETRY_NAME
 from mbtf_core.data.verify import verify
-from mbtf_core.errors import InputError, UsageError
+from mbtf_core.errors import EngineError, InputError, UsageError
 from mbtf_core.files.atomic import Stored, write_chunks
 from mbtf_core.files.digest import data_sha256
 from mbtf_core.files.folders import check_space, owned
 from mbtf_gen.config.publish import PublishConfig
-from mbtf_gen.publishing.card import CARD_NAME, Card
+from mbtf_gen.publishing.card import CARD_NAME, card_text
 from mbtf_gen.publishing.croissant import CROISSANT_NAME, croissant_text
 from mbtf_gen.publishing.facts import Facts
-from mbtf_gen.publishing.folder import DATA, PICTURES, RECIPE, PublishFolder
-from mbtf_gen.publishing.maps import MaterialCopy, check_copy, copy_of_material
-from mbtf_gen.publishing.parquet import check_pyarrow, write_parquet
-from mbtf_gen.publishing.pictures import picture_makers
+from mbtf_gen.publishing.folder import DATA, RECIPE, Makers, PublishFolder
+from mbtf_gen.publishing.material_copy import MaterialCopy, check_copy, copy_of_material
+from mbtf_gen.publishing.npz import copy_file, link_or_copy, public_documents
+from mbtf_gen.publishing.parquet import write_parquet
+from mbtf_gen.publishing.picture import PICTURE_NAME, write_picture
 from mbtf_gen.publishing.recipe import MATERIAL, recipe_makers
-from mbtf_gen.publishing.shards import copy_file, link_or_copy, public_documents
-from mbtf_gen.publishing.statistics import SplitStatistics, split_statistics
 from mbtf_gen.publishing.webdataset import write_tar
 
-# Bytes of pictures, card and documents.
+# Bytes of picture, card and documents.
 _DOCUMENT_BYTES = 4 << 20
-
-Makers = dict[str, Callable[[Path], Stored]]
+# Library that writes each form.
+_LIBRARIES = {"parquet": "pyarrow", "webdataset": "webdataset", "npz": "mlcroissant"}
 
 
 @dataclass(frozen=True)
@@ -41,16 +41,13 @@ class Publication:
 
     Parameters
     ----------
-    data : Dataset
-        A complete data set.
-    config : PublishConfig
-        What its publishers say.
+    facts : Facts
+        A complete data set, and what its publishers say.
     copy : MaterialCopy or None
         The input files of the material, if they are published.
     """
 
-    data: Dataset
-    config: PublishConfig
+    facts: Facts
     copy: MaterialCopy | None = None
 
     @classmethod
@@ -86,11 +83,13 @@ class Publication:
         UsageError
             Options contradict the data set.
         EngineError
-            The library of the file format is missing.
+            A library is missing.
         """
         data = Dataset.open(shards)
-        if config.form == "parquet":
-            check_pyarrow()
+        for library in ("mlcroissant", _LIBRARIES[config.form]):
+            if importlib.util.find_spec(library) is None:
+                hint = "pip install 'mbtf[publish]'"
+                raise EngineError(f"{library} is not installed", where=f"--form {config.form}", hint=hint)
         if config.form == "npz" and data.manifest["array_format"] != "npz":
             raise UsageError(
                 f"{data.folder} holds shards of another format ({data.manifest['array_format']})",
@@ -103,34 +102,14 @@ class Publication:
             raise UsageError("goes with --with-maps", where="--material")
         for fault in verify(data.folder):
             raise InputError(fault.what, where=data.folder.at(fault.file), hint=fault.hint)
-        return cls(data, config, copy_of_material(data, material) if with_maps else None)
-
-    @cached_property
-    def facts(self) -> Facts:
-        """What manifest and publishers say."""
-        return Facts(self.data, self.config)
-
-    @cached_property
-    def shards(self) -> dict[str, list[Shard]]:
-        """Shards of each split that has any."""
-        found = {split: self.data.shards(split) for split in self.data.splits}
-        return {split: shards for split, shards in found.items() if shards}
-
-    @cached_property
-    def splits(self) -> dict[str, dict[str, dict[str, Any]]]:
-        """Fields of each split."""
-        return {split: self.facts.fields(shards[0].read()) for split, shards in self.shards.items()}
-
-    @cached_property
-    def statistics(self) -> Mapping[str, SplitStatistics]:
-        """Statistics of each split."""
-        return {split: split_statistics(self.data, split) for split in self.shards}
+        return cls(Facts(data, config), copy_of_material(data, material) if with_maps else None)
 
     @property
     def size(self) -> int:
         """Bytes that the folder takes at most."""
-        shards = sum(int(shard.sidecar["bytes"]) for found in self.shards.values() for shard in found)
-        surface = self.data.folder.size(GEOMETRY_NAME) or 0
+        data = self.facts.data
+        shards = sum(int(s.sidecar["bytes"]) for found in self.facts.shards.values() for s in found)
+        surface = data.folder.size(GEOMETRY_NAME) or 0
         maps = sum(path.stat().st_size for path in self.copy.files.values()) if self.copy else 0
         # Tar files have a header and up to a block of padding per array.
         return round(1.02 * shards) + surface + maps + _DOCUMENT_BYTES
@@ -138,40 +117,42 @@ class Publication:
     @property
     def depends(self) -> dict[str, Any]:
         """Plain data that determine the content of the folder."""
-        stored = {shard.file: shard.sidecar["sha256"] for found in self.shards.values() for shard in found}
-        options = self.config.model_dump(mode="json", exclude={"version"})
-        # A long text would make a long message.
-        citation = None if self.config.citation is None else data_sha256(self.config.citation)
+        config = self.facts.config
+        stored = {s.file: s.sidecar["sha256"] for found in self.facts.shards.values() for s in found}
         return {
-            **options,
-            "citation": citation,
+            **config.model_dump(mode="json", exclude={"version"}),
+            # A long text would make a long message.
+            "citation": None if config.citation is None else data_sha256(config.citation),
             "with_maps": self.copy is not None,
-            "config_hash": self.data.manifest["config_hash"],
+            "config_hash": self.facts.data.manifest["config_hash"],
             "shards": data_sha256(stored),
         }
 
-    def _data_makers(self) -> Makers:
+    @cached_property
+    def makers(self) -> Makers:
+        """Writers of all files but the card and ``croissant.json``, by name."""
+        data = self.facts.data
         makers: Makers = {}
-        for found in self.shards.values():
+        for found in self.facts.shards.values():
             for shard in found:
                 makers |= self._shard_makers(shard)
-        if (geometry := self.data.manifest["geometry"]) is not None:
+        if (geometry := data.manifest["geometry"]) is not None:
             makers[f"{DATA}/{GEOMETRY_NAME}"] = lambda path: copy_file(
-                self.data.folder.file(GEOMETRY_NAME, geometry["sha256"]), path
+                data.folder.file(GEOMETRY_NAME, geometry["sha256"]), path
             )
-        if self.config.form == "npz":
-            for name, content in public_documents(self.data.manifest).items():
+        if self.facts.config.form == "npz":
+            for name, content in public_documents(data.manifest).items():
                 makers[f"{DATA}/{name}"] = partial(_write, content)
+        if not self.facts.measured:
+            makers |= recipe_makers(data, self.copy)
+        makers[PICTURE_NAME] = partial(write_picture, data)
         return makers
 
     def _shard_makers(self, shard: Shard) -> Makers:
-        stem, form = shard.file.rpartition(".")[0], self.config.form
+        stem, form = shard.file.rpartition(".")[0], self.facts.config.form
         if form == "parquet":
-            facts = {"layout": self.data.layout, "split": shard.sidecar["split"]}
-            described = self.data.manifest["arrays"]
-            return {
-                f"{DATA}/{stem}.parquet": lambda path: write_parquet(path, shard.read(), described, facts)
-            }
+            described = self.facts.data.manifest["arrays"]
+            return {f"{DATA}/{stem}.parquet": lambda path: write_parquet(path, shard.read(), described)}
         if form == "webdataset":
             return {f"{DATA}/{stem}.tar": lambda path: write_tar(path, shard.read())}
         sidecar = sidecar_name(shard.file)
@@ -180,18 +161,8 @@ class Publication:
             f"{DATA}/{sidecar}": lambda path: _write(shard.folder.read(sidecar), path),
         }
 
-    def makers(self) -> Makers:
-        """Writers of all files but the card and ``croissant.json``, by name."""
-        pictures = picture_makers(self.data, lambda: self.statistics)
-        recipe = {} if self.facts.measured else recipe_makers(self.data, self.copy)
-        return {
-            **self._data_makers(),
-            **recipe,
-            **{f"{PICTURES}/{name}": maker for name, maker in pictures.items()},
-        }
-
     def write(
-        self, output: Path, *, overwrite: bool = False, progress: Callable[[float], None] | None = None
+        self, output: Path, *, overwrite: bool = False, progress: Callable[[float], None] = lambda _: None
     ) -> dict[str, Stored]:
         """Write the folder, or finish an unfinished one.
 
@@ -201,7 +172,7 @@ class Publication:
             Folder to write.
         overwrite : bool
             Replace what was published there.
-        progress : callable, optional
+        progress : callable
             Called with 1 after each file.
 
         Returns
@@ -217,24 +188,18 @@ class Publication:
             It cannot be written, or another process writes to it; the same command resumes.
         """
         check_space(output, self.size, "choose another folder with -o")
-        makers = self.makers()
         with owned(output):
-            listed = [*makers, CARD_NAME, CROISSANT_NAME]
+            listed = [*self.makers, CARD_NAME, CROISSANT_NAME]
             folder = PublishFolder.claim(output, self.depends, listed, overwrite=overwrite)
-            for name, maker in makers.items():
+            for name, maker in self.makers.items():
                 folder.add(name, maker)
-                if progress is not None:
-                    progress(1)
+                progress(1)
             if self.copy is not None:
-                check_copy(self.data, output / RECIPE / MATERIAL)
-            files = {name: stored for name, stored in folder.files.items() if name in makers}
-
-            def card() -> str:
-                return Card(self.facts, self.splits, self.statistics, files, self.copy is not None).text
-
-            folder.add(CARD_NAME, lambda path: _write(card().encode(), path))
-            document = croissant_text(self.facts, files, self.splits)
-            folder.add(CROISSANT_NAME, partial(_write, document.encode()))
+                check_copy(self.facts.data, output / RECIPE / MATERIAL)
+            files = {name: stored for name, stored in folder.files.items() if name in self.makers}
+            maps = self.copy is not None
+            folder.add(CARD_NAME, lambda path: _write(card_text(self.facts, files, maps).encode(), path))
+            folder.add(CROISSANT_NAME, lambda path: _write(croissant_text(self.facts, files).encode(), path))
             return folder.files
 
 

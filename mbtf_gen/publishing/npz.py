@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -65,10 +65,5 @@ def copy_file(source: Path, path: Path) -> Stored:
     ------
     PartialError : the disk is full or the folder cannot be written
     """
-    return write_chunks(path, _pieces(source))
-
-
-def _pieces(source: Path) -> Iterator[bytes]:
     with source.open("rb") as stream:
-        while piece := stream.read(_CHUNK):
-            yield piece
+        return write_chunks(path, iter(lambda: stream.read(_CHUNK), b""))

@@ -1,0 +1,68 @@
+"""The picture of a card shows what the function behind the values shows, the right way round."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from support.fit_data import write_data
+from support.published import LAYOUTS, small
+
+from mbtf_core.data.dataset import Dataset
+from mbtf_gen.publishing.picture import brdf_image, displayed, tile_images, write_picture
+from mbtf_gen.publishing.statistics import sample
+
+
+def test_images_have_v_and_the_light_where_they_belong(tmp_path: Path) -> None:
+    """Red is a sine of u, green one of v; blue is the cosine between light and view, from 0 to 2."""
+
+    def value(u, sigma, omega_i, omega_o):  # type: ignore[no-untyped-def]
+        red, green = 1.0 + 0.5 * np.sin(2 * np.pi * u.T)
+        return np.stack([red, green, 1.0 + (omega_i * omega_o).sum(axis=-1)], axis=-1)
+
+    write_data(tmp_path / "data", value, train=60_000, test=10, finest=4)
+    arrays = sample(Dataset.open(tmp_path / "data").shards("train"))
+    tile = tile_images(arrays, 1.0)["all lights"]
+    assert len(tile) >= 8
+    at = (np.arange(len(tile)) + 0.5) / len(tile)
+    wave = np.broadcast_to(1.0 + 0.5 * np.sin(2 * np.pi * at), tile.shape[:2])
+    np.testing.assert_allclose(tile[..., 0], wave, atol=0.1)
+    np.testing.assert_allclose(tile[..., 1], wave[:, ::-1].T, atol=0.1)
+    brdf = brdf_image(arrays)
+    axis = (np.arange(len(brdf)) + 0.5) / len(brdf) * 2 - 1
+    x, y = axis[None, :], -axis[:, None]
+    known = (np.hypot(x, y) < 0.9) & np.isfinite(brdf[..., 2])
+    height = np.sqrt(np.maximum(0.0, 1 - x**2 - y**2))
+    expected = 1 + np.cos(np.radians(50)) * x + np.sin(np.radians(50)) * height
+    assert np.corrcoef(brdf[..., 2][known], expected[known])[0, 1] > 0.95
+
+
+def test_lights_come_from_their_sides(tmp_path: Path) -> None:
+    def lit(u, sigma, omega_i, omega_o):  # type: ignore[no-untyped-def]
+        return omega_i + 1.0
+
+    write_data(tmp_path / "data", lit, train=20_000, test=10, finest=2)
+    images = tile_images(sample(Dataset.open(tmp_path / "data").shards("train")), 1.0)
+    mean = {title: np.nanmean(image - 1, axis=(0, 1)) for title, image in images.items()}
+    assert mean["light from the left"][0] < -0.3
+    assert mean["light from the top"][1] > 0.3
+    assert np.abs(mean["all lights"][:2]).max() < 0.05
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_every_layout_has_its_picture(layout: str, tmp_path: Path, draws: None) -> None:
+    data = small(tmp_path / "data", layout)
+    first = write_picture(data, tmp_path / "a.png")
+    assert write_picture(data, tmp_path / "b.png").sha256 == first.sha256
+    assert np.asarray(Image.open(tmp_path / "a.png").convert("L"), np.float64).std() > 5
+
+
+def test_bright_is_bright_and_unknown_is_gray() -> None:
+    picture = np.full((1, 3, 3), 0.02)
+    picture[0, 1] = (0.04, 0.02, 0.01)
+    picture[0, 2] = np.nan
+    shown = displayed(picture).astype(int)[0]
+    assert shown[1, 0] > shown[0, 0] > shown[1, 2] > 20
+    assert shown[2].tolist() == [238, 238, 238]
