@@ -42,6 +42,9 @@ F32 = NDArray[np.float32]
 # Where the generated code stands in material.glsl.
 _MARK = "//GENERATED"
 
+# Operations that read neighborhoods of texels.
+_REFUSED = ("neighborhood", "inception")
+
 _ACTIVATIONS = {
     "relu": "max(sum, 0.0)",
     "leaky-relu": f"max(sum, {LEAK} * sum)",
@@ -151,12 +154,12 @@ class ShaderSource:
     """
 
     def __init__(self, material: Material) -> None:
-        if material.config.network.decoder != "mlp":
-            raise InputError(
-                f"the model '{material.config.model}' decodes neighborhoods of texels by convolutions, which "
-                "the viewer does not evaluate",
-                hint="fit the material with --model relief, neumip+ or neumip",
-            )
+        for operation in material.model.operations:
+            if operation.kind() in _REFUSED:
+                raise InputError(
+                    f"the shaders do not support the operation '{operation.kind()}'",
+                    hint="fit the material with --model relief, neumip+ or neumip",
+                )
         self._material = material
         self._network = material.config.network
         tensors = material.model.weights()

@@ -223,7 +223,7 @@ def test_what_cannot_be_written_is_refused(
     make("calibrated", tmp_path / "good")
     out = ["-o", str(tmp_path / "out")]
     for words, code, what in (
-        (["patches", "--to", "slang"], 3, "decodes neighborhoods"),
+        (["patches", "--to", "slang"], 3, "operation 'neighborhood'"),
         (["good", "--shader-target", "hlsl"], 2, "--shader-target: is an option of shaders"),
         (["good", "--to", "slang", "--to", "web", "--half"], 2, "--half: has no meaning for pages"),
     ):
