@@ -161,8 +161,8 @@ def fit_alone(
     """
     import drjit as dr
 
-    from mbtf_fit.mitsuba_plugin.bsdf import Frame, clamped
-    from mbtf_fit.mitsuba_plugin.integrator import camera_cone, write_footprint
+    from mbtf_fit.backends.mitsuba.bsdf import Frame, clamped
+    from mbtf_fit.backends.mitsuba.integrator import camera_cone, write_footprint
     from mbtf_gen.render.estimator import Stream
     from mbtf_gen.sampling.query_sampler import Queries
 
@@ -367,9 +367,9 @@ def main() -> int:
     parser.add_argument("--picture", type=Path)
     options = parser.parse_args()
     mi = load_mitsuba()
-    import mbtf_fit.mitsuba_plugin
+    import mbtf_fit.backends.mitsuba
 
-    mbtf_fit.mitsuba_plugin.register()
+    mbtf_fit.backends.mitsuba.register()
     rows = []
     for scene in SCENES:
         if options.scene and scene.name not in options.scene:

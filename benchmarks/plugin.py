@@ -113,11 +113,11 @@ def main() -> int:
     import drjit as dr
     import torch
 
-    import mbtf_fit.mitsuba_plugin
+    import mbtf_fit.backends.mitsuba
     from mbtf_fit import Material
-    from mbtf_fit.mitsuba_plugin import Evaluator, StoredMaterial, read_material
+    from mbtf_fit.backends.mitsuba import Evaluator, StoredMaterial, read_material
 
-    mbtf_fit.mitsuba_plugin.register()
+    mbtf_fit.backends.mitsuba.register()
     torch.set_num_threads(options.threads)
     dr.set_thread_count(options.threads)
     levels = options.resolution.bit_length() - 1

@@ -7,7 +7,7 @@ from pathlib import Path
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import UsageError
 from mbtf_core.options import Options, Output, Overwrite, PathText, Switch, takes_options
-from mbtf_fit.mitsuba_plugin.preview.config import PreviewConfig
+from mbtf_fit.preview.config import PreviewConfig
 
 
 @takes_options(PreviewConfig)
@@ -36,7 +36,7 @@ def preview(
     mp4
         Write the turntable as MP4, too; needs ffmpeg or the extra 'video'.
     """
-    from mbtf_fit.mitsuba_plugin.preview.command import draw
+    from mbtf_fit.preview.command import draw
 
     if sheet_only and mp4:
         raise UsageError("--sheet-only draws no turntable", where="--mp4", hint="leave out one of them")

@@ -16,7 +16,6 @@ from mbtf_core.lattice import Lattice
 from mbtf_fit.config import FitConfig, build_model
 from mbtf_fit.material.material import Material, export
 from mbtf_fit.material.transmittance import Transmittance
-from mbtf_fit.models.relief import Relief
 from mbtf_fit.surface.known import KnownSurface
 
 from .known_surfaces import geometry, rough_surface
@@ -58,7 +57,7 @@ def write_material(
     lattice = Lattice(finest, aspect)
     built = build_model(model, lattice, **(network or {}))
     built.initialize(torch.Generator().manual_seed(seed), 0.2)
-    if isinstance(built, Relief):
+    if built.tracing is not None:
         built.know(rough_surface(lattice, glossy=glossy) if constant is None else flat(lattice, constant))
     tensors = built.weights()
     for name, tensor in tensors.items():
@@ -72,7 +71,7 @@ def write_material(
         (int(n) for name in tensors if name.startswith("decoder.") and (n := name.split(".")[1]).isdigit()),
         default=0,
     )
-    if isinstance(built, Relief):
+    if built.tracing is not None:
         # Few values are 0.
         tensors[f"decoder.{last}.weight"] *= 0.3
     if constant is not None:
@@ -80,7 +79,7 @@ def write_material(
         tensors[f"decoder.{last}.weight"] = torch.zeros_like(tensors[f"decoder.{last}.weight"])
         own = torch.log1p(torch.tensor(constant, dtype=torch.float32))
         # With a gate of 1.
-        tensors[f"decoder.{last}.bias"] = torch.zeros(4) if isinstance(built, Relief) else own
+        tensors[f"decoder.{last}.bias"] = own if built.tracing is None else torch.zeros(4)
     tensors |= weights or {}
     built.load_weights(tensors)
     folder.mkdir(parents=True, exist_ok=True)

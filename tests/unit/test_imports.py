@@ -57,7 +57,7 @@ mbtf_fit.evaluation
 mbtf_fit.training
 mbtf_fit.viewer
 mbtf_fit.shaders
-mbtf_fit.mitsuba_plugin
+mbtf_fit.backends.mitsuba
 mbtf_fit.cli
 mbtf_fit
 mbtf_pipeline.recipe mbtf_pipeline.stages mbtf_pipeline.presets mbtf_pipeline.run_folder mbtf_pipeline.formatting
@@ -83,7 +83,7 @@ FORBIDDEN = {
 }
 # The fitter reads data sets, and files that its viewer shows; only its Mitsuba plugin, and the command that
 # draws with it, knows the renderer.
-PLUGIN = "mbtf_fit.mitsuba_plugin"
+PLUGIN = "mbtf_fit.backends.mitsuba"
 READS = (
     "mbtf_gen.dataset.geometry",
     "mbtf_gen.dataset.reader",
@@ -164,8 +164,8 @@ def test_imports_run_downwards() -> None:
         ("mbtf_fit.data.a", "from mbtf_gen.dataset.reader import Dataset", False),
         ("mbtf_fit.a.b", "from mbtf_pipeline.stages import run", True),
         ("mbtf_fit.data.a", "import drjit as dr", True),
-        ("mbtf_fit.mitsuba_plugin.a", "import drjit as dr", False),
-        ("mbtf_fit.mitsuba_plugin.a", "import torch", True),
+        ("mbtf_fit.backends.mitsuba.a", "import drjit as dr", False),
+        ("mbtf_fit.backends.mitsuba.a", "import torch", True),
         ("mbtf_pipeline.run", "import mbtf_fit, mbtf_gen, torch", False),
     ],
 )

@@ -17,8 +17,8 @@ from support.scenes import mi
 
 from mbtf_core.lattice import Lattice
 from mbtf_core.stats import Estimate, t_test
-from mbtf_fit.mitsuba_plugin.lobe_fit import fit_lobes
-from mbtf_fit.mitsuba_plugin.lobes import Lobe, LobeTextures, Mixture
+from mbtf_fit.backends.mitsuba.lobe_fit import fit_lobes
+from mbtf_fit.backends.mitsuba.lobes import Lobe, LobeTextures, Mixture
 
 COUNT = 32
 

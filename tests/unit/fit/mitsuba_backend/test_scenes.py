@@ -18,8 +18,8 @@ from mbtf_core.directions import from_angles
 from mbtf_core.errors import InputError, MbtfError, UsageError
 from mbtf_core.lattice import Lattice
 from mbtf_fit import Material
+from mbtf_fit.backends.mitsuba import load_scene
 from mbtf_fit.material.transmittance import Transmittance
-from mbtf_fit.mitsuba_plugin import load_scene
 from mbtf_gen.pictures.camera import Camera
 
 LIGHT = from_angles(40.0, 20.0)

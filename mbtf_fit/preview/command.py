@@ -10,7 +10,7 @@ from mbtf_core.folders import owned
 from mbtf_core.interruption import keep_on_interruption
 
 if TYPE_CHECKING:
-    from mbtf_fit.mitsuba_plugin.preview.config import PreviewConfig
+    from mbtf_fit.preview.config import PreviewConfig
 
 SHEET_NAME, GIF_NAME, MP4_NAME = "sheet.png", "turntable.gif", "turntable.mp4"
 
@@ -42,9 +42,9 @@ def _draw(
 ) -> None:
     from mbtf_core.exposure import describe_exposure, to_display
     from mbtf_core.folders import check_space
+    from mbtf_fit.backends.mitsuba import load_scene
     from mbtf_fit.material.format import read_description
-    from mbtf_fit.mitsuba_plugin import load_scene
-    from mbtf_fit.mitsuba_plugin.preview.animation import find_encoder, write_gif, write_mp4
+    from mbtf_fit.preview.animation import find_encoder, write_gif, write_mp4
     from mbtf_gen.forecast import announce
     from mbtf_gen.pictures.folder import PictureFolder
     from mbtf_gen.pictures.reference import PNG_BYTES, write_png
@@ -81,8 +81,8 @@ def _draw(
     exposure = (found[SHEET_NAME] or {}).get("exposure", 0.0)
     if not all(kept.values()):
         load_mitsuba()
-        from mbtf_fit.mitsuba_plugin.preview.sheet import contact_sheet, exposure_of, panels
-        from mbtf_fit.mitsuba_plugin.preview.turntable import frames, seconds_of
+        from mbtf_fit.preview.sheet import contact_sheet, exposure_of, panels
+        from mbtf_fit.preview.turntable import frames, seconds_of
 
         bsdf = load_scene({"type": "mbtf", "material": config.material})
         missing = [name for name in shows if not kept[name] and name != SHEET_NAME]

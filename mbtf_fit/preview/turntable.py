@@ -20,8 +20,8 @@ import numpy as np
 
 from mbtf_core.directions import from_angles
 from mbtf_core.interruption import reinstall_handlers
-from mbtf_fit.mitsuba_plugin.material_arrays import F32
-from mbtf_fit.mitsuba_plugin.preview.config import TurntableSection
+from mbtf_fit.backends.mitsuba.stored_material import F32
+from mbtf_fit.preview.config import TurntableSection
 from mbtf_gen.render.types import BSDF, Scene
 
 # Latitude beyond which the projection continues with constant scale.

@@ -15,22 +15,22 @@ from support.fuzzing import check_message
 from support.plugin_materials import write_material
 from support.scenes import mi
 
-import mbtf_fit.mitsuba_plugin
+import mbtf_fit.backends.mitsuba
 from mbtf_core import interruption
 from mbtf_core.config_file import resolve
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import EngineError, UsageError
 from mbtf_core.exposure import to_display
-from mbtf_fit.mitsuba_plugin.preview.config import PreviewConfig, SheetSection, TurntableSection
+from mbtf_fit.preview.config import PreviewConfig, SheetSection, TurntableSection
 from mbtf_gen.config.pictures import Direction
 from mbtf_gen.pictures.camera import Camera
 
-mbtf_fit.mitsuba_plugin.register()
+mbtf_fit.backends.mitsuba.register()
 
-from mbtf_fit.mitsuba_plugin.bsdf import Frame  # noqa: E402
-from mbtf_fit.mitsuba_plugin.evaluator import Evaluator  # noqa: E402
-from mbtf_fit.mitsuba_plugin.material_arrays import read_material  # noqa: E402
-from mbtf_fit.mitsuba_plugin.preview import animation, sheet, turntable  # noqa: E402
+from mbtf_fit.backends.mitsuba.bsdf import Frame  # noqa: E402
+from mbtf_fit.backends.mitsuba.evaluator import Evaluator  # noqa: E402
+from mbtf_fit.backends.mitsuba.stored_material import read_material  # noqa: E402
+from mbtf_fit.preview import animation, sheet, turntable  # noqa: E402
 
 SECTION = SheetSection(
     views=[Direction(elevation=70, azimuth=-90), Direction(elevation=35, azimuth=20)],
