@@ -57,7 +57,8 @@ mbtf_fit.evaluation
 mbtf_fit.training
 mbtf_fit.viewer
 mbtf_fit.shaders
-mbtf_fit.backends.mitsuba
+mbtf_fit.backends
+mbtf_fit.preview
 mbtf_fit.cli
 mbtf_fit
 mbtf_pipeline.recipe mbtf_pipeline.stages mbtf_pipeline.presets mbtf_pipeline.run_folder mbtf_pipeline.formatting
@@ -82,8 +83,8 @@ FORBIDDEN = {
     "mbtf_pipeline": set(),
 }
 # The fitter reads data sets, and files that its viewer shows; only its Mitsuba plugin, and the command that
-# draws with it, knows the renderer.
-PLUGIN = "mbtf_fit.backends.mitsuba"
+# draws with it, know the renderer.
+RENDERING = ("mbtf_fit.backends.mitsuba", "mbtf_fit.preview")
 READS = (
     "mbtf_gen.dataset.geometry",
     "mbtf_gen.dataset.reader",
@@ -128,13 +129,13 @@ def imported(source: str) -> Iterator[str]:
 def faults(source: str, module: str) -> list[str]:
     """Imports of a source text that break the rules above."""
     package = module.split(".")[0]
-    plugin = module == PLUGIN or module.startswith(PLUGIN + ".")
-    forbidden = {"torch", "trimesh"} if plugin else FORBIDDEN[package]
+    renders = f"{module}.".startswith(tuple(f"{room}." for room in RENDERING))
+    forbidden = {"torch", "trimesh"} if renders else FORBIDDEN[package]
     out = []
     for name in imported(source):
         top = name.split(".")[0]
         upwards = top in PACKAGES and rank(name) > rank(module)
-        beyond = package == "mbtf_fit" and top == "mbtf_gen" and not plugin and not name.startswith(READS)
+        beyond = package == "mbtf_fit" and top == "mbtf_gen" and not renders and not name.startswith(READS)
         if top in forbidden or upwards or beyond:
             out.append(f"{module} imports {name}")
     return out
