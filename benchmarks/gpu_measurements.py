@@ -235,7 +235,7 @@ def evaluate_plugin(device: str, arithmetic: Any, sizes: str, folder: str) -> An
     dr.eval(u, sigma, light, view)
 
     def work() -> None:
-        dr.eval(evaluator.value(evaluator.features(u, evaluator.level(sigma), view), light, view))
+        dr.eval(evaluator.value(evaluator.stage1(u, evaluator.level(sigma), view), light))
         dr.sync_thread()
 
     yield {"queries": len(queries.sigma)} | timed(work)

@@ -82,12 +82,11 @@ def random_material(folder: Path, levels: int, model: ModelName, network: dict[s
 
     from mbtf_fit.config import FitConfig, build_model
     from mbtf_fit.material.material import export
-    from mbtf_fit.models.relief import Relief
     from mbtf_fit.surface.known import KnownSurface
 
     lattice = Lattice(levels)
     built = build_model(model, lattice, **network)
-    if isinstance(built, Relief):
+    if built.tracing is not None:
         built.know(KnownSurface.of(random_surface(lattice), lattice, 1.0))
     built.initialize(torch.Generator().manual_seed(0), 0.2)
     training = {"steps": 0, "batch": 1, "seconds": 0.0, "device": "cpu", "threads": 1, "errors": {}}
@@ -150,26 +149,24 @@ def main() -> int:
 
     def plugin(material: StoredMaterial, arithmetic: Any) -> Callable[[], None]:
         evaluator = Evaluator(material, arithmetic)
-        return timed(
-            lambda: evaluator.value(evaluator.features(u, evaluator.level(sigma), view), light, view)
-        )
+        return timed(lambda: evaluator.value(evaluator.stage1(u, evaluator.level(sigma), view), light))
 
     ways: dict[str, Callable[[], Any]] = {
         "unrolled": plugin(stored, "unrolled"),
         "cooperative": plugin(stored, "cooperative"),
     }
     evaluator = Evaluator(stored)
-    surface = evaluator.surface
-    baseline = "pytorch" if surface is None else "neumip"
-    if surface is None:
+    tracing = material.model.tracing
+    baseline = "pytorch" if tracing is None else "neumip"
+    if tracing is None:
         ways["pytorch"] = lambda: material.evaluate(*arrays)
     else:
-        known, level = surface, evaluator.level(sigma)
+        (trace, shade), level = tracing, evaluator.level(sigma)
         dr.eval(level)
         ways["neumip"] = plugin(neumip, "unrolled")
-        ways["trace"] = timed(lambda: known.height(u, view))
+        ways["trace"] = timed(lambda: evaluator.stage1(u, level, view)[trace.output])
         ways["surface"] = timed(
-            lambda: known.shading(known.intersections(u, level, view)[1], level, light, view)
+            lambda: evaluator.stage2(evaluator.stage1(u, level, view), light)[shade.output]
         )
     first: dict[str, float] = {}
     seconds: dict[str, list[float]] = {name: [] for name in ways}
@@ -195,7 +192,7 @@ def main() -> int:
     )
     deviation = float((np.abs(found - wanted) / np.maximum(wanted, max(wanted.mean(), 1e-9))).max())
     ratio = median[baseline] / median["unrolled"]
-    least = FASTER if surface is None else 1 / SLOWER
+    least = FASTER if tracing is None else 1 / SLOWER
     say(f"unrolled {ratio:.2f} times as fast as {baseline}; deviation on conformance queries {deviation:.1e}")
     fast = ratio >= least or options.places != 1
     held = fast and first["unrolled"] <= COMPILE and deviation <= DEVIATION
