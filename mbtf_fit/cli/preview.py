@@ -6,6 +6,7 @@ from pathlib import Path
 
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import UsageError
+from mbtf_core.folders import owned
 from mbtf_core.options import Options, Output, Overwrite, PathText, Switch, takes_options
 from mbtf_fit.preview.config import PreviewConfig
 
@@ -43,4 +44,5 @@ def preview(
     if material is None and options.config is None:
         raise UsageError("no material given", hint="mbtf-fit preview material/ -o preview/")
     config = options.resolve(material=material)
-    draw(config, output, sheet_only=sheet_only, mp4=mp4, overwrite=overwrite, console=console)
+    with owned(output):
+        draw(config, output, sheet_only=sheet_only, mp4=mp4, overwrite=overwrite, console=console)

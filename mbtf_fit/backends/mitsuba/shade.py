@@ -80,20 +80,13 @@ def _shade(op: ops.Shade, load: Load) -> Step:
 
 @MITSUBA.implements(ops.Lobe)
 def _lobe(op: ops.Lobe, load: Load) -> Step:
-    def step(
-        base_color: Numbers,
-        specular: Numbers,
-        alpha2: Numbers,
-        slopes: Numbers,
-        omega_i: Numbers,
-        omega_o: Numbers,
-    ) -> Numbers:
-        light, view = mi.Vector3f(*omega_i), mi.Vector3f(*omega_o)
+    def step(base: Numbers, specular: Numbers, alpha2: Numbers, slopes: Numbers, *omega: Numbers) -> Numbers:
+        light, view = (mi.Vector3f(*w) for w in omega)
         normal = _normal(*slopes)
         roughness = dr.maximum(alpha2[0], op.least_alpha2)
         lobe = _ggx(op, mi.Color3f(*specular), roughness, normal, light, view)
         irradiance = dr.maximum(dr.dot(normal, light), 0.0) / light.z
-        return list(irradiance * (mi.Color3f(*base_color) / math.pi + lobe))
+        return list(irradiance * (mi.Color3f(*base) / math.pi + lobe))
 
     return step
 

@@ -213,17 +213,13 @@ def test_operations_without_their_tensors_are_refused(
 @pytest.mark.parametrize(
     ("name", "change", "fault"),
     [
-        ("surface.heights", None, "lacks the tensor 'surface.heights'"),
-        ("surface.heights", lambda a: a[..., 0], "has the shape (16, 16)"),
         ("surface.heights", lambda a: a[:0], "is empty"),
         ("surface.heights", lambda a: a + 0.01, "has heights above the reference plane"),
         ("surface.heights", lambda a: np.where(a == a.min(), np.nan, a), "not finite"),
         ("surface.maps.4", None, "lacks the tensor 'surface.maps.4'"),
         ("surface.maps.2", lambda a: a[:-1], "has the shape (3, 4, 8)"),
         ("surface.maps.0", lambda a: a[..., :7], "have neither 6 nor 8 channels"),
-        ("surface.horizons.3", None, "lacks the tensor 'surface.horizons.3'"),
         ("surface.horizons.0", lambda a: a[..., :-1], "has the shape (1, 1, 31)"),
-        ("surface.light_width", None, "lacks the tensor 'surface.light_width'"),
         ("surface.dielectric", lambda a: a[None], "has the shape (1,)"),
         ("depth_weights", lambda a: a[1:], "has the shape (3,)"),
     ],

@@ -19,7 +19,7 @@ import mbtf_fit.backends.mitsuba
 from mbtf_core import interruption
 from mbtf_core.config_file import resolve
 from mbtf_core.directions import from_angles
-from mbtf_core.errors import EngineError, UsageError
+from mbtf_core.errors import EngineError
 from mbtf_core.exposure import to_display
 from mbtf_fit.preview.config import PreviewConfig, SheetSection, TurntableSection
 from mbtf_gen.config.pictures import Direction
@@ -178,31 +178,14 @@ def test_view_and_light_replace_those_of_the_sheet() -> None:
     assert config.sheet.lamps == [Direction(elevation=45, azimuth=30)]
 
 
-def test_invalid_options_are_refused() -> None:
-    for key, value, fault in (
-        ("sheet.size", 2000, "pixels; use smaller or fewer"),
-        ("turntable.frames", 0, "turntable.frames"),
-        ("sheet.tiles_across", [], "sheet.tiles_across"),
-        ("sheet.vews", 3, "did you mean 'views'"),
-    ):
-        flags = {"material": "m", key: value}
-        if key == "sheet.size":
-            flags["sheet.tiles_across"] = [1.0, 2.0, 3.0]
-        with pytest.raises(UsageError, match=fault) as caught:
-            resolve(PreviewConfig, flags=flags)
-        check_message(caught.value)
-
-
 def test_bad_input_of_previews_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from mbtf_core.console import run
     from mbtf_fit.cli.app import app
 
     for code, what, *words in (
         (3, "no material.json", str(tmp_path), "-o", str(tmp_path / "out")),
-        (2, "--tiles-across: 'sheet.tiles_across': must be numbers", "m", "--tiles-across", "1;2"),
+        (2, "pixels; use smaller or fewer", "m", "--size", "2000"),
         (2, "no material given"),
-        (2, "--view: 'sheet.view': must be ELEVATION,AZIMUTH", "m", "--view", "60"),
-        (2, "--exposure: 'exposure': must be a", "m", "--exposure", "nan"),
         (2, "--mp4: --sheet-only draws no turntable", "m", "--sheet-only", "--mp4"),
     ):
         assert run(app, ["preview", *words]) == code
