@@ -26,11 +26,11 @@ Numbers = list[Float]
 # One result, or a tuple of several.
 Step = Callable[..., Any]
 
-MITSUBA: Backend[Callable[[Any, Load], Step]] = Backend("the Mitsuba plugin")
+MITSUBA: Backend[Callable[[Any, Loader], Step]] = Backend("the Mitsuba plugin")
 
 
 @dataclass(frozen=True)
-class Load:
+class Loader:
     """The material that implementations read.
 
     Attributes

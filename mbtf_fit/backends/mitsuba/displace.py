@@ -9,7 +9,7 @@ import numpy as np
 
 from mbtf_core.errors import InputError
 from mbtf_fit import ops
-from mbtf_fit.backends.mitsuba.backend import MITSUBA, Load, Numbers, Step
+from mbtf_fit.backends.mitsuba.backend import MITSUBA, Loader, Numbers, Step
 from mbtf_fit.material.format import WEIGHTS_NAME
 from mbtf_gen.geometry.heightfield import HeightGrid
 from mbtf_gen.render.heightfield import HeightField
@@ -18,8 +18,8 @@ from mbtf_gen.render.types import Float
 
 
 @MITSUBA.implements(ops.Offset)
-def _offset(op: ops.Offset, load: Load) -> Step:
-    aspect = load.lattice.aspect
+def _offset(op: ops.Offset, loader: Loader) -> Step:
+    aspect = loader.lattice.aspect
 
     def step(u: Numbers, r: Numbers, omega_o: Numbers) -> Numbers:
         if len(r) == 1:
@@ -30,12 +30,12 @@ def _offset(op: ops.Offset, load: Load) -> Step:
 
 
 @MITSUBA.implements(ops.Trace)
-def _trace(op: ops.Trace, load: Load) -> Step:
-    aspect = load.lattice.aspect
-    heights = load.stored.take(op.heights, (None, None, 1))[..., 0]
+def _trace(op: ops.Trace, loader: Loader) -> Step:
+    aspect = loader.lattice.aspect
+    heights = loader.stored.take(op.heights, (None, None, 1))[..., 0]
     if heights.size == 0 or heights.max() > 0:
         fault = "is empty" if heights.size == 0 else "has heights above the reference plane"
-        raise InputError(f"its tensor '{op.heights}' {fault}", where=load.stored.folder / WEIGHTS_NAME)
+        raise InputError(f"its tensor '{op.heights}' {fault}", where=loader.stored.folder / WEIGHTS_NAME)
     heightfield = HeightField.of(HeightGrid(heights.astype(np.float64), aspect), 1.0, two_sided=False)
 
     def height(u: Numbers, omega_o: Numbers) -> Float:
@@ -63,9 +63,9 @@ def _trace(op: ops.Trace, load: Load) -> Step:
 
 
 @MITSUBA.implements(ops.Displace)
-def _displace(op: ops.Displace, load: Load) -> Step:
-    finest, aspect = load.lattice.finest, load.lattice.aspect
-    weights = mi.Float(load.stored.take(op.weights, (finest + 1,)))
+def _displace(op: ops.Displace, loader: Loader) -> Step:
+    finest, aspect = loader.lattice.finest, loader.lattice.aspect
+    weights = mi.Float(loader.stored.take(op.weights, (finest + 1,)))
 
     def step(u: Numbers, z: Numbers, level: Numbers, omega_o: Numbers) -> Numbers:
         if finest == 0:

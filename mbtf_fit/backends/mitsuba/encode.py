@@ -8,16 +8,16 @@ import drjit as dr
 import mitsuba as mi
 
 from mbtf_fit import ops
-from mbtf_fit.backends.mitsuba.backend import MITSUBA, Load, Numbers, Step
+from mbtf_fit.backends.mitsuba.backend import MITSUBA, Loader, Numbers, Step
 
 
 @MITSUBA.implements(ops.HalfVector)
-def _half_vector(op: ops.HalfVector, load: Load) -> Step:
+def _half_vector(op: ops.HalfVector, loader: Loader) -> Step:
     return lambda omega_i, omega_o: list(dr.normalize(mi.Vector3f(*omega_i) + mi.Vector3f(*omega_o)))
 
 
 @MITSUBA.implements(ops.Rotate)
-def _rotate(op: ops.Rotate, load: Load) -> Step:
+def _rotate(op: ops.Rotate, loader: Loader) -> Step:
     def step(axis: Numbers, omega: Numbers) -> Numbers:
         x, y, *upright = axis
         z = upright[0] if upright else dr.safe_sqrt(1.0 - dr.fma(x, x, y * y))
@@ -29,18 +29,18 @@ def _rotate(op: ops.Rotate, load: Load) -> Step:
 
 
 @MITSUBA.implements(ops.Stereographic)
-def _stereographic(op: ops.Stereographic, load: Load) -> Step:
+def _stereographic(op: ops.Stereographic, loader: Loader) -> Step:
     return lambda omega: [c * dr.rcp(1.0 + omega[2]) for c in omega[:2]]
 
 
 @MITSUBA.implements(ops.Position)
-def _position(op: ops.Position, load: Load) -> Step:
+def _position(op: ops.Position, loader: Loader) -> Step:
     return lambda u: [2.0 * (x - dr.floor(x)) - 1.0 for x in u]
 
 
 @MITSUBA.implements(ops.Frequencies)
-def _frequencies(op: ops.Frequencies, load: Load) -> Step:
-    aspect = load.lattice.aspect
+def _frequencies(op: ops.Frequencies, loader: Loader) -> Step:
+    aspect = loader.lattice.aspect
     bands = [(k, (math.pi if op.pi else 1.0) * 2.0**k) for k in range(op.bands)]
 
     def step(x: Numbers, level: Numbers | None) -> Numbers:

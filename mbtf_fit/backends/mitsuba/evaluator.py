@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from mbtf_core.errors import InputError
 from mbtf_fit.backends.mitsuba import displace, encode, lookup, network, shade, value  # noqa: F401
-from mbtf_fit.backends.mitsuba.backend import MITSUBA, Arithmetic, Load, Numbers, Step
+from mbtf_fit.backends.mitsuba.backend import MITSUBA, Arithmetic, Loader, Numbers, Step
 from mbtf_fit.backends.mitsuba.stored_material import F32, StoredMaterial
 from mbtf_fit.backends.mitsuba.textures import Textures
 from mbtf_fit.material.format import DESCRIPTION_NAME
@@ -51,9 +51,9 @@ class Evaluator:
                 hint="PyTorch evaluates this material: mbtf-fit evaluate, or mbtf_fit.Material.load",
             ) from None
         self.arithmetic = network.default_arithmetic(stored) if arithmetic is None else arithmetic
-        load = Load(stored, self.arithmetic, sizes_of(stored.operations))
-        self.textures = load.textures
-        first, second = ([(op, MITSUBA[op](op, load)) for op in part] for part in stages(stored.operations))
+        loader = Loader(stored, self.arithmetic, sizes_of(stored.operations))
+        self.textures = loader.textures
+        first, second = ([(op, MITSUBA[op](op, loader)) for op in part] for part in stages(stored.operations))
         self._first, self._second, self._last = first, second, stored.operations[-1].output
         self._coefficients = None if stored.transmittance is None else Textures(stored.transmittance)
 

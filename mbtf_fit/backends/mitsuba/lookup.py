@@ -9,16 +9,16 @@ import numpy as np
 
 from mbtf_core.lattice import Lattice
 from mbtf_fit import ops
-from mbtf_fit.backends.mitsuba.backend import MITSUBA, Load, Numbers, Step
+from mbtf_fit.backends.mitsuba.backend import MITSUBA, Loader, Numbers, Step
 from mbtf_gen.render.types import Float, UInt32
 
 
 @MITSUBA.implements(ops.Lookup)
-def _lookup(op: ops.Lookup, load: Load) -> Step:
+def _lookup(op: ops.Lookup, loader: Loader) -> Step:
     finer = op.oversampling.bit_length() - 1
-    grids = Lattice(load.lattice.finest + finer, load.lattice.aspect)
+    grids = Lattice(loader.lattice.finest + finer, loader.lattice.aspect)
     shapes = [grids.shape(s) for s in range(finer, grids.finest + 1)]
-    textures = load.texture(op.textures, shapes[-1:] if op.level is None else shapes, op.channels)
+    textures = loader.texture(op.textures, shapes[-1:] if op.level is None else shapes, op.channels)
     if op.level is None:
         return lambda u, _: textures.first(mi.Point2f(*u))
     read = textures.blended if op.blending == "blend" else textures.side_by_side
@@ -26,8 +26,8 @@ def _lookup(op: ops.Lookup, load: Load) -> Step:
 
 
 @MITSUBA.implements(ops.Calibrate)
-def _calibrate(op: ops.Calibrate, load: Load) -> Step:
-    table = load.stored.take(op.factors, (2, load.lattice.finest + 1, None, 3))[op.table]
+def _calibrate(op: ops.Calibrate, loader: Loader) -> Step:
+    table = loader.stored.take(op.factors, (2, loader.lattice.finest + 1, None, 3))[op.table]
     levels, knots, _ = table.shape
     buffer = mi.Float(np.pad(table, ((0, 0), (0, 0), (0, 1))).reshape(-1))
     dr.eval(buffer)

@@ -18,7 +18,7 @@ import mitsuba as mi
 from drjit import nn
 
 from mbtf_fit import ops
-from mbtf_fit.backends.mitsuba.backend import MITSUBA, Arithmetic, Load, Numbers, Step
+from mbtf_fit.backends.mitsuba.backend import MITSUBA, Arithmetic, Loader, Numbers, Step
 from mbtf_fit.backends.mitsuba.stored_material import F32, StoredMaterial
 from mbtf_fit.ops.constants import LEAK
 from mbtf_fit.ops.operation import parse, reached_from
@@ -40,14 +40,14 @@ def default_arithmetic(stored: StoredMaterial) -> Arithmetic:
 
 
 @MITSUBA.implements(ops.Network)
-def _network(op: ops.Network, load: Load) -> Step:
-    take, layers, arithmetic = load.stored.take, [], load.arithmetic
-    for k, (inputs, outputs) in enumerate(pairwise(op.widths(sum(load.inputs(op))))):
+def _network(op: ops.Network, loader: Loader) -> Step:
+    take, layers, arithmetic = loader.stored.take, [], loader.arithmetic
+    for k, (inputs, outputs) in enumerate(pairwise(op.widths(sum(loader.inputs(op))))):
         name = f"{op.weights}.{k}"
         layers.append((take(f"{name}.weight", (outputs, inputs)), take(f"{name}.bias", (outputs,))))
     # Single precision for small networks that move lookups: values are sensitive to errors of the position.
     small = sum(weight.size + bias.size for weight, bias in layers) <= MOST_UNROLLED
-    if arithmetic == "half" and small and _moves_lookups(op, load.stored.operations):
+    if arithmetic == "half" and small and _moves_lookups(op, loader.stored.operations):
         arithmetic = "unrolled"
     network = Network(layers, arithmetic, op.activation)
     return lambda x: network([number for value in x for number in value])

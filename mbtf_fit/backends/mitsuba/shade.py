@@ -11,7 +11,7 @@ import numpy as np
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import Lattice
 from mbtf_fit import ops
-from mbtf_fit.backends.mitsuba.backend import MITSUBA, Load, Numbers, Step, opaque
+from mbtf_fit.backends.mitsuba.backend import MITSUBA, Loader, Numbers, Step, opaque
 from mbtf_fit.backends.mitsuba.stored_material import F32
 from mbtf_fit.backends.mitsuba.textures import GROUP, Textures
 from mbtf_fit.material.format import WEIGHTS_NAME
@@ -20,22 +20,22 @@ from mbtf_gen.render.types import Color3f, Float, Normal3f, Point2f, Vector3f
 
 
 @MITSUBA.implements(ops.Shade)
-def _shade(op: ops.Shade, load: Load) -> Step:
-    finer = Lattice(load.lattice.finest + 1, load.lattice.aspect)
+def _shade(op: ops.Shade, loader: Loader) -> Step:
+    finer = Lattice(loader.lattice.finest + 1, loader.lattice.aspect)
     grids = [finer.shape(s) for s in range(finer.finest + 1)]
-    first = load.stored.tensors.get(f"{op.maps}.0", np.empty((1, 1, GLOSSY_CHANNELS)))
+    first = loader.stored.tensors.get(f"{op.maps}.0", np.empty((1, 1, GLOSSY_CHANNELS)))
     channels = first.shape[-1]
     if channels not in (DIFFUSE_CHANNELS, GLOSSY_CHANNELS):
         raise InputError(
             f"its tensors '{op.maps}' have neither {DIFFUSE_CHANNELS} nor {GLOSSY_CHANNELS} channels",
-            where=load.stored.folder / WEIGHTS_NAME,
+            where=loader.stored.folder / WEIGHTS_NAME,
         )
-    maps = load.texture(op.maps, grids, channels)
+    maps = loader.texture(op.maps, grids, channels)
     horizons = Textures(
-        [_adjacent_azimuths(level) for level in load.levels(op.horizons, grids[:-1], 2 * AZIMUTHS)],
+        [_adjacent_azimuths(level) for level in loader.levels(op.horizons, grids[:-1], 2 * AZIMUTHS)],
         by_group=True,
     )
-    width, dielectric = load.scalar(op.light_width), opaque(load.scalar(op.dielectric))
+    width, dielectric = loader.scalar(op.light_width), opaque(loader.scalar(op.dielectric))
     blur, widening = opaque((op.light_blur * width) ** 2), opaque(width**2)
 
     def visibility(hit: Point2f, level: Float, omega_i: Vector3f) -> Float:
@@ -79,7 +79,7 @@ def _shade(op: ops.Shade, load: Load) -> Step:
 
 
 @MITSUBA.implements(ops.Lobe)
-def _lobe(op: ops.Lobe, load: Load) -> Step:
+def _lobe(op: ops.Lobe, loader: Loader) -> Step:
     def step(base: Numbers, specular: Numbers, alpha2: Numbers, slopes: Numbers, *omega: Numbers) -> Numbers:
         light, view = (mi.Vector3f(*w) for w in omega)
         normal = _normal(*slopes)

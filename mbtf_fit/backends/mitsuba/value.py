@@ -8,7 +8,7 @@ from collections.abc import Callable
 import drjit as dr
 
 from mbtf_fit import ops
-from mbtf_fit.backends.mitsuba.backend import MITSUBA, Load, Numbers, Step, opaque
+from mbtf_fit.backends.mitsuba.backend import MITSUBA, Loader, Numbers, Step, opaque
 from mbtf_gen.render.types import Float
 
 FUNCTIONS: dict[str, Callable[[Float], Float]] = {
@@ -24,24 +24,24 @@ FUNCTIONS: dict[str, Callable[[Float], Float]] = {
 
 
 @MITSUBA.implements(ops.Transform)
-def _transform(op: ops.Transform, load: Load) -> Step:
+def _transform(op: ops.Transform, loader: Loader) -> Step:
     function = FUNCTIONS[op.function]
-    divisor = 1.0 if op.divisor is None else load.scalar(op.divisor)
+    divisor = 1.0 if op.divisor is None else loader.scalar(op.divisor)
     by = opaque(divisor) if op.divisor and divisor else 1.0
     # A quotient by 0 is 0.
     scale = op.scale if divisor else 0.0
-    factor = 1.0 if op.factor is None else opaque(load.scalar(op.factor))
+    factor = 1.0 if op.factor is None else opaque(loader.scalar(op.factor))
     return lambda x: [factor * function(scale * (v / by)) for v in x]
 
 
 @MITSUBA.implements(ops.Matrix)
-def _matrix(op: ops.Matrix, load: Load) -> Step:
+def _matrix(op: ops.Matrix, loader: Loader) -> Step:
     return lambda x: [sum(a * v for a, v in zip(row, x, strict=True) if a) for row in op.rows]
 
 
 @MITSUBA.implements(ops.Gate)
-def _gate(op: ops.Gate, load: Load) -> Step:
-    on = op.unit is None or load.scalar(op.unit) > 0
+def _gate(op: ops.Gate, loader: Loader) -> Step:
+    on = op.unit is None or loader.scalar(op.unit) > 0
 
     def step(gate: Numbers, x: Numbers, plus: Numbers | None) -> Numbers:
         shares = [op.floor + op.scale * FUNCTIONS["sigmoid"](g) for g in gate]
@@ -53,15 +53,15 @@ def _gate(op: ops.Gate, load: Load) -> Step:
 
 
 @MITSUBA.implements(ops.Standardize)
-def _standardize(op: ops.Standardize, load: Load) -> Step:
+def _standardize(op: ops.Standardize, loader: Loader) -> Step:
     return lambda x, mean, deviation: [dr.fma(d, v, m) for v, m, d in zip(x, mean, deviation, strict=True)]
 
 
 @MITSUBA.implements(ops.DivideByCosine)
-def _divide_by_cosine(op: ops.DivideByCosine, load: Load) -> Step:
+def _divide_by_cosine(op: ops.DivideByCosine, loader: Loader) -> Step:
     return lambda x, omega: [v / dr.maximum(omega[2], op.least) for v in x]
 
 
 @MITSUBA.implements(ops.Product)
-def _product(op: ops.Product, load: Load) -> Step:
+def _product(op: ops.Product, loader: Loader) -> Step:
     return lambda x: [math.prod(numbers) for numbers in zip(*x, strict=True)]
