@@ -216,14 +216,14 @@ def infer(device: str, sizes: str, folder: str) -> Answers:
 
 def evaluate_plugin(device: str, arithmetic: Any, sizes: str, folder: str) -> Answers:
     """The same by the Mitsuba plugin, with one arithmetic of its networks."""
-    from mbtf_fit.mitsuba_plugin import register
+    from mbtf_fit.backends.mitsuba import register
 
     # Before what imports Dr.Jit.
     register(VARIANTS[device])
     import drjit as dr
     import mitsuba as mi
 
-    from mbtf_fit.mitsuba_plugin import Evaluator, read_material
+    from mbtf_fit.backends.mitsuba import Evaluator, read_material
 
     stored = read_material(folder)
     evaluator = Evaluator(stored, arithmetic)
@@ -236,7 +236,7 @@ def evaluate_plugin(device: str, arithmetic: Any, sizes: str, folder: str) -> An
     dr.eval(u, sigma, light, view)
 
     def work() -> None:
-        dr.eval(evaluator.value(evaluator.features(u, evaluator.level(sigma), view), light, view))
+        dr.eval(evaluator.value(evaluator.stage1(u, evaluator.level(sigma), view), light))
         dr.sync_thread()
 
     yield {"queries": len(queries.sigma)} | timed(work)
@@ -244,12 +244,12 @@ def evaluate_plugin(device: str, arithmetic: Any, sizes: str, folder: str) -> An
 
 def render(device: str, sizes: str, folder: str, out: str) -> Answers:
     """Two pictures of a ball of the material, of other random numbers, as arrays in a file."""
-    from mbtf_fit.mitsuba_plugin import register
+    from mbtf_fit.backends.mitsuba import register
 
     register(VARIANTS[device])
     import mitsuba as mi
 
-    from mbtf_fit.mitsuba_plugin import load_scene
+    from mbtf_fit.backends.mitsuba import load_scene
 
     wanted = Sizes.read(sizes)
     scene = load_scene(

@@ -105,11 +105,11 @@ def main() -> int:
     import drjit as dr
     import torch
 
-    import mbtf_fit.mitsuba_plugin
+    import mbtf_fit.backends.mitsuba
     from mbtf_fit import Material
-    from mbtf_fit.mitsuba_plugin import Evaluator, StoredMaterial, read_material
+    from mbtf_fit.backends.mitsuba import Evaluator, StoredMaterial, read_material
 
-    mbtf_fit.mitsuba_plugin.register()
+    mbtf_fit.backends.mitsuba.register()
     torch.set_num_threads(options.threads)
     dr.set_thread_count(options.threads)
     levels = options.resolution.bit_length() - 1
@@ -142,26 +142,24 @@ def main() -> int:
 
     def plugin(material: StoredMaterial, arithmetic: Any) -> Callable[[], None]:
         evaluator = Evaluator(material, arithmetic)
-        return evaluated(
-            lambda: evaluator.value(evaluator.features(u, evaluator.level(sigma), view), light, view)
-        )
+        return evaluated(lambda: evaluator.value(evaluator.stage1(u, evaluator.level(sigma), view), light))
 
     ways: dict[str, Callable[[], Any]] = {
         "unrolled": plugin(stored, "unrolled"),
         "cooperative": plugin(stored, "cooperative"),
     }
     evaluator = Evaluator(stored)
-    surface = evaluator.surface
-    baseline = "pytorch" if surface is None else "neumip"
-    if surface is None:
+    tracing = material.model.tracing
+    baseline = "pytorch" if tracing is None else "neumip"
+    if tracing is None:
         ways["pytorch"] = lambda: material.evaluate(*arrays)
     else:
-        known, level = surface, evaluator.level(sigma)
+        (trace, shade), level = tracing, evaluator.level(sigma)
         dr.eval(level)
         ways["neumip"] = plugin(neumip, "unrolled")
-        ways["trace"] = evaluated(lambda: known.height(u, view))
+        ways["trace"] = evaluated(lambda: evaluator.stage1(u, level, view)[trace.output])
         ways["surface"] = evaluated(
-            lambda: known.shading(known.intersections(u, level, view)[1], level, light, view)
+            lambda: evaluator.stage2(evaluator.stage1(u, level, view), light)[shade.output]
         )
     first: dict[str, float] = {}
     for name, way in ways.items():
@@ -176,7 +174,7 @@ def main() -> int:
         )
     deviation = conformance_deviation(Evaluator(stored, "unrolled"), stored)
     ratio = median[baseline] / median["unrolled"]
-    least = FASTER if surface is None else 1 / SLOWER
+    least = FASTER if tracing is None else 1 / SLOWER
     print(f"{ratio:.2f} times as fast as {baseline}; deviation on conformance queries {deviation:.1e}")
     fast = ratio >= least or options.places != 1
     met = fast and first["unrolled"] <= COMPILE and deviation <= DEVIATION

@@ -233,11 +233,11 @@ def measure(source: Path, shards: Path, folder: Path) -> dict[str, Any]:
     mi = load_mitsuba()
     import drjit as dr
 
-    import mbtf_fit.mitsuba_plugin
+    import mbtf_fit.backends.mitsuba
     from mbtf_core.data.dataset import Dataset
-    from mbtf_fit.mitsuba_plugin import Evaluator, read_material
+    from mbtf_fit.backends.mitsuba import Evaluator, read_material
 
-    mbtf_fit.mitsuba_plugin.register()
+    mbtf_fit.backends.mitsuba.register()
     start = time.perf_counter()
     plugin = {"type": "mbtf", "material": str(folder), "uv_scale": 40.0}
     scene = plane_scene(mi, plugin)

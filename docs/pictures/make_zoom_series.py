@@ -106,9 +106,9 @@ def rendered(mi: Any, tiles_across: float, integrator: str) -> NDArray[np.float6
 def main() -> None:
     """Write the sheet."""
     mi = load_mitsuba()
-    import mbtf_fit.mitsuba_plugin
+    import mbtf_fit.backends.mitsuba
 
-    mbtf_fit.mitsuba_plugin.register()
+    mbtf_fit.backends.mitsuba.register()
     sheet = Image.new("RGB", (len(TILES_ACROSS) * (SIZE + GAP) - GAP, 3 * (SIZE + CAPTION)), (255, 255, 255))
     draw = ImageDraw.Draw(sheet)
     for column, tiles_across in enumerate(TILES_ACROSS):

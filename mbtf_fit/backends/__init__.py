@@ -1,1 +1,1 @@
-"""Back ends: each implements the operations of models in its own language."""
+"""Back ends: each executes the operations of :mod:`mbtf_fit.ops`, and knows no model."""

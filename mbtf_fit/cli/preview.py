@@ -7,7 +7,8 @@ from pathlib import Path
 from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.options import Options, Output, Overwrite, PathText, Switch, options_from
 from mbtf_core.errors import UsageError
-from mbtf_fit.mitsuba_plugin.preview.config import PreviewConfig
+from mbtf_core.files.folders import owned
+from mbtf_fit.preview.config import PreviewConfig
 
 
 @options_from(PreviewConfig)
@@ -40,11 +41,12 @@ def preview(
     mp4
         Write the turntable as MP4, too; needs ffmpeg or the extra 'video'.
     """
-    from mbtf_fit.mitsuba_plugin.preview.command import draw
+    from mbtf_fit.preview.command import draw
 
     if sheet_only and mp4:
         raise UsageError("--sheet-only draws no turntable", where="--mp4", hint="leave out one of them")
     if material is None and options.config is None:
         raise UsageError("no material given", hint="mbtf-fit preview material/ -o preview/")
     config = options.resolve(material=material)
-    draw(config, output, sheet_only=sheet_only, mp4=mp4, overwrite=overwrite, console=console)
+    with owned(output):
+        draw(config, output, sheet_only=sheet_only, mp4=mp4, overwrite=overwrite, console=console)

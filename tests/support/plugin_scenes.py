@@ -8,12 +8,12 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-import mbtf_fit.mitsuba_plugin
+import mbtf_fit.backends.mitsuba
 from mbtf_core.pictures.camera import Camera
 
 from .scenes import mi
 
-mbtf_fit.mitsuba_plugin.register()
+mbtf_fit.backends.mitsuba.register()
 
 
 def plane(bsdf: dict[str, Any], to_uv: Any = None, aspect: float = 1.0, half: float = 200.0) -> Any:

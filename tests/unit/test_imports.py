@@ -73,7 +73,7 @@ mbtf_fit.presets
 mbtf_fit.material
 mbtf_fit.evaluation
 mbtf_fit.training
-mbtf_fit.mitsuba_plugin
+mbtf_fit.backends.mitsuba
 mbtf_fit.viewer
 mbtf_fit.shaders
 mbtf_fit.cli
@@ -102,7 +102,7 @@ FORBIDDEN = {
     "mbtf_core": {"torch", "mitsuba", "drjit", "trimesh"},
     "mbtf_gen": {"torch"},
     "mbtf_fit": {"mitsuba", "drjit", "mbtf_gen"},
-    "mbtf_fit.mitsuba_plugin": {"torch", "trimesh"},
+    "mbtf_fit.backends.mitsuba": {"torch", "trimesh"},
     "mbtf_pipeline": set(),
 }
 
@@ -170,8 +170,8 @@ def test_imports_run_downwards() -> None:
         ("mbtf_core.errors", "from mbtf_core.data.dataset import Dataset", True),
         ("mbtf_fit.cli.b", "from mbtf_pipeline.stages import run", True),
         ("mbtf_fit.data.a", "import drjit as dr", True),
-        ("mbtf_fit.mitsuba_plugin.a", "import drjit as dr", False),
-        ("mbtf_fit.mitsuba_plugin.a", "import torch", True),
+        ("mbtf_fit.backends.mitsuba.a", "import drjit as dr", False),
+        ("mbtf_fit.backends.mitsuba.a", "import torch", True),
         ("mbtf_pipeline.run", "import mbtf_fit, mbtf_gen, torch", False),
     ],
 )

@@ -13,9 +13,9 @@ from support.plugin_scenes import interaction, plane
 from support.scenes import mi
 
 from mbtf_core.data.lattice import Lattice
+from mbtf_fit.backends.mitsuba.evaluator import Evaluator
+from mbtf_fit.backends.mitsuba.stored_material import read_material
 from mbtf_fit.material.transmittance import Transmittance
-from mbtf_fit.mitsuba_plugin.evaluator import Evaluator
-from mbtf_fit.mitsuba_plugin.material_arrays import read_material
 
 GRAY, SHARE = 0.1, 0.35
 

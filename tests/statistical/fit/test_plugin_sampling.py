@@ -17,8 +17,8 @@ from support.scenes import mi
 
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.stats import Estimate, t_test
-from mbtf_fit.mitsuba_plugin.lobe_fit import fit_lobes
-from mbtf_fit.mitsuba_plugin.lobes import Lobe, LobeTextures, Mixture
+from mbtf_fit.backends.mitsuba.lobe_fit import fit_lobes
+from mbtf_fit.backends.mitsuba.lobes import Lobe, LobeTextures, Mixture
 
 COUNT = 32
 
@@ -76,10 +76,10 @@ class Glossy:
     def lobe(self) -> Lobe:
         return Lobe(*(mi.Float(v) for v in (self.alphas[0], 0.0, self.alphas[1], *self.tilt)))
 
-    def features(self, u: Any, level: Any, viewer: Any) -> list[Any]:
-        return []
+    def stage1(self, u: Any, level: Any, viewer: Any) -> Any:
+        return viewer
 
-    def value(self, features: list[Any], light: Any, viewer: Any) -> Any:
+    def value(self, viewer: Any, light: Any) -> Any:
         # Half of the lobe's own density over the cosine: energy one half.
         return mi.Color3f(self.base / dr.pi + 0.5 * self.lobe().density(light, viewer) / light.z)
 
@@ -110,7 +110,7 @@ def test_the_fit_lobes_a_known_material_are_found() -> None:
         viewer = mi.Vector3f(*(mi.Float(np.full(n, c, np.float32)) for c in direction))
 
         def value(light: Any, viewer: Any = viewer) -> Any:
-            return glossy.value([], light, viewer).x
+            return glossy.value(viewer, light).x
 
         at = textures.at(mi.Point2f(0.3, 0.6), mi.Float(0.0), viewer)
         mean, variance = second_moment(value, at, n)
@@ -122,8 +122,8 @@ def test_the_fit_lobes_a_known_material_are_found() -> None:
 def test_a_lambert_material_keeps_the_cosine() -> None:
     evaluator: Any = SimpleNamespace(
         lattice=Lattice(2),
-        features=lambda u, level, viewer: [],
-        value=lambda features, light, viewer: mi.Color3f(0.2),
+        stage1=lambda u, level, viewer: {},
+        value=lambda values, light: mi.Color3f(0.2),
     )
     assert np.concatenate([level[..., 5:].ravel() for level in fit_lobes(evaluator)]).max() == 0
 

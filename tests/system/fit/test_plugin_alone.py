@@ -17,10 +17,10 @@ CODE = """
 import sys
 for name in ("torch", "scipy", "trimesh", "matplotlib"):
     sys.modules[name] = None  # importing it fails
-import mbtf_fit.mitsuba_plugin
-mbtf_fit.mitsuba_plugin.register("llvm_ad_rgb")
+import mbtf_fit.backends.mitsuba
+mbtf_fit.backends.mitsuba.register("llvm_ad_rgb")
 import mitsuba as mi
-scene = mbtf_fit.mitsuba_plugin.load_scene({
+scene = mbtf_fit.backends.mitsuba.load_scene({
     "type": "scene", "integrator": {"type": "mbtf_path", "max_depth": 3}, "light": {"type": "constant"},
     "ball": {"type": "sphere", "b": {"type": "mbtf", "material": sys.argv[1], "uv_scale": 3.0}},
     "sensor": {"type": "perspective",
@@ -30,7 +30,7 @@ scene = mbtf_fit.mitsuba_plugin.load_scene({
 import numpy as np
 mean = np.array(mi.render(scene, spp=4)).mean()
 assert 0.05 < mean < 5, mean
-mbtf_fit.mitsuba_plugin.register()
+mbtf_fit.backends.mitsuba.register()
 print("rendered")
 """
 
@@ -60,8 +60,8 @@ def test_the_example_scene_in_xml_loads(tmp_path: Path, run_python: RunPython) -
     write_material(tmp_path / "material")
     (tmp_path / "scene.xml").write_bytes((PROJECT / "examples" / "ball.xml").read_bytes())
     code = (
-        "import mbtf_fit.mitsuba_plugin\nmbtf_fit.mitsuba_plugin.register('llvm_ad_rgb')\n"
-        "scene = mbtf_fit.mitsuba_plugin.load_scene('scene.xml', spp=9)\n"
+        "import mbtf_fit.backends.mitsuba\nmbtf_fit.backends.mitsuba.register('llvm_ad_rgb')\n"
+        "scene = mbtf_fit.backends.mitsuba.load_scene('scene.xml', spp=9)\n"
         "print(type(scene.integrator()).__name__, scene.shapes()[0].bsdf().uv_scale, "
         "scene.sensors()[0].sampler().sample_count())"
     )
@@ -81,7 +81,7 @@ except Exception:
     print("no LLVM without ours")
 else:
     try:
-        import mbtf_fit.mitsuba_plugin
+        import mbtf_fit.backends.mitsuba
         print("registered", drjit.detail.llvm_version()[0])
     except Exception as error:
         print(error)
@@ -97,22 +97,22 @@ else:
 
 def test_registration_reports_missing_variants(run_python: RunPython) -> None:
     code = """
-import mbtf_fit.mitsuba_plugin
+import mbtf_fit.backends.mitsuba
 from mbtf_gen.engine.llvm import use_shipped_llvm
 use_shipped_llvm()
 try:
-    mbtf_fit.mitsuba_plugin.register()
+    mbtf_fit.backends.mitsuba.register()
 except Exception as error:
     print(error)
 import mitsuba as mi
 mi.set_variant("scalar_rgb")
 try:
-    mbtf_fit.mitsuba_plugin.register()
+    mbtf_fit.backends.mitsuba.register()
 except Exception as error:
     print(error)
 mi.set_variant("llvm_ad_rgb")
-mbtf_fit.mitsuba_plugin.register()
-mbtf_fit.mitsuba_plugin.register()
+mbtf_fit.backends.mitsuba.register()
+mbtf_fit.backends.mitsuba.register()
 print("done")
 """
     done = run_python("-c", code)

@@ -27,7 +27,7 @@ def test_import_order(run_python: RunPython) -> None:
 
 
 @pytest.mark.parametrize(
-    "package", ["mbtf_core", "mbtf_gen", "mbtf_fit", "mbtf_fit.mitsuba_plugin", "mbtf_pipeline"]
+    "package", ["mbtf_core", "mbtf_gen", "mbtf_fit", "mbtf_fit.backends.mitsuba", "mbtf_pipeline"]
 )
 def test_importing_a_package_changes_no_variable(package: str, run_python: RunPython) -> None:
     code = f"import os; before = dict(os.environ); import {package}; print(os.environ == before)"

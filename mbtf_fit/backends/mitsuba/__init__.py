@@ -1,8 +1,8 @@
 """Fitted materials as Mitsuba BSDFs (``mbtf``), and a path tracer that provides their footprints
 (``mbtf_path``).
 
-    import mbtf_fit.mitsuba_plugin
-    mbtf_fit.mitsuba_plugin.register("llvm_ad_rgb")
+    import mbtf_fit.backends.mitsuba
+    mbtf_fit.backends.mitsuba.register("llvm_ad_rgb")
     import mitsuba as mi
     bsdf = mi.load_dict({"type": "mbtf", "material": "material/"})
 
@@ -16,13 +16,13 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-from mbtf_fit.mitsuba_plugin.registration import load_scene, register, variant_is_set
+from mbtf_fit.backends.mitsuba.registration import load_scene, register, variant_is_set
 
 _PUBLIC = {
     "Evaluator": "evaluator",
-    "StoredMaterial": "material_arrays",
+    "StoredMaterial": "stored_material",
     "check_scene": "bsdf",
-    "read_material": "material_arrays",
+    "read_material": "stored_material",
 }
 
 __all__ = ["Evaluator", "StoredMaterial", "check_scene", "load_scene", "read_material", "register"]

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from mbtf_fit.mitsuba_plugin.textures import Textures, in_image
+from mbtf_fit.backends.mitsuba.textures import Textures, in_image
 from mbtf_gen.engine.types import Float, Point2f, UInt32, Vector3f
 from mbtf_gen.render.bsdf.microfacet import visible_normal
 

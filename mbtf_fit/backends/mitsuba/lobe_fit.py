@@ -1,4 +1,4 @@
-"""Fit of :mod:`~mbtf_fit.mitsuba_plugin.lobes` to a material's values by expectation maximization.
+"""Fit of :mod:`~mbtf_fit.backends.mitsuba.lobes` to a material's values by expectation maximization.
 
 For every texel, views and lights are sampled and the material is evaluated; the values times the light's
 cosine are the weights of samples of the target density. The GGX distribution of slopes is a bivariate Student
@@ -14,9 +14,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mbtf_fit.mitsuba_plugin.evaluator import Evaluator
-from mbtf_fit.mitsuba_plugin.lobes import BANDS, CHANNELS, Lobe, Mixture, band_of, mixture_of
-from mbtf_fit.mitsuba_plugin.material_arrays import F32
+from mbtf_fit.backends.mitsuba.evaluator import Evaluator
+from mbtf_fit.backends.mitsuba.lobes import BANDS, CHANNELS, Lobe, Mixture, band_of, mixture_of
+from mbtf_fit.backends.mitsuba.stored_material import F32
 from mbtf_gen.engine.types import Float, UInt32, Vector3f
 
 # Finest level with lobes, samples per texel, iterations.
@@ -74,8 +74,7 @@ def _fit_texels(evaluator: Evaluator, level: int, first: int, count: int) -> F32
     light = start.sample(choice, mi.Point2f(random.next_float32(), random.next_float32()))
     above = light.z > 1e-3
     light = dr.select(above, light, mi.Vector3f(0, 0, 1))
-    features = evaluator.features(u, dr.opaque(mi.Float, float(level)), viewer)
-    value = evaluator.value(features, light, viewer)
+    value = evaluator.value(evaluator.stage1(u, dr.opaque(mi.Float, float(level)), viewer), light)
     density = start.density(light)
     target = dr.select(above, dr.mean(value) * light.z, 0.0)
     weight = target / density

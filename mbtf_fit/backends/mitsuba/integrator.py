@@ -15,8 +15,8 @@ import drjit as dr
 import mitsuba as mi
 
 from mbtf_core.errors import UsageError
-from mbtf_fit.mitsuba_plugin.bsdf import check_scene
-from mbtf_fit.mitsuba_plugin.names import INTEGRATOR_NAME, footprints_provided, refuse_unknown
+from mbtf_fit.backends.mitsuba.bsdf import check_scene
+from mbtf_fit.backends.mitsuba.names import INTEGRATOR_NAME, footprints_provided, refuse_unknown
 from mbtf_gen.engine.types import (
     DirectionSample3f,
     Float,

@@ -15,21 +15,21 @@ from support.fuzzing import check_message
 from support.plugin_materials import write_material
 from support.scenes import mi
 
-import mbtf_fit.mitsuba_plugin
+import mbtf_fit.backends.mitsuba
 from mbtf_core.config.settings import resolve
 from mbtf_core.directions import from_angles
-from mbtf_core.errors import EngineError, UsageError
+from mbtf_core.errors import EngineError
 from mbtf_core.exposure import to_display
 from mbtf_core.pictures.camera import Camera
-from mbtf_fit.mitsuba_plugin.preview.config import PreviewConfig, SheetSection, TurntableSection
+from mbtf_fit.preview.config import PreviewConfig, SheetSection, TurntableSection
 from mbtf_gen.config.pictures import Direction
 
-mbtf_fit.mitsuba_plugin.register()
+mbtf_fit.backends.mitsuba.register()
 
-from mbtf_fit.mitsuba_plugin.bsdf import Frame  # noqa: E402
-from mbtf_fit.mitsuba_plugin.evaluator import Evaluator  # noqa: E402
-from mbtf_fit.mitsuba_plugin.material_arrays import read_material  # noqa: E402
-from mbtf_fit.mitsuba_plugin.preview import animation, sheet, turntable  # noqa: E402
+from mbtf_fit.backends.mitsuba.bsdf import Frame  # noqa: E402
+from mbtf_fit.backends.mitsuba.evaluator import Evaluator  # noqa: E402
+from mbtf_fit.backends.mitsuba.stored_material import read_material  # noqa: E402
+from mbtf_fit.preview import animation, sheet, turntable  # noqa: E402
 
 SECTION = SheetSection(
     views=[Direction(elevation=70, azimuth=-90), Direction(elevation=35, azimuth=20)],
@@ -176,26 +176,13 @@ def test_view_and_light_replace_those_of_the_sheet() -> None:
     assert config.sheet.lamps == [Direction(elevation=45, azimuth=30)]
 
 
-def test_invalid_options_are_refused() -> None:
-    for key, value, fault in (
-        ("sheet.size", 2000, "pixels; use smaller or fewer"),
-        ("sheet.tiles_across", [], "sheet.tiles_across"),
-    ):
-        flags = {"material": "m", key: value}
-        if key == "sheet.size":
-            flags["sheet.tiles_across"] = [1.0, 2.0, 3.0]
-        with pytest.raises(UsageError, match=fault) as caught:
-            resolve(PreviewConfig, flags=flags)
-        check_message(caught.value)
-
-
 def test_bad_input_of_previews_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from mbtf_core.app.console import run
     from mbtf_fit.cli.app import app
 
     for code, what, *words in (
         (3, "no material.json", str(tmp_path), "-o", str(tmp_path / "out")),
-        (2, "--tiles-across: 'sheet.tiles_across': must be numbers", "m", "--tiles-across", "1;2"),
+        (2, "pixels; use smaller or fewer", "m", "--size", "2000"),
         (2, "no material given"),
         (2, "--mp4: --sheet-only draws no turntable", "m", "--sheet-only", "--mp4"),
     ):

@@ -6,11 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mbtf_core.app.console import Console
-from mbtf_core.files.folders import owned
 from mbtf_core.run.signals import keep_on_interruption
 
 if TYPE_CHECKING:
-    from mbtf_fit.mitsuba_plugin.preview.config import PreviewConfig
+    from mbtf_fit.preview.config import PreviewConfig
 
 SHEET_NAME, GIF_NAME, MP4_NAME = "sheet.png", "turntable.gif", "turntable.mp4"
 
@@ -18,7 +17,7 @@ SHEET_NAME, GIF_NAME, MP4_NAME = "sheet.png", "turntable.gif", "turntable.mp4"
 def draw(
     config: PreviewConfig, path: Path, *, sheet_only: bool, mp4: bool, overwrite: bool, console: Console
 ) -> None:
-    """Draw the pictures that are missing and report them.
+    """Draw the pictures that are missing and report them, in a folder that this process owns.
 
     Parameters
     ----------
@@ -30,26 +29,17 @@ def draw(
     InputError : the material cannot be used, or the folder holds something else
     UsageError : a view shows the horizon
     EngineError : MP4 is asked for, and there is no ffmpeg
-    PartialError : another process writes to the folder
     """
-    keep_on_interruption(f"the finished pictures are kept in {path}")
-    with owned(path):
-        _draw(config, path, overwrite, console, sheet_only, mp4)
-
-
-def _draw(
-    config: PreviewConfig, path: Path, overwrite: bool, console: Console, sheet_only: bool, mp4: bool
-) -> None:
     from mbtf_core.exposure import describe_exposure, to_display
     from mbtf_core.files.folders import check_space
     from mbtf_core.pictures.reference import PNG_BYTES, write_png
+    from mbtf_fit.backends.mitsuba import load_scene
     from mbtf_fit.material.format import read_description
-    from mbtf_fit.mitsuba_plugin import load_scene
-    from mbtf_fit.mitsuba_plugin.preview.animation import find_encoder, write_gif, write_mp4
+    from mbtf_fit.preview.animation import find_encoder, write_gif, write_mp4
     from mbtf_gen.engine.runtime import load_mitsuba
-    from mbtf_gen.forecast import announce
     from mbtf_gen.pictures.folder import PictureFolder
 
+    keep_on_interruption(f"the finished pictures are kept in {path}")
     encoder = find_encoder() if mp4 else ""
     sheet, turn, asked = config.sheet, config.turntable, config.exposure
     panels_of = len(sheet.cameras) * len(sheet.lamps) * len(sheet.tiles_across)
@@ -81,13 +71,11 @@ def _draw(
     exposure = (found[SHEET_NAME] or {}).get("exposure", 0.0)
     if not all(kept.values()):
         load_mitsuba()
-        from mbtf_fit.mitsuba_plugin.preview.sheet import contact_sheet, exposure_of, panels
-        from mbtf_fit.mitsuba_plugin.preview.turntable import frames, seconds_of
+        from mbtf_fit.preview.sheet import contact_sheet, exposure_of, panels
+        from mbtf_fit.preview.turntable import frames
 
         bsdf = load_scene({"type": "mbtf", "material": config.material})
         missing = [name for name in shows if not kept[name] and name != SHEET_NAME]
-        paths = turn.frames * turn.size**2 * turn.spp
-        announce(console, paths if missing else 0, lambda: seconds_of(bsdf, turn, paths), size)
         total = 1 + turn.frames * bool(missing)
         with console.progress(total=total, label="drawing", unit="pictures") as bar:
             if not kept[SHEET_NAME]:

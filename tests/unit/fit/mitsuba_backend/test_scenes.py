@@ -19,8 +19,8 @@ from mbtf_core.directions import from_angles
 from mbtf_core.errors import InputError, MbtfError, UsageError
 from mbtf_core.pictures.camera import Camera
 from mbtf_fit import Material
+from mbtf_fit.backends.mitsuba import load_scene
 from mbtf_fit.material.transmittance import Transmittance
-from mbtf_fit.mitsuba_plugin import load_scene
 
 LIGHT = from_angles(40.0, 20.0)
 # A narrow view: differentials, which the footprint comes from, are differences over a pixel.

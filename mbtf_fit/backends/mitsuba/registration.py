@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.errors import EngineError, MbtfError, UsageError
-from mbtf_fit.mitsuba_plugin.names import BSDF_NAME, INTEGRATOR_NAME, VARIANTS
+from mbtf_fit.backends.mitsuba.names import BSDF_NAME, INTEGRATOR_NAME, VARIANTS
 from mbtf_gen.engine.runtime import CPU_VARIANT, load_mitsuba, refuse_old_llvm
 from mbtf_gen.engine.types import Properties, Scene
 
@@ -49,7 +49,7 @@ def register(variant: str | None = None) -> None:
         load_mitsuba(variant)
     if not variant_is_set():
         raise UsageError(
-            "no variant of Mitsuba is set", hint=f'call mbtf_fit.mitsuba_plugin.register("{CPU_VARIANT}")'
+            "no variant of Mitsuba is set", hint=f'call mbtf_fit.backends.mitsuba.register("{CPU_VARIANT}")'
         )
     import mitsuba as mi
 
@@ -68,8 +68,8 @@ def register(variant: str | None = None) -> None:
         )
     if current == CPU_VARIANT:
         refuse_old_llvm()
-    from mbtf_fit.mitsuba_plugin.bsdf import MbtfBSDF
-    from mbtf_fit.mitsuba_plugin.integrator import ConePath
+    from mbtf_fit.backends.mitsuba.bsdf import MbtfBSDF
+    from mbtf_fit.backends.mitsuba.integrator import ConePath
 
     mi.register_bsdf(BSDF_NAME, lambda props: _construct(MbtfBSDF, props))
     mi.register_integrator(INTEGRATOR_NAME, lambda props: _construct(ConePath, props))
@@ -108,7 +108,7 @@ def load_scene(source: str | Path | Mapping[str, Any], **parameters: Any) -> Sce
     register()
     import mitsuba as mi
 
-    from mbtf_fit.mitsuba_plugin.bsdf import check_scene
+    from mbtf_fit.backends.mitsuba.bsdf import check_scene
 
     global _last_error
     _last_error = None

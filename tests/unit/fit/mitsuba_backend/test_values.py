@@ -23,9 +23,9 @@ from mbtf_fit.surface.heightfield import HeightfieldTracer
 
 assert mi.variant()
 
-from mbtf_fit.mitsuba_plugin import network  # noqa: E402
-from mbtf_fit.mitsuba_plugin.evaluator import Evaluator  # noqa: E402
-from mbtf_fit.mitsuba_plugin.material_arrays import read_material  # noqa: E402
+from mbtf_fit.backends.mitsuba import network  # noqa: E402
+from mbtf_fit.backends.mitsuba.evaluator import Evaluator  # noqa: E402
+from mbtf_fit.backends.mitsuba.stored_material import read_material  # noqa: E402
 
 RANDOM = torch.Generator().manual_seed(1)
 
@@ -117,7 +117,6 @@ def test_half_precision_errs_by_less_than_one_percent(options: dict[str, Any], t
 def test_black_data_are_black(tmp_path: Path) -> None:
     """Their unit is 0, whatever is known of the surface."""
     material = write_material(tmp_path, model="relief", weights={"unit": torch.zeros(())})
-    assert Evaluator(read_material(tmp_path), "cooperative").unit == 0
     queries = random_queries(np.random.default_rng(5), 100, material.lattice)
     plugin = Evaluator(read_material(tmp_path), "cooperative")
     assert not plugin.evaluate(*queries.values()).any()
@@ -128,13 +127,12 @@ def test_lines_that_pass_many_tiles_end_as_in_the_fit(cosine: float, tmp_path: P
     """The surface is so deep that the lowest ones reach the cap on crossings: against PyTorch and the cap."""
     heights = rough_heights(8, 12, depth=3.0)
     write_material(tmp_path, model="relief", aspect=0.75, weights={"surface.heights": tensor(heights)})
-    surface = Evaluator(read_material(tmp_path), "cooperative").surface
-    assert surface is not None
+    plugin = Evaluator(read_material(tmp_path), "cooperative")
     random = np.random.default_rng(6)
     angle, sine = 2 * np.pi * random.random(500), np.sqrt(1 - cosine**2)
     view = np.stack([sine * np.cos(angle), sine * np.sin(angle), np.full(500, cosine)], -1)
     u, view = (a.astype(np.float32) for a in (3 * random.random((500, 2)) - 1, view))
-    found = np.array(surface.height(mi.Point2f(u.T), mi.Vector3f(view.T)))
+    found = np.array(plugin.stage1(mi.Point2f(u.T), mi.Float(0.0), mi.Vector3f(view.T))["z"][0])
     wanted = HeightfieldTracer(heights, 0.75).trace(torch.from_numpy(u), torch.from_numpy(view)).numpy()
     difference = np.abs(found - wanted)
     # A line that just misses an edge in one of them meets it in the other.
@@ -163,7 +161,9 @@ def test_vertical_light_has_the_azimuth_0(tmp_path: Path) -> None:
         queries["omega_i"] = np.tile(np.float32([x, y, 1.0]), (n, 1))
         u, light = (torch.from_numpy(queries[name]) for name in ("u", "omega_i"))
         found += [plugin.evaluate(*queries.values()), material.evaluate(*queries.values())]
-        visible.append(material.model.known.visibility(material.model.tracing[1], u, level, light).numpy())
+        assert material.model.tracing is not None
+        shade = material.model.tracing[1]
+        visible.append(material.model.known.visibility(shade, u, level, light).numpy())
     assert np.ptp(visible[0]) > 0.3
     for shares in visible[1:]:
         np.testing.assert_allclose(shares, visible[0], atol=1e-6)
@@ -179,51 +179,47 @@ def test_half_precision_does_not_round_inputs() -> None:
     assert found[0] == 1.0
 
 
-def test_the_inception_decoder_is_refused(tmp_path: Path) -> None:
-    write_material(tmp_path)
-    path = tmp_path / "material.json"
-    description = json.loads(path.read_text())
-    description["model"] = "hierarchical"
-    description["config"] |= {"model": "hierarchical", "network": {}}
-    path.write_text(json.dumps(description))
-    with pytest.raises(InputError, match="does not support the inception decoder") as caught:
-        read_material(tmp_path)
+def test_an_operation_of_pytorch_alone_is_refused(tmp_path: Path) -> None:
+    write_material(tmp_path, model="hierarchical")
+    with pytest.raises(InputError, match="plugin does not support the operation 'neighborhood'") as caught:
+        Evaluator(read_material(tmp_path))
     check_message(caught.value)
+    assert "mbtf-fit evaluate" in caught.value.hint
 
 
 @pytest.mark.parametrize(
-    ("network", "fault"),
+    ("operation", "changes", "fault"),
     [
-        ({"channels": 7, "output_channels": 6}, "has 3 outputs, not 6"),
-        ({"encoding": {"direction": 2}}, "has the shape"),
-        ({"activation": "gelu"}, "activation"),
+        ("network", {"hidden": [24, 25, 25]}, "has the shape"),
+        ("lookup", {"channels": 6}, "has the shape"),
+        ("network", {"activation": "gelu"}, "activation"),
+        ("network", {"x": ["nothing"]}, "'nothing', which is not computed"),
+        ("lookup", {"operation": "guess"}, "is unknown: 'guess'"),
     ],
 )
-def test_weights_of_other_networks_are_refused(network: dict[str, Any], fault: str, tmp_path: Path) -> None:
+def test_operations_without_their_tensors_are_refused(
+    operation: str, changes: dict[str, Any], fault: str, tmp_path: Path
+) -> None:
     write_material(tmp_path)
     path = tmp_path / "material.json"
     description = json.loads(path.read_text())
-    description["config"]["network"] |= network
+    next(op for op in description["operations"] if op["operation"] == operation).update(changes)
     path.write_text(json.dumps(description))
     with pytest.raises(InputError, match=fault) as caught:
-        read_material(tmp_path)
+        Evaluator(read_material(tmp_path))
     check_message(caught.value)
 
 
 @pytest.mark.parametrize(
     ("name", "change", "fault"),
     [
-        ("surface.heights", None, "lacks the tensor 'surface.heights'"),
-        ("surface.heights", lambda a: a[..., 0], "has the shape (16, 16)"),
         ("surface.heights", lambda a: a[:0], "is empty"),
         ("surface.heights", lambda a: a + 0.01, "has heights above the reference plane"),
         ("surface.heights", lambda a: np.where(a == a.min(), np.nan, a), "not finite"),
         ("surface.maps.4", None, "lacks the tensor 'surface.maps.4'"),
         ("surface.maps.2", lambda a: a[:-1], "has the shape (3, 4, 8)"),
-        ("surface.maps.1", lambda a: a[..., :6], "have neither 6 nor 8 channels"),
-        ("surface.horizons.3", None, "lacks the tensor 'surface.horizons.3'"),
+        ("surface.maps.0", lambda a: a[..., :7], "have neither 6 nor 8 channels"),
         ("surface.horizons.0", lambda a: a[..., :-1], "has the shape (1, 1, 31)"),
-        ("surface.light_width", None, "lacks the tensor 'surface.light_width'"),
         ("surface.dielectric", lambda a: a[None], "has the shape (1,)"),
         ("depth_weights", lambda a: a[1:], "has the shape (3,)"),
     ],
@@ -233,5 +229,5 @@ def test_corrupt_surfaces_are_refused(name: str, change: Any, fault: str, tmp_pa
     tensor = load_file(tmp_path / "weights.safetensors")[name]
     replace_tensors(tmp_path, {name: None if change is None else change(tensor)})
     with pytest.raises(InputError, match=re.escape(fault)) as caught:
-        read_material(tmp_path)
+        Evaluator(read_material(tmp_path))
     check_message(caught.value)

@@ -16,9 +16,9 @@ from PIL import Image, ImageDraw, ImageFont
 from mbtf_core.directions import from_angles
 from mbtf_core.exposure import auto_exposure, brightness, to_display
 from mbtf_core.pictures.camera import Camera
-from mbtf_fit.mitsuba_plugin.evaluator import Evaluator
-from mbtf_fit.mitsuba_plugin.material_arrays import F32
-from mbtf_fit.mitsuba_plugin.preview.config import SheetSection
+from mbtf_fit.backends.mitsuba.evaluator import Evaluator
+from mbtf_fit.backends.mitsuba.stored_material import F32
+from mbtf_fit.preview.config import SheetSection
 from mbtf_gen.config.pictures import Direction
 
 GAP, MARGIN, CAPTION = 4, 8, 34

@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mbtf_fit.mitsuba_plugin.material_arrays import F32
+from mbtf_fit.backends.mitsuba.stored_material import F32
 from mbtf_gen.engine.types import Float, Point2f, UInt32
 
 # Channels that one gather reads.

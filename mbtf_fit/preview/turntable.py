@@ -10,7 +10,6 @@ shrink towards the poles, where footprints exceed them. Tiles on the plate are a
 from __future__ import annotations
 
 import signal
-import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -20,8 +19,8 @@ import numpy as np
 
 from mbtf_core.directions import from_angles
 from mbtf_core.run.signals import reinstall_handlers
-from mbtf_fit.mitsuba_plugin.material_arrays import F32
-from mbtf_fit.mitsuba_plugin.preview.config import TurntableSection
+from mbtf_fit.backends.mitsuba.stored_material import F32
+from mbtf_fit.preview.config import TurntableSection
 from mbtf_gen.engine.types import BSDF, Scene
 
 # Latitude beyond which the projection continues with constant scale.
@@ -138,10 +137,3 @@ def frames(bsdf: BSDF, section: TurntableSection) -> Iterator[F32]:
             signal.raise_signal(signal.SIGINT)
         dr.eval(picture)
         yield np.array(picture, np.float32)
-
-
-def seconds_of(bsdf: BSDF, section: TurntableSection, paths: int) -> float:
-    """Seconds to trace so many paths, measured by two small frames; the first one compiles."""
-    small = section.model_copy(update={"frames": 2, "size": 64, "spp": 16})
-    stamps = [time.perf_counter() for _ in frames(bsdf, small)]
-    return (stamps[1] - stamps[0]) * paths / (small.size**2 * small.spp)

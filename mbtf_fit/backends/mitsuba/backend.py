@@ -1,0 +1,75 @@
+"""What implementations of operations in Dr.Jit kernels have in common.
+
+An implementation is called once per material: it reads and checks the operation's tensors, and returns a
+function, its *step*. A step is called whenever a kernel is recorded, with the values that the operation's
+fields name, and returns its results. A value is a list of numbers, one Dr.Jit array each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import drjit as dr
+import mitsuba as mi
+
+from mbtf_core.data.lattice import Lattice
+from mbtf_fit.backends.mitsuba.stored_material import F32, StoredMaterial
+from mbtf_fit.backends.mitsuba.textures import Textures
+from mbtf_fit.ops import Backend, Operation
+from mbtf_fit.ops.operation import input_sizes
+from mbtf_gen.engine.types import Float
+
+Arithmetic = Literal["unrolled", "cooperative", "half"]
+Numbers = list[Float]
+# One result, or a tuple of several.
+Step = Callable[..., Any]
+
+MITSUBA: Backend[Callable[[Any, Loader], Step]] = Backend("the Mitsuba plugin")
+
+
+@dataclass(frozen=True)
+class Loader:
+    """The material that implementations read.
+
+    Attributes
+    ----------
+    stored : the material
+    arithmetic : of networks
+    sizes : of all values
+    textures : those that have been read, by name
+    """
+
+    stored: StoredMaterial
+    arithmetic: Arithmetic
+    sizes: Mapping[str, int]
+    textures: dict[str, Textures] = field(default_factory=dict)
+
+    @property
+    def lattice(self) -> Lattice:
+        """Texel grids of the tile."""
+        return self.stored.lattice
+
+    def inputs(self, op: Operation) -> list[int]:
+        """Sizes of an operation's inputs."""
+        return input_sizes(op, self.sizes)
+
+    def levels(self, name: str, grids: list[tuple[int, int]], channels: int) -> list[F32]:
+        """Levels of a texture, of these grids."""
+        return [self.stored.take(f"{name}.{s}", (*grid, channels)) for s, grid in enumerate(grids)]
+
+    def texture(self, name: str, grids: list[tuple[int, int]], channels: int) -> Textures:
+        """A texture, which operations may share and users may change."""
+        if name not in self.textures:
+            self.textures[name] = Textures(self.levels(name, grids, channels))
+        return self.textures[name]
+
+    def scalar(self, name: str) -> float:
+        """A tensor ()."""
+        return float(self.stored.take(name, ()))
+
+
+def opaque(value: float) -> Float:
+    """A number that kernels read, so that they do not depend on it."""
+    return dr.opaque(mi.Float, value)

@@ -1,0 +1,125 @@
+"""M(u, σ, ω_i, ω_o) of a stored material, inside Dr.Jit kernels: its operations, one after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mbtf_core.errors import InputError
+from mbtf_fit.backends.mitsuba import displace, encode, lookup, network, shade, value  # noqa: F401
+from mbtf_fit.backends.mitsuba.backend import MITSUBA, Arithmetic, Loader, Numbers, Step
+from mbtf_fit.backends.mitsuba.stored_material import F32, StoredMaterial
+from mbtf_fit.backends.mitsuba.textures import Textures
+from mbtf_fit.material.format import DESCRIPTION_NAME
+from mbtf_fit.ops import Operation, sizes_of, stages
+from mbtf_fit.ops.operation import output_names, parse
+from mbtf_gen.engine.types import Color3f, Float, Point2f, Vector3f
+
+# Values by name.
+Values = dict[str, Numbers]
+
+
+class Evaluator:
+    """Evaluation of a material for arrays of queries.
+
+    Parameters
+    ----------
+    stored : operations and tensors of the material
+    arithmetic : ``unrolled``, ``cooperative`` or ``half`` networks; the default depends on variant and size
+
+    Attributes
+    ----------
+    textures : those of the material by the names of their tensors; users may change their texels
+
+    Raises
+    ------
+    InputError : an operation is not supported, or a tensor is missing or of a wrong shape
+    """
+
+    def __init__(self, stored: StoredMaterial, arithmetic: Arithmetic | None = None) -> None:
+        self.lattice = stored.lattice
+        try:
+            MITSUBA.check(stored.operations)
+        except InputError as error:
+            raise InputError(
+                error.what,
+                where=stored.folder / DESCRIPTION_NAME,
+                hint="PyTorch evaluates this material: mbtf-fit evaluate, or mbtf_fit.Material.load",
+            ) from None
+        self.arithmetic = network.default_arithmetic(stored) if arithmetic is None else arithmetic
+        loader = Loader(stored, self.arithmetic, sizes_of(stored.operations))
+        self.textures = loader.textures
+        first, second = ([(op, MITSUBA[op](op, loader)) for op in part] for part in stages(stored.operations))
+        self._first, self._second, self._last = first, second, stored.operations[-1].output
+        self._coefficients = None if stored.transmittance is None else Textures(stored.transmittance)
+
+    def level(self, sigma: Float) -> Float:
+        """Fractional level of footprints in tile widths."""
+        return dr.clip(-dr.log2(2.0 * sigma), 0.0, float(self.lattice.finest))
+
+    def stage1(self, u: Point2f, level: Float, omega_o: Vector3f) -> Values:
+        """Values that do not depend on the light, at uv positions for unit view vectors."""
+        return _run(self._first, {"u": list(u), "level": [level], "omega_o": list(omega_o)})
+
+    def stage2(self, values: Values, omega_i: Vector3f) -> Values:
+        """All values, from those of stage 1 and unit vectors towards the light."""
+        return _run(self._second, {**values, "omega_i": list(omega_i)})
+
+    def value(self, values: Values, omega_i: Vector3f) -> Color3f:
+        """The value in 1/sr, at least 0, of values of stage 1."""
+        return dr.maximum(mi.Color3f(*self.stage2(values, omega_i)[self._last]), 0.0)
+
+    def transmittance(self, u: Point2f, level: Float, omega_o: Vector3f) -> Float:
+        """Transparent fraction of the footprint for unit vectors on either side of the plane, equal for
+        opposite ones. The formula is that of :mod:`mbtf_fit.material.transmittance`."""
+        if self._coefficients is None:
+            return mi.Float(0.0)
+        x, y = (dr.mulsign(w, omega_o.z) for w in (omega_o.x, omega_o.y))
+        c = self._coefficients.blended(u, level)
+        found = c[0] + c[1] * x + c[2] * y + c[3] * x * x + c[4] * x * y + c[5] * y * y
+        return dr.clip(found, 0.0, 1.0)
+
+    def evaluate(self, u: ArrayLike, sigma: ArrayLike, omega_i: ArrayLike, omega_o: ArrayLike) -> F32:
+        """Evaluate arrays of queries like :meth:`mbtf_fit.Material.evaluate`.
+
+        Parameters
+        ----------
+        u : (n, 2) float array
+            Positions on the reference plane, uv; the tile repeats.
+        sigma : (n,) float array
+            Standard deviations of the footprints in tile widths.
+        omega_i, omega_o : (n, 3) float array
+            Unit vectors towards light and viewer, z > 0.
+
+        Returns
+        -------
+        (n, 3) float32 array
+            Values in 1/sr, linear RGB, at least 0.
+        """
+        position = mi.Point2f(np.asarray(u, np.float32).T)
+        lights, views = (mi.Vector3f(np.asarray(w, np.float32).T) for w in (omega_i, omega_o))
+        values = self.stage1(position, self.level(mi.Float(np.asarray(sigma, np.float32))), views)
+        out: F32 = np.array(self.value(values, lights), np.float32).T
+        return out
+
+
+def _run(steps: Sequence[tuple[Operation, Step]], values: Values) -> Values:
+    """`values`, and those that the steps of operations compute."""
+    for op, step in steps:
+        found = step(*(_argument(getattr(op, name), values) for name in op.value_fields()))
+        values.update(zip(output_names(op), found if isinstance(found, tuple) else (found,), strict=True))
+    return values
+
+
+def _argument(field: str | tuple[str, ...] | None, values: Values) -> Numbers | list[Numbers] | None:
+    """What an operation's field refers to: a value, or several."""
+    if field is None:
+        return None
+    if not isinstance(field, str):
+        return [_argument(reference, values) for reference in field]
+    name, part = parse(field)
+    return values[name][part]

@@ -1,0 +1,114 @@
+"""Small fully connected networks in Dr.Jit kernels (:mod:`mbtf_fit.ops.network`).
+
+- ``unrolled``: multiply-adds with the weights as literals of the kernel. Fastest on a CPU, for networks that
+  compile in reasonable time. The kernel is compiled for one material.
+- ``cooperative``: cooperative vectors of :mod:`drjit.nn` in single precision; one kernel for all materials.
+- ``half``: cooperative vectors in half precision, for the tensor cores of GPUs. The first layer is unrolled
+  in single precision, because rounded inputs would cause half of the error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+from drjit import nn
+
+from mbtf_fit import ops
+from mbtf_fit.backends.mitsuba.backend import MITSUBA, Arithmetic, Loader, Numbers, Step
+from mbtf_fit.backends.mitsuba.stored_material import F32, StoredMaterial
+from mbtf_fit.ops.constants import LEAK
+from mbtf_fit.ops.operation import parse, reached_from
+from mbtf_gen.engine.types import Float
+
+# (weight (outputs, inputs), bias (outputs,)) of each layer.
+Layers = list[tuple[F32, F32]]
+# Most weights of unrolled networks: larger ones take too long to compile.
+MOST_UNROLLED = 12_000
+
+
+def default_arithmetic(stored: StoredMaterial) -> Arithmetic:
+    """Default for the current variant and the number of a material's weights."""
+    if mi.variant().startswith("cuda"):
+        return "half"
+    prefixes = tuple(f"{op.weights}." for op in stored.operations if isinstance(op, ops.Network))
+    weights = sum(tensor.size for name, tensor in stored.tensors.items() if name.startswith(prefixes))
+    return "unrolled" if weights <= MOST_UNROLLED else "cooperative"
+
+
+@MITSUBA.implements(ops.Network)
+def _network(op: ops.Network, loader: Loader) -> Step:
+    take, layers, arithmetic = loader.stored.take, [], loader.arithmetic
+    for k, (inputs, outputs) in enumerate(pairwise(op.widths(sum(loader.inputs(op))))):
+        name = f"{op.weights}.{k}"
+        layers.append((take(f"{name}.weight", (outputs, inputs)), take(f"{name}.bias", (outputs,))))
+    # Single precision for small networks that move lookups: values are sensitive to errors of the position.
+    small = sum(weight.size + bias.size for weight, bias in layers) <= MOST_UNROLLED
+    if arithmetic == "half" and small and _moves_lookups(op, loader.stored.operations):
+        arithmetic = "unrolled"
+    network = Network(layers, arithmetic, op.activation)
+    return lambda x: network([number for value in x for number in value])
+
+
+def _moves_lookups(op: ops.Network, operations: Sequence[ops.Operation]) -> bool:
+    reached = reached_from(operations, op.output)
+    return any(isinstance(o, ops.Lookup) and parse(o.u)[0] in reached for o in operations)
+
+
+class Network:
+    """A fully connected network with an activation after every layer but the last.
+
+    Parameters
+    ----------
+    layers : weights and biases
+    arithmetic : ``unrolled``, ``cooperative`` or ``half``
+    activation : ``relu``, ``leaky-relu`` or ``sine``
+    """
+
+    def __init__(self, layers: Layers, arithmetic: Arithmetic, activation: str = "relu") -> None:
+        self.layers = layers
+        self.activation = activation
+        self.arithmetic = arithmetic
+        # Layers that are unrolled; the others are cooperative.
+        self._single = {"unrolled": len(layers), "cooperative": 0, "half": 1}[arithmetic]
+        rest = layers[self._single :]
+        if rest:
+            tensor = mi.TensorXf16 if arithmetic == "half" else mi.TensorXf
+            parts = [tensor(array) for weight, bias in rest for array in (weight, bias[:, None])]
+            self._views = nn.pack(*parts, layout="inference")
+
+    def __call__(self, inputs: Sequence[Float]) -> Numbers:
+        """Outputs of the last layer."""
+        x = self._unrolled(inputs)
+        return x if self._single == len(self.layers) else self._cooperative(x)
+
+    def _activated(self, x: Any) -> Any:
+        """Activation of a number per lane, or of a cooperative vector where it is ``relu``."""
+        if self.activation == "relu":
+            return dr.maximum(x, 0.0)
+        return dr.sin(x) if self.activation == "sine" else dr.maximum(x, LEAK * x)
+
+    def _unrolled(self, inputs: Sequence[Float]) -> Numbers:
+        x = list(inputs)
+        for k, (weight, bias) in enumerate(self.layers[: self._single]):
+            y = []
+            for row, b in zip(weight.tolist(), bias.tolist(), strict=True):
+                total = mi.Float(b)
+                for value, w in zip(x, row, strict=True):
+                    total = dr.fma(value, w, total)
+                y.append(total if k == len(self.layers) - 1 else self._activated(total))
+            x = y
+        return x
+
+    def _cooperative(self, inputs: Sequence[Float]) -> Numbers:
+        number = mi.Float16 if self.arithmetic == "half" else mi.Float
+        x = nn.CoopVec(*(number(value) for value in inputs))
+        count = len(self.layers) - self._single
+        for k in range(count):
+            x = nn.matvec(self._views[2 * k], x, self._views[2 * k + 1])
+            if k < count - 1:
+                x = self._activated(x) if self.activation == "relu" else nn.CoopVec(*map(self._activated, x))
+        return [mi.Float(value) for value in x]
