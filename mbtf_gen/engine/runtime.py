@@ -94,8 +94,9 @@ def limit_threads() -> None:
 def refuse_old_llvm() -> None:
     """Refuse to run with an LLVM that is too old: some kernel would abort the process.
 
-    Dr.Jit has bound to such an LLVM where a program imports ``mitsuba`` or ``drjit`` before :func:`load_mitsuba`
-    or ``mbtf_fit.backends.mitsuba.register("llvm_ad_rgb")`` and the system's LLVM is old.
+    Dr.Jit has bound to such an LLVM where a program imports ``mitsuba`` or ``drjit`` before
+    :func:`load_mitsuba` or ``mbtf_fit.backends.mitsuba.register("llvm_ad_rgb")``, and the system's LLVM is
+    old.
 
     Raises
     ------

@@ -74,6 +74,7 @@ mbtf_fit.material
 mbtf_fit.evaluation
 mbtf_fit.training
 mbtf_fit.backends.mitsuba
+mbtf_fit.preview
 mbtf_fit.viewer
 mbtf_fit.shaders
 mbtf_fit.cli
@@ -103,6 +104,7 @@ FORBIDDEN = {
     "mbtf_gen": {"torch"},
     "mbtf_fit": {"mitsuba", "drjit", "mbtf_gen"},
     "mbtf_fit.backends.mitsuba": {"torch", "trimesh"},
+    "mbtf_fit.preview": {"torch", "trimesh"},
     "mbtf_pipeline": set(),
 }
 
