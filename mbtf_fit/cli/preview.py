@@ -8,11 +8,11 @@ from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.options import Options, Output, Overwrite, PathText, Switch, options_from
 from mbtf_core.errors import UsageError
 from mbtf_core.files.folders import owned
-from mbtf_fit.preview.config import PreviewConfig
+from mbtf_fit.preview.config import MaterialPreviewConfig
 
 
-@options_from(PreviewConfig)
-class MaterialPreviewOptions(Options[PreviewConfig]):
+@options_from(MaterialPreviewConfig)
+class MaterialPreviewOptions(Options[MaterialPreviewConfig]):
     """Options of ``mbtf-fit preview``."""
 
 

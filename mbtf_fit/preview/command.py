@@ -9,13 +9,19 @@ from mbtf_core.app.console import Console
 from mbtf_core.run.signals import keep_on_interruption
 
 if TYPE_CHECKING:
-    from mbtf_fit.preview.config import PreviewConfig
+    from mbtf_fit.preview.config import MaterialPreviewConfig
 
 SHEET_NAME, GIF_NAME, MP4_NAME = "sheet.png", "turntable.gif", "turntable.mp4"
 
 
 def draw(
-    config: PreviewConfig, path: Path, *, sheet_only: bool, mp4: bool, overwrite: bool, console: Console
+    config: MaterialPreviewConfig,
+    path: Path,
+    *,
+    sheet_only: bool,
+    mp4: bool,
+    overwrite: bool,
+    console: Console,
 ) -> None:
     """Draw the pictures that are missing and report them, in a folder that this process owns.
 

@@ -75,7 +75,7 @@ class TurntableSection(Settings):
     )
 
 
-class PreviewConfig(Settings):
+class MaterialPreviewConfig(Settings):
     """Every option of ``mbtf-fit preview``."""
 
     material: str = Field(description="folder made by mbtf-fit")

@@ -247,6 +247,5 @@ def public_classes() -> dict[str, list[str]]:
     return found
 
 
-@pytest.mark.xfail(strict=True, reason="about fifteen names are double")
 def test_no_two_public_classes_share_a_name() -> None:
     assert {name: where for name, where in public_classes().items() if len(where) > 1} == {}

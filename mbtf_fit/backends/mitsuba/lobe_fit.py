@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from mbtf_fit.backends.mitsuba.evaluator import Evaluator
-from mbtf_fit.backends.mitsuba.lobes import BANDS, CHANNELS, Lobe, Mixture, band_of, mixture_of
+from mbtf_fit.backends.mitsuba.lobes import BANDS, CHANNELS, Mixture, SlopeLobe, band_of, mixture_of
 from mbtf_fit.backends.mitsuba.stored_material import F32
 from mbtf_gen.engine.types import Float, UInt32, Vector3f
 
@@ -69,7 +69,7 @@ def _fit_texels(evaluator: Evaluator, level: int, first: int, count: int) -> F32
     viewer.z = dr.maximum(viewer.z, 0.02)
     viewer = dr.normalize(viewer)
     alpha, none = mi.Float(FIRST_ALPHA), mi.Float(0.0)
-    start = Mixture(Lobe(alpha, none, alpha, none, none), mi.Float(FIRST_WEIGHT), viewer)
+    start = Mixture(SlopeLobe(alpha, none, alpha, none, none), mi.Float(FIRST_WEIGHT), viewer)
     choice = random.next_float32()
     light = start.sample(choice, mi.Point2f(random.next_float32(), random.next_float32()))
     above = light.z > 1e-3

@@ -35,7 +35,7 @@ def band_of(cosine: Float) -> UInt32:
 
 
 @dataclass(frozen=True)
-class Lobe:
+class SlopeLobe:
     """Reflection at a distribution of slopes: lower triangle of L, and s0."""
 
     l11: Float
@@ -90,7 +90,7 @@ class Lobe:
 class Mixture:
     """The density for one view: the lobe with a weight, else cosine-weighted."""
 
-    lobe: Lobe
+    lobe: SlopeLobe
     weight: Float
     viewer: Vector3f
 
@@ -98,7 +98,7 @@ class Mixture:
     def cosine(cls, viewer: Vector3f) -> Mixture:
         """The cosine-weighted hemisphere alone."""
         one, none = mi.Float(1.0), mi.Float(0.0)
-        return cls(Lobe(one, none, one, none, none), none, viewer)
+        return cls(SlopeLobe(one, none, one, none, none), none, viewer)
 
     def density(self, light: Vector3f) -> Float:
         """In 1/sr; 0 below the surface."""
@@ -130,4 +130,4 @@ def mixture_of(buffer: Float, texel: UInt32, viewer: Vector3f) -> Mixture:
     y, *weights = dr.gather(mi.Vector4f, buffer, 2 * texel + 1)
     band = band_of(viewer.z)
     weight = dr.select(band == 0, weights[0], dr.select(band == 1, weights[1], weights[2]))
-    return Mixture(Lobe(l11, l21, l22, x, y), weight, viewer)
+    return Mixture(SlopeLobe(l11, l21, l22, x, y), weight, viewer)

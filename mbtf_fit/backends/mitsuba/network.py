@@ -49,7 +49,7 @@ def _network(op: ops.Network, loader: Loader) -> Step:
     small = sum(weight.size + bias.size for weight, bias in layers) <= MOST_UNROLLED
     if arithmetic == "half" and small and _moves_lookups(op, loader.stored.operations):
         arithmetic = "unrolled"
-    network = Network(layers, arithmetic, op.activation)
+    network = PackedNetwork(layers, arithmetic, op.activation)
     return lambda x: network([number for value in x for number in value])
 
 
@@ -58,7 +58,7 @@ def _moves_lookups(op: ops.Network, operations: Sequence[ops.Operation]) -> bool
     return any(isinstance(o, ops.Lookup) and parse(o.u)[0] in reached for o in operations)
 
 
-class Network:
+class PackedNetwork:
     """A fully connected network with an activation after every layer but the last.
 
     Parameters

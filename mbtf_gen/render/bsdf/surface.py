@@ -67,7 +67,7 @@ def _tables(kind: Any, variant: str) -> Any:
 
 
 @dataclass(frozen=True)
-class Lobe:
+class GgxLobe:
     """A GGX lobe: roughness √α, reflectances F0 and F90, energy tables, and their (L, B) for the viewer."""
 
     roughness: Float
@@ -205,7 +205,7 @@ class SurfacePoint:
         m = self.metallic
         normal = dr.lerp(mi.Color3f(dielectric), self.base, m)
         grazing = dr.lerp(mi.Color3f(edge), grazing_reflectance(self.base), m)
-        self.lobe = Lobe(roughness, normal, grazing, self.tables, pair)
+        self.lobe = GgxLobe(roughness, normal, grazing, self.tables, pair)
         # Energy that the dielectric's lobe does not reflect: 1 - E(μi) and 1 - Ē.
         self.dielectric, self.edge = dielectric, edge
         self.transmitted = 1.0 - (dielectric * (1.0 - pair[0] - pair[1]) + edge * pair[1])
@@ -223,7 +223,7 @@ class SurfacePoint:
         pair = self.tables.at(self.wi.z, roughness)
         self.clearcoat_weight = maps["clearcoat"].eval_1(si)
         normal, grazing = mi.Color3f(CLEARCOAT_REFLECTANCE), mi.Color3f(1.0)
-        self.clearcoat = Lobe(roughness, normal, grazing, self.tables, pair)
+        self.clearcoat = GgxLobe(roughness, normal, grazing, self.tables, pair)
 
     def _sheen(self, maps: dict[str, Texture], si: SurfaceInteraction3f) -> None:
         self.sheen_roughness = dr.clip(maps["sheen_roughness"].eval_1(si), 0.0, 1.0)

@@ -18,7 +18,7 @@ from support.scenes import mi
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.stats import Estimate, t_test
 from mbtf_fit.backends.mitsuba.lobe_fit import fit_lobes
-from mbtf_fit.backends.mitsuba.lobes import Lobe, LobeTextures, Mixture
+from mbtf_fit.backends.mitsuba.lobes import LobeTextures, Mixture, SlopeLobe
 
 COUNT = 32
 
@@ -29,7 +29,7 @@ def random_mixture(random: np.random.Generator, viewer: np.ndarray, width: int) 
     l21, x, y = random.normal(0, 0.3, 3)
     lanes = [mi.Float(np.full(width, v, np.float32)) for v in (l11, l21, l22, x, y)]
     view = mi.Vector3f(*(mi.Float(np.full(width, v, np.float32)) for v in viewer))
-    return Mixture(Lobe(*lanes), mi.Float(float(random.uniform(0, 0.9))), view)
+    return Mixture(SlopeLobe(*lanes), mi.Float(float(random.uniform(0, 0.9))), view)
 
 
 def uniform(n: int, seed: int) -> tuple[Any, Any]:
@@ -48,7 +48,7 @@ def p_value(seed: int, distort: float = 1.0) -> float:
 
     sampled = mixture(n)
     lobe = sampled.lobe
-    wrong = Lobe(lobe.l11 * distort, lobe.l21, lobe.l22, lobe.x, lobe.y)
+    wrong = SlopeLobe(lobe.l11 * distort, lobe.l21, lobe.l22, lobe.x, lobe.y)
     wo = np.array(Mixture(wrong, sampled.weight, sampled.viewer).sample(*uniform(n, seed))).T
 
     def density(w: np.ndarray) -> np.ndarray:
@@ -73,8 +73,8 @@ class Glossy:
     lattice = Lattice(1)
     alphas, tilt, base = (0.1, 0.25), (0.2, -0.1), 0.05
 
-    def lobe(self) -> Lobe:
-        return Lobe(*(mi.Float(v) for v in (self.alphas[0], 0.0, self.alphas[1], *self.tilt)))
+    def lobe(self) -> SlopeLobe:
+        return SlopeLobe(*(mi.Float(v) for v in (self.alphas[0], 0.0, self.alphas[1], *self.tilt)))
 
     def stage1(self, u: Any, level: Any, viewer: Any) -> Any:
         return viewer

@@ -175,7 +175,7 @@ def test_half_precision_does_not_round_inputs() -> None:
     """A difference of 2⁻¹², which half precision cannot hold beside 1, is seen by the first layer."""
     one = np.ones((1, 1), np.float32)
     layers = [(one, np.full(1, -1.0, np.float32)), (4096 * one, np.zeros(1, np.float32))]
-    (found,) = network.Network(layers, "half")([mi.Float(1.0 + 2.0**-12)])
+    (found,) = network.PackedNetwork(layers, "half")([mi.Float(1.0 + 2.0**-12)])
     assert found[0] == 1.0
 
 

@@ -21,7 +21,7 @@ from mbtf_core.directions import from_angles
 from mbtf_core.errors import EngineError
 from mbtf_core.exposure import to_display
 from mbtf_core.pictures.camera import Camera
-from mbtf_fit.preview.config import PreviewConfig, SheetSection, TurntableSection
+from mbtf_fit.preview.config import MaterialPreviewConfig, SheetSection, TurntableSection
 from mbtf_gen.config.pictures import Direction
 
 mbtf_fit.backends.mitsuba.register()
@@ -171,7 +171,9 @@ def test_a_video_needs_an_encoder(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 def test_view_and_light_replace_those_of_the_sheet() -> None:
     """Spelled as in ``mbtf-gen reference``."""
-    config = resolve(PreviewConfig, flags={"material": "m", "sheet.view": "60,-90", "sheet.light": "45,30"})
+    config = resolve(
+        MaterialPreviewConfig, flags={"material": "m", "sheet.view": "60,-90", "sheet.light": "45,30"}
+    )
     assert config.sheet.cameras == [Direction(elevation=60, azimuth=-90)]
     assert config.sheet.lamps == [Direction(elevation=45, azimuth=30)]
 
