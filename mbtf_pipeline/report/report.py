@@ -25,7 +25,7 @@ from mbtf_pipeline.report.times import provenance, read_training, time_context, 
 from mbtf_pipeline.run_folder import COMPARE, FITS, REPORT, RUN_NAME, SHARDS
 
 # Raised when the report or the viewer's page changes; part of the stage's key.
-LAYOUT = 10
+LAYOUT = 11
 
 _TABLE = """
 {%- set below = t.head[-1] == "command" %}
