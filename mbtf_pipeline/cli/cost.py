@@ -26,8 +26,8 @@ def cost(
 ) -> None:
     """Measure error against time for this material and machine: mbtf-pipeline cost RECIPE
 
-    Writes cost.html, cost.csv and PNGs. The same command resumes. A longer time keeps the measurements of the
-    generator and of complete runs, and adds longer runs. With --cluster, workers measure, each for itself.
+    Writes cost.html, cost.csv and PNGs. The same command resumes. A longer time keeps all measurements and
+    adds longer runs. With --cluster, workers measure, each for itself.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def cost(
     from mbtf_core.run.cluster import open_runner
     from mbtf_core.run.signals import keep_on_interruption
     from mbtf_core.units import asked_duration, format_duration
-    from mbtf_pipeline.cost.cost_page import whole_runs, write_page
+    from mbtf_pipeline.cost.cost_page import complete_runs, write_page
     from mbtf_pipeline.cost.pareto import pareto_front
     from mbtf_pipeline.cost.study import run_study, time_of
     from mbtf_pipeline.library.entries import is_library_recipe
@@ -82,7 +82,7 @@ def cost(
     with owned(folder):
         page = write_page(study)
     measured = len(study.measurements)
-    front = pareto_front(whole_runs(study.measurements))
+    front = pareto_front(complete_runs(study.measurements))
     lines = [f"{page}: {measured} configurations measured, {len(study.skipped)} skipped for lack of time"]
     lines += [f"failed: {text}" for text in study.failed]
     lines += [f"  {m.seconds.value:.0f} s: unexplained variance {m.error}   {m.command}" for m in front]

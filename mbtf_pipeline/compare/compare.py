@@ -15,9 +15,7 @@ from mbtf_core.directions import from_angles
 from mbtf_core.errors import PartialError
 from mbtf_core.exposure import auto_exposure, brightness, white_of
 from mbtf_core.files.atomic import write_json
-from mbtf_core.stats import Estimate
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_pipeline.compare.contrast import contrast, picture_blocks
 from mbtf_pipeline.compare.dataset_errors import dataset_errors
 from mbtf_pipeline.compare.image_files import (
     PICTURES,
@@ -44,7 +42,7 @@ if TYPE_CHECKING:
 COMPARISON_NAME = "comparison.json"
 COMPARISON_FORMAT = "mbtf-comparison"
 # Raised when the record or its files change; part of the stage's key.
-COMPARISON_SCHEMA = 10
+COMPARISON_SCHEMA = 11
 
 F32 = NDArray[np.float32]
 Progress = Callable[[str], None]
@@ -221,10 +219,6 @@ def _compare_scene(
             "file": file,
             "seconds": round(seconds, 4),
             "errors": {kind: {key: e.as_dict() for key, e in of.items()} for kind, of in errors.items()},
-            "contrast": {
-                kind: {key: e and e.as_dict() for key, e in _contrast(value, image).items()}
-                for kind, image in images.items()
-            },
             **scores,
         }
         if first is None:
@@ -234,8 +228,3 @@ def _compare_scene(
             record["fits"][name]["mse_minus_first"] = difference.as_dict()
         progress(f"{name} {scene.name}")
     return record
-
-
-def _contrast(value: F32, image: ReferenceImage) -> dict[str, Estimate | None]:
-    p, a, b = (x.reshape(-1, 3) for x in (value, image.value_a, image.value_b))
-    return contrast(p, a, b, picture_blocks(*value.shape[:2]))

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbtf_core.stats import Estimate, mean_estimate, noise_free_mse, psnr
-from mbtf_pipeline.compare.contrast import DEFINITION as CONTRAST_DEFINITION
 from mbtf_pipeline.compare.perceptual_metrics import FLIP_DEFINITION, SSIM_DEFINITION
 from mbtf_pipeline.compare.st_lpips import DEFINITION as ST_LPIPS_DEFINITION
 
@@ -29,7 +28,6 @@ DEFINITIONS: dict[str, str] = {
     "flip": FLIP_DEFINITION,
     "ssim": SSIM_DEFINITION,
     "st_lpips": ST_LPIPS_DEFINITION,
-    "contrast": CONTRAST_DEFINITION,
     "error_bar": "one standard error, over pixels of an image or queries of a data set. A value within "
     "two standard errors of zero is marked as not significant.",
 }

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,14 +11,12 @@ from mbtf_core.files.atomic import write_json, write_text
 from mbtf_core.stats import Estimate
 from mbtf_core.units import clock
 from mbtf_pipeline.cost.figures import (
-    ERROR_AXIS,
     NOISE_AXIS,
     TIME_AXIS,
     Figures,
     bias_figures,
     front_figures,
     lines,
-    model_figures,
 )
 from mbtf_pipeline.cost.measurements import ESTIMATES, Measurement
 from mbtf_pipeline.cost.pareto import extrapolation, pareto_front
@@ -104,20 +101,6 @@ class _Section(NamedTuple):
 
 
 _SECTIONS = {
-    "data": _Section(
-        "Queries or paths?",
-        "Training data of equal total paths, divided among many noisy or few clean queries. Every fit trains "
-        "equally long.",
-        lines("seconds of generating", ERROR_AXIS),
-        _RUNS,
-    ),
-    "models": _Section(
-        "Models and sizes",
-        "Models and network sizes trained on one data set: error over training time and over the time of an "
-        "evaluation.",
-        model_figures,
-        _RUNS,
-    ),
     "paths": _Section(
         "Paths per query",
         "More paths reduce the noise and leave no bias. Queries get equally many paths, more where a pilot "
@@ -146,20 +129,15 @@ def _table(columns: Sequence[Column], found: Sequence[Measurement]) -> dict[str,
     return Table("", "", "", columns, rows_of(columns, ([m] for m in found))).for_page()
 
 
-def whole_runs(found: Sequence[Measurement]) -> list[Measurement]:
-    """The runs of all comparisons, by their total time."""
-    return [
-        replace(m, seconds=Estimate(m.details["total_seconds"], 0.0, 1))
-        for m in found
-        if "total_seconds" in m.details
-    ]
+def complete_runs(found: Sequence[Measurement]) -> list[Measurement]:
+    """The runs from height map to material, among measurements of all kinds."""
+    return [m for m in found if m.study == "whole"]
 
 
 def _sections(study: Study) -> list[dict[str, Any]]:
-    runs = whole_runs(study.measurements)
+    runs = complete_runs(study.measurements)
     front = pareto_front(runs)
-    columns = [_of("run", lambda m: m.label), *_RUNS[1:]]
-    front_section = _Section("All runs", _front_text(front), front_figures, columns)
+    front_section = _Section("All runs", _front_text(front), front_figures, _RUNS)
     shown = {name: [m for m in study.measurements if m.study == name] for name in _SECTIONS}
     shown["front"] = runs
     return [

@@ -1,8 +1,7 @@
 """Measurements of a cost study on the workers of a cluster: a task is one configuration, with one seed.
 
 A worker generates data and fits as a process of its own would, and measures the time itself, so that all
-figures are of the workers' machine and threads. It keeps the test sets and the last data
-set for its next run.
+figures are of the workers' machine and threads. It keeps the test sets for its next run.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.cost.generator_runs import GeneratorTask
 from mbtf_pipeline.cost.measurements import Measurement
 from mbtf_pipeline.cost.repeats import FEWEST_SEEDS
-from mbtf_pipeline.cost.runs import DataRequest, Run, RunRunner, forecast_seconds
+from mbtf_pipeline.cost.runs import Run, RunRunner, forecast_seconds
 from mbtf_pipeline.run_folder import machine
 
 _RESUMES = "the same command resumes"
@@ -128,9 +127,6 @@ class ClusterRunner(RunRunner):
             self._tests, self.test_seconds = FEWEST_SEEDS * self._workers, queries * spp * self.path_seconds
         return self._workers * seconds - self._tests * self.test_seconds - sum(self._taken.values())
 
-    def forget(self, request: DataRequest) -> None:
-        """Nothing: each worker removes its data itself."""
-
     def measure_all(self, runs: Iterable[tuple[int, Run]]) -> Iterator[tuple[int, Run, Measurement | str]]:
         """As of the base class; a run is taken once a worker is nearly free."""
         by_name: dict[str, tuple[int, Run]] = {}
@@ -197,7 +193,6 @@ def measure_run(
         The disk is full.
     """
     runner = _runner(config.model_dump_json(), folder, command, test)
-    runner.keep_only(run.data)
     known = run.data.seed in runner.test_sets
     found = runner.measure(run)
     seconds = None if known else runner.test_seconds

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.stats import Estimate
-from mbtf_pipeline.cost.fit_runs import PRESET
-from mbtf_pipeline.cost.measurements import COMPARISONS, Measurement
+from mbtf_pipeline.cost.measurements import Measurement
 from mbtf_pipeline.cost.pareto import pareto_front
 from mbtf_pipeline.number_text import is_significant
 from mbtf_pipeline.report.plots import Cloud, scatter
@@ -80,44 +79,15 @@ def bias_figures(found: Sequence[Measurement], png: Path) -> list[dict[str, Any]
     return [_figure(clouds, TIME_AXIS, NOISE_AXIS, png, caption if unbiased else "")]
 
 
-def model_figures(found: Sequence[Measurement], png: Path) -> list[dict[str, Any]]:
-    """Error over seconds of training, and over milliseconds of evaluation."""
-    longest = {m.series: m for m in sorted(found, key=lambda m: m.seconds.value)}
-    evaluated = _by_series(
-        list(longest.values()),
-        x=lambda m: Estimate(m.details["evaluation_ms_1080p"], 0.0, 1),
-        label=lambda m: m.series.removeprefix("neumip, "),
-        joined=False,
-    )
-    axis = "milliseconds for a 1080p image, one query per pixel"
-    second = png.with_name(f"{png.stem}_evaluation.png")
-    return [
-        _figure(_by_series(found), "seconds of training", ERROR_AXIS, png),
-        _figure(evaluated, axis, ERROR_AXIS, second, "The longest training of each."),
-    ]
-
-
-def run_name(m: Measurement) -> str:
-    """Queries × paths, and the model where it is not that of the presets."""
-    name = f"{m.details['queries'] / 1e6:.2g} M × {m.details['spp']:g}"
-    if m.study != "models" or m.series == PRESET:
-        return name
-    return f"{name}, {m.series.partition(', ')[2] or f'{m.series} of its paper'}"
-
-
 def front_figures(runs: Sequence[Measurement], png: Path) -> list[dict[str, Any]]:
-    """All runs and their Pareto front, whose points have names."""
+    """All runs and their Pareto front, whose points have names: training queries × paths per query."""
     front = pareto_front(runs)
-    clouds = [
-        _cloud(
-            COMPARISONS[study],
-            [m for m in runs if m.study == study],
-            label=lambda m: run_name(m) if m in front else "",
-            joined=False,
-        )
-        for study in dict.fromkeys(m.study for m in runs)
-    ]
+
+    def name(m: Measurement) -> str:
+        return f"{m.details['queries'] / 1e6:.2g} M × {m.details['spp']:g}" if m in front else ""
+
+    cloud = _cloud("complete runs", runs, label=name, joined=False)
     axis = "seconds in total, from height map to material"
-    caption = "Names on the front: training queries × paths per query, and models other than the preset's."
+    caption = "Names on the front: training queries × paths per query."
     points = [(m.seconds.value, m.error.value) for m in front]
-    return [_figure(clouds, axis, ERROR_AXIS, png, caption, front=points)]
+    return [_figure([cloud], axis, ERROR_AXIS, png, caption, front=points)]

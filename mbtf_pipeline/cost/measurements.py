@@ -21,8 +21,6 @@ NORMAL = 1.96
 # The comparisons of a study, in words.
 COMPARISONS = {
     "whole": "complete run",
-    "models": "models and sizes",
-    "data": "queries or paths",
     "paths": "paths per query",
     "effects": "effects",
     "mesh": "mesh",
@@ -63,8 +61,8 @@ class Measurement(Configuration):
     Attributes
     ----------
     command : reproduces it with the programs
-    seconds : its time: per million queries for the generator; of generating in ``data``, of training in
-        ``models``, of both with everything around them in ``whole``
+    seconds : its time: per million queries for the generator; of generating, training and everything
+        around them for a run
     error : relative RMS error of the generator's values, or unexplained variance of a fit
     bias, noise : the two parts of the generator's error; error² = bias² + noise²
     details : further numbers by name: generation and training seconds, bytes, milliseconds

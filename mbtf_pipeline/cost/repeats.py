@@ -71,7 +71,7 @@ def measure_runs(
     def missing(order: Sequence[tuple[int, int]], deviation: Estimate | None) -> Iterator[tuple[int, Run]]:
         """Runs to be measured; each is chosen when the runner takes it."""
         tasks = [(k, replace(runs[k], data=replace(runs[k].data, seed=seed))) for k, seed in order]
-        for number, (k, task) in enumerate(tasks):
+        for k, task in tasks:
             seed = task.data.seed
             if seed == 0 or (k, seed - 1) in begun:
                 stored = store.get(task, runner.command_of(runs[k]))
@@ -81,8 +81,6 @@ def measure_runs(
                 elif k not in failed and (seed < FEWEST_SEEDS or too_wide(k, seed, deviation)) and fits(task):
                     begun.add((k, seed))
                     yield k, task
-            if all(other.data != task.data for _, other in tasks[number + 1 :]):
-                runner.forget(task.data)
 
     def too_wide(k: int, seed: int, deviation: Estimate | None) -> bool:
         own = group(k)

@@ -41,8 +41,6 @@ _TIMED = 5
 _OVERHEAD = 2.0
 # Seconds of a query at least: that of a closed form, written to disk.
 _CHEAPEST = 1e-8
-# The time that each study reports, by name of the detail.
-_SECONDS = {"data": "generation_seconds", "models": "training_seconds", "whole": "total_seconds"}
 
 
 @dataclass(frozen=True)
@@ -74,7 +72,7 @@ class Run(Configuration):
 
 @dataclass
 class RunRunner:
-    """Generates data and fits models in a working folder, and keeps data that several runs share."""
+    """Generates data and fits models in a working folder."""
 
     config: GeneratorConfig
     folder: Path
@@ -87,8 +85,6 @@ class RunRunner:
     path_seconds: float = 0.0
     # Seconds by which a run exceeds generating and training: the most of all so far, or a guess.
     overhead: float = _OVERHEAD
-    # Folder and seconds by request.
-    _data: dict[DataRequest, tuple[Path, float]] = field(default_factory=dict)
     # By seed.
     test_sets: dict[int, ShardQueries] = field(default_factory=dict)
     test_seconds: float = 0.0
@@ -113,37 +109,19 @@ class RunRunner:
         generate(job, folder)
         return folder, time.perf_counter() - start
 
-    def data(self, request: DataRequest) -> tuple[Path, float]:
-        """Folder of training data, generated where they are missing, and the seconds that this took."""
-        if request not in self._data:
-            self.progress(f"{request.queries / 1e6:.2f} M queries of {request.spp} paths")
-            train = (request.queries, request.spp)
-            self._data[request] = self._generate(request.seed, train, _NO_QUERIES)
-        return self._data[request]
-
-    def forget(self, request: DataRequest) -> None:
-        """Remove training data that no other run needs."""
-        if request in self._data:
-            shutil.rmtree(self._data.pop(request)[0], ignore_errors=True)
-
-    def keep_only(self, request: DataRequest) -> None:
-        """Remove all training data but these."""
-        for other in [known for known in self._data if known != request]:
-            self.forget(other)
-
     def work_left(self, seconds: float) -> float:
         """Seconds of work that can be done in a time."""
         return seconds
 
     def expected_seconds(self, run: Run) -> float:
-        """Expected time of measuring a run; existing data take none."""
+        """Expected time of measuring a run."""
         test = 0.0 if run.data.seed in self.test_sets else self.test_seconds
         return test + self.planned_seconds(run) + self.overhead
 
     def planned_seconds(self, run: Run) -> float:
-        paths = 0 if run.data in self._data else run.data.queries * run.data.spp
-        training = run.fit["training"].get("time")
-        return paths * self.path_seconds + (parse_duration(training) if training else 0.0)
+        """Seconds of generating and training."""
+        generating = run.data.queries * run.data.spp * self.path_seconds
+        return generating + parse_duration(run.fit["training"]["time"])
 
     def test_set(self, seed: int) -> ShardQueries:
         """The test queries of all runs with an offset of the seed."""
@@ -166,8 +144,9 @@ class RunRunner:
 
         test = self.test_set(run.data.seed)
         start, planned = time.perf_counter(), self.planned_seconds(run)
-        folder, generation_seconds = self.data(run.data)
         self.progress(run.label)
+        train = (run.data.queries, run.data.spp)
+        folder, generation_seconds = self._generate(run.data.seed, train, _NO_QUERIES)
         config = FitConfig.model_validate({"seed": self.config.seed + run.data.seed, **run.fit})
         out = self.folder / f"fit-{data_sha256(run.key)[:12]}"
         shutil.rmtree(out, ignore_errors=True)
@@ -182,9 +161,10 @@ class RunRunner:
             "evaluation_ms_1080p": 1e3 * _evaluation_seconds(result.material, test),
             "bytes": float(sum(p.stat().st_size for p in out.glob("weights*"))),
         }
-        shutil.rmtree(out, ignore_errors=True)
+        for used in (folder, out):
+            shutil.rmtree(used, ignore_errors=True)
         self.overhead = max(self.overhead, time.perf_counter() - start - planned)
-        seconds = Estimate(details[_SECONDS[run.study]], 0.0, 1)
+        seconds = Estimate(details["total_seconds"], 0.0, 1)
         command = self.command_of(run)
         return Measurement(run.study, run.series, run.name, command, seconds, error, details=details)
 

@@ -20,7 +20,7 @@ from mbtf_core.units import expectation
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
 from mbtf_pipeline.cost.distribute import ClusterRunner, measure_configurations, worker_facts
-from mbtf_pipeline.cost.fit_runs import GENERATOR, RUN_SHARES, planned_runs
+from mbtf_pipeline.cost.fit_runs import GENERATOR, planned_runs
 from mbtf_pipeline.cost.generator_benchmark import GeneratorBenchmark
 from mbtf_pipeline.cost.generator_runs import GeneratorTask, generator_tasks
 from mbtf_pipeline.cost.measurements import Measurement, MeasurementFolder
@@ -227,26 +227,19 @@ def _seconds_file(store: MeasurementFolder) -> Path:
 
 
 def disk_bytes(runs: Sequence[Run]) -> int:
-    """Disk space that runs take at most: the test set, and data of two seeds."""
+    """Disk space that runs take at most: the test set, and data of one seed."""
     most = max((run.data.queries for run in runs), default=0)
-    return (TEST[0] + 2 * most) * row_bytes(holes=True)
+    return (TEST[0] + most) * row_bytes(holes=True)
 
 
 def _measure_runs(
     study: Study, store: MeasurementFolder, runner: RunRunner, left: Callable[[bool], float], seeds: int
 ) -> None:
     """Measure runs in the remaining time, which is longer for repeats than for others."""
-    start = left(False)
     runs = planned_runs(study.description["time"], runner.config.queries.spp, runner.path_seconds)
-    # On a machine slower than planned, every comparison keeps its share of the time.
-    studies, shares = list(RUN_SHARES), list(RUN_SHARES.values())
-    reached = 0
 
     def fits(run: Run) -> bool:
-        nonlocal reached
-        reached = max(reached, studies.index(run.study))
-        reserved = start * sum(shares[reached + 1 :]) / sum(shares)
-        return left(run.data.seed > 0) - reserved > runner.expected_seconds(run)
+        return left(run.data.seed > 0) > runner.expected_seconds(run)
 
     groups, failed = measure_runs(runs, store, runner, fits, seeds)
     study.deviation = seed_deviation(groups)

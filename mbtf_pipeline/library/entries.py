@@ -40,10 +40,8 @@ class LibraryRecipe(Settings):
         description="options of all runs; without `fit`, the model that is best for each material"
     )
     training: Duration | None = Field(
-        None, description="training time of all fits together, more for larger errors; default: their own"
-    )
-    first_share: float = Field(
-        0.2, gt=0, lt=1, description="share of `training` for equal first fits, whose errors divide the rest"
+        None,
+        description="training time of each material, shared equally by its fits; default: theirs",
     )
     shared_network: Duration | None = Field(
         None, description="training time of further fits that share one network; default: none"
@@ -97,7 +95,7 @@ def load_library_recipe(path: Path, assignments: list[str]) -> LibraryRecipe:
     InputError
         The file cannot be read, or contains an unknown key or an invalid value, also in its options of runs.
     UsageError
-        An assignment is invalid, or there is one training time of all fits and one of each.
+        An assignment is invalid, or there is a training time of every material and one of a fit.
     """
     library = resolve(LibraryRecipe, file=path, assignments=assignments)
     if library.training is not None:
@@ -112,7 +110,7 @@ def load_library_recipe(path: Path, assignments: list[str]) -> LibraryRecipe:
 
 
 def _refuse_own_times(library: LibraryRecipe) -> None:
-    """Refuse training times of single fits beside one of all fits."""
+    """Refuse training times of single fits beside one of every material."""
     layers = {"base": library.base, **{f"materials.{name}": one for name, one in library.materials.items()}}
     for where, layer in layers.items():
         fits = {"each_fit": layer.each_fit, **{f"fit.{name}": fit for name, fit in layer.fit.items()}}
@@ -121,7 +119,7 @@ def _refuse_own_times(library: LibraryRecipe) -> None:
             for key in ("time", "steps"):
                 if isinstance(training, Mapping) and training.get(key) is not None:
                     hint = "leave out one of them"
-                    what = "is a time of its own beside 'training', the time of all fits"
+                    what = "is a time of its own beside 'training', the time of each material"
                     raise UsageError(what, where=f"{where}.{fit}.training.{key}", hint=hint)
 
 

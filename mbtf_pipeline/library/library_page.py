@@ -39,18 +39,14 @@ def library_page(record: Mapping[str, Any], runs: Path) -> str:
     spent: Counter[str] = Counter()
     for material in record["materials"]:
         spent.update(material.get("seconds", {}) if material["state"] == "done" else {})
-    shared, total = record["shared"], record["training"]
-    if "each" in record["division"]:
-        # Further materials bring a share of their own.
-        total = record["division"]["each"] * len(cards)
+    shared, training = record["shared"], record["training"]
     return render(
         "library.html",
         record=record,
         # The largest errors first: they are what one looks for. Then failures, then the rest.
         cards=sorted(cards, key=lambda c: (c["rank"], -c["error_value"], c["name"])),
         counts=counts,
-        training=None if total is None else clock(total),
-        divided=bool(record["division"].get("times")),
+        training=None if training is None else clock(training),
         spent=_times(spent),
         shared_error=shared.get("error", ""),
         shared_training=clock(shared["training"]) if shared else None,
@@ -80,8 +76,6 @@ def _card(material: Mapping[str, Any], run: Path, record: Mapping[str, Any]) -> 
         for title, file in (("report", REPORT), ("viewer", VIEWER))
         if done and (run / file).is_file()
     ]
-    division = record["division"]
-    first = division.get("errors", {}).get(name, {"error": None})["error"]
     return {
         "name": name,
         "path": material["path"],
@@ -93,8 +87,6 @@ def _card(material: Mapping[str, Any], run: Path, record: Mapping[str, Any]) -> 
         "reference": _thumbnail(run / material["reference"]) if done else None,
         "seconds": sum(seconds.values()),
         "times": _times(seconds),
-        "first": first,
-        "training": division.get("times", {}).get(name, {}).get("seconds"),
         "links": links,
     }
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +18,15 @@ from mbtf_core.run.task import Item, Result
 from mbtf_core.units import format_duration
 from mbtf_fit.config import DECODER_MODELS, SHARED_PRESET, FitConfig
 from mbtf_fit.material.decoder import DECODER_FOLDER
-from mbtf_pipeline.library.budget import Division
 from mbtf_pipeline.library.entries import Entry, LibraryRecipe
 from mbtf_pipeline.library.library_page import library_page
-from mbtf_pipeline.library.task import first_fit, fit_shared, run_material, shards_of, summarize
+from mbtf_pipeline.library.task import fit_shared, run_material, shards_of, summarize
+from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.run_folder import has_record, machine
 
 LIBRARY_NAME = "library.json"
 LIBRARY_FORMAT = "mbtf-library"
-LIBRARY_SCHEMA = 2
+LIBRARY_SCHEMA = 3
 PAGE = "library.html"
 # Sub-folders of the runs, and of the fits with a shared network.
 MATERIALS, SHARED = "materials", "shared"
@@ -121,7 +121,6 @@ class _LibraryRun:
         self.console, self.runner = console, runner
         before = read_json(folder / LIBRARY_NAME) if (folder / LIBRARY_NAME).is_file() else {}
         self.before = {state["name"]: state for state in before.get("materials", [])}
-        self.division: dict[str, Any] = before.get("division", {})
         self.shared: dict[str, Any] = before.get("shared", {})
         self.states: dict[str, dict[str, Any]] = {}
 
@@ -136,8 +135,7 @@ class _LibraryRun:
             )
         self._write()
         left = [entry for entry in found if entry.recipe is not None]
-        timed = left if self.library.training is None else self._divided(left, len(found))
-        items = [self._item(entry) for entry in timed]
+        items = [self._item(entry) for entry in left]
         with self.console.progress(len(items), "library", "materials") as bar:
             for done in self.runner.map(run_material, items, independent=True):
                 state = self.states[done.name]
@@ -149,31 +147,6 @@ class _LibraryRun:
         else:
             self._share([entry for entry in left if self.states[entry.name]["state"] == "done"])
         return LibraryResult(self.folder, self.folder / PAGE, self._write())
-
-    def _divided(self, left: list[Entry], count: int) -> list[Entry]:
-        """The materials with the training times that follow from their first fits."""
-        assert self.library.training is not None
-        division = Division(self.division, self.library.training, self.library.first_share, count)
-        self.division = division.record
-        keys = {entry.name: _digest(entry) for entry in left}
-        items = [
-            self._item(entry, seconds=division.first)
-            for entry in left
-            if not division.has_error(entry.name, keys[entry.name])
-        ]
-        with self.console.progress(len(items), "first fits", "materials") as bar:
-            for done in self.runner.map(first_fit, items, independent=True):
-                name = done.name
-                if done.error:
-                    self.states[name] |= {"state": "failed", "error": done.error}
-                    self.console.note(f"{name}: failed: {done.error}")
-                else:
-                    division.add(name, keys[name], done.value)
-                self._write()
-                bar.advance(1, f"{name}: {'failed' if done.error else 'done'}")
-        times = division.times(keys.items())
-        self._write()
-        return [_timed(entry, times[entry.name]) for entry in left if entry.name in times]
 
     def _share(self, done: list[Entry]) -> None:
         """Fit materials of one model and the same options with one network."""
@@ -212,12 +185,18 @@ class _LibraryRun:
             errors = {entry.name: {"fit": fit, **error} for (entry, fit), error in found}
             self.shared = asked | {"fit": name, "errors": errors, "error": result.error}
 
-    def _item(self, entry: Entry, **arguments: Any) -> Item:
+    def _item(self, entry: Entry) -> Item:
         assert entry.recipe is not None
-        folder = self.folder / MATERIALS / entry.name
-        shared = {"recipe": entry.recipe, "folder": folder, "command": self.command}
-        gpu = any(config.device == "cuda" for config in entry.recipe.fit.values())
-        return Item(entry.name, shared | arguments, gpu=gpu)
+        recipe = (
+            entry.recipe if self.library.training is None else _timed(entry.recipe, self.library.training)
+        )
+        arguments = {
+            "recipe": recipe,
+            "folder": self.folder / MATERIALS / entry.name,
+            "command": self.command,
+        }
+        gpu = any(config.device == "cuda" for config in recipe.fit.values())
+        return Item(entry.name, arguments, gpu=gpu)
 
     def _finish(self, state: dict[str, Any], done: Result) -> None:
         fault = done.error
@@ -242,7 +221,6 @@ class _LibraryRun:
             "command": self.command,
             "machine": machine(),
             "training": self.library.training,
-            "division": self.division if self.library.training is not None else {},
             "shared": self.shared,
             "materials": list(self.states.values()),
         }
@@ -251,15 +229,14 @@ class _LibraryRun:
         return record
 
 
-def _timed(entry: Entry, seconds: float) -> Entry:
-    """A material whose fits train for a stated time together."""
-    assert entry.recipe is not None
-    fits = {}
-    for name, config in entry.recipe.fit.items():
-        own = round(seconds / len(entry.recipe.fit), 3)
-        training = config.training.model_copy(update={"time": own, "steps": None})
-        fits[name] = config.model_copy(update={"training": training})
-    return replace(entry, recipe=entry.recipe.model_copy(update={"fit": fits}))
+def _timed(recipe: Recipe, seconds: float) -> Recipe:
+    """A recipe whose fits train for a stated time together."""
+    time = {"time": round(seconds / len(recipe.fit), 3), "steps": None}
+    fits = {
+        name: config.model_copy(update={"training": config.training.model_copy(update=time)})
+        for name, config in recipe.fit.items()
+    }
+    return recipe.model_copy(update={"fit": fits})
 
 
 def _untimed(config: FitConfig) -> dict[str, Any]:
@@ -267,14 +244,6 @@ def _untimed(config: FitConfig) -> dict[str, Any]:
     fields = config.fields()
     training = {key: value for key, value in fields["training"].items() if key not in ("time", "steps")}
     return {**fields, "training": training}
-
-
-def _digest(entry: Entry) -> str:
-    """Digest of the options that the error of a material's first fit depends on, its time excepted."""
-    assert entry.recipe is not None
-    fits = {name: _untimed(config) for name, config in entry.recipe.fit.items()}
-    generate = entry.recipe.generate.model_dump(mode="json", exclude={"material"})
-    return data_sha256({"generate": generate, "fit": fits})
 
 
 def _same_fits(done: Iterable[Entry]) -> list[tuple[Entry, str]]:

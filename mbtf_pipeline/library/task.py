@@ -16,48 +16,6 @@ if TYPE_CHECKING:
     from mbtf_core.data.dataset import Dataset
     from mbtf_fit.training.fit import FitResult
 
-# Sub-folder of a run with the first fit, whose error divides the training time.
-FIRST = "first"
-
-
-def first_fit(recipe: Recipe, folder: Path, seconds: float, command: str) -> float | None:
-    """Generate the data of a material and fit it for a short time; a task.
-
-    Parameters
-    ----------
-    recipe : Recipe
-        Resolved recipe.
-    folder : Path
-        Folder of the material's run.
-    seconds : float
-        Training time.
-    command : str
-        For the run's record.
-
-    Returns
-    -------
-    float or None
-        Unexplained variance of the recipe's first fit; None where it is undefined.
-
-    Raises
-    ------
-    InputError, PartialError
-        As :func:`~mbtf_pipeline.run.run_recipe`.
-    """
-    from mbtf_fit.training.fit import fit
-    from mbtf_fit.training.fit_folder import identity_of
-    from mbtf_pipeline.run import generate_data
-
-    generate_data(recipe, folder, command=command)
-    name, config = next(iter(recipe.fit.items()))
-    shards, out = shards_of(recipe, config, folder), folder / FIRST / name
-    training = config.training.model_copy(update={"time": seconds, "steps": None})
-    short = config.model_copy(update={"training": training})
-    identity = identity_of(short, _open(shards, config))
-    done = fit(short, shards, out, overwrite=not _holds(out, identity))
-    value = _unexplained(done, shards)["value"]
-    return None if value is None else float(value)
-
 
 def fit_shared(
     config: FitConfig, shards: Sequence[Path], folders: Sequence[Path], decoder: Path
@@ -139,8 +97,12 @@ def run_material(recipe: Recipe, folder: Path, command: str) -> dict[str, Any]:
 
     Parameters
     ----------
-    recipe, folder, command
-        As for :func:`first_fit`.
+    recipe : Recipe
+        Resolved recipe.
+    folder : Path
+        Folder of the material's run.
+    command : str
+        For the run's record.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Images as ``data:`` URIs and compressed linear data, within a size limit."""
+"""Images as ``data:`` URIs, within a size limit."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from mbtf_core.exposure import to_display, white_of
 from mbtf_pipeline.report.error_maps import Palette, indices, palette
-from mbtf_pipeline.report.linear_images import Coding, pack
 
 U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
@@ -35,40 +34,26 @@ def shrink(values: Pixels, factor: int) -> Pixels:
 
 @dataclass(frozen=True)
 class Encoding:
-    """How images are stored in the report.
+    """How images are reduced for the report.
 
     Attributes
     ----------
-    bits : per channel of a logarithmic code
-    quality : of the JPEG previews
     shrink : downsampling factor
-    preview_shrink : additional downsampling factor of the previews
     shades : colors of a map
     """
 
-    bits: int
-    quality: int
     shrink: int = 1
-    preview_shrink: int = 1
     shades: int = 256
 
-    def describe(self, coding: Coding) -> str:
+    def describe(self) -> str:
         """Text for the page."""
-        data = (
-            f"{self.bits} bits per channel on a logarithmic scale (error at most {coding.relative_error:.1%})"
-        )
         reductions = [f"{self.shrink} × {self.shrink} pixels averaged"] if self.shrink > 1 else []
         reductions += [f"maps in {self.shades} shades"] if self.shades < 256 else []
-        return f"{data}; reduced to limit the file size: {', '.join(reductions)}" if reductions else data
+        return f"PNG, reduced to limit the file size: {', '.join(reductions)}" if reductions else "PNG"
 
 
 # From best quality to smallest size.
-ENCODINGS = (
-    Encoding(10, 88),
-    Encoding(9, 82),
-    Encoding(9, 80, preview_shrink=2, shades=64),
-    *(Encoding(8, 75, shrink, preview_shrink=2, shades=32) for shrink in (1, 2, 4, 8, 16)),
-)
+ENCODINGS = (Encoding(), Encoding(1, 64), *(Encoding(shrink, 32) for shrink in (1, 2, 4, 8, 16)))
 
 
 def _data_uri(image: Any, kind: str, **options: int) -> str:
@@ -82,6 +67,13 @@ def jpeg_uri(display: U8, quality: int) -> str:
     from PIL import Image
 
     return _data_uri(Image.fromarray(display), "jpeg", quality=quality, subsampling=0)
+
+
+def png_uri(display: U8) -> str:
+    """``data:`` URI of an 8-bit sRGB image as PNG."""
+    from PIL import Image
+
+    return _data_uri(Image.fromarray(display), "png")
 
 
 def file_uri(path: Path, most: int | None = None) -> str:
@@ -131,26 +123,12 @@ class Gallery:
         return white_of(self.exposure)
 
 
-def encode(
-    gallery: Gallery, encoding: Encoding
-) -> tuple[Coding, dict[str, str], dict[str, dict[str, int | str]]]:
-    """Encode a gallery.
-
-    Returns
-    -------
-    coding : of all linear images
-    images : ``data:`` URIs of maps, and of linear images, by name
-    packed : rows, columns and data of linear images by name
-    """
-    coding = Coding.spanning(gallery.linear.values(), gallery.white, encoding.bits)
-    images: dict[str, str] = {}
-    packed: dict[str, dict[str, int | str]] = {}
-    for name, picture in gallery.linear.items():
-        small = shrink(picture, encoding.shrink).astype(np.float32)
-        preview = shrink(small, encoding.preview_shrink).astype(np.float32)
-        images[name] = jpeg_uri(to_display(preview, gallery.exposure), encoding.quality)
-        data = base64.b64encode(pack(coding.encode(small))).decode()
-        packed[name] = {"rows": small.shape[0], "columns": small.shape[1], "data": data}
+def encode(gallery: Gallery, encoding: Encoding) -> dict[str, str]:
+    """``data:`` URIs of a gallery's images by name; linear ones at its exposure."""
+    images = {
+        name: png_uri(to_display(shrink(picture, encoding.shrink), gallery.exposure))
+        for name, picture in gallery.linear.items()
+    }
     for name, (colors, values) in gallery.maps.items():
         images[name] = map_uri(shrink(values, encoding.shrink), colors, encoding.shades)
-    return coding, images, packed
+    return images

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from statistics import median_high
 from typing import Any
 
@@ -21,7 +21,6 @@ _TERMS = {
     "flip": "FLIP",
     "ssim": "SSIM",
     "st_lpips": "ST-LPIPS",
-    "contrast": "contrast",
     "error_bar": "error bar",
 }
 
@@ -41,7 +40,6 @@ def error_context(comparison: Mapping[str, Any], min_cos: float) -> dict[str, An
         "error_plots": [_plot(tests, min_cos, *grouping[:3]) for grouping in _GROUPINGS],
         "group_tables": [_group_table(tests, min_cos, *grouping) for grouping in _GROUPINGS],
         "picture_table": _pictures_table(comparison),
-        "contrast_table": _contrast_table(comparison),
         "definitions": [(_TERMS[k], v) for k, v in comparison["definitions"].items()],
     }
 
@@ -126,48 +124,24 @@ def _group_table(
     return {"title": f"{title}, test split", "head": [head, "queries", *heads], "rows": rows}
 
 
-# Of each image and fit: cells that follow its view, light, width and name.
-_Cells = Callable[[Mapping[str, Any], Mapping[str, Any]], list[str]]
-
-
-def _image_table(
-    comparison: Mapping[str, Any], title: str, heads: list[str], cells: _Cells
-) -> dict[str, Any]:
-    """One row per image and fit; `cells` gets the records of the image and of the fit."""
+def _pictures_table(comparison: Mapping[str, Any]) -> dict[str, Any]:
+    """Errors of every image against each kind of reference; one row per image and fit."""
+    kinds = comparison["kinds"]
+    metrics = available_metrics(comparison["pictures"], comparison["fits"])
     rows = []
     for picture in comparison["pictures"]:
         where = [*(short_direction(picture[d]) for d in ("view", "light")), f"{picture['tiles_across']:g}"]
+        noise = picture["references"][kinds[0]]
         for fit in comparison["fits"]:
-            rows.append([*where, fit, *cells(picture, picture["fits"][fit])])
-    return {"title": title, "head": ["view", "light", "tiles across", "fit", *heads], "rows": rows}
-
-
-def _pictures_table(comparison: Mapping[str, Any]) -> dict[str, Any]:
-    """Errors of every image against each kind of reference."""
-    kinds = comparison["kinds"]
-    metrics = available_metrics(comparison["pictures"], comparison["fits"])
-
-    def cells(picture: Mapping[str, Any], record: Mapping[str, Any]) -> list[str]:
-        row, noise = [], picture["references"][kinds[0]]
-        for kind in kinds:
-            errors = {name: estimate(e) for name, e in record["errors"][kind].items()}
-            row += [estimate_text(errors["mse"], 1e3), decibel(errors["psnr"], errors["mse"])]
-            row.append(estimate_text(errors["relative_mse"]))
-        return row + [m.text(m.of(record), m.of(noise)) for m in metrics]
-
+            record = picture["fits"][fit]
+            row = [*where, fit]
+            for kind in kinds:
+                errors = {name: estimate(e) for name, e in record["errors"][kind].items()}
+                row += [estimate_text(errors["mse"], 1e3), decibel(errors["psnr"], errors["mse"])]
+                row.append(estimate_text(errors["relative_mse"]))
+            rows.append(row + [m.text(m.of(record), m.of(noise)) for m in metrics])
     names = ("MSE [10⁻³/sr²]", "PSNR", "relative MSE")
     heads = [f"{name}, {kind} reference" for kind in kinds for name in names]
     title = f"Images at {describe_exposure(comparison['exposure'])}; white is the peak of the PSNR"
-    return _image_table(comparison, title, [*heads, *(m.title for m in metrics)], cells)
-
-
-def _contrast_table(comparison: Mapping[str, Any]) -> dict[str, Any]:
-    """Contrast of every image relative to each kind of reference."""
-    names = {"luminance": "luminance", "chroma": "chroma", "correlation": "correlation of chroma"}
-
-    def cells(picture: Mapping[str, Any], record: Mapping[str, Any]) -> list[str]:
-        found = [record["contrast"][kind][name] for kind in comparison["kinds"] for name in names]
-        return ["–" if one is None else estimate_text(estimate(one)) for one in found]
-
-    heads = [f"{name}, {kind} reference" for kind in comparison["kinds"] for name in names.values()]
-    return _image_table(comparison, "Contrast relative to the reference (1 is right)", heads, cells)
+    head = ["view", "light", "tiles across", "fit", *heads, *(m.title for m in metrics)]
+    return {"title": title, "head": head, "rows": rows}

@@ -59,7 +59,6 @@ def picture_section(folder: Path, comparison: Mapping[str, Any], gallery: Galler
     groups : per view and light: title, diagram, blocks of figures
     scenes : of the viewer, plain data
     color_bars : of local error, HDR-FLIP and signed difference
-    difference : end of the signed scale, as a fraction of white
     """
     sheet = _Sheet(comparison)
     groups: list[dict[str, Any]] = []
@@ -93,9 +92,10 @@ def picture_section(folder: Path, comparison: Mapping[str, Any], gallery: Galler
         scenes.append({"group": len(groups) - 1, **sheet.scene(picture)})
     local, flip, signed_end = (common_scale([e[i] for e in maps.values()]) for i in range(3))
     flip = min(flip, 1.0)
-    for file, (error, visible, _) in maps.items():
+    for file, (error, visible, signed) in maps.items():
         gallery.maps[f"{file}-local"] = "local", error / local
         gallery.maps[f"{file}-flip"] = "flip", visible / flip
+        gallery.maps[f"{file}-signed"] = "signed", signed / signed_end
     color_bars = (
         color_bar(
             "local",
@@ -123,7 +123,7 @@ def picture_section(folder: Path, comparison: Mapping[str, Any], gallery: Galler
         ),
     )
     bars = {bar["key"]: bar for bar in color_bars}
-    return {"groups": groups, "scenes": scenes, "color_bars": bars, "difference": signed_end}
+    return {"groups": groups, "scenes": scenes, "color_bars": bars}
 
 
 class _Sheet:
@@ -157,7 +157,7 @@ class _Sheet:
         if kind != self.kinds[0]:
             mse = estimate_text(estimate(picture["between_references"]), 1e3)
             lines.append(f"MSE to the other reference {mse} · 10⁻³/sr²")
-        return _figure(reference["file"], _KIND[kind], lines, f": {where}", linear=True)
+        return _figure(reference["file"], _KIND[kind], lines, f": {where}", exr=True)
 
     def _fit(self, picture: Mapping[str, Any], fit: str, where: str) -> list[dict[str, Any]]:
         record = picture["fits"][fit]
@@ -167,7 +167,7 @@ class _Sheet:
         psnr = [f"PSNR {decibel(estimate(errors['psnr']), mse)}"]
         local = [f"MSE {estimate_text(mse, 1e3)} · 10⁻³/sr²"]
         return [
-            _figure(file, fit, psnr, f": {where}", linear=True),
+            _figure(file, fit, psnr, f": {where}", exr=True),
             _figure(f"{file}-local", "Local RMS error", local, of_fit),
             _figure(f"{file}-flip", "HDR-FLIP", [f"mean {record['flip']['hdr']:.3f}"], of_fit),
         ]
@@ -208,9 +208,9 @@ class _Sheet:
         return rows
 
 
-def _figure(image: str, label: str, lines: list[str], where: str, *, linear: bool = False) -> dict[str, Any]:
-    figure = {"image": image, "linear": linear, "label": label, "lines": lines, "alt": f"{label}{where}"}
-    return figure | {"file": exr_link(image) if linear else ""}
+def _figure(image: str, label: str, lines: list[str], where: str, *, exr: bool = False) -> dict[str, Any]:
+    figure = {"image": image, "label": label, "lines": lines, "alt": f"{label}{where}"}
+    return figure | {"file": exr_link(image) if exr else ""}
 
 
 def exr_link(file: str) -> str:

@@ -14,10 +14,8 @@ from mbtf_pipeline.compare.compare import COMPARISON_NAME, COMPARISON_SCHEMA
 from mbtf_pipeline.number_text import NOT_SIGNIFICANT
 from mbtf_pipeline.recipe import RECIPE_NAME, Recipe
 from mbtf_pipeline.report.embed import ENCODINGS, Gallery, encode
-from mbtf_pipeline.report.error_maps import palette
 from mbtf_pipeline.report.errors import error_context
 from mbtf_pipeline.report.image_sheet import picture_section
-from mbtf_pipeline.report.linear_images import EXPOSURE_STOPS
 from mbtf_pipeline.report.material import material_section
 from mbtf_pipeline.report.offset_images import offset_section
 from mbtf_pipeline.report.plots import ERROR_BAR_NOTE
@@ -25,7 +23,7 @@ from mbtf_pipeline.report.times import provenance, read_training, time_context, 
 from mbtf_pipeline.run_folder import COMPARE, FITS, REPORT, RUN_NAME, SHARDS
 
 # Raised when the report or the viewer's page changes; part of the stage's key.
-LAYOUT = 10
+LAYOUT = 12
 
 _TABLE = """
 {%- set below = t.head[-1] == "command" %}
@@ -102,23 +100,18 @@ def write_report(folder: Path, recipe: Recipe, stages: Sequence[str]) -> None:
         **training_context(histories),
         **time_context(folder, stages, manifest, comparison),
         "exposure": describe_exposure(gallery.exposure),
-        "stops": EXPOSURE_STOPS,
-    }
-    viewer = {
-        "exposure": gallery.exposure,
-        "fits": comparison["fits"],
-        "scenes": shown["scenes"],
-        "difference": {"scale": shown["difference"] * gallery.white, "colors": palette("signed")},
     }
     # From best quality to smallest size.
     for encoding in ENCODINGS:
-        coding, images, packed = encode(gallery, encoding)
-        data = viewer | {"coding": coding.describe(), "pictures": packed}
+        images = encode(gallery, encoding)
+        # The page shows all other images in its sheet.
+        differences = {name: uri for name, uri in images.items() if name.endswith("-signed")}
+        data = {"fits": comparison["fits"], "scenes": shown["scenes"], "differences": differences}
         html = render(
             "report.html",
             **context,
             images=images,
-            encoding=encoding.describe(coding),
+            encoding=encoding.describe(),
             # Valid within a <script> element.
             viewer=json.dumps(data, ensure_ascii=False, separators=(",", ":")).replace("<", "\\u003c"),
         )

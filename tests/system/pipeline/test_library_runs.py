@@ -21,13 +21,13 @@ from mbtf_fit.material.material import Material
 from mbtf_gen.generation.run import generate
 from mbtf_gen.job import Job
 from mbtf_pipeline.cli.app import app
-from mbtf_pipeline.library.task import first_fit, fit_shared
-from mbtf_pipeline.recipe import Recipe, read_resolved
+from mbtf_pipeline.library.task import fit_shared
+from mbtf_pipeline.recipe import read_resolved
 
 RECIPE = """
 name: test
 library: [materials]
-training: 4s
+training: 1s
 base:
   generate:
     queries: {train: 100/texel, resolution: 8, test: "1024", test_spp: 16, min_cos: 0.3}
@@ -66,18 +66,9 @@ def record(out: Path) -> dict[str, dict[str, object]]:
     return {material["name"]: material for material in found["materials"]}
 
 
-def division(out: Path) -> dict[str, dict[str, dict[str, float]]]:
-    found: dict[str, dict[str, dict[str, float]]] = json.loads((out / "library.json").read_text())["division"]
-    return found
-
-
-def times_of(found: dict[str, dict[str, dict[str, float]]]) -> dict[str, float]:
-    return {name: time["seconds"] for name, time in found["times"].items()}
-
-
 def weights(out: Path, *names: str) -> dict[str, int]:
-    """When the fits of materials, and their first ones, were written."""
-    paths = [out / "materials" / name / sub / "neumip" for name in names for sub in ("fits", "first")]
+    """When the fits of materials were written."""
+    paths = [out / "materials" / name / "fits" / "neumip" for name in names]
     return {str(path): (path / "weights.safetensors").stat().st_mtime_ns for path in paths}
 
 
@@ -97,20 +88,12 @@ def test_failures_are_named_and_the_rest_is_kept(folder: Path, capsys: pytest.Ca
     for name in ("flat", "rough"):
         assert f'href="materials/{name}/report.html"' in page
         assert (out / "materials" / name / "report.html").is_file()
-    first = division(out)
-    assert set(first["errors"]) == {"flat", "rough"}
-    # The times of both fits are recorded, and sum to what the first fits left them; the rest waits.
-    assert sum(times_of(first).values()) == pytest.approx(2 * 0.8 * 4.0 / 3, abs=0.01)
-    for name, time in times_of(first).items():
-        fit = json.loads((out / f"materials/{name}/fits/neumip/fit.json").read_text())
-        assert str(time).rstrip("0").rstrip(".") in str(fit["config"]["training"]["time"])
     # Repaired, it runs, and the others are not run again.
     kept = weights(out, "flat", "rough")
     Image.fromarray(np.zeros((8, 8), np.uint8)).save(folder / "materials" / "broken" / "height.png")
     assert run(app, line) == 0
     assert record(out)["broken"]["state"] == "done"
     assert weights(out, "flat", "rough") == kept
-    assert sum(times_of(division(out)).values()) == pytest.approx(0.8 * 4.0, abs=0.01)
     assert run(app, ["report", str(out), "-q"]) == 0
     # A further material trains no other one again.
     kept = weights(out, "broken", "flat", "rough")
@@ -163,21 +146,6 @@ def test_a_shared_network(two: Path) -> None:
     assert "with the shared network" not in (two / "library.html").read_text()
 
 
-def test_a_first_fit_is_kept_for_the_same_options(two: Path) -> None:
-    run_folder = two / "materials" / "rough"
-    weights = run_folder / "first" / "neumip" / "weights.safetensors"
-    recipe = read_resolved(run_folder)
-    generated = recipe.generate.model_copy(update={"material": str(two.parent / "materials" / "rough")})
-    again = recipe.model_copy(update={"generate": generated})
-    before = weights.stat().st_mtime_ns
-    error = first_fit(again, run_folder, 0.4, "")
-    assert error is not None
-    assert weights.stat().st_mtime_ns == before
-    assert error == division(two)["errors"]["rough"]["error"]
-    first_fit(again, run_folder, 0.3, "")
-    assert weights.stat().st_mtime_ns != before
-
-
 @pytest.fixture
 def runs(tmp_path: Path) -> Path:
     """Data sets of runs: of another layout than the fits', and those that the fits learn from."""
@@ -189,15 +157,6 @@ def runs(tmp_path: Path) -> Path:
 
 def error_on(material: Path, shards: Path) -> float | None:
     return evaluate(Material.load(material), shards).values["test"].overall.unexplained.value
-
-
-def test_first_fits_are_tested_as_all_fits(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mbtf_pipeline.run.generate_data", lambda *arguments, **options: None)
-    fits = {"neumip": {}, "other": {"model": "neumip", "seed": 3}}
-    generate = {"material": "maps", "queries": {"layout": "image"}}
-    recipe = Recipe.model_validate({"name": "a", "generate": generate, "fit": fits})
-    error = first_fit(recipe, runs / "a", 0.1, "")
-    assert error == pytest.approx(error_on(runs / "a/first/neumip", runs / "a/shards"))
 
 
 def test_materials_join_and_leave_a_shared_network(runs: Path) -> None:

@@ -1,4 +1,4 @@
-"""The report in a headless browser: slider, exposure, selections and error maps."""
+"""The report in a headless browser: slider, selections and error maps."""
 
 from __future__ import annotations
 
@@ -58,17 +58,22 @@ class Page:
 
         WebDriverWait(self.driver, TIMEOUT, 0.05).until(lambda _: condition(), what)
 
-    def wait_for(self, scene: int, kind: int, fit: int, stops: str = "0") -> None:
+    def wait_for(self, scene: int, kind: int, fit: int) -> None:
         """Wait until the stage shows this selection."""
-        wanted = f"{scene} {kind} {fit} {stops}"
+        wanted = f"{scene} {kind} {fit}"
         self.until(lambda: self.js("return document.getElementById('stage').dataset.drawn") == wanted, wanted)
 
-    def canvas(self, css: str) -> np.ndarray:
-        """Pixels (rows, columns, 3) of a canvas."""
+    def image(self, css: str) -> np.ndarray:
+        """Pixels (rows, columns, 3) of an image."""
         code = """
-            const canvas = document.querySelector(arguments[0]);
-            const { width, height } = canvas;
-            return [height, width, [...canvas.getContext('2d').getImageData(0, 0, width, height).data]];
+            const image = document.querySelector(arguments[0]);
+            const [width, height] = [image.naturalWidth, image.naturalHeight];
+            const canvas = Object.assign(document.createElement('canvas'), { width, height });
+            const context = canvas.getContext('2d');
+            return image.decode().then(() => {
+                context.drawImage(image, 0, 0);
+                return [height, width, [...context.getImageData(0, 0, width, height).data]];
+            });
         """
         rows, columns, values = self.js(code, css)
         return np.array(values, np.int64).reshape(rows, columns, 4)[..., :3]
@@ -81,12 +86,12 @@ class Page:
         step = STAGE // PIXELS
         return image[step // 2 :: step, step // 2 :: step]
 
-    def expected(self, scene: int, what: str, stops: float = 0.0) -> np.ndarray:
+    def expected(self, scene: int, what: str) -> np.ndarray:
         """Expected display of an image: ``query``, ``pixel``, or the name of a fit."""
         picture = self.record["pictures"][scene]
         file = (picture["references"] if what in ("query", "pixel") else picture["fits"])[what]["file"]
         value = read_picture(self.folder / "compare" / file)
-        return to_display(value, self.record["exposure"] + stops).astype(np.int64)
+        return to_display(value, self.record["exposure"]).astype(np.int64)
 
     def collect(self) -> None:
         """Collect the browser's logs."""
@@ -106,12 +111,11 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
         options = [word for option in OPTIONS for word in ("--set", option)]
         assert run(app, ["run", str(ROOT / "pipelines" / "ci.yaml"), "-o", str(folder), "-q", *options]) == 0
         opened = Page(driver, folder)
-        opened.until(lambda: opened.js("return document.body.dataset.sheet") == "drawn", "the sheet")
         # An integer number of screen pixels per image pixel allows exact comparisons.
         opened.js(
             "const s = document.createElement('style'); document.head.append(s);"
             f"s.textContent = '.stage {{ width: {STAGE}px; border-radius: 0 }}"
-            ".stage canvas { image-rendering: pixelated }"
+            ".stage img { image-rendering: pixelated }"
             ".side, .border { visibility: hidden }"
             "#stage:focus { outline: none }';"
         )
@@ -125,7 +129,7 @@ def stage(page: Page) -> Iterator[Any]:
     page.js(
         "for (const name of ['fit', 'kind', 'group'])"
         " document.querySelector(`input[name=${name}][value='0']`).click();"
-        "document.querySelector('#tiles-across input').click(); document.getElementById('zero').click();"
+        "document.querySelector('#tiles-across input').click();"
         "document.querySelector('input[name=map]').click()"
     )
     page.wait_for(0, 0, 0)
@@ -135,14 +139,14 @@ def stage(page: Page) -> Iterator[Any]:
 
 
 def matches(found: np.ndarray, expected: np.ndarray) -> bool:
-    """Equal up to the 10-bit encoding of linear values and rounding."""
-    return found.shape == expected.shape and int(np.abs(found - expected).max()) <= 3
+    """Equal up to the rounding of the browser."""
+    return found.shape == expected.shape and int(np.abs(found - expected).max()) <= 1
 
 
 def test_the_compared_images_are_shown(page: Page, stage: Any) -> None:
-    assert matches(page.canvas("#reference"), page.expected(0, "query"))
-    assert matches(page.canvas("#fit"), page.expected(0, "neumip"))
-    # They differ by far more than the encoding error.
+    assert matches(page.image("#reference"), page.expected(0, "query"))
+    assert matches(page.image("#fit"), page.expected(0, "neumip"))
+    # They differ by far more than by rounding.
     assert not matches(page.expected(0, "query"), page.expected(0, "neumip"))
 
 
@@ -183,43 +187,23 @@ def test_dragging_moves_the_border(page: Page, stage: Any, kind: str) -> None:
         assert matches(shown[:, border:], fit[:, border:])
 
 
-@pytest.mark.parametrize(("key", "stops"), [("ARROW_RIGHT", 2.0), ("ARROW_LEFT", -2.0)])
-def test_exposure_scales_linear_values_of_both_sides(page: Page, stage: Any, key: str, stops: float) -> None:
-    from selenium.webdriver.common.keys import Keys
-
-    page.find("#stops").send_keys(*[getattr(Keys, key)] * 20)
-    text = f"{stops:g}"
-    page.wait_for(0, 0, 0, text)
-    assert matches(page.canvas("#reference"), page.expected(0, "query", stops))
-    assert matches(page.canvas("#fit"), page.expected(0, "neumip", stops))
-    stage.send_keys(Keys.HOME)
-    assert matches(page.screen(), page.expected(0, "neumip", stops))
-    white = page.record["white"] / 2.0**stops
-    caption = page.find("#caption").text
-    assert f"exposure {page.record['exposure'] + stops:+.2f} EV".replace("-", "−") in caption
-    assert f"{float(f'{white:.3g}'):g} 1/sr is white" in caption
-    page.until(lambda: page.js("return document.body.dataset.exposure") == text, "the sheet's exposure")
-    cells = "button.zoom[data-scene='1'] canvas"
-    assert matches(page.canvas(cells), page.expected(1, "query", stops))
-
-
 def test_selections_change_the_images(page: Page, stage: Any) -> None:
     def choose(name: str, value: str) -> None:
         page.js(f"document.querySelector(`input[name={name}][value='{value}']`).click()")
 
     choose("fit", "1")
     page.wait_for(0, 0, 1)
-    assert matches(page.canvas("#fit"), page.expected(0, "plain"))
+    assert matches(page.image("#fit"), page.expected(0, "plain"))
     choose("kind", "1")
     page.wait_for(0, 1, 1)
-    assert matches(page.canvas("#reference"), page.expected(0, "pixel"))
+    assert matches(page.image("#reference"), page.expected(0, "pixel"))
     choose("scene", "1")
     page.wait_for(1, 1, 1)
-    assert matches(page.canvas("#fit"), page.expected(1, "plain"))
+    assert matches(page.image("#fit"), page.expected(1, "plain"))
     choose("group", "1")
     # The field of view stays selected.
     page.wait_for(3, 1, 1)
-    assert matches(page.canvas("#fit"), page.expected(3, "plain"))
+    assert matches(page.image("#fit"), page.expected(3, "plain"))
     assert "4 tiles across" in page.find("#caption").text
 
 
@@ -235,8 +219,8 @@ def test_error_maps_match_the_selection(page: Page, stage: Any) -> None:
     page.until(lambda: page.find("#map-image").get_attribute("src") != first, "the other map")
     assert [bar.startswith("HDR-FLIP") for bar in shown()] == [True]
     page.js("document.querySelector('input[name=map][value=signed]').click()")
-    page.until(lambda: page.find("#map-canvas").is_displayed(), "the difference")
-    colors = page.canvas("#map-canvas")
+    page.until(lambda: "Fit" in page.find("#map-image").get_attribute("alt"), "the difference")
+    colors = page.image("#map-image")
     difference = (page.expected(0, "neumip") - page.expected(0, "query")).mean(axis=-1)
     # Blue is too dark, orange too bright.
     assert colors[difference > 40, 0].mean() > colors[difference > 40, 2].mean()
@@ -276,7 +260,7 @@ def test_images_are_visible_without_scripts(page: Page) -> None:
     driver.set_window_size(1300, 2400)
     driver.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})
     driver.get((page.folder / "report.html").as_uri())
-    png = page.find("img[data-linear]").screenshot_as_png
+    png = page.find("button.zoom img").screenshot_as_png
     image = Image.open(io.BytesIO(png)).convert("RGB")
     shown = np.asarray(image.resize((PIXELS, PIXELS), Image.Resampling.BOX))
     expected = page.expected(0, "query")

@@ -45,7 +45,7 @@ def test_plots_name_their_axes_and_error_bars(tmp_path: Path) -> None:
 
 def test_an_undefined_error_is_shown_as_such(tmp_path: Path) -> None:
     """Test values whose variance is not significant leave no unexplained variance."""
-    page = write_page(Study(tmp_path, DESCRIPTION, [measured("models", 10.0, math.nan)])).read_text()
+    page = write_page(Study(tmp_path, DESCRIPTION, [measured("whole", 10.0, math.nan)])).read_text()
     assert not re.search(r"\b(nan|inf)\b", page)
     assert "No unexplained variance of test queries could be measured" in page
     # Without repeats the error bars of runs are too narrow, and the page warns of it.
@@ -61,13 +61,13 @@ def test_the_page_shows_the_front_with_commands_and_what_is_biased(tmp_path: Pat
         return Measurement("interactions", "", name, "mbtf-gen c", *estimates)
 
     found = [
-        measured("models", 10.0, 0.3), measured("models", 20.0, 0.2), measured("models", 20.0, 0.4, "other"),
+        measured("whole", 10.0, 0.3), measured("whole", 20.0, 0.2), measured("whole", 20.0, 0.4, "other"),
         limited("1 interactions", Estimate(0.05, 0.004, 9)),
         limited("2 interactions", Estimate(0.002, 0.003, 9)), limited("no limit", Estimate(0.0, 0.0, 9)),
     ]  # fmt: skip
     study = Study(tmp_path, DESCRIPTION, found, deviation=Estimate(0.04, 0.01, 9))
     page = write_page(study).read_text()
-    pictures = {"front", "models", "models_evaluation", "interactions"}
+    pictures = {"front", "interactions"}
     assert {p.stem for p in tmp_path.glob("*.png")} == pictures
     front = page.split('id="front"')[1].split("</section>")[0]
     # Two of the three runs, each with a command that one click selects.

@@ -22,7 +22,7 @@ from mbtf_pipeline.cost.repeats import MOST_SEEDS, measure_runs
 from mbtf_pipeline.cost.runs import Run, RunRunner
 
 CONFIG = GeneratorConfig.model_validate({"material": "m", "seed": 5})
-RUNS = [run("whole", 3000, "long", 9.0), run("models", 2000, "one"), run("models", 2000, "two")]
+RUNS = [run(3000, "long", 9.0), run(2000, "one"), run(2000, "two")]
 ONE = Estimate(1.0, 0.1, 4)
 
 
@@ -52,11 +52,8 @@ def measured(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[tuple[str,
         if run.name == "diverges":
             raise InputError("training diverged at step 7")
         found.append((run.name, run.data.seed))
-        self._data[run.data] = (self.folder / "data", 1.0)
         if run.data.seed not in self.test_sets:
             self.test_sets[run.data.seed], self.test_seconds = None, 0.25  # type: ignore[assignment]
-        # A worker has one data set at a time.
-        assert self.folder == tmp_path or list(self._data) == [run.data]
         error = Estimate(0.1 + 0.03 * run.data.seed + 0.01 * len(run.name), 0.001, 9)
         return Measurement(run.study, run.series, run.name, self.command, ONE, error, details={"x": 1.0})
 
@@ -71,7 +68,7 @@ def cluster_runner(folder: Path, **options: Any) -> tuple[ClusterRunner, Workers
 
 
 def test_workers_measure_the_runs_of_one_process(measured: list[tuple[str, int]], tmp_path: Path) -> None:
-    runs = [*RUNS, run("data", 900, "diverges")]
+    runs = [*RUNS, run(900, "diverges")]
     plain = RunRunner(CONFIG, tmp_path, "mbtf-gen m", lambda note: None)
     expected = measure_runs(runs, MemoryStore(), plain, lambda run: True, MOST_SEEDS)  # type: ignore[arg-type]
     assert {len(group) for group in expected[0]} == {0, MOST_SEEDS}

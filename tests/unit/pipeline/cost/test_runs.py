@@ -19,34 +19,30 @@ from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.cost import runs as module
-from mbtf_pipeline.cost.fit_runs import GENERATOR, RUN_SHARES, SHORTEST, planned_runs
+from mbtf_pipeline.cost.fit_runs import GENERATOR, RUNS, SHORTEST, planned_runs
 from mbtf_pipeline.cost.runs import DataRequest, Run, RunRunner
 
 FIT = {"model": "neumip", "training": {"time": "5s"}}
 
 
 @pytest.mark.parametrize("seconds", [300.0, 600.0, 3600.0])
-def test_planned_runs_fit_into_the_time_twice(seconds: float, tmp_path: Path) -> None:
+def test_planned_runs_fit_into_the_time_twice(seconds: float) -> None:
     found = planned_runs(seconds, 4, 7.5e-7)
-    spent = dict.fromkeys(("whole", "models", "data"), 0.0)
-    made: set[DataRequest] = set()
-    for run in found:
-        generating = 7.5e-7 * run.data.queries * run.data.spp * (run.data not in made)
-        made.add(run.data)
-        spent[run.study] += generating + float(run.fit["training"]["time"].rstrip("s"))
-    for study, share in RUN_SHARES.items():
-        assert 0.5 * share * seconds / 2 < spent[study] <= 1.1 * share * seconds / 2
-    assert GENERATOR + sum(RUN_SHARES.values()) < 0.9
+    spent = sum(
+        7.5e-7 * run.data.queries * run.data.spp + float(run.fit["training"]["time"].rstrip("s"))
+        for run in found
+    )
+    assert 0.5 * RUNS * seconds / 2 < spent <= 1.1 * RUNS * seconds / 2
+    assert GENERATOR + RUNS < 0.9
     assert all(run.data.seed == 0 for run in found)
-    assert len({str((run.study, run.key)) for run in found}) == len(found)
-    # Equal total paths are compared, whatever their number per query.
-    totals = {run.data.queries * run.data.spp for run in found if run.study == "data"}
-    assert max(totals) / min(totals) == pytest.approx(4, rel=0.01)
-    # Whole runs double, so that a longer study keeps those of a shorter one.
+    assert len({str(run.key) for run in found}) == len(found)
+    # Total times double, so that a longer study keeps the runs of a shorter one.
     longer = planned_runs(2 * seconds, 4, 7.5e-7)
-    whole = [run for run in found if run.study == "whole" and "35 %" in run.series]
-    assert all(run in longer for run in whole)
-    assert [run.name for run in whole] == [f"planned for {SHORTEST * 2**n:g} s" for n in range(len(whole))]
+    doubling = [run for run in found if "35 %" in run.series]
+    assert all(run in longer for run in doubling)
+    assert [run.name for run in doubling] == [
+        f"planned for {SHORTEST * 2**n:g} s" for n in range(len(doubling))
+    ]
 
 
 @pytest.fixture
@@ -90,10 +86,9 @@ def runner(folder: Path, seed: int = 0, **options: Any) -> RunRunner:
     return made
 
 
-@pytest.mark.parametrize(("study", "seconds"), [("whole", 13.0), ("data", 7.0), ("models", 5.0)])
-def test_a_run_measures_time_and_error(clock: Any, tmp_path: Path, study: str, seconds: float) -> None:
-    found = runner(tmp_path).measure(Run(study, "", "", DataRequest(640, 4), FIT))
-    assert found.seconds.value == seconds
+def test_a_run_measures_time_and_error(clock: Any, tmp_path: Path) -> None:
+    found = runner(tmp_path).measure(Run("whole", "", "", DataRequest(640, 4), FIT))
+    assert found.seconds.value == 13.0
     d = found.details
     assert (d["generation_seconds"], d["training_seconds"], d["total_seconds"]) == (7, 5, 13)
     assert (d["queries"], d["spp"], d["bytes"]) == (640, 4, 100)
@@ -111,10 +106,9 @@ def test_seeds_change_data_and_fit(clock: Any, tmp_path: Path, monkeypatch: pyte
         mbtf_fit, "fit", lambda config, *rest: seeds.append(config.seed) or usual(config, *rest)
     )
     one = runner(tmp_path, seed=5)
-    for seed in (0, 2, 2):
+    for seed in (0, 2):
         one.measure(Run("whole", "", "", DataRequest(64, 4, seed), FIT))
-    # Data of one seed are generated once.
-    assert seeds == [5, 5, 7, 7, 7]
+    assert seeds == [5, 5, 7, 7]
 
 
 @pytest.mark.parametrize(("study_seed", "offset"), [(0, 0), (0, 2), (5, 0), (5, 2)])
@@ -128,12 +122,11 @@ def test_commands_reproduce_their_run(
     monkeypatch.setattr(mbtf_fit, "fit", lambda config, *rest: used.append(config) or usual(config, *rest))
     one = runner(tmp_path, study_seed)
     write_text(tmp_path / "generate.yaml", dump_yaml(one.config.model_dump(mode="json")))
-    runs = [run for run in planned_runs(600.0, 6, 1.5e-7) if run.study == "models"]
+    runs = planned_runs(600.0, 6, 1.5e-7)
     for run in (runs[0], runs[-1]):
         used.clear()
-        one.forget(run.data)
         data = DataRequest(run.data.queries, run.data.spp, offset)
-        command = one.measure(Run("models", "", "", data, run.fit)).command
+        command = one.measure(Run("whole", "", "", data, run.fit)).command
         generate, fit = (shlex.split(part) for part in command.split(" && "))
         flags = {"--queries": "queries.train", "--spp": "queries.spp", "--seed": "seed"}
         assigned = [f"{flags[a]}={b}" for a, b in pairwise(generate) if a in flags]
@@ -142,7 +135,6 @@ def test_commands_reproduce_their_run(
         assert found.model_copy(update={"queries": found.queries.model_copy(update=test)}) == used[0]
         options = [b for a, b in pairwise(fit) if a == "--set"]
         assert resolve(FitConfig, assignments=options) == used[1]
-        one.forget(data)
 
 
 def test_every_seed_has_one_test_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -61,9 +61,9 @@ def test_measurements_come_back_and_damaged_ones_are_repeated(tmp_path: Path) ->
     mesh = GeneratorTask("mesh", "", "64 cells", {"geometry.mesh": 64})
     kept = Measurement("mesh", "", "64 cells", "mbtf-gen", ONE, ONE, ONE, None, {"bytes": 12.0})
     store.put(mesh, kept)
-    store.put(run("models"), Measurement("models", "m", "5 s", "", ONE, Estimate(math.nan, math.inf, 100)))
+    store.put(run(), Measurement("whole", "m", "5 s", "", ONE, Estimate(math.nan, math.inf, 100)))
     assert store.get(mesh, "mbtf-gen") == kept
-    found = store.get(run("models"))
+    found = store.get(run())
     assert found is not None
     assert math.isnan(found.error.value)
     assert store.get(replace(mesh, changes={})) is store.get(replace(mesh, study="paths")) is None
@@ -101,7 +101,7 @@ def test_folders_of_something_else_are_refused(tmp_path: Path) -> None:
                 module.claim(folder, machine())
 
 
-RUNS = [run("whole", 3000, "long", 7200.0), run("whole", 2000, "short", 60.0), run("models", 1000, "m", 30.0)]
+RUNS = [run(3000, "long", 7200.0), run(2000, "short", 60.0), run(1000, "m", 40.0)]
 
 
 @pytest.fixture
@@ -135,23 +135,23 @@ def runners(monkeypatch: pytest.MonkeyPatch) -> list[FakeRunner]:
 
 def test_a_study_keeps_its_time_and_resumes(runners: list[FakeRunner], tmp_path: Path) -> None:
     recipe, folder = load_recipe(RECIPE, []), tmp_path / "study"
-    # One whole run of 60 s; a second one would take the share of the models, 30 s twice.
-    first = module.run_study(recipe, folder, seconds=150.0)
-    assert [m.details.get("seeds") for m in first.measurements] == [None, 1, 2]
-    assert sum(r.fit["training"]["time"] for r in runners[0].measured) <= 150.0
+    # Two runs of 60 s and one of 40 s.
+    first = module.run_study(recipe, folder, seconds=190.0)
+    assert [m.details.get("seeds") for m in first.measurements] == [None, 2, 1]
+    assert sum(r.fit["training"]["time"] for r in runners[0].measured) <= 190.0
     assert first.skipped == ["complete run: neumip, long"]
     assert first.deviation is not None
-    # Only what is missing is measured: the second seed of the whole run.
-    second = module.run_study(recipe, folder, seconds=150.0)
-    assert [(r.name, r.data.seed) for r in runners[1].measured] == [("short", 1)]
+    # Only what is missing is measured: the second seed of the last run.
+    second = module.run_study(recipe, folder, seconds=190.0)
+    assert [(r.name, r.data.seed) for r in runners[1].measured] == [("m", 1)]
     # Refining takes its own time, for further seeds.
-    module.run_study(recipe, folder, seconds=150.0, refine=3600.0)
+    module.run_study(recipe, folder, seconds=190.0, refine=3600.0)
     assert {r.data.seed for r in runners[2].measured} >= {2}
     assert all(r.name != "long" for r in runners[2].measured)
-    assert sum(r.fit["training"]["time"] for r in runners[2].measured) <= 3750.0
-    assert module.time_of(folder) == 150.0
+    assert sum(r.fit["training"]["time"] for r in runners[2].measured) <= 3790.0
+    assert module.time_of(folder) == 190.0
     assert module.time_of(tmp_path / "none") == module.NEW_TIME
-    assert second.measurements[2].error.value == first.measurements[2].error.value
+    assert second.measurements[1].error.value == first.measurements[1].error.value
 
 
 def test_a_study_states_its_size_and_is_refused_if_the_disk_is_full(
@@ -164,7 +164,7 @@ def test_a_study_states_its_size_and_is_refused_if_the_disk_is_full(
     assert not folder.exists()
     assert not said
     monkeypatch.undo()
-    assert module.disk_bytes(RUNS) == (module.TEST[0] + 2 * 3000) * 68
+    assert module.disk_bytes(RUNS) == (module.TEST[0] + 3000) * 68
 
 
 def test_other_seeds_and_materials_are_not_mixed(runners: list[FakeRunner], tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ def material(name: str, state: str, value: float = 0.1, **more: Any) -> dict[str
 
 def record(*materials: dict[str, Any], **more: Any) -> dict[str, Any]:
     found = {"title": "Test", "description": "", "command": "run", "machine": {"system": "here"}}
-    found |= {"training": None, "division": {}, "shared": {}}
+    found |= {"training": None, "shared": {}}
     return found | more | {"materials": list(materials)}
 
 
@@ -42,14 +42,13 @@ def test_failures_come_after_errors_and_show_nothing_of_earlier_runs(tmp_path: P
     assert "&lt;b&gt;&amp;" in shown
 
 
-def test_first_fits_and_shared_networks(tmp_path: Path) -> None:
-    division = {"errors": {"a": {"key": "k", "error": 0.301}}, "times": {"a": {"key": "k", "seconds": 1.5}}}
+def test_shared_networks(tmp_path: Path) -> None:
     errors: dict[str, dict[str, Any]] = {"a": {"value": 0.2, "error": 0.01, "n": 100}}
     shared = {"training": 60.0, "fit": "relief", "errors": errors, "error": ""}
     two = material("a", "done")
     two["fits"]["other"] = two["fits"]["relief"]
-    shown = library_page(record(two, division=division, shared=shared), tmp_path)
-    assert "unexplained variance 0.301 after the first fit, therefore 1.5 s of training" in shown
+    shown = library_page(record(two, training=30.0, shared=shared), tmp_path)
+    assert f"Each material is trained for {clock(30.0)}" in shown
     assert shown.count("with the shared network 0.20") == 1
     # Fits of the same options may have other names.
     errors["a"]["fit"] = "other"

@@ -29,7 +29,6 @@ class Runs(Runner):
         self.arguments: dict[tuple[str, str], Any] = {}
         self.gpus: set[bool] = set()
         self.seen: list[dict[str, str]] = []
-        self.interrupted_at = 0
         self.errors: dict[str, str] = {}
 
     def map(self, function: Any, items: Iterable[Item], **options: Any) -> Iterator[Result]:  # type: ignore[override]
@@ -39,14 +38,9 @@ class Runs(Runner):
             self.calls.append((function.__name__, task.name))
             self.arguments[self.calls[-1]] = task.arguments
             self.gpus.add(task.gpu)
-            if len(self.calls) - 1 == self.interrupted_at:
-                raise KeyboardInterrupt
             error = self.errors.get(task.name, "")
             value = getattr(self, self.calls[-1][0])(task.arguments)
             yield Result(task.name, None if error else value, error)
-
-    def first_fit(self, arguments: Any) -> float:
-        return 0.1
 
     def run_material(self, arguments: Any) -> dict[str, Any]:
         return {"seconds": {"generate": 1.0}}
@@ -88,20 +82,10 @@ def test_earlier_results_stay_until_their_run_ends(runs: Runs) -> None:
     assert [m["error"] for m in runs.record()["materials"]] == ["", ""]
 
 
-def test_each_first_fit_is_recorded_as_it_comes(runs: Runs) -> None:
-    runs.interrupted_at = 2
-    with pytest.raises(KeyboardInterrupt):
-        again(runs, "training: 10s\n")
-    assert set(runs.record()["division"]["errors"]) == {"a"}
-    runs.interrupted_at = 0
-    again(runs, "training: 10s\n")
-    assert runs.calls[1:] == [("first_fit", "b"), ("run_material", "a"), ("run_material", "b")]
-
-
 def test_the_others_go_on_after_a_failure(runs: Runs) -> None:
     runs.errors = {"a": "no memory"}
-    assert again(runs, "training: 10s\n").failed == runs.errors
-    assert runs.calls[1:] == [("first_fit", "a"), ("first_fit", "b"), ("run_material", "b")]
+    assert again(runs).failed == runs.errors
+    assert runs.calls[1:] == [("run_material", "a"), ("run_material", "b")]
 
 
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
@@ -111,22 +95,9 @@ def test_fits_on_a_gpu_take_one_of_their_worker(runs: Runs, device: str) -> None
     assert runs.gpus == {device == "cuda"}
 
 
-def test_only_other_options_of_data_or_fits_need_first_fits(runs: Runs) -> None:
-    again(runs, "training: 10s\n")
-    for own, needed in (
-        ("compare: {size: 64}", False),
-        ("generate: {seed: 3}", True),
-        ("generate: {seed: 3}, fit: {relief: {seed: 3}}", True),
-    ):
-        again(runs, f"training: 10s\nmaterials: {{b: {{{own}}}}}\n")
-        assert (("first_fit", "b") in runs.calls) == needed, own
-        assert ("first_fit", "a") not in runs.calls
-
-
-def test_fits_of_a_material_share_its_time_and_missing_ones_keep_theirs(runs: Runs) -> None:
-    again(runs, "training: 9s\nmaterials: {a: {fit: {neumip: {}}}, gone: gone}\n")
-    assert runs.arguments["first_fit", "a"]["seconds"] == pytest.approx(0.2 * 3.0)
-    for name, expected in (("a", ["1.2s"] * 2), ("b", ["2.4s"])):
+def test_fits_of_a_material_share_its_time(runs: Runs) -> None:
+    again(runs, "training: 3s\nmaterials: {a: {fit: {neumip: {}}}}\n")
+    for name, expected in (("a", ["1.5s"] * 2), ("b", ["3s"])):
         fits = runs.arguments["run_material", name]["recipe"].fit
         assert [format_duration(fit.training.time) for fit in fits.values()] == expected
 

@@ -30,8 +30,7 @@ def test_both_errors_of_a_group_are_significant_or_neither() -> None:
     direction = {"elevation": 45, "azimuth": 0}
     picture: dict[str, Any] = {"view": direction, "light": direction, "tiles_across": 1}
     picture["references"] = {"query": {"flip": flip}}
-    contrast = {"query": {"luminance": number(0.95, 0.02), "chroma": None, "correlation": None}}
-    picture["fits"] = {"a": {"errors": {"query": error}, "flip": flip, "contrast": contrast}}
+    picture["fits"] = {"a": {"errors": {"query": error}, "flip": flip}}
     test = {"a": {"splits": {"test": split}, "network_weights": 9, "texels": 9}}
     record: dict[str, Any] = {
         "fits": ["a"],
@@ -47,8 +46,6 @@ def test_both_errors_of_a_group_are_significant_or_neither() -> None:
     assert levels[1] == ["1", "50", "20.0 ± 1.0 %", "0.400 ± 0.010"]
     assert cosines[0][0] == "0.3–0.4"
     assert context["facts"][0]["value"] == "20.0 ± 1.0 %"
-    # Of a gray material there is no chroma.
-    assert context["contrast_table"]["rows"][0][3:] == ["a", "0.95 ± 0.02", "–", "–"]
 
 
 def test_the_warm_up_and_an_outlier_do_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
