@@ -5,12 +5,10 @@ from __future__ import annotations
 import json
 import math
 import re
-import subprocess
-import sys
+import shutil
 from pathlib import Path
 
 import pytest
-from conftest import RunPython
 from support.command_lines import call, fails
 from support.datasets import edit
 from support.fit_data import parallax, write_data
@@ -26,31 +24,28 @@ def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def material(shards: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("fit") / "material"
-    command = [sys.executable, "-m", "mbtf_fit", str(shards), "-o", str(folder), *QUICK]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "training for 5 steps (change it with --time or --steps)" in done.stderr
-    assert len(done.stdout.splitlines()) <= 5
-    assert re.search(r"^unexplained variance [\d.]+ ± [\d.]+ of \d+ test queries", done.stdout, re.M)
+    done = call(["mbtf-fit", str(shards), "-o", str(folder), *QUICK])
+    assert done.code == 0, done.err
+    assert "training for 5 steps (change it with --time or --steps)" in done.err
+    assert len(done.out.splitlines()) <= 5
+    assert re.search(r"^unexplained variance [\d.]+ ± [\d.]+ of \d+ test queries", done.out, re.M)
     return folder
 
 
-def test_export_writes_the_reported_files(material: Path, tmp_path: Path, run_python: RunPython) -> None:
+def test_export_writes_the_reported_files(material: Path, tmp_path: Path) -> None:
     out = tmp_path / "export"
-    done = run_python("-m", "mbtf_fit", "export", str(material), "--half", "-o", str(out), "--json")
-    assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
+    done = call(["mbtf-fit", "export", str(material), "--half", "-o", str(out), "--json"])
+    assert done.code == 0, done.err
+    found = json.loads(done.out)
     assert found["files"] == {p.name: p.stat().st_size for p in out.iterdir() if p.name != "export.json"}
     assert set(found["files"]) == {"textures.exr", "layers.json"}
     assert 0 < found["half"]["relative"] < 0.01
     again = tmp_path / "half"
-    done = run_python(
-        "-m", "mbtf_fit", "export", str(material), "--to", "material", "--half", "-o", str(again)
-    )
-    assert done.returncode == 0, done.stderr
-    assert "half precision: rms error" in done.stdout
-    done = run_python("-m", "mbtf_fit", "info", str(again))
-    deviation = re.search(r"largest deviation (\S+)", done.stdout)
+    done = call(["mbtf-fit", "export", str(material), "--to", "material", "--half", "-o", str(again)])
+    assert done.code == 0, done.err
+    assert "half precision: rms error" in done.out
+    done = call(["mbtf-fit", "info", str(again)])
+    deviation = re.search(r"largest deviation (\S+)", done.out)
     assert deviation is not None
     # Between the values of PyTorch, which are stored, and those of whatever evaluates here.
     assert float(deviation[1]) < 1e-6
@@ -58,26 +53,18 @@ def test_export_writes_the_reported_files(material: Path, tmp_path: Path, run_py
     assert "choose another folder with -o" in message
 
 
-def test_json_is_one_object(shards: Path, tmp_path: Path, run_python: RunPython) -> None:
-    done = run_python("-m", "mbtf_fit", str(shards), "-o", str(tmp_path / "m"), *QUICK, "--json")
-    assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
-    assert found["training"]["steps"] == 5
-    assert set(found["errors"]) == {"test", "held_out_queries", "held_out_directions", "training"}
-
-
-def test_all_commands_print_the_same_summary(shards: Path, material: Path, run_python: RunPython) -> None:
+def test_all_commands_print_the_same_summary(shards: Path, material: Path) -> None:
     """Of the same numbers, which JSON holds in full."""
     lines = {}
     for name, words in (("evaluate", (str(material), str(shards))), ("info", (str(material),))):
-        lines[name] = run_python("-m", "mbtf_fit", name, *words).stdout.splitlines()
+        lines[name] = call(["mbtf-fit", name, *words]).out.splitlines()
         # Five steps are too few, which is said, too.
         assert len([line for line in lines[name] if not line.startswith("above 1")]) <= 5, lines[name]
-        table = run_python("-m", "mbtf_fit", name, *words, "-v").stdout
+        table = call(["mbtf-fit", name, *words, "-v"]).out
         assert "cosine 0.7-1" in table
         assert table.splitlines()[: len(lines[name])] == lines[name]
     assert lines["evaluate"][1:] == lines["info"][2:]
-    found = json.loads(run_python("-m", "mbtf_fit", "evaluate", str(material), str(shards), "--json").stdout)
+    found = json.loads(call(["mbtf-fit", "evaluate", str(material), str(shards), "--json"]).out)
     test = found["errors"]["test"]
     psnr = 10 * math.log10(2 ** (-2 * test["exposure"]) / test["mse"]["value"])
     assert test["psnr"]["value"] == pytest.approx(psnr)
@@ -86,38 +73,39 @@ def test_all_commands_print_the_same_summary(shards: Path, material: Path, run_p
     assert {errors["exposure"] for errors in found["errors"].values()} == {test["exposure"]}
 
 
-def test_a_finished_fit_is_not_trained_again(shards: Path, material: Path, run_python: RunPython) -> None:
+def test_a_finished_fit_is_not_trained_again(shards: Path, material: Path) -> None:
     before = (material / "material.json").read_bytes()
-    done = run_python("-m", "mbtf_fit", str(shards), "-o", str(material), *QUICK)
-    assert done.returncode == 0, done.stderr
-    assert done.stderr.splitlines() == [
-        f"{material}: this fit is already finished; --overwrite trains it again"
-    ]
-    assert "gradients reached every texel" not in done.stdout
-    told = run_python("-m", "mbtf_fit", str(shards), "-o", str(material), *QUICK, "--verbose")
-    assert "gradients reached every texel" in told.stdout
-    assert "unexplained variance  test" in told.stdout
+    done = call(["mbtf-fit", str(shards), "-o", str(material), *QUICK])
+    assert done.code == 0, done.err
+    assert done.err.splitlines() == [f"{material}: this fit is already finished; --overwrite trains it again"]
+    assert "gradients reached every texel" not in done.out
+    told = call(["mbtf-fit", str(shards), "-o", str(material), *QUICK, "--verbose"])
+    assert "gradients reached every texel" in told.out
+    assert "unexplained variance  test" in told.out
     assert (material / "material.json").read_bytes() == before
-    done = run_python("-m", "mbtf_fit", str(shards), "-o", str(material), *QUICK, "--overwrite")
-    assert "training for 5 steps" in done.stderr
-    assert "already finished" not in done.stderr
+    done = call(["mbtf-fit", str(shards), "-o", str(material), *QUICK, "--overwrite"])
+    assert "training for 5 steps" in done.err
+    assert "already finished" not in done.err
 
 
-def test_data_of_another_material_cause_a_warning(tmp_path: Path, run_python: RunPython) -> None:
-    made = {}
-    for name, digest in (("own", "1"), ("other", "2")):
-        made[name] = write_data(tmp_path / name, parallax, train=2000, test=500)
-        inputs = {"height": digest, "settings": "same"}
-        edit(made[name] / "manifest.json", lambda manifest, inputs=inputs: manifest.update(inputs=inputs))
+def test_data_of_another_material_cause_a_warning(shards: Path, tmp_path: Path) -> None:
+    """Those that were made from other heights, whatever their values."""
+    made = {name: shutil.copytree(shards, tmp_path / name) for name in ("own", "other")}
+    for digest, folder in enumerate(made.values()):
+        inputs = {"height": str(digest), "settings": "same"}
+        edit(folder / "manifest.json", lambda manifest, inputs=inputs: manifest.update(inputs=inputs))
     fitted = tmp_path / "fitted"
-    done = run_python("-m", "mbtf_fit", str(made["own"]), "-o", str(fitted), *QUICK)
-    assert done.returncode == 0, done.stderr
+    done = call(["mbtf-fit", str(made["own"]), "-o", str(fitted), "--steps", "1", "--json"])
+    assert done.code == 0, done.err
+    found = json.loads(done.out)
+    assert found["training"]["steps"] == 1
+    assert set(found["errors"]) == {"test", "held_out_queries", "held_out_directions", "training"}
     for name, foreign in (("own", []), ("other", ["height"])):
-        done = run_python("-m", "mbtf_fit", "evaluate", str(fitted), str(made[name]), "--json")
-        assert done.returncode == 0, done.stderr
-        assert json.loads(done.stdout)["foreign_inputs"] == foreign
-        assert ("made from another material" in done.stderr) == bool(foreign)
-        assert ("(height differs)" in done.stderr) == bool(foreign)
+        done = call(["mbtf-fit", "evaluate", str(fitted), str(made[name]), "--json"])
+        assert done.code == 0, done.err
+        assert json.loads(done.out)["foreign_inputs"] == foreign
+        assert ("made from another material" in done.err) == bool(foreign)
+        assert ("(height differs)" in done.err) == bool(foreign)
 
 
 def test_evaluate_and_info_report_text_and_json(shards: Path, material: Path) -> None:

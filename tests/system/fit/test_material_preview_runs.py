@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 from conftest import RunPython
 from PIL import Image
+from support.command_lines import call, fails
 from support.plugin_materials import write_material
 
 BLOCKED = """
@@ -37,25 +39,20 @@ def test_pictures_without_pytorch_kept_and_refused(tmp_path: Path, run_python: R
     with Image.open(tmp_path / "out/sheet.png") as sheet:
         assert sheet.width > 6 * 64
     (tmp_path / "out/turntable.gif").unlink()
-    again = json.loads(run_python("-c", BLOCKED, *words, *SMALL, "--json").stdout)
-    assert [p["kept"] for p in again["pictures"]] == [True, False]
-    shown = [
-        json.loads(run_python("-c", BLOCKED, *words, *SMALL, "--exposure", e, "--json").stdout) for e in "11"
-    ]
+
+    def again(*options: str) -> dict[str, Any]:
+        return call(["mbtf-fit", *words, *SMALL, *options, "--json"]).result()
+
+    assert [p["kept"] for p in again()["pictures"]] == [True, False]
+    shown = [again("--exposure", "1") for _ in range(2)]
     assert [p["kept"] for p in shown[0]["pictures"] + shown[1]["pictures"]] == [False, False, True, True]
     assert (shown[0]["exposure"], shown[1]["exposure"]) == (1.0, 1.0) != (report["exposure"],) * 2
     record = json.loads((tmp_path / "out/pictures.json").read_text())
     assert [p["facts"]["exposure"] for p in record["pictures"].values()] == [1.0, 1.0]
-    sheet = json.loads(
-        run_python(
-            "-c", BLOCKED, *words[:2], "-o", str(tmp_path / "sheet"), *SMALL, "--sheet-only",
-            "--view", "60,-90", "--light", "45,45", "--json",
-        ).stdout
-    )  # fmt: skip
+    only = ("--sheet-only", "--view", "60,-90", "--light", "45,45", "-o", str(tmp_path / "sheet"))
+    sheet = call(["mbtf-fit", *words[:2], *SMALL, *only, "--json"]).result()
     assert [Path(p["file"]).name for p in sheet["pictures"]] == ["sheet.png"]
     with Image.open(tmp_path / "sheet/sheet.png") as picture:
         assert picture.width < 2 * 64
-    other = run_python("-c", BLOCKED, *words, *SMALL, "--tiles-around", "5")
-    assert other.returncode == 3
-    assert "holds pictures of another configuration: turntable.tiles: 8 -> 5" in other.stderr
-    assert len(other.stderr.splitlines()) <= 2
+    message = fails(3, *words, *SMALL, "--tiles-around", "5")
+    assert "another configuration: turntable.tiles: 8 -> 5" in message

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import RunPython
 from PIL import Image
+from support.command_lines import call
 from support.commands import Done, run_named
 
 from mbtf_core.data.dataset import Dataset
@@ -19,20 +19,18 @@ yarn: {type: silk1, fibers: 6, radius: 4, color: [0.8, 0.5, 0.2], width: 0.7}
 weft: {type: rayon2, fibers: 6, radius: 4, color: 0.3, width: 0.7}
 resolution: 16
 """
-SMALL = "--queries 40/texel --test-queries 256 --test-spp 64 --set output.shard_queries=4000"
+SMALL = "--queries 12/texel --test-queries 256 --test-spp 64 --set output.shard_queries=1000"
 LINES = {
     "generate": f"cloth.yaml {SMALL} -o data --json",
     "again": f"cloth.yaml {SMALL} -o data --json",
     "verify": "verify data",
-    "plan": "plan cloth.yaml --queries 40/texel",
-    "opaque": "plan cloth.yaml --queries 40/texel --effects=-transmission",
+    "plan": "plan cloth.yaml --queries 12/texel",
+    "opaque": "plan cloth.yaml --queries 12/texel --effects=-transmission",
     "images": "cloth.yaml --queries 4/texel --test-queries 256 --layout image --patch-size 4 -o images",
     "inspect": "inspect cloth.yaml --json",
     "reference": "reference cloth.yaml --view 50,20 --tiles-across 1 --size 24 --spp 8 -o reference",
     "preview": "preview cloth.yaml -o preview --size 64 --spp 4 --set queries.train=3000",
     "height scale": "cloth.yaml --height-scale 0.2 -o other",
-    "tileable": "cloth.yaml --make-tileable mirror -o other",
-    "write": "inspect cloth.yaml --write other.yaml",
     "no fibers": "cloth.yaml --effects -parallax -o other",
 }
 
@@ -107,19 +105,14 @@ def test_damaged_data_are_repaired(work: Path, done: dict[str, Done]) -> None:
     assert all(np.array_equal(a[key], b[key]) for key in a)
 
 
-def test_a_fit_learns_heights_by_default_and_draws_cloth(
-    work: Path, done: dict[str, Done], run_python: RunPython
-) -> None:
+def test_a_fit_learns_heights_by_default_and_draws_cloth(work: Path, done: dict[str, Done]) -> None:
     out = work / "material"
-    fitted = run_python(
-        "-m", "mbtf_fit", str(work / "data"), "--steps", "40", "--batch", "2048", "-o", str(out)
-    )
-    assert fitted.returncode == 0, fitted.stderr
-    assert "neumip+" in fitted.stdout
-    assert "transmittance" in fitted.stdout
-    drawn = run_python(
-        "-m", "mbtf_fit", "preview", str(out), "-o", str(work / "drawn"), "--size", "64", "--spp", "4"
-    )
-    assert drawn.returncode == 0, drawn.stderr
+    fitted = call(["mbtf-fit", str(work / "data"), "--steps", "10", "--batch", "2048", "-o", str(out)])
+    assert fitted.code == 0, fitted.err
+    assert "neumip+" in fitted.out
+    assert "transmittance" in fitted.out
+    small = ["--sheet-only", "--size", "64", "--spp", "4"]
+    drawn = call(["mbtf-fit", "preview", str(out), "-o", str(work / "drawn"), *small])
+    assert drawn.code == 0, drawn.err
     with Image.open(work / "drawn/sheet.png") as picture:
         assert np.asarray(picture).std() > 5

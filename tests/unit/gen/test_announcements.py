@@ -30,8 +30,8 @@ def heights(tmp_path: Path) -> Path:
     "words",
     [
         (),
-        ("reference", "--size", "4096"),
-        ("preview", "--size", "8192"),
+        ("reference", "--size", "512"),
+        ("preview", "--size", "1024"),
     ],
 )
 def test_what_does_not_fit_is_refused_before_anything_is_written(

@@ -37,16 +37,6 @@ def test_batches_are_those_of_data_in_memory(tmp_path: Path) -> None:
             assert (getattr(a, name) == getattr(b, name)).all(), name
 
 
-def test_a_streamed_fit_is_identical(tmp_path: Path) -> None:
-    shards = write_data(tmp_path / "d", parallax, train=3000, test=500)
-    found = []
-    for memory in ("1GB", "1kB"):
-        options = {"training": {"steps": 6, "batch": 500}, "data": {"memory": memory}}
-        config = FitConfig.model_validate(options)
-        found.append(fit(config, shards, tmp_path / memory).material.model.weights())
-    assert all((found[0][name] == found[1][name]).all() for name in found[0])
-
-
 @pytest.mark.parametrize("suffix", [".npz", ".exr"])
 def test_evaluation_streams_its_queries(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str) -> None:
     """Data that a fit streams can be evaluated too, on the queries that the fit held out."""

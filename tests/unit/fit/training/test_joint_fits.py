@@ -186,16 +186,7 @@ def test_noisy_materials_do_not_decide_the_decay_alone(data: dict[str, Path], tm
         assert decay["texels"] == alone["texels"]
 
 
-@pytest.mark.parametrize("kernel", ["kernel", "no_kernel"])
-def test_a_kept_network_keeps_its_bits(
-    library_folder: Path,
-    data: dict[str, Path],
-    tmp_path: Path,
-    kernel: str,
-    request: pytest.FixtureRequest,
-) -> None:
-    if kernel == "no_kernel":
-        request.getfixturevalue("no_kernel")
+def test_a_kept_network_keeps_its_bits(library_folder: Path, data: dict[str, Path], tmp_path: Path) -> None:
     model = Material.load(library_folder / "waves").model.name
     shared = Decoder.find(library_folder).tensors()
     errors = []
@@ -222,6 +213,10 @@ def test_kernel_and_pytorch_agree_on_kept_networks(
     fit(options, data["third"], tmp_path / "kernel")
     request.getfixturevalue("no_kernel")
     fit(options, data["third"], tmp_path / "pytorch")
+    shared = Decoder.find(library_folder).tensors()
+    for name in ("kernel", "pytorch"):
+        found = networks_of(tmp_path / name)
+        assert all(torch.equal(found[key], shared[key]) for key in shared)
     one, other = (Material.load(tmp_path / name).model.pyramid.texels for name in ("kernel", "pytorch"))
     # Adam normalizes gradients: the few that rounding decides differ by a step.
     assert ((one - other).abs() > 1e-4).float().mean() < 0.02
@@ -236,15 +231,13 @@ def test_any_material_has_a_network_to_keep(data: dict[str, Path], tmp_path: Pat
     assert record == {"sha256": Decoder.find(tmp_path / "m").sha256}
 
 
-@pytest.mark.parametrize("option", ["decoder", "init_from"])
-def test_a_fit_does_not_replace_what_it_starts_from(
-    data: dict[str, Path], tmp_path: Path, option: str
-) -> None:
+def test_a_fit_does_not_replace_what_it_starts_from(data: dict[str, Path], tmp_path: Path) -> None:
     fit(single_config(steps=2), data["waves"], tmp_path / "m")
     before = Decoder.find(tmp_path / "m").sha256
-    wanted = single_config(steps=2, **{option: str(tmp_path / "m")})
-    with pytest.raises(InputError, match="m: holds what the fit starts from"):
-        fit(wanted, data["stripes"], tmp_path / "m", overwrite=True)
+    for option in ("decoder", "init_from"):
+        wanted = single_config(steps=2, **{option: str(tmp_path / "m")})
+        with pytest.raises(InputError, match="m: holds what the fit starts from"):
+            fit(wanted, data["stripes"], tmp_path / "m", overwrite=True)
     assert Decoder.find(tmp_path / "m").sha256 == before
 
 
@@ -369,21 +362,17 @@ def test_divergence_names_the_material(
         fit_two(joint_config(steps=6), data, tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
+def test_other_architectures_are_refused(data: dict[str, Path], tmp_path: Path) -> None:
+    fit(single_config(steps=2), data["waves"], tmp_path / "m")
+    others: list[tuple[dict[str, Any], str]] = [
         ({"model": "neumip"}, r"its network has model relief, the fit neumip"),
         ({"network": {"width": 16}}, r"its network has network\.width 25, the fit 16"),
         ({"network": {"encoding": {"half_vector": False}}}, r"network\.encoding\.half_vector True, the fit"),
-    ],
-)
-def test_other_architectures_are_refused(
-    data: dict[str, Path], tmp_path: Path, options: dict[str, Any], message: str
-) -> None:
-    fit(single_config(steps=2), data["waves"], tmp_path / "m")
-    wanted = FitConfig.model_validate({"decoder": str(tmp_path / "m"), **options})
-    with pytest.raises(InputError, match=message):
-        fit(wanted, data["waves"], tmp_path / "n")
+    ]
+    for options, message in others:
+        wanted = FitConfig.model_validate({"decoder": str(tmp_path / "m"), **options})
+        with pytest.raises(InputError, match=message):
+            fit(wanted, data["waves"], tmp_path / "n")
     assert not (tmp_path / "n").exists()
 
 

@@ -74,13 +74,13 @@ def test_hints_of_the_data_and_of_batches_give_one_fit(
     found = {}
     for memory in ("1GB", "180kB", "1kB"):
         sizes.clear()
-        options = config(14, memory=memory, network={"relief": {"places": places}})
+        options = config(5, memory=memory, network={"relief": {"places": places}})
         found[memory] = fit(options, shards, tmp_path / memory)
         if memory == "1GB":
             assert len(sizes) == 1
             assert sizes[0] > 2000
         else:
-            assert sizes == [300] * 14
+            assert sizes == [300] * 5
     whole = found.pop("1GB")
     for other in found.values():
         assert all(torch.equal(tensor, weights(whole)[name]) for name, tensor in weights(other).items())
@@ -91,9 +91,9 @@ def test_hints_of_the_data_and_of_batches_give_one_fit(
 def test_pytorch_fits_as_the_kernel_does(
     shards: Path, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
-    compiled = fit(config(20), shards, tmp_path / "compiled")
+    compiled = fit(config(8), shards, tmp_path / "compiled")
     request.getfixturevalue("no_kernel")
-    plain = fit(config(20), shards, tmp_path / "plain")
+    plain = fit(config(8), shards, tmp_path / "plain")
     described = [r.material.description["training"] for r in (compiled, plain)]
     assert [d["backend"].split()[0] for d in described] == ["kernel", "pytorch"]
     assert described[1]["loss"] == pytest.approx(described[0]["loss"], rel=1e-3)
@@ -133,7 +133,7 @@ def test_holes_are_learned(tmp_path: Path) -> None:
 
 def test_another_material_gives_textures_and_depth_weights(shards: Path, tmp_path: Path) -> None:
     """Decoder and surface are those of the fit."""
-    fit(config(60), shards, tmp_path / "first")
+    fit(config(20), shards, tmp_path / "first")
     flat = write_data(tmp_path / "flat", parallax, train=1000, test=100, aspect=0.75)
     # At rates this low what training starts from is what it ends with.
     slow: dict[str, Any] = {"learning_rate": 1e-9, "texture_learning_rate": 1e-9}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,11 @@ import mbtf_fit.training.fit
 from mbtf_core.data.lattice import Lattice
 from mbtf_fit.config import FitConfig
 from mbtf_fit.training import fit_folder
-from mbtf_fit.training.fit import fit
+from mbtf_fit.training.fit import FitResult, fit
 from mbtf_fit.training.trainer import Trainer
 from mbtf_fit.training.validation import read_history
 
-STEPS = 14
+STEPS = 10
 
 
 class Killed(BaseException):
@@ -38,6 +39,12 @@ def config(memory: str = "1GB") -> FitConfig:
     return FitConfig.model_validate({"training": training, "data": {"memory": memory}})
 
 
+@pytest.fixture(scope="module")
+def whole(shards: Path, tmp_path_factory: pytest.TempPathFactory) -> FitResult:
+    """The fit that nothing stopped."""
+    return fit(config(), shards, tmp_path_factory.mktemp("whole") / "m")
+
+
 @pytest.fixture
 def often(monkeypatch: pytest.MonkeyPatch) -> None:
     """Look and save after every step."""
@@ -47,14 +54,18 @@ def often(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("memory", ["1GB", "1kB"])
 def test_a_fit_killed_at_random_steps_ends_with_the_same_bits(
-    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, often: None, memory: str
+    shards: Path,
+    whole: FitResult,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    often: None,
+    memory: str,
 ) -> None:
-    whole = fit(config(), shards, tmp_path / "whole")
     random = np.random.default_rng(0)
     out, step, kills = tmp_path / "killed", Trainer._step, 0
     saved = mbtf_fit.training.fit.write_checkpoint
     while not (out / "material.json").exists():
-        left = int(random.integers(1, 7))
+        left = int(random.integers(2, 7))
 
         def dying(self: Trainer, *arguments: Any) -> torch.Tensor:
             nonlocal left
@@ -65,7 +76,7 @@ def test_a_fit_killed_at_random_steps_ends_with_the_same_bits(
 
         def forgetful(*arguments: Any) -> None:
             # Not every step is saved: some are done again.
-            if random.random() < 0.4:
+            if random.random() < 0.6:
                 saved(*arguments)
 
         monkeypatch.setattr(Trainer, "_step", dying)
@@ -86,7 +97,7 @@ def test_a_fit_killed_at_random_steps_ends_with_the_same_bits(
 
 @pytest.mark.parametrize("at", ["unlink", "write_json", "write_text"])
 def test_a_fit_killed_while_it_replaces_another_is_repeated(
-    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: str
+    shards: Path, whole: FitResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: str
 ) -> None:
     unlink = Path.unlink
 
@@ -95,9 +106,8 @@ def test_a_fit_killed_while_it_replaces_another_is_repeated(
             raise Killed
         unlink(path, *arguments, **options)
 
-    short = {"steps": 2, "batch": 300}
-    first, other = (FitConfig.model_validate({"training": short, "seed": seed}) for seed in (0, 1))
-    fit(first, shards, tmp_path / "m")
+    other = FitConfig.model_validate({"training": {"steps": 2, "batch": 300}, "seed": 1})
+    shutil.copytree(whole.folder, tmp_path / "m")
     with monkeypatch.context() as patch:
         patch.setattr(Path if at == "unlink" else fit_folder, at, die)
         with pytest.raises(Killed):
