@@ -39,6 +39,7 @@ ObjectStore.write = stopped
 if program == "mbtf-gen":
     from mbtf_gen.cli.app import app
 else:
+    from mbtf_fit.cli.app import app
 sys.exit(run(app, line))
 """
 
