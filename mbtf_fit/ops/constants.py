@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 
-from mbtf_fit.sections import EncodingSection, NetworkSection
-
 # Slope of leaky-relu below zero.
 LEAK = 0.01
 # Offset in tile widths per unit of the offset network's output.
@@ -19,8 +17,6 @@ GATE = 0.1
 
 # Of the model `relief`. Columns of the hints: height, irradiance, normal (x, y), core (RGB).
 HINTS = 7
-# Inputs of the decoder from the hints, and of light and view about the known normal.
-HINT_INPUTS, FRAME_INPUTS = 6, 6
 # Factor of the irradiance under the logarithm.
 IRRADIANCE_SCALE = 4.0
 # Channels of the maps: slopes (x, y), their squared length, base color (RGB); of a glossy surface besides α²
@@ -52,28 +48,3 @@ KNOTS = 17
 # Tensors of the surface in a material, before the level.
 HEIGHTS, MAPS, HORIZONS = "surface.heights", "surface.maps", "surface.horizons"
 LIGHT_WIDTH, DIELECTRIC = "surface.light_width", "surface.dielectric"
-
-
-def encoded_size(coordinates: int, bands: int, options: EncodingSection) -> int:
-    """Numbers that encode so many coordinates."""
-    return coordinates * (2 * bands + options.raw) if bands else coordinates
-
-
-def direction_size(options: EncodingSection) -> int:
-    """Numbers that encode a direction."""
-    return encoded_size(3 if options.direction_xyz else 2, options.direction, options)
-
-
-def directions_size(options: EncodingSection) -> int:
-    """Numbers that encode light and view."""
-    return 2 * direction_size(options) + (6 if options.half_vector else 0)
-
-
-def position_size(options: EncodingSection) -> int:
-    """Numbers that encode a position."""
-    return encoded_size(2, options.position, options) if options.position else 0
-
-
-def hint_size(network: NetworkSection) -> int:
-    """Inputs of the decoder of `relief` besides features and directions."""
-    return HINT_INPUTS * network.relief.hints + FRAME_INPUTS * network.relief.frame
