@@ -74,6 +74,7 @@ class Hierarchical(Model):
         grid: list[Operation] = [Neighborhood("grid", "u", "level", REACH * modules)] if modules else []
         at = "grid" if grid else "u"
         moved, offset = neural_offset(at, network)
+        # (X1) e(p) = (sin 2^b π p, cos 2^b π p)
         encoded, position = encode_position(at, network.encoding)
         light_and_view, directions = encode_directions(network.encoding)
         features = ("features", *position)
@@ -85,7 +86,7 @@ class Hierarchical(Model):
         else:
             shared = tuple(directions)
             decoder = Inception("x", features, shared, "decoder", network.width, modules, outputs, activation)
-        # x = F(features of all positions, directions);  M = unit · x |x|³
+        # (X2) x = F(features of all positions, directions);  M = unit · x |x|³
         return [
             *grid,
             *offset,

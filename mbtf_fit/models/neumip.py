@@ -52,17 +52,17 @@ class Neumip(Model):
 
     @classmethod
     def operations(cls, lattice: Lattice, network: NetworkSection) -> list[Operation]:
-        # u' = u + r / max(ω_o,z, 0.6) · ω_o,xy  with  r = F_off(T_off(u), ω_o,xy)      (section 4.3)
+        # (N1) section 4.3: u' = u + r / max(ω_o,z, 0.6) · ω_o,xy,  r = F_off(T_off(u), ω_o,xy)
         moved, offset = neural_offset("u", network)
         encoded, position = encode_position("u", network.encoding)
         light_and_view, directions = encode_directions(network.encoding)
         return [
             *offset,
-            # P(u', σ): bilinear in a level, linear between the two nearest levels        (section 4.2)
+            # (N2) section 4.2: P(u', σ), bilinear in a level, linear between the two nearest levels
             pyramid(moved, network),
             *encoded,
             *light_and_view,
-            # x = F(P(u', σ), ω_i,xy, ω_o,xy): 4 layers of 25 units                       (section 4.1)
+            # (N3) section 4.1: x = F(P(u', σ), ω_i,xy, ω_o,xy), 4 layers of 25 units
             Network(
                 "x",
                 ("features", *position, *directions),
@@ -71,7 +71,7 @@ class Neumip(Model):
                 outputs=network.output_channels,
                 activation=network.activation,
             ),
-            # M = exp(x) - 1                                                              (section 5)
+            # Section 5: M = exp(x) - 1
             *color("x", network),
         ]
 

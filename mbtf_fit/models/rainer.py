@@ -85,7 +85,7 @@ class Rainer2019(Model):
             Lookup("texture", "u", "level", "pyramid", end),
             Stereographic("light", "omega_i"),
             Stereographic("view", "omega_o"),
-            # x = F(latents, light, view)
+            # (B3) x = F(latents, light, view)
             Network(
                 "x",
                 (f"texture[0:{latents}]", "light", "view"),
@@ -94,7 +94,7 @@ class Rainer2019(Model):
                 outputs=3,
                 activation=network.activation,
             ),
-            # M = unit · (exp(m + d x) - 1) / ω_i,z
+            # (B2) M = unit · (exp(m + d x) - 1) / ω_i,z
             Standardize("logarithm", "x", f"texture[{m}:{d}]", f"texture[{d}:{end}]"),
             Transform("radiance", "logarithm", "expm1", factor="unit"),
             DivideByCosine("value", "radiance", "omega_i", LEAST_COSINE),
@@ -146,7 +146,7 @@ class Rainer2019(Model):
         6)."""
         import torch
 
-        # Black data have no unit.
+        # (B1) z = encoder((y - m) / d), y = log(1 + M ω_i,z / unit). Black data have no unit.
         unit = self.material.number("unit")
         unit = torch.where(unit > 0, unit, torch.ones_like(unit))
         apparent = (values * omega_i[:, 2:]).clamp_min(0.0) / unit

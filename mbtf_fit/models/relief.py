@@ -67,7 +67,7 @@ class Relief(Model):
         return [
             # z: where the view ray meets the heights; its hints there.
             *known_surface(relief.places),
-            # u' = u + w_l z / ω_o,z · ω_o,xy
+            # (R1) u' = u + w_l z / ω_o,z · ω_o,xy
             Displace("moved", "u", "z", "level", "omega_o", "depth_weights", cls.learned),
             pyramid("moved", network),
             *encoded,
@@ -84,7 +84,7 @@ class Relief(Model):
             ),
             # unit · (exp(x) - 1)
             *color(f"x[0:{outputs}]" if relief.gate and outputs == 3 else "x", network, "own"),
-            # M = 2 σ(g) core + …
+            # (R3) M = 2 σ(g) core + …
             *(
                 [Gate("value", f"x[{outputs}:{outputs + 1}]", core, "own", scale=2.0, unit="unit")]
                 if relief.gate

@@ -19,7 +19,7 @@ class Shade(Operation):
     the horizon's elevation in the first half of the channels, the mean of its square in the second half,
     both linear between azimuths; v is their variance. The light is visible from the share
 
-        V = Φ((asin ω_i,z - h) / √max(v + (light_blur · light_width)², least_variance)).
+        (R2) V = Φ((asin ω_i,z - h) / √max(v + (light_blur · light_width)², least_variance)).
 
     Irradiance: ``e = V max(0, n·ω_i) / ω_i,z``, 1 on the reference plane. Core, in 1/sr: ``e b/π``, or of a
     glossy surface ``e ((1-m) b/π + GGX)`` with ``F0 = (1-m) dielectric + m b`` and ``α² = clamp(α² + max(0,

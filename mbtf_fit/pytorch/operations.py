@@ -138,6 +138,7 @@ def _rise(learned: str, run: Execution, u: Tensor, z: Tensor, omega_o: Tensor) -
     still = lookup(textures.table.detach(), textures.packing, hit)
     (gradient,) = torch.autograd.grad(still.sum(), hit)
     x = textures(hit.detach())
+    # (H1) dz = dh / (1 - ∇h · ω_o,xy / ω_o,z), the denominator bounded from below
     facing = 1.0 - HEIGHT_SCALE * (gradient / aspect * slope).sum(1, keepdim=True)
     return HEIGHT_SCALE * (x - x.detach()) / facing.clamp_min(LEAST_FACING)
 
