@@ -44,7 +44,7 @@ from mbtf_gen.tile.heightfield_tile import HeightFieldTile, Tile
 from mbtf_gen.tile.loading import load_material
 
 if TYPE_CHECKING:
-    from mbtf_gen.tile.heights.grid import HeightGrid
+    from mbtf_gen.tile.heights import HeightGrid
 
 MESH = 512
 DEPTH = 6
@@ -119,7 +119,7 @@ def mitsuba_run(material: Tile, grid: HeightGrid, count: int, spp: int) -> Run:
     import mitsuba as mi
 
     from mbtf_gen.render.scene import unit_of
-    from mbtf_gen.tile.heights.grid import mesh_of_grid
+    from mbtf_gen.tile.heights import mesh_of_grid
 
     unit = unit_of(grid.aspect)
     columns = max(1, round((count / grid.aspect) ** 0.5))

@@ -26,7 +26,7 @@ from mbtf_gen.engine.runtime import CPU_VARIANT, CUDA_VARIANT, load_mitsuba, pro
 from mbtf_gen.sampling.light_kernel import LightKernel
 from mbtf_gen.tile.fiber_tile import FiberTile
 from mbtf_gen.tile.fibers.curves import Curve
-from mbtf_gen.tile.heights.grid import HeightGrid
+from mbtf_gen.tile.heights import HeightGrid
 
 F64 = NDArray[np.float64]
 

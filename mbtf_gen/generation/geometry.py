@@ -14,7 +14,7 @@ from mbtf_core.images.resample import resample
 from mbtf_gen.effects.plan import EffectsPlan
 from mbtf_gen.job import Job
 from mbtf_gen.planning.simulation import shading_slopes
-from mbtf_gen.tile.heights.slopes import height_slopes
+from mbtf_gen.tile.heights import height_slopes
 
 F32 = NDArray[np.float32]
 

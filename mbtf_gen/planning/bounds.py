@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from mbtf_gen.effects.effect import DisplacementBounds
 from mbtf_gen.sampling.light_kernel import LightKernel
-from mbtf_gen.tile.heights.grid import HeightGrid
-from mbtf_gen.tile.heights.slopes import height_slopes
+from mbtf_gen.tile.heights import HeightGrid, height_slopes
 
 F64 = NDArray[np.float64]
 

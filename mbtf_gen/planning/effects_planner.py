@@ -18,7 +18,7 @@ from mbtf_gen.job import Job
 from mbtf_gen.planning.bounds import POINTS, displacement_bounds
 from mbtf_gen.planning.pilot import Change, Pilot, pilot_queries
 from mbtf_gen.sampling.light_kernel import LightKernel
-from mbtf_gen.tile.heights.statistics import triangle_slopes
+from mbtf_gen.tile.heights import triangle_slopes
 from mbtf_gen.tile.maps.material_file import REFLECTING
 from mbtf_gen.tile.protocol import Tile
 

@@ -14,7 +14,7 @@ from mbtf_gen.effects.plan import EffectsPlan
 from mbtf_gen.engine.runtime import CPU_VARIANT
 from mbtf_gen.job import Job
 from mbtf_gen.render.estimates import Estimates, Stream
-from mbtf_gen.tile.heights.slopes import height_slopes
+from mbtf_gen.tile.heights import height_slopes
 
 
 class ClosedForm:

@@ -18,10 +18,11 @@ from mbtf_core.images.read import MAX_PIXELS, gray
 from mbtf_core.images.resample import dequantize
 from mbtf_core.suggest import suggest_path
 from mbtf_gen.tile.heightfield_tile import MAPS, HeightFieldTile
-from mbtf_gen.tile.maps.blending import BAND
 from mbtf_gen.tile.maps.checks import (
+    Codes,
     choose_convention,
     coarse_step,
+    code_use,
     level_warning,
     normal_note,
     orientation_warning,
@@ -32,8 +33,7 @@ from mbtf_gen.tile.maps.discovery import Convention, FoundMaps, normal_conventio
 from mbtf_gen.tile.maps.map_loader import MapLoader
 from mbtf_gen.tile.maps.material_file import LOBES, ROLES, MaterialFile, NormalEntry, layers_above
 from mbtf_gen.tile.maps.normal_map import NormalFit, fit_normals
-from mbtf_gen.tile.maps.quantization import Codes, code_use
-from mbtf_gen.tile.maps.tiling import retile, seams
+from mbtf_gen.tile.maps.tiling import BAND, retile, seams
 
 # Tile widths per stored height: the range of integer images is unknown, floats are in tile widths.
 _INTEGER_SCALE, _FLOAT_SCALE = 0.05, 1.0

@@ -18,16 +18,21 @@ from mbtf_core.images.read import LUMINANCE
 from mbtf_core.images.resample import resample
 from mbtf_gen.config.generator import GeometrySection
 from mbtf_gen.config.values import NormalMode, Tracer
-from mbtf_gen.tile.heights.grid import HeightGrid, tile_mesh
-from mbtf_gen.tile.heights.slopes import residual_slopes
-from mbtf_gen.tile.heights.statistics import detail_size, repeats, rms_slope, slope_angles
+from mbtf_gen.tile.heights import (
+    HeightGrid,
+    detail_size,
+    repeats,
+    residual_slopes,
+    rms_slope,
+    slope_angles,
+    tile_mesh,
+)
 from mbtf_gen.tile.inspection import ALBEDO_RANGE, inspection_text, oddities
-from mbtf_gen.tile.maps.checks import suggestion_warning
+from mbtf_gen.tile.maps.checks import Codes, suggestion_warning
 from mbtf_gen.tile.maps.discovery import Convention
 from mbtf_gen.tile.maps.map_loader import Color, MapFacts
 from mbtf_gen.tile.maps.material_file import LOBES, REFLECTING, ROLES
 from mbtf_gen.tile.maps.normal_map import NormalFit
-from mbtf_gen.tile.maps.quantization import Codes
 from mbtf_gen.tile.maps.tiling import Seam, broken
 from mbtf_gen.tile.protocol import REFLECTION, Tile, displacement_fault
 from mbtf_gen.tile.reflectance import plugin_dictionary
@@ -193,7 +198,7 @@ class HeightFieldTile(Tile):
         return replace(self, maps={name: value for name, value in given.items() if value is not None})
 
     def normal_slopes(self, mode: NormalMode = "residual") -> tuple[NDArray[np.float64], float] | None:
-        """Slopes that the normal map adds, see :func:`~mbtf_gen.tile.heights.slopes.residual_slopes`."""
+        """Slopes that the normal map adds, see :func:`~mbtf_gen.tile.heights.residual_slopes`."""
         if "normal" not in self.maps or self.bsdf is not None or mode == "off":
             return None
         return residual_slopes(self.maps["normal"], self.grid, mode)

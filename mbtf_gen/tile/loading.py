@@ -45,7 +45,7 @@ def load_material(path: str | Path, tiling: Tiling | None = None) -> Tile:
         ``.curves``). Other maps beside a height map are ignored.
     tiling : {"none", "mirror", "blend"} or None
         Method for maps that do not tile. ``mirror``: 2 × 2 mirrored copies, a tile of twice the width;
-        ``blend``: the edges blended over an eighth of the tile (:mod:`mbtf_gen.tile.maps.blending`); None:
+        ``blend``: the edges blended over an eighth of the tile (:mod:`mbtf_gen.tile.maps.tiling`); None:
         that of the material file, else ``none``.
 
     Returns

@@ -16,7 +16,7 @@ from mbtf_core.data.schema import Tiling
 from mbtf_core.errors import InputError, UsageError
 from mbtf_gen.config.generator import GeometrySection
 from mbtf_gen.config.values import NormalMode
-from mbtf_gen.tile.heights.grid import HeightGrid
+from mbtf_gen.tile.heights import HeightGrid
 from mbtf_gen.tile.maps.map_loader import Color
 from mbtf_gen.tile.maps.material_file import REFLECTING
 from mbtf_gen.tile.tracers.protocol import TileGeometry

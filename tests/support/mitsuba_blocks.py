@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.data.queries import Queries
-from mbtf_gen.tile.heights.grid import HeightGrid, tile_mesh
+from mbtf_gen.tile.heights import HeightGrid, tile_mesh
 from support.scenes import mi, queries, rocks
 
 # After support.scenes, which loads Mitsuba.

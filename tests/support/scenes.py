@@ -20,7 +20,7 @@ from mbtf_gen.render.estimator import Estimates, Estimator, Stream  # noqa: E402
 from mbtf_gen.render.path_tracer import Transport  # noqa: E402
 from mbtf_gen.render.scene import build_scene, register_plugins  # noqa: E402
 from mbtf_gen.sampling.light_kernel import LightKernel  # noqa: E402
-from mbtf_gen.tile.heights.grid import HeightGrid  # noqa: E402
+from mbtf_gen.tile.heights import HeightGrid  # noqa: E402
 
 register_plugins()
 

@@ -12,7 +12,7 @@ from mbtf_fit import ops
 from mbtf_fit.backends.mitsuba.backend import MITSUBA, Loader, Numbers, Step
 from mbtf_fit.material.format import WEIGHTS_NAME
 from mbtf_gen.engine.types import Float
-from mbtf_gen.tile.heights.grid import HeightGrid
+from mbtf_gen.tile.heights import HeightGrid
 from mbtf_gen.tile.tracers.heightfield import HeightField
 from mbtf_gen.tile.tracers.heightfield_tracer import closest_height
 

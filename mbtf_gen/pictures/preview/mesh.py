@@ -19,7 +19,7 @@ from mbtf_core.exposure import to_display
 from mbtf_core.images.resample import resample
 from mbtf_core.pictures.camera import Camera
 from mbtf_core.run.child import run_child
-from mbtf_gen.tile.heights.grid import HeightGrid, grid_faces, grid_vertices
+from mbtf_gen.tile.heights import HeightGrid, grid_faces, grid_vertices
 from mbtf_gen.tile.protocol import Tile
 
 # Largest number of cells along each side of all tiles together, and of texels across the texture.

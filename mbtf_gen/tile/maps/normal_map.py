@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.images.resample import resample
-from mbtf_gen.tile.heights.grid import HeightGrid
-from mbtf_gen.tile.heights.slopes import height_slopes, normal_slopes
+from mbtf_gen.tile.heights import HeightGrid, height_slopes, normal_slopes
 from mbtf_gen.tile.maps.discovery import Convention
 
 Array = NDArray[np.floating[Any]]

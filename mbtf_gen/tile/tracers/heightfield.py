@@ -24,7 +24,7 @@ _RELATIVE_OFFSET = 5.0e-7
 
 
 class Heights(Protocol):
-    """Heights of a tile, as :class:`~mbtf_gen.tile.heights.grid.HeightGrid` holds them."""
+    """Heights of a tile, as :class:`~mbtf_gen.tile.heights.HeightGrid` holds them."""
 
     @property
     def z(self) -> NDArray[np.float64]:

@@ -13,7 +13,7 @@ from support.scenes import HeightGrid, build_scene, lambert, mi, rocks
 
 from mbtf_gen.config.values import Tracer
 from mbtf_gen.sampling.rng import sequence
-from mbtf_gen.tile.heights.grid import mesh_of_grid
+from mbtf_gen.tile.heights import mesh_of_grid
 from mbtf_gen.tile.tracers.heightfield_tracer import HeightfieldGeometry
 
 N = 200_000

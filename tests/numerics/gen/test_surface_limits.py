@@ -14,7 +14,7 @@ from support.surfaces import point, towards, vectors
 from mbtf_core.errors import PartialError
 from mbtf_gen.render.bsdf.surface import SurfaceParts
 from mbtf_gen.sampling.light_kernel import LightKernel
-from mbtf_gen.tile.heights.grid import HeightGrid
+from mbtf_gen.tile.heights import HeightGrid
 
 Array = NDArray[np.float64]
 GOLD = np.array([0.9, 0.6, 0.3])

@@ -12,7 +12,7 @@ from support.scenes import build_scene, lambert, mi, rocks
 
 from mbtf_gen.config.values import Tracer
 from mbtf_gen.render.scene import CLEARANCE
-from mbtf_gen.tile.heights.grid import HeightGrid
+from mbtf_gen.tile.heights import HeightGrid
 
 RAYS = 10_000_000
 RESOLUTION = 64

@@ -22,7 +22,7 @@ from support.scenes import (
 
 from mbtf_core.stats import Estimate, mean_of_halves, t_test
 from mbtf_gen.sampling.light_kernel import LightKernel
-from mbtf_gen.tile.heights.grid import HeightGrid
+from mbtf_gen.tile.heights import HeightGrid
 
 ROUGH = {"type": "roughconductor", "alpha": 0.4, "distribution": "ggx", "material": "none"}
 PAIRS = [((40, 0), (70, 120)), ((15, 30), (60, 250)), ((25, 200), (12, 90))]

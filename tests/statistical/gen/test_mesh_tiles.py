@@ -25,7 +25,7 @@ from support.scenes import (
 )
 
 from mbtf_core.stats import mean_of_halves
-from mbtf_gen.tile.heights.grid import tile_mesh
+from mbtf_gen.tile.heights import tile_mesh
 from mbtf_gen.tile.loading import load_material
 from mbtf_gen.tile.mesh_tile import MeshPart, MeshTile
 

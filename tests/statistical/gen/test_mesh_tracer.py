@@ -27,7 +27,7 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
 from mbtf_gen.planning.effects_planner import reference_plan
 from mbtf_gen.planning.simulation import build_estimator
-from mbtf_gen.tile.heights.grid import HeightGrid, Tracer
+from mbtf_gen.tile.heights import HeightGrid, Tracer
 from mbtf_gen.tile.tracers.heightfield_tracer import HeightfieldGeometry
 from mbtf_gen.tile.tracers.mesh_tracer import MeshGeometry
 from mbtf_gen.tile.tracers.protocol import Vertex

@@ -11,7 +11,7 @@ from support.mitsuba_blocks import GRIDS, SPP, block, mitsuba_halves, random_que
 from support.scenes import LightKernel, Transport, direction, directional, estimate, flat, mi, real_heights
 
 from mbtf_core.stats import aggregate_test, elevation_groups
-from mbtf_gen.tile.heights.grid import HeightGrid
+from mbtf_gen.tile.heights import HeightGrid
 
 
 def colors(shape: tuple[int, int] = (16, 16)) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from support.scenes import (
 from mbtf_core.data.lattice import Lattice, texel_centers
 from mbtf_core.pictures.camera import Camera
 from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan
-from mbtf_gen.tile.heights.grid import tile_mesh
+from mbtf_gen.tile.heights import tile_mesh
 
 ROWS, COLUMNS = 4, 8
 ASPECT = ROWS / COLUMNS

@@ -17,8 +17,7 @@ from mbtf_gen.planning.pilot import pilot_queries, relative_change
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Stream
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
-from mbtf_gen.tile.heights.grid import HeightGrid
-from mbtf_gen.tile.heights.slopes import height_slopes, residual_slopes
+from mbtf_gen.tile.heights import HeightGrid, height_slopes, residual_slopes
 from mbtf_gen.tile.loading import load_material
 
 

@@ -15,7 +15,7 @@ from mbtf_gen.planning.pilot import pilot_queries, relative_change
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
-from mbtf_gen.tile.heights.slopes import height_slopes
+from mbtf_gen.tile.heights import height_slopes
 from mbtf_gen.tile.loading import load_material
 
 SPP = 16

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from mbtf_core import height_planes
 from mbtf_core.height_planes import node_table
-from mbtf_gen.tile.heights.grid import HeightGrid, grid_faces, grid_vertices
+from mbtf_gen.tile.heights import HeightGrid, grid_faces, grid_vertices
 
 SHAPES = [(1, 1), (1, 7), (2, 2), (5, 3), (8, 8), (13, 32), (33, 9)]
 

@@ -12,7 +12,7 @@ from support.scenes import mi
 from mbtf_fit.native import library
 from mbtf_fit.surface import heightfield
 from mbtf_fit.surface.heightfield import HeightfieldTracer, horizons_reference, trace_reference
-from mbtf_gen.tile.heights.grid import HeightGrid
+from mbtf_gen.tile.heights import HeightGrid
 from mbtf_gen.tile.tracers.heightfield_tracer import HeightfieldGeometry
 
 needs_kernel = pytest.mark.skipif(library.kernel() is None, reason=library.missing_reason() or "kernel")

@@ -12,8 +12,8 @@ from support.height_maps import fractal, normals_of, save_heights, save_normals
 from mbtf_core.app.console import run
 from mbtf_gen.cli.app import app
 from mbtf_gen.config.generator import GeometrySection
-from mbtf_gen.tile.heights.grid import HeightGrid
-from mbtf_gen.tile.heights.statistics import (
+from mbtf_gen.tile.heights import (
+    HeightGrid,
     autocorrelation,
     detail_size,
     repeats,
@@ -29,7 +29,7 @@ class TestSlopes:
     @pytest.mark.parametrize("aspect", [1.0, 0.5])
     def test_slopes_are_those_of_the_mesh(self, aspect: float) -> None:
         """Against the triangles that are rendered."""
-        from mbtf_gen.tile.heights.grid import tile_mesh
+        from mbtf_gen.tile.heights import tile_mesh
 
         grid = HeightGrid.from_map(fractal(int(12 * aspect), 12), 0.2, aspect)
         normals = tile_mesh(grid).face_normals

@@ -9,7 +9,7 @@ import pytest
 
 from mbtf_core.directions import from_angles
 from mbtf_gen.engine.runtime import load_mitsuba
-from mbtf_gen.tile.heights.grid import HeightGrid
+from mbtf_gen.tile.heights import HeightGrid
 from mbtf_pipeline.compare.image_files import write_channels
 from mbtf_pipeline.compare.offsets import _regression, read_offset, towards_view, traced_offset
 from mbtf_pipeline.recipe import SceneView

@@ -10,8 +10,7 @@ from scipy.integrate import quad
 from scipy.stats import kstest
 
 from mbtf_gen.tile.fibers.curves import Curve
-from mbtf_gen.tile.fibers.yarn import CrossSection, YarnModel, _disk, fibers_of
-from mbtf_gen.tile.fibers.yarn_sets import YARNS, roughness_of
+from mbtf_gen.tile.fibers.yarn import YARNS, CrossSection, YarnModel, _disk, fibers_of, roughness_of
 
 # One tile width is four centimeters of a straight yarn.
 SECTION = CrossSection(0.25, 0.25, True)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mbtf_core.data.lattice import texel_centers
-from mbtf_gen.tile.heights.grid import HeightGrid, grid_faces, grid_vertices, tile_mesh
+from mbtf_gen.tile.heights import HeightGrid, grid_faces, grid_vertices, tile_mesh
 
 SHAPES = [(4, 6), (1, 1), (1, 5), (5, 1), (3, 3)]
 

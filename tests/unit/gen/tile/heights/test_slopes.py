@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mbtf_gen.tile.heights.grid import HeightGrid
-from mbtf_gen.tile.heights.slopes import carried_share, height_slopes, normal_slopes, residual_slopes
+from mbtf_gen.tile.heights import HeightGrid, carried_share, height_slopes, normal_slopes, residual_slopes
 
 F64 = NDArray[np.float64]
 

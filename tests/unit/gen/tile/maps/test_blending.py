@@ -10,8 +10,7 @@ from support.height_maps import Floats, fractal, normals_of, slopes
 
 from mbtf_core.data.lattice import texel_centers
 from mbtf_core.images.resample import resample
-from mbtf_gen.tile.maps.blending import BAND, blend_maps
-from mbtf_gen.tile.maps.tiling import broken, seams
+from mbtf_gen.tile.maps.tiling import BAND, blend_maps, broken, seams
 
 
 def blend(role: str, image: Floats) -> Floats:

@@ -10,7 +10,7 @@ from support.height_maps import Floats, fractal, rms, save_heights, slopes
 
 from mbtf_core.images.resample import dequantize
 from mbtf_gen.tile.loading import load_material
-from mbtf_gen.tile.maps.quantization import code_use
+from mbtf_gen.tile.maps.checks import code_use
 
 
 def stretched(truth: Floats, levels: int) -> Floats:

@@ -1,1 +1,0 @@
-"""Height grids: triangles, slopes, statistics."""
