@@ -236,7 +236,7 @@ def test_pictures_that_are_there_are_kept_and_others_refused(batch: dict[str, Do
     exposed = batch["pictures exposed"].result()
     assert [p["kept"] for p in exposed["pictures"]] == [True] * 4
     assert exposed["exposure"] == 1.5 != first["exposure"]
-    record = json.loads((work / "pictures/pictures.json").read_text())["pictures"]
+    record = json.loads((work / "pictures/pictures.json").read_text())["items"]
     assert {p["facts"]["exposure"] for name, p in record.items() if name.endswith(".png")} == {1.5}
     refused = batch["pictures changed"]
     assert refused.code == 3
