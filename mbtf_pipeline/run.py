@@ -169,8 +169,8 @@ class _RecipeRun:
 
     def _generate(self, data: DataSet, decision: Decision) -> float:
         from mbtf_core.data.dataset import is_dataset
+        from mbtf_core.data.documents import read_manifest
         from mbtf_core.data.folder import sidecar_name
-        from mbtf_core.data.manifest import read_manifest
         from mbtf_core.data.schema import MANIFEST_NAME
         from mbtf_gen.generation.run import generate
         from mbtf_gen.job import Job

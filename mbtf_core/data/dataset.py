@@ -5,24 +5,21 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast
+from typing import Any, cast
 
 import numpy as np
-from pydantic import BaseModel, Field
 
 from mbtf_core.config.settings import check_document, check_schema
-from mbtf_core.data.folder import DataFolder, sidecar_name
+from mbtf_core.data.documents import ABSENT, CHANGED, Manifest, read_sidecar, repair_hint
+from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.geometry import Geometry, read_geometry
-from mbtf_core.data.lattice import MAX_LEVEL, Lattice
+from mbtf_core.data.lattice import Lattice
 from mbtf_core.data.schema import ARRAY, FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, Layout, ShardEntry, Split
 from mbtf_core.data.shard_files import Arrays, check_values, column_means, read_shard
-from mbtf_core.data.sidecar import ABSENT, CHANGED, read_sidecar, repair_hint
 from mbtf_core.errors import InputError
 from mbtf_core.files.digest import file_sha256
 from mbtf_core.suggest import suggest_path
 
-_Count = Annotated[int, Field(strict=True, ge=0, lt=1 << 40)]
-_FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*\.(npz|exr)$", max_length=100)]
 _MAKE_AGAIN = "generate or download the data set again"
 # Shards that are downloaded ahead of their reader.
 _AHEAD = 2
@@ -30,53 +27,6 @@ _AHEAD = 2
 _READS = 8
 # The sidecar's mean and that of the shard are float64 sums in different orders.
 _SAME_MEAN = 1e-7
-
-
-class _Entry(BaseModel):
-    file: _FileName
-    rows: _Count
-
-
-class _Split(BaseModel):
-    shards: list[_Entry]
-
-
-class _Levels(BaseModel):
-    finest: Annotated[int, Field(strict=True, ge=0, le=MAX_LEVEL)]
-
-
-class _Tile(BaseModel):
-    aspect: float = Field(gt=0, le=1e6, allow_inf_nan=False)
-
-
-class _Geometry(BaseModel):
-    file: Literal["geometry.exr"]
-    sha256: str
-
-
-class _Manifest(BaseModel):
-    """Keys of a manifest that readers need; others are ignored."""
-
-    config_hash: str
-    layout: Layout
-    levels: _Levels
-    tile: _Tile
-    splits: dict[str, _Split]
-    geometry: _Geometry | None
-    patch_size: _Count | None = None
-    slice_size: _Count | None = None
-    estimates: Literal[1, 2] = 2
-
-
-class _Statistics(BaseModel, allow_inf_nan=False):
-    mean_value: tuple[float, float, float]
-
-
-class _Sidecar(BaseModel):
-    """Keys of a sidecar that readers need; others are ignored."""
-
-    statistics: _Statistics
-    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
 @dataclass(frozen=True)
@@ -257,7 +207,7 @@ class Dataset:
         check_schema(
             manifest, SCHEMA_VERSION, path, "generate the shards again with this version of mbtf-gen"
         )
-        check_document(_Manifest, manifest, path, _MAKE_AGAIN)
+        check_document(Manifest, manifest, path, _MAKE_AGAIN)
         return cls(folder, manifest)
 
     @property
@@ -333,7 +283,6 @@ class Dataset:
                     ) from None
                 hint = f"check the data set with: mbtf-gen verify {self.folder}"
                 raise InputError(error.what, where=self.folder.at(entry.file), hint=hint) from None
-            check_document(_Sidecar, record, self.folder.at(sidecar_name(entry.file)), _MAKE_AGAIN)
             out.append(Shard(self.folder, entry.file, record, image, self.estimates))
         return out
 

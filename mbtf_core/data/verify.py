@@ -12,11 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.documents import ABSENT, CHANGED, plan_digest, read_sidecar, repair_hint
 from mbtf_core.data.folder import DataFolder, is_leftover, sidecar_name
-from mbtf_core.data.manifest import plan_digest
 from mbtf_core.data.schema import CONFIG_NAME, GEOMETRY_NAME, MANIFEST_NAME, ShardEntry
 from mbtf_core.data.shard_files import check_arrays, check_values, read_shard
-from mbtf_core.data.sidecar import ABSENT, CHANGED, read_sidecar, repair_hint
 from mbtf_core.errors import InputError, reason
 from mbtf_core.files.digest import file_sha256
 

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.data.queries import Queries
+from mbtf_core.data.schema import Queries
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import UsageError
 

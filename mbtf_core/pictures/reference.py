@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.data.queries import Queries
+from mbtf_core.data.schema import Queries
 from mbtf_core.data.shard_files import read_exr, write_exr
 from mbtf_core.errors import InputError
 from mbtf_core.exposure import to_display
