@@ -35,17 +35,12 @@ class Shard:
 
     Attributes
     ----------
-    folder : DataFolder
-        The data set that it belongs to.
-    file : str
-        Name of its file.
-    sidecar : dict
-        The content of its sidecar.
-    image : tuple of int
-        Rows and columns of an image in the image layout, the number of directions in the slices layout;
-        empty in the shuffled layout.
-    estimates : int
-        Independent estimates of every value: 2, or 1 of measured data.
+    folder : the data set that it belongs to
+    file : name of its file
+    sidecar : the content of its sidecar
+    image : rows and columns of an image in the image layout, the number of directions in the slices layout;
+        empty in the shuffled layout
+    estimates : independent estimates of every value: 2, or 1 of measured data
     """
 
     folder: DataFolder
@@ -69,10 +64,8 @@ class Shard:
 
         Raises
         ------
-        InputError
-            It is missing, or not the shard that its sidecar describes.
-        PartialError
-            Its store cannot be reached, or the disk is full.
+        InputError : it is missing, or not the shard that its sidecar describes
+        PartialError : its store cannot be reached, or the disk is full
         """
         return self.folder.file(self.file, str(self.sidecar["sha256"]), int(self.sidecar["bytes"]))
 
@@ -98,20 +91,14 @@ class Shard:
 
         Parameters
         ----------
-        names : iterable of str, optional
-            Arrays to read; all by default.
-
-        Returns
-        -------
-        dict of str to float32 array
+        names : arrays to read; all by default
 
         Raises
         ------
-        InputError
-            It cannot be read, its numbers are invalid, or they are those of another shard. Its size and its
-            rows are compared with the sidecar's, and where both values are read, their mean. Without the
-            values, the numbers of a shard that was copied over another of the same size are returned;
-            ``mbtf-gen verify`` compares digests and finds it.
+        InputError : it cannot be read, its numbers are invalid, or they are those of another shard. Its size
+            and its rows are compared with the sidecar's, and where both values are read, their mean. Without
+            the values, the numbers of a shard that was copied over another of the same size are returned;
+            ``mbtf-gen verify`` compares digests and finds it
         """
         arrays = self.map(names)
         hint = f"check the data set with: mbtf-gen verify {self.folder}"
@@ -157,10 +144,8 @@ class Dataset:
 
     Attributes
     ----------
-    folder : DataFolder
-        Its files.
-    manifest : dict
-        The content of ``manifest.json``.
+    folder : its files
+    manifest : the content of ``manifest.json``
     """
 
     folder: DataFolder
@@ -172,21 +157,13 @@ class Dataset:
 
         Parameters
         ----------
-        folder : str, Path or DataFolder
-            The data set: a path, or a URL such as ``s3://bucket/data``.
-        cache : float, optional
-            Bytes of local disk for shards of object stores; 20 GB by default.
-
-        Returns
-        -------
-        Dataset
+        folder : the data set: a path, or a URL such as ``s3://bucket/data``
+        cache : bytes of local disk for shards of object stores; 20 GB by default
 
         Raises
         ------
-        InputError
-            No manifest, another format or schema version, or invalid keys.
-        PartialError
-            The store cannot be reached.
+        InputError : no manifest, another format or schema version, or invalid keys
+        PartialError : the store cannot be reached
         """
         folder = DataFolder.open(folder)
         if cache is not None:
@@ -247,19 +224,12 @@ class Dataset:
 
         Parameters
         ----------
-        split : str
-            ``train`` or ``test``.
-        finished_only : bool
-            Leave out shards that are not rendered yet.
-
-        Returns
-        -------
-        list of Shard
+        split : ``train`` or ``test``
+        finished_only : leave out shards that are not rendered yet
 
         Raises
         ------
-        InputError
-            No such split, a missing shard, a corrupt sidecar, or a shard that is not the one listed.
+        InputError : no such split, a missing shard, a corrupt sidecar, or a shard that is not the one listed
         """
         if split not in self.manifest["splits"]:
             raise InputError(f"has no split '{split}' (it has: {', '.join(self.splits)})", where=self.folder)
@@ -296,8 +266,7 @@ class Dataset:
 
         Raises
         ------
-        InputError
-            The file is missing or is not the one that was written.
+        InputError : the file is missing or is not the one that was written
         """
         record = self.manifest["geometry"]
         if record is None:
@@ -320,10 +289,8 @@ class Dataset:
 
         Parameters
         ----------
-        split : str
-            ``train`` or ``test``.
-        names : iterable of str, optional
-            Arrays to read; all by default.
+        split : ``train`` or ``test``
+        names : arrays to read; all by default
 
         Yields
         ------
@@ -332,8 +299,7 @@ class Dataset:
 
         Raises
         ------
-        InputError
-            See :meth:`shards` and :meth:`Shard.read`.
+        InputError : see :meth:`shards` and :meth:`Shard.read`
         """
         wanted = None if names is None else list(names)
         yield from (shard.read(wanted) for shard in ahead(self.shards(split)))
@@ -343,10 +309,8 @@ class Dataset:
 
         Parameters
         ----------
-        split : str
-            ``train`` or ``test``.
-        names : iterable of str, optional
-            Arrays to read; all by default.
+        split : ``train`` or ``test``
+        names : arrays to read; all by default
 
         Returns
         -------
@@ -355,8 +319,7 @@ class Dataset:
 
         Raises
         ------
-        InputError
-            See :meth:`iterate`; or the split has no shards.
+        InputError : see :meth:`iterate`; or the split has no shards
         """
         parts = list(self.iterate(split, names))
         if not parts:

@@ -219,7 +219,6 @@ class DataFolder:
 
     def prefetch(self, name: str, sha256: str) -> None:
         """Start to download a shard of a store in a background thread; nothing happens for local files.
-
         Failures are left to the reader. A cache of a few shards has no room for it."""
         if self.local is not None or _ROOM * (self.size(name) or 0) > self.cache.limit:
             return

@@ -42,12 +42,9 @@ class ShardEntry:
     Attributes
     ----------
     split : {"train", "test"}
-    index : int
-        Number within the split, from 0.
-    file : str
-        File name.
-    rows : int
-        Number of queries, of images in the image layout, or of positions in the slices layout.
+    index : number within the split, from 0
+    file : file name
+    rows : number of queries, of images in the image layout, or of positions in the slices layout
     """
 
     split: Split

@@ -36,12 +36,9 @@ class Fault:
 
     Attributes
     ----------
-    file : str
-        Name of the file.
-    what : str
-        The fault, in words.
-    hint : str
-        What to do about it.
+    file : name of the file
+    what : the fault, in words
+    hint : what to do about it
     """
 
     file: str
@@ -133,8 +130,7 @@ def verify(folder: str | Path | DataFolder) -> list[Fault]:
 
     Parameters
     ----------
-    folder : str, Path or DataFolder
-        The data set: a path or a URL.
+    folder : the data set: a path or a URL
 
     Returns
     -------
@@ -143,10 +139,8 @@ def verify(folder: str | Path | DataFolder) -> list[Fault]:
 
     Raises
     ------
-    InputError
-        The folder contains no data set of this schema version, or its manifest is damaged.
-    PartialError
-        The store cannot be reached.
+    InputError : the folder contains no data set of this schema version, or its manifest is damaged
+    PartialError : the store cannot be reached
     """
     folder = DataFolder.open(folder)
     dataset = Dataset.open(folder)

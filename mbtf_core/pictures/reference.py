@@ -37,14 +37,11 @@ class ReferenceImage:
     ----------
     kind : {"query", "pixel"}
         Meaning of a pixel, see :mod:`mbtf_core.pictures.camera`.
-    camera : Camera
-        The camera.
-    queries : Queries
-        One per pixel, with leading axes (rows, columns).
+    camera : the camera
+    queries : one per pixel, with leading axes (rows, columns)
     value_a, value_b : (rows, columns, 3) float32 array
         Independent halves, in 1/sr.
-    spp : int
-        Paths per pixel, both halves together.
+    spp : paths per pixel, both halves together
     transmittance : (rows, columns) float32 array or None
         Fraction of the view rays that the opacity mask transmits; None without a mask.
     """
@@ -118,8 +115,7 @@ def read_references(folder: Path) -> list[tuple[NDArray[np.float32], Camera, NDA
 
     Parameters
     ----------
-    folder : Path
-        Output folder of the command.
+    folder : output folder of the command
 
     Returns
     -------
@@ -127,8 +123,7 @@ def read_references(folder: Path) -> list[tuple[NDArray[np.float32], Camera, NDA
 
     Raises
     ------
-    InputError
-        The folder has no such pictures.
+    InputError : the folder has no such pictures
     """
     known = pictures_of("mbtf-gen reference").read(folder)
     if known is None:

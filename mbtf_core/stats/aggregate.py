@@ -25,16 +25,12 @@ class Comparison:
 
     Attributes
     ----------
-    group, channel : int
-        Label of the group, and channel.
+    group, channel : label of the group, and channel
     kind : {"mean", "scatter"}
         Mean difference, or mean squared true difference.
-    estimate : Estimate
-        The quantity, expected to be zero.
-    p_value : float
-        Of this test alone.
-    corrected : float
-        Corrected for the number of tests (Holm).
+    estimate : the quantity, expected to be zero
+    p_value : of this test alone
+    corrected : corrected for the number of tests (Holm)
     """
 
     group: int
@@ -90,21 +86,14 @@ def aggregate_test(
     ----------
     a1, b1 : (n, channels) or (items, rows, columns, channels) array_like
         Halves of the first data set.
-    a2, b2 : array_like of the same shape
-        Halves of the second data set at the same queries, sampled independently.
+    a2, b2 : halves of the second data set at the same queries, sampled independently
     groups : (n,) int array_like or None
         Labels; one group by default. Rows with negative labels are ignored.
-    minimum : int
-        Smallest number of units per group, below which heavy tails invalidate the t distribution.
-
-    Returns
-    -------
-    Aggregate
+    minimum : smallest number of units per group, below which heavy tails invalidate the t distribution
 
     Raises
     ------
-    ValueError
-        Shapes differ, there is no group, or a group has fewer than `minimum` units.
+    ValueError : shapes differ, there is no group, or a group has fewer than `minimum` units
     """
     arrays = [_channels(array, name) for array, name in ((a1, "a1"), (b1, "b1"), (a2, "a2"), (b2, "b2"))]
     if len({array.shape for array in arrays}) > 1:

@@ -18,14 +18,10 @@ class Estimate:
 
     Attributes
     ----------
-    value : float
-        The estimate, in the unit of its quantity.
-    error : float
-        Standard error (one standard deviation), same unit; ``inf`` where it is unknown.
-    n : int
-        Number of independent units: queries, or images in the image layout.
-    dof : float or None
-        Degrees of freedom of `error`; None means ``n - 1``.
+    value : the estimate, in the unit of its quantity
+    error : standard error (one standard deviation), same unit; ``inf`` where it is unknown
+    n : number of independent units: queries, or images in the image layout
+    dof : degrees of freedom of `error`; None means ``n - 1``
     """
 
     value: float

@@ -17,8 +17,7 @@ def by_group(function: Callable[..., Estimate], groups: ArrayLike, *arrays: Arra
 
     Parameters
     ----------
-    function : callable
-        A function of this package that takes arrays and returns an Estimate.
+    function : A function of this package that takes arrays and returns an Estimate
     groups : (n,) int array_like
         Labels; rows with negative labels are ignored.
     *arrays : (n, ...) array_like
@@ -55,14 +54,8 @@ def level_groups(sigma: ArrayLike, finest: int | None = None) -> NDArray[np.int6
 
     Parameters
     ----------
-    sigma : array_like
-        Standard deviations in tile widths, any shape.
-    finest : int or None
-        Labels are clamped to 0..finest.
-
-    Returns
-    -------
-    int64 array
+    sigma : standard deviations in tile widths, any shape
+    finest : labels are clamped to 0..finest
     """
     level = np.rint(level_of_sigma(sigma)).astype(np.int64)
     return np.clip(level, 0, finest)
@@ -75,8 +68,7 @@ def elevation_groups(*omegas: ArrayLike, edges: tuple[float, ...] = ELEVATION_BA
     ----------
     *omegas : (n, 3) array_like
         Unit vectors, such as ω_i and ω_o.
-    edges : tuple of float
-        Band i is ``edges[i] ≤ cos θ < edges[i+1]``; the last band includes its upper edge.
+    edges : band i is ``edges[i] ≤ cos θ < edges[i+1]``; the last band includes its upper edge
 
     Returns
     -------

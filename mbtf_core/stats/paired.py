@@ -94,10 +94,6 @@ def pooled_error(a: ArrayLike, b: ArrayLike) -> Estimate:
     ----------
     a, b : (n, ...) array_like
         Independent halves of the values.
-
-    Returns
-    -------
-    Estimate
     """
     return _root(pooled_variance(a, b))
 
@@ -111,10 +107,6 @@ def pooled_relative_error(a: ArrayLike, b: ArrayLike) -> Estimate:
     ----------
     a, b : (n, ...) array_like
         Independent halves of the values.
-
-    Returns
-    -------
-    Estimate
     """
     first, second = _pair(a, b)
     return _root(_ratio(per_unit((first - second) ** 2 / 4.0), per_unit(first * second)))
@@ -153,10 +145,6 @@ def mse_difference(prediction: ArrayLike, other: ArrayLike, a: ArrayLike, b: Arr
     prediction, other : (n, ...) array_like
     a, b : (n, ...) array_like
         Independent halves of the reference.
-
-    Returns
-    -------
-    Estimate
     """
     p, first, second = _with_prediction(prediction, a, b)
     q, _, _ = _with_prediction(other, a, b)
@@ -202,16 +190,10 @@ def unexplained_variance(prediction: ArrayLike, a: ArrayLike, b: ArrayLike) -> E
     prediction, a, b : (n, ...) array_like
         The prediction, and independent halves of the reference.
 
-    Returns
-    -------
-    Estimate
-
     Raises
     ------
-    InputError
-        A number is NaN or infinite.
-    ValueError
-        Shapes differ.
+    InputError : A number is NaN or infinite
+    ValueError : shapes differ
     """
     p, first, second = _with_prediction(prediction, a, b)
     products, correction = _centered_products(first, second)
@@ -223,10 +205,8 @@ def psnr(mse: Estimate, peak: float) -> Estimate:
 
     Parameters
     ----------
-    mse : Estimate
-        Noise-free mean squared error, 1/sr².
-    peak : float
-        Value of full scale, 1/sr.
+    mse : noise-free mean squared error, 1/sr²
+    peak : value of full scale, 1/sr
 
     Returns
     -------

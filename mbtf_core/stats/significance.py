@@ -20,12 +20,9 @@ class Outcome:
 
     Attributes
     ----------
-    difference : Estimate
-        Quantity that is tested against zero.
-    statistic : float
-        Difference over its error.
-    p_value : float
-        Probability of a statistic at least as extreme under the null hypothesis.
+    difference : quantity that is tested against zero
+    statistic : difference over its error
+    p_value : probability of a statistic at least as extreme under the null hypothesis
     """
 
     difference: Estimate
@@ -57,18 +54,12 @@ def t_test(x: Estimate, y: Estimate | float = 0.0, alternative: Alternative = "t
     Parameters
     ----------
     x : Estimate
-    y : Estimate or float
-        A known value or an independent estimate.
+    y : A known value or an independent estimate
     alternative : {"two-sided", "greater", "less"}
-
-    Returns
-    -------
-    Outcome
 
     Raises
     ------
-    ValueError
-        An estimate or its error is NaN.
+    ValueError : an estimate or its error is NaN
     """
     from scipy.special import stdtr
 
@@ -89,17 +80,11 @@ def holm(p_values: ArrayLike) -> NDArray[np.float64]:
 
     Parameters
     ----------
-    p_values : array_like
-        In [0, 1], any shape.
-
-    Returns
-    -------
-    float64 array
+    p_values : in [0, 1], any shape
 
     Raises
     ------
-    ValueError
-        A p-value lies outside [0, 1].
+    ValueError : A p-value lies outside [0, 1]
     """
     p = np.asarray(p_values, np.float64)
     if not np.all((p >= 0) & (p <= 1)):
