@@ -40,7 +40,7 @@ import numpy as np
 from common import ASSETS, finish, is_available, parser_of, source, start
 from numpy.typing import NDArray
 
-from mbtf_core.stats.groups import level_groups
+from mbtf_core.stats.estimate import level_groups
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.job import Job

@@ -37,7 +37,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from support.file_operations import FileOperations, Operation
 from support.small_runs import command, contents, die, ending, generate, in_child, noisy_plane
 
-from mbtf_core.data.sidecar import ABSENT
+from mbtf_core.data.documents import ABSENT
 from mbtf_core.data.verify import INCOMPLETE, verify
 from mbtf_core.errors import InputError
 from mbtf_gen.planning.simulation import ClosedForm

@@ -22,7 +22,7 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.engine.runtime import CPU_VARIANT, CUDA_VARIANT
 
 if TYPE_CHECKING:
-    from mbtf_core.data.queries import Queries
+    from mbtf_core.data.schema import Queries
 
 VARIANTS = {"cpu": CPU_VARIANT, "cuda": CUDA_VARIANT}
 # File of a fit's values at the test queries.
@@ -118,7 +118,7 @@ def estimate(device: str, sizes: str, shards: str, out: str) -> Answers:
     """Both halves at the test queries of a data set, with its random numbers and effects, as arrays in a
     file; rate of a second run, as the first one compiles."""
     from mbtf_core.data.dataset import Dataset
-    from mbtf_core.data.queries import Queries
+    from mbtf_core.data.schema import Queries
     from mbtf_fit.data.loader import load_split
     from mbtf_gen.generation.folder import read_run_plan
     from mbtf_gen.job import Job

@@ -140,7 +140,7 @@ def energies(material: Path, shards: Path, evaluator: Any) -> list[dict[str, flo
     """Reflected share by elevation of the light: fit, reference, error of their difference. Of views, those
     that the data have, and of elevations too."""
     from mbtf_core.data.dataset import Dataset
-    from mbtf_core.data.queries import Queries
+    from mbtf_core.data.schema import Queries
     from mbtf_gen.config.generator import GeneratorConfig
     from mbtf_gen.job import Job
     from mbtf_gen.planning.effects_planner import reference_plan

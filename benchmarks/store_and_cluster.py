@@ -36,8 +36,8 @@ import torch
 from common import ASSETS, alternate, finish, parser_of, start, timed
 
 from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.documents import finished_record
 from mbtf_core.data.shard_files import row_bytes, write_shard
-from mbtf_core.data.sidecar import finished_record
 from mbtf_core.data.store import ObjectStore
 from mbtf_core.data.verify import verify
 from mbtf_core.files.digest import file_sha256

@@ -56,10 +56,8 @@ def from_angles(elevation_deg: ArrayLike, azimuth_deg: ArrayLike) -> NDArray[np.
 
     Parameters
     ----------
-    elevation_deg : array_like
-        Angle above the reference plane in degrees.
-    azimuth_deg : array_like
-        Angle from +u towards +v in degrees; broadcast with the elevation.
+    elevation_deg : angle above the reference plane in degrees
+    azimuth_deg : angle from +u towards +v in degrees; broadcast with the elevation
 
     Returns
     -------

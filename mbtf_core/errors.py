@@ -28,12 +28,9 @@ class MbtfError(Exception):
 
     Parameters
     ----------
-    what : str
-        The fault, in one line.
-    where : object
-        File, key or line of the fault; printed before `what`.
-    hint : str
-        A remedy; printed after `what`.
+    what : the fault, in one line
+    where : file, key or line of the fault; printed before `what`
+    hint : a remedy; printed after `what`
     """
 
     exit_code = 1

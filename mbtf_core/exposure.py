@@ -28,8 +28,7 @@ def auto_exposure(bright: Iterable[float]) -> float:
 
     Parameters
     ----------
-    bright : iterable of float
-        :func:`brightness` of each picture, in 1/sr.
+    bright : :func:`brightness` of each picture, in 1/sr
 
     Returns
     -------

@@ -21,10 +21,8 @@ def pilot_seconds(piece: Callable[[int], float], seconds: float) -> Estimate:
 
     Parameters
     ----------
-    piece : callable
-        Does the piece of this number, from 1; returns how many units of work it was.
-    seconds : float
-        Time for all pieces, in seconds; three are timed at least.
+    piece : does the piece of this number, from 1; returns how many units of work it was
+    seconds : time for all pieces, in seconds; three are timed at least
 
     Returns
     -------
@@ -45,8 +43,7 @@ def median_estimate(times: Sequence[float]) -> Estimate:
 
     Parameters
     ----------
-    times : sequence of float
-        In seconds.
+    times : in seconds
 
     Returns
     -------

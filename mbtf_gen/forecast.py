@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from mbtf_core.app.console import Console
-from mbtf_core.data.queries import Queries
-from mbtf_core.data.schema import ShardEntry, Split
+from mbtf_core.data.schema import Queries, ShardEntry, Split
 from mbtf_core.data.shard_files import row_bytes, write_shard
 from mbtf_core.forecast import pilot_seconds
 from mbtf_core.stats import pooled_error

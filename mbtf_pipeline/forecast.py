@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from mbtf_core.files.folders import check_folder, check_space
+from mbtf_core.files.folders import check_space
 from mbtf_core.forecast import is_long
 from mbtf_core.units import clock, expectation
 from mbtf_gen.job import Job, planned_paths, split_queries
 from mbtf_pipeline.compare.image_files import scenes
 from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.run import COMPARE_STAGE, data_sets, fit_stage, survey
-from mbtf_pipeline.run_folder import is_run
+from mbtf_pipeline.run_folder import RUN
 from mbtf_pipeline.stages import STAMPS
 
 # Seconds of loading the programs, and of comparison and report besides the paths of their images.
@@ -135,7 +135,7 @@ def forecast_left(recipe: Recipe, folder: Path) -> RunForecast | None:
     ------
     InputError : they do not fit on the disk, or the folder contains something else
     """
-    check_folder(folder, is_run, "run")
+    RUN.check(folder)
     stages = None
     if (folder / STAMPS).exists():
         stages = [name for name, decision in survey(recipe, folder).items() if decision.runs]

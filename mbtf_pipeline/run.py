@@ -12,7 +12,7 @@ from mbtf_core.app.console import Console
 from mbtf_core.errors import InputError, PartialError
 from mbtf_core.files.atomic import read_json
 from mbtf_core.files.digest import file_sha256
-from mbtf_core.files.folders import check_folder, owned
+from mbtf_core.files.folders import owned
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item
 from mbtf_core.units import clock
@@ -25,10 +25,10 @@ from mbtf_pipeline.run_folder import (
     COMPARE,
     FITS,
     REPORT,
+    RUN,
     SHARDS,
     VIEWER,
     clear,
-    is_run,
     write_run_record,
 )
 from mbtf_pipeline.stages import (
@@ -169,8 +169,8 @@ class _RecipeRun:
 
     def _generate(self, data: DataSet, decision: Decision) -> float:
         from mbtf_core.data.dataset import is_dataset
+        from mbtf_core.data.documents import read_manifest
         from mbtf_core.data.folder import sidecar_name
-        from mbtf_core.data.manifest import read_manifest
         from mbtf_core.data.schema import MANIFEST_NAME
         from mbtf_gen.generation.run import generate
         from mbtf_gen.job import Job
@@ -270,13 +270,15 @@ def _manifest_digest(shards: Path) -> str:
 def _unfinished(out: Path, config: FitConfig, shards: Path) -> bool:
     """Whether a folder contains this fit from an interrupted run."""
     from mbtf_core.data.schema import MANIFEST_NAME
+    from mbtf_fit.training.fit_folder import FIT
 
     try:
-        record, manifest = read_json(out / "fit.json"), read_json(shards / MANIFEST_NAME)
+        record, manifest = FIT.read(out), read_json(shards / MANIFEST_NAME)
     except InputError:
         return False
-    same_data = record.get("data", {}).get("hash") == manifest.get("config_hash")
-    return same_data and record.get("config") == config.fields()
+    known = {} if record is None else record["depends"]
+    data = known.pop("data", {})
+    return data.get("hash") == manifest.get("config_hash") and known == config.fields()
 
 
 def _material_inputs(recipe: Recipe) -> dict[str, str]:
@@ -292,7 +294,7 @@ def generate_data(recipe: Recipe, folder: Path, *, command: str = "", console: C
     """
     console = console or Console(quiet=True)
     with owned(folder):
-        check_folder(folder, is_run, "run")
+        RUN.check(folder)
         write_run_record(folder, recipe, command)
         run = _RecipeRun(recipe, folder, console)
         stages = run.stages(_material_inputs(recipe))
@@ -347,7 +349,7 @@ def run_recipe(
     console, runner = console or Console(quiet=True), runner or Runner()
     inputs = _material_inputs(recipe)
     with owned(folder):
-        check_folder(folder, is_run, "run")
+        RUN.check(folder)
         write_run_record(folder, recipe, command)
         run = _RecipeRun(recipe, folder, console, live, runner)
         stages = run.stages(inputs)
@@ -399,7 +401,7 @@ def rerender(folder: Path, exposure: float | None = None) -> tuple[Path, float]:
     InputError
         The folder contains no run of this version, or its comparison is not finished.
     """
-    is_run(folder)
+    RUN.read(folder)
     recipe = read_resolved(folder)
     if exposure is not None:
         recipe = recipe.model_copy(update={"report": recipe.report.model_copy(update={"exposure": exposure})})

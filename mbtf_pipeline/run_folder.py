@@ -15,14 +15,10 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-from mbtf_core.config.settings import check_schema
-from mbtf_core.errors import InputError
-from mbtf_core.files.atomic import read_json, write_json
+from mbtf_core.files.folders import OutputKind
 from mbtf_pipeline.recipe import Recipe, write_recipe
 
-RUN_NAME = "run.json"
-RUN_FORMAT = "mbtf-run"
-RUN_SCHEMA = 2
+RUN = OutputKind("run.json", "mbtf-run", 2, "a run")
 SHARDS, FITS, COMPARE, REPORT = "shards", "fits", "compare", "report.html"
 VIEWER = "viewer.html"
 
@@ -35,16 +31,7 @@ def clear(folder: Path) -> None:
 
 def write_run_record(folder: Path, recipe: Recipe, command: str) -> None:
     """Write the resolved recipe and the command into the run's folder."""
-    write_json(
-        folder / RUN_NAME,
-        {
-            "format": RUN_FORMAT,
-            "schema": RUN_SCHEMA,
-            "name": recipe.name,
-            "command": command,
-            "machine": machine(),
-        },
-    )
+    RUN.write(folder, {"name": recipe.name, "command": command, "machine": machine()})
     write_recipe(recipe, folder)
 
 
@@ -62,30 +49,3 @@ def machine() -> dict[str, str]:
             out[name] = "not installed"
     out["system"] = f"{platform.system()} {platform.machine()}, {os.cpu_count()} processors"
     return out
-
-
-def is_run(folder: Path) -> bool:
-    """Whether a folder contains a run of a recipe.
-
-    Raises
-    ------
-    InputError : it contains a run of another schema version
-    """
-    return has_record(folder, RUN_NAME, RUN_FORMAT, RUN_SCHEMA)
-
-
-def has_record(folder: Path, name: str, record_format: str, schema: int) -> bool:
-    """Whether a folder contains a record of this format.
-
-    Raises
-    ------
-    InputError : the record has another schema version
-    """
-    try:
-        record = read_json(folder / name)
-    except InputError:
-        return False
-    if record.get("format") != record_format:
-        return False
-    check_schema(record, schema, folder / name, "run the recipe again in another folder with -o")
-    return True

@@ -25,7 +25,7 @@ from mbtf_core.data.shard_files import row_bytes
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.files.atomic import read_json, write_json
 from mbtf_core.files.digest import data_sha256
-from mbtf_core.files.folders import check_folder, check_space, owned
+from mbtf_core.files.folders import check_space, owned
 from mbtf_core.units import clock, format_duration
 from mbtf_fit.config import FitConfig
 from mbtf_gen.config.generator import count_queries
@@ -35,7 +35,7 @@ from mbtf_pipeline.forecast import RunForecaster
 from mbtf_pipeline.presets import preset_recipe
 from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.run import layout_of
-from mbtf_pipeline.run_folder import is_run, write_run_record
+from mbtf_pipeline.run_folder import RUN, write_run_record
 
 SPLIT_NAME = "time_split.json"
 SPLIT_SCHEMA = 5
@@ -129,7 +129,7 @@ class TimedRun:
         ]
         self._key = data_sha256({"schema": SPLIT_SCHEMA, "time": seconds, "recipes": options})
         with owned(self.folder):
-            check_folder(self.folder, is_run, "run")
+            RUN.check(self.folder)
             split = self._stored()
             if split is None:
                 split = self._plan(recipes)

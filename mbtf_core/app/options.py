@@ -290,8 +290,7 @@ def options_from(model: type[BaseModel], *keys: str) -> Callable[[type[C]], type
 
     Raises
     ------
-    ValueError
-        If two of them have the same flag.
+    ValueError : if two of them have the same flag
     """
     table = config_options(model, *keys)
     if len({o.flag for o in table}) < len(table):

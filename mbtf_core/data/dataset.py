@@ -5,24 +5,21 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast
+from typing import Any, cast
 
 import numpy as np
-from pydantic import BaseModel, Field
 
 from mbtf_core.config.settings import check_document, check_schema
-from mbtf_core.data.folder import DataFolder, sidecar_name
+from mbtf_core.data.documents import ABSENT, CHANGED, Manifest, read_sidecar, repair_hint
+from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.geometry import Geometry, read_geometry
-from mbtf_core.data.lattice import MAX_LEVEL, Lattice
+from mbtf_core.data.lattice import Lattice
 from mbtf_core.data.schema import ARRAY, FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, Layout, ShardEntry, Split
 from mbtf_core.data.shard_files import Arrays, check_values, column_means, read_shard
-from mbtf_core.data.sidecar import ABSENT, CHANGED, read_sidecar, repair_hint
 from mbtf_core.errors import InputError
 from mbtf_core.files.digest import file_sha256
 from mbtf_core.suggest import suggest_path
 
-_Count = Annotated[int, Field(strict=True, ge=0, lt=1 << 40)]
-_FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*\.(npz|exr)$", max_length=100)]
 _MAKE_AGAIN = "generate or download the data set again"
 # Shards that are downloaded ahead of their reader.
 _AHEAD = 2
@@ -32,70 +29,18 @@ _READS = 8
 _SAME_MEAN = 1e-7
 
 
-class _Entry(BaseModel):
-    file: _FileName
-    rows: _Count
-
-
-class _Split(BaseModel):
-    shards: list[_Entry]
-
-
-class _Levels(BaseModel):
-    finest: Annotated[int, Field(strict=True, ge=0, le=MAX_LEVEL)]
-
-
-class _Tile(BaseModel):
-    aspect: float = Field(gt=0, le=1e6, allow_inf_nan=False)
-
-
-class _Geometry(BaseModel):
-    file: Literal["geometry.exr"]
-    sha256: str
-
-
-class _Manifest(BaseModel):
-    """Keys of a manifest that readers need; others are ignored."""
-
-    config_hash: str
-    layout: Layout
-    levels: _Levels
-    tile: _Tile
-    splits: dict[str, _Split]
-    geometry: _Geometry | None
-    patch_size: _Count | None = None
-    slice_size: _Count | None = None
-    estimates: Literal[1, 2] = 2
-
-
-class _Statistics(BaseModel, allow_inf_nan=False):
-    mean_value: tuple[float, float, float]
-
-
-class _Sidecar(BaseModel):
-    """Keys of a sidecar that readers need; others are ignored."""
-
-    statistics: _Statistics
-    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
-
-
 @dataclass(frozen=True)
 class Shard:
     """One finished shard.
 
     Attributes
     ----------
-    folder : DataFolder
-        The data set that it belongs to.
-    file : str
-        Name of its file.
-    sidecar : dict
-        The content of its sidecar.
-    image : tuple of int
-        Rows and columns of an image in the image layout, the number of directions in the slices layout;
-        empty in the shuffled layout.
-    estimates : int
-        Independent estimates of every value: 2, or 1 of measured data.
+    folder : the data set that it belongs to
+    file : name of its file
+    sidecar : the content of its sidecar
+    image : rows and columns of an image in the image layout, the number of directions in the slices layout;
+        empty in the shuffled layout
+    estimates : independent estimates of every value: 2, or 1 of measured data
     """
 
     folder: DataFolder
@@ -119,10 +64,8 @@ class Shard:
 
         Raises
         ------
-        InputError
-            It is missing, or not the shard that its sidecar describes.
-        PartialError
-            Its store cannot be reached, or the disk is full.
+        InputError : it is missing, or not the shard that its sidecar describes
+        PartialError : its store cannot be reached, or the disk is full
         """
         return self.folder.file(self.file, str(self.sidecar["sha256"]), int(self.sidecar["bytes"]))
 
@@ -148,20 +91,14 @@ class Shard:
 
         Parameters
         ----------
-        names : iterable of str, optional
-            Arrays to read; all by default.
-
-        Returns
-        -------
-        dict of str to float32 array
+        names : arrays to read; all by default
 
         Raises
         ------
-        InputError
-            It cannot be read, its numbers are invalid, or they are those of another shard. Its size and its
-            rows are compared with the sidecar's, and where both values are read, their mean. Without the
-            values, the numbers of a shard that was copied over another of the same size are returned;
-            ``mbtf-gen verify`` compares digests and finds it.
+        InputError : it cannot be read, its numbers are invalid, or they are those of another shard. Its size
+            and its rows are compared with the sidecar's, and where both values are read, their mean. Without
+            the values, the numbers of a shard that was copied over another of the same size are returned;
+            ``mbtf-gen verify`` compares digests and finds it
         """
         arrays = self.map(names)
         hint = f"check the data set with: mbtf-gen verify {self.folder}"
@@ -207,10 +144,8 @@ class Dataset:
 
     Attributes
     ----------
-    folder : DataFolder
-        Its files.
-    manifest : dict
-        The content of ``manifest.json``.
+    folder : its files
+    manifest : the content of ``manifest.json``
     """
 
     folder: DataFolder
@@ -222,21 +157,13 @@ class Dataset:
 
         Parameters
         ----------
-        folder : str, Path or DataFolder
-            The data set: a path, or a URL such as ``s3://bucket/data``.
-        cache : float, optional
-            Bytes of local disk for shards of object stores; 20 GB by default.
-
-        Returns
-        -------
-        Dataset
+        folder : the data set: a path, or a URL such as ``s3://bucket/data``
+        cache : bytes of local disk for shards of object stores; 20 GB by default
 
         Raises
         ------
-        InputError
-            No manifest, another format or schema version, or invalid keys.
-        PartialError
-            The store cannot be reached.
+        InputError : no manifest, another format or schema version, or invalid keys
+        PartialError : the store cannot be reached
         """
         folder = DataFolder.open(folder)
         if cache is not None:
@@ -257,7 +184,7 @@ class Dataset:
         check_schema(
             manifest, SCHEMA_VERSION, path, "generate the shards again with this version of mbtf-gen"
         )
-        check_document(_Manifest, manifest, path, _MAKE_AGAIN)
+        check_document(Manifest, manifest, path, _MAKE_AGAIN)
         return cls(folder, manifest)
 
     @property
@@ -297,19 +224,12 @@ class Dataset:
 
         Parameters
         ----------
-        split : str
-            ``train`` or ``test``.
-        finished_only : bool
-            Leave out shards that are not rendered yet.
-
-        Returns
-        -------
-        list of Shard
+        split : ``train`` or ``test``
+        finished_only : leave out shards that are not rendered yet
 
         Raises
         ------
-        InputError
-            No such split, a missing shard, a corrupt sidecar, or a shard that is not the one listed.
+        InputError : no such split, a missing shard, a corrupt sidecar, or a shard that is not the one listed
         """
         if split not in self.manifest["splits"]:
             raise InputError(f"has no split '{split}' (it has: {', '.join(self.splits)})", where=self.folder)
@@ -333,7 +253,6 @@ class Dataset:
                     ) from None
                 hint = f"check the data set with: mbtf-gen verify {self.folder}"
                 raise InputError(error.what, where=self.folder.at(entry.file), hint=hint) from None
-            check_document(_Sidecar, record, self.folder.at(sidecar_name(entry.file)), _MAKE_AGAIN)
             out.append(Shard(self.folder, entry.file, record, image, self.estimates))
         return out
 
@@ -347,8 +266,7 @@ class Dataset:
 
         Raises
         ------
-        InputError
-            The file is missing or is not the one that was written.
+        InputError : the file is missing or is not the one that was written
         """
         record = self.manifest["geometry"]
         if record is None:
@@ -371,10 +289,8 @@ class Dataset:
 
         Parameters
         ----------
-        split : str
-            ``train`` or ``test``.
-        names : iterable of str, optional
-            Arrays to read; all by default.
+        split : ``train`` or ``test``
+        names : arrays to read; all by default
 
         Yields
         ------
@@ -383,8 +299,7 @@ class Dataset:
 
         Raises
         ------
-        InputError
-            See :meth:`shards` and :meth:`Shard.read`.
+        InputError : see :meth:`shards` and :meth:`Shard.read`
         """
         wanted = None if names is None else list(names)
         yield from (shard.read(wanted) for shard in ahead(self.shards(split)))
@@ -394,10 +309,8 @@ class Dataset:
 
         Parameters
         ----------
-        split : str
-            ``train`` or ``test``.
-        names : iterable of str, optional
-            Arrays to read; all by default.
+        split : ``train`` or ``test``
+        names : arrays to read; all by default
 
         Returns
         -------
@@ -406,8 +319,7 @@ class Dataset:
 
         Raises
         ------
-        InputError
-            See :meth:`iterate`; or the split has no shards.
+        InputError : see :meth:`iterate`; or the split has no shards
         """
         parts = list(self.iterate(split, names))
         if not parts:

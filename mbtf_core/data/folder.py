@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import queue
 import re
 import tempfile
 import threading
@@ -22,9 +21,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.data.cache import FileCache
 from mbtf_core.data.schema import CONFIG_NAME, GEOMETRY_NAME, MANIFEST_NAME, SPLITS
-from mbtf_core.data.store import LocalStore, Store, StoredFile, open_store
+from mbtf_core.data.store import FileCache, LocalStore, Store, StoredFile, open_store
 from mbtf_core.errors import InputError, MbtfError, PartialError, unwritable
 from mbtf_core.files.atomic import (
     TEMPORARY,
@@ -82,9 +80,9 @@ class DataFolder:
         # Of a store: its files as last seen, and the contents of the small ones.
         self._listed: dict[str, StoredFile] = {}
         self._contents: dict[str, bytes] = {}
-        self._wanted: queue.Queue[tuple[str, str]] = queue.Queue()
-        self._readers: list[threading.Thread] = []
-        self._guard = threading.Lock()
+        # Shards that are downloaded ahead of their readers.
+        self._coming: set[tuple[str, str]] = set()
+        self._slots = threading.Semaphore(_AHEAD)
 
     @classmethod
     def open(cls, where: str | Path | DataFolder) -> DataFolder:
@@ -92,12 +90,9 @@ class DataFolder:
 
         Raises
         ------
-        EngineError
-            The package of the protocol is not installed.
-        InputError
-            The URL is invalid, or the store refuses the request.
-        PartialError
-            The store cannot be reached.
+        EngineError : the package of the protocol is not installed
+        InputError : the URL is invalid, or the store refuses the request
+        PartialError : the store cannot be reached
         """
         found = where if isinstance(where, DataFolder) else cls(open_store(where))
         if found.local is None:
@@ -122,22 +117,19 @@ class DataFolder:
             return
         before, self._listed = self._listed, self.store.list()
 
-        def is_known(name: str, found: StoredFile) -> bool:
-            """What this process has written has no tag yet."""
-            known = before.get(name)
-            return name in self._contents and bool(found.tag) and known in (found, StoredFile(found.size, ""))
+        def content(name: str) -> bytes | None:
+            found, known = self._listed[name], before.get(name)
+            # What this process has written has no tag yet.
+            if found.tag and known in (found, StoredFile(found.size, "")) and name in self._contents:
+                return self._contents[name]
+            return self._read(name)
 
-        documents = {n: found for n, found in self._listed.items() if _KEPT.fullmatch(n)}
-        changed = [name for name, found in documents.items() if not is_known(name, found)]
+        documents = [name for name in self._listed if _KEPT.fullmatch(name)]
         with ThreadPoolExecutor(_THREADS) as pool:
-            contents = dict(zip(changed, pool.map(self._read, changed), strict=True))
-        for name in [name for name, content in contents.items() if content is None]:
+            contents = dict(zip(documents, pool.map(content, documents), strict=True))
+        self._contents = {name: found for name, found in contents.items() if found is not None}
+        for name in contents.keys() - self._contents.keys():
             del self._listed[name]
-        self._contents = {
-            name: content
-            for name, content in {**self._contents, **contents}.items()
-            if content is not None and name in self._listed
-        }
 
     def _read(self, name: str) -> bytes | None:
         try:
@@ -227,35 +219,22 @@ class DataFolder:
 
     def prefetch(self, name: str, sha256: str) -> None:
         """Start to download a shard of a store in a background thread; nothing happens for local files.
-
         Failures are left to the reader. A cache of a few shards has no room for it."""
         if self.local is not None or _ROOM * (self.size(name) or 0) > self.cache.limit:
             return
-        with self._guard:
-            while len(self._readers) < _AHEAD:
-                # As a daemon it does not delay the exit.
-                self._readers.append(threading.Thread(target=self._read_ahead, name="prefetch", daemon=True))
-                self._readers[-1].start()
-        if (name, sha256) not in self._wanted.queue:
-            self._wanted.put((name, sha256))
+        if (name, sha256) not in self._coming:
+            self._coming.add((name, sha256))
+            # As a daemon it does not delay the exit.
+            reader = threading.Thread(None, self._read_ahead, "prefetch", (name, sha256), daemon=True)
+            reader.start()
 
-    def _read_ahead(self) -> None:
-        while True:
-            name, sha256 = self._wanted.get()
-            with contextlib.suppress(MbtfError):
-                self.file(name, sha256)
+    def _read_ahead(self, name: str, sha256: str) -> None:
+        with self._slots, contextlib.suppress(MbtfError):
+            self.file(name, sha256)
+        self._coming.discard((name, sha256))
 
     def write(self, name: str, content: bytes, *, new: bool = False) -> bool:
-        """Write a document whole.
-
-        Parameters
-        ----------
-        new : do not replace another writer's
-
-        Returns
-        -------
-        bool
-            False where `new`, and there is one.
+        """Write a document whole; False where `new`, and another writer's is there.
 
         Raises
         ------
@@ -281,17 +260,12 @@ class DataFolder:
     def write_shard(
         self, name: str, write: Callable[[Path], Stored], record: Callable[[Stored], dict[str, Any]]
     ) -> dict[str, Any]:
-        """Write a shard, then its sidecar.
+        """Write a shard, then its sidecar, and return the sidecar.
 
         Parameters
         ----------
         write : writes the shard to a path, atomically
         record : the sidecar, given size and digest of the shard
-
-        Returns
-        -------
-        dict
-            The sidecar.
 
         Raises
         ------
@@ -337,25 +311,19 @@ class DataFolder:
 
     def upload_waiting(self, wanted: Callable[[dict[str, Any]], bool]) -> list[str]:
         """Upload the whole shards that earlier runs on this machine could not upload, instead of rendering
-        them again; the others are removed.
+        them again, and return their names; the others are removed.
 
         Parameters
         ----------
         wanted : whether a shard with this sidecar belongs to the data set, which lacks it
-
-        Returns
-        -------
-        list of str
-            Files that were uploaded.
 
         Raises
         ------
         PartialError : the store cannot be reached; the shards are kept
         """
         sent: list[str] = []
-        if self.local is not None:
-            return sent
-        for path in sorted(p for p in self.workspace.iterdir() if p.suffix in (".npz", ".exr")):
+        waiting = [] if self.local is not None else list(self.workspace.iterdir())
+        for path in sorted(p for p in waiting if p.suffix in (".npz", ".exr")):
             with shard_lock(path) as held:
                 if not held:
                     continue

@@ -45,8 +45,7 @@ class Geometry:
     ----------
     heights : (H, W) float32 array
         Heights ≤ 0 of the mesh in tile widths, maximum 0; vertices lie on texel centers.
-    aspect : float
-        Height of the tile over its width.
+    aspect : height of the tile over its width
     slopes : (h, w, 2) float32 array
         Means of the slopes ``s = (dz/dx, dz/dy)`` of the shading normal over each texel.
     slope_moments : (h, w, 3) float32 array
@@ -105,8 +104,7 @@ def encode_geometry(geometry: Geometry) -> bytes:
 
     Raises
     ------
-    PartialError
-        The folder for temporary files cannot be written.
+    PartialError : the folder for temporary files cannot be written
     """
     from mbtf_core.images.exr import encode_parts
 
@@ -125,8 +123,7 @@ def write_geometry(path: Path, geometry: Geometry) -> str:
 
     Parameters
     ----------
-    path : Path
-        The file.
+    path : the file
     geometry : Geometry
 
     Returns
@@ -136,8 +133,7 @@ def write_geometry(path: Path, geometry: Geometry) -> str:
 
     Raises
     ------
-    PartialError
-        The disk is full or the folder cannot be written.
+    PartialError : the disk is full or the folder cannot be written
     """
     return write_chunks(path, [encode_geometry(geometry)]).sha256
 
@@ -172,18 +168,12 @@ def read_geometry(path: Path) -> Geometry:
 
     Parameters
     ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    Geometry
+    path : the file
 
     Raises
     ------
-    InputError
-        It is missing, damaged, or no geometry: channels, shapes or numbers are not those of
-        :class:`Geometry`.
+    InputError : it is missing, damaged, or no geometry: channels, shapes or numbers are not those of
+        :class:`Geometry`
     """
     from mbtf_core.images.exr import read_parts
 

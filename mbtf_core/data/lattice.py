@@ -22,8 +22,7 @@ def sigma_of_level(level: ArrayLike) -> NDArray[np.float64]:
 
     Parameters
     ----------
-    level : array_like
-        Fractional levels l, any shape.
+    level : fractional levels l, any shape
 
     Returns
     -------
@@ -38,8 +37,7 @@ def level_of_sigma(sigma: ArrayLike) -> NDArray[np.float64]:
 
     Parameters
     ----------
-    sigma : array_like
-        Standard deviations σ in tile widths, any shape.
+    sigma : standard deviations σ in tile widths, any shape
 
     Returns
     -------
@@ -55,15 +53,12 @@ class Lattice:
 
     Attributes
     ----------
-    finest : int
-        Finest level k, 0 to 14.
-    aspect : float
-        Height of the tile over its width, ``a = H/W``.
+    finest : finest level k, 0 to 14
+    aspect : height of the tile over its width, ``a = H/W``
 
     Raises
     ------
-    ValueError
-        `finest` or `aspect` is out of range.
+    ValueError : `finest` or `aspect` is out of range
     """
 
     finest: int
@@ -81,14 +76,8 @@ class Lattice:
 
         Parameters
         ----------
-        rows, columns : int
-            Size of the map in pixels.
-        finest : int or None
-            Finest level k; by default ``floor(log2(columns))``, at most 14.
-
-        Returns
-        -------
-        Lattice
+        rows, columns : size of the map in pixels
+        finest : finest level k; by default ``floor(log2(columns))``, at most 14
         """
         k = min(int(columns).bit_length() - 1, MAX_LEVEL) if finest is None else finest
         return cls(k, rows / columns)
@@ -120,8 +109,7 @@ class Lattice:
 
         Parameters
         ----------
-        sigma : array_like
-            Standard deviations in tile widths, any shape.
+        sigma : standard deviations in tile widths, any shape
 
         Returns
         -------

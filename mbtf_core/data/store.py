@@ -1,4 +1,5 @@
-"""Where the files of a data set lie: a local folder, or a folder of an object store through fsspec.
+"""Where the files of a data set lie: a local folder, or a folder of an object store through fsspec; and the
+cache of the files that were downloaded.
 
 A store lists, reads, writes once and deletes. Files are written whole: a store shows a file only once all of
 it has arrived.
@@ -7,19 +8,21 @@ it has arrived.
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import logging
 import os
 import threading
 import time
+from collections import defaultdict, deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 from urllib.parse import unquote
 
-from mbtf_core.errors import EngineError, InputError, MbtfError, PartialError, UsageError, reason
+from mbtf_core.errors import EngineError, InputError, PartialError, UsageError, reason
 from mbtf_core.files.atomic import create_file, remove_file, write_chunks
+from mbtf_core.files.folders import make_folder
 from mbtf_core.suggest import refuse_special
 from mbtf_core.urls import split_url
 
@@ -30,38 +33,29 @@ T = TypeVar("T")
 PATIENCE_VARIABLE, PATIENCE_SECONDS = "MBTF_STORE_PATIENCE", 60.0
 # First pause between two attempts, and the longest one; each is twice as long as the one before.
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.5, 10.0
-# Errors of a request that another attempt does not help, by class or, of optional packages, by name.
-_REFUSED = (
-    PermissionError,
-    NotImplementedError,
-    TypeError,
-    ValueError,
-    IsADirectoryError,
-    NotADirectoryError,
-)
 # Packages of protocols that the extra `stores` leaves out.
 _PACKAGES = {"gs": "gcsfs", "gcs": "gcsfs", "abfs": "adlfs", "az": "adlfs"}
-_REFUSED_NAMES = (
-    "NoCredentialsError",
-    "PartialCredentialsError",
-    "ProfileNotFound",
-    "DefaultCredentialsError",
-    "ParamValidationError",
-)
-# The same by the code of an answer: that of HTTP in errors of gcsfs, those of S3 that s3fs has no class for.
-_REFUSED_CODES = (
-    401,
-    403,
-    "AuthorizationHeaderMalformed",
-    "InvalidBucketName",
-    "InvalidToken",
-    "KeyTooLongError",
-    "MethodNotAllowed",
-    "PermanentRedirect",
-)
+# Errors of a request that another attempt does not help: classes, also of optional packages, by name; codes
+# of answers, those of HTTP in errors of gcsfs, and of S3 where s3fs has no class for them.
+_REFUSED = {
+    *("PermissionError", "NotImplementedError", "TypeError", "ValueError"),
+    *("IsADirectoryError", "NotADirectoryError", "NoCredentialsError", "PartialCredentialsError"),
+    *("ProfileNotFound", "DefaultCredentialsError", "ParamValidationError"),
+}
+_REFUSED_CODES = {
+    *(401, 403, "AuthorizationHeaderMalformed", "InvalidBucketName", "InvalidToken"),
+    *("KeyTooLongError", "MethodNotAllowed", "PermanentRedirect"),
+}
 # Answers of S3 to a conditional write: there is such an object, and this store has no such writes. s3fs knows
 # the first one only where the answer names the condition, as that of Amazon does.
 _EXISTS, _UNCONDITIONAL = ("PreconditionFailed", "412"), ("NotImplemented", "501")
+
+# Bytes of a cache by default.
+CACHE_BYTES = 20e9
+# Files that were fetched last and that are never removed: their readers are about to open them.
+_KEPT = 4
+# Seconds after which the unfinished file of another process counts as abandoned.
+_ABANDONED_SECONDS = 86400.0
 
 
 @dataclass(frozen=True)
@@ -130,7 +124,7 @@ class LocalStore:
 
 
 class ObjectStore:
-    """The objects of one folder of an object store, by name; see :class:`Store`. A connection that drops is
+    """The objects of one folder of an object store; see :class:`Store`. A request whose connection drops is
     tried again with growing pauses until the patience ends.
 
     Parameters
@@ -194,8 +188,6 @@ class ObjectStore:
                 # The store has answered.
                 self._lost.clear()
                 raise
-            except MbtfError:
-                raise
             except Exception as error:
                 if _is_refusal(error):
                     raise InputError(
@@ -203,10 +195,10 @@ class ObjectStore:
                         where=where,
                         hint="check the credentials, the endpoint and the name of the bucket",
                     ) from None
+                log.debug("%s: %s", where, reason(error))
                 now = time.monotonic()
-                if give_up == 0.0:
-                    give_up = now + (0.0 if self._lost.is_set() else self.patience)
-                    log.debug("%s: %s; trying again for %.0f s", where, reason(error), self.patience)
+                # The patience begins with the first failure: a request may take long.
+                give_up = give_up or now + (0.0 if self._lost.is_set() else self.patience)
                 if now + pause > give_up:
                     self._lost.set()
                     raise PartialError(
@@ -242,17 +234,10 @@ class ObjectStore:
         return bytes(self._request(name, lambda: self._files.cat_file(self._at(name))))
 
     def write(self, name: str, content: bytes, *, new: bool = False) -> bool:
-        """Write an object whole.
+        """Write an object whole; False where `new`, and another one has that name.
 
-        Parameters
-        ----------
-        new : never replace an object of that name. The store decides where it has conditional writes, such as
-            S3; others have a short window in which the last writer succeeds
-
-        Returns
-        -------
-        bool
-            False where `new`, and another object has that name.
+        The store decides which of several writers is first where it has conditional writes, such as S3;
+        others have a short window in which the last writer succeeds.
         """
 
         def request() -> None:
@@ -288,6 +273,85 @@ class ObjectStore:
             return
 
 
+class FileCache:
+    """Whole files by their SHA-256, which all processes of a user share: at most `limit` bytes of them, but
+    at least the few that were fetched last.
+
+    A file is complete once it has its name, and never changes. The files that were used least recently make
+    room for new ones. A mapped file stays readable after it has been removed.
+
+    Parameters
+    ----------
+    folder : made if it is missing
+    limit : in bytes
+    """
+
+    def __init__(self, folder: Path, limit: float = CACHE_BYTES) -> None:
+        self.folder = folder
+        self.limit = limit
+        self._guard = threading.Lock()
+        self._locks: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
+        self._recent: deque[str] = deque(maxlen=_KEPT)
+
+    def fetch(self, sha256: str, suffix: str, size: int, read: Callable[[], bytes]) -> Path:
+        """The file with a digest; read and checked if it is missing.
+
+        Parameters
+        ----------
+        sha256, suffix, size : of the file: in hexadecimal, of its name, in bytes
+        read : returns the content
+
+        Raises
+        ------
+        InputError : what was read has another digest
+        PartialError : the disk is full
+        the errors of `read`
+        """
+        path = self.folder / f"{sha256}{suffix}"
+        with self._guard:
+            lock = self._locks[path.name]
+        # Another thread may be reading it.
+        with lock:
+            with self._guard:
+                if path.name in self._recent:
+                    self._recent.remove(path.name)
+                self._recent.append(path.name)
+            with contextlib.suppress(OSError):
+                if path.stat().st_size == size:
+                    # Its age is the time since it was used.
+                    os.utime(path)
+                    return path
+            make_folder(self.folder)
+            self._make_room(size)
+            content = read()
+            if hashlib.sha256(content).hexdigest() != sha256:
+                raise InputError("has changed since it was written (SHA-256 differs)")
+            write_chunks(path, [content])
+            return path
+
+    def _make_room(self, size: int) -> None:
+        """Remove files until `size` bytes more fit."""
+        with self._guard:
+            found: list[tuple[float, int, str]] = []
+            with contextlib.suppress(OSError), os.scandir(self.folder) as entries:
+                for entry in entries:
+                    with contextlib.suppress(OSError):
+                        stat = entry.stat()
+                        found.append((stat.st_mtime, stat.st_size, entry.name))
+            total = size + sum(bytes_ for _, bytes_, _ in found)
+            now = time.time()
+            for used, bytes_, name in sorted(found):
+                if name.startswith("."):
+                    removed = now - used > _ABANDONED_SECONDS
+                else:
+                    removed = total > self.limit and name not in self._recent
+                if not removed:
+                    continue
+                with contextlib.suppress(OSError):
+                    os.unlink(self.folder / name)
+                    total -= bytes_
+
+
 def open_store(where: str | Path) -> Store:
     """The store of a path, or of a URL such as ``s3://bucket/data``; ``file://`` is a local path.
 
@@ -309,7 +373,7 @@ def open_store(where: str | Path) -> Store:
 
 def _is_refusal(error: Exception) -> bool:
     """Whether another attempt would not help."""
-    if isinstance(error, _REFUSED) or type(error).__name__ in _REFUSED_NAMES:
+    if any(cls.__name__ in _REFUSED for cls in type(error).__mro__):
         return True
     # The text is that of gcsfs, whose error has no code.
     return _code(error) in _REFUSED_CODES or str(error).startswith("Forbidden: ")
@@ -338,5 +402,4 @@ def _quiet(files: Any) -> None:
 
 def _tag(info: dict[str, Any]) -> str:
     keys = ("ETag", "etag", "md5Hash", "content_md5", "LastModified", "last_modified", "mtime", "created")
-    value = next((info[key] for key in keys if info.get(key)), "")
-    return str(value.timestamp() if isinstance(value, datetime) else value)
+    return str(next((info[key] for key in keys if info.get(key)), ""))

@@ -12,11 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.documents import ABSENT, CHANGED, plan_digest, read_sidecar, repair_hint
 from mbtf_core.data.folder import DataFolder, is_leftover, sidecar_name
-from mbtf_core.data.manifest import plan_digest
 from mbtf_core.data.schema import CONFIG_NAME, GEOMETRY_NAME, MANIFEST_NAME, ShardEntry
 from mbtf_core.data.shard_files import check_arrays, check_values, read_shard
-from mbtf_core.data.sidecar import ABSENT, CHANGED, read_sidecar, repair_hint
 from mbtf_core.errors import InputError, reason
 from mbtf_core.files.digest import file_sha256
 
@@ -37,12 +36,9 @@ class Fault:
 
     Attributes
     ----------
-    file : str
-        Name of the file.
-    what : str
-        The fault, in words.
-    hint : str
-        What to do about it.
+    file : name of the file
+    what : the fault, in words
+    hint : what to do about it
     """
 
     file: str
@@ -134,8 +130,7 @@ def verify(folder: str | Path | DataFolder) -> list[Fault]:
 
     Parameters
     ----------
-    folder : str, Path or DataFolder
-        The data set: a path or a URL.
+    folder : the data set: a path or a URL
 
     Returns
     -------
@@ -144,10 +139,8 @@ def verify(folder: str | Path | DataFolder) -> list[Fault]:
 
     Raises
     ------
-    InputError
-        The folder contains no data set of this schema version, or its manifest is damaged.
-    PartialError
-        The store cannot be reached.
+    InputError : the folder contains no data set of this schema version, or its manifest is damaged
+    PartialError : the store cannot be reached
     """
     folder = DataFolder.open(folder)
     dataset = Dataset.open(folder)

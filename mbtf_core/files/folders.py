@@ -1,7 +1,8 @@
-"""Output folders: new, empty, resumed, or refused.
+"""Output folders: new, empty, resumed, replaced, or refused.
 
 A command owns its folder while it writes there. It writes its record first, such as ``manifest.json``: the
-folder is then its own, whatever instant the process is killed at.
+folder is then its own, whatever instant the process is killed at. Files that the record does not list belong
+to others and are never touched.
 """
 
 from __future__ import annotations
@@ -10,13 +11,19 @@ import contextlib
 import os
 import re
 import shutil
-from collections.abc import Callable, Container, Iterator, Mapping
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BaseModel
 
 from mbtf_core.config.nested import differences, in_short
+from mbtf_core.config.settings import check_document, check_schema
+from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.errors import InputError, LockedError, PartialError
-from mbtf_core.files.atomic import TEMPORARY, remove_file
+from mbtf_core.files.atomic import TEMPORARY, Stored, read_json, remove_file, write_json, write_text
+from mbtf_core.files.digest import data_sha256
 from mbtf_core.locks import lock_owner, take_lock
 from mbtf_core.units import size_text
 
@@ -24,6 +31,8 @@ from mbtf_core.units import size_text
 _LEFTOVER = re.compile(rf"\..+(?:{TEMPORARY}|\.lock)")
 
 ELSEWHERE = "choose another folder with -o"
+# Beside the record: the resolved options, which a command can be given again.
+CONFIG_NAME = "config.yaml"
 
 
 def cache_folder() -> Path:
@@ -32,11 +41,10 @@ def cache_folder() -> Path:
 
 
 @contextlib.contextmanager
-def owned(folder: Path, elsewhere: str = ELSEWHERE) -> Iterator[None]:
+def owned(folder: Path) -> Iterator[None]:
     """Own a folder in a block that writes to it, so that no other command does.
 
-    The folder is made if it is missing, and removed again if nothing was written. `elsewhere` names the
-    option that chooses another one.
+    The folder is made if it is missing, and removed again if nothing was written.
 
     Raises
     ------
@@ -58,7 +66,7 @@ def owned(folder: Path, elsewhere: str = ELSEWHERE) -> Iterator[None]:
         raise LockedError(
             f"is being written by another process{'' if owner is None else f' ({owner})'}",
             where=folder,
-            hint=f"wait for it and run the same command again, or {elsewhere}",
+            hint=f"wait for it and run the same command again, or {ELSEWHERE}",
         )
     try:
         yield
@@ -78,30 +86,17 @@ def is_empty(folder: Path) -> bool:
     return not folder.exists() or all(_LEFTOVER.fullmatch(p.name) for p in folder.iterdir())
 
 
-def check_folder(
-    folder: Path, is_ours: Callable[[Path], bool], what: str, elsewhere: str = ELSEWHERE
-) -> bool:
-    """Does an output folder contain a run to resume? False where it is missing or empty.
+def check_folder(folder: Path, is_ours: Callable[[Path], bool], what: str) -> bool:
+    """Whether an output folder contains a run to resume; False where it is missing or empty.
 
     Parameters
     ----------
-    folder : Path
-        The output folder; temporary files and locks in it are ignored.
-    is_ours : callable
-        Does the folder contain a record of this kind?
-    what : str
-        Name of the record, for the message.
-    elsewhere : str
-        Advice that names the option of the folder.
-
-    Returns
-    -------
-    bool
+    is_ours : whether the folder contains a record of this kind
+    what : name of the output, for the message
 
     Raises
     ------
-    InputError
-        It is a file, or contains something else.
+    InputError : it is a file, or contains something else
     """
     if folder.exists() and not folder.is_dir():
         raise InputError("is a file, not a folder", where=folder)
@@ -110,26 +105,16 @@ def check_folder(
     if is_ours(folder):
         return True
     if not empty:
-        raise InputError(f"is not empty and holds no {what}", where=folder, hint=elsewhere)
+        raise InputError(f"is not empty and holds no {what}", where=folder, hint=ELSEWHERE)
     return False
 
 
 def check_space(folder: Path, size: float, hint: str) -> None:
-    """Refuse what does not fit on the disk of an output folder.
-
-    Parameters
-    ----------
-    folder : Path
-        The output folder, which may be missing.
-    size : float
-        Bytes that are to be written.
-    hint : str
-        The option to change.
+    """Refuse output of this size, in bytes, that does not fit on the disk of its folder.
 
     Raises
     ------
-    InputError
-        Less is free.
+    InputError : less is free; `hint` names the option to change
     """
     there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
     free = shutil.disk_usage(there).free
@@ -151,30 +136,17 @@ def make_folder(folder: Path) -> None:
 
 
 def other_configuration(
-    folder: object,
-    what: str,
-    old: Mapping[str, Any],
-    new: Mapping[str, Any],
-    otherwise: str = "inputs differ",
+    folder: object, what: str, old: Mapping[str, Any], new: Mapping[str, Any]
 ) -> InputError:
     """Error for a folder that was written with another configuration.
 
     Parameters
     ----------
-    folder : Path or DataFolder
-        For the message.
-    what : str
-        Content of the folder, for the message.
-    old, new : mapping
-        Plain data that determine the content: those of the folder, and the requested ones.
-    otherwise : str
-        Message where these two do not differ.
-
-    Returns
-    -------
-    InputError
+    folder : path or URL, for the message
+    what : content of the folder, for the message
+    old, new : plain data that determine the content: those of the folder, and the requested ones
     """
-    changes = in_short(differences(old, new)) or otherwise
+    changes = in_short(differences(old, new)) or "inputs differ"
     return InputError(
         f"holds {what} of another configuration: {changes}",
         where=folder,
@@ -193,3 +165,175 @@ def remove_unfinished(folder: Path, names: Container[str]) -> None:
         match = re.fullmatch(rf"\.(.+?){TEMPORARY}", path.name)
         if match is not None and match[1] in names:
             remove_file(path)
+
+
+def _inside(name: str) -> str:
+    """A file name below the folder; a record of others must not lead out of it."""
+    path = PurePosixPath(name)
+    if path.is_absolute() or ".." in path.parts or "\0" in name or not path.name:
+        raise ValueError("must lie in the folder")
+    return name
+
+
+_Name = Annotated[str, AfterValidator(_inside)]
+
+
+class _Item(BaseModel):
+    files: dict[_Name, int]
+    facts: dict[str, Any]
+
+
+class _Record(BaseModel):
+    hash: str
+    depends: dict[str, Any]
+    listed: list[_Name]
+    items: dict[str, _Item] = {}
+
+
+@dataclass(frozen=True)
+class OutputKind:
+    """Kind of output, as the record in its folder states it.
+
+    Attributes
+    ----------
+    record : name of the record's file
+    format, schema : stated in the record
+    what : name of the output with its article, for messages
+    """
+
+    record: str
+    format: str
+    schema: int
+    what: str
+
+    def read(self, folder: Path) -> dict[str, Any] | None:
+        """The record of a folder; None where it has none of this kind.
+
+        Raises
+        ------
+        InputError : it has another schema version
+        """
+        try:
+            found = read_json(folder / self.record)
+        except InputError:
+            return None
+        if found.get("format") != self.format:
+            return None
+        check_schema(found, self.schema, folder / self.record, ELSEWHERE)
+        return found
+
+    def check(self, folder: Path) -> bool:
+        """:func:`check_folder` for output of this kind."""
+        name = re.sub("^an? ", "", self.what)
+        return check_folder(folder, lambda path: self.read(path) is not None, name)
+
+    def write(self, folder: Path, content: Mapping[str, Any]) -> None:
+        """Write a record, atomically."""
+        write_json(folder / self.record, {"format": self.format, "schema": self.schema, **content})
+
+
+class OutputFolder:
+    """A folder that :meth:`claim` has claimed for one configuration of a command; the caller owns it.
+
+    As a context manager it gives up the claim if an error comes before the first file.
+
+    Attributes
+    ----------
+    path : Path
+    """
+
+    def __init__(self, path: Path, kind: OutputKind, record: _Record) -> None:
+        self.path, self._kind, self._record = path, kind, record
+        # The files that tell whose the folder is.
+        self._claim = [kind.record]
+
+    @classmethod
+    def claim(
+        cls,
+        path: Path,
+        kind: OutputKind,
+        depends: Mapping[str, Any],
+        listed: Iterable[str],
+        *,
+        config: Mapping[str, Any] | None = None,
+        digest: str | None = None,
+        overwrite: bool = False,
+    ) -> OutputFolder:
+        """Claim a folder that is empty, of the same configuration, or to be replaced.
+
+        Parameters
+        ----------
+        depends : plain data that determine the content
+        listed : names of all files that may be written; when replaced, removed in this order
+        config : resolved options, written beside the record
+        digest : of all that determines the content; by default that of `depends`
+        overwrite : remove what the folder's record lists, and start anew
+
+        Raises
+        ------
+        InputError : the folder holds something else
+        PartialError : it cannot be written
+        """
+        new = _Record(hash=digest or data_sha256(depends), depends=dict(depends), listed=list(listed))
+        folder = cls(path, kind, new)
+        if kind.check(path):
+            old = check_document(_Record, kind.read(path) or {}, path / kind.record, ELSEWHERE)
+            if not overwrite and old.hash != new.hash:
+                raise other_configuration(path, kind.what, old.depends, new.depends)
+            for below in {path, *((path / name).parent for name in old.listed)}:
+                if below.is_dir():
+                    remove_unfinished(below, {kind.record, *(Path(name).name for name in old.listed)})
+            if overwrite:
+                for name in old.listed:
+                    remove_file(path / name)
+            else:
+                folder._record = old
+        make_folder(path)
+        # The record first, also in place of that of a replaced output.
+        if folder._record is new:
+            folder._save()
+        if config is not None:
+            folder._claim.insert(0, CONFIG_NAME)
+            file, text = path / CONFIG_NAME, dump_yaml(config)
+            remove_unfinished(path, [CONFIG_NAME])
+            if not file.exists() or file.read_text(encoding="utf-8") != text:
+                write_text(file, text)
+        return folder
+
+    def __enter__(self) -> OutputFolder:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        failed = kind is not None and issubclass(kind, Exception)
+        if failed and not any((self.path / name).exists() for name in self._record.listed):
+            for name in self._claim:
+                remove_file(self.path / name)
+
+    def _save(self) -> None:
+        self._kind.write(self.path, self._record.model_dump())
+
+    def finished(self, name: str) -> dict[str, Any] | None:
+        """Facts stored by :meth:`keep`, if all files of the item exist with their full size."""
+        item = self._record.items.get(name)
+        if item is None:
+            return None
+        for file, size in item.files.items():
+            path = self.path / file
+            if not path.is_file() or path.stat().st_size != size:
+                return None
+        return item.facts
+
+    def keep(self, name: str, files: Iterable[Path], facts: Mapping[str, Any]) -> None:
+        """Record an item as finished: its files, which lie in the folder, and plain data about it."""
+        sizes = {path.relative_to(self.path).as_posix(): path.stat().st_size for path in files}
+        self._record.items[name] = _Item(files=sizes, facts=dict(facts))
+        self._save()
+
+    def add(self, name: str, write: Callable[[Path], Stored]) -> Stored:
+        """Write a file with ``write(path)``, atomically, unless it is finished; its size and digest."""
+        path, known = self.path / name, self.finished(name)
+        if known is None:
+            make_folder(path.parent)
+            known = {"sha256": write(path).sha256}
+            self.keep(name, [path], known)
+        return Stored(path.stat().st_size, known["sha256"])

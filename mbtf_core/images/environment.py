@@ -24,10 +24,8 @@ def read_environment(path: Path, most_rows: int) -> NDArray[np.float32]:
 
     Parameters
     ----------
-    path : Path
-        EXR, HDR, PNG, JPG, TIFF or npy file; 8-bit colors are sRGB.
-    most_rows : int
-        Larger pictures are averaged down to so many rows.
+    path : EXR, HDR, PNG, JPG, TIFF or npy file; 8-bit colors are sRGB
+    most_rows : larger pictures are averaged down to so many rows
 
     Returns
     -------
@@ -36,8 +34,7 @@ def read_environment(path: Path, most_rows: int) -> NDArray[np.float32]:
 
     Raises
     ------
-    InputError
-        The file cannot be read.
+    InputError : the file cannot be read
     """
     suffix = path.suffix.lower()
     if path.is_file() and suffix not in (_RADIANCE, *SUFFIXES):

@@ -52,8 +52,7 @@ def read_file(path: Path, max_pixels: int) -> tuple[dict[str, Any], dict[str, ND
     Parameters
     ----------
     path : Path
-    max_pixels : int
-        Largest size that is read.
+    max_pixels : largest size that is read
 
     Returns
     -------
@@ -62,9 +61,8 @@ def read_file(path: Path, max_pixels: int) -> tuple[dict[str, Any], dict[str, ND
 
     Raises
     ------
-    InputError
-        The file is damaged, too large, deep, subsampled or cropped (data window unlike the display window),
-        or stores integers.
+    InputError : the file is damaged, too large, deep, subsampled or cropped (data window unlike the display
+        window), or stores integers
     """
     head, channels = _read(path, max_pixels)[0]
     check_floats(channels, path)

@@ -66,14 +66,10 @@ class Image:
     ----------
     pixels : (H, W, C) float64 (C = 1) or float32 array
         Row 0 is the top; C = 1 gray, 2 gray and alpha, 3 RGB, 4 RGBA; all finite.
-    bits : int or None
-        8 or 16 for integer files, whose pixels are code / largest code; None for floats.
-    path : Path
-        The file.
-    tags : Tags
-        Color space and orientation that the file declares; not applied here.
-    channels : tuple of str
-        Names of the selected channels; empty where the file has no others.
+    bits : 8 or 16 for integer files, whose pixels are code / largest code; None for floats
+    path : the file
+    tags : color space and orientation that the file declares; not applied here
+    channels : names of the selected channels; empty where the file has no others
     """
 
     pixels: NDArray[np.floating[Any]]
@@ -100,23 +96,15 @@ def read_image(
 
     Parameters
     ----------
-    path : str or Path
-        EXR, PNG, JPG, TIFF or npy file.
-    channel : str or None
-        A channel or layer of an EXR file; R, G, B, A or Y of other formats. None: see
-        :func:`~mbtf_core.images.exr.choose_channels`.
-    prefer : callable or None
-        Predicate on the layer names of an EXR file, for files of several layers.
-
-    Returns
-    -------
-    Image
+    path : EXR, PNG, JPG, TIFF or npy file
+    channel : a channel or layer of an EXR file; R, G, B, A or Y of other formats. None: see
+        :func:`~mbtf_core.images.exr.choose_channels`
+    prefer : predicate on the layer names of an EXR file, for files of several layers
 
     Raises
     ------
-    InputError
-        The file is missing, empty, damaged, truncated, unsupported, larger than ``MAX_PIXELS``, or not of
-        the format of its suffix; the channel is missing; or pixels are NaN or infinite.
+    InputError : the file is missing, empty, damaged, truncated, unsupported, larger than ``MAX_PIXELS``, or
+        not of the format of its suffix; the channel is missing; or pixels are NaN or infinite
     """
     path = Path(path)
     kind = _kind(path)

@@ -31,8 +31,7 @@ def resample(
     Parameters
     ----------
     image : (H, W, ...) float array
-    rows, columns : int
-        New resolution.
+    rows, columns : new resolution
     enlarge : {"linear", "cubic"}
         Interpolation: the tent, which stays within the range of the data, or the cubic of Keys (1981) with
         a = -1/2, which has continuous slopes and may overshoot.
@@ -43,8 +42,7 @@ def resample(
 
     Raises
     ------
-    ValueError
-        `rows` or `columns` is below 1.
+    ValueError : `rows` or `columns` is below 1
     """
     if rows < 1 or columns < 1:
         raise ValueError(f"a map needs at least one row and column, not {rows} x {columns}")
@@ -103,8 +101,7 @@ def dequantize(height: NDArray[np.float64], step: float) -> NDArray[np.float64]:
     Parameters
     ----------
     height : (H, W) float64 array
-    step : float
-        Distance of neighboring codes in the unit of `height`, such as 1/255 for 8-bit images.
+    step : distance of neighboring codes in the unit of `height`, such as 1/255 for 8-bit images
 
     Returns
     -------

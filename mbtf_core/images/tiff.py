@@ -24,13 +24,11 @@ def read_tiff(path: Path, check_size: Callable[[int, int, Path], None]) -> NDArr
     Parameters
     ----------
     path : Path
-    check_size : callable
-        Called with rows, columns and the path before any pixel is read; raises to refuse.
+    check_size : called with rows, columns and the path before any pixel is read; raises to refuse
 
     Raises
     ------
-    InputError
-        The file is damaged, truncated or not supported.
+    InputError : the file is damaged, truncated or not supported
     """
     import tifffile
 

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.data.queries import Queries
+from mbtf_core.data.schema import Queries
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import UsageError
 
@@ -34,8 +34,7 @@ def pixel_sigma(area: Any) -> Any:
 
     Parameters
     ----------
-    area : float, array or Float
-        Area of the pixel on the surface, in squared tile widths.
+    area : area of the pixel on the surface, in squared tile widths
 
     Returns
     -------
@@ -51,16 +50,12 @@ class Camera:
 
     Parameters
     ----------
-    elevation, azimuth : float
-        Direction from the target to the camera, in degrees.
-    tiles_across : float
-        Width of the field of view at the target, in tile widths.
+    elevation, azimuth : direction from the target to the camera, in degrees
+    tiles_across : width of the field of view at the target, in tile widths
     target : (float, float)
         Point of the reference plane at the image's center, in tile widths.
-    rows, columns : int
-        Size of the image in pixels.
-    field_of_view : float
-        Horizontal angle, in degrees.
+    rows, columns : size of the image in pixels
+    field_of_view : horizontal angle, in degrees
     """
 
     elevation: float = 60.0
@@ -107,17 +102,11 @@ class Camera:
         ----------
         omega_i : (3,) float array
             Direction towards the light.
-        aspect : float
-            H/W of the tile.
-
-        Returns
-        -------
-        Queries
+        aspect : H/W of the tile
 
         Raises
         ------
-        UsageError
-            The image shows the horizon.
+        UsageError : the image shows the horizon
         """
         forward, right, up = self.frame()
         x = (np.arange(self.columns) + 0.5 - self.columns / 2) * self.pixel_pitch

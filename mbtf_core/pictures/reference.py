@@ -6,22 +6,25 @@ A picture is stored as an EXR image with the channels of the shard schema (``u.x
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.data.queries import Queries
+from mbtf_core.data.schema import Queries
 from mbtf_core.data.shard_files import read_exr, write_exr
 from mbtf_core.errors import InputError
 from mbtf_core.exposure import to_display
-from mbtf_core.files.atomic import read_json, write_file
+from mbtf_core.files.atomic import write_file
+from mbtf_core.files.folders import OutputFolder, OutputKind
 from mbtf_core.pictures.camera import Camera, PixelKind
 from mbtf_core.suggest import suggest_path
 
-# Record of a folder of pictures.
-RECORD_NAME = "pictures.json"
+# What does not change the content of pictures: the name of the material, and how values are displayed.
+_DISPLAY = ("material", "exposure")
 # Of an 8-bit pixel, at most.
 PNG_BYTES = 3
 
@@ -34,14 +37,11 @@ class ReferenceImage:
     ----------
     kind : {"query", "pixel"}
         Meaning of a pixel, see :mod:`mbtf_core.pictures.camera`.
-    camera : Camera
-        The camera.
-    queries : Queries
-        One per pixel, with leading axes (rows, columns).
+    camera : the camera
+    queries : one per pixel, with leading axes (rows, columns)
     value_a, value_b : (rows, columns, 3) float32 array
         Independent halves, in 1/sr.
-    spp : int
-        Paths per pixel, both halves together.
+    spp : paths per pixel, both halves together
     transmittance : (rows, columns) float32 array or None
         Fraction of the view rays that the opacity mask transmits; None without a mask.
     """
@@ -70,13 +70,52 @@ class ReferenceImage:
         return exr
 
 
+def pictures_of(command: str) -> OutputKind:
+    """Pictures that a command writes, such as ``mbtf-gen reference``."""
+    return OutputKind("pictures.json", command.replace(" ", "-"), 3, f"pictures of {command}")
+
+
+def claim_pictures(
+    path: Path,
+    command: str,
+    *,
+    files: Iterable[str],
+    config: Mapping[str, Any],
+    inputs: Mapping[str, str],
+    overwrite: bool = False,
+) -> OutputFolder:
+    """Claim a folder for the pictures of a command; the caller owns it.
+
+    Parameters
+    ----------
+    command : such as ``mbtf-gen reference``
+    files : names of all files that may be written
+    config : resolved options, written beside the pictures; ``material`` and ``exposure`` do not determine
+        their content, the others do
+    inputs : digests of the input files by role, which determine it as well
+    overwrite : remove what the folder's record lists, and start anew
+
+    Raises
+    ------
+    InputError : the folder holds something else
+    """
+    depends = {key: value for key, value in config.items() if key not in _DISPLAY}
+    return OutputFolder.claim(
+        path,
+        pictures_of(command),
+        {**depends, "inputs": dict(inputs)},
+        files,
+        config=config,
+        overwrite=overwrite,
+    )
+
+
 def read_references(folder: Path) -> list[tuple[NDArray[np.float32], Camera, NDArray[np.float32]]]:
     """Value in 1/sr, camera, and direction of the light of the finished pictures of ``mbtf-gen reference``.
 
     Parameters
     ----------
-    folder : Path
-        Output folder of the command.
+    folder : output folder of the command
 
     Returns
     -------
@@ -84,20 +123,16 @@ def read_references(folder: Path) -> list[tuple[NDArray[np.float32], Camera, NDA
 
     Raises
     ------
-    InputError
-        The folder has no such pictures.
+    InputError : the folder has no such pictures
     """
-    record = folder / RECORD_NAME
-    if not record.is_file():
+    known = pictures_of("mbtf-gen reference").read(folder)
+    if known is None:
         hint = suggest_path(folder, Path.is_dir)
         raise InputError("holds no pictures of mbtf-gen reference", where=folder, hint=hint)
-    known = read_json(record)
-    options = known.get("depends", {}).get("reference", {})
-    if known.get("kind") != "reference" or not {"view", "light", "tiles_across"} <= set(options):
-        raise InputError("holds no pictures of mbtf-gen reference", where=folder)
+    options = known["depends"]["reference"]
     out = []
     for across in options["tiles_across"]:
-        name = next((n for n in known["pictures"] if n.endswith(f"-tiles{across:g}")), None)
+        name = next((n for n in known["items"] if n.endswith(f"-tiles{across:g}")), None)
         if name is None:
             continue
         path = folder / f"{name}.exr"

@@ -60,26 +60,16 @@ def run_child(
 
     Parameters
     ----------
-    module, function : str
-        The function returns or yields mappings; the message of an exception becomes the fault.
-    *arguments
-        Values that can be pickled.
-    timeout : float, optional
-        Seconds after which the child is killed.
-    environment : mapping, optional
-        Variables set for the child on top of this process's own.
-    trial : bool
-        Hide what it prints, and kill it on interruption. Otherwise it prints on standard error, and stores
-        its work first.
-
-    Returns
-    -------
-    ChildResult
+    module, function : the function returns or yields mappings; the message of an exception becomes the fault
+    *arguments : values that can be pickled
+    timeout : seconds after which the child is killed
+    environment : variables set for the child on top of this process's own
+    trial : hide what it prints, and kill it on interruption. Otherwise it prints on standard error, and
+        stores its work first
 
     Raises
     ------
-    KeyboardInterrupt
-        The command is interrupted; the child has ended.
+    KeyboardInterrupt : the command is interrupted; the child has ended
     """
     path = json.dumps([entry or os.getcwd() for entry in sys.path])
     start = time.monotonic()

@@ -16,24 +16,15 @@ def open_runner(
 
     Parameters
     ----------
-    where : str or None
-        ``local``, ``local:4``, a YAML file of :class:`~mbtf_core.run.workers.ClusterConfig`, or the address
-        of a scheduler; None for `otherwise`.
-    note : callable
-        Receives lines for the user.
-    otherwise : Runner, optional
-        This process by default.
-
-    Yields
-    ------
-    Runner
+    where : ``local``, ``local:4``, a YAML file of :class:`~mbtf_core.run.workers.ClusterConfig`, or the
+        address of a scheduler; None for `otherwise`
+    note : receives lines for the user
+    otherwise : this process by default
 
     Raises
     ------
-    UsageError
-        Dask is not installed, or `where` is none of these.
-    InputError
-        The batch system or the scheduler cannot be used.
+    UsageError : Dask is not installed, or `where` is none of these
+    InputError : the batch system or the scheduler cannot be used
     """
     if where is None:
         yield otherwise or Runner()

@@ -26,8 +26,7 @@ class Processes(Runner):
 
     Parameters
     ----------
-    workers : int
-        Number of items at a time; they divide the cores.
+    workers : number of items at a time; they divide the cores
     """
 
     here = False

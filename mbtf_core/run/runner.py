@@ -45,25 +45,15 @@ class Runner:
 
         Parameters
         ----------
-        function : callable
-            Of a module; see :mod:`mbtf_core.run.task`.
-        items : iterable of Item
-            Read as workers become free.
-        independent : bool
-            A failure that concerns files or options says nothing about the other items.
-        ahead : int, optional
-            Items that are read before workers are free for them, beyond two for each worker.
-
-        Yields
-        ------
-        Result
+        function : of a module; see :mod:`mbtf_core.run.task`
+        items : read as workers become free
+        independent : A failure that concerns files or options says nothing about the other items
+        ahead : items that are read before workers are free for them, beyond two for each worker
 
         Raises
         ------
-        InputError
-            An item failed for a reason that concerns all of them; the others are canceled.
-        PartialError
-            The workers cannot be reached any more.
+        InputError : an item failed for a reason that concerns all of them; the others are canceled
+        PartialError : the workers cannot be reached any more
         """
         waiting = iter(items)
         with contextlib.closing(_Overlap(function)) as overlap:

@@ -57,8 +57,7 @@ def handle_signals(silent: bool = False) -> None:
 
     Parameters
     ----------
-    silent : bool
-        Leave messages to the parent of this process.
+    silent : leave messages to the parent of this process
     """
     _State.program, _State.silent = True, silent
     for number in SIGNALS:

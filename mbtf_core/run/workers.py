@@ -56,19 +56,12 @@ def read_cluster(where: str) -> ClusterConfig | str:
 
     Parameters
     ----------
-    where : str
-        ``local``, ``local:4``, a YAML file, or an address such as ``tcp://scheduler:8786``.
-
-    Returns
-    -------
-    ClusterConfig or str
+    where : ``local``, ``local:4``, a YAML file, or an address such as ``tcp://scheduler:8786``
 
     Raises
     ------
-    UsageError
-        It is none of these.
-    InputError
-        The file is at fault.
+    UsageError : it is none of these
+    InputError : the file is at fault
     """
     if match := re.fullmatch(r"local(?::([1-9]\d{0,3}))?", where):
         return local_config(None if match[1] is None else int(match[1]))

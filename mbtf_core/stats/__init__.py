@@ -3,9 +3,7 @@
 Needs numpy and scipy alone. ``docs/explanation/statistics.md`` explains when to use which.
 """
 
-from mbtf_core.stats.aggregate import Aggregate, Comparison, aggregate_test
-from mbtf_core.stats.estimate import Estimate, mean_estimate
-from mbtf_core.stats.groups import by_group, elevation_groups, level_groups
+from mbtf_core.stats.estimate import Estimate, by_group, elevation_groups, level_groups, mean_estimate
 from mbtf_core.stats.paired import (
     mean_of_halves,
     mse_difference,
@@ -17,7 +15,7 @@ from mbtf_core.stats.paired import (
     signal_variance,
     unexplained_variance,
 )
-from mbtf_core.stats.significance import Outcome, holm, t_test
+from mbtf_core.stats.significance import Aggregate, Comparison, Outcome, aggregate_test, holm, t_test
 
 __all__ = [
     "Aggregate",

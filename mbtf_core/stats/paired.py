@@ -4,9 +4,9 @@ Every query q is estimated twice, ``a_q = t_q + α_q`` and ``b_q = t_q + β_q``,
 noise α, β of mean zero, independent of each other and between queries. Products of an a with a b therefore
 have the expectation they would have without noise; squares of one half do not.
 
-Arrays are ``(n,)``, ``(n, channels)`` or ``(items, rows, columns, channels)``. The first axis counts the
-independent units. Everything else is averaged within a unit before an error bar is taken: channels of one
-query are correlated, and texels of one image share its directions.
+The halves are arrays ``(n,)``, ``(n, channels)`` or ``(items, rows, columns, channels)``. The first axis
+counts the independent units. Everything else is averaged within a unit before an error bar is taken: channels
+of one query are correlated, and texels of one image share its directions.
 """
 
 from __future__ import annotations
@@ -48,13 +48,7 @@ def mean_of_halves(a: ArrayLike, b: ArrayLike) -> Estimate:
 
     Parameters
     ----------
-    a, b : (n, ...) array_like
-        Independent halves of the values.
-
-    Returns
-    -------
-    Estimate
-        In the unit of the values.
+    a, b : (n, ...) array_like, in the values' unit, which is that of the estimate
     """
     first, second = _pair(a, b)
     x, y = per_unit(first), per_unit(second)
@@ -72,13 +66,7 @@ def pooled_variance(a: ArrayLike, b: ArrayLike) -> Estimate:
 
     Parameters
     ----------
-    a, b : (n, ...) array_like
-        Independent halves of the values.
-
-    Returns
-    -------
-    Estimate
-        In the squared unit of the values.
+    a, b : (n, ...) array_like; the estimate has their squared unit
     """
     first, second = _pair(a, b)
     return mean_estimate((first - second) ** 2 / 4.0)
@@ -93,11 +81,6 @@ def pooled_error(a: ArrayLike, b: ArrayLike) -> Estimate:
     Parameters
     ----------
     a, b : (n, ...) array_like
-        Independent halves of the values.
-
-    Returns
-    -------
-    Estimate
     """
     return _root(pooled_variance(a, b))
 
@@ -110,11 +93,6 @@ def pooled_relative_error(a: ArrayLike, b: ArrayLike) -> Estimate:
     Parameters
     ----------
     a, b : (n, ...) array_like
-        Independent halves of the values.
-
-    Returns
-    -------
-    Estimate
     """
     first, second = _pair(a, b)
     return _root(_ratio(per_unit((first - second) ** 2 / 4.0), per_unit(first * second)))
@@ -129,14 +107,7 @@ def noise_free_mse(prediction: ArrayLike, a: ArrayLike, b: ArrayLike) -> Estimat
 
     Parameters
     ----------
-    prediction : (n, ...) array_like
-    a, b : (n, ...) array_like
-        Independent halves of the reference.
-
-    Returns
-    -------
-    Estimate
-        In the squared unit of the values.
+    prediction, a, b : (n, ...) array_like; the estimate has their squared unit
     """
     p, first, second = _with_prediction(prediction, a, b)
     return mean_estimate((p - first) * (p - second))
@@ -150,13 +121,7 @@ def mse_difference(prediction: ArrayLike, other: ArrayLike, a: ArrayLike, b: Arr
 
     Parameters
     ----------
-    prediction, other : (n, ...) array_like
-    a, b : (n, ...) array_like
-        Independent halves of the reference.
-
-    Returns
-    -------
-    Estimate
+    prediction, other, a, b : (n, ...) array_like; the estimate has their squared unit
     """
     p, first, second = _with_prediction(prediction, a, b)
     q, _, _ = _with_prediction(other, a, b)
@@ -173,13 +138,7 @@ def signal_variance(a: ArrayLike, b: ArrayLike) -> Estimate:
 
     Parameters
     ----------
-    a, b : (n, ...) array_like
-        Independent halves of the values.
-
-    Returns
-    -------
-    Estimate
-        In the squared unit of the values.
+    a, b : (n, ...) array_like; the estimate has their squared unit
     """
     products, correction = _centered_products(*_pair(a, b))
     spread = mean_estimate(products)
@@ -202,16 +161,10 @@ def unexplained_variance(prediction: ArrayLike, a: ArrayLike, b: ArrayLike) -> E
     prediction, a, b : (n, ...) array_like
         The prediction, and independent halves of the reference.
 
-    Returns
-    -------
-    Estimate
-
     Raises
     ------
-    InputError
-        A number is NaN or infinite.
-    ValueError
-        Shapes differ.
+    InputError : A number is NaN or infinite
+    ValueError : shapes differ
     """
     p, first, second = _with_prediction(prediction, a, b)
     products, correction = _centered_products(first, second)
@@ -223,10 +176,8 @@ def psnr(mse: Estimate, peak: float) -> Estimate:
 
     Parameters
     ----------
-    mse : Estimate
-        Noise-free mean squared error, 1/sr².
-    peak : float
-        Value of full scale, 1/sr.
+    mse : noise-free mean squared error, 1/sr²
+    peak : value of full scale, 1/sr
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Tests of estimates against known values and against each other, and the correction for many of them."""
+"""Tests of estimates and of whole data sets against known values and each other."""
 
 from __future__ import annotations
 
@@ -9,9 +9,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mbtf_core.stats.estimate import Estimate
+from mbtf_core.stats.estimate import Estimate, checked, group_labels, mean_estimate
+from mbtf_core.stats.paired import mean_of_halves
 
 Alternative = Literal["two-sided", "greater", "less"]
+Kind = Literal["mean", "scatter"]
+
+# Below this many independent units the t distribution of heavy-tailed noise is not trusted.
+_MINIMUM = 1000
 
 
 @dataclass(frozen=True)
@@ -20,12 +25,9 @@ class Outcome:
 
     Attributes
     ----------
-    difference : Estimate
-        Quantity that is tested against zero.
-    statistic : float
-        Difference over its error.
-    p_value : float
-        Probability of a statistic at least as extreme under the null hypothesis.
+    difference : quantity that is tested against zero
+    statistic : difference over its error
+    p_value : probability of a statistic at least as extreme under the null hypothesis
     """
 
     difference: Estimate
@@ -48,27 +50,15 @@ def _difference(x: Estimate, y: Estimate | float) -> Estimate:
 
 
 def t_test(x: Estimate, y: Estimate | float = 0.0, alternative: Alternative = "two-sided") -> Outcome:
-    """Does x differ from y, a known value or an independent estimate? Student statistic.
+    """Whether x differs from y, a known value or an independent estimate, by Student's statistic.
 
     The degrees of freedom are the estimate's own (``n-1``, or the effective number that
     :func:`~mbtf_core.stats.mean_of_halves` gives); those of two combine after Welch and Satterthwaite.
     Exact for normal noise of equal variance, at any n.
 
-    Parameters
-    ----------
-    x : Estimate
-    y : Estimate or float
-        A known value or an independent estimate.
-    alternative : {"two-sided", "greater", "less"}
-
-    Returns
-    -------
-    Outcome
-
     Raises
     ------
-    ValueError
-        An estimate or its error is NaN.
+    ValueError : an estimate or its error is NaN
     """
     from scipy.special import stdtr
 
@@ -87,19 +77,9 @@ def holm(p_values: ArrayLike) -> NDArray[np.float64]:
 
     Bounds the familywise error rate for any dependence between the tests; at least as powerful as Bonferroni.
 
-    Parameters
-    ----------
-    p_values : array_like
-        In [0, 1], any shape.
-
-    Returns
-    -------
-    float64 array
-
     Raises
     ------
-    ValueError
-        A p-value lies outside [0, 1].
+    ValueError : a p-value lies outside [0, 1]
     """
     p = np.asarray(p_values, np.float64)
     if not np.all((p >= 0) & (p <= 1)):
@@ -109,3 +89,108 @@ def holm(p_values: ArrayLike) -> NDArray[np.float64]:
     out = np.empty_like(flat)
     out[order] = np.minimum(np.maximum.accumulate(flat[order] * np.arange(flat.size, 0, -1)), 1.0)
     return out.reshape(p.shape)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One tested aggregate.
+
+    Attributes
+    ----------
+    group, channel : label of the group, and channel
+    kind : mean difference, or mean squared true difference
+    estimate : the quantity, expected to be zero
+    p_value, corrected : of this test alone, and corrected for the number of tests (Holm)
+    """
+
+    group: int
+    channel: int
+    kind: Kind
+    estimate: Estimate
+    p_value: float
+    corrected: float
+
+
+@dataclass(frozen=True)
+class Aggregate:
+    """All comparisons of :func:`aggregate_test`."""
+
+    comparisons: tuple[Comparison, ...]
+
+    @property
+    def p_value(self) -> float:
+        """Smallest corrected p-value: below α the data sets differ, with a false-alarm rate of at most α."""
+        return min(c.corrected for c in self.comparisons)
+
+    @property
+    def worst(self) -> Comparison:
+        """The comparison of the smallest p-value."""
+        return min(self.comparisons, key=lambda c: c.p_value)
+
+    def __str__(self) -> str:
+        w = self.worst
+        return (
+            f"{len(self.comparisons)} comparisons, smallest corrected p = {self.p_value:.3g} "
+            f"({w.kind} difference of group {w.group}, channel {w.channel}: {w.estimate})"
+        )
+
+
+def aggregate_test(
+    a1: ArrayLike,
+    b1: ArrayLike,
+    a2: ArrayLike,
+    b2: ArrayLike,
+    groups: ArrayLike | None = None,
+    *,
+    minimum: int = _MINIMUM,
+) -> Aggregate:
+    """Compare two data sets at the same queries, by group and channel, corrected for the number of tests.
+
+    Two aggregates are tested in each group and channel. The **mean** difference, with its error from the
+    halves, finds a bias. The **scatter**, the mean of ``(a1-a2)(b1-b2)``, has the expectation ``(t1-t2)²``
+    without noise and finds differences that average out, such as a shifted map; it is tested one-sided. Both
+    are tested by Student's t with their own degrees of freedom. To test one data set against known values,
+    give these as both `a2` and `b2`.
+
+    Parameters
+    ----------
+    a1, b1 : (n, channels) or (items, rows, columns, channels) array_like
+        Halves of the first data set.
+    a2, b2 : halves of the second data set at the same queries, sampled independently
+    groups : (n,) int array_like or None
+        Labels; one group by default. Rows with negative labels are ignored.
+    minimum : smallest number of units per group, below which heavy tails invalidate the t distribution
+
+    Raises
+    ------
+    ValueError : shapes differ, there is no group, or a group has fewer than `minimum` units
+    """
+    arrays = [checked(array, name) for array, name in ((a1, "a1"), (b1, "b1"), (a2, "a2"), (b2, "b2"))]
+    if len({array.shape for array in arrays}) > 1:
+        raise ValueError(f"the halves have different shapes: {', '.join(str(x.shape) for x in arrays)}")
+    shape = arrays[0].shape
+    arrays = [x.reshape(len(x), -1, shape[-1] if len(shape) > 1 else 1) for x in arrays]
+    labels = np.zeros(shape[0], np.int64) if groups is None else group_labels(groups, shape[0])
+    found: list[tuple[int, int, Kind, Outcome]] = []
+    for label in np.unique(labels[labels >= 0]):
+        halves = [array[labels == label] for array in arrays]
+        if len(halves[0]) < minimum:
+            raise ValueError(
+                f"group {label} has {len(halves[0])} units, fewer than {minimum}: "
+                "merge groups or lower `minimum`"
+            )
+        for c in range(halves[0].shape[-1]):
+            x1, y1, x2, y2 = (half[..., c] for half in halves)
+            # The two noises add, each with its own degrees of freedom.
+            mean = t_test(mean_of_halves(x1, y1), mean_of_halves(x2, y2))
+            scatter = t_test(mean_estimate((x1 - x2) * (y1 - y2)), 0.0, "greater")
+            found += [(int(label), c, "mean", mean), (int(label), c, "scatter", scatter)]
+    if not found:
+        raise ValueError("no group to compare")
+    corrected = holm([outcome.p_value for *_, outcome in found])
+    return Aggregate(
+        tuple(
+            Comparison(label, c, kind, outcome.difference, outcome.p_value, float(p))
+            for (label, c, kind, outcome), p in zip(found, corrected, strict=True)
+        )
+    )

@@ -11,9 +11,12 @@ from cyclopts import Parameter
 
 from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.options import Output, Overwrite, Switch
-from mbtf_core.errors import UsageError
+from mbtf_core.errors import InputError, UsageError
+from mbtf_core.files.folders import OutputKind
 from mbtf_core.run.signals import keep_on_interruption
 from mbtf_fit.cli.page_options import PAGE_OPTIONS, PageOptions
+
+EXPORT = OutputKind("export.json", "mbtf-export", 3, "an export")
 
 
 def export_material(
@@ -57,9 +60,8 @@ def export_material(
     """
     from mbtf_core.files.atomic import write_text
     from mbtf_core.files.digest import file_sha256
-    from mbtf_core.files.folders import owned
+    from mbtf_core.files.folders import OutputFolder, owned
     from mbtf_fit.material.export import LAYERS_NAME, TEXTURES_NAME, to_half, write_layers, write_textures
-    from mbtf_fit.material.export_folder import ExportClaim, ExportSource, claimed
     from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME
     from mbtf_fit.material.interchange.documents import WRITERS
     from mbtf_fit.material.interchange.images import BASE_COLOR, HEIGHT, NORMAL, ORM
@@ -87,25 +89,29 @@ def export_material(
         )
     loaded = Material.load(material)
     keep_on_interruption(f"the finished files are kept in {folder}")
-    named = ExportSource(
-        material=file_sha256(material / DESCRIPTION_NAME),
-        to=sorted(wanted),
-        half=half,
-        shader_target=sorted(set(shader_target or [])),
-        level=level,
-        page=page.digests(),
-    )
-    names = [TEXTURES_NAME, LAYERS_NAME, DESCRIPTION_NAME, WEIGHTS_NAME, TRANSMITTANCE_NAME, PAGE_NAME]
+    depends = {
+        "material": file_sha256(material / DESCRIPTION_NAME),
+        "to": sorted(wanted),
+        "half": half,
+        "shader_target": sorted(set(shader_target or [])),
+        "level": level,
+        "page": page.digests(),
+    }
+    # The description goes first: without it nothing counts as a finished material.
+    names = [DESCRIPTION_NAME, TEXTURES_NAME, LAYERS_NAME, WEIGHTS_NAME, TRANSMITTANCE_NAME, PAGE_NAME]
     names += [*FILE_NAMES, BASE_COLOR, NORMAL, ORM, HEIGHT, *(document for document, _ in WRITERS.values())]
     # Files of other formats may lie in the material's own folder.
     beside = "material" not in wanted and folder.is_dir() and folder.samefile(material)
-    claims = nullcontext(ExportClaim(False)) if beside else claimed(folder, named, names, overwrite=overwrite)
-    with owned(folder), claims as claim:
+    with (
+        owned(folder),
+        nullcontext() if beside else OutputFolder.claim(folder, EXPORT, depends, names, overwrite=overwrite),
+    ):
         written, error = loaded, None
         if half:
             written, error = to_half(loaded)
         made: Interchange | None = None
-        files, notes = claim.files, [] if error is None else [str(error)]
+        files: list[str] = []
+        notes = [] if error is None else [str(error)]
         if "exr" in wanted:
             write_textures(written, folder / TEXTURES_NAME, half=half)
             files.append(TEXTURES_NAME)
@@ -127,7 +133,7 @@ def export_material(
             notes.append(precision)
         if "material" in wanted:
             description = loaded.description
-            if not claim.is_complete:
+            if not _is_material(folder):
                 export(
                     written.model,
                     written.config,
@@ -149,3 +155,13 @@ def export_material(
         },
         "\n".join([*lines, *notes]),
     )
+
+
+def _is_material(folder: Path) -> bool:
+    from mbtf_fit.material.material import Material
+
+    try:
+        Material.load(folder)
+    except InputError:
+        return False
+    return True

@@ -38,12 +38,11 @@ def draw(
     """
     from mbtf_core.exposure import describe_exposure, to_display
     from mbtf_core.files.folders import check_space
-    from mbtf_core.pictures.reference import PNG_BYTES, write_png
+    from mbtf_core.pictures.reference import PNG_BYTES, claim_pictures, write_png
     from mbtf_fit.backends.mitsuba import load_scene
     from mbtf_fit.material.format import read_description
     from mbtf_fit.preview.animation import find_encoder, write_gif, write_mp4
     from mbtf_gen.engine.runtime import load_mitsuba
-    from mbtf_gen.pictures.folder import PictureFolder
 
     keep_on_interruption(f"the finished pictures are kept in {path}")
     encoder = find_encoder() if mp4 else ""
@@ -54,10 +53,9 @@ def draw(
         size += PNG_BYTES * turn.frames * turn.size**2
     check_space(path, size, "reduce --size or --frames, or choose another folder with -o")
     description, _ = read_description(Path(config.material))
-    folder = PictureFolder.claim(
+    folder = claim_pictures(
         path,
-        "material",
-        command="mbtf-fit preview",
+        "mbtf-fit preview",
         files=(SHEET_NAME, GIF_NAME, MP4_NAME),
         config=config.model_dump(mode="json"),
         inputs={"weights": description["weights"]["sha256"]},

@@ -244,7 +244,7 @@ def export_fit(
 
     Parameters
     ----------
-    identity : content of ``fit.json``
+    identity : configuration and data, and the hash of both
     validated : name of the set of the validations
     more : what the summary of the training says besides, or otherwise
     """

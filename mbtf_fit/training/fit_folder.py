@@ -6,12 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.config.settings import check_schema
-from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.data.dataset import Dataset
-from mbtf_core.files.atomic import read_json, write_json, write_text
 from mbtf_core.files.digest import data_sha256
-from mbtf_core.files.folders import ELSEWHERE, check_folder, make_folder, other_configuration
+from mbtf_core.files.folders import OutputFolder, OutputKind
 from mbtf_fit.config import FitConfig
 from mbtf_fit.material.decoder import DECODER_NAME, Decoder
 from mbtf_fit.material.export import LAYERS_NAME, TEXTURES_NAME
@@ -20,15 +17,17 @@ from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME
 from mbtf_fit.training.checkpoint import CHECKPOINT_NAME
 from mbtf_fit.training.validation import HISTORY_NAME
 
-FIT_NAME = "fit.json"
-CONFIG_NAME = "config.yaml"
-_FORMAT = "mbtf-fit"
-_SCHEMA = 2
+FIT = OutputKind("fit.json", "mbtf-fit", 3, "a fit")
+# The description goes first: without it nothing counts as a finished material.
+_FILES = (
+    *(DESCRIPTION_NAME, DECODER_NAME, HISTORY_NAME, CHECKPOINT_NAME),
+    *(WEIGHTS_NAME, TRANSMITTANCE_NAME, LAYERS_NAME, TEXTURES_NAME),
+)
 
 
 def identity_of(config: FitConfig, data: Dataset, group: Sequence[Dataset] = ()) -> dict[str, Any]:
-    """Content of ``fit.json``: configuration and data of a fit, and the hash of both; `group`: data sets of
-    the materials that share the network, in their order."""
+    """Configuration and data of a fit, and the hash of both; `group`: data sets of the materials that share
+    the network, in their order."""
     files = {split: [e["file"] for e in data.manifest["splits"][split]["shards"]] for split in data.splits}
     described = {
         "hash": str(data.manifest.get("config_hash", "")),
@@ -51,8 +50,6 @@ def identity_of(config: FitConfig, data: Dataset, group: Sequence[Dataset] = ())
     queries = (data.manifest.get("config") or {}).get("queries") or {}
     directions = {"min_cos": queries["min_cos"]} if "min_cos" in queries else {}
     return {
-        "format": _FORMAT,
-        "schema": _SCHEMA,
         "config_hash": config_hash,
         "config": config.fields(),
         "data": {**described, **directions, "shards": lengths, "inputs": data.manifest.get("inputs", {})},
@@ -61,21 +58,12 @@ def identity_of(config: FitConfig, data: Dataset, group: Sequence[Dataset] = ())
 
 def claim(out: Path, identity: dict[str, Any], config: FitConfig, overwrite: bool) -> None:
     """Claim the folder for a fit, or check that it already belongs to it."""
-    if check_folder(out, lambda path: (path / FIT_NAME).exists(), "fit"):
-        old = read_json(out / FIT_NAME)
-        if old.get("config_hash") == identity["config_hash"] and not overwrite:
-            return
-        if not overwrite:
-            check_schema(old, _SCHEMA, out / FIT_NAME, f"{ELSEWHERE}, or replace it with --overwrite")
-            before, after = ({**r.get("config", {}), "data": r.get("data")} for r in (old, identity))
-            raise other_configuration(out, "a fit", before, after, "other shards")
-        # The description goes first: without it nothing counts as a finished material. The record stays until
-        # it is replaced, so that a killed process leaves the folder of a fit.
-        for name in (
-            *(DESCRIPTION_NAME, DECODER_NAME, CONFIG_NAME, HISTORY_NAME, CHECKPOINT_NAME),
-            *(WEIGHTS_NAME, TRANSMITTANCE_NAME, LAYERS_NAME, TEXTURES_NAME),
-        ):
-            (out / name).unlink(missing_ok=True)
-    make_folder(out)
-    write_json(out / FIT_NAME, identity)
-    write_text(out / CONFIG_NAME, dump_yaml(config.model_dump(mode="json")))
+    OutputFolder.claim(
+        out,
+        FIT,
+        {**identity["config"], "data": identity["data"]},
+        _FILES,
+        config=config.model_dump(mode="json"),
+        digest=identity["config_hash"],
+        overwrite=overwrite,
+    )

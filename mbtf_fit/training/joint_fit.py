@@ -67,7 +67,7 @@ class JointResult:
 
 @dataclass(frozen=True)
 class _Member:
-    """One of the materials: its folder, its data, the content of its ``fit.json``."""
+    """One of the materials: its folder, its data, its identity."""
 
     folder: Path
     data: Dataset
@@ -167,12 +167,12 @@ def _check(
 
 
 def joint_identity(identities: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
-    """Content of ``fit.json`` of the shared network: that of the first material, with the hash of all.
+    """Identity of the shared network: that of the first material, with the hash of all.
 
     Parameters
     ----------
     identities : mapping
-        Name → content of ``fit.json`` of each material (:func:`~mbtf_fit.training.fit_folder.identity_of`).
+        Name → identity of each material (:func:`~mbtf_fit.training.fit_folder.identity_of`).
 
     Returns
     -------

@@ -44,9 +44,9 @@ def verify(folder: Path, /, *, digests: Path | None = None, console: Console = C
         Also compare its arrays with the digests.json of a published recipe.
     """
     from mbtf_core.data.dataset import Dataset
+    from mbtf_core.data.documents import ABSENT
     from mbtf_core.data.folder import DataFolder
     from mbtf_core.data.schema import GEOMETRY_NAME
-    from mbtf_core.data.sidecar import ABSENT
     from mbtf_core.data.verify import foreign_files, verify
 
     start = time.perf_counter()
@@ -117,7 +117,7 @@ def repair(
 
 
 def _describe_repair(done: RepairResult, dry_run: bool) -> str:
-    from mbtf_core.data.sidecar import ABSENT
+    from mbtf_core.data.documents import ABSENT
 
     rendered, written = ("would be rendered", "would be written") if dry_run else ("rendered", "written")
     shown = [f for f in done.faults if f.what not in ABSENT]

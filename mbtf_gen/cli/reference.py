@@ -44,13 +44,12 @@ def reference(
     from mbtf_core.exposure import auto_exposure, brightness, describe_exposure
     from mbtf_core.files.folders import check_space, owned
     from mbtf_core.pictures.camera import Camera, PixelKind
-    from mbtf_core.pictures.reference import PNG_BYTES, read_value, write_display
+    from mbtf_core.pictures.reference import PNG_BYTES, claim_pictures, read_value, write_display
     from mbtf_core.run.cluster import open_runner
     from mbtf_core.run.task import Item
     from mbtf_core.stats import pooled_relative_error
     from mbtf_gen.forecast import announce
     from mbtf_gen.job import Job
-    from mbtf_gen.pictures.folder import PictureFolder
     from mbtf_gen.pictures.reference import picture_seconds
     from mbtf_gen.pictures.tasks import picture_estimator, render_picture
 
@@ -76,9 +75,9 @@ def reference(
         owned(output),
         console.progress(total=len(cameras) * len(kinds), label="rendering", unit="pictures") as bar,
     ):
-        folder = PictureFolder.claim(
+        folder = claim_pictures(
             output,
-            "reference",
+            "mbtf-gen reference",
             files=[f"{name}.{suffix}" for name in names.values() for suffix in ("exr", "png")],
             config=job.config.model_dump(mode="json", exclude={"queries", "output"}),
             inputs=job.material.digests,

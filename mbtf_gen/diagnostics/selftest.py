@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mbtf_core.data.queries import Queries
+from mbtf_core.data.schema import Queries
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import EXIT_BAD_INPUT, EXIT_OK, EngineError, MbtfError, reason
 from mbtf_core.stats import Estimate, mean_estimate

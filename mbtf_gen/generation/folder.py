@@ -8,11 +8,10 @@ from typing import Any
 
 from mbtf_core.config.nested import differences
 from mbtf_core.config.yaml_file import dump_yaml
+from mbtf_core.data.documents import read_manifest, repair_hint
 from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.geometry import Geometry, encode_geometry, geometry_record
-from mbtf_core.data.manifest import read_manifest
 from mbtf_core.data.schema import CONFIG_NAME, FORMAT_NAME, GEOMETRY_NAME, MANIFEST_NAME, SCHEMA_VERSION
-from mbtf_core.data.sidecar import repair_hint
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import checksummed
 from mbtf_core.files.folders import (

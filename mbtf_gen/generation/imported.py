@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.config.yaml_file import dump_yaml
+from mbtf_core.data.documents import finished_record, plan_digest, read_manifest, sidecar, software_versions
 from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.lattice import sigma_of_level
-from mbtf_core.data.manifest import plan_digest, read_manifest, software_versions
 from mbtf_core.data.schema import (
     ARRAYS,
     CONFIG_NAME,
@@ -27,7 +27,6 @@ from mbtf_core.data.schema import (
     ShardEntry,
 )
 from mbtf_core.data.shard_files import Arrays, write_shard
-from mbtf_core.data.sidecar import finished_record, sidecar
 from mbtf_core.files.atomic import Stored, checksummed
 from mbtf_core.files.folders import make_folder, owned
 from mbtf_gen.generation.folder import holds_dataset, other_data_set

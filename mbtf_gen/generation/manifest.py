@@ -10,8 +10,8 @@ from pydantic import BaseModel, field_validator
 
 from mbtf_core.config.settings import check_document
 from mbtf_core.config.yaml_file import dump_yaml
+from mbtf_core.data.documents import software_versions
 from mbtf_core.data.lattice import sigma_of_level
-from mbtf_core.data.manifest import CHECK_HINT, software_versions
 from mbtf_core.data.schema import ARRAYS, CONVENTIONS, FORMAT_NAME, LEADING_AXES, SCHEMA_VERSION, SPLITS
 from mbtf_gen.effects.catalog import EFFECTS
 from mbtf_gen.effects.plan import EffectsPlan
@@ -37,7 +37,7 @@ class _Plan(BaseModel, allow_inf_nan=False):
 
 def stored_plan(manifest: Mapping[str, Any], path: object) -> RunPlan:
     """The run plan in a manifest, of the file `path`; an InputError where that is corrupt."""
-    found = check_document(_Plan, manifest, path, CHECK_HINT)
+    found = check_document(_Plan, manifest, path, "check the data set with: mbtf-gen verify")
     return RunPlan(found.effects, found.allocation)
 
 

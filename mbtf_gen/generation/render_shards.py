@@ -16,12 +16,10 @@ from typing import Any
 
 import numpy as np
 
+from mbtf_core.data.documents import finished_record, plan_digest, sidecar, upload_waiting
 from mbtf_core.data.folder import DataFolder
-from mbtf_core.data.manifest import plan_digest
-from mbtf_core.data.queries import Queries
-from mbtf_core.data.schema import MANIFEST_NAME, ShardEntry
+from mbtf_core.data.schema import MANIFEST_NAME, Queries, ShardEntry
 from mbtf_core.data.shard_files import write_shard
-from mbtf_core.data.sidecar import finished_record, sidecar, upload_waiting
 from mbtf_core.errors import InputError, LockedError, PartialError
 from mbtf_core.files.atomic import Stored
 from mbtf_core.locks import lock_owner, take_lock

@@ -16,9 +16,9 @@ from pydantic import ValidationError
 from mbtf_core.config.nested import differences, in_short
 from mbtf_core.config.yaml_file import dump_yaml, read_yaml
 from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.documents import plan_digest
 from mbtf_core.data.folder import DataFolder, sidecar_name
 from mbtf_core.data.geometry import encode_geometry, geometry_record
-from mbtf_core.data.manifest import plan_digest
 from mbtf_core.data.schema import CONFIG_NAME, FORMAT_NAME, GEOMETRY_NAME, MANIFEST_NAME, SCHEMA_VERSION
 from mbtf_core.data.verify import INCOMPLETE, Fault, document_faults, foreign_files, shard_faults
 from mbtf_core.errors import InputError, MbtfError

@@ -6,9 +6,9 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from mbtf_core.data.documents import finished_record
 from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.schema import ShardEntry
-from mbtf_core.data.sidecar import finished_record
 from mbtf_core.errors import PartialError
 from mbtf_core.run.runner import Runner
 from mbtf_gen.config.generator import GeneratorConfig

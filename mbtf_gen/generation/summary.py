@@ -10,20 +10,16 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, PositiveInt
 
-from mbtf_core.config.settings import check_document
 from mbtf_core.data.dataset import Dataset
-from mbtf_core.data.folder import DataFolder, sidecar_name
-from mbtf_core.data.manifest import CHECK_HINT, read_manifest, software_versions
+from mbtf_core.data.documents import finished_record, read_manifest, software_versions
+from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.schema import MANIFEST_NAME
-from mbtf_core.data.sidecar import finished_record
 from mbtf_core.errors import PartialError
 from mbtf_core.files.atomic import checksummed
 from mbtf_core.locks import brief_lock
 from mbtf_gen.effects.catalog import EFFECTS
 from mbtf_gen.generation.manifest import stored_plan
-from mbtf_gen.render.estimates import BadSample, TargetReached
 
 # A run fails beyond this share of non-finite samples, but never for so few: with one expected, more than four
 # occur by chance once in 300 runs.
@@ -182,31 +178,6 @@ def refuse_nonfinite(totals: ShardStatistics, paths: int, folder: object) -> Non
         )
 
 
-class _Statistics(BaseModel, allow_inf_nan=False):
-    mean_value: tuple[float, float, float]
-    mean_variance: tuple[float, float, float] | None
-
-
-class _Quarantined(BaseModel):
-    nonfinite_samples: int
-    nonfinite_at: list[BadSample]
-    lost_rays: int
-    capped_rays: int
-
-
-class _Sidecar(BaseModel, allow_inf_nan=False):
-    """Keys of a sidecar that :func:`finish` needs."""
-
-    split: str
-    file: str
-    queries: PositiveInt
-    paths: int
-    seconds: float
-    statistics: _Statistics
-    quarantined: _Quarantined
-    target: TargetReached | None
-
-
 def finish(
     folder: str | Path | DataFolder,
     *,
@@ -237,7 +208,6 @@ def finish(
         if record is None:
             complete = False
         else:
-            check_document(_Sidecar, record, folder.at(sidecar_name(entry.file)), CHECK_HINT)
             totals.add(record)
     if complete:
         refuse_nonfinite(totals, totals.paths, folder)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.data.queries import Queries
+from mbtf_core.data.schema import Queries
 from mbtf_core.pictures.camera import PIXEL_SIGMA, Camera, PixelKind
 from mbtf_core.pictures.reference import ReferenceImage
 

@@ -29,9 +29,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.data.queries import Queries
+from mbtf_core.data.documents import TargetReached
+from mbtf_core.data.schema import Queries
 from mbtf_gen.planning.sample_allocation import FEWEST, Allocation, mean_values
-from mbtf_gen.render.estimates import TARGET_PILOT_SPP, Estimates, Stream, Target, TargetReached
+from mbtf_gen.render.estimates import TARGET_PILOT_SPP, Estimates, Stream, Target
 
 F64 = NDArray[np.float64]
 

@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.data.queries import Queries
+from mbtf_core.data.schema import Queries
 from mbtf_gen.effects.plan import EffectsPlan
 from mbtf_gen.job import Job
 from mbtf_gen.planning.pilot import pilot_queries

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.data.queries import Queries
+from mbtf_core.data.schema import Queries
 from mbtf_core.images.resample import resample
 from mbtf_gen.effects.catalog import EFFECTS
 from mbtf_gen.effects.plan import EffectsPlan

@@ -13,8 +13,7 @@ from pathlib import PurePosixPath
 from typing import Any
 
 from mbtf_core.files.atomic import Stored
-from mbtf_gen.publishing.facts import TAGS, Facts
-from mbtf_gen.publishing.folder import DATA
+from mbtf_gen.publishing.facts import DATA, TAGS, Facts
 
 CROISSANT_NAME = "croissant.json"
 _FORMATS = {

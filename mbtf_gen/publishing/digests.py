@@ -17,7 +17,7 @@ from pydantic import BaseModel
 
 from mbtf_core.config.settings import check_document
 from mbtf_core.data.dataset import Dataset
-from mbtf_core.data.manifest import software_versions
+from mbtf_core.data.documents import software_versions
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import read_json
 

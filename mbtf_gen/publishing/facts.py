@@ -12,6 +12,8 @@ from typing import Any
 from mbtf_core.data.dataset import Dataset, Shard
 from mbtf_gen.config.publish import PublishConfig
 
+# Folder of the shards.
+DATA = "data"
 TAGS = (
     *("btf", "mbtf", "brdf", "reflectance", "appearance", "material", "rendering", "computer-graphics"),
     *("neural-materials", "level-of-detail"),

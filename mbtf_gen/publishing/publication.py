@@ -16,19 +16,19 @@ from mbtf_core.data.verify import verify
 from mbtf_core.errors import EngineError, InputError, UsageError
 from mbtf_core.files.atomic import Stored, write_chunks
 from mbtf_core.files.digest import data_sha256
-from mbtf_core.files.folders import check_space, owned
+from mbtf_core.files.folders import OutputFolder, OutputKind, check_space, owned
 from mbtf_gen.config.publish import PublishConfig
 from mbtf_gen.publishing.card import CARD_NAME, card_text
 from mbtf_gen.publishing.croissant import CROISSANT_NAME, croissant_text
-from mbtf_gen.publishing.facts import Facts
-from mbtf_gen.publishing.folder import DATA, RECIPE, Makers, PublishFolder
+from mbtf_gen.publishing.facts import DATA, Facts
 from mbtf_gen.publishing.material_copy import MaterialCopy, check_copy, copy_of_material
 from mbtf_gen.publishing.npz import copy_file, link_or_copy, public_documents
 from mbtf_gen.publishing.parquet import write_parquet
 from mbtf_gen.publishing.picture import PICTURE_NAME, write_picture
-from mbtf_gen.publishing.recipe import MATERIAL, recipe_makers
+from mbtf_gen.publishing.recipe import MATERIAL, RECIPE, Makers, recipe_makers
 from mbtf_gen.publishing.webdataset import write_tar
 
+PUBLICATION = OutputKind("publish.json", "mbtf-publication", 2, "a published data set")
 # Bytes of picture, card and documents.
 _DOCUMENT_BYTES = 4 << 20
 # Library that writes each form.
@@ -142,7 +142,7 @@ class Publication:
             )
         if self.facts.config.form == "npz":
             for name, content in public_documents(data.manifest).items():
-                makers[f"{DATA}/{name}"] = partial(_write, content)
+                makers[f"{DATA}/{name}"] = partial(write_chunks, chunks=[content])
         if not self.facts.measured:
             makers |= recipe_makers(data, self.copy)
         makers[PICTURE_NAME] = partial(write_picture, data)
@@ -158,7 +158,7 @@ class Publication:
         sidecar = sidecar_name(shard.file)
         return {
             f"{DATA}/{shard.file}": lambda path: link_or_copy(shard.local(), path),
-            f"{DATA}/{sidecar}": lambda path: _write(shard.folder.read(sidecar), path),
+            f"{DATA}/{sidecar}": lambda path: write_chunks(path, [shard.folder.read(sidecar)]),
         }
 
     def write(
@@ -190,18 +190,16 @@ class Publication:
         check_space(output, self.size, "choose another folder with -o")
         with owned(output):
             listed = [*self.makers, CARD_NAME, CROISSANT_NAME]
-            folder = PublishFolder.claim(output, self.depends, listed, overwrite=overwrite)
+            folder = OutputFolder.claim(output, PUBLICATION, self.depends, listed, overwrite=overwrite)
+            written = {}
             for name, maker in self.makers.items():
-                folder.add(name, maker)
+                written[name] = folder.add(name, maker)
                 progress(1)
+            files = dict(sorted(written.items()))
             if self.copy is not None:
                 check_copy(self.facts.data, output / RECIPE / MATERIAL)
-            files = {name: stored for name, stored in folder.files.items() if name in self.makers}
             maps = self.copy is not None
-            folder.add(CARD_NAME, lambda path: _write(card_text(self.facts, files, maps).encode(), path))
-            folder.add(CROISSANT_NAME, lambda path: _write(croissant_text(self.facts, files).encode(), path))
-            return folder.files
-
-
-def _write(content: bytes, path: Path) -> Stored:
-    return write_chunks(path, [content])
+            card, croissant = card_text(self.facts, files, maps), croissant_text(self.facts, files)
+            for name, text in ((CARD_NAME, card), (CROISSANT_NAME, croissant)):
+                files[name] = folder.add(name, partial(write_chunks, chunks=[text.encode()]))
+            return dict(sorted(files.items()))

@@ -13,11 +13,13 @@ from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.schema import CONFIG_NAME
 from mbtf_core.files.atomic import Stored, write_chunks
 from mbtf_gen.publishing.digests import DIGESTS_NAME, dataset_digests
-from mbtf_gen.publishing.folder import RECIPE, Makers
 from mbtf_gen.publishing.material_copy import MATERIAL_FILE, MaterialCopy
 from mbtf_gen.publishing.npz import copy_file, public_config
 
-SCRIPT_NAME, MATERIAL = "remake.sh", "material"
+RECIPE, SCRIPT_NAME, MATERIAL = "recipe", "remake.sh", "material"
+
+# Name of a file in the folder → what writes it to a given path, atomically.
+Makers = dict[str, Callable[[Path], Stored]]
 
 
 def material_of(maps: bool) -> str:

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.data.documents import BadSample, TargetReached
+
 # Non-finite samples whose location is kept.
 MOST_LOCATED = 8
 # Paths of each query's own pilot under a target error.
@@ -25,32 +27,6 @@ class Target:
 
     error: float
     max_spp: int
-
-
-@dataclass(frozen=True)
-class BadSample:
-    """A non-finite sample: number of its query in the shard, and the effect that caused it (``direct light``
-    or ``interreflection``)."""
-
-    query: int
-    effect: str
-
-
-@dataclass(frozen=True)
-class TargetReached:
-    """Error of a batch of queries under a target error; errors are relative to max(value, tile mean).
-
-    Attributes
-    ----------
-    queries, missed : number of queries, and of those that needed more paths than the cap
-    worst : largest error of a missed query that the pilot predicts; 0 without missed queries
-    square : mean square of the relative error, from the stored halves
-    """
-
-    queries: int
-    missed: int
-    worst: float
-    square: float
 
 
 @dataclass(frozen=True)

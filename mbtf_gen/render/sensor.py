@@ -13,7 +13,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mbtf_core.data.queries import Queries
+from mbtf_core.data.schema import Queries
 from mbtf_gen.engine.memory import padded
 from mbtf_gen.engine.types import Float, Mask, Point2f, Properties, Ray3f, Spectrum, UInt32, Vector3f
 

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.data.lattice import Lattice
-from mbtf_core.data.queries import Queries
-from mbtf_core.data.schema import Layout
+from mbtf_core.data.schema import Layout, Queries
 from mbtf_core.stats import level_groups
 from mbtf_gen.sampling.exact_math import exp2, sincos_turns
 from mbtf_gen.sampling.rng import Purpose, numpy_generator

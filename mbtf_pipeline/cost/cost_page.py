@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mbtf_core.files.atomic import write_json, write_text
+from mbtf_core.files.atomic import write_text
 from mbtf_core.stats import Estimate
 from mbtf_core.units import clock
 from mbtf_pipeline.cost.figures import (
@@ -20,7 +20,7 @@ from mbtf_pipeline.cost.figures import (
 )
 from mbtf_pipeline.cost.measurements import ESTIMATES, Measurement
 from mbtf_pipeline.cost.pareto import extrapolation, pareto_front
-from mbtf_pipeline.cost.study import STUDY_NAME, Study
+from mbtf_pipeline.cost.study import STUDY, Study
 from mbtf_pipeline.number_text import is_significant
 from mbtf_pipeline.report.report import render
 from mbtf_pipeline.tables import Cell, Column, Table, rows_of
@@ -187,5 +187,5 @@ def write_page(study: Study) -> Path:
         "skipped": study.skipped,
         "failed": study.failed,
     }
-    write_json(study.folder / STUDY_NAME, {**study.description, "summary": summary})
+    STUDY.write(study.folder, {**study.description, "summary": summary})
     return path

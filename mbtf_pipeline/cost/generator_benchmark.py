@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.config.nested import deep_merge, nested
-from mbtf_core.data.queries import Queries
+from mbtf_core.data.schema import Queries
 from mbtf_core.forecast import median_estimate
 from mbtf_core.stats import Estimate, mean_estimate
 from mbtf_gen.config.generator import GeneratorConfig

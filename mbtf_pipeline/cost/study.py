@@ -13,7 +13,7 @@ from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.data.shard_files import row_bytes
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import read_json, write_json, write_text
-from mbtf_core.files.folders import ELSEWHERE, check_folder, check_space, owned
+from mbtf_core.files.folders import ELSEWHERE, OutputKind, check_space, owned
 from mbtf_core.run.runner import Runner
 from mbtf_core.stats import Estimate, signal_variance
 from mbtf_core.units import expectation
@@ -27,11 +27,9 @@ from mbtf_pipeline.cost.measurements import Measurement, MeasurementFolder
 from mbtf_pipeline.cost.repeats import FEWEST_SEEDS, MOST_SEEDS, combined, measure_runs, seed_deviation
 from mbtf_pipeline.cost.runs import TEST, Run, RunRunner, forecast_seconds
 from mbtf_pipeline.recipe import Recipe
-from mbtf_pipeline.run_folder import has_record, machine
+from mbtf_pipeline.run_folder import machine
 
-STUDY_NAME = "study.json"
-STUDY_FORMAT = "mbtf-cost"
-STUDY_SCHEMA = 2
+STUDY = OutputKind("study.json", "mbtf-cost", 2, "a cost study")
 CONFIG_NAME = "generate.yaml"
 WORK = ".work"
 # Time of a new study, seconds.
@@ -58,16 +56,11 @@ class Study:
     failed: list[str] = field(default_factory=list)
 
 
-def is_study(folder: Path) -> bool:
-    """Whether a folder contains a cost study; one of another schema version is refused."""
-    return has_record(folder, STUDY_NAME, STUDY_FORMAT, STUDY_SCHEMA)
-
-
 def claim(folder: Path, on: Mapping[str, str]) -> None:
     """Take an empty folder, or one that holds a study of the kind of machine that measures."""
-    if not check_folder(folder, is_study, "cost study"):
+    if not STUDY.check(folder):
         return
-    there, here = read_json(folder / STUDY_NAME)["machine"]["system"], on["system"]
+    there, here = read_json(folder / STUDY.record)["machine"]["system"], on["system"]
     if there != here:
         problem = f"holds a cost study of another kind of machine ({there}; this is {here})"
         raise InputError(problem, where=folder, hint=ELSEWHERE)
@@ -75,7 +68,8 @@ def claim(folder: Path, on: Mapping[str, str]) -> None:
 
 def time_of(folder: Path) -> float:
     """Time in seconds of the study in a folder; that of a new one where there is none."""
-    return float(read_json(folder / STUDY_NAME)["time"]) if is_study(folder) else NEW_TIME
+    found = STUDY.read(folder)
+    return NEW_TIME if found is None else float(found["time"])
 
 
 def _check_variation(benchmark: GeneratorBenchmark) -> None:
@@ -147,8 +141,6 @@ def run_study(
         check_space(folder, size, "give a shorter --time, or choose another folder with -o")
         announce(expectation(seconds + refine, size))
         description = {
-            "format": STUDY_FORMAT,
-            "schema": STUDY_SCHEMA,
             "name": recipe.name,
             "command": command,
             "time": seconds,
@@ -157,7 +149,7 @@ def run_study(
             "date": time.strftime("%Y-%m-%d"),
             "machine": on,
         }
-        write_json(folder / STUDY_NAME, description)
+        STUDY.write(folder, description)
         write_text(folder / CONFIG_NAME, dump_yaml(config.model_dump(mode="json")))
         study = Study(folder, description)
         keep_path_seconds(store, path)

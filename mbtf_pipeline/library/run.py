@@ -10,9 +10,9 @@ from typing import Any
 
 from mbtf_core.app.console import Console
 from mbtf_core.errors import InputError, MbtfError, printable
-from mbtf_core.files.atomic import read_json, write_json, write_text
+from mbtf_core.files.atomic import write_text
 from mbtf_core.files.digest import data_sha256
-from mbtf_core.files.folders import check_folder, owned
+from mbtf_core.files.folders import OutputKind, owned
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item, Result
 from mbtf_core.units import format_duration
@@ -22,11 +22,9 @@ from mbtf_pipeline.library.entries import Entry, LibraryRecipe
 from mbtf_pipeline.library.library_page import library_page
 from mbtf_pipeline.library.task import fit_shared, run_material, shards_of, summarize
 from mbtf_pipeline.recipe import Recipe
-from mbtf_pipeline.run_folder import has_record, machine
+from mbtf_pipeline.run_folder import machine
 
-LIBRARY_NAME = "library.json"
-LIBRARY_FORMAT = "mbtf-library"
-LIBRARY_SCHEMA = 3
+LIBRARY = OutputKind("library.json", "mbtf-library", 3, "a library")
 PAGE = "library.html"
 # Sub-folders of the runs, and of the fits with a shared network.
 MATERIALS, SHARED = "materials", "shared"
@@ -59,11 +57,6 @@ class LibraryResult:
     def shared_error(self) -> str:
         """Why there is no shared network; empty if there is one, or none is asked for."""
         return str(self.record["shared"].get("error", ""))
-
-
-def is_library(folder: Path) -> bool:
-    """Whether a folder contains a library; those of another schema version are refused."""
-    return has_record(folder, LIBRARY_NAME, LIBRARY_FORMAT, LIBRARY_SCHEMA)
 
 
 def run_library(
@@ -106,7 +99,7 @@ def run_library(
     """
     console = console or Console(quiet=True)
     with owned(folder):
-        check_folder(folder, is_library, "library")
+        LIBRARY.check(folder)
         run = _LibraryRun(library, folder, command, console, runner)
         return run.run(list(found))
 
@@ -119,7 +112,7 @@ class _LibraryRun:
     ) -> None:
         self.library, self.folder, self.command = library, folder, command
         self.console, self.runner = console, runner
-        before = read_json(folder / LIBRARY_NAME) if (folder / LIBRARY_NAME).is_file() else {}
+        before = LIBRARY.read(folder) or {}
         self.before = {state["name"]: state for state in before.get("materials", [])}
         self.shared: dict[str, Any] = before.get("shared", {})
         self.states: dict[str, dict[str, Any]] = {}
@@ -213,8 +206,6 @@ class _LibraryRun:
     def _write(self) -> dict[str, Any]:
         """Record and page as they are now."""
         record = {
-            "format": LIBRARY_FORMAT,
-            "schema": LIBRARY_SCHEMA,
             "name": self.library.name,
             "title": self.library.title or self.library.name,
             "description": self.library.description,
@@ -224,7 +215,7 @@ class _LibraryRun:
             "shared": self.shared,
             "materials": list(self.states.values()),
         }
-        write_json(self.folder / LIBRARY_NAME, record)
+        LIBRARY.write(self.folder, record)
         write_text(self.folder / PAGE, library_page(record, self.folder / MATERIALS))
         return record
 
@@ -263,8 +254,8 @@ def write_again(folder: Path) -> Path:
     ------
     InputError : the folder contains no library
     """
-    if not is_library(folder):
+    record = LIBRARY.read(folder)
+    if record is None:
         raise InputError("contains no library", where=folder)
-    record = read_json(folder / LIBRARY_NAME)
     write_text(folder / PAGE, library_page(record, folder / MATERIALS))
     return folder / PAGE

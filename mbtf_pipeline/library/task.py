@@ -84,10 +84,10 @@ def _unexplained(result: FitResult, shards: Path) -> dict[str, Any]:
 
 def _holds(folder: Path, identity: Mapping[str, Any]) -> bool:
     """Whether a folder holds this fit, finished or not; any other one is worth nothing."""
-    from mbtf_fit.training.fit_folder import FIT_NAME
+    from mbtf_fit.training.fit_folder import FIT
 
     try:
-        return bool(read_json(folder / FIT_NAME).get("config_hash") == identity["config_hash"])
+        return (FIT.read(folder) or {}).get("hash") == identity["config_hash"]
     except InputError:
         return False
 

@@ -9,8 +9,8 @@ from typing import Any
 
 from mbtf_core.app.console import Console
 from mbtf_core.errors import InputError
-from mbtf_core.files.atomic import read_json, write_json, write_text
-from mbtf_core.files.folders import check_folder, owned
+from mbtf_core.files.atomic import read_json, write_text
+from mbtf_core.files.folders import OutputKind, owned
 from mbtf_pipeline.compare.metrics import DEFINITIONS
 from mbtf_pipeline.compare.st_lpips import weights_file
 from mbtf_pipeline.papers.checks import independence, offsets, timing, weights
@@ -21,12 +21,10 @@ from mbtf_pipeline.papers.runs import FinishedRun
 from mbtf_pipeline.report.plots import ERROR_BAR_NOTE
 from mbtf_pipeline.report.report import render
 from mbtf_pipeline.run import generate_data, run_recipe, slices_folder
-from mbtf_pipeline.run_folder import has_record, machine
+from mbtf_pipeline.run_folder import machine
 from mbtf_pipeline.tables import Table
 
-PAPER_NAME = "paper.json"
-PAPER_FORMAT = "mbtf-paper"
-PAPER_SCHEMA = 3
+PAPER = OutputKind("paper.json", "mbtf-paper", 3, "a paper recipe")
 PAGE = "paper.html"
 TABLES = "tables"
 _MAKERS: dict[str, Callable[[Sequence[FinishedRun], Sequence[Published]], list[Table]]] = {
@@ -61,11 +59,6 @@ class PaperResult:
     page: Path
     tables: list[Path]
     record: dict[str, Any]
-
-
-def is_paper(folder: Path) -> bool:
-    """Whether a folder contains the runs of a paper recipe; those of another schema version are refused."""
-    return has_record(folder, PAPER_NAME, PAPER_FORMAT, PAPER_SCHEMA)
 
 
 def run_paper(
@@ -110,8 +103,6 @@ def run_paper(
     """
     console = console or Console(quiet=True)
     record: dict[str, Any] = {
-        "format": PAPER_FORMAT,
-        "schema": PAPER_SCHEMA,
         "name": paper.name,
         "title": paper.title or paper.name,
         "description": paper.description,
@@ -125,8 +116,8 @@ def run_paper(
         "runs": [],
     }
     with owned(folder):
-        check_folder(folder, is_paper, "paper recipe")
-        write_json(folder / PAPER_NAME, record)
+        PAPER.check(folder)
+        PAPER.write(folder, record)
         for name, where in missing.items():
             console.note(f"{name}: skipped, {where} does not exist")
         learners = paper.learn_from_others
@@ -139,7 +130,7 @@ def run_paper(
             console.note(f"{one.name}: run {number} of {len(planned)}")
             run_recipe(one.recipe, folder / RUNS / one.name, force=force, command=command, console=console)
             record["runs"].append({"material": one.material, "variant": one.variant, "name": one.name})
-            write_json(folder / PAPER_NAME, record)
+            PAPER.write(folder, record)
         page, tables = _write_page(folder, record)
     return PaperResult(folder, page, tables, record)
 
@@ -166,7 +157,7 @@ def _with_other_materials(
 def write_again(folder: Path) -> Path:
     """Write the page and tables of the finished runs again; returns the page's path."""
     with owned(folder):
-        return _write_page(folder, read_json(folder / PAPER_NAME))[0]
+        return _write_page(folder, read_json(folder / PAPER.record))[0]
 
 
 def _write_page(folder: Path, record: Mapping[str, Any]) -> tuple[Path, list[Path]]:

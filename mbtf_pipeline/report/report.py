@@ -20,7 +20,7 @@ from mbtf_pipeline.report.material import material_section
 from mbtf_pipeline.report.offset_images import offset_section
 from mbtf_pipeline.report.plots import ERROR_BAR_NOTE
 from mbtf_pipeline.report.times import provenance, read_training, time_context, training_context
-from mbtf_pipeline.run_folder import COMPARE, FITS, REPORT, RUN_NAME, SHARDS
+from mbtf_pipeline.run_folder import COMPARE, FITS, REPORT, RUN, SHARDS
 
 # Raised when the report or the viewer's page changes; part of the stage's key.
 LAYOUT = 12
@@ -76,7 +76,7 @@ def write_report(folder: Path, recipe: Recipe, stages: Sequence[str]) -> None:
     hint = "run the recipe again: it repeats the comparison and keeps data and fits"
     check_schema(comparison, COMPARISON_SCHEMA, path, hint)
     manifest = read_json(folder / SHARDS / "manifest.json")
-    run = read_json(folder / RUN_NAME)
+    run = read_json(folder / RUN.record)
     asked = recipe.report.exposure
     gallery = Gallery(comparison["exposure"] if asked is None else asked)
     shown = picture_section(folder / COMPARE, comparison, gallery)

@@ -6,17 +6,17 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.documents import sidecar
 from mbtf_core.data.folder import DataFolder
-from mbtf_core.data.queries import Queries
-from mbtf_core.data.schema import FORMAT_NAME, SCHEMA_VERSION
+from mbtf_core.data.schema import Queries, ShardEntry, Split
 from mbtf_core.data.shard_files import read_shard, write_shard
-from mbtf_core.files.atomic import checksummed, parse_checksummed
+from mbtf_core.files.atomic import Stored, checksummed, parse_checksummed
 from mbtf_core.files.digest import file_sha256
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.folder import open_folder
@@ -77,18 +77,21 @@ def write_sidecar(shard: Path, split: str, index: int, config_hash: str, **chang
     arrays = read_shard(shard)
     halves = [arrays[name].reshape(-1, 3) for name in ("value_a", "value_b")]
     mean = 0.5 * sum(a.mean(axis=0, dtype=np.float64) if len(a) else np.zeros(3) for a in halves)
-    record = {
-        "format": FORMAT_NAME,
-        "schema": SCHEMA_VERSION,
-        "config_hash": config_hash,
-        "file": shard.name,
-        "split": split,
-        "index": index,
-        "rows": len(arrays["sigma"]),
-        "bytes": shard.stat().st_size,
-        "sha256": file_sha256(shard),
-        "statistics": {"mean_value": np.nan_to_num(mean).tolist()},
-    }
+    record = sidecar(
+        ShardEntry(cast(Split, split), index, shard.name, len(arrays["sigma"])),
+        Stored(shard.stat().st_size, file_sha256(shard)),
+        config_hash=config_hash,
+        plan="",
+        seed=0,
+        spp=2,
+        queries=arrays["sigma"].size,
+        paths=0,
+        seconds=0.0,
+        quarantined={"nonfinite_samples": 0, "nonfinite_at": [], "lost_rays": 0, "capped_rays": 0},
+        target=None,
+        mean_value=np.nan_to_num(mean).tolist(),
+        mean_variance=None,
+    )
     shard.with_suffix(".json").write_bytes(checksummed({**record, **changes}))
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mbtf_core.data.queries import Queries
+from mbtf_core.data.schema import Queries
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.run import Job
 from mbtf_gen.render.estimates import Estimates, Stream

@@ -15,7 +15,7 @@ from support.paths import ROOT
 
 mi = load_mitsuba()
 
-from mbtf_core.data.queries import Queries  # noqa: E402
+from mbtf_core.data.schema import Queries  # noqa: E402
 from mbtf_gen.render.estimator import Estimates, Estimator, Stream  # noqa: E402
 from mbtf_gen.render.path_tracer import Transport  # noqa: E402
 from mbtf_gen.render.scene import build_scene, register_plugins  # noqa: E402

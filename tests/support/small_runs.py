@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 from mbtf_core.app.console import run
-from mbtf_core.data.queries import Queries
+from mbtf_core.data.schema import Queries
 from mbtf_gen.cli.app import app
 from mbtf_gen.planning.simulation import ClosedForm
 from mbtf_gen.render.estimates import Estimates, Stream

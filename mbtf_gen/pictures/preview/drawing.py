@@ -13,12 +13,11 @@ from mbtf_core.errors import InputError, PartialError
 from mbtf_core.exposure import auto_exposure, brightness, describe_exposure
 from mbtf_core.files.folders import check_space, owned
 from mbtf_core.pictures.camera import tiles_camera
-from mbtf_core.pictures.reference import PNG_BYTES, write_display
+from mbtf_core.pictures.reference import PNG_BYTES, claim_pictures, write_display
 from mbtf_core.run.signals import keep_on_interruption
 from mbtf_gen.config.pictures import PreviewConfig
 from mbtf_gen.forecast import announce
 from mbtf_gen.job import Job
-from mbtf_gen.pictures.folder import PictureFolder
 from mbtf_gen.pictures.preview import mesh
 from mbtf_gen.pictures.preview.plots import level_histogram, write_plots
 from mbtf_gen.pictures.preview.sample import sampled_queries, stored_queries
@@ -109,9 +108,9 @@ class PreviewPictures:
             owned(path),
             self.console.progress(total=len(makers), label="drawing", unit="pictures") as bar,
         ):
-            folder = PictureFolder.claim(
+            folder = claim_pictures(
                 path,
-                "preview",
+                "mbtf-gen preview",
                 files=[f"{name}.png" for name in stages],
                 config=self.config.model_dump(mode="json"),
                 inputs=inputs,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.lattice import level_of_sigma
-from mbtf_core.data.queries import Queries
+from mbtf_core.data.schema import Queries
 from mbtf_core.errors import InputError
 from mbtf_gen.job import Job, split_queries
 from mbtf_gen.sampling.query_sampler import LevelMixture

@@ -14,7 +14,7 @@ from support.small_runs import contents
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.lattice import Lattice
-from mbtf_core.data.queries import Queries
+from mbtf_core.data.schema import Queries
 from mbtf_core.stats import mean_estimate, noise_free_mse, t_test
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.engine.runtime import load_mitsuba

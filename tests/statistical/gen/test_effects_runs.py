@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from mbtf_core.data.dataset import Dataset
-from mbtf_core.data.queries import Queries
+from mbtf_core.data.schema import Queries
 from mbtf_core.files.atomic import write_checksummed
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.effects.plan import EffectsPlan, without

@@ -48,7 +48,7 @@ def test_pictures_without_pytorch_kept_and_refused(tmp_path: Path, run_python: R
     assert [p["kept"] for p in shown[0]["pictures"] + shown[1]["pictures"]] == [False, False, True, True]
     assert (shown[0]["exposure"], shown[1]["exposure"]) == (1.0, 1.0) != (report["exposure"],) * 2
     record = json.loads((tmp_path / "out/pictures.json").read_text())
-    assert [p["facts"]["exposure"] for p in record["pictures"].values()] == [1.0, 1.0]
+    assert [p["facts"]["exposure"] for p in record["items"].values()] == [1.0, 1.0]
     only = ("--sheet-only", "--view", "60,-90", "--light", "45,45", "-o", str(tmp_path / "sheet"))
     sheet = call(["mbtf-fit", *words[:2], *SMALL, *only, "--json"]).result()
     assert [Path(p["file"]).name for p in sheet["pictures"]] == ["sheet.png"]

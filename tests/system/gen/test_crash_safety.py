@@ -20,10 +20,9 @@ from support.file_operations import FileOperations, Operation
 from support.paths import ROOT
 from support.small_runs import command, contents, die, ending, generate, in_child, noisy_plane
 
+from mbtf_core.data.documents import finished_record
 from mbtf_core.data.folder import DataFolder
-from mbtf_core.data.queries import Queries
-from mbtf_core.data.schema import ShardEntry
-from mbtf_core.data.sidecar import finished_record
+from mbtf_core.data.schema import Queries, ShardEntry
 from mbtf_core.data.verify import verify
 from mbtf_gen.planning.simulation import ClosedForm
 from mbtf_gen.render.estimates import Estimates, Stream

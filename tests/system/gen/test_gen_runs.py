@@ -236,9 +236,9 @@ def test_pictures_that_are_there_are_kept_and_others_refused(batch: dict[str, Do
     exposed = batch["pictures exposed"].result()
     assert [p["kept"] for p in exposed["pictures"]] == [True] * 4
     assert exposed["exposure"] == 1.5 != first["exposure"]
-    record = json.loads((work / "pictures/pictures.json").read_text())["pictures"]
+    record = json.loads((work / "pictures/pictures.json").read_text())["items"]
     assert {p["facts"]["exposure"] for name, p in record.items() if name.endswith(".png")} == {1.5}
     refused = batch["pictures changed"]
     assert refused.code == 3
-    assert "pictures: holds pictures of another configuration: reference.spp: 4 -> 256" in refused.err
+    assert "of another configuration: reference.spp: 4 -> 256" in refused.err
     assert "size: 24" in (work / "pictures/config.yaml").read_text()

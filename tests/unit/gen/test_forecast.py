@@ -12,7 +12,7 @@ from support.datasets import write_dataset
 
 from mbtf_core import forecast as core
 from mbtf_core.data.dataset import Dataset
-from mbtf_core.data.queries import Queries
+from mbtf_core.data.schema import Queries
 from mbtf_core.data.shard_files import row_bytes
 from mbtf_core.units import size_text
 from mbtf_gen import forecast as module

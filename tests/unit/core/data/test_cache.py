@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from mbtf_core.data.cache import FileCache
+from mbtf_core.data.store import FileCache
 from mbtf_core.errors import InputError, PartialError
 
 

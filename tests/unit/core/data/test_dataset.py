@@ -11,7 +11,7 @@ import pytest
 from support.datasets import FOREIGN, NOISE, formula, rewrite, write_dataset
 
 from mbtf_core.data.dataset import Dataset
-from mbtf_core.data.queries import Queries
+from mbtf_core.data.schema import Queries
 from mbtf_core.data.shard_files import Arrays, read_shard
 from mbtf_core.errors import InputError
 from mbtf_core.stats import pooled_error

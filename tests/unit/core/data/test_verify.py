@@ -13,10 +13,10 @@ import pytest
 from support.datasets import edit, sidecar_of, write_dataset
 
 from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.documents import finished_record
 from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.schema import ShardEntry
 from mbtf_core.data.shard_files import Arrays, read_shard, write_shard
-from mbtf_core.data.sidecar import finished_record
 from mbtf_core.data.verify import foreign_files, verify
 from mbtf_core.files.digest import file_sha256
 

@@ -1,11 +1,15 @@
-"""Output folders: what is taken, what is refused, what is swept."""
+"""Output folders: claimed, resumed, refused, replaced; files of others stay."""
 
 from __future__ import annotations
 
+import contextlib
+import json
 import os
 import resource
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -13,14 +17,19 @@ from mbtf_core.errors import InputError, PartialError
 from mbtf_core.files import folders
 from mbtf_core.files.atomic import temporary_of
 from mbtf_core.files.folders import (
+    OutputFolder,
+    OutputKind,
     check_folder,
     check_space,
     make_folder,
-    other_configuration,
     owned,
     remove_unfinished,
 )
 from mbtf_core.units import expectation
+
+CONFIG = {"light": {"width": 1.0}, "reference": {"size": 8, "spp": 4}}
+KIND = OutputKind("pictures.json", "mbtf-pictures", 1, "pictures")
+FILES = ["a.exr", "a.png", "b.png"]
 
 
 def is_ours(folder: Path) -> bool:
@@ -69,12 +78,6 @@ def test_files_of_others_are_refused(tmp_path: Path, name: str) -> None:
         make_folder(tmp_path / name / "below")
 
 
-def test_another_configuration_names_what_differs(tmp_path: Path) -> None:
-    error = other_configuration(tmp_path, "a fit", {"a": 1, "b": 2}, {"a": 1, "b": 3})
-    assert "holds a fit of another configuration: b: 2 -> 3" in error.message
-    assert "--overwrite" in error.hint
-
-
 def test_only_unfinished_files_of_ours_are_removed(tmp_path: Path) -> None:
     for name in ("a.npz", "b.npz"):
         temporary_of(tmp_path / name).touch()
@@ -103,3 +106,113 @@ def test_a_full_disk_leaves_neither_lock_nor_folder(tmp_path: Path) -> None:
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert [path.name for path in tmp_path.rglob("*")] == ["there"]
+
+
+def claim(path: Path, config: dict[str, Any] = CONFIG, height: str = "0f", **options: Any) -> OutputFolder:
+    depends = {**config, "inputs": {"height": 32 * height}}
+    return OutputFolder.claim(path, KIND, depends, FILES, config=config, **options)
+
+
+def make(folder: OutputFolder, *names: str) -> None:
+    paths = [folder.path / name for name in names]
+    for path in paths:
+        path.write_bytes(b"picture")
+    folder.keep(names[0].partition(".")[0], paths, {"noise": 0.5})
+
+
+def listing(path: Path) -> dict[str, bytes]:
+    return {p.name: p.read_bytes() for p in path.iterdir()}
+
+
+def test_the_same_configuration_keeps_what_is_finished(tmp_path: Path) -> None:
+    make(claim(tmp_path / "out"), "a.exr", "a.png")
+    record = json.loads((tmp_path / "out/pictures.json").read_text())
+    assert record["items"] == {"a": {"files": {"a.exr": 7, "a.png": 7}, "facts": {"noise": 0.5}}}
+    again = claim(tmp_path / "out")
+    assert again.finished("a") == {"noise": 0.5}
+    assert again.finished("b") is None
+    (again.path / "a.png").write_bytes(b"pict")
+    assert again.finished("a") is None
+    (again.path / "a.png").unlink()
+    assert again.finished("a") is None
+
+
+def test_another_configuration_is_refused_with_what_differs(tmp_path: Path) -> None:
+    make(claim(tmp_path / "out"), "a.exr", "a.png")
+    before = listing(tmp_path / "out")
+    other = {**CONFIG, "reference": {"size": 16, "spp": 4}}
+    with pytest.raises(InputError) as caught:
+        claim(tmp_path / "out", other, "ab")
+    assert "reference.size: 8 -> 16; inputs.height: 0f0f0f0f… -> abababab…" in caught.value.what
+    assert "--overwrite" in caught.value.hint
+    assert listing(tmp_path / "out") == before
+    older = replace(KIND, schema=0)
+    with pytest.raises(InputError, match="has schema version 1, this program reads version 0"):
+        OutputFolder.claim(tmp_path / "out", older, {}, FILES, overwrite=True)
+    assert listing(tmp_path / "out") == before
+
+
+def test_overwrite_removes_its_own_files_and_nothing_else(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    make(claim(out), "a.exr", "a.png")
+    (out / "b.png").write_bytes(b"written, not yet recorded")
+    (out / ".b.png.0123abcd-99.tmp").write_bytes(b"half")
+    mine = {"notes.txt": b"kept", "c.png": b"kept", ".c.png.0123abcd-99.tmp": b"kept", ".b.png.swp": b"kept"}
+    for name, content in mine.items():
+        (out / name).write_bytes(content)
+    other = {**CONFIG, "reference": {"size": 16, "spp": 4}}
+    replaced = claim(out, other, overwrite=True)
+    assert replaced.finished("a") is None
+    assert {k: v for k, v in listing(out).items() if k not in ("config.yaml", "pictures.json")} == mine
+    assert "size: 16" in (out / "config.yaml").read_text()
+
+
+def test_a_killed_run_is_resumed(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    # Killed while the record was written, then between record and configuration, then within a picture.
+    out.mkdir()
+    (out / ".pictures.json.0123abcd-7.tmp").write_text("{")
+    claim(out)
+    (out / "config.yaml").unlink()
+    (out / ".a.exr.0123abcd-7.tmp").write_bytes(b"half")
+    claim(out)
+    assert sorted(listing(out)) == ["config.yaml", "pictures.json"]
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+@pytest.mark.parametrize(
+    "files",
+    [
+        *({name: "mine"} for name in ("notes.txt", "a.png", "config.yaml")),
+        *({"pictures.json": text} for text in ('{"format": "mine"}', "{")),
+    ],
+    ids=["notes", "same name", "config", "foreign record", "broken record"],
+)
+def test_foreign_folders_are_refused_untouched(
+    files: dict[str, str], overwrite: bool, tmp_path: Path
+) -> None:
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    with pytest.raises(InputError):
+        claim(tmp_path, overwrite=overwrite)
+    assert {p.name: p.read_text() for p in tmp_path.iterdir()} == files
+
+
+def test_a_record_cannot_remove_what_lies_elsewhere(tmp_path: Path) -> None:
+    claim(tmp_path / "out")
+    record = json.loads((tmp_path / "out/pictures.json").read_text())
+    record["listed"].append("../mine.txt")
+    (tmp_path / "out/pictures.json").write_text(json.dumps(record))
+    (tmp_path / "mine.txt").write_text("kept")
+    with pytest.raises(InputError, match=r"is damaged .*must lie in the folder"):
+        claim(tmp_path / "out", overwrite=True)
+    assert (tmp_path / "mine.txt").exists()
+
+
+def test_a_command_that_fails_before_its_first_file_claims_nothing(tmp_path: Path) -> None:
+    for written in ([], ["a.png"]):
+        with contextlib.suppress(InputError), owned(tmp_path / "out"), claim(tmp_path / "out") as folder:
+            for name in written:
+                (folder.path / name).write_text("")
+            raise InputError("cannot be used")
+        assert (tmp_path / "out").exists() is bool(written)

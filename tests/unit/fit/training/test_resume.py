@@ -14,8 +14,8 @@ from support.known_surfaces import geometry, rough_heights
 
 import mbtf_fit.training.fit
 from mbtf_core.data.lattice import Lattice
+from mbtf_core.files import folders
 from mbtf_fit.config import FitConfig
-from mbtf_fit.training import fit_folder
 from mbtf_fit.training.fit import FitResult, fit
 from mbtf_fit.training.trainer import Trainer
 from mbtf_fit.training.validation import read_history
@@ -109,7 +109,7 @@ def test_a_fit_killed_while_it_replaces_another_is_repeated(
     other = FitConfig.model_validate({"training": {"steps": 2, "batch": 300}, "seed": 1})
     shutil.copytree(whole.folder, tmp_path / "m")
     with monkeypatch.context() as patch:
-        patch.setattr(Path if at == "unlink" else fit_folder, at, die)
+        patch.setattr(Path if at == "unlink" else folders, at, die)
         with pytest.raises(Killed):
             fit(other, shards, tmp_path / "m", overwrite=True)
     assert not (tmp_path / "m" / "material.json").exists()

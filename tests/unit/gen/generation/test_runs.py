@@ -32,7 +32,7 @@ from mbtf_gen.planning.run_plan import RunPlan
 
 load_mitsuba()
 
-from mbtf_gen.render.estimates import BadSample  # noqa: E402
+from mbtf_core.data.documents import BadSample  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("engine")
 

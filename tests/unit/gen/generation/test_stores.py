@@ -16,9 +16,9 @@ from support.small_runs import command, contents, generate, noisy_plane
 
 from mbtf_core.app.console import run
 from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.documents import upload_waiting
 from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.schema import ShardEntry
-from mbtf_core.data.sidecar import upload_waiting
 from mbtf_core.data.store import ObjectStore, StoredFile
 from mbtf_core.data.verify import verify
 from mbtf_core.errors import InputError, MbtfError, PartialError

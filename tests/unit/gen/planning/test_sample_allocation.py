@@ -11,7 +11,7 @@ from conftest import RunPython
 from numpy.typing import NDArray
 
 from mbtf_core.data.lattice import Lattice
-from mbtf_core.data.queries import Queries
+from mbtf_core.data.schema import Queries
 from mbtf_gen.planning.adaptive import DOUBT, MOST_CORRECTION, PRIOR_PATHS, correction, needed_paths, round_up
 from mbtf_gen.planning.sample_allocation import (
     FLOOR,

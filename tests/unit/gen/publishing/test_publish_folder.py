@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +10,7 @@ import pytest
 from support.datasets import edit, write_dataset
 from support.published import contents, publish, small
 
-from mbtf_core.errors import EngineError, InputError, PartialError, UsageError
+from mbtf_core.errors import EngineError, InputError, UsageError
 from mbtf_core.files.atomic import Stored
 from mbtf_gen.config.publish import PublishConfig
 from mbtf_gen.publishing import publication as module
@@ -35,9 +34,9 @@ def test_the_same_command_gives_the_same_bytes(form: str, shards: Path, tmp_path
 
 def stop(patch: pytest.MonkeyPatch, number: int, written: bool) -> None:
     """Interrupt the next run before its file of this number, or once it is `written` but not recorded."""
-    add, left = module.PublishFolder.add, iter(range(number))
+    add, left = module.OutputFolder.add, iter(range(number))
 
-    def stopping(folder: module.PublishFolder, name: str, write: Callable[[Path], Stored]) -> Stored:
+    def stopping(folder: module.OutputFolder, name: str, write: Callable[[Path], Stored]) -> Stored:
         if next(left, None) is None:
             if written:
                 (folder.path / name).parent.mkdir(exist_ok=True)
@@ -45,7 +44,7 @@ def stop(patch: pytest.MonkeyPatch, number: int, written: bool) -> None:
             raise KeyboardInterrupt
         return add(folder, name, write)
 
-    patch.setattr(module.PublishFolder, "add", stopping)
+    patch.setattr(module.OutputFolder, "add", stopping)
 
 
 @pytest.mark.parametrize("written", [False, True])
@@ -93,24 +92,6 @@ def test_other_options_are_refused_and_replace(shards: Path, tmp_path: Path) -> 
     assert not list(card.rglob("*.tar"))
     assert (card / "mine.txt").read_text() == "kept"
     assert "CC-BY-4.0" in (card / "README.md").read_text()
-
-
-def test_a_record_cannot_remove_what_lies_elsewhere(shards: Path, tmp_path: Path) -> None:
-    card = publish(shards, tmp_path / "card", form="webdataset")
-    record = json.loads((card / "publish.json").read_text())
-    record["listed"].append("../data/manifest.json")
-    (card / "publish.json").write_text(json.dumps(record))
-    with pytest.raises(InputError, match=r"is damaged .*must lie in the folder"):
-        Publication.prepare(shards, CONFIG).write(card, overwrite=True)
-    assert (shards / "manifest.json").exists()
-
-
-def test_a_folder_of_others_is_refused(shards: Path, tmp_path: Path) -> None:
-    (tmp_path / "card").mkdir()
-    (tmp_path / "card/notes.txt").write_text("mine")
-    for overwrite in (False, True):
-        with pytest.raises(InputError, match="is not empty and holds no published data set"):
-            Publication.prepare(shards, CONFIG).write(tmp_path / "card", overwrite=overwrite)
 
 
 def test_damage_is_found_before_anything_is_written(shards: Path, tmp_path: Path) -> None:
@@ -163,10 +144,3 @@ def test_shards_of_exr_are_not_npz(tmp_path: Path) -> None:
         publish(tmp_path / "data", tmp_path / "card", form="npz")
     card = publish(tmp_path / "data", tmp_path / "card", form="webdataset")
     assert (card / "data/train-00000.tar").exists()
-
-
-def test_a_folder_in_use_is_refused(shards: Path, tmp_path: Path) -> None:
-    from mbtf_core.files.folders import owned
-
-    with owned(tmp_path / "card"), pytest.raises(PartialError, match="is being written by another process"):
-        publish(shards, tmp_path / "card", form="webdataset")

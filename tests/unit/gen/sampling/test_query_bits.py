@@ -11,7 +11,7 @@ from conftest import RunPython
 from numpy.typing import NDArray
 
 from mbtf_core.data.lattice import Lattice
-from mbtf_core.data.queries import Queries
+from mbtf_core.data.schema import Queries
 from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan
 
 # Draws of every kind, and the elementary functions in double precision, where the last bit shows; prints

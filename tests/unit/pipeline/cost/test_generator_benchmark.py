@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support.fake_benchmark import NOISE, SHIFT, FakeEstimator, fake_benchmark
 
-from mbtf_core.data.queries import Queries
+from mbtf_core.data.schema import Queries
 from mbtf_core.errors import InputError
 from mbtf_core.stats import Estimate
 from mbtf_gen.config.generator import GeneratorConfig

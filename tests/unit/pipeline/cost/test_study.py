@@ -86,14 +86,14 @@ def test_folders_of_something_else_are_refused(tmp_path: Path) -> None:
     folder = tmp_path / "study"
     module.claim(folder, machine())
     folder.mkdir()
-    record = {"format": module.STUDY_FORMAT, "schema": module.STUDY_SCHEMA, "machine": machine()}
+    record = {"format": module.STUDY.format, "schema": module.STUDY.schema, "machine": machine()}
     changes: list[tuple[dict[str, Any], str | None]] = [
         ({}, None),
         ({"machine": {"system": "Plan 9"}}, r"another kind of machine .Plan 9; this is "),
         ({"schema": 1}, "schema version 1"),
     ]
     for change, message in changes:
-        write_json(folder / module.STUDY_NAME, {**record, **change})
+        write_json(folder / module.STUDY.record, {**record, **change})
         if message is None:
             module.claim(folder, machine())
         else:

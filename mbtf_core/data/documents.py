@@ -1,20 +1,148 @@
-"""Sidecars: the JSON file beside each shard, which marks it as finished and says what it belongs to."""
+"""The documents of a data set: its manifest, and the sidecar beside each shard.
+
+A sidecar marks its shard as finished and states what it belongs to.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict
-from typing import Any
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
+from pydantic import BaseModel, Field
+
+from mbtf_core.config.settings import check_document
 from mbtf_core.data.folder import DataFolder, sidecar_name
-from mbtf_core.data.schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, ShardEntry
+from mbtf_core.data.lattice import MAX_LEVEL
+from mbtf_core.data.schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, Layout, ShardEntry
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import Stored
+from mbtf_core.files.digest import data_sha256
 
+_Count = Annotated[int, Field(strict=True, ge=0, lt=1 << 40)]
+_FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*\.(npz|exr)$", max_length=100)]
 # Faults of shards that are not rendered yet; an interrupted run leaves many of them.
 ABSENT = ("is missing", "is unfinished (no sidecar)")
 # A file whose bytes are not those that were written.
 CHANGED = "has changed since it was written (SHA-256 differs)"
+
+
+class _Entry(BaseModel):
+    file: _FileName
+    rows: _Count
+
+
+class _Split(BaseModel):
+    shards: list[_Entry]
+
+
+class _Levels(BaseModel):
+    finest: Annotated[int, Field(strict=True, ge=0, le=MAX_LEVEL)]
+
+
+class _Tile(BaseModel):
+    aspect: float = Field(gt=0, le=1e6, allow_inf_nan=False)
+
+
+class _Geometry(BaseModel):
+    file: Literal["geometry.exr"]
+    sha256: str
+
+
+class Manifest(BaseModel):
+    """Keys of a manifest that readers need; others are ignored."""
+
+    config_hash: str
+    layout: Layout
+    levels: _Levels
+    tile: _Tile
+    splits: dict[str, _Split]
+    geometry: _Geometry | None
+    patch_size: _Count | None = None
+    slice_size: _Count | None = None
+    estimates: Literal[1, 2] = 2
+
+
+@dataclass(frozen=True)
+class BadSample:
+    """A non-finite sample: number of its query in the shard, and the effect that caused it (``direct light``
+    or ``interreflection``)."""
+
+    query: int
+    effect: str
+
+
+@dataclass(frozen=True)
+class TargetReached:
+    """Error of a batch of queries under a target error; errors are relative to max(value, tile mean).
+
+    Attributes
+    ----------
+    queries, missed : number of queries, and of those that needed more paths than the cap
+    worst : largest error of a missed query that the pilot predicts; 0 without missed queries
+    square : mean square of the relative error, from the stored halves
+    """
+
+    queries: int
+    missed: int
+    worst: float
+    square: float
+
+
+class _Statistics(BaseModel, allow_inf_nan=False):
+    mean_value: tuple[float, float, float]
+    mean_variance: tuple[float, float, float] | None
+
+
+class _Quarantined(BaseModel):
+    nonfinite_samples: int
+    nonfinite_at: list[BadSample]
+    lost_rays: int
+    capped_rays: int
+
+
+class _Sidecar(BaseModel, allow_inf_nan=False):
+    """Keys of a sidecar, besides those that :func:`read_sidecar` compares."""
+
+    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+    queries: int
+    paths: int
+    seconds: float
+    statistics: _Statistics
+    quarantined: _Quarantined
+    target: TargetReached | None
+
+
+def software_versions() -> dict[str, str]:
+    """Versions of the software that the values depend on."""
+    out = {"python": platform.python_version(), "machine": platform.machine()}
+    for name in ("mbtf", "mitsuba", "drjit", "numpy", "trimesh"):
+        try:
+            out[name] = version(name)
+        except PackageNotFoundError:
+            out[name] = "not installed"
+    return out
+
+
+def plan_digest(manifest: Mapping[str, Any]) -> str:
+    """SHA-256 of what the run plan in a manifest decides, hexadecimal. The sidecars of all shards repeat it.
+
+    Explanations and bias bounds are left out: they decide nothing, and other versions word them differently.
+    """
+    # Measured data have no plan.
+    plan = manifest.get("effects") or {}
+    decided = {key: plan.get(key) for key in ("max_depth", "roulette_depth", "closed_form")}
+    on = sorted(effect["name"] for effect in plan.get("effects", []) if effect["on"])
+    return data_sha256({**decided, "effects": on, "allocation": manifest.get("allocation")})
+
+
+def read_manifest(folder: str | Path | DataFolder) -> dict[str, Any]:
+    """The manifest of a folder; an InputError unless it is exactly as it was written."""
+    found = folder if isinstance(folder, DataFolder) else DataFolder.open(folder)
+    return found.read_checksummed(MANIFEST_NAME, repair_hint(found))
 
 
 def repair_hint(folder: object) -> str:
@@ -35,6 +163,7 @@ def read_sidecar(folder: DataFolder, entry: ShardEntry, config_hash: str) -> dic
             raise InputError(fault, where=where)
     try:
         record = folder.read_checksummed(sidecar)
+        check_document(_Sidecar, record, folder.at(sidecar), "")
     except InputError as error:
         raise InputError(f"has a corrupt sidecar: {error.what}", where=where) from None
     found = {key: record.get(key) for key in ("split", "index", "rows", "bytes")}
