@@ -26,7 +26,7 @@ def merge(folder: Path, /, *, console: Console = CONSOLE) -> int:
     folder
         Folder of shards, or its URL.
     """
-    from mbtf_gen.generation.summary import finish
+    from mbtf_gen.generation.manifest import finish
 
     summary = finish(folder)
     console.report(asdict(summary), describe(summary, ran=False))

@@ -26,8 +26,7 @@ from mbtf_core.locks import brief_lock
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.geometry import geometry_of
 from mbtf_gen.generation.manifest import build_manifest
-from mbtf_gen.generation.render_shards import ProgressCallback
-from mbtf_gen.generation.run import generate
+from mbtf_gen.generation.run import ProgressCallback, generate
 from mbtf_gen.job import Job
 from mbtf_gen.planning.run_plan import plan_run
 

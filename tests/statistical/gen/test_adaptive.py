@@ -18,8 +18,8 @@ from mbtf_core.data.queries import Queries
 from mbtf_core.stats import mean_estimate, noise_free_mse, t_test
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.engine.runtime import load_mitsuba
+from mbtf_gen.generation.manifest import finish
 from mbtf_gen.generation.run import generate
-from mbtf_gen.generation.summary import finish
 from mbtf_gen.job import Job, split_spp, split_target
 from mbtf_gen.planning.adaptive import estimate_shard
 from mbtf_gen.planning.effects_planner import plan_effects

@@ -21,12 +21,12 @@ from mbtf_core.errors import InputError, PartialError
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.effects.plan import EffectsPlan
 from mbtf_gen.engine.runtime import load_mitsuba
-from mbtf_gen.generation import folder, render_shards
+from mbtf_gen.generation import folder
 from mbtf_gen.generation import repair as repairs
 from mbtf_gen.generation import run as generation
 from mbtf_gen.generation.geometry import geometry_of
+from mbtf_gen.generation.manifest import finish
 from mbtf_gen.generation.run import generate, unfinished
-from mbtf_gen.generation.summary import finish
 from mbtf_gen.job import Job, split_queries
 from mbtf_gen.planning.run_plan import RunPlan
 
@@ -126,7 +126,7 @@ def test_a_finished_run_renders_nothing(
     first = generate(config, out)
     before = {p.name: (p.stat().st_mtime_ns, p.read_bytes()) for p in out.iterdir()}
     # Nothing is missing, so no estimator is built.
-    monkeypatch.setattr(render_shards, "build_estimator", None)
+    monkeypatch.setattr(generation, "build_estimator", None)
     second = generate(config, out)
     assert (second.paths, second.complete, second.mean_value) == (0, True, first.mean_value)
     assert before == {p.name: (p.stat().st_mtime_ns, p.read_bytes()) for p in out.iterdir()}

@@ -23,12 +23,10 @@ from mbtf_core.locks import shard_lock, take_lock
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.effects.plan import without
 from mbtf_gen.engine.runtime import load_mitsuba
-from mbtf_gen.generation import render_shards
 from mbtf_gen.generation import run as generation
 from mbtf_gen.generation.geometry import geometry_of
-from mbtf_gen.generation.manifest import build_manifest
+from mbtf_gen.generation.manifest import build_manifest, finish
 from mbtf_gen.generation.run import generate
-from mbtf_gen.generation.summary import finish
 from mbtf_gen.job import Job
 from mbtf_gen.planning.effects_planner import reference_plan
 from mbtf_gen.planning.run_plan import RunPlan
@@ -182,7 +180,7 @@ def test_a_shard_finished_before_its_lock_is_not_rendered(
     whole = tmp_path / "whole"
     generate(config, whole)
     engine.estimated.clear()
-    take = render_shards.take_lock
+    take = generation.take_lock
 
     def late(path: Path) -> Any:
         if path.name == FILES[1]:
@@ -190,7 +188,7 @@ def test_a_shard_finished_before_its_lock_is_not_rendered(
                 shutil.copy(whole / name, out / name)
         return take(path)
 
-    monkeypatch.setattr(render_shards, "take_lock", late)
+    monkeypatch.setattr(generation, "take_lock", late)
     assert generate(config, out).complete
     assert engine.estimated == [("train", 0), ("train", 2), ("test", 0)]
     assert contents(out) == contents(whole)
