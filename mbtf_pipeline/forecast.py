@@ -77,7 +77,7 @@ class RunForecaster:
     def speed(self) -> tuple[float, float]:
         """Seconds of starting the generator, and of a path."""
         from mbtf_gen.forecast import forecast
-        from mbtf_gen.planning.effects_planner import plan_effects
+        from mbtf_gen.planning.run_plan import plan_effects
         from mbtf_gen.planning.run_plan import allocate
 
         job = Job.of(self.recipe.generate, self.material)

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from mbtf_core.data.geometry import FINEST_LEVEL, GLOSSY, Geometry
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.images.resample import resample
-from mbtf_gen.effects.plan import EffectsPlan
 from mbtf_gen.job import Job
+from mbtf_gen.planning.effects_plan import EffectsPlan
 from mbtf_gen.planning.simulation import shading_slopes
 from mbtf_gen.tile.heights.slopes import height_slopes
 

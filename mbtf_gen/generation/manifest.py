@@ -35,10 +35,10 @@ from mbtf_core.files.atomic import checksummed
 from mbtf_core.locks import brief_lock
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.measured import ImportConfig
-from mbtf_gen.effects.catalog import EFFECTS
-from mbtf_gen.effects.plan import EffectsPlan
 from mbtf_gen.generation.shard_record import ShardStatistics
 from mbtf_gen.job import Job, split_queries, split_spp
+from mbtf_gen.planning.effects import EFFECTS
+from mbtf_gen.planning.effects_plan import EffectsPlan
 from mbtf_gen.planning.run_plan import RunPlan
 from mbtf_gen.planning.sample_allocation import Allocation
 from mbtf_gen.render.estimates import BadSample, TargetReached

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from mbtf_core.data.queries import Queries
 from mbtf_core.images.resample import resample
-from mbtf_gen.effects.catalog import EFFECTS
-from mbtf_gen.effects.plan import EffectsPlan
 from mbtf_gen.engine.runtime import CPU_VARIANT
 from mbtf_gen.job import Job
+from mbtf_gen.planning.effects import EFFECTS
+from mbtf_gen.planning.effects_plan import EffectsPlan
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.tile.heights.slopes import height_slopes
 

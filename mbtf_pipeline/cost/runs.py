@@ -195,7 +195,7 @@ class RunRunner:
 def forecast_seconds(config: GeneratorConfig) -> float:
     """Seconds of a training query, by a forecast."""
     from mbtf_gen.forecast import forecast
-    from mbtf_gen.planning.effects_planner import plan_effects
+    from mbtf_gen.planning.run_plan import plan_effects
     from mbtf_gen.planning.run_plan import allocate
 
     job = Job.load(config)

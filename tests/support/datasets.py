@@ -23,8 +23,7 @@ from mbtf_gen.generation.folder import open_folder
 from mbtf_gen.generation.manifest import finish
 from mbtf_gen.generation.run import ShardRun
 from mbtf_gen.job import Job, split_spp
-from mbtf_gen.planning.effects_planner import reference_plan
-from mbtf_gen.planning.run_plan import RunPlan
+from mbtf_gen.planning.run_plan import RunPlan, reference_plan
 from mbtf_gen.render.estimates import Estimates
 
 F32 = NDArray[np.float32]

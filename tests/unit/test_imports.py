@@ -41,7 +41,6 @@ mbtf_core.forecast
 mbtf_gen.sampling
 mbtf_gen.measured
 mbtf_gen.engine
-mbtf_gen.effects
 mbtf_gen.config
 mbtf_gen.tile.tracers
 mbtf_gen.tile.heights

@@ -20,7 +20,7 @@ from mbtf_core.images.exr import encode_parts
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.geometry import geometry_of
 from mbtf_gen.job import Job
-from mbtf_gen.planning.effects_planner import reference_plan
+from mbtf_gen.planning.run_plan import reference_plan
 from mbtf_gen.tile.loading import load_material
 
 F64 = NDArray[np.float64]

@@ -22,8 +22,7 @@ from mbtf_gen.cli.app import app
 from mbtf_gen.generation import repair as repairs
 from mbtf_gen.generation.repair import repair
 from mbtf_gen.job import Job
-from mbtf_gen.planning.effects_planner import reference_plan
-from mbtf_gen.planning.run_plan import RunPlan, plan_run
+from mbtf_gen.planning.run_plan import RunPlan, plan_run, reference_plan
 from mbtf_gen.planning.simulation import ClosedForm
 
 

@@ -19,7 +19,6 @@ from mbtf_core.data.shard_files import read_shard
 from mbtf_core.data.verify import verify
 from mbtf_core.errors import InputError, PartialError
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.effects.plan import EffectsPlan
 from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.generation import folder
 from mbtf_gen.generation import repair as repairs
@@ -28,6 +27,7 @@ from mbtf_gen.generation.geometry import geometry_of
 from mbtf_gen.generation.manifest import finish
 from mbtf_gen.generation.run import generate, unfinished
 from mbtf_gen.job import Job, split_queries
+from mbtf_gen.planning.effects_plan import EffectsPlan
 from mbtf_gen.planning.run_plan import RunPlan
 
 load_mitsuba()
