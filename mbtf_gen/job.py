@@ -16,8 +16,14 @@ from mbtf_core.data.shard_files import row_bytes
 from mbtf_core.errors import InputError, UsageError
 from mbtf_gen.config.generator import GeneratorConfig, count_queries
 from mbtf_gen.render.estimates import TARGET_PILOT_SPP, Target
-from mbtf_gen.sampling.query_sampler import F32, LevelMixture, QueryPlan
-from mbtf_gen.sampling.slice_directions import UBO2003_COUNT, UBO2003_LOWEST, slice_directions
+from mbtf_gen.sampling.query_sampler import (
+    F32,
+    UBO2003_COUNT,
+    UBO2003_LOWEST,
+    LevelMixture,
+    QueryPlan,
+    slice_directions,
+)
 from mbtf_gen.tile.loading import latest_material
 from mbtf_gen.tile.protocol import Tile
 

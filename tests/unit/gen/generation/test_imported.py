@@ -26,7 +26,7 @@ from mbtf_gen.config.measured import ImportConfig
 from mbtf_gen.generation import imported
 from mbtf_gen.generation.imported import Import, import_measured
 from mbtf_gen.generation.repair import repair
-from mbtf_gen.sampling.slice_directions import slice_directions
+from mbtf_gen.sampling.query_sampler import slice_directions
 from mbtf_pipeline.compare.dataset_errors import dataset_errors
 
 Open = Callable[..., Import]

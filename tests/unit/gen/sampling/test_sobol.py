@@ -11,11 +11,11 @@ from support.chi_square import uniformity
 
 from mbtf_core.stats import holm, mean_estimate, t_test
 from mbtf_gen.engine.runtime import load_mitsuba
-from mbtf_gen.sampling.rng import Purpose, sequence, stream_key, stream_number
+from mbtf_gen.sampling.rng import Purpose, stream_key, stream_number
 
 mi = load_mitsuba()
 
-from mbtf_gen.sampling.sobol import SobolSampler  # noqa: E402
+from mbtf_gen.sampling.sobol import SobolSampler, sequence  # noqa: E402
 
 QUERIES = 2048
 LENGTH = 16
