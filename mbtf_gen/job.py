@@ -122,6 +122,11 @@ class Job:
         """Texel grids of the levels."""
         return self.material.lattice(self.config.queries.finest)
 
+    @property
+    def inputs(self) -> dict[str, str]:
+        """Role → SHA-256 of the input files."""
+        return self.material.digests
+
     @cached_property
     def config_hash(self) -> str:
         """SHA-256 of the options and of the contents of the input files, hexadecimal."""

@@ -13,20 +13,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.lattice import MAX_LEVEL, Lattice, level_of_sigma, sigma_of_level
-from mbtf_core.data.manifest import plan_digest, read_manifest
-from mbtf_core.data.schema import CONFIG_NAME, CONVENTIONS, MANIFEST_NAME, SCHEMA_VERSION, ShardEntry, Split
+from mbtf_core.data.manifest import plan_digest
+from mbtf_core.data.schema import CONVENTIONS, ShardEntry, Split
 from mbtf_core.data.shard_files import Arrays
 from mbtf_core.data.sidecar import finished_record
 from mbtf_core.errors import InputError
-from mbtf_core.files.atomic import checksummed
 from mbtf_core.files.digest import data_sha256, file_sha256
-from mbtf_core.files.folders import make_folder, owned
+from mbtf_core.files.folders import owned
 from mbtf_gen.config.generator import count_queries
 from mbtf_gen.config.measured import ImportConfig
-from mbtf_gen.generation.folder import holds_dataset, other_data_set
+from mbtf_gen.generation.folder import claim_folder
 from mbtf_gen.generation.manifest import Summary, finish, new_manifest
 from mbtf_gen.generation.shard_record import store_shard
 from mbtf_gen.measured.interface import MeasuredBtf, MeasuredQueries, QueryBlock
@@ -65,7 +63,7 @@ class Import(ABC):
     ----------
     path : its file or folder
     config : options
-    digests : role → SHA-256 of the files
+    inputs : role → SHA-256 of the files
     lattice : texel grids, the finest at least as fine as the images
     divides_by_cosine : whether stored values include the cosine of the light
     facts : the manifest's key ``measured``
@@ -78,7 +76,7 @@ class Import(ABC):
 
     def __init__(self, path: Path, config: ImportConfig, source: object, cosine: bool | None) -> None:
         self.path, self.config, self.format = path, config, type(source).__name__
-        self.digests = {"measured": _digest(path)}
+        self.inputs = {"measured": _digest(path)}
         included = {"auto": cosine, "included": True, "excluded": False}[config.cosine]
         if included is None:
             hint = "state it: --cosine included, or --cosine excluded"
@@ -100,7 +98,7 @@ class Import(ABC):
     @cached_property
     def config_hash(self) -> str:
         """Hash of everything that determines the data."""
-        return self.config.hash(self.digests)
+        return self.config.hash(self.inputs)
 
     @abstractmethod
     def count(self, split: Split) -> int:
@@ -127,7 +125,6 @@ class Import(ABC):
         measured = {"format": self.format, "file": self.path.name, "light_width": None, **self.facts}
         return new_manifest(
             self,
-            inputs=self.digests,
             arrays=dict.fromkeys(MEASURED, "") | MEANINGS,
             splits={split: {"queries": self.count(split)} for split in ("train", "test")},
             entries=entries,
@@ -314,18 +311,8 @@ def import_measured(
     """
     start = time.perf_counter()
     folder = DataFolder.open(folder)
-    manifest = job.manifest()
-    plan, written = plan_digest(manifest), 0
     with owned(folder.workspace):
-        if holds_dataset(folder):
-            if overwrite:
-                folder.clear()
-            else:
-                _check_same(folder, manifest)
-        make_folder(folder.workspace)
-        if not folder.has(MANIFEST_NAME):
-            folder.write(MANIFEST_NAME, checksummed(manifest))
-        folder.write(CONFIG_NAME, dump_yaml(manifest["config"]).encode())
+        plan, written = plan_digest(claim_folder(job, folder, job.manifest, overwrite)), 0
 
         def finished(entry: ShardEntry) -> bool:
             return finished_record(folder, entry, job.config_hash) is not None
@@ -337,14 +324,6 @@ def import_measured(
             if progress is not None:
                 progress(written)
         return finish(folder, seconds=time.perf_counter() - start)
-
-
-def _check_same(folder: DataFolder, manifest: dict[str, Any]) -> None:
-    old = folder.read_json(MANIFEST_NAME)
-    if old.get("config_hash") != manifest["config_hash"]:
-        after = {**manifest["config"], "inputs": manifest["inputs"], "schema": SCHEMA_VERSION}
-        raise other_data_set(folder, old, after)
-    read_manifest(folder)
 
 
 def _cut(entries: Iterable[ShardEntry], arrays: Arrays) -> Iterator[tuple[ShardEntry, Arrays]]:

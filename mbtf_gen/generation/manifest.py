@@ -44,7 +44,7 @@ from mbtf_gen.planning.sample_allocation import Allocation
 from mbtf_gen.render.estimates import BadSample, TargetReached
 
 
-class _Source(Protocol):
+class DataSource(Protocol):
     """What becomes a data set: a job, or an import."""
 
     @property
@@ -54,13 +54,15 @@ class _Source(Protocol):
     def config_hash(self) -> str: ...
 
     @property
+    def inputs(self) -> Mapping[str, str]: ...
+
+    @property
     def lattice(self) -> Lattice: ...
 
 
 def new_manifest(
-    source: _Source,
+    source: DataSource,
     *,
-    inputs: Mapping[str, str],
     arrays: Mapping[str, str],
     splits: Mapping[str, dict[str, Any]],
     entries: Sequence[ShardEntry],
@@ -71,7 +73,6 @@ def new_manifest(
 
     Parameters
     ----------
-    inputs : role → SHA-256 of the input files
     arrays : stored arrays, and their meanings where those of the schema do not apply
     splits : what is stated of each split besides its shards
     entries : all shards
@@ -86,7 +87,7 @@ def new_manifest(
         "config_hash": source.config_hash,
         "config": config,
         "config_yaml": hashlib.sha256(dump_yaml(config).encode()).hexdigest(),
-        "inputs": dict(sorted(inputs.items())),
+        "inputs": dict(sorted(source.inputs.items())),
         "conventions": CONVENTIONS,
         "tile": {"aspect": lattice.aspect},
         "levels": {
@@ -126,7 +127,6 @@ def build_manifest(job: Job, plan: RunPlan, geometry: Mapping[str, Any] | None) 
     stored = [a.name for a in ARRAYS if a.name != "transmittance" or plan.effects.on("opacity")]
     found = new_manifest(
         job,
-        inputs=tile.digests,
         arrays=dict.fromkeys(stored, ""),
         splits={
             split: {"queries": split_queries(job, split), "spp": split_spp(job.config, split)}

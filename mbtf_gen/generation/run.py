@@ -117,8 +117,7 @@ def generate(
             planned(plans[0])
         return plans[0]
 
-    open_folder(job, folder, new_plan, overwrite)
-    run = ShardRun(job, folder, read_run_plan(folder))
+    run = ShardRun(job, folder, open_folder(job, folder, new_plan, overwrite))
     entries = unfinished(job, folder, slice_index, slice_count)
     if planned is not None and not plans and entries:
         planned(run.plan)

@@ -52,7 +52,7 @@ def write_dataset(folder: Path, *, rows: int = 4, columns: int = 8, **options: A
     job = Job.prepare(config)
     plan = RunPlan(reference_plan(job))
     files = DataFolder.open(folder)
-    open_folder(job, files, lambda job: plan, False)
+    open_folder(job, files, lambda job: plan)
     for number, entry in enumerate(job.shards):
         queries = job.query_plan.draw(entry.split, entry.index, entry.rows)
         truth, rng = formula(queries), np.random.default_rng(number)

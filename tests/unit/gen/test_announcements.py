@@ -66,9 +66,7 @@ def test_a_long_run_states_time_and_size(
         seen.append(out.exists())
         return SimpleNamespace(start=5.0, seconds=600.0)
 
-    monkeypatch.setattr(generation, "plan_run", lambda job: SimpleNamespace(effects=SimpleNamespace()))
-    monkeypatch.setattr(generation, "open_folder", lambda job, folder, plan, overwrite: plan(job))
-    monkeypatch.setattr(generation, "read_run_plan", stop)
+    monkeypatch.setattr(generation, "open_folder", lambda job, folder, plan, overwrite: stop(plan(job)))
     monkeypatch.setattr(forecast, "LONG_RUN", 1)
     monkeypatch.setattr(forecast, "forecast", pilot)
     plan = SimpleNamespace(effects=SimpleNamespace(closed_form=False))

@@ -17,7 +17,7 @@ from mbtf_core.locks import lock_file_of, take_lock
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Result, exhausted
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.generation.folder import open_folder, read_run_plan
+from mbtf_gen.generation.folder import open_folder
 from mbtf_gen.generation.run import ShardRun, render_shard, render_shards
 from mbtf_gen.job import Job, received_job
 from mbtf_gen.planning.run_plan import plan_run
@@ -34,8 +34,7 @@ def run(tmp_path: Path) -> ShardRun:
     config = GeneratorConfig.model_validate(options | {"output": {"shard_queries": 100}})
     job = Job.prepare(config)
     folder = DataFolder.open(tmp_path / "out")
-    open_folder(job, folder, plan_run, False)
-    return ShardRun(job, folder, read_run_plan(folder))
+    return ShardRun(job, folder, open_folder(job, folder, plan_run))
 
 
 def render(run: ShardRun) -> dict[str, Any]:
