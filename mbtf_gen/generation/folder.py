@@ -24,10 +24,10 @@ from mbtf_core.files.folders import (
     remove_unfinished,
 )
 from mbtf_core.locks import brief_lock
-from mbtf_gen.generation.geometry import geometry_of
 from mbtf_gen.generation.manifest import DataSource, build_manifest, stored_plan
 from mbtf_gen.job import Job
 from mbtf_gen.planning.run_plan import RunPlan
+from mbtf_gen.planning.simulation import geometry_of
 
 
 def has_dataset(folder: DataFolder, config_hash: str) -> bool:

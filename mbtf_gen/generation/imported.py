@@ -27,6 +27,7 @@ from mbtf_gen.config.measured import ImportConfig
 from mbtf_gen.generation.folder import claim_folder
 from mbtf_gen.generation.manifest import Summary, finish, new_manifest
 from mbtf_gen.generation.shard_record import store_shard
+from mbtf_gen.job import shard_entries
 from mbtf_gen.measured.interface import MeasuredBtf, MeasuredQueries, QueryBlock
 from mbtf_gen.measured.open import open_measured
 from mbtf_gen.measured.ubo2003 import SUFFIXES
@@ -115,9 +116,8 @@ class Import(ABC):
 
     def entries(self, split: Split) -> list[ShardEntry]:
         """Shards of a split."""
-        size, total = self.config.output.shard_queries, self.count(split)
-        names = (f"{split}-{k:05d}.{self.config.output.format}" for k in range(-(-total // size)))
-        return [ShardEntry(split, k, n, min(size, total - k * size)) for k, n in enumerate(names)]
+        output = self.config.output
+        return shard_entries(split, self.count(split), output.shard_queries, output.format)
 
     def manifest(self) -> dict[str, Any]:
         """Manifest of the data set without shards."""

@@ -24,11 +24,11 @@ from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import checksummed
 from mbtf_core.locks import brief_lock
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.generation.geometry import geometry_of
 from mbtf_gen.generation.manifest import build_manifest
 from mbtf_gen.generation.run import ProgressCallback, generate
 from mbtf_gen.job import Job
 from mbtf_gen.planning.run_plan import plan_run
+from mbtf_gen.planning.simulation import geometry_of
 
 _AGAIN = "generate the data set again, into another folder"
 

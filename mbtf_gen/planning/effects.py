@@ -34,6 +34,7 @@ class ReflectionLayer(Effect):
     ----------
     scale : from the weight to the strength, of which 1 is a full layer
     text, unit : explanation, and the unit of the weight in it
+    lacking : why the material has no such layer
     """
 
     stage = "reflection"
@@ -41,10 +42,7 @@ class ReflectionLayer(Effect):
     scale: ClassVar[float] = 1.0
     text: ClassVar[str]
     unit: ClassVar[float] = 1.0
-
-    def absent(self, scene: PlanScene) -> str:
-        """Why the material has no such layer."""
-        return "no map"
+    lacking: ClassVar[str] = "no map"
 
     def weight(self, scene: PlanScene) -> float:
         """Largest weight; 0 without a map."""
@@ -57,7 +55,7 @@ class ReflectionLayer(Effect):
             return self.decision(False, text, 0.0, present=False)
         weight = self.weight(scene)
         if weight <= 0.0:
-            return self.decision(False, self.absent(scene), 0.0, present=False)
+            return self.decision(False, self.lacking, 0.0, present=False)
         strength, text = weight * self.scale, self.text.format(weight * self.unit)
         if scene.pilots is None or strength >= FAINT or not scene.is_auto(self.name):
             return self.decision(True, text)
@@ -73,11 +71,7 @@ class Specular(ReflectionLayer):
     name, description = "specular", "specular lobe"
     # A specular of 1/4 (F0 = 2 %) is the smallest that reflects everything at grazing angles.
     scale, text, unit = 4.0, "F0 up to {:.2g} %", 8.0
-
-    def absent(self, scene: PlanScene) -> str:
-        """Lambert, or specular 0."""
-        lambert = "specular" not in scene.tile.maps
-        return "Lambert: no roughness, metallic or specular" if lambert else "specular is 0 everywhere"
+    lacking = "no roughness, metallic or specular, or specular 0"
 
     def propose(self, scene: PlanScene) -> EffectDecision:
         """As any layer, but on where the material has its own BSDF."""
@@ -92,10 +86,6 @@ class Metallic(ReflectionLayer):
 
     name, description = "metallic", "metallic"
     scale, text = math.inf, "metallic up to {:.2g}"
-
-    def absent(self, scene: PlanScene) -> str:
-        """No metal."""
-        return "no metal anywhere"
 
 
 class Clearcoat(ReflectionLayer):

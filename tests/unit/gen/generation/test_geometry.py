@@ -18,9 +18,9 @@ from mbtf_core.data.geometry import Geometry, encode_geometry, geometry_record, 
 from mbtf_core.errors import InputError
 from mbtf_core.images.exr import encode_parts
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.generation.geometry import geometry_of
 from mbtf_gen.job import Job
 from mbtf_gen.planning.run_plan import reference_plan
+from mbtf_gen.planning.simulation import geometry_of
 from mbtf_gen.tile.loading import load_material
 
 F64 = NDArray[np.float64]
@@ -204,7 +204,7 @@ def test_what_the_plan_leaves_out_is_left_out(tmp_path: Path) -> None:
 
 
 def test_maps_end_at_a_finest_level(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mbtf_gen.generation.geometry.FINEST_LEVEL", 4)
+    monkeypatch.setattr("mbtf_gen.planning.simulation.FINEST_LEVEL", 4)
     shapes = [made(job_of(tmp_path, np.zeros((32, 64)), finest=k)).slopes.shape[:2] for k in (2, 3, 4, 5)]
     assert shapes == [(4, 8), (8, 16), (8, 16), (8, 16)]
 

@@ -23,12 +23,12 @@ from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.generation import folder
 from mbtf_gen.generation import repair as repairs
 from mbtf_gen.generation import run as generation
-from mbtf_gen.generation.geometry import geometry_of
 from mbtf_gen.generation.manifest import finish
 from mbtf_gen.generation.run import generate, unfinished
 from mbtf_gen.job import Job, split_queries
 from mbtf_gen.planning.effects_plan import EffectsPlan
 from mbtf_gen.planning.run_plan import RunPlan
+from mbtf_gen.planning.simulation import geometry_of
 
 load_mitsuba()
 

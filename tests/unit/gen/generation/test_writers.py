@@ -23,12 +23,12 @@ from mbtf_core.locks import shard_lock, take_lock
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.generation import run as generation
-from mbtf_gen.generation.geometry import geometry_of
 from mbtf_gen.generation.manifest import build_manifest, finish
 from mbtf_gen.generation.run import generate
 from mbtf_gen.job import Job
 from mbtf_gen.planning.effects_plan import without
 from mbtf_gen.planning.run_plan import RunPlan, reference_plan
+from mbtf_gen.planning.simulation import geometry_of
 
 load_mitsuba()
 
