@@ -7,7 +7,7 @@ configuration and of its plan.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from mbtf_core.data.folder import DataFolder, sidecar_name
 from mbtf_core.data.geometry import geometry_record
 from mbtf_core.data.manifest import plan_digest
 from mbtf_core.data.schema import CONFIG_NAME, MANIFEST_NAME
-from mbtf_core.data.verify import INCOMPLETE, Fault, foreign_files, verify
+from mbtf_core.data.verify import INCOMPLETE, Fault, verify
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import checksummed
 from mbtf_core.locks import brief_lock
@@ -44,9 +44,7 @@ class RepairResult:
     faults : list of Fault
         Faults before the repair.
     shards, documents : list of str
-        Shards, and manifest, configuration and geometry, that were generated again, or would be.
-    foreign : list of str
-        Files in the folder that are no part of the data set; they are left alone.
+        Shards, and manifest, configuration and geometry, that were generated again.
     complete : bool
         Whether all shards are finished now.
     paths, seconds : int, float
@@ -57,17 +55,15 @@ class RepairResult:
     faults: list[Fault]
     shards: list[str]
     documents: list[str]
-    foreign: list[str]
-    complete: bool = False
-    paths: int = 0
-    seconds: float = 0.0
+    complete: bool
+    paths: int
+    seconds: float
 
 
 def repair(
     folder: str | Path | DataFolder,
     *,
     material: str | None = None,
-    dry_run: bool = False,
     progress: ProgressCallback | None = None,
 ) -> RepairResult:
     """Restore what ``verify`` finds missing or corrupt; the data set is then identical to the original.
@@ -78,8 +74,6 @@ def repair(
         The data set: a path or a URL.
     material : str, optional
         Current path of the material; by default the path in the data set's configuration.
-    dry_run : bool
-        Only find out what would be restored. If the manifest is lost, other faults are not known yet.
     progress : callable, optional
         As in :func:`~mbtf_gen.generation.run.generate`.
 
@@ -100,30 +94,23 @@ def repair(
         Dataset.open(folder)  # says what is missing
     manifest, faults = _manifest(folder)
     job = _job(folder, manifest, material)
-    if manifest is None and not dry_run:
-        _restore_manifest(folder, job)
-    if manifest is not None or not dry_run:
-        faults += verify(folder)
+    if manifest is None:
+        manifest = _restored_manifest(folder, job)
+        folder.write(MANIFEST_NAME, checksummed(manifest))
+    faults += verify(folder)
     shards = {fault.file for fault in faults} & {entry.file for entry in job.shards}
     documents = {fault.file for fault in faults if fault.what != INCOMPLETE} - shards
-    found = RepairResult(
-        str(folder),
-        faults,
-        sorted(shards),
-        sorted(documents, reverse=True),
-        foreign_files(folder, job.shards),
-    )
-    if dry_run:
-        return found
     with brief_lock(folder.workspace / MANIFEST_NAME):
         # Readers rely on `complete`.
-        if shards and manifest is not None and manifest["complete"]:
+        if shards and manifest["complete"]:
             folder.write(MANIFEST_NAME, checksummed({**manifest, "complete": False, "summary": None}))
         # A shard without its sidecar is unfinished.
         for name in (*map(sidecar_name, shards), *documents - {MANIFEST_NAME}):
             folder.delete(name)
     done = generate(job, folder, progress=progress)
-    return replace(found, complete=done.complete, paths=done.paths, seconds=done.seconds)
+    return RepairResult(
+        str(folder), faults, sorted(shards), sorted(documents), done.complete, done.paths, done.seconds
+    )
 
 
 def _manifest(folder: DataFolder) -> tuple[dict[str, Any] | None, list[Fault]]:
@@ -189,8 +176,8 @@ def _stated(folder: DataFolder, key: str) -> dict[str, object]:
     return found
 
 
-def _restore_manifest(folder: DataFolder, job: Job) -> None:
-    """Write the manifest of an unfinished run, if the intact sidecars state its plan."""
+def _restored_manifest(folder: DataFolder, job: Job) -> dict[str, Any]:
+    """The manifest of an unfinished run, if an intact sidecar states its plan."""
     plan = plan_run(job)
     if plan_digest(plan.to_manifest()) not in _stated(folder, "plan").values():
         raise InputError(
@@ -198,5 +185,4 @@ def _restore_manifest(folder: DataFolder, job: Job) -> None:
             where=folder.at(MANIFEST_NAME),
             hint="repair it on the machine that generated it, or generate the data set again",
         )
-    record = geometry_record(geometry_of(job, plan.effects))
-    folder.write(MANIFEST_NAME, checksummed(build_manifest(job, plan, record)))
+    return build_manifest(job, plan, geometry_record(geometry_of(job, plan.effects)))
