@@ -49,7 +49,7 @@ def load_mitsuba(variant: str = CPU_VARIANT) -> Any:
     Parameters
     ----------
     variant : str
-        ``llvm_ad_rgb``, ``cuda_ad_rgb``, or ``auto``: CUDA where it works, else LLVM.
+        ``llvm_ad_rgb`` or ``cuda_ad_rgb``.
 
     Returns
     -------
@@ -63,10 +63,8 @@ def load_mitsuba(variant: str = CPU_VARIANT) -> Any:
     EngineError
         Mitsuba, its LLVM or the CUDA device cannot be used here; says why and what to do.
     """
-    if variant == "auto":
-        variant = CUDA_VARIANT if not prove(CUDA_VARIANT).fault else CPU_VARIANT
     if variant not in (CPU_VARIANT, CUDA_VARIANT):
-        raise UsageError(f"no variant '{variant}'", hint=f"choose {CPU_VARIANT}, {CUDA_VARIANT} or auto")
+        raise UsageError(f"no variant '{variant}'", hint=f"choose {CPU_VARIANT} or {CUDA_VARIANT}")
     if variant not in _working:
         if variant == CPU_VARIANT:
             check_llvm()
@@ -91,11 +89,7 @@ def load_mitsuba(variant: str = CPU_VARIANT) -> Any:
 
 
 def shipped_llvm() -> Path | None:
-    """Path of the libLLVM of the installation; None where there is none.
-
-    It is found through the list of files of the installed distribution, in virtual environments, user and
-    prefix installations alike.
-    """
+    """Path of the libLLVM of the installation, by the list of its files; None where there is none."""
     from importlib.metadata import PackageNotFoundError, files
 
     try:
@@ -112,11 +106,8 @@ def chosen_llvm() -> str | None:
 
 
 def _load_runtime(library: Path) -> None:
-    """Load the C++ runtime of the shipped library where the links to it do not exist.
-
-    The first interpreter that may write beside the library creates the links. There is none if an
-    administrator installs and another user runs.
-    """
+    """Load the C++ runtime of the shipped library where the links to it do not exist: the first interpreter
+    that may write beside the library creates them, and there may be none."""
     for path in (p for name in _RUNTIME for p in library.parent.glob(f"*-linux-gnu/{name}")):
         if not path.with_suffix("").exists():
             ctypes.CDLL(str(path))
@@ -141,29 +132,13 @@ def use_shipped_llvm() -> None:
 
 
 def has_version(library: str) -> bool:
-    """Whether a library reports a version: LLVM 16 and newer do.
-
-    It loads the library: call it in a child process.
-
-    Raises
-    ------
-    OSError : the library cannot be loaded
-    """
+    """Whether a library reports a version, as LLVM 16 and newer do. It is loaded: use a child process."""
     return hasattr(ctypes.CDLL(library), "LLVMGetVersion")
 
 
 def refuse_old_llvm() -> None:
-    """Refuse to run with an LLVM that is too old: some kernel would abort the process.
-
-    Dr.Jit has bound to such an LLVM where a program imports ``mitsuba`` or ``drjit`` before
-    :func:`load_mitsuba` or ``mbtf_fit.backends.mitsuba.register("llvm_ad_rgb")``, and the system's LLVM is
-    old.
-
-    Raises
-    ------
-    EngineError
-        Dr.Jit uses an LLVM older than `OLDEST_LLVM`.
-    """
+    """Raise an EngineError if Dr.Jit uses an LLVM with which some kernel would abort the process: that of the
+    system, where a program imports ``mitsuba`` or ``drjit`` first."""
     import drjit
 
     major = int(drjit.detail.llvm_version()[0])
@@ -187,13 +162,8 @@ def prove(variant: str) -> ChildResult:
 
 
 def check_llvm() -> None:
-    """Test the LLVM that Dr.Jit will use, unless an earlier run on this machine did.
-
-    Raises
-    ------
-    EngineError
-        The library is missing, broken or too old.
-    """
+    """Test the LLVM that Dr.Jit will use, unless an earlier run on this machine did; an EngineError if it is
+    missing, broken or too old."""
     use_shipped_llvm()
     library = chosen_llvm()
     passed = _proof_file(library)
@@ -227,21 +197,19 @@ def _proof_file(library: str | None) -> Path | None:
 
 
 def _llvm_error(library: str | None, fault: str) -> EngineError:
+    again = "pip install --force-reinstall karellen-llvm-core"
     if library is None:
+        what, hint = f"no usable LLVM library was found ({fault})", f"{again}, into a virtual environment"
         return EngineError(
-            f"no usable LLVM library was found ({fault})",
-            hint="reinstall into a virtual environment (pip install --target loses it), "
-            f"or set {VARIABLE} to a libLLVM of version {OLDEST_LLVM} or newer",
+            what, hint=f"{hint}, or set {VARIABLE} to a libLLVM of version {OLDEST_LLVM} or newer"
         )
     shipped = shipped_llvm()
     if shipped is not None and library == str(shipped):
-        return EngineError(
-            f"the LLVM that came with the installation cannot be used: {fault}",
-            where=library,
-            hint="install it again: pip install --force-reinstall karellen-llvm-core",
-        )
-    use = "unset it to use the LLVM of the installation" if shipped else "pip install karellen-llvm-core"
-    return EngineError(fault, where=f"{VARIABLE}={library}", hint=f"{use}, or name a newer libLLVM")
+        what = f"the LLVM that came with the installation cannot be used: {fault}"
+        return EngineError(what, where=library, hint=f"install it again: {again}")
+    return EngineError(
+        fault, where=f"{VARIABLE}={library}", hint=f"unset it ({again}), or name a newer libLLVM"
+    )
 
 
 def _mitsuba_error(fault: str) -> EngineError:
