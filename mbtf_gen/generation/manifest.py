@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from pydantic import BaseModel, PositiveInt, field_validator
+from pydantic import BaseModel, field_validator
 
 from mbtf_core.config.settings import check_document
 from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.data.dataset import Dataset
-from mbtf_core.data.folder import DataFolder, sidecar_name
+from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.lattice import Lattice, sigma_of_level
 from mbtf_core.data.manifest import CHECK_HINT, read_manifest, software_versions
 from mbtf_core.data.schema import (
@@ -41,7 +41,6 @@ from mbtf_gen.planning.effects import EFFECTS
 from mbtf_gen.planning.effects_plan import EffectsPlan
 from mbtf_gen.planning.run_plan import RunPlan
 from mbtf_gen.planning.sample_allocation import Allocation
-from mbtf_gen.render.estimates import BadSample, TargetReached
 
 
 class DataSource(Protocol):
@@ -224,31 +223,6 @@ class Summary:
     measured: bool = False
 
 
-class _Statistics(BaseModel, allow_inf_nan=False):
-    mean_value: tuple[float, float, float]
-    mean_variance: tuple[float, float, float] | None
-
-
-class _Quarantined(BaseModel):
-    nonfinite_samples: int
-    nonfinite_at: list[BadSample]
-    lost_rays: int
-    capped_rays: int
-
-
-class _Sidecar(BaseModel, allow_inf_nan=False):
-    """Keys of a sidecar that :func:`finish` needs."""
-
-    split: str
-    file: str
-    queries: PositiveInt
-    paths: int
-    seconds: float
-    statistics: _Statistics
-    quarantined: _Quarantined
-    target: TargetReached | None
-
-
 def finish(
     folder: str | Path | DataFolder,
     *,
@@ -279,7 +253,6 @@ def finish(
         if record is None:
             complete = False
         else:
-            check_document(_Sidecar, record, folder.at(sidecar_name(entry.file)), CHECK_HINT)
             totals.add(record)
     if complete:
         totals.refuse_nonfinite(totals.paths, folder)
