@@ -251,18 +251,6 @@ def test_rounded_footprints_add_no_level(opened: Open) -> None:
         assert opened(source).lattice.finest == finest
 
 
-def test_only_images_identify_a_folder(tmp_path: Path) -> None:
-    """File managers leave files of their own behind."""
-    photographs = tmp_path / "photographs"
-    photographs.mkdir()
-    (photographs / "tl000 pl000 tv000 pv000.JPG").write_bytes(b"one")
-    before = imported._digest(photographs)
-    (photographs / "Thumbs.db").write_bytes(b"cache")
-    assert imported._digest(photographs) == before
-    (photographs / "tl015 pl000 tv000 pv000.png").write_bytes(b"two")
-    assert imported._digest(photographs) != before
-
-
 def test_rounded_footprints_of_the_whole_tile_are_fitted(opened: Open, tmp_path: Path) -> None:
     """Half precision rounds 0.5 up; the fit must not look for a level before the first."""
     source = Listed()

@@ -44,13 +44,6 @@ def test_irradiance_of_the_lobe(width: float) -> None:
 
 
 @pytest.mark.parametrize("width", WIDTHS)
-def test_irradiance_at_the_zenith_has_a_closed_form(width: float) -> None:
-    kappa = concentration(width)
-    exact = (1.0 - 1.0 / kappa + np.exp(-kappa) / kappa) / -np.expm1(-2 * kappa)
-    np.testing.assert_allclose(lobe_irradiance(kappa, np.pi / 2), exact, rtol=1e-9)
-
-
-@pytest.mark.parametrize("width", WIDTHS)
 def test_the_table_is_as_good_as_the_integral(width: float) -> None:
     light = LightKernel(width)
     elevation = np.concatenate([np.random.default_rng(0).uniform(0, 90, 300), np.geomspace(1e-4, 10, 100)])

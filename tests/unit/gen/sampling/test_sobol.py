@@ -122,15 +122,6 @@ def test_lengths_that_fill_no_net_are_unbiased_and_no_worse_than_independent_poi
     assert t_test(mean_estimate(means[0] * means[1])).p_value > 1e-3
 
 
-def test_a_smooth_integral_converges_faster_than_independent_points() -> None:
-    xy = pairs(points(), LENGTH)
-    value = np.sin(3.0 * xy[..., 0]) * np.exp(xy[..., 1])
-    exact = (1 - np.cos(3.0)) / 3.0 * (np.e - 1)
-    net, independent = value.mean(axis=1), value.reshape(-1).var() / LENGTH
-    assert t_test(mean_estimate(net), exact).p_value > 1e-3
-    assert net.var() < independent / 20
-
-
 def test_plain_numbers_are_uniform_and_leave_the_dimensions_alone() -> None:
     plain, sampler = points(1 << 12), points(1 << 12)
     numbers = np.array([np.array(plain.chance(), np.float64) for _ in range(2)])
