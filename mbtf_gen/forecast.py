@@ -35,21 +35,15 @@ class Forecast:
 
     Attributes
     ----------
-    seconds, seconds_se : float
-        Of sampling, tracing and writing all queries with compiled kernels, and the standard error.
-    start : float
-        Seconds of loading, compiling and the pilot's first piece.
-    query_seconds : float
-        Seconds per training query.
-    paths : int
-        Of all splits, including the queries' own pilots under a target error.
-    paths_per_query : float
-        Mean over the training split, without pilots.
-    bytes : int
-        Of all shards.
-    relative_error, relative_error_se : float
-        RMS noise of one training value relative to the mean value, as in a run's summary, and its standard
-        error.
+    seconds, seconds_se : of sampling, tracing and writing all queries with compiled kernels, and the standard
+        error
+    start : seconds of loading, compiling and the pilot's first piece
+    query_seconds : seconds per training query
+    paths : of all splits, including the queries' own pilots under a target error
+    paths_per_query : mean over the training split, without pilots
+    bytes : of all shards
+    relative_error, relative_error_se : RMS noise of one training value relative to the mean value, as in a
+        run's summary, and its standard error
     """
 
     seconds: float
@@ -84,16 +78,8 @@ def forecast(job: Job, plan: RunPlan, seconds: float = 2.0) -> Forecast:
 
     Parameters
     ----------
-    job : Job
-        The run.
-    plan : RunPlan
-        Its plan.
-    seconds : float
-        Time of the pilot at most, after its first pieces.
-
-    Returns
-    -------
-    Forecast
+    job, plan : the run
+    seconds : time of the pilot at most, after its first pieces
     """
     began = time.perf_counter()
     estimator = build_estimator(job, plan.effects)

@@ -170,37 +170,22 @@ class Summary:
 
     Attributes
     ----------
-    folder : str
-        The data set.
-    complete : bool
-        Whether all shards of the manifest are finished.
-    queries : int
-        Queries in finished shards, of all splits.
-    splits : dict of str to int
-        The same by split.
-    paths, seconds, paths_per_second : int, float, float
-        Paths traced in this run, its duration, their ratio.
-    writing_seconds : float
-        Processor time of writing and digesting in this run, parallel to the rendering.
-    waiting_seconds : float
-        Time that rendering waited for the writer.
-    shard_seconds : float
-        Rendering time of all finished shards, over all runs.
-    relative_error : float or None
-        Pooled relative standard error of the training values, √(mean variance) / mean value; None where
-        their noise is unknown.
-    mean_value : list of float
-        Mean training value per channel, 1/sr.
-    lost, capped, nonfinite : int
-        Rays that slipped through the surface, rays cut at the cap on tile crossings, and non-finite samples
-        that were sampled again, over all shards.
-    effects : list of str
-        Effects that are simulated, in words.
-    target : dict or None
-        Under a target error: the RMS error ``reached``, the number of queries that ``missed`` it, their
-        ``share``, and the ``worst`` error among them.
-    measured : bool
-        Whether the values are measured, not rendered.
+    folder : the data set
+    complete : whether all shards of the manifest are finished
+    queries, splits : queries in finished shards: of all splits, and by split
+    paths, seconds, paths_per_second : paths traced in this run, its duration, their ratio
+    writing_seconds : processor time of writing and digesting in this run, parallel to the rendering
+    waiting_seconds : time that rendering waited for the writer
+    shard_seconds : rendering time of all finished shards, over all runs
+    relative_error : pooled relative standard error of the training values, √(mean variance) / mean value;
+        None where their noise is unknown
+    mean_value : mean training value per channel, 1/sr
+    lost, capped, nonfinite : rays that slipped through the surface, rays cut at the cap on tile crossings,
+        and non-finite samples that were sampled again, over all shards
+    effects : effects that are simulated, in words
+    target : under a target error, the RMS error ``reached``, the number of queries that ``missed`` it, their
+        ``share``, and the ``worst`` error among them
+    measured : whether the values are measured, not rendered
     """
 
     folder: str

@@ -136,17 +136,8 @@ class ShardRun:
     """What the shards of a run share, built once in each process.
 
     Pickled, it is its job, its folder and the digest of its plan: a worker reads the plan from the manifest
-    that it sees, and writes into the folder itself.
-
-    Parameters
-    ----------
-    job : Job
-    folder : DataFolder
-        The data set.
-    plan : RunPlan
-        That of its manifest.
-    received : bool
-        Another process sent it, which gives a shard to one worker alone.
+    that it sees, and writes into the folder itself. The process that sent a `received` run gives a shard to
+    one worker alone.
     """
 
     def __init__(self, job: Job, folder: DataFolder, plan: RunPlan, received: bool = False) -> None:
@@ -194,12 +185,8 @@ class ShardRun:
 
 @lru_cache(maxsize=1)
 def received_run(config: str, config_hash: str, folder: str, digest: str) -> ShardRun:
-    """The run of another process, kept for its next shard.
-
-    Raises
-    ------
-    InputError : this machine does not see the folder or the material, or has others of them
-    """
+    """The run of another process, kept for its next shard; an InputError if this machine does not see the
+    folder or the material, or has others of them."""
     found = DataFolder.open(folder)
     if not found.has(MANIFEST_NAME):
         raise InputError("this machine does not see the data set", where=folder)
@@ -212,24 +199,13 @@ def received_run(config: str, config_hash: str, folder: str, digest: str) -> Sha
 def render_shard(run: ShardRun, entry: ShardEntry) -> Generator[None, None, dict[str, Any]]:
     """Render one shard into its folder, unless it is finished; a task in three parts.
 
-    Parameters
-    ----------
-    run : ShardRun
-    entry : ShardEntry
-        The shard.
-
-    Returns
-    -------
-    dict
-        ``record`` (the sidecar), ``rendered`` (whether this call rendered it), ``writing`` (processor seconds
-        of writing and digesting).
+    Returns ``record`` (the sidecar), ``rendered`` (whether this call rendered it), ``writing`` (processor
+    seconds of writing and digesting).
 
     Raises
     ------
-    LockedError
-        Another process writes it.
-    PartialError
-        The disk is full, or the store cannot be reached.
+    LockedError : another process writes it
+    PartialError : the disk is full, or the store cannot be reached
     """
     if (record := run.finished(entry)) is not None:
         return {"record": record, "rendered": False, "writing": 0.0}
@@ -263,14 +239,8 @@ def render_shard(run: ShardRun, entry: ShardEntry) -> Generator[None, None, dict
 
 @dataclass
 class Traced:
-    """Work of :func:`render_shards`.
-
-    Attributes
-    ----------
-    paths : traced
-    writing : processor seconds of writing and digesting, parallel to the rendering
-    waiting : seconds that this process waited for the writing
-    """
+    """Work of :func:`render_shards`: paths traced, processor seconds of writing and digesting parallel to
+    rendering, and seconds that this process waited for the writing."""
 
     paths: int = 0
     writing: float = 0.0

@@ -26,20 +26,13 @@ class EffectsPlan:
 
     Attributes
     ----------
-    effects : tuple of EffectDecision
-        One decision per effect.
-    max_depth : int
-        Surface interactions of a path at most; 0 means no limit.
-    cap_bias_bound : float
-        Bias bound of that limit, where the plan chose it.
-    roulette_depth : int
-        Surface interactions before Russian roulette begins.
-    mode : str
-        The user's request.
-    tolerance : float
-        Allowed bias bound of everything that is left out together.
-    closed_form : bool
-        Whether M is known without tracing.
+    effects : one decision per effect
+    max_depth : surface interactions of a path at most; 0 means no limit
+    cap_bias_bound : bias bound of that limit, where the plan chose it
+    roulette_depth : surface interactions before Russian roulette begins
+    mode : the user's request
+    tolerance : allowed bias bound of everything that is left out together
+    closed_form : whether M is known without tracing
     """
 
     effects: tuple[EffectDecision, ...]

@@ -30,10 +30,8 @@ class RunPlan:
 
     Attributes
     ----------
-    effects : EffectsPlan
-        Effects that are simulated.
-    allocation : Allocation or None
-        Numbers of paths by query; None where all queries get the same.
+    effects : effects that are simulated
+    allocation : numbers of paths by query; None where all queries get the same
     """
 
     effects: EffectsPlan
@@ -69,20 +67,13 @@ def plan_effects(job: Job, *, pilots: bool = True) -> EffectsPlan:
 
     Parameters
     ----------
-    job : Job
-        Configuration and material.
-    pilots : bool
-        Whether pilots measure where theory gives no bound. Otherwise such effects stay on.
-
-    Returns
-    -------
-    EffectsPlan
+    job : configuration and material
+    pilots : whether pilots measure where theory gives no bound; otherwise such effects stay on
 
     Raises
     ------
-    UsageError
-        The user requests an unknown effect, one that the material lacks, or one that needs another that is
-        switched off.
+    UsageError : the user requests an unknown effect, one that the material lacks, or one that needs another
+        that is switched off
     """
     request = EffectsRequest.parse(job.config.effects.mode, EFFECTS)
     scene = PlanScene(job, request)

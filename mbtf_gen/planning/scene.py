@@ -29,22 +29,13 @@ class EffectDecision:
 
     Attributes
     ----------
-    name : str
-        Name of the effect.
-    on : bool
-        Whether the effect is simulated.
-    explanation : str
-        Why, in words.
-    bias_bound : float or None
-        Root mean square change of M without the effect, relative to the mean of M: an upper bound where the
-        effect is off, an estimate where it is on. None where it is unknown.
-    reason : {"exact", "bound", "pilot", "forced"}
-        What the decision rests on: the material and the options alone, a bound from theory, a pilot or an
-        estimate on the maps, or the user's request.
-    present : bool
-        Whether the effect can be switched. If not, the material lacks it or requires it.
-    error : float
-        Standard error of a measured bias bound.
+    name, on, explanation : the effect, whether it is simulated, and why
+    bias_bound : root mean square change of M without the effect, relative to the mean of M: an upper bound
+        where the effect is off, an estimate where it is on; None where it is unknown
+    reason : what the decision rests on: the material and the options alone (``exact``), a bound from theory,
+        a pilot or an estimate on the maps, or the user's request (``forced``)
+    present : whether the effect can be switched; if not, the material lacks it or requires it
+    error : standard error of a measured bias bound
     """
 
     name: str
@@ -212,19 +203,13 @@ class Effect(ABC):
 
     Attributes
     ----------
-    name, description : str
-        As users write it, and in words.
-    stage : {"reflection", "maps", "transport"}
-        When it is decided: how the surface reflects, what maps add, how light travels.
-    switch : str
-        Field of :class:`~mbtf_gen.render.path_tracer.Transport` that it sets; empty for none.
-    alters_tile : bool
-        Whether the tile's shape or surface is another without it.
-    displaced : bool
-        Whether it needs the displaced surface.
-    order : int
-        When it is decided among those of the stage ``transport``: what is left of the tolerance passes from
-        one to the next, and pilots need the decisions before them.
+    name, description : as users write it, and in words
+    stage : when it is decided: how the surface reflects, what maps add, how light travels
+    switch : field of :class:`~mbtf_gen.render.path_tracer.Transport` that it sets; empty for none
+    alters_tile : whether the tile's shape or surface is another without it
+    displaced : whether it needs the displaced surface
+    order : when it is decided among those of the stage ``transport``: what is left of the tolerance passes
+        from one to the next, and pilots need the decisions before them
     """
 
     name: ClassVar[str]

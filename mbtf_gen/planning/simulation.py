@@ -42,26 +42,15 @@ def build_estimator(
 
     Parameters
     ----------
-    job : Job
-        Configuration and material.
-    plan : EffectsPlan
-        Effects to simulate.
-    tiles : dict, optional
-        Tiles of this job built so far, by the effects that change them. Plans that share a dictionary share
-        their tiles.
-    variant : str
-        Variant of Mitsuba, which sets the device; one per process.
-
-    Returns
-    -------
-    Estimator or ClosedForm
+    job, plan : configuration and material, and the effects to simulate
+    tiles : tiles of this job built so far, by the effects that change them; plans that share a dictionary
+        share their tiles
+    variant : of Mitsuba, which sets the device; one per process
 
     Raises
     ------
-    InputError
-        Mitsuba does not accept the material's BSDF.
-    EngineError
-        Mitsuba or the device cannot be used here.
+    InputError : Mitsuba does not accept the material's BSDF
+    EngineError : Mitsuba or the device cannot be used here
     """
     if plan.closed_form:
         return ClosedForm(np.asarray(job.material.base_color, np.float64).reshape(-1, 3)[0])
@@ -101,20 +90,8 @@ def shading_slopes(job: Job, plan: EffectsPlan) -> NDArray[np.float64] | None:
 
 
 def geometry_of(job: Job, plan: EffectsPlan) -> Geometry | None:
-    """Geometry of a job's surface, without the effects that its plan leaves out.
-
-    Parameters
-    ----------
-    job : Job
-        Configuration and material.
-    plan : EffectsPlan
-        Effects that are simulated.
-
-    Returns
-    -------
-    Geometry or None
-        None for fibers, which have neither heights nor slopes.
-    """
+    """Geometry of a job's surface, without the effects that its plan leaves out; None for fibers, which have
+    neither heights nor slopes."""
     material, grid = job.material, job.material.grid
     if grid is None:
         return None

@@ -14,7 +14,7 @@ from mbtf_gen.job import Job
 from mbtf_gen.planning.effects import EFFECTS
 from mbtf_gen.planning.effects_plan import EffectsPlan
 from mbtf_gen.planning.run_plan import plan_effects, reference_plan
-from mbtf_gen.planning.scene import EffectDecision, EffectsRequest
+from mbtf_gen.planning.scene import EffectsRequest
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 
 HEIGHTS = np.array([[0.0, 0.1], [0.05, 0.02]])
@@ -110,15 +110,6 @@ def test_effects_that_the_material_lacks_cannot_be_forced_on(name: str) -> None:
 def test_unknown_words_are_refused(text: str) -> None:
     with pytest.raises(UsageError, match="is not an effect"):
         EffectsRequest.parse(text, EFFECTS)
-
-
-def test_bias_bounds_add_up_over_what_is_off() -> None:
-    effects = (
-        EffectDecision("parallax", True, "", 0.5),
-        EffectDecision("shadowing", False, "", 0.001),
-        EffectDecision("bsdf_sampling", False, "", 0.002),
-    )
-    assert EffectsPlan(effects).bias_bound == pytest.approx(0.003)
 
 
 def test_a_small_run_has_no_pilot() -> None:
