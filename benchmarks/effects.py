@@ -31,8 +31,7 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
 from mbtf_gen.planning.bounds import Change
 from mbtf_gen.planning.effects_plan import EffectsPlan, without
-from mbtf_gen.planning.pilot import PILOT_ROULETTE, measured
-from mbtf_gen.planning.run_plan import SMALL_RUN, plan_effects
+from mbtf_gen.planning.run_plan import PILOT_ROULETTE, SMALL_RUN, measured, plan_effects
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.tile.loading import load_material

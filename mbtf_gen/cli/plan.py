@@ -42,8 +42,7 @@ def plan(
         console.report({**found.to_manifest(), "forecast": None}, found.describe())
         return
     from mbtf_gen.forecast import forecast
-    from mbtf_gen.planning.pilot import measured
-    from mbtf_gen.planning.run_plan import allocate
+    from mbtf_gen.planning.run_plan import allocate, measured
 
     expected = forecast(job, allocate(job, found))
     found = measured(job, found)

@@ -1,6 +1,7 @@
 """The plan of a run: which effects it simulates, and how many paths each query gets.
 
-Every effect proposes, the user's request counts, and a tolerance is divided.
+Every effect proposes, the user's request counts, and a tolerance is divided. Pilots, small runs of the
+generator, measure the bias of leaving effects out where theory gives no bound.
 """
 
 from __future__ import annotations
@@ -12,16 +13,22 @@ from typing import Any
 import numpy as np
 
 from mbtf_gen.job import Job, planned_paths
-from mbtf_gen.planning.bounds import POINTS, Change, DisplacementBounds, displacement_bounds
+from mbtf_gen.planning.bounds import CAUTION, FEW, POINTS, Change, DisplacementBounds, displacement_bounds
 from mbtf_gen.planning.effects import EFFECTS
 from mbtf_gen.planning.effects_plan import EffectsPlan, consistent, without
-from mbtf_gen.planning.pilot import Pilot, pilot_queries
 from mbtf_gen.planning.sample_allocation import Allocation, measure_allocation
 from mbtf_gen.planning.scene import EffectDecision, EffectsRequest, PlanScene
+from mbtf_gen.planning.simulation import build_estimator, pilot_queries
+from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.sampling.light_kernel import LightKernel
 
 # Runs of fewer paths end before a pilot has paid for itself.
 SMALL_RUN = 10_000_000
+# Queries of the pilot and paths of each.
+PILOT_QUERIES, PILOT_SPP = 8192, 4
+# Interactions before roulette. With early roulette few paths would reach late interactions, with large
+# weights, and both halves of a query would hardly ever see the same.
+PILOT_ROULETTE = 12
 
 
 @dataclass(frozen=True)
@@ -117,6 +124,35 @@ def _plan(scene: PlanScene, proposals: Mapping[str, EffectDecision] | None = Non
     )
 
 
+class Pilot:
+    """Compares queries of a run under one plan with the same queries under others.
+
+    All estimates use the same random numbers, so that unchanged paths cancel.
+    """
+
+    def __init__(self, job: Job, plan: EffectsPlan) -> None:
+        self.job = job
+        self.queries = pilot_queries(job, PILOT_QUERIES)
+        self._tiles: dict[frozenset[str], Any] = {}
+        self.estimator = build_estimator(job, plan, self._tiles)
+        self.full = self._run(self.estimator)
+
+    def _run(self, estimator: Any, limit: int | None = None) -> Estimates:
+        stream = Stream(self.job.config.seed, "pilot", 0)
+        found: Estimates = estimator.estimate(
+            self.queries, PILOT_SPP, stream, limit=limit, roulette=PILOT_ROULETTE
+        )
+        return found
+
+    def limited(self, limit: int) -> Change:
+        """Change under a limit on surface interactions, with the same kernel."""
+        return Change.of(self.full, self._run(self.estimator, limit))
+
+    def changed(self, plan: EffectsPlan) -> Change:
+        """Change under another plan."""
+        return Change.of(self.full, self._run(build_estimator(self.job, plan, self._tiles)))
+
+
 class _ScenePilots:
     """Pilots of a scene, see :class:`mbtf_gen.planning.scene.Pilots`."""
 
@@ -169,3 +205,33 @@ def _has_closed_form(scene: PlanScene, plan: EffectsPlan) -> bool:
         return True
     one = bool(np.all(base == base.reshape(-1, 3)[0]))
     return one and scene.flat and not on & {"parallax", "normal"}
+
+
+def measured(job: Job, plan: EffectsPlan) -> EffectsPlan:
+    """The plan with measured bias bounds: each effect that is on is left out once, with its dependents."""
+    if plan.closed_form:
+        return plan
+    pilot = Pilot(job, plan)
+
+    def measure(effect: EffectDecision) -> EffectDecision:
+        if not effect.on or not effect.present:
+            return effect
+        cut = without(plan, effect.name)
+        removed = [
+            e.description
+            for name, e in EFFECTS.items()
+            if name in plan.names_on - cut.names_on - {effect.name}
+        ]
+        listed = " and ".join([", ".join(removed[:-1]), *removed[-1:]]).removeprefix(" and ")
+        text = f"; the bound includes {listed}" if removed else ""
+        change = pilot.changed(cut)
+        upper = change.upper if change.changed >= FEW else change.bound()
+        return replace(
+            effect,
+            explanation=effect.explanation + text,
+            bias_bound=change.rms,
+            error=(upper - change.rms) / CAUTION,
+            reason="pilot",
+        )
+
+    return replace(plan, effects=tuple(measure(e) for e in plan.effects))

@@ -27,8 +27,7 @@ from numpy.typing import NDArray
 from mbtf_core.data.queries import Queries
 from mbtf_gen.job import Job
 from mbtf_gen.planning.effects_plan import EffectsPlan
-from mbtf_gen.planning.pilot import pilot_queries
-from mbtf_gen.planning.simulation import build_estimator
+from mbtf_gen.planning.simulation import build_estimator, pilot_queries
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.sampling import exact_math as exact
 

@@ -75,6 +75,15 @@ def build_estimator(
     return Estimator(tiles[key], LightKernel(job.config.light.width), transport)
 
 
+def pilot_queries(job: Job, count: int, shard: int = 0) -> Queries:
+    """`count` queries (one leading axis) with the run's distribution, from a random stream of their own per
+    `shard`.
+
+    In both layouts every query has its own footprint and directions: a few images would have few of them.
+    """
+    return replace(job.query_plan, layout="shuffled", patch_size=None).draw("pilot", shard, count)
+
+
 def shading_slopes(job: Job, plan: EffectsPlan) -> NDArray[np.float64] | None:
     """Slopes (h, w, 2) that shading adds to the geometry's: those of the normal map, and those of the heights
     where they are not displaced."""

@@ -15,10 +15,9 @@ from mbtf_gen.planning import run_plan
 from mbtf_gen.planning.bounds import Change, displacement_bounds
 from mbtf_gen.planning.effects import bounce_bound
 from mbtf_gen.planning.effects_plan import EffectsPlan, without
-from mbtf_gen.planning.pilot import pilot_queries
 from mbtf_gen.planning.run_plan import plan_effects
 from mbtf_gen.planning.scene import EffectDecision, EffectsRequest, PlanScene
-from mbtf_gen.planning.simulation import build_estimator
+from mbtf_gen.planning.simulation import build_estimator, pilot_queries
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.sampling.light_kernel import LightKernel
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile

@@ -17,9 +17,8 @@ from mbtf_gen.job import Job
 from mbtf_gen.planning.bounds import Change
 from mbtf_gen.planning.effects import EFFECTS
 from mbtf_gen.planning.effects_plan import EffectsPlan, without
-from mbtf_gen.planning.pilot import pilot_queries
 from mbtf_gen.planning.run_plan import plan_effects
-from mbtf_gen.planning.simulation import build_estimator
+from mbtf_gen.planning.simulation import build_estimator, pilot_queries
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 

@@ -13,9 +13,8 @@ from support.paths import ROOT
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
 from mbtf_gen.planning.bounds import Change
-from mbtf_gen.planning.pilot import pilot_queries
 from mbtf_gen.planning.run_plan import plan_effects, reference_plan
-from mbtf_gen.planning.simulation import build_estimator
+from mbtf_gen.planning.simulation import build_estimator, pilot_queries
 from mbtf_gen.render.estimates import Stream
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 from mbtf_gen.tile.heights.grid import HeightGrid
