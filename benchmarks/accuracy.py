@@ -45,8 +45,7 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.job import Job
 from mbtf_gen.planning.adaptive import estimate_shard, round_up
-from mbtf_gen.planning.effects_planner import reference_plan
-from mbtf_gen.planning.run_plan import plan_run
+from mbtf_gen.planning.run_plan import plan_run, reference_plan
 from mbtf_gen.planning.sample_allocation import measure_allocation
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream, Target

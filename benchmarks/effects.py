@@ -28,11 +28,10 @@ import numpy as np
 from common import ASSETS, finish, parser_of, start
 
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.effects.plan import EffectsPlan, without
 from mbtf_gen.job import Job
-from mbtf_gen.planning.effects_planner import plan_effects
-from mbtf_gen.planning.pilot import PILOT_ROULETTE, measured, relative_change
-from mbtf_gen.planning.run_plan import SMALL_RUN
+from mbtf_gen.planning.bounds import Change
+from mbtf_gen.planning.effects_plan import EffectsPlan, without
+from mbtf_gen.planning.run_plan import PILOT_ROULETTE, SMALL_RUN, measured, plan_effects
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.tile.loading import load_material
@@ -82,7 +81,8 @@ def compare(name: str, material: Tile, queries: int, spp: int, rounds: int) -> d
             if turn:
                 seconds[mode].append(took)
     full, auto = values["all"], values["auto"]
-    change, cautious = relative_change(full, auto)
+    found = Change.of(full, auto)
+    change, cautious = found.rms, found.upper
     shift = (0.5 * (full.value_a + full.value_b) - 0.5 * (auto.value_a + auto.value_b)).mean(axis=1)
     mean = float(full.value_a.mean())
     z = float(shift.mean() / (shift.std() / np.sqrt(len(shift)))) if shift.any() else 0.0

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 
 from mbtf_gen.measured.neumip_hdf5 import write_neumip
 from mbtf_gen.measured.neural_btf_hdf5 import write_neural_btf
-from mbtf_gen.sampling.slice_directions import direction_pairs, slice_directions
+from mbtf_gen.sampling.query_sampler import direction_pairs, slice_directions
 
 GENERATE = {"peak_gib": 2.0, "first_shard_seconds": 10.0}
 IMPORT = {"peak_gib": 4.0}

@@ -7,21 +7,19 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from mbtf_core.app.console import Console
-from mbtf_core.data.schema import Queries, ShardEntry, Split
-from mbtf_core.data.shard_files import row_bytes, write_shard
+from mbtf_core.data.schema import ShardEntry
+from mbtf_core.data.shard_files import write_shard
 from mbtf_core.forecast import pilot_seconds
 from mbtf_core.stats import pooled_error
 from mbtf_core.units import clock, expectation, size_text
-from mbtf_gen.job import Job, most_paths, planned_paths, split_queries, split_spp, split_target
+from mbtf_gen.job import Job, data_bytes, most_paths, planned_paths, split_queries, split_spp, split_target
 from mbtf_gen.planning.adaptive import estimate_shard
-from mbtf_gen.planning.pilot import pilot_queries
 from mbtf_gen.planning.run_plan import RunPlan
-from mbtf_gen.planning.simulation import build_estimator
+from mbtf_gen.planning.simulation import build_estimator, pilot_queries
 from mbtf_gen.render.estimates import Estimates, Stream, Target
 
 # Paths of one piece of the pilot.
@@ -36,21 +34,15 @@ class Forecast:
 
     Attributes
     ----------
-    seconds, seconds_se : float
-        Of sampling, tracing and writing all queries with compiled kernels, and the standard error.
-    start : float
-        Seconds of loading, compiling and the pilot's first piece.
-    query_seconds : float
-        Seconds per training query.
-    paths : int
-        Of all splits, including the queries' own pilots under a target error.
-    paths_per_query : float
-        Mean over the training split, without pilots.
-    bytes : int
-        Of all shards.
-    relative_error, relative_error_se : float
-        RMS noise of one training value relative to the mean value, as in a run's summary, and its standard
-        error.
+    seconds, seconds_se : of sampling, tracing and writing all queries with compiled kernels, and the standard
+        error
+    start : seconds of loading, compiling and the pilot's first piece
+    query_seconds : seconds per training query
+    paths : of all splits, including the queries' own pilots under a target error
+    paths_per_query : mean over the training split, without pilots
+    bytes : of all shards
+    relative_error, relative_error_se : RMS noise of one training value relative to the mean value, as in a
+        run's summary, and its standard error
     """
 
     seconds: float
@@ -80,90 +72,53 @@ class Forecast:
         )
 
 
-class _Pilot:
-    """Pieces of one split, estimated as in the run, from the pilot's random streams."""
-
-    def __init__(self, job: Job, plan: RunPlan, estimator: Any, split: Split) -> None:
-        self._job, self._plan, self._estimator, self._split = job, plan, estimator, split
-        self.found: list[Estimates] = []
-        self.spp = split_spp(job.config, split)
-        self.target = split_target(job.config, split)
-        self.size = max(1, _PIECE_PATHS // (self.spp if self.target is None else self.target.max_spp))
-
-    def piece(self, number: int) -> int:
-        """Sample, trace, write like a shard, and delete some queries; returns their number."""
-        count = min(self.size, split_queries(self._job, self._split))
-        queries = pilot_queries(self._job, max(1, count), number)
-        stream = Stream(self._job.config.seed, "pilot", number)
-        allocation = self._plan.allocation
-        found = estimate_shard(self._estimator, queries, self.spp, self.target, stream, allocation)
-        _write(queries, found)
-        self.found.append(found)
-        return len(found.value_a)
-
-    @property
-    def queries(self) -> int:
-        """Number of queries so far."""
-        return sum(len(found.value_a) for found in self.found)
-
-    @property
-    def stored(self) -> int:
-        """Paths of the stored values."""
-        return sum(
-            self.spp * len(found.value_a) if found.spp is None else int(found.spp.sum())
-            for found in self.found
-        )
-
-    @property
-    def paths(self) -> int:
-        """All paths, those of the queries' own pilots included."""
-        return max(sum(found.paths for found in self.found), self.stored)
-
-
 def forecast(job: Job, plan: RunPlan, seconds: float = 2.0) -> Forecast:
-    """Trace a small part of each split and extrapolate.
+    """Trace a small part of the training split and extrapolate.
 
     Parameters
     ----------
-    job : Job
-        The run.
-    plan : RunPlan
-        Its plan.
-    seconds : float
-        Time spent on the training split at most, after the first pieces.
-
-    Returns
-    -------
-    Forecast
+    job, plan : the run
+    seconds : time of the pilot at most, after its first pieces
     """
     began = time.perf_counter()
     estimator = build_estimator(job, plan.effects)
-    train = _Pilot(job, plan, estimator, "train")
+    spp, target = split_spp(job.config, "train"), split_target(job.config, "train")
+    count, test_paths = split_queries(job, "train"), split_queries(job, "test") * job.config.queries.test_spp
+    size = max(1, _PIECE_PATHS // (spp if target is None else target.max_spp))
+    found: list[Estimates] = []
+
+    def stored(estimates: Estimates) -> int:
+        return spp * len(estimates.value_a) if estimates.spp is None else int(estimates.spp.sum())
+
+    def piece(number: int) -> int:
+        """Estimate and write some queries as in the run; returns their paths."""
+        queries = pilot_queries(job, max(1, min(size, count)), number)
+        stream = Stream(job.config.seed, "pilot", number)
+        found.append(estimate_shard(estimator, queries, spp, target, stream, plan.allocation))
+        arrays = vars(queries) | {name: getattr(found[-1], name) for name in ("value_a", "value_b")}
+        with tempfile.TemporaryDirectory(prefix="mbtf-forecast-") as folder:
+            write_shard(Path(folder) / "piece.npz", arrays)
+        return max(found[-1].paths, stored(found[-1]))
+
     # Piece 0 compiles the kernels. Under a target error it traces fewer paths than the cap allows.
-    first = train.piece(0)
+    first = piece(0)
     start = time.perf_counter() - began
-    train.size = max(1, _PIECE_PATHS * first // max(train.paths, 1))
-    train.found.clear()
-    each = pilot_seconds(train.piece, seconds)
-    count, test_count = split_queries(job, "train"), split_queries(job, "test")
-    total = each.scaled(count)
-    expected, variance = total.value, total.error**2
-    if test_count:
-        test = pilot_seconds(_Pilot(job, plan, estimator, "test").piece, 0.25 * seconds).scaled(test_count)
-        expected, variance = expected + test.value, variance + test.error**2
-    a, b = (
-        np.concatenate([getattr(found, name) for found in train.found]) for name in ("value_a", "value_b")
-    )
+    size = max(1, _PIECE_PATHS * len(found.pop().value_a) // max(first, 1))
+    path = pilot_seconds(piece, seconds)
+    a, b = (np.concatenate([getattr(one, name) for one in found]) for name in ("value_a", "value_b"))
+    per_query = sum(max(one.paths, stored(one)) for one in found) / len(a)
+    paths = round(count * per_query) + test_paths
+    total = path.scaled(paths)
     mean = 0.5 * float(np.mean(a, dtype=np.float64) + np.mean(b, dtype=np.float64))
     error = pooled_error(a, b).scaled(1.0 / mean if mean > 0 else 0.0)
     return Forecast(
-        seconds=expected,
-        seconds_se=variance**0.5,
+        seconds=total.value,
+        seconds_se=total.error,
         start=start,
-        query_seconds=each.value,
-        paths=round(count * train.paths / train.queries) + test_count * split_spp(job.config, "test"),
-        paths_per_query=train.stored / train.queries,
-        bytes=(count + test_count) * row_bytes(plan.effects.on("opacity")),
+        query_seconds=path.value * per_query,
+        paths=paths,
+        paths_per_query=sum(map(stored, found)) / len(a),
+        bytes=data_bytes(job, job.shards),
         relative_error=error.value,
         relative_error_se=error.error,
     )
@@ -193,11 +148,3 @@ def announce_shards(
         return expected.start + share * expected.seconds
 
     announce(console, 0 if plan.effects.closed_form else share * most_paths(job), seconds, size)
-
-
-def _write(queries: Queries, found: Estimates) -> None:
-    """Write a piece like a shard, and delete it."""
-    arrays = vars(queries) | {name: getattr(found, name) for name in ("value_a", "value_b")}
-    arrays["spp"] = np.ones(len(queries.sigma), np.float32)
-    with tempfile.TemporaryDirectory(prefix="mbtf-forecast-") as folder:
-        write_shard(Path(folder) / "piece.npz", arrays)

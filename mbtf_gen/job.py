@@ -16,8 +16,14 @@ from mbtf_core.data.shard_files import row_bytes
 from mbtf_core.errors import InputError, UsageError
 from mbtf_gen.config.generator import GeneratorConfig, count_queries
 from mbtf_gen.render.estimates import TARGET_PILOT_SPP, Target
-from mbtf_gen.sampling.query_sampler import F32, LevelMixture, QueryPlan
-from mbtf_gen.sampling.slice_directions import UBO2003_COUNT, UBO2003_LOWEST, slice_directions
+from mbtf_gen.sampling.query_sampler import (
+    F32,
+    UBO2003_COUNT,
+    UBO2003_LOWEST,
+    LevelMixture,
+    QueryPlan,
+    slice_directions,
+)
 from mbtf_gen.tile.loading import latest_material
 from mbtf_gen.tile.protocol import Tile
 
@@ -77,22 +83,7 @@ class Job:
 
     @classmethod
     def prepare(cls, config: GeneratorConfig) -> Job:
-        """:meth:`load`, and log the material's notes and warnings.
-
-        Parameters
-        ----------
-        config : GeneratorConfig
-            All options.
-
-        Returns
-        -------
-        Job
-
-        Raises
-        ------
-        InputError
-            The material cannot be used.
-        """
+        """:meth:`load`, and log the material's notes and warnings."""
         job = cls.load(config)
         for note in job.material.notes:
             log.info(note)
@@ -116,6 +107,11 @@ class Job:
         """Texel grids of the levels."""
         return self.material.lattice(self.config.queries.finest)
 
+    @property
+    def inputs(self) -> dict[str, str]:
+        """Role → SHA-256 of the input files."""
+        return self.material.digests
+
     @cached_property
     def config_hash(self) -> str:
         """SHA-256 of the options and of the contents of the input files, hexadecimal."""
@@ -125,7 +121,20 @@ class Job:
     def slice_directions(self) -> F32 | None:
         """Directions (n, 3) of the slices layout, lights and views alike; None in other layouts. A UsageError
         if the number of training queries does not suit them."""
-        return _slice_directions(self)
+        queries, texels = self.config.queries, self.lattice.texels()
+        if queries.layout != "slices":
+            return None
+        each, rest = divmod(count_queries(queries.train, texels), texels)
+        if queries.slice_directions == "ubo2003":
+            if (each, rest) != (UBO2003_COUNT**2, 0):
+                raise UsageError(f"the slices of ubo2003 need {UBO2003_COUNT**2}/texel", where="--queries")
+            if queries.min_cos > UBO2003_LOWEST:
+                hint = f"use --min-cos {UBO2003_LOWEST - 5e-3:.2f} or less"
+                raise UsageError("the directions of ubo2003 are lower", where="--min-cos", hint=hint)
+        if each < 1:
+            what = "slices need at least one query per texel"
+            raise UsageError(what, where="--queries", hint="400/texel")
+        return slice_directions(queries.slice_directions, math.isqrt(each), queries.min_cos)
 
     @cached_property
     def query_plan(self) -> QueryPlan:
@@ -141,7 +150,7 @@ class Job:
             queries.min_cos,
             queries.layout,
             self.config.seed,
-            _shard_rows(self),
+            shard_rows(self),
             queries.patch_size,
             self.slice_directions,
         )
@@ -154,24 +163,8 @@ class Job:
 
 @lru_cache(maxsize=1)
 def received_job(config: str, config_hash: str) -> Job:
-    """The job of another process, kept for its next task.
-
-    Parameters
-    ----------
-    config : str
-        Options as JSON.
-    config_hash : str
-        Their hash, contents of the input files included.
-
-    Returns
-    -------
-    Job
-
-    Raises
-    ------
-    InputError
-        The material cannot be used, or its files differ from those of the sender.
-    """
+    """The job of another process, from its configuration as JSON, kept for its next task; an InputError if
+    the material's files differ from those of the sender."""
     job = Job.load(GeneratorConfig.model_validate_json(config))
     if job.config_hash != config_hash:
         raise InputError("the material's files differ on this machine", where=job.config.material)
@@ -189,29 +182,6 @@ def limit_resolution(job: Job) -> Job:
     return replace(job, config=job.config.model_copy(update={"queries": queries}))
 
 
-def _slice_directions(job: Job) -> F32 | None:
-    """Directions (n, 3) of the slices layout, lights and views alike; None in other layouts.
-
-    Raises
-    ------
-    UsageError : the number of training queries does not suit the directions
-    """
-    queries = job.config.queries
-    if queries.layout != "slices":
-        return None
-    each, rest = divmod(count_queries(queries.train, job.lattice.texels()), job.lattice.texels())
-    if queries.slice_directions == "ubo2003":
-        needed = UBO2003_COUNT**2
-        if (each, rest) != (needed, 0):
-            raise UsageError(f"the slices of ubo2003 need {needed}/texel", where="--queries")
-        if queries.min_cos > UBO2003_LOWEST:
-            hint = f"use --min-cos {UBO2003_LOWEST - 5e-3:.2f} or less"
-            raise UsageError("the directions of ubo2003 are lower", where="--min-cos", hint=hint)
-    if each < 1:
-        raise UsageError("slices need at least one query per texel", where="--queries", hint="400/texel")
-    return slice_directions(queries.slice_directions, math.isqrt(each), queries.min_cos)
-
-
 def row_queries(job: Job, split: Split) -> int:
     """Queries in one row of a shard: one, or those of an image, or those of a training slice."""
     queries = job.config.queries
@@ -221,7 +191,8 @@ def row_queries(job: Job, split: Split) -> int:
     return 1 if directions is None or split == "test" else len(directions) ** 2
 
 
-def _shard_rows(job: Job) -> int:
+def shard_rows(job: Job) -> int:
+    """Rows of a full shard."""
     return max(1, job.config.output.shard_queries // row_queries(job, "train"))
 
 
@@ -231,19 +202,20 @@ def _shards(job: Job, split: Split) -> list[ShardEntry]:
     rows = math.ceil(count_queries(count, job.lattice.texels()) / row_queries(job, split))
     if split == "train" and config.queries.layout == "slices":
         rows = job.lattice.texels()
-    size = _shard_rows(job)
+    size = shard_rows(job)
     if rows > size * MAX_SHARD_FILES:
         raise UsageError(
             f"{count} {split} queries are more than {MAX_SHARD_FILES} shards of {size}",
             where="queries",
             hint="reduce them, or raise output.shard_queries",
         )
-    return [
-        ShardEntry(
-            split, index, f"{split}-{index:05d}.{config.output.format}", min(size, rows - index * size)
-        )
-        for index in range(math.ceil(rows / size))
-    ]
+    return shard_entries(split, rows, size, config.output.format)
+
+
+def shard_entries(split: Split, rows: int, size: int, suffix: str) -> list[ShardEntry]:
+    """Shards of `rows` rows in all, of `size` rows each but for the last one."""
+    names = (f"{split}-{index:05d}.{suffix}" for index in range(-(-rows // size)))
+    return [ShardEntry(split, k, name, min(size, rows - k * size)) for k, name in enumerate(names)]
 
 
 def split_spp(config: GeneratorConfig, split: Split) -> int:
@@ -265,10 +237,7 @@ def split_queries(job: Job, split: Split) -> int:
 
 def planned_paths(job: Job, entries: Iterable[ShardEntry]) -> int:
     """Paths of some shards; a target error may change them."""
-    rows = (
-        entry.rows * row_queries(job, entry.split) * split_spp(job.config, entry.split) for entry in entries
-    )
-    return sum(rows)
+    return sum(e.rows * row_queries(job, e.split) * split_spp(job.config, e.split) for e in entries)
 
 
 def most_paths(job: Job) -> int:

@@ -77,8 +77,7 @@ class RunForecaster:
     def speed(self) -> tuple[float, float]:
         """Seconds of starting the generator, and of a path."""
         from mbtf_gen.forecast import forecast
-        from mbtf_gen.planning.effects_planner import plan_effects
-        from mbtf_gen.planning.run_plan import allocate
+        from mbtf_gen.planning.run_plan import allocate, plan_effects
 
         job = Job.of(self.recipe.generate, self.material)
         found = forecast(job, allocate(job, plan_effects(job, pilots=False)), seconds=1.0)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import pytest
 from hypothesis import settings
 
-from mbtf_gen.engine.llvm import use_shipped_llvm
+from mbtf_gen.engine.runtime import use_shipped_llvm
 
 # Tests import drjit at the top: before that, as load_mitsuba does, choose the LLVM of the installation.
 use_shipped_llvm()

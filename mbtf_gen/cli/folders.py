@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mbtf_core.app.console import CONSOLE, Console
-from mbtf_core.app.options import DryRun, PathText
+from mbtf_core.app.options import PathText
 from mbtf_core.errors import EXIT_BAD_INPUT, EXIT_OK, EXIT_PARTIAL
 from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.units import clock
@@ -26,7 +26,7 @@ def merge(folder: Path, /, *, console: Console = CONSOLE) -> int:
     folder
         Folder of shards, or its URL.
     """
-    from mbtf_gen.generation.summary import finish
+    from mbtf_gen.generation.manifest import finish
 
     summary = finish(folder)
     console.report(asdict(summary), describe(summary, ran=False))
@@ -84,14 +84,7 @@ def verify(folder: Path, /, *, digests: Path | None = None, console: Console = C
     return EXIT_BAD_INPUT if faults or data.get("differences") else EXIT_OK
 
 
-def repair(
-    folder: Path,
-    /,
-    *,
-    material: PathText | None = None,
-    dry_run: DryRun = False,
-    console: Console = CONSOLE,
-) -> int:
+def repair(folder: Path, /, *, material: PathText | None = None, console: Console = CONSOLE) -> int:
     """Generate missing and corrupt files again; the data set is then identical to the original.
 
     Parameters
@@ -105,33 +98,25 @@ def repair(
     from mbtf_gen.generation.repair import repair as run
 
     data_folder = DataFolder.open(folder)
-    if dry_run:
-        done = run(data_folder, material=material, dry_run=True)
-    else:
-        keep_on_interruption(f"{data_folder}: the shards rendered so far are kept")
-        with console.progress(None, "repairing", "paths") as bar:
-            done = run(data_folder, material=material, progress=bar.update)
-    data = {"dry_run": dry_run, **asdict(done)}
-    console.report(data, _describe_repair(done, dry_run))
-    return EXIT_OK if done.complete or dry_run else EXIT_PARTIAL
+    keep_on_interruption(f"{data_folder}: the shards rendered so far are kept")
+    with console.progress(None, "repairing", "paths") as bar:
+        done = run(data_folder, material=material, progress=bar.update)
+    console.report(asdict(done), _describe_repair(done))
+    return EXIT_OK if done.complete else EXIT_PARTIAL
 
 
-def _describe_repair(done: RepairResult, dry_run: bool) -> str:
+def _describe_repair(done: RepairResult) -> str:
     from mbtf_core.data.documents import ABSENT
 
-    rendered, written = ("would be rendered", "would be written") if dry_run else ("rendered", "written")
-    shown = [f for f in done.faults if f.what not in ABSENT]
-    lines = [f"{done.folder}/{f.file}: {f.what}" for f in shown]
+    lines = [f"{done.folder}/{f.file}: {f.what}" for f in done.faults if f.what not in ABSENT]
     if done.shards:
         first = ", ".join(done.shards[:5]) + (", …" if len(done.shards) > 5 else "")
-        lines.append(f"{done.folder}: {len(done.shards)} shards {rendered} again ({first})")
+        lines.append(f"{done.folder}: {len(done.shards)} shards rendered again ({first})")
     if done.documents:
-        lines.append(f"{done.folder}: {' and '.join(done.documents)} {written} again")
+        lines.append(f"{done.folder}: {' and '.join(done.documents)} written again")
     if not done.shards and not done.documents:
         lines.append(f"{done.folder}: nothing to repair")
-    if not done.complete and not dry_run:
-        lines.append(f"{done.folder}: unfinished; run the same command again")
-    return "\n".join([*lines, *_describe_foreign(done.folder, done.foreign)])
+    return "\n".join(lines)
 
 
 def _describe_foreign(folder: object, names: list[str]) -> list[str]:

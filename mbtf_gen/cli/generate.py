@@ -28,7 +28,7 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.presets import RESOLUTION, generator_options
 
 if TYPE_CHECKING:
-    from mbtf_gen.generation.summary import Summary
+    from mbtf_gen.generation.manifest import Summary
     from mbtf_gen.job import Job
 
 G = TypeVar("G", bound=GeneratorConfig)

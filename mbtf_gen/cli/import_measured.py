@@ -39,8 +39,7 @@ def import_measured(
     """
     from mbtf_core.data.folder import DataFolder
     from mbtf_core.files.folders import check_space
-    from mbtf_gen.generation.import_job import Import
-    from mbtf_gen.generation.imported import MEASURED_BYTES
+    from mbtf_gen.generation.imported import MEASURED_BYTES, Import
     from mbtf_gen.generation.imported import import_measured as run
 
     folder = DataFolder.open(output)
@@ -51,19 +50,11 @@ def import_measured(
     total = job.count("train") + job.count("test")
     size = total * MEASURED_BYTES
     console.note(
-        f"{measured} ({type(job.source).__name__}) -> {folder}: {job.count('train')} training + "
+        f"{measured} ({job.format}) -> {folder}: {job.count('train')} training + "
         f"{job.count('test')} test queries, {size_text(size)}"
     )
-    if job.pairs is not None:
-        console.note(
-            f"{job.left_out} of {job.left_out + sum(map(len, job.pairs))} pairs of light and view are "
-            "left out: too low"
-        )
-    elif job.left_out:
-        console.note(
-            f"{job.left_out} of {job.left_out + job.usable} queries are left out: too low, NaN, or of a "
-            "footprint that is no level's"
-        )
+    for note in job.notes:
+        console.note(note)
     if folder.local is not None:
         check_space(folder.local, size, "reduce --queries, or choose another folder with -o")
     keep_on_interruption(f"the shards that are finished are kept in {folder}")

@@ -34,19 +34,17 @@ def plan(
         Measure the bias of omitting each simulated effect by a pilot run, and forecast the run.
     """
     from mbtf_gen.job import split_target
-    from mbtf_gen.planning.effects_planner import plan_effects
-    from mbtf_gen.planning.plan_table import plan_table
+    from mbtf_gen.planning.run_plan import plan_effects
 
     job = prepare_job(options, material, quality)
     found = plan_effects(job)
     if not measure:
-        console.report({**found.to_manifest(), "forecast": None}, plan_table(found))
+        console.report({**found.to_manifest(), "forecast": None}, found.describe())
         return
     from mbtf_gen.forecast import forecast
-    from mbtf_gen.planning.pilot import measured
-    from mbtf_gen.planning.run_plan import allocate
+    from mbtf_gen.planning.run_plan import allocate, measured
 
     expected = forecast(job, allocate(job, found))
     found = measured(job, found)
-    text = f"{plan_table(found)}\n{expected.describe(split_target(job.config, 'train'))}"
+    text = f"{found.describe()}\n{expected.describe(split_target(job.config, 'train'))}"
     console.report({**found.to_manifest(), "forecast": asdict(expected)}, text)

@@ -15,10 +15,8 @@ from mbtf_core.app.options import Flag
 from mbtf_core.config.settings import FileName, Settings
 from mbtf_core.data.lattice import MAX_LEVEL
 from mbtf_core.data.schema import SCHEMA_VERSION, ArrayFormat, Layout, SliceDirections, Tiling
-from mbtf_core.errors import UsageError
 from mbtf_core.files.digest import data_sha256
 from mbtf_gen.config.values import NormalMode, Tracer
-from mbtf_gen.effects.request import EffectsRequest
 from mbtf_gen.sampling.light_kernel import MAX_WIDTH_DEG, MIN_WIDTH_DEG
 
 # Largest height scale.
@@ -198,18 +196,10 @@ class TransportSection(Settings):
     max_crossings: int = Field(4096, ge=1, description="tile borders that one ray may cross")
 
 
-def _effects(text: str) -> str:
-    try:
-        EffectsRequest.parse(text)
-    except UsageError as error:
-        raise ValueError(f"{error.what}; choose {error.hint}") from None
-    return text
-
-
 class EffectsSection(Settings):
     """Which light transport effects are simulated."""
 
-    mode: Annotated[str, AfterValidator(_effects), Flag("--effects")] = Field(
+    mode: Annotated[str, Flag("--effects")] = Field(
         "auto",
         description="simulated effects of light: auto, all or none, then +x or -x for single effects, "
         "comma-separated",

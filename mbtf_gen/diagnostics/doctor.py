@@ -22,8 +22,17 @@ from typing import Any, Literal, NamedTuple
 
 from mbtf_core.errors import EXIT_BAD_INPUT, EXIT_OK, EngineError
 from mbtf_core.run.child import run_child
-from mbtf_gen.engine.llvm import CACHE_VARIABLE, chosen_llvm, shipped_llvm, use_shipped_llvm
-from mbtf_gen.engine.runtime import CPU_VARIANT, CUDA_VARIANT, check_llvm, load_mitsuba, prove
+from mbtf_gen.engine.runtime import (
+    CACHE_VARIABLE,
+    CPU_VARIANT,
+    CUDA_VARIANT,
+    check_llvm,
+    chosen_llvm,
+    load_mitsuba,
+    prove,
+    shipped_llvm,
+    use_shipped_llvm,
+)
 
 Found = dict[Literal["found"], str]
 

@@ -1,14 +1,19 @@
-"""Loading of Mitsuba: checks that its compiler works on this machine, imports it, sets the variant.
+"""Loading of Mitsuba: chooses the LLVM of Dr.Jit's CPU kernels, checks that it works, sets the variant.
 
-A broken or old LLVM aborts the process at some kernel. Therefore test kernels run in a child process first,
-once per library, and the result is cached. Modules that import ``drjit`` or ``mitsuba`` at the top must be
-imported after :func:`load_mitsuba`.
+The distribution ``karellen-llvm-core`` contains ``libLLVM.so.N.M``. Dr.Jit reads ``DRJIT_LIBLLVM_PATH`` once,
+when it is first imported, so :func:`load_mitsuba` sets it before, unless the user did. A broken or old LLVM
+aborts the process at some kernel. Therefore test kernels run in a child process first, once per library, and
+the result is cached. Modules that import ``drjit`` or ``mitsuba`` at the top must be imported after
+:func:`load_mitsuba`.
 """
 
 from __future__ import annotations
 
+import ctypes
 import hashlib
+import os
 import platform
+import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import suppress
@@ -19,18 +24,17 @@ from mbtf_core.errors import EngineError, UsageError
 from mbtf_core.files.folders import cache_folder
 from mbtf_core.run.child import ChildResult, run_child
 from mbtf_core.run.task import worker_threads
-from mbtf_gen.engine.llvm import (
-    CACHE_VARIABLE,
-    OLDEST_LLVM,
-    VARIABLE,
-    chosen_llvm,
-    has_version,
-    shipped_llvm,
-    use_shipped_llvm,
-)
 
 CPU_VARIANT = "llvm_ad_rgb"
 CUDA_VARIANT = "cuda_ad_rgb"
+VARIABLE = "DRJIT_LIBLLVM_PATH"
+CACHE_VARIABLE = "DRJIT_CACHE_DIR"
+# LLVM 14 is refused by Dr.Jit; 15 is accepted and then aborts the process at the first `minimum`.
+OLDEST_LLVM = 16
+
+_LIBRARY = re.compile(r"libLLVM\.(so\.[0-9.]+|dylib)")
+# Dependencies of libLLVM, in a folder beside it. It loads them by links to these names.
+_RUNTIME = ("libunwind.so.1.0", "libc++abi.so.1.0", "libc++.so.1.0")
 # Seconds; a first start from a slow network disk takes tens of them.
 _PROOF_TIMEOUT = 180.0
 
@@ -45,7 +49,7 @@ def load_mitsuba(variant: str = CPU_VARIANT) -> Any:
     Parameters
     ----------
     variant : str
-        ``llvm_ad_rgb``, ``cuda_ad_rgb``, or ``auto``: CUDA where it works, else LLVM.
+        ``llvm_ad_rgb`` or ``cuda_ad_rgb``.
 
     Returns
     -------
@@ -59,10 +63,8 @@ def load_mitsuba(variant: str = CPU_VARIANT) -> Any:
     EngineError
         Mitsuba, its LLVM or the CUDA device cannot be used here; says why and what to do.
     """
-    if variant == "auto":
-        variant = CUDA_VARIANT if not prove(CUDA_VARIANT).fault else CPU_VARIANT
     if variant not in (CPU_VARIANT, CUDA_VARIANT):
-        raise UsageError(f"no variant '{variant}'", hint=f"choose {CPU_VARIANT}, {CUDA_VARIANT} or auto")
+        raise UsageError(f"no variant '{variant}'", hint=f"choose {CPU_VARIANT} or {CUDA_VARIANT}")
     if variant not in _working:
         if variant == CPU_VARIANT:
             check_llvm()
@@ -77,32 +79,66 @@ def load_mitsuba(variant: str = CPU_VARIANT) -> Any:
         raise _mitsuba_error(" ".join(str(error).split())) from None
     if variant == CPU_VARIANT:
         refuse_old_llvm()
-        if variant not in _working:
-            limit_threads()
+        # Workers share the processors of their machine.
+        if variant not in _working and (threads := worker_threads()) is not None:
+            import drjit
+
+            drjit.set_thread_count(threads)
     _working.add(variant)
     return mitsuba
 
 
-def limit_threads() -> None:
-    """Render with the threads of this worker; with all processors elsewhere."""
-    if (threads := worker_threads()) is not None:
-        import drjit
+def shipped_llvm() -> Path | None:
+    """Path of the libLLVM of the installation, by the list of its files; None where there is none."""
+    from importlib.metadata import PackageNotFoundError, files
 
-        drjit.set_thread_count(threads)
+    try:
+        recorded = files("karellen-llvm-core") or []
+    except PackageNotFoundError:
+        return None
+    libraries = (Path(os.path.abspath(f.locate())) for f in recorded if _LIBRARY.fullmatch(f.name))
+    return next((path for path in libraries if path.is_file()), None)
+
+
+def chosen_llvm() -> str | None:
+    """Value of ``DRJIT_LIBLLVM_PATH``; None where it is unset or empty: Dr.Jit then searches the system."""
+    return os.environ.get(VARIABLE) or None
+
+
+def _load_runtime(library: Path) -> None:
+    """Load the C++ runtime of the shipped library where the links to it do not exist: the first interpreter
+    that may write beside the library creates them, and there may be none."""
+    for path in (p for name in _RUNTIME for p in library.parent.glob(f"*-linux-gnu/{name}")):
+        if not path.with_suffix("").exists():
+            ctypes.CDLL(str(path))
+
+
+def use_shipped_llvm() -> None:
+    """Make Dr.Jit use the shipped LLVM and a kernel cache of its own, unless the user chose others.
+
+    Sets ``DRJIT_LIBLLVM_PATH`` and ``DRJIT_CACHE_DIR`` where they are unset. It must run before ``drjit`` is
+    imported and has no effect afterwards.
+    """
+    library = chosen_llvm()
+    shipped = shipped_llvm()
+    if library is None:
+        if shipped is None:
+            return
+        library = os.environ[VARIABLE] = str(shipped)
+    if shipped is not None and library == str(shipped):
+        _load_runtime(shipped)
+    # Kernels compiled by different LLVMs must not share a cache.
+    os.environ.setdefault(CACHE_VARIABLE, str(cache_folder() / f"kernels-{Path(library).resolve().name}"))
+
+
+def has_version(library: str) -> bool:
+    """Whether a library reports a version, as LLVM 16 and newer do. It is loaded: use a child process."""
+    return hasattr(ctypes.CDLL(library), "LLVMGetVersion")
 
 
 def refuse_old_llvm() -> None:
-    """Refuse to run with an LLVM that is too old: some kernel would abort the process.
-
-    Dr.Jit has bound to such an LLVM where a program imports ``mitsuba`` or ``drjit`` before
-    :func:`load_mitsuba` or ``mbtf_fit.backends.mitsuba.register("llvm_ad_rgb")``, and the system's LLVM is
-    old.
-
-    Raises
-    ------
-    EngineError
-        Dr.Jit uses an LLVM older than `OLDEST_LLVM`.
-    """
+    """Raise an EngineError if Dr.Jit uses an LLVM with which some kernel would abort the process: that of the
+    system, where a program imports ``mitsuba`` or ``drjit`` first."""
     import drjit
 
     major = int(drjit.detail.llvm_version()[0])
@@ -126,13 +162,8 @@ def prove(variant: str) -> ChildResult:
 
 
 def check_llvm() -> None:
-    """Test the LLVM that Dr.Jit will use, unless an earlier run on this machine did.
-
-    Raises
-    ------
-    EngineError
-        The library is missing, broken or too old.
-    """
+    """Test the LLVM that Dr.Jit will use, unless an earlier run on this machine did; an EngineError if it is
+    missing, broken or too old."""
     use_shipped_llvm()
     library = chosen_llvm()
     passed = _proof_file(library)
@@ -166,21 +197,19 @@ def _proof_file(library: str | None) -> Path | None:
 
 
 def _llvm_error(library: str | None, fault: str) -> EngineError:
+    again = "pip install --force-reinstall karellen-llvm-core"
     if library is None:
+        what, hint = f"no usable LLVM library was found ({fault})", f"{again}, into a virtual environment"
         return EngineError(
-            f"no usable LLVM library was found ({fault})",
-            hint="reinstall into a virtual environment (pip install --target loses it), "
-            f"or set {VARIABLE} to a libLLVM of version {OLDEST_LLVM} or newer",
+            what, hint=f"{hint}, or set {VARIABLE} to a libLLVM of version {OLDEST_LLVM} or newer"
         )
     shipped = shipped_llvm()
     if shipped is not None and library == str(shipped):
-        return EngineError(
-            f"the LLVM that came with the installation cannot be used: {fault}",
-            where=library,
-            hint="install it again: pip install --force-reinstall karellen-llvm-core",
-        )
-    use = "unset it to use the LLVM of the installation" if shipped else "pip install karellen-llvm-core"
-    return EngineError(fault, where=f"{VARIABLE}={library}", hint=f"{use}, or name a newer libLLVM")
+        what = f"the LLVM that came with the installation cannot be used: {fault}"
+        return EngineError(what, where=library, hint=f"install it again: {again}")
+    return EngineError(
+        fault, where=f"{VARIABLE}={library}", hint=f"unset it ({again}), or name a newer libLLVM"
+    )
 
 
 def _mitsuba_error(fault: str) -> EngineError:

@@ -1,4 +1,4 @@
-"""Names of Dr.Jit's and Mitsuba's array types, for annotations alone.
+"""Names of Dr.Jit's and Mitsuba's array types, for annotations; NumPy's memory as kernels read it.
 
 The classes themselves depend on the variant that is set (``llvm_ad_rgb``, ``cuda_ad_rgb``), so they exist
 only once Mitsuba is loaded, and type checkers do not know them. Each alias stands for the attribute of
@@ -7,7 +7,15 @@ only once Mitsuba is loaded, and type checkers do not know them. Each alias stan
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+Number = TypeVar("Number", bound=np.generic)
+
+# Largest packet of a kernel, in numbers.
+_PACKET = 16
 
 # One number per lane: float32, float64, uint32, int32, bool.
 Float: TypeAlias = Any
@@ -42,3 +50,15 @@ BSDFContext: TypeAlias = Any
 Properties: TypeAlias = Any
 Sampler: TypeAlias = Any
 Scene: TypeAlias = Any
+
+
+def padded(numbers: NDArray[Number]) -> NDArray[Number]:
+    """A copy with room behind it, C-ordered.
+
+    Dr.Jit does not copy arrays of NumPy, and its kernels read whole packets: up to 15 numbers beyond the end,
+    which may be the end of the memory that the process has.
+    """
+    room = np.empty(numbers.size + _PACKET, numbers.dtype)
+    copy = room[: numbers.size].reshape(numbers.shape)
+    copy[...] = numbers
+    return copy

@@ -2,44 +2,43 @@
 
 from __future__ import annotations
 
-import hashlib
+import math
 import time
-from collections.abc import Callable, Iterator
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator
+from functools import cached_property
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.config.yaml_file import dump_yaml
-from mbtf_core.data.documents import finished_record, plan_digest, read_manifest, sidecar, software_versions
+from mbtf_core.data.documents import finished_record, plan_digest
 from mbtf_core.data.folder import DataFolder
-from mbtf_core.data.lattice import sigma_of_level
-from mbtf_core.data.schema import (
-    ARRAYS,
-    CONFIG_NAME,
-    CONVENTIONS,
-    FORMAT_NAME,
-    LEADING_AXES,
-    MANIFEST_NAME,
-    SCHEMA_VERSION,
-    SPLITS,
-    ShardEntry,
-)
-from mbtf_core.data.shard_files import Arrays, write_shard
-from mbtf_core.files.atomic import Stored, checksummed
-from mbtf_core.files.folders import make_folder, owned
-from mbtf_gen.generation.folder import holds_dataset, other_data_set
-from mbtf_gen.generation.import_job import Import, has_images, usable_blocks
-from mbtf_gen.generation.summary import Summary, finish
-from mbtf_gen.measured.interface import MeasuredBtf, MeasuredQueries
+from mbtf_core.data.lattice import MAX_LEVEL, Lattice, level_of_sigma, sigma_of_level
+from mbtf_core.data.schema import CONVENTIONS, ShardEntry, Split
+from mbtf_core.data.shard_files import Arrays
+from mbtf_core.errors import InputError
+from mbtf_core.files.digest import data_sha256, file_sha256
+from mbtf_core.files.folders import owned
+from mbtf_gen.config.generator import count_queries
+from mbtf_gen.config.measured import ImportConfig
+from mbtf_gen.generation.folder import claim_folder
+from mbtf_gen.generation.manifest import Summary, finish, new_manifest
+from mbtf_gen.generation.shard_record import store_shard
+from mbtf_gen.job import shard_entries
+from mbtf_gen.measured.interface import MeasuredBtf, MeasuredQueries, QueryBlock
+from mbtf_gen.measured.open import open_measured
+from mbtf_gen.measured.ubo2003 import SUFFIXES
 from mbtf_gen.sampling.rng import Purpose, numpy_generator
 
-# Arrays of measured data.
+I64 = NDArray[np.int64]
+
+# Bytes of a query: its arrays of float32 numbers.
 MEASURED = ("u", "sigma", "omega_i", "omega_o", "value_a")
 MEASURED_BYTES = 48
 # What differs from rendered data.
-MEASURED_MEANINGS = {
+MEANINGS = {
     "sigma": "half the width of a texel, or as the file states",
     "value_a": "the only value of the query (linear Rec.709 RGB)",
 }
@@ -51,72 +50,230 @@ MEASURED_CONVENTIONS = {
     "halves": "value_a is the only value of a query; its noise is unknown",
     "holes": "unknown",
 }
+# Share of the pairs of light and view whose values are test queries alone.
+TEST_PAIRS = 0.05
+# Queries of a list that are read at once.
+_BLOCK = 1 << 22
 
-Progress = Callable[[int], None]
+
+class Import(ABC):
+    """A measured BTF that becomes a data set.
+
+    Attributes
+    ----------
+    path : its file or folder
+    config : options
+    inputs : role → SHA-256 of the files
+    lattice : texel grids, the finest at least as fine as the images
+    divides_by_cosine : whether stored values include the cosine of the light
+    facts : the manifest's key ``measured``
+    notes : what is left out, in words
+    """
+
+    lattice: Lattice
+    facts: dict[str, Any]
+    notes: list[str]
+
+    def __init__(self, path: Path, config: ImportConfig, source: object, cosine: bool | None) -> None:
+        self.path, self.config, self.format = path, config, type(source).__name__
+        self.inputs = {"measured": _digest(path)}
+        included = {"auto": cosine, "included": True, "excluded": False}[config.cosine]
+        if included is None:
+            hint = "state it: --cosine included, or --cosine excluded"
+            raise InputError("does not say whether values include the cosine", where=path, hint=hint)
+        self.divides_by_cosine = included
+
+    @staticmethod
+    def prepare(path: Path, config: ImportConfig) -> Import:
+        """Open a file or a folder.
+
+        Raises
+        ------
+        InputError : it is no measured BTF of a known format, is damaged, or has no usable values
+        """
+        source: Any = open_measured(path)
+        kind = ImportOfImages if hasattr(source, "light") else ImportOfList
+        return kind(path, config, source)
+
+    @cached_property
+    def config_hash(self) -> str:
+        """Hash of everything that determines the data."""
+        return self.config.hash(self.inputs)
+
+    @abstractmethod
+    def count(self, split: Split) -> int:
+        """Queries of a split, at most those of the file."""
+
+    @abstractmethod
+    def shards(self, finished: Callable[[ShardEntry], bool]) -> Iterator[tuple[ShardEntry, Arrays | None]]:
+        """Shards and their arrays, which may be left out of a finished shard."""
+
+    def requested(self, split: Split) -> int:
+        """Queries of a split that the configuration requests."""
+        queries = self.config.queries
+        return count_queries(queries.train if split == "train" else queries.test, self.lattice.texels())
+
+    def entries(self, split: Split) -> list[ShardEntry]:
+        """Shards of a split."""
+        output = self.config.output
+        return shard_entries(split, self.count(split), output.shard_queries, output.format)
+
+    def manifest(self) -> dict[str, Any]:
+        """Manifest of the data set without shards."""
+        entries = [*self.entries("train"), *self.entries("test")]
+        measured = {"format": self.format, "file": self.path.name, "light_width": None, **self.facts}
+        return new_manifest(
+            self,
+            arrays=dict.fromkeys(MEASURED, "") | MEANINGS,
+            splits={split: {"queries": self.count(split)} for split in ("train", "test")},
+            entries=entries,
+            measured={**measured, "divided_by_cosine": self.divides_by_cosine},
+            conventions=CONVENTIONS | MEASURED_CONVENTIONS,
+            estimates=1,
+            geometry=None,
+            effects=None,
+            allocation=None,
+        )
 
 
-def _manifest(job: Import) -> dict[str, Any]:
-    config, lattice, source = job.config.model_dump(mode="json"), job.lattice, job.source
-    conventions = CONVENTIONS | MEASURED_CONVENTIONS
-    read: dict[str, Any] = {
-        "format": type(source).__name__,
-        "file": job.path.name,
-        "left_out": job.left_out,
-        "divided_by_cosine": job.divides_by_cosine,
-        "light_width": None,
-    }
-    if has_images(source):
-        assert job.pairs is not None
-        read |= {
+class ImportOfImages(Import):
+    """Images under many pairs of light and view. Each query is a random texel under a random pair; test
+    queries have pairs of their own."""
+
+    def __init__(self, path: Path, config: ImportConfig, source: MeasuredBtf) -> None:
+        super().__init__(path, config, source, source.cosine)
+        self.source = source
+        lowest = np.minimum(source.light[:, 2], source.view[:, 2])
+        kept = np.flatnonzero(lowest >= config.queries.min_cos)
+        if len(kept) == 0:
+            what, hint = "has no pair of light and view above --min-cos", "lower it: --min-cos 0.05"
+            raise InputError(what, where=path, hint=hint)
+        kept = numpy_generator(config.seed, "test", 0, Purpose.CHOICE).permutation(kept)
+        tested = max(1, round(TEST_PAIRS * len(kept))) if len(kept) > 1 else 0
+        self.pairs: dict[Split, I64] = {"train": np.sort(kept[tested:]), "test": np.sort(kept[:tested])}
+        self.lattice = Lattice((source.columns - 1).bit_length(), source.rows / source.columns)
+        total = len(source.light) + source.left_out
+        self.facts = {
+            "left_out": total - len(kept),
             "images": [source.rows, source.columns],
-            "pairs": len(source.light) + source.left_out,
-            "test_pairs": len(job.pairs[1]),
+            "pairs": total,
+            "test_pairs": tested,
         }
-    else:
-        read["queries"] = cast(MeasuredQueries, source).count
-    return {
-        "format": FORMAT_NAME,
-        "schema": SCHEMA_VERSION,
-        "complete": False,
-        "config_hash": job.config_hash,
-        "config": config,
-        "config_yaml": hashlib.sha256(dump_yaml(config).encode()).hexdigest(),
-        "inputs": job.digests,
-        "measured": read,
-        "conventions": conventions,
-        "tile": {"aspect": lattice.aspect},
-        "levels": {
-            "finest": lattice.finest,
-            "shape": list(lattice.shape()),
-            "sigma_finest": float(sigma_of_level(lattice.finest)),
-        },
-        "layout": "shuffled",
-        "patch_size": None,
-        "slice_size": None,
-        "estimates": 1,
-        "array_format": job.config.output.format,
-        "arrays": {
-            a.name: {
-                "shape": [*LEADING_AXES["shuffled"], *a.trailing],
-                "unit": a.unit,
-                "meaning": MEASURED_MEANINGS.get(a.name, a.meaning),
-            }
-            for a in ARRAYS
-            if a.name in MEASURED
-        },
-        "geometry": None,
-        "effects": None,
-        "allocation": None,
-        "splits": {
-            split: {
-                "queries": job.count(split),
-                "shards": [{"file": e.file, "rows": e.rows} for e in job.entries(split)],
-            }
-            for split in SPLITS
-        },
-        "software": software_versions(),
-        "summary": None,
-    }
+        self.notes = [f"{total - len(kept)} of {total} pairs of light and view are left out: too low"]
+
+    def count(self, split: Split) -> int:
+        """Queries of a split, at most those of the file."""
+        return min(self.requested(split), self.source.rows * self.source.columns * len(self.pairs[split]))
+
+    def shards(self, finished: Callable[[ShardEntry], bool]) -> Iterator[tuple[ShardEntry, Arrays | None]]:
+        """Shards and their arrays; None for groups of finished shards."""
+        source = self.source
+        factor = np.full(len(source.light), self.config.scale, np.float32)
+        if self.divides_by_cosine:
+            factor /= source.light[:, 2]
+        for split, pairs in self.pairs.items():
+            entries = self.entries(split)
+            size = max(1, source.at_once // self.config.output.shard_queries)
+            for group in (entries[first : first + size] for first in range(0, len(entries), size)):
+                if all(finished(entry) for entry in group):
+                    yield from ((entry, None) for entry in group)
+                    continue
+                drawn = [self._draw(entry, pairs) for entry in group]
+                # Images are decoded once for all shards of the group.
+                pair, texel = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
+                value = source.values(pair, texel) * factor[pair, None]
+                j, i = np.divmod(texel, source.columns)
+                u = np.stack([(i + 0.5) / source.columns, 1.0 - (j + 0.5) / source.rows], axis=-1)
+                arrays = {
+                    "u": u.astype(np.float32),
+                    "sigma": np.full(len(u), 0.5 / source.columns, np.float32),
+                    "omega_i": source.light[pair],
+                    "omega_o": source.view[pair],
+                    "value_a": value,
+                }
+                yield from _cut(group, arrays)
+
+    def _draw(self, entry: ShardEntry, pairs: I64) -> tuple[I64, I64]:
+        """Random pairs and texels of a shard's queries."""
+        random = numpy_generator(self.config.seed, entry.split, entry.index, Purpose.QUERIES)
+        texels = self.source.rows * self.source.columns
+        return pairs[random.integers(len(pairs), size=entry.rows)], random.integers(texels, size=entry.rows)
+
+
+class ImportOfList(Import):
+    """A list of queries. Those that are too low or have the footprint of no level are left out."""
+
+    def __init__(self, path: Path, config: ImportConfig, source: MeasuredQueries) -> None:
+        # Lists are of NeuMIP, which divides by the cosine.
+        super().__init__(path, config, source, cosine=False)
+        self.source = source
+        self.usable, sigma = 0, 0.5
+        for block, rows in self._blocks():
+            self.usable += len(rows)
+            sigma = min(sigma, float(block["sigma"][rows].min(initial=0.5)))
+        if self.usable < 2:
+            raise InputError(
+                f"has {self.usable} usable queries of {source.count:,}",
+                where=path,
+                hint="lower --min-cos, or check that the file is complete",
+            )
+        # Rounding of a footprint must not add a level.
+        finest = max(0, math.ceil(float(level_of_sigma(np.float64(sigma))) - 2e-3))
+        self.lattice = Lattice(finest, 1.0)
+        left_out = source.count - self.usable
+        self.facts = {"left_out": left_out, "queries": source.count}
+        why = "too low, NaN, or of a footprint that is no level's"
+        self.notes = [f"{left_out} of {source.count} queries are left out: {why}"] if left_out else []
+
+    def count(self, split: Split) -> int:
+        """Queries of a split, at most those of the file."""
+        test = min(self.requested("test"), self.usable // 2)
+        return test if split == "test" else min(self.requested("train"), self.usable - test)
+
+    def shards(self, finished: Callable[[ShardEntry], bool]) -> Iterator[tuple[ShardEntry, Arrays | None]]:
+        """Shards and their arrays, in random order within blocks of the file. Every block gives its share of
+        the test queries and of the training queries."""
+        test, train = self.count("test"), self.count("train")
+        left: Arrays = {}
+        kept: list[Arrays] = []
+        waiting = self.entries("train")
+        read = 0
+        for number, (block, usable) in enumerate(self._blocks()):
+            found: Arrays = {name: block[name] for name in MEASURED[:-1]}  # type: ignore[literal-required]
+            found["value_a"] = block["value"] * np.float32(self.config.scale)
+            if self.divides_by_cosine:
+                found["value_a"] /= found["omega_i"][:, 2:]
+            # Counts are differences of cumulative ones, so that their sums are exact.
+            ends = (read, read + len(usable))
+            tested = [n * test // self.usable for n in ends]
+            trained = [(n - t) * train // (self.usable - test) for n, t in zip(ends, tested, strict=True)]
+            read = ends[1]
+            rows = numpy_generator(self.config.seed, "train", number, Purpose.QUERIES).permutation(usable)
+            count = tested[1] - tested[0]
+            kept.append({name: a[rows[:count]] for name, a in found.items()})
+            rows = rows[count : count + trained[1] - trained[0]]
+            parts = {name: a[rows] for name, a in found.items()}
+            left = {n: np.concatenate([left[n], a]) for n, a in parts.items()} if left else parts
+            full, begin = [], 0
+            while waiting and len(left["sigma"]) - begin >= waiting[0].rows:
+                begin += waiting[0].rows
+                full.append(waiting.pop(0))
+            yield from _cut(full, left)
+            left = {name: a[begin:] for name, a in left.items()}
+        yield from _cut(
+            self.entries("test"), {n: np.concatenate([part[n] for part in kept]) for n in MEASURED}
+        )
+
+    def _blocks(self) -> Iterator[tuple[QueryBlock, I64]]:
+        """The queries, block by block, and the rows of the usable ones."""
+        least, most = (float(sigma_of_level(level)) for level in (MAX_LEVEL, 0))
+        for start in range(0, self.source.count, _BLOCK):
+            block = self.source.read(start, min(start + _BLOCK, self.source.count))
+            lowest = np.minimum(block["omega_i"][:, 2], block["omega_o"][:, 2])
+            # Footprints of half precision are rounded.
+            sigma = (block["sigma"] >= least * (1 - 1e-3)) & (block["sigma"] <= most * (1 + 1e-3))
+            block["sigma"] = np.clip(block["sigma"], np.float32(least), np.float32(most))
+            yield block, np.flatnonzero((lowest >= self.config.queries.min_cos) & sigma)
 
 
 def import_measured(
@@ -124,7 +281,7 @@ def import_measured(
     folder: str | Path | DataFolder,
     *,
     overwrite: bool = False,
-    progress: Progress | None = None,
+    progress: Callable[[int], None] | None = None,
 ) -> Summary:
     """Write a measured BTF as a data set, or finish an unfinished one.
 
@@ -153,146 +310,32 @@ def import_measured(
     """
     start = time.perf_counter()
     folder = DataFolder.open(folder)
-    manifest = _manifest(job)
     with owned(folder.workspace):
-        if holds_dataset(folder):
-            if overwrite:
-                folder.clear()
-            else:
-                _check_same(folder, manifest)
-        make_folder(folder.workspace)
-        if not folder.has(MANIFEST_NAME):
-            folder.write(MANIFEST_NAME, checksummed(manifest))
-        folder.write(CONFIG_NAME, dump_yaml(manifest["config"]).encode())
-        plan, written = plan_digest(manifest), 0
-        source = job.source
-        parts = (
-            _of_images(job, source, folder)
-            if has_images(source)
-            else _of_list(job, cast(MeasuredQueries, source))
-        )
-        for entry, arrays in parts:
-            if arrays is not None and not finished_record(folder, entry, job.config_hash):
-                _store(job, folder, plan, entry, arrays)
+        plan, written = plan_digest(claim_folder(job, folder, job.manifest, overwrite)), 0
+
+        def finished(entry: ShardEntry) -> bool:
+            return finished_record(folder, entry, job.config_hash) is not None
+
+        for entry, arrays in job.shards(finished):
+            if arrays is not None and not finished(entry):
+                store_shard(folder, entry, arrays, job.config_hash, plan, job.config.seed)
             written += entry.rows
             if progress is not None:
                 progress(written)
         return finish(folder, seconds=time.perf_counter() - start)
 
 
-def _check_same(folder: DataFolder, manifest: dict[str, Any]) -> None:
-    old = folder.read_json(MANIFEST_NAME)
-    if old.get("config_hash") != manifest["config_hash"]:
-        after = {**manifest["config"], "inputs": manifest["inputs"], "schema": SCHEMA_VERSION}
-        raise other_data_set(folder, old, after)
-    read_manifest(folder)
-
-
-def _of_images(
-    job: Import, source: MeasuredBtf, folder: DataFolder
-) -> Iterator[tuple[ShardEntry, Arrays | None]]:
-    """Shards with their arrays; None where the shard is finished already."""
-    assert job.pairs is not None
-    factor = np.full(len(source.light), job.config.scale, np.float32)
-    if job.divides_by_cosine:
-        factor /= source.light[:, 2]
-    for pairs, split in zip(job.pairs, SPLITS, strict=True):
-        entries = job.entries(split)
-        size = max(1, source.at_once // job.config.output.shard_queries)
-        for first in range(0, len(entries), size):
-            group = entries[first : first + size]
-            if all(finished_record(folder, entry, job.config_hash) for entry in group):
-                yield from ((entry, None) for entry in group)
-                continue
-            drawn = [_draw(job, entry, pairs) for entry in group]
-            pair, texel = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
-            value = source.values(pair, texel) * factor[pair, None]
-            begin = 0
-            for entry in group:
-                rows = slice(begin, begin + entry.rows)
-                begin += entry.rows
-                j, i = np.divmod(texel[rows], source.columns)
-                u = np.stack([(i + 0.5) / source.columns, 1.0 - (j + 0.5) / source.rows], axis=-1)
-                yield (
-                    entry,
-                    {
-                        "u": u.astype(np.float32),
-                        "sigma": np.full(entry.rows, 0.5 / source.columns, np.float32),
-                        "omega_i": source.light[pair[rows]],
-                        "omega_o": source.view[pair[rows]],
-                        "value_a": value[rows],
-                    },
-                )
-
-
-def _draw(
-    job: Import, entry: ShardEntry, pairs: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Random pairs and texels of a shard's queries."""
-    random = numpy_generator(job.config.seed, entry.split, entry.index, Purpose.QUERIES)
-    return pairs[random.integers(len(pairs), size=entry.rows)], random.integers(job.texels, size=entry.rows)
-
-
-def _of_list(job: Import, source: MeasuredQueries) -> Iterator[tuple[ShardEntry, Arrays | None]]:
-    """Shards and arrays, in random order within blocks of the file. Every block gives its share of the test
-    queries and of the training queries."""
-    test, train = job.count("test"), job.count("train")
-    left: Arrays = {}
-    kept: list[Arrays] = []
-    waiting = iter(job.entries("train"))
-    entry = next(waiting, None)
-    read = 0
-    for number, (block, usable) in enumerate(usable_blocks(source, job.config.queries.min_cos)):
-        found: Arrays = {name: block[name] for name in MEASURED[:-1]}  # type: ignore[literal-required]
-        found["value_a"] = block["value"] * np.float32(job.config.scale)
-        if job.divides_by_cosine:
-            found["value_a"] /= found["omega_i"][:, 2:]
-        # Counts are differences of cumulative ones, so that their sums are exact.
-        ends = (read, read + len(usable))
-        tested = [n * test // job.usable for n in ends]
-        trained = [(n - t) * train // (job.usable - test) for n, t in zip(ends, tested, strict=True)]
-        read = ends[1]
-        random = numpy_generator(job.config.seed, "train", number, Purpose.QUERIES)
-        rows = random.permutation(usable)
-        count = tested[1] - tested[0]
-        kept.append({name: a[rows[:count]] for name, a in found.items()})
-        rows = rows[count : count + trained[1] - trained[0]]
-        parts = {name: a[rows] for name, a in found.items()}
-        left = {n: np.concatenate([left[n], a]) for n, a in parts.items()} if left else parts
-        begin = 0
-        while entry is not None and len(left["sigma"]) - begin >= entry.rows:
-            yield entry, {name: a[begin : begin + entry.rows] for name, a in left.items()}
-            begin += entry.rows
-            entry = next(waiting, None)
-        left = {name: a[begin:] for name, a in left.items()}
-    held = {name: np.concatenate([part[name] for part in kept]) for name in MEASURED}
+def _cut(entries: Iterable[ShardEntry], arrays: Arrays) -> Iterator[tuple[ShardEntry, Arrays]]:
+    """Shards and their rows of the arrays, one after the other."""
     begin = 0
-    for entry in job.entries("test"):
-        yield entry, {name: a[begin : begin + entry.rows] for name, a in held.items()}
+    for entry in entries:
+        yield entry, {name: a[begin : begin + entry.rows] for name, a in arrays.items()}
         begin += entry.rows
 
 
-def _store(job: Import, folder: DataFolder, plan: str, entry: ShardEntry, arrays: Arrays) -> None:
-    """Write a shard and its sidecar."""
-    started = time.perf_counter()
-
-    def record(stored: Stored) -> dict[str, Any]:
-        return sidecar(
-            entry,
-            stored,
-            config_hash=job.config_hash,
-            plan=plan,
-            seed=job.config.seed,
-            spp=None,
-            queries=entry.rows,
-            paths=0,
-            seconds=round(time.perf_counter() - started, 4),
-            quarantined={"nonfinite_samples": 0, "lost_rays": 0, "capped_rays": 0, "nonfinite_at": []},
-            target=None,
-            mean_value=arrays["value_a"].mean(axis=0, dtype=np.float64).tolist(),
-            # Unknown: a query has a single value.
-            mean_variance=None,
-        )
-
-    measured = {name: arrays[name] for name in MEASURED}
-    folder.write_shard(entry.file, lambda path: write_shard(path, measured), record)
+def _digest(path: Path) -> str:
+    """SHA-256 of a file, or of the names and files of a folder's images."""
+    if path.is_file():
+        return file_sha256(path)
+    files = sorted(p for p in path.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
+    return data_sha256({p.relative_to(path).as_posix(): file_sha256(p) for p in files})

@@ -1,41 +1,36 @@
-"""Restores what ``verify`` finds missing or corrupt: it is generated again, with the same bits.
+"""Repairs a data set: what ``verify`` finds damaged is removed, and generated again.
 
-The manifest says what the data set contains. If it is lost, it is built again from ``config.yaml`` and the
-material, and accepted only if it has the digests of configuration and run plan that the sidecars state.
+The data set's own configuration generates it, by the code of a resumed run, so that files have the same bits
+as before. A lost manifest is built from ``config.yaml``, if the sidecars state the digests of this
+configuration and of its plan.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from mbtf_core.config.nested import differences, in_short
-from mbtf_core.config.yaml_file import dump_yaml, read_yaml
+from mbtf_core.config.settings import build
+from mbtf_core.config.yaml_file import read_yaml
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.documents import plan_digest
 from mbtf_core.data.folder import DataFolder, sidecar_name
-from mbtf_core.data.geometry import encode_geometry, geometry_record
-from mbtf_core.data.schema import CONFIG_NAME, FORMAT_NAME, GEOMETRY_NAME, MANIFEST_NAME, SCHEMA_VERSION
-from mbtf_core.data.verify import INCOMPLETE, Fault, document_faults, foreign_files, shard_faults
-from mbtf_core.errors import InputError, MbtfError
+from mbtf_core.data.geometry import geometry_record
+from mbtf_core.data.schema import CONFIG_NAME, MANIFEST_NAME
+from mbtf_core.data.verify import INCOMPLETE, Fault, verify
+from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import checksummed
 from mbtf_core.locks import brief_lock
-from mbtf_core.run.runner import Runner
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.generation.folder import check_geometry
-from mbtf_gen.generation.geometry import geometry_of
-from mbtf_gen.generation.manifest import build_manifest, stored_plan
-from mbtf_gen.generation.render_shards import ProgressCallback, render_shards
-from mbtf_gen.generation.summary import finish
+from mbtf_gen.generation.manifest import build_manifest
+from mbtf_gen.generation.run import ProgressCallback, generate
 from mbtf_gen.job import Job
-from mbtf_gen.planning.run_plan import RunPlan, plan_run
+from mbtf_gen.planning.run_plan import plan_run
+from mbtf_gen.planning.simulation import geometry_of
 
 _AGAIN = "generate the data set again, into another folder"
-_SHOWN = 3
 
 
 @dataclass(frozen=True)
@@ -48,35 +43,27 @@ class RepairResult:
         The data set.
     faults : list of Fault
         Faults before the repair.
-    shards : list of str
-        Files of the shards that were rendered again, or would be.
-    documents : list of str
-        Manifest, configuration and geometry, if they were written again, or would be.
-    foreign : list of str
-        Files in the folder that are no part of the data set; they are left alone.
+    shards, documents : list of str
+        Shards, and manifest, configuration and geometry, that were generated again.
     complete : bool
         Whether all shards are finished now.
-    paths : int
-        Paths traced.
-    seconds : float
-        Duration of the rendering.
+    paths, seconds : int, float
+        Paths traced, and duration of the run.
     """
 
     folder: str
     faults: list[Fault]
     shards: list[str]
     documents: list[str]
-    foreign: list[str]
-    complete: bool = False
-    paths: int = 0
-    seconds: float = 0.0
+    complete: bool
+    paths: int
+    seconds: float
 
 
 def repair(
     folder: str | Path | DataFolder,
     *,
     material: str | None = None,
-    dry_run: bool = False,
     progress: ProgressCallback | None = None,
 ) -> RepairResult:
     """Restore what ``verify`` finds missing or corrupt; the data set is then identical to the original.
@@ -87,8 +74,6 @@ def repair(
         The data set: a path or a URL.
     material : str, optional
         Current path of the material; by default the path in the data set's configuration.
-    dry_run : bool
-        Only find out what would be restored.
     progress : callable, optional
         As in :func:`~mbtf_gen.generation.run.generate`.
 
@@ -107,162 +92,97 @@ def repair(
     folder = DataFolder.open(folder)
     if not folder.exists() or not (folder.has(MANIFEST_NAME) or folder.sidecars()):
         Dataset.open(folder)  # says what is missing
-    manifest, damage = _manifest(folder)
+    manifest, faults = _manifest(folder)
     job = _job(folder, manifest, material)
-    plan, geometry = _plan(folder, job, manifest), None
-    if manifest is None or manifest["geometry"] is not None:
-        geometry = geometry_of(job, plan.effects)
-    if manifest is not None and _listed(manifest) != [(entry.file, entry.rows) for entry in job.shards]:
-        damage = "does not list the shards of its configuration"
-    whole = manifest
-    if whole is None or damage is not None:
-        whole = build_manifest(job, plan, geometry_record(geometry))
-
-    faults = [] if damage is None else [Fault(MANIFEST_NAME, damage, _AGAIN)]
-    faults += document_faults(folder, whole)
-    documents = [fault.file for fault in faults]
-    digest = plan_digest(plan.to_manifest())
-    broken = list(shard_faults(folder, job.shards, job.config_hash, digest))
-    faulty = {fault.file for fault in broken}
-    entries = [entry for entry in job.shards if entry.file in faulty]
-    faults += broken
-    if not faults and not whole["complete"]:
-        faults.append(Fault(MANIFEST_NAME, INCOMPLETE, _AGAIN))
-    if geometry is not None and manifest is not None and GEOMETRY_NAME in documents:
-        check_geometry(folder, geometry, manifest)
-    foreign = foreign_files(folder, job.shards)
-    documents = sorted(documents, reverse=True)
-    if dry_run:
-        return RepairResult(str(folder), faults, [e.file for e in entries], documents, foreign)
-
+    if manifest is None:
+        manifest = _restored_manifest(folder, job)
+        folder.write(MANIFEST_NAME, checksummed(manifest))
+    faults += verify(folder)
+    shards = {fault.file for fault in faults} & {entry.file for entry in job.shards}
+    documents = {fault.file for fault in faults if fault.what != INCOMPLETE} - shards
     with brief_lock(folder.workspace / MANIFEST_NAME):
         # Readers rely on `complete`.
-        if MANIFEST_NAME in documents or (entries and whole["complete"]):
-            whole |= {"complete": False, "summary": None}
-            folder.write(MANIFEST_NAME, checksummed(whole))
-        if CONFIG_NAME in documents:
-            folder.write(CONFIG_NAME, dump_yaml(whole["config"]).encode())
-        if GEOMETRY_NAME in documents and geometry is not None:
-            folder.write(GEOMETRY_NAME, encode_geometry(geometry))
-        # A shard without its sidecar is unfinished, so that generation renders it.
-        for entry in entries:
-            folder.delete(sidecar_name(entry.file))
-    result = render_shards(job, folder, entries, plan, Runner(), progress=progress)
+        if shards and manifest["complete"]:
+            folder.write(MANIFEST_NAME, checksummed({**manifest, "complete": False, "summary": None}))
+        # A shard without its sidecar is unfinished.
+        for name in (*map(sidecar_name, shards), *documents - {MANIFEST_NAME}):
+            folder.delete(name)
+    done = generate(job, folder, progress=progress)
     return RepairResult(
-        folder=str(folder),
-        faults=faults,
-        shards=result.shards,
-        documents=documents,
-        foreign=foreign,
-        complete=finish(folder).complete,
-        paths=result.paths,
-        seconds=round(result.seconds, 3),
+        str(folder), faults, sorted(shards), sorted(documents), done.complete, done.paths, done.seconds
     )
 
 
-def _manifest(folder: DataFolder) -> tuple[dict[str, Any] | None, str | None]:
-    """(manifest, None), or (None, fault) where it is lost or damaged."""
+def _manifest(folder: DataFolder) -> tuple[dict[str, Any] | None, list[Fault]]:
+    """The manifest; None and its fault where it is lost or damaged."""
     try:
-        folder.read_checksummed(MANIFEST_NAME)
+        found = folder.read_checksummed(MANIFEST_NAME)
     except InputError as error:
-        return None, error.what
-    manifest = Dataset.open(folder).manifest
-    if "measured" in manifest:
+        return None, [Fault(MANIFEST_NAME, error.what, _AGAIN)]
+    if "measured" in Dataset.open(folder).manifest:
         raise InputError(
             "holds measured data, which cannot be generated again",
             where=folder,
             hint="remove the damaged files, then run the same mbtf-gen import again",
         )
-    return folder.read_checksummed(MANIFEST_NAME), None
-
-
-def _listed(manifest: dict[str, Any]) -> list[tuple[str, int]]:
-    return [(e["file"], e["rows"]) for split in manifest["splits"].values() for e in split["shards"]]
-
-
-def _sidecars(folder: DataFolder) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Names and contents of the intact sidecars of this schema version."""
-    for name in folder.sidecars():
-        try:
-            record = folder.read_checksummed(name)
-        except InputError:
-            continue
-        if (record.get("format"), record.get("schema")) == (FORMAT_NAME, SCHEMA_VERSION):
-            yield name, record
+    return found, []
 
 
 def _job(folder: DataFolder, manifest: dict[str, Any] | None, material: str | None) -> Job:
-    """The job of the data set, from the manifest's configuration or that of ``config.yaml``."""
-    stated = {} if manifest is None else {str(manifest["config_hash"]): [MANIFEST_NAME]}
-    for name, record in _sidecars(folder):
-        stated.setdefault(str(record.get("config_hash")), []).append(name)
-    if len(stated) > 1:
-        groups = (f"{', '.join(n[:_SHOWN])}{', …' if len(n) > _SHOWN else ''}" for n in stated.values())
-        raise InputError(
-            f"its files belong to {len(stated)} data sets: {'; '.join(groups)}",
-            where=folder,
-            hint="nothing was changed; move away those that do not belong here, then repair it again",
-        )
-    if not stated:
-        what = "cannot be restored: no sidecar of the folder is intact"
-        raise InputError(what, where=folder.at(MANIFEST_NAME), hint=_AGAIN)
-    tried: list[Job] = []
-    for config in _configurations(folder, material):
-        if not Path(config.material).exists():
-            raise InputError(
-                f"the material is not at '{config.material}'",
-                where=folder,
-                hint="give its path: mbtf-gen repair FOLDER --material PATH",
-            )
-        job = Job.prepare(config)
-        if job.config_hash in stated:
-            return job
-        tried.append(job)
-    if not tried:
-        what = f"neither {MANIFEST_NAME} nor {CONFIG_NAME} can be read"
-        raise InputError(what, where=folder, hint=_AGAIN)
-    before = (manifest or {}).get("inputs", {})
-    changes = in_short(differences(before, tried[0].material.digests)) if before else ""
-    raise InputError(
-        "the material or the configuration has changed since the data set was generated"
-        + (f" ({changes})" if changes else ""),
-        where=folder,
-        hint="restore it, or generate the data set again",
-    )
-
-
-def _configurations(folder: DataFolder, material: str | None) -> Iterator[GeneratorConfig]:
-    """Configurations that can be read, the manifest's first."""
-    found: list[GeneratorConfig] = []
-    for read in (
-        lambda: folder.read_json(MANIFEST_NAME)["config"],
-        lambda: _yaml(folder),
-    ):
-        try:
-            config = GeneratorConfig.model_validate(read())
-        except (MbtfError, KeyError, ValueError, ValidationError):
-            continue
-        if config not in found:
-            found.append(config)
-            yield config.model_copy(update={"material": material}) if material else config
-
-
-def _yaml(folder: DataFolder) -> Any:
-    if not folder.has(CONFIG_NAME):
-        raise InputError("no such file", where=folder.at(CONFIG_NAME))
-    with folder.fresh(CONFIG_NAME) as path:
-        return read_yaml(path)
-
-
-def _plan(folder: DataFolder, job: Job, manifest: dict[str, Any] | None) -> RunPlan:
-    """The run plan of the data set."""
+    """The job of the manifest's configuration, or of ``config.yaml`` without one, to which all intact files
+    must belong."""
     if manifest is not None:
-        return stored_plan(manifest, folder.at(MANIFEST_NAME))
-    plan = plan_run(job)
-    if plan_digest(plan.to_manifest()) not in {record.get("plan") for _, record in _sidecars(folder)}:
+        source, stored = folder.at(MANIFEST_NAME), manifest["config"]
+    elif folder.has(CONFIG_NAME):
+        with folder.fresh(CONFIG_NAME) as path:
+            source, stored = folder.at(CONFIG_NAME), read_yaml(path)
+    else:
+        raise InputError(f"neither {MANIFEST_NAME} nor {CONFIG_NAME} can be read", where=folder, hint=_AGAIN)
+    moved = {} if material is None else {"material": material}
+    config = build(GeneratorConfig, {**stored, **moved}, source=source)
+    if not Path(config.material).exists():
         raise InputError(
-            "cannot be restored: this machine plans the run differently",
+            f"the material is not at '{config.material}'",
+            where=folder,
+            hint="give its path: mbtf-gen repair FOLDER --material PATH",
+        )
+    job = Job.prepare(config)
+    if manifest is not None and manifest["config_hash"] != job.config_hash:
+        changes = in_short(differences(manifest["inputs"], job.material.digests))
+        raise InputError(
+            f"the material has changed since the data set was generated ({changes})",
+            where=folder,
+            hint="restore it, or generate the data set again",
+        )
+    others = [name for name, found in _stated(folder, "config_hash").items() if found != job.config_hash]
+    if others:
+        named = f"{', '.join(others[:3])}{', …' if len(others) > 3 else ''}"
+        raise InputError(
+            f"{named} belong to another configuration or material than {source}",
+            where=folder,
+            hint="nothing was changed; move away what does not belong here, then repair it again",
+        )
+    return job
+
+
+def _stated(folder: DataFolder, key: str) -> dict[str, object]:
+    """What the intact sidecars state, by their names."""
+    found = {}
+    for name in folder.sidecars():
+        try:
+            found[name] = folder.read_checksummed(name).get(key)
+        except InputError:  # verify names it
+            continue
+    return found
+
+
+def _restored_manifest(folder: DataFolder, job: Job) -> dict[str, Any]:
+    """The manifest of an unfinished run, if an intact sidecar states its plan."""
+    plan = plan_run(job)
+    if plan_digest(plan.to_manifest()) not in _stated(folder, "plan").values():
+        raise InputError(
+            "cannot be restored: no intact sidecar states the plan that this machine makes",
             where=folder.at(MANIFEST_NAME),
             hint="repair it on the machine that generated it, or generate the data set again",
         )
-    return plan
+    return build_manifest(job, plan, geometry_record(geometry_of(job, plan.effects)))

@@ -1,22 +1,45 @@
-"""Generates a data set from a configuration: a folder of shards. Resumes an unfinished one."""
+"""Generates a data set from a configuration: a folder of shards. Resumes an unfinished one.
+
+A task is a shard, done when its sidecar is there; a lock claims it. In this process, threads sample queries
+ahead and write shards behind.
+"""
 
 from __future__ import annotations
 
+import os
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Generator, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from pathlib import Path
+from typing import Any
 
-from mbtf_core.data.documents import finished_record
+import numpy as np
+
+from mbtf_core.data.documents import finished_record, plan_digest, upload_waiting
 from mbtf_core.data.folder import DataFolder
-from mbtf_core.data.schema import ShardEntry
-from mbtf_core.errors import PartialError
+from mbtf_core.data.schema import MANIFEST_NAME, Queries, ShardEntry
+from mbtf_core.errors import InputError, LockedError, PartialError
+from mbtf_core.locks import lock_owner, take_lock
 from mbtf_core.run.runner import Runner
+from mbtf_core.run.task import Item, Result
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.folder import has_dataset, open_folder, read_run_plan
-from mbtf_gen.generation.render_shards import ProgressCallback, render_shards
-from mbtf_gen.generation.summary import Summary, finish
-from mbtf_gen.job import Job
+from mbtf_gen.generation.manifest import Summary, finish
+from mbtf_gen.generation.shard_record import ShardStatistics, store_shard
+from mbtf_gen.job import Job, most_paths, planned_paths, received_job, split_spp, split_target
+from mbtf_gen.planning.adaptive import estimate_shard
 from mbtf_gen.planning.run_plan import RunPlan, plan_run
+from mbtf_gen.planning.simulation import build_estimator
+from mbtf_gen.render.estimates import Estimates, Stream
+
+# Called with the paths so far, a note, and the paths expected in all (None: not known yet).
+ProgressCallback = Callable[[float, str, float | None], None]
+
+# Failures in a row of workers after which the other shards are not tried: the disk is full.
+_FAILURES = 8
 
 
 def unfinished(
@@ -92,16 +115,12 @@ def generate(
             planned(plans[0])
         return plans[0]
 
-    open_folder(job, folder, new_plan, overwrite)
-    plan = read_run_plan(folder)
+    run = ShardRun(job, folder, open_folder(job, folder, new_plan, overwrite))
     entries = unfinished(job, folder, slice_index, slice_count)
     if planned is not None and not plans and entries:
-        planned(plan)
-    result = render_shards(job, folder, entries, plan, runner or Runner(), start=start, progress=progress)
-    seconds = time.perf_counter() - start
-    summary = finish(
-        folder, paths=result.paths, seconds=seconds, writing=result.writing, waiting=result.waiting
-    )
+        planned(run.plan)
+    traced = render_shards(run, entries, runner or Runner(), start=start, progress=progress)
+    summary = finish(folder, seconds=time.perf_counter() - start, **vars(traced))
     if slice_count == 1 and not summary.complete:
         raise PartialError(
             "finished shards are missing or cannot be read",
@@ -109,3 +128,217 @@ def generate(
             hint="run the same command again",
         )
     return summary
+
+
+class ShardRun:
+    """What the shards of a run share, built once in each process.
+
+    Pickled, it is its job, its folder and the digest of its plan: a worker reads the plan from the manifest
+    that it sees, and writes into the folder itself. The process that sent a `received` run gives a shard to
+    one worker alone.
+    """
+
+    def __init__(self, job: Job, folder: DataFolder, plan: RunPlan, received: bool = False) -> None:
+        self.job, self.folder, self.plan, self.received = job, folder, plan, received
+        self.digest = plan_digest(plan.to_manifest())
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        local = self.folder.local
+        folder = str(self.folder) if local is None else os.path.abspath(local)
+        return received_run, (*self.job.__reduce__()[1], folder, self.digest)
+
+    @cached_property
+    def estimator(self) -> Any:
+        """Built where a shard is to be rendered."""
+        return build_estimator(self.job, self.plan.effects)
+
+    def finished(self, entry: ShardEntry) -> dict[str, Any] | None:
+        """Sidecar of a finished shard."""
+        record = finished_record(self.folder, entry, self.job.config_hash)
+        if record is None or not self.received or self.folder.local is not None:
+            return record
+        # The store is listed again: the shard may have been removed since this worker saw it there.
+        self.folder.refresh()
+        return finished_record(self.folder, entry, self.job.config_hash)
+
+    def store(
+        self, entry: ShardEntry, queries: Queries, estimates: Estimates, seconds: float
+    ) -> dict[str, Any]:
+        """Write a shard and its sidecar, which is returned."""
+        lead, through = queries.lead, estimates.transmittance
+        planned = split_spp(self.job.config, entry.split)
+        spp = planned if estimates.spp is None else estimates.spp.reshape(lead)
+        arrays = {
+            **vars(queries),
+            "value_a": estimates.value_a.reshape(*lead, 3),
+            "value_b": estimates.value_b.reshape(*lead, 3),
+            "spp": np.broadcast_to(np.asarray(spp, np.float32), lead).copy(),
+            **({} if through is None else {"transmittance": through.reshape(lead)}),
+        }
+        digests, seed = (self.job.config_hash, self.digest), self.job.config.seed
+        return store_shard(
+            self.folder, entry, arrays, *digests, seed, spp=planned, estimates=estimates, seconds=seconds
+        )
+
+
+@lru_cache(maxsize=1)
+def received_run(config: str, config_hash: str, folder: str, digest: str) -> ShardRun:
+    """The run of another process, kept for its next shard; an InputError if this machine does not see the
+    folder or the material, or has others of them."""
+    found = DataFolder.open(folder)
+    if not found.has(MANIFEST_NAME):
+        raise InputError("this machine does not see the data set", where=folder)
+    run = ShardRun(received_job(config, config_hash), found, read_run_plan(found), received=True)
+    if run.digest != digest:
+        raise InputError("the manifest has another plan on this machine", where=folder)
+    return run
+
+
+def render_shard(run: ShardRun, entry: ShardEntry) -> Generator[None, None, dict[str, Any]]:
+    """Render one shard into its folder, unless it is finished; a task in three parts.
+
+    Returns ``record`` (the sidecar), ``rendered`` (whether this call rendered it), ``writing`` (processor
+    seconds of writing and digesting).
+
+    Raises
+    ------
+    LockedError : another process writes it
+    PartialError : the disk is full, or the store cannot be reached
+    """
+    if (record := run.finished(entry)) is not None:
+        return {"record": record, "rendered": False, "writing": 0.0}
+    lock = take_lock(run.folder.workspace / entry.file)
+    if lock is None:
+        raise LockedError("is being written by another process", where=run.folder.at(entry.file))
+    try:
+        # Another process may have finished it since.
+        if (record := run.finished(entry)) is not None:
+            return {"record": record, "rendered": False, "writing": 0.0}
+        queries = run.job.query_plan.draw(entry.split, entry.index, entry.rows)
+        yield
+        began, config = time.perf_counter(), run.job.config
+        # The values depend on seed, split and index, not on the process.
+        estimates = estimate_shard(
+            run.estimator,
+            queries.flat(),
+            split_spp(config, entry.split),
+            split_target(config, entry.split),
+            Stream(config.seed, entry.split, entry.index),
+            run.plan.allocation,
+        )
+        seconds = time.perf_counter() - began
+        yield
+        began = time.thread_time()
+        record = run.store(entry, queries, estimates, seconds)
+        return {"record": record, "rendered": True, "writing": time.thread_time() - began}
+    finally:
+        lock.release()
+
+
+@dataclass
+class Traced:
+    """Work of :func:`render_shards`: paths traced, processor seconds of writing and digesting parallel to
+    rendering, and seconds that this process waited for the writing."""
+
+    paths: int = 0
+    writing: float = 0.0
+    waiting: float = 0.0
+
+
+def render_shards(
+    run: ShardRun,
+    entries: Sequence[ShardEntry],
+    runner: Runner,
+    *,
+    start: float | None = None,
+    progress: ProgressCallback | None = None,
+) -> Traced:
+    """Render those of the shards that are not finished.
+
+    Parameters
+    ----------
+    runner : maps :func:`render_shard` over the shards
+    start : when the run began, by ``time.perf_counter``; now by default. Paths per second count from it
+    progress : called once per shard
+
+    Raises
+    ------
+    InputError : a worker cannot read the material or the folder
+    PartialError : other processes render some of them, shards failed, the disk is full, the store or the
+        workers cannot be reached, or there are too many non-finite samples; finished shards are kept
+    """
+    start = time.perf_counter() if start is None else start
+    job, folder = run.job, run.folder
+    pending = {entry.file: entry for entry in entries}
+    traced, totals, limit = Traced(), ShardStatistics(), most_paths(job)
+    # Leftovers of killed runs take disk space.
+    folder.remove_leftovers()
+    upload_waiting(folder, job.shards, job.config_hash, run.digest)
+    items = [Item(file, {"run": run, "entry": entry}) for file, entry in pending.items()]
+    busy, failed, row = list[str](), list[Result](), 0
+    planned_so_far, traced_so_far = Counter[str](), Counter[str]()
+    with closing(runner.map(render_shard, items)) as results:
+        for done in results:
+            if done.locked:
+                busy.append(done.name)
+            elif done.error:
+                failed.append(done)
+                row += 1
+                if row >= (1 if runner.here else max(_FAILURES, 2 * runner.workers)):
+                    break
+            else:
+                row, entry = 0, pending.pop(done.name)
+                totals.add(done.value["record"])
+                totals.refuse_nonfinite(limit, folder)
+                traced.writing += done.value["writing"]
+                traced.waiting = done.waited
+                if done.value["rendered"]:
+                    traced.paths += (paths := done.value["record"]["paths"])
+                    planned_so_far[entry.split] += planned_paths(job, [entry])
+                    traced_so_far[entry.split] += paths
+            if progress is not None:
+                rate = traced.paths / max(time.perf_counter() - start, 1e-9) / 1e6
+                where = "" if runner.here else f" on {runner.workers} workers"
+                noise = totals.relative_error() if totals.train else None
+                error = "" if noise is None else f", noise {noise:.2%}"
+                left = _expected_paths(job, list(pending.values()), planned_so_far, traced_so_far)
+                total = None if left is None else traced.paths + left
+                progress(traced.paths, f"{rate:.2f} M paths/s{where}{error}", total)
+    _refuse_failed(failed, len(pending), runner, folder)
+    if busy:
+        owner = lock_owner(folder.workspace / busy[0])
+        who = "" if owner is None else f" ({owner})"
+        raise PartialError(
+            f"{len(busy)} shard(s) are being written by another process, first {busy[0]}{who}",
+            where=folder,
+            hint="wait for it, then run the same command again",
+        )
+    return traced
+
+
+def _expected_paths(
+    job: Job, pending: Sequence[ShardEntry], planned: Counter[str], traced: Counter[str]
+) -> float | None:
+    """Paths of shards to come: those planned, times the ratio of traced and planned paths of the split so
+    far. None where a target error decides, and no shard is done."""
+    total = 0.0
+    for split in {entry.split for entry in pending}:
+        if not planned[split] and split_target(job.config, split) is not None:
+            return None
+        ratio = traced[split] / planned[split] if planned[split] else 1.0
+        total += ratio * planned_paths(job, [entry for entry in pending if entry.split == split])
+    return round(total)
+
+
+def _refuse_failed(failed: Sequence[Result], left: int, runner: Runner, folder: DataFolder) -> None:
+    """Fail if shards have failed, with the reason of the first."""
+    if failed and runner.here:
+        raise PartialError(failed[0].error, hint=failed[0].hint)
+    if failed:
+        first = failed[0]
+        raise PartialError(
+            f"{len(failed)} shard(s) failed, {left} are left; first {first.name}: {first.error} "
+            f"(on {first.worker})",
+            where=folder,
+            hint=first.hint or "the same command resumes",
+        )

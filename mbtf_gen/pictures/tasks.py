@@ -11,7 +11,7 @@ from mbtf_core.pictures.camera import Camera, PixelKind
 from mbtf_core.pictures.reference import ReferenceImage
 from mbtf_gen.job import Job
 from mbtf_gen.pictures.reference import render_reference
-from mbtf_gen.planning.effects_planner import reference_plan
+from mbtf_gen.planning.run_plan import reference_plan
 from mbtf_gen.planning.simulation import build_estimator
 
 _kept: tuple[Job, Any] | None = None

@@ -1,16 +1,18 @@
-"""Bias bounds of a displaced Lambert surface, estimated on its height grid before anything is rendered.
+"""Bias bounds of leaving effects out: from a pilot, or estimated on a height grid.
 
-Rays are marched over the periodic heights, and a Lambert surface is shaded with and without an effect. By
-Jensen's inequality the root mean square change at points (σ → 0) is at least that of footprint averages, so
-it bounds the bias for any mixture of levels.
+On a height grid, rays are marched over the periodic heights, and a Lambert surface is shaded with and without
+an effect. By Jensen's inequality the root mean square change at points (σ → 0) is at least that of footprint
+averages, so it bounds the bias for any mixture of levels.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_gen.effects.effect import DisplacementBounds
+from mbtf_gen.render.estimates import Estimates
 from mbtf_gen.sampling.light_kernel import LightKernel
 from mbtf_gen.tile.heights import HeightGrid, height_slopes
 
@@ -24,8 +26,93 @@ CAUTION = 2.0
 FEW = 8
 # An event that occurs in none of n samples has a probability below 3/n, at 95 % confidence (rule of three).
 NONE_OF = 3.0
+# The contribution to the mean square of changes larger than the largest sampled one, in units of its own
+# contribution: α/(α-1) for a power-law tail of exponent α, so 10 is safe for α = 1.1.
+UNSEEN = 10.0
 # Steps after which a marched ray is assumed to be unoccluded.
 MAX_STEPS = 4096
+
+
+@dataclass(frozen=True)
+class Change:
+    """Change of a sample of queries when something is left out, relative to the mean value.
+
+    Attributes
+    ----------
+    count : queries; changed : queries with any change
+    square, error : mean square change and its standard error. The product of both halves' changes estimates
+        it without bias from noise.
+    shift, shift_error : mean change and its standard error
+    largest : largest change of a query
+    """
+
+    count: int
+    changed: int
+    square: float
+    error: float
+    shift: float
+    shift_error: float
+    largest: float
+
+    @classmethod
+    def of(cls, full: Estimates, cut: Estimates) -> Change:
+        """Change between two estimates of the same queries."""
+        a = (full.value_a - cut.value_a).astype(np.float64)
+        b = (full.value_b - cut.value_b).astype(np.float64)
+        mean = 0.5 * float(np.mean(full.value_a + full.value_b))
+        n = len(a)
+        if mean <= 0.0:
+            return cls(n, 0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        square = np.mean(a * b, axis=-1) / mean**2
+        change = 0.5 * np.mean(a + b, axis=-1) / mean
+        return cls(
+            n,
+            int(np.count_nonzero(change)),
+            float(square.mean()),
+            float(square.std()) / np.sqrt(n),
+            float(change.mean()),
+            float(change.std()) / np.sqrt(n),
+            float(np.sqrt(max(np.abs(square).max(), (change**2).max()))),
+        )
+
+    @property
+    def rms(self) -> float:
+        """Root mean square change."""
+        return float(np.sqrt(max(self.square, 0.0)))
+
+    @property
+    def upper(self) -> float:
+        """Root mean square change plus :data:`CAUTION` standard errors, and at least the mean change plus as
+        many: rare changes that never occur in both halves still shift the mean."""
+        square = max(self.square, 0.0) + CAUTION * self.error
+        return max(float(np.sqrt(square)), abs(self.shift) + CAUTION * self.shift_error)
+
+    def bound(self, most: float = np.inf) -> float:
+        """Upper bound of the root mean square change, including changes too rare for the sample. If no change
+        exceeds `most`, the mean square is at most `most` times the mean."""
+        # We assume that an unsampled change equals the mean value.
+        largest = self.largest if self.changed >= FEW else max(self.largest, 1.0)
+        seen = self.upper**2 + UNSEEN * largest**2 / self.count
+        mean = abs(self.shift) + CAUTION * self.shift_error + NONE_OF * largest / self.count
+        return float(np.sqrt(min(seen, most * mean)))
+
+
+@dataclass(frozen=True)
+class DisplacementBounds:
+    """Bias bounds of leaving out effects of a displaced Lambert surface, relative to the mean value.
+
+    Attributes
+    ----------
+    parallax : the plane, shaded with the mesh's slopes and without shadows, replaces the displaced tile
+    shadowing : no shadows on the displaced tile
+    normal : shading without the given residual slopes
+    opacity : surface and occluders opaque everywhere
+    """
+
+    parallax: float
+    shadowing: float
+    normal: float
+    opacity: float
 
 
 class _Field:

@@ -25,10 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.data.schema import Queries
-from mbtf_gen.effects.plan import EffectsPlan
 from mbtf_gen.job import Job
-from mbtf_gen.planning.pilot import pilot_queries
-from mbtf_gen.planning.simulation import build_estimator
+from mbtf_gen.planning.effects_plan import EffectsPlan
+from mbtf_gen.planning.simulation import build_estimator, pilot_queries
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.sampling import exact_math as exact
 
@@ -120,17 +119,12 @@ class Allocation:
 
     Attributes
     ----------
-    weights : tuple of float
-        Of the polynomial's terms, for ln s with s the standard deviation of one path, in 1/sr.
-    typical : float
-        Mean of s over the run's queries, in 1/sr; 0 if all queries get the same number of paths, because
-        nothing is noisy or the fit of s did not converge.
-    scale : float
-        Factor on the counts that gives them the requested mean over the run's queries.
-    gain : float
-        Mean squared error with equal counts over that with these, on the pilot's data.
-    mean_weights : tuple of float
-        Of the terms without the level, for ln of the tile mean, in 1/sr.
+    weights : of the polynomial's terms, for ln s with s the standard deviation of one path, in 1/sr
+    typical : mean of s over the run's queries, in 1/sr; 0 if all queries get the same number of paths,
+        because nothing is noisy or the fit of s did not converge
+    scale : factor on the counts that gives them the requested mean over the run's queries
+    gain : mean squared error with equal counts over that with these, on the pilot's data
+    mean_weights : of the terms without the level, for ln of the tile mean, in 1/sr
     """
 
     weights: tuple[float, ...]

@@ -1,18 +1,21 @@
-"""Estimators of M under an effects plan: surface, tile and transport, or the closed form."""
+"""What a run simulates under an effects plan: the estimator of M, or its closed form, and the geometry."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from mbtf_core.data.geometry import FINEST_LEVEL, GLOSSY, Geometry
+from mbtf_core.data.lattice import Lattice
 from mbtf_core.data.schema import Queries
 from mbtf_core.images.resample import resample
-from mbtf_gen.effects.catalog import EFFECTS
-from mbtf_gen.effects.plan import EffectsPlan
 from mbtf_gen.engine.runtime import CPU_VARIANT
 from mbtf_gen.job import Job
+from mbtf_gen.planning.effects import EFFECTS
+from mbtf_gen.planning.effects_plan import EffectsPlan
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.tile.heights import height_slopes
 
@@ -39,26 +42,15 @@ def build_estimator(
 
     Parameters
     ----------
-    job : Job
-        Configuration and material.
-    plan : EffectsPlan
-        Effects to simulate.
-    tiles : dict, optional
-        Tiles of this job built so far, by the effects that change them. Plans that share a dictionary share
-        their tiles.
-    variant : str
-        Variant of Mitsuba, which sets the device; one per process.
-
-    Returns
-    -------
-    Estimator or ClosedForm
+    job, plan : configuration and material, and the effects to simulate
+    tiles : tiles of this job built so far, by the effects that change them; plans that share a dictionary
+        share their tiles
+    variant : of Mitsuba, which sets the device; one per process
 
     Raises
     ------
-    InputError
-        Mitsuba does not accept the material's BSDF.
-    EngineError
-        Mitsuba or the device cannot be used here.
+    InputError : Mitsuba does not accept the material's BSDF
+    EngineError : Mitsuba or the device cannot be used here
     """
     if plan.closed_form:
         return ClosedForm(np.asarray(job.material.base_color, np.float64).reshape(-1, 3)[0])
@@ -83,6 +75,15 @@ def build_estimator(
     return Estimator(tiles[key], LightKernel(job.config.light.width), transport)
 
 
+def pilot_queries(job: Job, count: int, shard: int = 0) -> Queries:
+    """`count` queries (one leading axis) with the run's distribution, from a random stream of their own per
+    `shard`.
+
+    In both layouts every query has its own footprint and directions: a few images would have few of them.
+    """
+    return replace(job.query_plan, layout="shuffled", patch_size=None).draw("pilot", shard, count)
+
+
 def shading_slopes(job: Job, plan: EffectsPlan) -> NDArray[np.float64] | None:
     """Slopes (h, w, 2) that shading adds to the geometry's: those of the normal map, and those of the heights
     where they are not displaced."""
@@ -95,3 +96,49 @@ def shading_slopes(job: Job, plan: EffectsPlan) -> NDArray[np.float64] | None:
     if residual is None:
         return slopes
     return residual + np.asarray(resample(slopes, *residual.shape[:2]), np.float64)
+
+
+def geometry_of(job: Job, plan: EffectsPlan) -> Geometry | None:
+    """Geometry of a job's surface, without the effects that its plan leaves out; None for fibers, which have
+    neither heights nor slopes."""
+    material, grid = job.material, job.material.grid
+    if grid is None:
+        return None
+    shape = Lattice(min(job.lattice.finest + 1, FINEST_LEVEL), grid.aspect).shape()
+    x, y = np.moveaxis(_slopes(job, plan), -1, 0)
+    geometry = Geometry(
+        grid.z.astype(np.float32),
+        grid.aspect,
+        np.stack([_means(s, shape) for s in (x, y)], axis=-1),
+        np.stack([_means(a * b, shape) for a, b in ((x, x), (x, y), (y, y))], axis=-1),
+    )
+    if material.bsdf_type is not None:
+        return geometry
+    maps: dict[str, Any] = {"base_color": _means(material.base_color, shape)}
+    if plan.on("specular") or plan.on("metallic"):
+        weights = {name: material.maps[name] if plan.on(name) else 0.0 for name in GLOSSY[1:]}
+        shares = {"roughness": material.maps["roughness"], **weights}
+        maps |= {name: _means(share, shape) for name, share in shares.items()}
+    if "opacity" in material.maps and plan.on("opacity"):
+        maps["opacity"] = _means(material.maps["opacity"], shape)
+    return replace(geometry, **maps)
+
+
+def _slopes(job: Job, plan: EffectsPlan) -> NDArray[np.float64]:
+    """Slopes (h, w, 2) of the shading normal, at the finest resolution of those that add up."""
+    added = shading_slopes(job, plan)
+    grid = job.material.grid
+    mesh = height_slopes(grid) if grid is not None and plan.on("parallax") else None
+    terms = [slopes for slopes in (added, mesh) if slopes is not None]
+    if not terms:
+        return np.zeros((1, 1, 2))
+    rows, columns = (max(slopes.shape[axis] for slopes in terms) for axis in (0, 1))
+    return np.asarray(sum(resample(slopes, rows, columns) for slopes in terms), np.float64)
+
+
+def _means(values: ArrayLike | None, shape: tuple[int, int]) -> NDArray[np.float32]:
+    """Means over the texels (h, w) of a map (H, W, ...) or of a constant."""
+    array = np.asarray(values, np.float64)
+    if array.ndim < 2:
+        return np.broadcast_to(array, (*shape, *array.shape)).astype(np.float32)
+    return resample(array, *shape).astype(np.float32)

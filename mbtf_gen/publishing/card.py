@@ -16,7 +16,7 @@ import jinja2
 from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.files.atomic import Stored
 from mbtf_core.units import size_text
-from mbtf_gen.effects.catalog import EFFECTS
+from mbtf_gen.planning.effects import EFFECTS
 from mbtf_gen.publishing.facts import DATA, TAGS, Facts
 from mbtf_gen.publishing.picture import PICTURE_NAME
 from mbtf_gen.publishing.recipe import material_of

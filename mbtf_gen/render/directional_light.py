@@ -20,7 +20,6 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbtf_gen.engine.memory import padded
 from mbtf_gen.engine.types import (
     DirectionSample3f,
     Float,
@@ -31,6 +30,7 @@ from mbtf_gen.engine.types import (
     SurfaceInteraction3f,
     UInt32,
     Vector3f,
+    padded,
 )
 from mbtf_gen.sampling.light_kernel import LightKernel
 

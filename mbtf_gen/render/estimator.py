@@ -18,15 +18,14 @@ from mbtf_core.data.documents import BadSample
 from mbtf_core.data.schema import Queries
 from mbtf_core.directions import check_unit
 from mbtf_core.errors import PartialError
-from mbtf_gen.engine.memory import padded
-from mbtf_gen.engine.types import Color3f, Float, Float64, Point2f, Ray3f, UInt32
+from mbtf_gen.engine.types import Color3f, Float, Float64, Point2f, Ray3f, UInt32, padded
 from mbtf_gen.render.directional_light import DirectionalLight
 from mbtf_gen.render.estimates import MOST_LOCATED, Estimates, Stream
 from mbtf_gen.render.path_tracer import PathTracer, Transport
 from mbtf_gen.render.scene import CLEARANCE, TileScene
 from mbtf_gen.sampling.light_kernel import LightKernel
-from mbtf_gen.sampling.rng import Purpose, sequence, stream_key, stream_number
-from mbtf_gen.sampling.sobol import SobolSampler
+from mbtf_gen.sampling.rng import Purpose, stream_key, stream_number
+from mbtf_gen.sampling.sobol import SobolSampler, sequence
 
 # Paths per launch: enough to fill any machine, few enough to fit into memory.
 LAUNCH_PATHS = 1 << 20

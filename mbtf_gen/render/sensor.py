@@ -14,8 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mbtf_core.data.schema import Queries
-from mbtf_gen.engine.memory import padded
-from mbtf_gen.engine.types import Float, Mask, Point2f, Properties, Ray3f, Spectrum, UInt32, Vector3f
+from mbtf_gen.engine.types import Float, Mask, Point2f, Properties, Ray3f, Spectrum, UInt32, Vector3f, padded
 
 
 def ray_through(point: Point2f, omega_o: Vector3f, unit: Float, aspect: Float, start: Float) -> Ray3f:

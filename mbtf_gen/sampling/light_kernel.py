@@ -156,22 +156,6 @@ class LightKernel:
         )
         return out
 
-    def density(self, omega: ArrayLike, omega_i: ArrayLike) -> NDArray[np.float64]:
-        """Density p(ω) of the lobe, not cut at the horizon; undefined for a delta light.
-
-        Parameters
-        ----------
-        omega, omega_i : (..., 3) arrays
-            Unit vectors: the direction, and the axis of the lobe.
-
-        Returns
-        -------
-        (...) float64 array
-            Density in 1/sr.
-        """
-        difference = np.asarray(omega, np.float64) - np.asarray(omega_i, np.float64)
-        return _density(self.kappa, 0.5 * np.sum(difference**2, axis=-1))
-
     def sample(self, omega_i: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
         """Sample one direction from the lobe around each axis, not cut at the horizon.
 
@@ -198,7 +182,8 @@ class LightKernel:
         return np.asarray((1.0 - versine)[:, None] * omega_i + sine[:, None] * aside)
 
     def radiance(self, omega: ArrayLike, omega_i: ArrayLike) -> NDArray[np.float64]:
-        """Incident radiance L(ω): the lobe, cut at the horizon and normalized to unit irradiance.
+        """Incident radiance L(ω): the lobe, cut at the horizon and normalized to unit irradiance;
+        undefined for a delta light.
 
         Parameters
         ----------
@@ -210,5 +195,6 @@ class LightKernel:
         (...) float64 array
             Radiance in 1/sr.
         """
-        above = np.asarray(omega)[..., 2] > 0
-        return np.where(above, self.density(omega, omega_i), 0.0) / self.irradiance(omega_i)
+        difference = np.asarray(omega, np.float64) - np.asarray(omega_i, np.float64)
+        density = _density(self.kappa, 0.5 * np.sum(difference**2, axis=-1))
+        return np.where(np.asarray(omega)[..., 2] > 0, density, 0.0) / self.irradiance(omega_i)

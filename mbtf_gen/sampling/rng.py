@@ -9,12 +9,8 @@ distinct keys, so that values do not depend on how paths are grouped into launch
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from mbtf_gen.sampling.sobol import SobolSampler
 
 MAX_SHARDS = 1 << 28
 # Data splits, reference pictures and pilots have separate streams.
@@ -65,23 +61,3 @@ def stream_key(root: int, number: int) -> int:
     """64-bit key of the paths of a stream; `number` from :func:`stream_number`."""
     # Each is hashed before the next is added, so that neighboring root seeds are independent.
     return _mix(_mix(number + 1) + root & _WORD)
-
-
-def sequence(key: Any, salt: Any, query: Any, index: Any) -> SobolSampler:
-    """Low-discrepancy points inside a kernel, one sequence per query of a stream.
-
-    Parameters
-    ----------
-    key, salt : UInt32
-        Lower and upper half of :func:`stream_key`, one or one per lane.
-    query, index : UInt32
-        Number of the query in its shard, and of the path within its half of the query.
-    """
-    import mitsuba as mi
-
-    from mbtf_gen.sampling.sobol import SobolSampler, mix
-
-    # Two independent bijections of the query's number.
-    return SobolSampler(
-        mix(query ^ key), mix(query * mi.UInt32(0x2C1B3C6D) + salt), mi.UInt32(index), mi.UInt32(query) * 0
-    )

@@ -65,7 +65,7 @@ class SobolSampler:
     Attributes
     ----------
     key, salt : mi.UInt32
-        Randomization of 64 bits, from :func:`mbtf_gen.sampling.rng.sequence`.
+        Randomization of 64 bits, from :func:`sequence`.
     index : mi.UInt32
         Number of the point.
     counter : mi.UInt32
@@ -103,3 +103,19 @@ class SobolSampler:
         number = self.counter >> 16
         self.counter = self.counter + _CHANCE_STEP
         return _unit(mix(self._seed(~number) ^ mix(self.index + 0x68E31DA4)))
+
+
+def sequence(key: Any, salt: Any, query: Any, index: Any) -> SobolSampler:
+    """The sequences of the queries of a stream.
+
+    Parameters
+    ----------
+    key, salt : UInt32
+        Lower and upper half of :func:`~mbtf_gen.sampling.rng.stream_key`, one or one per lane.
+    query, index : UInt32
+        Number of the query in its shard, and of the path within its half of the query.
+    """
+    # Two independent bijections of the query's number.
+    return SobolSampler(
+        mix(query ^ key), mix(query * mi.UInt32(0x2C1B3C6D) + salt), mi.UInt32(index), mi.UInt32(query) * 0
+    )

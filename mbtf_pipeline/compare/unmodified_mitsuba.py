@@ -157,7 +157,7 @@ def compare_with_mitsuba(
     from mbtf_gen.config.generator import LightSection
     from mbtf_gen.job import Job
     from mbtf_gen.pictures.reference import render_reference
-    from mbtf_gen.planning.effects_planner import reference_plan
+    from mbtf_gen.planning.run_plan import reference_plan
     from mbtf_gen.planning.simulation import build_estimator
 
     view, light, tiles_across = pick_scene(section)

@@ -24,8 +24,7 @@ from mbtf_core.stats import Estimate, mean_estimate
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job, split_spp, split_target
 from mbtf_gen.planning.adaptive import estimate_shard
-from mbtf_gen.planning.effects_planner import plan_effects
-from mbtf_gen.planning.run_plan import allocate
+from mbtf_gen.planning.run_plan import allocate, plan_effects
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Stream
 from mbtf_gen.tile.protocol import Tile

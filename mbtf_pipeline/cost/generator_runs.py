@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-from mbtf_gen.planning.effects_planner import plan_effects
+from mbtf_gen.planning.run_plan import plan_effects
 from mbtf_pipeline.cost.generator_benchmark import GeneratorBenchmark
 from mbtf_pipeline.cost.measurements import Configuration, Measurement
 

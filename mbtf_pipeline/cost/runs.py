@@ -195,8 +195,7 @@ class RunRunner:
 def forecast_seconds(config: GeneratorConfig) -> float:
     """Seconds of a training query, by a forecast."""
     from mbtf_gen.forecast import forecast
-    from mbtf_gen.planning.effects_planner import plan_effects
-    from mbtf_gen.planning.run_plan import allocate
+    from mbtf_gen.planning.run_plan import allocate, plan_effects
 
     job = Job.load(config)
     return max(forecast(job, allocate(job, plan_effects(job, pilots=False))).query_seconds, _CHEAPEST)

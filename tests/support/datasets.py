@@ -20,11 +20,10 @@ from mbtf_core.files.atomic import Stored, checksummed, parse_checksummed
 from mbtf_core.files.digest import file_sha256
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.folder import open_folder
-from mbtf_gen.generation.render_shards import store_shard
-from mbtf_gen.generation.summary import finish
+from mbtf_gen.generation.manifest import finish
+from mbtf_gen.generation.run import ShardRun
 from mbtf_gen.job import Job, split_spp
-from mbtf_gen.planning.effects_planner import reference_plan
-from mbtf_gen.planning.run_plan import RunPlan
+from mbtf_gen.planning.run_plan import RunPlan, reference_plan
 from mbtf_gen.render.estimates import Estimates
 
 F32 = NDArray[np.float32]
@@ -53,14 +52,14 @@ def write_dataset(folder: Path, *, rows: int = 4, columns: int = 8, **options: A
     job = Job.prepare(config)
     plan = RunPlan(reference_plan(job))
     files = DataFolder.open(folder)
-    open_folder(job, files, lambda job: plan, False)
+    open_folder(job, files, lambda job: plan)
     for number, entry in enumerate(job.shards):
         queries = job.query_plan.draw(entry.split, entry.index, entry.rows)
         truth, rng = formula(queries), np.random.default_rng(number)
         a, b = ((truth * (1 + NOISE * rng.normal(size=truth.shape))).astype(np.float32) for _ in range(2))
         paths = queries.sigma.size * split_spp(config, entry.split)
         made = Estimates(a.reshape(-1, 3), b.reshape(-1, 3), None, paths, 0, 0, 0)
-        store_shard(job, files, plan, entry, queries, made, 0.1)
+        ShardRun(job, files, plan).store(entry, queries, made, 0.1)
     finish(folder)
     return Dataset.open(folder)
 

@@ -11,8 +11,7 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.generation.run import unfinished
 from mbtf_gen.job import Job, planned_paths
-from mbtf_gen.planning.effects_planner import reference_plan
-from mbtf_gen.planning.run_plan import RunPlan
+from mbtf_gen.planning.run_plan import RunPlan, reference_plan
 from support.datasets import formula
 
 load_mitsuba()

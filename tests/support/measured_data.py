@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_gen.measured.interface import F32
-from mbtf_gen.sampling.slice_directions import direction_pairs, slice_directions
+from mbtf_gen.sampling.query_sampler import direction_pairs, slice_directions
 
 
 def known(u: NDArray[np.floating], omega_i: F32, omega_o: F32) -> F32:

@@ -15,8 +15,7 @@ from mbtf_core.data.shard_files import write_shard
 from mbtf_core.files.atomic import checksummed
 from mbtf_fit.models.registry import MODELS
 from mbtf_fit.pytorch.material import NeuralMaterial
-from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan
-from mbtf_gen.sampling.slice_directions import slice_directions
+from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan, slice_directions
 
 from .datasets import write_sidecar
 from .fit_data import F32, Function

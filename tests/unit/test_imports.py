@@ -41,7 +41,6 @@ mbtf_core.forecast
 mbtf_gen.sampling
 mbtf_gen.measured
 mbtf_gen.engine
-mbtf_gen.effects
 mbtf_gen.config
 mbtf_gen.tile.tracers
 mbtf_gen.tile.heights
@@ -165,7 +164,7 @@ def test_imports_run_downwards() -> None:
         ("mbtf_gen.render.a", "import torch.nn", True),
         ("mbtf_gen.cli.a", "def f():\n    from mbtf_fit import training", True),
         ("mbtf_gen.render.a", "import mitsuba", False),
-        ("mbtf_gen.render.a", "from mbtf_gen.planning.pilot import Pilot", True),
+        ("mbtf_gen.render.a", "from mbtf_gen.planning.run_plan import Pilot", True),
         (
             "mbtf_gen.config.a",
             "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import mbtf_gen.job",

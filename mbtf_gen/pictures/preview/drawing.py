@@ -22,7 +22,7 @@ from mbtf_gen.pictures.preview import mesh
 from mbtf_gen.pictures.preview.plots import level_histogram, write_plots
 from mbtf_gen.pictures.preview.sample import sampled_queries, stored_queries
 from mbtf_gen.pictures.reference import picture_seconds, render_reference
-from mbtf_gen.planning.effects_planner import reference_plan
+from mbtf_gen.planning.run_plan import reference_plan
 from mbtf_gen.planning.simulation import build_estimator
 
 

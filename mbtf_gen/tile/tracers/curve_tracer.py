@@ -19,8 +19,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_gen.engine.memory import padded
-from mbtf_gen.engine.types import Float, Mask, Point3f, Ray3f, SurfaceInteraction3f, UInt32, Vector3f
+from mbtf_gen.engine.types import Float, Mask, Point3f, Ray3f, SurfaceInteraction3f, UInt32, Vector3f, padded
 from mbtf_gen.tile.tracers.periodic_scene import OVERLAP, PeriodicScene
 from mbtf_gen.tile.tracers.protocol import Vertex
 

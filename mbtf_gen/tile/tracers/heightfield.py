@@ -14,8 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.height_planes import logarithms, node_table
-from mbtf_gen.engine.memory import padded
-from mbtf_gen.engine.types import Float, Int32, Mask, Normal3f, Point3f, Ray3f, SurfaceInteraction3f, Vector3f
+from mbtf_gen.engine.types import (
+    Float,
+    Int32,
+    Mask,
+    Normal3f,
+    Point3f,
+    Ray3f,
+    SurfaceInteraction3f,
+    Vector3f,
+    padded,
+)
 from mbtf_gen.tile.tracers.protocol import Vertex
 
 # Ray offset relative to the largest coordinate: a few units in the last place of float32. An offset four

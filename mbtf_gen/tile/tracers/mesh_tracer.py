@@ -11,7 +11,6 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_gen.engine.memory import padded
 from mbtf_gen.engine.types import (
     Mask,
     Normal3f,
@@ -21,6 +20,7 @@ from mbtf_gen.engine.types import (
     SurfaceInteraction3f,
     UInt32,
     Vector3f,
+    padded,
 )
 from mbtf_gen.tile.tracers.heightfield import surface_interaction
 from mbtf_gen.tile.tracers.periodic_scene import OVERLAP, PeriodicScene

@@ -20,7 +20,7 @@ from support.surfaces import point, vectors
 
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
-from mbtf_gen.planning.effects_planner import reference_plan
+from mbtf_gen.planning.run_plan import reference_plan
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.bsdf.surface import SurfaceParts
 from mbtf_gen.render.estimates import Stream

@@ -18,12 +18,11 @@ from mbtf_core.data.schema import Queries
 from mbtf_core.stats import mean_estimate, noise_free_mse, t_test
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.engine.runtime import load_mitsuba
+from mbtf_gen.generation.manifest import finish
 from mbtf_gen.generation.run import generate
-from mbtf_gen.generation.summary import finish
 from mbtf_gen.job import Job, split_spp, split_target
 from mbtf_gen.planning.adaptive import estimate_shard
-from mbtf_gen.planning.effects_planner import plan_effects
-from mbtf_gen.planning.run_plan import plan_run
+from mbtf_gen.planning.run_plan import plan_effects, plan_run
 from mbtf_gen.planning.sample_allocation import Allocation, fit_allocation
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream, Target
@@ -126,20 +125,6 @@ def test_errors_that_the_cap_leaves_are_reported(skewed: tuple[Queries, Allocati
     assert np.sqrt(e.target.square) == pytest.approx(error, rel=0.15)
 
 
-def test_stopping_when_the_paths_so_far_look_good_is_biased() -> None:
-    """The reason for discarding the pilot: the same rule applied to the stored paths is biased."""
-    y = FewBrightPaths().paths(N, 512, Stream(1, "train", 0))
-    value, open_ = np.zeros(N), np.ones(N, bool)
-    for n in (16, 32, 64, 128, 256, 512):
-        mean, error = y[:, :n].mean(axis=1), y[:, :n].std(axis=1, ddof=1) / np.sqrt(n)
-        stop = open_ & ((error < 0.2 * np.maximum(mean, TRUTH)) | (n == 512))
-        value[stop] = mean[stop]
-        open_ &= ~stop
-    found = mean_estimate(value)
-    assert t_test(found, TRUTH).p_value < 1e-9
-    assert found.value < 0.9 * TRUTH
-
-
 @pytest.fixture(scope="module")
 def config(tmp_path_factory: pytest.TempPathFactory) -> GeneratorConfig:
     folder = tmp_path_factory.mktemp("maps")
@@ -232,16 +217,6 @@ def test_counts_ignore_launches_and_threads(kind: str, config: GeneratorConfig, 
         assert (other.value_a == one.value_a).all()
         assert (other.value_b == one.value_b).all()
         assert other.target == one.target
-
-
-def test_a_closed_form_needs_no_paths(tmp_path: Path) -> None:
-    np.save(tmp_path / "height.npy", np.zeros((4, 4)))
-    queries = {"train": "50", "test": "8", "target_error": 0.01}
-    flat = GeneratorConfig.model_validate({"material": str(tmp_path / "height.npy"), "queries": queries})
-    found = generate(flat, tmp_path / "out")
-    assert found.paths == 0
-    assert found.relative_error == 0.0
-    assert found.target is None
 
 
 def test_images_and_transmittance_keep_their_shape(tmp_path: Path) -> None:

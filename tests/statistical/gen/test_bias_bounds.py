@@ -10,16 +10,14 @@ import pytest
 from numpy.typing import NDArray
 
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.effects.catalog import bounce_bound
-from mbtf_gen.effects.effect import EffectDecision
-from mbtf_gen.effects.plan import EffectsPlan, without
-from mbtf_gen.effects.request import EffectsRequest
 from mbtf_gen.job import Job
-from mbtf_gen.planning import effects_planner
-from mbtf_gen.planning.bounds import displacement_bounds
-from mbtf_gen.planning.effects_planner import PlannedScene, plan_effects
-from mbtf_gen.planning.pilot import Change, pilot_queries, relative_change
-from mbtf_gen.planning.simulation import build_estimator
+from mbtf_gen.planning import run_plan
+from mbtf_gen.planning.bounds import Change, displacement_bounds
+from mbtf_gen.planning.effects import bounce_bound
+from mbtf_gen.planning.effects_plan import EffectsPlan, without
+from mbtf_gen.planning.run_plan import plan_effects
+from mbtf_gen.planning.scene import EffectDecision, EffectsRequest, PlanScene
+from mbtf_gen.planning.simulation import build_estimator, pilot_queries
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.sampling.light_kernel import LightKernel
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
@@ -73,8 +71,8 @@ def test_a_plane_with_slopes_lacks_nothing_but_parallax(shape: tuple[int, int], 
     full_job, cut_job = job_of(stuff, "all", **high), job_of(stuff, "all,-parallax", **high)
     bare_job = job_of(replace(stuff, height_scale=0.0), "all,-parallax", **high)
     full = estimates(full_job, plan_effects(full_job))
-    _, upper = relative_change(full, estimates(cut_job, plan_effects(cut_job)))
-    bare = relative_change(full, estimates(bare_job, plan_effects(bare_job)))[0]
+    upper = Change.of(full, estimates(cut_job, plan_effects(cut_job))).upper
+    bare = Change.of(full, estimates(bare_job, plan_effects(bare_job))).rms
     assert bare > 0.002
     assert upper < 0.25 * bare
 
@@ -107,9 +105,9 @@ def test_bias_bounds_equal_the_rendered_change(shape: tuple[int, int]) -> None:
     full = estimates(plain, bare)
     assert bounds.opacity == 0.0
     for name, bound in (("parallax", bounds.parallax), ("shadowing", bounds.shadowing)):
-        measured, _ = relative_change(full, estimates(plain, without(bare, name)))
+        measured = Change.of(full, estimates(plain, without(bare, name))).rms
         assert bound == pytest.approx(measured, rel=0.3), name
-    measured, _ = relative_change(estimates(job, plan), estimates(job, without(plan, "normal")))
+    measured = Change.of(estimates(job, plan), estimates(job, without(plan, "normal"))).rms
     assert bounds.normal == pytest.approx(measured, rel=0.3)
 
 
@@ -126,10 +124,12 @@ def test_the_change_is_relative_to_the_mean_and_free_of_noise() -> None:
         a, b = (0.5 + shift + noise * rng.normal(size=(n, 3)).astype(np.float32) for _ in range(2))
         return Estimates(a.astype(np.float32), b.astype(np.float32), None, n, 0, 0, 0)
 
-    cost, upper = relative_change(values(0.0, 0.1), values(0.05, 0.1))
+    found = Change.of(values(0.0, 0.1), values(0.05, 0.1))
+    cost, upper = found.rms, found.upper
     assert cost == pytest.approx(0.1, rel=0.05)
     assert cost < upper < 0.12
-    cost, upper = relative_change(values(0.0, 0.1), values(0.0, 0.1))
+    found = Change.of(values(0.0, 0.1), values(0.0, 0.1))
+    cost, upper = found.rms, found.upper
     assert cost < 0.03
     assert upper > cost
 
@@ -154,7 +154,7 @@ def test_the_bias_bound_of_holes_is_near_the_rendered_change() -> None:
     stuff = lambert(heights, 0.4, opacity=opacity)
     job = finest_job(stuff, "all")
     plan = plan_effects(job)
-    found = relative_change(estimates(job, plan, 32), estimates(job, without(plan, "opacity"), 32))[0]
+    found = Change.of(estimates(job, plan, 32), estimates(job, without(plan, "opacity"), 32)).rms
     stated = plan_effects(finest_job(stuff, "auto"))["opacity"]
     assert stated.on
     assert stated.bias_bound is not None
@@ -188,7 +188,7 @@ class Rare:
 
 def test_rare_large_changes_keep_an_effect_on(monkeypatch: pytest.MonkeyPatch) -> None:
     """Three of eight thousand queries change, so the bound must allow for nine."""
-    monkeypatch.setattr(effects_planner, "Pilot", Rare)
+    monkeypatch.setattr(run_plan, "Pilot", Rare)
     job = job_of(lambert(waves(32, 32), 0.3), transport={"max_depth": 0})
     assert Rare().limited(1).upper < job.config.effects.tolerance
     plan = plan_effects(job)
@@ -240,6 +240,6 @@ def test_the_bounce_bound_is_above_that_of_grooves(slope: float, share: float) -
     base[:, : round(share * columns)] = 0.9
     stuff = replace(lambert(z, 1.0), maps={"base_color": base})
     job = job_of(stuff, queries={"min_cos": 0.99}, light={"width": 0.0}, geometry={"mesh": columns})
-    bound = bounce_bound(PlannedScene(job, EffectsRequest("auto", {}), False, frozenset()))
+    bound = bounce_bound(PlanScene(job, EffectsRequest("auto", {})))
     seen = 0.9 * (1 - np.cos(np.arctan(slope)))
     assert bound > seen / np.sqrt(share)

@@ -13,12 +13,12 @@ from support.scenes import rocks
 
 from mbtf_core.stats import Estimate, mean_of_halves
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.effects.catalog import EFFECTS
-from mbtf_gen.effects.plan import EffectsPlan, without
 from mbtf_gen.job import Job
-from mbtf_gen.planning.effects_planner import plan_effects
-from mbtf_gen.planning.pilot import pilot_queries, relative_change
-from mbtf_gen.planning.simulation import build_estimator
+from mbtf_gen.planning.bounds import Change
+from mbtf_gen.planning.effects import EFFECTS
+from mbtf_gen.planning.effects_plan import EffectsPlan, without
+from mbtf_gen.planning.run_plan import plan_effects
+from mbtf_gen.planning.simulation import build_estimator, pilot_queries
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 
@@ -144,7 +144,8 @@ def test_an_effect_is_on_where_it_matters_and_off_where_not(name: str, needed: s
     assert plan.on(name)
     assert not planned(idle)[1].on(name)
     full, cut = estimates(job, plan), estimates(job, without(plan, name))
-    change, upper = relative_change(full, cut)
+    found = Change.of(full, cut)
+    change, upper = found.rms, found.upper
     assert change > 2 * plan.tolerance
     assert upper - change < 0.5 * change
 
@@ -158,7 +159,7 @@ def test_a_faint_relief_becomes_its_slopes() -> None:
     plane = job_of(bare, min_cos=0.3)
     strong = job_of(replace(bare, height_scale=0.02), "-parallax", min_cos=0.3)
     shaded = estimates(strong, plan_effects(strong))
-    assert relative_change(shaded, estimates(plane, plan_effects(plane)))[0] > 0.02
+    assert Change.of(shaded, estimates(plane, plan_effects(plane))).rms > 0.02
 
 
 def test_the_bias_of_a_cap_is_within_its_bound() -> None:
@@ -166,7 +167,7 @@ def test_the_bias_of_a_cap_is_within_its_bound() -> None:
     assert plan.on("interreflection")
     assert 2 <= plan.max_depth <= 4
     unlimited = estimates(job, replace(plan, max_depth=0))
-    assert relative_change(unlimited, estimates(job, plan))[0] < plan.tolerance
+    assert Change.of(unlimited, estimates(job, plan)).rms < plan.tolerance
 
 
 def test_light_is_sampled_both_ways_only_where_it_helps() -> None:

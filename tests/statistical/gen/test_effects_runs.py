@@ -16,15 +16,13 @@ from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.schema import Queries
 from mbtf_core.files.atomic import write_checksummed
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.effects.plan import EffectsPlan, without
 from mbtf_gen.engine.runtime import load_mitsuba
-from mbtf_gen.generation import render_shards
+from mbtf_gen.generation import run as generation
 from mbtf_gen.generation.run import generate
 from mbtf_gen.job import Job
-from mbtf_gen.planning.effects_planner import plan_effects
-from mbtf_gen.planning.pilot import pilot_queries
-from mbtf_gen.planning.run_plan import RunPlan
-from mbtf_gen.planning.simulation import build_estimator
+from mbtf_gen.planning.effects_plan import EffectsPlan, without
+from mbtf_gen.planning.run_plan import RunPlan, plan_effects
+from mbtf_gen.planning.simulation import build_estimator, pilot_queries
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 
@@ -115,7 +113,7 @@ class Recorder:
 @pytest.fixture
 def recorder(monkeypatch: pytest.MonkeyPatch) -> Recorder:
     found = Recorder()
-    monkeypatch.setattr(render_shards, "build_estimator", found.build)
+    monkeypatch.setattr(generation, "build_estimator", found.build)
     return found
 
 

@@ -25,7 +25,7 @@ from mbtf_core.errors import InputError
 from mbtf_core.stats import aggregate_test, elevation_groups
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
-from mbtf_gen.planning.effects_planner import reference_plan
+from mbtf_gen.planning.run_plan import reference_plan
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.tile.heights import HeightGrid, Tracer
 from mbtf_gen.tile.tracers.heightfield_tracer import HeightfieldGeometry

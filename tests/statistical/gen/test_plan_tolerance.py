@@ -12,9 +12,9 @@ from support.paths import ROOT
 
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
-from mbtf_gen.planning.effects_planner import plan_effects, reference_plan
-from mbtf_gen.planning.pilot import pilot_queries, relative_change
-from mbtf_gen.planning.simulation import build_estimator
+from mbtf_gen.planning.bounds import Change
+from mbtf_gen.planning.run_plan import plan_effects, reference_plan
+from mbtf_gen.planning.simulation import build_estimator, pilot_queries
 from mbtf_gen.render.estimates import Stream
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 from mbtf_gen.tile.heights import HeightGrid, height_slopes, residual_slopes
@@ -98,7 +98,8 @@ def test_auto_is_all_within_the_tolerance(scene: str) -> None:
         build_estimator(j, plan_effects(j)).estimate(queries, spp, Stream(1, "test", 0))
         for j in (everything, job)
     )
-    cost, upper = relative_change(full, cut)
+    found = Change.of(full, cut)
+    cost, upper = found.rms, found.upper
     assert 2 * cost - upper < job.config.effects.tolerance
 
 

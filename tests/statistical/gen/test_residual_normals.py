@@ -10,9 +10,9 @@ from support.paths import ROOT
 
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
-from mbtf_gen.planning.effects_planner import reference_plan
-from mbtf_gen.planning.pilot import pilot_queries, relative_change
-from mbtf_gen.planning.simulation import build_estimator
+from mbtf_gen.planning.bounds import Change
+from mbtf_gen.planning.run_plan import reference_plan
+from mbtf_gen.planning.simulation import build_estimator, pilot_queries
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 from mbtf_gen.tile.heights import height_slopes
@@ -65,11 +65,13 @@ def test_a_coarse_mesh_with_the_residual_comes_closer_to_the_fine_one(name: str)
     fine = plain.height.shape[1]
     mapped = plain.with_maps(normal=normals_of(plain))
     full = estimates(mapped, fine, "off")
-    without = relative_change(full, estimates(mapped, fine // 16, "off"))[0]
-    residual, upper = relative_change(full, estimates(mapped, fine // 16, "residual"))
+    without = Change.of(full, estimates(mapped, fine // 16, "off")).rms
+    found = Change.of(full, estimates(mapped, fine // 16, "residual"))
+    residual, upper = found.rms, found.upper
     assert residual < 0.8 * without
     assert upper - residual < 0.2 * without
     # On the fine mesh the map repeats everything: nothing changes, while the slopes twice would.
-    same, bound = relative_change(full, estimates(mapped, fine, "residual"))
+    found = Change.of(full, estimates(mapped, fine, "residual"))
+    same, bound = found.rms, found.upper
     assert bound < 0.3 * without
     assert same < residual

@@ -8,7 +8,7 @@ from conftest import RunPython
 from support.paths import ROOT
 from support.plugin_materials import write_material
 
-from mbtf_gen.engine.llvm import OLDEST_LLVM
+from mbtf_gen.engine.runtime import OLDEST_LLVM
 
 PROJECT = ROOT
 MOVE = "import os, sys; os.chdir(sys.argv[1])\n"
@@ -98,7 +98,7 @@ else:
 def test_registration_reports_missing_variants(run_python: RunPython) -> None:
     code = """
 import mbtf_fit.backends.mitsuba
-from mbtf_gen.engine.llvm import use_shipped_llvm
+from mbtf_gen.engine.runtime import use_shipped_llvm
 use_shipped_llvm()
 try:
     mbtf_fit.backends.mitsuba.register()

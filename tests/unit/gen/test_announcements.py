@@ -14,7 +14,6 @@ from mbtf_core.data.shard_files import row_bytes
 from mbtf_core.files import folders
 from mbtf_gen import forecast
 from mbtf_gen.cli.app import app
-from mbtf_gen.generation import render_shards
 from mbtf_gen.generation import run as generation
 
 DRAFT = 400 * 128**2 + 65536
@@ -67,9 +66,7 @@ def test_a_long_run_states_time_and_size(
         seen.append(out.exists())
         return SimpleNamespace(start=5.0, seconds=600.0)
 
-    monkeypatch.setattr(generation, "plan_run", lambda job: SimpleNamespace(effects=SimpleNamespace()))
-    monkeypatch.setattr(generation, "open_folder", lambda job, folder, plan, overwrite: plan(job))
-    monkeypatch.setattr(generation, "read_run_plan", stop)
+    monkeypatch.setattr(generation, "open_folder", lambda job, folder, plan, overwrite: stop(plan(job)))
     monkeypatch.setattr(forecast, "LONG_RUN", 1)
     monkeypatch.setattr(forecast, "forecast", pilot)
     plan = SimpleNamespace(effects=SimpleNamespace(closed_form=False))
@@ -96,7 +93,7 @@ def test_a_short_run_needs_no_forecast(
     heights: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(forecast, "forecast", lambda *_, **__: pytest.fail("a pilot"))
-    monkeypatch.setattr(render_shards, "build_estimator", stop)
+    monkeypatch.setattr(generation, "build_estimator", stop)
     words = [str(heights), "--height-scale", "0", "--queries", "1000", "--test-queries", "10"]
     assert run(app, [*words, "-o", str(heights.parent / "out")]) == 130
     assert "expected" not in capsys.readouterr().err

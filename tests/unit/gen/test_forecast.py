@@ -20,9 +20,8 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.forecast import forecast
 from mbtf_gen.job import Job, split_target
 from mbtf_gen.planning import sample_allocation
-from mbtf_gen.planning.effects_planner import plan_effects
-from mbtf_gen.planning.pilot import pilot_queries
-from mbtf_gen.planning.run_plan import RunPlan, allocate
+from mbtf_gen.planning.run_plan import RunPlan, allocate, plan_effects
+from mbtf_gen.planning.simulation import pilot_queries
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 

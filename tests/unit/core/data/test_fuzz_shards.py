@@ -20,7 +20,7 @@ from mbtf_core.data.verify import verify
 from mbtf_core.errors import InputError
 from mbtf_fit.data.loader import load_split, load_training, open_data
 from mbtf_fit.sections import HeldOutSection
-from mbtf_gen.generation.summary import finish
+from mbtf_gen.generation.manifest import finish
 
 TRAILING = {"u": 2, "omega_i": 3, "omega_o": 3, "value_a": 3, "value_b": 3}
 ARRAYS = {name: np.ones((3, size), np.float32) for name, size in TRAILING.items()}

@@ -27,7 +27,7 @@ from mbtf_fit.objective.noise import typical_value
 from mbtf_fit.training.checkpoint import read_checkpoint, write_checkpoint
 from mbtf_fit.training.fit import prepare_trainer
 from mbtf_fit.training.fit_folder import identity_of
-from mbtf_gen.sampling.slice_directions import direction_pairs, slice_directions
+from mbtf_gen.sampling.query_sampler import direction_pairs, slice_directions
 
 NAMES = ("rainer2019", "rainer2020")
 

@@ -9,7 +9,7 @@ import pytest
 from mbtf_core.run.child import ChildResult
 from mbtf_gen.diagnostics import doctor
 from mbtf_gen.diagnostics.doctor import Part
-from mbtf_gen.engine import llvm
+from mbtf_gen.engine import runtime as llvm
 
 
 @pytest.mark.parametrize("required", [True, False])

@@ -9,7 +9,6 @@ import pytest
 from support.formula_runs import SMALL, Formula, cheap_plan
 
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.generation import render_shards
 from mbtf_gen.generation import run as generation
 
 
@@ -17,7 +16,7 @@ from mbtf_gen.generation import run as generation
 def engine(monkeypatch: pytest.MonkeyPatch) -> Formula:
     fake = Formula()
     monkeypatch.setattr(generation, "plan_run", cheap_plan)
-    monkeypatch.setattr(render_shards, "build_estimator", lambda job, plan: fake)
+    monkeypatch.setattr(generation, "build_estimator", lambda job, plan: fake)
     return fake
 
 

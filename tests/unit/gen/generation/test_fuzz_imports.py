@@ -14,8 +14,7 @@ from support.fuzzing import damaged, examples, loads_or_refuses
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_gen.config.measured import ImportConfig
-from mbtf_gen.generation.import_job import Import
-from mbtf_gen.generation.imported import import_measured
+from mbtf_gen.generation.imported import Import, import_measured
 
 CONFIG = ImportConfig.model_validate(
     {"queries": {"train": "60", "test": "20", "min_cos": 0.05}, "cosine": "included"}

@@ -23,11 +23,10 @@ from mbtf_fit.formatting import describe_coverage, summarize_errors
 from mbtf_fit.training.fit import prepare_trainer
 from mbtf_gen.cli.generate import describe
 from mbtf_gen.config.measured import ImportConfig
-from mbtf_gen.generation import import_job
-from mbtf_gen.generation.import_job import Import
-from mbtf_gen.generation.imported import import_measured
+from mbtf_gen.generation import imported
+from mbtf_gen.generation.imported import Import, import_measured
 from mbtf_gen.generation.repair import repair
-from mbtf_gen.sampling.slice_directions import slice_directions
+from mbtf_gen.sampling.query_sampler import slice_directions
 from mbtf_pipeline.compare.dataset_errors import dataset_errors
 
 Open = Callable[..., Import]
@@ -40,7 +39,7 @@ def opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Open:
     file.write_bytes(b"measured")
 
     def open_(source: Any, **options: Any) -> Import:
-        monkeypatch.setattr(import_job, "open_measured", lambda path: source)
+        monkeypatch.setattr(imported, "open_measured", lambda path: source)
         options["output"] = {"shard_queries": 300, **options.get("output", {})}
         return Import.prepare(file, ImportConfig.model_validate(options))
 
@@ -68,7 +67,7 @@ def test_values_are_those_of_the_reference_plane(opened: Open, tmp_path: Path) -
     page = (ROOT / "docs/reference/data-format.md").read_text()
     assert all(f"`{key}`" in page for key in measured)
     assert measured["divided_by_cosine"]
-    assert measured["left_out"] + sum(map(len, job.pairs or ())) == 64 + 3
+    assert measured["pairs"] == 64 + 3
 
 
 def test_test_queries_have_pairs_of_their_own(opened: Open, tmp_path: Path) -> None:
@@ -142,7 +141,7 @@ def test_no_noise_is_claimed(opened: Open, tmp_path: Path) -> None:
 def test_blocks_of_a_list_keep_every_query_once(
     opened: Open, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, test: int
 ) -> None:
-    monkeypatch.setattr(import_job, "_BLOCK", 256)
+    monkeypatch.setattr(imported, "_BLOCK", 256)
     source = Listed()
     import_measured(opened(source, queries={"test": str(test)}), tmp_path / "shards")
     data = Dataset.open(tmp_path / "shards")
@@ -166,7 +165,7 @@ def test_blocks_of_a_list_keep_every_query_once(
 
 
 def test_options_select_from_a_list(opened: Open, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(import_job, "_BLOCK", 256)
+    monkeypatch.setattr(imported, "_BLOCK", 256)
     source = Listed()
     queries = {"train": "123", "test": "45", "min_cos": 0.6}
     job = opened(source, queries=queries, cosine="included", scale=2.0)
@@ -176,7 +175,7 @@ def test_options_select_from_a_list(opened: Open, tmp_path: Path, monkeypatch: p
     assert [len(p["sigma"]) for p in parts] == [123, 45]
     lowest = np.minimum(source.arrays["omega_i"][:, 2], source.arrays["omega_o"][:, 2])
     assert data.manifest["measured"]["queries"] == 1000
-    assert data.manifest["measured"]["left_out"] == (lowest < 0.6).sum() == job.left_out
+    assert data.manifest["measured"]["left_out"] == (lowest < 0.6).sum()
     assert data.manifest["measured"]["divided_by_cosine"]
     found = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
     assert len(np.unique(found["u"], axis=0)) == 168
@@ -196,7 +195,7 @@ def test_footprints_of_a_list_are_those_of_levels(opened: Open, tmp_path: Path) 
     source = Listed()
     source.arrays["sigma"][::10], source.arrays["sigma"][5::10] = 1e-20, 7.0
     job = opened(source, queries={"test": "100"})
-    assert (job.usable, job.left_out, job.finest) == (800, 200, 4)
+    assert (job.facts["left_out"], job.lattice.finest) == (200, 4)
     import_measured(job, tmp_path / "shards")
     assert (Dataset.open(tmp_path / "shards").load("train")["sigma"] == np.float32(0.5 / 16)).all()
 
@@ -249,19 +248,7 @@ def test_rounded_footprints_add_no_level(opened: Open) -> None:
     for sigma, finest in ((0.5 / 16 * (1 - 5e-4), 4), (0.028, 5)):
         source = Listed()
         source.arrays["sigma"][:] = sigma
-        assert opened(source).finest == finest
-
-
-def test_only_images_identify_a_folder(tmp_path: Path) -> None:
-    """File managers leave files of their own behind."""
-    photographs = tmp_path / "photographs"
-    photographs.mkdir()
-    (photographs / "tl000 pl000 tv000 pv000.JPG").write_bytes(b"one")
-    before = import_job._digest(photographs)
-    (photographs / "Thumbs.db").write_bytes(b"cache")
-    assert import_job._digest(photographs) == before
-    (photographs / "tl015 pl000 tv000 pv000.png").write_bytes(b"two")
-    assert import_job._digest(photographs) != before
+        assert opened(source).lattice.finest == finest
 
 
 def test_rounded_footprints_of_the_whole_tile_are_fitted(opened: Open, tmp_path: Path) -> None:

@@ -17,8 +17,8 @@ from mbtf_core.locks import lock_file_of, take_lock
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Result, exhausted
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.generation.folder import open_folder, read_run_plan
-from mbtf_gen.generation.render_shards import ShardRun, render_shard, render_shards
+from mbtf_gen.generation.folder import open_folder
+from mbtf_gen.generation.run import ShardRun, render_shard, render_shards
 from mbtf_gen.job import Job, received_job
 from mbtf_gen.planning.run_plan import plan_run
 
@@ -34,8 +34,7 @@ def run(tmp_path: Path) -> ShardRun:
     config = GeneratorConfig.model_validate(options | {"output": {"shard_queries": 100}})
     job = Job.prepare(config)
     folder = DataFolder.open(tmp_path / "out")
-    open_folder(job, folder, plan_run, False)
-    return ShardRun(job, folder, read_run_plan(folder))
+    return ShardRun(job, folder, open_folder(job, folder, plan_run))
 
 
 def render(run: ShardRun) -> dict[str, Any]:
@@ -103,7 +102,7 @@ def test_samples_that_are_not_finite_end_the_run(run: ShardRun) -> None:
     value = render(run)
     value["record"]["quarantined"]["nonfinite_samples"] = 9
     with pytest.raises(PartialError, match="NaN or infinite"):
-        render_shards(run.job, run.folder, run.job.shards, run.plan, FullDisk(1, value))
+        render_shards(run, run.job.shards, FullDisk(1, value))
 
 
 def test_a_full_disk_ends_the_run(run: ShardRun) -> None:
@@ -113,10 +112,10 @@ def test_a_full_disk_ends_the_run(run: ShardRun) -> None:
     job, disk = Job.prepare(config), FullDisk()
     first = r"8 shard\(s\) failed, 103 are left.*no space left \(on node:1\)\n  make room"
     with pytest.raises(PartialError, match=first):
-        render_shards(job, run.folder, job.shards, run.plan, disk)
+        render_shards(ShardRun(job, run.folder, run.plan), job.shards, disk)
     assert disk.tried == 8
     # Failures that are not in a row do not end it.
     disk = FullDisk(6, render(run))
     with pytest.raises(PartialError, match=r"13 shard\(s\) failed"):
-        render_shards(job, run.folder, job.shards, run.plan, disk)
+        render_shards(ShardRun(job, run.folder, run.plan), job.shards, disk)
     assert disk.tried == 14

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import pickle
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,7 @@ from mbtf_core.run.task import exhausted
 from mbtf_gen.cli.app import app
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.folder import read_run_plan
-from mbtf_gen.generation.render_shards import ShardRun, render_shard
+from mbtf_gen.generation.run import ShardRun, render_shard
 from mbtf_gen.job import Job
 from mbtf_gen.planning.simulation import ClosedForm
 
@@ -75,34 +74,6 @@ def test_the_bits_are_those_of_a_local_run(tmp_path: Path, url: str, suffix: str
 def waiting(folder: Path) -> list[str]:
     """Files that are not uploaded."""
     return [path.name for path in (folder / "cache/mbtf/stores/waiting").glob("*/*")]
-
-
-def test_nothing_stays_on_the_machine_but_the_cache(tmp_path: Path, url: str) -> None:
-    assert generate(command_at(tmp_path, url)) == 0
-    assert waiting(tmp_path) == []
-
-
-def test_a_folder_of_a_store(tmp_path: Path, url: str) -> None:
-    assert generate(command_at(tmp_path, url)) == 0
-    folder = DataFolder.open(Path(url))
-    assert (str(folder), folder.at("a")) == (url, f"{url}/a")
-    assert folder.local is None
-    assert folder.names() == sorted(ObjectStore(url).list())
-    shard = Dataset.open(folder).shards("train")[0]
-    assert folder.size(shard.file) == shard.local().stat().st_size > 0
-    assert folder.size("train-00009.npz") is None
-    folder.delete(shard.file)
-    assert not folder.has(shard.file)
-    assert shard.file not in ObjectStore(url).list()
-    assert DataFolder.open(f"file://{tmp_path}/a%20b").local == tmp_path / "a b"
-    assert DataFolder.open(tmp_path).local == tmp_path
-
-
-def test_a_finished_run_renders_nothing(tmp_path: Path, url: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert generate(command_at(tmp_path, url)) == 0
-    capsys.readouterr()
-    assert generate(command_at(tmp_path, url)) == 0
-    assert "nothing left to do" in capsys.readouterr().out
 
 
 def test_a_list_that_lags_behind(tmp_path: Path, url: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -199,19 +170,13 @@ def test_corruption_is_found_and_repaired(
     assert {fault.file for fault in verify(url)} == faulty
     assert run(app, ["verify", url, "-q"]) == 3
     assert f"mbtf-gen repair {url}" in capsys.readouterr().out
-    assert run(app, ["repair", url, "-q"]) == 0
+    for lost in ("nothing else", "manifest.json"):
+        store.delete(lost)
+        assert run(app, ["repair", url, "-q"]) == 0
     assert verify(url) == []
     found = contents(downloaded(url, tmp_path / "after"))
     assert found.pop("notes.txt") == b"mine"
     assert found == expected
-
-
-def test_a_lost_manifest_is_restored(tmp_path: Path, url: str) -> None:
-    assert generate(command_at(tmp_path, url)) == 0
-    expected = contents(downloaded(url, tmp_path / "before"))
-    ObjectStore(url).delete("manifest.json")
-    assert run(app, ["repair", url, "-q"]) == 0
-    assert contents(downloaded(url, tmp_path / "after")) == expected
 
 
 def test_another_configuration_is_refused_and_replaced(
@@ -234,24 +199,6 @@ def test_a_folder_of_something_else_is_refused(
     assert set(ObjectStore(url).list()) == {"thesis.tex"}
 
 
-def test_missing_data_sets_are_named(url: str) -> None:
-    with pytest.raises(InputError, match=f"{url}: no manifest.json in it"):
-        Dataset.open(url)
-
-
-def test_a_url_names_a_bucket() -> None:
-    with pytest.raises(InputError, match="names no bucket"):
-        Dataset.open("s3://")
-
-
-def test_a_cache_that_cannot_be_written(tmp_path: Path, url: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert generate(command_at(tmp_path, url)) == 0
-    (tmp_path / "file").touch()
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    with pytest.raises(InputError, match="cannot be created"):
-        Dataset.open(url)
-
-
 def test_a_corrupt_shard_is_not_read(tmp_path: Path, url: str) -> None:
     assert generate(command_at(tmp_path, url)) == 0
     store = ObjectStore(url)
@@ -260,6 +207,11 @@ def test_a_corrupt_shard_is_not_read(tmp_path: Path, url: str) -> None:
     store.write("train-00001.npz", bytes(flipped))
     with pytest.raises(InputError, match=f"{url}/train-00001.npz: has changed since it was written"):
         Dataset.open(url).load("train")
+
+
+def test_a_url_names_a_bucket() -> None:
+    with pytest.raises(InputError, match="names no bucket"):
+        Dataset.open("s3://")
 
 
 def test_a_digest_names_no_file_elsewhere(tmp_path: Path, url: str) -> None:
@@ -375,14 +327,6 @@ def _documents_only(self: ObjectStore, name: str, content: bytes, *, new: bool =
     if name.startswith(("train", "test")):
         raise PartialError("the store cannot be reached")
     return _write(self, name, content, new=new)
-
-
-def test_a_stored_data_set_is_published(tmp_path: Path, url: str) -> None:
-    assert generate(command_at(tmp_path, url)) == 0
-    card = tmp_path / "card"
-    assert run(app, ["publish", url, "--license", "CC0-1.0", "--form", "npz", "-o", str(card), "-q"]) == 0
-    assert verify(card / "data") == []
-    shutil.rmtree(card)
 
 
 @pytest.mark.parametrize("program", ["preview", "reference"])

@@ -11,7 +11,8 @@ import pytest
 
 from mbtf_core.errors import PartialError
 from mbtf_gen.cli.generate import describe
-from mbtf_gen.generation.summary import ShardStatistics, Summary, refuse_nonfinite
+from mbtf_gen.generation.manifest import Summary
+from mbtf_gen.generation.shard_record import ShardStatistics
 
 COUNTS: dict[str, Any] = {"queries": 1000, "splits": {"train": 900, "test": 100}, "paths": 8000}
 COUNTS |= dict.fromkeys(("lost", "capped", "nonfinite", "writing_seconds", "waiting_seconds"), 0)
@@ -33,6 +34,7 @@ def test_halving_the_error_takes_three_times_the_seconds_so_far() -> None:
 def test_one_sample_in_a_million_may_be_nonfinite(count: int, paths: int, refused: bool) -> None:
     statistics = ShardStatistics()
     quarantined = {"nonfinite_samples": count, "lost_rays": 0, "capped_rays": 0, "nonfinite_at": []}
-    statistics.add_quarantined("train-00000.npz", quarantined)
+    record = {"file": "test-00000.npz", "split": "test", "queries": 1, "paths": paths, "seconds": 0.0}
+    statistics.add({**record, "quarantined": quarantined, "target": None})
     with pytest.raises(PartialError) if refused else contextlib.nullcontext():
-        refuse_nonfinite(statistics, paths, Path("out"))
+        statistics.refuse_nonfinite(paths, Path("out"))

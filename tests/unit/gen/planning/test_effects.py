@@ -10,12 +10,11 @@ import pytest
 
 from mbtf_core.errors import UsageError
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.effects.catalog import EFFECTS
-from mbtf_gen.effects.effect import EffectDecision
-from mbtf_gen.effects.plan import EffectsPlan
-from mbtf_gen.effects.request import EffectsRequest
 from mbtf_gen.job import Job
-from mbtf_gen.planning.effects_planner import plan_effects, reference_plan
+from mbtf_gen.planning.effects import EFFECTS
+from mbtf_gen.planning.effects_plan import EffectsPlan
+from mbtf_gen.planning.run_plan import plan_effects, reference_plan
+from mbtf_gen.planning.scene import EffectsRequest
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 
 HEIGHTS = np.array([[0.0, 0.1], [0.05, 0.02]])
@@ -110,16 +109,7 @@ def test_effects_that_the_material_lacks_cannot_be_forced_on(name: str) -> None:
 @pytest.mark.parametrize("text", ["", "every", "+", "-depth", "none,shadowing", "+shadowing,auto"])
 def test_unknown_words_are_refused(text: str) -> None:
     with pytest.raises(UsageError, match="is not an effect"):
-        EffectsRequest.parse(text)
-
-
-def test_bias_bounds_add_up_over_what_is_off() -> None:
-    effects = (
-        EffectDecision("parallax", True, "", 0.5),
-        EffectDecision("shadowing", False, "", 0.001),
-        EffectDecision("bsdf_sampling", False, "", 0.002),
-    )
-    assert EffectsPlan(effects).bias_bound == pytest.approx(0.003)
+        EffectsRequest.parse(text, EFFECTS)
 
 
 def test_a_small_run_has_no_pilot() -> None:

@@ -7,8 +7,7 @@ import pytest
 
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
-from mbtf_gen.planning.effects_planner import plan_effects
-from mbtf_gen.planning.pilot import measured
+from mbtf_gen.planning.run_plan import measured, plan_effects
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 
 # Root mean square change at 131 072 points of the bump below, without its shadows.

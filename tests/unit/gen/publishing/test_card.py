@@ -21,8 +21,7 @@ from support.published import LAYOUTS, publish, python_blocks, small, stored
 from mbtf_core.data.dataset import Dataset
 from mbtf_gen.config.measured import ImportConfig
 from mbtf_gen.config.publish import PublishConfig
-from mbtf_gen.generation.import_job import Import
-from mbtf_gen.generation.imported import import_measured
+from mbtf_gen.generation.imported import Import, import_measured
 from mbtf_gen.publishing.card import card_text
 from mbtf_gen.publishing.facts import Facts
 

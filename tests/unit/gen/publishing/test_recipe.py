@@ -21,7 +21,6 @@ from mbtf_core.data.dataset import Dataset
 from mbtf_core.errors import InputError, UsageError
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.publish import PublishConfig
-from mbtf_gen.generation import render_shards
 from mbtf_gen.generation import run as generation
 from mbtf_gen.publishing.digests import dataset_digests, digest_faults
 from mbtf_gen.publishing.publication import Publication
@@ -34,7 +33,7 @@ CONFIG = PublishConfig(license="CC0-1.0", form="webdataset")
 def engine(monkeypatch: pytest.MonkeyPatch) -> None:
     fake = Formula()
     monkeypatch.setattr(generation, "plan_run", cheap_plan)
-    monkeypatch.setattr(render_shards, "build_estimator", lambda job, plan: fake)
+    monkeypatch.setattr(generation, "build_estimator", lambda job, plan: fake)
 
 
 def write_maps(folder: Path) -> Path:

@@ -11,7 +11,6 @@ from conftest import RunPython
 
 from mbtf_core.errors import EngineError
 from mbtf_core.run.child import run_child
-from mbtf_gen.engine import llvm
 from mbtf_gen.engine import runtime as engine
 
 LOAD = """
@@ -39,10 +38,10 @@ def old_llvm(major: int) -> str:
 
 
 def test_the_installation_has_a_new_enough_llvm() -> None:
-    library = llvm.shipped_llvm()
+    library = engine.shipped_llvm()
     assert library is not None
     assert library.is_file()
-    assert llvm.has_version(str(library))
+    assert engine.has_version(str(library))
 
 
 def test_it_is_found_and_works_with_nothing_set(run_python: RunPython, tmp_path: Path) -> None:
@@ -53,17 +52,17 @@ def test_it_is_found_and_works_with_nothing_set(run_python: RunPython, tmp_path:
         DRJIT_CACHE_DIR=None,
         XDG_CACHE_HOME=str(tmp_path),
     )
-    assert done.stdout.splitlines() == ["llvm_ad_rgb", str(llvm.shipped_llvm())]
+    assert done.stdout.splitlines() == ["llvm_ad_rgb", str(engine.shipped_llvm())]
     assert done.stderr == ""
     assert any(p.name.startswith("llvm-proof-") for p in (tmp_path / "mbtf").iterdir())
 
 
 def test_a_path_the_user_set_wins(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(llvm.VARIABLE, "/somewhere/libLLVM.so.99")
-    monkeypatch.delenv(llvm.CACHE_VARIABLE, raising=False)
-    llvm.use_shipped_llvm()
-    assert os.environ[llvm.VARIABLE] == "/somewhere/libLLVM.so.99"
-    assert os.environ[llvm.CACHE_VARIABLE].endswith("kernels-libLLVM.so.99")
+    monkeypatch.setenv(engine.VARIABLE, "/somewhere/libLLVM.so.99")
+    monkeypatch.delenv(engine.CACHE_VARIABLE, raising=False)
+    engine.use_shipped_llvm()
+    assert os.environ[engine.VARIABLE] == "/somewhere/libLLVM.so.99"
+    assert os.environ[engine.CACHE_VARIABLE].endswith("kernels-libLLVM.so.99")
 
 
 def test_a_text_file_is_refused_in_one_line(run_python: RunPython, tmp_path: Path) -> None:
@@ -85,7 +84,7 @@ def test_an_old_llvm_is_refused(run_python: RunPython) -> None:
 
 def test_an_installation_never_started_by_its_owner_works(run_python: RunPython, tmp_path: Path) -> None:
     # Links of the C++ runtime appear at the first start that may write; here they never did.
-    shipped = llvm.shipped_llvm()
+    shipped = engine.shipped_llvm()
     assert shipped is not None
     runtime = sorted({p.resolve() for p in shipped.parent.glob("*-linux-gnu/lib*.so.*")})
     if not runtime:
@@ -110,7 +109,7 @@ def library(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """A library that the user chose, and an empty cache."""
     path = tmp_path / "libLLVM.so.20.1"
     path.write_bytes(b"x")
-    monkeypatch.setenv(llvm.VARIABLE, str(path))
+    monkeypatch.setenv(engine.VARIABLE, str(path))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     return path
 
@@ -151,7 +150,7 @@ def prove_whatever_the_version():  # type: ignore[no-untyped-def]
 
 def test_the_proof_catches_the_abort_of_llvm_15(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Without the version check, the test kernels end the child in the way they would end a render."""
-    monkeypatch.setenv(llvm.VARIABLE, old_llvm(15))
-    environment = {llvm.CACHE_VARIABLE: str(tmp_path)}
+    monkeypatch.setenv(engine.VARIABLE, old_llvm(15))
+    environment = {engine.CACHE_VARIABLE: str(tmp_path)}
     outcome = run_child(__name__, "prove_whatever_the_version", timeout=60, environment=environment)
     assert "ended by SIGABRT" in outcome.fault

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from conftest import RunPython
 
-from mbtf_gen.engine.memory import padded
+from mbtf_gen.engine.types import padded
 
 # Numbers at the end of readable memory.
 CODE = """
 import ctypes, mmap, sys
 import numpy as np
-from mbtf_gen.engine.memory import padded
+from mbtf_gen.engine.types import padded
 from mbtf_gen.engine.runtime import load_mitsuba
 mi = load_mitsuba()
 import drjit as dr

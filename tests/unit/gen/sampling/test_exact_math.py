@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from mbtf_gen.sampling.exact_math import exp, exp2, log, sincos_turns
@@ -57,16 +56,3 @@ def test_any_shape_is_taken() -> None:
     assert exp2(x).shape == exp(x).shape == log(x + 2.0).shape == x.shape
     assert all(part.shape == x.shape for part in sincos_turns(x))
     np.testing.assert_array_equal(exp2(x).ravel(), exp2(x.ravel()))
-
-
-def test_against_fifty_digits() -> None:
-    mpmath = pytest.importorskip("mpmath")
-    with mpmath.workdps(50):
-        for t in turns()[::200]:
-            sine, cosine = (float(part) for part in sincos_turns(np.float64(t)))
-            angle = 2 * mpmath.pi * mpmath.mpf(float(t))
-            assert abs(sine - mpmath.sin(angle)) < TOLERANCE
-            assert abs(cosine - mpmath.cos(angle)) < TOLERANCE
-        for x in np.random.default_rng(2).uniform(-20, 20, 200):
-            exact = mpmath.power(2, mpmath.mpf(float(x)))
-            assert abs(float(exp2(np.float64(x))) / exact - 1) < TOLERANCE

@@ -11,11 +11,11 @@ from support.chi_square import uniformity
 
 from mbtf_core.stats import holm
 from mbtf_gen.engine.runtime import load_mitsuba
-from mbtf_gen.sampling.rng import MAX_SHARDS, Purpose, numpy_generator, sequence, stream_key, stream_number
+from mbtf_gen.sampling.rng import MAX_SHARDS, Purpose, numpy_generator, stream_key, stream_number
 
 mi = load_mitsuba()
 
-from mbtf_gen.sampling.sobol import SobolSampler  # noqa: E402
+from mbtf_gen.sampling.sobol import SobolSampler, sequence  # noqa: E402
 
 SHARDS = [0, 1, 2, 3, 255, 256, 4095, 4096, 65535, 65536, MAX_SHARDS - 2, MAX_SHARDS - 1]
 PASSES = [0, 1, 2, 3, 15, 16, 2047, 4095]

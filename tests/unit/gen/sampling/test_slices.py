@@ -8,8 +8,7 @@ from support.datasets import write_dataset
 
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import UsageError
-from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan
-from mbtf_gen.sampling.slice_directions import direction_pairs, slice_directions
+from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan, direction_pairs, slice_directions
 
 
 @pytest.mark.parametrize(("count", "min_cos"), [(1, 0.5), (20, 0.1), (151, 0.3)])

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.images.resample import resample
-from mbtf_gen.effects.effect import Effect, EffectDecision, PlanScene
+from mbtf_gen.planning.scene import Effect, EffectDecision, PlanScene
 from mbtf_gen.sampling.light_kernel import LightKernel
 
 # The light lobe is cut at this many standard deviations; the second number is the tail of a Gaussian there.
@@ -34,6 +34,7 @@ class ReflectionLayer(Effect):
     ----------
     scale : from the weight to the strength, of which 1 is a full layer
     text, unit : explanation, and the unit of the weight in it
+    lacking : why the material has no such layer
     """
 
     stage = "reflection"
@@ -41,10 +42,7 @@ class ReflectionLayer(Effect):
     scale: ClassVar[float] = 1.0
     text: ClassVar[str]
     unit: ClassVar[float] = 1.0
-
-    def absent(self, scene: PlanScene) -> str:
-        """Why the material has no such layer."""
-        return "no map"
+    lacking: ClassVar[str] = "no map"
 
     def weight(self, scene: PlanScene) -> float:
         """Largest weight; 0 without a map."""
@@ -57,15 +55,13 @@ class ReflectionLayer(Effect):
             return self.decision(False, text, 0.0, present=False)
         weight = self.weight(scene)
         if weight <= 0.0:
-            return self.decision(False, self.absent(scene), 0.0, present=False)
+            return self.decision(False, self.lacking, 0.0, present=False)
         strength, text = weight * self.scale, self.text.format(weight * self.unit)
-        if self.name not in scene.auto or strength >= FAINT:
+        if scene.pilots is None or strength >= FAINT or not scene.is_auto(self.name):
             return self.decision(True, text)
-        bound = None
-        if scene.pilots:
-            # Noise would hide its effect, so a pilot measures the layer at full strength, and the result is
-            # scaled down.
-            bound = FAINT_CAUTION * strength * scene.change_of_layer(self.name, strength).bound()
+        # Noise would hide its effect, so a pilot measures the layer at full strength, and the result is
+        # scaled down.
+        bound = FAINT_CAUTION * strength * scene.pilots.change_of_layer(self.name, strength).bound()
         return self.decision(True, text, bound, "pilot")
 
 
@@ -75,11 +71,7 @@ class Specular(ReflectionLayer):
     name, description = "specular", "specular lobe"
     # A specular of 1/4 (F0 = 2 %) is the smallest that reflects everything at grazing angles.
     scale, text, unit = 4.0, "F0 up to {:.2g} %", 8.0
-
-    def absent(self, scene: PlanScene) -> str:
-        """Lambert, or specular 0."""
-        lambert = "specular" not in scene.tile.maps
-        return "Lambert: no roughness, metallic or specular" if lambert else "specular is 0 everywhere"
+    lacking = "no roughness, metallic or specular, or specular 0"
 
     def propose(self, scene: PlanScene) -> EffectDecision:
         """As any layer, but on where the material has its own BSDF."""
@@ -94,10 +86,6 @@ class Metallic(ReflectionLayer):
 
     name, description = "metallic", "metallic"
     scale, text = math.inf, "metallic up to {:.2g}"
-
-    def absent(self, scene: PlanScene) -> str:
-        """No metal."""
-        return "no metal anywhere"
 
 
 class Clearcoat(ReflectionLayer):
@@ -278,10 +266,10 @@ class Transmission(Effect):
     def propose(self, scene: PlanScene) -> EffectDecision:
         """Off where a pilot with and without it shows little change."""
         found = self.reference(scene)
-        if not found.present or self.name not in scene.auto or not scene.pilots:
+        if not found.present or scene.pilots is None or not scene.is_auto(self.name):
             return found
         many = EffectDecision("interreflection", True, scene.tile.kind)
-        change = scene.change_without(self.name, {self.name: found, many.name: many})
+        change = scene.pilots.change_without(self.name, {self.name: found, many.name: many})
         upper = change.bound()
         if upper > scene.left:
             return self.decision(True, found.explanation, change.rms, "pilot")
@@ -306,7 +294,7 @@ class Interreflection(Displacement):
         if scene.max_depth == 1:
             return self.decision(False, "max_depth 1", None, "forced")
         kind = scene.tile.kind
-        if self.name not in scene.auto or not scene.is_on("parallax"):
+        if not scene.is_auto(self.name) or not scene.decided["parallax"].on:
             return self.decision(True, kind)
         most = bounce_bound(scene) if scene.lambert and scene.tile.grid is not None else np.inf
         text = "light scattered by several fibers" if scene.tile.scatters else "light between facets"
@@ -314,9 +302,9 @@ class Interreflection(Displacement):
             text += f"; slopes up to {_degrees(scene.steepest)} interreflect little"
             scene.cap = 1
             return self.decision(False, text, most, "bound")
-        if not scene.pilots:
+        if scene.pilots is None:
             return self.decision(True, f"{kind}; the run is too small for a pilot")
-        limited = scene.capped({self.name: self.decision(True, kind)})
+        limited = scene.pilots.capped({self.name: self.decision(True, kind)})
         change = limited(1)
         upper = change.bound(most)
         if upper <= scene.left:

@@ -7,13 +7,17 @@ leaving out all of them (Minkowski's inequality), so a tolerance can be divided 
 
 from __future__ import annotations
 
+import math
+import textwrap
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from mbtf_core.errors import UsageError
-from mbtf_gen.effects.catalog import EFFECTS
-from mbtf_gen.effects.effect import EffectDecision
-from mbtf_gen.effects.request import EffectsRequest
+from mbtf_gen.planning.effects import EFFECTS
+from mbtf_gen.planning.scene import EffectDecision, EffectsRequest
+
+# Columns of the table before the explanation, and its width.
+_NAME, _BOUND, _WIDTH = 24, 24, 108
 
 
 @dataclass(frozen=True)
@@ -22,20 +26,13 @@ class EffectsPlan:
 
     Attributes
     ----------
-    effects : tuple of EffectDecision
-        One decision per effect.
-    max_depth : int
-        Surface interactions of a path at most; 0 means no limit.
-    cap_bias_bound : float
-        Bias bound of that limit, where the plan chose it.
-    roulette_depth : int
-        Surface interactions before Russian roulette begins.
-    mode : str
-        The user's request.
-    tolerance : float
-        Allowed bias bound of everything that is left out together.
-    closed_form : bool
-        Whether M is known without tracing.
+    effects : one decision per effect
+    max_depth : surface interactions of a path at most; 0 means no limit
+    cap_bias_bound : bias bound of that limit, where the plan chose it
+    roulette_depth : surface interactions before Russian roulette begins
+    mode : the user's request
+    tolerance : allowed bias bound of everything that is left out together
+    closed_form : whether M is known without tracing
     """
 
     effects: tuple[EffectDecision, ...]
@@ -68,27 +65,23 @@ class EffectsPlan:
         effects = [asdict(effect) for effect in self.effects]
         return {**vars(self), "bias_bound": self.bias_bound, "effects": effects}
 
-
-def decide(request: EffectsRequest, effect: EffectDecision) -> EffectDecision:
-    """The effect, switched where the user requests it.
-
-    Raises
-    ------
-    UsageError : the request switches an effect on that the material lacks, or off one that it requires
-    """
-    name = effect.name
-    if not effect.present:
-        requested = request.forced.get(name, effect.on)
-        if requested and not effect.on:
-            raise UsageError(f"the material has none: {effect.explanation}", where=f"--effects +{name}")
-        if effect.on and not requested:
-            raise UsageError(f"cannot be left out: {effect.explanation}", where=f"--effects -{name}")
-        return effect
-    on = request.forced.get(name, effect.on if request.base == "auto" else request.base == "all")
-    if on == effect.on:
-        return effect
-    explanation = f"forced {'on' if on else 'off'}; {effect.explanation}"
-    return replace(effect, on=on, explanation=explanation, reason="forced")
+    def describe(self) -> str:
+        """A table for people, a line or two per effect."""
+        before = _NAME + 5 + _BOUND
+        lines = [f"{'effect':<{_NAME}}{'':5}{'bias bound if omitted':<{_BOUND}}reason"]
+        for e in self.effects:
+            first, *rest = textwrap.wrap(e.explanation, _WIDTH - before) or [""]
+            state = "on" if e.on else "off"
+            lines.append(f"{EFFECTS[e.name].description:<{_NAME}}{state:<5}{_bound_text(e):<{_BOUND}}{first}")
+            lines += [" " * before + more for more in rest]
+        bound = self.bias_bound
+        share = "0 %" if bound == 0 else f"at most {_percent(bound)}"
+        lines.append(f"bias of all omitted effects: {share}; effects.tolerance is {_percent(self.tolerance)}")
+        if self.closed_form:
+            lines.append("M has a closed form: no paths are traced")
+        elif self.max_depth:
+            lines.append(f"paths end after {self.max_depth} surface interactions")
+        return "\n".join(lines)
 
 
 def consistent(decided: dict[str, EffectDecision], request: EffectsRequest) -> dict[str, EffectDecision]:
@@ -118,5 +111,29 @@ def without(plan: EffectsPlan, name: str) -> EffectsPlan:
     UsageError : the material requires the effect
     """
     request = EffectsRequest("auto", {name: False})
-    decided = consistent({e.name: decide(request, e) for e in plan.effects}, request)
+    decided = consistent({e.name: request.decide(e) for e in plan.effects}, request)
     return replace(plan, effects=tuple(decided.values()))
+
+
+def _bound_text(effect: EffectDecision) -> str:
+    """The bias bound of leaving an effect out, with its error or as an upper bound."""
+    if effect.bias_bound is None:
+        return "-"
+    if effect.reason == "exact" and effect.bias_bound == 0:
+        return "0 (exact)"
+    if effect.reason == "bound" or not effect.on:
+        return f"< {_percent(effect.bias_bound)}"
+    if effect.error:
+        if effect.bias_bound < 2.0 * effect.error:
+            return f"< {_percent(effect.bias_bound + 2 * effect.error)}"
+        return f"{_percent(effect.bias_bound)[:-2]} ± {_percent(effect.error, 1)}"
+    return f"~ {_percent(effect.bias_bound)}"
+
+
+def _percent(share: float, digits: int = 2) -> str:
+    """A share in percent, rounded to some digits but written out."""
+    percent = 100.0 * share
+    if percent <= 0.0:
+        return "0 %"
+    places = digits - 1 - math.floor(math.log10(percent))
+    return f"{round(percent, places):.{max(0, places)}f} %"
