@@ -1,23 +1,18 @@
-"""Validation during training: the set, the error on it, and the history of records."""
+"""Validation during training: the set, and the error on it."""
 
 from __future__ import annotations
 
-import json
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mbtf_core.data.dataset import Dataset
-from mbtf_core.files.atomic import write_text
 from mbtf_core.stats import Estimate, level_groups, unexplained_variance
 from mbtf_fit.data.loader import Partition, load_split
 from mbtf_fit.data.queries import ShardQueries
-from mbtf_fit.formatting import format_estimate
 from mbtf_fit.training.trainer import Trainer
 
-HISTORY_NAME = "metrics.jsonl"
 # Queries of the validation subset, and the fewest test queries that are preferred over held-out queries.
 _SUBSET, _FEWEST = 1 << 14, 1 << 12
 
@@ -78,66 +73,3 @@ def history_record(trainer: Trainer, subset: ShardQueries) -> dict[str, Any]:
         "unexplained_error": found.get("error"),
         "queries_per_second": round(state.step * trainer.batch / max(state.seconds, 1e-9)),
     }
-
-
-def append_history(folder: Path, record: dict[str, Any]) -> None:
-    """Add a record to the history of a fit."""
-    with (folder / HISTORY_NAME).open("a", encoding="utf-8") as stream:
-        stream.write(json.dumps(record) + "\n")
-
-
-def truncate_history(folder: Path, step: int) -> None:
-    """Remove the records after a step, to which a fit returns; all of them at step 0."""
-    if step == 0:
-        (folder / HISTORY_NAME).unlink(missing_ok=True)
-        return
-    kept = [line for line in read_history(folder) if line.get("step", 0) <= step]
-    write_text(folder / HISTORY_NAME, "".join(json.dumps(line) + "\n" for line in kept))
-
-
-def describe_record(record: dict[str, Any]) -> str:
-    """One line for the progress bar."""
-    text = f"loss {record['loss']:.3f}"
-    if record["unexplained"] is not None:
-        estimate = {"value": record["unexplained"], "error": record["unexplained_error"]}
-        text += f", validation error {format_estimate(estimate)}"
-    return f"{text}, {record['queries_per_second'] / 1e6:.2f} M queries/s"
-
-
-def read_history(folder: str | Path) -> list[dict[str, Any]]:
-    """Read the validation history of a fit; records after a corrupt line are left out.
-
-    Parameters
-    ----------
-    folder : str or Path
-        Folder of the material.
-
-    Returns
-    -------
-    list of dict
-        One record per validation, in order of time:
-
-        step : int
-            Steps done.
-        seconds : float
-            Training time in seconds.
-        fraction : float
-            Fraction of the budget that is spent, in [0, 1].
-        loss : float
-            Mean training loss since the record before.
-        unexplained, unexplained_error : float or None
-            Unexplained variance of the validation subset (1 - R²), and its standard error.
-        queries_per_second : int
-            Training throughput.
-    """
-    path = Path(folder) / HISTORY_NAME
-    out = []
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []:
-        try:
-            record = json.loads(line)
-        except (ValueError, RecursionError):
-            break
-        if not isinstance(record, dict):
-            break
-        out.append(record)
-    return out

@@ -39,10 +39,10 @@ def fit_shared(
     Raises
     ------
     InputError, PartialError
-        As :func:`~mbtf_fit.training.joint_fit.fit_jointly`.
+        As :func:`~mbtf_fit.fit_jointly`.
     """
-    from mbtf_fit.training.fit_folder import identity_of
-    from mbtf_fit.training.joint_fit import fit_jointly, joint_identity
+    from mbtf_fit.training.fit import fit_jointly
+    from mbtf_fit.training.fit_folder import identity_of, joint_identity
 
     group = [_open(folder, config) for folder in shards]
     identities = {

@@ -17,6 +17,7 @@ from mbtf_fit.config import build_model
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.objective.noise import NoiseModel
 from mbtf_fit.pytorch.material import NeuralMaterial
+from mbtf_fit.training.loop import TrainingLoop
 from mbtf_fit.training.trainer import Trainer
 
 LATTICE = Lattice(2)
@@ -49,7 +50,7 @@ def trainer(model: NeuralMaterial, data: TrainingQueries, **training: Any) -> Tr
 
 
 def finish(t: Trainer) -> None:
-    while not t.train(60.0):
+    while not TrainingLoop([t]).train(60.0):
         pass
     for texture in t.model.textures():
         texture.read(None)

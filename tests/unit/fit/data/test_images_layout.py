@@ -22,8 +22,8 @@ from mbtf_fit.data.loader import Partition, in_region, load_split, load_training
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.evaluation import evaluate_splits
 from mbtf_fit.sections import HeldOutSection
-from mbtf_fit.training.fit import prepare_trainer
-from mbtf_fit.training.trainer import BETAS
+from mbtf_fit.training.loop import TrainingLoop
+from mbtf_fit.training.trainer import BETAS, prepare_trainer
 from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan
 
 HELD_OUT = HeldOutSection(queries=0.1, radius=0.3)
@@ -229,7 +229,8 @@ def test_smaller_patches_give_more_lights_and_views(tmp_path: Path, patch_size: 
         config = FitConfig.model_validate({"model": "hierarchical", "training": training})
         data = Dataset.open(folder)
         part = load_training(data, config.held_out, 0)
-        batch = next(prepare_trainer(config, data, part, torch.device("cpu"))._batches())
+        trainer = prepare_trainer(config, data, part, torch.device("cpu"))
+        batch = next(trainer.queries.batches(trainer.batch, 0, 0, trainer.model.margin))
         assert isinstance(batch, Patches)
         assert batch.value.shape == shape
         assert len(batch.omega_i.unique(dim=0)) == shape[0]
@@ -289,14 +290,14 @@ def test_every_weight_gets_its_own_gradient(tmp_path: Path, monkeypatch: pytest.
     data = Dataset.open(write_images(tmp_path / "d", parallax, train=8))
     config = quick(1)
     trainer = prepare_trainer(config, data, load_training(data, config.held_out, 0), torch.device("cpu"))
-    batch = next(trainer._batches())
+    batch = next(trainer.queries.batches(trainer.batch, 0, 0, trainer.model.margin))
     assert isinstance(batch, Patches)
     for texture, table in zip(trainer.model.textures(), trainer._tables(), strict=True):
         texture.read(table.detach())
     found = trainer.model.evaluate_patches(batch.u, batch.sigma, batch.omega_i, batch.omega_o)
     weights = trainer.model.parameter_groups()[1]
     expected = torch.autograd.grad(trainer.loss(found, batch), weights)
-    trainer.train(60.0)
+    TrainingLoop([trainer]).train(60.0)
     for weight, gradient in zip(weights, expected, strict=True):
         moment = trainer.optimizer.state[weight]["exp_avg"] / (1 - BETAS[0])
         assert float((moment - gradient).norm()) <= 1e-3 * float(gradient.norm()) + 1e-9

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from mbtf_fit import FitConfig, FitResult, Material, evaluate, fit, read_history
 from mbtf_fit.data.loader import load_training
 from mbtf_fit.evaluation import split_errors
 from mbtf_fit.material.material import conformance_queries, export
-from mbtf_fit.training.fit import prepare_trainer
+from mbtf_fit.training.trainer import prepare_trainer
 
 
 def config(steps: int = 30, **options: Any) -> FitConfig:
@@ -214,17 +213,6 @@ def test_the_history_records_the_training(fitted: FitResult) -> None:
     assert history[-1]["step"] == 30
     assert history[-1]["fraction"] == 1.0
     assert {"seconds", "loss", "unexplained", "unexplained_error", "queries_per_second"} <= set(history[-1])
-
-
-def test_data_that_were_read_before_give_the_same_fit(fitted: FitResult, data: Path, tmp_path: Path) -> None:
-    default = config()
-    partition = load_training(Dataset.open(data), default.held_out, default.seed)
-    again = fit(default, data, tmp_path / "m", partition=partition)
-    assert again.errors == fitted.errors
-    # They are used for training and evaluation, whatever the folder holds.
-    few = dataclasses.replace(partition, held_out_queries=partition.held_out_queries.take(slice(7)))
-    other = fit(default, data, tmp_path / "o", partition=few)
-    assert other.errors["held_out_queries"]["unexplained"]["n"] == 7
 
 
 def test_the_same_fit_again_is_left_as_it_is(data: Path, tmp_path: Path) -> None:

@@ -21,8 +21,8 @@ from mbtf_fit import FitConfig, fit
 from mbtf_fit.data.loader import load_training, open_data
 from mbtf_fit.native import library
 from mbtf_fit.training.checkpoint import read_checkpoint, write_checkpoint
-from mbtf_fit.training.fit import prepare_trainer
-from mbtf_fit.training.trainer import Trainer
+from mbtf_fit.training.loop import TrainingLoop
+from mbtf_fit.training.trainer import Trainer, prepare_trainer
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.run import generate
 
@@ -48,7 +48,7 @@ def trainer_of(shards: Path, steps: int) -> Trainer:
 def train_to(trainer: Trainer, step: int) -> None:
     """Train step by step, which ends where it is asked to."""
     while trainer.progress.step < step:
-        trainer.train(0.0)
+        TrainingLoop([trainer]).train(0.0)
 
 
 def test_a_resumed_fit_is_the_same(shards: Path, tmp_path: Path) -> None:
@@ -56,8 +56,8 @@ def test_a_resumed_fit_is_the_same(shards: Path, tmp_path: Path) -> None:
     whole, first, second = (trainer_of(shards, 70) for _ in range(3))
     train_to(whole, 70)
     train_to(first, 57)
-    write_checkpoint(first, tmp_path / "checkpoint")
-    read_checkpoint(second, tmp_path / "checkpoint")
+    write_checkpoint(TrainingLoop([first]), tmp_path / "checkpoint")
+    read_checkpoint(TrainingLoop([second]), tmp_path / "checkpoint")
     train_to(second, 70)
     wanted = whole.model.weights()
     for name, tensor in second.model.weights().items():

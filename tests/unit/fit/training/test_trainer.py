@@ -10,13 +10,10 @@ import pytest
 import torch
 from support.fit_data import make_trainer, parallax, random_queries, train_fully, training_queries
 
-from mbtf_core.data.dataset import Shard
-from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries, TrainingQueries
-from mbtf_fit.data.streaming import Selection
 from mbtf_fit.objective.parallel import Workers
 from mbtf_fit.training.trainer import Trainer, learning_rate_factor
 
@@ -62,10 +59,9 @@ def test_every_epoch_takes_each_query_at_most_once() -> None:
     data = queries(1050)
     t = trainer(data, batch=100)
     seen = []
-    for k, batch in enumerate(islice(t._batches(), 20)):
+    for batch in islice(t.queries.batches(t.batch, 0, 0), 20):
         assert len(batch) == 100
         seen.append(batch.sigma)
-        t.progress.step = k + 1
     for epoch in (torch.cat(seen[:10]), torch.cat(seen[10:])):
         assert len(epoch.unique()) == 1000
     assert not torch.equal(torch.cat(seen[:10]), torch.cat(seen[10:]))
@@ -194,24 +190,6 @@ def test_weights_that_diverge_in_the_last_step_are_detected(monkeypatch: pytest.
     monkeypatch.setattr(Trainer, "_step", spoiling)
     with pytest.raises(InputError, match="diverged at step 3"):
         train_fully(trainer(queries(), steps=3))
-
-
-def test_divergence_names_the_first_bad_batch() -> None:
-    """The step, the shard and the rows, counted without what is held out."""
-    data = queries()
-    selection = Selection()
-    chosen = np.ones(3000, bool)
-    chosen[:7] = False
-    selection.add(Shard(DataFolder.open("."), "train-00000.npz", {}), chosen)
-    selection.add(Shard(DataFolder.open("."), "train-00001.npz", {}), np.ones(2007, bool))
-    data.value[4200] = torch.inf
-    t = make_trainer(data, LATTICE, steps=40, batch=100, huber_delta=None)
-    t.selection = selection
-    step, numbers = next((k, n) for k in range(50) for n in data.batch_ranges(100, 0, k) if 4200 in n)
-    # Number 4200 is row 1207 of the second shard.
-    first, last = numbers.start - 2993, numbers.stop - 1 - 2993
-    with pytest.raises(InputError, match=rf"at step {step + 1}: .*train-00001\.npz rows {first}-{last},"):
-        train_fully(t)
 
 
 def test_coverage_counts_texels_that_gradients_have_reached() -> None:

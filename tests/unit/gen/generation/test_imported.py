@@ -20,7 +20,7 @@ from mbtf_fit import fit
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import load_split, load_training
 from mbtf_fit.formatting import describe_coverage, summarize_errors
-from mbtf_fit.training.fit import prepare_trainer
+from mbtf_fit.training.trainer import prepare_trainer
 from mbtf_gen.cli.generate import describe
 from mbtf_gen.config.measured import ImportConfig
 from mbtf_gen.generation import import_job

@@ -13,9 +13,8 @@ from mbtf_core.data.lattice import Lattice
 from mbtf_fit.config import FitConfig, ModelName, build_model
 from mbtf_fit.data.loader import load_training, open_data
 from mbtf_fit.objective.noise import NoiseModel
-from mbtf_fit.objective.regularization import WeightDecay
 from mbtf_fit.sections import TrainingSection
-from mbtf_fit.training.fit import prepare_trainer
+from mbtf_fit.training.trainer import WeightDecay, prepare_trainer
 
 LATTICE = Lattice(3)
 
