@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +10,12 @@ import drjit as dr
 import numpy as np
 import pytest
 from PIL import Image
-from support.fuzzing import check_message
 from support.plugin_materials import write_material
 from support.scenes import mi
 
 import mbtf_fit.backends.mitsuba
 from mbtf_core.config.settings import resolve
 from mbtf_core.directions import from_angles
-from mbtf_core.errors import EngineError
 from mbtf_core.exposure import to_display
 from mbtf_core.pictures.camera import Camera
 from mbtf_fit.preview.config import MaterialPreviewConfig, SheetSection, TurntableSection
@@ -29,7 +26,7 @@ mbtf_fit.backends.mitsuba.register()
 from mbtf_fit.backends.mitsuba.bsdf import Frame  # noqa: E402
 from mbtf_fit.backends.mitsuba.evaluator import Evaluator  # noqa: E402
 from mbtf_fit.backends.mitsuba.stored_material import read_material  # noqa: E402
-from mbtf_fit.preview import animation, sheet, turntable  # noqa: E402
+from mbtf_fit.preview import sheet, turntable  # noqa: E402
 
 SECTION = SheetSection(
     views=[Direction(elevation=70, azimuth=-90), Direction(elevation=35, azimuth=20)],
@@ -130,13 +127,13 @@ def test_a_signal_after_a_frame_interrupts(tmp_path: Path) -> None:
 
 def test_the_animation_repeats_and_keeps_its_frames(tmp_path: Path) -> None:
     pictures = [np.full((8, 8, 3), (40 * k, 90, 250 - 40 * k), np.uint8) for k in range(5)]
-    animation.write_gif(tmp_path / "turn.gif", pictures)
+    turntable.write_gif(tmp_path / "turn.gif", pictures)
     with Image.open(tmp_path / "turn.gif") as file:
         assert file.info["loop"] == 0
         for k, picture in enumerate(pictures):
             file.seek(k)
             assert np.abs(np.asarray(file.convert("RGB")).astype(int) - picture).max() <= 8
-            assert file.info["duration"] == animation.TURN // 5
+            assert file.info["duration"] == turntable.TURN // 5
         assert file.n_frames == 5
 
 
@@ -146,27 +143,6 @@ def test_a_white_plate_and_a_white_sheet_have_one_exposure(tmp_path: Path) -> No
     (picture,) = turntable.frames(white(tmp_path), section)
     # The plate in front of the ball, which shadows none of the lights there and hides some of the sky.
     assert picture[19:21, 8:11].mean() == pytest.approx(0.25, rel=0.12)
-
-
-def test_a_video_needs_an_encoder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with monkeypatch.context() as patch:
-        patch.setattr(animation.shutil, "which", lambda name: None)
-        patch.setitem(sys.modules, "imageio_ffmpeg", None)
-        with pytest.raises(EngineError, match="there is no ffmpeg") as caught:
-            animation.find_encoder()
-        check_message(caught.value)
-        assert "mbtf[video]" in caught.value.message
-    pictures = [np.full((9, 7, 3), 90, np.uint8)] * 3
-    with pytest.raises(EngineError, match="ffmpeg failed") as caught:
-        animation.write_mp4(tmp_path / "turn.mp4", pictures, "false")
-    check_message(caught.value)
-    assert not list(tmp_path.iterdir())
-    try:
-        encoder = animation.find_encoder()
-    except EngineError:
-        pytest.skip("no ffmpeg here")
-    animation.write_mp4(tmp_path / "turn.mp4", pictures, encoder)
-    assert (tmp_path / "turn.mp4").read_bytes()[4:8] == b"ftyp"
 
 
 def test_view_and_light_replace_those_of_the_sheet() -> None:
@@ -186,7 +162,6 @@ def test_bad_input_of_previews_is_refused(tmp_path: Path, capsys: pytest.Capture
         (3, "no material.json", str(tmp_path), "-o", str(tmp_path / "out")),
         (2, "pixels; use smaller or fewer", "m", "--size", "2000"),
         (2, "no material given"),
-        (2, "--mp4: --sheet-only draws no turntable", "m", "--sheet-only", "--mp4"),
     ):
         assert run(app, ["preview", *words]) == code
         assert what in capsys.readouterr().err
