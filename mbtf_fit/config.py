@@ -113,6 +113,12 @@ class FitConfig(Settings):
             if given != default:
                 others = with_option(key)
                 raise ValueError(f"{self.model} has no option {key}, which {_listed(others)}")
+        gradient = any(term.kind == "gradient" for term in self.training.losses)
+        if gradient and MODELS[self.model].layout != "image":
+            raise ValueError(
+                "training.losses: the gradient loss compares neighboring texels, which "
+                f"{self.model} never sees together; use a model of the image layout"
+            )
         if self.decoder and (self.training.shared_decoder or self.init_from):
             raise ValueError("decoder keeps a network as it is: leave out shared_decoder and init_from")
         return self

@@ -243,7 +243,7 @@ def _fit_many(
     if processes is not None or cluster is not None:
         flag = "--cluster" if processes is None else "--processes"
         raise UsageError(f"a shared network is one fit: leave out {flag}")
-    from mbtf_fit.material.decoder import DECODER_FOLDER
+    from mbtf_fit.material.decoder import DECODER_FOLDER, Decoder
     from mbtf_fit.training.fit import fit_jointly
 
     config, decoder = resolve_config(options, quality, *shards), output / DECODER_FOLDER
@@ -251,7 +251,7 @@ def _fit_many(
     _announce(config, shards, output, what, console)
     keep_on_interruption(f"the last checkpoint is kept in {decoder}")
     with console.progress(total=100, label="fitting", unit="%") as bar:
-        result = fit_jointly(
+        results = fit_jointly(
             config,
             shards,
             folders,
@@ -259,12 +259,12 @@ def _fit_many(
             overwrite=overwrite,
             progress=lambda fraction, note: bar.update(round(100 * fraction, 1), note),
         )
-    fits = [fitted.as_dict() for fitted in result.fits]
+    fits = [fitted.as_dict() for fitted in results]
     outcomes = [
         {"shards": str(data), "material": fitted["material"], "result": fitted, "error": None}
         for data, fitted in zip(shards, fits, strict=True)
     ]
-    shared = {"folder": result.decoder.folder, "sha256": result.decoder.sha256}
+    shared = {"folder": decoder, "sha256": Decoder.find(decoder).sha256}
     table = fits_table({folder.name: fitted for folder, fitted in zip(folders, fits, strict=True)})
     console.report({"decoder": shared, "fits": outcomes}, table)
 

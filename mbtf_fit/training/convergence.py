@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from mbtf_core.units import clock
-from mbtf_fit.formatting import SPLIT_NAMES
 
 # Fractions of the budget between which a record counts as the middle of training.
 _MIDDLE = (0.35, 0.65)
@@ -23,32 +22,28 @@ class MarginalCost:
 
     Attributes
     ----------
-    validation_set : the set of queries that the errors are of, in words
-    half, half_error : unexplained variance of a subset of it after half of the training time, and its
-        standard error; None where the history does not resolve it
-    end, end_error : the same at the end
     halving : seconds of training that would halve the error if every doubling of the time divided it as the
-        last one did; None where that one was not significant. The learning rate falls towards the end, which
-        favors the last doubling, so this is a lower bound
+        last one did; infinite where that one was not significant, None where the history does not say. The
+        learning rate falls towards the end, which favors the last doubling, so this is a lower bound
     noise_share : share of the error on queries without training that is overfitting to the noise of the
         training queries; None where it is not significant
     """
 
-    validation_set: str
-    half: float | None
-    half_error: float | None
-    end: float | None
-    end_error: float | None
     halving: float | None
     noise_share: float | None
+
+    def as_dict(self) -> dict[str, float | None]:
+        """Plain data for JSON, which has no infinite numbers."""
+        finite = self.halving is not None and math.isfinite(self.halving)
+        return {"halving": self.halving if finite else None, "noise_share": self.noise_share}
 
     def describe(self) -> str:
         """One line, or two, without another number for the error."""
         lines = []
-        if self.halving is not None:
-            lines.append(f"halving the error takes about {clock(self.halving)} more of training, or longer")
-        elif self.end is not None:
+        if self.halving == math.inf:
             lines.append("longer training alone would hardly reduce the error")
+        elif self.halving is not None:
+            lines.append(f"halving the error takes about {clock(self.halving)} more of training, or longer")
         if self.noise_share is not None:
             lines.append(
                 f"overfitting to noise causes {self.noise_share:.0%} of the error of new queries: use more "
@@ -58,40 +53,28 @@ class MarginalCost:
 
 
 def marginal_cost_of(
-    history: list[dict[str, Any]],
-    errors: dict[str, Any],
-    noise: float | None = None,
-    validation_set: str = "test",
+    history: list[dict[str, Any]], errors: dict[str, Any], noise: float | None = None
 ) -> MarginalCost | None:
-    """Marginal cost of a finished fit, from the records of its history and its errors by split; None where
-    neither the history nor the errors resolve anything.
+    """Marginal cost of a finished fit, from the records of its history, its errors by split, and the variance
+    of the noise of training values in 1/sr² (None: unknown); None where nothing is resolved."""
+    share, halving = _noise_share(errors, noise), _halving(history)
+    return None if share is None and halving is None else MarginalCost(halving, share)
 
-    `noise` is the variance of the noise of training values in 1/sr² (None: unknown), `validation_set` the
-    split that the history is of.
-    """
-    share, name = _noise_share(errors, noise), SPLIT_NAMES[validation_set]
+
+def _halving(history: list[dict[str, Any]]) -> float | None:
     known = [r for r in history if _number(r.get("unexplained")) and _number(r.get("unexplained_error"))]
     middle = [r for r in known if _MIDDLE[0] <= r.get("fraction", -1.0) <= _MIDDLE[1]]
     if not middle or known[-1].get("fraction", 0.0) < 1.0:
-        return None if share is None else MarginalCost(name, None, None, None, None, None, share)
+        return None
     last, half = known[-1], min(middle, key=lambda r: abs(r["fraction"] - 0.5))
     before, after = half["unexplained"], last["unexplained"]
     spread = math.hypot(half["unexplained_error"], last["unexplained_error"])
-    halving = None
     # Both records are of the same queries, so this test is conservative.
-    if after > 0 and before - after > _SIGNIFICANT * spread:
-        doublings = math.log(2.0) / math.log(before / after) * math.log2(last["seconds"] / half["seconds"])
-        if doublings < _MOST_DOUBLINGS:
-            halving = last["seconds"] * (2.0**doublings - 1.0)
-    return MarginalCost(
-        validation_set=name,
-        half=before,
-        half_error=half["unexplained_error"],
-        end=after,
-        end_error=last["unexplained_error"],
-        halving=halving,
-        noise_share=share,
-    )
+    if after <= 0 or before - after <= _SIGNIFICANT * spread:
+        return math.inf
+    doublings = math.log(2.0) / math.log(before / after) * math.log2(last["seconds"] / half["seconds"])
+    never = doublings >= _MOST_DOUBLINGS
+    return math.inf if never else float(last["seconds"] * (2.0**doublings - 1.0))
 
 
 def _number(x: Any) -> bool:

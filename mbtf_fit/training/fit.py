@@ -96,32 +96,14 @@ class FitResult:
             "resumed": self.resumed,
             "training": self.material.description["training"],
             "errors": self.errors,
-            "marginal_cost": None if cost is None else asdict(cost),
+            "marginal_cost": None if cost is None else cost.as_dict(),
         }
 
     @property
     def marginal_cost(self) -> MarginalCost | None:
         """Estimated training time that halves the error; None where the history does not resolve it."""
-        training = self.material.description["training"]
-        return marginal_cost_of(
-            self.history, self.errors, training.get("noise_variance"), training.get("validation_set", "test")
-        )
-
-
-@dataclass(frozen=True)
-class JointResult:
-    """Result of :func:`fit_jointly`.
-
-    Attributes
-    ----------
-    decoder : Decoder
-        The shared network.
-    fits : list of FitResult
-        Result of each material, in the order of the data sets.
-    """
-
-    decoder: Decoder
-    fits: list[FitResult]
+        noise = self.material.description["training"].get("noise_variance")
+        return marginal_cost_of(self.history, self.errors, noise)
 
 
 @dataclass(frozen=True)
@@ -133,24 +115,13 @@ class _Member:
     identity: dict[str, Any]
 
 
-def check_options(config: FitConfig) -> None:
-    """Refuse losses, and a network to keep, that the model cannot have."""
-    if config.decoder is not None:
-        Decoder.find(config.decoder).check(config)
-    gradient = any(term.kind == "gradient" for term in config.training.losses)
-    if MODELS[config.model].layout != "image" and gradient:
-        raise InputError(
-            f"the gradient loss compares neighboring texels, which {config.model} never sees together",
-            where="training.losses",
-            hint="use another loss, or a model that learns from the image layout",
-        )
-
-
 def _check_folder(config: FitConfig, out: Path) -> None:
-    """Refuse to replace the network or the material that the fit reads."""
+    """Refuse a network of another architecture, and to replace what the fit reads."""
     read = []
     if config.decoder is not None:
-        read.append(Decoder.find(config.decoder).folder)
+        network = Decoder.find(config.decoder)
+        network.check(config)
+        read.append(network.folder)
     if config.init_from is not None:
         read.append(Path(config.init_from))
     if out.resolve() in (folder.resolve() for folder in read):
@@ -207,7 +178,6 @@ def fit(
             hint="mbtf-fit --many SHARDS SHARDS --shared-decoder -o materials/",
         )
     out = Path(out)
-    check_options(config)
     _check_folder(config, out)
     return _fit(config, [shards], [out], out, overwrite, progress, observe)[0]
 
@@ -220,7 +190,7 @@ def fit_jointly(
     *,
     overwrite: bool = False,
     progress: ProgressCallback | None = None,
-) -> JointResult:
+) -> list[FitResult]:
     """Fit a material to each of several data sets, all with one network.
 
     Textures, surfaces, depth weights and calibration factors are those of each material. An unfinished fit of
@@ -243,8 +213,8 @@ def fit_jointly(
 
     Returns
     -------
-    JointResult
-        The shared network, and the result of each material.
+    list of FitResult
+        Of each material, in the order of the data sets.
 
     Raises
     ------
@@ -266,9 +236,7 @@ def fit_jointly(
     for name, count in Counter(out.name for out in outs).items():
         if count > 1:
             raise InputError(f"{count} of the folders have this name", where=name, hint="rename them")
-    check_options(config)
-    fits = _fit(config, shards, outs, decoder, overwrite, progress)
-    return JointResult(Decoder.find(decoder), fits)
+    return _fit(config, shards, outs, decoder, overwrite, progress)
 
 
 def _fit(

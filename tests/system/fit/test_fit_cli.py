@@ -78,9 +78,7 @@ def test_a_finished_fit_is_not_trained_again(shards: Path, material: Path) -> No
     done = call(["mbtf-fit", str(shards), "-o", str(material), *QUICK])
     assert done.code == 0, done.err
     assert done.err.splitlines() == [f"{material}: this fit is already finished; --overwrite trains it again"]
-    assert "gradients reached every texel" not in done.out
     told = call(["mbtf-fit", str(shards), "-o", str(material), *QUICK, "--verbose"])
-    assert "gradients reached every texel" in told.out
     assert "unexplained variance  test" in told.out
     assert (material / "material.json").read_bytes() == before
     done = call(["mbtf-fit", str(shards), "-o", str(material), *QUICK, "--overwrite"])

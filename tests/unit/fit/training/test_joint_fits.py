@@ -18,12 +18,12 @@ import mbtf_fit.training.fit
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
-from mbtf_fit import FitConfig, Material, fit
+from mbtf_fit import FitConfig, FitResult, Material, fit
 from mbtf_fit.data.loader import load_split
 from mbtf_fit.evaluation import evaluate
 from mbtf_fit.material.decoder import Decoder, network_tensors
 from mbtf_fit.native import library
-from mbtf_fit.training.fit import JointResult, fit_jointly
+from mbtf_fit.training.fit import fit_jointly
 from mbtf_fit.training.fit_folder import read_history
 from mbtf_fit.training.loop import TrainingLoop
 from mbtf_fit.training.trainer import Trainer
@@ -84,7 +84,7 @@ def single_config(model: str = "relief", steps: int = 100, **options: Any) -> Fi
     return FitConfig.model_validate({"model": model, "training": {"steps": steps, **BATCH}, **options})
 
 
-def fit_two(config: FitConfig, data: dict[str, Path], out: Path, **options: Any) -> JointResult:
+def fit_two(config: FitConfig, data: dict[str, Path], out: Path, **options: Any) -> list[FitResult]:
     names = NAMES[:2]
     folders = [out / name for name in names]
     return fit_jointly(config, [data[name] for name in names], folders, out / "decoder", **options)
@@ -162,7 +162,7 @@ def test_materials_evaluate_as_the_trainers_predict(
 
 def test_steps_take_the_materials_in_turn(data: dict[str, Path], tmp_path: Path) -> None:
     result = fit_two(joint_config(steps=7), data, tmp_path)
-    summaries = [found.material.description["training"] for found in result.fits]
+    summaries = [found.material.description["training"] for found in result]
     assert [summary["steps"] for summary in summaries] == [4, 3]
     assert summaries[0]["shared_decoder"]["steps"] == 7
     seconds = summaries[0]["shared_decoder"]["seconds"]
@@ -178,7 +178,7 @@ def test_noisy_materials_do_not_decide_the_decay_alone(data: dict[str, Path], tm
     for name in NAMES[:2]:
         fit(single_config(steps=1), data[name], tmp_path / "own" / name)
         own.append(Material.load(tmp_path / "own" / name).description["training"]["weight_decay"])
-    fits = fit_two(joint_config(steps=2), data, tmp_path).fits
+    fits = fit_two(joint_config(steps=2), data, tmp_path)
     for found, alone in zip(fits, own, strict=True):
         decay = found.material.description["training"]["weight_decay"]
         assert decay["weights"] == pytest.approx(sum(o["weights"] for o in own) / 2 / np.sqrt(2))
@@ -298,7 +298,7 @@ def test_a_killed_joint_fit_ends_with_the_same_bits(
             kills += 1
             assert kills < 100
     assert kills >= 2
-    for mine, other in zip(found.fits, whole.fits, strict=True):
+    for mine, other in zip(found, whole, strict=True):
         expected = other.material.model.weights()
         weights = mine.material.model.weights()
         assert all(torch.equal(weights[name], expected[name]) for name in expected)
@@ -308,13 +308,13 @@ def test_a_killed_joint_fit_ends_with_the_same_bits(
     assert not (out / "decoder" / "checkpoint.safetensors").exists()
     # A finished one is kept.
     monkeypatch.undo()
-    assert all(again.resumed for again in fit_two(config, data, out).fits)
+    assert all(again.resumed for again in fit_two(config, data, out))
 
 
 def test_a_lost_material_is_fitted_again(data: dict[str, Path], tmp_path: Path) -> None:
     fit_two(joint_config(steps=2), data, tmp_path)
     shutil.rmtree(tmp_path / "stripes")
-    assert [found.resumed for found in fit_two(joint_config(steps=2), data, tmp_path).fits] == [False] * 2
+    assert [found.resumed for found in fit_two(joint_config(steps=2), data, tmp_path)] == [False] * 2
 
 
 def test_materials_divide_the_memory(
