@@ -176,7 +176,7 @@ def resolve_config(
 ) -> FitConfig:
     """Configuration of a fit, or of one of several data sets. Without a model among the options, the network
     to keep decides, or the data sets."""
-    from mbtf_fit.presets import fitter_options
+    from mbtf_fit.config import fitter_options
 
     overrides = options.explicit()
     kept = _kept_options(overrides.get("decoder"))

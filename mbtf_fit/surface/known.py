@@ -42,10 +42,9 @@ from mbtf_fit.ops.constants import (
 )
 from mbtf_fit.ops.displace import Trace
 from mbtf_fit.ops.shade import Shade
-from mbtf_fit.surface.copies import DeviceCopies
-from mbtf_fit.surface.heightfield import HeightfieldTracer
+from mbtf_fit.surface.heightfield import DeviceCopies, HeightfieldTracer
+from mbtf_fit.surface.lookup import Packing, lookup
 from mbtf_fit.surface.prefilter import prefiltered_levels
-from mbtf_fit.textures.lookup import Packing, lookup
 
 if TYPE_CHECKING:
     from mbtf_core.data.geometry import Geometry

@@ -34,8 +34,8 @@ from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.noise import NoiseModel, typical_value
 from mbtf_fit.objective.parallel import MAX_KERNEL_THREADS, MAX_THREADS, Batch, Workers
 from mbtf_fit.pytorch.material import NeuralMaterial
+from mbtf_fit.pytorch.textures import annealed_sigma
 from mbtf_fit.sections import TrainingSection
-from mbtf_fit.textures.blur import annealed_sigma
 from mbtf_fit.training.calibration import fit_calibration
 
 TrainingData = TrainingQueries | TrainingImages | TrainingSlices | SharedSlices | StreamedQueries

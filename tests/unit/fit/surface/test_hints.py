@@ -20,7 +20,7 @@ from mbtf_fit.native import library
 from mbtf_fit.surface import hints, known
 from mbtf_fit.surface.hints import compute_hints
 from mbtf_fit.surface.known import KnownSurface
-from mbtf_fit.textures.lookup import lookup
+from mbtf_fit.surface.lookup import lookup
 
 LATTICE = Lattice(3)
 needs_kernel = pytest.mark.skipif(library.kernel() is None, reason=library.missing_reason() or "kernel")

@@ -20,7 +20,7 @@ from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.noise import NoiseModel
 from mbtf_fit.ops.constants import KNOTS
 from mbtf_fit.surface import heightfield
-from mbtf_fit.surface.copies import DeviceCopies
+from mbtf_fit.surface.heightfield import DeviceCopies
 from mbtf_gen.sampling.slice_directions import slice_directions
 
 LATTICE, META = Lattice(3), torch.device("meta")
