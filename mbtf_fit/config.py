@@ -38,28 +38,7 @@ SHARED_PRESET: dict[str, Any] = {"training": {"batch": 1 << 14, "learning_rate":
 
 
 class FitConfig(Settings):
-    """Every option of ``mbtf-fit`` besides the shards.
-
-    Parameters
-    ----------
-    model : str
-        A model of :mod:`mbtf_fit.models`.
-    init_from : str, optional
-        Folder of a material that initializes textures and offset.
-    decoder : str, optional
-        Folder of a network, or of a material, whose network the fit keeps: it trains textures alone.
-    network : NetworkSection
-        Architecture.
-    training : TrainingSection
-        Budget, loss and optimizer.
-    held_out : HeldOutSection
-        Queries that are held out for validation.
-    data : DataSection
-        Reading of the data.
-    seed : int
-        Seed of the initial parameters and of the batch order.
-    device : str
-        ``auto``, ``cpu`` or ``cuda``.
+    """Every option of ``mbtf-fit`` besides the shards; each field describes itself.
 
     Raises
     ------

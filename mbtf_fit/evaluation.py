@@ -39,19 +39,9 @@ Predict = Callable[[ShardQueries], NDArray[np.float32]]
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors on a set of queries.
-
-    Attributes
-    ----------
-    n : int
-        Number of queries.
-    mse : Estimate
-        Mean squared error E[(p-a)(p-b)] without the noise of the data, in 1/sr².
-    variance : Estimate
-        Variance of the data's values without their noise, in 1/sr².
-    unexplained : Estimate
-        Unexplained variance mse / variance (1 - R²): 0 is exact, 1 as good as the mean value.
-    """
+    """Errors on `n` queries, without the noise of the data: mean squared error E[(p-a)(p-b)] and variance of
+    the values in 1/sr², and their ratio, the unexplained variance (1 - R²): 0 is exact, 1 as good as the mean
+    value."""
 
     n: int
     mse: Estimate
@@ -66,7 +56,7 @@ class Errors:
 
 @dataclass(frozen=True)
 class SplitErrors:
-    """Errors on one split: overall, by level, by elevation.
+    """Errors on one split.
 
     Attributes
     ----------
@@ -90,10 +80,9 @@ class SplitErrors:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON; the peak of the PSNR is the value that the exposure shows as white."""
-        found = {"mse": self.overall.mse.as_dict(), "exposure": self.exposure}
+        found = {**self.overall.as_dict(), "exposure": self.exposure}
         return {
-            **self.overall.as_dict(),
-            "exposure": self.exposure,
+            **found,
             "psnr": psnr(self.overall.mse, white_of(self.exposure)).as_dict(),
             "visibility": visibility(found)[1],
             "includes_noise": self.includes_noise,
@@ -153,15 +142,6 @@ def evaluate_splits(predict: Predict, data: Dataset, partition: Partition) -> di
     return {
         name: replace(errors, includes_noise=noisy) for name, errors in found.items() if errors is not None
     }
-
-
-def foreign_inputs(material: Material, shards: str | Path | DataFolder) -> list[str]:
-    """Inputs (height, base_color, …) that differ between a data set and the training data of a material;
-    empty where either records none."""
-    trained, given = material.description["data"].get("inputs"), Dataset.open(shards).manifest.get("inputs")
-    if not trained or not given:
-        return []
-    return [role for role in sorted({*trained, *given}) if trained.get(role) != given.get(role)]
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
@@ -102,20 +102,34 @@ def fit(
 
     folder = DataFolder.open(shards)
     config = resolve_config(options, quality, folder)
-    if dry_run:
-        from mbtf_fit.training.forecast import forecast_fit
-
-        expected = forecast_fit(config, folder)
-        data = {"shards": str(folder), "model": config.model, "forecast": asdict(expected)}
-        console.report(data, expected.describe())
+    if not dry_run:
+        _fit_one(config, folder, output, live, tensorboard, overwrite, verbose, console)
         return
+    from mbtf_fit.training.forecast import forecast_fit
+
+    expected = forecast_fit(config, folder)
+    data = {"shards": str(folder), "model": config.model, "forecast": asdict(expected)}
+    console.report(data, expected.describe())
+
+
+def _fit_one(
+    config: FitConfig,
+    shards: DataFolder,
+    output: Path,
+    live: bool,
+    tensorboard: Path | None,
+    overwrite: bool,
+    verbose: bool,
+    console: Console,
+) -> None:
+    """Fit a data set, watched by whoever asks for it."""
     from mbtf_fit.material.format import DESCRIPTION_NAME
     from mbtf_fit.training.fit import fit
     from mbtf_fit.training.tensorboard import EventLog
 
     finished = not overwrite and (output / DESCRIPTION_NAME).exists()
     if not finished:
-        _announce(config, [folder], output, f"{folder} -> {output}: {config.model}", console)
+        _announce(config, [shards], output, f"{shards} -> {output}: {config.model}", console)
     keep_on_interruption(f"the last checkpoint is kept in {output}")
     with (
         nullcontext() if tensorboard is None else EventLog(tensorboard) as log,
@@ -131,7 +145,7 @@ def fit(
 
         result = fit(
             config,
-            folder,
+            shards,
             output,
             overwrite=overwrite,
             progress=lambda fraction, note: bar.update(round(100 * fraction, 1), note),
@@ -192,13 +206,6 @@ def resolve_config(
     return options.resolve(presets)
 
 
-def _shares_decoder(options: Options[FitConfig]) -> bool:
-    """Whether the data sets of a command share a network."""
-    training = options.explicit().get("training")
-    # Values of --set are text.
-    return isinstance(training, Mapping) and str(training.get("shared_decoder")).lower() == "true"
-
-
 def _kept_options(folder: object) -> dict[str, Any]:
     """Options of the network that a fit keeps, by dotted key; none without one."""
     if not isinstance(folder, str):
@@ -236,7 +243,8 @@ def _fit_many(
 
     shards = find_data(many)
     folders = name_materials(shards, output)
-    if not _shares_decoder(options):
+    config = resolve_config(options, quality, *shards)
+    if not config.training.shared_decoder:
         configs = [resolve_config(options, quality, folder) for folder in shards]
         _fit_each(configs, shards, folders, output, processes, cluster, overwrite, console)
         return
@@ -246,7 +254,7 @@ def _fit_many(
     from mbtf_fit.material.decoder import DECODER_FOLDER, Decoder
     from mbtf_fit.training.fit import fit_jointly
 
-    config, decoder = resolve_config(options, quality, *shards), output / DECODER_FOLDER
+    decoder = output / DECODER_FOLDER
     what = f"{len(shards)} data sets -> {output}: {config.model} with a shared network"
     _announce(config, shards, output, what, console)
     keep_on_interruption(f"the last checkpoint is kept in {decoder}")
@@ -288,11 +296,8 @@ def _fit_each(
         import torch
 
         processes = max(1, torch.cuda.device_count()) if configs[0].device != "cpu" else 1
-    console.note(
-        f"{len(shards)} data set{'s' * (len(shards) != 1)} -> {output}: "
-        f"{' and '.join(sorted({config.model for config in configs}))}"
-        f"{'' if cluster is not None else f', {processes} at a time'}"
-    )
+    models = " and ".join(sorted({config.model for config in configs}))
+    console.note(f"{len(shards)} data sets -> {output}: {models}")
     keep_on_interruption(f"finished fits and the last checkpoints are kept in {output}")
     with (
         open_runner(cluster, console.note, Processes(processes)) as runner,

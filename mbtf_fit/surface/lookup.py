@@ -4,7 +4,7 @@ All levels lie one after the other in a single table (texels, channels); level s
 texels from row ``start[s]`` on, image row by image row: row 0 is the side ``v → 1``, texel centers at
 ``((i+½)/W, 1-(j+½)/H)``, wrapped in both directions.
 
-:func:`lookup` gathers by ``embedding_bag``, with analytic derivatives, and one sparse product for the gradients
+:func:`lookup` gathers by ``embedding_bag``, with analytic derivatives. One sparse product gives the gradients
 of the texels.
 """
 
