@@ -118,26 +118,6 @@ def test_random_initializations_approach_the_true_values(
     assert share < bound
 
 
-def test_the_third_coordinate_distinguishes_low_lights() -> None:
-    """Reflected light rises from zero to twice its mean within 6 degrees above the horizon."""
-    arrays = random_queries(np.random.default_rng(0), 40_000, LATTICE)
-    # Half of all lights between cosines of 0.05 and 0.25, any azimuth.
-    low = arrays["omega_i"][::2]
-    z = np.random.default_rng(1).uniform(0.05, 0.25, len(low)).astype(np.float32)
-    low[:, :2] *= (np.sqrt(1 - z**2) / np.maximum(np.hypot(low[:, 0], low[:, 1]), 1e-6))[:, None]
-    low[:, 2] = z
-    z = arrays["omega_i"][:, 2:]
-    arrays["value"] = np.broadcast_to(0.1 / (1 + np.exp(-(z - 0.15) / 0.01)) / (z + 0.1), (40_000, 3))
-    data = TrainingQueries(*(torch.from_numpy(a.astype(np.float32)) for a in arrays.values()))
-    left = {}
-    for direction_xyz in (False, True):
-        model = build_model("neumip-baseline", LATTICE, encoding={"direction_xyz": direction_xyz})
-        model.initialize(torch.Generator().manual_seed(0), 0.2)
-        finish(trainer(model, data, steps=300, batch=4000))
-        left[direction_xyz] = relative_error(model, data)
-    assert left[True] < 0.5 * left[False]
-
-
 def glossy(u: F32, sigma: F32, omega_i: F32, omega_o: F32) -> NDArray[np.float64]:
     """A homogeneous BRDF with a broad lobe."""
     half = omega_i.astype(np.float64) + omega_o

@@ -18,9 +18,7 @@ from mbtf_core.errors import InputError
 from mbtf_fit import FitConfig, Material, evaluate, fit
 from mbtf_fit.config import build_model
 from mbtf_fit.data.images import Patches, TrainingImages, nearest_shapes, strides
-from mbtf_fit.data.loader import Partition, in_region, load_split, load_training
-from mbtf_fit.data.queries import ShardQueries
-from mbtf_fit.evaluation import evaluate_splits
+from mbtf_fit.data.loader import Partition, in_region, load_training
 from mbtf_fit.sections import HeldOutSection
 from mbtf_fit.training.loop import TrainingLoop
 from mbtf_fit.training.trainer import BETAS, prepare_trainer
@@ -76,35 +74,6 @@ def test_whole_images_are_held_out(tmp_path: Path) -> None:
     assert other != held[0]
 
 
-def test_the_sample_is_of_training_images(tmp_path: Path) -> None:
-    """Equally many queries of each."""
-    folder = write_images(tmp_path / "d", parallax, train=60)
-    part = partition(folder, HeldOutSection(queries=0.4, radius=0.3))
-    kept = {row.tobytes() for row in images_of(part).omega_i.numpy()}
-    sampled = [row.tobytes() for row in part.sample.omega_i]
-    assert set(sampled) == kept
-    assert len({sampled.count(k) for k in kept}) == 1
-
-
-def test_training_images_are_evaluated_on_a_quarter_of_their_sample(tmp_path: Path) -> None:
-    """Of all images alike: neighborhoods take their time."""
-    data = Dataset.open(write_images(tmp_path / "d", parallax, train=20, test=1))
-    part = load_training(data, HeldOutSection(queries=0.1, radius=0), 0)
-    asked: list[ShardQueries] = []
-
-    def answer(queries: ShardQueries) -> np.ndarray:
-        asked.append(queries)
-        return 0.5 * (queries.value_a + queries.value_b)
-
-    found = evaluate_splits(answer, data, part)
-    assert list(found) == ["test", "held_out_queries", "training"]
-    assert found["test"].overall.n == 64
-    assert found["held_out_queries"].overall.n == len(part.held_out_queries)
-    assert found["training"].overall.n == len(part.sample) // 4
-    lights = np.unique(asked[-1].omega_i, axis=0)
-    assert len(lights) == len(np.unique(part.sample.omega_i, axis=0)) == 18
-
-
 def test_at_least_one_image_is_held_out(tmp_path: Path) -> None:
     folder = write_images(tmp_path / "d", parallax, train=6)
     few = HeldOutSection(queries=0.01, radius=0)
@@ -122,13 +91,6 @@ def test_values_are_the_mean_of_both_halves(tmp_path: Path) -> None:
     stored = Dataset.open(folder).load("train")
     np.testing.assert_allclose(training.value, 0.5 * (stored["value_a"] + stored["value_b"]), atol=1e-7)
     np.testing.assert_array_equal(training.u, stored["u"])
-
-
-def test_splits_of_images_are_read_as_queries(tmp_path: Path) -> None:
-    queries = load_split(Dataset.open(write_images(tmp_path / "d", parallax, test=3)), "test")
-    assert queries.u.shape == (3 * 64, 2)
-    expected = parallax(queries.u, queries.sigma, queries.omega_i, queries.omega_o)
-    np.testing.assert_allclose(queries.value_a, expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("aspect", [1.0, 0.5, 0.3])
@@ -192,19 +154,6 @@ def test_patches_extend_beyond_the_border_of_small_images() -> None:
     for item in range(30):
         rows, columns = nearest_shapes(lattice, patches.sigma[item : item + 1].numpy())[0]
         step = patches.u[item, 1:, 1:] - patches.u[item, :-1, :-1] - torch.tensor([1 / columns, -1 / rows])
-        torch.testing.assert_close(step, step.round().to(step.dtype), atol=1e-6, rtol=0)
-
-
-def test_small_images_are_read_with_their_grids(tmp_path: Path) -> None:
-    folder = write_images(tmp_path / "d", parallax, train=20, finest=4, aspect=0.5, patch_size=5)
-    data = images_of(partition(folder, HeldOutSection(queries=0, radius=0)))
-    assert data.u.shape == (20, 5, 5, 2)
-    patches = data.patches(np.arange(20), np.ones((20, 2), np.int64), 3, 2)
-    torch.testing.assert_close(patches.value, data.value[:, 1:4, 1:4])
-    shapes = nearest_shapes(Lattice(4, 0.5), data.sigma.numpy())
-    assert len(np.unique(shapes, axis=0)) > 3
-    for u, (rows, columns) in zip(patches.u, shapes, strict=True):
-        step = u[1:, 1:] - u[:-1, :-1] - torch.tensor([1 / columns, -1 / rows])
         torch.testing.assert_close(step, step.round().to(step.dtype), atol=1e-6, rtol=0)
 
 

@@ -88,12 +88,6 @@ def test_amounts_of_memory_are_read_and_written(text: str | float, size: float) 
     assert parse_size(format_size(size)) == size
 
 
-@pytest.mark.parametrize("text", ["", "-1GB", "0", "much", "nan"])
-def test_nonsense_amounts_are_refused(text: str) -> None:
-    with pytest.raises(ValueError, match="memory"):
-        parse_size(text)
-
-
 def test_memory_does_not_grow_with_the_data(tmp_path: Path, run_python: RunPython) -> None:
     """48 MB more of shards take less than 14 MB more at the peak; in memory they would take 38."""
     peaks = []

@@ -96,27 +96,6 @@ def test_slopes_are_derivatives(curve: LossCurve) -> None:
     torch.testing.assert_close(slope, curve.slope(x.detach()))
 
 
-@pytest.mark.parametrize("kind", ["squared", "log", "relative"])
-def test_without_noise_and_near_the_value_corrections_change_nothing(kind: str) -> None:
-    value = torch.tensor([[0.3, 1.0, 4.0]], dtype=torch.float64)
-    found = []
-    for correction in ("none", "linear"):
-        p = (value * 1.0001).requires_grad_()
-        loss = objective(kind, correction=correction)
-        found.append(torch.autograd.grad(loss(p, queries(value)), p)[0])
-    torch.testing.assert_close(found[1], found[0], rtol=1e-3, atol=0.0)
-
-
-def test_terms_add_up_with_their_weights() -> None:
-    p, data = torch.full((4, 3), 0.2), queries(torch.full((4, 3), 0.7))
-    both = TrainingSection.model_validate(
-        {"losses": [{"kind": "squared", "weight": 2.0}, {"kind": "log", "weight": 0.5}]}
-    )
-    noise = NoiseModel(SCALE, np.zeros(3), np.zeros((4, 3)), np.ones(4), 0.0)
-    total = 2.0 * objective("squared")(p, data) + 0.5 * objective("log")(p, data)
-    torch.testing.assert_close(Objective(both, noise)(p, data), total)
-
-
 def test_corrected_absolute_terms_are_parabolas_of_the_noise() -> None:
     """e²/2√(v + 0.01), e and v in units of the scale; of neighbors' differences v is that of both."""
     e, v = 0.3 / SCALE, 0.04 / SCALE**2

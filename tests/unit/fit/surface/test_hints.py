@@ -17,10 +17,9 @@ from torch import Tensor
 from mbtf_core.data.lattice import Lattice
 from mbtf_fit.models.relief import known_surface
 from mbtf_fit.native import library
-from mbtf_fit.surface import hints, known
+from mbtf_fit.surface import hints
 from mbtf_fit.surface.hints import compute_hints
 from mbtf_fit.surface.known import KnownSurface
-from mbtf_fit.surface.lookup import lookup
 
 LATTICE = Lattice(3)
 needs_kernel = pytest.mark.skipif(library.kernel() is None, reason=library.missing_reason() or "kernel")
@@ -195,26 +194,3 @@ def test_a_surface_survives_its_tensors() -> None:
     torch.testing.assert_close(
         hints_of(again, *arrays, places=4), hints_of(known, *arrays, places=4), atol=0, rtol=0
     )
-
-
-def test_parts_are_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
-    """PyTorch computes hints part by part, which bounds memory."""
-    monkeypatch.setattr(hints, "kernel", lambda: None)
-    surface, arrays = rough_surface(LATTICE), queries(250)
-    whole = hints_of(surface, *arrays, places=1)
-    monkeypatch.setattr(hints, "_CHUNK", 100)
-    torch.testing.assert_close(hints_of(surface, *arrays, places=1), whole, atol=1e-6, rtol=1e-5)
-
-
-def test_maps_are_read_where_the_queries_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a GPU; the device without numbers stands for it."""
-    devices = []
-
-    def recorded(table: Tensor, *arguments: Any) -> Tensor:
-        devices.append(table.device.type)
-        return lookup(table, *arguments)
-
-    monkeypatch.setattr(known, "lookup", recorded)
-    u, sigma, light, view = (a.to("meta") for a in queries(10))
-    assert rough_surface(LATTICE).shading(known_surface(1)[1], u, sigma, light, view).shape == (10, 6)
-    assert devices == ["meta", "meta"]

@@ -79,15 +79,6 @@ def test_overfitting_is_seen_where_the_unexplained_variance_is_undefined() -> No
     assert cost(unknown, both, 0.3).noise_share == pytest.approx(0.055 / 0.06)
 
 
-def test_overfitting_is_measured_on_the_queries_whose_error_is_known_best() -> None:
-    """A few held-out queries of few paths each can have a low error by chance."""
-    lucky = errors(0.05, 0.02, 0.02) | {"test": {"mse": {"value": 0.1, "error": 0.006}}}
-    lucky["training"]["mse"]["error"] = 0.006
-    assert cost(history(0.5), lucky, 0.3).noise_share == pytest.approx(0.04 / 0.1)
-    precise = errors(0.1, 0.02, 0.002) | {"test": {"mse": {"value": 0.03, "error": 0.02}}}
-    assert cost(history(0.5), precise, 0.3).noise_share == pytest.approx(0.04 / 0.1)
-
-
 def test_incomplete_histories_give_no_marginal_cost() -> None:
     unknown = [{**r, "unexplained": None, "unexplained_error": None} for r in history(0.5)]
     for records in ([], history(0.5)[:-1], history(0.5)[-1:], unknown):

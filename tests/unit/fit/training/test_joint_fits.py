@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +14,11 @@ from support.fit_data import F32, parallax, write_data
 from support.known_surfaces import geometry, rough_heights
 
 import mbtf_fit.training.fit
-from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
 from mbtf_fit import FitConfig, FitResult, Material, fit
-from mbtf_fit.data.loader import load_split
 from mbtf_fit.evaluation import evaluate
 from mbtf_fit.material.decoder import Decoder, network_tensors
-from mbtf_fit.native import library
 from mbtf_fit.training.fit import fit_jointly
 from mbtf_fit.training.fit_folder import read_history
 from mbtf_fit.training.loop import TrainingLoop
@@ -64,15 +60,6 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         )
         for k, (name, function) in enumerate(functions.items())
     }
-
-
-@pytest.fixture
-def no_kernel(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setenv(library.ENVIRONMENT, "off")
-    library.reload()
-    yield
-    monkeypatch.undo()
-    library.reload()
 
 
 def joint_config(model: str = "relief", steps: int = 300, **options: Any) -> FitConfig:
@@ -141,25 +128,6 @@ def test_joint_fits_learn_each_material(library_folder: Path, data: dict[str, Pa
             )
 
 
-def test_materials_evaluate_as_the_trainers_predict(
-    data: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    predicted = {}
-    export = mbtf_fit.training.fit.export_fit
-
-    def observed(trainer: Trainer, config: FitConfig, member: Any, *arguments: Any, **more: Any) -> None:
-        export(trainer, config, member, *arguments, **more)
-        predicted[member.folder.name] = trainer.predict(load_split(member.data, "test"))
-
-    monkeypatch.setattr(mbtf_fit.training.fit, "export_fit", observed)
-    fit_two(joint_config(steps=40), data, tmp_path)
-    for name in NAMES[:2]:
-        material = Material.load(tmp_path / name)
-        queries = load_split(Dataset.open(data[name]), "test")
-        np.testing.assert_allclose(material.predict(queries), predicted[name], rtol=1e-5, atol=1e-6)
-        assert material.deviation() < 1e-5
-
-
 def test_steps_take_the_materials_in_turn(data: dict[str, Path], tmp_path: Path) -> None:
     result = fit_two(joint_config(steps=7), data, tmp_path)
     summaries = [found.material.description["training"] for found in result]
@@ -202,32 +170,6 @@ def test_a_kept_network_keeps_its_bits(library_folder: Path, data: dict[str, Pat
         assert not torch.allclose(before.depth_weights, after.depth_weights, atol=1e-3)
     else:
         assert not torch.allclose(before.offset_texture.texels, after.offset_texture.texels, atol=1e-5)
-
-
-def test_kernel_and_pytorch_agree_on_kept_networks(
-    library_folder: Path, data: dict[str, Path], tmp_path: Path, request: pytest.FixtureRequest
-) -> None:
-    model = Material.load(library_folder / "waves").model.name
-    options = single_config(model, 3, decoder=str(library_folder))
-    fit(options, data["third"], tmp_path / "kernel")
-    request.getfixturevalue("no_kernel")
-    fit(options, data["third"], tmp_path / "pytorch")
-    shared = Decoder.find(library_folder).tensors()
-    for name in ("kernel", "pytorch"):
-        found = networks_of(tmp_path / name)
-        assert all(torch.equal(found[key], shared[key]) for key in shared)
-    one, other = (Material.load(tmp_path / name).model.pyramid.texels for name in ("kernel", "pytorch"))
-    # Adam normalizes gradients: the few that rounding decides differ by a step.
-    assert ((one - other).abs() > 1e-4).float().mean() < 0.02
-
-
-def test_any_material_has_a_network_to_keep(data: dict[str, Path], tmp_path: Path) -> None:
-    fit(single_config(steps=20), data["waves"], tmp_path / "m")
-    fit(single_config(steps=5, decoder=str(tmp_path / "m")), data["stripes"], tmp_path / "n")
-    one, other = networks_of(tmp_path / "m"), networks_of(tmp_path / "n")
-    assert all(torch.equal(one[name], other[name]) for name in one)
-    record = Material.load(tmp_path / "n").description["training"]["decoder"]
-    assert record == {"sha256": Decoder.find(tmp_path / "m").sha256}
 
 
 def test_a_fit_does_not_replace_what_it_starts_from(data: dict[str, Path], tmp_path: Path) -> None:
@@ -315,20 +257,6 @@ def test_a_lost_material_is_fitted_again(data: dict[str, Path], tmp_path: Path) 
     fit_two(joint_config(steps=2), data, tmp_path)
     shutil.rmtree(tmp_path / "stripes")
     assert [found.resumed for found in fit_two(joint_config(steps=2), data, tmp_path)] == [False] * 2
-
-
-def test_materials_divide_the_memory(
-    data: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    load, memory = mbtf_fit.training.fit.load_training, []
-
-    def observed(shards: Dataset, held_out: Any, seed: int, given: float) -> Any:
-        memory.append(given)
-        return load(shards, held_out, seed, given)
-
-    monkeypatch.setattr(mbtf_fit.training.fit, "load_training", observed)
-    fit_two(joint_config(steps=2, data={"memory": "1GB"}), data, tmp_path)
-    assert memory == [5e8] * 2
 
 
 def test_other_data_sets_are_another_fit(data: dict[str, Path], tmp_path: Path) -> None:

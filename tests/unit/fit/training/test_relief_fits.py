@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
-from support.fit_data import F32, parallax, random_queries, write_data
+from support.fit_data import parallax, random_queries, write_data
 from support.known_surfaces import geometry, rough_heights
 from support.paths import ROOT
 from torch import Tensor
@@ -110,25 +109,6 @@ def test_a_material_keeps_its_surface(shards: Path, tmp_path: Path) -> None:
     assert again.deviation() < 1e-5
     queries = random_queries(np.random.default_rng(1), 100, LATTICE).values()
     np.testing.assert_array_equal(again.evaluate(*queries), result.material.evaluate(*queries))
-
-
-def test_holes_are_learned(tmp_path: Path) -> None:
-    """Values are premultiplied; the transmittance is a part of the material."""
-
-    def through(u: F32, sigma: F32, omega: F32) -> NDArray[np.float64]:
-        wave = np.exp(-2 * (2 * np.pi * sigma) ** 2) * np.cos(2 * np.pi * u[:, 0])
-        return 0.5 + 0.4 * wave
-
-    def value(u: F32, sigma: F32, light: F32, view: F32) -> NDArray[np.float64]:
-        return parallax(u, sigma, light, view) * (1 - through(u, sigma, view))[:, None]
-
-    shards = write_data(tmp_path / "data", value, train=20_000, test=1000, through=through)
-    result = fit(config(200, training={"batch": 2000}), shards, tmp_path / "m")
-    assert result.errors["test"]["unexplained"]["value"] < 0.3
-    q = random_queries(np.random.default_rng(1), 1000, Lattice(3))
-    assert result.material.transmittance is not None
-    found = result.material.transmittance.evaluate(q["u"], q["sigma"], q["omega_o"])
-    assert np.abs(found - through(q["u"], q["sigma"], q["omega_o"])).mean() < 0.05
 
 
 def test_another_material_gives_textures_and_depth_weights(shards: Path, tmp_path: Path) -> None:

@@ -67,10 +67,6 @@ def test_every_epoch_takes_each_query_at_most_once() -> None:
     assert not torch.equal(torch.cat(seen[:10]), torch.cat(seen[10:]))
 
 
-def test_fewer_queries_than_a_batch_make_one_batch() -> None:
-    assert train_fully(trainer(queries(30), steps=3)).progress.step == 3
-
-
 def test_threads_share_a_batch_without_changing_its_gradient() -> None:
     data = queries(999)
     t = trainer(data)
@@ -83,13 +79,6 @@ def test_threads_share_a_batch_without_changing_its_gradient() -> None:
     torch.testing.assert_close(found[0][0], found[1][0])
     for one, three in zip(found[0][1], found[1][1], strict=True):
         torch.testing.assert_close(one, three, rtol=1e-4, atol=1e-6)
-
-
-def test_workers_leave_torchs_settings_as_they_were() -> None:
-    before = torch.get_num_threads(), torch.get_float32_matmul_precision()
-    with Workers(torch.device("cpu"), 2):
-        pass
-    assert (torch.get_num_threads(), torch.get_float32_matmul_precision()) == before
 
 
 def test_rates_rise_and_fall() -> None:

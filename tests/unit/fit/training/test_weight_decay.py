@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from support.fit_data import make_trainer, parallax, random_queries, training_queries, write_data
+from support.fit_data import parallax, random_queries, write_data
 
 from mbtf_core.data.lattice import Lattice
 from mbtf_fit.config import FitConfig, ModelName, build_model
 from mbtf_fit.data.loader import load_training, open_data
-from mbtf_fit.objective.noise import NoiseModel
 from mbtf_fit.sections import TrainingSection
 from mbtf_fit.training.trainer import WeightDecay, prepare_trainer
 
@@ -56,16 +55,6 @@ def test_texels_and_matrices_decay_and_biases_do_not(model: ModelName) -> None:
         assert matrix == ("weight" in name)
         expected = np.exp(-0.3) if texel else np.exp(-0.02) if matrix else 1.0
         torch.testing.assert_close(p.detach(), torch.full_like(p, expected))
-
-
-def test_a_trainer_counts_all_its_queries() -> None:
-    """Not as those of a batch."""
-    arrays = random_queries(np.random.default_rng(0), 5000, LATTICE)
-    noise = NoiseModel(0.1, np.zeros(3), np.zeros((4, 3)), np.ones(4), 0.7)
-    data = training_queries(arrays, parallax(*arrays.values()))
-    trainer = make_trainer(data, LATTICE, noise=noise, batch=1000, steps=1, noise_regularization=1000.0)
-    assert trainer.weight_decay.texels == 0.0
-    assert trainer.weight_decay.weights == pytest.approx(0.7 * 1000 / 5000)
 
 
 def test_a_fit_estimates_the_noise_ratio_of_its_data(tmp_path: Path) -> None:
