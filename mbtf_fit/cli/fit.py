@@ -68,8 +68,8 @@ def fit(
     shards
         Folder made by mbtf-gen, or its URL.
     many
-        Fit several data sets, one material each: folders made by mbtf-gen, folders of such folders, or text
-        files with one folder per line. A fit that fails does not stop the others.
+        Fit several data sets, one material each: folders made by mbtf-gen, or folders of such folders. A fit
+        that fails does not stop the others.
     processes
         With --many, number of simultaneous fits.
     shared_decoder

@@ -8,35 +8,23 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.data.dataset import is_dataset
-from mbtf_core.errors import InputError, UsageError, reason
+from mbtf_core.errors import InputError, UsageError
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item
-from mbtf_core.suggest import refuse_special
 from mbtf_fit.config import FitConfig
 
 
 def find_data(arguments: Sequence[Path]) -> list[Path]:
-    """Data sets of the arguments: a data set's folder, a folder of such folders, or a text file with one
-    folder per line, relative to the file; lines that start with # are comments.
+    """Data sets of the arguments: a data set's folder, or a folder of such folders.
 
     Raises
     ------
-    InputError : a list cannot be read, a folder contains no data sets, or one is a pipe or a device
+    InputError : a folder contains no data sets
     """
     found: list[Path] = []
     for argument in arguments:
-        refuse_special(argument)
-        if argument.is_file():
-            try:
-                lines = [line.strip() for line in argument.read_text(encoding="utf-8").splitlines()]
-            except (OSError, UnicodeDecodeError) as error:
-                raise InputError(f"cannot be read as a list ({reason(error)})", where=argument) from None
-            mine = [argument.parent / line for line in lines if line and not line.startswith("#")]
-            for folder in mine:
-                refuse_special(folder)
-        elif not argument.is_dir() or is_dataset(argument):
-            mine = [argument]
-        else:
+        mine = [argument]
+        if argument.is_dir() and not is_dataset(argument):
             mine = sorted(path for path in argument.iterdir() if path.is_dir() and is_dataset(path))
         if not mine:
             raise InputError(

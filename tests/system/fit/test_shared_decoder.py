@@ -102,8 +102,15 @@ def test_command_lines_that_cannot_share_a_network(materials: Path, data: Path, 
     a, out = str(data / "a"), ("-o", str(tmp_path / "m"), *QUICK)
     for more in ((), ("--decoder", str(materials))):
         assert "--shared-decoder requires --many" in fails(2, a, "--shared-decoder", *more, *out)
-    words = ("--many", str(data), "--shared-decoder", "--processes", "2")
-    assert "leave out --processes" in fails(2, *words, *out)
+    words = ("--many", str(data), "--shared-decoder")
+    assert "leave out --processes" in fails(2, *words, "--processes", "2", *out)
+    # The models that share networks, and the option that contradicts it, are a matter of usage; data are not.
+    assert "which neumip and relief have" in fails(2, *words, "--model", "neumip+", *out)
+    assert "leave out shared_decoder" in fails(2, *words, "--decoder", str(materials), *out)
+    assert "takes two data sets at least" in fails(3, "--many", a, "--shared-decoder", *out)
+    clash = write_data(tmp_path / "decoder", parallax, train=500, test=50)
+    assert "rename the data set of this name" in fails(3, "--many", str(clash), *words[1:], *out)
+    assert "no such folder" in fails(3, "--many", str(tmp_path / "none"), *words[1:], *out)
     assert not (tmp_path / "m").exists()
 
 
