@@ -40,17 +40,6 @@ def materials(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_every_command_takes_the_materials(materials: Path, data: Path, tmp_path: Path) -> None:
-    assert sorted(path.name for path in materials.iterdir()) == ["a", "b", "decoder"]
-    assert {"decoder.json", "weights.safetensors"} <= {p.name for p in (materials / "decoder").iterdir()}
-    done = call(["mbtf-fit", "info", str(materials / "a")])
-    assert done.code == 0, done.err
-    done = call(["mbtf-fit", "evaluate", str(materials / "b"), str(data / "b")])
-    assert done.code == 0, done.err
-    done = call(["mbtf-fit", "export", str(materials / "a"), "-o", str(tmp_path / "export")])
-    assert done.code == 0, done.err
-
-
 def test_a_fit_takes_model_and_network_from_the_folder(materials: Path, data: Path, tmp_path: Path) -> None:
     wanted = Decoder.find(materials).tensors()
     for folder in (materials / "decoder", materials / "a"):

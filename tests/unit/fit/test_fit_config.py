@@ -16,12 +16,6 @@ def test_durations_are_read(text: str | float, seconds: float) -> None:
     assert parse_duration(text) == seconds
 
 
-@pytest.mark.parametrize("text", ["", "fast", "-3s", "0s", "2 weeks", "1e9h", "nan"])
-def test_nonsense_durations_are_refused(text: str) -> None:
-    with pytest.raises(ValueError, match="duration"):
-        parse_duration(text)
-
-
 @pytest.mark.parametrize("seconds", [0.25, 45.0, 90.0, 120.0, 3600.0, 5400.0, 7261.0])
 def test_durations_survive_writing(seconds: float) -> None:
     assert parse_duration(format_duration(seconds)) == seconds

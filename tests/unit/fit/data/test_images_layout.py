@@ -85,30 +85,6 @@ def test_at_least_one_image_is_held_out(tmp_path: Path) -> None:
         partition(folder, HeldOutSection(radius=0.99, direction=(0.0, 0.0)))
 
 
-def test_values_are_the_mean_of_both_halves(tmp_path: Path) -> None:
-    folder = write_images(tmp_path / "d", parallax, train=4, noise=0.1)
-    training = images_of(partition(folder, HeldOutSection(queries=0, radius=0)))
-    stored = Dataset.open(folder).load("train")
-    np.testing.assert_allclose(training.value, 0.5 * (stored["value_a"] + stored["value_b"]), atol=1e-7)
-    np.testing.assert_array_equal(training.u, stored["u"])
-
-
-@pytest.mark.parametrize("aspect", [1.0, 0.5, 0.3])
-def test_neighbors_in_a_patch_are_a_texel_of_their_level_apart(aspect: float) -> None:
-    lattice = Lattice(4, aspect)
-    rows, _ = lattice.shape()
-    data = images(lattice, [0.0, 1.4, 2.6, 4.0], regular=True)
-    patches = data.patches(np.arange(4), np.array([[0, 0], [1, 3], [rows - 1, 2], [2, 15]]), 5, 2)
-    assert patches.u.shape == (4, 9, 9, 2)
-    assert patches.value.shape == (4, 5, 5, 3)
-    for item, level in enumerate((0, 1, 3, 4)):
-        down, across = lattice.shape(level)
-        step = patches.u[item, 1:, 1:] - patches.u[item, :-1, :-1]
-        step = (step + 0.5) % 1 - 0.5  # around the tile
-        expected = torch.tensor([1 / across, -round(rows / down) / rows])
-        torch.testing.assert_close((step - expected + 0.5) % 1 - 0.5, torch.zeros(8, 8, 2), atol=1e-6, rtol=0)
-
-
 def test_values_belong_to_the_positions_within_the_margin() -> None:
     lattice = Lattice(3)
     data = images(lattice, [3.0, 2.0], regular=False)

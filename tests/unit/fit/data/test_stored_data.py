@@ -133,17 +133,6 @@ def test_the_cache_is_bounded(
     assert len(downloads) > 8
 
 
-def test_a_shard_that_another_process_evicts_is_read_again(tmp_path: Path, url: str, local: Path) -> None:
-    data = Dataset.open(url)
-    shards = data.shards("train")
-    before = shards[0].read()
-    for path in (tmp_path / "cache/mbtf/stores/shards").iterdir():
-        path.unlink()
-    again = shards[0].read()
-    # The first arrays stay readable: they are mapped.
-    assert all((before[name] == again[name]).all() for name in before)
-
-
 def test_a_shard_that_leaves_the_cache_before_it_is_opened(
     url: str, local: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

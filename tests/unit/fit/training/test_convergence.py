@@ -67,18 +67,6 @@ def test_overfitting_is_bounded_by_the_noise(noise: float | None, share: float |
     assert found == (share if share is None else pytest.approx(share))
 
 
-def test_overfitting_is_seen_where_the_unexplained_variance_is_undefined() -> None:
-    """Noisy queries, in training and held out: the history and the ratio have no number."""
-    unknown = [{**r, "unexplained": None, "unexplained_error": None} for r in history(0.5)]
-    found = cost(unknown, errors(0.05, -0.05), 0.3)
-    assert found.noise_share == 1.0
-    assert found.describe().startswith("overfitting to noise causes 100% of the error of new queries")
-    # Held-out queries that resolve nothing at all, and a test split of many paths.
-    both = errors(0.01, -0.05, 0.02) | {"test": {"mse": {"value": 0.06, "error": 0.001}}}
-    both["training"]["mse"]["error"] = 0.001
-    assert cost(unknown, both, 0.3).noise_share == pytest.approx(0.055 / 0.06)
-
-
 def test_incomplete_histories_give_no_marginal_cost() -> None:
     unknown = [{**r, "unexplained": None, "unexplained_error": None} for r in history(0.5)]
     for records in ([], history(0.5)[:-1], history(0.5)[-1:], unknown):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 from support.fit_data import parallax, write_data
 
@@ -16,7 +15,7 @@ from mbtf_fit.data.loader import load_training, open_data
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.sections import HeldOutSection
 from mbtf_fit.training.forecast import forecast_fit
-from mbtf_fit.training.validation import validation_set, validation_subset
+from mbtf_fit.training.validation import validation_set
 
 
 @pytest.fixture(scope="module")
@@ -68,13 +67,3 @@ def test_the_last_validation_is_the_error_of_the_fit(shards: Path, tmp_path: Pat
     reached = found.errors["test"]["unexplained"]["value"]
     assert found.history[-1]["unexplained"] == pytest.approx(reached, rel=1e-5)
     assert found.errors["held_out_queries"]["unexplained"]["value"] != pytest.approx(reached, rel=1e-3)
-
-
-@pytest.mark.parametrize(("most", "step"), [(5000, 1), (2000, 1), (1999, 2), (150, 14)])
-def test_the_validation_subset_is_spread_evenly(most: int, step: int) -> None:
-    u = np.arange(2000.0, dtype=np.float32)[:, None].repeat(2, 1)
-    three = u[:, :1].repeat(3, 1)
-    queries = ShardQueries(u, u[:, 0], three, three, three, three)
-    assert np.array_equal(validation_subset(1, queries, most).u[:, 0], np.arange(0, 2000, step))
-    # Fewer for a model that reads its textures at nine positions per query.
-    assert len(validation_subset(9, queries, most)) <= max(1, most // 9)

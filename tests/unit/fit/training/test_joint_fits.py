@@ -311,29 +311,6 @@ def test_other_models_are_refused(model: str, option: str) -> None:
         FitConfig.model_validate({"model": model, **given})
 
 
-def test_a_network_is_kept_or_trained() -> None:
-    for more in ({"init_from": "m"}, {"training": {"shared_decoder": True}}):
-        with pytest.raises(ValueError, match="decoder keeps a network as it is: leave out"):
-            FitConfig.model_validate({"decoder": "m", **more})
-
-
-def test_too_few_data_sets_and_taken_names_are_refused(data: dict[str, Path], tmp_path: Path) -> None:
-    one = [data["waves"]]
-    with pytest.raises(InputError, match="takes two data sets at least"):
-        fit_jointly(joint_config(), one, [tmp_path / "waves"], tmp_path / "decoder")
-    with pytest.raises(InputError, match="a shared network takes several data sets"):
-        fit(joint_config(), data["waves"], tmp_path / "m")
-    folders = [tmp_path / "decoder", tmp_path / "b"]
-    with pytest.raises(InputError, match="decoder: this folder is that of the shared network"):
-        fit_jointly(joint_config(), one * 2, folders, tmp_path / "decoder")
-    folders = [tmp_path / "x" / "a", tmp_path / "y" / "a"]
-    with pytest.raises(InputError, match="a: 2 of the folders have this name"):
-        fit_jointly(joint_config(), one * 2, folders, tmp_path / "decoder")
-    with pytest.raises(InputError, match=r"training\.shared_decoder: is not set"):
-        fit_jointly(single_config(), one * 2, [tmp_path / "a", tmp_path / "b"], tmp_path / "decoder")
-    assert not any(tmp_path.iterdir())
-
-
 def test_options_of_shared_networks_leave_other_fits_as_they_are() -> None:
     plain = FitConfig.model_validate({})
     assert "decoder" not in plain.fields()
@@ -343,3 +320,12 @@ def test_options_of_shared_networks_leave_other_fits_as_they_are() -> None:
     shared = FitConfig.model_validate({"training": {"shared_decoder": True}}).training
     assert (shared.batch, shared.learning_rate) == (1 << 14, 0.01)
     assert joint.hash("x") != single_config(steps=300).hash("x")
+
+
+def test_one_data_set_shares_no_network(data: dict[str, Path], tmp_path: Path) -> None:
+    """The command line's refusals are those of :func:`fit_jointly`; these two it cannot ask for."""
+    with pytest.raises(InputError, match="a shared network takes several data sets"):
+        fit(joint_config(), data["waves"], tmp_path / "m")
+    with pytest.raises(InputError, match=r"training\.shared_decoder: is not set"):
+        fit_jointly(single_config(), [data["waves"]] * 2, [tmp_path / "a", tmp_path / "b"], tmp_path / "d")
+    assert not any(tmp_path.iterdir())

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from support.datasets import read_checksummed
 from support.fit_data import parallax, write_data
 from support.paths import ROOT
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.lattice import Lattice
-from mbtf_core.files.atomic import write_checksummed
 from mbtf_core.images.resample import resample
 from mbtf_fit import FitConfig, fit
 from mbtf_fit.data.loader import load_training, open_data
@@ -62,15 +59,6 @@ def test_a_resumed_fit_is_the_same(shards: Path, tmp_path: Path) -> None:
     wanted = whole.model.weights()
     for name, tensor in second.model.weights().items():
         assert torch.equal(tensor, wanted[name]), name
-
-
-def test_measured_data_have_neither_geometry_nor_configuration(shards: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "measured"
-    shutil.copytree(shards, folder)
-    manifest = read_checksummed(folder / "manifest.json")
-    write_checksummed(folder / "manifest.json", {**manifest, "geometry": None, "config": None})
-    result = fit(config(4), folder, tmp_path / "m")
-    assert result.material.model.tracing is not None
 
 
 def test_a_fit_starts_from_the_heights_of_another(shards: Path, tmp_path: Path) -> None:
