@@ -139,10 +139,10 @@ def test_a_white_plate_and_a_white_sheet_have_one_exposure(tmp_path: Path) -> No
 def test_view_and_light_replace_those_of_the_sheet() -> None:
     """Spelled as in ``mbtf-gen reference``."""
     config = resolve(
-        MaterialPreviewConfig, flags={"material": "m", "sheet.view": "60,-90", "sheet.light": "45,30"}
+        MaterialPreviewConfig, flags={"material": "m", "sheet.views": "60,-90", "sheet.lights": "45,30"}
     )
-    assert config.sheet.cameras == [Direction(elevation=60, azimuth=-90)]
-    assert config.sheet.lamps == [Direction(elevation=45, azimuth=30)]
+    assert config.sheet.views == [Direction(elevation=60, azimuth=-90)]
+    assert config.sheet.lights == [Direction(elevation=45, azimuth=30)]
 
 
 def test_bad_input_of_previews_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
