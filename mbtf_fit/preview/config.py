@@ -15,7 +15,6 @@ from mbtf_gen.config.pictures import EXPOSURE, Direction, Exposure
 MOST_PIXELS = 1 << 25
 
 
-
 def _listed(value: Any) -> Any:
     """A single direction as a list of one."""
     return [value] if isinstance(value, str) else value

@@ -29,8 +29,6 @@ from mbtf_fit.material.format import DESCRIPTION_NAME
 from mbtf_fit.material.material import Material, export
 from mbtf_fit.material.transmittance_fit import evaluate_transmittance, fit_transmittance
 from mbtf_fit.models.registry import MODELS
-from mbtf_fit.training.checkpoint import CHECKPOINT_NAME, read_checkpoint, write_checkpoint
-from mbtf_fit.training.convergence import MarginalCost, marginal_cost_of
 from mbtf_fit.training.fit_folder import (
     append_history,
     claim,
@@ -39,9 +37,22 @@ from mbtf_fit.training.fit_folder import (
     read_history,
     truncate_history,
 )
-from mbtf_fit.training.loop import TrainingLoop, choose_device, keep_freed_memory
+from mbtf_fit.training.loop import (
+    CHECKPOINT_NAME,
+    TrainingLoop,
+    choose_device,
+    keep_freed_memory,
+    read_checkpoint,
+    write_checkpoint,
+)
 from mbtf_fit.training.trainer import Trainer, prepare_trainer
-from mbtf_fit.training.validation import history_record, validation_set, validation_subset
+from mbtf_fit.training.validation import (
+    MarginalCost,
+    history_record,
+    marginal_cost_of,
+    validation_set,
+    validation_subset,
+)
 
 # Seconds of training between two validations, and between two checkpoints.
 _REPORT_SECONDS = 2.0

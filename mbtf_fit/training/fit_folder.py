@@ -18,7 +18,7 @@ from mbtf_fit.material.decoder import DECODER_NAME, Decoder
 from mbtf_fit.material.export import LAYERS_NAME, TEXTURES_NAME
 from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME, read_description
 from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME
-from mbtf_fit.training.checkpoint import CHECKPOINT_NAME
+from mbtf_fit.training.loop import CHECKPOINT_NAME
 
 FIT_NAME = "fit.json"
 CONFIG_NAME = "config.yaml"

@@ -1,7 +1,8 @@
 """The training loop: steps of one or several materials until a budget is spent, all numbers finite.
 
 Steps take the materials in turn. A step trains the textures of one material, and the network, which all
-materials share with the state of its optimizer: Adam's moments average the gradients of the materials.
+materials share with the state of its optimizer: Adam's moments average the gradients of the materials. A
+checkpoint is the state of a loop in one file.
 """
 
 from __future__ import annotations
@@ -12,7 +13,8 @@ import math
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
+from pathlib import Path
 from threading import Event
 from typing import NoReturn
 
@@ -21,8 +23,9 @@ from torch import Tensor
 
 from mbtf_core.errors import EngineError, InputError
 from mbtf_core.run.task import worker_threads
+from mbtf_fit.material.storage import read_tensors, write_tensors
 from mbtf_fit.objective.parallel import Workers
-from mbtf_fit.training.trainer import Trainer
+from mbtf_fit.training.trainer import Trainer, TrainingProgress
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 
@@ -157,3 +160,69 @@ class TrainingLoop:
             where=self.names[step % len(self.trainers)],
             hint=f"lower the learning rate: --learning-rate {lower:.1g} --overwrite",
         ) from None
+
+
+CHECKPOINT_NAME = "checkpoint.safetensors"
+_MOMENTS = ("step", "exp_avg", "exp_avg_sq")
+
+
+def _own_parameters(loop: TrainingLoop, number: int) -> dict[str, Tensor]:
+    """Parameters of a trainer by name; the first one has those of the networks."""
+    trainer = loop.trainers[number]
+    shared = tuple(f"{name}." for name in trainer.model.networks()) if number else ()
+    return {name: p for name, p in trainer.parameters().items() if not name.startswith(shared)}
+
+
+def state_tensors(loop: TrainingLoop) -> dict[str, Tensor]:
+    """Parameters, optimizer state and state of the model by number of the trainer and name."""
+    tensors: dict[str, Tensor] = {}
+    for k, trainer in enumerate(loop.trainers):
+        for name, p in _own_parameters(loop, k).items():
+            tensors[f"{k}.model.{name}"] = p.detach()
+            for key, value in trainer.optimizer.state.get(p, {}).items():
+                tensors[f"{k}.adam.{key}.{name}"] = value
+        tensors |= {f"{k}.state.{name}": tensor for name, tensor in trainer.hooks.state().items()}
+    return tensors
+
+
+def write_checkpoint(loop: TrainingLoop, path: Path) -> None:
+    """Write parameters, optimizer state and progress."""
+    write_tensors(path, state_tensors(loop), asdict(loop.progress))
+
+
+def read_checkpoint(loop: TrainingLoop, path: Path) -> None:
+    """Resume from a checkpoint of the same configuration and data, with identical results.
+
+    Raises
+    ------
+    InputError : the file is no such checkpoint
+    """
+    try:
+        tensors, progress = read_tensors(path)
+        for k, trainer in enumerate(loop.trainers):
+            mine = {n.removeprefix(f"{k}."): t for n, t in tensors.items() if n.startswith(f"{k}.")}
+            _load(trainer, _own_parameters(loop, k), mine)
+        loop.trainers[0].progress = TrainingProgress(
+            int(progress["step"]), float(progress["seconds"]), float(progress["loss"])
+        )
+    except (InputError, KeyError, TypeError, ValueError, RuntimeError):
+        raise InputError(
+            "is not a checkpoint of this fit: corrupt, or of an older version",
+            where=path,
+            hint="remove it: the same command then starts from the beginning",
+        ) from None
+    loop.link()
+
+
+def _load(trainer: Trainer, parameters: dict[str, Tensor], tensors: dict[str, Tensor]) -> None:
+    """Set parameters, optimizer state and the model's own state of a trainer."""
+    with torch.no_grad():
+        for name, p in parameters.items():
+            p.copy_(tensors[f"model.{name}"])
+            trainer.optimizer.state[p] = {
+                key: tensors[f"adam.{key}.{name}"].to(p.device)
+                for key in _MOMENTS
+                if f"adam.{key}.{name}" in tensors
+            }
+    state = {n.removeprefix("state."): t for n, t in tensors.items() if n.startswith("state.")}
+    trainer.hooks.restore(state)

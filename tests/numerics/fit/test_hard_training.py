@@ -21,8 +21,7 @@ from mbtf_core.directions import from_projected_disk
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.objective.noise import NoiseModel, typical_value
-from mbtf_fit.training.checkpoint import state_tensors
-from mbtf_fit.training.loop import TrainingLoop
+from mbtf_fit.training.loop import TrainingLoop, state_tensors
 from mbtf_fit.training.trainer import Trainer
 
 LATTICE = Lattice(2)

@@ -22,8 +22,8 @@ from mbtf_fit.data.loader import load_training
 from mbtf_fit.data.queries import batch_starts
 from mbtf_fit.data.streaming import StreamedQueries
 from mbtf_fit.sections import HeldOutSection
-from mbtf_fit.training.checkpoint import CHECKPOINT_NAME
 from mbtf_fit.training.fit import fit
+from mbtf_fit.training.loop import CHECKPOINT_NAME
 
 HELD_OUT = HeldOutSection(queries=0.1, radius=0.3)
 

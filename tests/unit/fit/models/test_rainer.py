@@ -24,9 +24,8 @@ from mbtf_fit.material.material import Material
 from mbtf_fit.models.model import Preparation
 from mbtf_fit.models.rainer import Rainer2019, shared_slices
 from mbtf_fit.objective.noise import typical_value
-from mbtf_fit.training.checkpoint import read_checkpoint, write_checkpoint
 from mbtf_fit.training.fit_folder import identity_of
-from mbtf_fit.training.loop import TrainingLoop
+from mbtf_fit.training.loop import TrainingLoop, read_checkpoint, write_checkpoint
 from mbtf_fit.training.trainer import prepare_trainer
 from mbtf_gen.sampling.slice_directions import direction_pairs, slice_directions
 

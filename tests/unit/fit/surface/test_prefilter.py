@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from mbtf_core.data.lattice import Lattice, sigma_of_level
+from mbtf_fit.surface.known import prefilter, prefiltered_levels
 from mbtf_fit.surface.lookup import Packing, lookup
-from mbtf_fit.surface.prefilter import prefilter, prefiltered_levels
 
 
 @pytest.mark.parametrize(("given", "shape"), [((12, 16), (12, 16)), ((15, 9), (8, 6)), ((6, 8), (20, 31))])

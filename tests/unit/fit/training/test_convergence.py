@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from mbtf_fit.training.convergence import MarginalCost, marginal_cost_of
+from mbtf_fit.training.validation import MarginalCost, marginal_cost_of
 
 
 def history(power: float, error: float = 1e-4, total: float = 80.0) -> list[dict[str, Any]]:

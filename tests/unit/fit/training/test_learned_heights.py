@@ -17,8 +17,7 @@ from mbtf_core.images.resample import resample
 from mbtf_fit import FitConfig, fit
 from mbtf_fit.data.loader import load_training, open_data
 from mbtf_fit.native import library
-from mbtf_fit.training.checkpoint import read_checkpoint, write_checkpoint
-from mbtf_fit.training.loop import TrainingLoop
+from mbtf_fit.training.loop import TrainingLoop, read_checkpoint, write_checkpoint
 from mbtf_fit.training.trainer import Trainer, prepare_trainer
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.run import generate
