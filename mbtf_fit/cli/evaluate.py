@@ -44,13 +44,9 @@ def evaluate(
             "materials and do not measure the quality of the fit"
         )
     found = evaluate(loaded, folder)
-    errors = {name: e.as_dict() for name, e in found.values.items()}
-    through = {name: e.as_dict() for name, e in (found.transmittance or {}).items()}
     lines = [
         f"{material}: {loaded.config.model} on {folder}",
-        *report_errors(errors, through, verbose, foreign=bool(foreign)),
+        *report_errors(found["errors"], found.get("transmittance"), verbose, foreign=bool(foreign)),
     ]
-    report = {"material": material, "shards": shards, "foreign_inputs": foreign, "errors": errors}
-    if found.transmittance is not None:
-        report["transmittance"] = through
+    report = {"material": material, "shards": shards, "foreign_inputs": foreign, **found}
     console.report(report, "\n".join(lines))

@@ -347,8 +347,8 @@ def prefilter(image: Tensor, shape: tuple[int, int], sigma: float, aspect: float
 def lookup_sigma(level: int, columns: int) -> float:
     """Standard deviation of the prefilter of a level whose texture has so many columns, in tile widths.
 
-    A lookup at level s stands for the footprint σ_s. Bilinear interpolation between texels of width w adds the
-    variance w²/6 of its tent, so that a map is filtered with the variance ``σ_s² - w²/6``.
+    A lookup at level s stands for the footprint σ_s. Bilinear interpolation between texels of width w adds
+    the variance w²/6 of its tent, so that a map is filtered with the variance ``σ_s² - w²/6``.
     """
     width = 1.0 / columns
     return math.sqrt(max(float(sigma_of_level(level)) ** 2 - width**2 / 6.0, 0.0))

@@ -407,7 +407,7 @@ def export_fit(
     trainer.fill_levels(float(level_of_sigma(partition.sample.sigma.max())))
     trainer.calibrate()
     errors = evaluate_splits(trainer.predict, data, partition)
-    variance = errors["training"].overall.variance.value
+    variance = errors["training"]["variance"]["value"]
     sample = partition.sample
     noise = pooled_variance(sample.value_a, sample.value_b).value if data.estimates == 2 else None
     training = {
@@ -421,10 +421,10 @@ def export_fit(
         "threads": torch.get_num_threads(),
         "backend": trainer.backend,
         "torch": torch.__version__,
-        "errors": {split: e.as_dict() for split, e in errors.items()},
+        "errors": errors,
         # Variance of the noise of values, in 1/sr² and over that of the values; null where it is unknown.
         "noise_variance": noise,
-        "noise_ratio": noise / variance if noise is not None and variance > 0 else None,
+        "noise_ratio": noise / variance if noise is not None and variance and variance > 0 else None,
     }
     transmittance = fit_transmittance(data, partition.selection)
     if transmittance is not None:

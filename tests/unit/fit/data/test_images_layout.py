@@ -200,9 +200,9 @@ def test_a_hierarchical_material_is_fitted_and_loads_again(tmp_path: Path) -> No
     assert material.deviation() < 1e-6
     # Evaluated on data of either layout, in any company.
     shuffled = write_data(tmp_path / "s", parallax, train=2000, test=500)
-    errors = evaluate(material, shuffled).values["test"].overall
-    assert errors.n == 500
-    assert errors.unexplained.value < 0.5
+    errors = evaluate(material, shuffled)["errors"]["test"]
+    assert errors["n"] == 500
+    assert errors["unexplained"]["value"] < 0.5
     queries = random_queries(np.random.default_rng(3), 1000, material.lattice)
     found = material.evaluate(*queries.values())
     alone = material.evaluate(*(a[500:501] for a in queries.values()))

@@ -92,7 +92,7 @@ def networks_of(folder: Path) -> dict[str, torch.Tensor]:
 
 
 def unexplained(folder: Path, shards: Path) -> float:
-    value = evaluate(Material.load(folder), shards).values["test"].overall.unexplained.value
+    value = evaluate(Material.load(folder), shards)["errors"]["test"]["unexplained"]["value"]
     assert value is not None
     return value
 
@@ -122,9 +122,9 @@ def test_joint_fits_learn_each_material(library_folder: Path, data: dict[str, Pa
         # The library itself states the same errors, of queries that training used or never saw.
         material = Material.load(library_folder / name)
         stated = material.description["training"]["errors"]
-        for split, found in evaluate(material, data[name]).values.items():
+        for split, found in evaluate(material, data[name])["errors"].items():
             assert stated[split]["unexplained"]["value"] == pytest.approx(
-                found.overall.unexplained.value, rel=1e-6
+                found["unexplained"]["value"], rel=1e-6
             )
 
 
