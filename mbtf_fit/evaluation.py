@@ -58,11 +58,11 @@ def split_errors(
     Returns
     -------
     dict
-        Plain data for JSON. Estimates, each with ``value``, ``error`` and ``n``: ``mse`` E[(p-a)(p-b)] and
-        ``variance`` of the values in 1/sr²; their ratio ``unexplained`` (1 - R²), 0 exact, 1 as good as the
-        mean value; ``psnr``, whose peak is the value that the exposure shows as white. ``visibility``: in words;
-        ``includes_noise``: whether the data have a single value per query. The first three also by nearest
-        level (``levels``) and by band of the smaller cosine of light and view (``elevations``).
+        Plain data for JSON. ``mse`` E[(p-a)(p-b)] and ``variance`` of the values, in 1/sr², and their ratio
+        ``unexplained`` (1 - R²: 0 is exact, 1 as good as the mean value), each an estimate with ``value``,
+        ``error`` and ``n``; also by nearest level (``levels``) and by band of the smaller cosine of light and
+        view (``elevations``). ``psnr``: its peak is the value that the exposure shows as white;
+        ``visibility``: in words; ``includes_noise``: whether the data have one value per query.
     """
     if len(queries) == 0:
         return None
