@@ -55,15 +55,6 @@ def test_a_fit_takes_model_and_network_from_the_folder(materials: Path, data: Pa
     assert all((own[name] == wanted[name]).all() for name in wanted)
 
 
-def test_many_fits_keep_one_network(materials: Path, data: Path, tmp_path: Path) -> None:
-    """In processes of their own."""
-    words = ["--many", str(data / "c"), "--decoder", str(materials), "-o", str(tmp_path / "m")]
-    done = call(["mbtf-fit", *words, *QUICK, "--json"])
-    assert done.code == 0, done.err
-    (fit,) = json.loads(done.out)["fits"]
-    assert fit["result"]["training"]["decoder"]["sha256"] == Decoder.find(materials).sha256
-
-
 def test_the_same_command_keeps_a_finished_fit(data: Path, tmp_path: Path) -> None:
     words = ["--many", str(data), "--shared-decoder", "-o", str(tmp_path / "m"), *QUICK]
     first = call(["mbtf-fit", *words, "--json"])

@@ -92,13 +92,6 @@ def test_values_are_the_mean_of_both_halves(tmp_path: Path) -> None:
     assert len(found.held_out_queries) == len(found.held_out_directions) == 0
 
 
-def test_exr_shards_hold_the_same(tmp_path: Path) -> None:
-    npz = partition(write_data(tmp_path / "npz", parallax, train=1000))
-    exr = partition(write_data(tmp_path / "exr", parallax, train=1000, suffix=".exr"))
-    for name in ("u", "sigma", "omega_i", "omega_o", "value"):
-        assert (getattr(npz.training, name) == getattr(exr.training, name)).all(), name
-
-
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 @pytest.mark.parametrize("name", ["value_b", "sigma"])
 def test_a_shard_with_nan_or_infinity_is_refused_by_name(tmp_path: Path, bad: float, name: str) -> None:

@@ -16,7 +16,6 @@ from mbtf_core.data.lattice import Lattice
 from mbtf_core.images.resample import resample
 from mbtf_fit import FitConfig, fit
 from mbtf_fit.data.loader import load_training, open_data
-from mbtf_fit.native import library
 from mbtf_fit.training.loop import TrainingLoop, read_checkpoint, write_checkpoint
 from mbtf_fit.training.trainer import Trainer, prepare_trainer
 from mbtf_gen.config.generator import GeneratorConfig
@@ -68,25 +67,6 @@ def test_a_fit_starts_from_the_heights_of_another(shards: Path, tmp_path: Path) 
     second = prepare_trainer(options, data, partition, torch.device("cpu")).model
     assert float(first.known.heights.std()) > 1e-6
     assert torch.equal(second.known.heights, first.known.heights)
-
-
-@pytest.mark.skipif(library.kernel() is None, reason=library.missing_reason() or "kernel")
-def test_pytorch_fits_as_the_kernel_does(
-    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    compiled = fit(config(20), shards, tmp_path / "compiled")
-    monkeypatch.setenv(library.ENVIRONMENT, "off")
-    library.reload()
-    try:
-        plain = fit(config(20), shards, tmp_path / "plain")
-    finally:
-        monkeypatch.undo()
-        library.reload()
-    described = [r.material.description["training"] for r in (compiled, plain)]
-    assert [d["backend"].split()[0] for d in described] == ["kernel", "pytorch"]
-    # Not the loss: it is the mean since the last report, which a busy machine sends after fewer steps.
-    found = [r.errors["test"]["mse"]["value"] for r in (compiled, plain)]
-    assert found[1] == pytest.approx(found[0], rel=2e-3)
 
 
 def test_a_depth_is_learned(tmp_path: Path) -> None:
