@@ -46,8 +46,8 @@ from mbtf_fit.native import library
 from mbtf_fit.objective.noise import NoiseModel
 from mbtf_fit.objective.parallel import MAX_KERNEL_THREADS, MAX_THREADS, Workers
 from mbtf_fit.pytorch.material import NeuralMaterial
-from mbtf_fit.textures.blur import NEGLIGIBLE, annealed_sigma
-from mbtf_fit.training.device import keep_freed_memory
+from mbtf_fit.pytorch.textures import NEGLIGIBLE, annealed_sigma
+from mbtf_fit.training.loop import keep_freed_memory
 from mbtf_fit.training.trainer import BETAS, Trainer
 
 # Times the plain way's queries per second, on two cores.

@@ -48,9 +48,8 @@ from mbtf_core.units import clock
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import load_training, open_data
 from mbtf_fit.models.registry import MODELS
-from mbtf_fit.training.device import keep_freed_memory
-from mbtf_fit.training.fit import prepare_trainer
-from mbtf_fit.training.trainer import Trainer
+from mbtf_fit.training.loop import TrainingLoop, keep_freed_memory
+from mbtf_fit.training.trainer import Trainer, prepare_trainer
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.run import generate
 
@@ -130,7 +129,7 @@ def started(folder: str, memory: str) -> tuple[Trainer, float]:
 def steps_per_second(trainer: Trainer, seconds: float) -> tuple[float, float]:
     """Of wall time, and of processor time."""
     step, began, busy = trainer.progress.step, time.perf_counter(), time.process_time()
-    trainer.train(seconds)
+    TrainingLoop([trainer]).train(seconds)
     steps = trainer.progress.step - step
     return steps / (time.perf_counter() - began), steps / (time.process_time() - busy)
 

@@ -33,10 +33,9 @@ from numpy.typing import NDArray
 from mbtf_core.data.geometry import Geometry
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.images.resample import resample
-from mbtf_fit.config import FitConfig, build_model
+from mbtf_fit.config import FitConfig, best_options, build_model
 from mbtf_fit.material.material import Material, export
 from mbtf_fit.ops.constants import PLACES
-from mbtf_fit.presets import best_options
 from mbtf_fit.surface.known import KnownSurface
 from mbtf_fit.viewer.content import material_content
 from mbtf_fit.viewer.page import write_page

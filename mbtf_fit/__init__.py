@@ -14,8 +14,8 @@ _PUBLIC = {
     "Material": "mbtf_fit.material.material",
     "evaluate": "mbtf_fit.evaluation",
     "fit": "mbtf_fit.training.fit",
-    "fit_jointly": "mbtf_fit.training.joint_fit",
-    "read_history": "mbtf_fit.training.validation",
+    "fit_jointly": "mbtf_fit.training.fit",
+    "read_history": "mbtf_fit.training.fit_folder",
 }
 
 __all__ = ["FitConfig", "FitResult", "Material", "evaluate", "fit", "fit_jointly", "read_history"]

@@ -1,17 +1,20 @@
-"""Configuration of the fitter: every option, typed, with its unit and its default."""
+"""Configuration of the fitter: every option, typed, with its unit and its default; options of each quality
+preset, see :mod:`mbtf_gen.config.presets`."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from mbtf_core.app.options import Flag
+from mbtf_core.app.options import Flag, Quality
 from mbtf_core.config.nested import deep_merge, leaves
 from mbtf_core.config.settings import Settings
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.files.digest import data_sha256
+from mbtf_core.units import parse_duration
 from mbtf_fit.models.model import SPECIAL
 from mbtf_fit.models.registry import MODELS, defaults_of, with_option
 from mbtf_fit.sections import DataSection, HeldOutSection, NetworkSection, TrainingSection
@@ -35,28 +38,7 @@ SHARED_PRESET: dict[str, Any] = {"training": {"batch": 1 << 14, "learning_rate":
 
 
 class FitConfig(Settings):
-    """Every option of ``mbtf-fit`` besides the shards.
-
-    Parameters
-    ----------
-    model : str
-        A model of :mod:`mbtf_fit.models`.
-    init_from : str, optional
-        Folder of a material that initializes textures and offset.
-    decoder : str, optional
-        Folder of a network, or of a material, whose network the fit keeps: it trains textures alone.
-    network : NetworkSection
-        Architecture.
-    training : TrainingSection
-        Budget, loss and optimizer.
-    held_out : HeldOutSection
-        Queries that are held out for validation.
-    data : DataSection
-        Reading of the data.
-    seed : int
-        Seed of the initial parameters and of the batch order.
-    device : str
-        ``auto``, ``cpu`` or ``cuda``.
+    """Every option of ``mbtf-fit`` besides the shards; each field describes itself.
 
     Raises
     ------
@@ -113,6 +95,12 @@ class FitConfig(Settings):
             if given != default:
                 others = with_option(key)
                 raise ValueError(f"{self.model} has no option {key}, which {_listed(others)}")
+        gradient = any(term.kind == "gradient" for term in self.training.losses)
+        if gradient and MODELS[self.model].layout != "image":
+            raise ValueError(
+                "training.losses: the gradient loss compares neighboring texels, which "
+                f"{self.model} never sees together; use a model of the image layout"
+            )
         if self.decoder and (self.training.shared_decoder or self.init_from):
             raise ValueError("decoder keeps a network as it is: leave out shared_decoder and init_from")
         return self
@@ -149,3 +137,82 @@ def build_model(name: str, lattice: Lattice, **network: Any) -> NeuralMaterial:
 
     config = FitConfig.model_validate({"model": name, "network": network})
     return material_of(name, lattice, config.network)
+
+
+# Options of least error per time in the cost studies: larger networks and textures than the paper's, growing
+# with the training time (seconds).
+_Sizes = tuple[tuple[float, dict[str, Any]], ...]
+_NEUMIP: _Sizes = (
+    (0.0, {"network.width": 40, "network.channels": 12}),
+    (300.0, {"network.width": 64, "network.channels": 16}),
+)
+# For the models of the paper: directions with z, and smooth textures where data are few.
+_SMOOTH: dict[str, Any] = {
+    "network.encoding.direction_xyz": True,
+    "training.texture_weight_decay": 1.0,
+    "training.blur.min_sigma": 0.8,
+}
+# Oversampled textures of `relief` gain nothing from more channels in a few minutes, and steps take longer.
+# Two view rays per footprint take 1.3 times as long to evaluate, four twice.
+_RELIEF: _Sizes = (
+    (0.0, {"network.width": 40, "network.channels": 8, "network.relief.places": 1}),
+    (100.0, {"network.width": 40, "network.channels": 8, "network.relief.places": 2}),
+    (300.0, {"network.width": 64, "network.channels": 16, "network.relief.places": 4}),
+)
+# Models that have such options.
+_MODELS: tuple[ModelName, ...] = ("relief", "neumip+", "neumip", "neumip-baseline")
+
+# Budget of each preset.
+FITTER: dict[Quality, dict[str, Any]] = {
+    "draft": {"training.time": "12s", "training.steps": None},
+    "standard": {"training.time": "3min", "training.steps": None},
+    "high": {"training.time": "10min", "training.steps": None},
+    # Kuznetsov et al. 2021: 30 000 steps of 2^20 queries.
+    "paper": {"training.steps": 30_000, "training.batch": 1 << 20},
+}
+
+
+def best_options(seconds: float, model: ModelName = DEFAULT_MODEL) -> dict[str, Any]:
+    """Network and smoothing options of a model, dotted names, for a training time (seconds) on two processor
+    cores; none for a model other than `relief`, `neumip` and its baseline."""
+    if model not in _MODELS:
+        return {}
+    sizes, rest = (_RELIEF, {}) if model == "relief" else (_NEUMIP, _SMOOTH)
+    return [size for least, size in sizes if seconds >= least][-1] | rest
+
+
+def best_at(quality: Quality, model: ModelName = DEFAULT_MODEL) -> dict[str, Any]:
+    """:func:`best_options` for the training time of a quality preset: infinite for a number of steps."""
+    training = FITTER[quality].get("training.time")
+    return best_options(math.inf if training is None else parse_duration(training), model)
+
+
+def fitter_options(
+    quality: Quality, fits: Mapping[str, Mapping[str, Any]], seconds: float | None = None
+) -> dict[str, dict[str, Any]]:
+    """Options of fits at a quality preset, dotted names: their budget, and :func:`best_at`. Explicit values
+    override the preset.
+
+    If any fit sets a network option, all keep the networks of their papers, so that they can be compared.
+
+    Parameters
+    ----------
+    fits : name → explicit options of files and command line, nested, with the model
+    seconds : training time that decides the network; the preset's by default
+    """
+    free = not any(
+        "network" in given or given.get("init_from") or given.get("decoder") for given in fits.values()
+    )
+    out = {}
+    for name, given in fits.items():
+        training = given.get("training")
+        training = training if isinstance(training, Mapping) else {}
+        model = given.get("model", DEFAULT_MODEL)
+        best = best_at(quality, model) if seconds is None else best_options(seconds, model)
+        kept = {
+            key: value
+            for key, value in best.items()
+            if (free if key.startswith("network.") else key.split(".")[1] not in training)
+        }
+        out[name] = kept | FITTER[quality]
+    return out

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +11,6 @@ from numpy.typing import NDArray
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.folder import DataFolder
-from mbtf_core.data.lattice import Lattice
 from mbtf_core.directions import ELEVATION_BANDS
 from mbtf_core.errors import InputError
 from mbtf_core.exposure import auto_exposure, brightness, white_of
@@ -29,84 +27,12 @@ from mbtf_core.stats import (
 from mbtf_fit.data.loader import MAX_HELD_OUT_OF_IMAGES, SAMPLE, Partition, load_split, load_training
 from mbtf_fit.data.queries import ShardQueries, mean_value
 from mbtf_fit.formatting import visibility
-from mbtf_fit.material.transmittance_fit import TransmittanceError, evaluate_transmittance, has_transmittance
+from mbtf_fit.material.transmittance_fit import evaluate_transmittance, has_transmittance
 
 if TYPE_CHECKING:
     from mbtf_fit.material.material import Material
 
 Predict = Callable[[ShardQueries], NDArray[np.float32]]
-
-
-@dataclass(frozen=True)
-class Errors:
-    """Errors on a set of queries.
-
-    Attributes
-    ----------
-    n : int
-        Number of queries.
-    mse : Estimate
-        Mean squared error E[(p-a)(p-b)] without the noise of the data, in 1/sr².
-    variance : Estimate
-        Variance of the data's values without their noise, in 1/sr².
-    unexplained : Estimate
-        Unexplained variance mse / variance (1 - R²): 0 is exact, 1 as good as the mean value.
-    """
-
-    n: int
-    mse: Estimate
-    variance: Estimate
-    unexplained: Estimate
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain data for JSON."""
-        estimates = ("mse", "variance", "unexplained")
-        return {"n": self.n, **{name: getattr(self, name).as_dict() for name in estimates}}
-
-
-@dataclass(frozen=True)
-class SplitErrors:
-    """Errors on one split: overall, by level, by elevation.
-
-    Attributes
-    ----------
-    overall : Errors
-        Of all queries.
-    levels : dict
-        Nearest level → errors.
-    elevations : dict
-        (lower, upper) edge of the smaller cosine of light and view → errors.
-    exposure : float
-        Exposure in EV that displays the values, see :mod:`mbtf_core.exposure`.
-    includes_noise : bool
-        Whether the errors include the noise of the data, which have a single value per query.
-    """
-
-    overall: Errors
-    levels: dict[int, Errors]
-    elevations: dict[tuple[float, float], Errors]
-    exposure: float
-    includes_noise: bool = False
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain data for JSON; the peak of the PSNR is the value that the exposure shows as white."""
-        found = {"mse": self.overall.mse.as_dict(), "exposure": self.exposure}
-        return {
-            **self.overall.as_dict(),
-            "exposure": self.exposure,
-            "psnr": psnr(self.overall.mse, white_of(self.exposure)).as_dict(),
-            "visibility": visibility(found)[1],
-            "includes_noise": self.includes_noise,
-            "levels": {str(level): errors.as_dict() for level, errors in self.levels.items()},
-            "elevations": {f"{low:g}-{high:g}": e.as_dict() for (low, high), e in self.elevations.items()},
-        }
-
-
-def _grouped(labels: NDArray[np.int64], *arrays: NDArray[np.float32]) -> dict[int, Errors]:
-    mse = by_group(noise_free_mse, labels, *arrays)
-    unexplained = by_group(unexplained_variance, labels, *arrays)
-    variance = by_group(signal_variance, labels, *arrays[1:])
-    return {k: Errors(mse[k].n, mse[k], variance[k], unexplained[k]) for k in mse}
 
 
 def exposure_of(queries: ShardQueries) -> float:
@@ -115,22 +41,71 @@ def exposure_of(queries: ShardQueries) -> float:
 
 
 def split_errors(
-    predict: Predict, queries: ShardQueries, lattice: Lattice, exposure: float | None = None
-) -> SplitErrors | None:
-    """Errors of a prediction on queries, at an exposure in EV (by default, their own); None where there are
-    none."""
+    predict: Predict, queries: ShardQueries, data: Dataset, exposure: float | None = None
+) -> dict[str, Any] | None:
+    """Errors of a prediction on queries of a data set, without the noise of the data; None where there are no
+    queries.
+
+    Parameters
+    ----------
+    predict : callable
+        Values (n, 3) of queries.
+    queries : ShardQueries
+    data : Dataset
+    exposure : float, optional
+        In EV, see :mod:`mbtf_core.exposure`; by default that of the queries.
+
+    Returns
+    -------
+    dict
+        Plain data for JSON. ``mse`` E[(p-a)(p-b)] and ``variance`` of the values, in 1/sr², and their ratio
+        ``unexplained`` (1 - R²: 0 is exact, 1 as good as the mean value), each an estimate with ``value``,
+        ``error`` and ``n``; also by nearest level (``levels``) and by band of the smaller cosine of light and
+        view (``elevations``). ``psnr``: its peak is the value that the exposure shows as white;
+        ``visibility``: in words; ``includes_noise``: whether the data have one value per query.
+    """
     if len(queries) == 0:
         return None
     exposure = exposure_of(queries) if exposure is None else exposure
     arrays = predict(queries), queries.value_a, queries.value_b
-    overall = noise_free_mse(*arrays), signal_variance(*arrays[1:]), unexplained_variance(*arrays)
-    levels = _grouped(level_groups(queries.sigma, lattice.finest), *arrays)
+    mse = noise_free_mse(*arrays)
+    found = {
+        **_errors(len(queries), mse, signal_variance(*arrays[1:]), unexplained_variance(*arrays)),
+        "exposure": exposure,
+    }
     bands = _grouped(elevation_groups(queries.omega_i, queries.omega_o), *arrays)
-    elevations = {(ELEVATION_BANDS[k], ELEVATION_BANDS[k + 1]): errors for k, errors in bands.items()}
-    return SplitErrors(Errors(len(queries), *overall), levels, elevations, exposure)
+    return {
+        **found,
+        "psnr": psnr(mse, white_of(exposure)).as_dict(),
+        "visibility": visibility(found)[1],
+        "includes_noise": data.estimates == 1,
+        "levels": {
+            str(level): errors
+            for level, errors in _grouped(level_groups(queries.sigma, data.lattice.finest), *arrays).items()
+        },
+        "elevations": {
+            f"{ELEVATION_BANDS[k]:g}-{ELEVATION_BANDS[k + 1]:g}": errors for k, errors in bands.items()
+        },
+    }
 
 
-def evaluate_splits(predict: Predict, data: Dataset, partition: Partition) -> dict[str, SplitErrors]:
+def _errors(n: int, mse: Estimate, variance: Estimate, unexplained: Estimate) -> dict[str, Any]:
+    return {
+        "n": n,
+        "mse": mse.as_dict(),
+        "variance": variance.as_dict(),
+        "unexplained": unexplained.as_dict(),
+    }
+
+
+def _grouped(labels: NDArray[np.int64], *arrays: NDArray[np.float32]) -> dict[int, dict[str, Any]]:
+    mse = by_group(noise_free_mse, labels, *arrays)
+    unexplained = by_group(unexplained_variance, labels, *arrays)
+    variance = by_group(signal_variance, labels, *arrays[1:])
+    return {k: _errors(mse[k].n, mse[k], variance[k], unexplained[k]) for k in mse}
+
+
+def evaluate_splits(predict: Predict, data: Dataset, partition: Partition) -> dict[str, dict[str, Any]]:
     """Errors of a prediction on ``test``, ``held_out_queries``, ``held_out_directions`` and ``training``
     queries; a set without queries is left out. The exposure of all is that of the first.
 
@@ -148,40 +123,12 @@ def evaluate_splits(predict: Predict, data: Dataset, partition: Partition) -> di
     )
     parts = {name: queries for name, queries in parts.items() if len(queries)}
     exposure = exposure_of(next(iter(parts.values()))) if parts else None
-    found = {name: split_errors(predict, queries, data.lattice, exposure) for name, queries in parts.items()}
-    noisy = data.estimates == 1
-    return {
-        name: replace(errors, includes_noise=noisy) for name, errors in found.items() if errors is not None
-    }
+    found = {name: split_errors(predict, queries, data, exposure) for name, queries in parts.items()}
+    return {name: errors for name, errors in found.items() if errors is not None}
 
 
-def foreign_inputs(material: Material, shards: str | Path | DataFolder) -> list[str]:
-    """Inputs (height, base_color, …) that differ between a data set and the training data of a material;
-    empty where either records none."""
-    trained, given = material.description["data"].get("inputs"), Dataset.open(shards).manifest.get("inputs")
-    if not trained or not given:
-        return []
-    return [role for role in sorted({*trained, *given}) if trained.get(role) != given.get(role)]
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """Errors of a material on a data set.
-
-    Attributes
-    ----------
-    values : dict
-        Split → :class:`SplitErrors` of the values.
-    transmittance : dict or None
-        Split → error of the transmittance; None unless both material and data have one.
-    """
-
-    values: dict[str, SplitErrors]
-    transmittance: dict[str, TransmittanceError] | None
-
-
-def evaluate(material: Material, shards: str | Path | DataFolder) -> Evaluation:
-    """Evaluate a fitted material on a data set of either layout.
+def evaluate(material: Material, shards: str | Path | DataFolder) -> dict[str, dict[str, Any]]:
+    """Evaluate a fitted material on a data set of any layout.
 
     Held-out queries are selected by the material's own configuration; they are held out only in the data set
     that the material was fitted to.
@@ -195,9 +142,10 @@ def evaluate(material: Material, shards: str | Path | DataFolder) -> Evaluation:
 
     Returns
     -------
-    Evaluation
-        Errors of values and transmittance on the splits ``test``, ``held_out_queries``,
-        ``held_out_directions`` and ``training``.
+    dict
+        ``errors``: those of values (:func:`split_errors`) by split, ``test``, ``held_out_queries``,
+        ``held_out_directions`` and ``training``; ``transmittance``: its errors by split, where both material
+        and data have one. A fit states the same (:attr:`FitResult.errors <mbtf_fit.FitResult>`).
 
     Raises
     ------
@@ -211,7 +159,8 @@ def evaluate(material: Material, shards: str | Path | DataFolder) -> Evaluation:
             where=data.folder,
         )
     partition = load_training(data, material.config.held_out, material.config.seed, memory=None)
-    transmittance = None
+    found = {"errors": evaluate_splits(material.predict, data, partition)}
     if material.transmittance is not None and has_transmittance(data):
-        transmittance = evaluate_transmittance(material.transmittance, data, partition.selection)
-    return Evaluation(evaluate_splits(material.predict, data, partition), transmittance)
+        through = evaluate_transmittance(material.transmittance, data, partition.selection)
+        found["transmittance"] = {split: errors.as_dict() for split, errors in through.items()}
+    return found

@@ -13,7 +13,7 @@ from mbtf_core.units import Duration, Size
 
 OutputTransform = Literal["expm1", "exp", "identity", "softplus", "fourth-root"]
 LossKind = Literal["relative", "squared", "linear", "log", "fourth-root", "gradient"]
-Correction = Literal["none", "second-order", "linear"]
+Correction = Literal["none", "linear"]
 
 
 class EncodingSection(Settings):

@@ -26,12 +26,17 @@ def evaluate(
     shards
         Folder made by mbtf-gen, or its URL.
     """
+    from mbtf_core.data.dataset import Dataset
     from mbtf_core.data.folder import DataFolder
-    from mbtf_fit.evaluation import evaluate, foreign_inputs
+    from mbtf_fit.evaluation import evaluate
     from mbtf_fit.material.material import Material
 
     loaded, folder = Material.load(material), DataFolder.open(shards)
-    foreign = foreign_inputs(loaded, folder)
+    # Inputs (height, base_color, …) that differ from those of the training data, where both record them.
+    trained = loaded.description["data"].get("inputs") or {}
+    given = Dataset.open(folder).manifest.get("inputs") or {}
+    both = sorted({*trained, *given}) if trained and given else []
+    foreign = [role for role in both if trained.get(role) != given.get(role)]
     if foreign:
         console.note(
             f"warning: {folder} was made from another material than {material} was trained on "
@@ -39,13 +44,9 @@ def evaluate(
             "materials and do not measure the quality of the fit"
         )
     found = evaluate(loaded, folder)
-    errors = {name: e.as_dict() for name, e in found.values.items()}
-    through = {name: e.as_dict() for name, e in (found.transmittance or {}).items()}
     lines = [
         f"{material}: {loaded.config.model} on {folder}",
-        *report_errors(errors, through, verbose, foreign=bool(foreign)),
+        *report_errors(found["errors"], found.get("transmittance"), verbose, foreign=bool(foreign)),
     ]
-    report = {"material": material, "shards": shards, "foreign_inputs": foreign, "errors": errors}
-    if found.transmittance is not None:
-        report["transmittance"] = through
+    report = {"material": material, "shards": shards, "foreign_inputs": foreign, **found}
     console.report(report, "\n".join(lines))

@@ -1,8 +1,8 @@
-"""``mbtf-fit SHARDS``: fit a material."""
+"""``mbtf-fit SHARDS``: fit a material, or several."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
@@ -30,14 +30,13 @@ from mbtf_fit.cli.page_options import Live, live_view
 from mbtf_fit.config import DECODER_MODELS, DEFAULT_MODEL, FIBER_MODEL, FitConfig, ModelName
 from mbtf_fit.formatting import describe_fit, fits_table
 
+if TYPE_CHECKING:
+    from mbtf_core.data.folder import DataFolder
+
 
 @options_from(FitConfig)
 class FitOptions(Options[FitConfig]):
     """Options of ``mbtf-fit``."""
-
-
-if TYPE_CHECKING:
-    from mbtf_core.data.folder import DataFolder
 
 
 def fit(
@@ -60,17 +59,17 @@ def fit(
 ) -> None:
     """Fit a material to a data set: mbtf-fit shards/ -o material/
 
-    The same command again resumes an unfinished fit. --time is that of training. --dry-run forecasts time,
-    size and a bound of the error by a short fit on this machine. With --many, the output folder holds one
-    folder per material.
+    The same command again resumes an unfinished fit. --time is that of training. --dry-run forecasts time
+    and size by some seconds of training on this machine. With --many, the output folder holds one folder per
+    material.
 
     Parameters
     ----------
     shards
         Folder made by mbtf-gen, or its URL.
     many
-        Fit several data sets, one material each: folders made by mbtf-gen, folders of such folders, or text
-        files with one folder per line. A fit that fails does not stop the others.
+        Fit several data sets, one material each: folders made by mbtf-gen, or folders of such folders. A fit
+        that fails does not stop the others.
     processes
         With --many, number of simultaneous fits.
     shared_decoder
@@ -79,73 +78,58 @@ def fit(
     tensorboard
         Write the curves of the fit as event files for TensorBoard to a folder.
     """
-    if dry_run and many is not None:
-        raise UsageError("--dry-run takes one data set", hint="mbtf-fit shards/ --dry-run")
-    if many is not None and shards is not None:
-        raise UsageError(
-            "--many replaces the argument SHARDS", hint=f"mbtf-fit --many {shards} ... -o materials/"
-        )
-    if processes is not None and (many is None or processes < 1):
-        raise UsageError("--processes must be a positive number and requires --many")
-    if cluster is not None and (many is None or processes is not None):
-        hint = "leave out --processes" if many is not None else "mbtf-fit --many shards/ -o materials/"
-        raise UsageError("requires --many, and sets the number of processes", where="--cluster", hint=hint)
-    if shared_decoder and many is None:
-        raise UsageError("--shared-decoder requires --many", hint="mbtf-fit --many a/ b/ --shared-decoder")
-    if shards is None and many is None:
-        raise UsageError("no shards given", hint="mbtf-fit shards/ -o material/")
-    for flag, used in (("--live", live), ("--tensorboard", tensorboard is not None)):
-        if many is not None and used:
-            raise UsageError("shows one fit", where=flag, hint=f"leave out --many, or {flag}")
+    for refused, what, hint in (
+        (many is not None and shards is not None, "--many replaces the argument SHARDS", "leave out one"),
+        (many is not None and dry_run, "--dry-run takes one data set", "mbtf-fit shards/ --dry-run"),
+        (many is not None and live, "--live shows one fit", "leave out --many, or --live"),
+        (many is not None and bool(tensorboard), "--tensorboard shows one fit", "leave out one of them"),
+        (many is None and shared_decoder, "--shared-decoder requires --many", "mbtf-fit --many a/ b/ ..."),
+        (many is None and processes is not None, "--processes requires --many", "mbtf-fit --many a/ b/ ..."),
+        (many is None and cluster is not None, "--cluster requires --many", "mbtf-fit --many a/ b/ ..."),
+        (bool(processes) and cluster is not None, "--cluster sets the processes", "leave out --processes"),
+        (processes is not None and processes < 1, "--processes must be positive", ""),
+    ):
+        if refused:
+            raise UsageError(what, hint=hint)
     if many is not None:
         if shared_decoder:
             options = options.assigning("training.shared_decoder=true")
         _fit_many(options, quality, many, output, processes, cluster, overwrite, console)
         return
-    assert shards is not None
+    if shards is None:
+        raise UsageError("no shards given", hint="mbtf-fit shards/ -o material/")
     from mbtf_core.data.folder import DataFolder
 
-    data_folder = DataFolder.open(shards)
-    resolved = resolve_config(options, quality, data_folder)
-    if dry_run:
-        from mbtf_fit.training.forecast import forecast_fit
-
-        expected = forecast_fit(resolved, data_folder)
-        console.report(
-            {"shards": str(data_folder), "model": resolved.model, "forecast": asdict(expected)},
-            expected.describe(),
-        )
+    folder = DataFolder.open(shards)
+    config = resolve_config(options, quality, folder)
+    if not dry_run:
+        _fit_one(config, folder, output, live, tensorboard, overwrite, verbose, console)
         return
-    from mbtf_core.files.folders import check_space
-    from mbtf_core.forecast import is_long
-    from mbtf_fit.data.loader import open_data
-    from mbtf_fit.material.format import DESCRIPTION_NAME
-    from mbtf_fit.models.registry import MODELS
-    from mbtf_fit.native import missing_reason
-    from mbtf_fit.training.fit import fit
-    from mbtf_fit.training.forecast import evaluation_seconds, fit_bytes, training_seconds
+    from mbtf_fit.training.forecast import forecast_fit
 
-    finished = not overwrite and (output / DESCRIPTION_NAME).exists()
-    partition = None
-    if not finished:
-        data = open_data(data_folder, MODELS[resolved.model].layout, resolved.model)
-        size = fit_bytes(resolved, data.lattice)
-        check_space(output, size, "reduce network.channels, or choose another folder with -o")
-        training = resolved.training
-        budget = format_duration(training.time) if training.steps is None else f"{training.steps} steps"
-        console.note(
-            f"{data_folder} -> {output}: {resolved.model}, training for {budget} "
-            "(change it with --time or --steps)"
-        )
-        seconds, partition = training_seconds(resolved, data_folder)
-        queries = int(data.manifest["splits"]["train"].get("queries", 0))
-        seconds += evaluation_seconds(queries)
-        if is_long(seconds, size):
-            console.note(expectation(seconds, size))
-    if missing := missing_reason():
-        console.note(f"note: training runs in PyTorch, not in the compiled kernel ({missing})")
+    expected = forecast_fit(config, folder)
+    data = {"shards": str(folder), "model": config.model, "forecast": asdict(expected)}
+    console.report(data, expected.describe())
+
+
+def _fit_one(
+    config: FitConfig,
+    shards: DataFolder,
+    output: Path,
+    live: bool,
+    tensorboard: Path | None,
+    overwrite: bool,
+    verbose: bool,
+    console: Console,
+) -> None:
+    """Fit a data set, watched by whoever asks for it."""
+    from mbtf_fit.material.format import DESCRIPTION_NAME
+    from mbtf_fit.training.fit import fit
     from mbtf_fit.training.tensorboard import EventLog
 
+    finished = not overwrite and (output / DESCRIPTION_NAME).exists()
+    if not finished:
+        _announce(config, [shards], output, f"{shards} -> {output}: {config.model}", console)
     keep_on_interruption(f"the last checkpoint is kept in {output}")
     with (
         nullcontext() if tensorboard is None else EventLog(tensorboard) as log,
@@ -160,13 +144,12 @@ def fit(
                 observer(*validation)
 
         result = fit(
-            resolved,
-            data_folder,
+            config,
+            shards,
             output,
             overwrite=overwrite,
             progress=lambda fraction, note: bar.update(round(100 * fraction, 1), note),
             observe=observe if observers else None,
-            partition=partition,
         )
         if shown is not None:
             shown.finished(output.name, output)
@@ -177,12 +160,37 @@ def fit(
     console.report(summary, "\n".join([describe_fit(summary, verbose), *cost]))
 
 
+def _announce(
+    config: FitConfig, shards: Sequence[Path | DataFolder], output: Path, what: str, console: Console
+) -> None:
+    """State budget and expected time of a fit, and refuse one that the disk cannot hold."""
+    from mbtf_core.files.folders import check_space
+    from mbtf_core.forecast import is_long
+    from mbtf_fit.data.loader import open_data
+    from mbtf_fit.models.registry import MODELS
+    from mbtf_fit.native import missing_reason
+    from mbtf_fit.training.forecast import evaluation_seconds, fit_bytes
+
+    data = [open_data(folder, MODELS[config.model].layout, config.model) for folder in shards]
+    size = sum(fit_bytes(config, one.lattice) for one in data)
+    check_space(output, size, "reduce network.channels, or choose another folder with -o")
+    training = config.training
+    budget = format_duration(training.time) if training.steps is None else f"{training.steps} steps"
+    console.note(f"{what}, training for {budget} (change it with --time or --steps)")
+    queries = sum(int(one.manifest["splits"]["train"].get("queries", 0)) for one in data)
+    seconds = evaluation_seconds(queries) + (training.time if training.steps is None else 0.0)
+    if is_long(seconds, size):
+        console.note(expectation(seconds, size))
+    if missing := missing_reason():
+        console.note(f"note: training runs in PyTorch, not in the compiled kernel ({missing})")
+
+
 def resolve_config(
     options: Options[FitConfig], quality: Quality | None, *shards: Path | DataFolder
 ) -> FitConfig:
     """Configuration of a fit, or of one of several data sets. Without a model among the options, the network
     to keep decides, or the data sets."""
-    from mbtf_fit.presets import fitter_options
+    from mbtf_fit.config import fitter_options
 
     overrides = options.explicit()
     kept = _kept_options(overrides.get("decoder"))
@@ -196,13 +204,6 @@ def resolve_config(
         # A time overrides the steps of a file or a preset.
         presets["training.steps"] = None
     return options.resolve(presets)
-
-
-def _shares_decoder(options: Options[FitConfig]) -> bool:
-    """Whether the data sets of a command share a network."""
-    training = options.explicit().get("training")
-    # Values of --set are text.
-    return isinstance(training, Mapping) and str(training.get("shared_decoder")).lower() == "true"
 
 
 def _kept_options(folder: object) -> dict[str, Any]:
@@ -227,53 +228,6 @@ def _model_for(shards: Sequence[Path | DataFolder]) -> ModelName:
     return FIBER_MODEL if len(shards) == 1 else DECODER_MODELS[-1]
 
 
-def _fit_jointly(
-    config: FitConfig,
-    shards: list[Path],
-    folders: list[Path],
-    output: Path,
-    overwrite: bool,
-    console: Console,
-) -> None:
-    from mbtf_core.files.folders import check_space
-    from mbtf_fit.data.loader import open_data
-    from mbtf_fit.material.decoder import DECODER_FOLDER
-    from mbtf_fit.models.registry import MODELS
-    from mbtf_fit.training.fit_many import FitOutcome
-    from mbtf_fit.training.forecast import fit_bytes
-    from mbtf_fit.training.joint_fit import fit_jointly
-
-    training = config.training
-    budget = format_duration(training.time) if training.steps is None else f"{training.steps} steps"
-    layout = MODELS[config.model].layout
-    size = sum(fit_bytes(config, open_data(folder, layout, config.model).lattice) for folder in shards)
-    check_space(output, size, "reduce network.channels, or choose another folder with -o")
-    console.note(
-        f"{len(shards)} data sets -> {output}: {config.model} with a shared network, training for {budget} "
-        "(change it with --time or --steps)"
-    )
-    decoder = output / DECODER_FOLDER
-    keep_on_interruption(f"the last checkpoint is kept in {decoder}")
-    with console.progress(total=100, label="fitting", unit="%") as bar:
-        result = fit_jointly(
-            config,
-            shards,
-            folders,
-            decoder,
-            overwrite=overwrite,
-            progress=lambda fraction, note: bar.update(round(100 * fraction, 1), note),
-        )
-    outcomes = [
-        FitOutcome(data, fitted.folder, fitted.as_dict(), None)
-        for data, fitted in zip(shards, result.fits, strict=True)
-    ]
-    report = {
-        "decoder": {"folder": result.decoder.folder, "sha256": result.decoder.sha256},
-        "fits": [outcome.as_dict() for outcome in outcomes],
-    }
-    console.report(report, fits_table({o.folder.name: o.result for o in outcomes}))
-
-
 def _fit_many(
     options: FitOptions,
     quality: Quality | None,
@@ -284,44 +238,82 @@ def _fit_many(
     overwrite: bool,
     console: Console,
 ) -> None:
-    from mbtf_core.run.cluster import open_runner
-    from mbtf_core.run.processes import Processes
-    from mbtf_fit.training.fit_many import FitOutcome, find_data, fit_many, name_materials
+    """Fit several data sets, each on its own or all with one network."""
+    from mbtf_fit.training.fit_many import find_data, name_materials
 
     shards = find_data(many)
     folders = name_materials(shards, output)
-    if _shares_decoder(options):
-        if processes is not None or cluster is not None:
-            flag = "--cluster" if processes is None else "--processes"
-            raise UsageError(f"a shared network is one fit: leave out {flag}")
-        _fit_jointly(resolve_config(options, quality, *shards), shards, folders, output, overwrite, console)
+    config = resolve_config(options, quality, *shards)
+    if not config.training.shared_decoder:
+        configs = [resolve_config(options, quality, folder) for folder in shards]
+        _fit_each(configs, shards, folders, output, processes, cluster, overwrite, console)
         return
-    configs = [resolve_config(options, quality, folder) for folder in shards]
+    if processes is not None or cluster is not None:
+        flag = "--cluster" if processes is None else "--processes"
+        raise UsageError(f"a shared network is one fit: leave out {flag}")
+    from mbtf_fit.material.decoder import DECODER_FOLDER, Decoder
+    from mbtf_fit.training.fit import fit_jointly
+
+    decoder = output / DECODER_FOLDER
+    what = f"{len(shards)} data sets -> {output}: {config.model} with a shared network"
+    _announce(config, shards, output, what, console)
+    keep_on_interruption(f"the last checkpoint is kept in {decoder}")
+    with console.progress(total=100, label="fitting", unit="%") as bar:
+        results = fit_jointly(
+            config,
+            shards,
+            folders,
+            decoder,
+            overwrite=overwrite,
+            progress=lambda fraction, note: bar.update(round(100 * fraction, 1), note),
+        )
+    fits = [fitted.as_dict() for fitted in results]
+    outcomes = [
+        {"shards": str(data), "material": fitted["material"], "result": fitted, "error": None}
+        for data, fitted in zip(shards, fits, strict=True)
+    ]
+    shared = {"folder": decoder, "sha256": Decoder.find(decoder).sha256}
+    table = fits_table({folder.name: fitted for folder, fitted in zip(folders, fits, strict=True)})
+    console.report({"decoder": shared, "fits": outcomes}, table)
+
+
+def _fit_each(
+    configs: Sequence[FitConfig],
+    shards: Sequence[Path],
+    folders: Sequence[Path],
+    output: Path,
+    processes: int | None,
+    cluster: str | None,
+    overwrite: bool,
+    console: Console,
+) -> None:
+    """Fit several data sets, in processes of their own or on a cluster."""
+    from mbtf_core.run.cluster import open_runner
+    from mbtf_core.run.processes import Processes
+    from mbtf_fit.training.fit_many import fit_many
+
     if processes is None:
         import torch
 
         processes = max(1, torch.cuda.device_count()) if configs[0].device != "cpu" else 1
-    console.note(
-        f"{len(shards)} data set{'s' * (len(shards) != 1)} -> {output}: "
-        f"{' and '.join(sorted({config.model for config in configs}))}"
-        f"{'' if cluster is not None else f', {processes} at a time'}"
-    )
+    models = " and ".join(sorted({config.model for config in configs}))
+    console.note(f"{len(shards)} data sets -> {output}: {models}")
     keep_on_interruption(f"finished fits and the last checkpoints are kept in {output}")
     with (
         open_runner(cluster, console.note, Processes(processes)) as runner,
         console.progress(total=len(shards), label="fitting", unit="data sets") as bar,
     ):
 
-        def finished(outcome: FitOutcome) -> None:
-            bar.advance(1, f"{outcome.folder.name}: {'failed' if outcome.error else 'done'}")
+        def finished(folder: Path, error: str | None) -> None:
+            bar.advance(1, f"{folder.name}: {'failed' if error else 'done'}")
 
         outcomes = fit_many(configs, shards, folders, runner, overwrite=overwrite, finished=finished)
-    console.report(
-        {"fits": [o.as_dict() for o in outcomes]}, fits_table({o.folder.name: o.result for o in outcomes})
-    )
-    failed = [o for o in outcomes if o.error is not None]
+    results = [outcome["result"] for outcome in outcomes]
+    table = fits_table({folder.name: found for folder, found in zip(folders, results, strict=True)})
+    console.report({"fits": outcomes}, table)
+    failed = [outcome for outcome in outcomes if outcome["error"] is not None]
     for outcome in failed:
-        console.note(f"{outcome.shards}: {outcome.error}")
+        console.note(f"{outcome['shards']}: {outcome['error']}")
     if failed:
         raise PartialError(
             f"{len(failed)} of {len(outcomes)} fits failed",

@@ -23,7 +23,6 @@ def preview(
     output: Output = Path("preview"),
     options: MaterialPreviewOptions = MaterialPreviewOptions(),  # noqa: B008
     sheet_only: Switch = False,
-    mp4: Switch = False,
     overwrite: Overwrite = False,
     console: Console = CONSOLE,
 ) -> None:
@@ -38,15 +37,11 @@ def preview(
         Folder made by mbtf-fit.
     sheet_only
         Draw no turntable.
-    mp4
-        Write the turntable as MP4, too; needs ffmpeg or the extra 'video'.
     """
-    from mbtf_fit.preview.command import draw
+    from mbtf_fit.preview.draw import draw
 
-    if sheet_only and mp4:
-        raise UsageError("--sheet-only draws no turntable", where="--mp4", hint="leave out one of them")
     if material is None and options.config is None:
         raise UsageError("no material given", hint="mbtf-fit preview material/ -o preview/")
     config = options.resolve(material=material)
     with owned(output):
-        draw(config, output, sheet_only=sheet_only, mp4=mp4, overwrite=overwrite, console=console)
+        draw(config, output, sheet_only=sheet_only, overwrite=overwrite, console=console)

@@ -160,7 +160,3 @@ class TrainingImages:
         epochs, position = np.divmod(np.arange(step * items, (step + 1) * items), count)
         order = {int(s): _order(seed, int(s), count) for s in np.unique(epochs)}
         return np.array([order[int(s)][p] for s, p in zip(epochs, position, strict=True)]), side
-
-    def batch_ranges(self, size: int, seed: int, step: int) -> list[range]:
-        """Indices of the images in the batch of a step."""
-        return [range(k, k + 1) for k in sorted(set(self._chosen(size, seed, step)[0].tolist()))]

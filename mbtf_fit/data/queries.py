@@ -81,12 +81,6 @@ def batch_starts(total: int, size: int, seed: int, step: int) -> Iterator[int]:
         step += count - done
 
 
-def batch_ranges(total: int, size: int, seed: int, step: int) -> list[range]:
-    """Indices of the queries in the batch of a step."""
-    start = next(batch_starts(total, size, seed, step))
-    return [range(start, start + size)]
-
-
 def mean_value(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
     """Mean of both halves, without overflow."""
     half = np.float32(0.5)
@@ -116,10 +110,6 @@ class TrainingQueries:
         """
         for start in batch_starts(len(self), size, seed, step):
             yield self.slice(start, start + size)
-
-    def batch_ranges(self, size: int, seed: int, step: int) -> list[range]:
-        """Indices of the queries in the batch of a step."""
-        return batch_ranges(len(self), size, seed, step)
 
     def slice(self, start: int, stop: int) -> TrainingQueries:
         """Consecutive queries, without a copy."""

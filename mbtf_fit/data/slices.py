@@ -105,10 +105,6 @@ class TrainingSlices:
             yield self.batch(size, seed, step)
             step += 1
 
-    def batch_ranges(self, size: int, seed: int, step: int) -> list[range]:
-        """Unknown: slices are not in the order of the shards."""
-        return []
-
 
 @dataclass(frozen=True)
 class SharedSlices:
@@ -131,7 +127,3 @@ class SharedSlices:
         while True:
             yield self.learned[step % len(self.learned)].batch(size, seed, step)
             step += 1
-
-    def batch_ranges(self, size: int, seed: int, step: int) -> list[range]:
-        """Unknown: the batch may be of another data set."""
-        return []

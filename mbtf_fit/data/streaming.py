@@ -7,7 +7,7 @@ that the fit does not depend on where the data lie.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 
@@ -17,14 +17,12 @@ from numpy.typing import NDArray
 
 from mbtf_core.data.dataset import Shard
 from mbtf_core.data.shard_files import Arrays
-from mbtf_fit.data.queries import TrainingQueries, batch_ranges, batch_starts, mean_value, needed
+from mbtf_fit.data.queries import TrainingQueries, batch_starts, mean_value, needed
 
 # Rows of a shard between two cumulative counts of selected rows.
 _BLOCK = 4096
 # Batches whose shards are downloaded ahead.
 _AHEAD = 6
-# Most row ranges that a message names.
-_NAMED = 3
 
 
 class Selection:
@@ -80,17 +78,6 @@ class Selection:
             if low < high:
                 yield self.shards[shard], self._rows(shard, low - begin, high - begin)
 
-    def describe(self, ranges: Sequence[range]) -> str:
-        """Text that names the first few rows: ``train-00003.npz rows 17-4112``."""
-        found = [piece for part in ranges for piece in self.pieces(part.start, part.stop)]
-        words = [
-            f"{shard.file} row{'s' if len(rows) > 1 else ''} "
-            + "-".join(str(r) for r in rows[[0, -1][: len(rows)]])
-            for shard, rows in found[:_NAMED]
-        ]
-        more = [f"{len(found) - _NAMED} more"] if len(found) > _NAMED else []
-        return " and ".join([*words, *more])
-
 
 class StreamedQueries:
     """Training queries on disk: rows of npz shards with so many estimates of every value, and the device of
@@ -109,10 +96,6 @@ class StreamedQueries:
     def to(self, device: torch.device) -> StreamedQueries:
         """The same queries with batches on another device."""
         return StreamedQueries(self.selection, device, estimates=self.estimates)
-
-    def batch_ranges(self, size: int, seed: int, step: int) -> list[range]:
-        """Indices of the queries in the batch of a step."""
-        return batch_ranges(len(self), size, seed, step)
 
     def slice(self, start: int, stop: int) -> TrainingQueries:
         """Consecutive queries, read from disk."""

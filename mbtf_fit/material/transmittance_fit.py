@@ -20,7 +20,7 @@ from mbtf_core.data.lattice import Lattice, level_of_sigma
 from mbtf_core.data.shard_files import Arrays, check_values
 from mbtf_core.stats import Estimate, mean_estimate
 from mbtf_fit.material.transmittance import COEFFICIENTS, Transmittance, basis, corners
-from mbtf_fit.textures.lookup import add_up
+from mbtf_fit.surface.lookup import add_up
 
 if TYPE_CHECKING:
     from mbtf_fit.data.streaming import Selection

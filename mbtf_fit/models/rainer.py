@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
     from mbtf_fit.data.slices import SliceBatch, TrainingSlices
     from mbtf_fit.pytorch.material import NeuralMaterial
-    from mbtf_fit.pytorch.slice_encoders import SetEncoder, SliceEncoder
+    from mbtf_fit.pytorch.networks import SetEncoder, SliceEncoder
 
 # Least standard deviation of a slice's logarithms.
 LEAST_DEVIATION = 1e-3
@@ -109,7 +109,7 @@ class Rainer2019(Model):
 
     def _encoder(self, pairs: int) -> SliceEncoder | SetEncoder:
         """An encoder of slices at so many pairs of light and view."""
-        from mbtf_fit.pytorch.slice_encoders import SliceEncoder
+        from mbtf_fit.pytorch.networks import SliceEncoder
 
         return SliceEncoder(pairs, self._width(), self.latents)
 
@@ -159,7 +159,7 @@ class Rainer2019(Model):
         """Texture values (items, channels) of slices (items, D, 3)."""
         import torch
 
-        from mbtf_fit.pytorch.encodings import stereographic
+        from mbtf_fit.pytorch.operations import stereographic
 
         assert self.encoder is not None
         normalized, statistics = self.normalized(values, omega_i)
@@ -201,7 +201,7 @@ class Rainer2020(Rainer2019):
     takes = (*Rainer2019.takes, "training.materials", "training.own_material")
 
     def _encoder(self, pairs: int) -> SliceEncoder | SetEncoder:
-        from mbtf_fit.pytorch.slice_encoders import SetEncoder
+        from mbtf_fit.pytorch.networks import SetEncoder
 
         return SetEncoder(self._width(), self.latents)
 

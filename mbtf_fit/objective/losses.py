@@ -4,20 +4,18 @@ A term compares ``f(p)`` with ``f(t)``: p is the prediction, t the noisy value o
 the typical value of the data, and f is a curve. Where f is not linear, ``E f(t)`` differs from ``f(E t)``,
 and the minimum is biased by about ``½ f''·variance / f'``. Absolute differences are biased towards the
 median.
-``correction`` selects one of three treatments:
+``correction`` selects one of two treatments:
 
 ``none``
     as published: f(t) itself.
-``second-order``
-    ``f(t) - ½ f''(p)·variance(p)``, with the variance model pooled over queries
-    (:mod:`mbtf_fit.objective.noise`): valid while the noise is small compared to the value.
 ``linear`` (default)
     the tangent of f at the prediction, ``f(p) + f'(p)(t - p)``: linear in t, so that noise of any size
     averages out. Squared terms become ``f'(p)² (p-t)²``, weighted by the prediction alone. Absolute terms
     become the parabola that they are on average where noise dominates the error,
-    ``f'(p)² (p-t)² / 2√(f'(p)² variance(p) + δ²)``.
+    ``f'(p)² (p-t)² / 2√(f'(p)² variance(p) + δ²)``, with the variance pooled over queries
+    (:mod:`mbtf_fit.objective.noise`).
 
-In all of these, p is detached (constant under differentiation), except in f(p) itself.
+In both, p is detached (constant under differentiation), except in f(p) itself.
 
 Outliers (fireflies, corrupt pixels) have a bounded influence: the Huber rule (Annals of Mathematical
 Statistics 35, 1964) clamps ``t - p`` to ``huber_delta`` times ``√(s² + noise variance(p))``. The data
@@ -34,7 +32,7 @@ import torch
 from torch import Tensor
 
 from mbtf_fit.objective.noise import NoiseModel
-from mbtf_fit.sections import Correction, LossKind, TrainingSection
+from mbtf_fit.sections import LossKind, TrainingSection
 
 if TYPE_CHECKING:
     from mbtf_fit.data.images import Patches
@@ -59,10 +57,6 @@ class LossCurve:
         """f'(x)"""
         return torch.ones_like(x)
 
-    def curvature(self, x: Tensor) -> Tensor:
-        """f''(x)"""
-        return torch.zeros_like(x)
-
 
 class Log(LossCurve):
     """log(1 + x)."""
@@ -73,9 +67,6 @@ class Log(LossCurve):
 
     def slope(self, x: Tensor) -> Tensor:
         return 1 / (1 + x.clamp_min(_LOG_START))
-
-    def curvature(self, x: Tensor) -> Tensor:
-        return torch.where(x > _LOG_START, -self.slope(x).square(), 0.0)
 
 
 class FourthRoot(LossCurve):
@@ -89,9 +80,6 @@ class FourthRoot(LossCurve):
         # Two square roots are several times faster than a power.
         z = x.clamp_min(0) + _ROOT_FLOOR
         return 0.25 * z.sqrt().sqrt() / z
-
-    def curvature(self, x: Tensor) -> Tensor:
-        return torch.where(x > 0, -0.1875 * (x.clamp_min(0) + _ROOT_FLOOR) ** -1.75, 0.0)
 
 
 # Of the error f(p) - f(t) and, where the correction needs it, the variance of f(t).
@@ -130,31 +118,24 @@ class CurveTerm:
     curve: LossCurve
     measure: Measure
 
-    def __call__(
-        self, p: Tensor, detached: Tensor, t: Tensor, variance: Tensor | None, correction: Correction
-    ) -> Tensor:
+    def __call__(self, p: Tensor, detached: Tensor, t: Tensor, variance: Tensor | None) -> Tensor:
         """Mean of the term over arrays (n, 3), or (items, rows, columns, 3), in units of s: prediction p, the
         same constant under differentiation, value t, and its variance (None without correction)."""
         if variance is None:
             return self.measure(self.curve.value(p) - self.curve.value(t), None)
-        if correction == "second-order":
-            target = self.curve.value(t) - 0.5 * self.curve.curvature(detached) * variance
-            return self.measure(self.curve.value(p) - target, None)
         slope = self.curve.slope(detached)
         target = self.curve.value(detached) + slope * (t - detached)
         return self.measure(self.curve.value(p) - target, slope.square() * variance)
 
 
-def relative(
-    p: Tensor, detached: Tensor, t: Tensor, variance: Tensor | None, correction: Correction
-) -> Tensor:
+def relative(p: Tensor, detached: Tensor, t: Tensor, variance: Tensor | None) -> Tensor:
     """``(p-t)² / (p² + s²)`` with a detached denominator, so that the weight causes no bias (for HDR images:
     Lehtinen et al., Noise2Noise, ICML 2018)."""
     return ((p - t).square() / (detached.square() + 1)).mean()
 
 
 # Of prediction, detached prediction, value, and its variance.
-Term = Callable[[Tensor, Tensor, Tensor, Tensor | None, Correction], Tensor]
+Term = Callable[[Tensor, Tensor, Tensor, Tensor | None], Tensor]
 _TERMS: dict[LossKind, Term] = {
     "relative": relative,
     "squared": CurveTerm(LossCurve(), squared),
@@ -204,7 +185,6 @@ class Objective:
     def __init__(self, training: TrainingSection, noise: NoiseModel) -> None:
         self._all_terms = training.losses
         self.fraction = 1.0
-        self._correction = training.correction
         self._huber_delta = training.huber_delta
         self._noise = noise
         # Black data have no scale.
@@ -249,5 +229,5 @@ class Objective:
         p, detached, t = prediction / self._unit, detached / self._unit, value / self._unit
         total = prediction.new_zeros(())
         for weight, term in self._terms:
-            total = total + weight * term(p, detached, t, variance, self._correction)
+            total = total + weight * term(p, detached, t, variance)
         return total

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
@@ -14,30 +14,30 @@ from mbtf_gen.config.pictures import EXPOSURE, Direction, Exposure
 # Limits the memory of sheet and turntable to a gigabyte.
 MOST_PIXELS = 1 << 25
 
-Directions = Annotated[list[Direction], Field(min_length=1, max_length=8)]
+
+def _listed(value: Any) -> Any:
+    """A single direction as a list of one."""
+    return [value] if isinstance(value, str) else value
+
+
+Directions = Annotated[list[Direction], BeforeValidator(_listed), Field(min_length=1, max_length=8)]
 Width = Annotated[float, Field(gt=0, le=1e4)]
 
 
 class SheetSection(Settings):
     """The contact sheet: a column per view and light, a row per width of the field of view."""
 
-    view: Annotated[Direction | None, Flag("--view", "ELEVATION,AZIMUTH")] = Field(
-        None, description="direction of the camera in degrees; default: all of views"
-    )
-    views: Directions = Field(
+    views: Annotated[Directions, Flag("--view", "ELEVATION,AZIMUTH")] = Field(
         [Direction(elevation=70, azimuth=-90), Direction(elevation=30, azimuth=-90)],
-        description="directions towards the camera",
+        description="directions towards the camera in degrees, or a single one; default: two views",
     )
-    light: Annotated[Direction | None, Flag("--light", "ELEVATION,AZIMUTH")] = Field(
-        None, description="direction of the light in degrees; default: all of lights"
-    )
-    lights: Directions = Field(
+    lights: Annotated[Directions, Flag("--light", "ELEVATION,AZIMUTH")] = Field(
         [
             Direction(elevation=65, azimuth=60),
             Direction(elevation=35, azimuth=180),
             Direction(elevation=20, azimuth=15),
         ],
-        description="directions towards the light",
+        description="directions towards the light in degrees, or a single one; default: three lights",
     )
     tiles_across: Annotated[list[Width], BeforeValidator(parse_numbers), Flag("--tiles-across", "1,2,4")] = (
         Field(
@@ -50,16 +50,6 @@ class SheetSection(Settings):
     size: Annotated[int, Flag("--size")] = Field(
         160, ge=64, le=2048, description="pixels along each side of a picture"
     )
-
-    @property
-    def cameras(self) -> list[Direction]:
-        """Directions of the columns: `view`, or else `views`."""
-        return self.views if self.view is None else [self.view]
-
-    @property
-    def lamps(self) -> list[Direction]:
-        """Lights of the columns: `light`, or else `lights`."""
-        return self.lights if self.light is None else [self.light]
 
 
 class TurntableSection(Settings):
@@ -86,7 +76,7 @@ class MaterialPreviewConfig(Settings):
     @model_validator(mode="after")
     def _fits(self) -> Self:
         sheet, turn = self.sheet, self.turntable
-        panels = len(sheet.cameras) * len(sheet.lamps) * len(sheet.tiles_across)
+        panels = len(sheet.views) * len(sheet.lights) * len(sheet.tiles_across)
         if max(panels * sheet.size**2, turn.frames * turn.size**2) > MOST_PIXELS:
             raise ValueError(f"asks for more than {MOST_PIXELS:,} pixels; use smaller or fewer pictures")
         return self

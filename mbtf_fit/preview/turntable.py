@@ -10,14 +10,18 @@ shrink towards the poles, where footprints exceed them. Tiles on the plate are a
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
 
 from mbtf_core.directions import from_angles
+from mbtf_core.files.atomic import write_file
 from mbtf_core.run.signals import reinstall_handlers
 from mbtf_fit.backends.mitsuba.stored_material import F32
 from mbtf_fit.preview.config import TurntableSection
@@ -35,6 +39,8 @@ _KEY, _RIM, _SKY = 2.6, 0.7, 0.22
 _TOTAL = float(_KEY * np.sin(np.radians(KEY[0])) + _RIM * np.sin(np.radians(RIM[0])) + np.pi * _SKY)
 KEY_IRRADIANCE, RIM_IRRADIANCE, SKY = _KEY / _TOTAL, _RIM / _TOTAL, _SKY / _TOTAL
 FIELD_OF_VIEW = 26.0
+# Milliseconds of one rotation.
+TURN = 2400
 
 
 def ball(bsdf: BSDF, tiles: int) -> Any:
@@ -137,3 +143,16 @@ def frames(bsdf: BSDF, section: TurntableSection) -> Iterator[F32]:
             signal.raise_signal(signal.SIGINT)
         dr.eval(picture)
         yield np.array(picture, np.float32)
+
+
+def write_gif(path: Path, pictures: Sequence[NDArray[np.uint8]]) -> None:
+    """Write an endlessly repeated animation with a common palette, atomically."""
+    strip = Image.fromarray(np.concatenate(pictures[:: max(1, len(pictures) // 8)], axis=0))
+    palette = strip.quantize(255, method=Image.Quantize.MEDIANCUT)
+    coded = [
+        Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures
+    ]
+    pause = max(20, round(TURN / len(coded)))
+
+    options = {"append_images": coded[1:], "duration": pause, "loop": 0, "optimize": False}
+    write_file(path, lambda file: coded[0].save(file, format="GIF", save_all=True, **options))

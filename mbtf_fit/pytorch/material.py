@@ -12,12 +12,11 @@ from mbtf_core.errors import InputError
 from mbtf_fit import ops
 from mbtf_fit.ops.operation import needed_for, output_names, parse, sizes_of
 from mbtf_fit.ops.value import calibrated
-from mbtf_fit.pytorch.inception import InceptionDecoder
-from mbtf_fit.pytorch.mlp import Mlp, initialize_layers
+from mbtf_fit.pytorch.networks import InceptionDecoder, Mlp, initialize_layers
 from mbtf_fit.pytorch.operations import FUNCTIONS, PYTORCH, Execution, displacement
+from mbtf_fit.pytorch.textures import FeatureTextures
 from mbtf_fit.surface.hints import compute_hints
 from mbtf_fit.surface.known import KnownSurface
-from mbtf_fit.textures.feature_textures import FeatureTextures
 
 # Standard deviation of the initial features; weight of the traced displacement before training.
 FEATURE_SCALE, FIRST_WEIGHT = 0.1, 0.9

@@ -23,7 +23,6 @@ from torch import Tensor
 from mbtf_core.height_planes import node_table
 from mbtf_fit.native.library import Heightfield, kernel
 from mbtf_fit.ops.constants import MAX_CROSSINGS
-from mbtf_fit.surface.copies import DeviceCopies
 
 # Rays, and vertices, per task of a thread.
 _RAYS, _VERTICES = 1 << 14, 1 << 12
@@ -33,6 +32,19 @@ _TINY = 1e-18
 HORIZON_DISTANCE = 4.0
 
 F32 = NDArray[np.float32]
+
+
+class DeviceCopies:
+    """A tensor that does not change, and its copies on other devices, each of which is made once."""
+
+    def __init__(self, tensor: Tensor) -> None:
+        self._copies = {tensor.device: tensor}
+
+    def on(self, device: torch.device) -> Tensor:
+        """The tensor on a device."""
+        if device not in self._copies:
+            self._copies[device] = next(iter(self._copies.values())).to(device)
+        return self._copies[device]
 
 
 class HeightfieldTracer:

@@ -20,7 +20,7 @@ from mbtf_fit.ops.constants import HINTS
 from mbtf_fit.ops.displace import Trace
 from mbtf_fit.ops.shade import Shade
 from mbtf_fit.surface.known import KnownSurface
-from mbtf_fit.textures.lookup import Packing
+from mbtf_fit.surface.lookup import Packing
 
 # Queries per task of a thread; in PyTorch, queries at once, which bounds the memory of the lookups.
 _TASK, _CHUNK = 1 << 14, 1 << 17

@@ -1,9 +1,11 @@
-"""From shards to a material: one fit, started or resumed."""
+"""From data sets to materials: one fit, or one of several materials that share their network."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -19,28 +21,35 @@ from mbtf_core.run.signals import stop_on_interruption
 from mbtf_core.stats import pooled_variance
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import Partition, load_training, open_data
-from mbtf_fit.data.queries import ShardQueries, mean_value
+from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.evaluation import evaluate_splits
-from mbtf_fit.material.decoder import Decoder
+from mbtf_fit.formatting import format_estimate
+from mbtf_fit.material.decoder import DECODER_NAME, Decoder, write_decoder
 from mbtf_fit.material.format import DESCRIPTION_NAME
 from mbtf_fit.material.material import Material, export
 from mbtf_fit.material.transmittance_fit import evaluate_transmittance, fit_transmittance
-from mbtf_fit.models.model import Model, Preparation
-from mbtf_fit.models.registry import MODELS, material_of
-from mbtf_fit.objective.noise import NoiseModel, typical_value
-from mbtf_fit.pytorch.material import NeuralMaterial
-from mbtf_fit.training.checkpoint import CHECKPOINT_NAME, read_checkpoint, write_checkpoint
-from mbtf_fit.training.convergence import MarginalCost, marginal_cost_of
-from mbtf_fit.training.device import choose_device, keep_freed_memory
-from mbtf_fit.training.fit_folder import claim, identity_of
-from mbtf_fit.training.loop import TrainingLoop
-from mbtf_fit.training.trainer import Trainer, TrainingData
-from mbtf_fit.training.validation import (
+from mbtf_fit.models.registry import MODELS
+from mbtf_fit.training.fit_folder import (
     append_history,
-    describe_record,
-    history_record,
+    claim,
+    identity_of,
+    joint_identity,
     read_history,
     truncate_history,
+)
+from mbtf_fit.training.loop import (
+    CHECKPOINT_NAME,
+    TrainingLoop,
+    choose_device,
+    keep_freed_memory,
+    read_checkpoint,
+    write_checkpoint,
+)
+from mbtf_fit.training.trainer import Trainer, prepare_trainer
+from mbtf_fit.training.validation import (
+    MarginalCost,
+    history_record,
+    marginal_cost_of,
     validation_set,
     validation_subset,
 )
@@ -48,13 +57,12 @@ from mbtf_fit.training.validation import (
 # Seconds of training between two validations, and between two checkpoints.
 _REPORT_SECONDS = 2.0
 _CHECKPOINT_SECONDS = 15.0
-# Tensors that ``init_from`` copies, by the first part of their names; the decoder keeps its initialization.
-_SHARED = ("pyramid", "offset_texture", "offset_network")
-# Displacement of `relief`, copied from materials that have it.
-_DEPTH_WEIGHTS = "depth_weights"
+# Materials that are validated in that interval.
+_VALIDATED = 4
 
-# Called with the fraction of the budget that is spent, and one line of text.
+# Called with the record of a validation, the trainer, and the queries of the validation.
 Observer = Callable[[dict[str, Any], Trainer, ShardQueries], None]
+# Called with the fraction of the budget that is spent, and one line of text.
 ProgressCallback = Callable[[float, str], None]
 
 
@@ -99,36 +107,32 @@ class FitResult:
             "resumed": self.resumed,
             "training": self.material.description["training"],
             "errors": self.errors,
-            "marginal_cost": None if cost is None else asdict(cost),
+            "marginal_cost": None if cost is None else cost.as_dict(),
         }
 
     @property
     def marginal_cost(self) -> MarginalCost | None:
         """Estimated training time that halves the error; None where the history does not resolve it."""
-        training = self.material.description["training"]
-        return marginal_cost_of(
-            self.history, self.errors, training.get("noise_variance"), training.get("validation_set", "test")
-        )
+        noise = self.material.description["training"].get("noise_variance")
+        return marginal_cost_of(self.history, self.errors, noise)
 
 
-def check_options(config: FitConfig) -> None:
-    """Refuse losses, and a network to keep, that the model cannot have."""
-    if config.decoder is not None:
-        Decoder.find(config.decoder).check(config)
-    gradient = any(term.kind == "gradient" for term in config.training.losses)
-    if MODELS[config.model].layout != "image" and gradient:
-        raise InputError(
-            f"the gradient loss compares neighboring texels, which {config.model} never sees together",
-            where="training.losses",
-            hint="use another loss, or a model that learns from the image layout",
-        )
+@dataclass(frozen=True)
+class _Member:
+    """A material: its folder, its data, the content of its ``fit.json``."""
+
+    folder: Path
+    data: Dataset
+    identity: dict[str, Any]
 
 
 def _check_folder(config: FitConfig, out: Path) -> None:
-    """Refuse to replace the network or the material that the fit reads."""
+    """Refuse a network of another architecture, and to replace what the fit reads."""
     read = []
     if config.decoder is not None:
-        read.append(Decoder.find(config.decoder).folder)
+        network = Decoder.find(config.decoder)
+        network.check(config)
+        read.append(network.folder)
     if config.init_from is not None:
         read.append(Path(config.init_from))
     if out.resolve() in (folder.resolve() for folder in read):
@@ -143,7 +147,6 @@ def fit(
     overwrite: bool = False,
     progress: ProgressCallback | None = None,
     observe: Observer | None = None,
-    partition: Partition | None = None,
 ) -> FitResult:
     """Fit a model to a data set and export it as a material.
 
@@ -163,9 +166,6 @@ def fit(
         Called with the fraction of the budget that is spent, in [0, 1], and one line of text.
     observe : callable, optional
         Called after each validation with its record, the trainer, and the queries of the validation.
-    partition : Partition, optional
-        Result of :func:`~mbtf_fit.data.loader.load_training` for these data, held-out settings and seed, to
-        share among several fits; read from `shards` by default.
 
     Returns
     -------
@@ -182,83 +182,237 @@ def fit(
         The disk is full, another process writes to the folder, or the store cannot be reached; the same
         command resumes.
     """
-    begin = time.perf_counter()
     if config.training.shared_decoder:
         raise InputError(
             "a shared network takes several data sets",
             where="training.shared_decoder",
             hint="mbtf-fit --many SHARDS SHARDS --shared-decoder -o materials/",
         )
-    device = choose_device(config.device)
     out = Path(out)
-    check_options(config)
     _check_folder(config, out)
-    data = open_data(shards, MODELS[config.model].layout, config.model, config.data.cache)
-    identity = identity_of(config, data)
-    with owned(out):
-        claim(out, identity, config, overwrite)
-        progress = progress or (lambda fraction, note: None)
-        finished = (out / DESCRIPTION_NAME).exists()
-        resumed = finished or _fit(config, data, identity, partition, device, out, progress, observe)
-        return result_of(out, time.perf_counter() - begin, resumed=resumed)
+    return _fit(config, [shards], [out], out, overwrite, progress, observe)[0]
+
+
+def fit_jointly(
+    config: FitConfig,
+    shards: Sequence[str | Path],
+    folders: Sequence[str | Path],
+    decoder: str | Path,
+    *,
+    overwrite: bool = False,
+    progress: ProgressCallback | None = None,
+) -> list[FitResult]:
+    """Fit a material to each of several data sets, all with one network.
+
+    Textures, surfaces, depth weights and calibration factors are those of each material. An unfinished fit of
+    the same configuration and data sets is resumed; a finished one is kept.
+
+    Parameters
+    ----------
+    config : FitConfig
+        Options of the fit, with ``training.shared_decoder``; the budget is that of all materials together.
+    shards : sequence of str or Path
+        Folders made by ``mbtf-gen``, two at least.
+    folders : sequence of str or Path
+        Folder of each material.
+    decoder : str or Path
+        Folder of the shared network.
+    overwrite : bool
+        Replace fits of another configuration.
+    progress : callable, optional
+        Called with the fraction of the budget that is spent, in [0, 1], and one line of text.
+
+    Returns
+    -------
+    list of FitResult
+        Of each material, in the order of the data sets.
+
+    Raises
+    ------
+    InputError, EngineError, PartialError
+        As :func:`fit`; or there are too few data sets.
+    """
+    decoder, outs = Path(decoder), [Path(folder) for folder in folders]
+    if not config.training.shared_decoder:
+        raise InputError("is not set", where="training.shared_decoder", hint="set it to true")
+    if len(shards) < 2:
+        raise InputError(
+            "a shared network takes two data sets at least",
+            hint="mbtf-fit --many SHARDS SHARDS --shared-decoder -o materials/",
+        )
+    if decoder in outs:
+        raise InputError(
+            "this folder is that of the shared network: rename the data set of this name", where=decoder
+        )
+    for name, count in Counter(out.name for out in outs).items():
+        if count > 1:
+            raise InputError(f"{count} of the folders have this name", where=name, hint="rename them")
+    return _fit(config, shards, outs, decoder, overwrite, progress)
 
 
 def _fit(
     config: FitConfig,
-    data: Dataset,
-    identity: dict[str, Any],
-    partition: Partition | None,
+    shards: Sequence[str | Path | DataFolder],
+    folders: Sequence[Path],
+    home: Path,
+    overwrite: bool,
+    progress: ProgressCallback | None,
+    observe: Observer | None = None,
+) -> list[FitResult]:
+    """Fit materials to data sets; `home` has the checkpoint, and the network where they share one."""
+    begin = time.perf_counter()
+    device = choose_device(config.device)
+    layout, shared = MODELS[config.model].layout, config.training.shared_decoder
+    data = [open_data(folder, layout, config.model, config.data.cache) for folder in shards]
+    group = data if shared else ()
+    members = [
+        _Member(out, one, identity_of(config, one, group)) for out, one in zip(folders, data, strict=True)
+    ]
+    identities = {member.folder.name: member.identity for member in members}
+    with ExitStack() as stack:
+        for folder in dict.fromkeys((home, *folders)):
+            stack.enter_context(owned(folder))
+        if shared:
+            claim(home, joint_identity(identities), config, overwrite)
+        for member in members:
+            claim(member.folder, member.identity, config, overwrite)
+        finished = all((folder / DESCRIPTION_NAME).exists() for folder in folders)
+        finished = finished and (not shared or (home / DECODER_NAME).exists())
+        resumed = finished or _train(
+            config, members, home, device, progress or (lambda fraction, note: None), observe
+        )
+        (home / CHECKPOINT_NAME).unlink(missing_ok=True)
+        total = time.perf_counter() - begin
+        return [result_of(folder, total, resumed=resumed) for folder in folders]
+
+
+def _train(
+    config: FitConfig,
+    members: Sequence[_Member],
+    home: Path,
     device: torch.device,
-    out: Path,
     progress: ProgressCallback,
     observe: Observer | None,
 ) -> bool:
     """Train and export; whether an earlier run was resumed."""
     keep_freed_memory()
-    if partition is None:
-        partition = load_training(data, config.held_out, config.seed, config.data.memory)
-    trainer = prepare_trainer(config, data, partition, device)
-    resumed = _resume(trainer, out)
-    name, queries = validation_set(data, partition)
-    subset = validation_subset(trainer.model.positions, queries)
-    del queries
-    _train(trainer, subset, out, progress, observe)
-    kept = None if config.decoder is None else {"decoder": {"sha256": Decoder.find(config.decoder).sha256}}
-    export_fit(trainer, config, data, partition, identity, out, validated=name, more=kept)
-    (out / CHECKPOINT_NAME).unlink(missing_ok=True)
+    # The memory is that of all data sets together.
+    memory = config.data.model_copy(update={"memory": config.data.memory / len(members)})
+    own = config.model_copy(update={"data": memory})
+    trainers: list[Trainer] = []
+    partitions: list[Partition] = []
+    subsets: list[tuple[str, ShardQueries]] = []
+    for member in members:
+        part = load_training(member.data, own.held_out, own.seed, own.data.memory)
+        network = trainers[0].model if trainers else None
+        trainers.append(prepare_trainer(own, member.data, part, device, network))
+        partitions.append(part)
+        name, queries = validation_set(member.data, part)
+        subsets.append((name, validation_subset(trainers[-1].model.positions, queries)))
+        del queries
+    names = [member.folder.name for member in members] if len(members) > 1 else [""]
+    loop = TrainingLoop(trainers, names)
+    checkpoint = home / CHECKPOINT_NAME
+    resumed = checkpoint.exists()
+    if resumed:
+        read_checkpoint(loop, checkpoint)
+    for member in members:
+        truncate_history(member.folder, loop.progress.step)
+
+    def report() -> None:
+        records = []
+        for member, trainer, (_, subset) in zip(members, trainers, subsets, strict=True):
+            records.append(history_record(trainer, subset))
+            append_history(member.folder, records[-1])
+            if observe is not None:
+                observe(records[-1], trainer, subset)
+        progress(loop.fraction, _describe(records))
+
+    _spend_budget(loop, report, checkpoint)
+    _export(config, loop, members, partitions, [name for name, _ in subsets], home)
     return resumed
+
+
+def _describe(records: Sequence[dict[str, Any]]) -> str:
+    """One line for the progress bar."""
+    first = records[0]
+    text = f"loss {first['loss']:.3f}"
+    known = [r["unexplained"] for r in records if r["unexplained"] is not None]
+    if len(records) > 1 and known:
+        text += f", validation error {min(known):.3f} to {max(known):.3f}"
+    elif known:
+        estimate = {"value": first["unexplained"], "error": first["unexplained_error"]}
+        text += f", validation error {format_estimate(estimate)}"
+    return f"{text}, {first['queries_per_second'] / 1e6:.2f} M queries/s"
+
+
+def _spend_budget(loop: TrainingLoop, report: Callable[[], None], checkpoint: Path) -> None:
+    """Train with reports and checkpoints at intervals; one is written before an interruption ends it."""
+    seconds = max(1.0, len(loop.trainers) / _VALIDATED) * _REPORT_SECONDS
+    saved = time.perf_counter()
+    done = loop.fraction >= 1.0
+    with stop_on_interruption() as stop:
+        while not (done or stop.is_set()):
+            try:
+                done = loop.train(seconds, stop)
+            except PartialError:
+                # The store of streamed queries cannot be reached.
+                write_checkpoint(loop, checkpoint)
+                raise
+            report()
+            if time.perf_counter() - saved > _CHECKPOINT_SECONDS or done or stop.is_set():
+                write_checkpoint(loop, checkpoint)
+                saved = time.perf_counter()
+        if stop.is_set():
+            raise KeyboardInterrupt
+
+
+def _export(
+    config: FitConfig,
+    loop: TrainingLoop,
+    members: Sequence[_Member],
+    partitions: Sequence[Partition],
+    validated: Sequence[str],
+    home: Path,
+) -> None:
+    """Write the materials, and the network that they share."""
+    steps, seconds = loop.progress.step, round(loop.progress.seconds, 3)
+    summary: dict[str, Any] = {"materials": list(loop.names), "steps": steps, "seconds": seconds}
+    for k, (member, partition) in enumerate(zip(members, partitions, strict=True)):
+        mine = loop.batches_of(k, steps)
+        share: dict[str, Any] = {"steps": mine, "seconds": round(seconds * mine / steps, 3)}
+        if config.training.shared_decoder:
+            share["shared_decoder"] = summary
+        if config.decoder is not None:
+            share["decoder"] = {"sha256": Decoder.find(config.decoder).sha256}
+        export_fit(loop.trainers[k], config, member, partition, validated=validated[k], share=share)
+    if config.training.shared_decoder:
+        # It tells other fits that all materials are complete.
+        data = {member.folder.name: member.identity["data"] for member in members}
+        write_decoder(home, loop.trainers[0].model, config, materials=data, training=summary)
 
 
 def export_fit(
     trainer: Trainer,
     config: FitConfig,
-    data: Dataset,
+    member: _Member,
     partition: Partition,
-    identity: dict[str, Any],
-    out: Path,
     *,
     validated: str,
-    more: dict[str, Any] | None = None,
+    share: dict[str, Any],
 ) -> None:
-    """Write the material of a finished training, with its errors.
-
-    Parameters
-    ----------
-    identity : configuration and data, and the hash of both
-    validated : name of the set of the validations
-    more : what the summary of the training says besides, or otherwise
-    """
+    """Write the material of a finished training, with its errors; `validated`: name of the set of the
+    validations, `share`: what the summary says of the material's part in the training."""
+    data = member.data
     trainer.fill_levels(float(level_of_sigma(partition.sample.sigma.max())))
     trainer.calibrate()
     errors = evaluate_splits(trainer.predict, data, partition)
-    variance = errors["training"].overall.variance.value
+    variance = errors["training"]["variance"]["value"]
     sample = partition.sample
     noise = pooled_variance(sample.value_a, sample.value_b).value if data.estimates == 2 else None
     training = {
-        "steps": trainer.progress.step,
         "batch": trainer.batch,
         "queries": len(partition.training),
-        "seconds": round(trainer.progress.seconds, 3),
         "loss": trainer.progress.loss,
         "validation_set": validated,
         "weight_decay": asdict(trainer.weight_decay),
@@ -267,129 +421,24 @@ def export_fit(
         "threads": torch.get_num_threads(),
         "backend": trainer.backend,
         "torch": torch.__version__,
-        "errors": {split: e.as_dict() for split, e in errors.items()},
+        "errors": errors,
         # Variance of the noise of values, in 1/sr² and over that of the values; null where it is unknown.
         "noise_variance": noise,
-        "noise_ratio": noise / variance if noise is not None and variance > 0 else None,
+        "noise_ratio": noise / variance if noise is not None and variance and variance > 0 else None,
     }
     transmittance = fit_transmittance(data, partition.selection)
     if transmittance is not None:
         found = evaluate_transmittance(transmittance, data, partition.selection)
         training["transmittance"] = {split: e.as_dict() for split, e in found.items()}
-    training |= more or {}
-    export(trainer.model, config, out, data=identity["data"], training=training, transmittance=transmittance)
-
-
-def prepare_trainer(
-    config: FitConfig,
-    data: Dataset,
-    partition: Partition,
-    device: torch.device,
-    shared: NeuralMaterial | None = None,
-) -> Trainer:
-    """A trainer at its first step, for the model and the data of a configuration; with the networks of the
-    model `shared`, if there is one."""
-    model = material_of(config.model, data.lattice, config.network)
-    unit = typical_value(mean_value(partition.sample.value_a, partition.sample.value_b))
-    model.initialize(torch.Generator().manual_seed(config.seed), unit)
-
-    def load(folder: str) -> tuple[TrainingData, float]:
-        other = open_data(folder, MODELS[config.model].layout, config.model, config.data.cache)
-        part = load_training(other, config.held_out, config.seed)
-        typical = typical_value(mean_value(part.sample.value_a, part.sample.value_b))
-        return part.training.to(device), typical
-
-    hooks, training = MODELS[config.model](model), partition.training.to(device)
-    training = hooks.prepare(Preparation(data, training, config.training, unit, config.seed, load))
-    if config.init_from is not None:
-        _initialize_from(hooks, config.init_from)
-    if config.decoder is not None:
-        Decoder.find(config.decoder).load(model)
-    noise = NoiseModel.silent(unit, data.lattice)
-    # A single value does not tell its noise; none is assumed.
-    if data.estimates == 2:
-        noise = NoiseModel.of(partition.sample, data.lattice, unit)
-    model = model.to(device)
-    if shared is not None:
-        model.share_networks(shared)
-    return Trainer(config, model, training, noise, partition.selection, hooks)
-
-
-def _initialize_from(hooks: Model, folder: str | Path) -> None:
-    """Copy textures and offset of a material into a model of like levels, channels, width and offset.
-
-    A step of the hierarchical model takes several times as long as a step of ``neumip``. Both share textures
-    and offset, which ``neumip`` learns sooner.
-    """
-    model, source = hooks.material, Material.load(folder).model
-    given, mine = source.weights(), model.weights()
-    names = [name for name in mine if name.partition(".")[0] in _SHARED]
-    names += [_DEPTH_WEIGHTS] if _DEPTH_WEIGHTS in mine and _DEPTH_WEIGHTS in given else []
-    for name in names:
-        if name not in given or given[name].shape != mine[name].shape:
-            raise InputError(
-                f"its '{name}' does not have the shape that the fit needs",
-                where=folder,
-                hint="fit it with the same levels, network.channels, network.width, network.layers, "
-                "network.offset and network.oversampling",
-            )
-    model.load_weights({**mine, **{name: given[name] for name in names}})
-    hooks.init_from(source)
-
-
-def _resume(trainer: Trainer, out: Path) -> bool:
-    """Resume from the checkpoint, if there is one."""
-    path = out / CHECKPOINT_NAME
-    resumed = path.exists()
-    if resumed:
-        read_checkpoint(trainer, path)
-    truncate_history(out, trainer.progress.step)
-    return resumed
-
-
-def _train(
-    trainer: Trainer,
-    subset: ShardQueries,
-    out: Path,
-    progress: ProgressCallback,
-    observe: Observer | None,
-) -> None:
-    def report() -> None:
-        record = history_record(trainer, subset)
-        append_history(out, record)
-        progress(trainer.fraction, describe_record(record))
-        if observe is not None:
-            observe(record, trainer, subset)
-
-    run_training(trainer, report, lambda: write_checkpoint(trainer, out / CHECKPOINT_NAME))
-
-
-def run_training(
-    loop: TrainingLoop, report: Callable[[], None], save: Callable[[], None], *, reports: float = 1.0
-) -> None:
-    """Spend the budget of a loop, with reports and checkpoints at intervals; `reports` is a factor on the
-    interval of the reports.
-
-    Raises
-    ------
-    KeyboardInterrupt : the program is interrupted; a checkpoint is written first
-    """
-    saved = time.perf_counter()
-    done = loop.fraction >= 1.0
-    with stop_on_interruption() as stop:
-        while not (done or stop.is_set()):
-            try:
-                done = loop.train(reports * _REPORT_SECONDS, stop)
-            except PartialError:
-                # The store of streamed queries cannot be reached.
-                save()
-                raise
-            report()
-            if time.perf_counter() - saved > _CHECKPOINT_SECONDS or done or stop.is_set():
-                save()
-                saved = time.perf_counter()
-        if stop.is_set():
-            raise KeyboardInterrupt
+    described = member.identity["data"]
+    export(
+        trainer.model,
+        config,
+        member.folder,
+        data=described,
+        training=training | share,
+        transmittance=transmittance,
+    )
 
 
 def result_of(out: Path, total: float, *, resumed: bool) -> FitResult:

@@ -1,12 +1,14 @@
-"""The folder of a fit: its files, and the claim of one configuration and data set on it."""
+"""The folder of a fit: the claim of one configuration and data set on it, and the history of validations."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from mbtf_core.data.dataset import Dataset
+from mbtf_core.files.atomic import write_text
 from mbtf_core.files.digest import data_sha256
 from mbtf_core.files.folders import OutputFolder, OutputKind
 from mbtf_fit.config import FitConfig
@@ -14,9 +16,9 @@ from mbtf_fit.material.decoder import DECODER_NAME, Decoder
 from mbtf_fit.material.export import LAYERS_NAME, TEXTURES_NAME
 from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME, read_description
 from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME
-from mbtf_fit.training.checkpoint import CHECKPOINT_NAME
-from mbtf_fit.training.validation import HISTORY_NAME
+from mbtf_fit.training.loop import CHECKPOINT_NAME
 
+HISTORY_NAME = "metrics.jsonl"
 FIT = OutputKind("fit.json", "mbtf-fit", 3, "a fit")
 # The description goes first: without it nothing counts as a finished material.
 _FILES = (
@@ -56,6 +58,14 @@ def identity_of(config: FitConfig, data: Dataset, group: Sequence[Dataset] = ())
     }
 
 
+def joint_identity(identities: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
+    """Identity of a shared network: that of the first material, with the hash of all; `identities`: name →
+    identity of each material."""
+    hashes = [identity["config_hash"] for identity in identities.values()]
+    data = {name: identity["data"] for name, identity in identities.items()}
+    return {**next(iter(identities.values())), "config_hash": data_sha256(hashes), "data": data}
+
+
 def claim(out: Path, identity: dict[str, Any], config: FitConfig, overwrite: bool) -> None:
     """Claim the folder for a fit, or check that it already belongs to it."""
     OutputFolder.claim(
@@ -67,3 +77,57 @@ def claim(out: Path, identity: dict[str, Any], config: FitConfig, overwrite: boo
         digest=identity["config_hash"],
         overwrite=overwrite,
     )
+
+
+def append_history(folder: Path, record: dict[str, Any]) -> None:
+    """Add a record to the history of a fit."""
+    with (folder / HISTORY_NAME).open("a", encoding="utf-8") as stream:
+        stream.write(json.dumps(record) + "\n")
+
+
+def truncate_history(folder: Path, step: int) -> None:
+    """Remove the records after a step, to which a fit returns; all of them at step 0."""
+    if step == 0:
+        (folder / HISTORY_NAME).unlink(missing_ok=True)
+        return
+    kept = [line for line in read_history(folder) if line.get("step", 0) <= step]
+    write_text(folder / HISTORY_NAME, "".join(json.dumps(line) + "\n" for line in kept))
+
+
+def read_history(folder: str | Path) -> list[dict[str, Any]]:
+    """Read the validation history of a fit; records after a corrupt line are left out.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Folder of the material.
+
+    Returns
+    -------
+    list of dict
+        One record per validation, in order of time:
+
+        step : int
+            Steps done.
+        seconds : float
+            Training time in seconds.
+        fraction : float
+            Fraction of the budget that is spent, in [0, 1].
+        loss : float
+            Mean training loss since the record before.
+        unexplained, unexplained_error : float or None
+            Unexplained variance of the validation subset (1 - R²), and its standard error.
+        queries_per_second : int
+            Training throughput.
+    """
+    path = Path(folder) / HISTORY_NAME
+    out = []
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []:
+        try:
+            record = json.loads(line)
+        except (ValueError, RecursionError):
+            break
+        if not isinstance(record, dict):
+            break
+        out.append(record)
+    return out

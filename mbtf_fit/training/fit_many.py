@@ -4,59 +4,27 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from mbtf_core.data.dataset import is_dataset
-from mbtf_core.errors import InputError, UsageError, reason
+from mbtf_core.errors import InputError, UsageError
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item
-from mbtf_core.suggest import refuse_special
 from mbtf_fit.config import FitConfig
 
 
-@dataclass(frozen=True)
-class FitOutcome:
-    """Folders of data and material, and the result (:meth:`FitResult.as_dict`) or the error of the fit."""
-
-    shards: Path
-    folder: Path
-    result: dict[str, Any] | None
-    error: str | None
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain data for JSON."""
-        return {
-            "shards": str(self.shards),
-            "material": str(self.folder),
-            "result": self.result,
-            "error": self.error,
-        }
-
-
 def find_data(arguments: Sequence[Path]) -> list[Path]:
-    """Data sets of the arguments: a data set's folder, a folder of such folders, or a text file with one
-    folder per line, relative to the file; lines that start with # are comments.
+    """Data sets of the arguments: a data set's folder, or a folder of such folders.
 
     Raises
     ------
-    InputError : a list cannot be read, a folder contains no data sets, or one is a pipe or a device
+    InputError : a folder contains no data sets
     """
     found: list[Path] = []
     for argument in arguments:
-        refuse_special(argument)
-        if argument.is_file():
-            try:
-                lines = [line.strip() for line in argument.read_text(encoding="utf-8").splitlines()]
-            except (OSError, UnicodeDecodeError) as error:
-                raise InputError(f"cannot be read as a list ({reason(error)})", where=argument) from None
-            mine = [argument.parent / line for line in lines if line and not line.startswith("#")]
-            for folder in mine:
-                refuse_special(folder)
-        elif not argument.is_dir() or is_dataset(argument):
-            mine = [argument]
-        else:
+        mine = [argument]
+        if argument.is_dir() and not is_dataset(argument):
             mine = sorted(path for path in argument.iterdir() if path.is_dir() and is_dataset(path))
         if not mine:
             raise InputError(
@@ -82,28 +50,8 @@ def name_materials(shards: Sequence[Path], out: Path) -> list[Path]:
 
 
 def fit_one(config: FitConfig, shards: Path, folder: Path, overwrite: bool) -> dict[str, Any]:
-    """Fit one data set; a task, done when its material is exported.
-
-    Parameters
-    ----------
-    config : FitConfig
-    shards, folder : Path
-        Data set and material.
-    overwrite : bool
-        Replace a fit of another configuration.
-
-    Returns
-    -------
-    dict
-        :meth:`~mbtf_fit.training.fit.FitResult.as_dict`.
-
-    Raises
-    ------
-    InputError
-        The fit cannot use its data.
-    PartialError
-        The disk is full, or another process writes to the folder.
-    """
+    """Fit one data set; a task, done when its material is exported. Returns
+    :meth:`~mbtf_fit.training.fit.FitResult.as_dict`."""
     from mbtf_fit.training.fit import fit
 
     return fit(config, shards, folder, overwrite=overwrite).as_dict()
@@ -116,12 +64,10 @@ def fit_many(
     runner: Runner,
     *,
     overwrite: bool,
-    finished: Callable[[FitOutcome], None],
-) -> list[FitOutcome]:
-    """Fit every data set with its configuration; outcomes in the order of the data sets.
-
-    A failure does not stop the others. A worker that dies leaves a checkpoint, from which the next one
-    resumes.
+    finished: Callable[[Path, str | None], None],
+) -> list[dict[str, Any]]:
+    """Fit every data set with its configuration; a failure does not stop the others. A worker that dies
+    leaves a checkpoint, from which the next one resumes.
 
     Parameters
     ----------
@@ -132,7 +78,13 @@ def fit_many(
     overwrite : bool
         Replace fits of other configurations.
     finished : callable
-        Called with each outcome as it comes.
+        Called with the folder of each fit as it ends, and its error.
+
+    Returns
+    -------
+    list of dict
+        In the order of the data sets: ``shards``, ``material``, and ``result`` (of :func:`fit_one`) or
+        ``error``.
 
     Raises
     ------
@@ -148,9 +100,14 @@ def fit_many(
         for i, (config, data, folder) in enumerate(zip(configs, shards, folders, strict=True))
     ]
     number = {item.name: i for i, item in enumerate(items)}
-    outcomes: dict[int, FitOutcome] = {}
+    outcomes: dict[int, dict[str, Any]] = {}
     for done in runner.map(fit_one, items, independent=True):
-        i = number[done.name]
-        outcomes[i] = FitOutcome(shards[i], folders[i], done.value, done.message or None)
-        finished(outcomes[i])
+        i, error = number[done.name], done.message or None
+        outcomes[i] = {
+            "shards": str(shards[i]),
+            "material": str(folders[i]),
+            "result": done.value,
+            "error": error,
+        }
+        finished(folders[i], error)
     return [outcomes[i] for i in range(len(items))]

@@ -1,73 +1,121 @@
-"""The training loop: steps until a budget is spent, with a check that all numbers are finite."""
+"""The training loop: steps of one or several materials until a budget is spent, all numbers finite.
+
+Steps take the materials in turn. A step trains the textures of one material, and the network, which all
+materials share with the state of its optimizer: Adam's moments average the gradients of the materials. A
+checkpoint is the state of a loop in one file.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import math
+import sys
 import time
-from abc import ABC, abstractmethod
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
 from threading import Event
 from typing import NoReturn
 
 import torch
 from torch import Tensor
 
-from mbtf_fit.config import FitConfig
+from mbtf_core.errors import EngineError, InputError
+from mbtf_core.run.task import worker_threads
+from mbtf_fit.material.storage import read_tensors, write_tensors
 from mbtf_fit.objective.parallel import Workers
+from mbtf_fit.training.trainer import Trainer, TrainingProgress
+
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 
 
-@dataclass
-class TrainingProgress:
-    """Progress of training: steps done, seconds spent in them over all runs, mean loss of the last steps."""
+def choose_device(name: str) -> torch.device:
+    """The device to train on; ``auto`` is CUDA if available. A worker trains with its threads."""
+    if (threads := worker_threads()) is not None:
+        torch.set_num_threads(threads)
+    available = torch.cuda.is_available()
+    if name == "cuda" and not available:
+        raise EngineError(
+            "no CUDA device is available", where="--device cuda", hint="use --device cpu or auto"
+        )
+    return torch.device("cuda" if available and name != "cpu" else "cpu")
 
-    step: int = 0
-    seconds: float = 0.0
-    loss: float = math.nan
+
+def keep_freed_memory() -> None:
+    """Let glibc keep freed blocks of up to 32 MiB instead of returning them to the kernel.
+
+    A training step frees and allocates the same few megabytes; page faults would cost as much as the
+    arithmetic.
+    """
+    if sys.platform != "linux":
+        return
+    with contextlib.suppress(OSError, AttributeError):
+        library = ctypes.CDLL(None)
+        library.mallopt(_M_MMAP_THRESHOLD, 1 << 25)
+        library.mallopt(_M_TRIM_THRESHOLD, 1 << 30)
 
 
-class TrainingLoop(ABC):
-    """Steps of an optimizer within a budget of steps or of time.
+def shared_decay(decays: Sequence[float]) -> float:
+    """Weight decay of a network that several materials share, from those of networks of their own.
+
+    The mean, divided by the square root of their number. More materials are more queries, which need less
+    decay, but the share of each in the network's weights is smaller.
+    """
+    return sum(decays) / len(decays) ** 1.5
+
+
+class TrainingLoop:
+    """Training of one model, or of several that share their networks.
+
+    Parameters
+    ----------
+    trainers : sequence of Trainer
+        Of each material, at the same step. The models share their networks already
+        (:meth:`NeuralMaterial.share_networks <mbtf_fit.pytorch.material.NeuralMaterial.share_networks>`).
+    names : sequence of str
+        Names of the materials, for messages.
 
     Attributes
     ----------
-    config : options of the fit; its budget is that of the loop
-    device : of the parameters
-    progress : steps done
+    progress : steps done, of all materials together
     """
 
-    config: FitConfig
-    device: torch.device
-    progress: TrainingProgress
+    def __init__(self, trainers: Sequence[Trainer], names: Sequence[str] = ("",)) -> None:
+        self.trainers, self.names = trainers, names
+        decay = shared_decay([trainer.weight_decay.weights for trainer in trainers])
+        for trainer in trainers:
+            trainer.weight_decay = replace(trainer.weight_decay, weights=decay)
+        self.link()
+
+    def link(self) -> None:
+        """Let all trainers have the progress of the first one, and its state of the networks' optimizer."""
+        first, *others = self.trainers
+        self.progress = first.progress
+        for trainer in others:
+            trainer.progress = self.progress
+            for module in first.model.networks().values():
+                for p in module.parameters():
+                    trainer.optimizer.state[p] = first.optimizer.state[p]
 
     @property
     def fraction(self) -> float:
         """Fraction of the budget that is spent, in [0, 1]."""
-        training = self.config.training
-        if training.steps is not None:
-            return min(1.0, self.progress.step / training.steps)
-        return min(1.0, self.progress.seconds / training.time)
+        return self.trainers[0].fraction
 
-    @property
-    @abstractmethod
-    def max_threads(self) -> int:
-        """Most threads that share a batch."""
+    def batches_of(self, index: int, step: int) -> int:
+        """Batches that a material has had before a step."""
+        return (step - index + len(self.trainers) - 1) // len(self.trainers)
 
-    @abstractmethod
     def _steps(self, workers: Workers) -> Iterator[Tensor]:
         """Endless steps from the current one on; each yields its mean loss."""
+        first = self.progress.step
+        steps = [t.steps(workers, self.batches_of(k, first)) for k, t in enumerate(self.trainers)]
+        while True:
+            yield next(steps[self.progress.step % len(steps)])
 
-    @abstractmethod
-    def _parameters(self) -> Iterator[Tensor]:
-        """Parameters that must stay finite."""
-
-    @abstractmethod
-    def health(self) -> Tensor:
-        """A number that is finite if all network weights are."""
-
-    @abstractmethod
-    def _stop_at(self, step: int) -> NoReturn:
-        """Report that training diverged at a step."""
+    def _is_finite(self) -> bool:
+        return all(bool(p.isfinite().all()) for t in self.trainers for p in t.parameters().values())
 
     def train(self, seconds: float, stop: Event | None = None) -> bool:
         """Train for about so long, or until the budget is spent; returns whether it is. Once `stop` is set,
@@ -76,7 +124,8 @@ class TrainingLoop(ABC):
         first = self.progress.step
         losses: list[Tensor] = []
         health: list[Tensor] = []
-        with Workers(self.device, limit=self.max_threads) as workers:
+        limit = min(trainer.max_threads for trainer in self.trainers)
+        with Workers(self.trainers[0].device, limit=limit) as workers:
             steps = self._steps(workers)
             while self.fraction < 1.0 and not (stop is not None and stop.is_set() and losses):
                 start = time.perf_counter()
@@ -86,10 +135,10 @@ class TrainingLoop(ABC):
                     losses.append(next(steps))
                 except (RuntimeError, IndexError):
                     # A lookup at NaN has no texel and fails before the loss could show it.
-                    if all(bool(p.isfinite().all()) for p in self._parameters()):
+                    if self._is_finite():
                         raise
                     self._stop_diverged(first, losses, health)
-                health.append(self.health())
+                health.append(self.trainers[self.progress.step % len(self.trainers)].health())
                 self.progress.step += 1
                 self.progress.seconds += time.perf_counter() - start
         if losses:
@@ -104,10 +153,76 @@ class TrainingLoop(ABC):
     def _stop_diverged(self, first: int, losses: list[Tensor], health: list[Tensor]) -> NoReturn:
         """Report the first bad step of those since `first`."""
         finite = [math.isfinite(float(a) + float(b)) for a, b in zip(losses, health, strict=False)]
-        self._stop_at(first + [*finite, False].index(False))
+        step = first + [*finite, False].index(False)
+        lower = self.trainers[0].config.training.learning_rate / 3
+        raise InputError(
+            f"training diverged at step {step + 1}: its batch gave numbers that are not finite",
+            where=self.names[step % len(self.trainers)],
+            hint=f"lower the learning rate: --learning-rate {lower:.1g} --overwrite",
+        ) from None
 
 
-def health_of(weights: list[torch.nn.Parameter], device: torch.device) -> Tensor:
-    """A number that is finite if all weights are."""
+CHECKPOINT_NAME = "checkpoint.safetensors"
+_MOMENTS = ("step", "exp_avg", "exp_avg_sq")
+
+
+def _own_parameters(loop: TrainingLoop, number: int) -> dict[str, Tensor]:
+    """Parameters of a trainer by name; the first one has those of the networks."""
+    trainer = loop.trainers[number]
+    shared = tuple(f"{name}." for name in trainer.model.networks()) if number else ()
+    return {name: p for name, p in trainer.parameters().items() if not name.startswith(shared)}
+
+
+def state_tensors(loop: TrainingLoop) -> dict[str, Tensor]:
+    """Parameters, optimizer state and state of the model by number of the trainer and name."""
+    tensors: dict[str, Tensor] = {}
+    for k, trainer in enumerate(loop.trainers):
+        for name, p in _own_parameters(loop, k).items():
+            tensors[f"{k}.model.{name}"] = p.detach()
+            for key, value in trainer.optimizer.state.get(p, {}).items():
+                tensors[f"{k}.adam.{key}.{name}"] = value
+        tensors |= {f"{k}.state.{name}": tensor for name, tensor in trainer.hooks.state().items()}
+    return tensors
+
+
+def write_checkpoint(loop: TrainingLoop, path: Path) -> None:
+    """Write parameters, optimizer state and progress."""
+    write_tensors(path, state_tensors(loop), asdict(loop.progress))
+
+
+def read_checkpoint(loop: TrainingLoop, path: Path) -> None:
+    """Resume from a checkpoint of the same configuration and data, with identical results.
+
+    Raises
+    ------
+    InputError : the file is no such checkpoint
+    """
+    try:
+        tensors, progress = read_tensors(path)
+        for k, trainer in enumerate(loop.trainers):
+            mine = {n.removeprefix(f"{k}."): t for n, t in tensors.items() if n.startswith(f"{k}.")}
+            _load(trainer, _own_parameters(loop, k), mine)
+        loop.trainers[0].progress = TrainingProgress(
+            int(progress["step"]), float(progress["seconds"]), float(progress["loss"])
+        )
+    except (InputError, KeyError, TypeError, ValueError, RuntimeError):
+        raise InputError(
+            "is not a checkpoint of this fit: corrupt, or of an older version",
+            where=path,
+            hint="remove it: the same command then starts from the beginning",
+        ) from None
+    loop.link()
+
+
+def _load(trainer: Trainer, parameters: dict[str, Tensor], tensors: dict[str, Tensor]) -> None:
+    """Set parameters, optimizer state and the model's own state of a trainer."""
     with torch.no_grad():
-        return torch.stack([torch.zeros((), device=device), *(p.sum() for p in weights)]).sum()
+        for name, p in parameters.items():
+            p.copy_(tensors[f"model.{name}"])
+            trainer.optimizer.state[p] = {
+                key: tensors[f"adam.{key}.{name}"].to(p.device)
+                for key in _MOMENTS
+                if f"adam.{key}.{name}" in tensors
+            }
+    state = {n.removeprefix("state."): t for n, t in tensors.items() if n.startswith("state.")}
+    trainer.hooks.restore(state)

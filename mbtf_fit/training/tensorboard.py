@@ -13,16 +13,8 @@ from mbtf_fit.training.validation import errors_by_level
 
 
 class EventLog:
-    """Writes each validation of a fit to a folder; a context manager, and an
-    :data:`~mbtf_fit.training.fit.Observer`.
-
-    Scalars by step: ``loss``, ``unexplained variance``, ``queries per second``, and ``unexplained variance by
-    level/S`` for each level S. Numbers that are not finite are left out.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of the event files, as for ``tensorboard --logdir``. A resumed fit continues its curves.
+    """Writes each validation of a fit to a folder, for ``tensorboard --logdir``; a context manager, and an
+    :data:`~mbtf_fit.training.fit.Observer`. A resumed fit continues its curves.
 
     Raises
     ------

@@ -1,40 +1,42 @@
-"""The training loop: batches, loss, and optimizer steps."""
+"""Training of one material: batches, loss, and optimizer steps."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
-from typing import NoReturn
+from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mbtf_core.data.dataset import Dataset
 from mbtf_core.errors import InputError
 from mbtf_fit.backends.cpu.model import supports
 from mbtf_fit.backends.cpu.stepper import NativeStepper
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.images import TrainingImages
-from mbtf_fit.data.queries import ShardQueries, TrainingQueries
+from mbtf_fit.data.loader import Partition, load_training, open_data
+from mbtf_fit.data.queries import ShardQueries, TrainingQueries, mean_value
 from mbtf_fit.data.slices import SharedSlices, TrainingSlices
-from mbtf_fit.data.streaming import Selection, StreamedQueries
+from mbtf_fit.data.streaming import StreamedQueries
+from mbtf_fit.material.decoder import Decoder
 from mbtf_fit.material.inference import predict
-from mbtf_fit.models.model import Model
-from mbtf_fit.models.registry import MODELS
+from mbtf_fit.material.material import Material
+from mbtf_fit.models.model import Model, Preparation
+from mbtf_fit.models.registry import MODELS, material_of
 from mbtf_fit.native import kernel
 from mbtf_fit.objective.losses import Objective
-from mbtf_fit.objective.noise import NoiseModel
+from mbtf_fit.objective.noise import NoiseModel, typical_value
 from mbtf_fit.objective.parallel import MAX_KERNEL_THREADS, MAX_THREADS, Batch, Workers
-from mbtf_fit.objective.regularization import WeightDecay
 from mbtf_fit.pytorch.material import NeuralMaterial
+from mbtf_fit.pytorch.textures import annealed_sigma
 from mbtf_fit.sections import TrainingSection
-from mbtf_fit.textures.blur import annealed_sigma
 from mbtf_fit.training.calibration import fit_calibration
-from mbtf_fit.training.loop import TrainingLoop, TrainingProgress, health_of
 
 TrainingData = TrainingQueries | TrainingImages | TrainingSlices | SharedSlices | StreamedQueries
 # Decay rates of Adam's moments.
@@ -42,8 +44,17 @@ BETAS = (0.8, 0.95)
 # Widest blur, in tile widths. A blur of half a tile made training unstable on textures of 16 × 16 texels: the
 # offsets of three of eight fits diverged before the textures became sharp.
 WIDEST_BLUR = 0.125
+# Tensors that ``init_from`` copies, by the first part of their names; the decoder keeps its initialization.
+_SHARED = ("pyramid", "offset_texture", "offset_network")
+# Displacement of `relief`, copied from materials that have it.
+_DEPTH_WEIGHTS = "depth_weights"
 # Difference of fractional levels that rounding explains.
 _SAME_LEVEL = 1e-4
+# Noise-to-signal ratio above which the decay of texels grows. Below it the decay of weights falls
+# quadratically, so that few but clean queries are fitted without bias.
+_REFERENCE_NOISE = 0.5
+# Largest decay of the network weights.
+_MOST_DECAY = 1.0
 
 
 def learning_rate_factor(training: TrainingSection, step: int, fraction: float) -> float:
@@ -54,7 +65,48 @@ def learning_rate_factor(training: TrainingSection, step: int, fraction: float) 
     return rise * fall
 
 
-class Trainer(TrainingLoop):
+@dataclass(frozen=True)
+class WeightDecay:
+    """Decay per step, relative to the learning rate: of the textures, and of the networks' matrices.
+
+    After many epochs a network overfits the noise of few queries. As the penalty of ridge regression does
+    (Hoerl and Kennard, Technometrics 12, 1970), both decays grow with the noise-to-signal ratio. The decay of
+    the network weights, which all queries share, falls with the number of queries. Both are applied to the
+    parameters themselves, not to the gradients (Loshchilov and Hutter, ICLR 2019).
+    """
+
+    texels: float
+    weights: float
+
+    @classmethod
+    def of(cls, training: TrainingSection, noise_ratio: float, queries: int) -> WeightDecay:
+        """Decay for a number of training queries with a noise-to-signal ratio (of variances)."""
+        relative = noise_ratio / _REFERENCE_NOISE
+        weights = training.noise_regularization * noise_ratio * min(1.0, relative) / queries
+        return cls(training.texture_weight_decay * max(1.0, relative), min(_MOST_DECAY, weights))
+
+    def apply(self, model: NeuralMaterial, texture_rate: float, rate: float) -> None:
+        """Decay a model's parameters by one step at these learning rates."""
+        texels, weights = model.parameter_groups()
+        # Biases do not decay: they keep the mean value.
+        matrices = [p for p in weights if p.ndim > 1 and p.requires_grad]
+        with torch.no_grad():
+            for parameters, amount in ((texels, texture_rate * self.texels), (matrices, rate * self.weights)):
+                if amount > 0:
+                    for p in parameters:
+                        p.mul_(math.exp(-amount))
+
+
+@dataclass
+class TrainingProgress:
+    """Progress of training: steps done, seconds spent in them over all runs, mean loss of the last steps."""
+
+    step: int = 0
+    seconds: float = 0.0
+    loss: float = math.nan
+
+
+class Trainer:
     """Training of one model on one set of queries.
 
     Parameters
@@ -62,8 +114,11 @@ class Trainer(TrainingLoop):
     model : initialized, on the device
     queries : on the device
     noise : model of their noise
-    selection : rows of the shards that the queries are, to name a bad batch
     hooks : the model of the material, prepared; by default that of the configuration
+
+    Attributes
+    ----------
+    progress : steps done; shared with the trainers of other materials that are trained in turn
     """
 
     def __init__(
@@ -72,7 +127,6 @@ class Trainer(TrainingLoop):
         model: NeuralMaterial,
         queries: TrainingData,
         noise: NoiseModel,
-        selection: Selection | None = None,
         hooks: Model | None = None,
     ) -> None:
         self.config = config
@@ -81,7 +135,6 @@ class Trainer(TrainingLoop):
         if isinstance(queries, TrainingImages):
             queries = replace(queries, patch_size=config.training.patch_size)
         self.queries: TrainingData = self.hooks.precompute(queries, config.data.memory)
-        self.selection = selection
         self.device = next(model.parameters()).device
         self.progress = TrainingProgress()
         self.batch = min(config.training.batch, len(queries))
@@ -101,41 +154,31 @@ class Trainer(TrainingLoop):
 
     @property
     def max_threads(self) -> int:
+        """Most threads that share a batch."""
         return MAX_THREADS if self._stepper is None else MAX_KERNEL_THREADS
 
-    def _batches(self, first: int | None = None) -> Iterator[Batch]:
-        """Endless batches, from that of a number or of the current step on."""
-        first = self.progress.step if first is None else first
-        return self.queries.batches(self.batch, self.config.seed, first, self.model.margin)
+    @property
+    def fraction(self) -> float:
+        """Fraction of the budget that is spent, in [0, 1]."""
+        training = self.config.training
+        if training.steps is not None:
+            return min(1.0, self.progress.step / training.steps)
+        return min(1.0, self.progress.seconds / training.time)
 
     def steps(self, workers: Workers, first: int) -> Iterator[Tensor]:
         """Endless steps from the batch of a number on; each yields its mean loss."""
-        for batch in self._batches(first):
+        for batch in self.queries.batches(self.batch, self.config.seed, first, self.model.margin):
             yield self._step(batch, workers)
 
-    def _steps(self, workers: Workers) -> Iterator[Tensor]:
-        return self.steps(workers, self.progress.step)
-
-    def _parameters(self) -> Iterator[Tensor]:
-        yield from self.model.parameters()
-        yield from self.hooks.parameters().values()
+    def parameters(self) -> dict[str, Tensor]:
+        """Parameters by name: of the material, and others that the model trains."""
+        return {**dict(self.model.named_parameters()), **self.hooks.parameters()}
 
     def health(self) -> Tensor:
         """A number that is finite if all network weights are."""
-        return health_of(self.hooks.trained()[1], self.device)
-
-    def _stop_at(self, step: int) -> NoReturn:
-        self.stop_at(step, step)
-
-    def stop_at(self, step: int, batch: int) -> NoReturn:
-        """Report that training diverged at a step of the loop, which read the batch of this number."""
-        ranges = self.queries.batch_ranges(self.batch, self.config.seed, batch)
-        named = f", {self.selection.describe(ranges)}," if self.selection is not None else ""
-        raise InputError(
-            f"training diverged at step {step + 1}: its batch{named} gave numbers that are not finite",
-            hint="lower the learning rate: --learning-rate "
-            f"{self.config.training.learning_rate / 3:.1g} --overwrite",
-        ) from None
+        with torch.no_grad():
+            sums = [p.sum() for p in self.hooks.trained()[1]]
+            return torch.stack([torch.zeros((), device=self.device), *sums]).sum()
 
     def _sigmas(self) -> list[float]:
         """Current blur of each texture, in texels of the finest level."""
@@ -233,3 +276,60 @@ class Trainer(TrainingLoop):
             s: 0.0 if moment is None else float((moment[a:b] > 0).any(1).float().mean())
             for s, (a, b) in enumerate(pairwise(pyramid.packing.starts))
         }
+
+
+def prepare_trainer(
+    config: FitConfig,
+    data: Dataset,
+    partition: Partition,
+    device: torch.device,
+    shared: NeuralMaterial | None = None,
+) -> Trainer:
+    """A trainer at its first step, for the model and the data of a configuration; with the networks of the
+    model `shared`, if there is one."""
+    model = material_of(config.model, data.lattice, config.network)
+    unit = typical_value(mean_value(partition.sample.value_a, partition.sample.value_b))
+    model.initialize(torch.Generator().manual_seed(config.seed), unit)
+
+    def load(folder: str) -> tuple[TrainingData, float]:
+        other = open_data(folder, MODELS[config.model].layout, config.model, config.data.cache)
+        part = load_training(other, config.held_out, config.seed)
+        typical = typical_value(mean_value(part.sample.value_a, part.sample.value_b))
+        return part.training.to(device), typical
+
+    hooks, training = MODELS[config.model](model), partition.training.to(device)
+    training = hooks.prepare(Preparation(data, training, config.training, unit, config.seed, load))
+    if config.init_from is not None:
+        _initialize_from(hooks, config.init_from)
+    if config.decoder is not None:
+        Decoder.find(config.decoder).load(model)
+    noise = NoiseModel.silent(unit, data.lattice)
+    # A single value does not tell its noise; none is assumed.
+    if data.estimates == 2:
+        noise = NoiseModel.of(partition.sample, data.lattice, unit)
+    model = model.to(device)
+    if shared is not None:
+        model.share_networks(shared)
+    return Trainer(config, model, training, noise, hooks)
+
+
+def _initialize_from(hooks: Model, folder: str | Path) -> None:
+    """Copy textures and offset of a material into a model of like levels, channels, width and offset.
+
+    A step of the hierarchical model takes several times as long as a step of ``neumip``. Both share textures
+    and offset, which ``neumip`` learns sooner.
+    """
+    model, source = hooks.material, Material.load(folder).model
+    given, mine = source.weights(), model.weights()
+    names = [name for name in mine if name.partition(".")[0] in _SHARED]
+    names += [_DEPTH_WEIGHTS] if _DEPTH_WEIGHTS in mine and _DEPTH_WEIGHTS in given else []
+    for name in names:
+        if name not in given or given[name].shape != mine[name].shape:
+            raise InputError(
+                f"its '{name}' does not have the shape that the fit needs",
+                where=folder,
+                hint="fit it with the same levels, network.channels, network.width, network.layers, "
+                "network.offset and network.oversampling",
+            )
+    model.load_weights({**mine, **{name: given[name] for name in names}})
+    hooks.init_from(source)

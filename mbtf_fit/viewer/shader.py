@@ -115,7 +115,7 @@ def _encoded(
     network: NetworkSection,
     spreads: Sequence[str] | None = None,
 ) -> list[str]:
-    """Expressions of encoded coordinates (mbtf_fit.pytorch.encodings)."""
+    """Expressions of encoded coordinates (mbtf_fit.pytorch.operations)."""
     if not bands:
         return list(coordinates)
     options = network.encoding

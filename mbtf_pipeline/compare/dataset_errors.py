@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -35,13 +34,11 @@ def dataset_errors(materials: Mapping[str, Material], data: Dataset) -> dict[str
     out: dict[str, Any] = {}
     for name, material in materials.items():
         value = material.predict(test)
-        found = split_errors(partial(_stored, value), test, data.lattice)
-        if found is not None:
-            found = replace(found, includes_noise=data.estimates == 1)
+        found = split_errors(partial(_stored, value), test, data)
         own = material.description["training"]["errors"]
         splits = {split: errors for split, errors in own.items() if split != "test"}
         record = {
-            "splits": {"test": None if found is None else found.as_dict(), **splits},
+            "splits": {"test": found, **splits},
             **_parameter_counts(material),
         }
         if first is None:

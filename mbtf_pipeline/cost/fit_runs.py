@@ -6,8 +6,7 @@ from itertools import product
 from typing import Any
 
 from mbtf_core.config.nested import nested
-from mbtf_fit.config import DEFAULT_MODEL
-from mbtf_fit.presets import best_options
+from mbtf_fit.config import DEFAULT_MODEL, best_options
 from mbtf_pipeline.cost.repeats import FEWEST_SEEDS
 from mbtf_pipeline.cost.runs import DataRequest, Run
 from mbtf_pipeline.time_split import round_down

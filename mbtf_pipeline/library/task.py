@@ -39,10 +39,10 @@ def fit_shared(
     Raises
     ------
     InputError, PartialError
-        As :func:`~mbtf_fit.training.joint_fit.fit_jointly`.
+        As :func:`~mbtf_fit.fit_jointly`.
     """
-    from mbtf_fit.training.fit_folder import identity_of
-    from mbtf_fit.training.joint_fit import fit_jointly, joint_identity
+    from mbtf_fit.training.fit import fit_jointly
+    from mbtf_fit.training.fit_folder import identity_of, joint_identity
 
     group = [_open(folder, config) for folder in shards]
     identities = {
@@ -50,8 +50,8 @@ def fit_shared(
     }
     identities[decoder] = joint_identity({str(folder): found for folder, found in identities.items()})
     same = all(_holds(folder, identity) for folder, identity in identities.items())
-    result = fit_jointly(config, shards, folders, decoder, overwrite=not same)
-    return [_unexplained(done, folder) for done, folder in zip(result.fits, shards, strict=True)]
+    results = fit_jointly(config, shards, folders, decoder, overwrite=not same)
+    return [_unexplained(done, folder) for done, folder in zip(results, shards, strict=True)]
 
 
 def shards_of(recipe: Recipe, config: FitConfig, run: Path) -> Path:

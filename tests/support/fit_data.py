@@ -19,6 +19,7 @@ from mbtf_core.files.atomic import checksummed
 from mbtf_fit.config import FitConfig, build_model
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.objective.noise import NoiseModel, typical_value
+from mbtf_fit.training.loop import TrainingLoop
 from mbtf_fit.training.trainer import Trainer
 
 from .datasets import write_sidecar
@@ -157,6 +158,6 @@ def make_trainer(
 
 def train_fully(trainer: Trainer) -> Trainer:
     """Train until the budget is spent."""
-    while not trainer.train(10.0):
+    while not TrainingLoop([trainer]).train(10.0):
         pass
     return trainer

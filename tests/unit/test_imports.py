@@ -57,7 +57,6 @@ mbtf_gen.pictures
 mbtf_gen.publishing
 mbtf_gen.cli
 mbtf_gen
-mbtf_fit.textures
 mbtf_fit.sections
 mbtf_fit.formatting
 mbtf_fit.ops
@@ -69,7 +68,6 @@ mbtf_fit.objective
 mbtf_fit.backends.cpu
 mbtf_fit.models
 mbtf_fit.config
-mbtf_fit.presets
 mbtf_fit.material
 mbtf_fit.evaluation
 mbtf_fit.training

@@ -1,4 +1,4 @@
-"""Blur of packed textures by the kernel, equal to :func:`mbtf_fit.textures.blur.blur_texture`."""
+"""Blur of packed textures by the kernel, equal to :func:`mbtf_fit.pytorch.textures.blur_texture`."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from torch import Tensor
 
 from mbtf_fit.backends.cpu.model import share
 from mbtf_fit.native.library import Kernel
-from mbtf_fit.textures.blur import NEGLIGIBLE, gaussian_taps
-from mbtf_fit.textures.feature_textures import FeatureTextures
+from mbtf_fit.pytorch.textures import NEGLIGIBLE, FeatureTextures, gaussian_taps
 
 if TYPE_CHECKING:
     from mbtf_fit.objective.parallel import Workers

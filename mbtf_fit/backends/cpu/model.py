@@ -21,7 +21,7 @@ from mbtf_fit.native.library import (
 )
 from mbtf_fit.ops.constants import HEIGHT_SCALE, LEAST_FACING
 from mbtf_fit.pytorch.material import NeuralMaterial
-from mbtf_fit.textures.feature_textures import FeatureTextures
+from mbtf_fit.pytorch.textures import FeatureTextures
 
 
 def pattern_of(material: NeuralMaterial) -> Pattern | None:

@@ -21,7 +21,7 @@ from mbtf_core.directions import from_projected_disk
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.objective.noise import NoiseModel, typical_value
-from mbtf_fit.training.checkpoint import state_tensors
+from mbtf_fit.training.loop import TrainingLoop, state_tensors
 from mbtf_fit.training.trainer import Trainer
 
 LATTICE = Lattice(2)
@@ -69,7 +69,7 @@ def rms(x: NDArray[np.floating]) -> float:
 
 def assert_finite(trainer: Trainer) -> None:
     """All numbers of the optimizer state are finite, gradient moments included."""
-    tensors = state_tensors(trainer)
+    tensors = state_tensors(TrainingLoop([trainer]))
     assert all(bool(t.isfinite().all()) for t in tensors.values())
 
 
@@ -80,7 +80,7 @@ def test_the_error_does_not_rise_after_convergence() -> None:
     options = {**SMALL, "batch": 250, "blur": {**SMALL["blur"], "fraction": 0.1}}
     trainer = make_trainer(training_queries(arrays(), value), LATTICE, steps=1200, **options)
     errors = []
-    while not trainer.train(0.0):
+    while not TrainingLoop([trainer]).train(0.0):
         if trainer.progress.step % 200 == 0:
             errors.append(missed(predictions(trainer), unseen()))
     errors.append(missed(predictions(trainer), unseen()))

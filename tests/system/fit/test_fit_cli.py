@@ -71,6 +71,8 @@ def test_all_commands_print_the_same_summary(shards: Path, material: Path) -> No
     assert f"PSNR {psnr:.1f} dB at exposure {test['exposure']:+.2f} EV" in lines["info"][3]
     assert lines["info"][3].endswith(f": {test['visibility']} beside the reference")
     assert {errors["exposure"] for errors in found["errors"].values()} == {test["exposure"]}
+    assert "train: 3000 queries in 2 shards" in call(["mbtf-fit", "info", str(shards)]).out
+    assert json.loads(call(["mbtf-fit", "info", str(material), "--json"]).out)["weights"]
 
 
 def test_a_finished_fit_is_not_trained_again(shards: Path, material: Path) -> None:
@@ -78,9 +80,7 @@ def test_a_finished_fit_is_not_trained_again(shards: Path, material: Path) -> No
     done = call(["mbtf-fit", str(shards), "-o", str(material), *QUICK])
     assert done.code == 0, done.err
     assert done.err.splitlines() == [f"{material}: this fit is already finished; --overwrite trains it again"]
-    assert "gradients reached every texel" not in done.out
     told = call(["mbtf-fit", str(shards), "-o", str(material), *QUICK, "--verbose"])
-    assert "gradients reached every texel" in told.out
     assert "unexplained variance  test" in told.out
     assert (material / "material.json").read_bytes() == before
     done = call(["mbtf-fit", str(shards), "-o", str(material), *QUICK, "--overwrite"])
@@ -106,22 +106,6 @@ def test_data_of_another_material_cause_a_warning(shards: Path, tmp_path: Path) 
         assert json.loads(done.out)["foreign_inputs"] == foreign
         assert ("made from another material" in done.err) == bool(foreign)
         assert ("(height differs)" in done.err) == bool(foreign)
-
-
-def test_evaluate_and_info_report_text_and_json(shards: Path, material: Path) -> None:
-    for words, texts in (
-        (
-            ["evaluate", str(material), str(shards), "--verbose"],
-            ("held-out directions", "training queries", "level 3", "cosine 0.7-1"),
-        ),
-        (["info", str(material)], ("2233 network weights", "conformance: 256 queries")),
-        (["info", str(shards)], ("train: 3000 queries in 2 shards",)),
-    ):
-        done = call(["mbtf-fit", *words])
-        assert all(text in done.out for text in texts), done
-        done = call(["mbtf-fit", *words, "--json"])
-        assert done.code == 0, done.err
-        json.loads(done.out)
 
 
 def test_bad_input_exits_with_3_and_a_hint(shards: Path, material: Path, tmp_path: Path) -> None:

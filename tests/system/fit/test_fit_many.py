@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 
 import pytest
@@ -46,24 +45,15 @@ def test_one_that_fails_does_not_stop_the_others(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "b" / "material.json").read_bytes() == before
 
 
-def test_data_sets_come_from_folders_folders_of_folders_and_lists(tmp_path: Path) -> None:
+def test_data_sets_come_from_folders_and_folders_of_folders(tmp_path: Path) -> None:
     for name in ("x/one", "x/two", "three"):
         (tmp_path / name).mkdir(parents=True)
         (tmp_path / name / "manifest.json").write_text("{}")
-    (tmp_path / "list.txt").write_text("# mine\nthree\n\nx/one\n")
-    names = [p.relative_to(tmp_path).as_posix() for p in find_data([tmp_path / "x", tmp_path / "list.txt"])]
-    assert names == ["x/one", "x/two", "three", "x/one"]
+    names = [p.relative_to(tmp_path).as_posix() for p in find_data([tmp_path / "x", tmp_path / "three"])]
+    assert names == ["x/one", "x/two", "three"]
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="contains no data sets"):
         find_data([tmp_path / "empty"])
-
-
-@pytest.mark.parametrize("name", ["pipe", "list.txt"])
-def test_a_pipe_is_refused_at_once(tmp_path: Path, name: str) -> None:
-    os.mkfifo(tmp_path / "pipe")
-    (tmp_path / "list.txt").write_text("pipe\n")
-    with pytest.raises(InputError, match="pipe: is a pipe, not a regular file"):
-        find_data([tmp_path / name])
 
 
 def test_materials_are_named_after_their_data(tmp_path: Path) -> None:

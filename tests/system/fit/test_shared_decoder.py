@@ -40,17 +40,6 @@ def materials(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_every_command_takes_the_materials(materials: Path, data: Path, tmp_path: Path) -> None:
-    assert sorted(path.name for path in materials.iterdir()) == ["a", "b", "decoder"]
-    assert {"decoder.json", "weights.safetensors"} <= {p.name for p in (materials / "decoder").iterdir()}
-    done = call(["mbtf-fit", "info", str(materials / "a")])
-    assert done.code == 0, done.err
-    done = call(["mbtf-fit", "evaluate", str(materials / "b"), str(data / "b")])
-    assert done.code == 0, done.err
-    done = call(["mbtf-fit", "export", str(materials / "a"), "-o", str(tmp_path / "export")])
-    assert done.code == 0, done.err
-
-
 def test_a_fit_takes_model_and_network_from_the_folder(materials: Path, data: Path, tmp_path: Path) -> None:
     wanted = Decoder.find(materials).tensors()
     for folder in (materials / "decoder", materials / "a"):
@@ -64,15 +53,6 @@ def test_a_fit_takes_model_and_network_from_the_folder(materials: Path, data: Pa
     assert found.config.network.width == 16
     own = network_tensors(found.model)
     assert all((own[name] == wanted[name]).all() for name in wanted)
-
-
-def test_many_fits_keep_one_network(materials: Path, data: Path, tmp_path: Path) -> None:
-    """In processes of their own."""
-    words = ["--many", str(data / "c"), "--decoder", str(materials), "-o", str(tmp_path / "m")]
-    done = call(["mbtf-fit", *words, *QUICK, "--json"])
-    assert done.code == 0, done.err
-    (fit,) = json.loads(done.out)["fits"]
-    assert fit["result"]["training"]["decoder"]["sha256"] == Decoder.find(materials).sha256
 
 
 def test_the_same_command_keeps_a_finished_fit(data: Path, tmp_path: Path) -> None:
@@ -102,8 +82,15 @@ def test_command_lines_that_cannot_share_a_network(materials: Path, data: Path, 
     a, out = str(data / "a"), ("-o", str(tmp_path / "m"), *QUICK)
     for more in ((), ("--decoder", str(materials))):
         assert "--shared-decoder requires --many" in fails(2, a, "--shared-decoder", *more, *out)
-    words = ("--many", str(data), "--shared-decoder", "--processes", "2")
-    assert "leave out --processes" in fails(2, *words, *out)
+    words = ("--many", str(data), "--shared-decoder")
+    assert "leave out --processes" in fails(2, *words, "--processes", "2", *out)
+    # The models that share networks, and the option that contradicts it, are a matter of usage; data are not.
+    assert "which neumip and relief have" in fails(2, *words, "--model", "neumip+", *out)
+    assert "leave out shared_decoder" in fails(2, *words, "--decoder", str(materials), *out)
+    assert "takes two data sets at least" in fails(3, "--many", a, "--shared-decoder", *out)
+    clash = write_data(tmp_path / "decoder", parallax, train=500, test=50)
+    assert "rename the data set of this name" in fails(3, "--many", str(clash), *words[1:], *out)
+    assert "no such folder" in fails(3, "--many", str(tmp_path / "none"), *words[1:], *out)
     assert not (tmp_path / "m").exists()
 
 

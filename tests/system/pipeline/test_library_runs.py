@@ -156,7 +156,7 @@ def runs(tmp_path: Path) -> Path:
 
 
 def error_on(material: Path, shards: Path) -> float | None:
-    return evaluate(Material.load(material), shards).values["test"].overall.unexplained.value
+    return evaluate(Material.load(material), shards)["errors"]["test"]["unexplained"]["value"]
 
 
 def test_materials_join_and_leave_a_shared_network(runs: Path) -> None:

@@ -15,8 +15,7 @@ from mbtf_core.files import folders
 from mbtf_fit.cli.app import app
 from mbtf_fit.config import FitConfig
 from mbtf_fit.training import fit as fits
-from mbtf_fit.training import forecast
-from mbtf_fit.training.forecast import fit_bytes, training_seconds
+from mbtf_fit.training.forecast import fit_bytes
 
 
 @pytest.fixture(scope="module")
@@ -38,26 +37,10 @@ def test_a_long_fit_states_time_and_size(
     assert "expected: about 2:04, " in capsys.readouterr().err
     assert run(app, [str(shards), "--time", "20s", "-o", str(out)]) == 130
     assert "expected" not in capsys.readouterr().err
-    # Steps are timed.
-    monkeypatch.setattr(forecast, "LONG_FIT", 1)
-    monkeypatch.setattr(forecast, "_STEPS_PILOT", 0.05)
-    assert run(app, [str(shards), "--steps", "1000000", "--batch", "500", "-o", str(out)]) == 130
-    assert "expected: about " in capsys.readouterr().err
     monkeypatch.setattr(folders.shutil, "disk_usage", lambda path: SimpleNamespace(free=1e4))
     assert run(app, [str(shards), "-o", str(out)]) == 3
     assert "10 kB are free" in capsys.readouterr().err
     assert not out.exists()
-
-
-def test_steps_are_timed_where_they_take_long(shards: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    few = FitConfig.model_validate({"training": {"steps": 100, "batch": 500}})
-    assert training_seconds(few, shards) == (0.0, None)
-    monkeypatch.setattr(forecast, "_STEPS_PILOT", 0.05)
-    many = FitConfig.model_validate({"training": {"steps": 100_000, "batch": 500}})
-    seconds, partition = training_seconds(many, shards)
-    assert partition is not None
-    # Between a microsecond and a second a step.
-    assert 0.1 < seconds < 1e5
 
 
 def test_the_size_is_that_of_two_checkpoints(shards: Path, tmp_path: Path) -> None:

@@ -6,47 +6,7 @@ from typing import Any
 
 import pytest
 
-from mbtf_fit.formatting import VISIBILITY, describe_errors, report_errors, summarize_errors, visibility
-
-
-def errors(value: float | None, by_level: float | None) -> dict[str, Any]:
-    def group(unexplained: float | None) -> dict[str, Any]:
-        error = None if unexplained is None else 0.1
-        return {"n": 100, "unexplained": {"value": unexplained, "error": error}}
-
-    return {"test": group(value) | {"levels": {"0": group(by_level)}, "elevations": {}}}
-
-
-@pytest.mark.parametrize(
-    ("value", "by_level", "remarks"),
-    [
-        (0.3, 0.2, []),
-        (0.3, None, ["undefined unexplained variance: the noise exceeds"]),
-        (1.0, 0.2, ["above 1: worse than the mean value"]),
-        (0.99, 7.0, []),
-        (None, None, ["undefined unexplained variance: the noise exceeds"]),
-        (
-            127.0,
-            None,
-            ["undefined unexplained variance: the noise exceeds", "above 1: worse than the mean value"],
-        ),
-    ],
-)
-def test_bad_errors_are_explained(value: float | None, by_level: float | None, remarks: list[str]) -> None:
-    lines = describe_errors(errors(value, by_level))
-    assert lines[3].split() == ["queries", "100"]
-    assert len(lines) == 4 + len(remarks)
-    for line, remark in zip(lines[4:], remarks, strict=True):
-        assert line.startswith(remark)
-
-
-def test_advice_for_measured_data_names_their_options() -> None:
-    found = errors(1.5, None)
-    found["test"]["includes_noise"] = True
-    remarks = " ".join(describe_errors(found)[4:])
-    assert "these values do not vary" in remarks
-    assert "mbtf-gen import --queries" in remarks
-    assert "--spp" not in remarks
+from mbtf_fit.formatting import VISIBILITY, report_errors, visibility
 
 
 def split(mse: float, error: float, unexplained: float | None = 0.16) -> dict[str, Any]:
@@ -87,26 +47,34 @@ def test_the_summary_has_one_number_of_one_split() -> None:
         "training": split(1e-3, 1e-5, 0.1),
         "test": split(1e-3, 1e-5),
     }
-    lines = summarize_errors(found)
+    lines = report_errors(found, None)
     assert lines == [
         "unexplained variance 0.160 ± 0.003 of 4096 test queries (0: exact, 1: as good as the mean value)",
         "PSNR 30.0 dB at exposure +0.00 EV (1 1/sr is white): visible beside the reference",
         "held-out queries 0.200 ± 0.003, training queries 0.100 ± 0.003",
     ]
-    assert report_errors(found, None) == lines
-    assert report_errors(found, None, verbose=True) == [*lines, *describe_errors(found)]
+    verbose = report_errors(found, None, verbose=True)
+    assert verbose[:3] == lines
+    assert verbose[-1].split() == ["queries", "4096", "4096", "4096"]
     del found["test"]
-    assert summarize_errors(found)[0].startswith(
+    assert report_errors(found, None)[0].startswith(
         "unexplained variance 0.200 ± 0.003 of 4096 held-out queries"
     )
 
 
 def test_where_the_unexplained_variance_is_undefined_the_psnr_is_the_number() -> None:
     """A material of one value, or few noisy queries."""
-    lines = summarize_errors({"test": split(1e-5, 1e-6, None), "training": split(1e-5, 1e-6, None)})
+    lines = report_errors({"test": split(1e-5, 1e-6, None), "training": split(1e-5, 1e-6, None)}, None)
     assert lines[0].startswith("PSNR 50.0 dB of 4096 test queries at exposure +0.00 EV")
     assert lines[-1].startswith("undefined unexplained variance: the noise exceeds")
 
 
-def test_errors_on_the_data_of_another_material_give_no_advice_about_queries() -> None:
-    assert len(describe_errors(errors(1.5, 0.4), foreign=True)) == 4
+@pytest.mark.parametrize(("value", "advice"), [(0.99, ""), (1.0, "mbtf-gen --queries"), (127.0, "--spp")])
+def test_errors_above_1_give_advice(value: float, advice: str) -> None:
+    found = {"test": split(1e-3, 1e-5, value)}
+    assert ("above 1: worse than the mean value" in report_errors(found, None)[-1]) == bool(advice)
+    assert advice in report_errors(found, None)[-1]
+    # The data of another material say nothing of the number of queries.
+    assert "above 1" not in report_errors(found, None, foreign=True)[-1]
+    found["test"]["includes_noise"] = True
+    assert ("mbtf-gen import --queries" in report_errors(found, None)[-1]) == bool(advice)

@@ -18,12 +18,10 @@ from mbtf_core.errors import InputError
 from mbtf_fit import FitConfig, Material, evaluate, fit
 from mbtf_fit.config import build_model
 from mbtf_fit.data.images import Patches, TrainingImages, nearest_shapes, strides
-from mbtf_fit.data.loader import Partition, in_region, load_split, load_training
-from mbtf_fit.data.queries import ShardQueries
-from mbtf_fit.evaluation import evaluate_splits
+from mbtf_fit.data.loader import Partition, in_region, load_training
 from mbtf_fit.sections import HeldOutSection
-from mbtf_fit.training.fit import prepare_trainer
-from mbtf_fit.training.trainer import BETAS
+from mbtf_fit.training.loop import TrainingLoop
+from mbtf_fit.training.trainer import BETAS, prepare_trainer
 from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan
 
 HELD_OUT = HeldOutSection(queries=0.1, radius=0.3)
@@ -76,35 +74,6 @@ def test_whole_images_are_held_out(tmp_path: Path) -> None:
     assert other != held[0]
 
 
-def test_the_sample_is_of_training_images(tmp_path: Path) -> None:
-    """Equally many queries of each."""
-    folder = write_images(tmp_path / "d", parallax, train=60)
-    part = partition(folder, HeldOutSection(queries=0.4, radius=0.3))
-    kept = {row.tobytes() for row in images_of(part).omega_i.numpy()}
-    sampled = [row.tobytes() for row in part.sample.omega_i]
-    assert set(sampled) == kept
-    assert len({sampled.count(k) for k in kept}) == 1
-
-
-def test_training_images_are_evaluated_on_a_quarter_of_their_sample(tmp_path: Path) -> None:
-    """Of all images alike: neighborhoods take their time."""
-    data = Dataset.open(write_images(tmp_path / "d", parallax, train=20, test=1))
-    part = load_training(data, HeldOutSection(queries=0.1, radius=0), 0)
-    asked: list[ShardQueries] = []
-
-    def answer(queries: ShardQueries) -> np.ndarray:
-        asked.append(queries)
-        return 0.5 * (queries.value_a + queries.value_b)
-
-    found = evaluate_splits(answer, data, part)
-    assert list(found) == ["test", "held_out_queries", "training"]
-    assert found["test"].overall.n == 64
-    assert found["held_out_queries"].overall.n == len(part.held_out_queries)
-    assert found["training"].overall.n == len(part.sample) // 4
-    lights = np.unique(asked[-1].omega_i, axis=0)
-    assert len(lights) == len(np.unique(part.sample.omega_i, axis=0)) == 18
-
-
 def test_at_least_one_image_is_held_out(tmp_path: Path) -> None:
     folder = write_images(tmp_path / "d", parallax, train=6)
     few = HeldOutSection(queries=0.01, radius=0)
@@ -114,37 +83,6 @@ def test_at_least_one_image_is_held_out(tmp_path: Path) -> None:
     assert len(images_of(none)) == 6 * 64
     with pytest.raises(InputError, match=r"all 6 images .* held out"):
         partition(folder, HeldOutSection(radius=0.99, direction=(0.0, 0.0)))
-
-
-def test_values_are_the_mean_of_both_halves(tmp_path: Path) -> None:
-    folder = write_images(tmp_path / "d", parallax, train=4, noise=0.1)
-    training = images_of(partition(folder, HeldOutSection(queries=0, radius=0)))
-    stored = Dataset.open(folder).load("train")
-    np.testing.assert_allclose(training.value, 0.5 * (stored["value_a"] + stored["value_b"]), atol=1e-7)
-    np.testing.assert_array_equal(training.u, stored["u"])
-
-
-def test_splits_of_images_are_read_as_queries(tmp_path: Path) -> None:
-    queries = load_split(Dataset.open(write_images(tmp_path / "d", parallax, test=3)), "test")
-    assert queries.u.shape == (3 * 64, 2)
-    expected = parallax(queries.u, queries.sigma, queries.omega_i, queries.omega_o)
-    np.testing.assert_allclose(queries.value_a, expected, atol=1e-6)
-
-
-@pytest.mark.parametrize("aspect", [1.0, 0.5, 0.3])
-def test_neighbors_in_a_patch_are_a_texel_of_their_level_apart(aspect: float) -> None:
-    lattice = Lattice(4, aspect)
-    rows, _ = lattice.shape()
-    data = images(lattice, [0.0, 1.4, 2.6, 4.0], regular=True)
-    patches = data.patches(np.arange(4), np.array([[0, 0], [1, 3], [rows - 1, 2], [2, 15]]), 5, 2)
-    assert patches.u.shape == (4, 9, 9, 2)
-    assert patches.value.shape == (4, 5, 5, 3)
-    for item, level in enumerate((0, 1, 3, 4)):
-        down, across = lattice.shape(level)
-        step = patches.u[item, 1:, 1:] - patches.u[item, :-1, :-1]
-        step = (step + 0.5) % 1 - 0.5  # around the tile
-        expected = torch.tensor([1 / across, -round(rows / down) / rows])
-        torch.testing.assert_close((step - expected + 0.5) % 1 - 0.5, torch.zeros(8, 8, 2), atol=1e-6, rtol=0)
 
 
 def test_values_belong_to_the_positions_within_the_margin() -> None:
@@ -195,19 +133,6 @@ def test_patches_extend_beyond_the_border_of_small_images() -> None:
         torch.testing.assert_close(step, step.round().to(step.dtype), atol=1e-6, rtol=0)
 
 
-def test_small_images_are_read_with_their_grids(tmp_path: Path) -> None:
-    folder = write_images(tmp_path / "d", parallax, train=20, finest=4, aspect=0.5, patch_size=5)
-    data = images_of(partition(folder, HeldOutSection(queries=0, radius=0)))
-    assert data.u.shape == (20, 5, 5, 2)
-    patches = data.patches(np.arange(20), np.ones((20, 2), np.int64), 3, 2)
-    torch.testing.assert_close(patches.value, data.value[:, 1:4, 1:4])
-    shapes = nearest_shapes(Lattice(4, 0.5), data.sigma.numpy())
-    assert len(np.unique(shapes, axis=0)) > 3
-    for u, (rows, columns) in zip(patches.u, shapes, strict=True):
-        step = u[1:, 1:] - u[:-1, :-1] - torch.tensor([1 / columns, -1 / rows])
-        torch.testing.assert_close(step, step.round().to(step.dtype), atol=1e-6, rtol=0)
-
-
 def test_patches_lie_inside_small_images() -> None:
     data = small_images(Lattice(4), 6, 8)
     for batch in islice(data.batches(2 * 16, 0, 0, 2), 20):
@@ -229,7 +154,8 @@ def test_smaller_patches_give_more_lights_and_views(tmp_path: Path, patch_size: 
         config = FitConfig.model_validate({"model": "hierarchical", "training": training})
         data = Dataset.open(folder)
         part = load_training(data, config.held_out, 0)
-        batch = next(prepare_trainer(config, data, part, torch.device("cpu"))._batches())
+        trainer = prepare_trainer(config, data, part, torch.device("cpu"))
+        batch = next(trainer.queries.batches(trainer.batch, 0, 0, trainer.model.margin))
         assert isinstance(batch, Patches)
         assert batch.value.shape == shape
         assert len(batch.omega_i.unique(dim=0)) == shape[0]
@@ -274,9 +200,9 @@ def test_a_hierarchical_material_is_fitted_and_loads_again(tmp_path: Path) -> No
     assert material.deviation() < 1e-6
     # Evaluated on data of either layout, in any company.
     shuffled = write_data(tmp_path / "s", parallax, train=2000, test=500)
-    errors = evaluate(material, shuffled).values["test"].overall
-    assert errors.n == 500
-    assert errors.unexplained.value < 0.5
+    errors = evaluate(material, shuffled)["errors"]["test"]
+    assert errors["n"] == 500
+    assert errors["unexplained"]["value"] < 0.5
     queries = random_queries(np.random.default_rng(3), 1000, material.lattice)
     found = material.evaluate(*queries.values())
     alone = material.evaluate(*(a[500:501] for a in queries.values()))
@@ -289,14 +215,14 @@ def test_every_weight_gets_its_own_gradient(tmp_path: Path, monkeypatch: pytest.
     data = Dataset.open(write_images(tmp_path / "d", parallax, train=8))
     config = quick(1)
     trainer = prepare_trainer(config, data, load_training(data, config.held_out, 0), torch.device("cpu"))
-    batch = next(trainer._batches())
+    batch = next(trainer.queries.batches(trainer.batch, 0, 0, trainer.model.margin))
     assert isinstance(batch, Patches)
     for texture, table in zip(trainer.model.textures(), trainer._tables(), strict=True):
         texture.read(table.detach())
     found = trainer.model.evaluate_patches(batch.u, batch.sigma, batch.omega_i, batch.omega_o)
     weights = trainer.model.parameter_groups()[1]
     expected = torch.autograd.grad(trainer.loss(found, batch), weights)
-    trainer.train(60.0)
+    TrainingLoop([trainer]).train(60.0)
     for weight, gradient in zip(weights, expected, strict=True):
         moment = trainer.optimizer.state[weight]["exp_avg"] / (1 - BETAS[0])
         assert float((moment - gradient).norm()) <= 1e-3 * float(gradient.norm()) + 1e-9

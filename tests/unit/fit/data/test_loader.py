@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.datasets import FOREIGN, edit, rewrite
+from support.datasets import rewrite
 from support.fit_data import constant, parallax, write_data
-from support.image_data import write_images
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.shard_files import read_shard
@@ -55,11 +54,6 @@ def test_every_query_is_used_in_some_epoch(total: int, size: int) -> None:
     assert {k for start in starts for k in range(start, start + size)} == set(range(total))
 
 
-def test_the_order_of_batches_follows_the_seed() -> None:
-    first, again, other = (list(islice(batch_starts(1000, 10, seed, 0), 50)) for seed in (0, 0, 1))
-    assert first == again != other
-
-
 def test_shards_are_divided_independently(tmp_path: Path) -> None:
     """Rows of equal number share no fate."""
     folder = write_data(tmp_path / "d", parallax, train=2000)
@@ -98,13 +92,6 @@ def test_values_are_the_mean_of_both_halves(tmp_path: Path) -> None:
     assert len(found.held_out_queries) == len(found.held_out_directions) == 0
 
 
-def test_exr_shards_hold_the_same(tmp_path: Path) -> None:
-    npz = partition(write_data(tmp_path / "npz", parallax, train=1000))
-    exr = partition(write_data(tmp_path / "exr", parallax, train=1000, suffix=".exr"))
-    for name in ("u", "sigma", "omega_i", "omega_o", "value"):
-        assert (getattr(npz.training, name) == getattr(exr.training, name)).all(), name
-
-
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 @pytest.mark.parametrize("name", ["value_b", "sigma"])
 def test_a_shard_with_nan_or_infinity_is_refused_by_name(tmp_path: Path, bad: float, name: str) -> None:
@@ -132,25 +119,3 @@ def test_nothing_to_train_on_is_refused(tmp_path: Path) -> None:
         partition(folder, held_out=HeldOutSection(direction=(0, 0), radius=0.999, queries=0.4))
     with pytest.raises(InputError, match="test split has no queries"):
         load_split(Dataset.open(write_data(tmp_path / "t", parallax, train=9, test=0)), "test")
-
-
-def test_rows_that_contradict_the_sidecar_are_refused(tmp_path: Path) -> None:
-    folder = write_data(tmp_path / "d", parallax, train=100, shards=1)
-    edit(folder / "train-00000.json", lambda record: record.update(rows=90))
-    with pytest.raises(InputError, match=r"train-00000.*has 90 rows, manifest.json says 100"):
-        partition(folder)
-    edit(folder / "manifest.json", lambda m: m["splits"]["train"]["shards"][0].update(rows=90))
-    with pytest.raises(InputError, match=r"train-00000.*has 100 rows, its sidecar says 90"):
-        partition(folder)
-
-
-@pytest.mark.parametrize("layout", ["shuffled", "image"])
-@pytest.mark.parametrize("name", sorted(FOREIGN.keys() - {"NaN"}))
-def test_foreign_and_impossible_data_are_not_trained_on(name: str, layout: str, tmp_path: Path) -> None:
-    write = write_data if layout == "shuffled" else write_images
-    for seed in (0, 1):
-        write(tmp_path / f"{seed}", parallax, train=20, test=4, noise=0.1, seed=seed)
-    change, says = FOREIGN[name]
-    change(tmp_path / "0", tmp_path / "1", ".npz")
-    with pytest.raises(InputError, match=says):
-        partition(tmp_path / "0")

@@ -13,17 +13,16 @@ import pytest
 from support.fit_data import parallax, write_data
 from support.object_stores import memory_store
 
-from mbtf_core.data.dataset import Dataset, Shard, ahead
+from mbtf_core.data.dataset import Dataset, ahead
 from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.store import ObjectStore
 from mbtf_core.errors import PartialError
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import load_training
-from mbtf_fit.data.queries import batch_starts
 from mbtf_fit.data.streaming import StreamedQueries
 from mbtf_fit.sections import HeldOutSection
-from mbtf_fit.training.checkpoint import CHECKPOINT_NAME
 from mbtf_fit.training.fit import fit
+from mbtf_fit.training.loop import CHECKPOINT_NAME
 
 HELD_OUT = HeldOutSection(queries=0.1, radius=0.3)
 
@@ -107,21 +106,6 @@ def test_the_shards_after_the_one_that_is_read_are_downloaded_ahead(
     assert sorted(downloads) == names
 
 
-def test_the_shards_of_later_batches_are_announced(
-    url: str, local: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Those of the six batches that follow the one that is being read."""
-    training = load_training(Dataset.open(url), HELD_OUT, 0, memory=1.0).training
-    assert isinstance(training, StreamedQueries)
-    announced: list[str] = []
-    monkeypatch.setattr(Shard, "prefetch", lambda shard: announced.append(shard.file))
-    starts = list(islice(batch_starts(len(training), 300, 0, 0), 20))
-    expected = [{shard.file for shard, _ in training.selection.pieces(s, s + 300)} for s in starts]
-    for at, start in enumerate(islice(training._announced(iter(starts), 300), 14)):
-        assert start == starts[at]
-        assert set(announced) == set().union(*expected[: at + 7])
-
-
 def test_the_cache_is_bounded(
     tmp_path: Path, url: str, local: Path, downloads: list[tuple[str, str]]
 ) -> None:
@@ -131,17 +115,6 @@ def test_the_cache_is_bounded(
     for _ in islice(training.batches(700, 0, 0), 30):  # type: ignore[arg-type, call-overload]
         assert cached(tmp_path) <= 6 * size
     assert len(downloads) > 8
-
-
-def test_a_shard_that_another_process_evicts_is_read_again(tmp_path: Path, url: str, local: Path) -> None:
-    data = Dataset.open(url)
-    shards = data.shards("train")
-    before = shards[0].read()
-    for path in (tmp_path / "cache/mbtf/stores/shards").iterdir():
-        path.unlink()
-    again = shards[0].read()
-    # The first arrays stay readable: they are mapped.
-    assert all((before[name] == again[name]).all() for name in before)
 
 
 def test_a_shard_that_leaves_the_cache_before_it_is_opened(

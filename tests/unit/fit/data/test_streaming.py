@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from mbtf_core.units import format_size, parse_size
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import Partition, load_training
 from mbtf_fit.data.streaming import Selection, StreamedQueries
-from mbtf_fit.evaluation import Predict, SplitErrors
+from mbtf_fit.evaluation import Predict
 from mbtf_fit.sections import HeldOutSection
 from mbtf_fit.training.fit import fit
 
@@ -48,13 +49,12 @@ def test_evaluation_streams_its_queries(tmp_path: Path, monkeypatch: pytest.Monk
     result = fit(config, folder, tmp_path / "m")
     original, found = mbtf_fit.evaluation.evaluate_splits, []
 
-    def watched(predict: Predict, data: Dataset, partition: Partition) -> dict[str, SplitErrors]:
+    def watched(predict: Predict, data: Dataset, partition: Partition) -> dict[str, Any]:
         found.append(partition.training)
         return original(predict, data, partition)
 
     monkeypatch.setattr(mbtf_fit.evaluation, "evaluate_splits", watched)
-    evaluated = mbtf_fit.evaluation.evaluate(result.material, folder).values
-    errors = {name: e.as_dict() for name, e in evaluated.items()}
+    errors = mbtf_fit.evaluation.evaluate(result.material, folder)["errors"]
     assert isinstance(found[0], StreamedQueries)
     assert set(errors) == set(result.errors)
     for name, expected in result.errors.items():
@@ -86,12 +86,6 @@ def test_exr_shards_too_large_for_memory_are_refused(tmp_path: Path) -> None:
 def test_amounts_of_memory_are_read_and_written(text: str | float, size: float) -> None:
     assert parse_size(text) == size
     assert parse_size(format_size(size)) == size
-
-
-@pytest.mark.parametrize("text", ["", "-1GB", "0", "much", "nan"])
-def test_nonsense_amounts_are_refused(text: str) -> None:
-    with pytest.raises(ValueError, match="memory"):
-        parse_size(text)
 
 
 def test_memory_does_not_grow_with_the_data(tmp_path: Path, run_python: RunPython) -> None:

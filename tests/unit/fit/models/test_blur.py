@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter1d
 
-from mbtf_fit.textures.blur import annealed_sigma, blur_texture
+from mbtf_fit.pytorch.textures import annealed_sigma, blur_texture
 
 
 @pytest.mark.parametrize(

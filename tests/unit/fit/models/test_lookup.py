@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from mbtf_core.data.lattice import Lattice, texel_centers
-from mbtf_fit.textures.lookup import Packing, lookup, lookup_reference
+from mbtf_fit.surface.lookup import Packing, coarse_level, lookup
 
 F64 = torch.float64
 
@@ -51,6 +51,25 @@ def test_levels_blend_with_the_fraction() -> None:
     found = lookup(table, packing, torch.rand(len(level), 2, dtype=F64), level).flatten()
     expected = [1, 2, 4, 8, 0.75 * 1 + 0.25 * 2, 3, 0.25 * 4 + 0.75 * 8, 1, 8]
     torch.testing.assert_close(found, torch.tensor(expected, dtype=F64))
+
+
+def lookup_reference(
+    table: torch.Tensor, packing: Packing, u: torch.Tensor, level: torch.Tensor | None
+) -> torch.Tensor:
+    """The same in plain PyTorch."""
+    out, starts = table.new_zeros(len(u), table.shape[1]), packing.starts
+    coarse, fine = coarse_level(torch.zeros_like(u[:, 0]) if level is None else level, len(packing.shapes))
+    for s, (rows, columns) in enumerate(packing.shapes):
+        weight = torch.where(coarse == s, 1 - fine, torch.where(coarse == s - 1, fine, 0))
+        texture = table[starts[s] : starts[s + 1]].view(rows, columns, -1)
+        x, y = u[:, 0] * columns - 0.5, (1 - u[:, 1]) * rows - 0.5
+        i, j = x.floor().long(), y.floor().long()
+        fx, fy = (x - i)[:, None], (y - j)[:, None]
+        left, right, top, bottom = i % columns, (i + 1) % columns, j % rows, (j + 1) % rows
+        upper = (1 - fx) * texture[top, left] + fx * texture[top, right]
+        lower = (1 - fx) * texture[bottom, left] + fx * texture[bottom, right]
+        out = out + weight[:, None] * ((1 - fy) * upper + fy * lower)
+    return out
 
 
 @pytest.mark.parametrize("aspect", [1.0, 0.4, 1.7])

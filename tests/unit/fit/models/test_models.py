@@ -13,7 +13,7 @@ from mbtf_core.errors import InputError, UsageError
 from mbtf_fit.config import FitConfig, build_model
 from mbtf_fit.ops import read_operations
 from mbtf_fit.pytorch.material import NeuralMaterial
-from mbtf_fit.pytorch.mlp import Mlp, initialize_layers
+from mbtf_fit.pytorch.networks import Mlp, initialize_layers
 from mbtf_fit.pytorch.operations import FUNCTIONS
 from mbtf_fit.sections import OutputTransform
 

@@ -24,9 +24,9 @@ from mbtf_fit.material.material import Material
 from mbtf_fit.models.model import Preparation
 from mbtf_fit.models.rainer import Rainer2019, shared_slices
 from mbtf_fit.objective.noise import typical_value
-from mbtf_fit.training.checkpoint import read_checkpoint, write_checkpoint
-from mbtf_fit.training.fit import prepare_trainer
 from mbtf_fit.training.fit_folder import identity_of
+from mbtf_fit.training.loop import TrainingLoop, read_checkpoint, write_checkpoint
+from mbtf_fit.training.trainer import prepare_trainer
 from mbtf_gen.sampling.query_sampler import direction_pairs, slice_directions
 
 NAMES = ("rainer2019", "rainer2020")
@@ -128,12 +128,12 @@ def test_a_fit_resumes_where_it_stopped(tmp_path: Path) -> None:
     options = config("rainer2019", steps=8)
     partition = load_training(data, options.held_out, 0)
     whole, first, second = (prepare_trainer(options, data, partition, torch.device("cpu")) for _ in range(3))
-    assert whole.train(1e3)
+    assert TrainingLoop([whole]).train(1e3)
     while first.progress.step < 5:
-        first.train(0.0)
-    write_checkpoint(first, tmp_path / "state")
-    read_checkpoint(second, tmp_path / "state")
-    assert second.train(1e3)
+        TrainingLoop([first]).train(0.0)
+    write_checkpoint(TrainingLoop([first]), tmp_path / "state")
+    read_checkpoint(TrainingLoop([second]), tmp_path / "state")
+    assert TrainingLoop([second]).train(1e3)
     for a, b in zip(whole.hooks.trained()[1], second.hooks.trained()[1], strict=True):
         assert torch.equal(a, b)
 

@@ -30,8 +30,8 @@ from mbtf_fit.native import library
 from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.noise import NoiseModel
 from mbtf_fit.objective.parallel import Workers
-from mbtf_fit.pytorch.encodings import rotate_to_z
 from mbtf_fit.pytorch.material import NeuralMaterial
+from mbtf_fit.pytorch.operations import rotate_to_z
 
 LATTICE = Lattice(3, 0.5)
 VARIANTS: dict[str, dict[str, Any]] = {

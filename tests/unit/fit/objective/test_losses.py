@@ -70,14 +70,6 @@ def test_without_correction_curved_losses_are_biased(kind: str, least: float) ->
     assert minimum(objective(kind, correction="none", huber_delta=None), skewed(0.8)) < 1 - least
 
 
-def test_second_order_removes_most_of_the_bias_of_small_noise() -> None:
-    value = skewed(0.3)
-    plain = 1 - minimum(objective("log", correction="none", huber_delta=None), value)
-    corrected = 1 - minimum(objective("log", 0.09, correction="second-order", huber_delta=None), value)
-    assert plain > 0.02
-    assert abs(corrected) < 0.1 * plain
-
-
 def test_the_default_huber_threshold_causes_little_bias() -> None:
     """Ten times noise and scale: of skewed noise as large as the value, three in a million are beyond."""
     assert minimum(objective("relative", 1.0), skewed(1.0)) == pytest.approx(1.0, abs=1e-3)
@@ -97,36 +89,11 @@ def test_an_outlier_has_the_gradient_of_the_bound() -> None:
 
 
 @pytest.mark.parametrize("curve", [Log(), FourthRoot()], ids=["log", "fourth-root"])
-def test_slopes_and_curvatures_are_derivatives(curve: LossCurve) -> None:
+def test_slopes_are_derivatives(curve: LossCurve) -> None:
     x = torch.tensor([-3.0, -0.6, -0.2, 0.0003, 0.1, 1.0, 30.0], dtype=torch.float64, requires_grad=True)
     value = curve.value(x)
     (slope,) = torch.autograd.grad(value.sum(), x)
     torch.testing.assert_close(slope, curve.slope(x.detach()))
-    h = 1e-7
-    bend = (curve.slope(x.detach() + h) - curve.slope(x.detach() - h)) / (2 * h)
-    torch.testing.assert_close(bend, curve.curvature(x.detach()), rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.parametrize("kind", ["squared", "log", "relative"])
-def test_without_noise_and_near_the_value_corrections_change_nothing(kind: str) -> None:
-    value = torch.tensor([[0.3, 1.0, 4.0]], dtype=torch.float64)
-    found = []
-    for correction in ("none", "second-order", "linear"):
-        p = (value * 1.0001).requires_grad_()
-        loss = objective(kind, correction=correction)
-        found.append(torch.autograd.grad(loss(p, queries(value)), p)[0])
-    torch.testing.assert_close(found[1], found[0])
-    torch.testing.assert_close(found[2], found[0], rtol=1e-3, atol=0.0)
-
-
-def test_terms_add_up_with_their_weights() -> None:
-    p, data = torch.full((4, 3), 0.2), queries(torch.full((4, 3), 0.7))
-    both = TrainingSection.model_validate(
-        {"losses": [{"kind": "squared", "weight": 2.0}, {"kind": "log", "weight": 0.5}]}
-    )
-    noise = NoiseModel(SCALE, np.zeros(3), np.zeros((4, 3)), np.ones(4), 0.0)
-    total = 2.0 * objective("squared")(p, data) + 0.5 * objective("log")(p, data)
-    torch.testing.assert_close(Objective(both, noise)(p, data), total)
 
 
 def test_corrected_absolute_terms_are_parabolas_of_the_noise() -> None:

@@ -80,30 +80,6 @@ def test_the_ratio_is_noise_to_signal(wild: int) -> None:
     assert NoiseModel.of(replace(queries, value_a=a, value_b=b), LATTICE, 1.0).ratio == 5.0
 
 
-def test_rarely_sampled_light_is_noise() -> None:
-    """One half in a hundred, a hundred times too bright, on few bright queries: noise far beyond the most."""
-    random = np.random.default_rng(2)
-    n = 60_000
-    at = random_queries(random, n, LATTICE)
-    true = parallax(*at.values()) + 5 * (random.random((n, 1)) < 0.02)
-    a, b = (100 * true * (random.random((n, 1)) < 0.01) for _ in range(2))
-    queries = ShardQueries(*at.values(), a.astype(np.float32), b.astype(np.float32))
-    assert NoiseModel.of(queries, LATTICE, 0.05).ratio == 5.0
-
-
-def test_images_are_pooled_like_queries() -> None:
-    queries, true, _ = noisy(64 * 500)
-    shaped = {k: v.reshape(500, 8, 8, *v.shape[1:]) for k, v in vars(queries).items()}
-    for name in ("sigma", "omega_i", "omega_o"):
-        shaped[name] = np.broadcast_to(shaped[name][:, :1, :1], shaped[name].shape)
-    model = NoiseModel.of(ShardQueries(**shaped), LATTICE, 0.05)
-    assert model.overall.sum() > 0
-    assert model.ratio == pytest.approx(NoiseModel.of(queries, LATTICE, 0.05).ratio, rel=0.2)
-    value = torch.from_numpy(true.reshape(500, 8, 8, 3))
-    first = [torch.from_numpy(np.array(shaped[n][:, 0, 0])) for n in ("sigma", "omega_i", "omega_o")]
-    assert model.variance(value, *first).shape == value.shape
-
-
 def test_the_typical_value_is_robust_to_outliers() -> None:
     value = np.random.default_rng(0).gamma(0.5, 2.0, (20_000, 3))
     assert typical_value(value) == pytest.approx(1.0, abs=0.05)

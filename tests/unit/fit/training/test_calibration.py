@@ -5,18 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 from support.fit_data import random_queries, training_queries, write_data
-from support.plugin_materials import write_material
 
 from mbtf_core.data.lattice import Lattice, level_of_sigma
-from mbtf_core.errors import InputError
 from mbtf_fit import FitConfig, fit
-from mbtf_fit.config import build_model
 from mbtf_fit.data.loader import in_region
 from mbtf_fit.data.queries import TrainingQueries
-from mbtf_fit.material.inference import evaluate_in_chunks, predict
+from mbtf_fit.material.inference import predict
 from mbtf_fit.ops.constants import KNOTS
 from mbtf_fit.pytorch.operations import interpolate_factors
 from mbtf_fit.sections import HeldOutSection
@@ -100,56 +96,6 @@ def test_outliers_do_not_dominate() -> None:
     queries.value[::2500] = 1e6
     found = fit_calibration(wrong, LATTICE, queries, HELD_OUT, lambda p: 2.0 + 0 * p)
     np.testing.assert_allclose(found, kept, atol=0.02)
-
-
-def random_calibration(levels: int, knots: int = 5) -> torch.Tensor:
-    return 0.7 + 0.6 * torch.rand((2, levels, knots, 3), generator=torch.Generator().manual_seed(2))
-
-
-def by_hand(table: F32, level: F32, cosine: F32) -> F32:
-    """Linear between knots and levels."""
-    levels, knots = table.shape[:2]
-    x = cosine * (knots - 1)
-    i, s = np.minimum(x.astype(int), knots - 2), np.minimum(level.astype(int), max(levels - 2, 0))
-    t, f = (x - i)[:, None], (level - s)[:, None]
-    low, high = (table[r, i] * (1 - t) + table[r, i + 1] * t for r in (s, np.minimum(s + 1, levels - 1)))
-    return np.asarray(low * (1 - f) + high * f)
-
-
-@pytest.mark.parametrize("finest", [0, 3])
-@pytest.mark.parametrize("model", ["neumip", "neumip-baseline"])
-def test_a_calibrated_model_is_the_model_times_its_factors(model: str, finest: int, tmp_path: Path) -> None:
-    """In one piece, in two stages, by the compiled kernel where there is one, and as read from a folder."""
-    lattice, calibration = Lattice(finest), random_calibration(finest + 1)
-    plain = write_material(tmp_path / "a", model=model, finest=finest)
-    material = write_material(
-        tmp_path / "b", model=model, finest=finest, weights={"calibration": calibration}
-    )
-    q = random_queries(np.random.default_rng(5), 500, lattice)
-    level = np.clip(level_of_sigma(q["sigma"].astype(np.float64)), 0, finest)
-    factor = by_hand(calibration[0].numpy(), level, q["omega_i"][:, 2]) * by_hand(
-        calibration[1].numpy(), level, q["omega_o"][:, 2]
-    )
-    wanted = plain.evaluate(*q.values()) * factor
-    assert factor.std() > 0.1
-    calibrated = material.model
-    for found in (
-        material.evaluate(*q.values()),
-        evaluate_in_chunks(lambda *a: calibrated(*a).clamp_min(0), torch.device("cpu"), 3, *q.values()),
-    ):
-        np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-6)
-
-
-@pytest.mark.parametrize("shape", [(2, 3, 5, 3), (2, 4, 1, 3), (2, 4, 3)])
-def test_factors_of_another_shape_are_refused(shape: tuple[int, ...]) -> None:
-    model = build_model("neumip", Lattice(3))
-    weights = model.weights()
-    with pytest.raises(InputError, match="do not fit the model neumip: 'calibration'"):
-        model.load_weights({**weights, "calibration": torch.ones(shape)})
-    model.load_weights({**weights, "calibration": torch.ones((2, 4, 5, 3))})
-    # And they go with the weights that they came with.
-    model.load_weights(weights)
-    assert model.weights().keys() == weights.keys()
 
 
 def test_fits_are_calibrated_by_default(tmp_path: Path) -> None:

@@ -20,7 +20,6 @@ from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.noise import NoiseModel
 from mbtf_fit.ops.constants import KNOTS
 from mbtf_fit.surface import heightfield
-from mbtf_fit.surface.copies import DeviceCopies
 from mbtf_gen.sampling.query_sampler import slice_directions
 
 LATTICE, META = Lattice(3), torch.device("meta")
@@ -84,11 +83,3 @@ def test_slices_stay_on_the_device(name: str) -> None:
     assert {g.device for g in gradients} == {META}
     model.write_textures(slices)
     assert material.pyramid.texels.device == META
-
-
-def test_a_tensor_is_copied_once_per_device() -> None:
-    tensor = torch.ones(3)
-    copies = DeviceCopies(tensor)
-    assert copies.on(torch.device("cpu")) is tensor
-    assert copies.on(META) is copies.on(META)
-    assert copies.on(META).device == META

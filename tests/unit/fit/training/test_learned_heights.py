@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from support.datasets import read_checksummed
 from support.fit_data import parallax, write_data
 from support.paths import ROOT
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.lattice import Lattice
-from mbtf_core.files.atomic import write_checksummed
 from mbtf_core.images.resample import resample
 from mbtf_fit import FitConfig, fit
 from mbtf_fit.data.loader import load_training, open_data
-from mbtf_fit.native import library
-from mbtf_fit.training.checkpoint import read_checkpoint, write_checkpoint
-from mbtf_fit.training.fit import prepare_trainer
-from mbtf_fit.training.trainer import Trainer
+from mbtf_fit.training.loop import TrainingLoop, read_checkpoint, write_checkpoint
+from mbtf_fit.training.trainer import Trainer, prepare_trainer
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.run import generate
 
@@ -48,7 +43,7 @@ def trainer_of(shards: Path, steps: int) -> Trainer:
 def train_to(trainer: Trainer, step: int) -> None:
     """Train step by step, which ends where it is asked to."""
     while trainer.progress.step < step:
-        trainer.train(0.0)
+        TrainingLoop([trainer]).train(0.0)
 
 
 def test_a_resumed_fit_is_the_same(shards: Path, tmp_path: Path) -> None:
@@ -56,21 +51,12 @@ def test_a_resumed_fit_is_the_same(shards: Path, tmp_path: Path) -> None:
     whole, first, second = (trainer_of(shards, 70) for _ in range(3))
     train_to(whole, 70)
     train_to(first, 57)
-    write_checkpoint(first, tmp_path / "checkpoint")
-    read_checkpoint(second, tmp_path / "checkpoint")
+    write_checkpoint(TrainingLoop([first]), tmp_path / "checkpoint")
+    read_checkpoint(TrainingLoop([second]), tmp_path / "checkpoint")
     train_to(second, 70)
     wanted = whole.model.weights()
     for name, tensor in second.model.weights().items():
         assert torch.equal(tensor, wanted[name]), name
-
-
-def test_measured_data_have_neither_geometry_nor_configuration(shards: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "measured"
-    shutil.copytree(shards, folder)
-    manifest = read_checksummed(folder / "manifest.json")
-    write_checksummed(folder / "manifest.json", {**manifest, "geometry": None, "config": None})
-    result = fit(config(4), folder, tmp_path / "m")
-    assert result.material.model.tracing is not None
 
 
 def test_a_fit_starts_from_the_heights_of_another(shards: Path, tmp_path: Path) -> None:
@@ -81,25 +67,6 @@ def test_a_fit_starts_from_the_heights_of_another(shards: Path, tmp_path: Path) 
     second = prepare_trainer(options, data, partition, torch.device("cpu")).model
     assert float(first.known.heights.std()) > 1e-6
     assert torch.equal(second.known.heights, first.known.heights)
-
-
-@pytest.mark.skipif(library.kernel() is None, reason=library.missing_reason() or "kernel")
-def test_pytorch_fits_as_the_kernel_does(
-    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    compiled = fit(config(20), shards, tmp_path / "compiled")
-    monkeypatch.setenv(library.ENVIRONMENT, "off")
-    library.reload()
-    try:
-        plain = fit(config(20), shards, tmp_path / "plain")
-    finally:
-        monkeypatch.undo()
-        library.reload()
-    described = [r.material.description["training"] for r in (compiled, plain)]
-    assert [d["backend"].split()[0] for d in described] == ["kernel", "pytorch"]
-    # Not the loss: it is the mean since the last report, which a busy machine sends after fewer steps.
-    found = [r.errors["test"]["mse"]["value"] for r in (compiled, plain)]
-    assert found[1] == pytest.approx(found[0], rel=2e-3)
 
 
 def test_a_depth_is_learned(tmp_path: Path) -> None:

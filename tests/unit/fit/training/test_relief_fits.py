@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
-from support.fit_data import F32, parallax, random_queries, write_data
+from support.fit_data import parallax, random_queries, write_data
 from support.known_surfaces import geometry, rough_heights
 from support.paths import ROOT
 from torch import Tensor
 
 from mbtf_core.data.lattice import Lattice
 from mbtf_fit import FitConfig, Material, fit
-from mbtf_fit.models.relief import Relief
 from mbtf_fit.native import library
-from mbtf_fit.pytorch.material import NeuralMaterial
 from mbtf_fit.training.fit import FitResult
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.run import generate
@@ -46,7 +42,7 @@ def no_kernel(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 def config(steps: int, *, memory: str = "1GB", **options: Any) -> FitConfig:
     training = {"steps": steps, "batch": 300, "warmup": 3, **options.pop("training", {})}
-    described = {"model": "relief", "training": training, "data": {"memory": memory}, **options}
+    described = {"model": "relief", "training": training, "data": {"memory": memory}} | options
     return FitConfig.model_validate(described)
 
 
@@ -54,49 +50,29 @@ def weights(result: FitResult) -> dict[str, Tensor]:
     return result.material.model.weights()
 
 
-@pytest.mark.parametrize("places", [1, 4])
-def test_hints_of_the_data_and_of_batches_give_one_fit(
-    places: int, shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_hints_of_the_data_and_of_batches_give_one_fit(shards: Path, tmp_path: Path) -> None:
     """In memory; computed for each batch, as they do not fit; of queries that are streamed."""
-    sizes: list[int] = []
-    compute = NeuralMaterial.hints
-
-    def counted(material: NeuralMaterial, u: Tensor, *rest: Tensor) -> Tensor:
-        sizes.append(len(u))
-        return compute(material, u, *rest)
-
-    def with_hints(self: Relief, queries: Any) -> Any:
-        found = counted(self.material, queries.u, queries.sigma, queries.omega_i, queries.omega_o)
-        return replace(queries, hints=found)
-
-    monkeypatch.setattr(Relief, "_with_hints", with_hints)
-    found = {}
-    for memory in ("1GB", "180kB", "1kB"):
-        sizes.clear()
-        options = config(5, memory=memory, network={"relief": {"places": places}})
-        found[memory] = fit(options, shards, tmp_path / memory)
-        if memory == "1GB":
-            assert len(sizes) == 1
-            assert sizes[0] > 2000
-        else:
-            assert sizes == [300] * 5
-    whole = found.pop("1GB")
-    for other in found.values():
+    options = {"network": {"relief": {"places": 4}}}
+    whole, *others = (
+        fit(config(5, memory=memory, **options), shards, tmp_path / memory)
+        for memory in ("1GB", "180kB", "1kB")
+    )
+    for other in others:
         assert all(torch.equal(tensor, weights(whole)[name]) for name, tensor in weights(other).items())
         assert other.errors == whole.errors
 
 
 @pytest.mark.skipif(library.kernel() is None, reason=library.missing_reason() or "kernel")
+@pytest.mark.parametrize("model", ["relief", "neumip+"])
 def test_pytorch_fits_as_the_kernel_does(
-    shards: Path, tmp_path: Path, request: pytest.FixtureRequest
+    model: str, shards: Path, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
-    compiled = fit(config(8), shards, tmp_path / "compiled")
+    compiled = fit(config(8, model=model), shards, tmp_path / "compiled")
     request.getfixturevalue("no_kernel")
-    plain = fit(config(8), shards, tmp_path / "plain")
+    plain = fit(config(8, model=model), shards, tmp_path / "plain")
     described = [r.material.description["training"] for r in (compiled, plain)]
     assert [d["backend"].split()[0] for d in described] == ["kernel", "pytorch"]
-    assert described[1]["loss"] == pytest.approx(described[0]["loss"], rel=1e-3)
+    # Not the loss: it is the mean since the last report, which a busy machine sends after fewer steps.
     errors = [r.errors["test"]["unexplained"]["value"] for r in (compiled, plain)]
     assert errors[1] == pytest.approx(errors[0], rel=1e-2)
 
@@ -110,25 +86,6 @@ def test_a_material_keeps_its_surface(shards: Path, tmp_path: Path) -> None:
     assert again.deviation() < 1e-5
     queries = random_queries(np.random.default_rng(1), 100, LATTICE).values()
     np.testing.assert_array_equal(again.evaluate(*queries), result.material.evaluate(*queries))
-
-
-def test_holes_are_learned(tmp_path: Path) -> None:
-    """Values are premultiplied; the transmittance is a part of the material."""
-
-    def through(u: F32, sigma: F32, omega: F32) -> NDArray[np.float64]:
-        wave = np.exp(-2 * (2 * np.pi * sigma) ** 2) * np.cos(2 * np.pi * u[:, 0])
-        return 0.5 + 0.4 * wave
-
-    def value(u: F32, sigma: F32, light: F32, view: F32) -> NDArray[np.float64]:
-        return parallax(u, sigma, light, view) * (1 - through(u, sigma, view))[:, None]
-
-    shards = write_data(tmp_path / "data", value, train=20_000, test=1000, through=through)
-    result = fit(config(200, training={"batch": 2000}), shards, tmp_path / "m")
-    assert result.errors["test"]["unexplained"]["value"] < 0.3
-    q = random_queries(np.random.default_rng(1), 1000, Lattice(3))
-    assert result.material.transmittance is not None
-    found = result.material.transmittance.evaluate(q["u"], q["sigma"], q["omega_o"])
-    assert np.abs(found - through(q["u"], q["sigma"], q["omega_o"])).mean() < 0.05
 
 
 def test_another_material_gives_textures_and_depth_weights(shards: Path, tmp_path: Path) -> None:

@@ -17,8 +17,8 @@ from mbtf_core.data.lattice import Lattice
 from mbtf_core.files import folders
 from mbtf_fit.config import FitConfig
 from mbtf_fit.training.fit import FitResult, fit
+from mbtf_fit.training.fit_folder import read_history
 from mbtf_fit.training.trainer import Trainer
-from mbtf_fit.training.validation import read_history
 
 STEPS = 10
 

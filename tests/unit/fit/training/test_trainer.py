@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from itertools import islice
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from support.fit_data import make_trainer, parallax, random_queries, train_fully, training_queries
+from support.fit_data import make_trainer, parallax, random_queries, train_fully, training_queries, write_data
 
-from mbtf_core.data.dataset import Shard
-from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
-from mbtf_fit.config import FitConfig
+from mbtf_fit.config import FitConfig, ModelName, build_model
+from mbtf_fit.data.loader import load_training, open_data
 from mbtf_fit.data.queries import ShardQueries, TrainingQueries
-from mbtf_fit.data.streaming import Selection
 from mbtf_fit.objective.parallel import Workers
-from mbtf_fit.training.trainer import Trainer, learning_rate_factor
+from mbtf_fit.sections import TrainingSection
+from mbtf_fit.training.trainer import Trainer, WeightDecay, learning_rate_factor, prepare_trainer
 
 LATTICE = Lattice(3)
 
@@ -47,34 +46,6 @@ def test_initial_blur_is_at_most_an_eighth(shape: tuple[int, int], asked: float,
     assert sigmas == [start if not x.moves_lookups else max(start, 0.5) for x in t.model.textures()]
 
 
-@pytest.mark.parametrize("model", ["neumip", "neumip-baseline"])
-def test_training_lowers_the_loss(model: str) -> None:
-    data = queries()
-    t = trainer(data, model, steps=150)
-    with torch.no_grad():
-        first = t._loss(data).item()
-    train_fully(t)
-    assert t.progress.step == 150
-    assert t.progress.loss < 0.3 * first
-
-
-def test_every_epoch_takes_each_query_at_most_once() -> None:
-    data = queries(1050)
-    t = trainer(data, batch=100)
-    seen = []
-    for k, batch in enumerate(islice(t._batches(), 20)):
-        assert len(batch) == 100
-        seen.append(batch.sigma)
-        t.progress.step = k + 1
-    for epoch in (torch.cat(seen[:10]), torch.cat(seen[10:])):
-        assert len(epoch.unique()) == 1000
-    assert not torch.equal(torch.cat(seen[:10]), torch.cat(seen[10:]))
-
-
-def test_fewer_queries_than_a_batch_make_one_batch() -> None:
-    assert train_fully(trainer(queries(30), steps=3)).progress.step == 3
-
-
 def test_threads_share_a_batch_without_changing_its_gradient() -> None:
     data = queries(999)
     t = trainer(data)
@@ -87,13 +58,6 @@ def test_threads_share_a_batch_without_changing_its_gradient() -> None:
     torch.testing.assert_close(found[0][0], found[1][0])
     for one, three in zip(found[0][1], found[1][1], strict=True):
         torch.testing.assert_close(one, three, rtol=1e-4, atol=1e-6)
-
-
-def test_workers_leave_torchs_settings_as_they_were() -> None:
-    before = torch.get_num_threads(), torch.get_float32_matmul_precision()
-    with Workers(torch.device("cpu"), 2):
-        pass
-    assert (torch.get_num_threads(), torch.get_float32_matmul_precision()) == before
 
 
 def test_rates_rise_and_fall() -> None:
@@ -116,16 +80,6 @@ def test_textures_and_networks_learn_at_their_own_rates(compiled: bool) -> None:
     for group, old, rate in zip(groups, before, (1e-3, 1e-4), strict=True):
         longest = max(float((p.detach() - q).abs().max()) for p, q in zip(group, old, strict=True))
         assert longest == pytest.approx(rate, rel=0.01)
-
-
-def test_the_blur_ends_with_its_fraction_of_the_budget() -> None:
-    blur = {"initial_sigma": 1.0, "final_sigma": 0.25, "fraction": 0.25, "offset_sigma": 0.0}
-    t = trainer(queries(10), blur=blur)
-    found = []
-    for step in (0, 5, 9, 10, 40):
-        t.progress.step = step
-        found.append(t._sigmas()[0])
-    assert found == pytest.approx([1.0, 0.5, 0.25**0.9, 0.0, 0.0])
 
 
 @pytest.mark.parametrize("compiled", [True, False])
@@ -196,24 +150,6 @@ def test_weights_that_diverge_in_the_last_step_are_detected(monkeypatch: pytest.
         train_fully(trainer(queries(), steps=3))
 
 
-def test_divergence_names_the_first_bad_batch() -> None:
-    """The step, the shard and the rows, counted without what is held out."""
-    data = queries()
-    selection = Selection()
-    chosen = np.ones(3000, bool)
-    chosen[:7] = False
-    selection.add(Shard(DataFolder.open("."), "train-00000.npz", {}), chosen)
-    selection.add(Shard(DataFolder.open("."), "train-00001.npz", {}), np.ones(2007, bool))
-    data.value[4200] = torch.inf
-    t = make_trainer(data, LATTICE, steps=40, batch=100, huber_delta=None)
-    t.selection = selection
-    step, numbers = next((k, n) for k in range(50) for n in data.batch_ranges(100, 0, k) if 4200 in n)
-    # Number 4200 is row 1207 of the second shard.
-    first, last = numbers.start - 2993, numbers.stop - 1 - 2993
-    with pytest.raises(InputError, match=rf"at step {step + 1}: .*train-00001\.npz rows {first}-{last},"):
-        train_fully(t)
-
-
 def test_coverage_counts_texels_that_gradients_have_reached() -> None:
     t = trainer(queries(), "neumip-baseline", blur={"initial_sigma": 0.0})
     assert set(t.coverage().values()) == {0.0}
@@ -225,3 +161,55 @@ def test_coverage_counts_texels_that_gradients_have_reached() -> None:
     assert found[0] == found[1] == 0.0
     # 5 of 8 texels each way are read, and the one before the first.
     assert found[3] == pytest.approx((6 / 8) ** 2, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "queries", "strength", "texels", "weights"),
+    [
+        (0.0, 5000, 1000.0, 2.0, 0.0),
+        (0.4, 5000, 1000.0, 2.0, 0.064),
+        (2.0, 5000, 1000.0, 8.0, 0.4),
+        (5.0, 10, 0.0, 20.0, 0.0),
+        (5.0, 50, 1000.0, 20.0, 1.0),
+    ],
+)
+def test_noise_increases_weight_decay(
+    ratio: float, queries: int, strength: float, texels: float, weights: float
+) -> None:
+    """Of texels from a ratio of a half on; of weights with its square up to there, then with it, over the
+    number of queries; at most 1, or few queries would decay all weights to 0."""
+    section = TrainingSection(texture_weight_decay=2.0, noise_regularization=strength)
+    found = WeightDecay.of(section, ratio, queries)
+    assert (found.texels, found.weights) == (pytest.approx(texels), pytest.approx(weights))
+
+
+@pytest.mark.parametrize("model", ["neumip", "neumip-baseline", "hierarchical"])
+def test_texels_and_matrices_decay_and_biases_do_not(model: ModelName) -> None:
+    found = build_model(model, LATTICE)
+    with torch.no_grad():
+        for p in found.parameters():
+            p.fill_(1.0)
+    WeightDecay(texels=3.0, weights=2.0).apply(found, 0.1, 0.01)
+    texels, _ = found.parameter_groups()
+    for name, p in found.named_parameters():
+        texel = any(p is t for t in texels)
+        matrix = not texel and p.ndim > 1
+        assert matrix == ("weight" in name)
+        expected = np.exp(-0.3) if texel else np.exp(-0.02) if matrix else 1.0
+        torch.testing.assert_close(p.detach(), torch.full_like(p, expected))
+
+
+def test_a_fit_estimates_the_noise_ratio_of_its_data(tmp_path: Path) -> None:
+    """Noise of 0.02 in each half is 2e-4 of variance in their mean."""
+    folder = write_data(tmp_path / "data", parallax, train=20_000, noise=0.02)
+    training = {"noise_regularization": 1000.0, "texture_weight_decay": 1.0}
+    config = FitConfig.model_validate({"training": training})
+    data = open_data(folder, "shuffled", "neumip")
+    partition = load_training(data, config.held_out, config.seed, config.data.memory)
+    trainer = prepare_trainer(config, data, partition, torch.device("cpu"))
+    arrays = random_queries(np.random.default_rng(5), 20_000, LATTICE)
+    ratio = 2e-4 / parallax(*arrays.values()).var(0).mean()
+    assert ratio > 0.5
+    n = len(partition.training)
+    assert trainer.weight_decay.weights == pytest.approx(1000 * ratio / n, rel=0.1)
+    assert trainer.weight_decay.texels == pytest.approx(2 * ratio, rel=0.1)

@@ -19,8 +19,8 @@ from mbtf_core.errors import InputError
 from mbtf_fit import fit
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import load_split, load_training
-from mbtf_fit.formatting import describe_coverage, summarize_errors
-from mbtf_fit.training.fit import prepare_trainer
+from mbtf_fit.formatting import report_errors
+from mbtf_fit.training.trainer import prepare_trainer
 from mbtf_gen.cli.generate import describe
 from mbtf_gen.config.measured import ImportConfig
 from mbtf_gen.generation import imported
@@ -214,7 +214,7 @@ def test_errors_of_a_fit_include_the_noise(opened: Open, tmp_path: Path) -> None
     assert test["includes_noise"]
     assert test["mse"]["value"] == pytest.approx(0.05**2, rel=0.15)
     assert result.material.description["training"]["noise_variance"] is None
-    assert any("include the noise of the data" in line for line in summarize_errors(result.errors))
+    assert any("include the noise of the data" in line for line in report_errors(result.errors, None))
     compared = dataset_errors({"a": result.material}, Dataset.open(tmp_path / "shards"))
     assert compared["a"]["splits"]["test"]["includes_noise"]
     # Error bars are the scatter of squared errors over queries.
@@ -231,8 +231,8 @@ def test_levels_without_data_are_averages(opened: Open, tmp_path: Path) -> None:
     import_measured(opened(Images(lights=16), queries=queries), tmp_path / "shards")
     config = FitConfig.model_validate({"model": "neumip-baseline", "training": {"steps": 400, "batch": 4096}})
     material = fit(config, tmp_path / "shards", tmp_path / "fit").material
-    line = describe_coverage(material.description["training"]["coverage"])
-    assert line.endswith("levels coarser than 3 have no data and are averages of it")
+    coverage = material.description["training"]["coverage"]
+    assert [level for level, share in coverage.items() if share == 0] == ["0", "1", "2"]
     pyramid = material.model.pyramid.export()
     np.testing.assert_allclose(pyramid["0"][0, 0], pyramid["3"].mean((0, 1)), atol=1e-5)
     omega = slice_directions("spiral", 40, 0.3)

@@ -4,9 +4,8 @@ All levels lie one after the other in a single table (texels, channels); level s
 texels from row ``start[s]`` on, image row by image row: row 0 is the side ``v → 1``, texel centers at
 ``((i+½)/W, 1-(j+½)/H)``, wrapped in both directions.
 
-:func:`lookup` is the fast path: it gathers by ``embedding_bag``, with analytic derivatives and one sparse
-product for the gradients of the texels. :func:`lookup_reference` is the same in plain PyTorch; the tests
-compare both.
+:func:`lookup` gathers by ``embedding_bag``, with analytic derivatives. One sparse product gives the gradients
+of the texels.
 """
 
 from __future__ import annotations
@@ -54,31 +53,6 @@ def coarse_level(level: Tensor, count: int) -> tuple[Tensor, Tensor]:
     clamped = level.clamp(0, count - 1)
     coarse = clamped.floor().clamp_max_(max(count - 2, 0))
     return coarse, clamped - coarse
-
-
-def lookup_reference(table: Tensor, packing: Packing, u: Tensor, level: Tensor | None = None) -> Tensor:
-    """Texture values (n, channels) at uv positions `u` (n, 2), in plain PyTorch; differentiable in `table`
-    (texels, channels) and `u`.
-
-    `level` (n,) is a fractional index into ``packing.shapes``; None reads level 0 alone.
-    """
-    starts = packing.starts
-    out = table.new_zeros(len(u), table.shape[1])
-    coarse, fine_weight = coarse_level(
-        torch.zeros_like(u[:, 0]) if level is None else level, len(packing.shapes)
-    )
-    for s, (rows, columns) in enumerate(packing.shapes):
-        weight = torch.where(coarse == s, 1 - fine_weight, torch.where(coarse == s - 1, fine_weight, 0))
-        texture = table[starts[s] : starts[s + 1]].view(rows, columns, -1)
-        x, y = u[:, 0] * columns - 0.5, (1 - u[:, 1]) * rows - 0.5
-        i, j = x.floor().long(), y.floor().long()
-        fx, fy = (x - i)[:, None], (y - j)[:, None]
-        left, right = i % columns, (i + 1) % columns
-        top, bottom = j % rows, (j + 1) % rows
-        upper = (1 - fx) * texture[top, left] + fx * texture[top, right]
-        lower = (1 - fx) * texture[bottom, left] + fx * texture[bottom, right]
-        out = out + weight[:, None] * ((1 - fy) * upper + fy * lower)
-    return out
 
 
 @dataclass(frozen=True)
@@ -205,6 +179,10 @@ class _Lookup(torch.autograd.Function):
 
 
 def lookup(table: Tensor, packing: Packing, u: Tensor, level: Tensor | None = None) -> Tensor:
-    """Same as :func:`lookup_reference`, several times faster; differentiable once in `table` and `u`."""
+    """Texture values (n, channels) at uv positions `u` (n, 2); differentiable once in `table` (texels,
+    channels) and `u`.
+
+    `level` (n,) is a fractional index into ``packing.shapes``; None reads level 0 alone.
+    """
     out: Tensor = _Lookup.apply(table, u, packing, level)
     return out

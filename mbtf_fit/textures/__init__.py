@@ -1,1 +1,0 @@
-"""Periodic textures in PyTorch: lookups, blur, pyramids of parameters."""
