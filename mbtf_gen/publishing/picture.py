@@ -13,13 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.geometry import Geometry
 from mbtf_core.data.lattice import level_of_sigma
 from mbtf_core.data.shard_files import Arrays
 from mbtf_core.exposure import auto_exposure, brightness, to_display
 from mbtf_core.files.atomic import Stored, write_chunks
 from mbtf_gen.measured.exported import mean_of
-from mbtf_gen.publishing.statistics import sample
 
 F64 = NDArray[np.float64]
 PICTURE_NAME = "contact_sheet.png"
@@ -107,13 +106,17 @@ def displayed(image: F64) -> NDArray[np.uint8]:
     return shown
 
 
-def write_picture(data: Dataset, path: Path) -> Stored:
-    """Write the contact sheet of a data set.
+def write_picture(arrays: Arrays, aspect: float, geometry: Geometry | None, path: Path) -> Stored:
+    """Write the contact sheet of a data set, atomically.
 
     Parameters
     ----------
-    data : Dataset
-        A complete data set.
+    arrays : dict of str to float32 array
+        Training queries.
+    aspect : float
+        Height of the tile over its width.
+    geometry : Geometry or None
+        Of the data set.
     path : Path
         PNG to write.
 
@@ -123,15 +126,11 @@ def write_picture(data: Dataset, path: Path) -> Stored:
 
     Raises
     ------
-    InputError
-        A shard cannot be read.
     PartialError
         The disk is full or the folder cannot be written.
     """
     from matplotlib.figure import Figure
 
-    arrays, aspect = sample(data.shards("train")), data.lattice.aspect
-    geometry = data.geometry()
     panels = [(title, image, (0, 1, 0, aspect)) for title, image in tile_images(arrays, aspect).items()]
     panels.append(("apparent BRDF by ω_o", brdf_image(arrays), (-1, 1, -1, 1)))
     figure = Figure(figsize=(3.0 * (len(panels) + (geometry is not None)), 3.3), layout="constrained")

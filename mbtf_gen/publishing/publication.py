@@ -9,9 +9,12 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mbtf_core.data.dataset import Dataset, Shard
-from mbtf_core.data.folder import DataFolder, sidecar_name
+from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.schema import GEOMETRY_NAME
+from mbtf_core.data.shard_files import Arrays
 from mbtf_core.data.verify import verify
 from mbtf_core.errors import EngineError, InputError, UsageError
 from mbtf_core.files.atomic import Stored, write_chunks
@@ -20,19 +23,24 @@ from mbtf_core.files.folders import check_space, owned
 from mbtf_gen.config.publish import PublishConfig
 from mbtf_gen.publishing.card import CARD_NAME, card_text
 from mbtf_gen.publishing.croissant import CROISSANT_NAME, croissant_text
-from mbtf_gen.publishing.facts import Facts
-from mbtf_gen.publishing.folder import DATA, RECIPE, Makers, PublishFolder
-from mbtf_gen.publishing.material_copy import MaterialCopy, check_copy, copy_of_material
-from mbtf_gen.publishing.npz import copy_file, link_or_copy, public_documents
-from mbtf_gen.publishing.parquet import write_parquet
+from mbtf_gen.publishing.digests import DIGESTS_NAME, Digests, array_digests
+from mbtf_gen.publishing.facts import Facts, name_of
+from mbtf_gen.publishing.folder import PublishFolder
+from mbtf_gen.publishing.formats import LIBRARIES, copied, published_names, shard_writers
 from mbtf_gen.publishing.picture import PICTURE_NAME, write_picture
-from mbtf_gen.publishing.recipe import MATERIAL, recipe_makers
-from mbtf_gen.publishing.webdataset import write_tar
+from mbtf_gen.publishing.recipe import (
+    MATERIAL,
+    RECIPE,
+    Content,
+    check_inputs,
+    public_documents,
+    recipe_files,
+)
 
 # Bytes of picture, card and documents.
 _DOCUMENT_BYTES = 4 << 20
-# Library that writes each form.
-_LIBRARIES = {"parquet": "pyarrow", "webdataset": "webdataset", "npz": "mlcroissant"}
+# Queries of a split that the statistics are of, at most.
+_SAMPLE = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -41,14 +49,20 @@ class Publication:
 
     Parameters
     ----------
-    facts : Facts
-        A complete data set, and what its publishers say.
-    copy : MaterialCopy or None
-        The input files of the material, if they are published.
+    data : Dataset
+        A complete data set.
+    config : PublishConfig
+        What its publishers say.
+    documents : dict of str to bytes or Path
+        Geometry, recipe and copies of documents, by name in the folder.
+    maps : bool
+        Whether the input files of the material are published.
     """
 
-    facts: Facts
-    copy: MaterialCopy | None = None
+    data: Dataset
+    config: PublishConfig
+    documents: dict[str, Content]
+    maps: bool = False
 
     @classmethod
     def prepare(
@@ -86,85 +100,81 @@ class Publication:
             A library is missing.
         """
         data = Dataset.open(shards)
-        for library in ("mlcroissant", _LIBRARIES[config.form]):
+        manifest, measured = data.manifest, "measured" in data.manifest
+        for library in ("mlcroissant", LIBRARIES[config.form]):
             if importlib.util.find_spec(library) is None:
                 hint = "pip install 'mbtf[publish]'"
                 raise EngineError(f"{library} is not installed", where=f"--form {config.form}", hint=hint)
-        if config.form == "npz" and data.manifest["array_format"] != "npz":
+        if config.form == "npz" and manifest["array_format"] != "npz":
             raise UsageError(
-                f"{data.folder} holds shards of another format ({data.manifest['array_format']})",
+                f"{data.folder} holds shards of another format ({manifest['array_format']})",
                 where="--form npz",
                 hint="use --form parquet or --form webdataset",
             )
-        if (with_maps or material is not None) and "measured" in data.manifest:
+        if (with_maps or material is not None) and measured:
             raise UsageError(f"{data.folder} holds measured data, without maps", where="--with-maps")
         if material is not None and not with_maps:
             raise UsageError("goes with --with-maps", where="--material")
         for fault in verify(data.folder):
             raise InputError(fault.what, where=data.folder.at(fault.file), hint=fault.hint)
-        return cls(Facts(data, config), copy_of_material(data, material) if with_maps else None)
+        documents: dict[str, Content] = {}
+        if (geometry := manifest["geometry"]) is not None:
+            documents[f"data/{GEOMETRY_NAME}"] = data.folder.file(GEOMETRY_NAME, geometry["sha256"])
+        if config.form == "npz":
+            documents |= {f"data/{name}": content for name, content in public_documents(manifest).items()}
+        if not measured:
+            documents |= recipe_files(data, with_maps=with_maps, moved=material)
+        return cls(data, config, documents, with_maps)
+
+    @cached_property
+    def shards(self) -> dict[str, list[Shard]]:
+        """Shards of each split that has any."""
+        found = {split: self.data.shards(split) for split in self.data.splits}
+        return {split: shards for split, shards in found.items() if shards}
+
+    @property
+    def name(self) -> str:
+        """Name of the published data set: the given one, else that of the material."""
+        return self.config.name or name_of(self.data.manifest)
+
+    @property
+    def count(self) -> int:
+        """Number of shards."""
+        return sum(map(len, self.shards.values()))
 
     @property
     def size(self) -> int:
         """Bytes that the folder takes at most."""
-        data = self.facts.data
-        shards = sum(int(s.sidecar["bytes"]) for found in self.facts.shards.values() for s in found)
-        surface = data.folder.size(GEOMETRY_NAME) or 0
-        maps = sum(path.stat().st_size for path in self.copy.files.values()) if self.copy else 0
+        shards = sum(int(shard.sidecar["bytes"]) for found in self.shards.values() for shard in found)
+        contents = self.documents.values()
+        documents = sum(c.stat().st_size if isinstance(c, Path) else len(c) for c in contents)
         # Tar files have a header and up to a block of padding per array.
-        return round(1.02 * shards) + surface + maps + _DOCUMENT_BYTES
+        return round(1.02 * shards) + documents + _DOCUMENT_BYTES
 
-    @property
-    def depends(self) -> dict[str, Any]:
+    def _depends(self) -> dict[str, Any]:
         """Plain data that determine the content of the folder."""
-        config = self.facts.config
-        stored = {s.file: s.sidecar["sha256"] for found in self.facts.shards.values() for s in found}
+        config = self.config
+        stored = {s.file: s.sidecar["sha256"] for found in self.shards.values() for s in found}
         return {
             **config.model_dump(mode="json", exclude={"version"}),
             # A long text would make a long message.
             "citation": None if config.citation is None else data_sha256(config.citation),
-            "with_maps": self.copy is not None,
-            "config_hash": self.facts.data.manifest["config_hash"],
+            "with_maps": self.maps,
+            "config_hash": self.data.manifest["config_hash"],
             "shards": data_sha256(stored),
         }
 
-    @cached_property
-    def makers(self) -> Makers:
-        """Writers of all files but the card and ``croissant.json``, by name."""
-        data = self.facts.data
-        makers: Makers = {}
-        for found in self.facts.shards.values():
-            for shard in found:
-                makers |= self._shard_makers(shard)
-        if (geometry := data.manifest["geometry"]) is not None:
-            makers[f"{DATA}/{GEOMETRY_NAME}"] = lambda path: copy_file(
-                data.folder.file(GEOMETRY_NAME, geometry["sha256"]), path
-            )
-        if self.facts.config.form == "npz":
-            for name, content in public_documents(data.manifest).items():
-                makers[f"{DATA}/{name}"] = partial(_write, content)
-        if not self.facts.measured:
-            makers |= recipe_makers(data, self.copy)
-        makers[PICTURE_NAME] = partial(write_picture, data)
-        return makers
-
-    def _shard_makers(self, shard: Shard) -> Makers:
-        stem, form = shard.file.rpartition(".")[0], self.facts.config.form
-        if form == "parquet":
-            described = self.facts.data.manifest["arrays"]
-            return {f"{DATA}/{stem}.parquet": lambda path: write_parquet(path, shard.read(), described)}
-        if form == "webdataset":
-            return {f"{DATA}/{stem}.tar": lambda path: write_tar(path, shard.read())}
-        sidecar = sidecar_name(shard.file)
-        return {
-            f"{DATA}/{shard.file}": lambda path: link_or_copy(shard.local(), path),
-            f"{DATA}/{sidecar}": lambda path: _write(shard.folder.read(sidecar), path),
-        }
+    def _names(self) -> list[str]:
+        """Names of all files."""
+        shards = [shard for found in self.shards.values() for shard in found]
+        data = [f"data/{name}" for shard in shards for name in published_names(shard, self.config.form)]
+        digests = f"{RECIPE}/{DIGESTS_NAME}"
+        return [*self.documents, *data, digests, PICTURE_NAME, CARD_NAME, CROISSANT_NAME]
 
     def write(
         self, output: Path, *, overwrite: bool = False, progress: Callable[[float], None] = lambda _: None
     ) -> dict[str, Stored]:
-        """Write the folder, or finish an unfinished one.
+        """Write the folder, or finish an unfinished one; every shard is read once.
 
         Parameters
         ----------
@@ -173,7 +183,7 @@ class Publication:
         overwrite : bool
             Replace what was published there.
         progress : callable
-            Called with 1 after each file.
+            Called with 1 after each shard.
 
         Returns
         -------
@@ -189,19 +199,47 @@ class Publication:
         """
         check_space(output, self.size, "choose another folder with -o")
         with owned(output):
-            listed = [*self.makers, CARD_NAME, CROISSANT_NAME]
-            folder = PublishFolder.claim(output, self.depends, listed, overwrite=overwrite)
-            for name, maker in self.makers.items():
-                folder.add(name, maker)
-                progress(1)
-            if self.copy is not None:
-                check_copy(self.facts.data, output / RECIPE / MATERIAL)
-            files = {name: stored for name, stored in folder.files.items() if name in self.makers}
-            maps = self.copy is not None
-            folder.add(CARD_NAME, lambda path: _write(card_text(self.facts, files, maps).encode(), path))
-            folder.add(CROISSANT_NAME, lambda path: _write(croissant_text(self.facts, files).encode(), path))
+            folder = PublishFolder.claim(output, self._depends(), self._names(), overwrite=overwrite)
+            for name, content in self.documents.items():
+                folder.add(name, partial(_store, content))
+            if self.maps:
+                hint = "leave out --with-maps, and add the files of the material to recipe/ by hand"
+                check_inputs(self.data, output / MATERIAL, "its copy is read differently", hint)
+            samples, digests = self._write_shards(folder, progress)
+            if not self._measured:
+                text = Digests.of(self.data, digests).model_dump_json(indent=2) + "\n"
+                folder.add(f"{RECIPE}/{DIGESTS_NAME}", partial(_store, text.encode()))
+            geometry, aspect = self.data.geometry(), self.data.lattice.aspect
+            folder.add(PICTURE_NAME, partial(write_picture, samples["train"], aspect, geometry))
+            listed = {n: stored for n, stored in folder.files.items() if n not in (CARD_NAME, CROISSANT_NAME)}
+            facts = Facts(self.data, self.config, self.name, samples, listed, self.maps)
+            folder.add(CARD_NAME, lambda path: _store(card_text(facts).encode(), path))
+            folder.add(CROISSANT_NAME, lambda path: _store(croissant_text(facts).encode(), path))
             return folder.files
 
+    def _write_shards(
+        self, folder: PublishFolder, progress: Callable[[float], None]
+    ) -> tuple[dict[str, Arrays], dict[str, dict[str, str]]]:
+        """Write the shards; returns evenly spaced rows of each split, and the digests of all arrays."""
+        described, digests, samples = self.data.manifest["arrays"], {}, {}
+        for split, shards in self.shards.items():
+            step = -(-int(self.data.manifest["splits"][split]["queries"]) // _SAMPLE)
+            parts = []
+            for shard in shards:
+                arrays = shard.read()
+                for name, write in shard_writers(shard, arrays, self.config.form, described).items():
+                    folder.add(f"data/{name}", write)
+                digests[shard.file.rpartition(".")[0]] = array_digests(arrays)
+                parts.append({name: np.array(array[::step]) for name, array in arrays.items()})
+                progress(1)
+            samples[split] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        return samples, digests
 
-def _write(content: bytes, path: Path) -> Stored:
-    return write_chunks(path, [content])
+    @property
+    def _measured(self) -> bool:
+        return "measured" in self.data.manifest
+
+
+def _store(content: Content, path: Path) -> Stored:
+    """Write or copy a document, atomically."""
+    return copied(content, path) if isinstance(content, Path) else write_chunks(path, [content])
