@@ -50,6 +50,11 @@ class Digests(BaseModel):
         geometry = (manifest["geometry"] or {}).get("sha256")
         return cls.model_validate({**stored, "geometry": geometry, "arrays": arrays})
 
+    @property
+    def content(self) -> bytes:
+        """The file."""
+        return f"{self.model_dump_json(indent=2)}\n".encode()
+
 
 def array_digests(arrays: Arrays) -> dict[str, str]:
     """SHA-256 of each array's numbers, hexadecimal."""

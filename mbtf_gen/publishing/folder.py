@@ -26,11 +26,7 @@ from mbtf_core.files.folders import (
 )
 
 RECORD_NAME = "publish.json"
-DATA, RECIPE = "data", "recipe"
 _FORMAT, _VERSION = "mbtf-publication", 1
-
-# Name of a file in the folder → what writes it to a given path, atomically.
-Makers = dict[str, Callable[[Path], Stored]]
 
 
 def _inside(name: str) -> str:
@@ -121,25 +117,12 @@ class PublishFolder:
         write_json(existing, claimed.record)
         return claimed
 
-    def add(self, name: str, write: Callable[[Path], Stored]) -> None:
-        """Write a file unless it is finished and has its full size.
-
-        Parameters
-        ----------
-        name : str
-            Relative to the folder, one of the listed ones.
-        write : callable
-            Writes the file of a given path, atomically.
-        """
+    def add(self, name: str, write: Callable[[Path], Stored]) -> Stored:
+        """Write a file with ``write(path)``, atomically, unless it is finished; its size and digest."""
         entry, path = self.record["files"].get(name), self.path / name
-        if entry is not None and path.is_file() and path.stat().st_size == entry["bytes"]:
-            return
-        make_folder(path.parent)
-        stored = write(path)
-        self.record["files"][name] = {"bytes": stored.bytes, "sha256": stored.sha256}
-        write_json(self.path / RECORD_NAME, self.record)
-
-    @property
-    def files(self) -> dict[str, Stored]:
-        """The finished files by name, sorted."""
-        return {name: Stored(f["bytes"], f["sha256"]) for name, f in sorted(self.record["files"].items())}
+        if entry is None or not path.is_file() or path.stat().st_size != entry["bytes"]:
+            make_folder(path.parent)
+            stored = write(path)
+            entry = self.record["files"][name] = {"bytes": stored.bytes, "sha256": stored.sha256}
+            write_json(self.path / RECORD_NAME, self.record)
+        return Stored(entry["bytes"], entry["sha256"])

@@ -200,44 +200,40 @@ class Publication:
         check_space(output, self.size, "choose another folder with -o")
         with owned(output):
             folder = PublishFolder.claim(output, self._depends(), self._names(), overwrite=overwrite)
-            for name, content in self.documents.items():
-                folder.add(name, partial(_store, content))
+            files = {name: folder.add(name, partial(_store, c)) for name, c in self.documents.items()}
             if self.maps:
                 hint = "leave out --with-maps, and add the files of the material to recipe/ by hand"
                 check_inputs(self.data, output / MATERIAL, "its copy is read differently", hint)
-            samples, digests = self._write_shards(folder, progress)
-            if not self._measured:
-                text = Digests.of(self.data, digests).model_dump_json(indent=2) + "\n"
-                folder.add(f"{RECIPE}/{DIGESTS_NAME}", partial(_store, text.encode()))
-            geometry, aspect = self.data.geometry(), self.data.lattice.aspect
-            folder.add(PICTURE_NAME, partial(write_picture, samples["train"], aspect, geometry))
-            listed = {n: stored for n, stored in folder.files.items() if n not in (CARD_NAME, CROISSANT_NAME)}
-            facts = Facts(self.data, self.config, self.name, samples, listed, self.maps)
-            folder.add(CARD_NAME, lambda path: _store(card_text(facts).encode(), path))
-            folder.add(CROISSANT_NAME, lambda path: _store(croissant_text(facts).encode(), path))
-            return folder.files
+            stored, samples, digests = self._write_shards(folder, progress)
+            files |= stored
+            if "measured" not in self.data.manifest:
+                content, name = Digests.of(self.data, digests).content, f"{RECIPE}/{DIGESTS_NAME}"
+                files[name] = folder.add(name, partial(_store, content))
+            drawn = samples["train"], self.data.lattice.aspect, self.data.geometry()
+            files[PICTURE_NAME] = folder.add(PICTURE_NAME, partial(write_picture, *drawn))
+            facts = Facts(self.data, self.config, self.name, samples, dict(sorted(files.items())), self.maps)
+            for name, text in ((CARD_NAME, card_text(facts)), (CROISSANT_NAME, croissant_text(facts))):
+                files[name] = folder.add(name, partial(_store, text.encode()))
+            return dict(sorted(files.items()))
 
     def _write_shards(
         self, folder: PublishFolder, progress: Callable[[float], None]
-    ) -> tuple[dict[str, Arrays], dict[str, dict[str, str]]]:
-        """Write the shards; returns evenly spaced rows of each split, and the digests of all arrays."""
-        described, digests, samples = self.data.manifest["arrays"], {}, {}
+    ) -> tuple[dict[str, Stored], dict[str, Arrays], dict[str, dict[str, str]]]:
+        """Write the shards: the files, evenly spaced rows of each split, and the digests of all arrays."""
+        files, digests, samples = {}, {}, {}
+        form, described = self.config.form, self.data.manifest["arrays"]
         for split, shards in self.shards.items():
             step = -(-int(self.data.manifest["splits"][split]["queries"]) // _SAMPLE)
             parts = []
             for shard in shards:
                 arrays = shard.read()
-                for name, write in shard_writers(shard, arrays, self.config.form, described).items():
-                    folder.add(f"data/{name}", write)
+                for name, write in shard_writers(shard, arrays, form, described).items():
+                    files[f"data/{name}"] = folder.add(f"data/{name}", write)
                 digests[shard.file.rpartition(".")[0]] = array_digests(arrays)
                 parts.append({name: np.array(array[::step]) for name, array in arrays.items()})
                 progress(1)
             samples[split] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-        return samples, digests
-
-    @property
-    def _measured(self) -> bool:
-        return "measured" in self.data.manifest
+        return files, samples, digests
 
 
 def _store(content: Content, path: Path) -> Stored:
