@@ -9,10 +9,9 @@ from mbtf_gen.cli.folders import merge, repair, verify
 from mbtf_gen.cli.generate import generate
 from mbtf_gen.cli.import_measured import import_measured
 from mbtf_gen.cli.inspect import inspect
+from mbtf_gen.cli.pictures import preview, reference
 from mbtf_gen.cli.plan import plan
-from mbtf_gen.cli.preview import preview
 from mbtf_gen.cli.publish import publish
-from mbtf_gen.cli.reference import reference
 from mbtf_gen.cli.selftest import selftest
 
 app = new_app("mbtf-gen", "Generate multi-resolution BTF (MBTF) data sets from displaced materials.")
