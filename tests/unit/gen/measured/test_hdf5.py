@@ -1,8 +1,8 @@
-"""Data sets of NeuMIP: conventions, round trip, and files that are refused."""
+"""HDF5 of NeuMIP and NeuralBTF: conventions, exports, and files that are refused."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +11,16 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support import measured_files as files
+from support.datasets import write_dataset
 from support.fuzzing import damaged, examples, loads_or_refuses
 from support.measured_files import write_hdf5
 
 from mbtf_core.errors import InputError
-from mbtf_gen.measured.neumip_hdf5 import read_neumip, write_neumip
+from mbtf_gen.measured.exported import export_neumip, export_neural_btf
+from mbtf_gen.measured.hdf5 import read_neumip, read_neural_btf
 
+TEXELS = files.ROWS * files.COLUMNS
 FIELDS = ("u", "sigma", "omega_i", "omega_o", "value")
 
 
@@ -84,69 +88,6 @@ def test_unusable_queries_are_left_out(tmp_path: Path) -> None:
     assert {len(queries[name]) for name in FIELDS} == {3}
 
 
-def ours(count: int, seed: int = 0) -> dict[str, np.ndarray]:
-    rng = np.random.default_rng(seed)
-    out = {
-        "u": rng.random((count, 2), np.float32),
-        "sigma": (2.0 ** -rng.uniform(1, 9, count)).astype(np.float32),
-    }
-    for name in ("omega_i", "omega_o"):
-        xyz = rng.normal(size=(count, 3))
-        xyz[:, 2] = np.abs(xyz[:, 2]) + 0.05
-        out[name] = (xyz / np.linalg.norm(xyz, axis=1, keepdims=True)).astype(np.float32)
-    out["value"] = rng.gamma(0.3, 2.0, (count, 3)).astype(np.float32)
-    out["value"][0] = [0, 1e-40, 3e38]
-    return out
-
-
-def batches(queries: dict[str, np.ndarray], sizes: tuple[int, ...]) -> Iterator[dict[str, np.ndarray]]:
-    at = 0
-    for size in sizes:
-        yield {name: array[at : at + size] for name, array in queries.items()}
-        at += size
-
-
-def test_round_trip(tmp_path: Path) -> None:
-    queries = ours(64)
-    path = tmp_path / "a.hdf5"
-    assert write_neumip(path, batches(queries, (3, 20, 0, 40, 1)), 128, (4, 8)) == 64
-    data = read_neumip(path)
-    assert (data.count, data.base_radius) == (64, 0.5 / 128)
-    again = data.read(0, data.count)
-    np.testing.assert_array_equal(again["value"], queries["value"])
-    np.testing.assert_array_equal(again["sigma"], queries["sigma"])
-    distance = np.abs(again["u"] - queries["u"])
-    assert np.minimum(distance, 1 - distance).max() < 1e-7
-    for name in ("omega_i", "omega_o"):
-        np.testing.assert_array_equal(again[name][:, :2], queries[name][:, :2])
-        np.testing.assert_allclose(again[name], queries[name], atol=2e-6)
-
-
-def test_the_written_shapes(tmp_path: Path) -> None:
-    assert write_neumip(tmp_path / "a.hdf5", batches(ours(70), (70,)), 128, (4, 8)) == 64
-    with h5py.File(tmp_path / "a.hdf5") as file:
-        shapes = {name: file[name].shape for name in file}
-        assert file.attrs["base_radius"] == 0.5 / 128
-    assert shapes == {
-        "ground_color": (2, 4, 8, 3),
-        "ground_camera_target_loc": (2, 4, 8, 2),
-        "ground_camera_query_radius": (2, 4, 8, 1),
-        "ground_camera_dir": (2, 4, 8, 2),
-        "ground_light": (2, 4, 8, 2),
-    }
-
-
-@pytest.mark.parametrize("name", FIELDS)
-def test_invalid_queries_are_not_written(name: str, tmp_path: Path) -> None:
-    queries = ours(32)
-    queries[name][3] = np.nan
-    with pytest.raises(InputError, match=name):
-        write_neumip(tmp_path / "a.hdf5", [queries], 128, (4, 8))
-    with pytest.raises(InputError, match="do not fill an image"):
-        write_neumip(tmp_path / "a.hdf5", [ours(31)], 128, (4, 8))
-    assert list(tmp_path.iterdir()) == []
-
-
 def changed(**new: Any) -> dict[str, Any]:
     return {name: array for name, array in (stored() | new).items() if array is not None}
 
@@ -210,27 +151,130 @@ def test_numbers_that_are_not_in_the_file(tmp_path: Path) -> None:
         read_neumip(tmp_path / "d.hdf5")
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("neumip")
+def pairs() -> tuple[np.ndarray, np.ndarray]:
+    """Nine lights and views above the horizon, as float32."""
+    light, view = files.unit(files.LIGHTS), files.unit(files.VIEWS[:3])
+    return np.tile(light, (3, 1)).astype(np.float32), np.repeat(view, 3, axis=0).astype(np.float32)
 
 
-@pytest.fixture(scope="module")
-def samples(folder: Path) -> dict[str, bytes]:
-    plain = write_hdf5(folder / "plain.hdf5", stored(), base_radius=0.1)
-    write_neumip(folder / "chunks.hdf5", [ours(64)], 128, (4, 8))
-    return {"plain": plain.read_bytes(), "chunks": (folder / "chunks.hdf5").read_bytes()}
+def images() -> dict[str, np.ndarray]:
+    """A file of the known function whose third light is at the horizon."""
+    light, view = pairs()
+    color = np.array([files.image(i, o) for i, o in zip(light, view, strict=True)], np.float32)
+    light[2, :2] = [1, 0]
+    return {"ground_light": light[:, :2], "ground_camera_dir": view[:, :2], "ground_color": color}
+
+
+def test_images_of_the_known_function(tmp_path: Path) -> None:
+    btf = read_neural_btf(write_hdf5(tmp_path / "a.hdf5", images()))
+    assert (btf.rows, btf.columns, btf.left_out, btf.cosine) == (files.ROWS, files.COLUMNS, 1, None)
+    assert len(btf.light) == 8
+    order = np.random.default_rng(2).permutation(8 * TEXELS)
+    pair, texel = order // TEXELS, order % TEXELS
+    row, column = np.divmod(texel, files.COLUMNS)
+    light, view = btf.light[pair].astype(np.float64), btf.view[pair].astype(np.float64)
+    np.testing.assert_allclose(btf.values(pair, texel), files.value(row, column, light, view), rtol=1e-5)
+    # A few texels of the last rows of one image.
+    at = (files.ROWS - 2) * files.COLUMNS + np.array([1, 6])
+    np.testing.assert_array_equal(
+        btf.values(np.array([3, 3]), at), images()["ground_color"][4].reshape(-1, 3)[at]
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "array", "message"),
+    [
+        ("ground_light", None, "no data set 'ground_light'"),
+        ("ground_light", np.zeros((8, 2)), "the shape"),
+        ("ground_camera_dir", np.zeros((9, files.ROWS, files.COLUMNS, 2)), "direction for each pixel"),
+        ("ground_camera_dir", np.full((9, 2), np.nan), "unit vectors"),
+        ("ground_camera_dir", np.full((9, 2), 0.8), "unit vectors"),
+        ("ground_light", np.ones((9, 2)) * [1, 0], None),
+        ("ground_color", np.zeros((9, 5, 4, 4)), "the shape"),
+        ("ground_color", np.zeros((9, 5, 4, 3), np.uint8), "floats are expected"),
+    ],
+)
+def test_images_that_are_refused(name: str, array: Any, message: str | None, tmp_path: Path) -> None:
+    arrays = {key: a for key, a in (images() | {name: array}).items() if a is not None}
+    path = write_hdf5(tmp_path / "a.hdf5", arrays)
+    if message is None:
+        assert read_neural_btf(path).left_out == 9
+        return
+    with pytest.raises(InputError) as caught:
+        read_neural_btf(path)
+    assert message in caught.value.message
+
+
+def test_nan_values_are_refused_where_they_are_used(tmp_path: Path) -> None:
+    arrays = images()
+    arrays["ground_color"][0, 1, 1, 1] = np.nan
+    btf = read_neural_btf(write_hdf5(tmp_path / "a.hdf5", arrays))
+    btf.values(np.array([0]), np.array([0]))
+    with pytest.raises(InputError, match="NaN or infinite"):
+        btf.values(np.array([0, 0]), np.array([0, files.COLUMNS + 1]))
+
+
+def test_an_export_for_neumip(tmp_path: Path) -> None:
+    """All that fills whole images, in the order of the shards; the program reads single precision too."""
+    data = write_dataset(
+        tmp_path / "data", queries={"train": "300", "test": "8"}, output={"shard_queries": 90}, rows=8
+    )
+    assert export_neumip(data, tmp_path / "a.hdf5") == 256
+    with h5py.File(tmp_path / "a.hdf5") as file:
+        assert {file[name].shape[:-1] for name in file} == {(1, 16, 16)}
+    found = read_neumip(tmp_path / "a.hdf5")
+    assert (found.count, found.base_radius) == (256, 0.5 / (1 << data.lattice.finest))
+    queries, whole = found.read(0, 256), data.load("train")
+    np.testing.assert_array_equal(queries["sigma"], whole["sigma"][:256])
+    distance = np.abs(queries["u"] - whole["u"][:256])
+    assert np.minimum(distance, 1 - distance).max() < 1e-7
+    for name in ("omega_i", "omega_o"):
+        np.testing.assert_array_equal(queries[name][:, :2], whole[name][:256, :2])
+    value = 0.5 * (whole["value_a"].astype(np.float64) + whole["value_b"])
+    np.testing.assert_allclose(queries["value"], value[:256], rtol=1e-6)
+
+
+def test_what_cannot_be_exported(tmp_path: Path) -> None:
+    wide = write_dataset(tmp_path / "wide", queries={"train": "30", "test": "8"})
+    with pytest.raises(InputError, match="tiles are square"):
+        export_neumip(wide, tmp_path / "a.hdf5")
+    with pytest.raises(InputError, match="learns from images under fixed lights"):
+        export_neural_btf(wide, tmp_path / "a.hdf5")
+    slices = write_dataset(tmp_path / "s", queries={"train": "9/texel", "test": "8", "layout": "slices"})
+    with pytest.raises(InputError, match="learns from shuffled queries"):
+        export_neumip(slices, tmp_path / "a.hdf5")
+    assert not (tmp_path / "a.hdf5").exists()
+
+
+def samples() -> dict[str, bytes]:
+    with tempfile.TemporaryDirectory() as folder:
+        plain, chunks = Path(folder, "plain.hdf5"), Path(folder, "chunks.hdf5")
+        write_hdf5(plain, stored(), base_radius=0.1)
+        with h5py.File(chunks, "w") as file:
+            for name, array in stored().items():
+                file.create_dataset(name, data=array, chunks=(1, *array.shape[1:]))
+        write_hdf5(Path(folder, "images.hdf5"), images())
+        return {path.name: path.read_bytes() for path in Path(folder).iterdir()}
+
+
+SAMPLES = samples()
 
 
 @given(data=st.data())
-@examples(300)
-def test_a_damaged_file(data: st.DataObject, samples: dict[str, bytes], folder: Path) -> None:
-    _, content = data.draw(damaged(samples))
-    path = folder / "damaged.hdf5"
+@examples(400)
+def test_a_damaged_file(data: st.DataObject, tmp_path_factory: pytest.TempPathFactory) -> None:
+    name, content = data.draw(damaged(SAMPLES))
+    path = tmp_path_factory.getbasetemp() / "damaged.hdf5"
     path.write_bytes(content)
+    if name == "images.hdf5":
+        btf = loads_or_refuses(lambda: read_neural_btf(path))
+        if btf is not None and len(btf.light):
+            texels = np.arange(min(btf.rows * btf.columns, 50))
+            values = loads_or_refuses(lambda: btf.values(np.zeros_like(texels), texels))
+            assert values is None or np.isfinite(values).all()
+        return
     found = loads_or_refuses(lambda: read_neumip(path))
-    if found is not None:
-        queries = loads_or_refuses(lambda: found.read(0, 30))
-        if queries is not None:
-            assert all(np.isfinite(queries[name]).all() for name in FIELDS)
-            assert ((queries["u"] >= 0) & (queries["u"] < 1)).all()
+    queries = None if found is None else loads_or_refuses(lambda: found.read(0, 30))
+    if queries is not None:
+        assert all(np.isfinite(queries[name]).all() for name in FIELDS)
+        assert ((queries["u"] >= 0) & (queries["u"] < 1)).all()
