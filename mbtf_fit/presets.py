@@ -1,4 +1,4 @@
-"""The fitter's options of each quality preset; see :mod:`mbtf_gen.config.presets`."""
+"""The fitter's options of each quality preset; see :mod:`mbtf_gen.config.generator`."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
-from mbtf_gen.config.values import Tracer
+from mbtf_gen.config.generator import Tracer
 from mbtf_gen.tile.tracers.protocol import TileGeometry
 
 # Cells of a grid that Mitsuba traces. Each takes about 300 bytes, with Mitsuba's and Embree's own data.

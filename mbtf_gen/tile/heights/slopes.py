@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mbtf_core.data.geometry import mesh_slopes
 from mbtf_core.images.resample import resample
-from mbtf_gen.config.values import NormalMode
+from mbtf_gen.config.generator import NormalMode
 from mbtf_gen.tile.heights.grid import HeightGrid
 
 # Smallest z, a slope of 20, that 8-bit maps resolve.
