@@ -82,14 +82,10 @@ def run_checks(
 
     Parameters
     ----------
-    checks : sequence of Check
-        Checks to run; they hold the findings.
-    seconds : float
-        Time to use; every check runs at least once.
-    progress : callable
-        Called before each round with (seconds passed, name of the check).
-    workers : int
-        Checks to run at a time in the first round.
+    checks : checks to run; they hold the findings
+    seconds : time to use; every check runs at least once
+    progress : called before each round with (seconds passed, name of the check)
+    workers : checks to run at a time in the first round
     """
     start = time.monotonic()
 

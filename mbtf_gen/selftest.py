@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -18,10 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from mbtf_core.data.queries import Queries
 from mbtf_core.directions import from_angles
-from mbtf_core.errors import EngineError
 from mbtf_core.stats import mean_estimate
 from mbtf_gen.checks import Check, Finding
-from mbtf_gen.engine.runtime import CPU_VARIANT, CUDA_VARIANT, load_mitsuba, prove
+from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.sampling.light_kernel import LightKernel
 from mbtf_gen.tile.heights.grid import HeightGrid
 
@@ -51,23 +50,18 @@ class KnownAnswer:
 
     Parameters
     ----------
-    tolerance : float
-        Error that a case may have, beside its statistical error.
-    measure : callable
-        Cases by name of one round, which has its own random numbers. None means that the part under test is
-        absent.
+    tolerance : error that a case may have, beside its statistical error
+    measure : cases by name of one round, which has its own random numbers
     """
 
-    def __init__(self, tolerance: float, measure: Callable[[int], Cases | None]) -> None:
+    def __init__(self, tolerance: float, measure: Callable[[int], Cases]) -> None:
         self.tolerance, self.measure = tolerance, measure
         self.cases: dict[str, Case] = {}
 
     def __call__(self, round_number: int) -> Finding:
         """Measure once more, and judge the means."""
-        n, found = round_number, self.measure(round_number)
-        if found is None:
-            return Finding("absent", "no device")
-        for name, new in found.items():
+        n = round_number
+        for name, new in self.measure(n).items():
             old = self.cases.get(name, Case(0.0))
             error = math.hypot(n * old.error, new.error) / (n + 1)
             self.cases[name] = Case((n * old.off + new.off) / (n + 1), error)
@@ -100,7 +94,6 @@ def all_checks() -> list[Check]:
         Check("reciprocity", KnownAnswer(2e-3, _reciprocity)),
         Check("surface energy", KnownAnswer(2e-3, _surface)),
         Check("periodicity", KnownAnswer(0.0, _lost)),
-        Check("CUDA", KnownAnswer(1e-3, _cuda), required=False),
     ]
 
 
@@ -183,11 +176,10 @@ def _estimates(
     sigma: ArrayLike = 4.0,
     spp: int = 16,
     direct: bool = False,
-    variant: str = CPU_VARIANT,
 ) -> Any:
     """Estimates of M at n queries; each round has its own random numbers. Footprints with σ of four tile
     widths cover the tile evenly: their values are tile means."""
-    load_mitsuba(variant)
+    load_mitsuba()
     from mbtf_gen.render.estimates import Stream
     from mbtf_gen.render.estimator import Estimator
     from mbtf_gen.render.path_tracer import Transport
@@ -225,13 +217,13 @@ def _lambert(round_number: int) -> Cases:
     return out
 
 
-def _groove(round_number: int, variant: str = CPU_VARIANT) -> Cases:
+def _groove(round_number: int) -> Cases:
     """Tile means of a groove agree with the closed form."""
     groove, out = Groove(0.4, 0.7), {}
     bsdf, delta = _diffuse(groove.albedo), LightKernel(0.0)
     for light, view in _PAIRS:
         i, o = from_angles(*light), from_angles(*view)
-        found = _estimates(groove.grid, bsdf, delta, i, o, round_number, direct=True, variant=variant)
+        found = _estimates(groove.grid, bsdf, delta, i, o, round_number, direct=True)
         out[f"light {light}, view {view}"] = _case(found, groove.tile_mean(i, o))
     return out
 
@@ -294,20 +286,3 @@ def _lost(round_number: int) -> Cases:
         e = _estimates(grid, _diffuse(0.0), LightKernel(0.0), _UP, view, round_number, **options)
         out[f"aspect {aspect:g}"] = Case(float(e.lost + e.capped))
     return out
-
-
-def _cuda(round_number: int) -> Cases | None:
-    """The groove on the GPU, in a child process, because a driver may abort it; None without a device."""
-    from mbtf_core.run.child import run_child
-
-    if prove(CUDA_VARIANT).fault:
-        return None
-    outcome = run_child(__name__, "groove_on_cuda", str(round_number), timeout=180.0)
-    if outcome.fault:
-        raise EngineError(outcome.fault)
-    return {name: Case(*numbers) for name, numbers in outcome.answers.items()}
-
-
-def groove_on_cuda(round_number: str) -> Iterator[dict[str, Any]]:
-    """Child process of the CUDA check."""
-    yield {name: tuple(case) for name, case in _groove(int(round_number), CUDA_VARIANT).items()}

@@ -29,10 +29,8 @@ def export_neumip(data: Dataset, path: Path) -> int:
 
     Parameters
     ----------
-    data : Dataset
-        Of the shuffled layout, of a square tile.
-    path : Path
-        It is replaced only once all queries are written.
+    data : of the shuffled layout, of a square tile
+    path : it is replaced only once all queries are written
 
     Returns
     -------
@@ -41,8 +39,7 @@ def export_neumip(data: Dataset, path: Path) -> int:
 
     Raises
     ------
-    InputError
-        The data set is another, or a shard cannot be read.
+    InputError : the data set is another, or a shard cannot be read
     """
     if data.layout != "shuffled":
         raise InputError(
@@ -104,10 +101,8 @@ def export_neural_btf(data: Dataset, path: Path) -> int:
 
     Parameters
     ----------
-    data : Dataset
-        Of the slices layout.
-    path : Path
-        It is replaced only once all images are written.
+    data : of the slices layout
+    path : it is replaced only once all images are written
 
     Returns
     -------
@@ -116,8 +111,7 @@ def export_neural_btf(data: Dataset, path: Path) -> int:
 
     Raises
     ------
-    InputError
-        The data set has no such images, or a shard cannot be read.
+    InputError : the data set has no such images, or a shard cannot be read
     """
     if data.layout != "slices":
         raise InputError(

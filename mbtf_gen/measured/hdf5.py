@@ -67,8 +67,7 @@ def opened(path: Path) -> Iterator[Any]:
 
     Raises
     ------
-    InputError
-        The file is missing, is not HDF5, is truncated or damaged.
+    InputError : the file is missing, is not HDF5, is truncated or damaged
     """
     import h5py
 
@@ -91,49 +90,31 @@ def data_set(file: Any, name: str, path: Path) -> Any:
 
     Raises
     ------
-    InputError
-        It is missing, leads to another file, has no floats, or has parts that were never written.
+    InputError : it is missing, leads to another file, has no floats, or has parts that were never written
     """
     import h5py
 
-    link = file.get(name, getlink=True)
-    if link is None:
-        found = ", ".join(sorted(file)[:10])
-        raise InputError(
-            f"has no data set '{name}'", where=path, hint=f"it has {found}" if found else "it is empty"
-        )
-    if not isinstance(link, h5py.HardLink):
-        raise InputError(f"has a link in place of the data set '{name}'", where=path)
-    found = file[name]
-    if not isinstance(found, h5py.Dataset):
-        raise InputError(f"has a group in place of the data set '{name}'", where=path)
-    if found.is_virtual or found.external:
-        raise InputError(f"keeps the data set '{name}' in other files", where=path)
+    found = file[name] if isinstance(file.get(name, getlink=True), h5py.HardLink) else None
+    if not isinstance(found, h5py.Dataset) or found.is_virtual or found.external:
+        names = ", ".join(sorted(file)[:10])
+        hint = f"it has {names}" if names else "it is empty"
+        raise InputError(f"has no data set '{name}' of its own", where=path, hint=hint)
     if found.dtype.kind != "f" or found.dtype.itemsize not in (2, 4, 8):
         raise InputError(f"has {found.dtype} numbers in '{name}'; floats are expected", where=path)
-    if found.shape is None or not found.shape or min(found.shape) < 1:
+    if not found.shape or min(found.shape) < 1:
         raise InputError(f"has the shape {found.shape} of '{name}'", where=path)
     if found.compression not in (None, "gzip", "lzf"):
         raise InputError(f"has '{name}' compressed by '{found.compression}'", where=path)
-    _check_stored(found, name, path)
-    return found
-
-
-def _check_stored(found: Any, name: str, path: Path) -> None:
-    size = math.prod(found.shape) * found.dtype.itemsize
     if found.chunks is None:
-        stored = found.id.get_storage_size()
-        if stored != size:
-            raise InputError(f"stores {stored:,} of the {size:,} bytes of '{name}'", where=path)
-        if stored > path.stat().st_size:
-            raise InputError(f"is too short for the {size:,} bytes of '{name}'", where=path)
-        return
-    if math.prod(found.chunks) * found.dtype.itemsize > _MOST_CHUNK_BYTES:
-        raise InputError(f"has chunks {found.chunks} of '{name}', which are too large", where=path)
-    chunks = math.prod(-(-n // c) for n, c in zip(found.shape, found.chunks, strict=True))
-    stored = found.id.get_num_chunks()
-    if stored != chunks:
-        raise InputError(f"stores {stored:,} of the {chunks:,} chunks of '{name}'", where=path)
+        unit, total, stored = "bytes", found.size * found.dtype.itemsize, found.id.get_storage_size()
+    else:
+        if math.prod(found.chunks) * found.dtype.itemsize > _MOST_CHUNK_BYTES:
+            raise InputError(f"has chunks {found.chunks} of '{name}', which are too large", where=path)
+        total = math.prod(-(-n // c) for n, c in zip(found.shape, found.chunks, strict=True))
+        unit, stored = "chunks", found.id.get_num_chunks()
+    if stored != total:
+        raise InputError(f"stores {stored:,} of the {total:,} {unit} of '{name}'", where=path)
+    return found
 
 
 def floats(found: Any, start: int, stop: int) -> NDArray[np.float64]:
@@ -215,8 +196,7 @@ def read_neumip(path: str | Path) -> NeumipQueries:
 
     Raises
     ------
-    InputError
-        Not HDF5, a data set is missing or has another shape, or it is the rendering of a scene.
+    InputError : not HDF5, a data set is missing or has another shape, or it is the rendering of a scene
     """
     path = Path(path)
     with opened(path) as file:
@@ -279,8 +259,7 @@ def read_neural_btf(path: str | Path) -> NeuralBtf:
 
     Raises
     ------
-    InputError
-        Not HDF5, a data set is missing or has another shape, or a direction is NaN.
+    InputError : not HDF5, a data set is missing or has another shape, or a direction is NaN
     """
     path = Path(path)
     directions = {}

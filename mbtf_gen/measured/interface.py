@@ -34,10 +34,8 @@ class MeasuredBtf(ABC):
 
     Parameters
     ----------
-    path : Path
-        The file or folder.
-    rows, columns : int
-        Texels of an image; row 0 is the top.
+    path : the file or folder
+    rows, columns : texels of an image; row 0 is the top
     light, view : (pairs, 3) float32 array
         Unit vectors of all pairs of the file; those at the horizon or below it are left out.
 
@@ -70,8 +68,7 @@ class MeasuredBtf(ABC):
 
         Raises
         ------
-        InputError
-            The file cannot be read, or one of the values is NaN or infinite.
+        InputError : the file cannot be read, or one of the values is NaN or infinite
         """
         out = self._values(self._number[pair], np.asarray(texel))
         bad = int((~np.isfinite(out).all(axis=-1)).sum())

@@ -31,8 +31,7 @@ def open_measured(path: str | Path) -> MeasuredBtf | MeasuredQueries:
 
     Raises
     ------
-    InputError
-        The file is missing, of no known kind, or damaged.
+    InputError : the file is missing, of no known kind, or damaged
     """
     path = Path(path)
     if path.is_dir():

@@ -103,8 +103,7 @@ def read_ubo2003(path: str | Path) -> Ubo2003:
 
     Parameters
     ----------
-    path : str or Path
-        The folder may have sub-folders; links are not followed out of it.
+    path : the folder may have sub-folders; links are not followed out of it
 
     Returns
     -------
@@ -183,10 +182,6 @@ def _archive(path: Path) -> tuple[list[str], Callable[[str], bytes]]:
         if angles_of(entry.filename) is None or entry.filename.startswith("__MACOSX/"):
             continue
         name = entry.filename
-        if name in by_name:
-            raise InputError(f"has two files of the name '{_short(name)}'", where=path)
-        if entry.flag_bits & 1:
-            raise InputError(f"'{_short(name)}' is encrypted", where=path)
         if entry.file_size > min(_MOST_BYTES, _MOST_RATIO * entry.compress_size + 10_000):
             raise InputError(
                 f"'{_short(name)}' claims {entry.file_size:,} bytes in {entry.compress_size:,}", where=path

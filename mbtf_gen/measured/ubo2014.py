@@ -146,8 +146,7 @@ def read_ubo2014(path: str | Path) -> Ubo2014:
 
     Raises
     ------
-    InputError
-        Not a DFMF file, truncated, inconsistent, or of a kind that cannot be converted to RGB.
+    InputError : not a DFMF file, truncated, inconsistent, or of a kind that cannot be converted to RGB
     """
     path = Path(path)
     try:

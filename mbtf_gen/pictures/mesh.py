@@ -83,14 +83,11 @@ def draw(tiles: TiledMesh, camera: Camera, omega_i: NDArray[np.float64], path: P
 
     Parameters
     ----------
-    tiles : TiledMesh
-        The mesh.
-    camera : Camera
-        The camera.
+    tiles : the mesh
+    camera : the camera
     omega_i : (3,) float array
         Direction towards the light.
-    path : Path
-        PNG to write.
+    path : PNG to write
 
     Returns
     -------

@@ -85,25 +85,18 @@ def draw_preview(
 
     Parameters
     ----------
-    config : PreviewConfig
-        Options of the pictures and of the material.
-    dataset : Dataset or None
-        Data set whose queries are shown; without one, those that a run would draw.
-    path : Path
-        Folder of the pictures.
-    console : Console
-        Where notes and results go.
-    overwrite : bool
-        Replace the pictures of another configuration.
+    config : options of the pictures and of the material
+    dataset : data set whose queries are shown; without one, those that a run would draw
+    path : folder of the pictures
+    console : where notes and results go
+    overwrite : replace the pictures of another configuration
 
     Raises
     ------
     InputError
         The material cannot be read, and there is no data set either; or the folder holds something else.
-    UsageError
-        The view shows the horizon.
-    PartialError
-        The mesh could not be drawn; everything else was.
+    UsageError : the view shows the horizon
+    PartialError : the mesh could not be drawn; everything else was
     """
     scene = _scene(config, dataset, console)
     inputs: dict[str, str] = {}

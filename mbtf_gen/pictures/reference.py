@@ -108,18 +108,14 @@ def render_reference(
 
     Parameters
     ----------
-    estimator : Estimator
-        Estimator of the tile.
-    camera : Camera
-        The camera.
+    estimator : estimator of the tile
+    camera : the camera
     omega_i : (3,) float array
         Direction towards the light.
     kind : {"query", "pixel"}
         Meaning of a pixel, see :mod:`mbtf_core.pictures.camera`.
-    spp : int
-        Paths per pixel, both halves together; even.
-    seed, index : int
-        Root seed of the random numbers, and number of the picture.
+    spp : paths per pixel, both halves together; even
+    seed, index : root seed of the random numbers, and number of the picture
 
     Returns
     -------
@@ -128,8 +124,7 @@ def render_reference(
 
     Raises
     ------
-    UsageError
-        The picture shows the horizon.
+    UsageError : the picture shows the horizon
     """
     from mbtf_gen.render.estimator import Stream
 
@@ -174,25 +169,18 @@ def render_references(
 
     Parameters
     ----------
-    config : ReferenceConfig
-        The material, the views and the light.
-    output : Path
-        The folder.
-    console : Console
-        Where progress and results go.
+    config : the material, the views and the light
+    output : the folder
+    console : where progress and results go
     cluster : str, optional
         Workers, as :func:`mbtf_core.run.cluster.open_runner` takes them.
-    overwrite : bool
-        Replace the pictures of another configuration.
+    overwrite : replace the pictures of another configuration
 
     Raises
     ------
-    UsageError
-        The view shows the horizon.
-    InputError
-        The folder holds something else, or the pictures do not fit on the disk.
-    PartialError
-        A picture failed; the same command renders the missing ones.
+    UsageError : the view shows the horizon
+    InputError : the folder holds something else, or the pictures do not fit on the disk
+    PartialError : a picture failed; the same command renders the missing ones
     """
     wanted, job = config.reference, Job.prepare(config)
     omega_i = from_angles(wanted.light.elevation, wanted.light.azimuth)

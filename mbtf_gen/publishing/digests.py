@@ -69,10 +69,8 @@ def digest_faults(data: Dataset, path: Path) -> list[str]:
 
     Parameters
     ----------
-    data : Dataset
-        The data set that was made again.
-    path : Path
-        ``digests.json`` of the published one.
+    data : the data set that was made again
+    path : ``digests.json`` of the published one
 
     Returns
     -------
@@ -80,8 +78,7 @@ def digest_faults(data: Dataset, path: Path) -> list[str]:
 
     Raises
     ------
-    InputError
-        The file or a shard cannot be read.
+    InputError : the file or a shard cannot be read
     """
     hint = f"name a {DIGESTS_NAME} of a recipe"
     document = read_json(path, hint)

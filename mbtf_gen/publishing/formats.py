@@ -49,14 +49,12 @@ def shard_writers(
 
     Parameters
     ----------
-    shard : Shard
-        The shard.
+    shard : the shard
     arrays : dict of str to float32 array
         Its arrays.
     form : {"parquet", "webdataset", "npz"}
         Form of the files.
-    described : mapping
-        ``unit`` and ``meaning`` of each array.
+    described : ``unit`` and ``meaning`` of each array
 
     Returns
     -------

@@ -49,8 +49,7 @@ def tile_images(arrays: Arrays, aspect: float) -> dict[str, F64]:
     ----------
     arrays : dict of str to float32 array
         Queries.
-    aspect : float
-        Height of the tile over its width.
+    aspect : height of the tile over its width
 
     Returns
     -------
@@ -113,12 +112,9 @@ def write_picture(arrays: Arrays, aspect: float, geometry: Geometry | None, path
     ----------
     arrays : dict of str to float32 array
         Training queries.
-    aspect : float
-        Height of the tile over its width.
-    geometry : Geometry or None
-        Of the data set.
-    path : Path
-        PNG to write.
+    aspect : height of the tile over its width
+    geometry : of the data set
+    path : PNG to write
 
     Returns
     -------
@@ -126,8 +122,7 @@ def write_picture(arrays: Arrays, aspect: float, geometry: Geometry | None, path
 
     Raises
     ------
-    PartialError
-        The disk is full or the folder cannot be written.
+    PartialError : the disk is full or the folder cannot be written
     """
     from matplotlib.figure import Figure
 

@@ -49,14 +49,10 @@ class Publication:
 
     Parameters
     ----------
-    data : Dataset
-        A complete data set.
-    config : PublishConfig
-        What its publishers say.
-    documents : dict of str to bytes or Path
-        Geometry, recipe and copies of documents, by name in the folder.
-    maps : bool
-        Whether the input files of the material are published.
+    data : A complete data set
+    config : what its publishers say
+    documents : geometry, recipe and copies of documents, by name in the folder
+    maps : whether the input files of the material are published
     """
 
     data: Dataset
@@ -77,14 +73,10 @@ class Publication:
 
         Parameters
         ----------
-        shards : str, Path or DataFolder
-            Folder of shards.
-        config : PublishConfig
-            What its publishers say.
-        with_maps : bool
-            Publish the input files of the material.
-        material : Path or None
-            Path of the material, if it was moved.
+        shards : folder of shards
+        config : what its publishers say
+        with_maps : publish the input files of the material
+        material : path of the material, if it was moved
 
         Returns
         -------
@@ -92,12 +84,9 @@ class Publication:
 
         Raises
         ------
-        InputError
-            The data set is damaged or unfinished, or its material cannot be copied.
-        UsageError
-            Options contradict the data set.
-        EngineError
-            A library is missing.
+        InputError : the data set is damaged or unfinished, or its material cannot be copied
+        UsageError : options contradict the data set
+        EngineError : a library is missing
         """
         data = Dataset.open(shards)
         manifest, measured = data.manifest, "measured" in data.manifest
@@ -178,12 +167,9 @@ class Publication:
 
         Parameters
         ----------
-        output : Path
-            Folder to write.
-        overwrite : bool
-            Replace what was published there.
-        progress : callable
-            Called with 1 after each shard.
+        output : folder to write
+        overwrite : replace what was published there
+        progress : called with 1 after each shard
 
         Returns
         -------
@@ -192,10 +178,8 @@ class Publication:
 
         Raises
         ------
-        InputError
-            The folder holds something else, or does not fit on the disk.
-        PartialError
-            It cannot be written, or another process writes to it; the same command resumes.
+        InputError : the folder holds something else, or does not fit on the disk
+        PartialError : it cannot be written, or another process writes to it; the same command resumes
         """
         check_space(output, self.size, "choose another folder with -o")
         with owned(output):

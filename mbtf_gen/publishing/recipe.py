@@ -52,12 +52,9 @@ def recipe_files(data: Dataset, *, with_maps: bool, moved: Path | None) -> dict[
 
     Parameters
     ----------
-    data : Dataset
-        Generated, not measured.
-    with_maps : bool
-        Whether the input files of the material are published.
-    moved : Path or None
-        Path of the material, if it is not where the data set was generated from.
+    data : generated, not measured
+    with_maps : whether the input files of the material are published
+    moved : path of the material, if it is not where the data set was generated from
 
     Returns
     -------
@@ -65,8 +62,7 @@ def recipe_files(data: Dataset, *, with_maps: bool, moved: Path | None) -> dict[
 
     Raises
     ------
-    InputError
-        The material cannot be read, has changed since, or consists of files that cannot be copied.
+    InputError : the material cannot be read, has changed since, or consists of files that cannot be copied
     """
     config = public_config(data.manifest)
     if not with_maps:

@@ -55,7 +55,7 @@ def test_rounds_are_averaged_and_exact_or_absent_checks_run_once() -> None:
     known = KnownAnswer(1.0, measure)
     noisy = Check("noisy", known)
     exact = Check("exact", KnownAnswer(0.0, lambda _: {"case": Case(0.0)}))
-    absent = Check("absent", KnownAnswer(0.0, lambda _: None))
+    absent = Check("absent", lambda _: Finding("absent", "no device"))
     run_checks([noisy, exact, absent], 0.05)
     n = noisy.rounds
     assert asked == list(range(n))
