@@ -49,7 +49,7 @@ class Publication:
 
     Parameters
     ----------
-    data : A complete data set
+    data : a complete data set
     config : what its publishers say
     documents : geometry, recipe and copies of documents, by name in the folder
     maps : whether the input files of the material are published

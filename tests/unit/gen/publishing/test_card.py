@@ -211,17 +211,10 @@ def test_text_is_shown_as_it_is(text: str) -> None:
 
 
 @pytest.mark.parametrize("text", TEXTS)
-def test_code_is_shown_as_it_is(text: str) -> None:
-    if "|" not in text:
-        assert shown(f"Name: {code(text)}") == (f"Name: {text}", {"p", "code"})
-
-
-@pytest.mark.parametrize("text", TEXTS)
 def test_cells_stay_cells(text: str) -> None:
     page = f"| a | b |\n| --- | --- |\n| {escaped(text)} | 1 |\n| {code(text)} | 2 |\n"
     found, tags = shown(page)
     assert tags == {"table", "thead", "tbody", "tr", "th", "td", "code"}
-    assert found.split("\n")[-1].strip() == "2" or found.endswith("2")
     assert found.count(text) == 2
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +10,7 @@ import pytest
 from support.datasets import edit, write_dataset
 from support.published import contents, publish, small
 
-from mbtf_core.errors import EngineError, InputError, PartialError, UsageError
+from mbtf_core.errors import EngineError, InputError, UsageError
 from mbtf_core.files.atomic import Stored
 from mbtf_gen.config.publish import PublishConfig
 from mbtf_gen.publishing import publication as module
@@ -63,24 +62,6 @@ def test_an_interrupted_run_resumes(
         shutil.rmtree(tmp_path / "cut")
 
 
-def test_finished_files_are_kept(shards: Path, tmp_path: Path) -> None:
-    card = publish(shards, tmp_path / "card", form="webdataset")
-    before = {path: path.stat().st_ino for path in card.rglob("*") if path.is_file()}
-    publish(shards, card, form="webdataset")
-    assert {path: path.stat().st_ino for path in card.rglob("*") if path.is_file()} == before
-
-
-def test_a_lost_file_is_written_again(shards: Path, tmp_path: Path) -> None:
-    card = publish(shards, tmp_path / "card", form="webdataset")
-    before = contents(card)
-    for name in ("data/train-00000.tar", "README.md"):
-        (card / name).unlink()
-    (card / "data/train-00001.tar").write_bytes(before["data/train-00001.tar"][:-512])
-    (card / ".README.md.00000000-1.tmp").write_text("half")
-    publish(shards, tmp_path / "card", form="webdataset")
-    assert contents(card) == before
-
-
 def test_other_options_are_refused_and_replace(shards: Path, tmp_path: Path) -> None:
     card = publish(shards, tmp_path / "card", form="webdataset")
     (card / "mine.txt").write_text("kept")
@@ -95,24 +76,6 @@ def test_other_options_are_refused_and_replace(shards: Path, tmp_path: Path) -> 
     assert "CC-BY-4.0" in (card / "README.md").read_text()
 
 
-def test_a_record_cannot_remove_what_lies_elsewhere(shards: Path, tmp_path: Path) -> None:
-    card = publish(shards, tmp_path / "card", form="webdataset")
-    record = json.loads((card / "publish.json").read_text())
-    record["listed"].append("../data/manifest.json")
-    (card / "publish.json").write_text(json.dumps(record))
-    with pytest.raises(InputError, match=r"is damaged .*must lie in the folder"):
-        Publication.prepare(shards, CONFIG).write(card, overwrite=True)
-    assert (shards / "manifest.json").exists()
-
-
-def test_a_folder_of_others_is_refused(shards: Path, tmp_path: Path) -> None:
-    (tmp_path / "card").mkdir()
-    (tmp_path / "card/notes.txt").write_text("mine")
-    for overwrite in (False, True):
-        with pytest.raises(InputError, match="is not empty and holds no published data set"):
-            Publication.prepare(shards, CONFIG).write(tmp_path / "card", overwrite=overwrite)
-
-
 def test_damage_is_found_before_anything_is_written(shards: Path, tmp_path: Path) -> None:
     path = shards / "train-00001.npz"
     content = bytearray(path.read_bytes())
@@ -121,12 +84,6 @@ def test_damage_is_found_before_anything_is_written(shards: Path, tmp_path: Path
     with pytest.raises(InputError, match=r"train-00001\.npz: has changed since it was written"):
         publish(shards, tmp_path / "card", form="webdataset")
     assert not (tmp_path / "card").exists()
-
-
-def test_an_unfinished_data_set_is_refused(shards: Path, tmp_path: Path) -> None:
-    (shards / "test-00000.npz").unlink()
-    with pytest.raises(InputError, match="is missing"):
-        publish(shards, tmp_path / "card", form="webdataset")
 
 
 def test_a_data_set_without_its_completion_is_refused(shards: Path, tmp_path: Path) -> None:
@@ -163,10 +120,3 @@ def test_shards_of_exr_are_not_npz(tmp_path: Path) -> None:
         publish(tmp_path / "data", tmp_path / "card", form="npz")
     card = publish(tmp_path / "data", tmp_path / "card", form="webdataset")
     assert (card / "data/train-00000.tar").exists()
-
-
-def test_a_folder_in_use_is_refused(shards: Path, tmp_path: Path) -> None:
-    from mbtf_core.files.folders import owned
-
-    with owned(tmp_path / "card"), pytest.raises(PartialError, match="is being written by another process"):
-        publish(shards, tmp_path / "card", form="webdataset")
