@@ -190,8 +190,6 @@ def _queries(file: Path, scene: _Scene | None, dataset: Dataset | None) -> dict[
     else:
         assert scene is not None
         sample, source = sampled_queries(scene.job), f"sampled for {scene.config.material}"
-    shown = f"{len(sample.u)} of {sample.total} training queries {source}"
-    if len(sample.level) < len(sample.u):
-        shown += f", in {len(sample.level)} images or slices, of which the first query is shown"
+    shown = f"{sample.queries.sigma.size} of {sample.total} training queries {source}"
     write_plots(file, sample, shown)
     return {"shows": f"positions, levels and directions of {shown}"}

@@ -36,30 +36,30 @@ class QuerySample:
 
     Attributes
     ----------
-    u : (n, 2) uv
-    level : (m,) fractional levels; omega_i, omega_o : (m, 3). One per query, or one per image in the image
-        layout, whose queries share them.
+    queries : one axis
     total : training queries of the whole data set
     mixture, finest : of the levels; min_cos : of both directions; aspect : H/W of the tile
     """
 
-    u: NDArray[np.float32]
-    level: NDArray[np.float64]
-    omega_i: NDArray[np.float32]
-    omega_o: NDArray[np.float32]
+    queries: Queries
     total: int
     mixture: LevelMixture
     finest: int
     min_cos: float
     aspect: float
 
+    @property
+    def level(self) -> NDArray[np.float64]:
+        """Fractional levels (n,)."""
+        return level_of_sigma(self.queries.sigma)
+
 
 def sampled_queries(job: Job) -> QuerySample:
     """Queries of the first shards that a configuration samples."""
     plan, entries = job.query_plan, (entry for entry in job.shards if entry.split == "train")
-    columns = _columns(plan.draw("train", entry.index, entry.rows) for entry in entries)
+    first = _first(plan.draw("train", entry.index, entry.rows) for entry in entries)
     total = split_queries(job, "train")
-    return QuerySample(*columns, total, plan.mixture, job.lattice.finest, plan.min_cos, job.lattice.aspect)
+    return QuerySample(first, total, plan.mixture, job.lattice.finest, plan.min_cos, job.lattice.aspect)
 
 
 def stored_queries(dataset: Dataset) -> QuerySample:
@@ -76,9 +76,8 @@ def stored_queries(dataset: Dataset) -> QuerySample:
             where=dataset.folder,
             hint="run the mbtf-gen command that made the folder again: it resumes",
         )
-    names = ("u", "sigma", "omega_i", "omega_o")
     return QuerySample(
-        *_columns(Queries(**shard.read(names)) for shard in shards),
+        _first(Queries(**shard.read(("u", "sigma", "omega_i", "omega_o"))) for shard in shards),
         int(manifest["splits"]["train"]["queries"]),
         LevelMixture(**manifest["levels"]["mixture"]),
         dataset.lattice.finest,
@@ -87,20 +86,15 @@ def stored_queries(dataset: Dataset) -> QuerySample:
     )
 
 
-def _columns(batches: Iterable[Queries]) -> tuple[Any, Any, Any, Any]:
-    """Positions, levels and directions of the first batches that reach the limit."""
+def _first(batches: Iterable[Queries]) -> Queries:
+    """The first batches that reach the limit, as one."""
     parts: list[Queries] = []
     for batch in batches:
-        parts.append(batch)
+        parts.append(batch.flat())
         if sum(part.sigma.size for part in parts) >= MAX_QUERIES:
             break
-    # The image layout repeats footprint and directions over an image: its first query stands for it.
-    one: Any = (slice(None), *(0,) * (len(parts[0].lead) - 1))
-    return (
-        np.concatenate([p.u.reshape(-1, 2) for p in parts]),
-        level_of_sigma(np.concatenate([p.sigma[one] for p in parts])),
-        np.concatenate([p.omega_i[one] for p in parts]),
-        np.concatenate([p.omega_o[one] for p in parts]),
+    return Queries(
+        *(np.concatenate(arrays) for arrays in zip(*(vars(p).values() for p in parts), strict=True))
     )
 
 
@@ -115,7 +109,7 @@ def level_histogram(
     if sample.finest == 0:
         edges, stated = np.array([-0.5, 0.5]), np.ones(1)
     else:
-        enough = len(sample.level) >= _PER_BIN * _BINS_PER_LEVEL * sample.finest
+        enough = sample.queries.sigma.size >= _PER_BIN * _BINS_PER_LEVEL * sample.finest
         bins = sample.finest * (_BINS_PER_LEVEL if enough else 1)
         edges = np.linspace(0.0, sample.finest, bins + 1)
         stated = sample.mixture.density(0.5 * (edges[1:] + edges[:-1]), sample.finest)
@@ -135,8 +129,8 @@ def write_plots(path: Path, sample: QuerySample, title: str) -> None:
     position, level, light, view = figure.subplots(2, 2).ravel()
     _positions(position, sample)
     _levels(level, sample)
-    _directions(light, sample.omega_i, sample.min_cos, "ω_i, towards the light")
-    _directions(view, sample.omega_o, sample.min_cos, "ω_o, towards the viewer")
+    _directions(light, sample.queries.omega_i, sample.min_cos, "ω_i, towards the light")
+    _directions(view, sample.queries.omega_o, sample.min_cos, "ω_o, towards the viewer")
     write_file(path, lambda stream: figure.savefig(stream, format="png", dpi=100))
 
 
@@ -152,7 +146,7 @@ def _spread(axes: Any, x: Any, y: Any, bins: tuple[int, int], extent: Any) -> No
 
 
 def _positions(axes: Any, sample: QuerySample) -> None:
-    u, v = sample.u.T
+    u, v = sample.queries.u.T
     axes.set(title="positions", xlabel="u", ylabel="v", xlim=(0, 1), ylim=(0, 1), aspect=sample.aspect)
     columns = _bins(round(len(u) * max(1.0, 1.0 / sample.aspect)))
     _spread(axes, u, v, (columns, max(1, round(sample.aspect * columns))), ((0, 1), (0, 1)))

@@ -8,6 +8,7 @@ from __future__ import annotations
 import html
 import re
 from collections.abc import Mapping
+from functools import partial
 from importlib.resources import files as resources
 from typing import Any
 
@@ -67,11 +68,10 @@ def front_matter(facts: Facts) -> str:
         data = {"license": "other", "license_name": facts.config.license}
     data |= {"pretty_name": facts.name, "tags": list(TAGS)}
     if facts.config.form != "npz":
-        suffix, shapes = SUFFIXES[facts.config.form], list(facts.shapes.values())
+        suffix = SUFFIXES[facts.config.form]
         parts = [{"split": split, "path": f"data/{split}-*{suffix}"} for split in facts.samples]
         # Rows of one configuration must have one shape.
-        alike = all(shape == shapes[0] for shape in shapes)
-        groups = {"default": parts} if alike else {part["split"]: [part] for part in parts}
+        groups = {"default": parts} if facts.same_shapes else {part["split"]: [part] for part in parts}
         data["configs"] = [{"config_name": name, "data_files": found} for name, found in groups.items()]
     return dump_yaml(data)
 
@@ -98,20 +98,11 @@ def _grouped(facts: Facts) -> dict[str, list[int]]:
     return groups
 
 
-def _row_shapes(facts: Facts) -> dict[str, str]:
-    """Shape of a row of each array, of each split where they differ."""
-    shapes = {
-        split: {name: " × ".join(map(str, shape)) or "1" for name, shape in arrays.items()}
-        for split, arrays in facts.shapes.items()
-    }
-    out = {}
-    for name in next(iter(shapes.values())):
-        of_splits = {split: arrays[name] for split, arrays in shapes.items()}
-        alike = len(set(of_splits.values())) == 1
-        out[name] = next(iter(of_splits.values()))
-        if not alike:
-            out[name] = "; ".join(f"{split}: {text}" for split, text in of_splits.items())
-    return out
+def _row_shape(facts: Facts, name: str) -> str:
+    """Shape of a row of an array, of each split where they differ."""
+    shapes = {split: " × ".join(map(str, arrays[name])) or "1" for split, arrays in facts.shapes.items()}
+    texts = set(shapes.values())
+    return texts.pop() if len(texts) == 1 else "; ".join(f"{split}: {text}" for split, text in shapes.items())
 
 
 def card_text(facts: Facts) -> str:
@@ -120,15 +111,15 @@ def card_text(facts: Facts) -> str:
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
     )
     environment.filters |= {"text": escaped, "code": code, "fenced": fenced, "size": size_text}
-    shapes, split = facts.shapes, "test" if "test" in facts.samples else next(iter(facts.samples))
+    split = "test" if "test" in facts.samples else next(iter(facts.samples))
     return environment.from_string(resources(__package__).joinpath("card.md.j2").read_text()).render(
         facts=facts,
         manifest=facts.data.manifest,
         front_matter=front_matter(facts),
-        fields=_row_shapes(facts),
+        row_shape=partial(_row_shape, facts),
         split=split,
-        shape=", ".join(str(n) for n in (-1, *shapes[split]["value_a"])),
-        configuration="" if all(s == shapes[split] for s in shapes.values()) else f'"{split}", ',
+        shape=", ".join(str(n) for n in (-1, *facts.shapes[split]["value_a"])),
+        configuration="" if facts.same_shapes else f'"{split}", ',
         labels={name: effect.description for name, effect in EFFECTS.items()},
         bound=_bound,
         files=_grouped(facts),

@@ -89,6 +89,12 @@ class Facts:
             for split, arrays in self.samples.items()
         }
 
+    @property
+    def same_shapes(self) -> bool:
+        """Whether rows of all splits have the same shapes."""
+        first, *others = self.shapes.values()
+        return all(shapes == first for shapes in others)
+
     def queries(self, split: str) -> int:
         """Number of queries of a split."""
         return int(self.data.manifest["splits"][split]["queries"])

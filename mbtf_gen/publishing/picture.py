@@ -34,12 +34,11 @@ _EMPTY = 238
 
 def mean_image(x: F64, y: F64, value: F64, rows: int, columns: int) -> F64:
     """Mean value (rows, columns, 3) of points of the unit square, row 0 at ``y → 1``; NaN without points."""
-    column, row = (np.clip(c * n, 0, n - 1).astype(int) for c, n in ((x, columns), (1.0 - y, rows)))
-    index, bins = row * columns + column, rows * columns
-    count = np.bincount(index, minlength=bins)
-    sums = np.stack([np.bincount(index, value[:, c], bins) for c in range(3)], -1)
-    with np.errstate(invalid="ignore"):
-        return np.asarray(sums / count[:, None]).reshape(rows, columns, 3)
+    from scipy.stats import binned_statistic_2d
+
+    unit = ((0.0, 1.0), (0.0, 1.0))
+    found = binned_statistic_2d(1.0 - y, x, value.T, "mean", (rows, columns), unit).statistic
+    return np.moveaxis(np.asarray(found), 0, -1)
 
 
 def tile_images(arrays: Arrays, aspect: float) -> dict[str, F64]:
