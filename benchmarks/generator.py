@@ -37,7 +37,7 @@ from common import alternate, finish, parser_of, start
 from numpy.typing import NDArray
 
 from mbtf_core.data.lattice import Lattice
-from mbtf_gen.config.values import Tracer
+from mbtf_gen.config.generator import Tracer
 from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile, Tile

@@ -96,14 +96,15 @@ def save_finite(path: str | Path, **arrays: Any) -> None:
 
 def selftest(sizes: str) -> Answers:
     """State of every check of ``mbtf-gen selftest``, or why it could not run."""
-    from mbtf_gen.diagnostics.selftest import all_checks, run_checks
+    from mbtf_gen.checks import run_checks
     from mbtf_gen.engine.runtime import load_mitsuba
+    from mbtf_gen.selftest import all_checks
 
     load_mitsuba()
     checks = all_checks()
     run_checks(checks, Sizes.read(sizes).selftest)
     for check in checks:
-        yield {check.name: check.fault or check.state}
+        yield {check.name: check.finding.found if check.failed else check.finding.state}
 
 
 def generate_data(sizes: str, layout: Layout, folder: str) -> Answers:

@@ -26,15 +26,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
+import h5py
 import numpy as np
 from common import finish, parser_of, start, timed
-from numpy.typing import NDArray
 
-from mbtf_gen.measured.neumip_hdf5 import write_neumip
-from mbtf_gen.measured.neural_btf_hdf5 import write_neural_btf
+from mbtf_gen.measured.hdf5 import CHANNELS, COLOR, LIGHT, PLACE, RADIUS, VIEW
 from mbtf_gen.sampling.query_sampler import direction_pairs, slice_directions
 
 GENERATE = {"peak_gib": 2.0, "first_shard_seconds": 10.0}
@@ -91,7 +89,11 @@ def write_images(path: Path, values: int) -> None:
     """A capture of NeuralBTF."""
     light, view = direction_pairs(slice_directions("spiral", 81, 0.2))
     random = np.random.default_rng(0)
-    write_neural_btf(path, light, view, (random.random((SIDE, SIDE, 3), np.float32) for _ in light))
+    with h5py.File(path, "w") as file:
+        file[LIGHT], file[VIEW] = light[:, :2], view[:, :2]
+        color = file.create_dataset(COLOR, (len(light), SIDE, SIDE, 3), np.float32)
+        for pair in range(len(light)):
+            color[pair] = random.random((SIDE, SIDE, 3), np.float32)
 
 
 def write_factors(path: Path, values: int) -> None:
@@ -118,19 +120,19 @@ def write_queries(path: Path, values: int) -> None:
     """A data set of NeuMIP: `values` queries, and the test queries."""
     random = np.random.default_rng(0)
     omega = slice_directions("spiral", 4096, 0.2)
-    image = 512**2
-
-    def batches() -> Iterator[dict[str, NDArray[np.float32]]]:
-        for _ in range(-(-(values + 8192) // image)):
-            yield {
-                "u": random.random((image, 2), np.float32),
-                "sigma": np.full(image, 0.5 / 512, np.float32),
-                "omega_i": omega[random.integers(4096, size=image)],
-                "omega_o": omega[random.integers(4096, size=image)],
-                "value": random.random((image, 3), np.float32),
-            }
-
-    write_neumip(path, batches(), 512)
+    shape = (-(-(values + 8192) // 512**2), 512, 512)
+    with h5py.File(path, "w") as file:
+        file.attrs["base_radius"] = 0.5 / 512
+        stored = {
+            name: file.create_dataset(name, (*shape, c), np.float32, chunks=(1, 512, 512, c))
+            for name, c in CHANNELS.items()
+        }
+        for image in range(shape[0]):
+            stored[PLACE][image] = 2 * random.random((512, 512, 2), np.float32) - 1
+            stored[RADIUS][image] = 0.5 / 512
+            for name in (LIGHT, VIEW):
+                stored[name][image] = -omega[random.integers(4096, size=(512, 512)), :2]
+            stored[COLOR][image] = random.random((512, 512, 3), np.float32)
 
 
 WRITERS = {"neuralbtf": write_images, "ubo2014": write_factors, "neumip": write_queries}

@@ -34,8 +34,7 @@ from mbtf_core.files.atomic import read_json, write_json
 from mbtf_core.files.digest import data_sha256
 from mbtf_core.units import clock
 from mbtf_fit.config import FITTER, FitConfig, best_at
-from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.config.presets import GENERATOR, RESOLUTION
+from mbtf_gen.config.generator import GENERATOR, RESOLUTION, GeneratorConfig
 from mbtf_pipeline.presets import COMPARE
 from mbtf_pipeline.run_folder import machine
 

@@ -9,7 +9,7 @@ from typing import Any
 from mbtf_core.app.options import Quality
 from mbtf_core.config.settings import explicit_options
 from mbtf_fit.config import DEFAULT_MODEL, fitter_options
-from mbtf_gen.config.presets import RESOLUTION, generator_options
+from mbtf_gen.config.generator import RESOLUTION, generator_options
 from mbtf_pipeline.recipe import Recipe, fit_names, load_recipe
 
 # Options of the comparison by preset.

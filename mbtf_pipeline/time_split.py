@@ -28,8 +28,7 @@ from mbtf_core.files.digest import data_sha256
 from mbtf_core.files.folders import check_space, owned
 from mbtf_core.units import clock, format_duration
 from mbtf_fit.config import FitConfig
-from mbtf_gen.config.generator import count_queries
-from mbtf_gen.config.presets import GENERATOR
+from mbtf_gen.config.generator import GENERATOR, count_queries
 from mbtf_gen.job import Job, split_queries
 from mbtf_pipeline.forecast import RunForecaster
 from mbtf_pipeline.presets import preset_recipe

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from mbtf_core.app.console import new_app
-from mbtf_gen.cli.doctor import doctor
-from mbtf_gen.cli.export import export
+from mbtf_gen.cli.diagnostics import doctor, selftest
 from mbtf_gen.cli.folders import merge, repair, verify
 from mbtf_gen.cli.generate import generate
-from mbtf_gen.cli.import_measured import import_measured
-from mbtf_gen.cli.inspect import inspect
-from mbtf_gen.cli.plan import plan
-from mbtf_gen.cli.preview import preview
+from mbtf_gen.cli.material import inspect, plan
+from mbtf_gen.cli.measured import export, import_measured
+from mbtf_gen.cli.pictures import preview, reference
 from mbtf_gen.cli.publish import publish
-from mbtf_gen.cli.reference import reference
-from mbtf_gen.cli.selftest import selftest
 
 app = new_app("mbtf-gen", "Generate multi-resolution BTF (MBTF) data sets from displaced materials.")
 app.default(generate)

@@ -24,8 +24,7 @@ from mbtf_core.app.options import (
 from mbtf_core.errors import UsageError
 from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.units import clock, size_text
-from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.config.presets import RESOLUTION, generator_options
+from mbtf_gen.config.generator import RESOLUTION, GeneratorConfig, generator_options
 
 if TYPE_CHECKING:
     from mbtf_gen.generation.manifest import Summary

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 
 from mbtf_core.app.console import CONSOLE, Console
@@ -61,18 +62,18 @@ def publish(
     )
     console.note(f"{data} -> {output}: {config.form}, at most {size_text(publication.size)}")
     keep_on_interruption(f"the finished files are kept in {output}")
-    with console.progress(len(publication.makers), "publishing", "files") as bar:
+    with console.progress(publication.count, "publishing", "shards") as bar:
         files = publication.write(output, overwrite=overwrite, progress=bar.advance)
     size = sum(stored.bytes for stored in files.values())
-    recipe = "no recipe: measured data" if publication.facts.measured else "with a recipe"
+    recipe = "no recipe: measured data" if "measured" in publication.data.manifest else "with a recipe"
     console.report(
         {
             "folder": output,
-            "name": publication.facts.name,
+            "name": publication.name,
             "form": config.form,
             "license": config.license,
             "bytes": size,
-            "files": {name: {"bytes": s.bytes, "sha256": s.sha256} for name, s in files.items()},
+            "files": {name: asdict(stored) for name, stored in files.items()},
         },
-        f"{output}: {publication.facts.name}, {len(files)} files, {size_text(size)}, {recipe}",
+        f"{output}: {publication.name}, {len(files)} files, {size_text(size)}, {recipe}",
     )

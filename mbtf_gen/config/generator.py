@@ -7,16 +7,17 @@ leaves out what does not (launch size, progress).
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from mbtf_core.app.options import Flag
+from mbtf_core.app.options import Flag, Quality
 from mbtf_core.config.settings import FileName, Settings
 from mbtf_core.data.lattice import MAX_LEVEL
 from mbtf_core.data.schema import SCHEMA_VERSION, ArrayFormat, Layout, SliceDirections, Tiling
+from mbtf_core.errors import UsageError
 from mbtf_core.files.digest import data_sha256
-from mbtf_gen.config.values import NormalMode, Tracer
 from mbtf_gen.sampling.light_kernel import MAX_WIDTH_DEG, MIN_WIDTH_DEG
 
 # Largest height scale.
@@ -81,9 +82,35 @@ def _power_of_two(resolution: int) -> int:
     return resolution
 
 
+def _gray(value: Any) -> Any:
+    return (value, value, value) if isinstance(value, int | float) and not isinstance(value, bool) else value
+
+
+Share = Annotated[float, Field(ge=0, le=1)]
+Positive = Annotated[float, Field(gt=0, le=1e6)]
+# A linear color: three numbers, or one for gray.
+Rgb = Annotated[tuple[Share, Share, Share], BeforeValidator(_gray)]
+
+# How rays find a height field: cell by cell, or as triangles by Mitsuba.
+Tracer = Literal["heightfield", "mesh"]
+# How a normal map and the slopes of the mesh add up.
+NormalMode = Literal["residual", "absolute", "off"]
+
 Count = Annotated[str, BeforeValidator(_count)]
 Resolution = Annotated[int, AfterValidator(_power_of_two)]
 Paths = Annotated[int, Field(ge=2, le=1 << 20), AfterValidator(_even)]
+
+
+def no_tiling(given: Tiling | None) -> Tiling:
+    """``none``: only maps are made tileable.
+
+    Raises
+    ------
+    UsageError : a method for maps is given
+    """
+    if given not in (None, "none"):
+        raise UsageError("is for height maps, not for fibers and triangles", where="--make-tileable")
+    return "none"
 
 
 class GeometrySection(Settings):
@@ -245,3 +272,36 @@ class GeneratorConfig(Settings):
         # The limit does not change the data.
         fields = self.model_dump(exclude={"material": True, "geometry": {"max_displacement"}})
         return data_sha256({"schema": SCHEMA_VERSION, "inputs": inputs, **fields})
+
+
+def _queries(train: str, spp: int, test: str, test_spp: int) -> dict[str, Any]:
+    return {"queries.train": train, "queries.spp": spp, "queries.test": test, "queries.test_spp": test_spp}
+
+
+RESOLUTION = "queries.resolution"
+# Options of the generator by quality preset, dotted names, from a quick draft to the sizes of the papers. A
+# preset overrides the configuration file; ``--set`` and flags override the preset. ``benchmarks/quality.py``
+# measures the time that each takes and the error that it reaches. Explicit resolutions and maps of lower
+# resolution override the resolution of a preset; `paper` uses the map's.
+GENERATOR: dict[Quality, dict[str, Any]] = {
+    # With half as many queries, fits of glossy materials overfit single bright paths. Test errors are free of
+    # noise and limited by their variance over queries, so many test queries get few paths each.
+    "draft": {RESOLUTION: 128, **_queries("400/texel", 4, "65536", 16)},
+    "standard": {RESOLUTION: 256, **_queries("800/texel", 4, "131072", 32)},
+    "high": {RESOLUTION: 512, **_queries("1600/texel", 4, "262144", 128)},
+    # Kuznetsov et al. 2021: 200 to 400 queries per texel of 64 paths.
+    "paper": _queries("400/texel", 64, "262144", 256),
+}
+
+
+def generator_options(quality: Quality | None, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of the generator at a quality preset, dotted names; none without a preset.
+
+    Parameters
+    ----------
+    given : explicit options of file and command line, nested; their resolution overrides the preset's
+    """
+    queries = given.get("queries")
+    explicit = isinstance(queries, Mapping) and queries.get("resolution") is not None
+    options = {} if quality is None else GENERATOR[quality]
+    return {name: value for name, value in options.items() if not (explicit and name == RESOLUTION)}

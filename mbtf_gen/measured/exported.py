@@ -1,9 +1,9 @@
-"""Data sets as files of other programs."""
+"""Data sets as HDF5 files of other programs, whose formats :mod:`mbtf_gen.measured.hdf5` describes."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.shard_files import Arrays
 from mbtf_core.errors import InputError
-from mbtf_gen.measured.neumip_hdf5 import write_neumip
-from mbtf_gen.measured.neural_btf_hdf5 import write_neural_btf
+from mbtf_core.files.atomic import write_through
+from mbtf_gen.measured.hdf5 import CHANNELS, COLOR, LIGHT, PLACE, RADIUS, VIEW
 
 # Largest images that NeuMIP's queries are arranged in.
 _LARGEST = 512
@@ -25,13 +25,22 @@ def mean_of(arrays: Arrays) -> NDArray[np.float32]:
 
 
 def export_neumip(data: Dataset, path: Path) -> int:
-    """Write the training queries for NeuMIP's code; returns how many.
+    """Write the training queries for NeuMIP's code, which trains on whole images of them.
+
+    Parameters
+    ----------
+    data : of the shuffled layout, of a square tile
+    path : it is replaced only once all queries are written
+
+    Returns
+    -------
+    int
+        Queries written. The last ones that do not fill an image are left out.
 
     Raises
     ------
-    InputError : the shards or the file cannot be used
+    InputError : the data set is another, or a shard cannot be read
     """
-    count = sum(shard.rows for shard in data.shards("train"))
     if data.layout != "shuffled":
         raise InputError(
             f"has the {data.layout} layout, but NeuMIP learns from shuffled queries",
@@ -44,19 +53,65 @@ def export_neumip(data: Dataset, path: Path) -> int:
             where=data.folder,
             hint="generate it from a square tile",
         )
-    side = _LARGEST
+    count, side = sum(shard.rows for shard in data.shards("train")), _LARGEST
     while side > 1 and side * side > count:
         side //= 2
-    batches = ({**arrays, "value": mean_of(arrays)} for arrays in data.iterate("train"))
-    return write_neumip(path, batches, 1 << data.lattice.finest, (side, side))
+    images = count // side**2
+
+    def write(temporary: Path) -> None:
+        import h5py
+
+        with h5py.File(temporary, "w") as file:
+            file.attrs["base_radius"] = 0.5 / (1 << data.lattice.finest)
+            stored = {
+                name: file.create_dataset(
+                    name, (images, side, side, c), np.float32, chunks=(1, side, side, c)
+                )
+                for name, c in CHANNELS.items()
+            }
+            waiting = {name: np.empty((0, c), np.float32) for name, c in CHANNELS.items()}
+            done = 0
+            for arrays in data.iterate("train"):
+                rows = _neumip_queries(arrays)
+                waiting = {name: np.concatenate([waiting[name], rows[name]]) for name in waiting}
+                new = len(waiting[COLOR]) // side**2
+                for name, channels in CHANNELS.items():
+                    whole, waiting[name] = np.split(waiting[name], [new * side**2])
+                    stored[name][done : done + new] = whole.reshape(new, side, side, channels)
+                done += new
+
+    write_through(path, write)
+    return images * side**2
+
+
+def _neumip_queries(arrays: Arrays) -> Arrays:
+    """Our queries in NeuMIP's conventions."""
+    found = {
+        COLOR: mean_of(arrays),
+        PLACE: 2.0 * arrays["u"].astype(np.float64) - 1.0,
+        RADIUS: arrays["sigma"][:, None],
+        VIEW: -arrays["omega_o"][:, :2],
+        LIGHT: -arrays["omega_i"][:, :2],
+    }
+    return {name: np.asarray(array, np.float32) for name, array in found.items()}
 
 
 def export_neural_btf(data: Dataset, path: Path) -> int:
-    """Write the images of all pairs of light and view for NeuralBTF's code; returns how many values.
+    """Write the images of all pairs of light and view for NeuralBTF's code.
+
+    Parameters
+    ----------
+    data : of the slices layout
+    path : it is replaced only once all images are written
+
+    Returns
+    -------
+    int
+        Values written.
 
     Raises
     ------
-    InputError : the data set has no such images, or the file cannot be written
+    InputError : the data set has no such images, or a shard cannot be read
     """
     if data.layout != "slices":
         raise InputError(
@@ -68,9 +123,14 @@ def export_neural_btf(data: Dataset, path: Path) -> int:
     whole = data.load("train")
     values = mean_of(whole)[np.argsort(data.lattice.texel_of(whole["u"][:, 0]))].reshape(rows, columns, -1, 3)
 
-    def images() -> Iterator[NDArray[np.float32]]:
-        for pair in range(values.shape[2]):
-            yield values[:, :, pair]
+    def write(temporary: Path) -> None:
+        import h5py
 
-    write_neural_btf(path, whole["omega_i"][0], whole["omega_o"][0], images())
+        with h5py.File(temporary, "w") as file:
+            file[LIGHT], file[VIEW] = whole["omega_i"][0, :, :2], whole["omega_o"][0, :, :2]
+            color: Any = file.create_dataset(COLOR, (values.shape[2], rows, columns, 3), np.float32)
+            for pair in range(values.shape[2]):
+                color[pair] = values[:, :, pair]
+
+    write_through(path, write)
     return int(values.size // 3)

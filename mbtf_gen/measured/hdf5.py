@@ -1,20 +1,62 @@
-"""Checked access to the data sets of untrusted HDF5 files."""
+"""Data sets of other programs as HDF5: queries of NeuMIP, images of NeuralBTF. Files are untrusted.
+
+**NeuMIP** (Kuznetsov et al. 2021, "NeuMIP: multi-resolution neural materials"). The
+program straintensor/NeuMIP writes and reads these. They have N images of H x W unrelated queries; the images
+have no meaning of their own. Its numbers are of half precision, ours of single precision:
+
+- ``ground_color`` (N, H, W, 3): radiance under a directional light of irradiance 1 across its direction,
+  divided by the cosine of the light. This is our value: radiance under an irradiance of 1 on the plane.
+- ``ground_camera_target_loc`` (N, H, W, 2): x and y on the plane in [-1, 1]; the tile is 2 wide.
+- ``ground_camera_query_radius`` (N, H, W, 1): in tile widths. The file's attribute ``base_radius`` is that of
+  the finest level: half a texel, as is our sigma, the standard deviation of a Gaussian. Which kernel its
+  renderer applies is not part of the published source. Files that were made from measured BTFs have 0, which
+  is read as ``base_radius`` or as half a texel of an image.
+- ``ground_camera_dir``, ``ground_light`` (N, H, W, 2): x and y of the directions in which the camera looks
+  and the light travels, z < 0: the opposites of ours. Another writer calls the latter ``ground_light_dir``.
+- ``ground_valid``: in renderings of scenes only, which are refused: their pixels are no queries.
+
+**NeuralBTF** (mandyxmq/NeuralBTF-release), images of a material under many pairs of light and view:
+
+- ``ground_light``, ``ground_camera_dir`` (N, 2): x and y of unit vectors towards the light and the viewer;
+- ``ground_color`` (N, H, W, 3): radiance, linear RGB.
+
+Its documentation says this much. It does not say whether the values include the cosine of the light (the word
+is radiance), which unit they have, or that row 0 is the side of positive y, which is assumed here. Captures
+with a direction for each pixel, (N, H, W, 2), are another format, which that program refuses as well.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError, MbtfError, reason
 from mbtf_core.suggest import refuse_special, suggest_path
+from mbtf_gen.measured.interface import (
+    F32,
+    HORIZON,
+    I64,
+    MOST_PAIRS,
+    ImageBtf,
+    QueryBlock,
+    check_texels,
+    from_plane,
+)
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
+COLOR, VIEW, LIGHT = "ground_color", "ground_camera_dir", "ground_light"
+PLACE, RADIUS = "ground_camera_target_loc", "ground_camera_query_radius"
+_OTHER_LIGHT = "ground_light_dir"
+# Numbers of a query of NeuMIP.
+CHANNELS = {COLOR: 3, PLACE: 2, RADIUS: 1, VIEW: 2, LIGHT: 2}
+# Most queries of an image of NeuMIP, which is read as a whole.
+MOST_OF_IMAGE = 1 << 24
 # Largest chunk, which is the least that the library decompresses at a time.
 _MOST_CHUNK_BYTES = 1 << 28
 
@@ -25,8 +67,7 @@ def opened(path: Path) -> Iterator[Any]:
 
     Raises
     ------
-    InputError
-        The file is missing, is not HDF5, is truncated or damaged.
+    InputError : the file is missing, is not HDF5, is truncated or damaged
     """
     import h5py
 
@@ -44,62 +85,202 @@ def opened(path: Path) -> Iterator[Any]:
         ) from None
 
 
-def names_of(file: Any) -> set[str]:
-    """Names in the root of a file."""
-    return set(file.keys())
-
-
 def data_set(file: Any, name: str, path: Path) -> Any:
     """A data set of floats in the root of a file, with every number stored in this file.
 
     Raises
     ------
-    InputError
-        It is missing, leads to another file, has no floats, or has parts that were never written.
+    InputError : it is missing, leads to another file, has no floats, or has parts that were never written
     """
     import h5py
 
-    link = file.get(name, getlink=True)
-    if link is None:
-        found = ", ".join(sorted(names_of(file))[:10])
-        raise InputError(
-            f"has no data set '{name}'", where=path, hint=f"it has {found}" if found else "it is empty"
-        )
-    if not isinstance(link, h5py.HardLink):
-        raise InputError(f"has a link in place of the data set '{name}'", where=path)
-    found = file[name]
-    if not isinstance(found, h5py.Dataset):
-        raise InputError(f"has a group in place of the data set '{name}'", where=path)
-    if found.is_virtual or found.external:
-        raise InputError(f"keeps the data set '{name}' in other files", where=path)
+    found = file[name] if isinstance(file.get(name, getlink=True), h5py.HardLink) else None
+    if not isinstance(found, h5py.Dataset) or found.is_virtual or found.external:
+        names = ", ".join(sorted(file)[:10])
+        hint = f"it has {names}" if names else "it is empty"
+        raise InputError(f"has no data set '{name}' of its own", where=path, hint=hint)
     if found.dtype.kind != "f" or found.dtype.itemsize not in (2, 4, 8):
         raise InputError(f"has {found.dtype} numbers in '{name}'; floats are expected", where=path)
-    if found.shape is None or not found.shape or min(found.shape) < 1:
+    if not found.shape or min(found.shape) < 1:
         raise InputError(f"has the shape {found.shape} of '{name}'", where=path)
     if found.compression not in (None, "gzip", "lzf"):
         raise InputError(f"has '{name}' compressed by '{found.compression}'", where=path)
-    _check_stored(found, name, path)
-    return found
-
-
-def _check_stored(found: Any, name: str, path: Path) -> None:
-    size = math.prod(found.shape) * found.dtype.itemsize
     if found.chunks is None:
-        stored = found.id.get_storage_size()
-        if stored != size:
-            raise InputError(f"stores {stored:,} of the {size:,} bytes of '{name}'", where=path)
-        if stored > path.stat().st_size:
-            raise InputError(f"is too short for the {size:,} bytes of '{name}'", where=path)
-        return
-    if math.prod(found.chunks) * found.dtype.itemsize > _MOST_CHUNK_BYTES:
-        raise InputError(f"has chunks {found.chunks} of '{name}', which are too large", where=path)
-    chunks = math.prod(-(-n // c) for n, c in zip(found.shape, found.chunks, strict=True))
-    stored = found.id.get_num_chunks()
-    if stored != chunks:
-        raise InputError(f"stores {stored:,} of the {chunks:,} chunks of '{name}'", where=path)
+        unit, total, stored = "bytes", found.size * found.dtype.itemsize, found.id.get_storage_size()
+    else:
+        if math.prod(found.chunks) * found.dtype.itemsize > _MOST_CHUNK_BYTES:
+            raise InputError(f"has chunks {found.chunks} of '{name}', which are too large", where=path)
+        total = math.prod(-(-n // c) for n, c in zip(found.shape, found.chunks, strict=True))
+        unit, stored = "chunks", found.id.get_num_chunks()
+    if stored != total:
+        raise InputError(f"stores {stored:,} of the {total:,} {unit} of '{name}'", where=path)
+    return found
 
 
 def floats(found: Any, start: int, stop: int) -> NDArray[np.float64]:
     """Numbers of the first axis from `start` to before `stop`; those beyond the range become infinite."""
     with np.errstate(invalid="ignore"):
         return np.asarray(found[start:stop]).astype(np.float64)
+
+
+class NeumipQueries:
+    """An opened file; see :class:`~mbtf_gen.measured.interface.MeasuredQueries`.
+
+    Attributes
+    ----------
+    count : int
+        Queries of the file.
+    base_radius : float or None
+        Sigma of the finest level in tile widths; None where neither the file nor its shape says it.
+    """
+
+    def __init__(self, path: Path, shape: tuple[int, ...], light: str, base_radius: float | None) -> None:
+        self.path, self.base_radius = path, base_radius
+        self._light = light
+        self._each = math.prod(shape[1:])
+        self.count = shape[0] * self._each
+
+    def read(self, start: int, stop: int) -> QueryBlock:
+        """Queries from `start` to before `stop`, those left out that cannot be used."""
+        start, stop = max(start, 0), min(stop, self.count)
+        number = np.arange(start, max(start, stop), dtype=np.int64)
+        with opened(self.path) as file:
+            part = {
+                name: self._part(
+                    data_set(file, self._light if name == LIGHT else name, self.path), start, stop
+                )
+                for name in CHANNELS
+            }
+        with np.errstate(over="ignore", invalid="ignore"):
+            u = np.mod(0.5 * (part[PLACE] + 1.0), 1.0).astype(np.float32)
+            u[u >= 1.0] = 0.0
+            sigma = part[RADIUS][:, 0]
+            if self.base_radius is not None:
+                sigma = np.where(sigma == 0.0, self.base_radius, sigma)
+            out = QueryBlock(
+                query=number,
+                u=u,
+                sigma=sigma.astype(np.float32),
+                omega_i=from_plane(-part[LIGHT]),
+                omega_o=from_plane(-part[VIEW]),
+                value=part[COLOR].astype(np.float32),
+            )
+        ok = (out["sigma"] > 0) & np.isfinite(out["sigma"])
+        for array in (out["u"], out["value"], out["omega_i"], out["omega_o"]):
+            ok &= np.isfinite(array).all(axis=-1)
+        ok &= np.minimum(out["omega_i"][:, 2], out["omega_o"][:, 2]) > HORIZON
+        return cast(QueryBlock, {name: cast(F32, array)[ok] for name, array in out.items()})
+
+    def _part(self, found: Any, start: int, stop: int) -> NDArray[np.float64]:
+        """Rows (stop - start, channels) of a data set."""
+        channels = found.shape[-1]
+        if math.prod(found.shape[:-1]) != self.count:
+            raise InputError("has changed while it was read", where=self.path)
+        if stop <= start:
+            return np.empty((0, channels))
+        first, last = start // self._each, -(-stop // self._each)
+        rows = floats(found, first, last).reshape(-1, channels)
+        return rows[start - first * self._each : stop - first * self._each]
+
+
+def read_neumip(path: str | Path) -> NeumipQueries:
+    """Open a data set of NeuMIP; its numbers stay on disk.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    NeumipQueries
+
+    Raises
+    ------
+    InputError : not HDF5, a data set is missing or has another shape, or it is the rendering of a scene
+    """
+    path = Path(path)
+    with opened(path) as file:
+        if "ground_valid" in file:
+            raise InputError("is the rendering of a scene (it has 'ground_valid'), not queries", where=path)
+        light = LIGHT if LIGHT in file or _OTHER_LIGHT not in file else _OTHER_LIGHT
+        shape: tuple[int, ...] | None = None
+        for name, channels in CHANNELS.items():
+            stored = light if name == LIGHT else name
+            found = data_set(file, stored, path).shape
+            shape = found[:-1] if shape is None else shape
+            if len(found) not in (2, 3, 4) or found != (*shape, channels):
+                raise InputError(
+                    f"has the shape {found} of '{stored}'; {(*shape, channels)} is expected", where=path
+                )
+        assert shape is not None
+        if math.prod(shape[1:]) > MOST_OF_IMAGE:
+            raise InputError(f"has images of more than {MOST_OF_IMAGE:,} queries", where=path)
+        base = file.attrs.get("base_radius")
+    if base is None:
+        return NeumipQueries(path, shape, light, 0.5 / shape[2] if len(shape) == 3 else None)
+    try:
+        radius = float(base)
+    except (TypeError, ValueError):
+        radius = math.nan
+    if not 0.0 < radius < math.inf:
+        raise InputError("has an attribute 'base_radius' that is not a positive number", where=path)
+    return NeumipQueries(path, shape, light, radius)
+
+
+class NeuralBtf(ImageBtf):
+    """An opened capture of NeuralBTF; of an image the rows from the first to the last texel are read."""
+
+    def __init__(self, path: Path, shape: tuple[int, int, int], light: F32, view: F32) -> None:
+        self._shape = shape
+        super().__init__(path, *shape[1:], light, view)
+
+    def _opened(self) -> AbstractContextManager[Any]:
+        return opened(self.path)
+
+    def _texels(self, file: Any, number: int, row: I64, column: I64) -> F32:
+        color, first = data_set(file, COLOR, self.path), int(row.min())
+        if color.shape != (*self._shape, 3):
+            raise InputError("has changed while it was read", where=self.path)
+        part = np.asarray(color[number, first : int(row.max()) + 1])[row - first, column]
+        with np.errstate(over="ignore", invalid="ignore"):
+            return part.astype(np.float32)
+
+
+def read_neural_btf(path: str | Path) -> NeuralBtf:
+    """Open a capture; its images stay on disk.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    NeuralBtf
+
+    Raises
+    ------
+    InputError : not HDF5, a data set is missing or has another shape, or a direction is NaN
+    """
+    path = Path(path)
+    directions = {}
+    with opened(path) as file:
+        shape = data_set(file, COLOR, path).shape
+        if len(shape) != 4 or shape[3] != 3:
+            raise InputError(f"has the shape {shape} of '{COLOR}'; (N, H, W, 3) is expected", where=path)
+        check_texels(shape[1], shape[2], path)
+        if shape[0] > MOST_PAIRS:
+            raise InputError(f"claims {shape[0]:,} images", where=path)
+        for name in (LIGHT, VIEW):
+            found = data_set(file, name, path)
+            if found.shape != (shape[0], 2):
+                near = found.shape == (*shape[:3], 2)
+                raise InputError(
+                    f"has the shape {found.shape} of '{name}'; {(shape[0], 2)} is expected",
+                    where=path,
+                    hint="captures with a direction for each pixel are not read" if near else "",
+                )
+            xy = floats(found, 0, shape[0])
+            if not np.isfinite(xy).all() or (xy * xy).sum(axis=-1).max() > 1.0 + 1e-3:
+                raise InputError(f"has numbers in '{name}' that are not x and y of unit vectors", where=path)
+            directions[name] = from_plane(xy)
+    return NeuralBtf(path, shape[:3], directions[LIGHT], directions[VIEW])

@@ -7,6 +7,8 @@ before it allocates memory for it.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, Protocol, TypedDict
 
@@ -25,45 +27,39 @@ HORIZON = 1e-4
 MOST_PAIRS = 10_000_000
 MOST_TEXELS = 1 << 26
 MOST_ACROSS = 1 << MAX_LEVEL
-# Values to read at once from images that are decoded as a whole.
-MANY = 1 << 24
 
 
-class MeasuredBtf(Protocol):
-    """Images of a material under many pairs of light and view."""
+class MeasuredBtf(ABC):
+    """Images of a material under many pairs of light and view.
 
-    @property
-    def rows(self) -> int:
-        """Texels of a column of an image; row 0 is the top."""
+    Parameters
+    ----------
+    path : the file or folder
+    rows, columns : texels of an image; row 0 is the top
+    light, view : (pairs, 3) float32 array
+        Unit vectors of all pairs of the file; those at the horizon or below it are left out.
 
-    @property
-    def columns(self) -> int:
-        """Texels of a row of an image."""
+    Attributes
+    ----------
+    cosine : bool or None
+        Whether the values include the cosine of the light; None: the file does not say.
+    at_once : int
+        Values that one call should read: many where each image is decoded as a whole.
+    left_out : int
+        Pairs that are left out.
+    """
 
-    @property
-    def light(self) -> F32:
-        """Unit vectors (pairs, 3) towards the light; z > 0."""
+    cosine: bool | None = None
+    at_once = 1 << 24
 
-    @property
-    def view(self) -> F32:
-        """Unit vectors (pairs, 3) towards the viewer; z > 0."""
+    def __init__(self, path: Path, rows: int, columns: int, light: F32, view: F32) -> None:
+        self.path, self.rows, self.columns = path, rows, columns
+        above = (light[:, 2] > HORIZON) & (view[:, 2] > HORIZON)
+        self._number = np.flatnonzero(above)
+        self.light, self.view, self.left_out = light[above], view[above], int((~above).sum())
 
-    @property
-    def left_out(self) -> int:
-        """Pairs of the file whose light or view is at the horizon or below it."""
-
-    @property
-    def cosine(self) -> bool | None:
-        """Do the values include the cosine of the light? None: the file does not say."""
-
-    @property
-    def at_once(self) -> int:
-        """Number of values that one call should read: many where each image is decoded as a whole."""
-
-    def values(self, pair: NDArray[np.integer[Any]], texel: NDArray[np.integer[Any]]) -> F32:
-        """Values at texels (n,), row-major, of pairs (n,).
-
-        Each image is decoded once per call.
+    def values(self, pair: I64, texel: I64) -> F32:
+        """Values at texels (n,), row-major, of pairs (n,); each image is decoded once per call.
 
         Returns
         -------
@@ -72,9 +68,39 @@ class MeasuredBtf(Protocol):
 
         Raises
         ------
-        InputError
-            The file cannot be read, or one of the values is NaN or infinite.
+        InputError : the file cannot be read, or one of the values is NaN or infinite
         """
+        out = self._values(self._number[pair], np.asarray(texel))
+        bad = int((~np.isfinite(out).all(axis=-1)).sum())
+        if bad:
+            what = f"has NaN or infinite values ({bad} of {len(out)} that were read)"
+            raise InputError(what, where=self.path)
+        return out
+
+    @abstractmethod
+    def _values(self, number: I64, texel: I64) -> F32:
+        """Values (n, 3) at texels of pairs, which have their number in the file."""
+
+
+class ImageBtf(MeasuredBtf):
+    """A BTF whose images are stored one by one."""
+
+    def _values(self, number: I64, texel: I64) -> F32:
+        out = np.empty((len(number), 3), np.float32)
+        order = np.argsort(number, kind="stable")
+        used, starts = np.unique(number[order], return_index=True)
+        with self._opened() as file:
+            for image, group in zip(used, np.split(order, starts[1:]), strict=True):
+                out[group] = self._texels(file, int(image), *np.divmod(texel[group], self.columns))
+        return out
+
+    def _opened(self) -> AbstractContextManager[Any]:
+        """What :meth:`_texels` reads from."""
+        return nullcontext()
+
+    @abstractmethod
+    def _texels(self, file: Any, number: int, row: I64, column: I64) -> NDArray[Any]:
+        """Values (n, 3) of an image at rows and columns (n,)."""
 
 
 class QueryBlock(TypedDict):
@@ -136,38 +162,9 @@ def from_plane(xy: NDArray[np.floating[Any]]) -> F32:
 
 def check_texels(rows: int, columns: int, path: Path) -> None:
     """Refuse images without texels, and images that are too large."""
-    if rows < 1 or columns < 1:
-        raise InputError(f"claims images of {columns} x {rows} texels", where=path)
-    if max(rows, columns) > MOST_ACROSS:
+    if min(rows, columns) < 1 or max(rows, columns) > MOST_ACROSS or rows * columns > MOST_TEXELS:
         raise InputError(
-            f"claims {columns} x {rows} texels; at most {MOST_ACROSS:,} across are read", where=path
+            f"claims images of {columns} x {rows} texels; 1 to {MOST_ACROSS:,} across are read, "
+            f"{MOST_TEXELS:,} at most",
+            where=path,
         )
-    if rows * columns > MOST_TEXELS:
-        raise InputError(f"claims {columns} x {rows} texels; at most {MOST_TEXELS:,} are read", where=path)
-
-
-def check_indices(
-    pair: NDArray[np.integer[Any]], texel: NDArray[np.integer[Any]], pairs: int, texels: int
-) -> tuple[I64, I64]:
-    """Both arrays as int64 (n,).
-
-    Raises
-    ------
-    IndexError
-        One of them is out of range: a fault of the caller.
-    """
-    i, j = np.atleast_1d(pair).astype(np.int64), np.atleast_1d(texel).astype(np.int64)
-    if i.shape != j.shape or i.ndim != 1:
-        raise IndexError(f"pairs {i.shape} and texels {j.shape} differ")
-    for numbers, count, name in ((i, pairs, "pair"), (j, texels, "texel")):
-        if numbers.size and (numbers.min() < 0 or numbers.max() >= count):
-            raise IndexError(f"a {name} is not in 0..{count - 1}")
-    return i, j
-
-
-def check_finite(values: F32, where: object) -> F32:
-    """The values (n, 3), all of which must be finite."""
-    bad = int((~np.isfinite(values).all(axis=-1)).sum())
-    if bad:
-        raise InputError(f"has NaN or infinite values ({bad} of {len(values)} that were read)", where=where)
-    return values

@@ -6,11 +6,8 @@ from pathlib import Path
 
 from mbtf_core.errors import InputError
 from mbtf_core.suggest import refuse_special, suggest_path
-from mbtf_gen.measured.hdf5 import MAGIC as HDF5
-from mbtf_gen.measured.hdf5 import names_of, opened
+from mbtf_gen.measured.hdf5 import COLOR, MAGIC, RADIUS, opened, read_neumip, read_neural_btf
 from mbtf_gen.measured.interface import MeasuredBtf, MeasuredQueries
-from mbtf_gen.measured.neumip_hdf5 import RADIUS, read_neumip
-from mbtf_gen.measured.neural_btf_hdf5 import COLOR, read_neural_btf
 from mbtf_gen.measured.ubo2003 import read_ubo2003
 from mbtf_gen.measured.ubo2014 import read_ubo2014
 
@@ -34,8 +31,7 @@ def open_measured(path: str | Path) -> MeasuredBtf | MeasuredQueries:
 
     Raises
     ------
-    InputError
-        The file is missing, of no known kind, or damaged.
+    InputError : the file is missing, of no known kind, or damaged
     """
     path = Path(path)
     if path.is_dir():
@@ -52,10 +48,10 @@ def open_measured(path: str | Path) -> MeasuredBtf | MeasuredQueries:
         return read_ubo2014(path)
     if start.startswith(_ZIP):
         return read_ubo2003(path)
-    if start != HDF5:
+    if start != MAGIC:
         raise InputError("is not a measured BTF of a known kind", where=path, hint=f"known are {_KNOWN}")
     with opened(path) as file:
-        names = names_of(file)
+        names = set(file)
     if COLOR not in names:
         raise InputError(f"is an HDF5 file without '{COLOR}'", where=path, hint=f"known are {_KNOWN}")
     return read_neumip(path) if RADIUS in names or "ground_valid" in names else read_neural_btf(path)

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError, reason
 from mbtf_core.suggest import refuse_special
-from mbtf_gen.measured.interface import F32, HORIZON, MANY, check_indices, check_texels, from_angles
+from mbtf_gen.measured.interface import I64, ImageBtf, check_texels, from_angles
 
 SUFFIXES = (".jpg", ".jpeg", ".png")
 _ANGLES = tuple(
@@ -36,49 +36,33 @@ _MOST_FILES = 200_000
 # Largest file of an image, and the largest ratio to its compressed size in an archive.
 _MOST_BYTES = 1 << 28
 _MOST_RATIO = 100
+# Linear values of the codes.
+_LINEAR = srgb_to_linear(np.arange(256) / 255.0).astype(np.float32)
 
 
-class Ubo2003:
-    """An opened set of photographs; see :class:`~mbtf_gen.measured.interface.MeasuredBtf`.
-
-    Images are decoded anew by each call of :meth:`values`.
-    """
-
-    cosine = None
-    at_once = MANY
+class Ubo2003(ImageBtf):
+    """An opened set of photographs."""
 
     def __init__(
         self, path: Path, names: list[str], angles: NDArray[np.float64], content: Callable[[str], bytes]
     ) -> None:
-        self.path = path
-        self._content = content
+        self.path, self._names, self._content = path, names, content
         radians = np.deg2rad(angles)
         light, view = from_angles(radians[:, 0], radians[:, 1]), from_angles(radians[:, 2], radians[:, 3])
-        above = (light[:, 2] > HORIZON) & (view[:, 2] > HORIZON)
-        self.light, self.view, self.left_out = light[above], view[above], int((~above).sum())
-        self._names = [name for name, kept in zip(names, above, strict=True) if kept]
-        if not self._names:
+        super().__init__(path, 0, 0, light, view)
+        if not len(self._number):
             raise InputError("has no image with light and view above the horizon", where=path)
-        self.rows, self.columns = self._decoded(0).shape[:2]
+        self.rows, self.columns = self._decoded(int(self._number[0])).shape[:2]
 
-    def values(self, pair: NDArray[np.integer[Any]], texel: NDArray[np.integer[Any]]) -> F32:
-        """Linear values (n, 3) in [0, 1]."""
-        texels = self.rows * self.columns
-        pair, texel = check_indices(pair, texel, len(self._names), texels)
-        out = np.empty((len(pair), 3), np.float32)
-        order = np.argsort(pair, kind="stable")
-        used, starts = np.unique(pair[order], return_index=True)
-        table = srgb_to_linear(np.arange(256) / 255.0).astype(np.float32)
-        for number, group in zip(used, np.split(order, starts[1:]), strict=True):
-            codes = self._decoded(int(number))
-            if codes.shape[:2] != (self.rows, self.columns):
-                raise InputError(
-                    f"'{self._names[number]}' has {codes.shape[1]} x {codes.shape[0]} texels,"
-                    f" other images {self.columns} x {self.rows}",
-                    where=self.path,
-                )
-            out[group] = table[codes.reshape(texels, 3)[texel[group]]]
-        return out
+    def _texels(self, file: Any, number: int, row: I64, column: I64) -> NDArray[np.float32]:
+        codes = self._decoded(number)
+        if codes.shape[:2] != (self.rows, self.columns):
+            raise InputError(
+                f"'{self._names[number]}' has {codes.shape[1]} x {codes.shape[0]} texels,"
+                f" other images {self.columns} x {self.rows}",
+                where=self.path,
+            )
+        return _LINEAR[codes[row, column]]
 
     def _decoded(self, number: int) -> NDArray[np.uint8]:
         """Codes (H, W, 3) of an image; gray becomes RGB."""
@@ -119,8 +103,7 @@ def read_ubo2003(path: str | Path) -> Ubo2003:
 
     Parameters
     ----------
-    path : str or Path
-        The folder may have sub-folders; links are not followed out of it.
+    path : the folder may have sub-folders; links are not followed out of it
 
     Returns
     -------
@@ -199,10 +182,6 @@ def _archive(path: Path) -> tuple[list[str], Callable[[str], bytes]]:
         if angles_of(entry.filename) is None or entry.filename.startswith("__MACOSX/"):
             continue
         name = entry.filename
-        if name in by_name:
-            raise InputError(f"has two files of the name '{_short(name)}'", where=path)
-        if entry.flag_bits & 1:
-            raise InputError(f"'{_short(name)}' is encrypted", where=path)
         if entry.file_size > min(_MOST_BYTES, _MOST_RATIO * entry.compress_size + 10_000):
             raise InputError(
                 f"'{_short(name)}' claims {entry.file_size:,} bytes in {entry.compress_size:,}", where=path

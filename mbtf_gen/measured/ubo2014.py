@@ -31,15 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
-from mbtf_gen.measured.interface import (
-    F32,
-    HORIZON,
-    MOST_PAIRS,
-    check_finite,
-    check_indices,
-    check_texels,
-    from_angles,
-)
+from mbtf_gen.measured.interface import F32, I64, MOST_PAIRS, MeasuredBtf, check_texels, from_angles
 
 MAGIC = b"!DFMF08FCR"
 _COMPLETE = "check that the file is complete"
@@ -103,42 +95,35 @@ class _Cursor:
         return numbers
 
 
-class Ubo2014:
-    """An opened DFMF file; see :class:`~mbtf_gen.measured.interface.MeasuredBtf`."""
+class Ubo2014(MeasuredBtf):
+    """An opened DFMF file; of no image more than the texels that are asked for is computed."""
 
     at_once = 1 << 20
 
     def __init__(
         self, path: Path, header: _Header, pairs: list[NDArray[Any]], texels: list[NDArray[Any]]
     ) -> None:
-        self.path = path
-        self.rows, self.columns, self.cosine = header.rows, header.columns, header.cosine
-        self._header, self._pairs, self._texels = header, pairs, texels
         view = np.repeat(header.view, header.lights, axis=0)
-        above = (header.light[:, 2] > HORIZON) & (view[:, 2] > HORIZON)
-        self._number = np.flatnonzero(above)
-        self.light, self.view = header.light[above], view[above]
-        self.left_out = int((~above).sum())
+        super().__init__(path, header.rows, header.columns, header.light, view)
+        self.cosine = header.cosine
+        self._header, self._pairs, self._texels = header, pairs, texels
 
-    def values(self, pair: NDArray[np.integer[Any]], texel: NDArray[np.integer[Any]]) -> F32:
-        """Values (n, 3); of no image more than these texels is computed."""
-        pair, texel = check_indices(pair, texel, len(self._number), self.rows * self.columns)
-        number = self._number[pair]
-        channels = np.empty((len(pair), 3), np.float32)
+    def _values(self, number: I64, texel: I64) -> F32:
+        channels = np.empty((len(number), 3), np.float32)
         with np.errstate(over="ignore", invalid="ignore"):
             for c, factors in enumerate(zip(self._pairs, self._texels, strict=True)):
-                of_pairs, of_texels = (_widened(f, len(pair)) for f in factors)
+                of_pairs, of_texels = (_widened(f, len(number)) for f in factors)
                 size = max(1, min(_BLOCK, _MOST_NUMBERS // of_pairs.shape[1]))
-                for start in range(0, len(pair), size):
+                for start in range(0, len(number), size):
                     part = slice(start, start + size)
                     left = of_pairs[number[part]].astype(np.float32, copy=False)
                     right = of_texels[texel[part]].astype(np.float32, copy=False)
                     channels[part, c] = np.linalg.vecdot(left, right)
             out = np.empty_like(channels)
-            for start in range(0, len(pair), _BLOCK):
+            for start in range(0, len(number), _BLOCK):
                 part = slice(start, start + _BLOCK)
                 out[part] = _rgb(channels[part].astype(np.float64), self._header)
-        return check_finite(out, self.path)
+        return out
 
 
 def _widened(factors: NDArray[Any], values: int) -> NDArray[Any]:
@@ -161,8 +146,7 @@ def read_ubo2014(path: str | Path) -> Ubo2014:
 
     Raises
     ------
-    InputError
-        Not a DFMF file, truncated, inconsistent, or of a kind that cannot be converted to RGB.
+    InputError : not a DFMF file, truncated, inconsistent, or of a kind that cannot be converted to RGB
     """
     path = Path(path)
     try:

@@ -8,17 +8,36 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.app.console import Console
 from mbtf_core.data.schema import Queries
+from mbtf_core.data.shard_files import row_bytes
+from mbtf_core.directions import from_angles
+from mbtf_core.errors import PartialError
+from mbtf_core.exposure import auto_exposure, brightness, describe_exposure
+from mbtf_core.files.folders import check_space, owned
 from mbtf_core.pictures.camera import PIXEL_SIGMA, Camera, PixelKind
-from mbtf_core.pictures.reference import ReferenceImage
+from mbtf_core.pictures.reference import PNG_BYTES, ReferenceImage, claim_pictures, read_value, write_display
+from mbtf_core.run.cluster import open_runner
+from mbtf_core.run.signals import keep_on_interruption
+from mbtf_core.run.task import Item
+from mbtf_core.stats import pooled_relative_error
+from mbtf_gen.config.pictures import ReferenceConfig
+from mbtf_gen.forecast import announce
+from mbtf_gen.job import Job
+from mbtf_gen.planning.run_plan import reference_plan
+from mbtf_gen.planning.simulation import build_estimator
 
 if TYPE_CHECKING:
     from mbtf_gen.render.estimator import Estimator
+
+_kept: tuple[Job, Any] | None = None
 
 
 def _camera_rays(camera: Camera, estimator: Estimator) -> Any:
@@ -88,18 +107,14 @@ def render_reference(
 
     Parameters
     ----------
-    estimator : Estimator
-        Estimator of the tile.
-    camera : Camera
-        The camera.
+    estimator : estimator of the tile
+    camera : the camera
     omega_i : (3,) float array
         Direction towards the light.
     kind : {"query", "pixel"}
         Meaning of a pixel, see :mod:`mbtf_core.pictures.camera`.
-    spp : int
-        Paths per pixel, both halves together; even.
-    seed, index : int
-        Root seed of the random numbers, and number of the picture.
+    spp : paths per pixel, both halves together; even
+    seed, index : root seed of the random numbers, and number of the picture
 
     Returns
     -------
@@ -108,8 +123,7 @@ def render_reference(
 
     Raises
     ------
-    UsageError
-        The picture shows the horizon.
+    UsageError : the picture shows the horizon
     """
     from mbtf_gen.render.estimator import Stream
 
@@ -127,3 +141,118 @@ def render_reference(
         spp,
         None if through is None else through.reshape(queries.lead),
     )
+
+
+def picture_estimator(job: Job) -> Any:
+    """The estimator of a job's pictures, kept for the next one."""
+    global _kept
+    if _kept is None or _kept[0] is not job:
+        _kept = job, build_estimator(job, reference_plan(job))
+    return _kept[1]
+
+
+def render_picture(job: Job, camera: Camera, omega_i: NDArray[np.float64], **options: Any) -> ReferenceImage:
+    """Render one picture of a job's material; a task, with the options of :func:`render_reference`."""
+    return render_reference(picture_estimator(job), camera, omega_i, **options)
+
+
+def render_references(
+    config: ReferenceConfig,
+    output: Path,
+    console: Console,
+    *,
+    cluster: str | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Render the missing pictures of a folder, show all at one exposure, and report them.
+
+    Parameters
+    ----------
+    config : the material, the views and the light
+    output : the folder
+    console : where progress and results go
+    cluster : str, optional
+        Workers, as :func:`mbtf_core.run.cluster.open_runner` takes them.
+    overwrite : replace the pictures of another configuration
+
+    Raises
+    ------
+    UsageError : the view shows the horizon
+    InputError : the folder holds something else, or the pictures do not fit on the disk
+    PartialError : a picture failed; the same command renders the missing ones
+    """
+    wanted, job = config.reference, Job.prepare(config)
+    omega_i = from_angles(wanted.light.elevation, wanted.light.azimuth)
+    kinds: tuple[PixelKind, ...] = ("query", "pixel") if wanted.kind == "both" else (wanted.kind,)
+    size, pixels = wanted.size, wanted.size**2
+    cameras = [
+        Camera(wanted.view.elevation, wanted.view.azimuth, across, rows=size, columns=size)
+        for across in wanted.tiles_across
+    ]
+    names = {(camera, kind): f"{kind}-tiles{camera.tiles_across:g}" for camera in cameras for kind in kinds}
+    stored = len(names) * pixels * (row_bytes(job.material.transmits) + PNG_BYTES)
+    check_space(output, stored, "reduce --size, or choose another folder with -o")
+    cameras[0].queries(omega_i)  # refuses a view of the horizon, which all cameras share
+    keep_on_interruption(f"the finished pictures are kept in {output}")
+    with (
+        owned(output),
+        console.progress(total=len(names), label="rendering", unit="pictures") as bar,
+    ):
+        folder = claim_pictures(
+            output,
+            "mbtf-gen reference",
+            files=[f"{name}.{suffix}" for name in names.values() for suffix in ("exr", "png")],
+            config=job.config.model_dump(mode="json", exclude={"queries", "output"}),
+            inputs=job.material.digests,
+            overwrite=overwrite,
+        )
+        missing = {key: name for key, name in names.items() if folder.finished(name) is None}
+        bar.advance(len(names) - len(missing))
+        items = [
+            Item(
+                name,
+                {
+                    **{"job": job, "camera": camera, "omega_i": omega_i, "kind": kind},
+                    **{"spp": wanted.spp, "seed": config.seed, "index": cameras.index(camera)},
+                },
+            )
+            for (camera, kind), name in missing.items()
+        ]
+        with open_runner(cluster if missing else None, console.note) as runner:
+            if runner.here and missing:
+                paths, estimator = len(missing) * pixels * wanted.spp, picture_estimator(job)
+                seconds = partial(picture_seconds, estimator, cameras[0], omega_i, paths)
+                announce(console, paths, seconds, stored)
+            for done in runner.map(render_picture, items):
+                if done.error:
+                    hint = "the same command renders the missing pictures"
+                    raise PartialError(f"picture {done.name} failed: {done.error}", hint=hint)
+                image = done.value
+                noise = pooled_relative_error(image.value_a.reshape(-1, 3), image.value_b.reshape(-1, 3))
+                facts = {"relative_noise": noise.value, "brightness": brightness(image.value)}
+                folder.keep(done.name, [image.write(folder.path / done.name)], facts)
+                bar.advance(1)
+        known = {name: folder.finished(name) or {} for name in names.values()}
+        exposure = config.exposure
+        if exposure is None:
+            exposure = auto_exposure([facts["brightness"] for facts in known.values()])
+        for name in known:
+            if folder.finished(f"{name}.png") != {"exposure": exposure}:
+                png = write_display(folder.path / name, read_value(folder.path / f"{name}.exr"), exposure)
+                folder.keep(f"{name}.png", [png], {"exposure": exposure})
+    pictures = [
+        {
+            "file": output / f"{name}.exr",
+            "kind": kind,
+            "tiles_across": camera.tiles_across,
+            "relative_noise": known[name]["relative_noise"],
+            "kept": (camera, kind) not in missing,
+        }
+        for (camera, kind), name in names.items()
+    ]
+    lines = [
+        f"{p['file']}: noise {p['relative_noise']:.2%} of the mean value{' (kept)' if p['kept'] else ''}"
+        for p in pictures
+    ]
+    text = "\n".join([*lines, f"PNG: {describe_exposure(exposure)}"])
+    console.report({"pictures": pictures, "exposure": exposure}, text)

@@ -8,12 +8,10 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
 from pathlib import PurePosixPath
 from typing import Any
 
-from mbtf_core.files.atomic import Stored
-from mbtf_gen.publishing.facts import DATA, TAGS, Facts
+from mbtf_gen.publishing.facts import TAGS, Facts
 
 CROISSANT_NAME = "croissant.json"
 _FORMATS = {
@@ -24,24 +22,11 @@ _FORMATS = {
     ".png": "image/png",
     ".json": "application/json",
     ".yaml": "application/yaml",
-    ".sh": "application/x-sh",
 }
 
 
-def croissant_text(facts: Facts, files: Mapping[str, Stored]) -> str:
-    """The document.
-
-    Parameters
-    ----------
-    facts : Facts
-        The data set and what its publishers say.
-    files : mapping of str to Stored
-        The published files that it lists, by name.
-
-    Returns
-    -------
-    str
-    """
+def croissant_text(facts: Facts) -> str:
+    """The document, which lists the files of the facts."""
     import mlcroissant as mlc
 
     config, license = facts.config, facts.config.license
@@ -55,7 +40,7 @@ def croissant_text(facts: Facts, files: Mapping[str, Stored]) -> str:
             encoding_formats=[_FORMATS.get(PurePosixPath(name).suffix.lower(), "application/octet-stream")],
             sha256=stored.sha256,
         )
-        for name, stored in files.items()
+        for name, stored in facts.files.items()
     ]
     splits = facts.shapes if config.form == "parquet" else {}
     distribution += [
@@ -63,7 +48,7 @@ def croissant_text(facts: Facts, files: Mapping[str, Stored]) -> str:
             id=f"{split}-files",
             name=f"{split}-files",
             encoding_formats=[_FORMATS[".parquet"]],
-            includes=[f"{DATA}/{split}-*.parquet"],
+            includes=[f"data/{split}-*.parquet"],
         )
         for split in splits
     ]

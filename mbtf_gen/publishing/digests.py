@@ -9,68 +9,58 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from mbtf_core.config.settings import check_document
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.documents import software_versions
-from mbtf_core.errors import InputError
+from mbtf_core.data.shard_files import Arrays
 from mbtf_core.files.atomic import read_json
 
 DIGESTS_NAME = "digests.json"
-_FORMAT, _VERSION = "mbtf-digests", 1
 # Arrays whose bits depend on no machine.
 _QUERIES = ("u", "sigma", "omega_i", "omega_o")
 
 
-class _Digests(BaseModel):
-    """Keys of ``digests.json`` that a comparison needs."""
+class Digests(BaseModel):
+    """Content of ``digests.json``.
 
+    Attributes
+    ----------
+    config_hash, software : of the manifest: what the numbers depend on
+    geometry : SHA-256 of ``geometry.exr``, or None
+    arrays : shard → array → SHA-256
+    """
+
+    format: Literal["mbtf-digests"] = "mbtf-digests"
+    version: Literal[1] = 1
     config_hash: str
     software: dict[str, str]
-    arrays: dict[str, dict[str, str]]
     geometry: str | None
+    arrays: dict[str, dict[str, str]]
+
+    @classmethod
+    def of(cls, data: Dataset, arrays: Mapping[str, Mapping[str, str]]) -> Digests:
+        """Digests of a data set whose arrays have these."""
+        manifest = data.manifest
+        stored = {key: manifest[key] for key in ("config_hash", "software")}
+        geometry = (manifest["geometry"] or {}).get("sha256")
+        return cls.model_validate({**stored, "geometry": geometry, "arrays": arrays})
+
+    @property
+    def content(self) -> bytes:
+        """The file."""
+        return f"{self.model_dump_json(indent=2)}\n".encode()
 
 
-def array_sha256(array: NDArray[np.float32]) -> str:
-    """SHA-256 of an array's numbers, hexadecimal."""
-    return hashlib.sha256(np.ascontiguousarray(array, "<f4").data).hexdigest()
-
-
-def dataset_digests(data: Dataset) -> dict[str, Any]:
-    """Digests of all arrays of a data set, as plain data.
-
-    Parameters
-    ----------
-    data : Dataset
-        A complete data set.
-
-    Returns
-    -------
-    dict
-        ``arrays``: shard → array → SHA-256; ``geometry``: SHA-256 of ``geometry.exr`` or None;
-        ``config_hash``; ``software``: the versions that the numbers depend on.
-
-    Raises
-    ------
-    InputError
-        A shard cannot be read.
-    """
+def array_digests(arrays: Arrays) -> dict[str, str]:
+    """SHA-256 of each array's numbers, hexadecimal."""
     return {
-        "format": _FORMAT,
-        "version": _VERSION,
-        "config_hash": data.manifest["config_hash"],
-        "software": data.manifest["software"],
-        "geometry": (data.manifest["geometry"] or {}).get("sha256"),
-        "arrays": {
-            shard.file.rpartition(".")[0]: {name: array_sha256(array) for name, array in shard.read().items()}
-            for split in data.splits
-            for shard in data.shards(split)
-        },
+        name: hashlib.sha256(np.ascontiguousarray(array, "<f4").data).hexdigest()
+        for name, array in arrays.items()
     }
 
 
@@ -79,49 +69,43 @@ def digest_faults(data: Dataset, path: Path) -> list[str]:
 
     Parameters
     ----------
-    data : Dataset
-        The data set that was made again.
-    path : Path
-        ``digests.json`` of the published one.
+    data : the data set that was made again
+    path : ``digests.json`` of the published one
+
+    Returns
+    -------
+    list of str
 
     Raises
     ------
-    InputError
-        The file or a shard cannot be read.
+    InputError : the file or a shard cannot be read
     """
-    published = read_json(path)
-    if [published.get(key) for key in ("format", "version")] != [_FORMAT, _VERSION]:
-        raise InputError("holds no digests of arrays", where=path, hint=f"name a {DIGESTS_NAME} of a recipe")
-    check_document(_Digests, published, path, "download it again")
-    found = dataset_digests(data)
-    if found["config_hash"] != published["config_hash"]:
+    hint = f"name a {DIGESTS_NAME} of a recipe"
+    document = read_json(path, hint)
+    check_document(Digests, document, path, hint)
+    published = Digests.model_validate(document)
+    if data.manifest["config_hash"] != published.config_hash:
         return ["belongs to another configuration, or was made from other maps"]
-    faults = _array_faults(found["arrays"], published["arrays"])
-    if found["geometry"] != published["geometry"]:
+    shards = [shard for split in data.splits for shard in data.shards(split)]
+    found = {shard.file.rpartition(".")[0]: array_digests(shard.read()) for shard in shards}
+    faults = []
+    for name in sorted({array for shard in published.arrays.values() for array in shard}):
+        other = [
+            stem
+            for stem in sorted({*found, *published.arrays})
+            if found.get(stem, {}).get(name) != published.arrays.get(stem, {}).get(name)
+        ]
+        if other:
+            faults.append(
+                f"{name} differs in {len(other)} of {len(published.arrays)} shards, first {other[0]}"
+            )
+            if name in _QUERIES:
+                return [*faults, "queries are equal on every machine: this is another data set"]
+    if Digests.of(data, found).geometry != published.geometry:
         faults.append("geometry.exr differs")
-    return faults and [*faults, *_reasons(faults, published["software"])]
-
-
-def _array_faults(
-    found: Mapping[str, Mapping[str, str]], published: Mapping[str, Mapping[str, str]]
-) -> list[str]:
-    lines = []
-    for name in sorted({arrays for shard in published.values() for arrays in shard}):
-        shards = [s for s in sorted({*found, *published}) if _get(found, s, name) != _get(published, s, name)]
-        if shards:
-            lines.append(f"{name} differs in {len(shards)} of {len(published)} shards, first {shards[0]}")
-    return lines
-
-
-def _get(arrays: Mapping[str, Mapping[str, str]], shard: str, name: str) -> str | None:
-    return arrays.get(shard, {}).get(name)
-
-
-def _reasons(faults: list[str], published: Mapping[str, str]) -> list[str]:
-    """Other software or another type of machine, which explains other values but no other queries."""
-    if any(fault.split()[0] in _QUERIES for fault in faults):
-        return ["queries are equal on every machine: this is another data set"]
-    here = software_versions()
-    other = [f"{k} {published[k]} -> {here.get(k)}" for k in sorted(published) if published[k] != here.get(k)]
-    why = "; ".join(other) or "the processor may be of another type"
-    return [f"values are equal on one type of machine with the same software ({why})"]
+    if not faults:
+        return []
+    here, software = software_versions(), published.software
+    changed = [f"{k} {v} -> {here.get(k)}" for k, v in sorted(software.items()) if v != here.get(k)]
+    why = "; ".join(changed) or "the processor may be of another type"
+    return [*faults, f"values are equal on one type of machine with the same software ({why})"]

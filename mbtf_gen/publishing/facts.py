@@ -1,16 +1,23 @@
-"""What a manifest says of a data set, in the words of its card and of ``croissant.json``."""
+"""What a card, ``croissant.json`` and the picture state of a data set, from its manifest and its numbers.
+
+Statistics are those of evenly spaced rows of all shards, about a million queries at most. Independent units
+are queries of the shuffled layout, images of the image layout, positions of the slices layout.
+"""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.data.dataset import Dataset, Shard
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.shard_files import Arrays
+from mbtf_core.files.atomic import Stored
+from mbtf_core.stats import Estimate, mean_estimate, pooled_relative_error
 from mbtf_gen.config.publish import PublishConfig
+from mbtf_gen.measured.exported import mean_of
 
 # Folder of the shards.
 DATA = "data"
@@ -29,18 +36,30 @@ _GENERIC = ("material", "maps", "heights", "height", "")
 
 @dataclass(frozen=True)
 class Facts:
-    """A data set that is published, and what its publishers say.
+    """A data set that is published.
 
     Attributes
     ----------
     data : Dataset
         The data set.
     config : PublishConfig
-        What the publishers say.
+        What its publishers say.
+    name : str
+        Name of the published data set.
+    samples : mapping of str to arrays
+        Evenly spaced rows of each split.
+    files : mapping of str to Stored
+        The published files by name.
+    maps : bool
+        Whether the input files of the material are among them.
     """
 
     data: Dataset
     config: PublishConfig
+    name: str
+    samples: Mapping[str, Arrays]
+    files: Mapping[str, Stored]
+    maps: bool = False
 
     @property
     def measured(self) -> Mapping[str, Any] | None:
@@ -48,23 +67,10 @@ class Facts:
         return self.data.manifest.get("measured")
 
     @property
-    def name(self) -> str:
-        """Name of the data set: the given one, else that of the material."""
-        if self.config.name is not None:
-            return self.config.name
-        path = Path(self.measured["file"] if self.measured else self.data.manifest["config"]["material"])
-        found = path.stem if path.suffix else path.name
-        if path.stem.lower() in _GENERIC:
-            found = path.parent.name
-        words = re.sub(r"[^\w.]+|_+", " ", found if found.isprintable() else "").strip()
-        return words or "material"
-
-    @property
     def summary(self) -> str:
         """One sentence about the data set, of plain text."""
-        splits = self.data.manifest["splits"]
         counts = " and ".join(
-            f"{splits[name]['queries']:,} {'training' if name == 'train' else name}" for name in self.shards
+            f"{self.queries(name):,} {'training' if name == 'train' else name}" for name in self.samples
         )
         return (
             f"Multi-resolution bidirectional texture function (MBTF) of one material tile: {counts} queries "
@@ -77,22 +83,40 @@ class Facts:
         """What one row is."""
         return _LAYOUTS[self.data.layout]
 
-    @cached_property
-    def shards(self) -> dict[str, list[Shard]]:
-        """Shards of each split that has any."""
-        found = {split: self.data.shards(split) for split in self.data.splits}
-        return {split: shards for split, shards in found.items() if shards}
-
-    @cached_property
+    @property
     def shapes(self) -> dict[str, dict[str, tuple[int, ...]]]:
         """Shape of one row of each array of each split."""
         return {
-            split: {name: array.shape[1:] for name, array in shards[0].read().items()}
-            for split, shards in self.shards.items()
+            split: {name: array.shape[1:] for name, array in arrays.items()}
+            for split, arrays in self.samples.items()
         }
 
     @property
     def same_shapes(self) -> bool:
         """Whether rows of all splits have the same shapes."""
-        shapes = list(self.shapes.values())
-        return all(shape == shapes[0] for shape in shapes)
+        first, *others = self.shapes.values()
+        return all(shapes == first for shapes in others)
+
+    def queries(self, split: str) -> int:
+        """Number of queries of a split."""
+        return int(self.data.manifest["splits"][split]["queries"])
+
+    def mean(self, split: str) -> list[Estimate]:
+        """Mean value of each color channel of a split, in 1/sr."""
+        value = mean_of(self.samples[split])
+        return [mean_estimate(value[..., channel]) for channel in range(3)]
+
+    def noise(self, split: str) -> Estimate | None:
+        """RMS noise of the value of one query over the RMS value; None of measured data: it is unknown."""
+        arrays = self.samples[split]
+        return pooled_relative_error(arrays["value_a"], arrays["value_b"]) if "value_b" in arrays else None
+
+
+def name_of(manifest: Mapping[str, Any]) -> str:
+    """Name of the material of a data set."""
+    path = Path(manifest["measured"]["file"] if "measured" in manifest else manifest["config"]["material"])
+    found = path.stem if path.suffix else path.name
+    if path.stem.lower() in _GENERIC:
+        found = path.parent.name
+    words = re.sub(r"[^\w.]+|_+", " ", found if found.isprintable() else "").strip()
+    return words or "material"

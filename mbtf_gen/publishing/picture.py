@@ -13,13 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.geometry import Geometry
 from mbtf_core.data.lattice import level_of_sigma
 from mbtf_core.data.shard_files import Arrays
 from mbtf_core.exposure import auto_exposure, brightness, to_display
 from mbtf_core.files.atomic import Stored, write_chunks
 from mbtf_gen.measured.exported import mean_of
-from mbtf_gen.publishing.statistics import sample
 
 F64 = NDArray[np.float64]
 PICTURE_NAME = "contact_sheet.png"
@@ -35,12 +34,11 @@ _EMPTY = 238
 
 def mean_image(x: F64, y: F64, value: F64, rows: int, columns: int) -> F64:
     """Mean value (rows, columns, 3) of points of the unit square, row 0 at ``y → 1``; NaN without points."""
-    column, row = (np.clip(c * n, 0, n - 1).astype(int) for c, n in ((x, columns), (1.0 - y, rows)))
-    index, bins = row * columns + column, rows * columns
-    count = np.bincount(index, minlength=bins)
-    sums = np.stack([np.bincount(index, value[:, c], bins) for c in range(3)], -1)
-    with np.errstate(invalid="ignore"):
-        return np.asarray(sums / count[:, None]).reshape(rows, columns, 3)
+    from scipy.stats import binned_statistic_2d
+
+    unit = ((0.0, 1.0), (0.0, 1.0))
+    found = binned_statistic_2d(1.0 - y, x, value.T, "mean", (rows, columns), unit).statistic
+    return np.moveaxis(np.asarray(found), 0, -1)
 
 
 def tile_images(arrays: Arrays, aspect: float) -> dict[str, F64]:
@@ -50,8 +48,7 @@ def tile_images(arrays: Arrays, aspect: float) -> dict[str, F64]:
     ----------
     arrays : dict of str to float32 array
         Queries.
-    aspect : float
-        Height of the tile over its width.
+    aspect : height of the tile over its width
 
     Returns
     -------
@@ -107,15 +104,16 @@ def displayed(image: F64) -> NDArray[np.uint8]:
     return shown
 
 
-def write_picture(data: Dataset, path: Path) -> Stored:
-    """Write the contact sheet of a data set.
+def write_picture(arrays: Arrays, aspect: float, geometry: Geometry | None, path: Path) -> Stored:
+    """Write the contact sheet of a data set, atomically.
 
     Parameters
     ----------
-    data : Dataset
-        A complete data set.
-    path : Path
-        PNG to write.
+    arrays : dict of str to float32 array
+        Training queries.
+    aspect : height of the tile over its width
+    geometry : of the data set
+    path : PNG to write
 
     Returns
     -------
@@ -123,15 +121,10 @@ def write_picture(data: Dataset, path: Path) -> Stored:
 
     Raises
     ------
-    InputError
-        A shard cannot be read.
-    PartialError
-        The disk is full or the folder cannot be written.
+    PartialError : the disk is full or the folder cannot be written
     """
     from matplotlib.figure import Figure
 
-    arrays, aspect = sample(data.shards("train")), data.lattice.aspect
-    geometry = data.geometry()
     panels = [(title, image, (0, 1, 0, aspect)) for title, image in tile_images(arrays, aspect).items()]
     panels.append(("apparent BRDF by ω_o", brdf_image(arrays), (-1, 1, -1, 1)))
     figure = Figure(figsize=(3.0 * (len(panels) + (geometry is not None)), 3.3), layout="constrained")

@@ -9,9 +9,12 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mbtf_core.data.dataset import Dataset, Shard
-from mbtf_core.data.folder import DataFolder, sidecar_name
+from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.schema import GEOMETRY_NAME
+from mbtf_core.data.shard_files import Arrays
 from mbtf_core.data.verify import verify
 from mbtf_core.errors import EngineError, InputError, UsageError
 from mbtf_core.files.atomic import Stored, write_chunks
@@ -20,19 +23,24 @@ from mbtf_core.files.folders import OutputFolder, OutputKind, check_space, owned
 from mbtf_gen.config.publish import PublishConfig
 from mbtf_gen.publishing.card import CARD_NAME, card_text
 from mbtf_gen.publishing.croissant import CROISSANT_NAME, croissant_text
-from mbtf_gen.publishing.facts import DATA, Facts
-from mbtf_gen.publishing.material_copy import MaterialCopy, check_copy, copy_of_material
-from mbtf_gen.publishing.npz import copy_file, link_or_copy, public_documents
-from mbtf_gen.publishing.parquet import write_parquet
+from mbtf_gen.publishing.digests import DIGESTS_NAME, Digests, array_digests
+from mbtf_gen.publishing.facts import Facts, name_of
+from mbtf_gen.publishing.formats import LIBRARIES, copied, published_names, shard_writers
 from mbtf_gen.publishing.picture import PICTURE_NAME, write_picture
-from mbtf_gen.publishing.recipe import MATERIAL, RECIPE, Makers, recipe_makers
-from mbtf_gen.publishing.webdataset import write_tar
+from mbtf_gen.publishing.recipe import (
+    MATERIAL,
+    RECIPE,
+    Content,
+    check_inputs,
+    public_documents,
+    recipe_files,
+)
 
 PUBLICATION = OutputKind("publish.json", "mbtf-publication", 2, "a published data set")
 # Bytes of picture, card and documents.
 _DOCUMENT_BYTES = 4 << 20
-# Library that writes each form.
-_LIBRARIES = {"parquet": "pyarrow", "webdataset": "webdataset", "npz": "mlcroissant"}
+# Queries of a split that the statistics are of, at most.
+_SAMPLE = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -41,14 +49,16 @@ class Publication:
 
     Parameters
     ----------
-    facts : Facts
-        A complete data set, and what its publishers say.
-    copy : MaterialCopy or None
-        The input files of the material, if they are published.
+    data : a complete data set
+    config : what its publishers say
+    documents : geometry, recipe and copies of documents, by name in the folder
+    maps : whether the input files of the material are published
     """
 
-    facts: Facts
-    copy: MaterialCopy | None = None
+    data: Dataset
+    config: PublishConfig
+    documents: dict[str, Content]
+    maps: bool = False
 
     @classmethod
     def prepare(
@@ -63,14 +73,10 @@ class Publication:
 
         Parameters
         ----------
-        shards : str, Path or DataFolder
-            Folder of shards.
-        config : PublishConfig
-            What its publishers say.
-        with_maps : bool
-            Publish the input files of the material.
-        material : Path or None
-            Path of the material, if it was moved.
+        shards : folder of shards
+        config : what its publishers say
+        with_maps : publish the input files of the material
+        material : path of the material, if it was moved
 
         Returns
         -------
@@ -78,102 +84,92 @@ class Publication:
 
         Raises
         ------
-        InputError
-            The data set is damaged or unfinished, or its material cannot be copied.
-        UsageError
-            Options contradict the data set.
-        EngineError
-            A library is missing.
+        InputError : the data set is damaged or unfinished, or its material cannot be copied
+        UsageError : options contradict the data set
+        EngineError : a library is missing
         """
         data = Dataset.open(shards)
-        for library in ("mlcroissant", _LIBRARIES[config.form]):
+        manifest, measured = data.manifest, "measured" in data.manifest
+        for library in ("mlcroissant", LIBRARIES[config.form]):
             if importlib.util.find_spec(library) is None:
                 hint = "pip install 'mbtf[publish]'"
                 raise EngineError(f"{library} is not installed", where=f"--form {config.form}", hint=hint)
-        if config.form == "npz" and data.manifest["array_format"] != "npz":
+        if config.form == "npz" and manifest["array_format"] != "npz":
             raise UsageError(
-                f"{data.folder} holds shards of another format ({data.manifest['array_format']})",
+                f"{data.folder} holds shards of another format ({manifest['array_format']})",
                 where="--form npz",
                 hint="use --form parquet or --form webdataset",
             )
-        if (with_maps or material is not None) and "measured" in data.manifest:
+        if (with_maps or material is not None) and measured:
             raise UsageError(f"{data.folder} holds measured data, without maps", where="--with-maps")
         if material is not None and not with_maps:
             raise UsageError("goes with --with-maps", where="--material")
         for fault in verify(data.folder):
             raise InputError(fault.what, where=data.folder.at(fault.file), hint=fault.hint)
-        return cls(Facts(data, config), copy_of_material(data, material) if with_maps else None)
+        documents: dict[str, Content] = {}
+        if (geometry := manifest["geometry"]) is not None:
+            documents[f"data/{GEOMETRY_NAME}"] = data.folder.file(GEOMETRY_NAME, geometry["sha256"])
+        if config.form == "npz":
+            documents |= {f"data/{name}": content for name, content in public_documents(manifest).items()}
+        if not measured:
+            documents |= recipe_files(data, with_maps=with_maps, moved=material)
+        return cls(data, config, documents, with_maps)
+
+    @cached_property
+    def shards(self) -> dict[str, list[Shard]]:
+        """Shards of each split that has any."""
+        found = {split: self.data.shards(split) for split in self.data.splits}
+        return {split: shards for split, shards in found.items() if shards}
+
+    @property
+    def name(self) -> str:
+        """Name of the published data set: the given one, else that of the material."""
+        return self.config.name or name_of(self.data.manifest)
+
+    @property
+    def count(self) -> int:
+        """Number of shards."""
+        return sum(map(len, self.shards.values()))
 
     @property
     def size(self) -> int:
         """Bytes that the folder takes at most."""
-        data = self.facts.data
-        shards = sum(int(s.sidecar["bytes"]) for found in self.facts.shards.values() for s in found)
-        surface = data.folder.size(GEOMETRY_NAME) or 0
-        maps = sum(path.stat().st_size for path in self.copy.files.values()) if self.copy else 0
+        shards = sum(int(shard.sidecar["bytes"]) for found in self.shards.values() for shard in found)
+        contents = self.documents.values()
+        documents = sum(c.stat().st_size if isinstance(c, Path) else len(c) for c in contents)
         # Tar files have a header and up to a block of padding per array.
-        return round(1.02 * shards) + surface + maps + _DOCUMENT_BYTES
+        return round(1.02 * shards) + documents + _DOCUMENT_BYTES
 
-    @property
-    def depends(self) -> dict[str, Any]:
+    def _depends(self) -> dict[str, Any]:
         """Plain data that determine the content of the folder."""
-        config = self.facts.config
-        stored = {s.file: s.sidecar["sha256"] for found in self.facts.shards.values() for s in found}
+        config = self.config
+        stored = {s.file: s.sidecar["sha256"] for found in self.shards.values() for s in found}
         return {
             **config.model_dump(mode="json", exclude={"version"}),
             # A long text would make a long message.
             "citation": None if config.citation is None else data_sha256(config.citation),
-            "with_maps": self.copy is not None,
-            "config_hash": self.facts.data.manifest["config_hash"],
+            "with_maps": self.maps,
+            "config_hash": self.data.manifest["config_hash"],
             "shards": data_sha256(stored),
         }
 
-    @cached_property
-    def makers(self) -> Makers:
-        """Writers of all files but the card and ``croissant.json``, by name."""
-        data = self.facts.data
-        makers: Makers = {}
-        for found in self.facts.shards.values():
-            for shard in found:
-                makers |= self._shard_makers(shard)
-        if (geometry := data.manifest["geometry"]) is not None:
-            makers[f"{DATA}/{GEOMETRY_NAME}"] = lambda path: copy_file(
-                data.folder.file(GEOMETRY_NAME, geometry["sha256"]), path
-            )
-        if self.facts.config.form == "npz":
-            for name, content in public_documents(data.manifest).items():
-                makers[f"{DATA}/{name}"] = partial(write_chunks, chunks=[content])
-        if not self.facts.measured:
-            makers |= recipe_makers(data, self.copy)
-        makers[PICTURE_NAME] = partial(write_picture, data)
-        return makers
-
-    def _shard_makers(self, shard: Shard) -> Makers:
-        stem, form = shard.file.rpartition(".")[0], self.facts.config.form
-        if form == "parquet":
-            described = self.facts.data.manifest["arrays"]
-            return {f"{DATA}/{stem}.parquet": lambda path: write_parquet(path, shard.read(), described)}
-        if form == "webdataset":
-            return {f"{DATA}/{stem}.tar": lambda path: write_tar(path, shard.read())}
-        sidecar = sidecar_name(shard.file)
-        return {
-            f"{DATA}/{shard.file}": lambda path: link_or_copy(shard.local(), path),
-            f"{DATA}/{sidecar}": lambda path: write_chunks(path, [shard.folder.read(sidecar)]),
-        }
+    def _names(self) -> list[str]:
+        """Names of all files."""
+        shards = [shard for found in self.shards.values() for shard in found]
+        data = [f"data/{name}" for shard in shards for name in published_names(shard, self.config.form)]
+        digests = f"{RECIPE}/{DIGESTS_NAME}"
+        return [*self.documents, *data, digests, PICTURE_NAME, CARD_NAME, CROISSANT_NAME]
 
     def write(
         self, output: Path, *, overwrite: bool = False, progress: Callable[[float], None] = lambda _: None
     ) -> dict[str, Stored]:
-        """Write the folder, or finish an unfinished one.
+        """Write the folder, or finish an unfinished one; every shard is read once.
 
         Parameters
         ----------
-        output : Path
-            Folder to write.
-        overwrite : bool
-            Replace what was published there.
-        progress : callable
-            Called with 1 after each file.
+        output : folder to write
+        overwrite : replace what was published there
+        progress : called with 1 after each shard
 
         Returns
         -------
@@ -182,24 +178,50 @@ class Publication:
 
         Raises
         ------
-        InputError
-            The folder holds something else, or does not fit on the disk.
-        PartialError
-            It cannot be written, or another process writes to it; the same command resumes.
+        InputError : the folder holds something else, or does not fit on the disk
+        PartialError : it cannot be written, or another process writes to it; the same command resumes
         """
         check_space(output, self.size, "choose another folder with -o")
         with owned(output):
-            listed = [*self.makers, CARD_NAME, CROISSANT_NAME]
-            folder = OutputFolder.claim(output, PUBLICATION, self.depends, listed, overwrite=overwrite)
-            written = {}
-            for name, maker in self.makers.items():
-                written[name] = folder.add(name, maker)
-                progress(1)
-            files = dict(sorted(written.items()))
-            if self.copy is not None:
-                check_copy(self.facts.data, output / RECIPE / MATERIAL)
-            maps = self.copy is not None
-            card, croissant = card_text(self.facts, files, maps), croissant_text(self.facts, files)
-            for name, text in ((CARD_NAME, card), (CROISSANT_NAME, croissant)):
-                files[name] = folder.add(name, partial(write_chunks, chunks=[text.encode()]))
+            folder = OutputFolder.claim(
+                output, PUBLICATION, self._depends(), self._names(), overwrite=overwrite
+            )
+            files = {name: folder.add(name, partial(_store, c)) for name, c in self.documents.items()}
+            if self.maps:
+                hint = "leave out --with-maps, and add the files of the material to recipe/ by hand"
+                check_inputs(self.data, output / MATERIAL, "its copy is read differently", hint)
+            stored, samples, digests = self._write_shards(folder, progress)
+            files |= stored
+            if "measured" not in self.data.manifest:
+                content, name = Digests.of(self.data, digests).content, f"{RECIPE}/{DIGESTS_NAME}"
+                files[name] = folder.add(name, partial(_store, content))
+            drawn = samples["train"], self.data.lattice.aspect, self.data.geometry()
+            files[PICTURE_NAME] = folder.add(PICTURE_NAME, partial(write_picture, *drawn))
+            facts = Facts(self.data, self.config, self.name, samples, dict(sorted(files.items())), self.maps)
+            for name, text in ((CARD_NAME, card_text(facts)), (CROISSANT_NAME, croissant_text(facts))):
+                files[name] = folder.add(name, partial(_store, text.encode()))
             return dict(sorted(files.items()))
+
+    def _write_shards(
+        self, folder: OutputFolder, progress: Callable[[float], None]
+    ) -> tuple[dict[str, Stored], dict[str, Arrays], dict[str, dict[str, str]]]:
+        """Write the shards: the files, evenly spaced rows of each split, and the digests of all arrays."""
+        files, digests, samples = {}, {}, {}
+        form, described = self.config.form, self.data.manifest["arrays"]
+        for split, shards in self.shards.items():
+            step = -(-int(self.data.manifest["splits"][split]["queries"]) // _SAMPLE)
+            parts = []
+            for shard in shards:
+                arrays = shard.read()
+                for name, write in shard_writers(shard, arrays, form, described).items():
+                    files[f"data/{name}"] = folder.add(f"data/{name}", write)
+                digests[shard.file.rpartition(".")[0]] = array_digests(arrays)
+                parts.append({name: np.array(array[::step]) for name, array in arrays.items()})
+                progress(1)
+            samples[split] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        return files, samples, digests
+
+
+def _store(content: Content, path: Path) -> Stored:
+    """Write or copy a document, atomically."""
+    return copied(content, path) if isinstance(content, Path) else write_chunks(path, [content])

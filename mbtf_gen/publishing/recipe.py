@@ -1,60 +1,122 @@
-"""The recipe of a data set: configuration, digests, and a script that makes it again bit by bit."""
+"""The recipe of a data set: its configuration and, if they are published, the input files of its material."""
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Callable
-from functools import partial
-from importlib.resources import files
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.data.dataset import Dataset
-from mbtf_core.data.schema import CONFIG_NAME
-from mbtf_core.files.atomic import Stored, write_chunks
-from mbtf_gen.publishing.digests import DIGESTS_NAME, dataset_digests
-from mbtf_gen.publishing.material_copy import MATERIAL_FILE, MaterialCopy
-from mbtf_gen.publishing.npz import copy_file, public_config
+from mbtf_core.data.schema import CONFIG_NAME, MANIFEST_NAME
+from mbtf_core.errors import InputError
+from mbtf_core.files.atomic import checksummed
+from mbtf_gen.tile.loading import described, load_material
 
-RECIPE, SCRIPT_NAME, MATERIAL = "recipe", "remake.sh", "material"
+# Folders of the recipe and of the material in the published folder.
+RECIPE, MATERIAL = "recipe", "recipe/material"
+_MATERIAL_FILE = "material.yaml"
+# Keys of material files that name a file.
+_NAMES = ("file", "filename", "mesh", "pattern", "curves")
 
-# Name of a file in the folder → what writes it to a given path, atomically.
-Makers = dict[str, Callable[[Path], Stored]]
-
-
-def material_of(maps: bool) -> str:
-    """The material in a command that runs in the published folder: its copy, or a word to replace."""
-    return f"{RECIPE}/{MATERIAL}/{MATERIAL_FILE}" if maps else "MATERIAL"
+# A file of the publication: its content, or the file that is copied.
+Content = bytes | Path
 
 
-def recipe_makers(data: Dataset, copy: MaterialCopy | None) -> Makers:
-    """Writers of the files of a recipe, by file name.
+def public_config(manifest: Mapping[str, Any]) -> dict[str, Any]:
+    """The configuration in a manifest with the bare name of the material, without the folders above it."""
+    config = dict(manifest["config"])
+    if "material" in config:
+        config["material"] = Path(config["material"]).name or "material"
+    return config
+
+
+def public_documents(manifest: Mapping[str, Any]) -> dict[str, Content]:
+    """Manifest and configuration of a published copy of the shards, by file name.
+
+    The hash of the configuration does not cover the material's name, so that the sidecars stay valid.
+    """
+    config = public_config(manifest)
+    text = dump_yaml(config).encode()
+    digest = hashlib.sha256(text).hexdigest()
+    return {
+        MANIFEST_NAME: checksummed({**manifest, "config": config, "config_yaml": digest}),
+        CONFIG_NAME: text,
+    }
+
+
+def recipe_files(data: Dataset, *, with_maps: bool, moved: Path | None) -> dict[str, Content]:
+    """Configuration and material of a recipe, by name in the published folder.
 
     Parameters
     ----------
-    data : Dataset
-        A complete generated data set.
-    copy : MaterialCopy or None
-        The input files of the material, if they are published.
+    data : generated, not measured
+    with_maps : whether the input files of the material are published
+    moved : path of the material, if it is not where the data set was generated from
 
     Returns
     -------
-    dict of str to callable
+    dict of str to bytes or Path
+
+    Raises
+    ------
+    InputError : the material cannot be read, has changed since, or consists of files that cannot be copied
     """
     config = public_config(data.manifest)
-    if copy is not None:
-        config["material"] = f"{MATERIAL}/{MATERIAL_FILE}"
-    makers: Makers = {
-        f"{RECIPE}/{CONFIG_NAME}": _text(lambda: dump_yaml(config)),
-        f"{RECIPE}/{DIGESTS_NAME}": _text(lambda: json.dumps(dataset_digests(data), indent=2) + "\n"),
-        f"{RECIPE}/{SCRIPT_NAME}": _text(files(__package__).joinpath(SCRIPT_NAME).read_text),
+    if not with_maps:
+        return {f"{RECIPE}/{CONFIG_NAME}": dump_yaml(config).encode()}
+    path = Path(data.manifest["config"]["material"]) if moved is None else moved
+    hint = "name it: --material PATH; or leave out --with-maps"
+    try:
+        check_inputs(data, path, "has changed since the data set was made", hint)
+    except InputError as error:
+        raise InputError(error.what, where=error.where, hint=error.hint or hint) from None
+    spec, folder, _ = described(path)
+    files: dict[str, Content] = {}
+    document = _copied(spec.model_dump(mode="json", exclude_unset=True), folder, "", files)
+    config["material"] = f"{Path(MATERIAL).name}/{_MATERIAL_FILE}"
+    return {
+        f"{RECIPE}/{CONFIG_NAME}": dump_yaml(config).encode(),
+        f"{MATERIAL}/{_MATERIAL_FILE}": dump_yaml(document).encode(),
+        **{f"{MATERIAL}/{name}": source for name, source in files.items()},
     }
-    if copy is not None:
-        makers[f"{RECIPE}/{MATERIAL}/{MATERIAL_FILE}"] = _text(lambda: dump_yaml(copy.document))
-        for name, source in sorted(copy.files.items()):
-            makers[f"{RECIPE}/{MATERIAL}/{name}"] = partial(copy_file, source)
-    return makers
 
 
-def _text(content: Callable[[], str]) -> Callable[[Path], Stored]:
-    return lambda path: write_chunks(path, [content().encode()])
+def check_inputs(data: Dataset, material: Path, what: str, hint: str) -> None:
+    """Refuse a material that is not the one that a data set was generated from."""
+    tile = load_material(material, data.manifest["config"]["geometry"]["make_tileable"])
+    if tile.digests != data.manifest["inputs"]:
+        raise InputError(what, where=material, hint=hint)
+
+
+def _copied(node: dict[str, Any], folder: Path, role: str, files: dict[str, Content]) -> dict[str, Any]:
+    """A material file that names copies, each in a folder of its role; adds them to `files`."""
+    out: dict[str, Any] = {}
+    for key, value in node.items():
+        out[key] = value
+        if isinstance(value, dict):
+            out[key] = _copied(value, folder, f"{role}{key}/", files)
+        elif key in _NAMES and isinstance(value, str):
+            source = folder / value
+            if _has_companions(source):
+                raise InputError(
+                    "names other files, which the digests do not cover",
+                    where=source,
+                    hint="leave out --with-maps; a .glb holds everything in one file",
+                )
+            out[key] = f"{role or f'{key}/'}{source.name}"
+            files[out[key]] = source
+    return out
+
+
+def _has_companions(path: Path) -> bool:
+    """Whether a mesh consists of several files."""
+    if path.suffix.lower() == ".obj":
+        return any(line.startswith(b"mtllib") for line in path.read_bytes().splitlines())
+    if path.suffix.lower() == ".gltf":
+        document = json.loads(path.read_bytes())
+        parts = [*document.get("buffers", []), *document.get("images", [])]
+        return any(not str(part.get("uri", "data:")).startswith("data:") for part in parts)
+    return False

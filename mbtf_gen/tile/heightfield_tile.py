@@ -16,8 +16,7 @@ from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
 from mbtf_core.images.read import LUMINANCE
 from mbtf_core.images.resample import resample
-from mbtf_gen.config.generator import GeometrySection
-from mbtf_gen.config.values import NormalMode, Tracer
+from mbtf_gen.config.generator import GeometrySection, NormalMode, Tracer
 from mbtf_gen.tile.heights import (
     HeightGrid,
     detail_size,

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mbtf_core.data.geometry import mesh_slopes
 from mbtf_core.errors import InputError
 from mbtf_core.images.resample import resample
-from mbtf_gen.config.values import NormalMode, Tracer
+from mbtf_gen.config.generator import NormalMode, Tracer
 from mbtf_gen.tile.tracers.protocol import TileGeometry
 
 # Cells of a grid that Mitsuba traces. Each takes about 300 bytes, with Mitsuba's and Embree's own data.

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.data.schema import Tiling
 from mbtf_core.errors import InputError, UsageError
-from mbtf_gen.config.generator import GeometrySection
-from mbtf_gen.config.values import NormalMode
+from mbtf_gen.config.generator import GeometrySection, NormalMode
 from mbtf_gen.tile.heights import HeightGrid
 from mbtf_gen.tile.maps.map_loader import Color
 from mbtf_gen.tile.maps.material_file import REFLECTING

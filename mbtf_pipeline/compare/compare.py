@@ -83,7 +83,7 @@ def compare(
     from mbtf_core.data.dataset import Dataset
     from mbtf_fit import Material
     from mbtf_gen.job import Job
-    from mbtf_gen.pictures.tasks import picture_estimator
+    from mbtf_gen.pictures.reference import picture_estimator
 
     if section.st_lpips:
         require()
@@ -139,7 +139,7 @@ def _render_references(
 ) -> list[tuple[Scene, dict[PixelKind, ReferenceImage]]]:
     """References by scene and kind."""
     from mbtf_core.run.task import Item
-    from mbtf_gen.pictures.tasks import render_picture
+    from mbtf_gen.pictures.reference import render_picture
 
     items = []
     for scene, kind in ((scene, kind) for scene in scenes(section) for kind in section.kinds):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
-from mbtf_gen.config.values import Tracer
+from mbtf_gen.config.generator import Tracer
 from mbtf_gen.engine.runtime import load_mitsuba
 from support.paths import ROOT
 

@@ -48,7 +48,8 @@ mbtf_gen.tile.fibers
 mbtf_gen.tile.maps
 mbtf_gen.tile
 mbtf_gen.render
-mbtf_gen.diagnostics
+mbtf_gen.checks
+mbtf_gen.doctor mbtf_gen.selftest
 mbtf_gen.job
 mbtf_gen.planning
 mbtf_gen.forecast

@@ -8,8 +8,7 @@ from pydantic import Field, model_validator
 
 from mbtf_core.config.settings import FileName, Settings
 from mbtf_core.data.schema import Tiling
-from mbtf_gen.config.generator import Resolution
-from mbtf_gen.config.values import Positive, Rgb, no_tiling
+from mbtf_gen.config.generator import Positive, Resolution, Rgb, no_tiling
 from mbtf_gen.tile.fibers.yarn import YarnName
 
 # Files that can be given in place of a material file, by suffix, with the key that names them there.

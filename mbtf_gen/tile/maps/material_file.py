@@ -11,8 +11,7 @@ from pydantic import Field, model_validator
 from mbtf_core.config.settings import FileName, Settings
 from mbtf_core.data.schema import Tiling
 from mbtf_core.images.metadata import ColorSpace
-from mbtf_gen.config.generator import MAX_SCALE, Resolution
-from mbtf_gen.config.values import Rgb, Share
+from mbtf_gen.config.generator import MAX_SCALE, Resolution, Rgb, Share
 
 Channel = Annotated[str, Field(min_length=1)]
 _CHANNEL = "channel or layer of an EXR file; R, G, B, A or Y of others; default: all that belongs together"

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.closed_forms import Groove
 from support.scenes import DIRECT, LightKernel, direction, estimate, lambert, queries
 
 from mbtf_core.stats import mean_estimate, t_test
-from mbtf_gen.diagnostics.closed_forms import Groove
 
 GROOVE = Groove(0.4, 0.7)
 ELEVATIONS = st.floats(8.0, 90.0)

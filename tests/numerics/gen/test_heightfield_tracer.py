@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from support.scenes import HeightGrid, build_scene, lambert, mi, rocks
 
-from mbtf_gen.config.values import Tracer
+from mbtf_gen.config.generator import Tracer
 from mbtf_gen.sampling.sobol import sequence
 from mbtf_gen.tile.heights import mesh_of_grid
 from mbtf_gen.tile.tracers.heightfield_tracer import HeightfieldGeometry

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from support.scenes import build_scene, lambert, mi, rocks
 
-from mbtf_gen.config.values import Tracer
+from mbtf_gen.config.generator import Tracer
 from mbtf_gen.render.scene import CLEARANCE
 from mbtf_gen.tile.heights import HeightGrid
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from support.closed_forms import Groove
 from support.scenes import DIRECT, HeightGrid, direction, estimate, lambert, queries, tile_mean_queries
 
 from mbtf_core.stats import Estimate, aggregate_test, mean_of_halves, t_test
-from mbtf_gen.diagnostics.closed_forms import Groove
 from mbtf_gen.sampling.light_kernel import LightKernel
 
 ALBEDO = 0.7

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
+import re
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -63,10 +61,8 @@ def test_a_published_folder_is_complete(work: Path, done: dict[str, Done]) -> No
     assert done["again"].result() == result
     files = set(contents(work / "card"))
     assert set(result["files"]) | {"publish.json"} == files
-    expected = (
-        "README.md croissant.json data/manifest.json data/geometry.exr recipe/remake.sh recipe/config.yaml"
-    )
-    assert {*expected.split(), "recipe/material/height.npy", "contact_sheet.png"} <= files
+    expected = "README.md croissant.json data/manifest.json data/geometry.exr recipe/config.yaml"
+    assert {*expected.split(), "recipe/material/height/height.npy", "contact_sheet.png"} <= files
     card = (work / "card/README.md").read_text()
     assert "# wool\n" in card
     assert "@misc{a,\n  title = {b}\n}" in card
@@ -74,38 +70,19 @@ def test_a_published_folder_is_complete(work: Path, done: dict[str, Done]) -> No
     assert "no recipe: measured data" in done["measured card"].out
 
 
-def test_the_script_makes_the_data_again(work: Path, done: dict[str, Done], tmp_path: Path) -> None:
-    """In another folder, from the recipe alone."""
+def test_the_recipe_makes_the_data_again(work: Path, done: dict[str, Done], tmp_path: Path) -> None:
+    """By the commands of the card, in another folder, from the recipe alone."""
     assert done["publish"].code == 0
-    shutil.copytree(work / "card/recipe", tmp_path / "recipe")
-    program = tmp_path / "bin/mbtf-gen"
-    program.parent.mkdir()
-    program.write_text(f'#!/bin/sh\nexec {sys.executable} -m mbtf_gen "$@"\n')
-    program.chmod(0o755)
-    path = f"{program.parent}{os.pathsep}{os.environ['PATH']}"
-    ran = subprocess.run(
-        ["sh", "recipe/remake.sh", "made"],
-        cwd=tmp_path,
-        env=os.environ | {"PATH": path},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert ran.returncode == 0, ran.stderr
-    assert "equal to recipe/digests.json bit by bit" in ran.stdout
+    (tmp_path / "card").mkdir()
+    shutil.copytree(work / "card/recipe", tmp_path / "card/recipe")
+    generate, verify = re.findall(r"^mbtf-gen (.*)$", (work / "card/README.md").read_text(), re.MULTILINE)
+    again = run_named({"generate": generate, "verify": verify}, tmp_path / "card")
+    assert again["generate"].code == 0, again["generate"].err
+    assert "equal to recipe/digests.json bit by bit" in again["verify"].out
     shards = [path.name for path in (work / "shards").glob("*.npz")]
     assert len(shards) == 4
     for name in (*shards, "geometry.exr"):
-        assert (tmp_path / "made" / name).read_bytes() == (work / "shards" / name).read_bytes()
-
-
-def test_the_script_asks_for_a_material_that_is_not_published(work: Path, done: dict[str, Done]) -> None:
-    assert done["images card"].code == 0
-    ran = subprocess.run(
-        ["sh", "images_card/recipe/remake.sh"], cwd=work, capture_output=True, text=True, timeout=60
-    )
-    assert (ran.returncode, ran.stdout) == (2, "")
-    assert ran.stderr == "error: name the material: sh images_card/recipe/remake.sh MATERIAL [FOLDER]\n"
+        assert (tmp_path / "remade" / name).read_bytes() == (work / "shards" / name).read_bytes()
 
 
 def test_digests_are_compared(done: dict[str, Done]) -> None:

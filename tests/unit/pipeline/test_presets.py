@@ -13,8 +13,7 @@ from support.paths import ROOT
 from mbtf_core.app.options import Quality
 from mbtf_core.config.settings import resolve
 from mbtf_fit.config import FITTER, FitConfig, best_at, best_options, fitter_options
-from mbtf_gen.config.generator import GeneratorConfig, count_queries
-from mbtf_gen.config.presets import GENERATOR
+from mbtf_gen.config.generator import GENERATOR, GeneratorConfig, count_queries
 from mbtf_pipeline.presets import COMPARE, preset_recipe, quality_options
 from mbtf_pipeline.recipe import load_recipe
 

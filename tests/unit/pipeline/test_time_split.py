@@ -12,8 +12,7 @@ from support.paths import ROOT
 
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError, UsageError
-from mbtf_gen.config.generator import count_queries
-from mbtf_gen.config.presets import GENERATOR
+from mbtf_gen.config.generator import GENERATOR, count_queries
 from mbtf_pipeline import time_split as module
 from mbtf_pipeline.forecast import RunForecaster
 from mbtf_pipeline.presets import preset_recipe

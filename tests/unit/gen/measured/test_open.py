@@ -9,8 +9,7 @@ import pytest
 from support import measured_files as files
 
 from mbtf_core.errors import InputError
-from mbtf_gen.measured.neumip_hdf5 import NeumipQueries
-from mbtf_gen.measured.neural_btf_hdf5 import NeuralBtf
+from mbtf_gen.measured.hdf5 import NeumipQueries, NeuralBtf
 from mbtf_gen.measured.open import open_measured
 from mbtf_gen.measured.ubo2003 import Ubo2003
 from mbtf_gen.measured.ubo2014 import Ubo2014

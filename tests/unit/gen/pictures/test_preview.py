@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,17 +11,18 @@ import numpy as np
 import pytest
 from support.datasets import write_dataset
 
-from mbtf_core.data.lattice import level_of_sigma, texel_centers
+from mbtf_core.app.console import run
+from mbtf_core.data.lattice import texel_centers
 from mbtf_core.directions import from_angles
-from mbtf_core.errors import EngineError, InputError
+from mbtf_core.errors import InputError
 from mbtf_core.pictures.camera import Camera, tiles_camera
 from mbtf_core.run.child import run_child
+from mbtf_gen.cli.app import app
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
-from mbtf_gen.pictures.preview import mesh
-from mbtf_gen.pictures.preview.mesh import MOST_CELLS, draw, tiled_mesh
-from mbtf_gen.pictures.preview.plots import level_histogram
-from mbtf_gen.pictures.preview.sample import QuerySample, sampled_queries, stored_queries
+from mbtf_gen.pictures import mesh
+from mbtf_gen.pictures.mesh import MOST_CELLS, draw, tiled_mesh
+from mbtf_gen.pictures.query_plots import QuerySample, level_histogram, sampled_queries, stored_queries
 from mbtf_gen.sampling.query_sampler import LevelMixture
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 
@@ -147,12 +149,10 @@ def test_stored_queries_are_those_that_the_configuration_samples(layout: str, tm
     a, b = stored_queries(dataset), sampled_queries(Job.prepare(config))
     data = dataset.load("train")
     for sample in (a, b):
-        np.testing.assert_array_equal(sample.u, data["u"].reshape(-1, 2))
-        one = ... if layout == "shuffled" else (slice(None), 0, 0)
-        np.testing.assert_array_equal(sample.omega_i, data["omega_i"][one])
-        np.testing.assert_array_equal(sample.omega_o, data["omega_o"][one])
-        np.testing.assert_array_equal(sample.level, level_of_sigma(data["sigma"][one]))
-        assert sample.total == len(sample.u)
+        for name, axes in (("u", 2), ("sigma", 1), ("omega_i", 2), ("omega_o", 2)):
+            expected = data[name].reshape(-1, *data[name].shape[data[name].ndim + 1 - axes :])
+            np.testing.assert_array_equal(getattr(sample.queries, name), expected)
+        assert sample.total == sample.level.size
         assert (sample.mixture, sample.finest) == (LevelMixture(0.6, 0.4), 3)
         assert (sample.min_cos, sample.aspect) == (0.1, 0.5)
 
@@ -165,7 +165,7 @@ def test_unfinished_shards_are_left_out(tmp_path: Path) -> None:
     finished = dataset.shards("train", finished_only=True)
     assert [shard.file for shard in finished] == ["train-00000.npz", "train-00002.npz"]
     sample = stored_queries(dataset)
-    assert (len(sample.u), sample.total) == (60, 100)
+    assert (sample.level.size, sample.total) == (60, 100)
     for name in ("train-00000.npz", "train-00002.npz"):
         (tmp_path / "set" / name).unlink()
     with pytest.raises(InputError, match="no finished train shard"):
@@ -181,6 +181,15 @@ def test_a_crash_while_drawing_is_one_line(tmp_path: Path, monkeypatch: pytest.M
     fault = draw(block, camera, LIGHT, tmp_path / "mesh.png")
     assert fault == "the process was ended by SIGSEGV"
     assert list(tmp_path.iterdir()) == []
-    monkeypatch.setenv("DISPLAY", ":0")
-    with pytest.raises(EngineError, match=r"SIGSEGV.*\n.*doctor"):
-        mesh.show(block, camera, LIGHT)
+
+
+def test_pictures_that_do_not_fit_are_refused_before_their_pixels_are_computed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    np.save(tmp_path / "flat.npy", np.zeros((8, 8)))
+    monkeypatch.setattr(Camera, "queries", lambda *_: pytest.fail("pixels are computed"))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(1, 1, 10_000))
+    line = ["reference", str(tmp_path / "flat.npy"), "--size", "4096", "-o", str(tmp_path / "out")]
+    assert run(app, line) == 3
+    assert "10 kB are free" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import os
 import re
@@ -22,7 +23,7 @@ from mbtf_core.data.dataset import Dataset
 from mbtf_gen.config.measured import ImportConfig
 from mbtf_gen.config.publish import PublishConfig
 from mbtf_gen.generation.imported import Import, import_measured
-from mbtf_gen.publishing.card import card_text
+from mbtf_gen.publishing.card import card_text, code, escaped, fenced
 from mbtf_gen.publishing.facts import Facts
 
 HOSTILE = '<script>alert("1")</script> ![x](https://example.org/p.png) | `*_'
@@ -94,7 +95,6 @@ def test_front_matter_is_that_of_data_hubs(tmp_path: Path) -> None:
     found = front_matter(card)
     assert found["license"] == "cc-by-4.0"
     assert found["pretty_name"] == HOSTILE
-    assert found["size_categories"] == ["n<1K"]
     assert found["configs"] == [
         {
             "config_name": "default",
@@ -108,21 +108,27 @@ def test_front_matter_is_that_of_data_hubs(tmp_path: Path) -> None:
     assert (found["license"], found["license_name"]) == ("other", "LicenseRef-Mine")
 
 
-def test_statistics_are_those_of_the_data(tmp_path: Path) -> None:
-    small(tmp_path / "data")
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_statistics_are_those_of_the_data(layout: str, tmp_path: Path) -> None:
+    data = small(tmp_path / "data", layout)
+    config = PublishConfig(license="MIT", form="npz")
+    facts = Facts(data, config, "a", {split: data.load(split) for split in data.splits}, {})
+    for split in data.splits:
+        arrays = stored(tmp_path / "data", split)
+        a, b = (arrays[name].astype(np.float64) for name in ("value_a", "value_b"))
+        assert facts.queries(split) == a[..., 0].size
+        # Queries of one row depend on each other: the error is that of the means of rows.
+        rows = (a + b).reshape(len(a), -1, 3).mean(axis=1) / 2
+        for found, channel in zip(facts.mean(split), rows.T, strict=True):
+            assert found.value == pytest.approx(channel.mean(), rel=1e-5)
+            assert found.error == pytest.approx(channel.std(ddof=1) / np.sqrt(len(channel)), rel=1e-4)
+        noise = facts.noise(split)
+        assert noise is not None
+        assert noise.value == pytest.approx(np.sqrt(((a - b) ** 2 / 4).mean() / (a * b).mean()), rel=1e-5)
     text = (publish(tmp_path / "data", tmp_path / "card", form="npz") / "README.md").read_text()
-    row = next(line for line in text.splitlines() if line.startswith("| train |")).split(" | ")
-    arrays = stored(tmp_path / "data", "train")
-    value = 0.5 * (arrays["value_a"].astype(np.float64) + arrays["value_b"])
-    for said, channel in zip(row[2].split(", "), value.T, strict=True):
-        mean, error = map(float, said.split(" ± "))
-        assert mean == pytest.approx(channel.mean(), abs=error)
-        assert error == pytest.approx(channel.std() / np.sqrt(len(channel)), rel=0.25)
-    noise, error = map(float, row[3].removesuffix(" % |").split(" ± "))
-    variance = (arrays["value_a"].astype(np.float64) - arrays["value_b"]) ** 2 / 4
-    power = arrays["value_a"].astype(np.float64) * arrays["value_b"]
-    assert noise == pytest.approx(100 * np.sqrt(variance.mean() / power.mean()), abs=error)
-    assert int(row[1]) == len(value)
+    noise, mean = facts.noise("train"), ", ".join(map(str, facts.mean("train")))
+    assert noise is not None
+    assert f"| train | {facts.queries('train'):,} | {mean} | {noise.scaled(100)} % |" in text
 
 
 def test_names_are_shown_and_nothing_is_loaded_from_elsewhere(tmp_path: Path) -> None:
@@ -134,14 +140,14 @@ def test_names_are_shown_and_nothing_is_loaded_from_elsewhere(tmp_path: Path) ->
         "url": "https://example.org/a",
     }
     card = publish(tmp_path / "data", tmp_path / "card", form="npz", **says)
-    html = page(card)
-    assert "<script" not in html
-    assert html.count("&lt;script&gt;") == 3
-    sources = re.findall(r'src="([^"]*)"', html)
+    shown = page(card)
+    assert "<script" not in shown
+    assert shown.count("&lt;script&gt;") == 3
+    sources = re.findall(r'src="([^"]*)"', shown)
     assert sources
     for source in sources:
         assert (card / source).is_file()
-    assert set(re.findall(r'href="([^"]*)"', html)) == {"https://example.org/a"}
+    assert set(re.findall(r'href="([^"]*)"', shown)) == {"https://example.org/a"}
     for file in card.rglob("*"):
         if file.suffix in (".md", ".json", ".yaml", ".sh"):
             assert str(tmp_path) not in file.read_text(), file
@@ -169,7 +175,54 @@ def test_what_is_left_out_has_its_bound(tmp_path: Path) -> None:
     shadowing = next(e for e in effects["effects"] if e["name"] == "shadowing")
     shadowing.update(on=False, present=True, bias_bound=0.0041, error=0.0004, explanation="few | <slopes>")
     edit(path, lambda manifest: manifest.update(effects=effects))
-    facts = Facts(Dataset.open(tmp_path / "data"), PublishConfig(license="MIT"))
-    text = card_text(facts, {}, maps=False)
+    data = Dataset.open(tmp_path / "data")
+    samples = {split: data.load(split) for split in data.splits}
+    text = card_text(Facts(data, PublishConfig(license="MIT"), "a", samples, {}))
     assert "| shadowing | left out | 0.41 ± 0.04 % | few \\| &lt;slopes&gt; |" in text
     assert "| parallax and masking | simulated |" in text
+
+
+TEXTS = [
+    "<script>alert(1)</script>",
+    "![x](https://example.org/pixel.png)",
+    "[x](javascript:alert(1))",
+    "a | b",
+    "**bold** _it_ ~~no~~ `code`",
+    "&lt;b&gt; &amp;",
+    "<https://example.org>",
+    "back\\slash \\*",
+    "<!-- hidden",
+    "``` `` `",
+    "`start and end`",
+    "$x_1$ @name",
+]
+
+
+def shown(markdown: str) -> tuple[str, set[str]]:
+    """Text that a reader of a page sees, and the tags of the page."""
+    page = MarkdownIt("commonmark", {"html": True}).enable(["table", "strikethrough"]).render(markdown)
+    return html.unescape(re.sub(r"<[^>]*>", "", page)).strip(), set(re.findall(r"</?(\w+|!--)", page))
+
+
+@pytest.mark.parametrize("text", TEXTS)
+def test_text_is_shown_as_it_is(text: str) -> None:
+    assert shown(f"Name: {escaped(text)}") == (f"Name: {text}", {"p"})
+
+
+@pytest.mark.parametrize("text", TEXTS)
+def test_cells_stay_cells(text: str) -> None:
+    page = f"| a | b |\n| --- | --- |\n| {escaped(text)} | 1 |\n| {code(text)} | 2 |\n"
+    found, tags = shown(page)
+    assert tags == {"table", "thead", "tbody", "tr", "th", "td", "code"}
+    assert found.count(text) == 2
+
+
+@pytest.mark.parametrize("text", [*TEXTS, "```\n# heading\n```", "~~~\n````\nx"])
+def test_blocks_end_where_they_should(text: str) -> None:
+    found, tags = shown(fenced(text) + "\n\nafter")
+    assert tags == {"pre", "code", "p"}
+    assert found == f"{text.strip()}\n\nafter" or found.split() == f"{text} after".split()
+
+
+def test_line_breaks_and_controls_become_blanks() -> None:
+    assert escaped("a\n# b\x1b[2J\u202ec") == "a # b \\[2J c"

@@ -12,7 +12,7 @@ from support.published import LAYOUTS, contents, publish, small, stored
 
 from mbtf_core.data.schema import ARRAY
 from mbtf_core.data.verify import verify
-from mbtf_gen.publishing.webdataset import write_tar
+from mbtf_gen.publishing.formats import write_tar
 
 pq = pytest.importorskip("pyarrow.parquet")
 webdataset = pytest.importorskip("webdataset")

@@ -62,24 +62,6 @@ def test_an_interrupted_run_resumes(
         shutil.rmtree(tmp_path / "cut")
 
 
-def test_finished_files_are_kept(shards: Path, tmp_path: Path) -> None:
-    card = publish(shards, tmp_path / "card", form="webdataset")
-    before = {path: path.stat().st_ino for path in card.rglob("*") if path.is_file()}
-    publish(shards, card, form="webdataset")
-    assert {path: path.stat().st_ino for path in card.rglob("*") if path.is_file()} == before
-
-
-def test_a_lost_file_is_written_again(shards: Path, tmp_path: Path) -> None:
-    card = publish(shards, tmp_path / "card", form="webdataset")
-    before = contents(card)
-    for name in ("data/train-00000.tar", "README.md"):
-        (card / name).unlink()
-    (card / "data/train-00001.tar").write_bytes(before["data/train-00001.tar"][:-512])
-    (card / ".README.md.00000000-1.tmp").write_text("half")
-    publish(shards, tmp_path / "card", form="webdataset")
-    assert contents(card) == before
-
-
 def test_other_options_are_refused_and_replace(shards: Path, tmp_path: Path) -> None:
     card = publish(shards, tmp_path / "card", form="webdataset")
     (card / "mine.txt").write_text("kept")
@@ -102,12 +84,6 @@ def test_damage_is_found_before_anything_is_written(shards: Path, tmp_path: Path
     with pytest.raises(InputError, match=r"train-00001\.npz: has changed since it was written"):
         publish(shards, tmp_path / "card", form="webdataset")
     assert not (tmp_path / "card").exists()
-
-
-def test_an_unfinished_data_set_is_refused(shards: Path, tmp_path: Path) -> None:
-    (shards / "test-00000.npz").unlink()
-    with pytest.raises(InputError, match="is missing"):
-        publish(shards, tmp_path / "card", form="webdataset")
 
 
 def test_a_data_set_without_its_completion_is_refused(shards: Path, tmp_path: Path) -> None:

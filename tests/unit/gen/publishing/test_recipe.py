@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +20,7 @@ from mbtf_core.errors import InputError, UsageError
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.publish import PublishConfig
 from mbtf_gen.generation import run as generation
-from mbtf_gen.publishing.digests import dataset_digests, digest_faults
+from mbtf_gen.publishing.digests import digest_faults
 from mbtf_gen.publishing.publication import Publication
 from mbtf_gen.tile.loading import load_material
 
@@ -59,8 +57,9 @@ def remade(card: Path, output: Path, material: Path | None = None) -> Dataset:
 
 
 def test_digests_are_those_of_the_numbers(tmp_path: Path) -> None:
-    data = small(tmp_path / "data")
-    arrays: dict[str, Any] = dataset_digests(data)["arrays"]
+    small(tmp_path / "data")
+    card = publish(tmp_path / "data", tmp_path / "card", form="npz")
+    arrays: dict[str, Any] = json.loads((card / "recipe/digests.json").read_text())["arrays"]
     assert set(arrays) == {path.stem for path in (tmp_path / "data").glob("*.npz")}
     for stem, digests in arrays.items():
         with np.load(tmp_path / f"data/{stem}.npz") as shard:
@@ -84,27 +83,6 @@ def test_the_recipe_makes_the_same_data(with_maps: bool, tmp_path: Path) -> None
             assert first[name] == second[name], name
 
 
-@pytest.mark.usefixtures("engine")
-@pytest.mark.parametrize("with_maps", [False, True])
-def test_the_script_writes_beside_the_card(with_maps: bool, tmp_path: Path) -> None:
-    maps = write_maps(tmp_path / "maps")
-    generation.generate(GeneratorConfig.model_validate({"material": str(maps), **SMALL}), tmp_path / "data")
-    card = tmp_path / "card"
-    Publication.prepare(tmp_path / "data", CONFIG, with_maps=with_maps).write(card)
-    call = "sh recipe/remake.sh" if with_maps else "sh recipe/remake.sh MATERIAL"
-    assert f"`{call}` runs both" in " ".join((card / "README.md").read_text().split())
-    program = tmp_path / "mbtf-gen"
-    program.write_text(
-        '#!/bin/sh\nfor word; do case "$last" in -o) mkdir -p "$word";; esac; last="$word"; done\n'
-    )
-    program.chmod(0o755)
-    path = f"{tmp_path}:{os.environ['PATH']}"
-    before = set(card.rglob("*"))
-    subprocess.run(call.split(), cwd=card, env={"PATH": path}, check=True, timeout=60)
-    assert set(card.rglob("*")) == before
-    assert (tmp_path / "remade").is_dir()
-
-
 def test_differences_are_found_and_explained(tmp_path: Path) -> None:
     small(tmp_path / "data")
     digests = publish(tmp_path / "data", tmp_path / "card", form="npz") / "recipe/digests.json"
@@ -118,6 +96,10 @@ def test_differences_are_found_and_explained(tmp_path: Path) -> None:
     found = digest_faults(Dataset.open(tmp_path / "data"), digests)
     assert found[0] == "value_b differs in 1 of 3 shards, first train-00001"
     assert "values are equal on one type of machine" in found[1]
+    document = json.loads(digests.read_text())
+    document["software"]["mitsuba"] = "3.8.0"
+    digests.write_text(json.dumps(document))
+    assert "mitsuba 3.8.0 -> " in digest_faults(Dataset.open(tmp_path / "data"), digests)[-1]
     path.write_bytes(before)
     path.with_suffix(".json").write_bytes(sidecar)
     sigma[0] *= np.float32(0.5)
@@ -127,23 +109,12 @@ def test_differences_are_found_and_explained(tmp_path: Path) -> None:
     assert "another data set" in found[1]
 
 
-def test_other_software_is_named(tmp_path: Path) -> None:
-    small(tmp_path / "data")
-    digests = publish(tmp_path / "data", tmp_path / "card", form="npz") / "recipe/digests.json"
-    document = json.loads(digests.read_text())
-    document["arrays"]["test-00000"]["value_a"] = "0" * 64
-    document["software"]["mitsuba"] = "3.8.0"
-    digests.write_text(json.dumps(document))
-    found = digest_faults(Dataset.open(tmp_path / "data"), digests)
-    assert "mitsuba 3.8.0 -> " in found[-1]
-
-
 def test_digests_of_another_data_set(tmp_path: Path) -> None:
     digests = publish(tmp_path / "a", tmp_path / "card", form="npz") if small(tmp_path / "a") else tmp_path
     write_dataset(tmp_path / "b", queries={"train": "300", "test": "40"}, seed=1)
     found = digest_faults(Dataset.open(tmp_path / "b"), digests / "recipe/digests.json")
     assert found == ["belongs to another configuration, or was made from other maps"]
-    with pytest.raises(InputError, match="holds no digests of arrays"):
+    with pytest.raises(InputError, match=r"publish\.json: is damaged"):
         digest_faults(Dataset.open(tmp_path / "b"), tmp_path / "card/publish.json")
 
 
@@ -153,7 +124,8 @@ def test_maps_of_one_name_are_all_copied(tmp_path: Path) -> None:
     generation.generate(GeneratorConfig.model_validate({"material": str(maps), **SMALL}), tmp_path / "data")
     Publication.prepare(tmp_path / "data", CONFIG, with_maps=True).write(tmp_path / "card")
     copy = tmp_path / "card/recipe/material"
-    assert {p.name for p in copy.iterdir()} == {"material.yaml", "map.npy", "2-map.npy", "color.png"}
+    maps_of = {str(p.relative_to(copy)) for p in copy.rglob("*.*")}
+    assert maps_of == {"material.yaml", "height/map.npy", "roughness/map.npy", "base_color/color.png"}
     original, found = load_material(maps), load_material(copy)
     assert found.digests == original.digests
     np.testing.assert_array_equal(found.height, original.height)
@@ -179,11 +151,8 @@ def test_a_mesh_of_several_files_is_refused(tmp_path: Path) -> None:
     (tmp_path / "tile.obj").write_text(
         "mtllib tile.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nusemtl a\nf 1 2 4\nf 1 4 3\n"
     )
-    data = small(tmp_path / "data")
+    small(tmp_path / "data")
     material = load_material(tmp_path / "tile.obj")
     edit(tmp_path / "data/manifest.json", lambda m: m.update(inputs=dict(material.digests)))
-    from mbtf_gen.publishing.material_copy import copy_of_material
-
-    data = Dataset.open(data.folder)
     with pytest.raises(InputError, match="names other files, which the digests do not cover"):
-        copy_of_material(data, tmp_path / "tile.obj")
+        Publication.prepare(tmp_path / "data", CONFIG, with_maps=True, material=tmp_path / "tile.obj")

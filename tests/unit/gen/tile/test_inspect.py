@@ -187,3 +187,34 @@ class TestCommand:
         assert warned()
         assert not warned("--height-scale", "0.4")
         assert not warned("--set", "geometry.max_displacement=300")
+
+    @pytest.mark.parametrize(
+        ("options", "fault", "hint"),
+        [
+            (["s3://bucket/rock"], "is a URL", "mbtf-fit info s3://bucket/rock"),
+            (["{rock}", "--write", "{folder}/a.txt"], "must end in .yaml or .yml", ""),
+            (
+                ["{rock}", "--write", "{folder}/old.yaml"],
+                "old.yaml: exists already",
+                "--overwrite replaces it",
+            ),
+            (["{rock}", "--export", "{folder}/b.exr"], "b.exr: exists already", "name a file"),
+            (["{folder}/plain.curves", "--export", "{folder}/c.exr"], "--export: is for height maps", ""),
+            (["{folder}/felt.btf"], "is a measured BTF", "mbtf-gen import"),
+            (["{folder}/roc"], "no such file", "did you mean"),
+        ],
+    )
+    def test_refusals_say_what_to_do(
+        self, options: list[str], fault: str, hint: str, folder: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        work = folder.parent
+        (work / "old.yaml").write_text("kept")
+        (work / "b.exr").mkdir()
+        (work / "felt.btf").touch()
+        (work / "plain.curves").write_text("0 0 0 .1\n1 0 0 .1\n2 0 0 .1\n3 1 0 .1\n")
+        assert run(app, ["inspect", *(o.format(rock=folder, folder=work) for o in options)]) in (2, 3)
+        lines = capsys.readouterr().err.splitlines()
+        assert fault in lines[0]
+        assert hint in lines[-1]
+        assert len(lines) <= 2
+        assert (work / "old.yaml").read_text() == "kept"

@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.closed_forms import Wall
+from support.closed_forms import Groove, Wall
 
 from mbtf_core.directions import from_angles
-from mbtf_gen.diagnostics.closed_forms import Groove
 
 PAIRS = [((70, 0), (80, 0)), ((35, 10), (50, 200)), ((20, 180), (60, 30)), ((15, 60), (25, 75))]
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -27,15 +25,11 @@ MOST_CELLS = 1024
 MOST_TEXELS = 2048
 # Seconds; software rendering of the largest mesh takes ten.
 _TIMEOUT = 180.0
-# Seconds until the interactive window closes.
-_DAY = 86400.0
 # Factor of supersampling, because drivers need not support anti-aliasing.
 _OVERSAMPLING = 2
 # Ambient light, and the largest intensity of the light, which a flat surface needs to show its base color.
 _AMBIENT, _STRONGEST = 0.3, 3.0
 _BACKGROUND, _WALL = (0.95, 0.95, 0.95), (0.45, 0.45, 0.45)
-# VTK's off-screen windows, to which it falls back silently.
-_UNSEEN = ("EGL", "OSOpenGL", "OSMesa")
 
 
 @dataclass(frozen=True)
@@ -57,13 +51,11 @@ class TiledMesh:
     cells: tuple[int, int]
 
 
-def tiled_mesh(material: Tile, tiles: int, exposure: float) -> TiledMesh | None:
-    """Mesh of `tiles` × `tiles` tiles of a height field: the mesh that is traced, or a coarser one; None for
-    other tiles. The texture has an `exposure` in EV."""
-    most = MOST_CELLS // tiles
-    grid = material.coarser_grid(most)
-    if grid is None:
-        return None
+def tiled_mesh(material: Tile, tiles: int, exposure: float) -> TiledMesh:
+    """Mesh of `tiles` × `tiles` tiles of a height field: the mesh that is traced, or a coarser one. The
+    texture has an `exposure` in EV."""
+    grid = material.coarser_grid(MOST_CELLS // tiles)
+    assert grid is not None
     repeated = HeightGrid(np.tile(grid.z, (tiles, tiles)), grid.aspect)
     points = grid_vertices(repeated) * (tiles, tiles, 1)
     hole = np.zeros(repeated.z.shape, np.bool_)
@@ -87,36 +79,21 @@ def tiled_mesh(material: Tile, tiles: int, exposure: float) -> TiledMesh | None:
 
 
 def draw(tiles: TiledMesh, camera: Camera, omega_i: NDArray[np.float64], path: Path) -> str:
-    """Write a PNG of the mesh under light from `omega_i`; returns the reason of a failure, or ""."""
-    return _run(tiles, camera, omega_i, str(path), _TIMEOUT)
+    """Draw the mesh under light from `omega_i`, in a child process.
 
+    Parameters
+    ----------
+    tiles : the mesh
+    camera : the camera
+    omega_i : (3,) float array
+        Direction towards the light.
+    path : PNG to write
 
-def show(tiles: TiledMesh, camera: Camera, omega_i: NDArray[np.float64]) -> None:
-    """Show the mesh in a window until the user closes it.
-
-    Raises
-    ------
-    EngineError : VTK cannot draw on the display
+    Returns
+    -------
+    str
+        Reason of a failure, or "".
     """
-    fault = _run(tiles, camera, omega_i, "", _DAY)
-    if fault:
-        what = f"the window could not be shown ({fault})"
-        raise EngineError(what, where="--interactive", hint="run mbtf-gen doctor")
-
-
-def check_display() -> None:
-    """Refuse to show a window where the environment names no display."""
-    named = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    if sys.platform.startswith("linux") and not named:
-        raise EngineError(
-            "there is no display",
-            where="--interactive",
-            hint="leave it out: the pictures are written as files",
-        )
-
-
-def _run(tiles: TiledMesh, camera: Camera, omega_i: NDArray[np.float64], path: str, timeout: float) -> str:
-    """Draw into a file, or in a window where `path` is empty; returns the reason of a failure, or ""."""
     forward, _, up = camera.frame()
     target = camera.position + camera.distance * forward
     view = {
@@ -129,10 +106,10 @@ def _run(tiles: TiledMesh, camera: Camera, omega_i: NDArray[np.float64], path: s
     with tempfile.TemporaryDirectory(prefix="mbtf-preview-") as folder:
         scene = Path(folder, "scene.npz")
         np.savez(scene, points=tiles.points, uv=tiles.uv, hole=tiles.hole, texture=tiles.texture)
-        return run_child(__name__, "child", str(scene), json.dumps(view), path, timeout=timeout).fault
+        return run_child(__name__, "child", str(scene), json.dumps(view), str(path), timeout=_TIMEOUT).fault
 
 
-def _plotter(scene: str, view: dict[str, Any], **options: Any) -> Any:
+def _plotter(scene: str, view: dict[str, Any]) -> Any:
     """A plotter with the mesh, its walls, the light and the camera."""
     import pyvista
 
@@ -144,7 +121,8 @@ def _plotter(scene: str, view: dict[str, Any], **options: Any) -> Any:
     mesh.active_texture_coordinates = uv.reshape(-1, 2)
     image = pyvista.Texture(np.ascontiguousarray(texture))
     image.repeat = image.interpolate = image.mipmap = True
-    plotter = pyvista.Plotter(lighting="none", **options)
+    size = [_OVERSAMPLING * n for n in view["size"]]
+    plotter = pyvista.Plotter(lighting="none", off_screen=True, window_size=size)
     plotter.set_background(_BACKGROUND)
     look = {"ambient": _AMBIENT, "diffuse": 1.0, "specular": 0.0}
     plotter.add_mesh(mesh, texture=image, **look)
@@ -170,22 +148,13 @@ def _plotter(scene: str, view: dict[str, Any], **options: Any) -> Any:
 
 
 def child(scene: str, view_json: str, path: str) -> Iterator[dict[str, Any]]:
-    """Child process of :func:`draw` and :func:`show`."""
+    """Child process of :func:`draw`."""
     from PIL import Image
 
-    view = json.loads(view_json)
-    if not path:
-        plotter = _plotter(scene, view, window_size=view["size"])
-        window = type(plotter.render_window).__name__
-        if any(word in window for word in _UNSEEN):
-            raise EngineError(f"the display {os.environ.get('DISPLAY', '')} cannot be opened")
-        plotter.show(title="mbtf-gen preview")
-    else:
-        size = [_OVERSAMPLING * n for n in view["size"]]
-        plotter = _plotter(scene, view, off_screen=True, window_size=size)
-        picture = plotter.screenshot(return_img=True)
-        plotter.close()
-        if picture is None or not int(picture.max()) > int(picture.min()):
-            raise EngineError("the picture came out empty")
-        Image.fromarray(picture).reduce(_OVERSAMPLING).save(path, format="PNG")
+    plotter = _plotter(scene, json.loads(view_json))
+    picture = plotter.screenshot(return_img=True)
+    plotter.close()
+    if picture is None or not int(picture.max()) > int(picture.min()):
+        raise EngineError("the picture came out empty")
+    Image.fromarray(picture).reduce(_OVERSAMPLING).save(path, format="PNG")
     yield {"done": True}

@@ -1,14 +1,14 @@
-"""``mbtf-gen preview``: pictures of a material and of its queries."""
+"""``mbtf-gen preview`` and ``mbtf-gen reference``: pictures of a material and of its queries."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from mbtf_core.app.console import CONSOLE, Console
-from mbtf_core.app.options import Options, Output, Overwrite, PathText, Switch, options_from
+from mbtf_core.app.options import ClusterOption, Options, Output, Overwrite, PathText, options_from
 from mbtf_core.errors import InputError, UsageError
 from mbtf_gen.cli.generate import resolve_config
-from mbtf_gen.config.pictures import RENDERING, PreviewConfig
+from mbtf_gen.config.pictures import RENDERING, PreviewConfig, ReferenceConfig
 
 _QUERIES = ("train", "resolution", "min_cos", "layout", "patch_size")
 
@@ -24,7 +24,6 @@ def preview(
     *,
     output: Output = Path("preview"),
     options: PreviewOptions = PreviewOptions(),  # noqa: B008
-    interactive: Switch = False,
     overwrite: Overwrite = False,
     console: Console = CONSOLE,
 ) -> None:
@@ -35,17 +34,11 @@ def preview(
     material
         Height map, folder of maps, material.yaml, mesh, file of yarns or fibers, or a folder of shards or its
         URL.
-    interactive
-        Also show the mesh in a window, where the mouse turns it.
     """
     from mbtf_core.data.dataset import Dataset, is_dataset
     from mbtf_core.data.folder import DataFolder
-    from mbtf_gen.pictures.preview.drawing import PreviewPictures
+    from mbtf_gen.pictures.preview import draw_preview
 
-    if interactive:
-        from mbtf_gen.pictures.preview.mesh import check_display
-
-        check_display()
     dataset = None
     if material is not None and is_dataset(folder := DataFolder.open(material)):
         dataset = Dataset.open(folder)
@@ -66,4 +59,35 @@ def preview(
         resolved = options.resolve(**dataset.manifest["config"])
     else:
         resolved = resolve_config(options, material)
-    PreviewPictures(resolved, dataset, console).draw(output, overwrite, interactive)
+    draw_preview(resolved, dataset, output, console, overwrite=overwrite)
+
+
+@options_from(ReferenceConfig, "reference", "exposure", *RENDERING)
+class ReferenceOptions(Options[ReferenceConfig]):
+    """Options of ``mbtf-gen reference``."""
+
+
+def reference(
+    material: PathText | None = None,
+    /,
+    *,
+    output: Output = Path("reference"),
+    options: ReferenceOptions = ReferenceOptions(),  # noqa: B008
+    cluster: ClusterOption = None,
+    overwrite: Overwrite = False,
+    console: Console = CONSOLE,
+) -> None:
+    """Render reference pictures of the micro-geometry on the plane: EXR with two estimates, and PNG.
+
+    The same command again renders the missing pictures. All pictures have one exposure. Another --exposure
+    renders nothing again.
+
+    Parameters
+    ----------
+    material
+        Height map, folder of maps, material.yaml, mesh, or file of yarns or fibers.
+    """
+    resolved = resolve_config(options, material)
+    from mbtf_gen.pictures.reference import render_references
+
+    render_references(resolved, output, console, cluster=cluster, overwrite=overwrite)

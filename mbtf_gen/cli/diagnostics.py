@@ -1,9 +1,21 @@
-"""``mbtf-gen selftest``: physics with known answers on this machine."""
+"""``mbtf-gen doctor`` and ``mbtf-gen selftest``: checks of the installation and of its physics."""
 
 from __future__ import annotations
 
 from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.options import Time
+
+
+def doctor(*, console: Console = CONSOLE) -> int:
+    """Test each part of the installation, and suggest a fix for each failure."""
+    from mbtf_gen.checks import report, run_checks
+    from mbtf_gen.doctor import all_checks
+    from mbtf_gen.engine.runtime import use_shipped_llvm
+
+    use_shipped_llvm()
+    checks = all_checks()
+    run_checks(checks, workers=4)
+    return report(checks, console)
 
 
 def selftest(*, time: Time = "2min", console: Console = CONSOLE) -> int:
@@ -15,13 +27,13 @@ def selftest(*, time: Time = "2min", console: Console = CONSOLE) -> int:
     from mbtf_core.units import asked_duration, expectation
 
     seconds = asked_duration(time or "2min", "--time")
-    from mbtf_gen.diagnostics.selftest import all_checks, as_json, as_text, exit_code, run_checks
+    from mbtf_gen.checks import report, run_checks
     from mbtf_gen.engine.runtime import load_mitsuba
+    from mbtf_gen.selftest import all_checks
 
     console.note(expectation(seconds, 0))
     load_mitsuba()
     checks = all_checks()
     with console.progress(total=seconds, label="checking", unit="s") as bar:
         run_checks(checks, seconds, lambda done, name: bar.update(round(min(done, seconds)), name))
-    console.report(as_json(checks), as_text(checks))
-    return exit_code(checks)
+    return report(checks, console)

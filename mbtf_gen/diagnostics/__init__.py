@@ -1,1 +1,0 @@
-"""Diagnosis of the machine, and the self-test of the physics."""

@@ -1,0 +1,156 @@
+"""Diagnosis of the machine: each part is used, and each failure comes with a hint.
+
+A part fails by aborting or hanging as often as by an exception, therefore in a child process
+(:mod:`mbtf_core.run.child`).
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from importlib import import_module
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from mbtf_core.errors import EngineError
+from mbtf_core.run.child import run_child
+from mbtf_gen.checks import Check, Finding
+from mbtf_gen.engine.runtime import (
+    CACHE_VARIABLE,
+    CPU_VARIANT,
+    CUDA_VARIANT,
+    check_llvm,
+    chosen_llvm,
+    load_mitsuba,
+    prove,
+    shipped_llvm,
+)
+
+# Seconds; first starts from a slow network disk take tens of them.
+_TIMEOUT = 180.0
+_REINSTALL = "install again: pip install --force-reinstall"
+_OPENGL = (
+    "only 3D pictures need it; install OpenGL (software rendering is enough), on Debian: "
+    "apt install libgl1 libegl1 libosmesa6"
+)
+_CACHE = f"without it every run compiles its kernels again; make its folder writable or set {CACHE_VARIABLE}"
+
+
+def all_checks() -> list[Check]:
+    """Every part of the machine, in the order in which they are reported."""
+    return [
+        Check("Python", _python),
+        Check("LLVM", _llvm, hint=f"{_REINSTALL} karellen-llvm-core"),
+        Check("CUDA", _cuda, required=False),
+        Check(
+            "Mitsuba", _in_child(use_mitsuba), hint=f"see LLVM; if that works, {_REINSTALL} mitsuba==3.9.1"
+        ),
+        Check("PyTorch", _in_child(use_torch), hint=f"{_REINSTALL} torch==2.13.0"),
+        Check("Drawing", _in_child(use_drawing), required=False, hint=_OPENGL),
+        Check("Kernel cache", _in_child(use_kernel_cache), required=False, hint=_CACHE),
+    ]
+
+
+def _in_child(use: Callable[[], Iterator[dict[str, str]]]) -> Callable[[int], Finding]:
+    """A check that calls a function of this module in a child process; it yields ``found``, in words."""
+
+    def run(_: int) -> Finding:
+        outcome = run_child(__name__, use.__name__, timeout=_TIMEOUT)
+        if outcome.fault:
+            raise EngineError(outcome.fault)
+        return Finding("ok", outcome.answers["found"])
+
+    return run
+
+
+def _python(_: int) -> Finding:
+    free = shutil.disk_usage(Path.cwd()).free
+    found = f"{platform.python_version()} on {platform.platform(terse=True)}, {sys.executable}; "
+    return Finding("ok", f"{found}{free / 1e9:.1f} GB free in {Path.cwd()}")
+
+
+def _llvm(_: int) -> Finding:
+    library = chosen_llvm()
+    # Tested again: a cached result does not show the state of today.
+    outcome = prove(CPU_VARIANT)
+    if outcome.fault:
+        check_llvm()
+        raise EngineError(outcome.fault)
+    numbers = ".".join(str(n) for n in outcome.answers["llvm"])
+    origin = "set by the user"
+    if library is None or library == str(shipped_llvm()):
+        origin = "of the system" if library is None else "of the installation"
+    return Finding("ok", f"{numbers} {origin}, ran test kernels, {library or 'found by Dr.Jit'}")
+
+
+def _cuda(_: int) -> Finding:
+    outcome = prove(CUDA_VARIANT)
+    if outcome.fault:
+        return Finding("absent", f"{outcome.fault}; the CPU is used")
+    return Finding("ok", "ran test kernels")
+
+
+# The functions below run in child processes.
+
+
+def use_mitsuba() -> Iterator[dict[str, str]]:
+    """Mitsuba renders a sphere: a convex body of albedo 0.5 under constant radiance 1 has radiance 0.5."""
+    mi = load_mitsuba(CPU_VARIANT)
+    import drjit as dr
+
+    look_at = mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "path"},
+        "light": {"type": "constant"},
+        "shape": {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": 0.5}},
+        "sensor": {"type": "orthographic", "to_world": look_at.scale([0.5, 0.5, 1]), "film": film},
+    }
+    mean = float(dr.mean(mi.render(mi.load_dict(scene), spp=16).array)[0])
+    if not abs(mean - 0.5) < 0.01:
+        raise EngineError(f"a test image has the mean {mean:.3f} instead of 0.5")
+    yield {
+        "found": f"{version('mitsuba')} with Dr.Jit {version('drjit')}, rendered a test image with "
+        f"{dr.thread_count()} threads"
+    }
+
+
+def use_torch() -> Iterator[dict[str, str]]:
+    """PyTorch takes a derivative."""
+    # By name: this package does not depend on PyTorch, but the fitter in the same installation does.
+    torch: Any = import_module("torch")
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    weight = torch.zeros(1, device=device, requires_grad=True)
+    (weight - 1).square().sum().backward()
+    if weight.grad.item() != -2.0:
+        raise EngineError(f"a derivative is {weight.grad.item()} instead of -2")
+    yield {"found": f"{torch.__version__} on {device}, took a derivative"}
+
+
+def use_drawing() -> Iterator[dict[str, str]]:
+    """PyVista draws a sphere off screen."""
+    import pyvista
+
+    plotter = pyvista.Plotter(off_screen=True, window_size=[64, 64])
+    plotter.set_background("black")
+    plotter.add_mesh(pyvista.Sphere(), color="white")
+    picture = plotter.screenshot(return_img=True)
+    plotter.close()
+    if picture is None or not picture.max() > picture.min() + 100:
+        raise EngineError("the picture is empty")
+    yield {"found": f"pyvista {pyvista.__version__} drew a sphere off screen"}
+
+
+def use_kernel_cache() -> Iterator[dict[str, str]]:
+    """The folder of compiled kernels is writable."""
+    folder = Path(os.environ.get(CACHE_VARIABLE) or "~/.drjit").expanduser()
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile(dir=folder, prefix=".doctor-"):
+        sizes = [entry.stat().st_size for entry in os.scandir(folder)]
+    yield {"found": f"{folder}, {len(sizes)} files, {sum(sizes) / 2**10:.0f} KiB"}

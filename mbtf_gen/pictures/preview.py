@@ -1,0 +1,194 @@
+"""The pictures of ``mbtf-gen preview``: displaced mesh, path-traced picture, and query distribution."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbtf_core.app.console import Console
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.directions import from_angles
+from mbtf_core.errors import InputError, PartialError
+from mbtf_core.exposure import auto_exposure, brightness, describe_exposure
+from mbtf_core.files.folders import check_space, owned
+from mbtf_core.pictures.camera import Camera, tiles_camera
+from mbtf_core.pictures.reference import PNG_BYTES, claim_pictures, write_display
+from mbtf_core.run.signals import keep_on_interruption
+from mbtf_gen.config.pictures import PreviewConfig
+from mbtf_gen.forecast import announce
+from mbtf_gen.job import Job
+from mbtf_gen.pictures import mesh
+from mbtf_gen.pictures.query_plots import sampled_queries, stored_queries, write_plots
+from mbtf_gen.pictures.reference import picture_estimator, picture_seconds, render_reference
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """A material as both 3D pictures show it."""
+
+    config: PreviewConfig
+    job: Job
+    camera: Camera
+    omega_i: NDArray[np.float64]
+    console: Console
+
+    def beauty(self, file: Path) -> dict[str, Any]:
+        """Write the path-traced picture; returns what it shows, and its exposure."""
+        options, estimator = self.config.preview, picture_estimator(self.job)
+        paths = self.camera.rows * self.camera.columns * options.spp
+        announce(
+            self.console,
+            paths,
+            lambda: picture_seconds(estimator, self.camera, self.omega_i, paths),
+            PNG_BYTES * options.size**2,
+        )
+        image = render_reference(
+            estimator, self.camera, self.omega_i, kind="pixel", spp=options.spp, seed=self.config.seed
+        )
+        exposure = self.config.exposure
+        if exposure is None:
+            exposure = auto_exposure([brightness(image.value)])
+        write_display(file.with_suffix(""), image.value, exposure)
+        shows = f"the infinite plane from the same camera, path-traced with {options.spp} paths per pixel"
+        return {"shows": shows, "exposure": exposure}
+
+    def mesh(self, file: Path, exposure: float) -> dict[str, Any]:
+        """Write the picture of the mesh; returns what it shows and its exposure, or the ``fault``."""
+        options = self.config.preview
+        drawn = mesh.tiled_mesh(self.job.material, options.tiles, exposure)
+        if fault := mesh.draw(drawn, self.camera, self.omega_i, file):
+            return {"fault": fault}
+        view, light, (rows, columns) = options.view, options.light, drawn.cells
+        return {
+            "shows": f"the displaced mesh ({columns} x {rows} cells per tile) of {options.tiles} x "
+            f"{options.tiles} tiles with its base color, from elevation {view.elevation:g}, azimuth "
+            f"{view.azimuth:g}, light from {light.elevation:g}, {light.azimuth:g} degrees",
+            "exposure": exposure,
+        }
+
+
+def draw_preview(
+    config: PreviewConfig,
+    dataset: Dataset | None,
+    path: Path,
+    console: Console,
+    *,
+    overwrite: bool = False,
+) -> None:
+    """Draw the missing pictures of a material or a data set, and report them.
+
+    Parameters
+    ----------
+    config : options of the pictures and of the material
+    dataset : data set whose queries are shown; without one, those that a run would draw
+    path : folder of the pictures
+    console : where notes and results go
+    overwrite : replace the pictures of another configuration
+
+    Raises
+    ------
+    InputError
+        The material cannot be read, and there is no data set either; or the folder holds something else.
+    UsageError : the view shows the horizon
+    PartialError : the mesh could not be drawn; everything else was
+    """
+    scene = _scene(config, dataset, console)
+    inputs: dict[str, str] = {}
+    # What each picture depends on beside the configuration, in the order of the report.
+    states: dict[str, Any] = {"queries": 0}
+    if dataset is not None:
+        inputs["data set"] = dataset.manifest["config_hash"]
+        states["queries"] = len(dataset.shards("train", finished_only=True))
+    if scene is not None:
+        config = scene.config
+        states = {"mesh": config.exposure, "beauty": config.exposure, **states}
+        if scene.job.material.grid is None:
+            del states["mesh"]
+        inputs |= scene.job.material.digests
+    size = len(states) * PNG_BYTES * config.preview.size**2
+    check_space(path, size, "reduce --size, or choose another folder with -o")
+    keep_on_interruption(f"the finished pictures are kept in {path}")
+    found: dict[str, dict[str, Any]] = {}
+    with owned(path), console.progress(len(states), "drawing", "pictures") as bar:
+        folder = claim_pictures(
+            path,
+            "mbtf-gen preview",
+            files=[f"{name}.png" for name in states],
+            config=config.model_dump(mode="json"),
+            inputs=inputs,
+            overwrite=overwrite,
+        )
+
+        def draw(name: str, maker: Callable[[Path], dict[str, Any]]) -> dict[str, Any]:
+            """Facts of a picture, which is drawn unless it is finished."""
+            file, facts = path / f"{name}.png", folder.finished(name)
+            kept = facts is not None and facts.get("of") == states[name]
+            if facts is None or not kept:
+                facts = {**maker(file), "of": states[name]}
+                if "fault" not in facts:
+                    folder.keep(name, [file], facts)
+            bar.advance(1)
+            found[name] = {"file": file, "kept": kept, **facts}
+            return found[name]
+
+        if scene is not None:
+            # The mesh has the exposure of the path-traced picture.
+            exposure = draw("beauty", scene.beauty)["exposure"]
+            if "mesh" in states:
+                draw("mesh", lambda file: scene.mesh(file, exposure))
+        draw("queries", lambda file: _queries(file, scene, dataset))
+    fault = found.get("mesh", {}).get("fault")
+    pictures = [found[name] for name in states if "fault" not in found[name]]
+    lines = [f"{p['file']}: {p['shows']}{' (kept)' if p['kept'] else ''}" for p in pictures]
+    if scene is not None:
+        lines.append(describe_exposure(exposure))
+    console.report({"folder": path, "pictures": pictures, "fault": fault}, "\n".join(lines))
+    if fault:
+        raise PartialError(
+            f"could not be drawn ({fault})",
+            where=path / "mesh.png",
+            hint="the other pictures are finished; mbtf-gen doctor names the missing package, "
+            "then the same command draws it",
+        )
+
+
+def _scene(config: PreviewConfig, dataset: Dataset | None, console: Console) -> _Scene | None:
+    """The scene of the 3D pictures; None with a data set whose material cannot be read."""
+    options = config.preview
+    try:
+        job = Job.prepare(config)
+        if dataset is not None and job.material.digests != dataset.manifest["inputs"]:
+            raise InputError("has changed since the data set was made", where=config.material)
+    except InputError as error:
+        if dataset is None:
+            raise
+        console.note(f"only the queries are drawn: {error.where}: {error.what}")
+        return None
+    camera = tiles_camera(
+        options.view.elevation,
+        options.view.azimuth,
+        tiles=options.tiles,
+        aspect=job.material.aspect,
+        displacement_range=job.material.thickness,
+        columns=options.size,
+    )
+    omega_i = from_angles(options.light.elevation, options.light.azimuth)
+    camera.queries(omega_i, job.material.aspect)  # refuses a view of the horizon
+    return _Scene(config.model_copy(update=dict(job.config)), job, camera, omega_i, console)
+
+
+def _queries(file: Path, scene: _Scene | None, dataset: Dataset | None) -> dict[str, Any]:
+    """Write the plots of the queries; returns what they show."""
+    if dataset is not None:
+        sample, source = stored_queries(dataset), f"stored in {dataset.folder}"
+    else:
+        assert scene is not None
+        sample, source = sampled_queries(scene.job), f"sampled for {scene.config.material}"
+    shown = f"{sample.queries.sigma.size} of {sample.total} training queries {source}"
+    write_plots(file, sample, shown)
+    return {"shows": f"positions, levels and directions of {shown}"}

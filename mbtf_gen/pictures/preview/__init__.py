@@ -1,1 +1,0 @@
-"""Previews of a material: its mesh, a path-traced picture, and its queries."""

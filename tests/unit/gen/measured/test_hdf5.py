@@ -1,0 +1,280 @@
+"""HDF5 of NeuMIP and NeuralBTF: conventions, exports, and files that are refused."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support import measured_files as files
+from support.datasets import write_dataset
+from support.fuzzing import damaged, examples, loads_or_refuses
+from support.measured_files import write_hdf5
+
+from mbtf_core.errors import InputError
+from mbtf_gen.measured.exported import export_neumip, export_neural_btf
+from mbtf_gen.measured.hdf5 import read_neumip, read_neural_btf
+
+TEXELS = files.ROWS * files.COLUMNS
+FIELDS = ("u", "sigma", "omega_i", "omega_o", "value")
+
+
+def stored(shape: tuple[int, ...] = (2, 3, 4), dtype: Any = np.float16) -> dict[str, np.ndarray]:
+    """Arrays of a file whose numbers are all known."""
+    n = np.arange(np.prod(shape)).reshape(shape)
+    two = np.stack([n, n], axis=-1)
+    return {
+        "ground_color": (np.stack([n, n + 100, n + 200], axis=-1) / 8).astype(dtype),
+        "ground_camera_target_loc": (two * [1 / 32, -1 / 64] + [-0.5, 0.75]).astype(dtype),
+        "ground_camera_query_radius": ((n[..., None] + 1) / 64).astype(dtype),
+        "ground_camera_dir": (two * [1 / 64, -1 / 128] + [0.125, 0.25]).astype(dtype),
+        "ground_light": (two * [-1 / 64, 1 / 128] + [0.0, -0.5]).astype(dtype),
+    }
+
+
+def test_conventions(tmp_path: Path) -> None:
+    data = read_neumip(write_hdf5(tmp_path / "a.hdf5", stored(), base_radius=1 / 64))
+    assert (data.count, data.base_radius) == (24, 1 / 64)
+    # Query 17 is image 1, row 1, column 1; the range begins and ends within images.
+    queries = data.read(7, 20)
+    i = 17 - 7
+    assert queries["query"].tolist() == list(range(7, 20))
+    x, y = 17 / 32 - 0.5, 0.75 - 17 / 64
+    np.testing.assert_array_equal(queries["u"][i], [(x + 1) / 2, (y + 1) / 2])
+    assert queries["sigma"][i] == 18 / 64
+    # Towards the light and the viewer: against the stored directions, which go down.
+    np.testing.assert_allclose(queries["omega_i"][i, :2], [17 / 64, 0.5 - 17 / 128])
+    np.testing.assert_allclose(queries["omega_o"][i, :2], [-17 / 64 - 0.125, 17 / 128 - 0.25])
+    for omega in (queries["omega_i"], queries["omega_o"]):
+        np.testing.assert_allclose(np.linalg.norm(omega, axis=1), 1, atol=1e-6)
+        assert omega[:, 2].min() > 0
+    np.testing.assert_array_equal(queries["value"][i], [17 / 8, 117 / 8, 217 / 8])
+    assert all(queries[name].dtype == np.float32 for name in FIELDS)
+
+
+def test_a_flat_file_with_the_other_name(tmp_path: Path) -> None:
+    arrays = stored((24,), np.float32)
+    arrays["ground_light_dir"] = arrays.pop("ground_light")
+    flat = read_neumip(write_hdf5(tmp_path / "a.hdf5", arrays)).read(5, 9)
+    images = read_neumip(write_hdf5(tmp_path / "b.hdf5", stored())).read(5, 9)
+    for name in ("query", *FIELDS):
+        np.testing.assert_array_equal(flat[name], images[name])
+
+
+def test_positions_wrap_and_a_radius_of_zero_is_a_texel(tmp_path: Path) -> None:
+    arrays = stored()
+    arrays["ground_camera_target_loc"][0, 0, 0] = [1.0, -1.25]
+    arrays["ground_camera_query_radius"][:] = 0
+    queries = read_neumip(write_hdf5(tmp_path / "a.hdf5", arrays)).read(0, 1)
+    np.testing.assert_array_equal(queries["u"], [[0, 0.875]])
+    assert queries["sigma"].tolist() == [0.5 / 4]
+
+
+def test_unusable_queries_are_left_out(tmp_path: Path) -> None:
+    arrays = stored()
+    arrays["ground_color"][0, 0, 1, 2] = np.nan
+    arrays["ground_color"][0, 0, 2, 0] = np.inf
+    arrays["ground_light"][0, 0, 3] = [0.8, 0.7]
+    arrays["ground_camera_dir"][0, 1, 0] = [1, 0]
+    arrays["ground_camera_query_radius"][0, 1, 1] = -1
+    arrays["ground_camera_target_loc"][0, 1, 2, 0] = np.nan
+    queries = read_neumip(write_hdf5(tmp_path / "a.hdf5", arrays)).read(0, 9)
+    assert queries["query"].tolist() == [0, 7, 8]
+    assert {len(queries[name]) for name in FIELDS} == {3}
+
+
+def changed(**new: Any) -> dict[str, Any]:
+    return {name: array for name, array in (stored() | new).items() if array is not None}
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        (changed(ground_light=None), "no data set 'ground_light'"),
+        (changed(ground_color=None), "no data set 'ground_color'"),
+        (changed(ground_light=np.zeros((2, 3, 4, 3))), "the shape"),
+        (changed(ground_camera_query_radius=np.zeros((2, 3, 5, 1))), "the shape"),
+        (changed(ground_color=np.zeros((2, 3, 4, 3), np.int32)), "floats are expected"),
+        (changed(ground_color=np.zeros(3)), "the shape"),
+        (changed(ground_color=np.zeros((0, 3, 4, 3))), "the shape"),
+        (changed(ground_valid=np.ones((2, 3, 4, 1))), "rendering of a scene"),
+    ],
+)
+def test_refused(arrays: dict[str, np.ndarray], message: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=message):
+        read_neumip(write_hdf5(tmp_path / "a.hdf5", arrays))
+
+
+@pytest.mark.parametrize("radius", [-1.0, np.nan, "x", [1.0, 2.0]])
+def test_base_radius_is_a_positive_number(radius: Any, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="base_radius"):
+        read_neumip(write_hdf5(tmp_path / "a.hdf5", stored(), base_radius=radius))
+
+
+def test_numbers_that_are_not_in_the_file(tmp_path: Path) -> None:
+    path = write_hdf5(tmp_path / "a.hdf5", changed(ground_color=None))
+    elsewhere = write_hdf5(tmp_path / "b.hdf5", stored())
+    shape = (2, 3, 4, 3)
+    with h5py.File(path, "r+") as file:
+        file["ground_color"] = h5py.ExternalLink(elsewhere.name, "ground_color")
+    with pytest.raises(InputError, match="of its own"):
+        read_neumip(path)
+    with h5py.File(path, "r+") as file:
+        del file["ground_color"]
+        file.create_dataset("ground_color", shape, "f4", external=[(str(elsewhere), 0, 288)])
+    with pytest.raises(InputError, match="of its own"):
+        read_neumip(path)
+    with h5py.File(path, "r+") as file:
+        del file["ground_color"]
+        file.create_dataset("ground_color", shape, "f4")
+    with pytest.raises(InputError, match="stores 0 of the 288 bytes"):
+        read_neumip(path)
+    with h5py.File(path, "r+") as file:
+        del file["ground_color"]
+        file.create_dataset("ground_color", shape, "f4", chunks=(1, 3, 4, 3))[0] = 1
+    with pytest.raises(InputError, match="stores 1 of the 2 chunks"):
+        read_neumip(path)
+    with h5py.File(path, "r+") as file:
+        del file["ground_color"]
+        file.create_dataset("ground_color", (10**9, 3, 4, 3), "f4", chunks=(10**7, 3, 4, 3))
+    with pytest.raises(InputError, match="too large"):
+        read_neumip(path)
+    with pytest.raises(InputError, match="no such file"):
+        read_neumip(tmp_path / "c.hdf5")
+    (tmp_path / "d.hdf5").write_bytes(elsewhere.read_bytes()[:-100])
+    with pytest.raises(InputError, match="cannot be read as HDF5"):
+        read_neumip(tmp_path / "d.hdf5")
+
+
+def pairs() -> tuple[np.ndarray, np.ndarray]:
+    """Nine lights and views above the horizon, as float32."""
+    light, view = files.unit(files.LIGHTS), files.unit(files.VIEWS[:3])
+    return np.tile(light, (3, 1)).astype(np.float32), np.repeat(view, 3, axis=0).astype(np.float32)
+
+
+def images() -> dict[str, np.ndarray]:
+    """A file of the known function whose third light is at the horizon."""
+    light, view = pairs()
+    color = np.array([files.image(i, o) for i, o in zip(light, view, strict=True)], np.float32)
+    light[2, :2] = [1, 0]
+    return {"ground_light": light[:, :2], "ground_camera_dir": view[:, :2], "ground_color": color}
+
+
+def test_images_of_the_known_function(tmp_path: Path) -> None:
+    btf = read_neural_btf(write_hdf5(tmp_path / "a.hdf5", images()))
+    assert (btf.rows, btf.columns, btf.left_out, btf.cosine) == (files.ROWS, files.COLUMNS, 1, None)
+    assert len(btf.light) == 8
+    order = np.random.default_rng(2).permutation(8 * TEXELS)
+    pair, texel = order // TEXELS, order % TEXELS
+    row, column = np.divmod(texel, files.COLUMNS)
+    light, view = btf.light[pair].astype(np.float64), btf.view[pair].astype(np.float64)
+    np.testing.assert_allclose(btf.values(pair, texel), files.value(row, column, light, view), rtol=1e-5)
+    # A few texels of the last rows of one image.
+    at = (files.ROWS - 2) * files.COLUMNS + np.array([1, 6])
+    np.testing.assert_array_equal(
+        btf.values(np.array([3, 3]), at), images()["ground_color"][4].reshape(-1, 3)[at]
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "array", "message"),
+    [
+        ("ground_light", None, "no data set 'ground_light'"),
+        ("ground_light", np.zeros((8, 2)), "the shape"),
+        ("ground_camera_dir", np.zeros((9, files.ROWS, files.COLUMNS, 2)), "direction for each pixel"),
+        ("ground_camera_dir", np.full((9, 2), np.nan), "unit vectors"),
+        ("ground_camera_dir", np.full((9, 2), 0.8), "unit vectors"),
+        ("ground_light", np.ones((9, 2)) * [1, 0], None),
+        ("ground_color", np.zeros((9, 5, 4, 4)), "the shape"),
+        ("ground_color", np.zeros((9, 5, 4, 3), np.uint8), "floats are expected"),
+    ],
+)
+def test_images_that_are_refused(name: str, array: Any, message: str | None, tmp_path: Path) -> None:
+    arrays = {key: a for key, a in (images() | {name: array}).items() if a is not None}
+    path = write_hdf5(tmp_path / "a.hdf5", arrays)
+    if message is None:
+        assert read_neural_btf(path).left_out == 9
+        return
+    with pytest.raises(InputError) as caught:
+        read_neural_btf(path)
+    assert message in caught.value.message
+
+
+def test_nan_values_are_refused_where_they_are_used(tmp_path: Path) -> None:
+    arrays = images()
+    arrays["ground_color"][0, 1, 1, 1] = np.nan
+    btf = read_neural_btf(write_hdf5(tmp_path / "a.hdf5", arrays))
+    btf.values(np.array([0]), np.array([0]))
+    with pytest.raises(InputError, match="NaN or infinite"):
+        btf.values(np.array([0, 0]), np.array([0, files.COLUMNS + 1]))
+
+
+def test_an_export_for_neumip(tmp_path: Path) -> None:
+    """All that fills whole images, in the order of the shards; the program reads single precision too."""
+    data = write_dataset(
+        tmp_path / "data", queries={"train": "300", "test": "8"}, output={"shard_queries": 90}, rows=8
+    )
+    assert export_neumip(data, tmp_path / "a.hdf5") == 256
+    with h5py.File(tmp_path / "a.hdf5") as file:
+        assert {file[name].shape[:-1] for name in file} == {(1, 16, 16)}
+    found = read_neumip(tmp_path / "a.hdf5")
+    assert (found.count, found.base_radius) == (256, 0.5 / (1 << data.lattice.finest))
+    queries, whole = found.read(0, 256), data.load("train")
+    np.testing.assert_array_equal(queries["sigma"], whole["sigma"][:256])
+    distance = np.abs(queries["u"] - whole["u"][:256])
+    assert np.minimum(distance, 1 - distance).max() < 1e-7
+    for name in ("omega_i", "omega_o"):
+        np.testing.assert_array_equal(queries[name][:, :2], whole[name][:256, :2])
+    value = 0.5 * (whole["value_a"].astype(np.float64) + whole["value_b"])
+    np.testing.assert_allclose(queries["value"], value[:256], rtol=1e-6)
+
+
+def test_what_cannot_be_exported(tmp_path: Path) -> None:
+    wide = write_dataset(tmp_path / "wide", queries={"train": "30", "test": "8"})
+    with pytest.raises(InputError, match="tiles are square"):
+        export_neumip(wide, tmp_path / "a.hdf5")
+    with pytest.raises(InputError, match="learns from images under fixed lights"):
+        export_neural_btf(wide, tmp_path / "a.hdf5")
+    slices = write_dataset(tmp_path / "s", queries={"train": "9/texel", "test": "8", "layout": "slices"})
+    with pytest.raises(InputError, match="learns from shuffled queries"):
+        export_neumip(slices, tmp_path / "a.hdf5")
+    assert not (tmp_path / "a.hdf5").exists()
+
+
+def samples() -> dict[str, bytes]:
+    with tempfile.TemporaryDirectory() as folder:
+        plain, chunks = Path(folder, "plain.hdf5"), Path(folder, "chunks.hdf5")
+        write_hdf5(plain, stored(), base_radius=0.1)
+        with h5py.File(chunks, "w") as file:
+            for name, array in stored().items():
+                file.create_dataset(name, data=array, chunks=(1, *array.shape[1:]))
+        write_hdf5(Path(folder, "images.hdf5"), images())
+        return {path.name: path.read_bytes() for path in Path(folder).iterdir()}
+
+
+SAMPLES = samples()
+
+
+@given(data=st.data())
+@examples(400)
+def test_a_damaged_file(data: st.DataObject, tmp_path_factory: pytest.TempPathFactory) -> None:
+    name, content = data.draw(damaged(SAMPLES))
+    path = tmp_path_factory.getbasetemp() / "damaged.hdf5"
+    path.write_bytes(content)
+    if name == "images.hdf5":
+        btf = loads_or_refuses(lambda: read_neural_btf(path))
+        if btf is not None and len(btf.light):
+            texels = np.arange(min(btf.rows * btf.columns, 50))
+            values = loads_or_refuses(lambda: btf.values(np.zeros_like(texels), texels))
+            assert values is None or np.isfinite(values).all()
+        return
+    found = loads_or_refuses(lambda: read_neumip(path))
+    queries = None if found is None else loads_or_refuses(lambda: found.read(0, 30))
+    if queries is not None:
+        assert all(np.isfinite(queries[name]).all() for name in FIELDS)
+        assert ((queries["u"] >= 0) & (queries["u"] < 1)).all()

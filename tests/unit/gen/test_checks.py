@@ -1,0 +1,128 @@
+"""Checks of doctor and self-test: verdicts, means over rounds, hints, and that every check can fail."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mbtf_core.app.console import Console
+from mbtf_core.run.child import ChildResult
+from mbtf_gen import doctor, selftest
+from mbtf_gen.checks import Check, Finding, report, run_checks
+from mbtf_gen.engine import runtime
+from mbtf_gen.selftest import Case, KnownAnswer
+
+
+def compared(cases: Mapping[str, Case], tolerance: float = 1e-3) -> Finding:
+    return KnownAnswer(tolerance, lambda _: cases)(0)
+
+
+@pytest.mark.parametrize(
+    ("off", "error", "state"),
+    [
+        (9e-4, 0.0, "ok"),
+        (-1.1e-3, 0.0, "failed"),
+        (-5.4e-3, 1e-3, "ok"),
+        (5.6e-3, 1e-3, "failed"),
+        (math.nan, 1.0, "failed"),
+        (0.0, math.inf, "failed"),
+    ],
+)
+def test_a_case_may_be_off_by_tolerance_and_noise(off: float, error: float, state: str) -> None:
+    assert compared({"right": Case(0.0), "other": Case(off, error)}).state == state
+
+
+def test_the_case_closest_to_its_limit_is_reported() -> None:
+    """Not the one with the largest error."""
+    assert "(close; 2 cases)" in compared({"noisy": Case(4e-3, 1e-2), "close": Case(-9e-4)}).found
+    assert compared({"lost": Case(0.0)}, 0.0).state == "ok"
+    assert compared({"lost": Case(1.0)}, 0.0).state == "failed"
+
+
+def test_rounds_are_averaged_and_exact_or_absent_checks_run_once() -> None:
+    rng = np.random.default_rng(0)
+    asked: list[int] = []
+
+    def measure(number: int) -> Mapping[str, Case]:
+        asked.append(number)
+        return {"case": Case(float(rng.normal(0.5, 0.1)), 0.1)}
+
+    known = KnownAnswer(1.0, measure)
+    noisy = Check("noisy", known)
+    exact = Check("exact", KnownAnswer(0.0, lambda _: {"case": Case(0.0)}))
+    absent = Check("absent", lambda _: Finding("absent", "no device"))
+    run_checks([noisy, exact, absent], 0.05)
+    n = noisy.rounds
+    assert asked == list(range(n))
+    assert known.cases["case"].error == pytest.approx(0.1 / math.sqrt(n))
+    assert abs(known.cases["case"].off - 0.5) < 4 * 0.1 / math.sqrt(n)
+    assert (exact.rounds, absent.rounds) == (1, 1)
+    assert (exact.finding.state, absent.finding.state) == ("ok", "absent")
+
+
+@pytest.mark.parametrize("required", [True, False])
+def test_only_required_checks_fail_the_installation(
+    required: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def broken(_: int) -> Finding:
+        raise RuntimeError("drjit: no memory\nleft")
+
+    checks = [Check("right", lambda _: Finding("ok", "3.11")), Check("broken", broken, required, "free some")]
+    run_checks(checks, workers=2)
+    assert report(checks, Console(json=True)) == (3 if required else 0)
+    found = json.loads(capsys.readouterr().out)
+    assert found["ok"] is not required
+    assert [(c["state"], c["found"]) for c in found["checks"]] == [
+        ("ok", "3.11"),
+        ("failed", "drjit: no memory left"),
+    ]
+    report(checks, Console())
+    assert "                → free some" in capsys.readouterr().out.splitlines()
+
+
+def run_one(checks: list[Check], name: str) -> Check:
+    (found,) = (check for check in checks if check.name == name)
+    found.run_round()
+    return found
+
+
+# That all checks pass is seen by the system test, which runs them all.
+@pytest.mark.parametrize("name", ["Lambert plane", "V-groove", "furnace", "surface energy"])
+def test_checks_of_the_physics_can_fail(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three percent of albedo too little."""
+    right: Callable[[float], object] = selftest._diffuse
+    monkeypatch.setattr(selftest, "_diffuse", lambda albedo: right(0.97 * albedo))
+    finding = run_one(selftest.all_checks(), name).finding
+    assert finding.state == "failed"
+    assert finding.found.startswith("off by")
+
+
+def test_a_broken_llvm_is_a_finding_not_a_crash(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    fake = tmp_path / "libLLVM.so"
+    fake.write_text("no library\n")
+    monkeypatch.setenv(runtime.VARIABLE, str(fake))
+    found = [run_one(doctor.all_checks(), name) for name in ("LLVM", "Mitsuba")]
+    assert all(check.failed and check.required for check in found)
+    assert str(fake) in found[0].finding.found
+    assert "unset" in found[0].finding.hint
+
+
+def test_an_abort_of_the_drawing_library_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
+    fault = "the process was ended by SIGSEGV"
+    monkeypatch.setattr(doctor, "run_child", lambda *a, **k: ChildResult({}, fault, 0.1))
+    check = run_one(doctor.all_checks(), "Drawing")
+    assert (check.failed, check.required, check.finding.found) == (True, False, fault)
+    assert "OpenGL" in check.finding.hint
+
+
+def test_an_unwritable_kernel_cache_is_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv(runtime.CACHE_VARIABLE, str(tmp_path / "file"))
+    check = run_one(doctor.all_checks(), "Kernel cache")
+    assert (check.failed, check.required) == (True, False)
+    assert runtime.CACHE_VARIABLE in check.finding.hint
