@@ -31,9 +31,9 @@ def report(
         Exposure of the pictures: a value v in 1/sr is shown as 2^EV v.
     """
     from mbtf_core.exposure import describe_exposure
-    from mbtf_pipeline.library.run import is_library
-    from mbtf_pipeline.library.run import write_again as write_library
-    from mbtf_pipeline.papers.suite import is_paper, write_again
+    from mbtf_pipeline.collection.library import is_library
+    from mbtf_pipeline.collection.library import write_again as write_library
+    from mbtf_pipeline.collection.paper import is_paper, write_again
     from mbtf_pipeline.run import rerender
 
     used = None

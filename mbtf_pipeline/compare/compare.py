@@ -16,7 +16,6 @@ from mbtf_core.errors import PartialError
 from mbtf_core.exposure import auto_exposure, brightness, white_of
 from mbtf_core.files.atomic import write_json
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_pipeline.compare.dataset_errors import dataset_errors
 from mbtf_pipeline.compare.image_files import (
     PICTURES,
     Scene,
@@ -24,10 +23,9 @@ from mbtf_pipeline.compare.image_files import (
     write_map,
     write_picture,
 )
-from mbtf_pipeline.compare.metrics import DEFINITIONS, image_errors, reference_difference
+from mbtf_pipeline.compare.metrics import DEFINITIONS, dataset_errors, image_errors, reference_difference
 from mbtf_pipeline.compare.offsets import write_offsets
-from mbtf_pipeline.compare.perceptual_metrics import perceptual_scores
-from mbtf_pipeline.compare.st_lpips import require
+from mbtf_pipeline.compare.perceptual_metrics import perceptual_scores, require
 from mbtf_pipeline.compare.timing import measure_timing, timed
 from mbtf_pipeline.compare.unmodified_mitsuba import pick_scene, write_agreement
 from mbtf_pipeline.recipe import CompareSection

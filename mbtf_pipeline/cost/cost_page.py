@@ -21,9 +21,8 @@ from mbtf_pipeline.cost.figures import (
 from mbtf_pipeline.cost.measurements import ESTIMATES, Measurement
 from mbtf_pipeline.cost.pareto import extrapolation, pareto_front
 from mbtf_pipeline.cost.study import STUDY_NAME, Study
-from mbtf_pipeline.number_text import is_significant
 from mbtf_pipeline.report.report import render
-from mbtf_pipeline.tables import Cell, Column, Table, rows_of
+from mbtf_pipeline.tables import Cell, Column, Table, is_significant, rows_of
 
 CSV_NAME, PAGE_NAME = "cost.csv", "cost.html"
 _DETAILS = (

@@ -9,14 +9,12 @@ from typing import Any
 
 import pytest
 
-from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import read_json
 from mbtf_pipeline.stages import (
     Decision,
     Stage,
     StageResult,
     read_stamp,
-    run_again,
     run_stages,
     stamp_path,
 )
@@ -78,7 +76,7 @@ def pipeline(tmp_path: Path) -> Pipeline:
 def test_nothing_runs_twice(pipeline: Pipeline) -> None:
     results = pipeline.run()
     assert pipeline.ran == []
-    assert not any(r.ran for r in results.values())
+    assert not any(r.reason for r in results.values())
 
 
 @pytest.mark.parametrize(
@@ -156,7 +154,7 @@ def test_an_interrupted_stage_has_not_run(pipeline: Pipeline) -> None:
 def test_force_runs_everything(pipeline: Pipeline) -> None:
     pipeline.run(force=True)
     assert pipeline.ran == list(Pipeline.needs)
-    assert pipeline.decisions["generate"].forced
+    assert pipeline.decisions["generate"].reason == "forced"
 
 
 def test_an_unreadable_stamp_is_ignored(pipeline: Pipeline) -> None:
@@ -166,17 +164,6 @@ def test_an_unreadable_stamp_is_ignored(pipeline: Pipeline) -> None:
         path.write_text(text)
         pipeline.run()
         assert pipeline.ran == ["report"]
-
-
-def test_running_one_stage_again(pipeline: Pipeline) -> None:
-    pipeline.ran = []
-    run_again(pipeline.folder, pipeline.stage("report"))
-    assert pipeline.ran == ["report"]
-    pipeline.run()
-    assert pipeline.ran == []
-    stamp_path(pipeline.folder, "fit b").unlink()
-    with pytest.raises(InputError, match="fit b"):
-        run_again(pipeline.folder, pipeline.stage("report"))
 
 
 def test_an_interruption_does_not_wait_for_other_machines(tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ from mbtf_gen.generation.import_job import Import
 from mbtf_gen.generation.imported import import_measured
 from mbtf_gen.generation.repair import repair
 from mbtf_gen.sampling.slice_directions import slice_directions
-from mbtf_pipeline.compare.dataset_errors import dataset_errors
+from mbtf_pipeline.compare.metrics import dataset_errors
 
 Open = Callable[..., Import]
 

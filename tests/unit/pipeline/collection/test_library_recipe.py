@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from mbtf_core.errors import InputError, UsageError
-from mbtf_pipeline.library.entries import entries, is_library_recipe, load_library_recipe
+from mbtf_pipeline.collection import recipes
+from mbtf_pipeline.collection.recipes import LibraryRecipe
+from mbtf_pipeline.recipe import Recipe
 
 BASE = "base: {generate: {queries: {train: 10/texel}}}\n"
 
@@ -34,47 +36,41 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def load(folder: Path, text: str) -> dict[str, tuple[object, str]]:
+def load(folder: Path, text: str) -> tuple[dict[str, Recipe], dict[str, str]]:
+    """Recipes by name of the material, and errors of the others."""
     file = folder / "library.yaml"
     file.write_text(f"name: test\n{text}")
-    assert is_library_recipe(file)
-    found = entries(load_library_recipe(file, []), file)
-    return {entry.name: (entry.recipe, entry.error) for entry in found}
+    library = recipes.load(file)
+    assert isinstance(library, LibraryRecipe)
+    planned, skipped = library.plan(file)
+    return {one.name: one.recipe for one in planned}, {name: one.error for name, one in skipped.items()}
 
 
 def test_folders_lists_and_broken_materials(folder: Path) -> None:
-    found = load(folder, "library: [assets, more/list.txt]\n" + BASE)
-    assert list(found) == ["broken", "shell", "assets-wool", "more-wool", "missing"]
-    assert "heigth" in found["broken"][1]
-    assert found["missing"] == (None, "does not exist")
-    assert found["shell"][1] == "" == found["more-wool"][1]
+    found, errors = load(folder, "library: [assets, more/list.txt]\n" + BASE)
+    assert list(found) == ["shell", "assets-wool", "more-wool"]
+    assert "heigth" in errors["broken"]
+    assert errors["missing"] == "does not exist"
 
 
 def test_own_options_and_further_materials(folder: Path) -> None:
     text = "library: [assets/shell]\n" + BASE
     text += "materials:\n  shell: {generate: {geometry: {height_scale: 0.5}}}\n  fleece: more/wool\n"
-    file = folder / "library.yaml"
-    file.write_text(f"name: test\n{text}")
-    shell, fleece = entries(load_library_recipe(file, []), file)
-    assert shell.recipe is not None
-    assert fleece.recipe is not None
-    assert shell.recipe.generate.geometry.height_scale == 0.5
-    assert shell.recipe.generate.queries.train == "10/texel"
-    assert fleece.recipe.generate.geometry.height_scale is None
-    assert Path(fleece.recipe.generate.material) == folder / "more" / "wool"
-    assert list(shell.recipe.fit) == ["relief"]
+    found, _ = load(folder, text)
+    shell, fleece = found["shell"], found["fleece"]
+    assert shell.generate.geometry.height_scale == 0.5
+    assert shell.generate.queries.train == "10/texel"
+    assert fleece.generate.geometry.height_scale is None
+    assert Path(fleece.generate.material) == folder / "more" / "wool"
+    assert list(shell.fit) == ["relief"]
 
 
 def test_cloths_get_the_model_without_geometry(folder: Path) -> None:
     cloth = folder / "assets" / "cloth"
     cloth.mkdir()
     (cloth / "material.yaml").write_text("weave: plain\n")
-    file = folder / "library.yaml"
-    file.write_text("name: test\nlibrary: [assets/cloth]\n" + BASE)
-    (found,) = entries(load_library_recipe(file, []), file)
-    if found.recipe is None:
-        pytest.fail(found.error)
-    assert list(found.recipe.fit) == ["neumip+"]
+    found, _ = load(folder, "library: [assets/cloth]\n" + BASE)
+    assert list(found["cloth"].fit) == ["neumip+"]
 
 
 def test_faults_of_the_recipe(folder: Path) -> None:
@@ -97,7 +93,7 @@ def test_faults_of_the_recipe(folder: Path) -> None:
 def test_equal_names_are_numbered(tmp_path: Path) -> None:
     for name in ("木", "石", "oak dark", "oak_dark"):
         material(tmp_path / "u" / name)
-    assert sorted(load(tmp_path, "library: [u]\n" + BASE)) == [
+    assert sorted(load(tmp_path, "library: [u]\n" + BASE)[0]) == [
         *("u-material", "u-material-2", "u-oak_dark", "u-oak_dark-2")
     ]
 
@@ -109,7 +105,8 @@ def test_a_file_and_what_it_names_are_one_material(tmp_path: Path) -> None:
     # The recipe itself is no material, nor is what an earlier run has written.
     material(tmp_path / "out" / "runs")
     (tmp_path / "out" / "library.json").write_text("{}")
-    assert list(load(tmp_path, "library: [.]\n" + BASE)) == ["other", "shirt"]
+    found = load(tmp_path, "library: [.]\n" + BASE)
+    assert sorted({**found[0], **found[1]}) == ["other", "shirt"]
 
 
 def test_folders_of_folders_and_stray_pictures(tmp_path: Path) -> None:
@@ -122,23 +119,23 @@ def test_folders_of_folders_and_stray_pictures(tmp_path: Path) -> None:
     (tmp_path / "q" / "loop").symlink_to(tmp_path / "q", target_is_directory=True)
     for hidden in (".cache", "_old"):
         material(tmp_path / "q" / hidden / "d")
-    found = load(tmp_path, "library: [q]\n" + BASE)
-    assert list(found) == ["b", "c", "a", "unclear"]
-    assert "height" in found["unclear"][1]
+    found, errors = load(tmp_path, "library: [q]\n" + BASE)
+    assert list(found) == ["b", "c", "a"]
+    assert "height" in errors["unclear"]
 
 
-def test_a_fault_of_the_base_is_one_error_with_its_line(folder: Path) -> None:
+def test_a_fault_of_the_base_is_one_error(folder: Path) -> None:
     base = "library: [assets]\nbase:\n  generate:\n    querys: {train: 10/texel}\n"
-    with pytest.raises(InputError, match=r"library\.yaml:5: unknown key 'generate\.querys'"):
+    with pytest.raises(InputError, match=r"library\.yaml: base: unknown key 'generate\.querys'"):
         load(folder, base)
-    with pytest.raises(InputError, match=r"library\.yaml:4: unknown key 'trainig'"):
+    with pytest.raises(InputError, match=r"library\.yaml: base: unknown key 'fit\.relief\.trainig'"):
         load(folder, "library: [assets]\nbase:\n  each_fit: {trainig: {batch: 5}}\n")
 
 
 @pytest.mark.parametrize("key", ["time: 3s", "steps: 10"])
 def test_one_training_time_of_all_or_of_each(folder: Path, key: str) -> None:
     own = "training: 10s\nlibrary: [assets]\n" + BASE
-    with pytest.raises(UsageError, match=r"materials\.shell\.fit\.relief\.training\."):
+    with pytest.raises(InputError, match=r"materials\.shell: 'relief' has a training time"):
         load(folder, f"{own}materials: {{shell: {{fit: {{relief: {{training: {{{key}}}}}}}}}}}\n")
-    with pytest.raises(UsageError, match=r"base\.each_fit\.training\."):
+    with pytest.raises(InputError, match=r"base: 'each_fit' has a training time"):
         load(folder, f"training: 10s\nlibrary: [assets]\nbase: {{each_fit: {{training: {{{key}}}}}}}\n")

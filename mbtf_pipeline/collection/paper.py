@@ -1,9 +1,10 @@
-"""Runs all recipes of a paper recipe, keeps those that are up to date, and writes page and tables."""
+"""A paper recipe: runs of its materials and variants, a page and tables of their results."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,34 +12,25 @@ from mbtf_core.app.console import Console
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import read_json, write_json, write_text
 from mbtf_core.files.folders import check_folder, owned
+from mbtf_pipeline.collection.check_tables import independence, offsets, timing, weights
+from mbtf_pipeline.collection.error_tables import ablations, levels, methods, zooms
+from mbtf_pipeline.collection.finished_run import FinishedRun, each_fit
+from mbtf_pipeline.collection.recipes import PaperRecipe, Planned, Published, Skipped
 from mbtf_pipeline.compare.metrics import DEFINITIONS
-from mbtf_pipeline.compare.st_lpips import weights_file
-from mbtf_pipeline.papers.checks import independence, offsets, timing, weights
-from mbtf_pipeline.papers.errors import ablations, levels, methods, zooms
-from mbtf_pipeline.papers.plan import RUNS, PaperRecipe, Planned
-from mbtf_pipeline.papers.published import Published
-from mbtf_pipeline.papers.runs import FinishedRun
+from mbtf_pipeline.compare.perceptual_metrics import weights_file
+from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.report.plots import ERROR_BAR_NOTE
 from mbtf_pipeline.report.report import render
 from mbtf_pipeline.run import generate_data, run_recipe, slices_folder
 from mbtf_pipeline.run_folder import has_record, machine
-from mbtf_pipeline.tables import Table
 
 PAPER_NAME = "paper.json"
 PAPER_FORMAT = "mbtf-paper"
 PAPER_SCHEMA = 3
 PAGE = "paper.html"
-TABLES = "tables"
-_MAKERS: dict[str, Callable[[Sequence[FinishedRun], Sequence[Published]], list[Table]]] = {
-    "methods": methods,
-    "levels": levels,
-    "weights": weights,
-    "ablations": ablations,
-    "timing": timing,
-    "offsets": offsets,
-    "zooms": zooms,
-    "independence": independence,
-}
+# Sub-folders of the runs, and of the CSV files.
+RUNS, TABLES = "runs", "tables"
+_MAKERS = {f.__name__: f for f in (methods, levels, weights, ablations, timing, offsets, zooms, independence)}
 
 
 @dataclass(frozen=True)
@@ -70,8 +62,8 @@ def is_paper(folder: Path) -> bool:
 
 def run_paper(
     paper: PaperRecipe,
-    planned: list[Planned],
-    missing: Mapping[str, str],
+    planned: Sequence[Planned],
+    skipped: Mapping[str, Skipped],
     folder: Path,
     *,
     quick: bool,
@@ -84,8 +76,8 @@ def run_paper(
     Parameters
     ----------
     paper : PaperRecipe
-    planned, missing
-        From :func:`~mbtf_pipeline.papers.plan.plan`.
+    planned, skipped
+        From :meth:`PaperRecipe.plan`.
     folder : Path
         Folder of all runs.
     quick : bool
@@ -119,7 +111,7 @@ def run_paper(
         "command": command,
         "tables": list(paper.tables),
         "published": [one.model_dump(mode="json") for one in paper.published],
-        "skipped": dict(missing),
+        "skipped": {name: os.path.abspath(one.path) for name, one in skipped.items()},
         "machine": machine(),
         "planned": len(planned),
         "runs": [],
@@ -127,40 +119,39 @@ def run_paper(
     with owned(folder):
         check_folder(folder, is_paper, "paper recipe")
         write_json(folder / PAPER_NAME, record)
-        for name, where in missing.items():
-            console.note(f"{name}: skipped, {where} does not exist")
-        learners = paper.learn_from_others
-        planned = [_with_other_materials(one, planned, learners, folder) for one in planned]
-        for one in planned:
-            if any(config.training.materials for config in one.recipe.fit.values()):
+        for name, why in skipped.items():
+            console.note(f"{name}: skipped, {why.error}")
+        runs = [(one, _learning_recipe(one, planned, paper, folder)) for one in planned]
+        for one, recipe in runs:
+            if any(config.training.materials for config in recipe.fit.values()):
                 console.note(f"{one.name}: data")
-                generate_data(one.recipe, folder / RUNS / one.name, command=command, console=console)
-        for number, one in enumerate(planned, 1):
-            console.note(f"{one.name}: run {number} of {len(planned)}")
-            run_recipe(one.recipe, folder / RUNS / one.name, force=force, command=command, console=console)
+                generate_data(recipe, folder / RUNS / one.name, command=command, console=console)
+        for number, (one, recipe) in enumerate(runs, 1):
+            console.note(f"{one.name}: run {number} of {len(runs)}")
+            run_recipe(recipe, folder / RUNS / one.name, force=force, command=command, console=console)
             record["runs"].append({"material": one.material, "variant": one.variant, "name": one.name})
             write_json(folder / PAPER_NAME, record)
         page, tables = _write_page(folder, record)
     return PaperResult(folder, page, tables, record)
 
 
-def _with_other_materials(
-    one: Planned, planned: Sequence[Planned], learners: Sequence[str], folder: Path
-) -> Planned:
-    """A recipe of which these fits also learn from the slices of all other materials."""
+def _learning_recipe(one: Planned, planned: Sequence[Planned], paper: PaperRecipe, folder: Path) -> Recipe:
+    """The recipe of a run, some fits of which also learn from the slices of all other materials."""
     others = [p for p in planned if p.material != one.material and p.variant == one.variant]
     fits = dict(one.recipe.fit)
-    for name, config in fits.items():
-        if name in learners and not config.training.materials:
-            if not (others or config.training.own_material):
-                raise InputError(
-                    f"the fit '{name}' of {one.name} learns from other materials alone, but there are none",
-                    hint="add a material to the recipe, or leave this fit out",
-                )
-            data = (folder / RUNS / p.name / slices_folder(p.recipe) for p in others)
-            training = config.training.model_copy(update={"materials": tuple(map(str, data))})
-            fits[name] = config.model_copy(update={"training": training})
-    return replace(one, recipe=one.recipe.model_copy(update={"fit": fits}))
+    for name in fits.keys() & set(paper.learn_from_others):
+        training = fits[name].training
+        if training.materials:
+            continue
+        if not (others or training.own_material):
+            raise InputError(
+                f"the fit '{name}' of {one.name} learns from other materials alone, but there are none",
+                hint="add a material to the recipe, or leave this fit out",
+            )
+        data = (folder / RUNS / p.name / slices_folder(p.recipe) for p in others)
+        training = training.model_copy(update={"materials": tuple(map(str, data))})
+        fits[name] = fits[name].model_copy(update={"training": training})
+    return one.recipe.model_copy(update={"fit": fits})
 
 
 def write_again(folder: Path) -> Path:
@@ -208,5 +199,5 @@ def _sizes(runs: Sequence[FinishedRun]) -> dict[str, Any]:
         "pictures": len(run.pictures),
         "size": run.comparison["size"],
         "picture_spp": run.comparison["spp"],
-        "training": max(r.seconds(fit) for r in runs for fit in r.fits),
+        "training": max(float(r.fit(fit)["training_seconds"]) for r, fit in each_fit(runs)),
     }

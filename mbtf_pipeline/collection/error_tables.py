@@ -8,12 +8,29 @@ from itertools import combinations
 from typing import Any
 
 from mbtf_core.stats import Estimate, psnr
+from mbtf_pipeline.collection.finished_run import (
+    MATERIAL,
+    METHOD,
+    FinishedRun,
+    each_fit,
+    mean_of,
+    ratio_of,
+)
+from mbtf_pipeline.collection.recipes import Published, first_known
 from mbtf_pipeline.compare.perceptual_metrics import PERCEPTUAL_METRICS, PerceptualMetric
-from mbtf_pipeline.number_text import decibel, estimate, levels_text, signed
-from mbtf_pipeline.papers.published import Published, level_ratios, mse_ratio
-from mbtf_pipeline.papers.runs import MATERIAL, METHOD, FinishedRun, each_fit, mean_of, preview, ratio_of
 from mbtf_pipeline.report.plots import points
-from mbtf_pipeline.tables import Cell, Column, Shown, Table, Thumbnail, rows_of
+from mbtf_pipeline.tables import (
+    Cell,
+    Column,
+    Shown,
+    Table,
+    Thumbnail,
+    decibel,
+    estimate,
+    levels_text,
+    rows_of,
+    signed,
+)
 
 # Records of images.
 Pictures = Sequence[dict[str, Any]]
@@ -35,6 +52,11 @@ def _metric_column(metric: PerceptualMetric) -> Column:
         return Shown(metric.text(value, noise, with_noise=False), value, noise, "noise")
 
     return Column(metric.title, metric.key.replace(".", "_"), mean)
+
+
+def _recorded(title: str, key: str, digits: str = ".3g") -> Column:
+    """A number of a fit's record."""
+    return Column(title, key, lambda run, fit, *_: run.fit(fit)[key], digits=digits)
 
 
 _METRICS = [_metric_column(m) for m in PERCEPTUAL_METRICS]
@@ -68,14 +90,14 @@ _RATIOS_TEXT = (
 _METHODS = [
     MATERIAL,
     METHOD,
-    Column("unexplained variance [%]", "unexplained", FinishedRun.unexplained, 100.0),
-    Column("MSE [10⁻³/sr²]", "mse", FinishedRun.mse, 1e3),
+    Column("unexplained variance [%]", "unexplained", lambda r, fit: r.error(fit, "unexplained"), 100.0),
+    Column("MSE [10⁻³/sr²]", "mse", FinishedRun.error, 1e3),
     Column("MSE − MSE of the first method [10⁻³/sr²]", "mse_minus_first", FinishedRun.minus_first, 1e3),
     Column("PSNR of images", "psnr", lambda run, fit: _psnr(run, _picture_error(run, fit, "mse"))),
     Column("relative MSE of images", "relative_mse", lambda r, fit: _picture_error(r, fit, "relative_mse")),
     *_METRICS,
-    Column("training [s]", "training_seconds", FinishedRun.seconds, digits=".0f"),
-    Column("network weights", "network_weights", lambda run, fit: run.fit(fit)["network_weights"]),
+    _recorded("training [s]", "training_seconds", ".0f"),
+    _recorded("network weights", "network_weights"),
 ]
 
 
@@ -95,20 +117,20 @@ def methods(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list
     ratios: list[list[Cell]] = []
     for run in runs:
         for base, fit in combinations(run.fits, 2):
-            known = mse_ratio(published, run.material, fit, base) or (None, None)
-            ratios.append([run.title, fit, base, ratio_of(run.mse(fit), run.mse(base)), *known])
+            known = first_known(published, lambda p: p.mse_ratio(run.material, fit, base))  # noqa: B023
+            ratios.append([run.title, fit, base, ratio_of(run.error(fit), run.error(base)), *known])
     return [errors, Table("ratios", "MSE ratios beside published ones", _RATIOS_TEXT, columns, ratios)]
 
 
 def _last_image(run: FinishedRun) -> list[Thumbnail]:
     """The last image of a run: reference and fits."""
     shown = run.pictures[-1]
-    row = [preview(run.file(shown["references"][run.kind]["file"]), "reference")]
+    row = [run.preview(shown["references"][run.kind]["file"], "reference")]
     for fit in run.fits:
         record = shown["fits"][fit]
         found = record["errors"][run.kind]["psnr"]["value"]
         line = "" if found is None else signed(f"{found:.1f} dB")
-        row.append(preview(run.file(record["file"]), fit, line))
+        row.append(run.preview(record["file"], fit, line))
     return row
 
 
@@ -125,10 +147,11 @@ _LEVEL_RATIOS_TEXT = (
 
 def levels(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[Table]:
     """MSE at every level, and relative to the finest, beside published ratios."""
-    names = sorted({int(level) for run in runs for level in run.test(run.fits[0])["levels"]})
+    tests = [run.fit(run.fits[0])["splits"]["test"] for run in runs]
+    names = sorted({int(level) for test in tests for level in test["levels"]})
 
     def column(level: int) -> Column:
-        return Column(f"level {level}", f"mse_level_{level}", lambda r, f: _at(r, f, level, "mse"), 1e3)
+        return Column(f"level {level}", f"mse_level_{level}", lambda r, f: r.error_at(f, level), 1e3)
 
     columns = [MATERIAL, METHOD, *map(column, names)]
     fits = dict.fromkeys(fit for _, fit in each_fit(runs))
@@ -145,16 +168,10 @@ def levels(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[
     return [errors, _level_ratios(runs, names[::-1], published)]
 
 
-def _at(run: FinishedRun, fit: str, level: int, key: str) -> Estimate | None:
-    group = run.test(fit)["levels"].get(str(level))
-    return None if group is None or group[key]["value"] is None else estimate(group[key])
-
-
 def _mean_at(runs: Sequence[FinishedRun], fit: str, level: int) -> tuple[float, float] | None:
-    found = [_at(run, fit, level, "unexplained") for run in runs if fit in run.fits]
+    found = [run.error_at(fit, level, "unexplained") for run in runs if fit in run.fits]
     known = [e for e in found if e is not None]
-    mean = mean_of(known) if known else None
-    return None if mean is None else (mean.value, mean.error)
+    return (mean_of(known).value, mean_of(known).error) if known else None
 
 
 def _level_ratios(
@@ -163,15 +180,15 @@ def _level_ratios(
     zooms = [Column(f"zoom {k}", f"ratio_zoom_{k}") for k in range(len(finest_first))]
     rows: list[list[Cell]] = []
     for run, fit in each_fit(runs):
-        first, *others = (_at(run, fit, n, "mse") for n in finest_first)
+        first, *others = (run.error_at(fit, n) for n in finest_first)
         if first is None:
             continue
         cells = [None if e is None else ratio_of(e, first) for e in others]
         rows.append([run.title, fit, "measured here", 1.0, *cells])
-        known = level_ratios(published, run.material, fit)
+        known, source = first_known(published, lambda p: p.level_ratios(run.material, fit))  # noqa: B023
         if known is not None:
-            ratios = [*known[0], *[None] * len(finest_first)][: len(finest_first)]
-            rows.append([run.title, fit, f"published, {known[1]}", *ratios])
+            ratios = [*known, *[None] * len(finest_first)][: len(finest_first)]
+            rows.append([run.title, fit, f"published, {source}", *ratios])
     columns = [MATERIAL, METHOD, Column("source", "source"), *zooms]
     return Table("level_ratios", "Errors relative to the finest level", _LEVEL_RATIOS_TEXT, columns, rows)
 
@@ -225,13 +242,13 @@ def _ablation_columns(first: FinishedRun) -> list[Column]:
     def difference(run: FinishedRun, fit: str) -> Cell:
         if run is first:
             return run.minus_first(fit)
-        mse, base = run.mse(fit), first.mse(first.fits[0])
+        mse, base = run.error(fit), first.error(first.fits[0])
         return Estimate(mse.value - base.value, math.hypot(mse.error, base.error), min(mse.n, base.n))
 
     return [
-        column("unexplained variance [%]", "unexplained", FinishedRun.unexplained, 100.0),
+        column("unexplained variance [%]", "unexplained", lambda r, fit: r.error(fit, "unexplained"), 100.0),
         column("MSE − MSE of the first [10⁻³/sr²]", "minus_first", difference, 1e3),
-        column("training [s]", "seconds", FinishedRun.seconds, 1.0, ".0f"),
+        column("training [s]", "seconds", lambda r, fit: r.fit(fit)["training_seconds"], 1.0, ".0f"),
     ]
 
 
@@ -295,7 +312,7 @@ def _zoom_images(run: FinishedRun) -> list[tuple[str, list[Thumbnail]]]:
     return [
         (
             f"{run.title}: {title}",
-            [preview(run.file(p[group][name]["file"]), f"{p['tiles_across']:g} tiles across") for p in shown],
+            [run.preview(p[group][name]["file"], f"{p['tiles_across']:g} tiles across") for p in shown],
         )
         for title, group, name in sources
     ]

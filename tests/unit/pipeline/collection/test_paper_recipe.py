@@ -9,8 +9,8 @@ import pytest
 from support.paths import ROOT
 
 from mbtf_core.errors import InputError
-from mbtf_pipeline.papers.plan import Planned, load_paper_recipe, plan
-from mbtf_pipeline.papers.suite import run_paper
+from mbtf_pipeline.collection.paper import run_paper
+from mbtf_pipeline.collection.recipes import PaperRecipe, Planned, load
 
 PIPELINES = ROOT / "pipelines"
 SHIPPED = sorted(PIPELINES.glob("paper_*.yaml"))
@@ -41,10 +41,16 @@ def written(folder: Path, text: str = TEXT) -> Path:
     return path
 
 
-def planned(path: Path, quick: bool = False, *assignments: str) -> tuple[dict[str, Planned], dict[str, str]]:
-    found, missing = plan(load_paper_recipe(path, list(assignments)), path, quick)
+def paper_of(path: Path) -> PaperRecipe:
+    found = load(path)
+    assert isinstance(found, PaperRecipe)
+    return found
+
+
+def planned(path: Path, quick: bool = False) -> tuple[dict[str, Planned], dict[str, str]]:
+    found, skipped = paper_of(path).plan(path, quick)
     assert len({one.name for one in found}) == len(found)
-    return {one.name: one for one in found}, missing
+    return {one.name: one for one in found}, {name: str(one.path) for name, one in skipped.items()}
 
 
 def test_order_of_layers(tmp_path: Path) -> None:
@@ -109,10 +115,9 @@ def test_a_fit_of_other_materials_needs_some(tmp_path: Path) -> None:
         "  fit:\n    rainer2020: {training: {own_material: false}}\n"
     )
     path = written(tmp_path, text)
-    paper = load_paper_recipe(path, [])
-    found, missing = plan(paper, path, False)
+    paper = paper_of(path)
     with pytest.raises(InputError, match="learns from other materials alone, but there are none"):
-        run_paper(paper, found, missing, tmp_path / "out", quick=False, command="")
+        run_paper(paper, *paper.plan(path), tmp_path / "out", quick=False, command="")
     assert not (tmp_path / "out" / "runs").exists()
 
 
