@@ -1,9 +1,9 @@
 """Time of a run: its forecast, and a run that fits into a total time.
 
 A pilot of the generator forecasts the time of a recipe on this machine, from start to report. A total time
-takes the best quality preset that fits, and training gets the rest. Once the data are generated, training
-gets the time that is then left, but no less than that of the preset: a run that thus takes longer than its
-time says so. A time too short for any preset gets a draft of fewer queries and less training.
+takes the best quality preset that fits, and training gets the rest; a time too short for any preset shortens
+the training of a draft. Once the data are generated, training gets the time that is then left, but no less
+than that of the preset: a run that thus takes longer than its time says so.
 """
 
 from __future__ import annotations
@@ -43,11 +43,8 @@ SPLIT_NAME = "time_split.json"
 SPLIT_SCHEMA = 6
 # Presets that a time chooses from; `paper` needs a GPU.
 PRESETS: tuple[Quality, ...] = ("draft", "standard", "high")
-# The shortest total time, seconds: start-up takes most of a shorter one.
-SHORTEST = 60.0
 # Share of the time that is left for what the forecast does not know.
 _RESERVE = 0.04
-_FEWEST_QUERIES = 4096
 
 
 @dataclass(frozen=True)
@@ -85,13 +82,7 @@ class RunForecast:
 
 
 class RunForecaster:
-    """Forecasts runs of one material.
-
-    Parameters
-    ----------
-    recipe : Recipe
-        Its material and generator are measured by the pilot.
-    """
+    """Forecasts runs of one material; a pilot measures the material and the generator of a recipe."""
 
     def __init__(self, recipe: Recipe) -> None:
         self.recipe = recipe
@@ -111,14 +102,7 @@ class RunForecaster:
     def of(
         self, recipe: Recipe, stages: Collection[str] | None = None, speed: tuple[float, float] | None = None
     ) -> RunForecast:
-        """Forecast of a recipe of this material.
-
-        Parameters
-        ----------
-        recipe : Recipe
-        stages : names of the stages that will run; all by default
-        speed : as :attr:`speed`, which is measured by default
-        """
+        """Forecast of some stages of a recipe of this material, by default of all, at the pilot's speed."""
         from mbtf_fit.training.forecast import evaluation_seconds, fit_bytes
         from mbtf_gen.job import data_bytes
 
@@ -174,14 +158,13 @@ class Split:
 
     Attributes
     ----------
-    quality : the preset; queries : of training, where they are fewer than the preset's
+    quality : the preset
     training, least : seconds of training each fit, as planned and at least
     after : seconds of loading, evaluation, comparison and report
     final : whether the training time counts how long generating took
     """
 
     quality: Quality
-    queries: int | None
     training: float
     least: float
     after: float
@@ -220,9 +203,6 @@ class TimedRun:
         self._progress = progress
         self._began = time.perf_counter() if began is None else began
         self._seconds, self._file, self._assignments = seconds, file, assignments
-        if seconds < SHORTEST:
-            problem = f"{format_duration(seconds)} is too short: starting up takes most of it"
-            raise UsageError(problem, where="--time", hint=f"give {format_duration(SHORTEST)} or more")
         names = PRESETS if quality is None else (quality,)
         recipes = {name: preset_recipe(file, name, assignments) for name in names}
         first = recipes[names[0]]
@@ -244,10 +224,10 @@ class TimedRun:
 
     @property
     def recipe(self) -> Recipe:
-        """The recipe with the split's queries, network and training time."""
+        """The recipe with the split's preset and training time."""
         split = self.split
         recipe = preset_recipe(self._file, split.quality, self._assignments, split.training)
-        return _trained(_reduced(recipe, split.queries), split.training)
+        return _trained(recipe, split.training)
 
     def generated(self, recipe: Recipe) -> Recipe:
         """The recipe with the training time that is left now that the data are generated."""
@@ -275,41 +255,30 @@ class TimedRun:
         write_json(self._path, {"key": self._key, "split": asdict(split)})
 
     def _plan(self, recipes: Mapping[Quality, Recipe]) -> Split:
-        """The best preset that fits; the first one, reduced, if none does."""
+        """The best preset that fits; the first one with less training if none does."""
         forecaster = RunForecaster(next(iter(recipes.values())))
         forecasts = {name: forecaster.of(recipe) for name, recipe in recipes.items()}
         left, free = self._left(), shutil.disk_usage(self._path.parent).free
         fitting = [name for name, f in forecasts.items() if f.seconds <= left and f.bytes <= free]
         quality = fitting[-1] if fitting else next(iter(recipes))
-        recipe, expected, queries = recipes[quality], forecasts[quality], None
-        least = expected.training / len(recipe.fit)
-        if not fitting and expected.seconds > left:
-            fixed = expected.start + expected.comparing
-            scale = (left - fixed) / (expected.seconds - fixed)
-            own = split_queries(Job.of(recipe.generate, forecaster.material), "train")
-            queries = min(own, max(_FEWEST_QUERIES, int(scale * own)))
-            expected = forecaster.of(_reduced(recipe, queries))
-            least *= 0.5 * max(0.0, scale)
+        expected, fits = forecasts[quality], len(recipes[quality].fit)
         hint = "choose another folder with -o, or a lower resolution: --set generate.queries.resolution=64"
         check_space(self._path.parent, expected.bytes, hint)
-        each = max(1.0, round((left - expected.seconds + expected.training) / len(recipe.fit), 1))
-        fewer = "" if queries is None else f", reduced to {queries} queries"
+        each = round((left - expected.seconds + expected.training) / fits, 1)
+        if each < 1.0:
+            rest = expected.seconds - expected.training
+            problem = (
+                f"{format_duration(self._seconds)} is too short: all but training takes about {clock(rest)}"
+            )
+            raise UsageError(problem, where="--time", hint="give more, or reduce generate.queries with --set")
+        after = round(expected.evaluating + expected.comparing, 1)
         self._progress(
-            f"time: preset {quality}{fewer}, {clock(expected.generating)} of generating, {clock(each)} of "
-            f"training each fit, {clock(expected.evaluating + expected.comparing)} of evaluation, comparison "
-            "and report"
+            f"time: preset {quality}, {clock(expected.generating)} of generating, {clock(each)} of training "
+            f"each fit, {clock(after)} of evaluation, comparison and report"
         )
-        # `paper` counts steps; its training takes what is left.
-        least = least or 0.5 * each
-        return Split(quality, queries, each, least, round(expected.evaluating + expected.comparing, 1))
-
-
-def _reduced(recipe: Recipe, queries: int | None) -> Recipe:
-    """The recipe with fewer training queries."""
-    if queries is None:
-        return recipe
-    section = recipe.generate.queries.model_copy(update={"train": str(queries)})
-    return recipe.model_copy(update={"generate": recipe.generate.model_copy(update={"queries": section})})
+        # `paper` counts steps; its training, and that of a shortened draft, may lose half.
+        least = expected.training / fits
+        return Split(quality, each, least if 0 < least <= each else 0.5 * each, after)
 
 
 def _trained(recipe: Recipe, seconds: float) -> Recipe:

@@ -155,11 +155,11 @@ def rows_of(columns: Sequence[Column], items: Iterable[Sequence[Any]]) -> list[l
 
 
 class Thumbnail(NamedTuple):
-    """An image below a table: ``data:`` URI, label, and lines of its caption."""
+    """An image below a table: ``data:`` URI, label, and a line below it."""
 
     image: str
     label: str
-    lines: Sequence[str] = ()
+    line: str = ""
 
 
 @dataclass(frozen=True)
