@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time as clocks
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -27,8 +27,7 @@ from mbtf_core.units import clock
 from mbtf_fit.cli.page_options import Live, live_view
 
 if TYPE_CHECKING:
-    from mbtf_core.run.runner import Runner
-    from mbtf_pipeline.collection.recipes import LibraryRecipe, PaperRecipe
+    from mbtf_pipeline.collection.run import CollectionResult
     from mbtf_pipeline.run import RunResult
 
 
@@ -65,26 +64,35 @@ def run(
     began = clocks.perf_counter() - 1.0
     from mbtf_core.run.cluster import open_runner
     from mbtf_core.run.processes import Processes
-    from mbtf_pipeline.collection.recipes import LibraryRecipe, PaperRecipe, load
+    from mbtf_pipeline.collection.recipes import Collection, LibraryRecipe, load
 
     given = {"quality": quality, "time": time, "quick": quick, "output": output, "set": assignments}
     command = command_line("mbtf-pipeline", "run", recipe, **given)
-    given |= {"force": force, "live": live, "cluster": cluster}
     loaded, own = load(recipe, assignments or []), assignments or []
-    if isinstance(loaded, PaperRecipe):
-        _refuse(given, "quality time live cluster", "a paper recipe", "--quick is its small size")
+    given |= {"live": live}
+    if isinstance(loaded, Collection):
+        from mbtf_pipeline.collection.run import run_collection
+
+        hint = "set times in the recipe; --quick is its small size"
+        _refuse(given, ("quality", "time", "live"), "a recipe of several materials", hint)
         folder = output or loaded.folder_of(quick)
         keep_on_interruption(f"the finished stages are kept in {folder}")
-        _run_paper(loaded, recipe, folder, quick, force, command, console)
-    elif isinstance(loaded, LibraryRecipe):
-        hint = "set 'base' and 'training' in the recipe"
-        _refuse(given, "quality time quick force live", "a library of materials", hint)
-        folder = output or loaded.folder
-        keep_on_interruption(f"the finished stages are kept in {folder}")
-        with open_runner(cluster, console.note, Processes()) as runner:
-            _run_library(loaded, recipe, folder, command, console, runner)
+        # A crash ends one material of a library alone; the runs of a paper show their progress.
+        otherwise = Processes() if isinstance(loaded, LibraryRecipe) else None
+        with open_runner(cluster, console.note, otherwise) as runner:
+            done = run_collection(
+                loaded,
+                recipe,
+                folder,
+                command=command,
+                runner=runner,
+                quick=quick,
+                force=force,
+                console=console,
+            )
+        _report_collection(done, folder, console)
     else:
-        _refuse(given, "quick", "a recipe of one material", "use --quality draft")
+        _refuse(given, ("quick",), "a recipe of one material", "use --quality draft")
         folder = output or loaded.folder
         if time is None:
             from mbtf_pipeline.presets import preset_recipe
@@ -118,45 +126,22 @@ def run(
         _report(result, console, quality)
 
 
-def _refuse(given: Mapping[str, Any], flags: str, kind: str, hint: str) -> None:
+def _refuse(given: Mapping[str, Any], flags: Sequence[str], kind: str, hint: str) -> None:
     """Refuse flags that a kind of recipe does not have."""
-    for flag in flags.split():
+    for flag in flags:
         if given[flag]:
             raise UsageError(f"is not for {kind}", where=f"--{flag}", hint=f"leave it out: {hint}")
 
 
-def _run_paper(
-    paper: PaperRecipe, file: Path, folder: Path, quick: bool, force: bool, command: str, console: Console
-) -> None:
-    from mbtf_pipeline.collection.paper import run_paper
-
-    planned, skipped = paper.plan(file, quick)
-    done = run_paper(
-        paper, planned, skipped, folder, quick=quick, command=command, force=force, console=console
-    )
-    size = done.record["size"]
-    data = {"folder": folder, "page": done.page, "size": size, "tables": done.tables}
-    data |= {"runs": [one.name for one in planned], "skipped": done.record["skipped"]}
-    left_out = f", {len(skipped)} skipped: {', '.join(skipped)}" if skipped else ""
-    console.report(data, f"{done.page}: {size} size, {len(planned)} runs{left_out}")
-
-
-def _run_library(
-    library: LibraryRecipe, file: Path, folder: Path, command: str, console: Console, runner: Runner
-) -> None:
-    from mbtf_pipeline.collection.library import run_library
-
-    planned, skipped = library.plan(file)
-    done = run_library(library, planned, skipped, folder, command=command, console=console, runner=runner)
-    failed = done.failed
-    text = f"{len(done.materials) - len(failed)} of {len(done.materials)} materials"
-    data = {"folder": folder, "page": done.page, "materials": done.materials}
-    console.report(data, f"{done.page}: {text}")
-    for name, error in failed.items():
-        console.note(f"{name}: {error}")
+def _report_collection(done: CollectionResult, folder: Path, console: Console) -> None:
+    skipped, failed = done.names("skipped"), done.names("failed")
+    count = len(done.runs) - len(skipped)
+    text = f"{done.page}: {count - len(failed)} of {count} runs"
+    text += f", {len(skipped)} skipped: {', '.join(skipped)}" if skipped else ""
+    console.report({"folder": folder, "page": done.page, "tables": done.tables, "runs": done.runs}, text)
     if failed:
         raise PartialError(
-            f"{len(failed)} of {len(done.materials)} materials failed",
+            f"{len(failed)} of {count} runs failed: {', '.join(failed)}",
             where=folder,
             hint="the same command tries them again and keeps the others",
         )

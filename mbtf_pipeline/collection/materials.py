@@ -17,7 +17,7 @@ from mbtf_core.errors import InputError, UsageError, reason
 _SUFFIXES = {".yaml", ".yml", ".pyp", ".bcc", ".curves", ".glb", ".gltf", ".ply", ".obj"}
 _YAML = (".yaml", ".yml")
 # Records of folders that the programs have written, and keys of recipes.
-_RECORDS = {"library.json", "run.json", "manifest.json", "fit.json"}
+_RECORDS = {"collection.json", "run.json", "manifest.json", "fit.json"}
 _RECIPE_KEYS = {"library", "generate"}
 # Characters of a name besides its number.
 _LONGEST = 90

@@ -100,40 +100,24 @@ class Skipped(NamedTuple):
     error: str
 
 
-Plan = tuple[list[Planned], dict[str, Skipped]]
-
-
-class _Collection(Settings):
+class Collection(Settings):
     """What recipes of several materials have in common."""
 
     name: Name
     title: str | None = Field(None, description="title of the page; default: the name")
     description: str = ""
-    output: str | None = Field(None, description="folder; default: out/NAME")
-    base: Layer = Field(description="options of all runs")
-
-    @property
-    def folder(self) -> Path:
-        """Default folder of all runs, relative to the current folder."""
-        return Path("out") / self.name if self.output is None else Path(self.output)
-
-
-class LibraryRecipe(_Collection):
-    """Configuration of a library."""
-
-    version: Literal[1] = 1
+    output: str | None = Field(None, description="folder; default: out/NAME, or out/NAME-quick")
     base: Layer = Field(
         description="options of all runs; without `fit`, the model that is best for each material"
     )
-    library: list[FileName] = Field(
-        description="folders of materials, materials, and text files with one of them per line"
-    )
-    materials: dict[Name, MaterialLayer] = Field(
-        {}, description="name → path or layer: further materials, and own options of those in `library`"
-    )
+    quick: Layer = Field(Layer(), description="overrides the base with --quick")
+    materials: dict[Name, MaterialLayer] = Field({}, description="name → path or layer")
+    variants: dict[Name, Layer] = Field({}, description="name → options; run for every material")
     training: Duration | None = Field(
-        None,
-        description="training time of each material, shared equally by its fits; default: theirs",
+        None, description="training time of each run, shared equally by its fits; default: theirs"
+    )
+    learn_from_others: list[Name] = Field(
+        [], description="fits that also learn from the slices of all other materials"
     )
 
     @model_validator(mode="after")
@@ -146,91 +130,28 @@ class LibraryRecipe(_Collection):
                     raise ValueError(f"{where}: '{fit}' has a training time beside 'training'; leave out one")
         return self
 
-    def plan(self, file: Path) -> Plan:
-        """The runs in the order of the recipe, those of one folder by name; and unusable materials.
-
-        Parameters
-        ----------
-        file : Path
-            The recipe; paths are relative to it.
-
-        Returns
-        -------
-        list of Planned, dict of str to Skipped
-
-        Raises
-        ------
-        InputError
-            There are none, a list cannot be read, or the options of all runs are at fault.
-        UsageError
-            A material is listed twice.
-        """
-        any_fit = [] if self.base.fit else [Layer(fit={DEFAULT_MODEL: None})]
-        compose([self.base, *any_fit], "base", Path("any"), str(file))
-        own = {
-            name: layer.generate["material"]
-            for name, layer in self.materials.items()
-            if "material" in layer.generate
-        }
-        paths = [path for text in self.library for path in find_materials(file.parent / text)]
-        found = dict(zip(name_materials(paths, own), paths, strict=True))
-        found |= {name: _beside(file, path) for name, path in own.items()}
-        for name in self.materials.keys() - found.keys():
-            hint = "add generate.material, or correct the name"
-            raise InputError("is no material of the library", where=f"{file}: materials.{name}", hint=hint)
-        if not found:
-            raise InputError("names no material", where=file, hint="add folders to 'library'")
-        planned, skipped = [], {}
-        for name, path in found.items():
-            try:
-                planned.append(Planned(self._recipe(name, path, file), name))
-            except MbtfError as error:
-                skipped[name] = Skipped(path, " ".join(error.message.split()))
-        return planned, skipped
-
-    def _recipe(self, name: str, path: Path, file: Path) -> Recipe:
-        try:
-            str(path).encode()
-        except UnicodeEncodeError:
-            raise InputError("its path is not UTF-8 text: rename it") from None
-        if not path.exists():
-            raise InputError("does not exist")
-        layers = [self.base, self.materials.get(name, Layer())]
-        if not any(layer.fit for layer in layers):
-            layers.append(Layer(fit={_model_for(path): None}))
-        return self._timed(compose(layers, name, path, str(file)))
-
-    def _timed(self, recipe: Recipe) -> Recipe:
-        """A recipe whose fits share the training time."""
-        if self.training is None:
-            return recipe
-        time = {"time": round(self.training / len(recipe.fit), 3), "steps": None}
-        fits = {
-            name: config.model_copy(update={"training": config.training.model_copy(update=time)})
-            for name, config in recipe.fit.items()
-        }
-        return recipe.model_copy(update={"fit": fits})
-
-
-class PaperRecipe(_Collection):
-    """Configuration of a paper recipe; each material is run with each variant."""
-
-    version: Literal[2] = 2
-    tables: list[TableName] = Field(min_length=1, description="tables to write")
-    materials: dict[Name, MaterialLayer] = Field(min_length=1, description="name → path or layer")
-    quick: Layer = Field(Layer(), description="overrides the base with --quick")
-    variants: dict[Name, Layer] = Field({}, description="name → options; run for every material")
-    learn_from_others: list[Name] = Field(
-        [], description="fits that also learn from the slices of all other materials"
-    )
-    published: list[Published] = Field([], description="published numbers, shown beside measured ones")
+    @property
+    def folder(self) -> Path:
+        """Default folder of all runs, relative to the current folder."""
+        return Path("out") / self.name if self.output is None else Path(self.output)
 
     def folder_of(self, quick: bool) -> Path:
         """Default folder of the runs of a size."""
-        return Path("out") / f"{self.name}-quick" if quick and self.output is None else self.folder
+        return self.folder.with_name(f"{self.name}-quick") if quick and self.output is None else self.folder
 
-    def plan(self, file: Path, quick: bool = False) -> Plan:
-        """The runs in their order, and missing materials.
+    def paths(self, file: Path) -> dict[str, Path]:
+        """Path of each material by its name."""
+        for name, layer in self.materials.items():
+            if "material" not in layer.generate:
+                where = f"{file}: materials.{name}"
+                raise InputError("has no path", where=where, hint="add generate.material")
+        return {
+            name: Path(os.path.normpath(file.parent / str(layer.generate["material"])))
+            for name, layer in self.materials.items()
+        }
+
+    def plan(self, file: Path, quick: bool = False) -> tuple[list[Planned], dict[str, Skipped]]:
+        """The runs in their order, and materials that cannot be run, by name.
 
         Parameters
         ----------
@@ -246,25 +167,83 @@ class PaperRecipe(_Collection):
         Raises
         ------
         InputError
-            An option is unknown or invalid, or all materials are missing.
+            The options of all runs are at fault, or no material can be run.
+        UsageError
+            A material is listed twice.
         """
-        planned, skipped = [], {}
-        for material, own in self.materials.items():
-            if "material" not in own.generate:
-                where = f"{file}: materials.{material}"
-                raise InputError("has no path", where=where, hint="add generate.material")
-            path = _beside(file, own.generate["material"])
-            if not path.exists():
-                skipped[material] = Skipped(path, f"{os.path.abspath(path)} does not exist")
-                continue
-            for variant, over in (self.variants or {"": Layer()}).items():
-                layers = [self.base, *([self.quick] if quick else []), own, over]
-                name = f"{material}-{variant}" if variant else material
-                planned.append(Planned(compose(layers, name, path, str(file)), material, variant))
+        paths = self.paths(file)
+        if not paths:
+            raise InputError("names no material", where=file, hint="add some to 'materials' or 'library'")
+        self._compose([], quick, "base", Path("any"), file)
+        planned: list[Planned] = []
+        skipped = {}
+        for material, path in paths.items():
+            layer = self.materials.get(material, Layer())
+            try:
+                if not path.exists():
+                    raise InputError(f"{os.path.abspath(path)} does not exist")
+                str(path).encode()
+                for variant, over in (self.variants or {"": Layer()}).items():
+                    name = f"{material}-{variant}" if variant else material
+                    recipe = self._compose([layer, over], quick, name, path, file)
+                    planned.append(Planned(recipe, material, variant))
+            except UnicodeEncodeError:
+                skipped[material] = Skipped(path, "its path is not UTF-8 text: rename it")
+            except MbtfError as error:
+                skipped[material] = Skipped(path, " ".join(error.message.split()))
         if not planned:
-            hint = f"{next(iter(skipped.values())).error}; edit 'materials'"
-            raise InputError("all of its materials are missing", where=file, hint=hint)
+            name, why = next(iter(skipped.items()))
+            raise InputError("no material can be run", where=file, hint=f"{name}: {why.error}")
         return planned, skipped
+
+    def _compose(self, layers: Sequence[Layer], quick: bool, name: str, path: Path, file: Path) -> Recipe:
+        """The recipe of one run: the options of all runs, overridden by the layers."""
+        data: dict[str, Any] = {}
+        for layer in (self.base, *([self.quick] if quick else []), *layers):
+            data = deep_merge(data, layer.model_dump(mode="json"))
+        each, fits = data.pop("each_fit"), data["fit"] or {_model_for(path): None}
+        data["fit"] = {fit: deep_merge(each, {"model": fit, **(own or {})}) for fit, own in fits.items()}
+        if self.training is not None:
+            time = {"time": round(self.training / len(fits), 3), "steps": None}
+            data["fit"] = {
+                fit: deep_merge(options, {"training": time}) for fit, options in data["fit"].items()
+            }
+        data["generate"]["material"] = str(path)
+        # The optional metric is computed if its weights are installed.
+        data["compare"] = {"st_lpips": weights_file() is not None, **data["compare"]}
+        data |= {"name": name, "report": {"title": name.replace("_", " ")}}
+        return build(Recipe, data, source=f"{file}: {name}")
+
+
+class LibraryRecipe(Collection):
+    """Configuration of a library."""
+
+    version: Literal[1] = 1
+    library: list[FileName] = Field(
+        description="folders of materials, materials, and text files with one of them per line"
+    )
+    materials: dict[Name, MaterialLayer] = Field(
+        {}, description="name → path or layer: further materials, and own options of those in `library`"
+    )
+
+    def paths(self, file: Path) -> dict[str, Path]:
+        """Those in `library` in its order, of one folder by name, and further ones."""
+        listed = [path for text in self.library for path in find_materials(file.parent / text)]
+        own = {name: layer for name, layer in self.materials.items() if "material" in layer.generate}
+        found = dict(zip(name_materials(listed, own), listed, strict=True))
+        for name in self.materials.keys() - own.keys() - found.keys():
+            hint = "add generate.material, or correct the name"
+            raise InputError("is no material of the library", where=f"{file}: materials.{name}", hint=hint)
+        return found | Collection.paths(self.model_copy(update={"materials": own}), file)
+
+
+class PaperRecipe(Collection):
+    """Configuration of a paper recipe; each material is run with each variant."""
+
+    version: Literal[2] = 2
+    tables: list[TableName] = Field(min_length=1, description="tables to write")
+    materials: dict[Name, MaterialLayer] = Field(min_length=1, description="name → path or layer")
+    published: list[Published] = Field([], description="published numbers, shown beside measured ones")
 
 
 def load(file: Path, assignments: Sequence[str] = ()) -> Recipe | LibraryRecipe | PaperRecipe:
@@ -292,49 +271,11 @@ def load(file: Path, assignments: Sequence[str] = ()) -> Recipe | LibraryRecipe 
     return load_recipe(file, assignments)
 
 
-def compose(layers: Sequence[Layer], name: str, material: Path, source: str) -> Recipe:
-    """The recipe of one material.
-
-    Parameters
-    ----------
-    layers : sequence of Layer
-        Later ones override earlier ones.
-    name : str
-        Of the recipe.
-    material : Path
-        The material.
-    source : str
-        File of the layers, for messages.
-
-    Returns
-    -------
-    Recipe
-
-    Raises
-    ------
-    InputError
-        An option is unknown or invalid.
-    """
-    data: dict[str, Any] = {}
-    for layer in layers:
-        data = deep_merge(data, layer.model_dump(mode="json"))
-    each = data.pop("each_fit")
-    data["fit"] = {fit: deep_merge(each, {"model": fit, **(own or {})}) for fit, own in data["fit"].items()}
-    data["generate"]["material"] = str(material)
-    # The optional metric is computed if its weights are installed.
-    data["compare"] = {"st_lpips": weights_file() is not None, **data["compare"]}
-    data |= {"name": name, "report": {"title": name.replace("_", " ")}}
-    return build(Recipe, data, source=f"{source}: {name}")
-
-
-def _beside(file: Path, path: Any) -> Path:
-    """A path of a recipe, relative to the current folder."""
-    return Path(os.path.normpath(file.parent / str(path)))
-
-
 def _model_for(path: Path) -> str:
     """The model that is best for a material; that of heights traces them."""
     from mbtf_gen.tile.loading import described
     from mbtf_gen.tile.maps.material_file import MaterialFile
 
-    return DEFAULT_MODEL if isinstance(described(path)[0], MaterialFile) else FIBER_MODEL
+    if not path.exists() or isinstance(described(path)[0], MaterialFile):
+        return DEFAULT_MODEL
+    return FIBER_MODEL

@@ -55,13 +55,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def record(out: Path) -> dict[str, dict[str, object]]:
-    found = json.loads((out / "library.json").read_text())
-    return {material["name"]: material for material in found["materials"]}
+    found = json.loads((out / "collection.json").read_text())
+    return {run["name"]: run for run in found["runs"]}
 
 
 def weights(out: Path, *names: str) -> dict[str, int]:
     """When the fits of materials were written."""
-    paths = [out / "materials" / name / "fits" / "neumip" for name in names]
+    paths = [out / "runs" / name / "fits" / "neumip" for name in names]
     return {str(path): (path / "weights.safetensors").stat().st_mtime_ns for path in paths}
 
 
@@ -69,7 +69,7 @@ def test_failures_are_named_and_the_rest_is_kept(folder: Path, capsys: pytest.Ca
     out = folder / "out"
     line = ["run", str(folder / "library.yaml"), "-o", str(out), "-q"]
     assert run(app, line) == 4
-    assert "1 of 3 materials failed" in capsys.readouterr().err
+    assert "1 of 3 runs failed" in capsys.readouterr().err
     found = record(out)
     assert {name: material["state"] for name, material in found.items()} == {
         **{"broken": "failed", "flat": "done", "rough": "done"}
@@ -79,8 +79,8 @@ def test_failures_are_named_and_the_rest_is_kept(folder: Path, capsys: pytest.Ca
     assert page.count("data:image/jpeg;base64,") == 4
     assert "height.png" in page
     for name in ("flat", "rough"):
-        assert f'href="materials/{name}/report.html"' in page
-        assert (out / "materials" / name / "report.html").is_file()
+        assert f'href="runs/{name}/report.html"' in page
+        assert (out / "runs" / name / "report.html").is_file()
     # Repaired, it runs, and the others are not run again.
     kept = weights(out, "flat", "rough")
     Image.fromarray(np.zeros((8, 8), np.uint8)).save(folder / "materials" / "broken" / "height.png")
@@ -108,7 +108,7 @@ def test_workers_make_the_same_data(folder: Path) -> None:
     two = folder / "clustered"
     assert run(app, ["run", str(folder / "two.yaml"), "-o", str(two), "-q", "--cluster", "local:2"]) == 0
     assert {material["state"] for material in record(two).values()} == {"done"}
-    config = read_resolved(two / "materials" / "rough").generate
+    config = read_resolved(two / "runs" / "rough").generate
     material = str(folder / "materials" / "rough")
     generate(Job.prepare(config.model_copy(update={"material": material})), folder / "own")
-    assert contents(folder / "own") == contents(two / "materials/rough/shards")
+    assert contents(folder / "own") == contents(two / "runs/rough/shards")

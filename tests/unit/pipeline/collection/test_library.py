@@ -13,8 +13,9 @@ import pytest
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item, Result
 from mbtf_core.units import clock, format_duration
-from mbtf_pipeline.collection.library import LibraryResult, library_page, run_library
-from mbtf_pipeline.collection.recipes import LibraryRecipe, load
+from mbtf_pipeline.collection.pages import library_page
+from mbtf_pipeline.collection.recipes import Collection, load
+from mbtf_pipeline.collection.run import CollectionResult, run_collection
 
 BASE = "library: [a, b]\nbase: {fit: {relief: {}}, generate: {queries: {train: 10/texel}}}\n"
 DONE = {"seconds": {"generate": 1.0}, "fits": {}, "reference": "none.png"}
@@ -32,13 +33,13 @@ class Runs(Runner):
     def map(self, function: Any, items: Iterable[Item], **options: Any) -> Iterator[Result]:  # type: ignore[override]
         assert options["independent"]
         for item in items:
-            self.seen.append({m["name"]: m["state"] for m in self.record()["materials"]})
+            self.seen.append({m["name"]: m["state"] for m in self.record()["runs"]})
             self.items[item.name] = item
             error = self.errors.get(item.name, "")
             yield Result(item.name, None if error else DONE, error)
 
     def record(self) -> dict[str, Any]:
-        found: dict[str, Any] = json.loads((self.out / "library.json").read_text())
+        found: dict[str, Any] = json.loads((self.out / "collection.json").read_text())
         return found
 
 
@@ -50,13 +51,13 @@ def runs(tmp_path: Path) -> Runs:
     return Runs(tmp_path / "out")
 
 
-def again(runs: Runs, options: str = "", base: str = BASE) -> LibraryResult:
+def again(runs: Runs, options: str = "", base: str = BASE) -> CollectionResult:
     file = runs.out.parent / "library.yaml"
     file.write_text(f"name: test\n{options}{base}")
     library = load(file)
-    assert isinstance(library, LibraryRecipe)
+    assert isinstance(library, Collection)
     runs.items, runs.seen = {}, []
-    return run_library(library, *library.plan(file), runs.out, command="", runner=runs)
+    return run_collection(library, file, runs.out, command="", runner=runs)
 
 
 def test_earlier_results_stay_until_their_run_ends(runs: Runs) -> None:
@@ -64,11 +65,11 @@ def test_earlier_results_stay_until_their_run_ends(runs: Runs) -> None:
     assert runs.seen == [{"a": "pending", "b": "pending"}, {"a": "done", "b": "pending"}]
     # The others go on after a failure.
     runs.errors = {"a": "no memory"}
-    assert again(runs).failed == {"a": "no memory"}
+    assert again(runs).names("failed") == ["a"]
     assert runs.seen == [{"a": "done", "b": "done"}, {"a": "failed", "b": "done"}]
     runs.errors = {}
-    assert not again(runs).failed
-    assert [m["error"] for m in runs.record()["materials"]] == ["", ""]
+    assert not again(runs).names("failed")
+    assert [m["error"] for m in runs.record()["runs"]] == ["", ""]
 
 
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
@@ -92,9 +93,10 @@ def material(name: str, state: str, value: float = 0.1, **more: Any) -> dict[str
     return found | {"seconds": seconds, "reference": "reference.png", **more}
 
 
-def record(*materials: dict[str, Any], **more: Any) -> dict[str, Any]:
-    found = {"title": "Test", "description": "", "command": "run", "machine": {"system": "here"}}
-    return found | {"training": None} | more | {"materials": list(materials)}
+def record(*materials: dict[str, Any], training: str | None = None) -> dict[str, Any]:
+    recipe = {"title": "Test", "description": "", "training": training}
+    machine = {"system": "here"}
+    return {"recipe": recipe, "command": "run", "machine": machine, "runs": list(materials)}
 
 
 def test_order_and_sum_of_times_where_runs_are_finished(tmp_path: Path) -> None:
@@ -103,8 +105,8 @@ def test_order_and_sum_of_times_where_runs_are_finished(tmp_path: Path) -> None:
     assert "largest errors come first" in shown
     assert shown.index('id="b"') < shown.index('id="a"')
     assert f"took {clock(100.0)}: generate {clock(40.0)}, fit relief {clock(60.0)}." in shown
-    shown = library_page(record(material("a", "done"), training=30.0), tmp_path)
-    assert f"Each material is trained for {clock(30.0)}" in shown
+    shown = library_page(record(material("a", "done"), training="30s"), tmp_path)
+    assert "Each material is trained for 30s." in shown
 
 
 def test_failures_come_after_errors_and_show_nothing_of_earlier_runs(tmp_path: Path) -> None:

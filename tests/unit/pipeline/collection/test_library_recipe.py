@@ -9,7 +9,7 @@ import pytest
 
 from mbtf_core.errors import InputError, UsageError
 from mbtf_pipeline.collection import recipes
-from mbtf_pipeline.collection.recipes import LibraryRecipe
+from mbtf_pipeline.collection.recipes import Collection
 from mbtf_pipeline.recipe import Recipe
 
 BASE = "base: {generate: {queries: {train: 10/texel}}}\n"
@@ -41,7 +41,7 @@ def load(folder: Path, text: str) -> tuple[dict[str, Recipe], dict[str, str]]:
     file = folder / "library.yaml"
     file.write_text(f"name: test\n{text}")
     library = recipes.load(file)
-    assert isinstance(library, LibraryRecipe)
+    assert isinstance(library, Collection)
     planned, skipped = library.plan(file)
     return {one.name: one.recipe for one in planned}, {name: one.error for name, one in skipped.items()}
 
@@ -50,7 +50,7 @@ def test_folders_lists_and_broken_materials(folder: Path) -> None:
     found, errors = load(folder, "library: [assets, more/list.txt]\n" + BASE)
     assert list(found) == ["shell", "assets-wool", "more-wool"]
     assert "heigth" in errors["broken"]
-    assert errors["missing"] == "does not exist"
+    assert errors["missing"].endswith("more/missing does not exist")
 
 
 def test_own_options_and_further_materials(folder: Path) -> None:
@@ -104,7 +104,7 @@ def test_a_file_and_what_it_names_are_one_material(tmp_path: Path) -> None:
     (tmp_path / "shirt.yaml").write_text("mesh: shirt.obj\nparts: [{file: ./sleeve.obj}]\n")
     # The recipe itself is no material, nor is what an earlier run has written.
     material(tmp_path / "out" / "runs")
-    (tmp_path / "out" / "library.json").write_text("{}")
+    (tmp_path / "out" / "collection.json").write_text("{}")
     found = load(tmp_path, "library: [.]\n" + BASE)
     assert sorted({**found[0], **found[1]}) == ["other", "shirt"]
 

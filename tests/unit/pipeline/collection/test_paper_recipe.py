@@ -9,8 +9,8 @@ import pytest
 from support.paths import ROOT
 
 from mbtf_core.errors import InputError
-from mbtf_pipeline.collection.paper import run_paper
 from mbtf_pipeline.collection.recipes import PaperRecipe, Planned, load
+from mbtf_pipeline.collection.run import run_collection
 
 PIPELINES = ROOT / "pipelines"
 SHIPPED = sorted(PIPELINES.glob("paper_*.yaml"))
@@ -85,7 +85,7 @@ def test_missing_materials_are_skipped_and_listed(tmp_path: Path) -> None:
     assert list(runs) == ["here", "steep"]
     assert missing == {"elsewhere": str(tmp_path / "maps" / "nowhere.npy")}
     (tmp_path / "maps" / "height.npy").unlink()
-    with pytest.raises(InputError, match="all of its materials are missing"):
+    with pytest.raises(InputError, match="no material can be run"):
         planned(path)
 
 
@@ -115,10 +115,9 @@ def test_a_fit_of_other_materials_needs_some(tmp_path: Path) -> None:
         "  fit:\n    rainer2020: {training: {own_material: false}}\n"
     )
     path = written(tmp_path, text)
-    paper = paper_of(path)
     with pytest.raises(InputError, match="learns from other materials alone, but there are none"):
-        run_paper(paper, *paper.plan(path), tmp_path / "out", quick=False, command="")
-    assert not (tmp_path / "out" / "runs").exists()
+        run_collection(paper_of(path), path, tmp_path / "out", command="")
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=[p.stem for p in SHIPPED])
