@@ -288,3 +288,9 @@ def _trained(recipe: Recipe, seconds: float) -> Recipe:
         name: FitConfig.model_validate(deep_merge(fit.model_dump(), time)) for name, fit in recipe.fit.items()
     }
     return recipe.model_copy(update={"fit": fits})
+
+
+def round_down(count: float) -> int:
+    """A number of queries with two significant digits."""
+    digits = 10 ** max(0, len(str(int(count))) - 2)
+    return max(1, int(count / digits) * digits)

@@ -164,11 +164,10 @@ class Thumbnail(NamedTuple):
 
 @dataclass(frozen=True)
 class Table:
-    """A table with a title, a text above it, plots, and titled rows of images."""
+    """A table with a title, plots, and titled rows of images."""
 
     key: str
     title: str
-    text: str
     columns: Sequence[Column]
     rows: Sequence[Sequence[Cell]]
     plots: Sequence[Mapping[str, str]] = ()

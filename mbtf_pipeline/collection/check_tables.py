@@ -12,13 +12,7 @@ from mbtf_core.stats import Estimate
 from mbtf_pipeline.collection.finished_run import MATERIAL, METHOD, FinishedRun, each_fit, signed_map
 from mbtf_pipeline.collection.recipes import Published, first_known
 from mbtf_pipeline.compare.image_files import read_picture
-from mbtf_pipeline.compare.unmodified_mitsuba import (
-    MAX_STANDARD_ERRORS,
-    MEAN_TOLERANCE,
-    MIN_BLOCKS,
-    RMS_TOLERANCE,
-    verdict,
-)
+from mbtf_pipeline.compare.unmodified_mitsuba import MAX_STANDARD_ERRORS, MIN_BLOCKS, verdict
 from mbtf_pipeline.report.offset_images import displacements
 from mbtf_pipeline.run_folder import COMPARE
 from mbtf_pipeline.tables import (
@@ -52,18 +46,7 @@ def weights(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list
         Column("published", "published"),
         Column("source", "source"),
     ]
-    across = 2 ** runs[0].comparison["finest"]
-    text = f"Counts include biases. Textures have {across} texels across at the finest level."
-    return [Table("weights", "Parameter counts", text, columns, rows)]
-
-
-_TIMING_TEXT = (
-    "Milliseconds for one query per pixel of 1920 × 1080: the median of three timings after a warm-up run. "
-    "The first number is the evaluation of a material, which uses a compiled kernel on the CPU if the "
-    "model has one. The others are parts timed in PyTorch. Stage 1 (offset and lookup) depends on the view "
-    "only and is shared by all lights; stage 2 runs once per light. An eighth of the pixels is evaluated, "
-    "fewer for models that read several positions per query, and the times are scaled up."
-)
+    return [Table("weights", "Parameter counts", columns, rows)]
 
 
 def timing(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[Table]:
@@ -97,9 +80,7 @@ def timing(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[
         *(milliseconds(f"{n} light{'s' * (n != '1')}", f"lights_{n}", "lights_ms", n) for n in lights),
         Column("timed queries", "queries", lambda fit, record: record["queries"]),
     ]
-    text = " ".join([_TIMING_TEXT, *(f"{p.source}: {p.timing}." for p in published if p.timing)])
-    rows = rows_of(columns, items)
-    return [Table("timing", "Time of one evaluation of 1080p", text, columns, rows)]
+    return [Table("timing", "Time of one evaluation of 1080p", columns, rows_of(columns, items))]
 
 
 def _view(title: str, key: str) -> Column:
@@ -120,13 +101,6 @@ _OFFSETS = (
     _learned("correlation", "correlation", "correlation", ".2f"),
     _learned("slope of learned on traced", "slope", "slope", ".2f"),
 )
-_OFFSETS_TEXT = (
-    "Displacement towards the viewer between the point where a view ray crosses the reference plane and "
-    "the visible surface. Spread is the standard deviation over the tile. A slope of 1 means equal "
-    "magnitude. Fits learn their offsets from colors only, so the offsets need not agree with the traced "
-    "ones. Images of a row share one scale, blue away from the viewer and orange towards; the median of "
-    "each image is subtracted."
-)
 
 
 def offsets(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[Table]:
@@ -138,7 +112,7 @@ def offsets(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list
         if fit in record["fits"]
     ]
     rows, images = rows_of(_OFFSETS, items), [row for run in runs for row in _offset_images(run)]
-    return [Table("offsets", "Learned offsets by view angle", _OFFSETS_TEXT, _OFFSETS, rows, images=images)]
+    return [Table("offsets", "Learned offsets by view angle", _OFFSETS, rows, images=images)]
 
 
 def _offset_images(run: FinishedRun) -> list[tuple[str, list[Thumbnail]]]:
@@ -157,16 +131,6 @@ def _offset_images(run: FinishedRun) -> list[tuple[str, list[Thumbnail]]]:
 _RENDERERS = {"base color": "unmodified Mitsuba", "full": "Mitsuba with the BSDF of mbtf"}
 # The difference images saturate at this fraction of white.
 _SCALE = 0.1
-_INDEPENDENCE_TEXT = (
-    "The filtered image near normal incidence under a delta light, rendered by mbtf and by Mitsuba. "
-    "Mitsuba renders a block of instances of the tile’s mesh with the emitter directional, the sensor "
-    "perspective with a Gaussian filter of half a pixel, and the integrator path. The base color uses "
-    "Mitsuba’s BSDF diffuse; the full surface uses the BSDF of mbtf in both. Opacity is ignored. The "
-    f"images agree if their means differ by less than {100 * MEAN_TOLERANCE:g} % and their pixels by less "
-    f"than {100 * RMS_TOLERANCE:g} % RMS, or if the differences lie within {MAX_STANDARD_ERRORS:g} "
-    "standard errors. Images with fewer than 20 pixels a side are inconclusive. The detection limit is the "
-    "smallest RMS difference that would be detected despite the noise."
-)
 
 
 def _rms_text(square: Estimate) -> str | None:
@@ -203,7 +167,7 @@ def independence(runs: Sequence[FinishedRun], published: Sequence[Published]) ->
     items = [(run, found, estimate(found["mean"]), estimate(found["square"])) for run, found in surfaces]
     rows, images = rows_of(_INDEPENDENCE, items), [_surface_images(*one) for one in surfaces]
     title = "References rendered with unmodified Mitsuba"
-    return [Table("independence", title, _INDEPENDENCE_TEXT, _INDEPENDENCE, rows, images=images)]
+    return [Table("independence", title, _INDEPENDENCE, rows, images=images)]
 
 
 def _surface_images(run: FinishedRun, found: Mapping[str, Any]) -> tuple[str, list[Thumbnail]]:

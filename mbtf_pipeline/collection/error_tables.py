@@ -76,17 +76,6 @@ def _psnr(run: FinishedRun, mse: Estimate) -> Shown:
     return Shown(decibel(found, mse), found.value, found.error, "se")
 
 
-_METHODS_TEXT = (
-    "Unexplained variance and MSE are measured on the same test queries of each material, which are not used "
-    "for training. The other metrics are means over the same path-traced images. MSE, relative MSE and PSNR "
-    "are noise-free; FLIP, SSIM and ST-LPIPS include the noise of the reference. Differences are paired: "
-    "they use the same queries."
-)
-_RATIOS_TEXT = (
-    "A ratio below 1 means that the method is better than the one it is divided by. Published numbers belong "
-    "to other data: another material of the same name or kind, other light, other training. The errors of "
-    "the two MSEs are taken as independent, which overestimates the error bars."
-)
 _METHODS = [
     MATERIAL,
     METHOD,
@@ -105,7 +94,7 @@ def methods(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list
     """Errors of every method on every material, and ratios of MSE beside published ones."""
     rows = rows_of(_METHODS, each_fit(runs))
     images = [(run.title, _last_image(run)) for run in runs]
-    errors = Table("methods", "Comparison of methods", _METHODS_TEXT, _METHODS, rows, images=images)
+    errors = Table("methods", "Comparison of methods", _METHODS, rows, images=images)
     columns = [
         MATERIAL,
         METHOD,
@@ -119,7 +108,7 @@ def methods(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list
         for base, fit in combinations(run.fits, 2):
             known = first_known(published, lambda p: p.mse_ratio(run.material, fit, base))  # noqa: B023
             ratios.append([run.title, fit, base, ratio_of(run.error(fit), run.error(base)), *known])
-    return [errors, Table("ratios", "MSE ratios beside published ones", _RATIOS_TEXT, columns, ratios)]
+    return [errors, Table("ratios", "MSE ratios beside published ones", columns, ratios)]
 
 
 def _last_image(run: FinishedRun) -> list[Thumbnail]:
@@ -132,17 +121,6 @@ def _last_image(run: FinishedRun) -> list[Thumbnail]:
         line = "" if found is None else signed(f"{found:.1f} dB")
         row.append(run.preview(record["file"], fit, line))
     return row
-
-
-_LEVELS_TEXT = (
-    "MSE in 10⁻³/sr² of test queries by the level nearest to their footprint. Level 0 is the whole tile, the "
-    "last level the finest. The true value of a query is the integral over its own footprint. The plot shows "
-    "unexplained variance, averaged over materials so that bright ones do not dominate."
-)
-_LEVEL_RATIOS_TEXT = (
-    "MSE divided by the MSE at the finest level (zoom 0). Published ratios belong to another material with "
-    "the same name. The errors at two levels are taken as independent."
-)
 
 
 def levels(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[Table]:
@@ -164,7 +142,7 @@ def levels(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[
     )
     plots = [{"title": f"Mean over {len(runs)} materials", "svg": svg}]
     title = f"Errors at {len(names)} levels of detail"
-    errors = Table("levels", title, _LEVELS_TEXT, columns, rows_of(columns, each_fit(runs)), plots)
+    errors = Table("levels", title, columns, rows_of(columns, each_fit(runs)), plots)
     return [errors, _level_ratios(runs, names[::-1], published)]
 
 
@@ -190,14 +168,9 @@ def _level_ratios(
             ratios = [*known, *[None] * len(finest_first)][: len(finest_first)]
             rows.append([run.title, fit, f"published, {source}", *ratios])
     columns = [MATERIAL, METHOD, Column("source", "source"), *zooms]
-    return Table("level_ratios", "Errors relative to the finest level", _LEVEL_RATIOS_TEXT, columns, rows)
+    return Table("level_ratios", "Errors relative to the finest level", columns, rows)
 
 
-_ABLATIONS_TEXT = (
-    "The first row is the baseline; every other row changes one option. Differences are of MSE on the same "
-    "test queries. They are paired for fits on the same data. For fits on other data, the two errors are "
-    "taken as independent, so the error bars are wider."
-)
 # The runs of one variant, by material.
 _Variant = dict[str, FinishedRun]
 
@@ -227,7 +200,7 @@ def ablations(runs: Sequence[FinishedRun], published: Sequence[Published]) -> li
         ({run.material: run for run in runs if run.variant == variant and fit in run.fits}, fit)
         for variant, fit in dict.fromkeys((run.variant, fit) for run, fit in each_fit(runs))
     ]
-    return [Table("ablations", "Ablations", _ABLATIONS_TEXT, columns, rows_of(columns, items))]
+    return [Table("ablations", "Ablations", columns, rows_of(columns, items))]
 
 
 def _ablation_columns(first: FinishedRun) -> list[Column]:
@@ -252,13 +225,6 @@ def _ablation_columns(first: FinishedRun) -> list[Column]:
     ]
 
 
-_ZOOMS_TEXT = (
-    "The same view and light from near to far. The fits approximate M at the footprint of each pixel. The "
-    "filtered pixel is what a camera sees; the two differ for anisotropic footprints. All images of one "
-    "material share one exposure."
-)
-
-
 def zooms(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[Table]:
     """Errors for every field of view and kind of reference, averaged over views and lights."""
 
@@ -281,7 +247,7 @@ def zooms(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[T
         for fit in run.fits
     ]
     rows, images = rows_of(columns, items), [row for run in runs for row in _zoom_images(run)]
-    return [Table("zooms", "Materials at several zooms", _ZOOMS_TEXT, columns, rows, images=images)]
+    return [Table("zooms", "Materials at several zooms", columns, rows, images=images)]
 
 
 def _zoom_errors(kind: str) -> list[Column]:

@@ -15,6 +15,7 @@ from mbtf_pipeline.collection.check_tables import independence, offsets, timing,
 from mbtf_pipeline.collection.error_tables import ablations, levels, methods, zooms
 from mbtf_pipeline.collection.finished_run import FinishedRun, each_fit
 from mbtf_pipeline.collection.recipes import Published
+from mbtf_pipeline.compare import unmodified_mitsuba
 from mbtf_pipeline.compare.metrics import DEFINITIONS
 from mbtf_pipeline.compare.perceptual_metrics import weights_file
 from mbtf_pipeline.report.embed import file_uri
@@ -148,6 +149,7 @@ def paper_page(record: Mapping[str, Any], folder: Path) -> tuple[str, dict[str, 
         failed={run["name"]: run["error"] for run in record["runs"] if run["state"] == "failed"},
         skipped=[run["name"] for run in record["runs"] if run["state"] == "skipped"],
         sizes=_sizes(runs) if runs else None,
+        check=unmodified_mitsuba,
         definitions=DEFINITIONS,
         error_bar_note=ERROR_BAR_NOTE,
         st_lpips=weights_file() is not None,

@@ -55,7 +55,7 @@ _CSV = [_column(name) for name in ("study", "series", "name", *ESTIMATES, *_DETA
 
 def to_csv(found: Sequence[Measurement]) -> str:
     """One row per configuration; ``_se`` are standard errors, empty cells were not measured."""
-    return Table("cost", "", "", _CSV, rows_of(_CSV, ([m] for m in found))).csv()
+    return Table("cost", "", _CSV, rows_of(_CSV, ([m] for m in found))).csv()
 
 
 def _percent(e: Estimate | None) -> str:
@@ -125,7 +125,7 @@ _SECTIONS = {
 
 
 def _table(columns: Sequence[Column], found: Sequence[Measurement]) -> dict[str, Any]:
-    return Table("", "", "", columns, rows_of(columns, ([m] for m in found))).for_page()
+    return Table("", "", columns, rows_of(columns, ([m] for m in found))).for_page()
 
 
 def complete_runs(found: Sequence[Measurement]) -> list[Measurement]:

@@ -10,6 +10,7 @@ from mbtf_fit.config import DEFAULT_MODEL
 from mbtf_fit.presets import best_options
 from mbtf_pipeline.cost.repeats import FEWEST_SEEDS
 from mbtf_pipeline.cost.runs import DataRequest, Run
+from mbtf_pipeline.run_time import round_down
 
 # Shares of a study's time that the generator and the runs get, of two seeds each. The rest is left for
 # start-up, the test set and evaluation.
@@ -63,9 +64,3 @@ def planned_runs(seconds: float, spp: int, path_seconds: float) -> list[Run]:
 def _preset(seconds: float) -> dict[str, Any]:
     """A fit with the options of the quality presets."""
     return nested({"model": DEFAULT_MODEL, **best_options(seconds), "training.time": f"{seconds:.3g}s"})
-
-
-def round_down(count: float) -> int:
-    """A number of queries with two significant digits."""
-    digits = 10 ** max(0, len(str(int(count))) - 2)
-    return max(1, int(count / digits) * digits)

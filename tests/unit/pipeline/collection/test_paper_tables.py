@@ -194,7 +194,7 @@ def test_unmodified_mitsuba_agrees_or_differs(tmp_path: Path, monkeypatch: pytes
 def test_cells_are_printed_and_exported() -> None:
     columns = [Column("a", "a", factor=100.0), Column("b", "b"), Column("c", "c")]
     seen = Shown("0.970, within noise", 0.97, 0.9, "noise")
-    table = Table("t", "", "", columns, [[Estimate(0.5, 0.01, 9), None, seen], ["x", 1200, None]])
+    table = Table("t", "", columns, [[Estimate(0.5, 0.01, 9), None, seen], ["x", 1200, None]])
     assert table.for_page()["rows"] == [["50.0 ± 1.0", "–", "0.970, within noise"], ["x", "1,200", "–"]]
     assert table.csv().splitlines() == ["a,a_se,b,c,c_noise", "0.5,0.01,,0.97,0.9", "x,,1200,,"]
 
