@@ -37,7 +37,7 @@ from mbtf_fit.config import FitConfig
 from mbtf_fit.presets import FITTER, best_at
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.presets import GENERATOR, RESOLUTION
-from mbtf_pipeline.presets import COMPARE
+from mbtf_pipeline.recipe import COMPARE
 from mbtf_pipeline.run_folder import machine
 
 STORED = Path(__file__).with_name("quality_measured.json")

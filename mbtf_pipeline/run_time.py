@@ -26,8 +26,7 @@ from mbtf_core.units import clock, expectation, format_duration
 from mbtf_fit.config import FitConfig
 from mbtf_gen.job import Job, planned_paths, split_queries
 from mbtf_pipeline.compare.image_files import scenes
-from mbtf_pipeline.presets import preset_recipe
-from mbtf_pipeline.recipe import Recipe
+from mbtf_pipeline.recipe import Recipe, preset_recipe
 from mbtf_pipeline.run import COMPARE_STAGE, data_sets, fit_stage, layout_of, survey
 from mbtf_pipeline.run_folder import is_run, write_run_record
 from mbtf_pipeline.stages import STAMPS

@@ -117,11 +117,10 @@ def _depends(folder: Path, stage: Stage) -> tuple[dict[str, Any], str]:
 
 
 def _what_changed(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
-    from mbtf_core.config.nested import differences
+    from mbtf_core.config.nested import differences, in_short
 
     if changes := differences(old["config"], new["config"]):
-        more = f" and {len(changes) - 3} more" if len(changes) > 3 else ""
-        return f"options changed: {'; '.join(changes[:3])}{more}"
+        return f"options changed: {in_short(changes, 3)}"
     for part, what in (("inputs", "input"), ("needs", "inputs")):
         before, after = old[part], new[part]
         if names := [n for n in sorted({*before, *after}) if before.get(n) != after.get(n)]:

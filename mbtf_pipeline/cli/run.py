@@ -95,7 +95,7 @@ def run(
         _refuse(given, ("quick",), "a recipe of one material", "use --quality draft")
         folder = output or loaded.folder
         if time is None:
-            from mbtf_pipeline.presets import preset_recipe
+            from mbtf_pipeline.recipe import preset_recipe
             from mbtf_pipeline.run_time import forecast_left
 
             loaded, generated = preset_recipe(recipe, quality, own), None

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import partial
 from itertools import combinations
 from typing import Any
 
@@ -63,27 +64,35 @@ _METRICS = [_metric_column(m) for m in PERCEPTUAL_METRICS]
 
 
 def _picture_error(
-    run: FinishedRun, fit: str, key: str, pictures: Pictures | None = None, kind: str = ""
-) -> Estimate:
-    """Mean over images of ``mse`` or ``relative_mse``."""
-    errors = [p["fits"][fit]["errors"][kind or run.kind] for p in pictures or run.pictures]
-    return mean_of([estimate(e[key]) for e in errors])
+    run: FinishedRun, fit: str, pictures: Pictures | None = None, *, key: str = "mse", kind: str = ""
+) -> Estimate | None:
+    """Mean over images of ``mse`` or ``relative_mse`` against a kind of reference, where the run has it."""
+    kind = kind or run.kind
+    if kind not in run.comparison["kinds"]:
+        return None
+    return mean_of([estimate(p["fits"][fit]["errors"][kind][key]) for p in pictures or run.pictures])
 
 
-def _psnr(run: FinishedRun, mse: Estimate) -> Shown:
-    """PSNR in dB of a noise-free MSE, with white as peak."""
+def _psnr(run: FinishedRun, fit: str, pictures: Pictures | None = None, *, kind: str = "") -> Shown | None:
+    """PSNR in dB of the mean noise-free MSE of images, with white as peak."""
+    mse = _picture_error(run, fit, pictures, kind=kind)
+    if mse is None:
+        return None
     found = psnr(mse, run.comparison["white"])
     return Shown(decibel(found, mse), found.value, found.error, "se")
 
 
+_UNEXPLAINED = Column(
+    "unexplained variance [%]", "unexplained", lambda run, fit: run.error(fit, "unexplained"), 100.0
+)
 _METHODS = [
     MATERIAL,
     METHOD,
-    Column("unexplained variance [%]", "unexplained", lambda r, fit: r.error(fit, "unexplained"), 100.0),
+    _UNEXPLAINED,
     Column("MSE [10⁻³/sr²]", "mse", FinishedRun.error, 1e3),
     Column("MSE − MSE of the first method [10⁻³/sr²]", "mse_minus_first", FinishedRun.minus_first, 1e3),
-    Column("PSNR of images", "psnr", lambda run, fit: _psnr(run, _picture_error(run, fit, "mse"))),
-    Column("relative MSE of images", "relative_mse", lambda r, fit: _picture_error(r, fit, "relative_mse")),
+    Column("PSNR of images", "psnr", _psnr),
+    Column("relative MSE of images", "relative_mse", partial(_picture_error, key="relative_mse")),
     *_METRICS,
     _recorded("training [s]", "training_seconds", ".0f"),
     _recorded("network weights", "network_weights"),
@@ -131,11 +140,16 @@ def levels(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[
     def column(level: int) -> Column:
         return Column(f"level {level}", f"mse_level_{level}", lambda r, f: r.error_at(f, level), 1e3)
 
+    def mean_at(fit: str, level: int) -> tuple[float, float] | None:
+        found = [run.error_at(fit, level, "unexplained") for run in runs if fit in run.fits]
+        known = [e for e in found if e is not None]
+        return (mean_of(known).value, mean_of(known).error) if known else None
+
     columns = [MATERIAL, METHOD, *map(column, names)]
     fits = dict.fromkeys(fit for _, fit in each_fit(runs))
     svg = points(
         [str(n) for n in names],
-        {fit: [_mean_at(runs, fit, n) for n in names] for fit in fits},
+        {fit: [mean_at(fit, n) for n in names] for fit in fits},
         "level of detail",
         "unexplained variance",
         "unexplained variance by level of detail",
@@ -144,12 +158,6 @@ def levels(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[
     title = f"Errors at {len(names)} levels of detail"
     errors = Table("levels", title, columns, rows_of(columns, each_fit(runs)), plots)
     return [errors, _level_ratios(runs, names[::-1], published)]
-
-
-def _mean_at(runs: Sequence[FinishedRun], fit: str, level: int) -> tuple[float, float] | None:
-    found = [run.error_at(fit, level, "unexplained") for run in runs if fit in run.fits]
-    known = [e for e in found if e is not None]
-    return (mean_of(known).value, mean_of(known).error) if known else None
 
 
 def _level_ratios(
@@ -171,15 +179,9 @@ def _level_ratios(
     return Table("level_ratios", "Errors relative to the finest level", columns, rows)
 
 
-# The runs of one variant, by material.
-_Variant = dict[str, FinishedRun]
-
-
 def ablations(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[Table]:
-    """Every fit of every variant against the first fit of the first variant, per material."""
-
-    def of_any(get: Callable[[FinishedRun, str], Cell]) -> Callable[[_Variant, str], Cell]:
-        return lambda own, fit: get(next(iter(own.values())), fit)
+    """Every fit of every variant against the first fit of the first variant of its material."""
+    firsts = {run.material: run for run in reversed(runs)}
 
     def label(run: FinishedRun, fit: str) -> str:
         return fit if len(run.fits) > 1 or not run.variant else run.variant
@@ -187,42 +189,24 @@ def ablations(runs: Sequence[FinishedRun], published: Sequence[Published]) -> li
     def density(run: FinishedRun, fit: str) -> float:
         return float(run.manifest["splits"]["train"]["queries"] / run.texels)
 
-    columns = [
-        Column("variant", "variant", of_any(label)),
-        Column("network weights", "network_weights", of_any(lambda r, fit: r.fit(fit)["network_weights"])),
-        Column("texture values", "texels", of_any(lambda r, fit: r.fit(fit)["texels"])),
-        Column("queries per texel", "queries_per_texel", of_any(density), digits=".0f"),
-    ]
-    for material in dict.fromkeys(run.material for run in runs):
-        columns += _ablation_columns(next(run for run in runs if run.material == material))
-    # All fits of the first variant, then of the next.
-    items = [
-        ({run.material: run for run in runs if run.variant == variant and fit in run.fits}, fit)
-        for variant, fit in dict.fromkeys((run.variant, fit) for run, fit in each_fit(runs))
-    ]
-    return [Table("ablations", "Ablations", columns, rows_of(columns, items))]
-
-
-def _ablation_columns(first: FinishedRun) -> list[Column]:
-    """Columns of the material whose baseline is the first fit of this run."""
-
-    def column(title: str, key: str, get: Callable[[FinishedRun, str], Cell], *look: Any) -> Column:
-        def cell(own: _Variant, fit: str) -> Cell:
-            return get(own[first.material], fit) if first.material in own else None
-
-        return Column(f"{first.title}: {title}", f"{first.material}_{key}", cell, *look)
-
     def difference(run: FinishedRun, fit: str) -> Cell:
+        first = firsts[run.material]
         if run is first:
             return run.minus_first(fit)
         mse, base = run.error(fit), first.error(first.fits[0])
         return Estimate(mse.value - base.value, math.hypot(mse.error, base.error), min(mse.n, base.n))
 
-    return [
-        column("unexplained variance [%]", "unexplained", lambda r, fit: r.error(fit, "unexplained"), 100.0),
-        column("MSE − MSE of the first [10⁻³/sr²]", "minus_first", difference, 1e3),
-        column("training [s]", "seconds", lambda r, fit: r.fit(fit)["training_seconds"], 1.0, ".0f"),
+    columns = [
+        MATERIAL,
+        Column("variant", "variant", label),
+        _recorded("network weights", "network_weights"),
+        _recorded("texture values", "texels"),
+        Column("queries per texel", "queries_per_texel", density, digits=".0f"),
+        _UNEXPLAINED,
+        Column("MSE − MSE of the first [10⁻³/sr²]", "minus_first", difference, 1e3),
+        _recorded("training [s]", "training_seconds", ".0f"),
     ]
+    return [Table("ablations", "Ablations", columns, rows_of(columns, each_fit(runs)))]
 
 
 def zooms(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[Table]:
@@ -238,7 +222,9 @@ def zooms(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[T
         METHOD,
     ]
     for kind in dict.fromkeys(kind for run in runs for kind in run.comparison["kinds"]):
-        columns += _zoom_errors(kind)
+        mse = partial(_picture_error, key="mse", kind=kind)
+        columns.append(Column(f"MSE against {_KINDS[kind]} [10⁻³/sr²]", f"mse_{kind}", mse, 1e3))
+        columns.append(Column(f"PSNR against {_KINDS[kind]}", f"psnr_{kind}", partial(_psnr, kind=kind)))
     columns += _METRICS
     items = [
         (run, fit, [p for p in run.pictures if p["tiles_across"] == width])
@@ -248,22 +234,6 @@ def zooms(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[T
     ]
     rows, images = rows_of(columns, items), [row for run in runs for row in _zoom_images(run)]
     return [Table("zooms", "Materials at several zooms", columns, rows, images=images)]
-
-
-def _zoom_errors(kind: str) -> list[Column]:
-    """MSE and PSNR against one kind of reference, where a run has it."""
-
-    def mse(run: FinishedRun, fit: str, shown: Pictures) -> Estimate | None:
-        return _picture_error(run, fit, "mse", shown, kind) if kind in run.comparison["kinds"] else None
-
-    def psnr_of(run: FinishedRun, fit: str, shown: Pictures) -> Shown | None:
-        found = mse(run, fit, shown)
-        return None if found is None else _psnr(run, found)
-
-    return [
-        Column(f"MSE against {_KINDS[kind]} [10⁻³/sr²]", f"mse_{kind}", mse, 1e3),
-        Column(f"PSNR against {_KINDS[kind]}", f"psnr_{kind}", psnr_of),
-    ]
 
 
 def _widths(run: FinishedRun) -> list[float]:

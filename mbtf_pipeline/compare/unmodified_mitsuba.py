@@ -138,16 +138,12 @@ def write_agreement(
     for surface, found in compare_with_mitsuba(section, generate, material).items():
         stem = f"{PICTURES}/check-{surface.replace(' ', '-')}"
         files = {renderer: f"{stem}-{renderer}" for renderer in ("mbtf", "mitsuba")}
-        for file, value in zip(files.values(), (found.mbtf, found.mitsuba), strict=True):
-            write_picture(out / file, value.astype(np.float32), exposure)
-        mean, square = found.mean.as_dict(), found.square.as_dict()
-        surfaces.append({"surface": surface, "mean": mean, "square": square, "files": files})
-    return {
-        "view": view.model_dump(),
-        "light": light.model_dump(),
-        "tiles_across": tiles_across,
-        "surfaces": surfaces,
-    }
+        for renderer, file in files.items():
+            write_picture(out / file, getattr(found, renderer), exposure)
+        errors = {"mean": found.mean.as_dict(), "square": found.square.as_dict()}
+        surfaces.append({"surface": surface, **errors, "files": files})
+    scene = {"view": view.model_dump(), "light": light.model_dump(), "tiles_across": tiles_across}
+    return {**scene, "surfaces": surfaces}
 
 
 def compare_with_mitsuba(

@@ -84,7 +84,6 @@ mbtf_pipeline.recipe
 mbtf_pipeline.stages
 mbtf_pipeline.compare
 mbtf_pipeline.run_folder
-mbtf_pipeline.presets
 mbtf_pipeline.tables
 mbtf_pipeline.report
 mbtf_pipeline.run

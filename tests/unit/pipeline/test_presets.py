@@ -16,8 +16,7 @@ from mbtf_fit.config import FitConfig
 from mbtf_fit.presets import FITTER, best_at, best_options, fitter_options
 from mbtf_gen.config.generator import GeneratorConfig, count_queries
 from mbtf_gen.config.presets import GENERATOR
-from mbtf_pipeline.presets import COMPARE, preset_recipe, quality_options
-from mbtf_pipeline.recipe import load_recipe
+from mbtf_pipeline.recipe import COMPARE, load_recipe, preset_recipe, quality_options
 
 QUALITIES: tuple[Quality, ...] = get_args(Quality)
 

@@ -17,8 +17,7 @@ from mbtf_gen.config.presets import GENERATOR
 from mbtf_pipeline import run as runs
 from mbtf_pipeline import run_time as module
 from mbtf_pipeline.cli.app import app
-from mbtf_pipeline.presets import preset_recipe
-from mbtf_pipeline.recipe import load_recipe
+from mbtf_pipeline.recipe import load_recipe, preset_recipe
 from mbtf_pipeline.run_time import RunForecaster, TimedRun, forecast_left
 
 FILE = ROOT / "pipelines" / "quickstart.yaml"

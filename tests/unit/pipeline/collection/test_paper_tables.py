@@ -126,9 +126,9 @@ def test_ablations_compare_with_the_first_row(tmp_path: Path) -> None:
     runs = [make(tmp_path, variant="architecture"), make(tmp_path, variant="queries-100")]
     rows = csv_of(ablations(runs, PUBLISHED)[0])
     assert [r["variant"] for r in rows] == ["neumip-baseline", "neumip"] * 2
-    assert rows[0]["turtle_shell_minus_first"] == ""
+    assert rows[0]["minus_first"] == ""
     # Paired on the same data, otherwise from two independent errors.
-    less = "turtle_shell_minus_first"
+    less = "minus_first"
     assert (rows[1][less], rows[1][f"{less}_se"]) == ("-0.0002", "0.0003")
     assert float(rows[3][less]) == pytest.approx(-2e-4)
     assert float(rows[3][f"{less}_se"]) == pytest.approx(math.hypot(1e-6, 1e-6), rel=1e-3)
