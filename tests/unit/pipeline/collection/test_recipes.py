@@ -1,4 +1,4 @@
-"""Which materials a library has, and with which options."""
+"""Which runs a library or a paper has, and with which options."""
 
 from __future__ import annotations
 
@@ -6,13 +6,33 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.paths import ROOT
 
 from mbtf_core.errors import InputError, UsageError
 from mbtf_pipeline.collection import recipes
 from mbtf_pipeline.collection.recipes import Collection
+from mbtf_pipeline.collection.run import run_collection
 from mbtf_pipeline.recipe import Recipe
 
 BASE = "base: {generate: {queries: {train: 10/texel}}}\n"
+SHIPPED = sorted((ROOT / "pipelines").glob("paper_*.yaml"))
+TEXT = """\
+name: small
+tables: [methods]
+materials:
+  here: maps/height.npy
+  elsewhere: maps/nowhere.npy
+  steep: {generate: {material: maps/height.npy, geometry: {height_scale: 0.5}}}
+base:
+  generate: {geometry: {height_scale: 0.1, mesh: 8}, queries: {train: 400/texel, resolution: 4}}
+  each_fit: {training: {steps: 500, batch: 64}}
+  fit:
+    neumip-baseline:
+    wide: {model: neumip, network: {width: 40}, training: {batch: 32}}
+quick:
+  generate: {geometry: {height_scale: 0.2}, queries: {train: 4/texel}}
+  each_fit: {training: {steps: 3}}
+"""
 
 
 def material(folder: Path) -> Path:
@@ -139,3 +159,98 @@ def test_one_training_time_of_all_or_of_each(folder: Path, key: str) -> None:
         load(folder, f"{own}materials: {{shell: {{fit: {{relief: {{training: {{{key}}}}}}}}}}}\n")
     with pytest.raises(InputError, match=r"base: 'each_fit' has a training time"):
         load(folder, f"training: 10s\nlibrary: [assets]\nbase: {{each_fit: {{training: {{{key}}}}}}}\n")
+
+
+def written(folder: Path, text: str = TEXT) -> Path:
+    (folder / "maps").mkdir(exist_ok=True)
+    np.save(folder / "maps" / "height.npy", np.zeros((4, 4), np.float32))
+    path = folder / "paper-under-test.yaml"
+    path.write_text(text)
+    return path
+
+
+def planned(path: Path, quick: bool = False) -> tuple[dict[str, Recipe], dict[str, str]]:
+    """Recipes by name of the run, and paths of the materials that are skipped."""
+    paper = recipes.load(path)
+    assert isinstance(paper, Collection)
+    found, skipped = paper.plan(path, quick)
+    return {one.name: one.recipe for one in found}, {name: str(one.path) for name, one in skipped.items()}
+
+
+def test_order_of_layers(tmp_path: Path) -> None:
+    path = written(tmp_path)
+    full, _ = planned(path)
+    quick, _ = planned(path, True)
+    # The quick size overrides the base; options of a material override both.
+    heights = [runs["here"].generate.geometry.height_scale for runs in (full, quick)]
+    assert heights == [0.1, 0.2]
+    assert {runs["steep"].generate.geometry.height_scale for runs in (full, quick)} == {0.5}
+    assert quick["here"].generate.geometry.mesh == 8
+    assert quick["here"].generate.queries.resolution == 4
+    # A fit's own options override those of every fit.
+    fits = quick["here"].fit
+    assert [f.training.steps for f in fits.values()] == [3, 3]
+    assert [f.training.batch for f in fits.values()] == [64, 32]
+    assert fits["wide"].network.width == 40
+
+
+def test_every_variant_is_one_run(tmp_path: Path) -> None:
+    text = TEXT + "variants:\n  few: {generate: {queries: {train: 2/texel}}}\n  many: {}\n"
+    runs, _ = planned(written(tmp_path, text), True)
+    assert list(runs) == ["here-few", "here-many", "steep-few", "steep-many"]
+    counts = [runs[name].generate.queries.train for name in ("here-few", "here-many")]
+    assert counts == ["2/texel", "4/texel"]
+
+
+def test_missing_materials_are_skipped_and_listed(tmp_path: Path) -> None:
+    path = written(tmp_path)
+    runs, missing = planned(path)
+    assert list(runs) == ["here", "steep"]
+    assert missing == {"elsewhere": str(tmp_path / "maps" / "nowhere.npy")}
+    (tmp_path / "maps" / "height.npy").unlink()
+    with pytest.raises(InputError, match="no material can be run"):
+        planned(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        (("train: 4/texel", "tarin: 4/texel"), "queries.tarin"),
+        (("wide: {model: neumip", "wide: {model: newmip"), "fit.wide"),
+        (("steep: {generate: {material: maps/height.npy, ", "steep: {generate: {"), "steep"),
+    ],
+)
+def test_errors_name_the_key(tmp_path: Path, change: tuple[str, str], key: str) -> None:
+    path = written(tmp_path, TEXT.replace(*change))
+    with pytest.raises(InputError) as raised:
+        planned(path, True)
+    assert key in str(raised.value)
+
+
+def test_a_fit_of_other_materials_needs_some(tmp_path: Path) -> None:
+    """Before anything is generated."""
+    text = (
+        "name: lonely\ntables: [methods]\nlearn_from_others: [rainer2020]\n"
+        "materials:\n  here: maps/height.npy\n"
+        "base:\n  generate: {queries: {train: 4/texel, resolution: 4}}\n"
+        "  fit:\n    rainer2020: {training: {own_material: false}}\n"
+    )
+    path = written(tmp_path, text)
+    with pytest.raises(InputError, match="learns from other materials alone, but there are none"):
+        run_collection(recipes.load(path), path, tmp_path / "out", command="")  # type: ignore[arg-type]
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=[p.stem for p in SHIPPED])
+def test_shipped_recipes_are_valid_and_quick_is_smaller(path: Path) -> None:
+    full, missing = planned(path)
+    quick, _ = planned(path, True)
+    assert list(full) == list(quick)
+    assert all("shared" in where for where in missing.values())
+    for name, large in full.items():
+        small = quick[name]
+        assert small.compare.size <= large.compare.size
+        assert small.compare.spp <= large.compare.spp
+        assert int(small.generate.queries.test) <= int(large.generate.queries.test)
+        assert (small.generate.queries.resolution or 99) < (large.generate.queries.resolution or 0)
+        assert small.fit.keys() == large.fit.keys()
