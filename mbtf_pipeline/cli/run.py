@@ -56,7 +56,7 @@ def run(
     recipe
         YAML file.
     quick
-        Use the small sizes of a paper recipe: minutes in place of hours.
+        Use the small size of a recipe of several materials: minutes in place of hours.
     force
         Run every stage, also those that are up to date.
     """
