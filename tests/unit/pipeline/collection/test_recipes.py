@@ -56,14 +56,17 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
+def planned(file: Path, quick: bool = False) -> tuple[dict[str, Recipe], dict[str, str]]:
+    """Recipes by name of the run, and errors of the materials that are skipped."""
+    found = recipes.load(file)
+    assert isinstance(found, Collection)
+    runs, skipped = found.plan(file, quick)
+    return {one.name: one.recipe for one in runs}, {name: one.error for name, one in skipped.items()}
+
+
 def load(folder: Path, text: str) -> tuple[dict[str, Recipe], dict[str, str]]:
-    """Recipes by name of the material, and errors of the others."""
-    file = folder / "library.yaml"
-    file.write_text(f"name: test\n{text}")
-    library = recipes.load(file)
-    assert isinstance(library, Collection)
-    planned, skipped = library.plan(file)
-    return {one.name: one.recipe for one in planned}, {name: one.error for name, one in skipped.items()}
+    (folder / "library.yaml").write_text(f"name: test\n{text}")
+    return planned(folder / "library.yaml")
 
 
 def test_folders_lists_and_broken_materials(folder: Path) -> None:
@@ -150,15 +153,16 @@ def test_a_fault_of_the_base_is_one_error(folder: Path) -> None:
         load(folder, base)
     with pytest.raises(InputError, match=r"library\.yaml: base: unknown key 'fit\.relief\.trainig'"):
         load(folder, "library: [assets]\nbase:\n  each_fit: {trainig: {batch: 5}}\n")
+    with pytest.raises(InputError, match=r"materials\.steep: has no path"):
+        planned(written(folder, TEXT.replace("material: maps/height.npy, ", "")))
 
 
-@pytest.mark.parametrize("key", ["time: 3s", "steps: 10"])
-def test_one_training_time_of_all_or_of_each(folder: Path, key: str) -> None:
-    own = "training: 10s\nlibrary: [assets]\n" + BASE
+def test_one_training_time_of_all_or_of_each(folder: Path) -> None:
+    own = "training: 10s\nlibrary: [assets]\n"
     with pytest.raises(InputError, match=r"materials\.shell: 'relief' has a training time"):
-        load(folder, f"{own}materials: {{shell: {{fit: {{relief: {{training: {{{key}}}}}}}}}}}\n")
+        load(folder, f"{own}{BASE}materials: {{shell: {{fit: {{relief: {{training: {{steps: 9}}}}}}}}}}\n")
     with pytest.raises(InputError, match=r"base: 'each_fit' has a training time"):
-        load(folder, f"training: 10s\nlibrary: [assets]\nbase: {{each_fit: {{training: {{{key}}}}}}}\n")
+        load(folder, f"{own}base: {{each_fit: {{training: {{time: 3s}}}}}}\n")
 
 
 def written(folder: Path, text: str = TEXT) -> Path:
@@ -167,14 +171,6 @@ def written(folder: Path, text: str = TEXT) -> Path:
     path = folder / "paper-under-test.yaml"
     path.write_text(text)
     return path
-
-
-def planned(path: Path, quick: bool = False) -> tuple[dict[str, Recipe], dict[str, str]]:
-    """Recipes by name of the run, and paths of the materials that are skipped."""
-    paper = recipes.load(path)
-    assert isinstance(paper, Collection)
-    found, skipped = paper.plan(path, quick)
-    return {one.name: one.recipe for one in found}, {name: str(one.path) for name, one in skipped.items()}
 
 
 def test_order_of_layers(tmp_path: Path) -> None:
@@ -186,7 +182,6 @@ def test_order_of_layers(tmp_path: Path) -> None:
     assert heights == [0.1, 0.2]
     assert {runs["steep"].generate.geometry.height_scale for runs in (full, quick)} == {0.5}
     assert quick["here"].generate.geometry.mesh == 8
-    assert quick["here"].generate.queries.resolution == 4
     # A fit's own options override those of every fit.
     fits = quick["here"].fit
     assert [f.training.steps for f in fits.values()] == [3, 3]
@@ -206,25 +201,10 @@ def test_missing_materials_are_skipped_and_listed(tmp_path: Path) -> None:
     path = written(tmp_path)
     runs, missing = planned(path)
     assert list(runs) == ["here", "steep"]
-    assert missing == {"elsewhere": str(tmp_path / "maps" / "nowhere.npy")}
+    assert missing == {"elsewhere": f"{tmp_path}/maps/nowhere.npy does not exist"}
     (tmp_path / "maps" / "height.npy").unlink()
     with pytest.raises(InputError, match="no material can be run"):
         planned(path)
-
-
-@pytest.mark.parametrize(
-    ("change", "key"),
-    [
-        (("train: 4/texel", "tarin: 4/texel"), "queries.tarin"),
-        (("wide: {model: neumip", "wide: {model: newmip"), "fit.wide"),
-        (("steep: {generate: {material: maps/height.npy, ", "steep: {generate: {"), "steep"),
-    ],
-)
-def test_errors_name_the_key(tmp_path: Path, change: tuple[str, str], key: str) -> None:
-    path = written(tmp_path, TEXT.replace(*change))
-    with pytest.raises(InputError) as raised:
-        planned(path, True)
-    assert key in str(raised.value)
 
 
 def test_a_fit_of_other_materials_needs_some(tmp_path: Path) -> None:
@@ -246,7 +226,7 @@ def test_shipped_recipes_are_valid_and_quick_is_smaller(path: Path) -> None:
     full, missing = planned(path)
     quick, _ = planned(path, True)
     assert list(full) == list(quick)
-    assert all("shared" in where for where in missing.values())
+    assert all("/shared/" in error for error in missing.values())
     for name, large in full.items():
         small = quick[name]
         assert small.compare.size <= large.compare.size
