@@ -22,14 +22,13 @@ from mbtf_core.files.atomic import read_json, write_json
 from mbtf_core.files.digest import data_sha256
 from mbtf_core.files.folders import check_folder, check_space, owned
 from mbtf_core.forecast import is_long
-from mbtf_core.units import clock, expectation, format_duration
+from mbtf_core.units import clock, expectation
 from mbtf_fit.config import FitConfig
 from mbtf_gen.job import Job, planned_paths, split_queries
 from mbtf_pipeline.compare.image_files import scenes
 from mbtf_pipeline.recipe import Recipe, preset_recipe
 from mbtf_pipeline.run import COMPARE_STAGE, data_sets, fit_stage, layout_of, survey
 from mbtf_pipeline.run_folder import is_run, write_run_record
-from mbtf_pipeline.stages import STAMPS
 
 # Seconds of loading the programs, and of comparison and report besides the paths of their images.
 _START, _COMPARE = 2.5, 5.0
@@ -141,9 +140,7 @@ def forecast_left(recipe: Recipe, folder: Path) -> RunForecast | None:
     InputError : they do not fit on the disk, or the folder contains something else
     """
     check_folder(folder, is_run, "run")
-    stages = None
-    if (folder / STAMPS).exists():
-        stages = [name for name, reason in survey(recipe, folder).items() if reason]
+    stages = [name for name, reason in survey(recipe, folder).items() if reason]
     forecaster = RunForecaster(recipe)
     expected = forecaster.of(recipe, stages, _SLOW)
     hint = "reduce generate.queries with --set or --quality, or choose another folder with -o"
@@ -263,21 +260,18 @@ class TimedRun:
         expected, fits = forecasts[quality], len(recipes[quality].fit)
         hint = "choose another folder with -o, or a lower resolution: --set generate.queries.resolution=64"
         check_space(self._path.parent, expected.bytes, hint)
-        each = round((left - expected.seconds + expected.training) / fits, 1)
+        rest, after = expected.seconds - expected.training, expected.evaluating + expected.comparing
+        each = round((left - rest) / fits, 1)
         if each < 1.0:
-            rest = expected.seconds - expected.training
-            problem = (
-                f"{format_duration(self._seconds)} is too short: all but training takes about {clock(rest)}"
-            )
+            problem = f"is too short: all but training takes about {clock(rest)}"
             raise UsageError(problem, where="--time", hint="give more, or reduce generate.queries with --set")
-        after = round(expected.evaluating + expected.comparing, 1)
         self._progress(
             f"time: preset {quality}, {clock(expected.generating)} of generating, {clock(each)} of training "
             f"each fit, {clock(after)} of evaluation, comparison and report"
         )
         # `paper` counts steps; its training, and that of a shortened draft, may lose half.
         least = expected.training / fits
-        return Split(quality, each, least if 0 < least <= each else 0.5 * each, after)
+        return Split(quality, each, least if 0 < least <= each else 0.5 * each, round(after, 1))
 
 
 def _trained(recipe: Recipe, seconds: float) -> Recipe:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -79,37 +79,31 @@ def library_page(record: Mapping[str, Any], runs: Path) -> str:
     )
 
 
-def _card(material: Mapping[str, Any], run: Path) -> dict[str, Any]:
+def _card(run: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """What the page shows of one material."""
-    state, done = material["state"], material["state"] == "done"
+    done = run["state"] == "done"
     fits = []
-    for fit, found in material["fits"].items() if done else ():
+    for name, found in run["fits"].items() if done else ():
         error = estimate(found["unexplained"])
-        fits.append(
-            {
-                "name": fit,
-                "error": estimate_text(error),
-                "value": error.value if math.isfinite(error.value) else 0.0,
-                "image": _thumbnail(run / found["picture"]),
-            }
-        )
-    seconds = material["seconds"] if done else {}
+        value = error.value if math.isfinite(error.value) else 0.0
+        image = _thumbnail(folder / found["picture"])
+        fits.append({"name": name, "error": estimate_text(error), "value": value, "image": image})
+    seconds = run["seconds"] if done else {}
+    pages = [
+        page for page in (("report", REPORT), ("viewer", VIEWER)) if done and (folder / page[1]).is_file()
+    ]
     return {
-        "name": material["name"],
-        "path": material["path"],
-        "state": _STATES[state],
-        "rank": list(_STATES).index(state),
-        "problem": material["error"] if state == "failed" else "",
+        "name": run["name"],
+        "path": run["path"],
+        "state": _STATES[run["state"]],
+        "rank": list(_STATES).index(run["state"]),
+        "problem": run["error"] if run["state"] == "failed" else "",
         "fits": fits,
         "error_value": max((fit["value"] for fit in fits), default=0.0),
-        "reference": _thumbnail(run / material["reference"]) if done else None,
+        "reference": _thumbnail(folder / run["reference"]) if done else None,
         "seconds": sum(seconds.values()),
         "times": _times(seconds),
-        "links": [
-            (title, f"{run.parent.name}/{run.name}/{file}")
-            for title, file in (("report", REPORT), ("viewer", VIEWER))
-            if done and (run / file).is_file()
-        ],
+        "links": [(title, f"{RUNS}/{folder.name}/{file}") for title, file in pages],
     }
 
 
@@ -148,27 +142,11 @@ def paper_page(record: Mapping[str, Any], folder: Path) -> tuple[str, dict[str, 
         planned=sum(run["state"] != "skipped" for run in record["runs"]),
         failed={run["name"]: run["error"] for run in record["runs"] if run["state"] == "failed"},
         skipped=[run["name"] for run in record["runs"] if run["state"] == "skipped"],
-        sizes=_sizes(runs) if runs else None,
+        first=runs[0] if runs else None,
+        training=max((run.fit(fit)["training_seconds"] for run, fit in each_fit(runs)), default=0.0),
         check=unmodified_mitsuba,
         definitions=DEFINITIONS,
         error_bar_note=ERROR_BAR_NOTE,
         st_lpips=weights_file() is not None,
     )
     return html, {table.key: table.csv() for table in tables}
-
-
-def _sizes(runs: Sequence[FinishedRun]) -> dict[str, Any]:
-    """Sizes of the first run, for the head of the page."""
-    run = runs[0]
-    splits = run.manifest["splits"]
-    return {
-        "resolution": 2 ** run.comparison["finest"],
-        "train": splits["train"]["queries"],
-        "spp": splits["train"]["spp"],
-        "test": splits["test"]["queries"],
-        "test_spp": splits["test"]["spp"],
-        "pictures": len(run.pictures),
-        "size": run.comparison["size"],
-        "picture_spp": run.comparison["spp"],
-        "training": max(float(r.fit(fit)["training_seconds"]) for r, fit in each_fit(runs)),
-    }
