@@ -94,8 +94,6 @@ class RunResult:
 
     Attributes
     ----------
-    folder : Path
-        Folder of the run.
     report : Path
         HTML file.
     viewer : Path or None
@@ -106,7 +104,6 @@ class RunResult:
         Content of ``compare/comparison.json``.
     """
 
-    folder: Path
     report: Path
     viewer: Path | None
     stages: dict[str, StageResult]
@@ -126,43 +123,25 @@ class _RecipeRun:
     def stages(self, inputs: Mapping[str, str]) -> list[Stage]:
         """All stages; `inputs` holds the digests of the material's files by role."""
         recipe = self.recipe
-        out: list[Stage] = []
-        data_of: dict[str, DataSet] = {}
-        for data in data_sets(recipe):
-            data_of[data.config.queries.layout] = data
-            generate = data.config.model_dump(mode="json", exclude={"material"})
-            files, run = self._files(data.sub), partial(self._generate, data)
-            out.append(Stage(data.stage, (), generate, inputs, files, run))
-        for name, config in recipe.fit.items():
-            data = data_of[layout_of(config)]
-            files, run = self._files(f"{FITS}/{name}"), partial(self._fit, name, data)
-            fields = config.fields()
+        data_of: dict[str, DataSet] = {d.config.queries.layout: d for d in data_sets(recipe)}
+        out = []
+        for data in data_of.values():
+            config = data.config.model_dump(mode="json", exclude={"material"})
+            out.append(Stage(data.stage, (), config, inputs, (data.sub,), partial(self._generate, data)))
+        for name, fit in recipe.fit.items():
+            data, fields = data_of[layout_of(fit)], fit.fields()
             # Data sets of other materials count by what they hold, not by where they lie.
-            others = [_manifest_digest(Path(folder)) for folder in config.training.materials]
+            others = [_manifest_digest(Path(folder)) for folder in fit.training.materials]
             fields["training"] = {**fields["training"], "materials": others}
-            remote = not self.runner.here
-            out.append(Stage(fit_stage(name), (data.stage,), fields, {}, files, run, remote))
-        compared = {"record": COMPARISON_SCHEMA, **recipe.compare.model_dump(mode="json")}
+            run, remote = partial(self._fit, name, data), not self.runner.here
+            out.append(Stage(fit_stage(name), (data.stage,), fields, {}, (f"{FITS}/{name}",), run, remote))
         needs = (GENERATE_STAGE, *map(fit_stage, recipe.fit))
-        out.append(Stage(COMPARE_STAGE, needs, compared, {}, self._files(COMPARE), self._compare))
-        shown = {
-            "name": recipe.name,
-            "description": recipe.description,
-            "layout": LAYOUT,
-            **recipe.report.model_dump(mode="json"),
-        }
+        compared = {"record": COMPARISON_SCHEMA, **recipe.compare.model_dump(mode="json")}
+        out.append(Stage(COMPARE_STAGE, needs, compared, {}, (COMPARE,), self._compare))
+        shown = {"name": recipe.name, "description": recipe.description, "layout": LAYOUT}
+        shown |= recipe.report.model_dump(mode="json")
         needs = (*needs, COMPARE_STAGE)
-        pages = [self.folder / REPORT, self.folder / VIEWER]
-        written = lambda: [page for page in pages if page.is_file()]  # noqa: E731
-        out.append(Stage(REPORT_STAGE, needs, shown, {}, written, self._report))
-        return out
-
-    def _files(self, sub: str) -> Callable[[], list[Path]]:
-        """Lists the files below a sub-folder, without hidden ones."""
-        top = self.folder / sub
-        return lambda: [
-            p for p in top.rglob("*") if p.is_file() and "/." not in f"/{p.relative_to(top).as_posix()}"
-        ]
+        return [*out, Stage(REPORT_STAGE, needs, shown, {}, (REPORT, VIEWER), self._report)]
 
     def _generate(self, data: DataSet, decision: Decision) -> float:
         from mbtf_core.data.dataset import is_dataset
@@ -356,14 +335,8 @@ def run_recipe(
             write_run_record(folder, run.recipe, command)
         left = run.stages(inputs)[count:]
         results = run_stages(folder, left, force=force, notify=run.show, before=done)
-    viewer = folder / VIEWER
-    return RunResult(
-        folder,
-        folder / REPORT,
-        viewer if viewer.is_file() else None,
-        results,
-        read_json(folder / COMPARE / COMPARISON_NAME),
-    )
+    viewer, comparison = folder / VIEWER, read_json(folder / COMPARE / COMPARISON_NAME)
+    return RunResult(folder / REPORT, viewer if viewer.is_file() else None, results, comparison)
 
 
 def survey(recipe: Recipe, folder: Path) -> dict[str, str]:
@@ -406,7 +379,6 @@ def rerender(folder: Path, exposure: float | None = None) -> tuple[Path, float]:
                 hint = "run the recipe again: it resumes"
                 raise InputError(f"stage '{name}' is not finished", where=folder, hint=hint)
         run_stages(folder, [stage], force=True)
+    comparison = read_json(folder / COMPARE / COMPARISON_NAME)
     used = recipe.report.exposure
-    if used is None:
-        used = float(read_json(folder / COMPARE / COMPARISON_NAME)["exposure"])
-    return folder / REPORT, used
+    return folder / REPORT, float(comparison["exposure"]) if used is None else used

@@ -39,7 +39,7 @@ class Stage:
     needs : names of the stages whose outputs it reads
     config : resolved options, plain data
     inputs : digests of input files from outside the run, by role
-    outputs : lists the files it has written
+    outputs : folders and files that it writes, relative to the run's folder; hidden files do not count
     run : does the work, given why; may return the seconds that it took in all, earlier processes included
     remote : other machines do the work, so that consecutive stages of this kind run at the same time
     """
@@ -48,7 +48,7 @@ class Stage:
     needs: tuple[str, ...]
     config: Mapping[str, Any]
     inputs: Mapping[str, str]
-    outputs: Callable[[], Sequence[Path]]
+    outputs: tuple[str, ...]
     run: Callable[[Decision], float | None]
     remote: bool = False
 
@@ -199,6 +199,14 @@ def run_stages(
     return done
 
 
+def _written(folder: Path, stage: Stage) -> list[str]:
+    """Files that a stage has written, relative to the run's folder."""
+    tops = [folder / path for path in stage.outputs]
+    files = {file for top in tops for file in (top, *top.rglob("*")) if file.is_file()}
+    names = sorted(file.relative_to(folder).as_posix() for file in files)
+    return [name for name in names if "/." not in f"/{name}"]
+
+
 def _run(folder: Path, stage: Stage, decision: Decision) -> Stamp:
     path = stamp_path(folder, stage.name)
     # Without a stamp, an interrupted stage counts as not run.
@@ -207,7 +215,7 @@ def _run(folder: Path, stage: Stage, decision: Decision) -> Stamp:
     whole = stage.run(decision) or 0.0
     seconds = max(whole, time.perf_counter() - start)
     depends, key = _depends(folder, stage)
-    outputs = {file.relative_to(folder).as_posix(): file_sha256(file) for file in sorted(stage.outputs())}
+    outputs = {path: file_sha256(folder / path) for path in _written(folder, stage)}
     stamp = Stamp(stage.name, key, depends, outputs, round(seconds, 3))
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, {"format": STAMP_FORMAT, "schema": STAGE_SCHEMA, **vars(stamp)})

@@ -153,7 +153,7 @@ def _report(result: RunResult, console: Console, quality: Quality | None) -> Non
     tests = {fit: record["splits"]["test"] for fit, record in result.comparison["test"].items()}
     ran = {name: stage.seconds for name, stage in result.stages.items() if stage.reason}
     data = {
-        "folder": result.folder,
+        "folder": result.report.parent,
         "report": result.report,
         "viewer": result.viewer,
         "quality": quality,

@@ -58,7 +58,7 @@ def test_data_are_out_of_date_when_a_map_has_changed(tmp_path: Path) -> None:
     """By its content, not by its date."""
     recipe, folder = load_recipe(written(tmp_path, SINGLE)), tmp_path / "out"
     stages = _RecipeRun(recipe, folder, Console(quiet=True)).stages(_material_inputs(recipe))
-    run_stages(folder, [replace(stage, outputs=tuple, run=lambda decision: None) for stage in stages])
+    run_stages(folder, [replace(stage, outputs=(), run=lambda decision: None) for stage in stages])
     path = tmp_path / "maps" / "height.npy"
     path.touch()
     assert not survey(recipe, folder)["generate"]

@@ -177,17 +177,13 @@ def test_all_stages_count(fake: Machine) -> None:
     parts = (found.start, found.generating, found.training, found.evaluating, found.comparing)
     assert found.seconds == sum(parts)
     assert found.describe().startswith("expected: about 3:")
+    by_steps = forecaster.of(load_recipe(FILE, ["fit.neumip.training.steps=100"]))
+    assert by_steps.training == 60.0
+    assert by_steps.describe().endswith(", and the steps of neumip")
     # What is finished costs nothing.
     left = forecaster.of(recipe, ["fit neumip", "compare", "report"])
     assert (left.generating, left.training) == (0.0, 60.0)
     assert left.bytes < 2e8
-
-
-def test_fits_by_steps_are_named(fake: Machine) -> None:
-    recipe = load_recipe(FILE, ["fit.neumip.training.steps=100"])
-    found = RunForecaster(recipe).of(recipe)
-    assert found.training == 60.0
-    assert found.describe().endswith(", and the steps of neumip")
 
 
 def test_short_runs_need_no_pilot(fake: Machine, tmp_path: Path) -> None:

@@ -55,7 +55,7 @@ class Pipeline:
             read = [self.file(n).read_text() for n in self.needs[name]]
             self.file(name).write_text(f"{name} {self.config[name]} {inputs} of {read}")
 
-        return Stage(name, self.needs[name], self.config[name], inputs, lambda: [self.file(name)], work)
+        return Stage(name, self.needs[name], self.config[name], inputs, (self.file(name).name,), work)
 
     def stages(self) -> list[Stage]:
         return [self.stage(name) for name in self.needs]
@@ -167,7 +167,7 @@ def test_an_interruption_does_not_wait_for_other_machines(tmp_path: Path) -> Non
             signal.pthread_kill(main, signal.SIGINT)
         ended.wait(60.0)
 
-    stages = [Stage(f"fit {n}", (), {}, {}, list, work, remote=True) for n in "ab"]
+    stages = [Stage(f"fit {n}", (), {}, {}, (), work, remote=True) for n in "ab"]
     try:
         with pytest.raises(KeyboardInterrupt):
             run_stages(tmp_path, stages)
