@@ -27,11 +27,11 @@ from common import HEIGHT_SCALES, RELIEFS, finish, is_available, kept, parser_of
 from quality import generator_config
 
 from mbtf_core.config.nested import deep_merge
+from mbtf_core.config.settings import resolve
 from mbtf_core.data.dataset import Dataset
 from mbtf_fit import FitConfig, fit
 from mbtf_gen.generation.run import generate
-from mbtf_pipeline.papers.plan import load_paper_recipe
-from mbtf_pipeline.papers.published import mse_ratio
+from mbtf_pipeline.collection.recipes import PaperRecipe, first_known
 
 RESOLUTION = 128
 # Paths per test query.
@@ -135,13 +135,14 @@ def compared(name: str, folder: Path, times: list[str], seed: int) -> dict[str, 
     extent = Dataset.open(data).manifest["tile"]["displacement_range"]
     limit = THRESHOLDS["displaced" if extent >= DISPLACED else "any"]
     found = {"material": name, "displacement_range": extent, "fits": front, "ratio": ratio, "error": error}
-    published = mse_ratio(load_paper_recipe(PAPER, []).published, name, "neumip", "neumip-baseline")
+    sources = resolve(PaperRecipe, file=PAPER).published
+    published, _ = first_known(sources, lambda p: p.mse_ratio(name, "neumip", "neumip-baseline"))
     if published is not None:
         plain = fits_of({"neumip-baseline": BASELINE}, times[-1])["neumip-baseline"]
         ratios = {label: ratio_of(one, plain) for label, one in fits.items()}
-        found["over_baseline"] = {"published neumip": published[0], "ratios": ratios}
+        found["over_baseline"] = {"published neumip": published, "ratios": ratios}
         texts = "   ".join(f"{label} {value:.2f} ± {bar:.2f}" for label, (value, bar) in ratios.items())
-        print(f"{name:16s} over neumip-baseline: {texts}   published for neumip {published[0]:.2f}")
+        print(f"{name:16s} over neumip-baseline: {texts}   published for neumip {published:.2f}")
     print(f"{name:16s} relief over neumip {ratio:.2f} ± {error:.2f}", flush=True)
     return {**found, "met": ratio - STANDARD_ERRORS * error <= limit}
 

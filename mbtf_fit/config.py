@@ -1,5 +1,5 @@
 """Configuration of the fitter: every option, typed, with its unit and its default; options of each quality
-preset, see :mod:`mbtf_gen.config.presets`."""
+preset, see :mod:`mbtf_gen.config.generator`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A recipe: one YAML file that defines data, fits, comparison and report of a run."""
+"""A recipe: one YAML file that defines data, fits, comparison and report of a run; and quality presets."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from mbtf_core.config.settings import Settings, resolve
+from mbtf_core.app.options import Quality
+from mbtf_core.config.settings import Settings, explicit_options, resolve
 from mbtf_core.config.yaml_file import dump_yaml, line_of, read_yaml
 from mbtf_core.errors import InputError
-from mbtf_fit.config import FitConfig
-from mbtf_gen.config.generator import GeneratorConfig, Paths
+from mbtf_fit.config import DEFAULT_MODEL, FitConfig, fitter_options
+from mbtf_gen.config.generator import RESOLUTION, GeneratorConfig, Paths, generator_options
 from mbtf_gen.config.pictures import EXPOSURE, Exposure
 
 RECIPE_NAME = "recipe.yaml"
@@ -22,6 +23,14 @@ RECIPE_NAME = "recipe.yaml"
 _NAME = r"^[A-Za-z0-9][A-Za-z0-9._+-]*$"
 # Field of view in degrees: narrow, so that the elevation hardly varies within an image.
 FIELD_OF_VIEW = 20.0
+
+# Options of the comparison by preset.
+COMPARE: dict[Quality, dict[str, Any]] = {
+    "draft": {"compare.size": 128, "compare.spp": 32},
+    "standard": {"compare.size": 256, "compare.spp": 128},
+    "high": {"compare.size": 512, "compare.spp": 256},
+    "paper": {"compare.size": 512, "compare.spp": 1024},
+}
 
 Name = Annotated[str, Field(pattern=_NAME, max_length=100)]
 
@@ -209,12 +218,58 @@ def load_recipe(
     return recipe.model_copy(update={"generate": generate})
 
 
-def fit_names(recipe: Mapping[str, Any]) -> list[str]:
-    """Dotted names of the fits in a recipe's options: ``fit``, or ``fit.NAME`` for each."""
-    fits = recipe.get("fit")
-    if not isinstance(fits, Mapping) or _is_single(fits):
-        return ["fit"]
-    return [f"fit.{name}" for name in fits]
+def quality_options(
+    path: Path, quality: Quality | None, assignments: Sequence[str] = (), training: float | None = None
+) -> dict[str, Any]:
+    """Options, by dotted key, that apply a preset to the recipe of a file.
+
+    Parameters
+    ----------
+    assignments : ``a.b=c`` that will override them
+    training : seconds of training that decide the networks; the preset's by default
+
+    Raises
+    ------
+    InputError : the file cannot be read
+    """
+    if quality is None:
+        return {}
+    given = explicit_options(path, assignments)
+    generate, fits = (
+        {} if not isinstance(given.get(key), Mapping) else given[key] for key in ("generate", "fit")
+    )
+    own = {"fit": {"model": DEFAULT_MODEL, **fits}}
+    if fits and not _is_single(fits):
+        own = {f"fit.{name}": {"model": name, **(options or {})} for name, options in fits.items()}
+    out = dict(COMPARE[quality])
+    out |= {f"generate.{key}": value for key, value in generator_options(quality, generate).items()}
+    for prefix, options in fitter_options(quality, own, training).items():
+        out |= {f"{prefix}.{key}": value for key, value in options.items()}
+    return out
+
+
+def preset_recipe(
+    path: Path, quality: Quality | None, assignments: Sequence[str] = (), training: float | None = None
+) -> Recipe:
+    """The recipe of a file at a quality preset.
+
+    Parameters
+    ----------
+    assignments : ``a.b=c``, which override the preset
+    training : as in :func:`quality_options`
+
+    Raises
+    ------
+    InputError : file or material cannot be read
+    UsageError : an assignment is invalid
+    """
+    preset = quality_options(path, quality, assignments, training)
+    recipe = load_recipe(path, assignments, presets=preset)
+    if f"generate.{RESOLUTION}" not in preset:
+        return recipe
+    from mbtf_gen.job import Job, limit_resolution
+
+    return recipe.model_copy(update={"generate": limit_resolution(Job.load(recipe.generate)).config})
 
 
 def write_recipe(recipe: Recipe, folder: Path) -> None:

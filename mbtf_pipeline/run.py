@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -21,24 +22,15 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.compare.compare import COMPARISON_NAME, COMPARISON_SCHEMA
 from mbtf_pipeline.recipe import Recipe, read_resolved
 from mbtf_pipeline.report.report import LAYOUT
-from mbtf_pipeline.run_folder import (
-    COMPARE,
-    FITS,
-    REPORT,
-    RUN,
-    SHARDS,
-    VIEWER,
-    clear,
-    write_run_record,
-)
+from mbtf_pipeline.run_folder import COMPARE, FITS, REPORT, RUN, SHARDS, VIEWER, clear, write_run_record
 from mbtf_pipeline.stages import (
+    FORCED,
     NOT_RUN,
     Decision,
     Stage,
     StageResult,
-    Stamp,
     decide,
-    run_again,
+    read_stamp,
     run_stages,
 )
 
@@ -93,8 +85,6 @@ class RunResult:
 
     Attributes
     ----------
-    folder : Path
-        Folder of the run.
     report : Path
         HTML file.
     viewer : Path or None
@@ -105,7 +95,6 @@ class RunResult:
         Content of ``compare/comparison.json``.
     """
 
-    folder: Path
     report: Path
     viewer: Path | None
     stages: dict[str, StageResult]
@@ -125,47 +114,25 @@ class _RecipeRun:
     def stages(self, inputs: Mapping[str, str]) -> list[Stage]:
         """All stages; `inputs` holds the digests of the material's files by role."""
         recipe = self.recipe
-        out: list[Stage] = []
-        data_of: dict[str, DataSet] = {}
-        for data in data_sets(recipe):
-            data_of[data.config.queries.layout] = data
-            generate = data.config.model_dump(mode="json", exclude={"material"})
-            files, run = self._files(data.sub), partial(self._generate, data)
-            out.append(Stage(data.stage, (), generate, inputs, files, run))
-        for name, config in recipe.fit.items():
-            data = data_of[layout_of(config)]
-            files, run = self._files(f"{FITS}/{name}"), partial(self._fit, name, data)
-            fields = config.fields()
+        data_of: dict[str, DataSet] = {d.config.queries.layout: d for d in data_sets(recipe)}
+        out = []
+        for data in data_of.values():
+            config = data.config.model_dump(mode="json", exclude={"material"})
+            out.append(Stage(data.stage, (), config, inputs, (data.sub,), partial(self._generate, data)))
+        for name, fit in recipe.fit.items():
+            data, fields = data_of[layout_of(fit)], fit.fields()
             # Data sets of other materials count by what they hold, not by where they lie.
-            others = [_manifest_digest(Path(folder)) for folder in config.training.materials]
+            others = [_manifest_digest(Path(folder)) for folder in fit.training.materials]
             fields["training"] = {**fields["training"], "materials": others}
-            remote = not self.runner.here
-            out.append(Stage(fit_stage(name), (data.stage,), fields, {}, files, run, remote))
-        compared = {"record": COMPARISON_SCHEMA, **recipe.compare.model_dump(mode="json")}
+            run, remote = partial(self._fit, name, data), not self.runner.here
+            out.append(Stage(fit_stage(name), (data.stage,), fields, {}, (f"{FITS}/{name}",), run, remote))
         needs = (GENERATE_STAGE, *map(fit_stage, recipe.fit))
-        out.append(Stage(COMPARE_STAGE, needs, compared, {}, self._files(COMPARE), self._compare))
-        shown = {
-            "name": recipe.name,
-            "description": recipe.description,
-            "layout": LAYOUT,
-            **recipe.report.model_dump(mode="json"),
-        }
+        compared = {"record": COMPARISON_SCHEMA, **recipe.compare.model_dump(mode="json")}
+        out.append(Stage(COMPARE_STAGE, needs, compared, {}, (COMPARE,), self._compare))
+        shown = {"name": recipe.name, "description": recipe.description, "layout": LAYOUT}
+        shown |= recipe.report.model_dump(mode="json")
         needs = (*needs, COMPARE_STAGE)
-        out.append(Stage(REPORT_STAGE, needs, shown, {}, self._pages, self._report))
-        return out
-
-    def _files(self, sub: str) -> Callable[[], list[Path]]:
-        """Lists the files below a sub-folder, without hidden ones."""
-        top = self.folder / sub
-        return lambda: [
-            p
-            for p in sorted(top.rglob("*"))
-            if p.is_file() and not any(part.startswith(".") for part in p.relative_to(top).parts)
-        ]
-
-    def _pages(self) -> list[Path]:
-        """The report, and the viewer's page where there is one."""
-        return [path for name in (REPORT, VIEWER) if (path := self.folder / name).is_file()]
+        return [*out, Stage(REPORT_STAGE, needs, shown, {}, (REPORT, VIEWER), self._report)]
 
     def _generate(self, data: DataSet, decision: Decision) -> float:
         from mbtf_core.data.dataset import is_dataset
@@ -183,7 +150,7 @@ class _RecipeRun:
                 path.with_name(sidecar_name(path.name)).unlink(missing_ok=True)
         # A lost or damaged manifest is refused: the shards may be whole.
         if (
-            decision.forced
+            decision.reason == FORCED
             or not is_dataset(shards)
             or read_manifest(shards)["config_hash"] != job.config_hash
         ):
@@ -230,23 +197,23 @@ class _RecipeRun:
             advance = partial(bar.advance, 1)
             compare(recipe.compare, recipe.generate, shards, fits, out, advance, self.runner)
 
-    def show(self, stage: str, decision: Decision, stamp: Stamp | None) -> None:
+    def show(self, stage: str, decision: Decision, seconds: float | None) -> None:
         """Say a stage's state, and show what it has made."""
-        if stamp is None:
-            state = f"running ({decision.reason})" if decision.runs else "up to date"
+        if seconds is None:
+            state = f"running ({decision.reason})" if decision.reason else "up to date"
         else:
-            state = f"finished in {clock(stamp.seconds)}"
-        if decision.runs or stamp is None:
+            state = f"finished in {clock(seconds)}"
+        if decision.reason or seconds is None:
             self.console.note(f"{stage}: {state}")
         if self.live is None:
             return
         self.live.stage(stage, state)
-        if stamp is None:
+        if seconds is None:
             return
-        for name in self.recipe.fit:
-            if stage == fit_stage(name):
-                self.live.finished(name, self.folder / FITS / name)
-        if stage == COMPARE_STAGE:
+        name = stage.removeprefix(fit_stage(""))
+        if name != stage:
+            self.live.finished(name, self.folder / FITS / name)
+        elif stage == COMPARE_STAGE:
             from mbtf_pipeline.report.viewer import run_pictures
 
             self.live.pictures(run_pictures(self.folder))
@@ -287,18 +254,24 @@ def _material_inputs(recipe: Recipe) -> dict[str, str]:
     return dict(latest_material(recipe.generate.material).digests)
 
 
+@contextmanager
+def _claimed(recipe: Recipe, folder: Path, command: str) -> Iterator[None]:
+    """Own the folder of a run in a block, with its records."""
+    with owned(folder):
+        RUN.check(folder)
+        write_run_record(folder, recipe, command)
+        yield
+
+
 def generate_data(recipe: Recipe, folder: Path, *, command: str = "", console: Console | None = None) -> None:
     """Run the stages of a recipe that generate data, for fits that learn from the data of several runs.
 
     Parameters and exceptions are those of :func:`run_recipe`.
     """
-    console = console or Console(quiet=True)
-    with owned(folder):
-        RUN.check(folder)
-        write_run_record(folder, recipe, command)
-        run = _RecipeRun(recipe, folder, console)
-        stages = run.stages(_material_inputs(recipe))
-        run_stages(folder, stages[: len(data_sets(recipe))], notify=run.show)
+    run = _RecipeRun(recipe, folder, console or Console(quiet=True))
+    with _claimed(recipe, folder, command):
+        stages = run.stages(_material_inputs(recipe))[: len(data_sets(recipe))]
+        run_stages(folder, stages, notify=run.show)
 
 
 def run_recipe(
@@ -346,38 +319,25 @@ def run_recipe(
         Another process uses the folder, or the disk is full; the same command resumes the run.
     """
     folder = recipe.folder if folder is None else folder
-    console, runner = console or Console(quiet=True), runner or Runner()
-    inputs = _material_inputs(recipe)
-    with owned(folder):
-        RUN.check(folder)
-        write_run_record(folder, recipe, command)
-        run = _RecipeRun(recipe, folder, console, live, runner)
-        stages = run.stages(inputs)
-        results: dict[str, StageResult] = {}
+    inputs, count = _material_inputs(recipe), len(data_sets(recipe))
+    run = _RecipeRun(recipe, folder, console or Console(quiet=True), live, runner or Runner())
+    with _claimed(recipe, folder, command):
+        done = run_stages(folder, run.stages(inputs)[:count], force=force, notify=run.show)
         if generated is not None:
-            count = len(data_sets(recipe))
-            results = run_stages(folder, stages[:count], force=force, notify=run.show)
-            recipe = generated(recipe)
-            write_run_record(folder, recipe, command)
-            run = _RecipeRun(recipe, folder, console, live, runner)
-            stages = run.stages(inputs)[count:]
-        results |= run_stages(folder, stages, force=force, notify=run.show)
-    viewer = folder / VIEWER
-    return RunResult(
-        folder,
-        folder / REPORT,
-        viewer if viewer.is_file() else None,
-        results,
-        read_json(folder / COMPARE / COMPARISON_NAME),
-    )
+            run = replace(run, recipe=generated(recipe))
+            write_run_record(folder, run.recipe, command)
+        left = run.stages(inputs)[count:]
+        results = run_stages(folder, left, force=force, notify=run.show, before=done)
+    viewer, comparison = folder / VIEWER, read_json(folder / COMPARE / COMPARISON_NAME)
+    return RunResult(folder / REPORT, viewer if viewer.is_file() else None, results, comparison)
 
 
-def survey(recipe: Recipe, folder: Path) -> dict[str, Decision]:
-    """The decision of :func:`run_recipe` about each stage, without running any."""
+def survey(recipe: Recipe, folder: Path) -> dict[str, str]:
+    """Why :func:`run_recipe` would run each stage, without running any; empty where it is up to date."""
     run = _RecipeRun(recipe, folder, Console(quiet=True))
-    out: dict[str, Decision] = {}
+    out: dict[str, str] = {}
     for stage in run.stages(_material_inputs(recipe)):
-        out[stage.name] = decide(folder, stage, [name for name, decision in out.items() if decision.runs])
+        out[stage.name] = decide(folder, stage, [name for name, reason in out.items() if reason]).reason
     return out
 
 
@@ -405,10 +365,13 @@ def rerender(folder: Path, exposure: float | None = None) -> tuple[Path, float]:
     recipe = read_resolved(folder)
     if exposure is not None:
         recipe = recipe.model_copy(update={"report": recipe.report.model_copy(update={"exposure": exposure})})
-    run = _RecipeRun(recipe, folder, Console(quiet=True))
+    stage = _RecipeRun(recipe, folder, Console(quiet=True)).stages({})[-1]
     with owned(folder):
-        run_again(folder, run.stages({})[-1])
+        for name in stage.needs:
+            if read_stamp(folder, name) is None:
+                hint = "run the recipe again: it resumes"
+                raise InputError(f"stage '{name}' is not finished", where=folder, hint=hint)
+        run_stages(folder, [stage], force=True)
+    comparison = read_json(folder / COMPARE / COMPARISON_NAME)
     used = recipe.report.exposure
-    return folder / REPORT, read_json(folder / COMPARE / COMPARISON_NAME)[
-        "exposure"
-    ] if used is None else used
+    return folder / REPORT, float(comparison["exposure"]) if used is None else used

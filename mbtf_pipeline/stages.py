@@ -12,10 +12,10 @@ import itertools
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import read_json, write_json
@@ -39,8 +39,8 @@ class Stage:
     needs : names of the stages whose outputs it reads
     config : resolved options, plain data
     inputs : digests of input files from outside the run, by role
-    outputs : lists the files it has written
-    run : does the work; may return the seconds that it took in all, earlier processes included
+    outputs : folders and files that it writes, relative to the run's folder; hidden files do not count
+    run : does the work, given why; may return the seconds that it took in all, earlier processes included
     remote : other machines do the work, so that consecutive stages of this kind run at the same time
     """
 
@@ -48,7 +48,7 @@ class Stage:
     needs: tuple[str, ...]
     config: Mapping[str, Any]
     inputs: Mapping[str, str]
-    outputs: Callable[[], Sequence[Path]]
+    outputs: tuple[str, ...]
     run: Callable[[Decision], float | None]
     remote: bool = False
 
@@ -77,28 +77,18 @@ class Stamp:
         return data_sha256(self.outputs)
 
 
-@dataclass(frozen=True)
-class Decision:
-    """Whether a stage must run.
-
-    Attributes
-    ----------
-    reason : why it runs; empty if it is up to date
-    changed_files : outputs that are missing or have changed, if that is the reason
-    """
+class Decision(NamedTuple):
+    """Why a stage must run, empty if it is up to date; and outputs that have changed, if that is why."""
 
     reason: str
     changed_files: tuple[Path, ...] = ()
 
-    @property
-    def runs(self) -> bool:
-        """Whether the stage must run."""
-        return bool(self.reason)
 
-    @property
-    def forced(self) -> bool:
-        """Whether the user forces it to run, so that nothing of the last run may be kept."""
-        return self.reason == FORCED
+class StageResult(NamedTuple):
+    """Why a stage ran in this run, empty if it was up to date; and the seconds that it took."""
+
+    reason: str
+    seconds: float
 
 
 def stamp_path(folder: Path, stage: str) -> Path:
@@ -127,11 +117,10 @@ def _depends(folder: Path, stage: Stage) -> tuple[dict[str, Any], str]:
 
 
 def _what_changed(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
-    from mbtf_core.config.nested import differences
+    from mbtf_core.config.nested import differences, in_short
 
     if changes := differences(old["config"], new["config"]):
-        more = f" and {len(changes) - 3} more" if len(changes) > 3 else ""
-        return f"options changed: {'; '.join(changes[:3])}{more}"
+        return f"options changed: {in_short(changes, 3)}"
     for part, what in (("inputs", "input"), ("needs", "inputs")):
         before, after = old[part], new[part]
         if names := [n for n in sorted({*before, *after}) if before.get(n) != after.get(n)]:
@@ -160,16 +149,8 @@ def decide(folder: Path, stage: Stage, fresh: Sequence[str] = ()) -> Decision:
     return Decision("")
 
 
-@dataclass(frozen=True)
-class StageResult:
-    """Result of one stage in this run: its stamp, whether it ran, and why."""
-
-    stamp: Stamp
-    ran: bool
-    reason: str
-
-
-Notify = Callable[[str, Decision, Stamp | None], None]
+# Called before each stage with its name, its decision, and None; after it, with its seconds.
+Notify = Callable[[str, Decision, float | None], None]
 
 
 def run_stages(
@@ -177,73 +158,53 @@ def run_stages(
     stages: Sequence[Stage],
     *,
     force: bool = False,
-    notify: Notify | None = None,
+    notify: Notify = lambda name, decision, seconds: None,
+    before: Mapping[str, StageResult] | None = None,
 ) -> dict[str, StageResult]:
-    """Run all stages that are not up to date, in the given order.
+    """Run all stages that are not up to date, in the given order; all of them if forced.
 
-    Parameters
-    ----------
-    force : run every stage
-    notify : called before each stage with (stage, decision, None), and after it with its stamp
+    Returns their results after those of the stages that ran `before`.
     """
-    done: dict[str, StageResult] = {}
+    done = dict(before or {})
+
+    def decided(stage: Stage) -> Decision:
+        fresh = [name for name, result in done.items() if result.reason]
+        decision = Decision(FORCED) if force else decide(folder, stage, fresh)
+        notify(stage.name, decision, None)
+        return decision
+
+    def finished(stage: Stage, decision: Decision) -> StageResult:
+        stamp = None if decision.reason else read_stamp(folder, stage.name)
+        seconds = (stamp or _run(folder, stage, decision)).seconds
+        notify(stage.name, decision, seconds)
+        return StageResult(decision.reason, seconds)
+
     for remote, group in itertools.groupby(stages, lambda stage: stage.remote):
         together = list(group)
         if not remote:
             for stage in together:
-                decision = _decide(folder, stage, done, force, notify)
-                done[stage.name] = _finish(folder, stage, decision, notify)
+                done[stage.name] = finished(stage, decided(stage))
             continue
         # Decided before any runs; none needs another.
-        decisions = [_decide(folder, stage, done, force, notify) for stage in together]
+        decisions = [decided(stage) for stage in together]
         pool = ThreadPoolExecutor(len(together), "stages")
         try:
-            running = {
-                pool.submit(_finish, folder, stage, decision, notify): stage.name
-                for stage, decision in zip(together, decisions, strict=True)
-            }
-            results = {running[future]: future for future in as_completed(running)}
+            running = [pool.submit(finished, *pair) for pair in zip(together, decisions, strict=True)]
+            wait(running)
         finally:
             # An interruption does not wait for what other machines do.
             pool.shutdown(wait=False, cancel_futures=True)
         # In the stages' order; the first that failed raises, when all have ended.
-        done |= {stage.name: results[stage.name].result() for stage in together}
+        done |= {stage.name: future.result() for stage, future in zip(together, running, strict=True)}
     return done
 
 
-def _decide(
-    folder: Path, stage: Stage, done: Mapping[str, StageResult], force: bool, notify: Notify | None
-) -> Decision:
-    fresh = [name for name, result in done.items() if result.ran]
-    decision = Decision(FORCED) if force else decide(folder, stage, fresh)
-    if notify is not None:
-        notify(stage.name, decision, None)
-    return decision
-
-
-def _finish(folder: Path, stage: Stage, decision: Decision, notify: Notify | None) -> StageResult:
-    """Run a stage if it must run."""
-    stamp = read_stamp(folder, stage.name)
-    if decision.runs or stamp is None:
-        stamp = _run(folder, stage, decision)
-    if notify is not None:
-        notify(stage.name, decision, stamp)
-    return StageResult(stamp, decision.runs, decision.reason)
-
-
-def run_again(folder: Path, stage: Stage) -> None:
-    """Run one stage regardless of its state.
-
-    Raises
-    ------
-    InputError : a stage that it needs has not finished
-    """
-    for name in stage.needs:
-        if read_stamp(folder, name) is None:
-            raise InputError(
-                f"stage '{name}' is not finished", where=folder, hint="run the recipe again: it resumes"
-            )
-    _run(folder, stage, Decision(FORCED))
+def _written(folder: Path, stage: Stage) -> list[str]:
+    """Files that a stage has written, relative to the run's folder."""
+    tops = [folder / path for path in stage.outputs]
+    files = {file for top in tops for file in (top, *top.rglob("*")) if file.is_file()}
+    names = sorted(file.relative_to(folder).as_posix() for file in files)
+    return [name for name in names if "/." not in f"/{name}"]
 
 
 def _run(folder: Path, stage: Stage, decision: Decision) -> Stamp:
@@ -254,7 +215,7 @@ def _run(folder: Path, stage: Stage, decision: Decision) -> Stamp:
     whole = stage.run(decision) or 0.0
     seconds = max(whole, time.perf_counter() - start)
     depends, key = _depends(folder, stage)
-    outputs = {file.relative_to(folder).as_posix(): file_sha256(file) for file in sorted(stage.outputs())}
+    outputs = {path: file_sha256(folder / path) for path in _written(folder, stage)}
     stamp = Stamp(stage.name, key, depends, outputs, round(seconds, 3))
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, {"format": STAMP_FORMAT, "schema": STAGE_SCHEMA, **vars(stamp)})

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from mbtf_core.app.console import new_app
 from mbtf_pipeline.cli.cost import cost
-from mbtf_pipeline.cli.list import list_recipes
 from mbtf_pipeline.cli.report import report
-from mbtf_pipeline.cli.run import run
+from mbtf_pipeline.cli.run import list_recipes, run
 
 app = new_app("mbtf-pipeline", "Run recipes: generate, fit, compare, report.")
 for command in (run, report, cost):

@@ -42,17 +42,16 @@ def cost(
     from mbtf_core.run.cluster import open_runner
     from mbtf_core.run.signals import keep_on_interruption
     from mbtf_core.units import asked_duration, format_duration
+    from mbtf_pipeline.collection.recipes import load
     from mbtf_pipeline.cost.cost_page import complete_runs, write_page
     from mbtf_pipeline.cost.pareto import pareto_front
     from mbtf_pipeline.cost.study import run_study, time_of
-    from mbtf_pipeline.library.entries import is_library_recipe
-    from mbtf_pipeline.papers.plan import is_paper_recipe
-    from mbtf_pipeline.recipe import load_recipe
+    from mbtf_pipeline.recipe import Recipe
 
-    if is_library_recipe(recipe) or is_paper_recipe(recipe):
+    loaded = load(recipe, assignments or [])
+    if not isinstance(loaded, Recipe):
         raise UsageError("has several materials", where=recipe, hint="study the recipe of one of them")
     more = 0.0 if refine is None else asked_duration(refine, "--refine")
-    loaded = load_recipe(recipe, assignments or [])
     folder = output if output is not None else loaded.folder.with_name(f"{loaded.folder.name}-cost")
     seconds = time_of(folder) if time is None else asked_duration(time, "--time")
     keep_on_interruption(f"the measurements are kept in {folder}")

@@ -31,17 +31,14 @@ def report(
         Exposure of the pictures: a value v in 1/sr is shown as 2^EV v.
     """
     from mbtf_core.exposure import describe_exposure
-    from mbtf_pipeline.library.run import LIBRARY
-    from mbtf_pipeline.library.run import write_again as write_library
-    from mbtf_pipeline.papers.suite import PAPER, write_again
+    from mbtf_pipeline.collection.run import is_collection, write_again
     from mbtf_pipeline.run import rerender
 
     used = None
-    again = write_again if PAPER.read(folder) else write_library if LIBRARY.read(folder) else None
-    if again is not None:
+    if is_collection(folder):
         if exposure is not None:
             raise UsageError("the page of several runs has no exposure", where="--exposure")
-        path = again(folder)
+        path = write_again(folder)
     else:
         path, used = rerender(folder, exposure)
     size = path.stat().st_size

@@ -1,10 +1,11 @@
-"""``mbtf-pipeline run``: a recipe."""
+"""``mbtf-pipeline run`` and ``list``: recipes."""
 
 from __future__ import annotations
 
 import time as clocks
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
@@ -17,14 +18,16 @@ from mbtf_core.app.options import (
     Set,
     Switch,
     Time,
+    Verbose,
     command_line,
 )
-from mbtf_core.errors import PartialError, UsageError
+from mbtf_core.errors import InputError, MbtfError, PartialError, UsageError
 from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.units import clock
 from mbtf_fit.cli.page_options import Live, live_view
 
 if TYPE_CHECKING:
+    from mbtf_pipeline.collection.run import CollectionResult
     from mbtf_pipeline.run import RunResult
 
 
@@ -45,165 +48,119 @@ def run(
     """Run a recipe: mbtf-pipeline run pipelines/quickstart.yaml
 
     A stage whose inputs have not changed is skipped; the same command again resumes an interrupted run.
-    --time is the time of everything: it takes the best preset of --quality that fits, with more queries and
-    longer training, and replaces the recipe's own.
+    --time is the time of everything: it takes the best preset of --quality that fits, trains for the rest,
+    and replaces the recipe's own times.
 
     Parameters
     ----------
     recipe
         YAML file.
     quick
-        Use the small sizes of a paper recipe: minutes in place of hours.
+        Use the small size of a recipe of several materials: minutes in place of hours.
     force
         Run every stage, also those that are up to date.
     """
     # Python itself has run for about a second.
     began = clocks.perf_counter() - 1.0
-    from mbtf_pipeline.library.entries import is_library_recipe
-    from mbtf_pipeline.papers.plan import is_paper_recipe
+    from mbtf_core.run.cluster import open_runner
+    from mbtf_core.run.processes import Processes
+    from mbtf_pipeline.collection.recipes import Collection, LibraryRecipe, load
 
     given = {"quality": quality, "time": time, "quick": quick, "output": output, "set": assignments}
     command = command_line("mbtf-pipeline", "run", recipe, **given)
-    own = assignments or []
-    if is_paper_recipe(recipe):
-        for flag, used in (("--live", live), ("--cluster", cluster is not None)):
-            if used:
-                raise UsageError("is for a single run", where=flag, hint="leave it out for a paper recipe")
-        if quality is not None or time is not None:
-            raise UsageError(
-                "a paper recipe has sizes and times of its own",
-                where="--time" if quality is None else "--quality",
-                hint="leave it out; --quick is the small size",
+    loaded, own = load(recipe, assignments or []), assignments or []
+    given |= {"live": live}
+    if isinstance(loaded, Collection):
+        from mbtf_pipeline.collection.run import run_collection
+
+        hint = "set times in the recipe; --quick is its small size"
+        _refuse(given, ("quality", "time", "live"), "a recipe of several materials", hint)
+        folder = output or loaded.folder_of(quick)
+        keep_on_interruption(f"the finished stages are kept in {folder}")
+        # A crash ends one material of a library alone; the runs of a paper show their progress.
+        otherwise = Processes() if isinstance(loaded, LibraryRecipe) else None
+        with open_runner(cluster, console.note, otherwise) as runner:
+            done = run_collection(
+                loaded,
+                recipe,
+                folder,
+                command=command,
+                runner=runner,
+                quick=quick,
+                force=force,
+                console=console,
             )
-        return _run_paper(recipe, output, quick, force, own, command, console)
-    if is_library_recipe(recipe):
-        refused = {"--quality": quality, "--time": time, "--quick": quick, "--force": force, "--live": live}
-        if wrong := [flag for flag, used in refused.items() if used]:
-            hint = "set 'base' and 'training' in the recipe"
-            raise UsageError("is not for a library of materials", where=wrong[0], hint=hint)
-        return _run_library(recipe, output, own, cluster, command, console)
-    if quick:
-        raise UsageError("only paper recipes have quick sizes", where="--quick", hint="use --quality draft")
-    from mbtf_core.run.cluster import open_runner
-    from mbtf_pipeline.run import run_recipe
+        _report_collection(done, folder, console)
+    else:
+        _refuse(given, ("quick",), "a recipe of one material", "use --quality draft")
+        folder = output or loaded.folder
+        if time is None:
+            from mbtf_pipeline.recipe import preset_recipe
+            from mbtf_pipeline.run_time import forecast_left
 
-    if time is not None:
-        from mbtf_core.units import asked_duration
-        from mbtf_pipeline.time_split import TimedRun
+            loaded, generated = preset_recipe(recipe, quality, own), None
+            if (expected := forecast_left(loaded, folder)) is not None:
+                console.note(expected.describe())
+        else:
+            from mbtf_core.units import asked_duration
+            from mbtf_pipeline.run_time import TimedRun
 
-        seconds = asked_duration(time, "--time")
-        timed = TimedRun(
-            recipe, seconds, output, command, console.note, quality=quality, assignments=own, began=began
-        )
-        keep_on_interruption(f"the finished stages are kept in {timed.folder}")
-        with (
-            open_runner(cluster, console.note) as runner,
-            live_view(timed.recipe.title, live, console) as shown,
-        ):
+            timed = TimedRun(
+                recipe, asked_duration(time, "--time"), folder, command, console.note, quality, own, began
+            )
+            loaded, generated, quality = timed.recipe, timed.generated, timed.split.quality
+        keep_on_interruption(f"the finished stages are kept in {folder}")
+        from mbtf_pipeline.run import run_recipe
+
+        with open_runner(cluster, console.note) as runner, live_view(loaded.title, live, console) as page:
             result = run_recipe(
-                timed.recipe,
-                timed.folder,
+                loaded,
+                folder,
                 force=force,
                 command=command,
                 console=console,
-                generated=timed.generated,
-                live=shown,
+                generated=generated,
+                live=page,
                 runner=runner,
             )
-        return _report(result, console, timed.split.quality)
-    from mbtf_pipeline.forecast import forecast_left
-    from mbtf_pipeline.presets import preset_recipe
-
-    loaded = preset_recipe(recipe, quality, own)
-    keep_on_interruption(f"the finished stages are kept in {output or loaded.folder}")
-    expected = forecast_left(loaded, output or loaded.folder)
-    if expected is not None:
-        console.note(expected.describe())
-    with (
-        open_runner(cluster, console.note) as runner,
-        live_view(loaded.title, live, console) as shown,
-    ):
-        result = run_recipe(
-            loaded, output, force=force, command=command, console=console, live=shown, runner=runner
-        )
-    _report(result, console, quality)
+        _report(result, console, quality)
 
 
-def _run_paper(
-    file: Path,
-    output: Path | None,
-    quick: bool,
-    force: bool,
-    assignments: list[str],
-    command: str,
-    console: Console,
-) -> None:
-    from mbtf_pipeline.papers.plan import load_paper_recipe, plan
-    from mbtf_pipeline.papers.suite import run_paper
-
-    paper = load_paper_recipe(file, assignments)
-    planned, missing = plan(paper, file, quick)
-    folder = output if output is not None else paper.folder(quick)
-    keep_on_interruption(f"the finished stages are kept in {folder}")
-    done = run_paper(
-        paper, planned, missing, folder, quick=quick, command=command, force=force, console=console
-    )
-    skipped = f", {len(missing)} skipped: {', '.join(missing)}" if missing else ""
-    size = done.record["size"]
-    data = {"folder": done.folder, "page": done.page, "size": size, "tables": done.tables}
-    data |= {"runs": [one.name for one in planned], "skipped": missing}
-    console.report(data, f"{done.page}: {size} size, {len(planned)} runs{skipped}")
+def _refuse(given: Mapping[str, Any], flags: Sequence[str], kind: str, hint: str) -> None:
+    """Refuse flags that a kind of recipe does not have."""
+    for flag in flags:
+        if given[flag]:
+            raise UsageError(f"is not for {kind}", where=f"--{flag}", hint=f"leave it out: {hint}")
 
 
-def _run_library(
-    file: Path,
-    output: Path | None,
-    assignments: list[str],
-    cluster: str | None,
-    command: str,
-    console: Console,
-) -> None:
-    from mbtf_core.run.cluster import open_runner
-    from mbtf_core.run.processes import Processes
-    from mbtf_pipeline.library.entries import entries, load_library_recipe
-    from mbtf_pipeline.library.run import run_library
-
-    library = load_library_recipe(file, assignments)
-    found = entries(library, file)
-    folder = output if output is not None else library.folder
-    keep_on_interruption(f"the finished stages are kept in {folder}")
-    with open_runner(cluster, console.note, Processes()) as runner:
-        done = run_library(library, found, folder, command=command, console=console, runner=runner)
-    count = len(found) - len(done.failed)
-    data = {"folder": done.folder, "page": done.page, "materials": done.record["materials"]}
-    console.report(data, f"{done.page}: {count} of {len(found)} materials")
-    for name, error in done.failed.items():
-        console.note(f"{name}: {error}")
-    if done.failed:
+def _report_collection(done: CollectionResult, folder: Path, console: Console) -> None:
+    skipped, failed = done.names("skipped"), done.names("failed")
+    count = len(done.runs) - len(skipped)
+    text = f"{done.page}: {count - len(failed)} of {count} runs"
+    text += f", {len(skipped)} skipped: {', '.join(skipped)}" if skipped else ""
+    console.report({"folder": folder, "page": done.page, "tables": done.tables, "runs": done.runs}, text)
+    if failed:
         raise PartialError(
-            f"{len(done.failed)} of {len(found)} materials failed",
+            f"{len(failed)} of {count} runs failed: {', '.join(failed)}",
             where=folder,
             hint="the same command tries them again and keeps the others",
         )
-    if done.shared_error:
-        hint = "the same command tries it again"
-        raise PartialError(f"no shared network: {done.shared_error}", where=folder, hint=hint)
 
 
 def _report(result: RunResult, console: Console, quality: Quality | None) -> None:
-    from mbtf_pipeline.number_text import estimate
+    from mbtf_pipeline.tables import estimate
 
     tests = {fit: record["splits"]["test"] for fit, record in result.comparison["test"].items()}
-    ran = {name: stage.stamp.seconds for name, stage in result.stages.items() if stage.ran}
+    ran = {name: stage.seconds for name, stage in result.stages.items() if stage.reason}
     data = {
-        "folder": result.folder,
+        "folder": result.report.parent,
         "report": result.report,
         "viewer": result.viewer,
         "quality": quality,
         "seconds": round(sum(ran.values()), 3),
         "stages": {
-            name: {"ran": o.ran, "reason": o.reason or "up to date", "seconds": o.stamp.seconds}
-            for name, o in result.stages.items()
+            name: {"ran": name in ran, "reason": stage.reason or "up to date", "seconds": stage.seconds}
+            for name, stage in result.stages.items()
         },
         "test": {
             fit: {"unexplained_variance": e["unexplained"], "mse": e["mse"]} for fit, e in tests.items()
@@ -215,3 +172,48 @@ def _report(result: RunResult, console: Console, quality: Quality | None) -> Non
     if result.viewer is not None:
         lines.append(f"{result.viewer}: open it in a browser to turn the fits under lights")
     console.report(data, "\n".join(lines))
+
+
+def list_recipes(
+    folder: Path = Path("pipelines"),
+    /,
+    *,
+    verbose: Verbose = False,
+    console: Console = CONSOLE,
+) -> None:
+    """List the recipes of a folder; with --verbose also the stages that would run, given earlier runs.
+
+    Parameters
+    ----------
+    folder
+        Folder of recipes.
+    """
+    if not folder.is_dir():
+        raise InputError("no such folder", where=folder)
+    found = [_entry(path, verbose) for path in sorted(folder.glob("*.y*ml"))]
+    lines = []
+    for entry in found:
+        lines.append(f"{entry['file']}: {entry['error'] or entry['description'] or entry['name']}")
+        lines += [f"    {stage}: {state}" for stage, state in entry["stages"].items()]
+    console.report({"recipes": found}, "\n".join(lines) or f"{folder}: no recipes")
+
+
+def _entry(path: Path, verbose: bool) -> dict[str, Any]:
+    from mbtf_pipeline.collection.recipes import load
+    from mbtf_pipeline.recipe import Recipe
+    from mbtf_pipeline.run import survey
+
+    keys: dict[str, Any] = dict.fromkeys(("name", "description", "error"))
+    entry = {"file": str(path), **keys, "stages": {}}
+    try:
+        recipe = load(path)
+        entry |= {"name": recipe.name, "description": recipe.description, "folder": str(recipe.folder)}
+        if verbose and isinstance(recipe, Recipe):
+            decisions = survey(recipe, recipe.folder)
+            entry["stages"] = {name: reason or "up to date" for name, reason in decisions.items()}
+    except MbtfError as error:
+        # The recipe's path stands before the message already.
+        first = error.message.splitlines()[0]
+        rest = first.removeprefix(f"{path}:")
+        entry["error"] = f"line {rest}" if rest[:1].isdigit() and rest != first else rest.strip()
+    return entry

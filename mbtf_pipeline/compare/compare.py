@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,18 +17,10 @@ from mbtf_core.errors import PartialError
 from mbtf_core.exposure import auto_exposure, brightness, white_of
 from mbtf_core.files.atomic import write_json
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_pipeline.compare.dataset_errors import dataset_errors
-from mbtf_pipeline.compare.image_files import (
-    PICTURES,
-    Scene,
-    scenes,
-    write_map,
-    write_picture,
-)
-from mbtf_pipeline.compare.metrics import DEFINITIONS, image_errors, reference_difference
+from mbtf_pipeline.compare.image_files import PICTURES, Scene, scenes, write_map, write_picture
+from mbtf_pipeline.compare.metrics import DEFINITIONS, dataset_errors, image_errors, reference_difference
 from mbtf_pipeline.compare.offsets import write_offsets
-from mbtf_pipeline.compare.perceptual_metrics import perceptual_scores
-from mbtf_pipeline.compare.st_lpips import require
+from mbtf_pipeline.compare.perceptual_metrics import perceptual_scores, require
 from mbtf_pipeline.compare.timing import measure_timing, timed
 from mbtf_pipeline.compare.unmodified_mitsuba import pick_scene, write_agreement
 from mbtf_pipeline.recipe import CompareSection
@@ -141,18 +134,12 @@ def _render_references(
     from mbtf_core.run.task import Item
     from mbtf_gen.pictures.reference import render_picture
 
+    common = {"job": job, "spp": section.spp, "seed": section.seed}
     items = []
-    for scene, kind in ((scene, kind) for scene in scenes(section) for kind in section.kinds):
-        arguments = {
-            "job": job,
-            "camera": scene.camera(section.size),
-            "omega_i": from_angles(scene.light.elevation, scene.light.azimuth),
-            "kind": kind,
-            "spp": section.spp,
-            "seed": section.seed,
-            "index": scene.index,
-        }
-        items.append(Item(f"{scene.name}-{kind}", arguments))
+    for scene, kind in product(scenes(section), section.kinds):
+        omega_i = from_angles(scene.light.elevation, scene.light.azimuth)
+        own = {"camera": scene.camera(section.size), "omega_i": omega_i, "kind": kind, "index": scene.index}
+        items.append(Item(f"{scene.name}-{kind}", {**common, **own}))
     rendered: dict[str, ReferenceImage] = {}
     for done in runner.map(render_picture, items):
         if done.error:

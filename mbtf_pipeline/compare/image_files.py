@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,11 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.errors import InputError
 from mbtf_core.pictures.camera import Camera
 from mbtf_pipeline.recipe import FIELD_OF_VIEW, CompareSection, SceneDirection, SceneView
 
 F32 = NDArray[np.float32]
 PICTURES = "pictures"
+# Ending of a fit's HDR-FLIP map.
+_FLIP = "-flip.png"
 
 
 @dataclass(frozen=True)
@@ -70,11 +73,26 @@ def write_channels(path: Path, values: NDArray[Any], names: str) -> None:
     """Write an array (rows, columns, channels) as a float32 EXR image, atomically."""
     import OpenEXR
 
-    from mbtf_core.files.atomic import write_through
+    from mbtf_core.images import exr
 
     channels = {name: np.ascontiguousarray(values[..., i], np.float32) for i, name in enumerate(names)}
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    write_through(path, lambda p: OpenEXR.File(header, channels).write(str(p)))
+    exr.write_channels(path, channels, {"compression": OpenEXR.ZIP_COMPRESSION})
+
+
+def read_channels(path: Path, *sets: Sequence[str]) -> F32:
+    """Channels (rows, columns, channels) of an EXR image: the first of some sets that it has.
+
+    Raises
+    ------
+    InputError : missing or corrupt
+    """
+    from mbtf_core.images import exr
+
+    found = exr.read_channels(path, 1 << 26)
+    names = next((names for names in sets if found.keys() >= set(names)), None)
+    if names is None:
+        raise InputError(f"has no channels {', '.join(sets[0])}", where=path)
+    return np.stack([found[name] for name in names], axis=-1).astype(np.float32)
 
 
 def write_picture(path: Path, value: NDArray[Any], exposure: float) -> None:
@@ -86,8 +104,26 @@ def write_picture(path: Path, value: NDArray[Any], exposure: float) -> None:
     write_display(path, value, exposure)
 
 
-# Ending of a fit's HDR-FLIP map.
-_FLIP = "-flip.png"
+# Channels of both halves of a reference.
+_HALVES = [f"value_{half}.{color}" for half in "ab" for color in "RGB"]
+
+
+def read_picture(path: Path) -> F32:
+    """Linear RGB (rows, columns, 3) of ``path`` + ``.exr``; of a reference, the mean of its halves.
+
+    Raises
+    ------
+    InputError : missing or corrupt
+    """
+    found = read_channels(with_ending(path, ".exr"), "RGB", _HALVES)
+    return found if found.shape[-1] == 3 else 0.5 * (found[..., :3] + found[..., 3:])
+
+
+def read_halves(path: Path) -> tuple[F32, F32]:
+    """Both halves of a reference, linear RGB (rows, columns, 3); exceptions are those of
+    :func:`read_picture`."""
+    both = read_channels(with_ending(path, ".exr"), _HALVES)
+    return both[..., :3], both[..., 3:]
 
 
 def write_map(path: Path, flip: F32) -> None:
@@ -98,51 +134,8 @@ def write_map(path: Path, flip: F32) -> None:
 
 
 def read_map(path: Path) -> F32:
-    """Read a map (rows, columns) in [0, 1] written by :func:`write_map`.
+    """Read a map (rows, columns) in [0, 1] written by :func:`write_map`; exceptions are those of
+    :func:`read_picture`."""
+    from mbtf_core.images.read import read_image
 
-    Raises
-    ------
-    InputError : missing or corrupt
-    """
-    from PIL import Image
-
-    from mbtf_core.errors import InputError
-
-    file = with_ending(path, _FLIP)
-    try:
-        with Image.open(file) as image:
-            return (np.asarray(image.convert("L"), np.float32) / 255.0).astype(np.float32)
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"cannot be read ({error})", where=file, hint="run the recipe again to recreate it"
-        ) from None
-
-
-def read_halves(path: Path) -> tuple[F32, F32]:
-    """Both halves of a reference, linear RGB (rows, columns, 3).
-
-    Raises
-    ------
-    InputError : missing or corrupt
-    """
-    from mbtf_core.images.exr import read_channels
-
-    channels = read_channels(with_ending(path, ".exr"), 1 << 26)
-    a, b = (np.stack([channels[f"value_{h}.{c}"] for c in "RGB"], axis=-1) for h in "ab")
-    return a.astype(np.float32), b.astype(np.float32)
-
-
-def read_picture(path: Path) -> F32:
-    """Linear RGB (rows, columns, 3) of an image; of a reference, the mean of its halves.
-
-    Raises
-    ------
-    InputError : missing or corrupt
-    """
-    from mbtf_core.images.exr import read_channels
-
-    channels = read_channels(with_ending(path, ".exr"), 1 << 26)
-    if "R" not in channels:
-        a, b = read_halves(path)
-        return (0.5 * (a + b)).astype(np.float32)
-    return np.stack([channels[c] for c in "RGB"], axis=-1).astype(np.float32)
+    return read_image(with_ending(path, _FLIP)).pixels[..., 0].astype(np.float32)

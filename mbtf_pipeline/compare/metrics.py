@@ -1,20 +1,34 @@
-"""Errors of an image against a path-traced reference that is stored as two independent halves.
+"""Errors of images against path-traced references, and of fits on a data set.
 
-The estimates are paired (split-half): with the image p and the halves a and b of the reference,
-``(p-a)(p-b)`` has the expectation ``(p-t)²``, where t is the true image. The noise of the reference
-therefore does not bias the error. Error bars are one standard error over pixels.
+References and data are stored as two independent halves. The estimates are paired (split-half): with the
+image p and the halves a and b of the reference, ``(p-a)(p-b)`` has the expectation ``(p-t)²``, where t is the
+true image. The noise of the reference therefore does not bias the error. Error bars are one standard error
+over pixels or queries.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbtf_core.stats import Estimate, mean_estimate, noise_free_mse, psnr
-from mbtf_pipeline.compare.perceptual_metrics import FLIP_DEFINITION, SSIM_DEFINITION
-from mbtf_pipeline.compare.st_lpips import DEFINITION as ST_LPIPS_DEFINITION
+from mbtf_core.stats import (
+    Estimate,
+    by_group,
+    level_groups,
+    mean_estimate,
+    mse_difference,
+    noise_free_mse,
+    psnr,
+)
+from mbtf_pipeline.compare.perceptual_metrics import PERCEPTUAL_DEFINITIONS
+
+if TYPE_CHECKING:
+    from mbtf_core.data.dataset import Dataset
+    from mbtf_fit import Material
 
 # Floor of the relative error's denominator, as a fraction of the image's mean value.
 RELATIVE_FLOOR = 0.1
@@ -25,9 +39,7 @@ DEFINITIONS: dict[str, str] = {
     "psnr": "10 log10(peak²/MSE) in dB, with the noise-free MSE. The peak is the value shown as white.",
     "relative_mse": "mean of (p-a)(p-b) / (t² + (0.1 m)²). t = (a+b)/2 per pixel and channel; m is the mean "
     "value of the image.",
-    "flip": FLIP_DEFINITION,
-    "ssim": SSIM_DEFINITION,
-    "st_lpips": ST_LPIPS_DEFINITION,
+    **PERCEPTUAL_DEFINITIONS,
     "error_bar": "one standard error, over pixels of an image or queries of a data set. A value within "
     "two standard errors of zero is marked as not significant.",
 }
@@ -60,3 +72,61 @@ def reference_difference(
     """Noise-free mean squared difference of two references, each given as two independent halves."""
     a1, b1, a2, b2 = (np.asarray(x, np.float64).reshape(-1, 3) for x in (*first, value_a, value_b))
     return mean_estimate((a1 - a2) * (b1 - b2))
+
+
+def dataset_errors(materials: Mapping[str, Material], data: Dataset) -> dict[str, Any]:
+    """Errors of every fit on the test split of one data set, and on the splits held out in its own training.
+
+    All fits but the first also have ``mse_minus_first``: their MSE minus that of the first fit on the same
+    test queries, overall and by level. Of measured data, which have one value per query, errors include the
+    noise and say so (``includes_noise``); differences do not. Returns plain data by name of the fit.
+
+    Raises
+    ------
+    InputError : a test shard is missing or corrupt
+    """
+    from mbtf_fit.data.loader import load_split
+    from mbtf_fit.evaluation import split_errors
+
+    test = load_split(data, "test")
+    halves = test.value_a, test.value_b
+    labels = level_groups(test.sigma, data.lattice.finest)
+    first: Any = None
+    out: dict[str, Any] = {}
+    for name, material in materials.items():
+        value = material.predict(test)
+        found = split_errors(lambda queries: value, test, data)  # noqa: B023
+        own = material.description["training"]["errors"]
+        splits = {split: errors for split, errors in own.items() if split != "test"}
+        record = {
+            "splits": {"test": found, **splits},
+            **_parameter_counts(material),
+        }
+        if first is None:
+            first = value
+        else:
+            levels = by_group(mse_difference, labels, value, first, *halves)
+            record["mse_minus_first"] = {
+                **mse_difference(value, first, *halves).as_dict(),
+                "levels": {str(level): e.as_dict() for level, e in levels.items()},
+            }
+        out[name] = record
+    return out
+
+
+def _parameter_counts(material: Material) -> dict[str, Any]:
+    """Parameter counts of a material: per network, and of its textures."""
+    weights = material.description["weights"]
+    networks: dict[str, int] = {}
+    textures = {id(texture.texels) for texture in material.model.textures()}
+    for name, parameter in material.model.named_parameters():
+        if id(parameter) not in textures:
+            part = name.split(".")[0]
+            networks[part] = networks.get(part, 0) + parameter.numel()
+    return {
+        "network_weights": weights["network_weights"],
+        "networks": networks,
+        "texels": weights["texels"],
+        "training_seconds": material.description["training"]["seconds"],
+        "model": material.config.model,
+    }

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from mbtf_core.data.lattice import Lattice, texel_centers
 from mbtf_core.directions import from_angles
-from mbtf_pipeline.compare.image_files import write_channels
+from mbtf_pipeline.compare.image_files import read_channels, write_channels
 from mbtf_pipeline.recipe import SceneView
 
 if TYPE_CHECKING:
@@ -59,10 +59,7 @@ def read_offset(path: Path) -> F32:
     ------
     InputError : missing or corrupt
     """
-    from mbtf_core.images.exr import read_channels
-
-    channels = read_channels(path, 1 << 26)
-    return np.stack([channels["X"], channels["Y"]], axis=-1).astype(np.float32)
+    return read_channels(path, "XY")
 
 
 def towards_view(offset: F32, view: SceneView) -> F32:

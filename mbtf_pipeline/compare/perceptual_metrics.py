@@ -1,23 +1,33 @@
-"""Perceptual metrics of two images at stated exposures: FLIP, SSIM and, on request, ST-LPIPS.
+"""Perceptual metrics of two images: FLIP at stated exposures, SSIM and, on request, ST-LPIPS.
 
 FLIP: Andersson et al., "FLIP: A Difference Evaluator for Alternating Images", HPG 2020; HDR-FLIP: Andersson
 et al., "Visualizing Errors in Rendered High Dynamic Range Images", Eurographics 2021. Both predict how
 visible a difference is when two images alternate on a screen, from 0 (none) to 1 (maximal). SSIM: Wang,
 Bovik, Sheikh, Simoncelli, "Image Quality Assessment: From Error Visibility to Structural Similarity", IEEE
-TIP 13(4), 2004, as implemented in scikit-image with the paper's Gaussian window. All respond to noise of the
-reference too, so the two halves of the reference are compared with each other as a noise baseline.
+TIP 13(4), 2004, as implemented in scikit-image with the paper's Gaussian window. ST-LPIPS: Ghildyal and Liu,
+"Shift-tolerant Perceptual Similarity Metric", ECCV 2022, with the weights of the package ``stlpips-pytorch``
+(network ``alex``), an optional extra. Its code is not used: its dependencies would install another PyTorch.
+All respond to noise of the reference too, so the two halves of the reference are compared with each other as
+a noise baseline.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from functools import lru_cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mbtf_pipeline.compare.st_lpips import st_lpips, to_srgb
+from mbtf_core.color import linear_to_srgb
+from mbtf_core.errors import EngineError
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 F32 = NDArray[np.float32]
 
@@ -27,40 +37,47 @@ TONE_MAPPER = "ACES"
 # Pixels per degree of visual angle: a 0.7 m wide screen of 3840 pixels at a distance of 0.7 m.
 PIXELS_PER_DEGREE = 67.0
 
+# Standard deviation of SSIM's window in pixels, and its size; both as in the paper (11 × 11 pixels).
+WINDOW = 1.5
+_WINDOW_SIZE = 11
+
+# Package of ST-LPIPS, its weights, and the smallest image side for which its deepest layer is not empty.
+PACKAGE = "stlpips_pytorch"
+_WEIGHTS = Path("weights/vST0.0/alex_shift_tolerant.pth")
+_SMALLEST = 32
+
 _STOPS = ", ".join(f"{stop:+g}".replace("-", "−").replace("+0", "0") for stop in EXPOSURES)
-FLIP_DEFINITION = (
-    "LDR-FLIP (Andersson et al. 2020) is the mean over pixels of the visible difference, with values above "
-    f"white clipped. HDR-FLIP (2021) takes per pixel the largest difference at {_STOPS} stops from the "
+_BASELINE = "include the reference noise; its two estimates, compared, give a baseline."
+PERCEPTUAL_DEFINITIONS = {
+    "flip": "LDR-FLIP (Andersson et al. 2020) is the mean over pixels of the visible difference, with values "
+    f"above white clipped. HDR-FLIP (2021) takes per pixel the largest difference at {_STOPS} stops from the "
     f"comparison's exposure, tone mapper {TONE_MAPPER}. Both assume {PIXELS_PER_DEGREE:g} pixels per degree; "
-    "0 is no difference, 1 the largest. They include the reference noise; its two estimates, compared, "
-    "give a baseline."
-)
+    f"0 is no difference, 1 the largest. They {_BASELINE}",
+    "ssim": "structural similarity (Wang et al. 2004) of the images in sRGB, values above white clipped: "
+    f"mean over pixels and channels, Gaussian window with σ = {WINDOW:g} pixels; 1 means equal. Its values "
+    f"{_BASELINE}",
+    "st_lpips": "ST-LPIPS (Ghildyal and Liu 2022, network alex) of the images in sRGB, with values above "
+    f"white clipped; 0 means equal. Its values {_BASELINE}",
+}
 
 
-class Flip(NamedTuple):
-    """FLIP of two images: means over pixels from 0 to 1, and HDR-FLIP per pixel (rows, columns)."""
-
-    ldr: float
-    hdr: float
-    hdr_map: F32
-
-
-def flip(image: ArrayLike, reference: ArrayLike, white: float) -> Flip:
-    """FLIP of linear images (rows, columns, 3) in 1/sr.
+def flip(image: ArrayLike, reference: ArrayLike, white: float) -> tuple[float, float, F32]:
+    """LDR-FLIP and HDR-FLIP of linear images (rows, columns, 3) in 1/sr, both from 0 to 1.
 
     Parameters
     ----------
     white : linear value displayed as white, 1/sr
+
+    Returns
+    -------
+    (float, float, (rows, columns) array)
+        Means over pixels, and HDR-FLIP per pixel.
     """
     test, truth = (np.maximum(np.asarray(x, np.float32) / np.float32(white), 0) for x in (image, reference))
-    exposures = {
-        "startExposure": EXPOSURES[0],
-        "stopExposure": EXPOSURES[-1],
-        "numExposures": len(EXPOSURES),
-    }
-    hdr_map, hdr = _evaluate(truth, test, "HDR", **exposures, tonemapper=TONE_MAPPER)
+    stops = {"startExposure": EXPOSURES[0], "stopExposure": EXPOSURES[-1], "numExposures": len(EXPOSURES)}
+    hdr_map, hdr = _evaluate(truth, test, "HDR", **stops, tonemapper=TONE_MAPPER)
     _, ldr = _evaluate(np.minimum(truth, 1), np.minimum(test, 1), "LDR")
-    return Flip(ldr, hdr, hdr_map)
+    return ldr, hdr, hdr_map
 
 
 def _evaluate(reference: F32, test: F32, kind: str, **parameters: Any) -> tuple[F32, float]:
@@ -76,17 +93,6 @@ def _evaluate(reference: F32, test: F32, kind: str, **parameters: Any) -> tuple[
         parameters={"ppd": PIXELS_PER_DEGREE, **parameters},
     )
     return np.asarray(field, np.float32)[..., 0], float(mean)
-
-
-# Standard deviation of the window in pixels, and its size; both as in the paper (11 × 11 pixels).
-WINDOW = 1.5
-_WINDOW_SIZE = 11
-
-SSIM_DEFINITION = (
-    "structural similarity (Wang et al. 2004) of the images in sRGB, values above white clipped: "
-    f"mean over pixels and channels, Gaussian window with σ = {WINDOW:g} pixels; 1 means equal. It includes "
-    "the reference noise; its two estimates, compared, give a baseline."
-)
 
 
 def ssim(image: ArrayLike, reference: ArrayLike, white: float) -> float | None:
@@ -112,6 +118,100 @@ def ssim(image: ArrayLike, reference: ArrayLike, white: float) -> float | None:
             use_sample_covariance=False,
         )
     )
+
+
+def to_srgb(image: ArrayLike, white: float) -> NDArray[np.float64]:
+    """sRGB in [0, 1] of linear values (..., 3) in 1/sr, clipped at `white`."""
+    linear = np.clip(np.asarray(image, np.float64) / white, 0.0, 1.0)
+    return np.asarray(linear_to_srgb(linear), np.float64)
+
+
+def weights_file() -> Path | None:
+    """Path of the package's weights; None if it is not installed."""
+    spec = find_spec(PACKAGE)
+    places = (spec and spec.submodule_search_locations) or []
+    return next((path for place in places if (path := Path(place) / _WEIGHTS).is_file()), None)
+
+
+def require() -> Path:
+    """Path of the weights.
+
+    Raises
+    ------
+    EngineError : the package with its weights is not installed
+    """
+    file = weights_file()
+    if file is None:
+        raise EngineError(
+            "ST-LPIPS needs the weights of the package stlpips-pytorch, which is not installed",
+            where="compare.perceptual_metrics",
+            hint="pip install 'mbtf[perceptual]', or remove the option",
+        )
+    return file
+
+
+@lru_cache(maxsize=1)
+def _tensors() -> dict[str, Tensor]:
+    """Tensors of the network, named as in the package's file."""
+    import torch
+
+    return dict(torch.load(require(), map_location="cpu", weights_only=True))
+
+
+def _features(x: Tensor) -> list[Tensor]:
+    """Features of AlexNet's five layers for an image (1, 3, rows, columns) in [-1, 1], normalized over
+    channels. A 1 2 1 blur with reflected edges, two pixels wide, replaces the strides."""
+    import torch
+    from torch.nn.functional import conv2d, max_pool2d, pad
+
+    tensors = _tensors()
+
+    def layer(x: Tensor, name: str, padding: int) -> Tensor:
+        return conv2d(x, tensors[f"net.{name}.weight"], tensors[f"net.{name}.bias"], padding=padding)
+
+    def blurred(x: Tensor) -> Tensor:
+        row = torch.tensor([0.25, 0.5, 0.25])
+        kernel = (row[:, None] * row).expand(x.shape[1], 1, 3, 3)
+        return conv2d(pad(x, (2, 2, 2, 2), mode="reflect"), kernel, stride=2, groups=x.shape[1])
+
+    x = (x - tensors["scaling_layer.shift"]) / tensors["scaling_layer.scale"]
+    first = blurred(layer(x, "slice1.0", 2)).relu()
+    second = layer(blurred(max_pool2d(first, 3, stride=1)), "slice2.5", 2).relu()
+    third = layer(blurred(max_pool2d(second, 3, stride=1)), "slice3.9", 1).relu()
+    fourth = layer(third, "slice4.11", 1).relu()
+    found = [first, second, third, fourth, layer(fourth, "slice5.13", 1).relu()]
+    return [f / (f.square().sum(1, keepdim=True).sqrt() + 1e-10) for f in found]
+
+
+def st_lpips(image: ArrayLike, reference: ArrayLike, white: float) -> float | None:
+    """ST-LPIPS of linear images (rows, columns, 3) in 1/sr; None for images too small for the network.
+
+    Parameters
+    ----------
+    white : linear value displayed as white, 1/sr
+
+    Raises
+    ------
+    EngineError : the package with its weights is not installed
+    """
+    import torch
+
+    tensors = _tensors()
+    if min(np.shape(reference)[:2]) < _SMALLEST:
+        return None
+    with torch.no_grad():
+        first, second = (
+            _features(
+                torch.from_numpy((2.0 * to_srgb(x, white) - 1.0).astype(np.float32).transpose(2, 0, 1)[None])
+            )
+            for x in (image, reference)
+        )
+        weights = [tensors[f"lin{number}.model.1.weight"].view(1, -1, 1, 1) for number in range(len(first))]
+        # Squared differences, weighted per channel and averaged over positions.
+        return sum(
+            float(((x - y).square() * w).sum(1).mean())
+            for x, y, w in zip(first, second, weights, strict=True)
+        )
 
 
 def perceptual_scores(

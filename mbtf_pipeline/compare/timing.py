@@ -62,12 +62,12 @@ def _seconds(work: Callable[[], Any]) -> float:
     import torch
 
     def run() -> None:
-        with torch.no_grad():
-            work()
+        work()
         if torch.cuda.is_available():
             torch.cuda.synchronize()
 
-    return timed(run)[1]
+    with torch.no_grad():
+        return timed(run)[1]
 
 
 def measure_timing(material: Material, pixels: int, device: str) -> dict[str, Any]:
@@ -88,23 +88,21 @@ def measure_timing(material: Material, pixels: int, device: str) -> dict[str, An
     def milliseconds(part: Callable[..., Any]) -> float:
         return scale * _seconds(lambda: [part(*chunk) for chunk in chunks])
 
-    whole = scale * _seconds(lambda: material.evaluate(*queries))
-    first = milliseconds(lambda u, s, i, o: model.stage1(u, s, o))
     # Stage 2 is timed with the features of the first chunk: its time does not depend on their values.
     u, sigma, _, view = chunks[0]
     with torch.no_grad():
         features = model.stage1(u, sigma, view)
+    first = milliseconds(lambda u, s, i, o: model.stage1(u, s, o))
     second = milliseconds(lambda u, s, i, o: model.stage2(_first(features, len(u), len(view)), i, o))
-    parts = {name: milliseconds(part) for name, part in _parts(material).items()}
     return {
         "device": device,
         "pixels": pixels,
         "queries": count,
-        "evaluate_ms": round(whole, 3),
+        "evaluate_ms": round(scale * _seconds(lambda: material.evaluate(*queries)), 3),
         "stage1_ms": round(first, 3),
         "stage2_ms": round(second, 3),
         "lights_ms": {str(n): round(first + n * second, 3) for n in LIGHTS},
-        "parts_ms": {name: round(ms, 3) for name, ms in parts.items()},
+        "parts_ms": {name: round(milliseconds(part), 3) for name, part in _parts(material).items()},
     }
 
 

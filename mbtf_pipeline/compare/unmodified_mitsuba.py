@@ -36,10 +36,9 @@ if TYPE_CHECKING:
 F64 = NDArray[np.float64]
 # Lowest elevations of view and light for which the finite block suffices.
 LOWEST_VIEW, LOWEST_LIGHT = 75.0, 30.0
-# Side in pixels of the blocks taken as independent: neighboring pixels share samples of the Gaussian filter.
-# Correlation across block borders makes error bars 5 % too small, 12 % for the smallest blocks. Small
-# images use smaller blocks, so that _BLOCKS_ACROSS fit along a side.
-_BLOCK, _MIN_BLOCK, _BLOCKS_ACROSS = 8, 4, 4
+# Pixels along every edge that are ignored, and the side of the blocks taken as independent: neighboring
+# pixels share samples of the Gaussian filter. Correlation across borders makes error bars 5 % too small.
+_MARGIN, _BLOCK = 4, 8
 # With fewer blocks the error bars are too uncertain to decide anything.
 MIN_BLOCKS = 9
 # Tolerated differences relative to the mean value: of the mean, and root mean square over pixels.
@@ -85,30 +84,23 @@ def verdict(mean: Estimate, square: Estimate) -> Verdict:
     return "agree" if pixels_agree and means_agree else "differ"
 
 
-def agreement(mbtf: tuple[F64, F64], mitsuba: tuple[F64, F64], margin: int = 0) -> MitsubaAgreement:
-    """Compare two renderings (rows, columns, 3), each given as two independent halves.
-
-    Parameters
-    ----------
-    margin : pixels to ignore along every edge; reduced for images that would have none left
-    """
-    margin = min(margin, (min(mbtf[0].shape[:2]) - 1) // 2)
-    inner = slice(margin, -margin if margin else None)
-    a1, b1, a2, b2 = (_blocks(x[inner, inner]) for x in (*mbtf, *mitsuba))
-    mean = float((a1 + b1 + a2 + b2).mean() / 4.0)
-    scale = 1.0 / max(mean, 1e-30)
+def agreement(mbtf: tuple[F64, F64], mitsuba: tuple[F64, F64]) -> MitsubaAgreement:
+    """Compare two renderings (rows, columns, 3), each given as two independent halves."""
+    a1, b1, a2, b2 = (_blocks(x) for x in (*mbtf, *mitsuba))
+    scale = 4.0 / max(float((a1 + b1 + a2 + b2).mean()), 1e-30)
     difference = mean_estimate((a1 + b1 - a2 - b2) / 2.0).scaled(scale)
     square = mean_estimate((a1 - a2) * (b1 - b2)).scaled(scale**2)
     return MitsubaAgreement(difference, square, (mbtf[0] + mbtf[1]) / 2, (mitsuba[0] + mitsuba[1]) / 2)
 
 
 def _blocks(picture: F64) -> F64:
-    """(blocks, pixels of a block, 3) of an image; incomplete blocks at the right and bottom are dropped."""
-    shortest = min(picture.shape[:2])
-    side = min(_BLOCK, shortest, max(_MIN_BLOCK, shortest // _BLOCKS_ACROSS))
-    rows, columns = (n // side for n in picture.shape[:2])
-    cut = picture[: rows * side, : columns * side].reshape(rows, side, columns, side, 3)
-    return cut.transpose(0, 2, 1, 3, 4).reshape(rows * columns, side * side, 3)
+    """(blocks, pixels, 3) within the margin; incomplete blocks are dropped. A small image is one block."""
+    rows, columns = ((n - 2 * _MARGIN) // _BLOCK for n in picture.shape[:2])
+    if min(rows, columns) < 1:
+        return picture.reshape(1, -1, 3)
+    inner = picture[_MARGIN : _MARGIN + rows * _BLOCK, _MARGIN : _MARGIN + columns * _BLOCK]
+    cut = inner.reshape(rows, _BLOCK, columns, _BLOCK, 3)
+    return cut.transpose(0, 2, 1, 3, 4).reshape(rows * columns, -1, 3)
 
 
 def pick_scene(section: CompareSection) -> tuple[SceneView, SceneDirection, float]:
@@ -138,16 +130,12 @@ def write_agreement(
     for surface, found in compare_with_mitsuba(section, generate, material).items():
         stem = f"{PICTURES}/check-{surface.replace(' ', '-')}"
         files = {renderer: f"{stem}-{renderer}" for renderer in ("mbtf", "mitsuba")}
-        for file, value in zip(files.values(), (found.mbtf, found.mitsuba), strict=True):
-            write_picture(out / file, value.astype(np.float32), exposure)
-        mean, square = found.mean.as_dict(), found.square.as_dict()
-        surfaces.append({"surface": surface, "mean": mean, "square": square, "files": files})
-    return {
-        "view": view.model_dump(),
-        "light": light.model_dump(),
-        "tiles_across": tiles_across,
-        "surfaces": surfaces,
-    }
+        for renderer, file in files.items():
+            write_picture(out / file, getattr(found, renderer), exposure)
+        errors = {"mean": found.mean.as_dict(), "square": found.square.as_dict()}
+        surfaces.append({"surface": surface, **errors, "files": files})
+    scene = {"view": view.model_dump(), "light": light.model_dump(), "tiles_across": tiles_across}
+    return {**scene, "surfaces": surfaces}
 
 
 def compare_with_mitsuba(
@@ -173,7 +161,7 @@ def compare_with_mitsuba(
         )
         mbtf = image.value_a.astype(np.float64), image.value_b.astype(np.float64)
         mitsuba = render_with_mitsuba(job, camera, omega_i, section.spp, section.seed)
-        out[surface] = agreement(mbtf, mitsuba, margin=4)
+        out[surface] = agreement(mbtf, mitsuba)
     return out
 
 

@@ -21,9 +21,8 @@ from mbtf_pipeline.cost.figures import (
 from mbtf_pipeline.cost.measurements import ESTIMATES, Measurement
 from mbtf_pipeline.cost.pareto import extrapolation, pareto_front
 from mbtf_pipeline.cost.study import STUDY, Study
-from mbtf_pipeline.number_text import is_significant
 from mbtf_pipeline.report.report import render
-from mbtf_pipeline.tables import Cell, Column, Table, rows_of
+from mbtf_pipeline.tables import Cell, Column, Table, is_significant, rows_of
 
 CSV_NAME, PAGE_NAME = "cost.csv", "cost.html"
 _DETAILS = (
@@ -56,7 +55,7 @@ _CSV = [_column(name) for name in ("study", "series", "name", *ESTIMATES, *_DETA
 
 def to_csv(found: Sequence[Measurement]) -> str:
     """One row per configuration; ``_se`` are standard errors, empty cells were not measured."""
-    return Table("cost", "", "", _CSV, rows_of(_CSV, ([m] for m in found))).csv()
+    return Table("cost", "", _CSV, rows_of(_CSV, ([m] for m in found))).csv()
 
 
 def _percent(e: Estimate | None) -> str:
@@ -126,7 +125,7 @@ _SECTIONS = {
 
 
 def _table(columns: Sequence[Column], found: Sequence[Measurement]) -> dict[str, Any]:
-    return Table("", "", "", columns, rows_of(columns, ([m] for m in found))).for_page()
+    return Table("", "", columns, rows_of(columns, ([m] for m in found))).for_page()
 
 
 def complete_runs(found: Sequence[Measurement]) -> list[Measurement]:

@@ -11,8 +11,8 @@ from typing import Any
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.cost.measurements import Measurement
 from mbtf_pipeline.cost.pareto import pareto_front
-from mbtf_pipeline.number_text import is_significant
 from mbtf_pipeline.report.plots import Cloud, scatter
+from mbtf_pipeline.tables import is_significant
 
 NOISE_AXIS = "RMS error relative to the mean value"
 ERROR_AXIS = "unexplained variance of test queries"

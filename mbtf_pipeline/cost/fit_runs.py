@@ -9,7 +9,7 @@ from mbtf_core.config.nested import nested
 from mbtf_fit.config import DEFAULT_MODEL, best_options
 from mbtf_pipeline.cost.repeats import FEWEST_SEEDS
 from mbtf_pipeline.cost.runs import DataRequest, Run
-from mbtf_pipeline.time_split import round_down
+from mbtf_pipeline.run_time import round_down
 
 # Shares of a study's time that the generator and the runs get, of two seeds each. The rest is left for
 # start-up, the test set and evaluation.

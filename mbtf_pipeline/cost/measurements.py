@@ -10,7 +10,7 @@ from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import read_json, write_json
 from mbtf_core.files.digest import data_sha256
 from mbtf_core.stats import Estimate
-from mbtf_pipeline.number_text import estimate
+from mbtf_pipeline.tables import estimate
 
 # Raised when the method of measuring changes: older measurements are then repeated.
 SCHEMA = 7

@@ -10,8 +10,8 @@ from typing import Any
 from mbtf_core.exposure import describe_exposure
 from mbtf_fit.formatting import SPLIT_NAMES
 from mbtf_pipeline.compare.perceptual_metrics import available_metrics
-from mbtf_pipeline.number_text import data_errors, decibel, estimate, estimate_text, short_direction
 from mbtf_pipeline.report.plots import points
+from mbtf_pipeline.tables import data_errors, decibel, estimate, estimate_text, short_direction
 
 UNEXPLAINED = "unexplained variance"
 _TERMS = {

@@ -12,7 +12,10 @@ import numpy as np
 
 from mbtf_pipeline.compare.image_files import read_halves, read_map, read_picture
 from mbtf_pipeline.compare.perceptual_metrics import available_metrics
-from mbtf_pipeline.number_text import (
+from mbtf_pipeline.report.embed import Gallery, Pixels
+from mbtf_pipeline.report.error_maps import color_bar, common_scale, local_error
+from mbtf_pipeline.run_folder import COMPARE
+from mbtf_pipeline.tables import (
     decibel,
     direction,
     estimate,
@@ -21,9 +24,6 @@ from mbtf_pipeline.number_text import (
     short_direction,
     width,
 )
-from mbtf_pipeline.report.embed import Gallery, Pixels
-from mbtf_pipeline.report.error_maps import color_bar, common_scale, local_error
-from mbtf_pipeline.run_folder import COMPARE
 
 _KIND = {"query": "Reference", "pixel": "Reference, filtered pixel"}
 

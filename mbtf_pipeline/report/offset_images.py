@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from mbtf_pipeline.compare.offsets import read_offset, towards_view
-from mbtf_pipeline.number_text import direction, signed
 from mbtf_pipeline.recipe import SceneView
 from mbtf_pipeline.report.embed import Gallery, Pixels
 from mbtf_pipeline.report.error_maps import color_bar, common_scale
 from mbtf_pipeline.report.image_sheet import exr_link
+from mbtf_pipeline.tables import direction, signed
 
 
 def displacements(

@@ -11,7 +11,6 @@ from mbtf_core.config.settings import check_schema
 from mbtf_core.exposure import describe_exposure
 from mbtf_core.files.atomic import read_json, write_text
 from mbtf_pipeline.compare.compare import COMPARISON_NAME, COMPARISON_SCHEMA
-from mbtf_pipeline.number_text import NOT_SIGNIFICANT
 from mbtf_pipeline.recipe import RECIPE_NAME, Recipe
 from mbtf_pipeline.report.embed import ENCODINGS, Gallery, encode
 from mbtf_pipeline.report.errors import error_context
@@ -21,6 +20,7 @@ from mbtf_pipeline.report.offset_images import offset_section
 from mbtf_pipeline.report.plots import ERROR_BAR_NOTE
 from mbtf_pipeline.report.times import provenance, read_training, time_context, training_context
 from mbtf_pipeline.run_folder import COMPARE, FITS, REPORT, RUN, SHARDS
+from mbtf_pipeline.tables import NOT_SIGNIFICANT
 
 # Raised when the report or the viewer's page changes; part of the stage's key.
 LAYOUT = 12

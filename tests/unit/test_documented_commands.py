@@ -19,7 +19,7 @@ from mbtf_core.errors import MbtfError
 from mbtf_fit.cli.app import app as fit
 from mbtf_gen.cli.app import app as generate
 from mbtf_pipeline.cli.app import app as pipeline
-from mbtf_pipeline.papers.plan import is_paper_recipe, load_paper_recipe
+from mbtf_pipeline.collection.recipes import load
 from mbtf_pipeline.recipe import Recipe
 
 APPS = {"mbtf-gen": generate, "mbtf-fit": fit, "mbtf-pipeline": pipeline}
@@ -100,8 +100,8 @@ def check_values(command: Any, arguments: dict[str, Any]) -> None:
         recipe = ROOT / arguments["recipe"]
         if not recipe.exists():
             recipe = ROOT / "pipelines/quickstart.yaml"
-        if is_paper_recipe(recipe):
-            load_paper_recipe(recipe, arguments["assignments"])
+        if "paper" in recipe.name:
+            load(recipe, arguments["assignments"])
         else:
             resolve(Recipe, file=recipe, assignments=arguments["assignments"])
 

@@ -35,8 +35,7 @@ MODULES = (
     "mbtf_gen.tile.fibers.cloth_file",
     "mbtf_gen.tile.maps.material_file",
     "mbtf_gen.tile.mesh_file",
-    "mbtf_pipeline.library.entries",
-    "mbtf_pipeline.papers.plan",
+    "mbtf_pipeline.collection.recipes",
     "mbtf_pipeline.recipe",
 )
 # What a command needs before it reads its options.

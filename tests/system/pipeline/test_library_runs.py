@@ -9,19 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from support.datasets import edit
-from support.fit_data import parallax, write_data
 from support.small_runs import contents
 
 from mbtf_core.app.console import run
-from mbtf_fit.config import FitConfig
-from mbtf_fit.evaluation import evaluate
-from mbtf_fit.material.decoder import Decoder
-from mbtf_fit.material.material import Material
 from mbtf_gen.generation.run import generate
 from mbtf_gen.job import Job
 from mbtf_pipeline.cli.app import app
-from mbtf_pipeline.library.task import fit_shared
 from mbtf_pipeline.recipe import read_resolved
 
 RECIPE = """
@@ -62,13 +55,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def record(out: Path) -> dict[str, dict[str, object]]:
-    found = json.loads((out / "library.json").read_text())
-    return {material["name"]: material for material in found["materials"]}
+    found = json.loads((out / "collection.json").read_text())
+    return {run["name"]: run for run in found["runs"]}
 
 
 def weights(out: Path, *names: str) -> dict[str, int]:
     """When the fits of materials were written."""
-    paths = [out / "materials" / name / "fits" / "neumip" for name in names]
+    paths = [out / "runs" / name / "fits" / "neumip" for name in names]
     return {str(path): (path / "weights.safetensors").stat().st_mtime_ns for path in paths}
 
 
@@ -76,7 +69,7 @@ def test_failures_are_named_and_the_rest_is_kept(folder: Path, capsys: pytest.Ca
     out = folder / "out"
     line = ["run", str(folder / "library.yaml"), "-o", str(out), "-q"]
     assert run(app, line) == 4
-    assert "1 of 3 materials failed" in capsys.readouterr().err
+    assert "1 of 3 runs failed" in capsys.readouterr().err
     found = record(out)
     assert {name: material["state"] for name, material in found.items()} == {
         **{"broken": "failed", "flat": "done", "rough": "done"}
@@ -86,8 +79,8 @@ def test_failures_are_named_and_the_rest_is_kept(folder: Path, capsys: pytest.Ca
     assert page.count("data:image/jpeg;base64,") == 4
     assert "height.png" in page
     for name in ("flat", "rough"):
-        assert f'href="materials/{name}/report.html"' in page
-        assert (out / "materials" / name / "report.html").is_file()
+        assert f'href="runs/{name}/report.html"' in page
+        assert (out / "runs" / name / "report.html").is_file()
     # Repaired, it runs, and the others are not run again.
     kept = weights(out, "flat", "rough")
     Image.fromarray(np.zeros((8, 8), np.uint8)).save(folder / "materials" / "broken" / "height.png")
@@ -109,74 +102,13 @@ def test_failures_are_named_and_the_rest_is_kept(folder: Path, capsys: pytest.Ca
 TWO = RECIPE.replace("[materials]", "[materials/flat, materials/rough]")
 
 
-@pytest.fixture(scope="module")
-def two(folder: Path) -> Path:
-    """A library of two materials, made on workers, with a shared network."""
+def test_workers_make_the_same_data(folder: Path) -> None:
     pytest.importorskip("distributed", reason="no Dask; to enable: pip install 'mbtf[cluster]'")
-    (folder / "two.yaml").write_text(f"{TWO}shared_network: 1s\n")
-    out = folder / "clustered"
-    assert run(app, ["run", str(folder / "two.yaml"), "-o", str(out), "-q", "--cluster", "local:2"]) == 0
-    return out
-
-
-def test_workers_make_the_same_data(folder: Path, two: Path) -> None:
+    (folder / "two.yaml").write_text(TWO)
+    two = folder / "clustered"
+    assert run(app, ["run", str(folder / "two.yaml"), "-o", str(two), "-q", "--cluster", "local:2"]) == 0
     assert {material["state"] for material in record(two).values()} == {"done"}
-    config = read_resolved(two / "materials" / "rough").generate
+    config = read_resolved(two / "runs" / "rough").generate
     material = str(folder / "materials" / "rough")
     generate(Job.prepare(config.model_copy(update={"material": material})), folder / "own")
-    assert contents(folder / "own") == contents(two / "materials/rough/shards")
-
-
-def test_a_shared_network(two: Path) -> None:
-    shared = json.loads((two / "library.json").read_text())["shared"]
-    assert shared["fit"] == "neumip"
-    assert set(shared["errors"]) == {"flat", "rough"}
-    assert not shared["error"]
-    for name in ("flat", "rough"):
-        material = Material.load(two / "shared" / name)
-        assert material.description["training"]["shared_decoder"]["materials"] == ["flat", "rough"]
-    assert Decoder.find(two / "shared").config.training.time == 1.0
-    assert (two / "library.html").read_text().count("with the shared network") == 2
-    # Up to date, nothing is trained again; without it, the page no longer shows it.
-    before = (two / "shared/decoder/weights.safetensors").stat().st_mtime_ns
-    line = ["run", str(two.parent / "two.yaml"), "-o", str(two), "-q"]
-    assert run(app, line) == 0
-    assert (two / "shared/decoder/weights.safetensors").stat().st_mtime_ns == before
-    assert run(app, [*line, "--set", "shared_network=null"]) == 0
-    assert "with the shared network" not in (two / "library.html").read_text()
-
-
-@pytest.fixture
-def runs(tmp_path: Path) -> Path:
-    """Data sets of runs: of another layout than the fits', and those that the fits learn from."""
-    for seed, name in enumerate("abc"):
-        write_data(tmp_path / name / "shards", parallax, train=200, test=300, seed=seed)
-        write_data(tmp_path / name / "shards-shuffled", parallax, train=1000, test=1, seed=seed)
-    return tmp_path
-
-
-def error_on(material: Path, shards: Path) -> float | None:
-    return evaluate(Material.load(material), shards)["errors"]["test"]["unexplained"]["value"]
-
-
-def test_materials_join_and_leave_a_shared_network(runs: Path) -> None:
-    training = {"steps": 4, "batch": 300, "shared_decoder": True}
-    config = FitConfig.model_validate({"model": "neumip", "training": training})
-    network = runs / "shared/decoder"
-
-    def share(names: str) -> int:
-        shards = [runs / name / "shards-shuffled" for name in names]
-        found = fit_shared(config, shards, [runs / "shared" / name for name in names], network)
-        expected = [error_on(runs / "shared" / name, runs / name / "shards") for name in names]
-        assert [error["value"] for error in found] == pytest.approx(expected)
-        return (network / "weights.safetensors").stat().st_mtime_ns
-
-    first = share("ab")
-    assert share("ab") == first
-    joined = share("abc")
-    assert joined != first
-    left = share("ab")
-    assert left != joined
-    # As after a kill between the claims of the network's folder and those of the materials.
-    edit(network / "fit.json", lambda record: record.update(config_hash="another"))
-    assert share("ab") != left
+    assert contents(folder / "own") == contents(two / "runs/rough/shards")

@@ -68,9 +68,9 @@ def table(folder: Path, name: str) -> list[dict[str, str]]:
 
 
 def test_tables_contain_the_measured_numbers(made: Path) -> None:
-    record: dict[str, Any] = json.loads((made / "out" / "paper.json").read_text())
+    record: dict[str, Any] = json.loads((made / "out" / "collection.json").read_text())
     assert record["size"] == "quick"
-    assert list(record["skipped"]) == ["elsewhere"]
+    assert {run["name"]: run["state"] for run in record["runs"]} == {"bumps": "done", "elsewhere": "skipped"}
     methods = table(made, "methods")
     assert [r["method"] for r in methods[:3]] == ["neumip-baseline", "neumip", "hierarchical"]
     assert len(methods) == 3
@@ -106,18 +106,13 @@ def test_the_page_is_self_contained_and_names_the_size(made: Path) -> None:
 def test_the_same_command_runs_nothing_again(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
     stamps = {p: p.stat().st_mtime_ns for p in (made / "out" / "runs").rglob("stages/*.json")}
     assert len(stamps) == 7
-    (made / "out" / "paper.html").unlink()
-    capsys.readouterr()
-    assert run(app, command(made)) == 0
-    assert json.loads(capsys.readouterr().out)["skipped"].keys() == {"elsewhere"}
-    assert {p: p.stat().st_mtime_ns for p in stamps} == stamps
-    assert (made / "out" / "paper.html").exists()
-
-
-def test_the_page_can_be_written_again(made: Path) -> None:
     page, rows = made / "out" / "paper.html", made / "out" / "tables" / "methods.csv"
     before = page.read_bytes(), rows.read_bytes()
     page.unlink()
+    capsys.readouterr()
+    assert run(app, command(made)) == 0
+    assert [run["state"] for run in json.loads(capsys.readouterr().out)["runs"]] == ["done", "skipped"]
+    assert {p: p.stat().st_mtime_ns for p in stamps} == stamps
     rows.unlink()
     assert run(app, ["report", str(made / "out")]) == 0
     assert (page.read_bytes(), rows.read_bytes()) == before
@@ -125,11 +120,12 @@ def test_the_page_can_be_written_again(made: Path) -> None:
 
 def test_an_incomplete_page_is_marked(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.copytree(made / "out", tmp_path / "out")
-    record = tmp_path / "out" / "paper.json"
-    data = json.loads(record.read_text()) | {"planned": 3}
-    record.write_text(json.dumps(data))
+    record = tmp_path / "out" / "collection.json"
+    data = json.loads(record.read_text())
+    pending = data["runs"][0] | {"name": "other", "state": "pending"}
+    record.write_text(json.dumps(data | {"runs": [*data["runs"], pending]}))
     assert run(app, ["report", str(tmp_path / "out")]) == 0
-    assert "1 of 3 runs are finished" in (tmp_path / "out" / "paper.html").read_text()
-    record.write_text(json.dumps(data | {"runs": []}))
+    assert "1 of 2 runs are finished" in (tmp_path / "out" / "paper.html").read_text()
+    record.write_text(json.dumps(data | {"runs": [pending]}))
     assert run(app, ["report", str(tmp_path / "out")]) == 3
     assert "contains no finished run" in capsys.readouterr().err

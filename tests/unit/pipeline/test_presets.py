@@ -14,8 +14,7 @@ from mbtf_core.app.options import Quality
 from mbtf_core.config.settings import resolve
 from mbtf_fit.config import FITTER, FitConfig, best_at, best_options, fitter_options
 from mbtf_gen.config.generator import GENERATOR, GeneratorConfig, count_queries
-from mbtf_pipeline.presets import COMPARE, preset_recipe, quality_options
-from mbtf_pipeline.recipe import load_recipe
+from mbtf_pipeline.recipe import COMPARE, load_recipe, preset_recipe, quality_options
 
 QUALITIES: tuple[Quality, ...] = get_args(Quality)
 
@@ -25,17 +24,12 @@ def test_each_preset_takes_more_paths_than_the_one_before() -> None:
     for quality in QUALITIES:
         config = resolve(GeneratorConfig, presets={"material": "m", **GENERATOR[quality]})
         paths.append(count_queries(config.queries.train, 128**2) * config.queries.spp)
-    assert paths == sorted(paths)
-    assert len(set(paths)) == len(paths)
-    # Test errors are free of noise; their error bars depend on the number of queries.
-    tests = [int(GENERATOR[q]["queries.test"]) for q in QUALITIES]
-    assert tests == sorted(tests)
+    assert paths == sorted(set(paths))
 
 
 @pytest.mark.parametrize("quality", QUALITIES)
-@pytest.mark.parametrize("name", ["quickstart", "ci"])
-def test_recipes_take_a_preset(quality: Quality, name: str) -> None:
-    path = ROOT / "pipelines" / f"{name}.yaml"
+def test_recipes_take_a_preset(quality: Quality) -> None:
+    path = ROOT / "pipelines" / "quickstart.yaml"
     recipe = load_recipe(path, presets=quality_options(path, quality))
     assert recipe.generate.queries.train == GENERATOR[quality]["queries.train"]
     # Other options stay those of the recipe.
@@ -88,21 +82,8 @@ def test_longer_training_gets_a_larger_network() -> None:
     assert quality_options(path, "high")["fit.neumip.network.width"] == 64
 
 
-def test_explicit_options_override_the_preset(tmp_path: Path) -> None:
-    path = ROOT / "pipelines" / "quickstart.yaml"
-    given = ["generate.queries.train=5/texel"]
-    assert load_recipe(path, given, quality_options(path, "draft")).generate.queries.train == "5/texel"
-    file = tmp_path / "fit.yaml"
-    file.write_text("training: {steps: 7}\n")
-    resolved = resolve(FitConfig, file=file, presets=FITTER["draft"])
-    assert resolved.training.steps is None
-    assert resolved.training.time == 12
-
-
 SECTIONS = [
     ("fit.neumip={network: {width: 7}}", "fit.neumip.network.width=7"),
-    ("fit.neumip={training: {batch: 50}}", "fit.neumip.training.batch=50"),
-    ("fit={neumip: {network: {width: 7}}}", "fit.neumip.network.width=7"),
     ("fit={neumip: {training: {blur: {fraction: 0.4}}}}", "fit.neumip.training.blur.fraction=0.4"),
 ]
 

@@ -58,12 +58,12 @@ def test_data_are_out_of_date_when_a_map_has_changed(tmp_path: Path) -> None:
     """By its content, not by its date."""
     recipe, folder = load_recipe(written(tmp_path, SINGLE)), tmp_path / "out"
     stages = _RecipeRun(recipe, folder, Console(quiet=True)).stages(_material_inputs(recipe))
-    run_stages(folder, [replace(stage, outputs=tuple, run=lambda decision: None) for stage in stages])
+    run_stages(folder, [replace(stage, outputs=(), run=lambda decision: None) for stage in stages])
     path = tmp_path / "maps" / "height.npy"
     path.touch()
-    assert not survey(recipe, folder)["generate"].runs
+    assert not survey(recipe, folder)["generate"]
     np.save(path, np.ones((4, 4), np.float32))
-    assert survey(recipe, folder)["generate"].reason == "input changed: height"
+    assert survey(recipe, folder)["generate"] == "input changed: height"
 
 
 def test_an_assigned_material_is_relative_to_the_current_folder(
@@ -82,7 +82,6 @@ def test_an_assigned_material_is_relative_to_the_current_folder(
 @pytest.mark.parametrize(
     ("fit", "models"),
     [
-        ("fit: {model: neumip}\n", {"neumip": "neumip"}),
         ("fit: {training: {time: 9s}}\n", {"relief": "relief"}),
         (NAMED.removeprefix(HEAD), {"neumip": "neumip", "quick": "neumip-baseline"}),
         ("fit: {neumip+: }\n", {"neumip+": "neumip+"}),
@@ -96,13 +95,10 @@ def test_names_and_models_default_to_each_other(tmp_path: Path, fit: str, models
 @pytest.mark.parametrize(
     ("text", "line", "what"),
     [
-        (SINGLE + "compar: {}\n", 6, "did you mean 'compare'"),
         (SINGLE + "compare:\n  views:\n  - {elevation: 45, azimut: 3}\n", 8, "did you mean 'azimuth'"),
         (NAMED.replace("time: 5s", "tmie: 5s"), 10, "did you mean 'time'"),
-        (NAMED.replace("model: neumip-baseline", "model: neural"), 8, "neumip-baseline"),
         (HEAD + "fit:\n  other:\n", 6, "'rainer2020'"),
         (HEAD + "fit: {}\n", 5, "contains no fit"),
-        (SINGLE.replace("small", "a/b"), 1, "'name'"),
         (SINGLE + "compare: {tiles_across: [2, 2.0]}\n", 6, "same entry twice"),
     ],
 )
@@ -129,13 +125,10 @@ def test_a_missing_material_is_one_clear_line(tmp_path: Path, capsys: pytest.Cap
 @pytest.mark.parametrize(
     ("arguments", "code", "what"),
     [
-        (["run", "absent.yaml"], 3, "no such file"),
         (["run", "recipe-under-tset.yaml"], 3, "did you mean 'recipe-under-test.yaml'?"),
-        (["run", "."], 3, "is a folder"),
         (["run", "recipe-under-test.yaml", "--set", "compare.sp=2"], 2, "did you mean 'spp'"),
         (["run", "recipe-under-test.yaml", "-o", "maps"], 3, "not empty"),
         (["report", "maps"], 3, "contains no run"),
-        (["list", "absent"], 3, "no such folder"),
     ],
 )
 def test_exit_codes(

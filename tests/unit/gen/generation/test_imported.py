@@ -27,7 +27,7 @@ from mbtf_gen.generation import imported
 from mbtf_gen.generation.imported import Import, import_measured
 from mbtf_gen.generation.repair import repair
 from mbtf_gen.sampling.query_sampler import slice_directions
-from mbtf_pipeline.compare.dataset_errors import dataset_errors
+from mbtf_pipeline.compare.metrics import dataset_errors
 
 Open = Callable[..., Import]
 

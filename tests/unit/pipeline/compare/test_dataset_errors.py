@@ -16,7 +16,7 @@ from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.lattice import Lattice
 from mbtf_fit.config import build_model
 from mbtf_pipeline.compare import timing
-from mbtf_pipeline.compare.dataset_errors import dataset_errors
+from mbtf_pipeline.compare.metrics import dataset_errors
 from mbtf_pipeline.compare.timing import LIGHTS, measure_timing
 from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.run import _RecipeRun, data_sets

@@ -1,4 +1,4 @@
-"""SSIM and ST-LPIPS against closed forms, the definition and the published network."""
+"""FLIP, SSIM and ST-LPIPS against closed forms, the definition and the published network."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ import pytest
 
 from mbtf_core.errors import EngineError
 from mbtf_core.exposure import to_display
-from mbtf_pipeline.compare import st_lpips as perceptual
-from mbtf_pipeline.compare.perceptual_metrics import ssim
-from mbtf_pipeline.compare.st_lpips import st_lpips, to_srgb, weights_file
+from mbtf_pipeline.compare import perceptual_metrics as perceptual
+from mbtf_pipeline.compare.perceptual_metrics import flip, ssim, st_lpips, to_srgb, weights_file
 
 F64 = np.ndarray
 needs_weights = pytest.mark.skipif(
@@ -52,7 +51,7 @@ def test_only_the_ratio_to_white_matters_and_values_above_are_clipped() -> None:
 
 def test_missing_weights_of_st_lpips_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(perceptual, "PACKAGE", "no_such_package_of_weights")
-    perceptual._network.cache_clear()
+    perceptual._tensors.cache_clear()
     with pytest.raises(EngineError, match="ST-LPIPS needs the weights") as raised:
         st_lpips(*pair(), 1.0)
     assert "mbtf[perceptual]" in str(raised.value)
@@ -95,3 +94,23 @@ def test_st_lpips_of_equal_and_of_small_images() -> None:
     expected = pytest.approx(st_lpips(5 * picture, 5 * reference, 5.0), rel=1e-5)
     assert st_lpips(picture, reference, 1.0) == expected
     assert st_lpips(picture[:20], reference[:20], 1.0) is None
+
+
+# A reference with a bright half, and a fit that differs only there: 4 or 5 times white.
+REFERENCE, FIT = (np.repeat(np.array([0.05, bright], np.float32), 16) for bright in (0.8, 1.0))
+REFERENCE, FIT = (np.broadcast_to(row[:, None], (24, 32, 3)) for row in (REFERENCE, FIT))
+
+
+def test_only_hdr_flip_responds_above_white() -> None:
+    assert flip(REFERENCE, REFERENCE, 0.2)[:2] == (0, 0)
+    ldr, hdr, hdr_map = flip(FIT, REFERENCE, 0.2)
+    assert ldr < 1e-6
+    assert hdr > 0.01
+    assert hdr_map.shape == (24, 32)
+    assert hdr_map[:, 22:].mean() > 10 * hdr_map[:, :10].mean()
+    assert hdr == pytest.approx(float(hdr_map.mean()), rel=1e-3)
+
+
+def test_only_the_ratio_to_white_matters_to_flip() -> None:
+    assert flip(7 * FIT, 7 * REFERENCE, 1.4)[1] == pytest.approx(flip(FIT, REFERENCE, 0.2)[1], rel=1e-4)
+    assert flip(FIT, REFERENCE, 2.0)[0] > 0.01

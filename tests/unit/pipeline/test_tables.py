@@ -8,7 +8,7 @@ import pytest
 
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.compare.perceptual_metrics import PERCEPTUAL_METRICS, available_metrics
-from mbtf_pipeline.number_text import data_errors, decibel, estimate_text, levels_text
+from mbtf_pipeline.tables import data_errors, decibel, estimate_text, levels_text
 
 
 @pytest.mark.parametrize("value", [0.03, -0.03, 0.0])

@@ -14,14 +14,15 @@ from PIL import Image
 from support.paths import ROOT
 
 from mbtf_core.stats import Estimate
-from mbtf_pipeline.papers.checks import independence, timing, weights
-from mbtf_pipeline.papers.errors import ablations, levels, methods, zooms
-from mbtf_pipeline.papers.plan import load_paper_recipe
-from mbtf_pipeline.papers.published import level_ratios, mse_ratio
-from mbtf_pipeline.papers.runs import FinishedRun, mean_of, ratio_of
+from mbtf_pipeline.collection.check_tables import independence, timing, weights
+from mbtf_pipeline.collection.error_tables import ablations, levels, methods, zooms
+from mbtf_pipeline.collection.finished_run import FinishedRun, mean_of, ratio_of
+from mbtf_pipeline.collection.recipes import PaperRecipe, first_known, load
 from mbtf_pipeline.tables import Column, Shown, Table
 
-PUBLISHED = load_paper_recipe(ROOT / "pipelines" / "paper_methods.yaml", []).published
+PAPER = load(ROOT / "pipelines" / "paper_methods.yaml")
+assert isinstance(PAPER, PaperRecipe)
+PUBLISHED = PAPER.published
 MSE = {"neumip-baseline": 4e-4, "neumip": 2e-4}
 
 
@@ -93,16 +94,19 @@ def test_methods_mark_insignificant_and_missing_numbers(tmp_path: Path) -> None:
 
 
 def test_published_numbers_match_the_papers() -> None:
-    found = mse_ratio(PUBLISHED, "insulation_foam", "rainer2020", "neumip")
+    def mse_ratio(material: str, method: str, base: str) -> tuple[float | None, str | None]:
+        return first_known(PUBLISHED, lambda p: p.mse_ratio(material, method, base))
+
+    found = mse_ratio("insulation_foam", "rainer2020", "neumip")
     assert found == (pytest.approx(21.75 / 3.90), "Kuznetsov et al. 2021")
-    assert mse_ratio(PUBLISHED, "insulation_foam", "hierarchical", "neumip") is None
-    assert mse_ratio(PUBLISHED, "tree_bark", "neumip", "neumip-baseline") is None
-    decibels = mse_ratio(PUBLISHED, "turtle_shell", "hierarchical", "neumip")
+    assert mse_ratio("insulation_foam", "hierarchical", "neumip") == (None, None)
+    assert mse_ratio("tree_bark", "neumip", "neumip-baseline") == (None, None)
+    decibels, _ = mse_ratio("turtle_shell", "hierarchical", "neumip")
     assert decibels is not None
-    assert -10 * math.log10(decibels[0]) == pytest.approx(32.18 - 30.79)
-    zooms = level_ratios(PUBLISHED, "twisted_wool", "neumip")
+    assert -10 * math.log10(decibels) == pytest.approx(32.18 - 30.79)
+    zooms, _ = first_known(PUBLISHED, lambda p: p.level_ratios("twisted_wool", "neumip"))
     assert zooms is not None
-    assert [round(3.98 * ratio, 2) for ratio in zooms[0]] == [3.98, 2.1, 1.47, 1.07, 0.74, 1.16, 1.17, 1.08]
+    assert [round(3.98 * ratio, 2) for ratio in zooms] == [3.98, 2.1, 1.47, 1.07, 0.74, 1.16, 1.17, 1.08]
 
 
 def test_levels_start_at_the_coarsest_and_zooms_at_the_finest(tmp_path: Path) -> None:
@@ -122,9 +126,9 @@ def test_ablations_compare_with_the_first_row(tmp_path: Path) -> None:
     runs = [make(tmp_path, variant="architecture"), make(tmp_path, variant="queries-100")]
     rows = csv_of(ablations(runs, PUBLISHED)[0])
     assert [r["variant"] for r in rows] == ["neumip-baseline", "neumip"] * 2
-    assert rows[0]["turtle_shell_minus_first"] == ""
+    assert rows[0]["minus_first"] == ""
     # Paired on the same data, otherwise from two independent errors.
-    less = "turtle_shell_minus_first"
+    less = "minus_first"
     assert (rows[1][less], rows[1][f"{less}_se"]) == ("-0.0002", "0.0003")
     assert float(rows[3][less]) == pytest.approx(-2e-4)
     assert float(rows[3][f"{less}_se"]) == pytest.approx(math.hypot(1e-6, 1e-6), rel=1e-3)
@@ -156,7 +160,7 @@ def test_zooms_have_one_row_per_span_and_fit(tmp_path: Path) -> None:
 
 def test_unmodified_mitsuba_agrees_or_differs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        "mbtf_pipeline.papers.checks.read_picture", lambda path: np.zeros((4, 4, 3), np.float32)
+        "mbtf_pipeline.collection.check_tables.read_picture", lambda path: np.zeros((4, 4, 3), np.float32)
     )
     direction = {"elevation": 85, "azimuth": 0}
     files = {"mbtf": "reference", "mitsuba": "neumip"}
@@ -165,32 +169,27 @@ def test_unmodified_mitsuba_agrees_or_differs(tmp_path: Path, monkeypatch: pytes
         for s, square in (("base color", 1e-5), ("full", 4e-2))
     ]
     check = {"view": direction, "light": direction, "surfaces": surfaces}
-    table = independence([make(tmp_path, unmodified_mitsuba=check)], PUBLISHED)[0]
-    same, other = rows_of(table)
+
+    def first() -> dict[str, str]:
+        return rows_of(independence([make(tmp_path, unmodified_mitsuba=check)], PUBLISHED)[0])[0]
+
+    same, other = rows_of(independence([make(tmp_path, unmodified_mitsuba=check)], PUBLISHED)[0])
     rms = "RMS difference, noise-free [% of the mean]"
     assert (same["verdict"], same[rms]) == ("agree", "below 1.6 %")
     assert (other["verdict"], other[rms]) == ("differ", "20.00 ± 0.03 %")
     # The verdict changes at the detection limit.
-    surfaces[0]["square"] = number(0.0, 1e-3)
-    seen = float(
-        csv_of(independence([make(tmp_path, unmodified_mitsuba=check)], PUBLISHED)[0])[0]["rms_detectable"]
-    )
     for factor, verdict in ((0.99, "agree"), (1.01, "differ")):
-        surfaces[0]["square"] = number((factor * seen) ** 2, 1e-3)
-        assert (
-            rows_of(independence([make(tmp_path, unmodified_mitsuba=check)], PUBLISHED)[0])[0]["verdict"]
-            == verdict
-        )
+        surfaces[0]["square"] = number(3e-3 * factor**2, 1e-3)
+        assert first()["verdict"] == verdict
     # A single block of pixels has no error bar and is inconclusive.
     surfaces[0] |= {key: {"value": 0.4, "error": None, "n": 1} for key in ("mean", "square")}
-    row = rows_of(independence([make(tmp_path, unmodified_mitsuba=check)], PUBLISHED)[0])[0]
-    assert (row["verdict"], row[rms]) == ("inconclusive", "–")
+    assert (first()["verdict"], first()[rms]) == ("inconclusive", "–")
 
 
 def test_cells_are_printed_and_exported() -> None:
     columns = [Column("a", "a", factor=100.0), Column("b", "b"), Column("c", "c")]
     seen = Shown("0.970, within noise", 0.97, 0.9, "noise")
-    table = Table("t", "", "", columns, [[Estimate(0.5, 0.01, 9), None, seen], ["x", 1200, None]])
+    table = Table("t", "", columns, [[Estimate(0.5, 0.01, 9), None, seen], ["x", 1200, None]])
     assert table.for_page()["rows"] == [["50.0 ± 1.0", "–", "0.970, within noise"], ["x", "1,200", "–"]]
     assert table.csv().splitlines() == ["a,a_se,b,c,c_noise", "0.5,0.01,,0.97,0.9", "x,,1200,,"]
 

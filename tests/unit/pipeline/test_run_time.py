@@ -1,4 +1,4 @@
-"""A total time takes the best preset that fits, counts everything, and is kept by the same command."""
+"""Forecasts of runs; a total time takes the best preset that fits, and is kept by the same command."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from support.paths import ROOT
 
-from mbtf_core.data.lattice import Lattice
+from mbtf_core.app.console import run
+from mbtf_core.data.shard_files import row_bytes
 from mbtf_core.errors import InputError, UsageError
-from mbtf_gen.config.generator import GENERATOR, count_queries
-from mbtf_pipeline import time_split as module
-from mbtf_pipeline.forecast import RunForecaster
-from mbtf_pipeline.presets import preset_recipe
-from mbtf_pipeline.time_split import TimedRun
+from mbtf_pipeline import run as runs
+from mbtf_pipeline import run_time as module
+from mbtf_pipeline.cli.app import app
+from mbtf_pipeline.recipe import load_recipe, preset_recipe
+from mbtf_pipeline.run_time import RunForecaster, TimedRun, forecast_left
 
 FILE = ROOT / "pipelines" / "quickstart.yaml"
 # One fit, at the resolution of each preset.
@@ -26,6 +27,8 @@ generate: {material: maps/height.npy, geometry: {height_scale: 0.1}}
 fit: {model: neumip}
 """
 START, PATH = 4.5, 4e-7
+PATHS = 400 * 128**2 * 4 + 32768 * 128
+ROWS = 400 * 128**2 + 32768
 
 
 class Machine:
@@ -70,8 +73,8 @@ def seconds_of(run: TimedRun) -> float:
     return RunForecaster(run.recipe).of(run.recipe).seconds
 
 
-@pytest.mark.parametrize("seconds", [100.0, 300.0, 900.0, 7200.0])
-def test_the_best_preset_that_fits_is_scaled_to_the_time(fake: Machine, one: Path, seconds: float) -> None:
+@pytest.mark.parametrize("seconds", [100.0, 300.0, 7200.0])
+def test_the_best_preset_that_fits_trains_for_the_rest(fake: Machine, one: Path, seconds: float) -> None:
     found = timed(one, seconds)
     stated = {}
     for name in module.PRESETS:
@@ -79,34 +82,33 @@ def test_the_best_preset_that_fits_is_scaled_to_the_time(fake: Machine, one: Pat
         stated[name] = RunForecaster(recipe).of(recipe).seconds
     fitting = [name for name in module.PRESETS if stated[name] <= 0.96 * seconds]
     assert found.split.quality == (fitting or ["draft"])[-1]
-    # Neither fewer queries nor less training than the preset: never worse.
+    # The data of the preset, and no less training: never worse.
     preset = preset_recipe(one, found.split.quality)
-    lattice = Lattice.for_map(512, 512, preset.generate.queries.finest)
-    assert found.split.queries >= count_queries(preset.generate.queries.train, lattice.texels())
+    assert found.recipe.generate == preset.generate
     assert found.recipe.fit["neumip"].training.time >= preset.fit["neumip"].training.time
     assert found.recipe.fit["neumip"].network.width >= preset.fit["neumip"].network.width
-    assert found.recipe.generate.queries.resolution == preset.generate.queries.resolution
     # Everything is counted: starting, generating, loading, training, evaluation, comparison.
     assert seconds_of(found) == pytest.approx(0.96 * seconds, rel=0.02)
 
 
-def test_less_than_a_draft_is_a_smaller_draft(fake: Machine, one: Path) -> None:
-    fake.path *= 8.0
-    found = timed(one, 90.0)
+def test_less_than_a_draft_is_a_draft_of_less_training(fake: Machine, one: Path) -> None:
+    recipe = preset_recipe(one, "draft")
+    expected = RunForecaster(recipe).of(recipe)
+    seconds = (expected.seconds - 5.0) / 0.96
+    found = timed(one, seconds)
     assert found.split.quality == "draft"
-    assert found.split.scale < 1.0
-    assert found.split.queries < 400 * 128**2
-    assert found.split.training_each < 12.0
-    assert seconds_of(found) == pytest.approx(0.96 * 90.0, rel=0.02)
+    assert found.split.training == pytest.approx(7.0, abs=0.1)
+    assert seconds_of(found) == pytest.approx(0.96 * seconds, rel=0.02)
+    with pytest.raises(UsageError, match="too short: all but training"):
+        timed(one, seconds - 7.0, folder=one.parent / "short")
 
 
 def test_training_is_shortened_when_generating_overran(fake: Machine, one: Path) -> None:
     found = timed(one, 120.0)
     planned = found.recipe
     before = planned.fit["neumip"].training.time
-    fake.now = found.split.generating + 15.0
+    fake.now = START + RunForecaster(planned).of(planned).generating + 15.0
     after = found.generated(planned).fit["neumip"].training.time
-    # The starting time, which the forecast counts although the clock has not run, is what it gains.
     assert before - 15.0 <= after <= before - 15.0 + 3.0
     assert after == pytest.approx(0.96 * 120.0 - fake.now - found.split.after, abs=0.1)
     # The same command resumes with the same time, however late.
@@ -122,27 +124,10 @@ def test_training_is_shortened_when_generating_overran(fake: Machine, one: Path)
     assert "the run will be about" in notes[-1]
 
 
-@pytest.mark.parametrize("scarce", ["disk", "memory", "preset"])
-def test_queries_are_limited_and_the_rest_is_training(fake: Machine, one: Path, scarce: str) -> None:
-    """Where paths cost nothing, any time would fill the disk."""
-    fake.path = 1e-12
-    assignments = ["generate.queries.resolution=128"]
-    most = 1600.0 * 128**2
-    if scarce == "disk":
-        fake.free = 4 * 68 * 7e6
-    elif scarce == "memory":
-        assignments.append("fit.data.memory=476MB")
-    if scarce != "preset":
-        most = 7e6
-    found = timed(one, 1000.0, *assignments, quality="draft")
-    assert 0.9 * most < found.split.queries <= most
-    assert found.split.training_each > 900.0
-
-
 def test_a_preset_that_does_not_fit_on_the_disk_is_not_chosen(fake: Machine, one: Path) -> None:
     fake.path = 1e-12
-    fake.free = 5e9
-    assert timed(one, 1200.0).split.quality == "standard"
+    fake.free = 1e9
+    assert timed(one, 1200.0).split.quality == "draft"
     fake.free = 1e5
     with pytest.raises(InputError, match="are free"):
         timed(one, 1000.0, folder=one.parent / "full")
@@ -155,28 +140,21 @@ def test_a_given_preset_is_kept_and_fits_share_the_training(fake: Machine, one: 
     assert found.split.quality == "draft"
     assert len(found.recipe.fit) == 2
     assert all(fit.training.steps is None for fit in found.recipe.fit.values())
-    assert {fit.training.time for fit in found.recipe.fit.values()} == {found.split.training_each}
-    assert found.recipe.generate.queries.test == GENERATOR["draft"]["queries.test"]
+    assert {fit.training.time for fit in found.recipe.fit.values()} == {found.split.training}
     assert found.recipe.generate.light == preset_recipe(FILE, None).generate.light
-    assert len(notes) == 1
-    assert "preset draft with" in notes[0]
+    assert [note.split(",")[0] for note in notes] == ["time: preset draft"]
 
 
 def test_the_same_command_resumes_with_the_same_split(fake: Machine, one: Path) -> None:
     first = timed(one, 200.0)
     fake.path *= 1.5
     assert timed(one, 200.0).split == first.split
-    # Another time, or a damaged record, is split anew.
-    assert timed(one, 190.0).split != first.split
-    again = timed(one, 200.0)
-    assert again.split.training_each < first.split.training_each
+    # A damaged record is split anew.
     (one.parent / "run" / module.SPLIT_NAME).write_text('{"key": 1}')
-    assert timed(one, 200.0).split == again.split
+    assert timed(one, 200.0).split.training < first.split.training
 
 
 def test_what_cannot_be_split_is_refused(fake: Machine, one: Path) -> None:
-    with pytest.raises(UsageError, match="too short"):
-        timed(one, 5.0)
     with pytest.raises(UsageError, match="layout"):
         timed(one, 100.0, "fit.model=hierarchical")
     assert not (one.parent / "run").exists()
@@ -184,3 +162,50 @@ def test_what_cannot_be_split_is_refused(fake: Machine, one: Path) -> None:
     (one.parent / "run" / "file").write_text("")
     with pytest.raises(InputError, match="holds no run"):
         timed(one, 100.0)
+
+
+def test_all_stages_count(fake: Machine) -> None:
+    recipe = load_recipe(FILE)
+    forecaster = RunForecaster(recipe)
+    found = forecaster.of(recipe)
+    assert found.generating == pytest.approx(PATHS * PATH)
+    assert found.training == 120.0
+    # Eight pictures of 256 x 256 pixels and 96 paths.
+    assert found.comparing == pytest.approx(5.0 + 8 * 256**2 * 96 * PATH, abs=2.0)
+    data = ROWS * row_bytes(holes=False)
+    assert data < found.bytes < data + 2e8
+    parts = (found.start, found.generating, found.training, found.evaluating, found.comparing)
+    assert found.seconds == sum(parts)
+    assert found.describe().startswith("expected: about 3:")
+    by_steps = forecaster.of(load_recipe(FILE, ["fit.neumip.training.steps=100"]))
+    assert by_steps.training == 60.0
+    assert by_steps.describe().endswith(", and the steps of neumip")
+    # What is finished costs nothing.
+    left = forecaster.of(recipe, ["fit neumip", "compare", "report"])
+    assert (left.generating, left.training) == (0.0, 60.0)
+    assert left.bytes < 2e8
+
+
+def test_short_runs_need_no_pilot(fake: Machine, tmp_path: Path) -> None:
+    assert forecast_left(load_recipe(ROOT / "pipelines" / "ci.yaml"), tmp_path / "out") is None
+    assert forecast_left(load_recipe(FILE), tmp_path / "out") is not None
+
+
+def test_a_run_states_its_cost_and_is_refused_if_the_disk_is_full(
+    fake: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stop(*_: Any, **__: Any) -> Any:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(runs, "run_recipe", stop)
+    out = tmp_path / "out"
+    assert run(app, ["run", str(FILE), "-o", str(out)]) == 130
+    assert "expected: about 3:" in capsys.readouterr().err
+    fake.free = 1e6
+    assert run(app, ["run", str(FILE), "-o", str(out)]) == 3
+    problem, hint = capsys.readouterr().err.splitlines()
+    assert problem.startswith(f"error: {out}: needs 519 MB; 1.0 MB are free")
+    assert "--set" in hint
+    assert not out.exists()
+    with pytest.raises(InputError, match="holds no run"):
+        forecast_left(load_recipe(FILE), ROOT / "pipelines")

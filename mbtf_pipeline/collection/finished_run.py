@@ -1,4 +1,4 @@
-"""Finished runs of a paper recipe, and what its tables share."""
+"""A finished run of a paper recipe, and what the tables share."""
 
 from __future__ import annotations
 
@@ -16,13 +16,9 @@ from mbtf_core.files.atomic import read_json
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.compare.compare import COMPARISON_NAME
 from mbtf_pipeline.compare.image_files import with_ending
-from mbtf_pipeline.number_text import estimate, is_significant
 from mbtf_pipeline.report.embed import file_uri, map_uri
 from mbtf_pipeline.run_folder import COMPARE, SHARDS
-from mbtf_pipeline.tables import Column, Thumbnail
-
-MATERIAL = Column("material", "material", lambda run, *_: run.title)
-METHOD = Column("method", "method", lambda run, fit, *_: fit)
+from mbtf_pipeline.tables import Column, Thumbnail, estimate, is_significant
 
 
 @dataclass(frozen=True)
@@ -52,11 +48,9 @@ class FinishedRun:
         return list(self.comparison["fits"])
 
     @property
-    def texels(self) -> int:
-        """Number of texels of the finest level."""
-        finest, aspect = self.manifest["levels"]["finest"], self.manifest["tile"]["aspect"]
-        rows, columns = Lattice(int(finest), float(aspect)).shape()
-        return rows * columns
+    def pictures(self) -> list[dict[str, Any]]:
+        """Records of the comparison's images."""
+        return list(self.comparison["pictures"])
 
     @property
     def kind(self) -> str:
@@ -64,38 +58,36 @@ class FinishedRun:
         return str(self.comparison["kinds"][0])
 
     @property
-    def pictures(self) -> list[dict[str, Any]]:
-        """Records of the comparison's images."""
-        return list(self.comparison["pictures"])
+    def texels(self) -> int:
+        """Number of texels of the finest level."""
+        finest, aspect = self.manifest["levels"]["finest"], self.manifest["tile"]["aspect"]
+        return Lattice(int(finest), float(aspect)).texels()
 
     def fit(self, name: str) -> Any:
         """Record of a fit: errors, parameter counts and training time."""
         return self.comparison["test"][name]
 
-    def test(self, fit: str) -> Any:
-        """Errors of a fit on the test queries."""
-        return self.fit(fit)["splits"]["test"]
+    def error(self, fit: str, key: str = "mse") -> Estimate:
+        """``mse`` or ``unexplained`` variance of a fit on the test queries."""
+        return estimate(self.fit(fit)["splits"]["test"][key])
 
-    def seconds(self, fit: str) -> float:
-        """Training time of a fit."""
-        return float(self.fit(fit)["training_seconds"])
-
-    def unexplained(self, fit: str) -> Estimate:
-        """Unexplained variance of a fit on the test queries."""
-        return estimate(self.test(fit)["unexplained"])
-
-    def mse(self, fit: str) -> Estimate:
-        """MSE of a fit on the test queries."""
-        return estimate(self.test(fit)["mse"])
+    def error_at(self, fit: str, level: int, key: str = "mse") -> Estimate | None:
+        """As :meth:`error`, of the queries of one level; None where it is unknown."""
+        group = self.fit(fit)["splits"]["test"]["levels"].get(str(level))
+        return None if group is None or group[key]["value"] is None else estimate(group[key])
 
     def minus_first(self, fit: str) -> Estimate | None:
         """Paired difference of the MSE to that of the first fit; None for the first."""
         found = self.fit(fit).get("mse_minus_first")
         return None if found is None else estimate(found)
 
-    def file(self, name: str) -> Path:
-        """Path of a file of the comparison."""
-        return self.folder / COMPARE / name
+    def preview(self, name: str, label: str, line: str = "") -> Thumbnail:
+        """An image of the comparison (path without suffix) at its exposure."""
+        return Thumbnail(file_uri(with_ending(self.folder / COMPARE / name, ".png")), label, line)
+
+
+MATERIAL = Column("material", "material", lambda run, *_: run.title)
+METHOD = Column("method", "method", lambda run, fit, *_: fit)
 
 
 def each_fit(runs: Sequence[FinishedRun]) -> Iterator[tuple[FinishedRun, str]]:
@@ -103,14 +95,9 @@ def each_fit(runs: Sequence[FinishedRun]) -> Iterator[tuple[FinishedRun, str]]:
     return ((run, fit) for run in runs for fit in run.fits)
 
 
-def preview(path: Path, label: str, *lines: str) -> Thumbnail:
-    """An image of the comparison (path without suffix) at its exposure."""
-    return Thumbnail(file_uri(with_ending(path, ".png")), label, lines)
-
-
-def signed_map(values: NDArray[np.floating], scale: float, label: str, *lines: str) -> Thumbnail:
+def signed_map(values: NDArray[np.floating], scale: float, label: str, line: str = "") -> Thumbnail:
     """A signed map (rows, columns), saturated at ± `scale`."""
-    return Thumbnail(map_uri((values / scale).astype(np.float64), "signed", 256), label, lines)
+    return Thumbnail(map_uri((values / scale).astype(np.float64), "signed", 256), label, line)
 
 
 def mean_of(estimates: Sequence[Estimate]) -> Estimate:

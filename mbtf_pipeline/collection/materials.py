@@ -6,7 +6,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from mbtf_core.errors import InputError, UsageError, reason
 _SUFFIXES = {".yaml", ".yml", ".pyp", ".bcc", ".curves", ".glb", ".gltf", ".ply", ".obj"}
 _YAML = (".yaml", ".yml")
 # Records of folders that the programs have written, and keys of recipes.
-_RECORDS = {"library.json", "run.json", "manifest.json", "fit.json"}
+_RECORDS = {"collection.json", "run.json", "manifest.json", "fit.json"}
 _RECIPE_KEYS = {"library", "generate"}
 # Characters of a name besides its number.
 _LONGEST = 90
@@ -42,16 +42,17 @@ def find_materials(path: Path) -> list[Path]:
         A list cannot be read.
     """
     path = Path(os.path.normpath(path))
-    if path.suffix == ".txt" and path.is_file():
-        try:
-            lines = [line.strip() for line in path.read_text(encoding="utf-8-sig").splitlines()]
-        except (OSError, UnicodeDecodeError) as error:
-            raise InputError(f"cannot be read as a list ({reason(error)})", where=path) from None
-        if any("\0" in line for line in lines):
-            raise InputError("is no list of paths: it holds null characters", where=path)
-        listed = [path.parent / line for line in lines if line and not line.startswith("#")]
-        return [Path(os.path.normpath(file)) for file in listed]
-    return _in_folder(path) if path.is_dir() else [path]
+    if path.is_dir():
+        return _in_folder(path)
+    if path.suffix != ".txt" or not path.is_file():
+        return [path]
+    try:
+        lines = [line.strip() for line in path.read_text(encoding="utf-8-sig").splitlines()]
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot be read as a list ({reason(error)})", where=path) from None
+    if any("\0" in line for line in lines):
+        raise InputError("is no list of paths: it holds null characters", where=path)
+    return [Path(os.path.normpath(path.parent / line)) for line in lines if line and not line.startswith("#")]
 
 
 def _in_folder(folder: Path) -> list[Path]:
@@ -65,12 +66,8 @@ def _in_folder(folder: Path) -> list[Path]:
     if files & {"material.yaml", "material.yml"} or any(role_of(name) == "height" for name in images):
         return [folder]
     documents = {path: _document(path) for path in inside if path.suffix.lower() in _YAML and path.is_file()}
-    parts = {
-        os.path.normpath(folder / text)
-        for document in documents.values()
-        for text in _texts(document)
-        if "\0" not in text
-    }
+    texts = {text for document in documents.values() for text in _texts(document) if "\0" not in text}
+    parts = {os.path.normpath(folder / text) for text in texts}
     out: list[Path] = []
     for path in inside:
         if path.is_dir():
@@ -126,18 +123,12 @@ def name_materials(paths: Sequence[Path], taken: Collection[str] = ()) -> list[s
         if listed > 1:
             raise UsageError("is listed twice", where=real, hint="list each material once in 'library'")
     plain = [_name(path.stem if path.suffix.lower() in _SUFFIXES else path.name) for path in paths]
-    often, used = Counter([*plain, *taken]), {*taken}
-    names: list[str] = []
+    often, names = Counter([*plain, *taken]), [*taken]
     for name, path in zip(plain, paths, strict=True):
         base = name if often[name] == 1 else _name(f"{path.parent.name}-{name}")
-        own = base
-        for number in count(2):
-            if own not in used:
-                break
-            own = f"{base}-{number}"
-        names.append(own)
-        used.add(own)
-    return names
+        numbered = (f"{base}-{number}" for number in count(2))
+        names.append(next(own for own in chain([base], numbered) if own not in names))
+    return names[len(taken) :]
 
 
 def _name(text: str) -> str:

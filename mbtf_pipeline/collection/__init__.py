@@ -1,0 +1,1 @@
+"""Runs of several materials: a library with one page, or a paper with tables."""

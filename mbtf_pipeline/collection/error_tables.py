@@ -1,0 +1,254 @@
+"""Tables of errors: methods, levels of detail, ablations, zooms."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import partial
+from itertools import combinations
+from typing import Any
+
+from mbtf_core.stats import Estimate, psnr
+from mbtf_pipeline.collection.finished_run import (
+    MATERIAL,
+    METHOD,
+    FinishedRun,
+    each_fit,
+    mean_of,
+    ratio_of,
+)
+from mbtf_pipeline.collection.recipes import Published, first_known
+from mbtf_pipeline.compare.perceptual_metrics import PERCEPTUAL_METRICS, PerceptualMetric
+from mbtf_pipeline.report.plots import points
+from mbtf_pipeline.tables import (
+    Cell,
+    Column,
+    Shown,
+    Table,
+    Thumbnail,
+    decibel,
+    estimate,
+    levels_text,
+    rows_of,
+    signed,
+)
+
+# Records of images.
+Pictures = Sequence[dict[str, Any]]
+_KINDS = {"query": "M at each pixel’s footprint", "pixel": "filtered pixels"}
+
+
+def _metric_column(metric: PerceptualMetric) -> Column:
+    """Mean of a metric over the images given as a third argument, by default over all."""
+
+    def mean(run: FinishedRun, fit: str, pictures: Pictures | None = None) -> Shown | None:
+        chosen = pictures or run.pictures
+        values = [metric.of(p["fits"][fit]) for p in chosen]
+        noises = [metric.of(p["references"][run.kind]) for p in chosen]
+        known, quiet = ([x for x in found if x is not None] for found in (values, noises))
+        if len(known) < len(chosen):
+            return None
+        value = sum(known) / len(known)
+        noise = sum(quiet) / len(quiet) if len(quiet) == len(chosen) else None
+        return Shown(metric.text(value, noise, with_noise=False), value, noise, "noise")
+
+    return Column(metric.title, metric.key.replace(".", "_"), mean)
+
+
+def _recorded(title: str, key: str, digits: str = ".3g") -> Column:
+    """A number of a fit's record."""
+    return Column(title, key, lambda run, fit, *_: run.fit(fit)[key], digits=digits)
+
+
+_METRICS = [_metric_column(m) for m in PERCEPTUAL_METRICS]
+
+
+def _picture_error(
+    run: FinishedRun, fit: str, pictures: Pictures | None = None, *, key: str = "mse", kind: str = ""
+) -> Estimate | None:
+    """Mean over images of ``mse`` or ``relative_mse`` against a kind of reference, where the run has it."""
+    kind = kind or run.kind
+    if kind not in run.comparison["kinds"]:
+        return None
+    return mean_of([estimate(p["fits"][fit]["errors"][kind][key]) for p in pictures or run.pictures])
+
+
+def _psnr(run: FinishedRun, fit: str, pictures: Pictures | None = None, *, kind: str = "") -> Shown | None:
+    """PSNR in dB of the mean noise-free MSE of images, with white as peak."""
+    mse = _picture_error(run, fit, pictures, kind=kind)
+    if mse is None:
+        return None
+    found = psnr(mse, run.comparison["white"])
+    return Shown(decibel(found, mse), found.value, found.error, "se")
+
+
+_UNEXPLAINED = Column(
+    "unexplained variance [%]", "unexplained", lambda run, fit: run.error(fit, "unexplained"), 100.0
+)
+_METHODS = [
+    MATERIAL,
+    METHOD,
+    _UNEXPLAINED,
+    Column("MSE [10⁻³/sr²]", "mse", FinishedRun.error, 1e3),
+    Column("MSE − MSE of the first method [10⁻³/sr²]", "mse_minus_first", FinishedRun.minus_first, 1e3),
+    Column("PSNR of images", "psnr", _psnr),
+    Column("relative MSE of images", "relative_mse", partial(_picture_error, key="relative_mse")),
+    *_METRICS,
+    _recorded("training [s]", "training_seconds", ".0f"),
+    _recorded("network weights", "network_weights"),
+]
+
+
+def methods(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[Table]:
+    """Errors of every method on every material, and ratios of MSE beside published ones."""
+    rows = rows_of(_METHODS, each_fit(runs))
+    images = [(run.title, _last_image(run)) for run in runs]
+    errors = Table("methods", "Comparison of methods", _METHODS, rows, images=images)
+    columns = [
+        MATERIAL,
+        METHOD,
+        Column("relative to", "relative_to"),
+        Column("MSE ratio, measured here", "measured"),
+        Column("MSE ratio, published for another material of the same name or kind", "published"),
+        Column("source", "source"),
+    ]
+    ratios: list[list[Cell]] = []
+    for run in runs:
+        for base, fit in combinations(run.fits, 2):
+            known = first_known(published, lambda p: p.mse_ratio(run.material, fit, base))  # noqa: B023
+            ratios.append([run.title, fit, base, ratio_of(run.error(fit), run.error(base)), *known])
+    return [errors, Table("ratios", "MSE ratios beside published ones", columns, ratios)]
+
+
+def _last_image(run: FinishedRun) -> list[Thumbnail]:
+    """The last image of a run: reference and fits."""
+    shown = run.pictures[-1]
+    row = [run.preview(shown["references"][run.kind]["file"], "reference")]
+    for fit in run.fits:
+        record = shown["fits"][fit]
+        found = record["errors"][run.kind]["psnr"]["value"]
+        line = "" if found is None else signed(f"{found:.1f} dB")
+        row.append(run.preview(record["file"], fit, line))
+    return row
+
+
+def levels(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[Table]:
+    """MSE at every level, and relative to the finest, beside published ratios."""
+    tests = [run.fit(run.fits[0])["splits"]["test"] for run in runs]
+    names = sorted({int(level) for test in tests for level in test["levels"]})
+
+    def column(level: int) -> Column:
+        return Column(f"level {level}", f"mse_level_{level}", lambda r, f: r.error_at(f, level), 1e3)
+
+    def mean_at(fit: str, level: int) -> tuple[float, float] | None:
+        found = [run.error_at(fit, level, "unexplained") for run in runs if fit in run.fits]
+        known = [e for e in found if e is not None]
+        return (mean_of(known).value, mean_of(known).error) if known else None
+
+    columns = [MATERIAL, METHOD, *map(column, names)]
+    fits = dict.fromkeys(fit for _, fit in each_fit(runs))
+    svg = points(
+        [str(n) for n in names],
+        {fit: [mean_at(fit, n) for n in names] for fit in fits},
+        "level of detail",
+        "unexplained variance",
+        "unexplained variance by level of detail",
+    )
+    plots = [{"title": f"Mean over {len(runs)} materials", "svg": svg}]
+    title = f"Errors at {len(names)} levels of detail"
+    errors = Table("levels", title, columns, rows_of(columns, each_fit(runs)), plots)
+    return [errors, _level_ratios(runs, names[::-1], published)]
+
+
+def _level_ratios(
+    runs: Sequence[FinishedRun], finest_first: list[int], published: Sequence[Published]
+) -> Table:
+    zooms = [Column(f"zoom {k}", f"ratio_zoom_{k}") for k in range(len(finest_first))]
+    rows: list[list[Cell]] = []
+    for run, fit in each_fit(runs):
+        first, *others = (run.error_at(fit, n) for n in finest_first)
+        if first is None:
+            continue
+        cells = [None if e is None else ratio_of(e, first) for e in others]
+        rows.append([run.title, fit, "measured here", 1.0, *cells])
+        known, source = first_known(published, lambda p: p.level_ratios(run.material, fit))  # noqa: B023
+        if known is not None:
+            ratios = [*known, *[None] * len(finest_first)][: len(finest_first)]
+            rows.append([run.title, fit, f"published, {source}", *ratios])
+    columns = [MATERIAL, METHOD, Column("source", "source"), *zooms]
+    return Table("level_ratios", "Errors relative to the finest level", columns, rows)
+
+
+def ablations(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[Table]:
+    """Every fit of every variant against the first fit of the first variant of its material."""
+    firsts = {run.material: run for run in reversed(runs)}
+
+    def label(run: FinishedRun, fit: str) -> str:
+        return fit if len(run.fits) > 1 or not run.variant else run.variant
+
+    def density(run: FinishedRun, fit: str) -> float:
+        return float(run.manifest["splits"]["train"]["queries"] / run.texels)
+
+    def difference(run: FinishedRun, fit: str) -> Cell:
+        first = firsts[run.material]
+        if run is first:
+            return run.minus_first(fit)
+        mse, base = run.error(fit), first.error(first.fits[0])
+        return Estimate(mse.value - base.value, math.hypot(mse.error, base.error), min(mse.n, base.n))
+
+    columns = [
+        MATERIAL,
+        Column("variant", "variant", label),
+        _recorded("network weights", "network_weights"),
+        _recorded("texture values", "texels"),
+        Column("queries per texel", "queries_per_texel", density, digits=".0f"),
+        _UNEXPLAINED,
+        Column("MSE − MSE of the first [10⁻³/sr²]", "minus_first", difference, 1e3),
+        _recorded("training [s]", "training_seconds", ".0f"),
+    ]
+    return [Table("ablations", "Ablations", columns, rows_of(columns, each_fit(runs)))]
+
+
+def zooms(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[Table]:
+    """Errors for every field of view and kind of reference, averaged over views and lights."""
+
+    def level(run: FinishedRun, fit: str, shown: Pictures) -> str:
+        return levels_text(shown[0]["levels"], run.comparison["finest"])
+
+    columns = [
+        MATERIAL,
+        Column("tiles across", "tiles_across", lambda *item: float(item[-1][0]["tiles_across"]), digits="g"),
+        Column("level", "level", level),
+        METHOD,
+    ]
+    for kind in dict.fromkeys(kind for run in runs for kind in run.comparison["kinds"]):
+        mse = partial(_picture_error, key="mse", kind=kind)
+        columns.append(Column(f"MSE against {_KINDS[kind]} [10⁻³/sr²]", f"mse_{kind}", mse, 1e3))
+        columns.append(Column(f"PSNR against {_KINDS[kind]}", f"psnr_{kind}", partial(_psnr, kind=kind)))
+    columns += _METRICS
+    items = [
+        (run, fit, [p for p in run.pictures if p["tiles_across"] == width])
+        for run in runs
+        for width in _widths(run)
+        for fit in run.fits
+    ]
+    rows, images = rows_of(columns, items), [row for run in runs for row in _zoom_images(run)]
+    return [Table("zooms", "Materials at several zooms", columns, rows, images=images)]
+
+
+def _widths(run: FinishedRun) -> list[float]:
+    return list(dict.fromkeys(p["tiles_across"] for p in run.pictures))
+
+
+def _zoom_images(run: FinishedRun) -> list[tuple[str, list[Thumbnail]]]:
+    """Rows of a run: each kind of reference, then each fit, from near to far."""
+    shown = [next(p for p in run.pictures if p["tiles_across"] == width) for width in _widths(run)]
+    sources = [(f"reference, {_KINDS[kind]}", "references", kind) for kind in run.comparison["kinds"]]
+    sources += [(fit, "fits", fit) for fit in run.fits]
+    return [
+        (
+            f"{run.title}: {title}",
+            [run.preview(p[group][name]["file"], f"{p['tiles_across']:g} tiles across") for p in shown],
+        )
+        for title, group, name in sources
+    ]

@@ -1,1 +1,0 @@
-"""A library of materials: one run of a recipe for each, failures named and skipped, one page for all."""

@@ -1,1 +1,0 @@
-"""Tables and figures of papers, made from several runs of one recipe."""

@@ -1,0 +1,236 @@
+"""Which runs a library or a paper has, and with which options."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.paths import ROOT
+
+from mbtf_core.errors import InputError, UsageError
+from mbtf_pipeline.collection import recipes
+from mbtf_pipeline.collection.recipes import Collection
+from mbtf_pipeline.collection.run import run_collection
+from mbtf_pipeline.recipe import Recipe
+
+BASE = "base: {generate: {queries: {train: 10/texel}}}\n"
+SHIPPED = sorted((ROOT / "pipelines").glob("paper_*.yaml"))
+TEXT = """\
+name: small
+tables: [methods]
+materials:
+  here: maps/height.npy
+  elsewhere: maps/nowhere.npy
+  steep: {generate: {material: maps/height.npy, geometry: {height_scale: 0.5}}}
+base:
+  generate: {geometry: {height_scale: 0.1, mesh: 8}, queries: {train: 400/texel, resolution: 4}}
+  each_fit: {training: {steps: 500, batch: 64}}
+  fit:
+    neumip-baseline:
+    wide: {model: neumip, network: {width: 40}, training: {batch: 32}}
+quick:
+  generate: {geometry: {height_scale: 0.2}, queries: {train: 4/texel}}
+  each_fit: {training: {steps: 3}}
+"""
+
+
+def material(folder: Path) -> Path:
+    folder.mkdir(parents=True)
+    np.save(folder / "height.npy", np.zeros((4, 4), np.float32))
+    (folder / "material.yaml").write_text("height: height.npy\n")
+    return folder
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder of two materials, a broken one, and something else; another with one of the same name."""
+    for name in ("shell", "wool"):
+        material(tmp_path / "assets" / name)
+    (tmp_path / "assets" / "broken").mkdir()
+    (tmp_path / "assets" / "broken" / "material.yaml").write_text("heigth: x.png\n")
+    (tmp_path / "assets" / "scripts").mkdir()
+    (tmp_path / "assets" / "scripts" / "make.py").write_text("")
+    material(tmp_path / "more" / "wool")
+    (tmp_path / "more" / "list.txt").write_text("# a comment\nwool\nmissing\n", encoding="utf-8-sig")
+    return tmp_path
+
+
+def planned(file: Path, quick: bool = False) -> tuple[dict[str, Recipe], dict[str, str]]:
+    """Recipes by name of the run, and errors of the materials that are skipped."""
+    found = recipes.load(file)
+    assert isinstance(found, Collection)
+    runs, skipped = found.plan(file, quick)
+    return {one.name: one.recipe for one in runs}, {name: one.error for name, one in skipped.items()}
+
+
+def load(folder: Path, text: str) -> tuple[dict[str, Recipe], dict[str, str]]:
+    (folder / "library.yaml").write_text(f"name: test\n{text}")
+    return planned(folder / "library.yaml")
+
+
+def test_folders_lists_and_broken_materials(folder: Path) -> None:
+    found, errors = load(folder, "library: [assets, more/list.txt]\n" + BASE)
+    assert list(found) == ["shell", "assets-wool", "more-wool"]
+    assert "heigth" in errors["broken"]
+    assert errors["missing"].endswith("more/missing does not exist")
+
+
+def test_own_options_and_further_materials(folder: Path) -> None:
+    text = "library: [assets/shell]\n" + BASE
+    text += "materials:\n  shell: {generate: {geometry: {height_scale: 0.5}}}\n  fleece: more/wool\n"
+    found, _ = load(folder, text)
+    shell, fleece = found["shell"], found["fleece"]
+    assert shell.generate.geometry.height_scale == 0.5
+    assert shell.generate.queries.train == "10/texel"
+    assert fleece.generate.geometry.height_scale is None
+    assert Path(fleece.generate.material) == folder / "more" / "wool"
+    assert list(shell.fit) == ["relief"]
+
+
+def test_cloths_get_the_model_without_geometry(folder: Path) -> None:
+    cloth = folder / "assets" / "cloth"
+    cloth.mkdir()
+    (cloth / "material.yaml").write_text("weave: plain\n")
+    found, _ = load(folder, "library: [assets/cloth]\n" + BASE)
+    assert list(found["cloth"].fit) == ["neumip+"]
+
+
+def test_faults_of_the_recipe(folder: Path) -> None:
+    with pytest.raises(InputError, match=r"materials\.shel\b.*no material of the library"):
+        load(folder, "library: [assets]\nmaterials:\n  shel: {fit: {relief: {}}}\n" + BASE)
+    (folder / "link").symlink_to(folder / "assets" / "shell")
+    for again in ("assets/shell", "link"):
+        with pytest.raises(UsageError, match="listed twice"):
+            load(folder, f"library: [assets/shell, {again}]\n" + BASE)
+    (folder / "list.txt").write_text("assets/shell\n\0\n")
+    with pytest.raises(InputError, match=r"list\.txt: is no list of paths"):
+        load(folder, "library: [list.txt]\n" + BASE)
+    with pytest.raises(InputError, match="is not a valid file name"):
+        load(folder, f"library: [{'x' * 300}]\n" + BASE)
+    (folder / "empty").mkdir()
+    with pytest.raises(InputError, match="names no material"):
+        load(folder, "library: [empty]\n" + BASE)
+
+
+def test_equal_names_are_numbered(tmp_path: Path) -> None:
+    for name in ("木", "石", "oak dark", "oak_dark"):
+        material(tmp_path / "u" / name)
+    assert sorted(load(tmp_path, "library: [u]\n" + BASE)[0]) == [
+        *("u-material", "u-material-2", "u-oak_dark", "u-oak_dark-2")
+    ]
+
+
+def test_a_file_and_what_it_names_are_one_material(tmp_path: Path) -> None:
+    for name in ("shirt", "sleeve", "other"):
+        (tmp_path / f"{name}.obj").write_text("")
+    (tmp_path / "shirt.yaml").write_text("mesh: shirt.obj\nparts: [{file: ./sleeve.obj}]\n")
+    # The recipe itself is no material, nor is what an earlier run has written.
+    material(tmp_path / "out" / "runs")
+    (tmp_path / "out" / "collection.json").write_text("{}")
+    found = load(tmp_path, "library: [.]\n" + BASE)
+    assert sorted({**found[0], **found[1]}) == ["other", "shirt"]
+
+
+def test_folders_of_folders_and_stray_pictures(tmp_path: Path) -> None:
+    material(tmp_path / "q" / "group" / "a")
+    material(tmp_path / "q" / "b")
+    np.save(material(tmp_path / "q" / "c") / "more.npy", np.zeros((4, 4), np.float32))
+    (tmp_path / "q" / "preview.png").write_bytes(b"")
+    (tmp_path / "q" / "unclear").mkdir()
+    (tmp_path / "q" / "unclear" / "wood.png").write_bytes(b"")
+    (tmp_path / "q" / "loop").symlink_to(tmp_path / "q", target_is_directory=True)
+    for hidden in (".cache", "_old"):
+        material(tmp_path / "q" / hidden / "d")
+    found, errors = load(tmp_path, "library: [q]\n" + BASE)
+    assert list(found) == ["b", "c", "a"]
+    assert "height" in errors["unclear"]
+
+
+def test_a_fault_of_the_base_is_one_error(folder: Path) -> None:
+    base = "library: [assets]\nbase:\n  generate:\n    querys: {train: 10/texel}\n"
+    with pytest.raises(InputError, match=r"library\.yaml: base: unknown key 'generate\.querys'"):
+        load(folder, base)
+    with pytest.raises(InputError, match=r"library\.yaml: base: unknown key 'fit\.relief\.trainig'"):
+        load(folder, "library: [assets]\nbase:\n  each_fit: {trainig: {batch: 5}}\n")
+    with pytest.raises(InputError, match=r"materials\.steep: has no path"):
+        planned(written(folder, TEXT.replace("material: maps/height.npy, ", "")))
+
+
+def test_one_training_time_of_all_or_of_each(folder: Path) -> None:
+    own = "training: 10s\nlibrary: [assets]\n"
+    with pytest.raises(InputError, match=r"materials\.shell: 'relief' has a training time"):
+        load(folder, f"{own}{BASE}materials: {{shell: {{fit: {{relief: {{training: {{steps: 9}}}}}}}}}}\n")
+    with pytest.raises(InputError, match=r"base: 'each_fit' has a training time"):
+        load(folder, f"{own}base: {{each_fit: {{training: {{time: 3s}}}}}}\n")
+
+
+def written(folder: Path, text: str = TEXT) -> Path:
+    (folder / "maps").mkdir(exist_ok=True)
+    np.save(folder / "maps" / "height.npy", np.zeros((4, 4), np.float32))
+    path = folder / "paper-under-test.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_order_of_layers(tmp_path: Path) -> None:
+    path = written(tmp_path)
+    full, _ = planned(path)
+    quick, _ = planned(path, True)
+    # The quick size overrides the base; options of a material override both.
+    heights = [runs["here"].generate.geometry.height_scale for runs in (full, quick)]
+    assert heights == [0.1, 0.2]
+    assert {runs["steep"].generate.geometry.height_scale for runs in (full, quick)} == {0.5}
+    assert quick["here"].generate.geometry.mesh == 8
+    # A fit's own options override those of every fit.
+    fits = quick["here"].fit
+    assert [f.training.steps for f in fits.values()] == [3, 3]
+    assert [f.training.batch for f in fits.values()] == [64, 32]
+    assert fits["wide"].network.width == 40
+
+
+def test_every_variant_is_one_run(tmp_path: Path) -> None:
+    text = TEXT + "variants:\n  few: {generate: {queries: {train: 2/texel}}}\n  many: {}\n"
+    runs, _ = planned(written(tmp_path, text), True)
+    assert list(runs) == ["here-few", "here-many", "steep-few", "steep-many"]
+    counts = [runs[name].generate.queries.train for name in ("here-few", "here-many")]
+    assert counts == ["2/texel", "4/texel"]
+
+
+def test_missing_materials_are_skipped_and_listed(tmp_path: Path) -> None:
+    path = written(tmp_path)
+    runs, missing = planned(path)
+    assert list(runs) == ["here", "steep"]
+    assert missing == {"elsewhere": f"{tmp_path}/maps/nowhere.npy does not exist"}
+    (tmp_path / "maps" / "height.npy").unlink()
+    with pytest.raises(InputError, match="no material can be run"):
+        planned(path)
+
+
+def test_a_fit_of_other_materials_needs_some(tmp_path: Path) -> None:
+    """Before anything is generated."""
+    text = (
+        "name: lonely\ntables: [methods]\nlearn_from_others: [rainer2020]\n"
+        "materials:\n  here: maps/height.npy\n"
+        "base:\n  generate: {queries: {train: 4/texel, resolution: 4}}\n"
+        "  fit:\n    rainer2020: {training: {own_material: false}}\n"
+    )
+    path = written(tmp_path, text)
+    with pytest.raises(InputError, match="learns from other materials alone, but there are none"):
+        run_collection(recipes.load(path), path, tmp_path / "out", command="")  # type: ignore[arg-type]
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=[p.stem for p in SHIPPED])
+def test_shipped_recipes_are_valid_and_quick_is_smaller(path: Path) -> None:
+    full, missing = planned(path)
+    quick, _ = planned(path, True)
+    assert list(full) == list(quick)
+    assert all("/shared/" in error for error in missing.values())
+    for name, large in full.items():
+        small = quick[name]
+        assert small.compare.size <= large.compare.size
+        assert small.compare.spp <= large.compare.spp
+        assert int(small.generate.queries.test) <= int(large.generate.queries.test)
+        assert (small.generate.queries.resolution or 99) < (large.generate.queries.resolution or 0)
+        assert small.fit.keys() == large.fit.keys()
