@@ -20,7 +20,7 @@ from mbtf_pipeline.compare.unmodified_mitsuba import (
 from mbtf_pipeline.number_text import direction, estimate, is_significant
 from mbtf_pipeline.papers.published import Published, network_weights
 from mbtf_pipeline.papers.runs import MATERIAL, METHOD, FinishedRun, each_fit, preview, signed_map
-from mbtf_pipeline.report.offset_images import displacements
+from mbtf_pipeline.report.images import displacements
 from mbtf_pipeline.run_folder import COMPARE
 from mbtf_pipeline.tables import Cell, Column, Table, Thumbnail, rows_of
 

@@ -110,7 +110,7 @@ def preview(path: Path, label: str, *lines: str) -> Thumbnail:
 
 def signed_map(values: NDArray[np.floating], scale: float, label: str, *lines: str) -> Thumbnail:
     """A signed map (rows, columns), saturated at ± `scale`."""
-    return Thumbnail(map_uri((values / scale).astype(np.float64), "signed", 256), label, lines)
+    return Thumbnail(map_uri(values / scale, "signed"), label, lines)
 
 
 def mean_of(estimates: Sequence[Estimate]) -> Estimate:

@@ -13,7 +13,7 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.run import Job
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
-from mbtf_pipeline.cost.generator_benchmark import GeneratorBenchmark
+from mbtf_pipeline.cost.generator import GeneratorBenchmark
 
 NOISE = 0.8  # standard deviation of one path, relative to the value
 SHIFT = 0.25  # bias of one interaction, relative to the value
@@ -47,7 +47,7 @@ class FakeEstimator:
 
 def fake_benchmark(monkeypatch: pytest.MonkeyPatch) -> GeneratorBenchmark:
     """A small height field, traced by :class:`FakeEstimator` until the test ends."""
-    module = "mbtf_pipeline.cost.generator_benchmark"
+    module = "mbtf_pipeline.cost.generator"
     plan = SimpleNamespace(effects=SimpleNamespace(closed_form=False), allocation=None)
     monkeypatch.setattr(f"{module}.build_estimator", lambda job, plan: FakeEstimator(job))
     monkeypatch.setattr(f"{module}.plan_effects", lambda job: plan.effects)

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from mbtf_pipeline.compare import timing
-from mbtf_pipeline.report.errors import error_context, group_label
+from mbtf_pipeline.report.sections import error_context, group_label
 
 
 @pytest.mark.parametrize(
