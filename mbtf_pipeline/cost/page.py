@@ -20,30 +20,8 @@ from mbtf_pipeline.tables import Column, Table, rows_of
 
 CSV_NAME, PAGE_NAME = "cost.csv", "cost.html"
 _NOISE_AXIS = "RMS error relative to the mean value"
-# Of the generator's comparisons: title, text, and whether the bias is shown.
-_COMPARISONS = {
-    "paths": (
-        "Paths per query",
-        "More paths reduce the noise and leave no bias. Queries get equally many paths, more where a pilot "
-        "expects more noise, or as many as a target error takes.",
-        False,
-    ),
-    "effects": (
-        "Effects",
-        "The time that each effect takes, and the bias of leaving it out, which more paths do not reduce.",
-        True,
-    ),
-    "mesh": (
-        "Mesh resolution",
-        "Bias against the finest mesh of this plot. A coarser mesh is a different, smoother surface.",
-        True,
-    ),
-    "interactions": (
-        "Surface interactions",
-        "A limit on the interactions of a path saves time and adds a bias; no limit adds none.",
-        True,
-    ),
-}
+# The comparisons of the generator, in the order of the page.
+_COMPARISONS = ("paths", "effects", "mesh", "interactions")
 
 
 def _field(title: str, name: str, **options: Any) -> Column:
@@ -108,15 +86,8 @@ def _figure(
 
 
 def _front_section(runs: Sequence[Measurement], png: Path) -> dict[str, Any]:
-    """All runs and their Pareto front, whose points have names."""
+    """All runs and their Pareto front, whose points have names; and its extrapolation."""
     front = pareto_front(runs)
-    text = "Error over total time, and the Pareto front: the runs that no other one beats in both."
-    if (further := extrapolation(front)) is not None:
-        text += (
-            " Extrapolation: we fit a power law to the last three points of the front. The error falls as "
-            f"time to the power -{further[1]}, so halving the last error takes about {clock(further[0])} "
-            "more. Expect longer, because gains shrink with time."
-        )
 
     def name(m: Measurement) -> str:
         return f"{m.details['queries'] / 1e6:.2g} M × {m.details['spp']:g}" if m in front else ""
@@ -125,43 +96,33 @@ def _front_section(runs: Sequence[Measurement], png: Path) -> dict[str, Any]:
     caption = "Names on the front: training queries × paths per query."
     stepped = [(m.seconds.value, m.error.value) for m in front]
     series = [_series("complete runs", runs, label=name, style="points")]
+    further = extrapolation(front)
     return {
-        "title": "All runs",
-        "text": text,
         "figure": _figure(series, *axes, png, caption, front=stepped),
         "table": _table(_RUNS, front).for_page(),
+        "further": None if further is None else (clock(further[0]), further[1]),
     }
 
 
-def _generator_section(kind: str, found: Sequence[Measurement], png: Path) -> dict[str, Any]:
+def _generator_section(found: Sequence[Measurement], png: Path) -> dict[str, Any]:
     """Error over time of one comparison of the generator, split into bias and noise where there is a bias."""
-    title, text, split = _COMPARISONS[kind]
     found = sorted(found, key=lambda m: (m.series, m.seconds.value))
+    biased = [m for m in found if m.bias and is_significant(m.bias)]
+    unbiased = [m for m in found if m.bias and m not in biased]
     caption = ""
-    if split:
-        biased = [m for m in found if m.bias and is_significant(m.bias)]
-        unbiased = [m for m in found if m not in biased]
-        series = [
-            _series("bias", biased, "bias", style="points"),
-            _series(
-                "noise",
-                found,
-                "noise",
-                lambda m: m.name if m in unbiased else "",
-                style="points",
-                hollow=True,
-            ),
-        ]
-        limit = max((2 * max(m.bias.error, m.bias.value) for m in unbiased if m.bias), default=0.0)
-        if unbiased:
-            caption = "Labels at the noise: the bias is not significant, "
-            caption += f"at most {100 * limit:.2g} % of the mean value."
+    if biased or unbiased:
+        series = [_series("bias", biased, "bias", style="points")]
+        label = {"label": lambda m: m.name if m in unbiased else ""}
+        series.append(_series("noise", found, "noise", style="points", hollow=True, **label))
     else:
         names = dict.fromkeys(m.series for m in found)
         series = [_series(n, [m for m in found if m.series == n], style="joined") for n in names]
+    if unbiased:
+        limit = 100 * max(2 * max(m.bias.error, m.bias.value) for m in unbiased if m.bias)
+        caption = (
+            f"Labels at the noise: the bias is not significant, at most {limit:.2g} % of the mean value."
+        )
     return {
-        "title": title,
-        "text": text,
         "figure": _figure(series, "seconds per million queries", _NOISE_AXIS, png, caption),
         "table": _table(_GENERATOR, found).for_page(),
     }
@@ -176,7 +137,7 @@ def write_page(study: Study) -> Path:
         if found and kind == "run":
             sections["front"] = _front_section(found, study.folder / "front.png")
         elif found:
-            sections[kind] = _generator_section(kind, found, study.folder / f"{kind}.png")
+            sections[kind] = _generator_section(found, study.folder / f"{kind}.png")
     html = render(
         "cost.html",
         study=study.description,

@@ -66,16 +66,8 @@ def common_scale(maps: Sequence[ArrayLike]) -> float:
     return round_scale(float(np.percentile(np.concatenate([np.abs(np.ravel(m)) for m in maps]), 99)))
 
 
-def color_bar(
-    key: Palette, title: str, high: float, unit: str, note: str, factor: float = 1.0
-) -> dict[str, Any]:
-    """A labeled color bar with five evenly spaced numbers.
-
-    Parameters
-    ----------
-    high : end of the scale; `factor` converts it to `unit`
-    note : definition of the quantity
-    """
+def color_bar(key: Palette, title: str, high: float, unit: str, factor: float = 1.0) -> dict[str, Any]:
+    """A labeled color bar with five evenly spaced numbers up to `high`, which `factor` converts to `unit`."""
     low = -high if key == "signed" else 0.0
     colors = palette(key)[np.linspace(0, 255, 17).round().astype(int)].tolist()
     return {
@@ -84,7 +76,6 @@ def color_bar(
         "gradient": f"linear-gradient(90deg, {', '.join('rgb({} {} {})'.format(*c) for c in colors)})",
         "ticks": [f"{factor * x:.3g}".replace("-", "−") for x in np.linspace(low, high, 5)],
         "unit": unit,
-        "note": note,
     }
 
 

@@ -42,27 +42,11 @@ from mbtf_pipeline.run_folder import COMPARE
 _KIND = {"query": "Reference", "pixel": "Reference, filtered pixel"}
 # Standard deviation in pixels of the averaging window of local errors.
 WINDOW = 2.0
-# Error maps: title, unit, factor to that unit, and definition.
-_MAPS: dict[Palette, tuple[str, str, float, str]] = {
-    "local": (
-        "Local RMS error",
-        "% of white",
-        100.0,
-        "Noise-free: root of (p−a)(p−b), averaged over channels and a Gaussian window with σ = 2 pixels. "
-        "0 where the average is negative, because the error lies below the noise.",
-    ),
-    "flip": (
-        "HDR-FLIP",
-        "from 0 to 1",
-        1.0,
-        "Visible difference: maximum over −2, 0 and +2 stops. Includes the noise of the reference.",
-    ),
-    "signed": (
-        "Fit − reference",
-        "% of white",
-        100.0,
-        "Mean of the channels. Blue is too dark, orange too bright. Includes the noise of the reference.",
-    ),
+# Error maps: title, unit, and factor to that unit.
+_MAPS: dict[Palette, tuple[str, str, float]] = {
+    "local": ("Local RMS error", "% of white", 100.0),
+    "flip": ("HDR-FLIP", "from 0 to 1", 1.0),
+    "signed": ("Fit − reference", "% of white", 100.0),
 }
 
 
@@ -142,8 +126,8 @@ def picture_section(
     for name, found in maps.items():
         scale = common_scale(list(found.values()))
         scale = min(scale, 1.0) if name == "flip" else scale
-        title, unit, factor, note = _MAPS[name]
-        bars[name] = color_bar(name, title, scale, unit, note, factor)
+        title, unit, factor = _MAPS[name]
+        bars[name] = color_bar(name, title, scale, unit, factor)
         gallery |= {
             f"{file}-{name}": partial(map_uri, values / scale, name) for file, values in found.items()
         }
@@ -261,8 +245,7 @@ def _offset_row(
             lines.append(signed(f"correlation with the traced offset {found:.2f}"))
         cell = _figure(name, title, lines, f", {view}")
         cells.append(cell | {"file": _exr_link(_offset_file(record, fit))})
-    note = "Displacement towards the viewer’s azimuth, minus the median of each image."
-    return {"cells": cells, "bar": color_bar("signed", "Displacement", scale, "tile widths", note)}
+    return {"cells": cells, "bar": color_bar("signed", "Displacement", scale, "tile widths")}
 
 
 def _figure(image: str, label: str, lines: list[str], where: str, *, exr: bool = False) -> dict[str, Any]:

@@ -16,7 +16,6 @@ from mbtf_core.files.atomic import read_json, write_text
 from mbtf_core.pictures.camera import Camera
 from mbtf_pipeline.compare.compare import COMPARISON_NAME, COMPARISON_SCHEMA
 from mbtf_pipeline.compare.image_files import read_picture
-from mbtf_pipeline.number_text import NOT_SIGNIFICANT
 from mbtf_pipeline.recipe import RECIPE_NAME, Recipe
 from mbtf_pipeline.report.embed import REDUCTIONS, Gallery
 from mbtf_pipeline.report.images import offset_section, picture_section
@@ -37,32 +36,13 @@ _MOST_PICTURES = 4
 
 _log = logging.getLogger(__name__)
 
-_TABLE = """
-{%- set below = t.head[-1] == "command" %}
-{%- set head = t.head[:-1] if below else t.head %}
-<table><thead><tr>{% for h in head %}<th>{{ h }}</th>{% endfor %}</tr></thead><tbody>
-{% for row in t.rows %}<tr>
-{%- for cell in row %}
-{%- if below and loop.last %}</tr>
-<tr class=command><td class=command colspan={{ row|length - 1 }}><code>{{ cell }}</code></td>
-{%- elif cell is command %}<td class=command><code>{{ cell }}</code></td>
-{%- else %}<td{{ ' class=long' if cell is long }}>{{ cell }}</td>{% endif %}
-{%- endfor %}</tr>
-{% endfor %}</tbody></table>
-"""
-
 
 def render(page: str, **context: Any) -> str:
     """A page of ``templates/`` as HTML."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
-    from markupsafe import Markup
 
     templates = PackageLoader("mbtf_pipeline.report")
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, loader=templates)
-    environment.tests["long"] = lambda cell: NOT_SIGNIFICANT in cell
-    environment.tests["command"] = lambda cell: cell.startswith("mbtf-")
-    table = environment.from_string(_TABLE)
-    environment.globals["table"] = lambda t: Markup(table.render(t=t))
     return environment.get_template(page).render(context)
 
 
@@ -100,16 +80,15 @@ def write_report(folder: Path, recipe: Recipe, stages: Sequence[str]) -> None:
         "description": recipe.description,
         **shown,
         "error_bar_note": ERROR_BAR_NOTE,
-        "train_spp": manifest["splits"]["train"]["spp"],
+        "manifest": manifest,
         "offsets": offset_section(folder / COMPARE, comparison["offsets"], gallery),
         "material": material_section(recipe.generate, manifest["inputs"]),
-        "effects": manifest["effects"]["effects"],
         "command": run["command"],
         "recipe_yaml": (folder / RECIPE_NAME).read_text(encoding="utf-8"),
         "provenance": provenance(folder, manifest, comparison["fits"], run["machine"]),
-        **error_context(comparison, float(manifest["config"]["queries"]["min_cos"])),
+        **error_context(comparison),
         **training_context(fit_folders),
-        "time_tables": time_tables(folder, stages, manifest, comparison),
+        "time_tables": time_tables(folder, stages, comparison),
         "exposure": describe_exposure(exposure),
     }
     # The first page that is small enough, or the smallest.

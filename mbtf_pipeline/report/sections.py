@@ -23,15 +23,6 @@ from mbtf_pipeline.run_folder import FITS
 from mbtf_pipeline.stages import read_stamp
 
 UNEXPLAINED = "unexplained variance"
-_TERMS = {
-    "mse": "MSE",
-    "psnr": "PSNR",
-    "relative_mse": "relative MSE",
-    "flip": "FLIP",
-    "ssim": "SSIM",
-    "st_lpips": "ST-LPIPS",
-    "error_bar": "error bar",
-}
 # Ways to group queries: key in the record, title, axis of the plot, and head of the table.
 _GROUPINGS = (
     ("levels", "By level of detail (level 0: the whole tile)", "level of the footprint", "level"),
@@ -41,22 +32,16 @@ _GROUPINGS = (
 _THUMBNAIL = 192
 
 
-def error_context(comparison: Mapping[str, Any], min_cos: float) -> dict[str, Any]:
-    """Data about errors.
-
-    Parameters
-    ----------
-    min_cos : smallest cosine of light and view in the data
-    """
+def error_context(comparison: Mapping[str, Any]) -> dict[str, Any]:
+    """Data about errors."""
     tests = {fit: record["splits"]["test"] for fit, record in comparison["test"].items()}
-    groupings = [_grouping(tests, min_cos, *grouping) for grouping in _GROUPINGS]
+    groupings = [_grouping(tests, *grouping) for grouping in _GROUPINGS]
     return {
         "facts": _facts(comparison, tests),
         "test": next(iter(tests.values())),
         "error_table": _error_table(comparison),
         "error_plots": [shown for shown, _ in groupings],
         "group_tables": [table for _, table in groupings],
-        "definitions": [(_TERMS[k], v) for k, v in comparison["definitions"].items()],
     }
 
 
@@ -88,20 +73,12 @@ def _error_table(comparison: Mapping[str, Any]) -> dict[str, Any]:
     return {"head": head, "rows": rows}
 
 
-def group_label(name: str, min_cos: float) -> str:
-    """``4`` for a level, ``0.3–0.4`` for a range of cosines, which is cut at the smallest in the data."""
-    low, _, high = name.partition("-")
-    if not high:
-        return name
-    return f"{min_cos:g}–{high}" if float(low) < min_cos < float(high) else f"{low}–{high}"
-
-
 def _grouping(
-    tests: Mapping[str, Any], min_cos: float, key: str, title: str, axis: str, head: str
+    tests: Mapping[str, Any], key: str, title: str, axis: str, head: str
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Plot and table of the errors by level or by cosine."""
     names = sorted({n for test in tests.values() for n in test[key]}, key=lambda n: float(n.split("-")[0]))
-    labels = [group_label(name, min_cos) for name in names]
+    labels = [name.replace("-", "–") for name in names]
     series: dict[str, list[tuple[float, float] | None]] = {fit: [] for fit in tests}
     rows = []
     for name, label in zip(names, labels, strict=True):
@@ -130,14 +107,6 @@ def training_context(fits: Mapping[str, Path]) -> dict[str, Any]:
     from mbtf_fit import Material, read_history
 
     histories = {name: read_history(folder) for name, folder in fits.items()}
-    lines = []
-    for name, folder in fits.items():
-        training = Material.load(folder).description["training"]
-        rate = training["steps"] * training["batch"] / max(training["seconds"], 1e-9) / 1e6
-        lines.append(
-            "{}: {steps:,} steps of {batch:,} queries in {seconds:.0f} s on {device}, {threads} threads "
-            "({:.2f} M queries/s)".format(name, rate, **training)
-        )
     plots = []
     for title, label, y, key in (
         ("Training loss, including noise", "training loss over seconds", "training loss", "loss"),
@@ -151,12 +120,11 @@ def training_context(fits: Mapping[str, Path]) -> dict[str, Any]:
                 series.append(Series(name, seconds, values, errors))
         if series:
             plots.append({"title": title, "svg": plot(series, "seconds of training", y, label, log="y")})
-    return {"training_plots": plots, "training_lines": lines}
+    trainings = {name: Material.load(folder).description["training"] for name, folder in fits.items()}
+    return {"training_plots": plots, "trainings": trainings}
 
 
-def time_tables(
-    folder: Path, stages: Sequence[str], manifest: Mapping[str, Any], comparison: Mapping[str, Any]
-) -> list[dict[str, Any]]:
+def time_tables(folder: Path, stages: Sequence[str], comparison: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Tables of the time that each part of a run took.
 
     Parameters
@@ -166,18 +134,6 @@ def time_tables(
     """
     stamps = {name: read_stamp(folder, name) for name in stages}
     each = {name: stamp.seconds for name, stamp in stamps.items() if stamp is not None}
-    summary, train = manifest["summary"], manifest["splits"]["train"]
-    seconds, paths = float(summary["shard_seconds"]), int(summary["paths"])
-    noise = float(summary["relative_error"])
-    generation = {
-        "seconds": f"{seconds:.1f}",
-        "paths": f"{paths:,}",
-        "M paths/s": f"{paths / max(seconds, 1e-9) / 1e6:.2f}",
-        "training queries": f"{train['queries']:,}",
-        "paths per query": f"{train['spp']:g}",
-        "noise of a training query": f"{noise:.0%} of the mean value",
-        "noise of the mean over queries": f"{noise / np.sqrt(train['queries']):.2%}",
-    }
     images = {"references": f"{comparison['seconds']['references'] / len(comparison['pictures']):.1f}"}
     for fit in comparison["fits"]:
         # The median is robust against images that another process slowed down.
@@ -185,7 +141,6 @@ def time_tables(
     stage_seconds = {name: f"{s:.1f}" for name, s in each.items()} | {"total": f"{sum(each.values()):.1f}"}
     return [
         {"title": "Seconds per stage", **_as_table(stage_seconds)},
-        {"title": "Generate", **_as_table(generation)},
         {"title": "Compare: seconds per image", **_as_table(images)},
     ]
 

@@ -91,7 +91,7 @@ def test_scales_and_color_bars_are_round() -> None:
         assert common_scale([np.full(100, size)]) == pytest.approx(expected)
     zero = np.zeros((10, 10))
     assert common_scale([zero - 0.03, zero]) == pytest.approx(0.05)
-    bar = color_bar("local", "", 0.2, "%", "", 100)
+    bar = color_bar("local", "", 0.2, "%", 100)
     assert bar["ticks"] == ["0", "5", "10", "15", "20"]
-    assert color_bar("signed", "", 0.5, "", "")["ticks"] == ["−0.5", "−0.25", "0", "0.25", "0.5"]
+    assert color_bar("signed", "", 0.5, "")["ticks"] == ["−0.5", "−0.25", "0", "0.25", "0.5"]
     assert bar["gradient"].startswith("linear-gradient(90deg, rgb({} {} {}),".format(*palette("local")[0]))
