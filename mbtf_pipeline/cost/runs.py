@@ -133,22 +133,10 @@ class Run(Configuration):
 
 
 def planned_runs(seconds: float, spp: int, path_seconds: float) -> list[Run]:
-    """All runs of a study, in the order of measuring, each with the study's own seed.
+    """All runs of a study of some seconds, in the order of measuring, each with the study's own seed and
+    `spp` paths per query of `path_seconds` each.
 
     Total times double; the time that is then left goes to other shares of generating, shortest first.
-
-    Parameters
-    ----------
-    seconds : float
-        Time of the study.
-    spp : int
-        Paths of a query.
-    path_seconds : float
-        Seconds of generating a query over its number of paths.
-
-    Returns
-    -------
-    list of Run
     """
     seconds *= RUNS / FEWEST_SEEDS
     totals = [SHORTEST]

@@ -78,13 +78,12 @@ class Study:
     failed: list[str] = field(default_factory=list)
 
 
-def is_study(folder: Path) -> bool:
-    """Whether a folder contains a cost study; one of another schema version is refused."""
-    return has_record(folder, STUDY_NAME, STUDY_FORMAT, STUDY_SCHEMA)
-
-
 def claim(folder: Path, on: Mapping[str, str]) -> None:
     """Take an empty folder, or one that holds a study of the kind of machine that measures."""
+
+    def is_study(folder: Path) -> bool:
+        return has_record(folder, STUDY_NAME, STUDY_FORMAT, STUDY_SCHEMA)
+
     if not check_folder(folder, is_study, "cost study"):
         return
     there, here = read_json(folder / STUDY_NAME)["machine"]["system"], on["system"]
@@ -109,32 +108,30 @@ def measuring_machine() -> dict[str, str]:
     return found
 
 
+@dataclass
 class Measurements:
     """The measurements of a study by the label of their configuration, stored as they come.
 
-    Parameters
+    Attributes
     ----------
     conditions, store, runner : what measures, and where the results are kept
     note : called with the label of a configuration when it is taken
+    failed : why runs failed
+    path_seconds : seconds of generating a query over its number of paths
     """
 
-    def __init__(
-        self,
-        conditions: Conditions,
-        store: MeasurementFolder,
-        runner: Runner,
-        note: Callable[[str], None] = lambda label: None,
-    ) -> None:
-        self.conditions, self.store, self.runner, self.note = conditions, store, runner, note
-        self.found: dict[str, Measurement] = {}
-        # Why runs failed.
-        self.failed: dict[str, str] = {}
-        self.path_seconds = 0.0
-        # Taken, but not measured yet.
-        self._pending: dict[str, Configuration] = {}
-        # Seeds with a test set, and most seconds of a run besides test set, generating and training.
-        self._seeds: set[int] = set()
-        self._overhead = _OVERHEAD
+    conditions: Conditions
+    store: MeasurementFolder
+    runner: Runner
+    note: Callable[[str], None] = lambda label: None
+    found: dict[str, Measurement] = field(default_factory=dict)
+    failed: dict[str, str] = field(default_factory=dict)
+    path_seconds: float = 0.0
+    # Taken, but not measured yet.
+    _pending: dict[str, Configuration] = field(default_factory=dict)
+    # Seeds with a test set, and most seconds of a run besides test set, generating and training.
+    _seeds: set[int] = field(default_factory=set)
+    _overhead: float = _OVERHEAD
 
     def recall(self, configuration: Configuration) -> bool:
         """Whether a measurement is stored; it then counts as found."""
@@ -162,7 +159,7 @@ class Measurements:
                 self._pending[configuration.label] = configuration
                 self.note(configuration.label)
                 arguments = {"configuration": configuration, "conditions": self.conditions}
-                yield Item(configuration.label, arguments, gpu=self.runner.takes_gpu("auto"))
+                yield Item(configuration.label, arguments)
 
         for done in self.runner.map(measure, items(), independent=independent, ahead=0):
             configuration = self._pending.pop(done.name)
@@ -204,13 +201,12 @@ class Measurements:
                 begun = run.seed == 0 or before in self.found or before in self._pending
                 if not begun or run.label in self.failed or self.recall(run):
                     continue
-                if (run.seed < FEWEST_SEEDS or too_wide(run, deviation)) and fits(run):
+                own = self.group(run)
+                few = run.seed < FEWEST_SEEDS
+                if not few and len(own) == run.seed < seeds:
+                    few = NORMAL * combined(own, deviation).error.relative_error > HALF_WIDTH
+                if few and fits(run):
                     yield run
-
-        def too_wide(run: Run, deviation: Estimate | None) -> bool:
-            own = self.group(run)
-            relative = combined(own, deviation).error.relative_error if len(own) == run.seed else 0.0
-            return run.seed < seeds and NORMAL * relative > HALF_WIDTH
 
         rounds = [[replace(run, seed=seed) for run in runs for seed in range(FEWEST_SEEDS)]]
         rounds += [[replace(run, seed=seed) for run in runs] for seed in range(1, MOST_SEEDS)]

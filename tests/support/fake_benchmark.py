@@ -20,7 +20,10 @@ SHIFT = 0.25  # bias of one interaction, relative to the value
 
 
 class FakeEstimator:
-    """Values of known bias and noise; random numbers depend on the stream alone, as the real ones."""
+    """Values of known bias and noise, between 0.2 and 0.3 along u; random numbers depend on the stream alone,
+    as the real ones."""
+
+    scale, slope, noise = 1.0, 0.1, NOISE
 
     def __init__(self, job: Job) -> None:
         self.shift = SHIFT if job.config.transport.max_depth == 1 else 0.0
@@ -32,12 +35,12 @@ class FakeEstimator:
         key = [stream.root, stream.shard, stream.first_pass, len(queries.sigma), self.shift > 0]
         rng = np.random.default_rng(key)
         each = np.broadcast_to(spp, len(queries.sigma))
-        truth = 0.2 + 0.1 * queries.u[:, :1]
+        truth = self.scale * (0.25 + self.slope * (queries.u[:, :1] - 0.5))
         # The bias has both signs: its square is measured, query by query.
         sign = np.where(queries.u[:, 1:] < 0.5, -1.0, 1.0)
         halves = [
             truth * (1 + self.shift * sign)
-            + 0.25 * NOISE * rng.normal(size=(len(truth), 3)) / np.sqrt(each[:, None] / 2)
+            + 0.25 * self.scale * self.noise * rng.normal(size=(len(truth), 3)) / np.sqrt(each[:, None] / 2)
             for _ in range(2)
         ]
         a, b = (h.astype(np.float32) for h in halves)

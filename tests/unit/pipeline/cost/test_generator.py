@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,6 @@ from support.fake_runs import conditions
 from mbtf_core.data.queries import Queries
 from mbtf_core.errors import InputError
 from mbtf_core.stats import Estimate
-from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.planning.effects_planner import plan_effects
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_pipeline.cost import generator as module
@@ -121,30 +120,22 @@ def test_the_time_of_a_path_is_that_of_the_next_number_of_paths() -> None:
 
 
 @pytest.mark.parametrize(
-    ("factor", "spread", "message"),
-    [(0.0, 0.0, "reflects nothing"), (1.0, 0.0, "reflects the same everywhere"), (1.0, 0.02, None)],
+    ("values", "message"),
+    [
+        ({"scale": 0.0}, "reflects nothing"),
+        ({"slope": 0.0}, "reflects the same everywhere"),
+        # A standard deviation of a fiftieth of the mean.
+        ({"slope": 0.02 * 0.25 * math.sqrt(12)}, None),
+    ],
 )
 def test_materials_without_anything_to_learn_are_refused(
-    monkeypatch: pytest.MonkeyPatch, factor: float, spread: float, message: str | None
+    benchmark: GeneratorBenchmark,
+    monkeypatch: pytest.MonkeyPatch,
+    values: dict[str, float],
+    message: str | None,
 ) -> None:
-    """Noise does not count; values that vary by a fiftieth of their mean do."""
-
-    class Even(FakeEstimator):
-        def estimate(self, queries: Queries, spp: Any, stream: Stream, **_: Any) -> Estimates:
-            found = super().estimate(queries, spp, stream)
-            truth = 0.2 + 0.1 * queries.u[:, :1]
-            own = 0.25 * (1 + spread * np.sign(queries.u[:, :1] - 0.5))
-            a, b = (
-                (factor * (0.1 * (v - truth) + own)).astype(np.float32)
-                for v in (found.value_a, found.value_b)
-            )
-            return replace(found, value_a=a, value_b=b)
-
-    benchmark = fake_benchmark(monkeypatch)
-    assert isinstance(benchmark.config, GeneratorConfig)
-    monkeypatch.setattr(module, "build_estimator", lambda job, plan: Even(job))
-    if message is None:
-        benchmark.check_variation()
-        return
-    with pytest.raises(InputError, match=message):
+    """Noise does not count."""
+    for name, value in {"noise": 0.1 * NOISE, **values}.items():
+        monkeypatch.setattr(FakeEstimator, name, value)
+    with nullcontext() if message is None else pytest.raises(InputError, match=message):
         benchmark.check_variation()
