@@ -53,10 +53,10 @@ def cost(
 
     if is_library_recipe(recipe) or is_paper_recipe(recipe):
         raise UsageError("has several materials", where=recipe, hint="study the recipe of one of them")
+    seconds = asked_duration(time, "--time")
     more = 0.0 if refine is None else asked_duration(refine, "--refine")
     loaded = load_recipe(recipe, assignments or [])
     folder = output if output is not None else loaded.folder.with_name(f"{loaded.folder.name}-cost")
-    seconds = asked_duration(time, "--time")
     keep_on_interruption(f"the measurements are kept in {folder}")
     with (
         open_runner(cluster, console.note) as runner,
@@ -83,14 +83,10 @@ def cost(
         )
     with owned(folder):
         page = write_page(study)
-    measured = len(study.measurements)
     front = pareto_front(study.measurements)
-    lines = [f"{page}: {measured} configurations measured, {len(study.skipped)} skipped for lack of time"]
-    lines += [f"failed: {text}" for text in study.failed]
-    lines += [f"  {m.seconds.value:.0f} s: unexplained variance {m.error}   {m.command}" for m in front]
     data = {
         "page": page,
-        "measurements": measured,
+        "measurements": len(study.measurements),
         "skipped": study.skipped,
         "failed": study.failed,
         "front": [
@@ -98,4 +94,7 @@ def cost(
             for m in front
         ],
     }
+    counts = f"{len(study.measurements)} configurations measured, {len(study.skipped)} skipped"
+    lines = [f"{page}: {counts} for lack of time", *(f"failed: {text}" for text in study.failed)]
+    lines += [f"  {m.seconds.value:.0f} s: unexplained variance {m.error}   {m.command}" for m in front]
     console.report(data, "\n".join(lines))

@@ -45,8 +45,6 @@ UNIFORM = {"queries.allocation": "uniform"}
 # Queries of one batch of the reference, and paths of each there and in the configuration.
 BIAS_QUERIES, BIAS_SPP = 1 << 14, 64
 _MOST_BIAS_BATCHES = 16
-# Queries for the mean value, and paths of each.
-_MEAN_QUERIES, _MEAN_SPP = 1 << 19, 2
 # Paths of one timed batch, and the fewest batches. Closed forms take fewer paths per query than counted here.
 _BATCH_PATHS = 1 << 19
 _FEWEST_BATCHES = 8
@@ -57,7 +55,7 @@ _NEGLIGIBLE = 0.005
 _LEAST_VARIATION = 0.005
 # Random streams of the study stand for shards of so many queries, from these numbers on.
 SHARD = 1 << 14
-_FIRST_MEAN, _FIRST_REFERENCE, _FIRST_BATCH = 1_001, 5_001, 10_001
+_FIRST_REFERENCE, _FIRST_BATCH = 5_001, 10_001
 # Queries that measure how many paths a batch takes.
 _PROBE = 2048
 
@@ -106,10 +104,8 @@ class Reference:
 
     @cached_property
     def mean(self) -> float:
-        """Mean value, 1/sr."""
-        queries = self.job.query_plan.draw("test", _FIRST_MEAN, _MEAN_QUERIES)
-        a, b = _halves(self.job, self.estimator, queries, _MEAN_SPP, _FIRST_MEAN)
-        return float(0.5 * (a + b).mean())
+        """Mean value over the first batch, 1/sr."""
+        return float(np.mean(self.batch(0)[1]))
 
     def batch(self, number: int) -> tuple[Queries, Halves]:
         """Queries, and both halves (n, 3) of the values there; batches are made in their order."""
