@@ -214,13 +214,12 @@ class _RecipeRun:
         if name != stage:
             self.live.finished(name, self.folder / FITS / name)
         elif stage == COMPARE_STAGE:
-            from mbtf_pipeline.report.viewer import run_pictures
+            from mbtf_pipeline.report.report import run_pictures
 
             self.live.pictures(run_pictures(self.folder))
 
     def _report(self, decision: Decision) -> None:
-        from mbtf_pipeline.report.report import write_report
-        from mbtf_pipeline.report.viewer import write_viewer
+        from mbtf_pipeline.report.report import write_report, write_viewer
 
         write_report(self.folder, self.recipe, [stage.name for stage in self.stages({})][:-1])
         write_viewer(self.folder, self.recipe.title, read_json(self.folder / COMPARE / COMPARISON_NAME))

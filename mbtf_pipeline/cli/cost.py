@@ -8,7 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from mbtf_core.app.console import CONSOLE, Console
-from mbtf_core.app.options import ClusterOption, Output, Set, Time, command_line
+from mbtf_core.app.options import ClusterOption, Output, Set, command_line
 from mbtf_core.errors import UsageError
 
 
@@ -17,7 +17,7 @@ def cost(
     /,
     *,
     output: Annotated[Output | None, Parameter(show_default="out/NAME-cost")] = None,
-    time: Annotated[Time, Parameter(show_default="that of the study in the folder, or 10min")] = None,
+    time: Annotated[str, Parameter(metavar="DURATION")] = "10min",
     refine: Annotated[str | None, Parameter(metavar="DURATION")] = None,
     seed: Annotated[int | None, Parameter(show_default="the recipe's")] = None,
     cluster: ClusterOption = None,
@@ -33,6 +33,8 @@ def cost(
     ----------
     recipe
         YAML file; its material and generator are studied.
+    time
+        Time of the study: 90s, 2min, 1h.
     refine
         Additional time: repeats runs with further seeds until their 95 % intervals are within ±10 %.
     seed
@@ -41,19 +43,19 @@ def cost(
     from mbtf_core.files.folders import owned
     from mbtf_core.run.cluster import open_runner
     from mbtf_core.run.signals import keep_on_interruption
-    from mbtf_core.units import asked_duration, format_duration
+    from mbtf_core.units import asked_duration
     from mbtf_pipeline.collection.recipes import load
-    from mbtf_pipeline.cost.cost_page import complete_runs, write_page
-    from mbtf_pipeline.cost.pareto import pareto_front
-    from mbtf_pipeline.cost.study import run_study, time_of
+    from mbtf_pipeline.cost.analysis import pareto_front
+    from mbtf_pipeline.cost.page import write_page
+    from mbtf_pipeline.cost.study import run_study
     from mbtf_pipeline.recipe import Recipe
 
     loaded = load(recipe, assignments or [])
     if not isinstance(loaded, Recipe):
         raise UsageError("has several materials", where=recipe, hint="study the recipe of one of them")
+    seconds = asked_duration(time, "--time")
     more = 0.0 if refine is None else asked_duration(refine, "--refine")
     folder = output if output is not None else loaded.folder.with_name(f"{loaded.folder.name}-cost")
-    seconds = time_of(folder) if time is None else asked_duration(time, "--time")
     keep_on_interruption(f"the measurements are kept in {folder}")
     with (
         open_runner(cluster, console.note) as runner,
@@ -67,7 +69,7 @@ def cost(
             seed=seed,
             command=command_line(
                 *("mbtf-pipeline", "cost", recipe),
-                time=time or format_duration(seconds),
+                time=time,
                 refine=refine,
                 output=output,
                 seed=seed,
@@ -80,14 +82,10 @@ def cost(
         )
     with owned(folder):
         page = write_page(study)
-    measured = len(study.measurements)
-    front = pareto_front(complete_runs(study.measurements))
-    lines = [f"{page}: {measured} configurations measured, {len(study.skipped)} skipped for lack of time"]
-    lines += [f"failed: {text}" for text in study.failed]
-    lines += [f"  {m.seconds.value:.0f} s: unexplained variance {m.error}   {m.command}" for m in front]
+    front = pareto_front(study.measurements)
     data = {
         "page": page,
-        "measurements": measured,
+        "measurements": len(study.measurements),
         "skipped": study.skipped,
         "failed": study.failed,
         "front": [
@@ -95,4 +93,7 @@ def cost(
             for m in front
         ],
     }
+    counts = f"{len(study.measurements)} configurations measured, {len(study.skipped)} skipped"
+    lines = [f"{page}: {counts} for lack of time", *(f"failed: {text}" for text in study.failed)]
+    lines += [f"  {m.seconds.value:.0f} s: unexplained variance {m.error}   {m.command}" for m in front]
     console.report(data, "\n".join(lines))

@@ -97,7 +97,7 @@ def each_fit(runs: Sequence[FinishedRun]) -> Iterator[tuple[FinishedRun, str]]:
 
 def signed_map(values: NDArray[np.floating], scale: float, label: str, line: str = "") -> Thumbnail:
     """A signed map (rows, columns), saturated at ± `scale`."""
-    return Thumbnail(map_uri((values / scale).astype(np.float64), "signed", 256), label, line)
+    return Thumbnail(map_uri(values / scale, "signed"), label, line)
 
 
 def mean_of(estimates: Sequence[Estimate]) -> Estimate:

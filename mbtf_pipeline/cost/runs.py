@@ -8,28 +8,44 @@ paths. Data and fits come from the generator and the fitter, called as the progr
 
 from __future__ import annotations
 
+import os
 import shutil
+import socket
 import time
 import timeit
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict, dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mbtf_core.errors import InputError
+from mbtf_core.config.nested import deep_merge, nested
+from mbtf_core.data.shard_files import row_bytes
 from mbtf_core.files.digest import data_sha256
 from mbtf_core.stats import Estimate, unexplained_variance
 from mbtf_core.units import parse_duration
+from mbtf_fit.config import DEFAULT_MODEL, best_options
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.run import generate
 from mbtf_gen.job import Job
-from mbtf_pipeline.cost.measurements import Configuration, Measurement
+from mbtf_pipeline.cost.measurement import Conditions, Configuration, Measurement
+from mbtf_pipeline.run_time import round_down
 
 if TYPE_CHECKING:
     from mbtf_fit.data.queries import ShardQueries
 
+# Seeds that every run gets, and at most.
+FEWEST_SEEDS, MOST_SEEDS = 2, 12
+# Shares of a study's time that the generator and the runs get, of two seeds each. The rest is left for
+# start-up, the test set and evaluation.
+GENERATOR, RUNS = 0.1, 0.7
+# Total times of runs, seconds: this one, twice, four times, ...; the share of each that generates.
+SHORTEST = 8.0
+SHARE, OTHER_SHARES = 0.35, (0.6, 0.15)
+_FEWEST_QUERIES = 20_000
 # Test queries, and paths of each.
 TEST = (1 << 20, 8)
 # The smallest split that the generator takes.
@@ -38,175 +54,145 @@ _NO_QUERIES = (1, 2)
 PIXELS = 1920 * 1080
 _TIMED_QUERIES = 1 << 18
 _TIMED = 5
-_OVERHEAD = 2.0
-# Seconds of a query at least: that of a closed form, written to disk.
-_CHEAPEST = 1e-8
-
-
-@dataclass(frozen=True)
-class DataRequest:
-    """Training data: number of queries, paths of each, and an offset that is added to the study's seed."""
-
-    queries: int
-    spp: int
-    seed: int = 0
 
 
 @dataclass(frozen=True)
 class Run(Configuration):
-    """A run to measure: its data, whose seed offset is that of the fit, too, and nested options of the
-    fitter."""
+    """A run to measure.
 
-    data: DataRequest
-    fit: dict[str, Any] = field(default_factory=dict)
+    Attributes
+    ----------
+    queries, spp : training queries, and paths of each
+    fit : options of the fitter, by dotted name
+    seed : added to the study's seed, for data and fit
+    """
+
+    queries: int
+    spp: int
+    fit: dict[str, Any]
+    seed: int = 0
 
     @property
     def label(self) -> str:
-        seed = f", seed + {self.data.seed}" if self.data.seed else ""
-        return f"{super().label}{seed}"
+        return f"{super().label}, seed + {self.seed}" if self.seed else super().label
 
     @property
     def key(self) -> dict[str, Any]:
-        return {**asdict(self.data), "fit": self.fit}
+        return {"queries": self.queries, "spp": self.spp, "seed": self.seed, "fit": self.fit}
 
+    def planned_seconds(self, path_seconds: float) -> float:
+        """Seconds of generating and training, from those of a path."""
+        return self.queries * self.spp * path_seconds + parse_duration(self.fit["training.time"])
 
-@dataclass
-class RunRunner:
-    """Generates data and fits models in a working folder."""
-
-    config: GeneratorConfig
-    folder: Path
-    # The generator's, with the study's configuration.
-    command: str
-    progress: Callable[[str], None]
-    # Number of test queries, and paths of each.
-    test: tuple[int, int] = field(default_factory=lambda: TEST)
-    # Time to generate a query over its number of paths.
-    path_seconds: float = 0.0
-    # Seconds by which a run exceeds generating and training: the most of all so far, or a guess.
-    overhead: float = _OVERHEAD
-    # By seed.
-    test_sets: dict[int, ShardQueries] = field(default_factory=dict)
-    test_seconds: float = 0.0
-
-    def clear(self) -> None:
-        """Remove data and fits."""
-        shutil.rmtree(self.folder, ignore_errors=True)
-
-    def _generate(self, seed: int, train: tuple[int, int], test: tuple[int, int]) -> tuple[Path, float]:
-        """Folder of a new data set with (queries, paths of each) of both splits, and the seconds it took."""
-        data = self.config.model_dump(mode="json")
-        data["seed"] += seed
-        data["queries"] |= {"train": str(train[0]), "spp": train[1], "layout": "shuffled"}
-        data["queries"] |= {"test": str(test[0]), "test_spp": test[1]}
-        config = GeneratorConfig.model_validate(data)
-        folder = self.folder / f"data-{data_sha256(data)[:12]}"
-        # Data that an interrupted study left behind were not timed.
-        shutil.rmtree(folder, ignore_errors=True)
-        start = time.perf_counter()
-        # `Job.prepare` would log the material's warnings for every data set.
-        job = Job.load(config)
-        generate(job, folder)
-        return folder, time.perf_counter() - start
-
-    def work_left(self, seconds: float) -> float:
-        """Seconds of work that can be done in a time."""
-        return seconds
-
-    def expected_seconds(self, run: Run) -> float:
-        """Expected time of measuring a run."""
-        test = 0.0 if run.data.seed in self.test_sets else self.test_seconds
-        return test + self.planned_seconds(run) + self.overhead
-
-    def planned_seconds(self, run: Run) -> float:
-        """Seconds of generating and training."""
-        generating = run.data.queries * run.data.spp * self.path_seconds
-        return generating + parse_duration(run.fit["training"]["time"])
-
-    def test_set(self, seed: int) -> ShardQueries:
-        """The test queries of all runs with an offset of the seed."""
-        if seed not in self.test_sets:
-            from mbtf_core.data.dataset import Dataset
-            from mbtf_fit.data.loader import load_split
-
-            self.progress("test set")
-            folder, self.test_seconds = self._generate(seed, _NO_QUERIES, self.test)
-            if len(self.test_sets) > 1:
-                # Further seeds are measured one after the other.
-                self.test_sets.popitem()
-            self.test_sets[seed] = load_split(Dataset.open(folder), "test")
-            shutil.rmtree(folder, ignore_errors=True)
-        return self.test_sets[seed]
-
-    def measure(self, run: Run) -> Measurement:
-        """Generate the data, fit, and evaluate."""
-        from mbtf_fit import FitConfig, fit
-
-        test = self.test_set(run.data.seed)
-        start, planned = time.perf_counter(), self.planned_seconds(run)
-        self.progress(run.label)
-        train = (run.data.queries, run.data.spp)
-        folder, generation_seconds = self._generate(run.data.seed, train, _NO_QUERIES)
-        config = FitConfig.model_validate({"seed": self.config.seed + run.data.seed, **run.fit})
-        out = self.folder / f"fit-{data_sha256(run.key)[:12]}"
-        shutil.rmtree(out, ignore_errors=True)
-        result = fit(config, folder, out)
-        error = unexplained_variance(result.material.predict(test), test.value_a, test.value_b)
-        details = {
-            "queries": float(run.data.queries),
-            "spp": float(run.data.spp),
-            "generation_seconds": generation_seconds,
-            "training_seconds": result.seconds,
-            "total_seconds": generation_seconds + result.total_seconds,
-            "evaluation_ms_1080p": 1e3 * _evaluation_seconds(result.material, test),
-            "bytes": float(sum(p.stat().st_size for p in out.glob("weights*"))),
-        }
-        for used in (folder, out):
-            shutil.rmtree(used, ignore_errors=True)
-        self.overhead = max(self.overhead, time.perf_counter() - start - planned)
-        seconds = Estimate(details["total_seconds"], 0.0, 1)
-        command = self.command_of(run)
-        return Measurement(run.study, run.series, run.name, command, seconds, error, details=details)
-
-    def measure_all(self, runs: Iterable[tuple[int, Run]]) -> Iterator[tuple[int, Run, Measurement | str]]:
-        """Measure numbered runs; yields number, run, and its measurement or why it failed. A run is taken
-        once the one before has been measured."""
-        for number, run in runs:
-            try:
-                measured: Measurement | str = self.measure(run)
-            except InputError as error:
-                measured = error.what
-            yield number, run, measured
-
-    def command_of(self, run: Run) -> str:
-        """The command that reproduces a run; the test split is that of the recipe."""
-        fit = _flat(run.fit)
-        seed = self.config.seed + run.data.seed
-        own = f" --seed {seed}" if run.data.seed else ""
-        if seed:
-            fit["seed"] = seed
-        flags = "".join(f" --set {name}={value}" for name, value in fit.items())
+    def command(self, conditions: Conditions) -> str:
+        """The commands that reproduce it; the test split is that of the recipe."""
+        seed = conditions.config.seed + self.seed
+        own = f" --seed {seed}" if self.seed else ""
+        flags = "".join(f" --set {k}={v}" for k, v in (self.fit | ({"seed": seed} if seed else {})).items())
         return (
-            f"{self.command} --queries {run.data.queries} --spp {run.data.spp}{own} -o shards/ && "
+            f"{conditions.command} --queries {self.queries} --spp {self.spp}{own} -o shards/ && "
             f"mbtf-fit shards/{flags} -o material/"
         )
 
+    def measure(self, conditions: Conditions) -> Measurement:
+        """Generate the data, fit, and evaluate.
 
-def forecast_seconds(config: GeneratorConfig) -> float:
-    """Seconds of a training query, by a forecast."""
-    from mbtf_gen.forecast import forecast
-    from mbtf_gen.planning.run_plan import allocate, plan_effects
+        Raises
+        ------
+        InputError : the fit diverged
+        PartialError : the disk is full
+        """
+        from mbtf_fit import FitConfig, fit
 
-    job = Job.load(config)
-    return max(forecast(job, allocate(job, plan_effects(job, pilots=False))).query_seconds, _CHEAPEST)
+        test = test_set(conditions, self.seed)
+        start = time.perf_counter()
+        shards, generation_seconds = _generated(conditions, self.seed, (self.queries, self.spp), _NO_QUERIES)
+        options = nested({"seed": conditions.config.seed + self.seed, **self.fit})
+        out = _own_folder(conditions) / f"fit-{data_sha256(self.key)[:12]}"
+        shutil.rmtree(out, ignore_errors=True)
+        result = fit(FitConfig.model_validate(options), shards, out)
+        error = unexplained_variance(result.material.predict(test), test.value_a, test.value_b)
+        seconds = generation_seconds + result.total_seconds
+        details = {
+            "queries": float(self.queries),
+            "spp": float(self.spp),
+            "generation_seconds": generation_seconds,
+            "training_seconds": result.seconds,
+            "total_seconds": seconds,
+            "evaluation_ms_1080p": 1e3 * _evaluation_seconds(result.material, test),
+            "bytes": float(sum(p.stat().st_size for p in out.glob("weights*"))),
+        }
+        for used in (shards, out):
+            shutil.rmtree(used, ignore_errors=True)
+        # Of everything but the test set.
+        details["run_seconds"] = time.perf_counter() - start
+        took = Estimate(seconds, 0.0, 1)
+        command = self.command(conditions)
+        return Measurement(self.study, self.series, self.name, command, took, error, details=details)
 
 
-def _flat(options: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested options by dotted name."""
-    out: dict[str, Any] = {}
-    for name, value in options.items():
-        out |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
-    return out
+def planned_runs(seconds: float, spp: int, path_seconds: float) -> list[Run]:
+    """All runs of a study of some seconds, in the order of measuring, each with the study's own seed and
+    `spp` paths per query of `path_seconds` each.
+
+    Total times double; the time that is then left goes to other shares of generating, shortest first.
+    """
+    seconds *= RUNS / FEWEST_SEEDS
+    totals = [SHORTEST]
+    while sum(totals) + 2 * totals[-1] <= seconds:
+        totals.append(2 * totals[-1])
+    left = seconds - sum(totals)
+    planned = [(total, SHARE) for total in totals]
+    for total, share in product(totals, OTHER_SHARES):
+        if total <= left:
+            planned.append((total, share))
+            left -= total
+    runs = []
+    for total, share in planned:
+        queries = round_down(max(_FEWEST_QUERIES, share * total / (spp * path_seconds)))
+        training = (1 - share) * total
+        fit = {"model": DEFAULT_MODEL, **best_options(training), "training.time": f"{training:.3g}s"}
+        series = f"{100 * share:.0f} % of the time for generating"
+        runs.append(Run("run", series, f"planned for {total:g} s", queries, spp, fit))
+    return runs
+
+
+def disk_bytes(runs: Sequence[Run]) -> int:
+    """Disk space that runs take at most: the test set, and data of one seed."""
+    return (TEST[0] + max((run.queries for run in runs), default=0)) * row_bytes(holes=True)
+
+
+@lru_cache(maxsize=FEWEST_SEEDS)
+def test_set(conditions: Conditions, seed: int) -> ShardQueries:
+    """The test queries of all runs with an offset of the seed; this process keeps those of two seeds."""
+    from mbtf_core.data.dataset import Dataset
+    from mbtf_fit.data.loader import load_split
+
+    folder, _ = _generated(conditions, seed, _NO_QUERIES, TEST)
+    found = load_split(Dataset.open(folder), "test")
+    shutil.rmtree(folder, ignore_errors=True)
+    return found
+
+
+def _own_folder(conditions: Conditions) -> Path:
+    """This process's folder of temporary data and fits."""
+    return conditions.folder / f"{socket.gethostname()}-{os.getpid()}"
+
+
+def _generated(
+    conditions: Conditions, seed: int, train: tuple[int, int], test: tuple[int, int]
+) -> tuple[Path, float]:
+    """Folder of a new data set with (queries, paths of each) of both splits, and the seconds it took."""
+    queries = {"train": str(train[0]), "spp": train[1], "test": str(test[0]), "test_spp": test[1]}
+    changes = {"seed": conditions.config.seed + seed, "queries": {**queries, "layout": "shuffled"}}
+    data = deep_merge(conditions.config.model_dump(mode="json"), changes)
+    folder = _own_folder(conditions) / f"data-{data_sha256(data)[:12]}"
+    # Data that an interrupted study left behind were not timed.
+    shutil.rmtree(folder, ignore_errors=True)
+    start = time.perf_counter()
+    # `Job.prepare` would log the material's warnings for every data set.
+    generate(Job.load(GeneratorConfig.model_validate(data)), folder)
+    return folder, time.perf_counter() - start
 
 
 def _evaluation_seconds(material: Any, test: ShardQueries) -> float:

@@ -1,43 +1,63 @@
-"""A cost study: measures what accuracy costs within a given time, and resumes where it stopped."""
+"""A cost study: measures what accuracy costs within a given time, and resumes where it stopped.
+
+Measurements are tasks: this process does them one after the other, the workers of a cluster each for itself.
+A worker generates data and fits as a process of its own would, and measures the time itself, so that all
+figures are of the workers' machine and threads.
+"""
 
 from __future__ import annotations
 
 import shlex
+import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
 from mbtf_core.config.yaml_file import dump_yaml
-from mbtf_core.data.shard_files import row_bytes
-from mbtf_core.errors import InputError
-from mbtf_core.files.atomic import read_json, write_json, write_text
+from mbtf_core.errors import InputError, PartialError
+from mbtf_core.files.atomic import read_json, write_text
 from mbtf_core.files.folders import ELSEWHERE, OutputKind, check_space, owned
 from mbtf_core.run.runner import Runner
-from mbtf_core.stats import Estimate, signal_variance
+from mbtf_core.run.task import Item, worker_threads
+from mbtf_core.stats import Estimate
 from mbtf_core.units import expectation
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
-from mbtf_pipeline.cost.distribute import ClusterRunner, measure_configurations, worker_facts
-from mbtf_pipeline.cost.fit_runs import GENERATOR, planned_runs
-from mbtf_pipeline.cost.generator_benchmark import GeneratorBenchmark
-from mbtf_pipeline.cost.generator_runs import GeneratorTask, generator_tasks
-from mbtf_pipeline.cost.measurements import Measurement, MeasurementFolder
-from mbtf_pipeline.cost.repeats import FEWEST_SEEDS, MOST_SEEDS, combined, measure_runs, seed_deviation
-from mbtf_pipeline.cost.runs import TEST, Run, RunRunner, forecast_seconds
+from mbtf_pipeline.cost.analysis import combined, seed_deviation
+from mbtf_pipeline.cost.generator import benchmark_of, generator_configurations, path_seconds
+from mbtf_pipeline.cost.measurement import (
+    HALF_WIDTH,
+    NORMAL,
+    Conditions,
+    Configuration,
+    Measurement,
+    MeasurementFolder,
+    measure,
+)
+from mbtf_pipeline.cost.runs import (
+    FEWEST_SEEDS,
+    GENERATOR,
+    MOST_SEEDS,
+    TEST,
+    Run,
+    disk_bytes,
+    planned_runs,
+    test_set,
+)
 from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.run_folder import machine
 
 STUDY = OutputKind("study.json", "mbtf-cost", 2, "a cost study")
 CONFIG_NAME = "generate.yaml"
 WORK = ".work"
-# Time of a new study, seconds.
-NEW_TIME = 600.0
-# Relative standard deviation of the values below which a fit has nothing to learn.
-_LEAST_VARIATION = 0.005
 # About as many configurations of the generator share its time.
 _CONFIGURATIONS = 35
+# Seconds by which a run exceeds generating and training, until one has been measured.
+_OVERHEAD = 2.0
+_RESUMES = "the same command resumes"
 
 
 @dataclass
@@ -66,30 +86,127 @@ def claim(folder: Path, on: Mapping[str, str]) -> None:
         raise InputError(problem, where=folder, hint=ELSEWHERE)
 
 
-def time_of(folder: Path) -> float:
-    """Time in seconds of the study in a folder; that of a new one where there is none."""
-    found = STUDY.read(folder)
-    return NEW_TIME if found is None else float(found["time"])
-
-
-def _check_variation(benchmark: GeneratorBenchmark) -> None:
-    """Refuse a material that gives a fit nothing to learn."""
-    reference, where = benchmark.reference({}), benchmark.config.material
-    if not reference.mean > 0:
-        hint = "study a material with a base color or gloss"
-        raise InputError("reflects nothing: every value is 0", where=where, hint=hint)
-    variance = signal_variance(*reference.batch(0)[1])
-    if variance.value + 2 * variance.error < (_LEAST_VARIATION * reference.mean) ** 2:
-        problem = "reflects the same everywhere and in all directions: there is nothing to fit"
-        raise InputError(problem, where=where, hint="study a material with displacement or textures")
-
-
 def study_config(config: GeneratorConfig, seed: int | None) -> GeneratorConfig:
     """A recipe's generator as its study uses it: without a target error, which would override the numbers of
     paths, and with shuffled queries."""
     queries = config.queries.model_copy(update={"target_error": None, "layout": "shuffled"})
     seeds = {} if seed is None else {"seed": seed}
     return config.model_copy(update={"queries": queries, **seeds})
+
+
+def measuring_machine() -> dict[str, str]:
+    """Record of the machine that runs it; a task."""
+    found = machine()
+    if (threads := worker_threads()) is not None:
+        found["system"] += f", workers of {threads} thread{'s' * (threads != 1)}"
+    return found
+
+
+@dataclass
+class Measurements:
+    """The measurements of a study by the label of their configuration, stored as they come.
+
+    Attributes
+    ----------
+    conditions, store, runner : what measures, and where the results are kept
+    note : called with the label of a configuration when it is taken
+    failed : why runs failed
+    path_seconds : seconds of generating a query over its number of paths
+    """
+
+    conditions: Conditions
+    store: MeasurementFolder
+    runner: Runner
+    note: Callable[[str], None] = lambda label: None
+    found: dict[str, Measurement] = field(default_factory=dict)
+    failed: dict[str, str] = field(default_factory=dict)
+    path_seconds: float = 0.0
+    # Taken, but not measured yet.
+    _pending: dict[str, Configuration] = field(default_factory=dict)
+    # Seeds with a test set, and most seconds of a run besides test set, generating and training.
+    _seeds: set[int] = field(default_factory=set)
+    _overhead: float = _OVERHEAD
+
+    def recall(self, configuration: Configuration) -> bool:
+        """Whether a measurement is stored; it then counts as found."""
+        stored = self.store.get(configuration)
+        if stored is not None:
+            self.found[configuration.label] = stored
+        return stored is not None
+
+    def measure(self, wanted: Iterable[Configuration], *, independent: bool) -> None:
+        """Measure configurations; each is taken once a worker is nearly free.
+
+        Parameters
+        ----------
+        wanted : iterable of Configuration
+        independent : whether one that fails says nothing about the others
+
+        Raises
+        ------
+        InputError : a configuration failed, which is not independent
+        PartialError : a worker died, or the disk is full
+        """
+
+        def items() -> Iterator[Item]:
+            for configuration in wanted:
+                self._pending[configuration.label] = configuration
+                self.note(configuration.label)
+                arguments = {"configuration": configuration, "conditions": self.conditions}
+                yield Item(configuration.label, arguments)
+
+        for done in self.runner.map(measure, items(), independent=independent, ahead=0):
+            configuration = self._pending.pop(done.name)
+            if done.error and not done.fatal:
+                raise PartialError(f"{done.name} failed: {done.error}", hint=done.hint or _RESUMES)
+            if done.error:
+                # The other runs are worth a page all the same.
+                self.failed[done.name] = done.error
+                continue
+            self.found[done.name] = done.value
+            self.store.put(configuration, done.value)
+            if isinstance(configuration, Run):
+                self._seeds.add(configuration.seed)
+                planned = configuration.planned_seconds(self.path_seconds)
+                self._overhead = max(self._overhead, done.value.details["run_seconds"] - planned)
+
+    def expected_seconds(self, run: Run) -> float:
+        """Expected seconds of measuring a run, the first one of a seed with its test set."""
+        test = 0.0 if run.seed in self._seeds else TEST[0] * TEST[1] * self.path_seconds
+        return run.planned_seconds(self.path_seconds) + test + self._overhead
+
+    def fits(self, run: Run, seconds: float) -> bool:
+        """Whether the workers can begin and finish a run in a time, besides those that they have taken."""
+        taken = sum(self.expected_seconds(r) for r in self._pending.values() if isinstance(r, Run))
+        return max(1, self.runner.workers) * seconds - taken > self.expected_seconds(run)
+
+    def group(self, run: Run) -> list[Measurement]:
+        """The measurements of a run with the first seeds, without gaps."""
+        labels = (replace(run, seed=seed).label for seed in range(MOST_SEEDS))
+        return [self.found[label] for label in takewhile(self.found.__contains__, labels)]
+
+    def measure_runs(self, runs: Sequence[Run], fits: Callable[[Run], bool], seeds: int) -> None:
+        """Measure every run with two seeds before the next one, then runs whose 95 % interval is too wide
+        with further seeds, up to `seeds`, while they fit into the remaining time."""
+
+        def missing(order: Iterable[Run], deviation: Estimate | None) -> Iterator[Run]:
+            for run in order:
+                before = replace(run, seed=max(0, run.seed - 1)).label
+                begun = run.seed == 0 or before in self.found or before in self._pending
+                if not begun or run.label in self.failed or self.recall(run):
+                    continue
+                own = self.group(run)
+                few = run.seed < FEWEST_SEEDS
+                if not few and len(own) == run.seed < seeds:
+                    few = NORMAL * combined(own, deviation).error.relative_error > HALF_WIDTH
+                if few and fits(run):
+                    yield run
+
+        rounds = [[replace(run, seed=seed) for run in runs for seed in range(FEWEST_SEEDS)]]
+        rounds += [[replace(run, seed=seed) for run in runs] for seed in range(1, MOST_SEEDS)]
+        for order in rounds:
+            deviation = seed_deviation([self.group(run) for run in runs])
+            self.measure(missing(order, deviation), independent=True)
 
 
 def run_study(
@@ -109,14 +226,35 @@ def run_study(
 
     Parameters
     ----------
-    refine : additional seconds for repeating runs with wide error bars
-    seed : of queries, paths and initial weights; the recipe's by default
-    progress : called with (share of the time spent, note)
-    announce : called with expected time and size as a line, before anything is written
-    runner : measures configurations and runs; its workers on their machines and with their threads
+    recipe : Recipe
+    folder : Path
+    seconds : float
+    refine : float
+        Additional seconds for repeating runs with wide error bars.
+    seed : int, optional
+        Of queries, paths and initial weights; the recipe's by default.
+    command : str
+        For the page.
+    progress : callable
+        Called with (share of the time spent, note).
+    announce : callable
+        Called with expected time and size as a line, before the first run.
+    runner : Runner, optional
+        Measures; its workers on their machines and with their threads. This process by default.
+
+    Returns
+    -------
+    Study
+
+    Raises
+    ------
+    InputError
+        The folder holds something else, there is nothing to fit, or the disk is too small.
+    PartialError
+        A worker died, or the disk is full; finished measurements are kept.
     """
     start = time.perf_counter()
-    workers = None if runner is None or runner.here else runner
+    runner = runner or Runner()
 
     def spent() -> float:
         return time.perf_counter() - start
@@ -124,22 +262,24 @@ def run_study(
     def note(text: str) -> None:
         progress(min(1.0, spent() / (seconds + refine)), text)
 
-    config = study_config(recipe.generate, seed)
-    job = Job.prepare(config)
-    config, material = job.config, job.material
+    job = Job.prepare(study_config(recipe.generate, seed))
+    config = job.config
     with owned(folder):
-        on, per_path = (machine(), None) if workers is None else worker_facts(workers, config)
-        claim(folder, on)
-        benchmark = GeneratorBenchmark(config, material)
+        (there,) = runner.map(measuring_machine, [Item("machine")])
+        if there.error:
+            raise PartialError(f"no worker answers: {there.error}", hint=there.hint or _RESUMES)
+        claim(folder, there.value)
+        conditions = Conditions(
+            config.model_dump_json(),
+            config.hash(job.material.digests),
+            folder / WORK,
+            0.5 * GENERATOR * seconds / _CONFIGURATIONS,
+            shlex.join(["mbtf-gen", config.material, "--config", str(folder / CONFIG_NAME)]),
+        )
+        benchmark = benchmark_of(conditions)
         note("reference")
         # Before anything is written: a refused study leaves the folder as it was.
-        _check_variation(benchmark)
-        store = MeasurementFolder(folder, config.hash(material.digests))
-        path = path_seconds(config, store, per_path)
-        size = disk_bytes(planned_runs(seconds, config.queries.spp, path))
-        size *= 1 if workers is None else workers.workers
-        check_space(folder, size, "give a shorter --time, or choose another folder with -o")
-        announce(expectation(seconds + refine, size))
+        benchmark.check_variation()
         description = {
             "name": recipe.name,
             "command": command,
@@ -147,94 +287,45 @@ def run_study(
             "seed": config.seed,
             "material": config.material,
             "date": time.strftime("%Y-%m-%d"),
-            "machine": on,
+            "machine": there.value,
         }
         STUDY.write(folder, description)
         write_text(folder / CONFIG_NAME, dump_yaml(config.model_dump(mode="json")))
-        study = Study(folder, description)
-        keep_path_seconds(store, path)
-        generator = shlex.join(["mbtf-gen", config.material, "--config", str(folder / CONFIG_NAME)])
-        each = 0.5 * GENERATOR * seconds / _CONFIGURATIONS
-        tasks = list(generator_tasks(benchmark))
-        found = {task.label: store.get(task, task.command(generator)) for task in tasks}
-
+        measurements = Measurements(conditions, MeasurementFolder(folder, conditions), runner, note)
+        configurations = list(generator_configurations(benchmark))
         # Configurations take longer than their share where kernels are compiled; workers start anew.
-        until = 1.2 * GENERATOR * seconds + (0.0 if workers is None else spent())
+        until = 1.2 * GENERATOR * seconds + (0.0 if runner.here else spent())
 
-        def missing() -> Iterator[GeneratorTask]:
-            for task in tasks:
-                if found[task.label] is None and spent() < until:
-                    note(task.label)
-                    yield task
+        def missing() -> Iterator[Configuration]:
+            for number, configuration in enumerate(configurations):
+                if not measurements.recall(configuration) and (number == 0 or spent() < until):
+                    yield configuration
 
-        measured: Iterator[tuple[GeneratorTask, Measurement]]
-        if workers is None:
-            measured = ((task, task.run(benchmark, each, task.command(generator))) for task in missing())
-        else:
-            measured = measure_configurations(workers, config, missing(), each, generator)
-        for task, measurement in measured:
-            found[task.label] = measurement
-            store.put(task, measurement)
-        for label, known in found.items():
-            if known is None:
-                study.skipped.append(label)
-            else:
-                study.measurements.append(known)
-        options: dict[str, Any] = {"path_seconds": path}
-        if workers is None:
-            runs = RunRunner(config, folder / WORK, generator, note, **options)
-        else:
-            runs = ClusterRunner(config, folder / WORK, generator, note, runner=workers, **options)
         try:
-            seeds = MOST_SEEDS if refine else FEWEST_SEEDS
-            _measure_runs(
-                study,
-                store,
+            measurements.measure(missing(), independent=False)
+            measured = [m for c in configurations if (m := measurements.found.get(c.label))]
+            measurements.path_seconds = path_seconds(measured, config.queries.spp)
+            runs = planned_runs(seconds, config.queries.spp, measurements.path_seconds)
+            size = disk_bytes(runs) * runner.workers
+            check_space(folder, size, "give a shorter --time, or choose another folder with -o")
+            announce(expectation(seconds + refine, size))
+            measurements.measure_runs(
                 runs,
-                lambda again: runs.work_left(seconds + again * refine - spent()),
-                seeds,
+                lambda run: measurements.fits(run, seconds + (refine if run.seed else 0.0) - spent()),
+                MOST_SEEDS if refine else FEWEST_SEEDS,
             )
         finally:
-            runs.clear()
-    return study
-
-
-def path_seconds(config: GeneratorConfig, store: MeasurementFolder, expected: float | None = None) -> float:
-    """Seconds to generate a query over its number of paths; those stored, so that a resumed study plans the
-    same runs, else those expected, by default the forecast of this machine."""
-    try:
-        return float(read_json(_seconds_file(store))["path_seconds"])
-    except InputError:
-        return forecast_seconds(config) / config.queries.spp if expected is None else expected
-
-
-def keep_path_seconds(store: MeasurementFolder, seconds: float) -> None:
-    """Store what :func:`path_seconds` then returns."""
-    store.folder.mkdir(parents=True, exist_ok=True)
-    write_json(_seconds_file(store), {"path_seconds": seconds})
-
-
-def _seconds_file(store: MeasurementFolder) -> Path:
-    return store.folder / f"seconds-{store.basis[:16]}.json"
-
-
-def disk_bytes(runs: Sequence[Run]) -> int:
-    """Disk space that runs take at most: the test set, and data of one seed."""
-    most = max((run.data.queries for run in runs), default=0)
-    return (TEST[0] + most) * row_bytes(holes=True)
-
-
-def _measure_runs(
-    study: Study, store: MeasurementFolder, runner: RunRunner, left: Callable[[bool], float], seeds: int
-) -> None:
-    """Measure runs in the remaining time, which is longer for repeats than for others."""
-    runs = planned_runs(study.description["time"], runner.config.queries.spp, runner.path_seconds)
-
-    def fits(run: Run) -> bool:
-        return left(run.data.seed > 0) > runner.expected_seconds(run)
-
-    groups, failed = measure_runs(runs, store, runner, fits, seeds)
-    study.deviation = seed_deviation(groups)
-    study.failed = list(failed.values())
-    study.measurements += [combined(group, study.deviation) for group in groups if group]
-    study.skipped += [run.label for k, run in enumerate(runs) if not groups[k] and k not in failed]
+            shutil.rmtree(conditions.folder, ignore_errors=True)
+            for kept in (benchmark_of, test_set):
+                kept.cache_clear()
+    groups = [measurements.group(run) for run in runs]
+    deviation = seed_deviation(groups)
+    known, failed = measurements.found, measurements.failed
+    return Study(
+        folder,
+        description,
+        measured + [combined(group, deviation) for group in groups if group],
+        deviation,
+        [c.label for c in (*configurations, *runs) if c.label not in known and c.label not in failed],
+        [f"{label}: {why}" for label, why in failed.items()],
+    )

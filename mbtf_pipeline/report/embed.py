@@ -1,24 +1,82 @@
-"""Images as ``data:`` URIs, within a size limit."""
+"""Images and maps as ``data:`` URIs, and the palettes and scales of maps."""
 
 from __future__ import annotations
 
 import base64
 import io
-from dataclasses import dataclass, field
+import math
+from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from mbtf_core.exposure import to_display, white_of
-from mbtf_pipeline.report.error_maps import Palette, indices, palette
+from mbtf_core.exposure import to_display
 
 U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
 Pixels = NDArray[np.floating]
-# Quality of images of files.
-_QUALITY = 86
+Palette = Literal["local", "flip", "signed"]
+# Color maps of magnitudes from 0 to 1. Both are perceptually uniform, with monotonic lightness.
+_MAGNITUDES = {"local": "viridis", "flip": "magma"}
+# sRGB colors of a signed difference from -1 (blue) over 0 (nearly black) to 1 (orange). Lightness encodes the
+# magnitude. Blue and orange are distinguishable under every common color-vision deficiency.
+_STOPS = (-1.0, -0.5, 0.0, 0.5, 1.0)
+_COLORS = ((199, 233, 255), (34, 136, 209), (13, 15, 20), (214, 98, 16), (255, 232, 189))
+# A page's images by name, each a function of the reduction.
+Gallery = dict[str, Callable[[int], str]]
+# Side of the blocks of pixels that a page's images are averaged over, until it is small enough.
+REDUCTIONS = (1, 2, 4, 8, 16)
+_JPEG_QUALITY = 86
+
+
+@cache
+def palette(name: Palette) -> U8:
+    """256 sRGB colors (256, 3) for magnitudes from 0 to 1, or for signed values from -1 to 1."""
+    if name == "signed":
+        t = np.linspace(-1.0, 1.0, 256)
+        table = np.stack([np.interp(t, _STOPS, channel) for channel in zip(*_COLORS, strict=True)], axis=-1)
+    else:
+        from matplotlib import colormaps
+
+        table = 255.0 * np.asarray(colormaps[_MAGNITUDES[name]](np.linspace(0.0, 1.0, 256)))[:, :3]
+    return np.round(table).astype(np.uint8)
+
+
+def indices(values: ArrayLike, name: Palette) -> U8:
+    """Palette indices of values, clipped to the palette's range; NaN counts as 0."""
+    x = np.nan_to_num(np.asarray(values, np.float64))
+    if name == "signed":
+        x = 0.5 * (x + 1.0)
+    return np.round(255.0 * np.clip(x, 0.0, 1.0)).astype(np.uint8)
+
+
+def round_scale(x: float) -> float:
+    """Smallest of 1, 2, 5 times a power of ten that is not below x; 1 if x is not positive."""
+    if not x > 0 or not math.isfinite(x):
+        return 1.0
+    power = 10.0 ** math.floor(math.log10(x))
+    return next(m * power for m in (1.0, 2.0, 5.0, 10.0) if m * power >= x * (1 - 1e-9))
+
+
+def common_scale(maps: Sequence[ArrayLike]) -> float:
+    """Rounded end of the scale of several maps: the 99th percentile of all magnitudes."""
+    return round_scale(float(np.percentile(np.concatenate([np.abs(np.ravel(m)) for m in maps]), 99)))
+
+
+def color_bar(key: Palette, title: str, high: float, unit: str, factor: float = 1.0) -> dict[str, Any]:
+    """A labeled color bar with five evenly spaced numbers up to `high`, which `factor` converts to `unit`."""
+    low = -high if key == "signed" else 0.0
+    colors = palette(key)[np.linspace(0, 255, 17).round().astype(int)].tolist()
+    return {
+        "key": key,
+        "title": title,
+        "gradient": f"linear-gradient(90deg, {', '.join('rgb({} {} {})'.format(*c) for c in colors)})",
+        "ticks": [f"{factor * x:.3g}".replace("-", "−") for x in np.linspace(low, high, 5)],
+        "unit": unit,
+    }
 
 
 def shrink(values: Pixels, factor: int) -> Pixels:
@@ -32,48 +90,28 @@ def shrink(values: Pixels, factor: int) -> Pixels:
     return out
 
 
-@dataclass(frozen=True)
-class Encoding:
-    """How images are reduced for the report.
+def data_uri(display: U8, kind: Literal["png", "jpeg"] = "png", colors: Palette | None = None) -> str:
+    """``data:`` URI of an 8-bit sRGB or gray image, or of indices into a palette."""
+    from PIL import Image
 
-    Attributes
-    ----------
-    shrink : downsampling factor
-    shades : colors of a map
-    """
-
-    shrink: int = 1
-    shades: int = 256
-
-    def describe(self) -> str:
-        """Text for the page."""
-        reductions = [f"{self.shrink} × {self.shrink} pixels averaged"] if self.shrink > 1 else []
-        reductions += [f"maps in {self.shades} shades"] if self.shades < 256 else []
-        return f"PNG, reduced to limit the file size: {', '.join(reductions)}" if reductions else "PNG"
-
-
-# From best quality to smallest size.
-ENCODINGS = (Encoding(), Encoding(1, 64), *(Encoding(shrink, 32) for shrink in (1, 2, 4, 8, 16)))
-
-
-def _data_uri(image: Any, kind: str, **options: int) -> str:
+    image = Image.fromarray(display)
+    if colors is not None:
+        image.putpalette(palette(colors).tobytes())
     stream = io.BytesIO()
+    options = {"quality": _JPEG_QUALITY, "subsampling": 0} if kind == "jpeg" else {}
     image.save(stream, kind, optimize=True, **options)
     return f"data:image/{kind};base64,{base64.b64encode(stream.getvalue()).decode()}"
 
 
-def jpeg_uri(display: U8, quality: int) -> str:
-    """``data:`` URI of an 8-bit sRGB image as JPEG."""
-    from PIL import Image
+def linear_uri(picture: F32, exposure: float, reduction: int = 1) -> str:
+    """``data:`` URI of a linear image (rows, columns, 3) in 1/sr at an exposure in EV, as PNG of averages of
+    `reduction` × `reduction` pixels."""
+    return data_uri(to_display(shrink(picture, reduction), exposure))
 
-    return _data_uri(Image.fromarray(display), "jpeg", quality=quality, subsampling=0)
 
-
-def png_uri(display: U8) -> str:
-    """``data:`` URI of an 8-bit sRGB image as PNG."""
-    from PIL import Image
-
-    return _data_uri(Image.fromarray(display), "png")
+def map_uri(values: Pixels, name: Palette, reduction: int = 1) -> str:
+    """``data:`` URI of a map (rows, columns) as PNG in the colors of a palette, likewise."""
+    return data_uri(indices(shrink(values, reduction), name), colors=name)
 
 
 def file_uri(path: Path, most: int | None = None) -> str:
@@ -89,46 +127,4 @@ def file_uri(path: Path, most: int | None = None) -> str:
         small = image.convert("RGB")
     if most is not None:
         small.thumbnail((most, most))
-    return jpeg_uri(np.asarray(small), _QUALITY)
-
-
-def map_uri(values: Pixels, name: Palette, shades: int) -> str:
-    """``data:`` URI of a map (rows, columns) as PNG with `shades` colors of a palette."""
-    from PIL import Image
-
-    steps = np.round(indices(values, name) * ((shades - 1) / 255.0))
-    image = Image.fromarray(np.round(steps * (255.0 / (shades - 1))).astype(np.uint8))
-    image.putpalette([channel for color in palette(name) for channel in color])
-    return _data_uri(image, "png")
-
-
-@dataclass
-class Gallery:
-    """Images of the page by name.
-
-    Attributes
-    ----------
-    exposure : of the linear images, in EV
-    linear : images (rows, columns, 3) in 1/sr
-    maps : palettes and maps (rows, columns), scaled to [0, 1] or, if signed, to [-1, 1]
-    """
-
-    exposure: float
-    linear: dict[str, F32] = field(default_factory=dict)
-    maps: dict[str, tuple[Palette, Pixels]] = field(default_factory=dict)
-
-    @property
-    def white(self) -> float:
-        """Linear value displayed as white, 1/sr."""
-        return white_of(self.exposure)
-
-
-def encode(gallery: Gallery, encoding: Encoding) -> dict[str, str]:
-    """``data:`` URIs of a gallery's images by name; linear ones at its exposure."""
-    images = {
-        name: png_uri(to_display(shrink(picture, encoding.shrink), gallery.exposure))
-        for name, picture in gallery.linear.items()
-    }
-    for name, (colors, values) in gallery.maps.items():
-        images[name] = map_uri(shrink(values, encoding.shrink), colors, encoding.shades)
-    return images
+    return data_uri(np.asarray(small), "jpeg")

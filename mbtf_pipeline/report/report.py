@@ -1,56 +1,48 @@
-"""The report: one self-contained HTML file."""
+"""The pages of a run, each one self-contained HTML file: its report, and its fits in a viewer."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import logging
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from mbtf_core.config.settings import check_schema
+from mbtf_core.directions import from_angles
+from mbtf_core.errors import InputError
 from mbtf_core.exposure import describe_exposure
 from mbtf_core.files.atomic import read_json, write_text
+from mbtf_core.pictures.camera import Camera
 from mbtf_pipeline.compare.compare import COMPARISON_NAME, COMPARISON_SCHEMA
+from mbtf_pipeline.compare.image_files import read_picture
 from mbtf_pipeline.recipe import RECIPE_NAME, Recipe
-from mbtf_pipeline.report.embed import ENCODINGS, Gallery, encode
-from mbtf_pipeline.report.errors import error_context
-from mbtf_pipeline.report.image_sheet import picture_section
-from mbtf_pipeline.report.material import material_section
-from mbtf_pipeline.report.offset_images import offset_section
+from mbtf_pipeline.report.embed import REDUCTIONS, Gallery
+from mbtf_pipeline.report.images import offset_section, picture_section
 from mbtf_pipeline.report.plots import ERROR_BAR_NOTE
-from mbtf_pipeline.report.times import provenance, read_training, time_context, training_context
-from mbtf_pipeline.run_folder import COMPARE, FITS, REPORT, RUN, SHARDS
-from mbtf_pipeline.tables import NOT_SIGNIFICANT
+from mbtf_pipeline.report.sections import (
+    error_context,
+    material_section,
+    provenance,
+    time_tables,
+    training_context,
+)
+from mbtf_pipeline.run_folder import COMPARE, FITS, REPORT, RUN, SHARDS, VIEWER
 
 # Raised when the report or the viewer's page changes; part of the stage's key.
-LAYOUT = 12
+LAYOUT = 13
+# Path-traced pictures in the viewer's page.
+_MOST_PICTURES = 4
 
-_TABLE = """
-{%- set below = t.head[-1] == "command" %}
-{%- set head = t.head[:-1] if below else t.head %}
-<table><thead><tr>{% for h in head %}<th>{{ h }}</th>{% endfor %}</tr></thead><tbody>
-{% for row in t.rows %}<tr>
-{%- for cell in row %}
-{%- if below and loop.last %}</tr>
-<tr class=command><td class=command colspan={{ row|length - 1 }}><code>{{ cell }}</code></td>
-{%- elif cell is command %}<td class=command><code>{{ cell }}</code></td>
-{%- else %}<td{{ ' class=long' if cell is long }}>{{ cell }}</td>{% endif %}
-{%- endfor %}</tr>
-{% endfor %}</tbody></table>
-"""
+_log = logging.getLogger(__name__)
 
 
 def render(page: str, **context: Any) -> str:
     """A page of ``templates/`` as HTML."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
-    from markupsafe import Markup
 
     templates = PackageLoader("mbtf_pipeline.report")
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, loader=templates)
-    environment.tests["long"] = lambda cell: NOT_SIGNIFICANT in cell
-    environment.tests["command"] = lambda cell: cell.startswith("mbtf-")
-    table = environment.from_string(_TABLE)
-    environment.globals["table"] = lambda t: Markup(table.render(t=t))
     return environment.get_template(page).render(context)
 
 
@@ -78,32 +70,30 @@ def write_report(folder: Path, recipe: Recipe, stages: Sequence[str]) -> None:
     manifest = read_json(folder / SHARDS / "manifest.json")
     run = read_json(folder / RUN.record)
     asked = recipe.report.exposure
-    gallery = Gallery(comparison["exposure"] if asked is None else asked)
-    shown = picture_section(folder / COMPARE, comparison, gallery)
+    exposure = comparison["exposure"] if asked is None else asked
+    gallery: Gallery = {}
+    shown = picture_section(folder / COMPARE, comparison, exposure, gallery)
     fit_folders = {name: folder / FITS / name for name in comparison["fits"]}
-    histories = {name: read_training(path) for name, path in fit_folders.items()}
     context: dict[str, Any] = {
         "title": recipe.title,
         "comparison": comparison,
         "description": recipe.description,
-        "groups": shown["groups"],
-        "color_bars": shown["color_bars"],
+        **shown,
         "error_bar_note": ERROR_BAR_NOTE,
-        "train_spp": manifest["splits"]["train"]["spp"],
+        "manifest": manifest,
         "offsets": offset_section(folder / COMPARE, comparison["offsets"], gallery),
         "material": material_section(recipe.generate, manifest["inputs"]),
-        "effects": manifest["effects"]["effects"],
         "command": run["command"],
         "recipe_yaml": (folder / RECIPE_NAME).read_text(encoding="utf-8"),
-        "provenance": provenance(folder, manifest, fit_folders, run["machine"]),
-        **error_context(comparison, float(manifest["config"]["queries"]["min_cos"])),
-        **training_context(histories),
-        **time_context(folder, stages, manifest, comparison),
-        "exposure": describe_exposure(gallery.exposure),
+        "provenance": provenance(folder, manifest, comparison["fits"], run["machine"]),
+        **error_context(comparison),
+        **training_context(fit_folders),
+        "time_tables": time_tables(folder, stages, comparison),
+        "exposure": describe_exposure(exposure),
     }
-    # From best quality to smallest size.
-    for encoding in ENCODINGS:
-        images = encode(gallery, encoding)
+    # The first page that is small enough, or the smallest.
+    for reduction in REDUCTIONS:
+        images = {name: image(reduction) for name, image in gallery.items()}
         # The page shows all other images in its sheet.
         differences = {name: uri for name, uri in images.items() if name.endswith("-signed")}
         data = {"fits": comparison["fits"], "scenes": shown["scenes"], "differences": differences}
@@ -111,10 +101,55 @@ def write_report(folder: Path, recipe: Recipe, stages: Sequence[str]) -> None:
             "report.html",
             **context,
             images=images,
-            encoding=encoding.describe(),
+            reduction=reduction,
             # Valid within a <script> element.
             viewer=json.dumps(data, ensure_ascii=False, separators=(",", ":")).replace("<", "\\u003c"),
         )
         if len(html.encode()) <= recipe.report.max_megabytes * 1e6:
             break
     write_text(folder / REPORT, html)
+
+
+def write_viewer(folder: Path, title: str, comparison: Mapping[str, Any]) -> None:
+    """Write ``viewer.html`` of a finished run: its fits, and path-traced pictures beside them; none where no
+    fit can be shown in a browser.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the run.
+    title : str
+        Of the page.
+    comparison : mapping
+        Content of ``comparison.json``.
+    """
+    from mbtf_fit.viewer.content import material_content
+    from mbtf_fit.viewer.page import write_page
+
+    path = folder / VIEWER
+    materials = []
+    for name in comparison["fits"]:
+        try:
+            materials.append(material_content(folder / FITS / name, name)[0])
+        except InputError as error:
+            _log.info("%s: not in the viewer: %s", name, error)
+    if not materials:
+        path.unlink(missing_ok=True)
+        return
+    write_text(path, write_page({"materials": materials, "pictures": run_pictures(folder)}, title))
+
+
+def run_pictures(folder: Path) -> list[dict[str, Any]]:
+    """The first path-traced pictures of a run's comparison, for the viewer."""
+    from mbtf_fit.viewer.extras import picture_content, tiles_text
+
+    out = []
+    for picture in read_json(folder / COMPARE / COMPARISON_NAME)["pictures"][:_MOST_PICTURES]:
+        view, light, across = picture["view"], picture["light"], picture["tiles_across"]
+        reference = picture["references"].get("query") or next(iter(picture["references"].values()))
+        value = read_picture(folder / COMPARE / reference["file"])
+        camera = Camera(view["elevation"], view["azimuth"], across)
+        name = f"path-traced, light {light['elevation']:g}°, {tiles_text(across)} across"
+        light_direction = from_angles(light["elevation"], light["azimuth"])
+        out.append(picture_content(name, value, camera, light_direction))
+    return out

@@ -13,14 +13,17 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.run import Job
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
-from mbtf_pipeline.cost.generator_benchmark import GeneratorBenchmark
+from mbtf_pipeline.cost.generator import GeneratorBenchmark
 
 NOISE = 0.8  # standard deviation of one path, relative to the value
 SHIFT = 0.25  # bias of one interaction, relative to the value
 
 
 class FakeEstimator:
-    """Values of known bias and noise; random numbers depend on the stream alone, as the real ones."""
+    """Values of known bias and noise, between 0.2 and 0.3 along u; random numbers depend on the stream alone,
+    as the real ones."""
+
+    scale, slope, noise = 1.0, 0.1, NOISE
 
     def __init__(self, job: Job) -> None:
         self.shift = SHIFT if job.config.transport.max_depth == 1 else 0.0
@@ -32,12 +35,12 @@ class FakeEstimator:
         key = [stream.root, stream.shard, stream.first_pass, len(queries.sigma), self.shift > 0]
         rng = np.random.default_rng(key)
         each = np.broadcast_to(spp, len(queries.sigma))
-        truth = 0.2 + 0.1 * queries.u[:, :1]
+        truth = self.scale * (0.25 + self.slope * (queries.u[:, :1] - 0.5))
         # The bias has both signs: its square is measured, query by query.
         sign = np.where(queries.u[:, 1:] < 0.5, -1.0, 1.0)
         halves = [
             truth * (1 + self.shift * sign)
-            + 0.25 * NOISE * rng.normal(size=(len(truth), 3)) / np.sqrt(each[:, None] / 2)
+            + 0.25 * self.scale * self.noise * rng.normal(size=(len(truth), 3)) / np.sqrt(each[:, None] / 2)
             for _ in range(2)
         ]
         a, b = (h.astype(np.float32) for h in halves)
@@ -47,7 +50,7 @@ class FakeEstimator:
 
 def fake_benchmark(monkeypatch: pytest.MonkeyPatch) -> GeneratorBenchmark:
     """A small height field, traced by :class:`FakeEstimator` until the test ends."""
-    module = "mbtf_pipeline.cost.generator_benchmark"
+    module = "mbtf_pipeline.cost.generator"
     plan = SimpleNamespace(effects=SimpleNamespace(closed_form=False), allocation=None)
     monkeypatch.setattr(f"{module}.build_estimator", lambda job, plan: FakeEstimator(job))
     monkeypatch.setattr(f"{module}.plan_effects", lambda job: plan.effects)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mbtf_core.errors import InputError
 from mbtf_core.stats import Estimate
-from mbtf_pipeline.cost.measurements import Measurement
-from mbtf_pipeline.cost.runs import DataRequest, Run
+from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_pipeline.cost.measurement import Conditions, Configuration, Measurement
+from mbtf_pipeline.cost.runs import Run
 
 # Unexplained variance, its relative deviation over seeds, and that of the test set.
 TRUE = 0.05
@@ -18,12 +19,18 @@ SEEDS, TEST = 0.1, 0.02
 
 
 def run(queries: int = 1000, name: str = "a run", seconds: float = 5.0) -> Run:
-    fit: dict[str, Any] = {"model": "neumip", "training": {"time": seconds}, "name": name}
-    return Run("whole", "neumip", name, DataRequest(queries, 4), fit)
+    fit = {"model": "neumip", "training.time": f"{seconds:g}s", "name": name}
+    return Run("run", "neumip", name, queries, 4, fit)
 
 
-class FakeRunner:
-    """Stands for :class:`mbtf_pipeline.cost.runs.RunRunner`: errors of normal seed deviation around the
+def conditions(folder: Path = Path(), **options: Any) -> Conditions:
+    config = GeneratorConfig.model_validate({"material": "m", **options})
+    command = f"mbtf-gen m --config {folder / 'generate.yaml'}"
+    return Conditions(config.model_dump_json(), "basis", folder, 3.0, command)
+
+
+class FakeRuns:
+    """Stands for :meth:`mbtf_pipeline.cost.runs.Run.measure`: errors of normal seed deviation around the
     truth, those of each seed shifted by the error of its test set."""
 
     def __init__(self, seeds: float = SEEDS, test: float = TEST, study_seed: int = 0) -> None:
@@ -34,51 +41,31 @@ class FakeRunner:
         # Names of runs that fail.
         self.failing: set[str] = set()
 
-    def measure(self, run: Run) -> Measurement:
+    def measure(self, run: Run, conditions: Conditions | None = None) -> Measurement:
         self.measured.append(run)
         if run.name in self.failing:
             raise InputError("training diverged at step 7")
-        error = TRUE * self.shifts[run.data.seed] * (1 + self.seeds * self.random.normal())
-        seconds = run.fit["training"]["time"]
-        total = seconds + run.data.queries * 1e-6
+        error = TRUE * self.shifts[run.seed] * (1 + self.seeds * self.random.normal())
+        seconds = run.planned_seconds(0.0)
         return Measurement(
             run.study,
             run.series,
             run.name,
-            self.command_of(run),
+            f"command of {run.label}",
             Estimate(seconds, 0.0, 1),
             Estimate(error, self.test * error, 1000),
-            details={"total_seconds": total, "seed": float(run.data.seed)},
+            details={"run_seconds": seconds + 1.0, "seed": float(run.seed), "queries": 1e6, "spp": 4.0},
         )
-
-    def measure_all(self, runs: Iterable[tuple[int, Run]]) -> Iterator[tuple[int, Run, Measurement | str]]:
-        for number, run in runs:
-            try:
-                yield number, run, self.measure(run)
-            except InputError as error:
-                yield number, run, error.what
-
-    def work_left(self, seconds: float) -> float:
-        return seconds
-
-    def expected_seconds(self, run: Run) -> float:
-        return float(run.fit["training"]["time"])
-
-    def command_of(self, run: Run) -> str:
-        return f"command of {run.label}"
-
-    def clear(self) -> None:
-        """Nothing is stored."""
 
 
 class MemoryStore:
-    """Stands for :class:`mbtf_pipeline.cost.measurements.MeasurementFolder`."""
+    """Stands for :class:`mbtf_pipeline.cost.measurement.MeasurementFolder`."""
 
     def __init__(self) -> None:
         self.found: dict[str, Measurement] = {}
 
-    def get(self, task: Run, command: str = "") -> Measurement | None:
-        return self.found.get(f"{task.study} {task.key}")
+    def get(self, of: Configuration) -> Measurement | None:
+        return self.found.get(f"{of.study} {of.key}")
 
-    def put(self, task: Run, found: Measurement) -> None:
-        self.found[f"{task.study} {task.key}"] = found
+    def put(self, of: Configuration, found: Measurement) -> None:
+        self.found[f"{of.study} {of.key}"] = found

@@ -223,14 +223,15 @@ def test_a_cost_study_measures_reports_and_resumes(
 ) -> None:
     """Two configurations of the generator, then a third one and a run of two seeds."""
     from mbtf_pipeline.cost import study
-    from mbtf_pipeline.cost.fit_runs import planned_runs
-    from mbtf_pipeline.cost.generator_runs import generator_tasks
+    from mbtf_pipeline.cost.generator import generator_configurations
+    from mbtf_pipeline.cost.runs import planned_runs
 
     some, runs = 2, 0
-    monkeypatch.setattr(study, "generator_tasks", lambda benchmark: islice(generator_tasks(benchmark), some))
+    all_of = generator_configurations
+    monkeypatch.setattr(study, "generator_configurations", lambda benchmark: islice(all_of(benchmark), some))
     monkeypatch.setattr(study, "planned_runs", lambda *arguments: planned_runs(30.0, *arguments[1:])[:runs])
     monkeypatch.setattr(study, "_CONFIGURATIONS", 1000)
-    monkeypatch.setattr("mbtf_pipeline.cost.fit_runs.SHORTEST", 2.0)
+    monkeypatch.setattr("mbtf_pipeline.cost.runs.SHORTEST", 2.0)
     monkeypatch.setattr("mbtf_pipeline.cost.runs.TEST", (4096, 8))
     out = tmp_path / "study"
     # Long enough never to decide what is measured.
@@ -240,10 +241,9 @@ def test_a_cost_study_measures_reports_and_resumes(
     assert first["measurements"] == 2
     stored = {p: p.read_bytes() for p in (out / "measurements").iterdir()}
     assert (out / "paths.png").stat().st_size > 1000
-    # The same command with more to do keeps what was measured; without a time, that of the study counts.
+    # The same command with more to do keeps what was measured.
     some, runs = 3, 1
-    flag = command.index("--time")
-    assert run(app, [*command[:flag], *command[flag + 2 :]]) == 0
+    assert run(app, command) == 0
     second = json.loads(capsys.readouterr().out)
     assert second["measurements"] == 4
     assert all(p.read_bytes() == content for p, content in stored.items())

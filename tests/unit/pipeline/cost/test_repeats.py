@@ -3,106 +3,98 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
-from support.fake_runs import TRUE, FakeRunner, MemoryStore, run
+from support.fake_runs import TRUE, FakeRuns, MemoryStore, conditions, run
 
+from mbtf_core.run.runner import Runner
 from mbtf_core.stats import Estimate
-from mbtf_pipeline.cost.measurements import HALF_WIDTH, NORMAL
-from mbtf_pipeline.cost.repeats import MOST_SEEDS, combined, measure_runs, seed_deviation
-from mbtf_pipeline.cost.runs import Run
+from mbtf_pipeline.cost.analysis import combined, seed_deviation
+from mbtf_pipeline.cost.measurement import HALF_WIDTH, NORMAL, Measurement
+from mbtf_pipeline.cost.runs import MOST_SEEDS, Run
+from mbtf_pipeline.cost.study import Measurements
 
 RUNS = [run(3000, "long", 9.0), run(3000, "short", 4.0), run(2000, "one"), run(2000, "two")]
 RUNS += [run(1000 + n, f"{n}") for n in range(8)]
+Repeat = Callable[..., list[list[Measurement]]]
 
 
-def repeat(store: MemoryStore, runner: FakeRunner, seeds: int = 2, most: int = 10**6) -> Any:
-    def fits(run: Run) -> bool:
-        return len(runner.measured) < most
+@pytest.fixture
+def repeat(monkeypatch: pytest.MonkeyPatch) -> Repeat:
+    """Measures RUNS until `most` are measured; returns the measurements of each."""
 
-    return measure_runs(RUNS, store, runner, fits, seeds)  # type: ignore[arg-type]
+    def measured(store: MemoryStore, fake: FakeRuns, seeds: int = 2, most: int = 10**6) -> Any:
+        monkeypatch.setattr(Run, "measure", lambda run, conditions: fake.measure(run))
+        found = Measurements(conditions(), store, Runner())  # type: ignore[arg-type]
+        found.measure_runs(RUNS, lambda run: len(fake.measured) < most, seeds)
+        return [found.group(run) for run in RUNS]
+
+    return measured
 
 
-def test_every_run_gets_two_seeds_before_the_next_one() -> None:
-    runner = FakeRunner()
-    found = repeat(MemoryStore(), runner)
-    assert [len(group) for group in found[0]] == [2] * len(RUNS)
-    assert [(r.name, r.data.seed) for r in runner.measured[:3]] == [("long", 0), ("long", 1), ("short", 0)]
+def test_every_run_gets_two_seeds_before_the_next_one(repeat: Repeat) -> None:
+    fake = FakeRuns()
+    # A failed run leaves the others, and is not tried with another seed.
+    fake.failing = {"one", "3"}
+    assert [len(group) for group in repeat(MemoryStore(), fake)] == [2, 2, 0, 2, 2, 2, 2, 0, 2, 2, 2, 2]
+    assert [(r.name, r.seed) for r in fake.measured[:3]] == [("long", 0), ("long", 1), ("short", 0)]
+    assert sum(r.name in fake.failing for r in fake.measured) == 2
 
 
-def test_nothing_is_measured_twice() -> None:
+def test_nothing_is_measured_twice(repeat: Repeat) -> None:
     store = MemoryStore()
-    first = FakeRunner(0.2)
+    first, second, third = FakeRuns(0.2), FakeRuns(0.2, study_seed=1), FakeRuns()
     some = repeat(store, first, most=5)
-    assert len(first.measured) == 5
-    assert [len(group) for group in some[0]] == [2, 2, 1] + 9 * [0]
-    second = FakeRunner(0.2, study_seed=1)
+    assert [len(group) for group in some] == [2, 2, 1] + 9 * [0]
     found = repeat(store, second)
     assert len(second.measured) == 2 * len(RUNS) - 5
-    assert not {(r.study, str(r.key)) for r in first.measured} & {
-        (r.study, str(r.key)) for r in second.measured
-    }
-    assert found[0][0] == some[0][0]
-    third = FakeRunner()
-    assert repeat(store, third)[0] == found[0]
+    assert not {str(r.key) for r in first.measured} & {str(r.key) for r in second.measured}
+    assert found[0] == some[0]
+    assert repeat(store, third) == found
     assert not third.measured
     # Further seeds of an earlier refinement count without further time.
     repeat(store, third, seeds=MOST_SEEDS)
-    refined = repeat(store, FakeRunner(), most=0)
-    assert max(len(group) for group in refined[0]) > 2
+    assert max(len(group) for group in repeat(store, FakeRuns(), most=0)) > 2
 
 
-def test_refining_stops_where_the_intervals_are_narrow() -> None:
-    runner = FakeRunner()
-    found = repeat(MemoryStore(), runner, seeds=MOST_SEEDS)
-    deviation = seed_deviation(found[0])
+def test_refining_stops_where_the_intervals_are_narrow(repeat: Repeat) -> None:
+    found = repeat(MemoryStore(), FakeRuns(), seeds=MOST_SEEDS)
+    deviation = seed_deviation(found)
     assert deviation is not None
-    for group in found[0]:
+    for group in found:
         narrow = NORMAL * combined(group, deviation).error.relative_error <= 1.2 * HALF_WIDTH
         assert narrow or len(group) == MOST_SEEDS
         assert 2 <= len(group) <= MOST_SEEDS
     # About the number that the deviation asks for.
     needed = (deviation.value * NORMAL / HALF_WIDTH) ** 2
-    assert 0.8 * needed < np.mean([len(group) for group in found[0]]) < 2.5 * needed
-
-
-@pytest.mark.parametrize(("seeds", "test"), [(0.01, 0.02), (0.03, 0.01)])
-def test_no_more_seeds_where_the_intervals_are_narrow(seeds: float, test: float) -> None:
-    found = repeat(MemoryStore(), FakeRunner(seeds, test), seeds=MOST_SEEDS)
-    assert {len(group) for group in found[0]} == {2}
-
-
-def test_a_run_that_fails_leaves_the_others() -> None:
-    runner = FakeRunner()
-    runner.failing = {"one", "3"}
-    found = repeat(MemoryStore(), runner)
-    assert [len(group) for group in found[0]] == [2, 2, 0, 2, 2, 2, 2, 0, 2, 2, 2, 2]
-    assert found[1] == {
-        2: "complete run: neumip, one: training diverged at step 7",
-        7: "complete run: neumip, 3: training diverged at step 7",
-    }
-    # A failed run is not tried with another seed.
-    assert sum(r.name in runner.failing for r in runner.measured) == 2
+    assert 0.8 * needed < np.mean([len(group) for group in found]) < 2.5 * needed
+    sure = repeat(MemoryStore(), FakeRuns(0.01, 0.02), seeds=MOST_SEEDS)
+    assert {len(group) for group in sure} == {2}
 
 
 @pytest.mark.parametrize(("deviation", "test"), [(0.1, 0.02), (0.03, 0.05)])
-def test_error_bars_are_honest(deviation: float, test: float) -> None:
+def test_error_bars_are_honest(repeat: Repeat, deviation: float, test: float) -> None:
     """Studies with other seeds: the difference from the truth over the error bar has mean 0 and deviation 1.
     An error bar too narrow by a factor 2 gives a deviation of 2."""
     deviations = []
     for seed in range(60):
-        runner = FakeRunner(deviation, test, study_seed=seed)
-        found = repeat(MemoryStore(), runner)
-        pooled = seed_deviation(found[0])
-        for group in found[0]:
+        found = repeat(MemoryStore(), FakeRuns(deviation, test, study_seed=seed))
+        pooled = seed_deviation(found)
+        for group in found:
             error = combined(group, pooled).error
             deviations.append((error.value - TRUE) / error.error)
     # All runs of a seed share the error of its test set, so there are fewer independent values.
     assert abs(np.mean(deviations)) < 4 / math.sqrt(60)
     assert 0.8 < np.std(deviations) < 1.2
     assert 0.9 < np.mean(np.abs(deviations) < NORMAL) < 0.99
+
+
+def measured(error: float, **details: float) -> Measurement:
+    found = FakeRuns(0.0, 0.0).measure(run())
+    return Measurement(**{**vars(found), "error": Estimate(error, 0.01 * error, 9), "details": details})
 
 
 def test_the_seed_deviation_is_pooled_and_unbiased() -> None:
@@ -121,13 +113,8 @@ def test_the_seed_deviation_is_pooled_and_unbiased() -> None:
     assert seed_deviation([[measured(0.5)], []]) is None
 
 
-def measured(error: float, **details: float) -> Any:
-    found = FakeRunner(0.0, 0.0).measure(run())
-    return type(found)(**{**vars(found), "error": Estimate(error, 0.01 * error, 9), "details": details})
-
-
 def test_a_mean_has_the_error_of_its_seeds_and_test_sets() -> None:
-    group = [measured(e, total_seconds=t) for e, t in ((0.2, 4.0), (0.3, 6.0))]
+    group = [measured(0.2, total_seconds=4.0), measured(0.3, total_seconds=6.0)]
     found = combined(group, Estimate(0.1, 0.02, 9))
     assert found.error.value == pytest.approx(0.25)
     assert found.error.error == pytest.approx(0.1 * 0.25 / math.sqrt(2))

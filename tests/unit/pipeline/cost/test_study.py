@@ -1,29 +1,33 @@
-"""Cost studies: within their time, resumable, never mixed with others; fronts and what follows from them."""
+"""Cost studies: within their time, resumable, never mixed with others, on workers as in one process; fronts
+and what follows from them."""
 
 from __future__ import annotations
 
 import csv
 import io
 import math
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from support.fake_runs import FakeRunner, run
+from support.fake_runs import FakeRuns, MemoryStore, conditions, run
 from support.paths import ROOT
 
-from mbtf_core.errors import InputError
+from mbtf_core.errors import InputError, PartialError
 from mbtf_core.files import folders
-from mbtf_core.files.atomic import write_json
+from mbtf_core.run.runner import Runner
+from mbtf_core.run.task import Item, Result, packed, run_task
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.cost import study as module
-from mbtf_pipeline.cost.cost_page import to_csv
-from mbtf_pipeline.cost.generator_runs import GeneratorTask
-from mbtf_pipeline.cost.measurements import Measurement, MeasurementFolder
-from mbtf_pipeline.cost.pareto import extrapolation, pareto_front
-from mbtf_pipeline.cost.runs import Run
+from mbtf_pipeline.cost.analysis import extrapolation, pareto_front
+from mbtf_pipeline.cost.generator import GeneratorBenchmark, GeneratorConfiguration
+from mbtf_pipeline.cost.measurement import Conditions, Measurement, MeasurementFolder
+from mbtf_pipeline.cost.page import to_csv
+from mbtf_pipeline.cost.runs import MOST_SEEDS, TEST, Run, disk_bytes
+from mbtf_pipeline.cost.study import Measurements
 from mbtf_pipeline.recipe import load_recipe
 from mbtf_pipeline.run_folder import machine
 
@@ -31,14 +35,14 @@ RECIPE = ROOT / "pipelines" / "quickstart.yaml"
 ONE = Estimate(1.0, 0.1, 4)
 
 
-def point(seconds: float, error: float, study: str = "whole", **details: float) -> Measurement:
+def point(seconds: float, error: float, study: str = "run", **details: float) -> Measurement:
     estimates = Estimate(seconds, 0.0, 1), Estimate(error, 0.01, 9)
     return Measurement(study, "s", f"{seconds:g}", "command", *estimates, details=details)
 
 
 def test_the_front_holds_what_nothing_beats() -> None:
     found = [(10, 0.5), (20, 0.6), (20, 0.4), (40, 0.4), (80, 0.1), (5, math.nan), (90, 0.2)]
-    front = pareto_front([point(*pair) for pair in found])
+    front = pareto_front([*(point(*pair) for pair in found), point(1, 0.01, "paths")])
     assert [(m.seconds.value, m.error.value) for m in front] == [(10, 0.5), (20, 0.4), (80, 0.1)]
 
 
@@ -57,17 +61,17 @@ def test_the_extrapolation_follows_the_end_of_the_front() -> None:
 
 
 def test_measurements_come_back_and_damaged_ones_are_repeated(tmp_path: Path) -> None:
-    store = MeasurementFolder(tmp_path, "abc")
-    mesh = GeneratorTask("mesh", "", "64 cells", {"geometry.mesh": 64})
-    kept = Measurement("mesh", "", "64 cells", "mbtf-gen", ONE, ONE, ONE, None, {"bytes": 12.0})
+    store = MeasurementFolder(tmp_path, conditions())
+    mesh = GeneratorConfiguration("mesh", "", "64 cells", {"geometry.mesh": 64})
+    kept = Measurement("mesh", "", "64 cells", mesh.command(conditions()), ONE, ONE, ONE, None, {"b": 12.0})
     store.put(mesh, kept)
-    store.put(run(), Measurement("whole", "m", "5 s", "", ONE, Estimate(math.nan, math.inf, 100)))
-    assert store.get(mesh, "mbtf-gen") == kept
+    store.put(run(), point(5.0, math.nan))
+    assert store.get(mesh) == kept
     found = store.get(run())
     assert found is not None
     assert math.isnan(found.error.value)
     assert store.get(replace(mesh, changes={})) is store.get(replace(mesh, study="paths")) is None
-    assert MeasurementFolder(tmp_path, "abd").get(mesh) is None
+    assert MeasurementFolder(tmp_path, replace(conditions(), basis="other")).get(mesh) is None
     (path,) = store.folder.glob("mesh-*")
     path.write_text(path.read_text()[:-20])
     assert store.get(mesh) is None
@@ -79,105 +83,156 @@ def test_the_csv_holds_every_number_with_its_error() -> None:
     assert (rows[0]["bytes"], rows[0]["bias"], rows[1]["error"]) == ("300000", "", "")
 
 
-def test_folders_of_something_else_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "thesis.tex").write_text("")
-    with pytest.raises(InputError, match="holds no cost study"):
-        module.claim(tmp_path, machine())
-    folder = tmp_path / "study"
-    module.claim(folder, machine())
-    folder.mkdir()
-    record = {"format": module.STUDY.format, "schema": module.STUDY.schema, "machine": machine()}
-    changes: list[tuple[dict[str, Any], str | None]] = [
-        ({}, None),
-        ({"machine": {"system": "Plan 9"}}, r"another kind of machine .Plan 9; this is "),
-        ({"schema": 1}, "schema version 1"),
-    ]
-    for change, message in changes:
-        write_json(folder / module.STUDY.record, {**record, **change})
-        if message is None:
-            module.claim(folder, machine())
-        else:
-            with pytest.raises(InputError, match=message):
-                module.claim(folder, machine())
+def test_studies_of_other_machines_are_refused(tmp_path: Path) -> None:
+    module.STUDY.write(tmp_path, {"machine": machine()})
+    module.claim(tmp_path, machine())
+    with pytest.raises(InputError, match=r"another kind of machine .*; this is Plan 9\)"):
+        module.claim(tmp_path, {"system": "Plan 9"})
+
+
+class Workers(Runner):
+    """Takes all items, and ends the last first."""
+
+    workers = 2
+    here = False
+
+    def map(self, function: Any, items: Iterable[Item], **options: Any) -> Iterator[Result]:  # type: ignore[override]
+        for item in reversed(list(items)):
+            yield Result(item.name, **run_task(*packed(function, item)))
+
+
+@pytest.fixture
+def measured(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
+    """Name and seed of all runs that are measured; the error follows from both."""
+    found: list[tuple[str, int]] = []
+
+    def measure(self: Run, conditions: Conditions) -> Measurement:
+        if self.name == "diverges":
+            raise InputError("training diverged at step 7")
+        found.append((self.name, self.seed))
+        return point(5.0, 0.1 + 0.03 * self.seed + 0.01 * len(self.name), run_seconds=12.0)
+
+    monkeypatch.setattr(Run, "measure", measure)
+    return found
+
+
+def test_workers_measure_the_runs_of_one_process(measured: list[tuple[str, int]]) -> None:
+    runs = [run(3000, "long", 9.0), run(2000, "one"), run(900, "diverges")]
+    groups, names = [], []
+    for runner in (Runner(), Workers()):
+        found = Measurements(conditions(), MemoryStore(), runner)  # type: ignore[arg-type]
+        found.measure_runs(runs, lambda run: True, MOST_SEEDS)
+        groups.append([found.group(run) for run in runs])
+        names.append(sorted(measured))
+        assert found.failed[runs[2].label] == "training diverged at step 7"
+        measured.clear()
+    assert groups[0] == groups[1]
+    assert [len(group) for group in groups[0]] == [MOST_SEEDS, MOST_SEEDS, 0]
+    assert names[0] == names[1]
+    assert len(names[0]) == 2 * MOST_SEEDS
+
+
+def test_workers_begin_what_fits_into_the_time_of_all(measured: list[tuple[str, int]]) -> None:
+    found = Measurements(conditions(), MemoryStore(), Workers())  # type: ignore[arg-type]
+    found.path_seconds = 1e-9
+    test = 1e-9 * TEST[0] * TEST[1]
+    # Two workers for 14 s; a run takes 9 or 5 s of training and 2 s besides.
+    runs = [run(3000, "long", 9.0), run(2000, "one"), run(2000, "two")]
+    assert found.expected_seconds(runs[0]) == pytest.approx(11.0 + test, abs=1e-4)
+    found.measure_runs(runs, lambda run: found.fits(run, 14.0), 2)
+    assert sorted(measured) == [("long", 0), ("long", 1)]
+    # The test set is there, and the runs took 3 s beyond their plan.
+    assert found.expected_seconds(runs[1]) == pytest.approx(5.0 + 3.0, abs=1e-4)
+
+
+def test_a_full_disk_ends_the_study(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(self: Run, conditions: Conditions) -> Measurement:
+        raise PartialError("no space left on device", hint="free some")
+
+    monkeypatch.setattr(Run, "measure", full)
+    found = Measurements(conditions(), MemoryStore(), Runner())  # type: ignore[arg-type]
+    with pytest.raises(PartialError, match="no space left"):
+        found.measure_runs([run()], lambda run: True, 2)
+
+
+def test_a_study_is_of_the_machine_of_its_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MBTF_WORKER_THREADS", "1")
+    assert module.measuring_machine()["system"].endswith("workers of 1 thread")
 
 
 RUNS = [run(3000, "long", 7200.0), run(2000, "short", 60.0), run(1000, "m", 40.0)]
 
 
 @pytest.fixture
-def runners(monkeypatch: pytest.MonkeyPatch) -> list[FakeRunner]:
+def fake(monkeypatch: pytest.MonkeyPatch) -> FakeRuns:
     """Studies of one configuration of the generator and three runs, of which the first takes too long."""
-    found: list[FakeRunner] = []
-    clock = SimpleNamespace(now=0.0, perf_counter=lambda: clock.now, strftime=lambda form: "2001-02-03")
+    found = FakeRuns(seeds=0.5)
+    clock: Any = SimpleNamespace(now=0.0, perf_counter=lambda: clock.now, strftime=lambda form: "2001-02-03")
 
-    class Runner(FakeRunner):
-        def __init__(self, config: Any, *_: Any, path_seconds: Any) -> None:
-            super().__init__(seeds=0.5)
-            self.config = config
-            found.append(self)
-            self.path_seconds = path_seconds
+    def measure(run: Run, conditions: Conditions) -> Measurement:
+        clock.now += run.planned_seconds(0.0)
+        return found.measure(run)
 
-        def measure(self, run: Run) -> Measurement:
-            clock.now += self.expected_seconds(run)
-            return super().measure(run)
-
-    result = Measurement("paths", "uniform", "4", "", ONE, ONE, None, ONE)
-    monkeypatch.setattr(GeneratorTask, "run", lambda *_: result)
-    task = GeneratorTask("paths", "uniform", "4", {"queries.spp": 4}, None)
+    result = Measurement("paths", "uniform", "4", "", ONE, ONE, None, ONE, {"spp": 4.0})
+    monkeypatch.setattr(GeneratorConfiguration, "measure", lambda *_: result)
+    configuration = GeneratorConfiguration("paths", "uniform", "4", {"queries.spp": 4}, None)
     monkeypatch.setattr(module, "time", clock)
-    monkeypatch.setattr(module, "RunRunner", Runner)
-    monkeypatch.setattr(module, "generator_tasks", lambda benchmark: [task])
-    monkeypatch.setattr(module, "path_seconds", lambda *_: 1e-9)
-    monkeypatch.setattr(module, "_check_variation", lambda benchmark: None)
+    monkeypatch.setattr(Run, "measure", measure)
+    monkeypatch.setattr(module, "generator_configurations", lambda benchmark: [configuration])
+    monkeypatch.setattr(GeneratorBenchmark, "check_variation", lambda benchmark: None)
     monkeypatch.setattr(module, "planned_runs", lambda *_: RUNS)
+    monkeypatch.setattr(module, "path_seconds", lambda *_: 1e-9)
     return found
 
 
-def test_a_study_keeps_its_time_and_resumes(runners: list[FakeRunner], tmp_path: Path) -> None:
+def test_a_study_keeps_its_time_and_resumes(fake: FakeRuns, tmp_path: Path) -> None:
     recipe, folder = load_recipe(RECIPE, []), tmp_path / "study"
+
+    def measured(**options: float) -> tuple[module.Study, list[Run]]:
+        fake.measured.clear()
+        return module.run_study(recipe, folder, **options), [*fake.measured]  # type: ignore[arg-type]
+
     # Two runs of 60 s and one of 40 s.
-    first = module.run_study(recipe, folder, seconds=190.0)
+    first, runs = measured(seconds=190.0)
     assert [m.details.get("seeds") for m in first.measurements] == [None, 2, 1]
-    assert sum(r.fit["training"]["time"] for r in runners[0].measured) <= 190.0
-    assert first.skipped == ["complete run: neumip, long"]
+    assert sum(r.planned_seconds(0.0) for r in runs) <= 190.0
+    assert first.skipped == ["run, neumip, long"]
     assert first.deviation is not None
     # Only what is missing is measured: the second seed of the last run.
-    second = module.run_study(recipe, folder, seconds=190.0)
-    assert [(r.name, r.data.seed) for r in runners[1].measured] == [("m", 1)]
-    # Refining takes its own time, for further seeds.
-    module.run_study(recipe, folder, seconds=190.0, refine=3600.0)
-    assert {r.data.seed for r in runners[2].measured} >= {2}
-    assert all(r.name != "long" for r in runners[2].measured)
-    assert sum(r.fit["training"]["time"] for r in runners[2].measured) <= 3790.0
-    assert module.time_of(folder) == 190.0
-    assert module.time_of(tmp_path / "none") == module.NEW_TIME
+    second, runs = measured(seconds=190.0)
+    assert [(r.name, r.seed) for r in runs] == [("m", 1)]
     assert second.measurements[1].error.value == first.measurements[1].error.value
+    # Refining takes its own time, for further seeds.
+    _, runs = measured(seconds=190.0, refine=3600.0)
+    assert {r.seed for r in runs} >= {2}
+    assert all(r.name != "long" for r in runs)
+    assert sum(r.planned_seconds(0.0) for r in runs) <= 3790.0
 
 
-def test_a_study_states_its_size_and_is_refused_if_the_disk_is_full(
-    runners: list[FakeRunner], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_runs_that_do_not_fit_on_the_disk_are_refused(
+    fake: FakeRuns, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    recipe, folder, said = load_recipe(RECIPE, []), tmp_path / "study", list[str]()
+    recipe, said = load_recipe(RECIPE, []), list[str]()
     monkeypatch.setattr(folders.shutil, "disk_usage", lambda path: SimpleNamespace(free=1e6))
     with pytest.raises(InputError, match=r"needs 72 MB; 1.0 MB are free\n.*--time"):
-        module.run_study(recipe, folder, seconds=150.0, announce=said.append)
-    assert not folder.exists()
+        module.run_study(recipe, tmp_path / "study", seconds=150.0, announce=said.append)
     assert not said
-    monkeypatch.undo()
-    assert module.disk_bytes(RUNS) == (module.TEST[0] + 3000) * 68
+    assert not fake.measured
+    assert disk_bytes(RUNS) == (TEST[0] + 3000) * 68
 
 
-def test_other_seeds_and_materials_are_not_mixed(runners: list[FakeRunner], tmp_path: Path) -> None:
+def test_other_seeds_and_materials_are_not_mixed(fake: FakeRuns, tmp_path: Path) -> None:
     recipe = load_recipe(RECIPE, [])
     wool = load_recipe(RECIPE, ["generate.material=assets/twisted_wool"])
-    for one, seed, measured in ((recipe, None, 4), (recipe, None, 0), (recipe, 7, 4), (wool, None, 4)):
-        module.run_study(one, tmp_path / "study", seconds=600.0, seed=seed)
-        assert len(runners[-1].measured) == measured
-        assert runners[-1].config.seed == (seed or 0)
+    for one, seed, count in ((recipe, None, 4), (recipe, None, 0), (recipe, 7, 4), (wool, None, 4)):
+        fake.measured.clear()
+        study = module.run_study(one, tmp_path / "study", seconds=600.0, seed=seed)
+        assert len(fake.measured) == count
+        assert study.description["seed"] == (seed or 0)
 
 
 def test_a_refused_study_leaves_the_folder_as_it_was(
-    runners: list[FakeRunner], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    fake: FakeRuns, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recipe, folder = load_recipe(RECIPE, []), tmp_path / "study"
     module.run_study(recipe, folder, seconds=600.0)
@@ -190,7 +245,7 @@ def test_a_refused_study_leaves_the_folder_as_it_was(
     def refuse(benchmark: Any) -> None:
         raise InputError("reflects nothing")
 
-    monkeypatch.setattr(module, "_check_variation", refuse)
+    monkeypatch.setattr(GeneratorBenchmark, "check_variation", refuse)
     with pytest.raises(InputError, match="reflects nothing"):
         module.run_study(recipe, folder, seconds=60.0, seed=5)
     assert content() == before

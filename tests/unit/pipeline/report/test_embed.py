@@ -1,4 +1,4 @@
-"""Images of the report: encodings within a size limit, and pixels that match their sources."""
+"""Images and maps of the report: pixels that match their sources, noise-free errors, palettes and scales."""
 
 from __future__ import annotations
 
@@ -10,8 +10,18 @@ import pytest
 from PIL import Image
 
 from mbtf_core.exposure import to_display
-from mbtf_pipeline.report.embed import ENCODINGS, Encoding, Gallery, encode, shrink
-from mbtf_pipeline.report.error_maps import palette
+from mbtf_pipeline.report.embed import (
+    REDUCTIONS,
+    Palette,
+    color_bar,
+    common_scale,
+    indices,
+    linear_uri,
+    map_uri,
+    palette,
+    shrink,
+)
+from mbtf_pipeline.report.images import local_error
 
 
 def decoded(uri: str) -> np.ndarray:
@@ -20,41 +30,67 @@ def decoded(uri: str) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))
 
 
-@pytest.fixture
-def gallery() -> Gallery:
-    noise = np.random.default_rng(1).random((96, 128, 3)).astype(np.float32)
+def luma(colors: np.ndarray) -> np.ndarray:
+    return np.asarray(colors, float) @ [0.2126, 0.7152, 0.0722]
+
+
+def test_images_match_their_sources_and_shrink() -> None:
+    picture = np.random.default_rng(1).random((96, 128, 3)).astype(np.float32)
+    assert (decoded(linear_uri(picture, 1.0)) == to_display(picture, 1.0)).all()
+    assert decoded(linear_uri(picture, 1.0, 8)).shape == (96 // 8, 128 // 8, 3)
     values = np.tile(np.linspace(0, 1, 128), (96, 1))
-    linear = {"a": noise, "b": 3 * noise[::-1]}
-    return Gallery(1.0, linear, {"map": ("local", values), "offset": ("signed", 2 * values - 1)})
-
-
-def test_every_encoding_is_smaller_than_the_one_before(gallery: Gallery) -> None:
-    def size(encoding: Encoding) -> int:
-        return sum(map(len, encode(gallery, encoding).values()))
-
-    sizes = [size(encoding) for encoding in ENCODINGS]
+    assert (decoded(map_uri(values, "local"))[0, [0, -1]] == palette("local")[[0, -1]]).all()
+    assert decoded(map_uri(2 * values - 1, "signed"))[0, 64].max() < 40
+    sizes = [len(linear_uri(picture, 1.0, n)) + len(map_uri(values, "flip", n)) for n in REDUCTIONS]
     assert sizes == sorted(sizes, reverse=True)
-
-
-def test_reductions_are_reported(gallery: Gallery) -> None:
-    assert ENCODINGS[0].describe() == "PNG"
-    small = ENCODINGS[-2]
-    assert "reduced to limit the file size: 8 × 8 pixels averaged" in small.describe()
-    assert decoded(encode(gallery, small)["a"]).shape == (96 // 8, 128 // 8, 3)
-
-
-def test_images_match_their_sources(gallery: Gallery) -> None:
-    images = encode(gallery, ENCODINGS[0])
-    assert (decoded(images["b"]) == to_display(gallery.linear["b"], 1.0)).all()
-    colors = decoded(images["map"])
-    assert colors[0, 0].tolist() == list(palette("local")[0])
-    assert colors[0, -1].tolist() == list(palette("local")[-1])
-    assert decoded(images["offset"])[0, 64].max() < 40
 
 
 def test_averaging_preserves_the_mean() -> None:
     x = np.arange(6 * 9, dtype=float).reshape(6, 9)
-    assert shrink(x, 3).shape == (2, 3)
     assert shrink(x, 3).mean() == pytest.approx(x.mean())
     assert shrink(x, 4).tolist() == [[x[:4, :4].mean(), x[:4, 4:8].mean()]]
     assert shrink(np.ones((5, 3, 3)), 16).shape == (1, 1, 3)
+
+
+def test_local_error_is_not_biased_by_noise() -> None:
+    random = np.random.default_rng(1)
+    truth = np.full((96, 96, 3), 0.5, np.float32)
+    a, b = (truth + np.float32(0.2) * random.standard_normal(truth.shape, np.float32) for _ in range(2))
+    picture = truth.copy()
+    picture[:, 48:] += 0.3
+    found = local_error(picture, a, b)
+    assert found[:, 56:].mean() == pytest.approx(0.3, rel=0.05)
+    # Without an error, the map lies far below the noise, and half of it is 0.
+    assert np.median(found[:, :40]) < 0.05
+    assert 0.3 < np.mean(found[:, :40] == 0) < 0.7
+    assert (found >= 0).all()
+
+
+@pytest.mark.parametrize("name", ["local", "flip"])
+def test_lightness_encodes_magnitude(name: Palette) -> None:
+    lightness = luma(palette(name))
+    assert np.diff(lightness).min() > -0.6
+    assert lightness[-1] - lightness[0] > 150
+
+
+def test_signed_colors_encode_sign_and_magnitude() -> None:
+    colors = palette("signed")[indices([-1.0, -0.5, 0.0, 0.5, 1.0, 7.0, np.nan], "signed")].astype(int)
+    shades = luma(colors)
+    assert shades[2] < 20
+    assert shades[1] < shades[0]
+    assert shades[3] < shades[4]
+    assert colors[0, 2] > colors[0, 0]
+    assert colors[4, 0] > colors[4, 2]
+    assert (colors[5] == colors[4]).all()
+    assert (colors[6] == colors[2]).all()
+
+
+def test_scales_and_color_bars_are_round() -> None:
+    for size, expected in {0.011: 0.02, 0.02: 0.02, 0.3: 0.5, 7.0: 10.0, 0.0: 1.0}.items():
+        assert common_scale([np.full(100, size)]) == pytest.approx(expected)
+    zero = np.zeros((10, 10))
+    assert common_scale([zero - 0.03, zero]) == pytest.approx(0.05)
+    bar = color_bar("local", "", 0.2, "%", 100)
+    assert bar["ticks"] == ["0", "5", "10", "15", "20"]
+    assert color_bar("signed", "", 0.5, "")["ticks"] == ["−0.5", "−0.25", "0", "0.25", "0.5"]
+    assert bar["gradient"].startswith("linear-gradient(90deg, rgb({} {} {}),".format(*palette("local")[0]))

@@ -13,7 +13,7 @@ from PIL import Image
 
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.tile.loading import load_material
-from mbtf_pipeline.report.material import material_section
+from mbtf_pipeline.report.sections import material_section
 
 
 @pytest.fixture

@@ -7,14 +7,7 @@ from typing import Any
 import pytest
 
 from mbtf_pipeline.compare import timing
-from mbtf_pipeline.report.errors import error_context, group_label
-
-
-@pytest.mark.parametrize(
-    ("name", "label"), [("4", "4"), ("0-0.2", "0–0.2"), ("0.2-0.4", "0.3–0.4"), ("0.4-0.7", "0.4–0.7")]
-)
-def test_ranges_of_cosines_start_at_the_smallest_in_the_data(name: str, label: str) -> None:
-    assert group_label(name, 0.3) == label
+from mbtf_pipeline.report.sections import error_context
 
 
 def number(value: float, error: float) -> dict[str, Any]:
@@ -40,11 +33,11 @@ def test_both_errors_of_a_group_are_significant_or_neither() -> None:
         "definitions": {},
     }
     record |= {"pictures": [picture], "test": test}
-    context = error_context(record, 0.3)
+    context = error_context(record)
     levels, cosines = (table["rows"] for table in context["group_tables"])
     assert levels[0] == ["0", "50", "not significant (11 ± 6 %)", "not significant (0.20 ± 0.09)"]
     assert levels[1] == ["1", "50", "20.0 ± 1.0 %", "0.400 ± 0.010"]
-    assert cosines[0][0] == "0.3–0.4"
+    assert cosines[0][0] == "0.2–0.4"
     assert context["facts"][0]["value"] == "20.0 ± 1.0 %"
 
 

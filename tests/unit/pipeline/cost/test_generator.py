@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
 import pytest
 from support.fake_benchmark import NOISE, SHIFT, FakeEstimator, fake_benchmark
+from support.fake_runs import conditions
 
 from mbtf_core.data.schema import Queries
 from mbtf_core.errors import InputError
 from mbtf_core.stats import Estimate
-from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.planning.run_plan import plan_effects
 from mbtf_gen.render.estimates import Estimates, Stream
-from mbtf_pipeline.cost import generator_benchmark as module
-from mbtf_pipeline.cost.generator_benchmark import GeneratorBenchmark
-from mbtf_pipeline.cost.generator_runs import PATHS, TARGETS, GeneratorTask, generator_tasks
-from mbtf_pipeline.cost.measurements import Measurement
-from mbtf_pipeline.cost.study import _check_variation
+from mbtf_pipeline.cost import generator as module
+from mbtf_pipeline.cost.generator import (
+    PATHS,
+    TARGETS,
+    GeneratorBenchmark,
+    generator_configurations,
+    path_seconds,
+)
+from mbtf_pipeline.cost.measurement import Measurement
 
 
 @pytest.fixture
@@ -28,8 +32,12 @@ def benchmark(monkeypatch: pytest.MonkeyPatch) -> GeneratorBenchmark:
     return fake_benchmark(monkeypatch)
 
 
-def measure(benchmark: GeneratorBenchmark, changes: dict[str, Any], *against: Any) -> Measurement:
-    return GeneratorTask("paths", "", "", changes, *against).run(benchmark, 0.0)
+# The reference with all effects.
+ALL: dict[str, Any] = {}
+
+
+def measure(benchmark: GeneratorBenchmark, changes: dict[str, Any], against: Any = ALL) -> Measurement:
+    return Measurement("paths", "", "", "", *benchmark.measure(changes, against, 0.0))
 
 
 @pytest.mark.parametrize("spp", [4, 64])
@@ -65,15 +73,20 @@ def test_error_bars_agree_with_other_seeds(benchmark: GeneratorBenchmark) -> Non
         assert 0.4 < spread / np.mean([e.error for e in estimates]) < 1.9
 
 
-def test_every_configuration_is_one_that_the_generator_takes(benchmark: GeneratorBenchmark) -> None:
-    tasks = list(generator_tasks(benchmark))
+def test_every_configuration_is_one_that_the_generator_takes(
+    benchmark: GeneratorBenchmark, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "plan_effects", plan_effects)
+    tasks = list(generator_configurations(benchmark))
     for task in tasks:
         job = benchmark.job(task.changes)
         plan_effects(job, pilots=False)
         # The command sets what was measured, and nothing else.
-        words = task.command("mbtf-gen m").split()
+        words = task.command(conditions()).split()
         given = dict(w.split("=") for w, flag in zip(words[1:], words, strict=False) if flag == "--set")
         assert given == {name: str(value) for name, value in task.changes.items()}
+    # The rate of the recipe's own number of paths is measured first.
+    assert tasks[0].changes["queries.spp"] == benchmark.config.queries.spp
     names = {task.name for task in tasks if task.study == "effects"}
     assert {"auto", "all", "without shadowing", "without interreflection"} <= names
     assert sum(task.study == "paths" for task in tasks) == len(PATHS) + len(PATHS[1::2]) + len(TARGETS)
@@ -93,36 +106,36 @@ def test_closed_forms_fit_into_memory(benchmark: GeneratorBenchmark, monkeypatch
         return Estimates(zero, zero, None, 0, 0, 0, 0)
 
     monkeypatch.setattr(FakeEstimator, "estimate", estimate)
-    variance, _ = benchmark._noise(benchmark.job({"queries.spp": 2}), 0.0, 0.25)
-    assert variance.value == 0
+    benchmark._noise(benchmark.job({"queries.spp": 2}), 0.0, 0.25)
     assert max(sizes) == 1 << 18
 
 
+def test_the_time_of_a_path_is_that_of_the_next_number_of_paths() -> None:
+    one = Estimate(1.0, 0.1, 4)
+    found = [
+        Measurement("paths", series, "", "", Estimate(seconds, 0.1, 4), one, details={"spp": spp})
+        for series, spp, seconds in (("uniform", 2.0, 3.0), ("uniform", 8.0, 4.0), ("by noise", 6.0, 9.0))
+    ]
+    assert path_seconds(found, 6) == pytest.approx(4.0 / 8e6)
+
+
 @pytest.mark.parametrize(
-    ("factor", "spread", "message"),
-    [(0.0, 0.0, "reflects nothing"), (1.0, 0.0, "reflects the same everywhere"), (1.0, 0.02, None)],
+    ("values", "message"),
+    [
+        ({"scale": 0.0}, "reflects nothing"),
+        ({"slope": 0.0}, "reflects the same everywhere"),
+        # A standard deviation of a fiftieth of the mean.
+        ({"slope": 0.02 * 0.25 * math.sqrt(12)}, None),
+    ],
 )
 def test_materials_without_anything_to_learn_are_refused(
-    monkeypatch: pytest.MonkeyPatch, factor: float, spread: float, message: str | None
+    benchmark: GeneratorBenchmark,
+    monkeypatch: pytest.MonkeyPatch,
+    values: dict[str, float],
+    message: str | None,
 ) -> None:
-    """Noise does not count; values that vary by a fiftieth of their mean do."""
-
-    class Even(FakeEstimator):
-        def estimate(self, queries: Queries, spp: Any, stream: Stream, **_: Any) -> Estimates:
-            found = super().estimate(queries, spp, stream)
-            truth = 0.2 + 0.1 * queries.u[:, :1]
-            own = 0.25 * (1 + spread * np.sign(queries.u[:, :1] - 0.5))
-            a, b = (
-                (factor * (0.1 * (v - truth) + own)).astype(np.float32)
-                for v in (found.value_a, found.value_b)
-            )
-            return replace(found, value_a=a, value_b=b)
-
-    benchmark = fake_benchmark(monkeypatch)
-    assert isinstance(benchmark.config, GeneratorConfig)
-    monkeypatch.setattr(module, "build_estimator", lambda job, plan: Even(job))
-    if message is None:
-        _check_variation(benchmark)
-        return
-    with pytest.raises(InputError, match=message):
-        _check_variation(benchmark)
+    """Noise does not count."""
+    for name, value in {"noise": 0.1 * NOISE, **values}.items():
+        monkeypatch.setattr(FakeEstimator, name, value)
+    with nullcontext() if message is None else pytest.raises(InputError, match=message):
+        benchmark.check_variation()

@@ -1,0 +1,133 @@
+"""What a cost study measures: configurations, time and error of each, and the files that keep them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from mbtf_core.errors import InputError
+from mbtf_core.files.atomic import read_json, write_json
+from mbtf_core.files.digest import data_sha256
+from mbtf_core.stats import Estimate
+from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_pipeline.tables import estimate
+
+# Raised when the method of measuring changes: older measurements are then repeated.
+SCHEMA = 8
+FOLDER = "measurements"
+# Relative half-width of a 95 % interval that a study aims at, and that half-width over the standard error.
+HALF_WIDTH = 0.1
+NORMAL = 1.96
+ESTIMATES = ("seconds", "error", "bias", "noise")
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What all measurements of a study share.
+
+    Attributes
+    ----------
+    config_json : the generator's configuration; basis : hash of it and of the material
+    folder : of temporary data and fits
+    seconds : time for noise and bias of a configuration of the generator, each
+    command : of the generator with this configuration
+    """
+
+    config_json: str
+    basis: str
+    folder: Path
+    seconds: float
+    command: str
+
+    @cached_property
+    def config(self) -> GeneratorConfig:
+        """The generator's configuration."""
+        return GeneratorConfig.model_validate_json(self.config_json)
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """What is measured: the comparison that it belongs to (``run``, or a part of the generator), its line in
+    the plot of that comparison (empty where there is only one), and its name on that line."""
+
+    study: str
+    series: str
+    name: str
+
+    @property
+    def label(self) -> str:
+        """Its name among all configurations."""
+        return ", ".join(filter(None, (self.study, self.series, self.name)))
+
+    @property
+    def key(self) -> dict[str, Any]:
+        """What its measurement depends on besides the study's conditions."""
+        raise NotImplementedError
+
+    def command(self, conditions: Conditions) -> str:
+        """Reproduces it with the programs."""
+        raise NotImplementedError
+
+    def measure(self, conditions: Conditions) -> Measurement:
+        """Measure it in this process."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """A measured configuration.
+
+    Attributes
+    ----------
+    study, series, name : of the configuration
+    command : reproduces it with the programs
+    seconds : its time: per million queries for the generator; of generating, training and everything
+        around them for a run
+    error : relative RMS error of the generator's values, or unexplained variance of a fit
+    bias, noise : the two parts of the generator's error; error² = bias² + noise²
+    details : further numbers by name: generation and training seconds, bytes, milliseconds
+    """
+
+    study: str
+    series: str
+    name: str
+    command: str
+    seconds: Estimate
+    error: Estimate
+    bias: Estimate | None = None
+    noise: Estimate | None = None
+    details: dict[str, float] = field(default_factory=dict)
+
+
+def measure(configuration: Configuration, conditions: Conditions) -> Measurement:
+    """Measure a configuration; a task, see :mod:`mbtf_core.run.task`."""
+    return configuration.measure(conditions)
+
+
+class MeasurementFolder:
+    """Finished measurements, one file each, so that a study resumes where it stopped."""
+
+    def __init__(self, folder: Path, conditions: Conditions) -> None:
+        self.folder, self.conditions = folder / FOLDER, conditions
+
+    def _path(self, of: Configuration) -> Path:
+        key = {"schema": SCHEMA, "basis": self.conditions.basis, "study": of.study, "key": of.key}
+        return self.folder / f"{of.study}-{data_sha256(key)[:16]}.json"
+
+    def get(self, of: Configuration) -> Measurement | None:
+        """The stored measurement of a configuration; None where it is missing or its file is damaged."""
+        try:
+            data = read_json(self._path(of))
+            numbers = {name: data[name] and estimate(data[name]) for name in ESTIMATES}
+            command = of.command(self.conditions)
+            return Measurement(of.study, of.series, of.name, command, **numbers, details=data["details"])
+        except (InputError, KeyError, TypeError):
+            return None
+
+    def put(self, of: Configuration, found: Measurement) -> None:
+        """Store a measurement."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        numbers = {name: e and e.as_dict() for name in ESTIMATES for e in (getattr(found, name),)}
+        write_json(self._path(of), {"label": of.label, **numbers, "details": found.details})

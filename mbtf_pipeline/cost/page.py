@@ -1,0 +1,151 @@
+"""The page of a study ``cost.html``, its plots as PNG, and ``cost.csv``."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from operator import attrgetter
+from pathlib import Path
+from typing import Any
+
+from mbtf_core.files.atomic import write_text
+from mbtf_core.units import clock
+from mbtf_pipeline.cost.analysis import extrapolation, pareto_front
+from mbtf_pipeline.cost.measurement import Measurement
+from mbtf_pipeline.cost.study import Study
+from mbtf_pipeline.report.plots import Series, plot
+from mbtf_pipeline.report.report import render
+from mbtf_pipeline.tables import Column, Table, is_significant, rows_of
+
+CSV_NAME, PAGE_NAME = "cost.csv", "cost.html"
+_NOISE_AXIS = "RMS error relative to the mean value"
+# The comparisons of the generator, in the order of the page.
+_COMPARISONS = ("paths", "effects", "mesh", "interactions")
+
+
+def _field(title: str, name: str, **options: Any) -> Column:
+    return Column(title, name, attrgetter(name), **options)
+
+
+def _detail(title: str, name: str, **options: Any) -> Column:
+    return Column(title, name, lambda m: m.details.get(name), **options)
+
+
+_TITLE = Column("configuration", "", lambda m: ", ".join(filter(None, (m.series, m.name))))
+_COMMAND = _field("command", "command")
+_PARTS = [_field(f"{name}, %", name, factor=100.0) for name in ("bias", "noise", "error")]
+_SECONDS = _field("seconds per million queries", "seconds")
+_DETAILS = [
+    _detail("million queries", "queries", factor=1e-6, digits=".2f"),
+    _detail("paths each", "spp", digits="g"),
+    _detail("generating, s", "generation_seconds", digits=".1f"),
+    _detail("training, s", "training_seconds", digits=".1f"),
+    _detail("total, s", "total_seconds", digits=".1f"),
+    _detail("1080p, ms", "evaluation_ms_1080p", digits=".0f"),
+    _detail("MB", "bytes", factor=1e-6, digits=".2f"),
+    _detail("seeds", "seeds", digits="g"),
+]
+_GENERATOR = [_TITLE, _SECONDS, *_PARTS, _COMMAND]
+_RUNS = [_TITLE, *_DETAILS, _field("unexplained variance", "error"), _COMMAND]
+_NAMES = [_field("", name) for name in ("study", "series", "name")]
+_CSV = [*_NAMES, _SECONDS, *reversed(_PARTS), *_DETAILS, _COMMAND]
+
+
+def _table(columns: Sequence[Column], found: Sequence[Measurement]) -> Table:
+    return Table("cost", "", columns, rows_of(columns, ([m] for m in found)))
+
+
+def to_csv(found: Sequence[Measurement]) -> str:
+    """One row per configuration; ``_se`` are standard errors, empty cells were not measured."""
+    return _table(_CSV, found).csv()
+
+
+def _series(
+    name: str,
+    found: Sequence[Measurement],
+    part: str = "error",
+    label: Callable[[Measurement], str] = attrgetter("name"),
+    **options: Any,
+) -> Series:
+    """A part of the error over time."""
+    usable = [m for m in found if math.isfinite(getattr(m, part).value) and math.isfinite(m.seconds.value)]
+    usable.sort(key=lambda m: m.seconds.value)
+    x, y = [m.seconds for m in usable], [getattr(m, part) for m in usable]
+    (xs, ys), (dx, dy) = ([[getattr(e, k) for e in axis] for axis in (x, y)] for k in ("value", "error"))
+    return Series(name, xs, ys, dy, dx, [label(m) for m in usable], **options)
+
+
+def _figure(
+    series: Sequence[Series], x: str, y: str, png: Path, caption: str = "", **options: Any
+) -> dict[str, str]:
+    shown = [one for one in series if one.x]
+    if not shown:
+        return {"svg": "", "caption": f"No {y} could be measured."}
+    return {"svg": plot(shown, x, y, f"cost {png.stem}", png=png, **options), "caption": caption}
+
+
+def _front_section(runs: Sequence[Measurement], png: Path) -> dict[str, Any]:
+    """All runs and their Pareto front, whose points have names; and its extrapolation."""
+    front = pareto_front(runs)
+
+    def name(m: Measurement) -> str:
+        return f"{m.details['queries'] / 1e6:.2g} M × {m.details['spp']:g}" if m in front else ""
+
+    axes = "seconds in total, from height map to material", "unexplained variance of test queries"
+    caption = "Names on the front: training queries × paths per query."
+    stepped = [(m.seconds.value, m.error.value) for m in front]
+    series = [_series("complete runs", runs, label=name, style="points")]
+    further = extrapolation(front)
+    return {
+        "figure": _figure(series, *axes, png, caption, front=stepped),
+        "table": _table(_RUNS, front).for_page(),
+        "further": None if further is None else (clock(further[0]), further[1]),
+    }
+
+
+def _generator_section(found: Sequence[Measurement], png: Path) -> dict[str, Any]:
+    """Error over time of one comparison of the generator, split into bias and noise where there is a bias."""
+    found = sorted(found, key=lambda m: (m.series, m.seconds.value))
+    biased = [m for m in found if m.bias and is_significant(m.bias)]
+    unbiased = [m for m in found if m.bias and m not in biased]
+    caption = ""
+    if biased or unbiased:
+        series = [_series("bias", biased, "bias", style="points")]
+        label = {"label": lambda m: m.name if m in unbiased else ""}
+        series.append(_series("noise", found, "noise", style="points", hollow=True, **label))
+    else:
+        names = dict.fromkeys(m.series for m in found)
+        series = [_series(n, [m for m in found if m.series == n], style="joined") for n in names]
+    if unbiased:
+        limit = 100 * max(2 * max(m.bias.error, m.bias.value) for m in unbiased if m.bias)
+        caption = (
+            f"Labels at the noise: the bias is not significant, at most {limit:.2g} % of the mean value."
+        )
+    return {
+        "figure": _figure(series, "seconds per million queries", _NOISE_AXIS, png, caption),
+        "table": _table(_GENERATOR, found).for_page(),
+    }
+
+
+def write_page(study: Study) -> Path:
+    """Write CSV, page and plots into the study's folder; returns the path of the page."""
+    write_text(study.folder / CSV_NAME, to_csv(study.measurements))
+    sections = {}
+    for kind in ("run", *_COMPARISONS):
+        found = [m for m in study.measurements if m.study == kind]
+        if found and kind == "run":
+            sections["front"] = _front_section(found, study.folder / "front.png")
+        elif found:
+            sections[kind] = _generator_section(found, study.folder / f"{kind}.png")
+    html = render(
+        "cost.html",
+        study=study.description,
+        time=clock(study.description["time"]),
+        sections=sections,
+        skipped=study.skipped,
+        failed=study.failed,
+        deviation=None if study.deviation is None else f"{study.deviation.scaled(100.0)} %",
+        seeds=round(max((m.details.get("seeds", 0.0) for m in study.measurements), default=0.0)),
+    )
+    write_text(study.folder / PAGE_NAME, html)
+    return study.folder / PAGE_NAME

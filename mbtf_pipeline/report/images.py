@@ -1,0 +1,258 @@
+"""Images of the report: scenes of the viewer, the sheet of references, fits and error maps, and offsets."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbtf_core.exposure import white_of
+from mbtf_pipeline.compare.image_files import read_halves, read_map, read_picture
+from mbtf_pipeline.compare.offsets import read_offset, towards_view
+from mbtf_pipeline.compare.perceptual_metrics import available_metrics
+from mbtf_pipeline.recipe import SceneView
+from mbtf_pipeline.report.embed import (
+    F32,
+    Gallery,
+    Palette,
+    Pixels,
+    color_bar,
+    common_scale,
+    linear_uri,
+    map_uri,
+)
+from mbtf_pipeline.run_folder import COMPARE
+from mbtf_pipeline.tables import (
+    decibel,
+    direction,
+    estimate,
+    estimate_text,
+    levels_text,
+    short_direction,
+    signed,
+    width,
+)
+
+_KIND = {"query": "Reference", "pixel": "Reference, filtered pixel"}
+# Standard deviation in pixels of the averaging window of local errors.
+WINDOW = 2.0
+# Error maps: title, unit, and factor to that unit.
+_MAPS: dict[Palette, tuple[str, str, float]] = {
+    "local": ("Local RMS error", "% of white", 100.0),
+    "flip": ("HDR-FLIP", "from 0 to 1", 1.0),
+    "signed": ("Fit − reference", "% of white", 100.0),
+}
+
+
+def local_error(picture: F32, value_a: F32, value_b: F32) -> NDArray[np.float64]:
+    """Local noise-free root mean square error (rows, columns) in 1/sr.
+
+    The root of the Gaussian average (σ = 2 pixels) of the mean over channels of ``(p-a)(p-b)``. Single
+    products are often negative where the error is small compared to the noise, so they are averaged. The
+    map is 0 where the average is negative: the error lies below the noise.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    p, a, b = (np.asarray(x, np.float64) for x in (picture, value_a, value_b))
+    squared = gaussian_filter(((p - a) * (p - b)).mean(axis=-1), WINDOW, mode="nearest")
+    return np.sqrt(np.maximum(squared, 0.0))
+
+
+def hemisphere(view: Mapping[str, float], light: Mapping[str, float]) -> str:
+    """The hemisphere from above with the view (square) and the light (disk), as an ``<svg>`` element."""
+
+    def position(d: Mapping[str, float]) -> tuple[float, float]:
+        r = 20.0 * math.cos(math.radians(d["elevation"]))
+        a = math.radians(d["azimuth"])
+        return r * math.cos(a), -r * math.sin(a)
+
+    (vx, vy), (lx, ly) = position(view), position(light)
+    return (
+        '<svg viewBox="-24 -24 48 48" aria-hidden="true">'
+        '<g fill="none" stroke="currentColor" opacity=".35"><circle r="20"/><circle r="10"/>'
+        '<path d="M-20 0H20M0-20V20" stroke-width=".6"/></g>'
+        f'<rect x="{vx - 3.4:.2f}" y="{vy - 3.4:.2f}" width="6.8" height="6.8" rx="1" fill="var(--accent)"/>'
+        f'<circle cx="{lx:.2f}" cy="{ly:.2f}" r="3.9" fill="#e69f00"/></svg>'
+    )
+
+
+def picture_section(
+    folder: Path, comparison: Mapping[str, Any], exposure: float, gallery: Gallery
+) -> dict[str, Any]:
+    """Lay out all images of a comparison.
+
+    Parameters
+    ----------
+    folder : of the comparison
+    exposure : of the images, in EV; errors are shown as fractions of its white
+    gallery : receives the images
+
+    Returns
+    -------
+    groups : per view and light: title, diagram, blocks of figures
+    scenes : of the viewer, plain data
+    color_bars : of local error, HDR-FLIP and signed difference
+    """
+    white = white_of(exposure)
+    groups: list[dict[str, Any]] = []
+    scenes = []
+    maps: dict[Palette, dict[str, Pixels]] = {name: {} for name in _MAPS}
+    for number, picture in enumerate(comparison["pictures"]):
+        references = [picture["references"][kind]["file"] for kind in comparison["kinds"]]
+        fits = [picture["fits"][fit]["file"] for fit in comparison["fits"]]
+        pictures = {file: read_picture(folder / file) for file in (*references, *fits)}
+        gallery |= {file: partial(linear_uri, value, exposure) for file, value in pictures.items()}
+        a, b = read_halves(folder / references[0])
+        mean = 0.5 * (a.astype(np.float64) + b)
+        for file in fits:
+            maps["local"][file] = local_error(pictures[file], a, b) / white
+            maps["flip"][file] = read_map(folder / file)
+            maps["signed"][file] = (pictures[file] - mean).mean(axis=-1) / white
+        key = (picture["view"], picture["light"])
+        if not groups or groups[-1]["key"] != key:
+            group = {"key": key, "diagram": hemisphere(*key), "blocks": []}
+            group["title"] = f"View {direction(key[0])}  ·  light {direction(key[1])}"
+            group["short"] = [f"view {short_direction(key[0])}", f"light {short_direction(key[1])}"]
+            groups.append(group)
+        groups[-1]["blocks"].append(_block(comparison, picture, number))
+        scenes.append({"group": len(groups) - 1, **_scene(comparison, picture)})
+    bars = {}
+    for name, found in maps.items():
+        scale = common_scale(list(found.values()))
+        scale = min(scale, 1.0) if name == "flip" else scale
+        title, unit, factor = _MAPS[name]
+        bars[name] = color_bar(name, title, scale, unit, factor)
+        gallery |= {
+            f"{file}-{name}": partial(map_uri, values / scale, name) for file, values in found.items()
+        }
+    return {"groups": groups, "scenes": scenes, "color_bars": bars}
+
+
+def _title(comparison: Mapping[str, Any], picture: Mapping[str, Any]) -> str:
+    return f"{width(picture['tiles_across'])}, {levels_text(picture['levels'], comparison['finest'])}"
+
+
+def _block(comparison: Mapping[str, Any], picture: Mapping[str, Any], number: int) -> dict[str, Any]:
+    """Figures of one scene: rows of four, references in the first column."""
+    where = f": view {direction(picture['view'])}, light {direction(picture['light'])}, "
+    where += width(picture["tiles_across"])
+    fits, kinds = comparison["fits"], comparison["kinds"]
+    rows: list[list[dict[str, Any] | None]] = [[None] for _ in range(max(len(kinds), len(fits)))]
+    for row, kind in zip(rows, kinds, strict=False):
+        reference = picture["references"][kind]
+        lines = [f"noise per pixel {100 * estimate(reference['noise']).value:.1f} %"]
+        if kind != kinds[0]:
+            other = estimate_text(estimate(picture["between_references"]), 1e3)
+            lines.append(f"MSE to the other reference {other} · 10⁻³/sr²")
+        row[0] = _figure(reference["file"], _KIND[kind], lines, where, exr=True)
+    for row, fit in zip(rows, fits, strict=False):
+        record = picture["fits"][fit]
+        file, errors = record["file"], record["errors"][kinds[0]]
+        mse, of_fit = estimate(errors["mse"]), f" of {fit}{where}"
+        psnr = f"PSNR {decibel(estimate(errors['psnr']), mse)}"
+        local = f"MSE {estimate_text(mse, 1e3)} · 10⁻³/sr²"
+        row += [
+            _figure(file, fit, [psnr], where, exr=True),
+            _figure(f"{file}-local", _MAPS["local"][0], [local], of_fit),
+            _figure(f"{file}-flip", _MAPS["flip"][0], [f"mean {record['flip']['hdr']:.3f}"], of_fit),
+        ]
+    return {"title": _title(comparison, picture), "rows": rows, "scene": number}
+
+
+def _scene(comparison: Mapping[str, Any], picture: Mapping[str, Any]) -> dict[str, Any]:
+    """Data of a scene for the viewer."""
+    where = f"View {direction(picture['view'])}; light {direction(picture['light'])}; "
+    references = [
+        {
+            "label": _KIND[kind],
+            "picture": picture["references"][kind]["file"],
+            "rows": _numbers(comparison, picture, kind),
+        }
+        for kind in comparison["kinds"]
+    ]
+    return {
+        "where": where + _title(comparison, picture),
+        "tiles_across": width(picture["tiles_across"]),
+        "references": references,
+        "fits": [picture["fits"][fit]["file"] for fit in comparison["fits"]],
+    }
+
+
+def _numbers(comparison: Mapping[str, Any], picture: Mapping[str, Any], kind: str) -> list[list[str]]:
+    """Errors of a scene: name of the metric, then one cell per fit."""
+    records = [picture["fits"][fit] for fit in comparison["fits"]]
+    errors = [{name: estimate(e) for name, e in record["errors"][kind].items()} for record in records]
+    rows = [
+        ["MSE [10⁻³/sr²]", *(estimate_text(e["mse"], 1e3) for e in errors)],
+        ["relative MSE", *(estimate_text(e["relative_mse"]) for e in errors)],
+        ["PSNR", *(decibel(e["psnr"], e["mse"]) for e in errors)],
+    ]
+    if kind == comparison["kinds"][0]:
+        noise = picture["references"][kind]
+        metrics = available_metrics(comparison["pictures"], comparison["fits"])
+        rows += [[m.title, *(m.text(m.of(r), m.of(noise)) for r in records)] for m in metrics]
+        if len(records) > 1:
+            cells = (estimate_text(estimate(r["mse_minus_first"]), 1e3) for r in records[1:])
+            rows.append([f"MSE − MSE of {comparison['fits'][0]} [10⁻³/sr²]", "–", *cells])
+    return rows
+
+
+def displacements(
+    folder: Path, records: list[dict[str, Any]], fit: str | None
+) -> tuple[list[Pixels], list[float], float]:
+    """Displacements towards the viewer, traced (`fit` is None) or learned, minus their median.
+
+    Returns
+    -------
+    (one map per record, their medians in tile widths, end of their common scale)
+    """
+    maps: list[Pixels] = [
+        towards_view(read_offset(folder / _offset_file(r, fit)), SceneView(**r["view"])) for r in records
+    ]
+    medians = [float(np.median(m)) for m in maps]
+    centered = [m - median for m, median in zip(maps, medians, strict=True)]
+    return centered, medians, common_scale(centered)
+
+
+def offset_section(folder: Path, records: list[dict[str, Any]], gallery: Gallery) -> list[dict[str, Any]]:
+    """Rows of offset images: traced, then learned by each fit, each with its own color scale."""
+    fits = (None, *records[0]["fits"]) if records else ()
+    return [_offset_row(folder, records, fit, gallery) for fit in fits]
+
+
+def _offset_file(record: Mapping[str, Any], fit: str | None) -> str:
+    return str(record["traced"] if fit is None else record["fits"][fit]["file"])
+
+
+def _offset_row(
+    folder: Path, records: list[dict[str, Any]], fit: str | None, gallery: Gallery
+) -> dict[str, Any]:
+    title = "Traced through the heights" if fit is None else f"Learned by {fit}"
+    maps, medians, scale = displacements(folder, records, fit)
+    cells = []
+    for number, (record, values, median) in enumerate(zip(records, maps, medians, strict=True)):
+        name = f"offset-{fit or 'traced'}-{number}"
+        gallery[name] = partial(map_uri, values / scale, "signed")
+        view = f"view {direction(record['view'])}"
+        lines = [view, signed(f"median {median:.2g} tile widths")]
+        if fit is not None and (found := record["fits"][fit]["correlation"]) is not None:
+            lines.append(signed(f"correlation with the traced offset {found:.2f}"))
+        cell = _figure(name, title, lines, f", {view}")
+        cells.append(cell | {"file": _exr_link(_offset_file(record, fit))})
+    return {"cells": cells, "bar": color_bar("signed", "Displacement", scale, "tile widths")}
+
+
+def _figure(image: str, label: str, lines: list[str], where: str, *, exr: bool = False) -> dict[str, Any]:
+    figure = {"image": image, "label": label, "lines": lines, "alt": f"{label}{where}"}
+    return figure | {"file": _exr_link(image) if exr else ""}
+
+
+def _exr_link(file: str) -> str:
+    """Address, relative to the report, of an EXR file of the comparison."""
+    return quote(f"{COMPARE}/{file.removesuffix('.exr')}.exr")
