@@ -235,14 +235,13 @@ def quality_options(
     if quality is None:
         return {}
     given = explicit_options(path, assignments)
-    generate, fits = (
-        {} if not isinstance(given.get(key), Mapping) else given[key] for key in ("generate", "fit")
-    )
-    own = {"fit": {"model": DEFAULT_MODEL, **fits}}
-    if fits and not _is_single(fits):
+    generate, fits = given.get("generate"), given.get("fit")
+    if isinstance(fits, Mapping) and not _is_single(fits):
         own = {f"fit.{name}": {"model": name, **(options or {})} for name, options in fits.items()}
-    out = dict(COMPARE[quality])
-    out |= {f"generate.{key}": value for key, value in generator_options(quality, generate).items()}
+    else:
+        own = {"fit": {"model": DEFAULT_MODEL, **(fits if isinstance(fits, Mapping) else {})}}
+    preset = generator_options(quality, generate if isinstance(generate, Mapping) else {})
+    out = COMPARE[quality] | {f"generate.{key}": value for key, value in preset.items()}
     for prefix, options in fitter_options(quality, own, training).items():
         out |= {f"{prefix}.{key}": value for key, value in options.items()}
     return out

@@ -30,7 +30,7 @@ def test_each_preset_takes_more_paths_than_the_one_before() -> None:
 @pytest.mark.parametrize("quality", QUALITIES)
 def test_recipes_take_a_preset(quality: Quality) -> None:
     path = ROOT / "pipelines" / "quickstart.yaml"
-    recipe = load_recipe(path, presets=quality_options(path, quality))
+    recipe = preset_recipe(path, quality)
     assert recipe.generate.queries.train == GENERATOR[quality]["queries.train"]
     # Other options stay those of the recipe.
     plain = load_recipe(path)

@@ -127,6 +127,7 @@ def test_a_missing_material_is_one_clear_line(tmp_path: Path, capsys: pytest.Cap
     [
         (["run", "recipe-under-tset.yaml"], 3, "did you mean 'recipe-under-test.yaml'?"),
         (["run", "recipe-under-test.yaml", "--set", "compare.sp=2"], 2, "did you mean 'spp'"),
+        (["run", "recipe-under-test.yaml", "--quality", "draft", "--set", "fit={}"], 2, "contains no fit"),
         (["run", "recipe-under-test.yaml", "-o", "maps"], 3, "not empty"),
         (["report", "maps"], 3, "contains no run"),
     ],
