@@ -1,6 +1,6 @@
 """What `gpu.py` measures, each in a process of its own, as a compiler or driver may abort it.
 
-Every function takes texts and yields JSON objects, as :func:`mbtf_core.run.child.run_child` asks. Devices
+Every function takes texts and yields JSON objects, as :func:`mbtf_core.run.processes.run_child` asks. Devices
 are ``cpu`` and ``cuda``.
 """
 

@@ -8,19 +8,21 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import re
+import shutil
+import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from importlib.metadata import version
 from typing import Any
 from uuid import uuid4
 
 from mbtf_core.errors import InputError, PartialError, UsageError, reason
-from mbtf_core.run.batch_jobs import submitted_jobs
+from mbtf_core.run.cluster import MEMORY, PRELOAD, ClusterConfig, read_cluster
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import GPUS_VARIABLE, THREADS_VARIABLE, Item, Result, TaskFunction, packed, run_task
-from mbtf_core.run.workers import MEMORY, PRELOAD, ClusterConfig, read_cluster
 from mbtf_core.units import format_duration
 
 # Tasks that the scheduler knows at a time, beyond those that run.
@@ -34,6 +36,15 @@ _PAUSE_SECONDS, _LOCKED_SECONDS = 10.0, 420.0
 # Seconds in which a scheduler must answer.
 _CONNECT_SECONDS = 30.0
 _RESUMES = "the same command goes on with the rest"
+# Class of dask-jobqueue, and the command that submits a job.
+_SYSTEMS = {
+    "slurm": ("SLURMCluster", "sbatch"),
+    "pbs": ("PBSCluster", "qsub"),
+    "sge": ("SGECluster", "qsub"),
+    "lsf": ("LSFCluster", "bsub"),
+    "oar": ("OARCluster", "oarsub"),
+    "htcondor": ("HTCondorCluster", "condor_submit"),
+}
 
 
 class DaskRunner(Runner):
@@ -61,21 +72,26 @@ class DaskRunner(Runner):
         """Stop to observe the workers."""
         self._ended.set()
 
-    def wait(self) -> None:
+    def wait(self, where: str) -> None:
         """Wait for the first worker, and observe the workers from then on.
 
         Raises
         ------
-        TimeoutError : none has started within the time of the configuration
-        ConnectionRefusedError : the batch system refuses the jobs
+        InputError : none has started within the time of the configuration, or the batch system refuses the
+            jobs; names the option of `where`
         """
-        until = time.monotonic() + self._config.start_timeout
+        limit = self._config.start_timeout
+        until = time.monotonic() + limit
         self._look()
         while not self.workers:
             if self._refused:
-                raise ConnectionRefusedError(self._refused[0])
+                what = f"the batch system refuses the jobs ({self._refused[0]})"
+                hint = "correct the options of the file, such as queue and account"
+                raise InputError(what, where=where, hint=hint)
             if time.monotonic() > until:
-                raise TimeoutError
+                what = f"no worker has started within {format_duration(limit)}"
+                hint = "see the batch system's queue and logs; 'start_timeout' is the time to wait"
+                raise InputError(what, where=where, hint=hint)
             time.sleep(_START_SECONDS)
             self._look()
         self._watch.start()
@@ -181,7 +197,7 @@ def _result(item: Item, future: Any) -> Result:
 
 @contextlib.contextmanager
 def open_workers(where: str, note: Callable[[str], None]) -> Iterator[DaskRunner]:
-    """Workers for the tasks of a block; see :func:`~mbtf_core.run.runner.open_runner`."""
+    """Workers for the tasks of a block; see :func:`~mbtf_core.run.cluster.open_runner`."""
     found = read_cluster(where)
     address = found if isinstance(found, str) else None
     # Of workers that the user has started, only retries and times are ours.
@@ -222,43 +238,19 @@ def open_workers(where: str, note: Callable[[str], None]) -> Iterator[DaskRunner
             raise InputError(
                 f"cannot be used ({reason(error)})", where=f"--cluster {where}", hint=hint
             ) from None
-        limit = format_duration(config.start_timeout)
         if config.engine != "local" or address is not None:
-            note(f"cluster: waiting for the first worker, at most {limit}")
-        try:
-            cluster.wait()
-        except TimeoutError:
-            hint = "see the batch system's queue and logs; 'start_timeout' is the time to wait"
-            raise InputError(
-                f"no worker has started within {limit}", where=f"--cluster {where}", hint=hint
-            ) from None
-        except ConnectionRefusedError as error:
-            hint = "correct the options of the file, such as queue and account"
-            raise InputError(
-                f"the batch system refuses the jobs ({error})", where=f"--cluster {where}", hint=hint
-            ) from None
-        note(_describe(address or config.engine, client, cluster))
+            note(f"cluster: waiting for the first worker, at most {format_duration(config.start_timeout)}")
+        cluster.wait(f"--cluster {where}")
+        name, count = address or config.engine, f"{cluster.workers} worker{'s' * (cluster.workers != 1)}"
+        note(f"cluster: {name}, {count}{' so far' * (name != 'local')}")
         yield cluster
 
 
-def _describe(name: str, client: Any, cluster: DaskRunner) -> str:
-    """What a command says of its workers."""
-    text = f"cluster: {name}, {cluster.workers} worker{'s' * (cluster.workers != 1)} so far"
-    if name == "local":
-        text = text.removesuffix(" so far")
-    try:
-        import bokeh  # noqa: F401
-    except ImportError:
-        return text
-    return f"{text}, dashboard {client.dashboard_link}"
-
-
 def _started(config: ClusterConfig, refused: list[str]) -> Any:
-    """A Dask cluster, which ends its workers when its block ends; `refused` gets the reasons why jobs cannot
-    be submitted."""
+    """A Dask cluster, which ends its workers when its block ends."""
     environment = {THREADS_VARIABLE: str(config.threads), "OMP_NUM_THREADS": str(config.threads)}
     if config.engine != "local":
-        return submitted_jobs(config, environment, refused)
+        return _submitted_jobs(config, environment, refused)
     from distributed import LocalCluster
     from distributed.system import MEMORY_LIMIT
 
@@ -277,3 +269,74 @@ def _started(config: ClusterConfig, refused: list[str]) -> Any:
         silence_logs=logging.CRITICAL,
         **config.options,
     )
+
+
+@contextlib.contextmanager
+def _submitted_jobs(
+    config: ClusterConfig, environment: Mapping[str, str], refused: list[str]
+) -> Iterator[Any]:
+    """Workers as jobs of a batch system, canceled when the block ends; `refused` gets the reasons why jobs
+    cannot be submitted."""
+    handler = signal.getsignal(signal.SIGINT)
+    import dask_jobqueue
+
+    # Its import lets Ctrl-C end the program as if all were done.
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, handler)
+
+    name, command = _SYSTEMS[config.engine]
+    if shutil.which(command) is None:
+        raise OSError(f"this machine has no command {command}")
+    hours, rest = divmod(int(config.walltime), 3600)
+    # One task at a time, which has the threads.
+    extra = ["--nthreads", "1", "--preload", PRELOAD]
+    if config.gpus:
+        extra += ["--resources", f"GPU={config.gpus}"]
+    # Workers end before the batch system ends them, one after the other.
+    extra += ["--lifetime", f"{max(60, int(0.9 * config.walltime))}s", "--lifetime-stagger", "60s"]
+    memory = {f"DASK_DISTRIBUTED__WORKER__MEMORY__{key.upper()}": str(v) for key, v in MEMORY.items()}
+    own = dict(config.options)
+    exports = [f"export {key}={value}" for key, value in {**environment, **memory}.items()]
+    options: dict[str, Any] = {
+        "cores": config.threads,
+        "processes": 1,
+        "memory": f"{int(config.memory or 2e9 * config.threads)}B",
+        "walltime": f"{hours:02d}:{rest // 60:02d}:{rest % 60:02d}",
+        # What a site needs comes on top.
+        "worker_extra_args": [*extra, *own.pop("worker_extra_args", [])],
+        "job_script_prologue": [*own.pop("job_script_prologue", []), *exports],
+        "log_directory": "worker-logs",
+        **own,
+    }
+    system = getattr(dask_jobqueue, name)
+    try:
+        cluster = system(job_cls=_reporting(system.job_cls, refused), **options)
+    except (TypeError, ValueError) as error:
+        # Its text goes on with all the options.
+        unknown = re.search(r"unexpected keyword argument '(\w+)'", str(error))
+        if unknown is None:
+            raise
+        raise ValueError(f"options: {name} has no option '{unknown[1]}'") from None
+    try:
+        # Unlike scale(), this replaces workers that have ended.
+        cluster.adapt(minimum=config.workers, maximum=config.workers)
+        yield cluster
+    finally:
+        # Jobs that were never submitted cannot be closed.
+        with contextlib.suppress(Exception):
+            cluster.close()
+
+
+def _reporting(job: Any, refused: list[str]) -> Any:
+    """A class of jobs that also reports why one cannot be submitted."""
+
+    class Reporting(job):
+        async def start(self) -> None:
+            try:
+                await super().start()
+            except Exception as error:
+                # dask-jobqueue appends what the command has printed.
+                refused.append(reason(str(error).rpartition("stderr:")[2], 300))
+                raise
+
+    return Reporting

@@ -1,7 +1,7 @@
 """Diagnosis of the machine: each part is used in a child process, and each failure comes with a hint.
 
 A part fails by aborting or hanging as often as by an exception, therefore in a child process
-(:mod:`mbtf_core.run.child`).
+(:mod:`mbtf_core.run.processes`).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from mbtf_core.errors import EXIT_BAD_INPUT, EXIT_OK, EngineError
-from mbtf_core.run.child import run_child
+from mbtf_core.run.processes import run_child
 from mbtf_gen.engine.llvm import CACHE_VARIABLE, chosen_llvm, shipped_llvm, use_shipped_llvm
 from mbtf_gen.engine.runtime import CPU_VARIANT, CUDA_VARIANT, check_llvm, load_mitsuba, prove
 

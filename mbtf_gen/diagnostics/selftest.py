@@ -371,7 +371,7 @@ def _lost(round_number: int) -> Cases:
 
 def _cuda(round_number: int) -> Cases | None:
     """In a child process, because a driver may abort it. None without a device."""
-    from mbtf_core.run.child import run_child
+    from mbtf_core.run.processes import run_child
 
     if prove(CUDA_VARIANT).fault:
         return None

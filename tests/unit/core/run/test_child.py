@@ -6,7 +6,7 @@ import subprocess
 
 import pytest
 
-from mbtf_core.run.child import run_child
+from mbtf_core.run.processes import run_child
 
 
 @pytest.mark.parametrize(
@@ -39,7 +39,7 @@ def test_an_interrupted_parent_leaves_no_child(monkeypatch: pytest.MonkeyPatch) 
         def stdin(self, pipe):  # type: ignore[no-untyped-def]
             self.pipe = pipe
 
-    monkeypatch.setattr("mbtf_core.run.child.subprocess.Popen", Interrupted)
+    monkeypatch.setattr("mbtf_core.run.processes.subprocess.Popen", Interrupted)
     with pytest.raises(KeyboardInterrupt):
         run_child("support.children", "hang", timeout=60)
     assert started[0].poll() is not None

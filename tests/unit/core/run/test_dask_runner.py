@@ -16,10 +16,9 @@ from support import run_tasks
 
 from mbtf_core.errors import InputError, PartialError, UsageError
 from mbtf_core.run import dask_runner, task
-from mbtf_core.run.cluster import open_runner
+from mbtf_core.run.cluster import ClusterConfig, open_runner
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item, packed, run_task
-from mbtf_core.run.workers import ClusterConfig
 
 
 @pytest.fixture(scope="module")

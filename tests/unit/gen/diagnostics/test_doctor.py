@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from mbtf_core.run.child import ChildResult
+from mbtf_core.run.processes import ChildResult
 from mbtf_gen.diagnostics import doctor
 from mbtf_gen.diagnostics.doctor import Part
 from mbtf_gen.engine import llvm
