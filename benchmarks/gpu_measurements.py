@@ -178,7 +178,7 @@ def train(device: str, model: str, sizes: str, shards: str, out: str) -> Answers
 def picture(sizes: Sizes) -> Queries:
     """Queries of a perspective picture of the plane."""
     from mbtf_core.directions import from_angles
-    from mbtf_core.pictures.camera import Camera
+    from mbtf_core.pictures import Camera
 
     camera = Camera(elevation=45, tiles_across=4.0, rows=sizes.rows, columns=sizes.columns)
     return camera.queries(from_angles(40, 30)).flat()

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.color import auto_exposure, brightness, white_of
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.directions import ELEVATION_BANDS
 from mbtf_core.errors import InputError
-from mbtf_core.exposure import auto_exposure, brightness, white_of
 from mbtf_core.stats import (
     Estimate,
     by_group,
@@ -77,7 +77,7 @@ class SplitErrors:
     elevations : dict
         (lower, upper) edge of the smaller cosine of light and view → errors.
     exposure : float
-        Exposure in EV that displays the values, see :mod:`mbtf_core.exposure`.
+        Exposure in EV that displays the values, see :mod:`mbtf_core.color`.
     includes_noise : bool
         Whether the errors include the noise of the data, which have a single value per query.
     """

@@ -8,8 +8,7 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field
 
-from mbtf_core.config.nested import deep_merge
-from mbtf_core.config.settings import Settings, build
+from mbtf_core.config.settings import Settings, build, deep_merge
 from mbtf_pipeline.compare.st_lpips import weights_file
 from mbtf_pipeline.recipe import Name, Recipe
 

@@ -20,11 +20,10 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from mbtf_core.app.options import Quality
-from mbtf_core.config.nested import deep_merge
+from mbtf_core.config.settings import deep_merge
 from mbtf_core.data.shard_files import row_bytes
 from mbtf_core.errors import InputError, UsageError
-from mbtf_core.files.atomic import read_json, write_json
-from mbtf_core.files.digest import data_sha256
+from mbtf_core.files.atomic import data_sha256, read_json, write_json
 from mbtf_core.files.folders import check_space, owned
 from mbtf_core.units import clock, format_duration
 from mbtf_fit.config import FitConfig

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from mbtf_core.data.schema import ARRAY, ARRAYS
 from mbtf_core.errors import InputError, reason
 from mbtf_core.files.atomic import Stored, write_chunks
-from mbtf_core.suggest import refuse_special
+from mbtf_core.paths import refuse_special
 
 Arrays = dict[str, NDArray[np.float32]]
 

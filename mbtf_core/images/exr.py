@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError, reason, unwritable
 from mbtf_core.files.atomic import Stored, write_through
-from mbtf_core.suggest import suggest_name
+from mbtf_core.paths import suggest_name
 
 # Limit of the numbers in all channels of all parts, in multiples of the largest image.
 _MOST_CHANNELS = 4

@@ -7,11 +7,12 @@ maps are sRGB; no color space is applied here.
 from __future__ import annotations
 
 import contextlib
+import logging
 import warnings as python_warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +20,7 @@ from numpy.typing import NDArray
 from mbtf_core.errors import InputError, reason
 from mbtf_core.images.exr import check_floats, choose_channels, read_channels, silenced
 from mbtf_core.images.metadata import NO_TAGS, Tags, tags_of
-from mbtf_core.images.tiff import read_tiff
-from mbtf_core.suggest import refuse_special, suggest_path
+from mbtf_core.paths import refuse_special, suggest_path
 
 # Largest image that is allocated (11 585² pixels), whatever size a header claims.
 MAX_PIXELS = 2**27
@@ -53,6 +53,9 @@ _MAGIC = {
     b"MM\x00+": "TIFF",
     b"\x93NUMPY": "NPY",
 }
+# Photometric interpretations of TIFF that are read as stored.
+_GRAY, _RGB = 1, 2
+_SHORT = "cannot be read as a TIFF image (file ends early)"
 # Channels of PNG color types of more than one channel.
 _PNG_COLORS = {2: 3, 4: 2, 6: 4}
 SUFFIXES = tuple(_KINDS)
@@ -226,7 +229,7 @@ def _from_pillow(path: Path, kind: str) -> Image:
 
     codes: NDArray[Any] | None = None
     if kind != "JPEG":
-        codes = _deep_png(path) if kind == "PNG" else read_tiff(path, _check_size)
+        codes = _deep_png(path) if kind == "PNG" else _read_tiff(path)
     if codes is not None:
         return replace(_decoded(codes, path), tags=_tags(path, kind))
     try:
@@ -265,6 +268,50 @@ def _deep_png(path: Path) -> NDArray[np.uint16] | None:
         raise InputError(f"cannot be read as a PNG image ({reason(error)})", where=path) from None
     # The decoder turns a transparent color into an alpha channel, which is left out.
     return np.ascontiguousarray(codes.reshape(rows, columns, -1)[..., :channels])
+
+
+def _read_tiff(path: Path) -> NDArray[Any] | None:
+    """The first image of a TIFF file, (H, W, C), C = 1..4, as stored: uint8, uint16 or floats, however
+    compressed. None for kinds that Pillow reads: palettes, single bits, inverted gray, YCbCr."""
+    import tifffile
+
+    # The library logs faults that its exception already reports.
+    logging.getLogger("tifffile").setLevel(logging.CRITICAL)
+    try:
+        with tifffile.TiffFile(path) as file:
+            page: Any = file.pages[0]
+            rows, columns = int(page.imagelength), int(page.imagewidth)
+            _check_size(rows, columns, path)
+            channels = int(page.samplesperpixel)
+            if page.photometric not in (_GRAY, _RGB) or page.dtype is None:
+                return None
+            if page.bitspersample != 8 * page.dtype.itemsize:
+                return None if page.bitspersample < 8 else _refuse(f"{page.bitspersample}-bit", path)
+            if page.dtype.kind == "f" or page.dtype in (np.uint8, np.uint16):
+                if not 1 <= channels <= 4 or page.imagedepth != 1:
+                    raise InputError(f"has {channels} channels; 1 to 4 are expected", where=path)
+                # Missing strips or tiles of a truncated file would be read as zeros.
+                ends = (o + n for o, n in zip(page.dataoffsets, page.databytecounts, strict=True))
+                if not page.is_contiguous and any(end > path.stat().st_size for end in ends):
+                    raise InputError(_SHORT, where=path)
+                array = page.asarray(maxworkers=1)
+            elif page.dtype.kind in "ui" and page.dtype.itemsize > 1:
+                _refuse(page.dtype.name, path)
+            else:
+                return None
+    except InputError:
+        raise
+    except Exception as error:  # a damaged file may make the decoder raise anything
+        raise InputError(f"cannot be read as a TIFF image ({reason(error)})", where=path) from None
+    if page.planarconfig == 2 and channels > 1:
+        array = np.moveaxis(array.reshape(channels, rows, columns), 0, -1)
+    if array.size != rows * columns * channels:
+        raise InputError(_SHORT, where=path)
+    return array.reshape(rows, columns, channels)
+
+
+def _refuse(kind: str, path: Path) -> NoReturn:
+    raise InputError(f"contains {kind} numbers", where=path, hint="save it as 8 or 16 bits or as floats")
 
 
 def _tags(path: Path, kind: str) -> Tags:

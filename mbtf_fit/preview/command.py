@@ -36,9 +36,9 @@ def draw(
     UsageError : a view shows the horizon
     EngineError : MP4 is asked for, and there is no ffmpeg
     """
-    from mbtf_core.exposure import describe_exposure, to_display
+    from mbtf_core.color import describe_exposure, to_display
     from mbtf_core.files.folders import check_space
-    from mbtf_core.pictures.reference import PNG_BYTES, claim_pictures, write_png
+    from mbtf_core.pictures import PNG_BYTES, claim_pictures, write_png
     from mbtf_fit.backends.mitsuba import load_scene
     from mbtf_fit.material.format import read_description
     from mbtf_fit.preview.animation import find_encoder, write_gif, write_mp4

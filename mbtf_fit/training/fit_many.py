@@ -10,9 +10,9 @@ from typing import Any
 
 from mbtf_core.data.dataset import is_dataset
 from mbtf_core.errors import InputError, UsageError, reason
+from mbtf_core.paths import refuse_special
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item
-from mbtf_core.suggest import refuse_special
 from mbtf_fit.config import FitConfig
 
 

@@ -14,7 +14,7 @@ import torch
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.errors import InputError
-from mbtf_core.files.digest import data_sha256
+from mbtf_core.files.atomic import data_sha256
 from mbtf_core.files.folders import owned
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import Partition, load_training, open_data

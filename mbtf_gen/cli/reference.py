@@ -39,12 +39,11 @@ def reference(
         Height map, folder of maps, material.yaml, mesh, or file of yarns or fibers.
     """
     resolved = resolve_config(options, material)
+    from mbtf_core.color import auto_exposure, brightness, describe_exposure
     from mbtf_core.data.shard_files import row_bytes
     from mbtf_core.directions import from_angles
-    from mbtf_core.exposure import auto_exposure, brightness, describe_exposure
     from mbtf_core.files.folders import check_space, owned
-    from mbtf_core.pictures.camera import Camera, PixelKind
-    from mbtf_core.pictures.reference import PNG_BYTES, claim_pictures, read_value, write_display
+    from mbtf_core.pictures import PNG_BYTES, Camera, PixelKind, claim_pictures, read_value, write_display
     from mbtf_core.run.cluster import open_runner
     from mbtf_core.run.task import Item
     from mbtf_core.stats import pooled_relative_error

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mbtf_core.data.lattice import MAX_LEVEL, Lattice, level_of_sigma, sigma_of_level
 from mbtf_core.data.schema import SPLITS, ShardEntry, Split
 from mbtf_core.errors import InputError
-from mbtf_core.files.digest import data_sha256, file_sha256
+from mbtf_core.files.atomic import data_sha256, file_sha256
 from mbtf_gen.config.generator import count_queries
 from mbtf_gen.config.measured import ImportConfig
 from mbtf_gen.measured.interface import MeasuredBtf, MeasuredQueries, QueryBlock

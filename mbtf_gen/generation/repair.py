@@ -13,7 +13,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from mbtf_core.config.nested import differences, in_short
+from mbtf_core.config.settings import differences, in_short
 from mbtf_core.config.yaml_file import dump_yaml, read_yaml
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.documents import plan_digest

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError, MbtfError, reason
-from mbtf_core.suggest import refuse_special, suggest_path
+from mbtf_core.paths import refuse_special, suggest_path
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
 # Largest chunk, which is the least that the library decompresses at a time.

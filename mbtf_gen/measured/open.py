@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from mbtf_core.errors import InputError
-from mbtf_core.suggest import refuse_special, suggest_path
+from mbtf_core.paths import refuse_special, suggest_path
 from mbtf_gen.measured.hdf5 import MAGIC as HDF5
 from mbtf_gen.measured.hdf5 import names_of, opened
 from mbtf_gen.measured.interface import MeasuredBtf, MeasuredQueries

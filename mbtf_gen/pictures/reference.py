@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.data.schema import Queries
-from mbtf_core.pictures.camera import PIXEL_SIGMA, Camera, PixelKind
-from mbtf_core.pictures.reference import ReferenceImage
+from mbtf_core.pictures import PIXEL_SIGMA, Camera, PixelKind, ReferenceImage
 
 if TYPE_CHECKING:
     from mbtf_gen.render.estimator import Estimator
@@ -95,7 +94,7 @@ def render_reference(
     omega_i : (3,) float array
         Direction towards the light.
     kind : {"query", "pixel"}
-        Meaning of a pixel, see :mod:`mbtf_core.pictures.camera`.
+        Meaning of a pixel, see :mod:`mbtf_core.pictures`.
     spp : int
         Paths per pixel, both halves together; even.
     seed, index : int

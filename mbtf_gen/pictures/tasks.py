@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.pictures.camera import Camera, PixelKind
-from mbtf_core.pictures.reference import ReferenceImage
+from mbtf_core.pictures import Camera, PixelKind, ReferenceImage
 from mbtf_gen.job import Job
 from mbtf_gen.pictures.reference import render_reference
 from mbtf_gen.planning.effects_planner import reference_plan

@@ -9,7 +9,7 @@ from typing import Any
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.errors import InputError
-from mbtf_core.files.digest import file_sha256
+from mbtf_core.files.atomic import file_sha256
 from mbtf_gen.tile.loading import described, load_material
 
 MATERIAL_FILE = "material.yaml"

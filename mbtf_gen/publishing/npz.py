@@ -11,8 +11,7 @@ from typing import Any
 
 from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.data.schema import CONFIG_NAME, MANIFEST_NAME
-from mbtf_core.files.atomic import Stored, checksummed, sync_folder, temporary_of, write_chunks
-from mbtf_core.files.digest import file_sha256
+from mbtf_core.files.atomic import Stored, checksummed, file_sha256, sync_folder, temporary_of, write_chunks
 
 _CHUNK = 1 << 20
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import product
 from typing import Any
 
-from mbtf_core.config.nested import nested
+from mbtf_core.config.settings import nested
 from mbtf_fit.config import DEFAULT_MODEL
 from mbtf_fit.presets import best_options
 from mbtf_pipeline.cost.repeats import FEWEST_SEEDS

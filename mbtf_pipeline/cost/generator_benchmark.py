@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.config.nested import deep_merge, nested
+from mbtf_core.config.settings import deep_merge, nested
 from mbtf_core.data.schema import Queries
 from mbtf_core.forecast import median_estimate
 from mbtf_core.stats import Estimate, mean_estimate

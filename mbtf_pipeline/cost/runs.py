@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mbtf_core.errors import InputError
-from mbtf_core.files.digest import data_sha256
+from mbtf_core.files.atomic import data_sha256
 from mbtf_core.stats import Estimate, unexplained_variance
 from mbtf_core.units import parse_duration
 from mbtf_gen.config.generator import GeneratorConfig

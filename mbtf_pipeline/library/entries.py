@@ -11,8 +11,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from mbtf_core.config.nested import deep_merge
-from mbtf_core.config.settings import FileName, Settings, build, resolve
+from mbtf_core.config.settings import FileName, Settings, build, deep_merge, resolve
 from mbtf_core.config.yaml_file import read_yaml
 from mbtf_core.errors import InputError, MbtfError, UsageError
 from mbtf_core.units import Duration

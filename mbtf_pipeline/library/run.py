@@ -10,8 +10,7 @@ from typing import Any
 
 from mbtf_core.app.console import Console
 from mbtf_core.errors import InputError, MbtfError, printable
-from mbtf_core.files.atomic import write_text
-from mbtf_core.files.digest import data_sha256
+from mbtf_core.files.atomic import data_sha256, write_text
 from mbtf_core.files.folders import OutputKind, owned
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item, Result

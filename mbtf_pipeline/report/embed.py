@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.exposure import to_display, white_of
+from mbtf_core.color import to_display, white_of
 from mbtf_pipeline.report.error_maps import Palette, indices, palette
 
 U8 = NDArray[np.uint8]

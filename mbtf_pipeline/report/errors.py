@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from statistics import median_high
 from typing import Any
 
-from mbtf_core.exposure import describe_exposure
+from mbtf_core.color import describe_exposure
 from mbtf_fit.formatting import SPLIT_NAMES
 from mbtf_pipeline.compare.perceptual_metrics import available_metrics
 from mbtf_pipeline.number_text import data_errors, decibel, estimate, estimate_text, short_direction

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from mbtf_core.color import describe_exposure
 from mbtf_core.config.settings import check_schema
-from mbtf_core.exposure import describe_exposure
 from mbtf_core.files.atomic import read_json, write_text
 from mbtf_pipeline.compare.compare import COMPARISON_NAME, COMPARISON_SCHEMA
 from mbtf_pipeline.number_text import NOT_SIGNIFICANT

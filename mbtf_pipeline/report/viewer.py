@@ -10,7 +10,7 @@ from typing import Any
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import read_json, write_text
-from mbtf_core.pictures.camera import Camera
+from mbtf_core.pictures import Camera
 from mbtf_fit.viewer.content import material_content
 from mbtf_fit.viewer.extras import picture_content, tiles_text
 from mbtf_fit.viewer.page import write_page

@@ -31,7 +31,7 @@ APPS: dict[str, App] = {
 CANDIDATES = ("no-such-value", "1.5.5", "-1e300", "1e300", "nan", "{no: such}")
 # Modules of configurations that the commands load when they run.
 MODULES = (
-    "mbtf_core.run.cluster",
+    "mbtf_core.run.workers",
     "mbtf_gen.tile.fibers.cloth_file",
     "mbtf_gen.tile.maps.material_file",
     "mbtf_gen.tile.mesh_file",

@@ -15,7 +15,7 @@ from mbtf_core.color import srgb_to_linear
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.lattice import level_of_sigma
 from mbtf_core.directions import from_angles
-from mbtf_core.pictures.camera import tiles_camera
+from mbtf_core.pictures import tiles_camera
 from mbtf_gen.pictures.preview.mesh import draw, tiled_mesh
 from mbtf_gen.tile.loading import load_material
 

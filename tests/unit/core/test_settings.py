@@ -8,8 +8,7 @@ from typing import Annotated, Any, Literal
 import pytest
 from pydantic import Field
 
-from mbtf_core.config.nested import differences, in_short
-from mbtf_core.config.settings import Settings, build, resolve
+from mbtf_core.config.settings import Settings, build, differences, in_short, resolve
 from mbtf_core.config.yaml_file import dump_yaml, read_yaml
 from mbtf_core.errors import InputError, UsageError
 

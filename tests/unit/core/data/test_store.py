@@ -14,7 +14,7 @@ from support.object_stores import memory_store
 import mbtf_core.data.store
 from mbtf_core.data.store import ObjectStore
 from mbtf_core.errors import EngineError, InputError, PartialError
-from mbtf_core.urls import split_url
+from mbtf_core.paths import split_url
 
 
 @pytest.fixture

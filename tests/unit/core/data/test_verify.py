@@ -18,7 +18,7 @@ from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.schema import ShardEntry
 from mbtf_core.data.shard_files import Arrays, read_shard, write_shard
 from mbtf_core.data.verify import foreign_files, verify
-from mbtf_core.files.digest import file_sha256
+from mbtf_core.files.atomic import file_sha256
 
 FORMATS = ["npz", "exr"]
 

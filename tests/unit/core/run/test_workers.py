@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from mbtf_core.errors import InputError, UsageError
-from mbtf_core.run.cluster import local_config, read_cluster
+from mbtf_core.run.workers import local_config, read_cluster
 
 
 def test_local_workers_share_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,7 @@ from support.datasets import write_dataset
 from mbtf_core.data.lattice import level_of_sigma, texel_centers
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import EngineError, InputError
-from mbtf_core.pictures.camera import Camera, tiles_camera
+from mbtf_core.pictures import Camera, tiles_camera
 from mbtf_core.run.processes import run_child
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
