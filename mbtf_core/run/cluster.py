@@ -203,8 +203,8 @@ def open_runner(
 
     Parameters
     ----------
-    where : ``local``, ``local:4``, a YAML file of :class:`~mbtf_core.run.workers.ClusterConfig`, or the address of a scheduler; None
-        for `otherwise`
+    where : ``local``, ``local:4``, a YAML file of :class:`~mbtf_core.run.workers.ClusterConfig`, or the
+        address of a scheduler; None for `otherwise`
     note : receives lines for the user
     otherwise : this process by default
 

@@ -52,7 +52,7 @@ def local_config(workers: int | None = None) -> ClusterConfig:
 
 
 def read_cluster(where: str) -> ClusterConfig | str:
-    """Meaning of ``--cluster``, see :func:`~mbtf_core.run.cluster.open_runner`: a configuration, or the address of a scheduler.
+    """Meaning of ``--cluster``: a configuration, or the address of a scheduler.
 
     Raises
     ------

@@ -125,17 +125,6 @@ def test_unexplained_variance() -> None:
     assert_honest(experiment, 0.16)
 
 
-def test_unexplained_variance_of_images_has_an_error_bar_by_image() -> None:
-    def experiment(rng: np.random.Generator) -> Estimate:
-        truth, a, b = draw(rng, (200, 2, 2, 3))
-        return unexplained_variance(
-            np.array([1.0, 2.0, 3.0]) + 0.0 * truth + rng.normal(size=(200, 1, 1, 1)), a, b
-        )
-
-    _, deviations = normalized_deviations(experiment, 1.0 + 1.0 / SIGNAL)
-    assert abs(deviations.std(ddof=1) - 1.0) < 0.2
-
-
 def test_mse_difference_is_sharper_than_two_errors() -> None:
     """The paired difference detects an improvement that two separate error bars hide."""
 

@@ -8,7 +8,6 @@ import logging
 import math
 import re
 import sys
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,6 @@ from cyclopts import App
 
 from mbtf_core.app.console import CONSOLE, Console, new_app, run
 from mbtf_core.errors import EngineError, InputError, MbtfError, PartialError, UsageError
-from mbtf_core.units import clock
 
 
 @pytest.fixture
@@ -106,27 +104,6 @@ def test_json_is_one_object_on_failure(
     assert json.loads(capsys.readouterr().out) == {"done": 1}
     assert run(app, []) == code
     assert capsys.readouterr().out == ""
-
-
-def test_json_is_one_object_on_wrong_usage(app: App, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(app, ["plan", "a", "--dpth", "2", "--json"]) == 2
-    assert json.loads(capsys.readouterr().out)["exit_code"] == 2
-
-
-def test_raw_warnings_of_libraries_are_hidden_unless_debugging(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    app = new_app("prog", "A program.")
-
-    @app.default
-    def divide(console: Console = CONSOLE) -> None:
-        np.log(np.zeros(1))
-
-    monkeypatch.setattr(sys, "warnoptions", [])
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert run(app, []) == 0
-        assert run(app, ["--debug"]) == 1
 
 
 def test_json_takes_arrays_paths_and_missing_numbers(capsys: pytest.CaptureFixture[str]) -> None:
@@ -286,15 +263,6 @@ def test_progress_of_percentages_unknown_totals_and_nothing(capsys: pytest.Captu
     assert capsys.readouterr().err == ""
 
 
-def test_quiet_shows_nothing(capsys: pytest.CaptureFixture[str]) -> None:
-    console = Console(quiet=True)
-    console.note("started")
-    with console.progress(2, "rendering") as bar:
-        bar.advance(2)
-    assert bar.done == 2
-    assert capsys.readouterr() == ("", "")
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="no pseudo-terminals")
 @pytest.mark.parametrize("columns", [60, 80, 100])
 def test_progress_on_a_terminal_is_a_bar(columns: int) -> None:
@@ -331,21 +299,3 @@ def test_help_and_version_answer(app: App, capsys: pytest.CaptureFixture[str]) -
     assert all(word in text for word in ("plan", "doctor", "--queries", "--json", "--debug"))
     assert run(app, ["--version"]) == 0
     assert re.fullmatch(r"prog \d+\.\d+\.\d+\S*\n", capsys.readouterr().out)
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"), [(0.2, "0:00"), (59.6, "1:00"), (723, "12:03"), (3723, "1:02:03")]
-)
-def test_clock(seconds: float, text: str) -> None:
-    assert clock(seconds) == text
-
-
-def test_json_takes_names_that_are_no_text(capsys: pytest.CaptureFixture[str]) -> None:
-    app = new_app("prog", "A program.")
-
-    @app.default
-    def show(console: Console = CONSOLE) -> None:
-        console.report({"file": Path("x\udcff")}, "x")
-
-    assert run(app, ["--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == {"file": "x?"}

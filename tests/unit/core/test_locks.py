@@ -54,14 +54,6 @@ def test_a_lock_is_exclusive_names_its_writer_and_is_removed(shard: Path) -> Non
     assert not lock_of(shard).exists()
 
 
-def test_an_error_inside_releases_the_lock(shard: Path) -> None:
-    with pytest.raises(RuntimeError, match="boom"), shard_lock(shard):
-        raise RuntimeError("boom")
-    assert not lock_of(shard).exists()
-    with shard_lock(shard) as held:
-        assert held
-
-
 def hold(shard: Path) -> subprocess.Popen[bytes]:
     """Another process that holds the lock until its standard input ends."""
     code = f"""

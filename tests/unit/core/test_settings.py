@@ -50,10 +50,6 @@ def write(tmp_path: Path) -> Any:
     return write
 
 
-def test_defaults(write: Any) -> None:
-    assert resolve(Whole) == resolve(Whole, file=write("# nothing yet\n")) == Whole()
-
-
 def test_flags_win_over_assignments_over_the_file(write: Any) -> None:
     path = write("height: 0.1\nlevels: 3\nlight:\n  width_deg: 2\n")
     assert resolve(Whole, file=path).height == 0.1
@@ -132,13 +128,6 @@ def test_bad_assignments_are_usage_errors(assignment: str, what: str) -> None:
     assert caught.value.exit_code == 2
 
 
-def test_a_file_at_fault_is_blamed_before_the_flags(write: Any) -> None:
-    path = write("source: a\nssp: 2\n")
-    with pytest.raises(InputError) as caught:
-        resolve(Needy, file=path, flags={"spp": 3})
-    assert caught.value.where == f"{path}:2"
-
-
 def test_required_keys_may_come_from_flags(write: Any) -> None:
     assert resolve(Needy, file=write("spp: 2\n"), flags={"source": "map.exr"}) == Needy(
         source="map.exr", spp=2
@@ -166,12 +155,6 @@ def test_missing_and_unreadable_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00a: 1")
     with pytest.raises(InputError, match="is not UTF-8 text"):
         read_yaml(tmp_path / "binary.yaml")
-
-
-def test_settings_do_not_change_once_read() -> None:
-    whole = Whole()
-    with pytest.raises(ValueError, match="frozen"):
-        whole.height = 2.0  # type: ignore[misc]
 
 
 def test_what_is_dumped_reads_back(tmp_path: Path) -> None:

@@ -17,9 +17,10 @@ from support import run_tasks
 from mbtf_core.errors import InputError, PartialError, UsageError
 from mbtf_core.run import cluster as module
 from mbtf_core.run import task
+from mbtf_core.run.cluster import open_runner
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item, packed, run_task
-from mbtf_core.run.workers import ClusterConfig, open_runner
+from mbtf_core.run.workers import ClusterConfig, local_config, read_cluster
 
 
 @pytest.fixture(scope="module")
@@ -120,11 +121,6 @@ def test_other_versions_are_refused() -> None:
     assert "version" in found["hint"]
 
 
-def test_a_working_folder_that_a_worker_does_not_see_is_named() -> None:
-    call, version, _ = packed(run_tasks.fail, Item("x", {"kind": "input"}))
-    assert "working folder /nowhere" in run_task(call, version, "/nowhere")["hint"]
-
-
 def test_without_dask_one_line_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(UsageError, match=r"mbtf\[cluster\]"), open_runner("local", lambda line: None):
@@ -211,15 +207,6 @@ def test_jobs_of_batch_systems(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "-p short" in scripts[0]
 
 
-def test_a_batch_system_that_is_not_there() -> None:
-    pytest.importorskip("dask_jobqueue")
-    with (
-        pytest.raises(OSError, match="no command bsub"),
-        module._started(ClusterConfig(engine="lsf"), []),
-    ):
-        pass
-
-
 def test_unknown_options_of_a_batch_system_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("dask_jobqueue")
     monkeypatch.setattr("shutil.which", lambda command: f"/usr/bin/{command}")
@@ -247,6 +234,30 @@ def test_workers_of_this_machine_divide_its_gpus(monkeypatch: pytest.MonkeyPatch
     assert handlers == {signal.SIGINT: signal.SIG_IGN}
 
 
-def test_threads_outside_of_workers_are_unknown(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv(task.THREADS_VARIABLE, raising=False)
-    assert task.worker_threads() is None
+def test_local_workers_share_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.sched_getaffinity", lambda pid: set(range(16)), raising=False)
+    assert (local_config().workers, local_config().threads) == (4, 4)
+    config = read_cluster("local:8")
+    assert not isinstance(config, str)
+    assert (config.engine, config.workers, config.threads) == ("local", 8, 2)
+    many = read_cluster("local:64")
+    assert not isinstance(many, str)
+    assert many.threads == 1
+
+
+def test_files_and_addresses(tmp_path: Path) -> None:
+    file = tmp_path / "slurm.yaml"
+    file.write_text(
+        "engine: slurm\nworkers: 16\nthreads: 8\nmemory: 16GB\nwalltime: 2h\noptions: {queue: short}\n"
+    )
+    config = read_cluster(str(file))
+    assert not isinstance(config, str)
+    assert (config.engine, config.workers, config.memory, config.walltime) == ("slurm", 16, 16e9, 7200.0)
+    assert config.options == {"queue": "short"}
+    assert read_cluster("tcp://scheduler:8786") == "tcp://scheduler:8786"
+
+
+@pytest.mark.parametrize("where", ["lokal", "local:0", "local:", "local:-1", "http://x", ""])
+def test_other_words_are_refused(where: str) -> None:
+    with pytest.raises(UsageError, match="is no cluster"):
+        read_cluster(where)

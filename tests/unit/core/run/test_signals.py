@@ -103,13 +103,6 @@ def test_a_signal_while_a_command_works(command: str, number: signal.Signals, tm
     assert [path.name for path in (tmp_path / "out").glob("[!.]*")] == ["file"]
 
 
-def test_one_ctrl_c_that_arrives_twice_is_one(tmp_path: Path) -> None:
-    """A terminal signals the program and its wrapper, which signals the program again."""
-    twice = "try: send()\n    except KeyboardInterrupt: os.kill(os.getpid(), 2); print('stored')"
-    done = run_program(signal.SIGINT, tmp_path, "-c", SEND + PROGRAM.replace("BODY", twice))
-    assert (done.returncode, done.stdout) == (130, "stored\n")
-
-
 def test_a_signal_after_the_last_act_changes_nothing(tmp_path: Path) -> None:
     code = f"{SEND}\nfrom mbtf_core.run.signals import *\nhandle_signals()\ncode = finish(4)\nsend()"
     assert run_program(signal.SIGTERM, tmp_path, "-c", code).returncode == 4

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 
 import numpy as np
@@ -45,19 +44,6 @@ from mbtf_core.stats import (
 )
 def test_estimates_print_with_as_many_digits_as_they_know(value: float, error: float, text: str) -> None:
     assert str(Estimate(value, error, 10)) == text
-
-
-def test_estimates_go_into_json() -> None:
-    undefined = json.dumps(Estimate(math.nan, math.inf, 1).as_dict(), allow_nan=False)
-    assert json.loads(undefined) == {"value": None, "error": None, "n": 1}
-    assert Estimate(2.0, 0.1, 5).as_dict() == {"value": 2.0, "error": 0.1, "n": 5}
-
-
-def test_scaled_and_relative() -> None:
-    estimate = Estimate(2.0, 0.1, 50, 7.0).scaled(-3.0)
-    assert estimate == Estimate(-6.0, pytest.approx(0.3), 50, 7.0)
-    assert estimate.relative_error == pytest.approx(0.05)
-    assert Estimate(0.0, 0.1, 5).relative_error == math.inf
 
 
 def test_mean_estimate_by_hand() -> None:
