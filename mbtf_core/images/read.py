@@ -7,19 +7,19 @@ maps are sRGB; no color space is applied here.
 from __future__ import annotations
 
 import contextlib
+import io
 import logging
 import warnings as python_warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, Literal, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError, reason
 from mbtf_core.images.exr import check_floats, choose_channels, read_channels, silenced
-from mbtf_core.images.metadata import NO_TAGS, Tags, tags_of
 from mbtf_core.paths import refuse_special, suggest_path
 
 # Largest image that is allocated (11 585² pixels), whatever size a header claims.
@@ -59,6 +59,32 @@ _SHORT = "cannot be read as a TIFF image (file ends early)"
 # Channels of PNG color types of more than one channel.
 _PNG_COLORS = {2: 3, 4: 2, 6: 4}
 SUFFIXES = tuple(_KINDS)
+
+
+ColorSpace = Literal["srgb", "linear"]
+
+# Stored gammas of the known spaces (sRGB: 1/2.2), and the tolerance of their comparison.
+_GAMMAS: dict[ColorSpace, float] = {"srgb": 0.45455, "linear": 1.0}
+_SLACK = 0.005
+
+
+@dataclass(frozen=True)
+class Tags:
+    """Metadata of an image file.
+
+    Attributes
+    ----------
+    space : declared color space, if supported
+    foreign : unsupported declaration, such as ``color profile 'Display P3'``
+    orientation : of EXIF; 1 is upright
+    """
+
+    space: ColorSpace | None = None
+    foreign: str | None = None
+    orientation: int = 1
+
+
+NO_TAGS = Tags()
 
 
 @dataclass(frozen=True)
@@ -238,7 +264,7 @@ def _from_pillow(path: Path, kind: str) -> Image:
             with Pillow.open(path, formats=[kind]) as picture:
                 _check_size(picture.height, picture.width, path)
                 picture.load()
-                return replace(_from_picture(picture, path), tags=tags_of(picture.info, picture.getexif()))
+                return replace(_from_picture(picture, path), tags=_tags_of(picture.info, picture.getexif()))
     except Pillow.DecompressionBombError:
         raise InputError(f"claims more than {MAX_PIXELS:,} pixels", where=path) from None
     except InputError:
@@ -322,7 +348,7 @@ def _tags(path: Path, kind: str) -> Tags:
         with python_warnings.catch_warnings(), silenced():
             python_warnings.simplefilter("ignore")
             with Pillow.open(path, formats=[kind]) as picture:
-                return tags_of(picture.info, picture.getexif())
+                return _tags_of(picture.info, picture.getexif())
     except Exception:  # what the library does not know may make it raise anything
         return NO_TAGS
 
@@ -367,3 +393,40 @@ def gray(image: Image) -> tuple[NDArray[np.float64], list[str]]:
             f"{image.path}: is colored where one number per pixel is expected; its luminance is used"
         )
     return rgb.astype(np.float64) @ np.asarray(LUMINANCE), warnings
+
+
+def _tags_of(info: Mapping[Any, Any], exif: Mapping[int, Any]) -> Tags:
+    """Tags from the metadata that Pillow read.
+
+    The profile takes precedence over the ``sRGB`` chunk, and that over ``gAMA`` (PNG specification, third
+    edition, 4.3). A gamma of 1 means linear, 1/2.2 sRGB; a profile whose description names sRGB means sRGB.
+    Other profiles and gammas are reported, not applied.
+    """
+    from PIL import ExifTags
+
+    orientation = exif.get(ExifTags.Base.Orientation, 1)
+    turned = orientation if orientation in range(1, 9) else 1
+    space: ColorSpace | None = None
+    foreign = None
+    gamma = info.get("gamma")
+    if info.get("icc_profile"):
+        name = _profile_name(info["icc_profile"])
+        space, foreign = ("srgb", None) if "srgb" in name.lower() else (None, f"color profile '{name}'")
+    elif "srgb" in info:
+        space = "srgb"
+    elif isinstance(gamma, float) and gamma > 0:
+        space = next((s for s, g in _GAMMAS.items() if abs(gamma - g) < _SLACK), None)
+        foreign = None if space else f"gamma of {gamma:g}"
+    return Tags(space, foreign, turned)
+
+
+def _profile_name(profile: bytes) -> str:
+    """Description of an ICC profile, one line."""
+    from PIL import ImageCms
+
+    try:
+        text = ImageCms.getProfileDescription(ImageCms.ImageCmsProfile(io.BytesIO(profile)))
+    except Exception:  # a damaged profile may make the library raise anything
+        return "unreadable"
+    printable = "".join(c for c in " ".join(text.split()) if c.isprintable())
+    return printable[:60] or "without a name"
