@@ -60,8 +60,8 @@ def read_channels(path: Path, max_pixels: int) -> dict[str, NDArray[Any]]:
 
     Raises
     ------
-    InputError : the file is damaged, larger than `max_pixels`, deep, subsampled or cropped (data window unlike
-        the display window), or two channels have one name
+    InputError : the file is damaged, larger than `max_pixels`, deep, subsampled or cropped (data window
+        unlike the display window), or two channels have one name
     """
     parts = _read(path, max_pixels)
     if len(parts) == 1:

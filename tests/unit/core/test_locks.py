@@ -146,7 +146,7 @@ def test_lock_owners_are_named(shard: Path) -> None:
     assert lock_owner(shard) is None
     since = time.time() - 7300
     plant(shard, json.dumps({"host": "oak", "process": 12, "since": since}))
-    assert str(lock_owner(shard)) == "process 12 on oak, for 2 h"
+    assert lock_owner(shard) == "process 12 on oak, for 2 h"
     for text in ("", "{", '{"host": "oak"}', '{"host": "oak", "process": "x", "since": 0}'):
         plant(shard, text)
         assert lock_owner(shard) is None
