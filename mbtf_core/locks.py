@@ -52,7 +52,7 @@ def lock_file_of(path: Path) -> Path:
 
 
 def lock_owner(path: Path) -> str | None:
-    """Current or last owner of the lock of `path` by its file: ``process 7 on oak, for 2 h``; None if unknown."""
+    """Current or last owner of the lock of `path`, such as ``process 7 on oak, for 2 h``; None if unknown."""
     try:
         data = json.loads(lock_file_of(path).read_bytes()[:4096])
         age = _age(time.time() - float(data["since"]))
