@@ -68,20 +68,6 @@ def test_variances_of_noise_and_signal(estimator: Callable[[Floats, Floats], Est
     assert_honest(lambda rng: estimator(*draw(rng)[1:]), truth)
 
 
-@pytest.mark.parametrize(
-    ("wrong", "truth"),
-    [
-        # ``(a-b)²/2``, the variance of one half, is not that of the mean.
-        (lambda t, a, b: pooled_variance(np.sqrt(2.0) * a, np.sqrt(2.0) * b), VARIANCE),
-        # Squaring the distance to the mean of the halves adds the noise.
-        (lambda t, a, b: noise_free_mse(t, (a + b) / 2.0, (a + b) / 2.0), 0.0),
-    ],
-)
-def test_the_same_check_refuses_wrong_estimates(wrong: Callable[..., Estimate], truth: float) -> None:
-    with pytest.raises(AssertionError):
-        assert_honest(lambda rng: wrong(*draw(rng)), truth)
-
-
 def test_noise_free_mse() -> None:
     def experiment(rng: np.random.Generator) -> Estimate:
         truth, a, b = draw(rng)

@@ -101,13 +101,6 @@ def test_workers_that_die_each_time_are_reported(cluster: Runner) -> None:
     assert after.value == 2
 
 
-def test_workers_state_their_threads(cluster: Runner) -> None:
-    (done,) = cluster.map(run_tasks.threads, [Item("threads")])
-    stated, environment = done.value
-    assert stated is not None
-    assert environment == str(stated)
-
-
 def test_tasks_for_gpus_run_where_none_is_stated(cluster: Runner) -> None:
     (done,) = cluster.map(run_tasks.double, [Item("gpu", {"x": 3}, gpu=True)])
     assert done.value == 6

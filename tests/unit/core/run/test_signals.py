@@ -153,20 +153,6 @@ def test_a_reader_that_has_gone_is_no_error(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (4, b"")
 
 
-@pytest.mark.parametrize("closed", ["stdout", "stderr"])
-def test_a_closed_stream_is_no_error(closed: str, tmp_path: Path) -> None:
-    code = "import sys\nfrom mbtf_core.run import signals as i\ni.handle_signals()\n"
-    code += "from mbtf_core.app.console import new_app, run\napp = new_app('prog', 'A program.')\n"
-    code += "app.default(lambda: print('result'))\nsys.exit(i.finish(run(app, [])))"
-    number = {"stdout": 1, "stderr": 2}[closed]
-    shell = f'exec "$0" -c "$1" {number}>&-'
-    done = subprocess.run(
-        ["sh", "-c", shell, sys.executable, code], capture_output=True, timeout=15, check=False
-    )
-    assert (done.returncode, done.stderr) == (0, b"")
-    assert done.stdout == (b"" if closed == "stdout" else b"result\n")
-
-
 def test_work_stops_at_a_step_and_then_as_usual(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(signals._State, "received", None)
     with stop_on_interruption() as stop:
