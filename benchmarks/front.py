@@ -26,8 +26,7 @@ from typing import Any
 from common import HEIGHT_SCALES, RELIEFS, finish, is_available, kept, parser_of, start
 from quality import generator_config
 
-from mbtf_core.config.nested import deep_merge
-from mbtf_core.config.settings import resolve
+from mbtf_core.config.settings import deep_merge, resolve
 from mbtf_core.data.dataset import Dataset
 from mbtf_fit import FitConfig, fit
 from mbtf_gen.generation.run import generate

@@ -33,7 +33,7 @@ from common import ASSETS, finish, parser_of, start
 from gpu_measurements import PREDICTIONS, Sizes
 from numpy.typing import NDArray
 
-from mbtf_core.run.child import ChildResult, run_child
+from mbtf_core.run.processes import ChildResult, run_child
 from mbtf_core.stats import Estimate, level_groups, mean_estimate, mse_difference, noise_free_mse
 from mbtf_gen.selftest import STANDARD_ERRORS
 

@@ -1,6 +1,6 @@
 """What `gpu.py` measures, each in a process of its own, as a compiler or driver may abort it.
 
-Every function takes texts and yields JSON objects, as :func:`mbtf_core.run.child.run_child` asks. Devices
+Every function takes texts and yields JSON objects, as :func:`mbtf_core.run.processes.run_child` asks. Devices
 are ``cpu`` and ``cuda``.
 """
 
@@ -179,7 +179,7 @@ def train(device: str, model: str, sizes: str, shards: str, out: str) -> Answers
 def picture(sizes: Sizes) -> Queries:
     """Queries of a perspective picture of the plane."""
     from mbtf_core.directions import from_angles
-    from mbtf_core.pictures.camera import Camera
+    from mbtf_core.pictures import Camera
 
     camera = Camera(elevation=45, tiles_across=4.0, rows=sizes.rows, columns=sizes.columns)
     return camera.queries(from_angles(40, 30)).flat()

@@ -34,7 +34,7 @@ from common import alternate, conformance_deviation, finish, parser_of, start, t
 from mbtf_core.data.geometry import Geometry  # noqa: E402
 from mbtf_core.data.lattice import Lattice  # noqa: E402
 from mbtf_core.directions import from_angles  # noqa: E402
-from mbtf_core.pictures.camera import Camera  # noqa: E402
+from mbtf_core.pictures import Camera  # noqa: E402
 from mbtf_fit.config import ModelName  # noqa: E402
 from mbtf_gen.engine.runtime import load_mitsuba  # noqa: E402
 

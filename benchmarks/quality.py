@@ -30,8 +30,7 @@ from common import HEIGHT_SCALES, finish, is_available, parser_of, source, start
 from mbtf_core.app.options import Quality
 from mbtf_core.config.settings import resolve
 from mbtf_core.errors import InputError
-from mbtf_core.files.atomic import read_json, write_json
-from mbtf_core.files.digest import data_sha256
+from mbtf_core.files.atomic import data_sha256, read_json, write_json
 from mbtf_core.units import clock
 from mbtf_fit.config import FITTER, FitConfig, best_at
 from mbtf_gen.config.generator import GENERATOR, RESOLUTION, GeneratorConfig

@@ -40,7 +40,7 @@ from mbtf_core.data.documents import finished_record
 from mbtf_core.data.shard_files import row_bytes, write_shard
 from mbtf_core.data.store import ObjectStore
 from mbtf_core.data.verify import verify
-from mbtf_core.files.digest import file_sha256
+from mbtf_core.files.atomic import file_sha256
 from mbtf_core.run.cluster import open_runner
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item, TaskFunction

@@ -1,11 +1,20 @@
-"""The transfer curve of sRGB (IEC 61966-2-1)."""
+"""The transfer curve of sRGB (IEC 61966-2-1), and the display of linear values: one rule for all pictures.
+
+An exposure is a number of stops (EV): a value v in 1/sr is displayed as sRGB of ``min(1, 2^EV v)``. Pictures
+with the same exposure can be compared by eye, whichever command made them.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+# Percentile of a picture's mean channel, and the fraction of white as which the automatic exposure shows it.
+_PERCENTILE, _SHOWN = 95.0, 0.8
 
 
 def srgb_to_linear(encoded: ArrayLike) -> NDArray[np.floating[Any]]:
@@ -25,3 +34,41 @@ def linear_to_srgb(linear: ArrayLike) -> NDArray[np.floating[Any]]:
 def _floating(numbers: ArrayLike) -> NDArray[np.floating[Any]]:
     c = np.asarray(numbers)
     return c if c.dtype.kind == "f" else c.astype(np.float64)
+
+
+def brightness(picture: ArrayLike) -> float:
+    """The 95th percentile of the mean channel of linear values (..., 3)."""
+    return float(np.percentile(np.asarray(picture, np.float64).mean(axis=-1), _PERCENTILE))
+
+
+def auto_exposure(bright: Iterable[float]) -> float:
+    """Automatic exposure of pictures that are displayed alike.
+
+    Parameters
+    ----------
+    bright : :func:`brightness` of each picture, in 1/sr
+
+    Returns
+    -------
+    float
+        Exposure in EV that shows the median as 0.8; 0 if it is black. Rounded to hundredths, so that the
+        printed number is exact.
+    """
+    level = float(np.median(list(bright)))
+    return round(math.log2(_SHOWN / level), 2) if level > 0 else 0.0
+
+
+def white_of(exposure: float) -> float:
+    """The smallest value in 1/sr that an exposure in EV shows as white."""
+    return 2.0**-exposure
+
+
+def to_display(value: ArrayLike, exposure: float) -> NDArray[np.uint8]:
+    """8-bit sRGB of linear values (..., 3) in 1/sr at an exposure in EV."""
+    linear = np.clip(np.asarray(value, np.float64) * 2.0**exposure, 0, 1)
+    return np.round(255.0 * linear_to_srgb(linear)).astype(np.uint8)
+
+
+def describe_exposure(exposure: float) -> str:
+    """``exposure +2.31 EV (0.202 1/sr is white)``."""
+    return f"exposure {exposure:+.2f} EV ({white_of(exposure):.3g} 1/sr is white)"

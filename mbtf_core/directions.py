@@ -67,24 +67,6 @@ def from_angles(elevation_deg: ArrayLike, azimuth_deg: ArrayLike) -> NDArray[np.
     return np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=-1)
 
 
-def to_angles(omega: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Elevation and azimuth of unit vectors.
-
-    Parameters
-    ----------
-    omega : (..., 3) array_like
-        Unit vectors.
-
-    Returns
-    -------
-    elevation, azimuth : (...) float64 array
-        Degrees; the azimuth is in [0, 360).
-    """
-    w = np.asarray(omega, np.float64)
-    elevation = np.degrees(np.arctan2(w[..., 2], np.hypot(w[..., 0], w[..., 1])))
-    return elevation, np.degrees(np.arctan2(w[..., 1], w[..., 0])) % 360.0
-
-
 def normalize(omega: ArrayLike) -> NDArray[np.float64]:
     """Scale vectors to unit length.
 

@@ -12,7 +12,6 @@ import os
 import socket
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 from filelock import BaseFileLock, FileLock, SoftFileLock, Timeout
@@ -22,18 +21,6 @@ from mbtf_core.errors import PartialError, unwritable
 # Timeout of locks that are used briefly; of one attempt, since an owner may just have removed its file; and
 # the interval of attempts.
 _PATIENCE_SECONDS, _ATTEMPT_SECONDS, _POLL_SECONDS = 60.0, 0.05, 0.01
-
-
-@dataclass(frozen=True)
-class Owner:
-    """Owner of a lock: machine, process, and start (seconds since 1970)."""
-
-    host: str
-    process: int
-    since: float
-
-    def __str__(self) -> str:
-        return f"process {self.process} on {self.host}, for {_age(time.time() - self.since)}"
 
 
 def _age(seconds: float) -> str:
@@ -64,11 +51,12 @@ def lock_file_of(path: Path) -> Path:
     return path.with_name(f".{path.stem}.lock")
 
 
-def lock_owner(path: Path) -> Owner | None:
-    """Current or last owner of the lock of `path` according to its file; None if unknown."""
+def lock_owner(path: Path) -> str | None:
+    """Current or last owner of the lock of `path`, such as ``process 7 on oak, for 2 h``; None if unknown."""
     try:
         data = json.loads(lock_file_of(path).read_bytes()[:4096])
-        return Owner(str(data["host"]), int(data["process"]), float(data["since"]))
+        age = _age(time.time() - float(data["since"]))
+        return f"process {int(data['process'])} on {data['host']}, for {age}"
     except (OSError, ValueError, KeyError, TypeError):
         return None
 

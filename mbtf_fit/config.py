@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from mbtf_core.app.options import Flag, Quality
-from mbtf_core.config.nested import deep_merge, leaves
-from mbtf_core.config.settings import Settings
+from mbtf_core.config.settings import Settings, deep_merge, leaves
 from mbtf_core.data.lattice import Lattice
-from mbtf_core.files.digest import data_sha256
+from mbtf_core.files.atomic import data_sha256
 from mbtf_core.units import parse_duration
 from mbtf_fit.models.model import SPECIAL
 from mbtf_fit.models.registry import MODELS, defaults_of, with_option

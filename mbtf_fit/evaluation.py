@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.color import auto_exposure, brightness, white_of
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.folder import DataFolder
 from mbtf_core.directions import ELEVATION_BANDS
 from mbtf_core.errors import InputError
-from mbtf_core.exposure import auto_exposure, brightness, white_of
 from mbtf_core.stats import (
     Estimate,
     by_group,
@@ -53,7 +53,7 @@ def split_errors(
     queries : ShardQueries
     data : Dataset
     exposure : float, optional
-        In EV, see :mod:`mbtf_core.exposure`; by default that of the queries.
+        In EV, see :mod:`mbtf_core.color`; by default that of the queries.
 
     Returns
     -------

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from mbtf_core.exposure import describe_exposure, white_of
+from mbtf_core.color import describe_exposure, white_of
 from mbtf_core.units import clock
 
 SPLIT_NAMES = {

@@ -9,7 +9,7 @@ from importlib import import_module
 from typing import Any
 
 _PUBLIC = {
-    "Camera": "mbtf_core.pictures.camera",
+    "Camera": "mbtf_core.pictures",
     "Dataset": "mbtf_core.data.dataset",
     "GeneratorConfig": "mbtf_gen.config.generator",
     "Geometry": "mbtf_core.data.geometry",

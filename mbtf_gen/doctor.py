@@ -1,7 +1,7 @@
 """Diagnosis of the machine: each part is used, and each failure comes with a hint.
 
 A part fails by aborting or hanging as often as by an exception, therefore in a child process
-(:mod:`mbtf_core.run.child`).
+(:mod:`mbtf_core.run.processes`).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.errors import EngineError
-from mbtf_core.run.child import run_child
+from mbtf_core.run.processes import run_child
 from mbtf_gen.checks import Check, Finding
 from mbtf_gen.engine.runtime import (
     CACHE_VARIABLE,

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mbtf_core.app.console import Console
 from mbtf_core.errors import InputError, PartialError
-from mbtf_core.files.atomic import read_json
-from mbtf_core.files.digest import file_sha256
+from mbtf_core.files.atomic import file_sha256, read_json
 from mbtf_core.files.folders import owned
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item

@@ -16,10 +16,9 @@ from functools import cached_property
 from pathlib import Path
 
 from mbtf_core.app.options import Quality
-from mbtf_core.config.nested import deep_merge
+from mbtf_core.config.settings import deep_merge
 from mbtf_core.errors import InputError, UsageError
-from mbtf_core.files.atomic import read_json, write_json
-from mbtf_core.files.digest import data_sha256
+from mbtf_core.files.atomic import data_sha256, read_json, write_json
 from mbtf_core.files.folders import check_space, owned
 from mbtf_core.forecast import is_long
 from mbtf_core.units import clock, expectation

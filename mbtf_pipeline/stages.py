@@ -18,8 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from mbtf_core.errors import InputError
-from mbtf_core.files.atomic import read_json, write_json
-from mbtf_core.files.digest import data_sha256, file_sha256
+from mbtf_core.files.atomic import data_sha256, file_sha256, read_json, write_json
 
 STAMP_FORMAT = "mbtf-stage"
 # Part of every key; raised when a stage produces different outputs from the same inputs.
@@ -117,7 +116,7 @@ def _depends(folder: Path, stage: Stage) -> tuple[dict[str, Any], str]:
 
 
 def _what_changed(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
-    from mbtf_core.config.nested import differences, in_short
+    from mbtf_core.config.settings import differences, in_short
 
     if changes := differences(old["config"], new["config"]):
         return f"options changed: {in_short(changes, 3)}"

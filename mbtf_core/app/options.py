@@ -34,7 +34,7 @@ from pydantic.fields import FieldInfo
 
 from mbtf_core.config.settings import Settings, explicit_options, resolve
 from mbtf_core.errors import UsageError
-from mbtf_core.urls import split_url
+from mbtf_core.paths import split_url
 
 S = TypeVar("S", bound=Settings)
 C = TypeVar("C", bound="Options[Any]")

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.errors import InputError, reason
-from mbtf_core.suggest import refuse_special, suggest_path
+from mbtf_core.paths import refuse_special, suggest_path
 
 # Bounds on the length, the depth and (because of YAML's aliases) the number of values of a configuration.
 _MAX_CHARACTERS = 1 << 18

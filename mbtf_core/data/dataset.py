@@ -17,8 +17,8 @@ from mbtf_core.data.lattice import Lattice
 from mbtf_core.data.schema import ARRAY, FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, Layout, ShardEntry, Split
 from mbtf_core.data.shard_files import Arrays, check_values, column_means, read_shard
 from mbtf_core.errors import InputError
-from mbtf_core.files.digest import file_sha256
-from mbtf_core.suggest import suggest_path
+from mbtf_core.files.atomic import file_sha256
+from mbtf_core.paths import suggest_path
 
 _MAKE_AGAIN = "generate or download the data set again"
 # Shards that are downloaded ahead of their reader.

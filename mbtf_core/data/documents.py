@@ -19,8 +19,7 @@ from mbtf_core.data.folder import DataFolder, sidecar_name
 from mbtf_core.data.lattice import MAX_LEVEL
 from mbtf_core.data.schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, Layout, ShardEntry
 from mbtf_core.errors import InputError
-from mbtf_core.files.atomic import Stored
-from mbtf_core.files.digest import data_sha256
+from mbtf_core.files.atomic import Stored, data_sha256
 
 _Count = Annotated[int, Field(strict=True, ge=0, lt=1 << 40)]
 _FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*\.(npz|exr)$", max_length=100)]

@@ -27,12 +27,12 @@ from mbtf_core.errors import InputError, MbtfError, PartialError, unwritable
 from mbtf_core.files.atomic import (
     TEMPORARY,
     Stored,
+    file_sha256,
     parse_checksummed,
     parse_json,
     remove_file,
     write_checksummed,
 )
-from mbtf_core.files.digest import file_sha256
 from mbtf_core.files.folders import cache_folder, make_folder, remove_unfinished
 from mbtf_core.locks import lock_owner, shard_lock, take_lock
 

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.data.schema import GEOMETRY, GEOMETRY_NAME, ArraySpec
 from mbtf_core.errors import InputError
-from mbtf_core.files.atomic import write_chunks
 
 F32 = NDArray[np.float32]
 
@@ -116,26 +115,6 @@ def encode_geometry(geometry: Geometry) -> bytes:
             part[channel] = np.ascontiguousarray(array[..., index] if spec.trailing else array)
     # As text: EXR files have no float64 attributes that every reader knows.
     return encode_parts(parts, {_ASPECT: repr(float(geometry.aspect))})
-
-
-def write_geometry(path: Path, geometry: Geometry) -> str:
-    """Write ``geometry.exr``, atomically.
-
-    Parameters
-    ----------
-    path : the file
-    geometry : Geometry
-
-    Returns
-    -------
-    str
-        SHA-256 of the file, hexadecimal.
-
-    Raises
-    ------
-    PartialError : the disk is full or the folder cannot be written
-    """
-    return write_chunks(path, [encode_geometry(geometry)]).sha256
 
 
 def geometry_record(geometry: Geometry | None) -> dict[str, Any] | None:

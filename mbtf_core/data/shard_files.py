@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from mbtf_core.data.schema import ARRAY, ARRAYS
 from mbtf_core.errors import InputError, reason
 from mbtf_core.files.atomic import Stored, write_chunks
-from mbtf_core.suggest import refuse_special
+from mbtf_core.paths import refuse_special
 
 Arrays = dict[str, NDArray[np.float32]]
 
@@ -250,12 +250,12 @@ def read_exr(path: Path, names: Iterable[str] | None = None) -> Arrays:
     ------
     InputError : missing file, not an EXR file, or not a shard
     """
-    from mbtf_core.images.exr import read_file
+    from mbtf_core.images.exr import read_parts
 
     if not path.exists():
         raise InputError("no such shard", where=path)
     # Shards are uncompressed: one that states more pixels than it has bytes is corrupt.
-    header, stored = read_file(path, min(_MAX_PIXELS, path.stat().st_size))
+    header, stored = next(iter(read_parts(path, min(_MAX_PIXELS, path.stat().st_size)).values()))
     if "mbtf.lead" not in header:
         raise InputError("EXR image is not a shard (no 'mbtf.lead' in its header)", where=path)
     out: Arrays = {}

@@ -23,8 +23,7 @@ from urllib.parse import unquote
 from mbtf_core.errors import EngineError, InputError, PartialError, UsageError, reason
 from mbtf_core.files.atomic import create_file, remove_file, write_chunks
 from mbtf_core.files.folders import make_folder
-from mbtf_core.suggest import refuse_special
-from mbtf_core.urls import split_url
+from mbtf_core.paths import refuse_special, split_url
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")

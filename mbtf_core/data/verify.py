@@ -17,7 +17,7 @@ from mbtf_core.data.folder import DataFolder, is_leftover, sidecar_name
 from mbtf_core.data.schema import CONFIG_NAME, GEOMETRY_NAME, MANIFEST_NAME, ShardEntry
 from mbtf_core.data.shard_files import check_arrays, check_values, read_shard
 from mbtf_core.errors import InputError, reason
-from mbtf_core.files.digest import file_sha256
+from mbtf_core.files.atomic import file_sha256
 
 # The manifest only lacks its completion.
 INCOMPLETE = "is not complete"

@@ -1,4 +1,4 @@
-"""Files that are absent or complete: temporary file, fsync, rename, fsync of the folder."""
+"""Files that are absent or complete (temporary file, fsync, rename, fsync of the folder); digests."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from mbtf_core.errors import InputError, reason, unwritable
-from mbtf_core.files.digest import file_sha256
-from mbtf_core.suggest import refuse_special
+from mbtf_core.paths import refuse_special
 
 _CHECKSUM = "checksum"
 
@@ -265,3 +264,15 @@ def read_json(path: Path, hint: str = "") -> dict[str, Any]:
 
 def _refuse_constant(name: str) -> None:
     raise ValueError(f"{name} is not a JSON number")
+
+
+def file_sha256(path: Path) -> str:
+    """SHA-256 of a regular file, in hexadecimal (what ``sha256sum`` prints)."""
+    refuse_special(path)
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def data_sha256(data: Any) -> str:
+    """SHA-256 of plain data as canonical JSON, in hexadecimal: the order of keys does not count."""
+    return hashlib.sha256(json.dumps(data, sort_keys=True, separators=(",", ":")).encode()).hexdigest()

@@ -18,12 +18,18 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel
 
-from mbtf_core.config.nested import differences, in_short
-from mbtf_core.config.settings import check_document, check_schema
+from mbtf_core.config.settings import check_document, check_schema, differences, in_short
 from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.errors import InputError, LockedError, PartialError
-from mbtf_core.files.atomic import TEMPORARY, Stored, read_json, remove_file, write_json, write_text
-from mbtf_core.files.digest import data_sha256
+from mbtf_core.files.atomic import (
+    TEMPORARY,
+    Stored,
+    data_sha256,
+    read_json,
+    remove_file,
+    write_json,
+    write_text,
+)
 from mbtf_core.locks import lock_owner, take_lock
 from mbtf_core.units import size_text
 

@@ -11,7 +11,7 @@ from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError, reason
 from mbtf_core.images.read import SUFFIXES, read_image
 from mbtf_core.images.resample import resample
-from mbtf_core.suggest import suggest_path
+from mbtf_core.paths import suggest_path
 
 _RADIANCE = ".hdr"
 

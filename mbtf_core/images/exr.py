@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError, reason, unwritable
 from mbtf_core.files.atomic import Stored, write_through
-from mbtf_core.suggest import suggest_name
+from mbtf_core.paths import suggest_name
 
 # Limit of the numbers in all channels of all parts, in multiples of the largest image.
 _MOST_CHANNELS = 4
@@ -46,29 +46,6 @@ def silenced() -> Iterator[None]:
             os.close(handle)
 
 
-def read_file(path: Path, max_pixels: int) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Read the first part of an EXR file.
-
-    Parameters
-    ----------
-    path : Path
-    max_pixels : largest size that is read
-
-    Returns
-    -------
-    header : dict
-    channels : dict of str to (H, W) float16 or float32 arrays
-
-    Raises
-    ------
-    InputError : the file is damaged, too large, deep, subsampled or cropped (data window unlike the display
-        window), or stores integers
-    """
-    head, channels = _read(path, max_pixels)[0]
-    check_floats(channels, path)
-    return head, channels
-
-
 def check_floats(channels: dict[str, NDArray[Any]], path: Path) -> None:
     """Refuse channels of integers."""
     for name, channel in channels.items():
@@ -83,7 +60,8 @@ def read_channels(path: Path, max_pixels: int) -> dict[str, NDArray[Any]]:
 
     Raises
     ------
-    InputError : as :func:`read_file`, or two channels of one name
+    InputError : the file is damaged, larger than `max_pixels`, deep, subsampled or cropped (data window
+        unlike the display window), or two channels have one name
     """
     parts = _read(path, max_pixels)
     if len(parts) == 1:
@@ -104,7 +82,7 @@ def read_parts(path: Path, max_pixels: int) -> dict[str, tuple[dict[str, Any], d
 
     Raises
     ------
-    InputError : as :func:`read_file`, or two parts of one name
+    InputError : as :func:`read_channels`, two parts have one name, or a channel stores integers
     """
     out: dict[str, tuple[dict[str, Any], dict[str, NDArray[Any]]]] = {}
     for head, channels in _read(path, max_pixels, cropped=True):

@@ -7,20 +7,20 @@ maps are sRGB; no color space is applied here.
 from __future__ import annotations
 
 import contextlib
+import io
+import logging
 import warnings as python_warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError, reason
 from mbtf_core.images.exr import check_floats, choose_channels, read_channels, silenced
-from mbtf_core.images.metadata import NO_TAGS, Tags, tags_of
-from mbtf_core.images.tiff import read_tiff
-from mbtf_core.suggest import refuse_special, suggest_path
+from mbtf_core.paths import refuse_special, suggest_path
 
 # Largest image that is allocated (11 585² pixels), whatever size a header claims.
 MAX_PIXELS = 2**27
@@ -53,9 +53,38 @@ _MAGIC = {
     b"MM\x00+": "TIFF",
     b"\x93NUMPY": "NPY",
 }
+# Photometric interpretations of TIFF that are read as stored.
+_GRAY, _RGB = 1, 2
+_SHORT = "cannot be read as a TIFF image (file ends early)"
 # Channels of PNG color types of more than one channel.
 _PNG_COLORS = {2: 3, 4: 2, 6: 4}
 SUFFIXES = tuple(_KINDS)
+
+
+ColorSpace = Literal["srgb", "linear"]
+
+# Stored gammas of the known spaces (sRGB: 1/2.2), and the tolerance of their comparison.
+_GAMMAS: dict[ColorSpace, float] = {"srgb": 0.45455, "linear": 1.0}
+_SLACK = 0.005
+
+
+@dataclass(frozen=True)
+class Tags:
+    """Metadata of an image file.
+
+    Attributes
+    ----------
+    space : declared color space, if supported
+    foreign : unsupported declaration, such as ``color profile 'Display P3'``
+    orientation : of EXIF; 1 is upright
+    """
+
+    space: ColorSpace | None = None
+    foreign: str | None = None
+    orientation: int = 1
+
+
+NO_TAGS = Tags()
 
 
 @dataclass(frozen=True)
@@ -226,7 +255,7 @@ def _from_pillow(path: Path, kind: str) -> Image:
 
     codes: NDArray[Any] | None = None
     if kind != "JPEG":
-        codes = _deep_png(path) if kind == "PNG" else read_tiff(path, _check_size)
+        codes = _deep_png(path) if kind == "PNG" else _read_tiff(path)
     if codes is not None:
         return replace(_decoded(codes, path), tags=_tags(path, kind))
     try:
@@ -235,7 +264,7 @@ def _from_pillow(path: Path, kind: str) -> Image:
             with Pillow.open(path, formats=[kind]) as picture:
                 _check_size(picture.height, picture.width, path)
                 picture.load()
-                return replace(_from_picture(picture, path), tags=tags_of(picture.info, picture.getexif()))
+                return replace(_from_picture(picture, path), tags=_tags_of(picture.info, picture.getexif()))
     except Pillow.DecompressionBombError:
         raise InputError(f"claims more than {MAX_PIXELS:,} pixels", where=path) from None
     except InputError:
@@ -267,6 +296,50 @@ def _deep_png(path: Path) -> NDArray[np.uint16] | None:
     return np.ascontiguousarray(codes.reshape(rows, columns, -1)[..., :channels])
 
 
+def _read_tiff(path: Path) -> NDArray[Any] | None:
+    """The first image of a TIFF file, (H, W, C), C = 1..4, as stored: uint8, uint16 or floats, however
+    compressed. None for kinds that Pillow reads: palettes, single bits, inverted gray, YCbCr."""
+    import tifffile
+
+    # The library logs faults that its exception already reports.
+    logging.getLogger("tifffile").setLevel(logging.CRITICAL)
+    try:
+        with tifffile.TiffFile(path) as file:
+            page: Any = file.pages[0]
+            rows, columns = int(page.imagelength), int(page.imagewidth)
+            _check_size(rows, columns, path)
+            channels = int(page.samplesperpixel)
+            if page.photometric not in (_GRAY, _RGB) or page.dtype is None:
+                return None
+            if page.bitspersample != 8 * page.dtype.itemsize:
+                return None if page.bitspersample < 8 else _refuse(f"{page.bitspersample}-bit", path)
+            if page.dtype.kind == "f" or page.dtype in (np.uint8, np.uint16):
+                if not 1 <= channels <= 4 or page.imagedepth != 1:
+                    raise InputError(f"has {channels} channels; 1 to 4 are expected", where=path)
+                # Missing strips or tiles of a truncated file would be read as zeros.
+                ends = (o + n for o, n in zip(page.dataoffsets, page.databytecounts, strict=True))
+                if not page.is_contiguous and any(end > path.stat().st_size for end in ends):
+                    raise InputError(_SHORT, where=path)
+                array = page.asarray(maxworkers=1)
+            elif page.dtype.kind in "ui" and page.dtype.itemsize > 1:
+                _refuse(page.dtype.name, path)
+            else:
+                return None
+    except InputError:
+        raise
+    except Exception as error:  # a damaged file may make the decoder raise anything
+        raise InputError(f"cannot be read as a TIFF image ({reason(error)})", where=path) from None
+    if page.planarconfig == 2 and channels > 1:
+        array = np.moveaxis(array.reshape(channels, rows, columns), 0, -1)
+    if array.size != rows * columns * channels:
+        raise InputError(_SHORT, where=path)
+    return array.reshape(rows, columns, channels)
+
+
+def _refuse(kind: str, path: Path) -> NoReturn:
+    raise InputError(f"contains {kind} numbers", where=path, hint="save it as 8 or 16 bits or as floats")
+
+
 def _tags(path: Path, kind: str) -> Tags:
     """Tags of a file whose pixels another reader has decoded; none where they cannot be read."""
     from PIL import Image as Pillow
@@ -275,7 +348,7 @@ def _tags(path: Path, kind: str) -> Tags:
         with python_warnings.catch_warnings(), silenced():
             python_warnings.simplefilter("ignore")
             with Pillow.open(path, formats=[kind]) as picture:
-                return tags_of(picture.info, picture.getexif())
+                return _tags_of(picture.info, picture.getexif())
     except Exception:  # what the library does not know may make it raise anything
         return NO_TAGS
 
@@ -320,3 +393,40 @@ def gray(image: Image) -> tuple[NDArray[np.float64], list[str]]:
             f"{image.path}: is colored where one number per pixel is expected; its luminance is used"
         )
     return rgb.astype(np.float64) @ np.asarray(LUMINANCE), warnings
+
+
+def _tags_of(info: Mapping[Any, Any], exif: Mapping[int, Any]) -> Tags:
+    """Tags from the metadata that Pillow read.
+
+    The profile takes precedence over the ``sRGB`` chunk, and that over ``gAMA`` (PNG specification, third
+    edition, 4.3). A gamma of 1 means linear, 1/2.2 sRGB; a profile whose description names sRGB means sRGB.
+    Other profiles and gammas are reported, not applied.
+    """
+    from PIL import ExifTags
+
+    orientation = exif.get(ExifTags.Base.Orientation, 1)
+    turned = orientation if orientation in range(1, 9) else 1
+    space: ColorSpace | None = None
+    foreign = None
+    gamma = info.get("gamma")
+    if info.get("icc_profile"):
+        name = _profile_name(info["icc_profile"])
+        space, foreign = ("srgb", None) if "srgb" in name.lower() else (None, f"color profile '{name}'")
+    elif "srgb" in info:
+        space = "srgb"
+    elif isinstance(gamma, float) and gamma > 0:
+        space = next((s for s, g in _GAMMAS.items() if abs(gamma - g) < _SLACK), None)
+        foreign = None if space else f"gamma of {gamma:g}"
+    return Tags(space, foreign, turned)
+
+
+def _profile_name(profile: bytes) -> str:
+    """Description of an ICC profile, one line."""
+    from PIL import ImageCms
+
+    try:
+        text = ImageCms.getProfileDescription(ImageCms.ImageCmsProfile(io.BytesIO(profile)))
+    except Exception:  # a damaged profile may make the library raise anything
+        return "unreadable"
+    printable = "".join(c for c in " ".join(text.split()) if c.isprintable())
+    return printable[:60] or "without a name"

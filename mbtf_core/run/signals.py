@@ -14,7 +14,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from types import FrameType
 from typing import NoReturn
 
@@ -28,37 +28,29 @@ _ECHO_SECONDS = 0.5
 
 
 class _State:
-    """State of this process.
+    """State of this process."""
 
-    Attributes
-    ----------
-    program : it runs one of our programs, so that a signal may end it; not so in notebooks and tests
-    silent : messages are its parent's
-    raising : a signal raises KeyboardInterrupt, which :func:`mbtf_core.app.console.run` handles
-    received : time of the first signal; None before
-    stop : the event that the first signal sets in place of an exception
-    kept : what an interruption leaves, for the message
-    cleanups : called before the process ends without unwinding
-    code : exit code of the program's command once it has ended
-    """
-
+    # It runs one of our programs, so that a signal may end it; not so in notebooks and tests.
     program = False
+    # Messages are its parent's.
     silent = False
+    # A signal raises KeyboardInterrupt, which :func:`mbtf_core.app.console.run` handles.
     raising = False
+    # Time of the first signal.
     received: float | None = None
+    # The event that the first signal sets in place of an exception.
     stop: threading.Event | None = None
+    # What an interruption leaves, for the message.
     kept = ""
+    # Called before the process ends without unwinding.
     cleanups: list[Callable[[], None]] = []  # noqa: RUF012
+    # Exit code of the program's command once it has ended.
     code: int | None = None
 
 
 def handle_signals(silent: bool = False) -> None:
-    """Prepare a new process of a program for signals; precedes all slow imports.
-
-    Parameters
-    ----------
-    silent : leave messages to the parent of this process
-    """
+    """Prepare a new process of a program for signals; precedes all slow imports. The parent of a
+    `silent` one prints its messages."""
     _State.program, _State.silent = True, silent
     for number in SIGNALS:
         # `nohup` and shells without job control have it ignored.
@@ -92,21 +84,16 @@ def _flush() -> None:
 
 def _handle(number: int, frame: FrameType | None) -> None:
     """The one handler of both signals."""
-    again = _State.received is not None
-    if _State.received is not None and time.monotonic() - _State.received < _ECHO_SECONDS:
+    now, before = time.monotonic(), _State.received
+    if before is not None and now - before < _ECHO_SECONDS:
         return
-    _note()
+    _State.received = now if before is None else before
     if _State.stop is not None and not _State.stop.is_set():
         _State.stop.set()
         return
-    if _State.program and (again or not _State.raising or _importing(frame)):
+    if _State.program and (before is not None or not _State.raising or _importing(frame)):
         _end_process()
     raise KeyboardInterrupt
-
-
-def _note() -> None:
-    if _State.received is None:
-        _State.received = time.monotonic()
 
 
 def _importing(frame: FrameType | None) -> bool:
@@ -124,7 +111,6 @@ def _watch(reader: int) -> None:
     time.sleep(_NOTE_SECONDS)
     _say("stopping after the current step; a second signal stops at once\n")
     time.sleep(_GRACE_SECONDS)
-    _note()
     _end_process()
 
 
@@ -165,34 +151,46 @@ def at_end(cleanup: Callable[[], None]) -> None:
     _State.cleanups.append(cleanup)
 
 
+def _in_main_thread() -> bool:
+    return threading.current_thread() is threading.main_thread()
+
+
 @contextlib.contextmanager
-def raising() -> Iterator[None]:
-    """Signals raise KeyboardInterrupt in this block; it runs a command."""
-    before = {}
-    if not _State.program:
-        _State.received, _State.kept = None, ""
-        if threading.current_thread() is threading.main_thread():
-            # None stands for a native handler, which a renderer leaves and which is no longer valid.
-            usual = (signal.SIG_DFL, signal.default_int_handler, None)
-            before = {n: h for n in SIGNALS if (h := signal.getsignal(n)) in usual}
+def _handling(numbers: Iterable[signal.Signals]) -> Iterator[None]:
+    """Handle these signals here in a block."""
+    before = {number: signal.getsignal(number) for number in numbers}
     for number in before:
         signal.signal(number, _handle)
-    _State.raising = True
     try:
         yield
     finally:
-        _State.raising = False
         for number, handler in before.items():
+            # None stands for a native handler, which a renderer leaves and which is no longer valid.
             signal.signal(number, signal.default_int_handler if handler is None else handler)
+
+
+@contextlib.contextmanager
+def raising() -> Iterator[None]:
+    """Signals raise KeyboardInterrupt in this block; it runs a command."""
+    numbers: list[signal.Signals] = []
+    if not _State.program:
+        _State.received, _State.kept = None, ""
+        usual = (signal.SIG_DFL, signal.default_int_handler, None)
+        numbers = [n for n in SIGNALS if _in_main_thread() and signal.getsignal(n) in usual]
+    _State.raising = True
+    try:
+        with _handling(numbers):
+            yield
+    finally:
+        _State.raising = False
 
 
 def reinstall_handlers() -> None:
     """Install Python's handlers again. After rendering with an integrator that is written in Python, Mitsuba
     leaves its own one behind, which ignores SIGINT: the inner of nested handlers restores the outer one."""
-    if threading.current_thread() is threading.main_thread():
-        for number in SIGNALS:
-            if callable(handler := signal.getsignal(number)):
-                signal.signal(number, handler)
+    for number in SIGNALS if _in_main_thread() else ():
+        if callable(handler := signal.getsignal(number)):
+            signal.signal(number, handler)
 
 
 @contextlib.contextmanager
@@ -201,21 +199,17 @@ def stop_on_interruption() -> Iterator[threading.Event]:
     the second signal interrupts as usual. The block raises KeyboardInterrupt itself once it has stored its
     state."""
     stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
+    if not _in_main_thread():
         yield stop
         return
     if not _State.program:
         _State.received = None
-    before = {n: h for n in SIGNALS if callable(h := signal.getsignal(n))}
-    for number in before:
-        signal.signal(number, _handle)
     _State.stop = stop
     try:
-        yield stop
+        with _handling(number for number in SIGNALS if callable(signal.getsignal(number))):
+            yield stop
     finally:
         _State.stop = None
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 @contextlib.contextmanager

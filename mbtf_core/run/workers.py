@@ -1,4 +1,4 @@
-"""Where a command runs: options of a cluster's workers, and their YAML file."""
+"""The option ``--cluster``: what it names, the options of a cluster's workers, and their YAML file."""
 
 from __future__ import annotations
 
@@ -53,10 +53,6 @@ def local_config(workers: int | None = None) -> ClusterConfig:
 
 def read_cluster(where: str) -> ClusterConfig | str:
     """Meaning of ``--cluster``: a configuration, or the address of a scheduler.
-
-    Parameters
-    ----------
-    where : ``local``, ``local:4``, a YAML file, or an address such as ``tcp://scheduler:8786``
 
     Raises
     ------

@@ -58,8 +58,7 @@ def export_material(
     half
         Round all weights and texels to 16 bits first, and print the resulting error; not for web.
     """
-    from mbtf_core.files.atomic import write_text
-    from mbtf_core.files.digest import file_sha256
+    from mbtf_core.files.atomic import file_sha256, write_text
     from mbtf_core.files.folders import OutputFolder, owned
     from mbtf_fit.material.export import LAYERS_NAME, TEXTURES_NAME, to_half, write_layers, write_textures
     from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME

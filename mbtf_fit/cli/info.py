@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.options import Verbose
 from mbtf_core.errors import InputError
-from mbtf_core.suggest import suggest_path
+from mbtf_core.paths import suggest_path
 from mbtf_core.units import clock
 from mbtf_fit.formatting import report_errors
 

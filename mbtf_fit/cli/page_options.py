@@ -49,7 +49,7 @@ class PageOptions:
 
     def digests(self) -> dict[str, list[str]]:
         """Digests of the files that the given flags name; of a folder those of its records."""
-        from mbtf_core.files.digest import file_sha256
+        from mbtf_core.files.atomic import file_sha256
 
         out: dict[str, list[str]] = {}
         for name, value in vars(self).items():

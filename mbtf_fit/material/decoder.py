@@ -12,11 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import BaseModel, Field
 
-from mbtf_core.config.nested import leaves
-from mbtf_core.config.settings import build, check_document, check_schema
+from mbtf_core.config.settings import build, check_document, check_schema, leaves
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import read_json, write_json
-from mbtf_core.suggest import suggest_path
+from mbtf_core.paths import suggest_path
 from mbtf_fit.config import DECODER_MODELS, FitConfig
 from mbtf_fit.material.format import (
     DESCRIPTION_NAME,

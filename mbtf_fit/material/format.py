@@ -16,9 +16,8 @@ from pydantic import BaseModel, Field
 from mbtf_core.config.settings import check_document, check_schema
 from mbtf_core.data.lattice import MAX_LEVEL, Lattice
 from mbtf_core.errors import InputError
-from mbtf_core.files.atomic import read_json
-from mbtf_core.files.digest import file_sha256
-from mbtf_core.suggest import suggest_path
+from mbtf_core.files.atomic import file_sha256, read_json
+from mbtf_core.paths import suggest_path
 
 FORMAT_NAME = "mbtf-material"
 SCHEMA_VERSION = 3

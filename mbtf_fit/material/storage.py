@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from mbtf_core.errors import InputError, reason
 from mbtf_core.files.atomic import Stored, write_chunks
-from mbtf_core.suggest import refuse_special
+from mbtf_core.paths import refuse_special
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from mbtf_core.app.console import Console
-from mbtf_core.exposure import describe_exposure, to_display
+from mbtf_core.color import describe_exposure, to_display
 from mbtf_core.files.folders import OutputFolder, check_space
-from mbtf_core.pictures.reference import PNG_BYTES, claim_pictures, write_png
+from mbtf_core.pictures import PNG_BYTES, claim_pictures, write_png
 from mbtf_core.run.signals import keep_on_interruption
 from mbtf_fit.material.format import read_description
 from mbtf_fit.preview.config import MaterialPreviewConfig

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from mbtf_core.color import auto_exposure, brightness, to_display
 from mbtf_core.directions import from_angles
-from mbtf_core.exposure import auto_exposure, brightness, to_display
-from mbtf_core.pictures.camera import Camera
+from mbtf_core.pictures import Camera
 from mbtf_fit.backends.mitsuba.evaluator import Evaluator
 from mbtf_fit.backends.mitsuba.stored_material import F32
 from mbtf_fit.preview.config import SheetSection

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.data.dataset import Dataset
-from mbtf_core.files.atomic import write_text
-from mbtf_core.files.digest import data_sha256
+from mbtf_core.files.atomic import data_sha256, write_text
 from mbtf_core.files.folders import OutputFolder, OutputKind
 from mbtf_fit.config import FitConfig
 from mbtf_fit.material.decoder import DECODER_NAME, Decoder

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from mbtf_core.images.environment import read_environment
 from mbtf_core.images.resample import resample
-from mbtf_core.pictures.camera import Camera
-from mbtf_core.pictures.reference import read_references
+from mbtf_core.pictures import Camera, read_references
 from mbtf_fit.viewer.content import encode
 from mbtf_fit.viewer.shape import read_shape
 from mbtf_fit.viewer.textures import pack
@@ -82,7 +81,7 @@ def picture_content(
 
 
 def pictures_content(folder: Path) -> list[dict[str, Any]]:
-    """Pictures of ``mbtf-gen reference`` (:func:`~mbtf_core.pictures.reference.read_references`), as JSON."""
+    """Pictures of ``mbtf-gen reference`` (:func:`~mbtf_core.pictures.read_references`), as JSON."""
     return [
         picture_content(f"path-traced, {tiles_text(camera.tiles_across)} across", value, camera, light)
         for value, camera, light in read_references(folder)

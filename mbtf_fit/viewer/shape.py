@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError, reason
-from mbtf_core.suggest import suggest_path
+from mbtf_core.paths import suggest_path
 
 F64 = NDArray[np.float64]
 # Suffixes of files.

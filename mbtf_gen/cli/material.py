@@ -12,7 +12,7 @@ from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.options import Options, Overwrite, PathText, QualityOption, options_from
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.files.folders import make_folder
-from mbtf_core.urls import split_url
+from mbtf_core.paths import split_url
 from mbtf_gen.cli.generate import GenerateOptions, prepare_job, resolve_config
 from mbtf_gen.config.generator import GeneratorConfig
 

@@ -17,7 +17,7 @@ from mbtf_core.config.settings import FileName, Settings
 from mbtf_core.data.lattice import MAX_LEVEL
 from mbtf_core.data.schema import SCHEMA_VERSION, ArrayFormat, Layout, SliceDirections, Tiling
 from mbtf_core.errors import UsageError
-from mbtf_core.files.digest import data_sha256
+from mbtf_core.files.atomic import data_sha256
 from mbtf_gen.sampling.light_kernel import MAX_WIDTH_DEG, MIN_WIDTH_DEG
 
 # Largest height scale.

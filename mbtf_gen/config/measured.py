@@ -9,7 +9,7 @@ from pydantic import Field
 from mbtf_core.app.options import Flag
 from mbtf_core.config.settings import Settings
 from mbtf_core.data.schema import SCHEMA_VERSION
-from mbtf_core.files.digest import data_sha256
+from mbtf_core.files.atomic import data_sha256
 from mbtf_gen.config.generator import Count, OutputSection
 
 Cosine = Literal["auto", "included", "excluded"]

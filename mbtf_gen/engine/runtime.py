@@ -22,7 +22,7 @@ from typing import Any
 
 from mbtf_core.errors import EngineError, UsageError
 from mbtf_core.files.folders import cache_folder
-from mbtf_core.run.child import ChildResult, run_child
+from mbtf_core.run.processes import ChildResult, run_child
 from mbtf_core.run.task import worker_threads
 
 CPU_VARIANT = "llvm_ad_rgb"

@@ -7,7 +7,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.config.nested import differences
+from mbtf_core.config.settings import differences
 from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.data.documents import read_manifest, repair_hint
 from mbtf_core.data.folder import DataFolder

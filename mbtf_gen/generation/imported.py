@@ -19,7 +19,7 @@ from mbtf_core.data.lattice import MAX_LEVEL, Lattice, level_of_sigma, sigma_of_
 from mbtf_core.data.schema import CONVENTIONS, ShardEntry, Split
 from mbtf_core.data.shard_files import Arrays
 from mbtf_core.errors import InputError
-from mbtf_core.files.digest import data_sha256, file_sha256
+from mbtf_core.files.atomic import data_sha256, file_sha256
 from mbtf_core.files.folders import owned
 from mbtf_gen.config.generator import count_queries
 from mbtf_gen.config.measured import ImportConfig

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.config.nested import differences, in_short
-from mbtf_core.config.settings import build
+from mbtf_core.config.settings import build, differences, in_short
 from mbtf_core.config.yaml_file import read_yaml
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.documents import plan_digest

@@ -37,7 +37,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError, MbtfError, reason
-from mbtf_core.suggest import refuse_special, suggest_path
+from mbtf_core.paths import refuse_special, suggest_path
 from mbtf_gen.measured.interface import (
     F32,
     HORIZON,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from mbtf_core.errors import InputError
-from mbtf_core.suggest import refuse_special, suggest_path
+from mbtf_core.paths import refuse_special, suggest_path
 from mbtf_gen.measured.hdf5 import COLOR, MAGIC, RADIUS, opened, read_neumip, read_neural_btf
 from mbtf_gen.measured.interface import MeasuredBtf, MeasuredQueries
 from mbtf_gen.measured.ubo2003 import read_ubo2003

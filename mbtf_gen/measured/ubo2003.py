@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError, reason
-from mbtf_core.suggest import refuse_special
+from mbtf_core.paths import refuse_special
 from mbtf_gen.measured.interface import I64, ImageBtf, check_texels, from_angles
 
 SUFFIXES = (".jpg", ".jpeg", ".png")

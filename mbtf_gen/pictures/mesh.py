@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.color import to_display
 from mbtf_core.errors import EngineError
-from mbtf_core.exposure import to_display
 from mbtf_core.images.resample import resample
-from mbtf_core.pictures.camera import Camera
-from mbtf_core.run.child import run_child
+from mbtf_core.pictures import Camera
+from mbtf_core.run.processes import run_child
 from mbtf_gen.tile.heights import HeightGrid, grid_faces, grid_vertices
 from mbtf_gen.tile.protocol import Tile
 

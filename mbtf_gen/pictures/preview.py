@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.app.console import Console
+from mbtf_core.color import auto_exposure, brightness, describe_exposure
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import InputError, PartialError
-from mbtf_core.exposure import auto_exposure, brightness, describe_exposure
 from mbtf_core.files.folders import check_space, owned
-from mbtf_core.pictures.camera import Camera, tiles_camera
-from mbtf_core.pictures.reference import PNG_BYTES, claim_pictures, write_display
+from mbtf_core.pictures import PNG_BYTES, Camera, claim_pictures, tiles_camera, write_display
 from mbtf_core.run.signals import keep_on_interruption
 from mbtf_gen.config.pictures import PreviewConfig
 from mbtf_gen.forecast import announce

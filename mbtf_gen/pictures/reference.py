@@ -16,14 +16,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.app.console import Console
+from mbtf_core.color import auto_exposure, brightness, describe_exposure
 from mbtf_core.data.schema import Queries
 from mbtf_core.data.shard_files import row_bytes
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import PartialError
-from mbtf_core.exposure import auto_exposure, brightness, describe_exposure
 from mbtf_core.files.folders import check_space, owned
-from mbtf_core.pictures.camera import PIXEL_SIGMA, Camera, PixelKind
-from mbtf_core.pictures.reference import PNG_BYTES, ReferenceImage, claim_pictures, read_value, write_display
+from mbtf_core.pictures import (
+    PIXEL_SIGMA,
+    PNG_BYTES,
+    Camera,
+    PixelKind,
+    ReferenceImage,
+    claim_pictures,
+    read_value,
+    write_display,
+)
 from mbtf_core.run.cluster import open_runner
 from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.run.task import Item
@@ -112,7 +120,7 @@ def render_reference(
     omega_i : (3,) float array
         Direction towards the light.
     kind : {"query", "pixel"}
-        Meaning of a pixel, see :mod:`mbtf_core.pictures.camera`.
+        Meaning of a pixel, see :mod:`mbtf_core.pictures`.
     spp : paths per pixel, both halves together; even
     seed, index : root seed of the random numbers, and number of the picture
 

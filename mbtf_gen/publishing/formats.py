@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 from mbtf_core.data.dataset import Shard
 from mbtf_core.data.folder import sidecar_name
 from mbtf_core.data.shard_files import Arrays
-from mbtf_core.files.atomic import Stored, sync_folder, temporary_of, write_chunks, write_through
-from mbtf_core.files.digest import file_sha256
+from mbtf_core.files.atomic import Stored, file_sha256, sync_folder, temporary_of, write_chunks, write_through
 from mbtf_gen.config.publish import Form
 
 Described = Mapping[str, Mapping[str, Any]]

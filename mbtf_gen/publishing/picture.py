@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.color import auto_exposure, brightness, to_display
 from mbtf_core.data.geometry import Geometry
 from mbtf_core.data.lattice import level_of_sigma
 from mbtf_core.data.shard_files import Arrays
-from mbtf_core.exposure import auto_exposure, brightness, to_display
 from mbtf_core.files.atomic import Stored, write_chunks
 from mbtf_gen.measured.exported import mean_of
 

@@ -17,8 +17,7 @@ from mbtf_core.data.schema import GEOMETRY_NAME
 from mbtf_core.data.shard_files import Arrays
 from mbtf_core.data.verify import verify
 from mbtf_core.errors import EngineError, InputError, UsageError
-from mbtf_core.files.atomic import Stored, write_chunks
-from mbtf_core.files.digest import data_sha256
+from mbtf_core.files.atomic import Stored, data_sha256, write_chunks
 from mbtf_core.files.folders import OutputFolder, OutputKind, check_space, owned
 from mbtf_gen.config.publish import PublishConfig
 from mbtf_gen.publishing.card import CARD_NAME, card_text

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.data.schema import Tiling
 from mbtf_core.errors import InputError
-from mbtf_core.files.digest import data_sha256, file_sha256
+from mbtf_core.files.atomic import data_sha256, file_sha256
 from mbtf_core.images.read import MAX_PIXELS, gray
 from mbtf_core.images.resample import dequantize
-from mbtf_core.suggest import suggest_path
+from mbtf_core.paths import suggest_path
 from mbtf_gen.tile.heightfield_tile import MAPS, HeightFieldTile
 from mbtf_gen.tile.maps.checks import (
     Codes,

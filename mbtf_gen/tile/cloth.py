@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mbtf_core.errors import InputError
-from mbtf_core.files.digest import data_sha256, file_sha256
+from mbtf_core.files.atomic import data_sha256, file_sha256
 from mbtf_gen.tile.fiber_tile import FiberScattering, FiberTile
 from mbtf_gen.tile.fibers.cloth_file import ClothFile, YarnEntry
 from mbtf_gen.tile.fibers.curve_files import read_curves

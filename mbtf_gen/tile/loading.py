@@ -11,9 +11,9 @@ from mbtf_core.config.settings import build
 from mbtf_core.config.yaml_file import read_yaml
 from mbtf_core.data.schema import Tiling
 from mbtf_core.errors import InputError
-from mbtf_core.files.digest import file_sha256
+from mbtf_core.files.atomic import file_sha256
 from mbtf_core.images.read import SUFFIXES, is_image
-from mbtf_core.suggest import suggest_path
+from mbtf_core.paths import suggest_path
 from mbtf_gen.tile.assembly import assemble, retiled
 from mbtf_gen.tile.cloth import cloth_tile
 from mbtf_gen.tile.fibers.cloth_file import CLOTH_KEYS, CURVE_FILES, ClothFile

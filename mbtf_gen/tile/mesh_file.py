@@ -14,7 +14,7 @@ from mbtf_core.color import srgb_to_linear
 from mbtf_core.config.settings import FileName, Settings
 from mbtf_core.data.schema import Tiling
 from mbtf_core.errors import InputError, reason
-from mbtf_core.files.digest import data_sha256, file_sha256
+from mbtf_core.files.atomic import data_sha256, file_sha256
 from mbtf_gen.config.generator import Positive, Resolution, Rgb, Share, no_tiling
 from mbtf_gen.tile.mesh_tile import F64, MeshPart, MeshTile
 

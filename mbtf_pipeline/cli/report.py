@@ -30,7 +30,7 @@ def report(
     exposure
         Exposure of the pictures: a value v in 1/sr is shown as 2^EV v.
     """
-    from mbtf_core.exposure import describe_exposure
+    from mbtf_core.color import describe_exposure
     from mbtf_pipeline.collection.run import is_collection, write_again
     from mbtf_pipeline.run import rerender
 

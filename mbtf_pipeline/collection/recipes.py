@@ -9,8 +9,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Self, TypeVar
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from mbtf_core.config.nested import deep_merge
-from mbtf_core.config.settings import FileName, Settings, build, resolve
+from mbtf_core.config.settings import FileName, Settings, build, deep_merge, resolve
 from mbtf_core.config.yaml_file import read_yaml
 from mbtf_core.errors import InputError, MbtfError
 from mbtf_core.units import Duration

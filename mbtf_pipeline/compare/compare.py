@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.color import auto_exposure, brightness, white_of
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import PartialError
-from mbtf_core.exposure import auto_exposure, brightness, white_of
 from mbtf_core.files.atomic import write_json
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.compare.image_files import PICTURES, Scene, scenes, write_map, write_picture
@@ -26,8 +26,7 @@ from mbtf_pipeline.compare.unmodified_mitsuba import pick_scene, write_agreement
 from mbtf_pipeline.recipe import CompareSection
 
 if TYPE_CHECKING:
-    from mbtf_core.pictures.camera import PixelKind
-    from mbtf_core.pictures.reference import ReferenceImage
+    from mbtf_core.pictures import PixelKind, ReferenceImage
     from mbtf_core.run.runner import Runner
     from mbtf_fit import Material
     from mbtf_gen.job import Job
@@ -164,7 +163,7 @@ def _compare_scene(
 ) -> dict[str, Any]:
     """Write the images of one scene and measure their errors."""
     from mbtf_core.data.lattice import level_of_sigma
-    from mbtf_core.pictures.reference import write_display
+    from mbtf_core.pictures import write_display
     from mbtf_core.stats import mse_difference, pooled_relative_error
 
     white = white_of(exposure)

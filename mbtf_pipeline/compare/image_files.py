@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
-from mbtf_core.pictures.camera import Camera
+from mbtf_core.pictures import Camera
 from mbtf_pipeline.recipe import FIELD_OF_VIEW, CompareSection, SceneDirection, SceneView
 
 F32 = NDArray[np.float32]
@@ -98,7 +98,7 @@ def read_channels(path: Path, *sets: Sequence[str]) -> F32:
 def write_picture(path: Path, value: NDArray[Any], exposure: float) -> None:
     """Write linear RGB (rows, columns, 3) in 1/sr as ``path`` + ``.exr``, and at an exposure in EV as
     ``.png``."""
-    from mbtf_core.pictures.reference import write_display
+    from mbtf_core.pictures import write_display
 
     write_channels(with_ending(path, ".exr"), value, "RGB")
     write_display(path, value, exposure)
@@ -128,7 +128,7 @@ def read_halves(path: Path) -> tuple[F32, F32]:
 
 def write_map(path: Path, flip: F32) -> None:
     """Write a map (rows, columns) from 0 to 1 as ``path`` + ``-flip.png``, 8-bit gray, atomically."""
-    from mbtf_core.pictures.reference import write_png
+    from mbtf_core.pictures import write_png
 
     write_png(with_ending(path, _FLIP), np.round(255.0 * np.clip(flip, 0.0, 1.0)).astype(np.uint8))
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import UsageError
-from mbtf_core.pictures.camera import PIXEL_SIGMA, Camera
+from mbtf_core.pictures import PIXEL_SIGMA, Camera
 from mbtf_core.stats import Estimate, mean_estimate
 from mbtf_gen.tile.maps.material_file import ROLES
 from mbtf_pipeline.compare.image_files import PICTURES, write_picture

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.config.nested import deep_merge, nested
+from mbtf_core.config.settings import deep_merge, nested
 from mbtf_core.data.schema import Queries
 from mbtf_core.errors import InputError
 from mbtf_core.forecast import median_estimate

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.errors import InputError
-from mbtf_core.files.atomic import read_json, write_json
-from mbtf_core.files.digest import data_sha256
+from mbtf_core.files.atomic import data_sha256, read_json, write_json
 from mbtf_core.stats import Estimate
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.tables import estimate

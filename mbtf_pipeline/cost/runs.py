@@ -22,9 +22,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mbtf_core.config.nested import deep_merge, nested
+from mbtf_core.config.settings import deep_merge, nested
 from mbtf_core.data.shard_files import row_bytes
-from mbtf_core.files.digest import data_sha256
+from mbtf_core.files.atomic import data_sha256
 from mbtf_core.stats import Estimate, unexplained_variance
 from mbtf_core.units import parse_duration
 from mbtf_fit.config import DEFAULT_MODEL, best_options

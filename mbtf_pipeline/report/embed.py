@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mbtf_core.exposure import to_display
+from mbtf_core.color import to_display
 
 U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]

@@ -12,7 +12,7 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.exposure import white_of
+from mbtf_core.color import white_of
 from mbtf_pipeline.compare.image_files import read_halves, read_map, read_picture
 from mbtf_pipeline.compare.offsets import read_offset, towards_view
 from mbtf_pipeline.compare.perceptual_metrics import available_metrics

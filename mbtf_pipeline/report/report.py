@@ -8,12 +8,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from mbtf_core.color import describe_exposure
 from mbtf_core.config.settings import check_schema
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import InputError
-from mbtf_core.exposure import describe_exposure
 from mbtf_core.files.atomic import read_json, write_text
-from mbtf_core.pictures.camera import Camera
+from mbtf_core.pictures import Camera
 from mbtf_pipeline.compare.compare import COMPARISON_NAME, COMPARISON_SCHEMA
 from mbtf_pipeline.compare.image_files import read_picture
 from mbtf_pipeline.recipe import RECIPE_NAME, Recipe

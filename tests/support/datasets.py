@@ -16,8 +16,7 @@ from mbtf_core.data.documents import sidecar
 from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.schema import Queries, ShardEntry, Split
 from mbtf_core.data.shard_files import read_shard, write_shard
-from mbtf_core.files.atomic import Stored, checksummed, parse_checksummed
-from mbtf_core.files.digest import file_sha256
+from mbtf_core.files.atomic import Stored, checksummed, file_sha256, parse_checksummed
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.folder import open_folder
 from mbtf_gen.generation.manifest import finish

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mbtf_core.data.geometry import Geometry, geometry_record, write_geometry
+from mbtf_core.data.geometry import Geometry, encode_geometry, geometry_record
 from mbtf_core.data.lattice import Lattice, sigma_of_level
 from mbtf_core.data.schema import FORMAT_NAME, GEOMETRY_NAME, MANIFEST_NAME, SCHEMA_VERSION
 from mbtf_core.data.shard_files import write_shard
@@ -89,7 +89,7 @@ def write_data(
     lattice = Lattice(finest, aspect)
     random = np.random.default_rng(seed)
     geometry = geometry or flat_geometry(lattice)
-    write_geometry(folder / GEOMETRY_NAME, geometry)
+    (folder / GEOMETRY_NAME).write_bytes(encode_geometry(geometry))
     config_hash = f"{function.__name__}-{seed}-{noise}"
     splits: dict[str, dict[str, object]] = {}
     for split, total, count in (("train", train, shards), ("test", test, 1)):

@@ -12,7 +12,7 @@ import torch
 from safetensors.numpy import load_file, save_file
 
 from mbtf_core.data.lattice import Lattice
-from mbtf_core.files.digest import file_sha256
+from mbtf_core.files.atomic import file_sha256
 from mbtf_fit.config import FitConfig, build_model
 from mbtf_fit.material.material import Material, export
 from mbtf_fit.material.transmittance import Transmittance

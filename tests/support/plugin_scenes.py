@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import mbtf_fit.backends.mitsuba
-from mbtf_core.pictures.camera import Camera
+from mbtf_core.pictures import Camera
 
 from .scenes import mi
 

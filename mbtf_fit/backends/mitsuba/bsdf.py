@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from mbtf_core.errors import InputError, UsageError
-from mbtf_core.pictures.camera import pixel_sigma
+from mbtf_core.pictures import pixel_sigma
 from mbtf_fit.backends.mitsuba.backend import Arithmetic
 from mbtf_fit.backends.mitsuba.evaluator import Evaluator
 from mbtf_fit.backends.mitsuba.lobe_fit import fit_lobes

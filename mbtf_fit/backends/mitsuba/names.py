@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from contextvars import ContextVar
 
 from mbtf_core.errors import UsageError
-from mbtf_core.suggest import suggest_name
+from mbtf_core.paths import suggest_name
 from mbtf_gen.engine.runtime import CPU_VARIANT, CUDA_VARIANT
 from mbtf_gen.engine.types import Properties
 

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError
-from mbtf_core.images.metadata import ColorSpace
-from mbtf_core.images.read import Image, count_and_first, gray, read_image
+from mbtf_core.images.read import ColorSpace, Image, count_and_first, gray, read_image
 from mbtf_gen.tile.maps.discovery import role_of
 from mbtf_gen.tile.maps.material_file import ColorEntry, HeightEntry, NormalEntry, ShareEntry
 

@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from mbtf_core.config.settings import FileName, Settings
 from mbtf_core.data.schema import Tiling
-from mbtf_core.images.metadata import ColorSpace
+from mbtf_core.images.read import ColorSpace
 from mbtf_gen.config.generator import MAX_SCALE, Resolution, Rgb, Share
 
 Channel = Annotated[str, Field(min_length=1)]

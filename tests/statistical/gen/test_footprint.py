@@ -20,7 +20,7 @@ from support.scenes import (
     queries,
 )
 
-from mbtf_core.pictures.camera import Camera
+from mbtf_core.pictures import Camera
 from mbtf_core.stats import mean_of_halves, t_test
 from mbtf_gen.pictures.reference import _camera_rays
 from mbtf_gen.render.scene import CLEARANCE, LONG_SIDE

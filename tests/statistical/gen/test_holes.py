@@ -160,7 +160,7 @@ def test_transmittance_agrees_with_mitsuba(tmp_path: Path) -> None:
 def test_pictures_store_the_transmittance(tmp_path: Path) -> None:
     """A picture straight from above shows the holes where the map has them, and stores them."""
     from mbtf_core.images.exr import read_channels
-    from mbtf_core.pictures.camera import Camera
+    from mbtf_core.pictures import Camera
     from mbtf_gen.pictures.reference import render_reference
 
     camera = Camera(90.0, -90.0, tiles_across=1.0, rows=16, columns=16)

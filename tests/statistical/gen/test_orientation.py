@@ -22,7 +22,7 @@ from support.scenes import (
 )
 
 from mbtf_core.data.lattice import Lattice, texel_centers
-from mbtf_core.pictures.camera import Camera
+from mbtf_core.pictures import Camera
 from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan
 from mbtf_gen.tile.heights import tile_mesh
 

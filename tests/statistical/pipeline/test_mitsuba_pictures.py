@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from mbtf_core.errors import UsageError
-from mbtf_core.pictures.camera import Camera
+from mbtf_core.pictures import Camera
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile

@@ -16,7 +16,7 @@ from support.shader_cases import CASES, make
 from support.viewer_page import Page
 
 from mbtf_core.directions import from_angles
-from mbtf_core.pictures.camera import Camera
+from mbtf_core.pictures import Camera
 from mbtf_fit import fit
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries

@@ -12,7 +12,7 @@ from support.viewer_page import Page
 from mbtf_core.color import linear_to_srgb, srgb_to_linear
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.directions import from_angles
-from mbtf_core.pictures.camera import Camera
+from mbtf_core.pictures import Camera
 from mbtf_fit.material.transmittance import Transmittance
 from mbtf_fit.viewer.content import material_content
 from mbtf_fit.viewer.extras import picture_content

@@ -14,7 +14,7 @@ from support.viewer_page import Page
 
 from mbtf_core.color import linear_to_srgb
 from mbtf_core.directions import from_angles
-from mbtf_core.pictures.camera import Camera
+from mbtf_core.pictures import Camera
 from mbtf_fit.material.material import Material
 from mbtf_fit.viewer.content import as_read, encode, material_content, pack_textures
 from mbtf_fit.viewer.extras import mesh_content

@@ -13,7 +13,7 @@ from support.datasets import write_dataset
 
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.directions import from_angles
-from mbtf_core.pictures.camera import tiles_camera
+from mbtf_core.pictures import tiles_camera
 from mbtf_gen.pictures.mesh import draw, tiled_mesh
 from mbtf_gen.tile.loading import load_material
 

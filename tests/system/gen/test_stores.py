@@ -171,19 +171,6 @@ def test_a_store_that_is_gone(tmp_path: Path, proxy: Proxy, monkeypatch: pytest.
     assert not list((tmp_path / "cache/mbtf/stores/waiting").glob("*/*"))
 
 
-def test_no_store_at_all(tmp_path: Path, proxy: Proxy, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("MBTF_STORE_PATIENCE", "1")
-    proxy.down = True
-    for program, line in (
-        ("mbtf-gen", line_at(tmp_path)),
-        ("mbtf-gen", ["verify", URL]),
-        ("mbtf-fit", [URL, "-o", tmp_path / "m"]),
-    ):
-        done = call(*line, program=program)
-        assert done.code == 4, done.err
-        assert "the store cannot be reached" in done.err
-
-
 @pytest.mark.parametrize("at", ["manifest.json", "geometry.exr", "train-00001.npz", "train-00001.json"])
 def test_a_writer_that_is_killed(tmp_path: Path, proxy: Proxy, at: str) -> None:
     """Also between a shard and its sidecar; then another machine goes on, or the same one."""

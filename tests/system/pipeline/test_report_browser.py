@@ -16,7 +16,7 @@ from support.browser import browser
 from support.paths import ROOT
 
 from mbtf_core.app.console import run
-from mbtf_core.exposure import to_display
+from mbtf_core.color import to_display
 from mbtf_pipeline.cli.app import app
 from mbtf_pipeline.compare.image_files import read_picture
 

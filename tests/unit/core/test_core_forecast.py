@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 
 from mbtf_core import forecast as module
-from mbtf_core.forecast import FEWEST_PIECES, median_estimate, pilot_seconds
+from mbtf_core.forecast import FEWEST_PIECES, pilot_seconds
 
 
 class Clock:
@@ -31,10 +30,3 @@ def test_a_pilot_times_its_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     found = pilot_seconds(piece, 100.0)
     assert found.value == pytest.approx(0.5)
     assert found.error < 0.01
-
-
-def test_the_error_of_a_median_is_that_of_normal_timings() -> None:
-    rng = np.random.default_rng(0)
-    found = [median_estimate(list(rng.normal(10.0, 1.0, 101))) for _ in range(400)]
-    spread = np.std([e.value for e in found])
-    assert np.mean([e.error for e in found]) == pytest.approx(spread, rel=0.15)

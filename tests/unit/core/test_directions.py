@@ -4,20 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from mbtf_core.directions import check_unit, from_angles, from_projected_disk, normalize, to_angles
+from mbtf_core.directions import check_unit, from_angles, from_projected_disk
 from mbtf_core.errors import InputError
-
-
-@given(st.floats(0.01, 89.9), st.floats(0, 359.9))
-def test_angles_round_trip(elevation: float, azimuth: float) -> None:
-    omega = from_angles(elevation, azimuth)
-    assert np.linalg.norm(omega) == pytest.approx(1.0)
-    back = to_angles(omega)
-    assert back[0] == pytest.approx(elevation, abs=1e-9)
-    assert (back[1] - azimuth + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=1e-6)
 
 
 def test_axes() -> None:
@@ -26,24 +15,9 @@ def test_axes() -> None:
     assert from_angles(0, 90) == pytest.approx([0, 1, 0], abs=1e-15)
     assert from_angles([90, 90], [10, 200]) == pytest.approx(np.array([[0, 0, 1], [0, 0, 1]]), abs=1e-15)
     assert from_angles(np.zeros((2, 1)), np.zeros(3)).shape == (2, 3, 3)
+    assert np.linalg.norm(from_angles(33.0, 123.0)) == pytest.approx(1.0)
     # Grazing elevations keep their precision.
-    assert to_angles(from_angles(1e-6, 45.0))[0] == pytest.approx(1e-6, rel=1e-9)
-
-
-@pytest.mark.parametrize("radius", [0.0, 0.5, 0.99, 1.0])
-def test_projected_disk(radius: float) -> None:
-    omega = from_projected_disk([radius * 0.6, radius * -0.8])
-    assert omega[:2] == pytest.approx([radius * 0.6, radius * -0.8])
-    assert np.linalg.norm(omega) == pytest.approx(1.0)
-    assert omega[2] >= 0.0
-    # Rounding beyond the disk gives no NaN.
-    assert from_projected_disk([1.0 + 1e-12, 0.0])[2] == 0.0
-
-
-def test_normalize() -> None:
-    assert normalize([[0.0, 0.0, 5.0], [3.0, 0.0, 4.0]]) == pytest.approx(
-        np.array([[0, 0, 1], [0.6, 0, 0.8]])
-    )
+    assert from_angles(1e-6, 45.0)[2] == pytest.approx(np.radians(1e-6), rel=1e-9)
 
 
 def test_directions_that_are_no_unit_vectors_are_refused() -> None:
@@ -55,3 +29,12 @@ def test_directions_that_are_no_unit_vectors_are_refused() -> None:
         bad[1] *= factor
         with pytest.raises(InputError, match=r"omega_i: 1 of 3 directions are not .* at index 1"):
             check_unit(bad, "omega_i")
+
+
+@pytest.mark.parametrize("radius", [0.0, 0.5, 0.99, 1.0])
+def test_projected_disk(radius: float) -> None:
+    omega = from_projected_disk([radius * 0.6, radius * -0.8])
+    assert omega[:2] == pytest.approx([radius * 0.6, radius * -0.8])
+    assert np.linalg.norm(omega) == pytest.approx(1.0)
+    # Rounding beyond the disk gives no NaN.
+    assert from_projected_disk([1.0 + 1e-12, 0.0])[2] == 0.0

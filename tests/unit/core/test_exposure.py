@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mbtf_core.exposure import auto_exposure, brightness, describe_exposure, to_display, white_of
+from mbtf_core.color import auto_exposure, brightness, describe_exposure, to_display, white_of
 
 RAMP = np.repeat(np.linspace(0, 1, 1001)[:, None], 3, axis=1).reshape(-1, 1, 3)
 

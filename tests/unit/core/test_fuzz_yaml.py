@@ -140,14 +140,6 @@ def odd(draw: st.DrawFn, text: str) -> str:
 
 
 @pytest.mark.parametrize("kind", DOCUMENTS)
-def test_the_documents_are_taken(kind: str, folder: Path) -> None:
-    text, load = DOCUMENTS[kind]
-    path = folder / f"{kind}.yaml"
-    path.write_text(text)
-    assert loads_or_refuses(lambda: load(path)) is not None
-
-
-@pytest.mark.parametrize("kind", DOCUMENTS)
 @given(data=st.data())
 @examples(120)
 def test_odd_words(kind: str, data: st.DataObject, folder: Path) -> None:
@@ -216,23 +208,6 @@ def test_a_value_that_holds_itself(text: str, write: Callable[[str], Path]) -> N
     loads_or_refuses(lambda: load_material(path))
 
 
-@pytest.mark.parametrize(
-    ("text", "data"),
-    [
-        ("\ufeffa: 1\n", {"a": 1}),
-        ("a: &a {x: 1}\nc:\n  <<: *a\n  y: 2\n", {"a": {"x": 1}, "c": {"y": 2, "x": 1}}),
-    ],
-    ids=["byte order mark", "alias"],
-)
-def test_harmless_yaml_is_read(text: str, data: dict[str, Any], write: Callable[[str], Path]) -> None:
-    assert read_yaml(write(text)) == data
-
-
-def test_a_hostile_assignment_is_refused() -> None:
-    with pytest.raises(InputError, match="holds more than 100,000 values"):
-        resolve(GeneratorConfig, assignments=[f"seed={{{BOMB.strip().replace(chr(10), ', ')}}}"])
-
-
 @pytest.mark.parametrize("text", ["a: " + "[" * 100_000, "a: " + "{a: " * 50_000])
 def test_brackets_are_counted_first(
     text: str, write: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
@@ -241,10 +216,3 @@ def test_brackets_are_counted_first(
     monkeypatch.setattr("mbtf_core.config.yaml_file._yaml", lambda: pytest.fail("the text was read"))
     with pytest.raises(InputError, match="levels deep"):
         read_yaml(write(text))
-
-
-@pytest.mark.parametrize("name", ["a\\0b", "x" * 300, "folder/" + "y" * 300, "z/" * 3000])
-@pytest.mark.parametrize("line", ["height: {}", "height: heights.npy\nroughness: {}"])
-def test_names_that_no_file_can_have(name: str, line: str, write: Callable[[str], Path]) -> None:
-    with pytest.raises(InputError, match="is not a valid file name"):
-        load_material(write(line.format(f'"{name}"')))

@@ -68,13 +68,3 @@ def test_no_vertex_pierces_a_plane(
                 assert plane[3] == 0
     # As low as they can be.
     assert touched == sum(-(-rows // s) * -(-columns // s) for s in 2 ** np.arange(1, finest + 1))
-
-
-def test_planes_follow_a_slope() -> None:
-    """Above a ramp they stand nowhere higher than the ramp itself, except where it starts anew."""
-    z = np.tile(np.arange(8.0), (8, 1))
-    table = node_table(z)
-    first = z.size + (1 << 4)
-    planes = table[first : first + 16].reshape(4, 4, 4)
-    np.testing.assert_allclose(planes[:, :3, 0], np.tile([0.0, 2.0, 4.0], (4, 1)), atol=1e-5)
-    np.testing.assert_allclose(planes[:, :3, 1], 1.0, atol=1e-6)

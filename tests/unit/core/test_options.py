@@ -27,10 +27,6 @@ class Config(Settings):
     widths: Annotated[list[float], Flag("--widths")] = Field([1.0, 2.5], description="widths")
 
 
-class Twice(Config):
-    spp: Annotated[int, Flag("--spp")] = Field(4, description="paths per pixel")
-
-
 @options_from(Config)
 class All(Options[Config]):
     """All options."""
@@ -116,12 +112,6 @@ def test_a_wrong_value_names_its_flag(capsys: pytest.CaptureFixture[str]) -> Non
     assert run(app, ["--spp", "1"]) == 2
     assert capsys.readouterr().err.startswith("error: --spp: 'queries.spp': must be ")
     assert run(app, ["--layout", "image"]) == 2
-
-
-def test_two_options_of_one_flag_are_refused() -> None:
-    with pytest.raises(ValueError, match="same flag"):
-        options_from(Twice)
-    options_from(Twice, "spp", "layout")
 
 
 def test_a_command_line_can_be_given_to_a_shell() -> None:

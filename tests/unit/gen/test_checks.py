@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mbtf_core.app.console import Console
-from mbtf_core.run.child import ChildResult
+from mbtf_core.run.processes import ChildResult
 from mbtf_gen import doctor, selftest
 from mbtf_gen.checks import Check, Finding, report, run_checks
 from mbtf_gen.engine import runtime

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import os
 import threading
@@ -12,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from mbtf_core.data.store import FileCache
-from mbtf_core.errors import InputError, PartialError
+from mbtf_core.errors import InputError
 
 
 def content(number: int) -> bytes:
@@ -76,16 +75,6 @@ def test_unfinished_files_of_others_stay_for_a_day(tmp_path: Path) -> None:
     fetch(cache, 2)
     assert fresh.exists()
     assert not old.exists()
-
-
-def test_a_full_disk_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(os, "replace", full)
-    with pytest.raises(PartialError, match="No space left"):
-        fetch(FileCache(tmp_path), 1)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_threads_share_a_download(tmp_path: Path) -> None:

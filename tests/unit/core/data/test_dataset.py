@@ -60,22 +60,6 @@ def test_images_share_direction_and_footprint(tmp_path: Path, array_format: str)
     assert np.array_equal(row, np.broadcast_to(np.arange(4)[:, None], (5, 4, 8)))
 
 
-def test_chosen_arrays_are_mapped(tmp_path: Path) -> None:
-    data = write_dataset(tmp_path / "shards", queries={"train": "100", "test": "10"}, output=OUTPUT)
-    parts = list(data.iterate("train", ["u", "sigma"]))
-    assert [len(p["sigma"]) for p in parts] == [64, 36]
-    assert set(parts[0]) == {"u", "sigma"}
-    assert isinstance(parts[0]["u"], np.memmap)
-
-
-def test_a_folder_can_move(tmp_path: Path) -> None:
-    data = write_dataset(tmp_path / "here", queries={"train": "100", "test": "10"}, output=OUTPUT)
-    before = data.load("train")
-    moved = (tmp_path / "here").rename(tmp_path / "there")
-    (tmp_path / "here.npy").unlink()
-    assert np.array_equal(Dataset.open(moved).load("train")["u"], before["u"])
-
-
 @pytest.mark.parametrize("suffix", ["npz", "json"])
 def test_missing_and_unfinished_shards(tmp_path: Path, suffix: str) -> None:
     data = write_dataset(tmp_path / "shards", queries={"train": "100", "test": "10"}, output=OUTPUT)

@@ -39,12 +39,6 @@ def test_default_lattice_of_a_map(rows: int, columns: int, finest: int, shape: t
     assert lattice.shape(0) == (max(1, round(rows / columns)), 1)
 
 
-def test_chosen_finest_level_and_range_of_footprints() -> None:
-    lattice = Lattice.for_map(512, 1024, 7)
-    assert lattice.shape() == (64, 128)
-    assert lattice.sigma_range == (0.5 / 128, 0.5)
-
-
 @given(st.integers(0, 14), st.floats(-3, 18))
 def test_blending(finest: int, level: float) -> None:
     """Weights of the two levels reproduce the level, clamped to the data's range."""

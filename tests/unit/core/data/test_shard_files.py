@@ -45,15 +45,6 @@ def test_arrays_round_trip(tmp_path: Path, suffix: str, lead: tuple[int, ...], h
     assert check_arrays(back, path) == lead
 
 
-@pytest.mark.parametrize("suffix", FORMATS)
-def test_chosen_arrays(tmp_path: Path, suffix: str) -> None:
-    path = tmp_path / f"x.{suffix}"
-    write_shard(path, arrays(SHUFFLED))
-    assert set(read_shard(path, ["sigma", "value_b"])) == {"sigma", "value_b"}
-    with pytest.raises(InputError, match="lacks the array 'transmittance'"):
-        read_shard(path, ["transmittance"])
-
-
 def test_npz_is_read_by_numpy_itself(tmp_path: Path) -> None:
     path = tmp_path / "x.npz"
     written = arrays(IMAGE)
@@ -103,15 +94,6 @@ def test_exr_has_named_float_channels_of_the_right_place(tmp_path: Path) -> None
         image = file.channels()["value_a.G"].pixels
         assert image.shape == (3 * 4, 8)
         assert image[2 * 4 + 1, 5] == images["value_a"][2, 1, 5, 1]
-
-
-@pytest.mark.parametrize("suffix", FORMATS)
-def test_a_failed_write_leaves_nothing(tmp_path: Path, suffix: str) -> None:
-    wrong = arrays(SHUFFLED)
-    del wrong["sigma"]
-    with pytest.raises(InputError, match=r"lacks the array\(s\) sigma"):
-        write_shard(tmp_path / f"x.{suffix}", wrong)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_arrays_that_do_not_belong_together_are_refused() -> None:

@@ -14,7 +14,7 @@ from support.object_stores import memory_store
 import mbtf_core.data.store
 from mbtf_core.data.store import ObjectStore
 from mbtf_core.errors import EngineError, InputError, PartialError
-from mbtf_core.urls import split_url
+from mbtf_core.paths import split_url
 
 
 @pytest.fixture
@@ -58,13 +58,6 @@ def test_objects_are_listed_read_and_deleted(store: ObjectStore) -> None:
     assert set(store.list()) == {"sub/"}
     with pytest.raises(FileNotFoundError):
         store.read("a")
-
-
-def test_the_mark_of_a_folder_is_no_object_of_it(store: ObjectStore, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Programs of stores make an empty object of a folder's own name."""
-    found = [{"name": f"/data/x/{name}", "size": 0, "type": "file"} for name in ("", "a")]
-    monkeypatch.setattr(store._files, "ls", lambda path, detail: found)
-    assert set(store.list()) == {"a"}
 
 
 def test_the_tag_changes_with_the_content(store: ObjectStore) -> None:

@@ -18,7 +18,7 @@ from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.schema import ShardEntry
 from mbtf_core.data.shard_files import Arrays, read_shard, write_shard
 from mbtf_core.data.verify import foreign_files, verify
-from mbtf_core.files.digest import file_sha256
+from mbtf_core.files.atomic import file_sha256
 
 FORMATS = ["npz", "exr"]
 
@@ -67,14 +67,16 @@ def test_an_intact_set_has_no_fault(copy: Path) -> None:
 
 
 def test_every_flipped_byte_is_found(copy: Path) -> None:
-    path = shard(copy)
-    intact = path.read_bytes()
-    # Ends, headers, numbers: a spread over the file.
-    for position in [*range(0, len(intact), len(intact) // 40), len(intact) - 1]:
-        damaged = bytearray(intact)
-        damaged[position] ^= 0x10
-        path.write_bytes(damaged)
-        assert list(faults(copy)) == [path.name], position
+    for path in (copy / "geometry.exr", shard(copy)):
+        intact = path.read_bytes()
+        # Ends, headers, numbers: a spread over the file.
+        for position in [*range(0, len(intact), len(intact) // 40), len(intact) - 1]:
+            damaged = bytearray(intact)
+            damaged[position] ^= 0x10
+            path.write_bytes(damaged)
+            assert list(faults(copy)) == [path.name], position
+        if path.stem == "geometry":
+            path.write_bytes(intact)
     wanted = json.loads((copy / "manifest.json").read_text())["config_hash"]
     # On resuming, sidecar and size alone are checked.
     assert finished_record(DataFolder.open(copy), entry(copy, 40), wanted)
@@ -94,15 +96,9 @@ def test_a_truncated_shard_is_found(copy: Path, kept: int) -> None:
     assert finished_record(DataFolder.open(copy), entry(copy, 40, 0), manifest["config_hash"])
 
 
-def test_every_flipped_byte_of_the_geometry_is_found(copy: Path) -> None:
+def test_a_damaged_geometry_is_found(copy: Path) -> None:
     path = copy / "geometry.exr"
-    intact = path.read_bytes()
-    for position in [*range(0, len(intact), len(intact) // 40), len(intact) - 1]:
-        damaged = bytearray(intact)
-        damaged[position] ^= 0x10
-        path.write_bytes(damaged)
-        assert list(faults(copy)) == [path.name], position
-    path.write_bytes(intact[:-1])
+    path.write_bytes(path.read_bytes()[:-1])
     assert "SHA-256" in faults(copy)[path.name]
     path.unlink()
     assert (faults(copy), foreign(copy)) == ({path.name: "is missing"}, [])

@@ -81,11 +81,6 @@ def test_a_full_disk_is_partial_and_keeps_the_old_file(tmp_path: Path, through_n
     assert no_leftovers(tmp_path)
 
 
-def test_a_missing_folder_is_partial(tmp_path: Path) -> None:
-    with pytest.raises(PartialError, match="No such file or directory"):
-        atomic.write_text(tmp_path / "none" / "a.txt", "text")
-
-
 def test_the_data_are_synced_before_the_rename(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     events: list[str] = []
     for name in ("fsync", "replace", "link"):
@@ -100,12 +95,6 @@ def test_the_data_are_synced_before_the_rename(tmp_path: Path, monkeypatch: pyte
         events.clear()
         operation()
         assert events == expected
-
-
-def test_json_goes_there_and_back(tmp_path: Path) -> None:
-    data = {"name": "α", "rows": [1, 2.5, None], "nested": {"flag": True}}
-    atomic.write_json(tmp_path / "a.json", data)
-    assert atomic.read_json(tmp_path / "a.json") == data
 
 
 def test_json_refuses_what_is_no_number(tmp_path: Path) -> None:
@@ -212,14 +201,6 @@ def test_what_a_library_wrote_is_digested_not_what_it_replaces(tmp_path: Path) -
         assert stored == atomic.Stored(len(content), hashlib.sha256(content).hexdigest())
         assert (tmp_path / "a").read_bytes() == content
     assert no_leftovers(tmp_path)
-
-
-def test_pieces_are_digested_as_they_are_written(tmp_path: Path) -> None:
-    pieces = [b"abc", memoryview(b"x" * 100_000), b"", bytearray(b"z")]
-    stored = atomic.write_chunks(tmp_path / "a", pieces)
-    content = (tmp_path / "a").read_bytes()
-    assert content == b"".join(pieces)
-    assert stored == atomic.Stored(len(content), hashlib.sha256(content).hexdigest())
 
 
 @pytest.mark.parametrize("number", [errno.EIO, errno.ENOSPC])

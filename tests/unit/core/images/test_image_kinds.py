@@ -11,7 +11,7 @@ import tifffile
 from support.image_files import exr, png, rng
 
 from mbtf_core.errors import InputError
-from mbtf_core.images.exr import choose_channels, layers
+from mbtf_core.images.exr import choose_channels
 from mbtf_core.images.read import read_image
 
 
@@ -73,16 +73,6 @@ class TestTiff:
 
 
 class TestLayers:
-    def test_grouping(self) -> None:
-        found = layers(["R", "G", "B", "A", "N.X", "N.Y", "N.Z", "displacement.Y", "rough", "id.number"])
-        assert found == {
-            "": ["R", "G", "B", "A"],
-            "N": ["N.X", "N.Y", "N.Z"],
-            "displacement": ["displacement.Y"],
-            "rough": ["rough"],
-            "id.number": ["id.number"],
-        }
-
     def test_choice_by_name(self, tmp_path: Path) -> None:
         names = ["R", "G", "B", "displacement.Y", "roughness.Y"]
         path = tmp_path / "x.exr"

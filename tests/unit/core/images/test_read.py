@@ -49,13 +49,6 @@ def test_palettes_and_single_bits(suffix: str, tmp_path: Path) -> None:
     assert np.array_equal(read_image(tmp_path / f"b.{suffix}").pixels[..., 0], mask.astype(float))
 
 
-def test_jpg(tmp_path: Path) -> None:
-    from PIL import Image as Pillow
-
-    Pillow.fromarray(np.full((16, 24), 77, np.uint8)).save(tmp_path / "x.JPG", "JPEG", quality=95)
-    assert read_image(tmp_path / "x.JPG").pixels[..., 0] == pytest.approx(77 / 255, abs=1.5 / 255)
-
-
 @pytest.mark.parametrize("dtype", [np.float16, np.float32])
 def test_exr(tmp_path: Path, dtype: type) -> None:
     numbers = (100 * rng().normal(size=(5, 6, 4))).astype(dtype)

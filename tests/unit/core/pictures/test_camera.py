@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mbtf_core.directions import from_angles
-from mbtf_core.pictures.camera import Camera
+from mbtf_core.pictures import Camera
 
 UP = np.array([0.0, 0.0, 1.0])
 CAMERA = Camera(

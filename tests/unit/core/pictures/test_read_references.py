@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from mbtf_core.errors import InputError
-from mbtf_core.pictures.reference import claim_pictures, read_references
+from mbtf_core.pictures import claim_pictures, read_references
 
 
 def test_folders_without_pictures_are_refused(tmp_path: Path) -> None:

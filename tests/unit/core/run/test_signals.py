@@ -103,13 +103,6 @@ def test_a_signal_while_a_command_works(command: str, number: signal.Signals, tm
     assert [path.name for path in (tmp_path / "out").glob("[!.]*")] == ["file"]
 
 
-def test_one_ctrl_c_that_arrives_twice_is_one(tmp_path: Path) -> None:
-    """A terminal signals the program and its wrapper, which signals the program again."""
-    twice = "try: send()\n    except KeyboardInterrupt: os.kill(os.getpid(), 2); print('stored')"
-    done = run_program(signal.SIGINT, tmp_path, "-c", SEND + PROGRAM.replace("BODY", twice))
-    assert (done.returncode, done.stdout) == (130, "stored\n")
-
-
 def test_a_signal_after_the_last_act_changes_nothing(tmp_path: Path) -> None:
     code = f"{SEND}\nfrom mbtf_core.run.signals import *\nhandle_signals()\ncode = finish(4)\nsend()"
     assert run_program(signal.SIGTERM, tmp_path, "-c", code).returncode == 4
@@ -158,20 +151,6 @@ def test_a_reader_that_has_gone_is_no_error(tmp_path: Path) -> None:
     )
     os.close(writer)
     assert (done.returncode, done.stderr) == (4, b"")
-
-
-@pytest.mark.parametrize("closed", ["stdout", "stderr"])
-def test_a_closed_stream_is_no_error(closed: str, tmp_path: Path) -> None:
-    code = "import sys\nfrom mbtf_core.run import signals as i\ni.handle_signals()\n"
-    code += "from mbtf_core.app.console import new_app, run\napp = new_app('prog', 'A program.')\n"
-    code += "app.default(lambda: print('result'))\nsys.exit(i.finish(run(app, [])))"
-    number = {"stdout": 1, "stderr": 2}[closed]
-    shell = f'exec "$0" -c "$1" {number}>&-'
-    done = subprocess.run(
-        ["sh", "-c", shell, sys.executable, code], capture_output=True, timeout=15, check=False
-    )
-    assert (done.returncode, done.stderr) == (0, b"")
-    assert done.stdout == (b"" if closed == "stdout" else b"result\n")
 
 
 def test_work_stops_at_a_step_and_then_as_usual(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,7 +16,7 @@ from support.fit_data import constant, write_data
 from support.fuzzing import altered, damaged, examples, loads_or_refuses
 
 from mbtf_core.errors import InputError
-from mbtf_core.files.digest import file_sha256
+from mbtf_core.files.atomic import file_sha256
 from mbtf_fit import FitConfig, Material, fit, read_history
 from mbtf_fit.material.storage import read_tensors
 

@@ -17,7 +17,7 @@ from support.scenes import directional, mi
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import InputError, MbtfError, UsageError
-from mbtf_core.pictures.camera import Camera
+from mbtf_core.pictures import Camera
 from mbtf_fit import Material
 from mbtf_fit.backends.mitsuba import load_scene
 from mbtf_fit.material.transmittance import Transmittance

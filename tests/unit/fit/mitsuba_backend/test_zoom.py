@@ -14,7 +14,7 @@ from support.plugin_scenes import plane, sensor_of, through_pixel_centers
 from support.scenes import directional, mi
 
 from mbtf_core.directions import from_angles
-from mbtf_core.pictures.camera import Camera
+from mbtf_core.pictures import Camera
 
 FINEST = 6
 LIGHT = from_angles(60.0, 20.0)

@@ -13,10 +13,10 @@ from support.plugin_materials import write_material
 from support.scenes import mi
 
 import mbtf_fit.backends.mitsuba
+from mbtf_core.color import to_display
 from mbtf_core.config.settings import resolve
 from mbtf_core.directions import from_angles
-from mbtf_core.exposure import to_display
-from mbtf_core.pictures.camera import Camera
+from mbtf_core.pictures import Camera
 from mbtf_fit.preview.config import MaterialPreviewConfig, SheetSection, TurntableSection
 from mbtf_gen.config.pictures import Direction
 

@@ -15,8 +15,8 @@ from mbtf_core.app.console import run
 from mbtf_core.data.lattice import texel_centers
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import InputError
-from mbtf_core.pictures.camera import Camera, tiles_camera
-from mbtf_core.run.child import run_child
+from mbtf_core.pictures import Camera, tiles_camera
+from mbtf_core.run.processes import run_child
 from mbtf_gen.cli.app import app
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job

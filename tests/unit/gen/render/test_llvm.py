@@ -10,7 +10,7 @@ import pytest
 from conftest import RunPython
 
 from mbtf_core.errors import EngineError
-from mbtf_core.run.child import run_child
+from mbtf_core.run.processes import run_child
 from mbtf_gen.engine import runtime as engine
 
 LOAD = """

@@ -8,8 +8,8 @@ import types
 import numpy as np
 import pytest
 
+from mbtf_core.color import to_display
 from mbtf_core.errors import EngineError
-from mbtf_core.exposure import to_display
 from mbtf_pipeline.compare import perceptual_metrics as perceptual
 from mbtf_pipeline.compare.perceptual_metrics import flip, ssim, st_lpips, to_srgb, weights_file
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mbtf_core.exposure import to_display
+from mbtf_core.color import to_display
 from mbtf_pipeline.report.embed import (
     REDUCTIONS,
     Palette,

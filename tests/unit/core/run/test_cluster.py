@@ -15,11 +15,12 @@ import pytest
 from support import run_tasks
 
 from mbtf_core.errors import InputError, PartialError, UsageError
-from mbtf_core.run import dask_runner, task
+from mbtf_core.run import cluster as module
+from mbtf_core.run import task
 from mbtf_core.run.cluster import open_runner
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item, packed, run_task
-from mbtf_core.run.workers import ClusterConfig
+from mbtf_core.run.workers import ClusterConfig, local_config, read_cluster
 
 
 @pytest.fixture(scope="module")
@@ -84,11 +85,11 @@ def test_a_task_is_run_again_when_it_fails_by_a_bug(cluster: Runner, tmp_path: P
 def test_tasks_whose_files_are_locked_are_tried_later(
     cluster: Runner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(dask_runner, "_PAUSE_SECONDS", 0.2)
+    monkeypatch.setattr(module, "_PAUSE_SECONDS", 0.2)
     arguments = {"marks": str(tmp_path), "times": 3}
     (done,) = cluster.map(run_tasks.locked_at_first, [Item("locked", arguments)])
     assert (done.value, done.error) == (4, "")
-    monkeypatch.setattr(dask_runner, "_LOCKED_SECONDS", 0.5)
+    monkeypatch.setattr(module, "_LOCKED_SECONDS", 0.5)
     (done,) = cluster.map(run_tasks.locked_at_first, [Item("for ever", arguments | {"times": 1000})])
     assert done.error == "folder: is being written by another process"
 
@@ -98,13 +99,6 @@ def test_workers_that_die_each_time_are_reported(cluster: Runner) -> None:
     assert "died each time" in done.error
     (after,) = cluster.map(run_tasks.double, [Item("after", {"x": 1})])
     assert after.value == 2
-
-
-def test_workers_state_their_threads(cluster: Runner) -> None:
-    (done,) = cluster.map(run_tasks.threads, [Item("threads")])
-    stated, environment = done.value
-    assert stated is not None
-    assert environment == str(stated)
 
 
 def test_tasks_for_gpus_run_where_none_is_stated(cluster: Runner) -> None:
@@ -120,11 +114,6 @@ def test_other_versions_are_refused() -> None:
     assert "version" in found["hint"]
 
 
-def test_a_working_folder_that_a_worker_does_not_see_is_named() -> None:
-    call, version, _ = packed(run_tasks.fail, Item("x", {"kind": "input"}))
-    assert "working folder /nowhere" in run_task(call, version, "/nowhere")["hint"]
-
-
 def test_without_dask_one_line_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(UsageError, match=r"mbtf\[cluster\]"), open_runner("local", lambda line: None):
@@ -132,7 +121,7 @@ def test_without_dask_one_line_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_scheduler_that_is_not_there_is_bad_input(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dask_runner, "_CONNECT_SECONDS", 1.0)
+    monkeypatch.setattr(module, "_CONNECT_SECONDS", 1.0)
     pytest.importorskip("distributed")
     with (
         pytest.raises(InputError, match=r"tcp://127\.0\.0\.1:9") as caught,
@@ -143,7 +132,7 @@ def test_a_scheduler_that_is_not_there_is_bad_input(monkeypatch: pytest.MonkeyPa
 
 
 def test_a_scheduler_that_ends_leaves_resumable_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dask_runner, "_CONNECT_SECONDS", 1.0)
+    monkeypatch.setattr(module, "_CONNECT_SECONDS", 1.0)
     distributed = pytest.importorskip("distributed")
     with (
         distributed.LocalCluster(
@@ -193,7 +182,7 @@ def test_jobs_of_batch_systems(monkeypatch: pytest.MonkeyPatch) -> None:
             walltime=7200,
             options=own,  # type: ignore[arg-type]
         )
-        with dask_runner._started(config, []):
+        with module._started(config, []):
             pass
     for script in scripts:
         lines = script.splitlines()
@@ -211,22 +200,13 @@ def test_jobs_of_batch_systems(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "-p short" in scripts[0]
 
 
-def test_a_batch_system_that_is_not_there() -> None:
-    pytest.importorskip("dask_jobqueue")
-    with (
-        pytest.raises(OSError, match="no command bsub"),
-        dask_runner._started(ClusterConfig(engine="lsf"), []),
-    ):
-        pass
-
-
 def test_unknown_options_of_a_batch_system_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("dask_jobqueue")
     monkeypatch.setattr("shutil.which", lambda command: f"/usr/bin/{command}")
     file = tmp_path / "slurm.yaml"
     file.write_text("engine: slurm\noptions: {qeue: short}\n")
     with (
-        pytest.raises(InputError, match="has no option 'qeue'; did you mean 'queue'"),
+        pytest.raises(InputError, match="has no option 'qeue'"),
         open_runner(str(file), lambda line: None),
     ):
         pass
@@ -247,6 +227,30 @@ def test_workers_of_this_machine_divide_its_gpus(monkeypatch: pytest.MonkeyPatch
     assert handlers == {signal.SIGINT: signal.SIG_IGN}
 
 
-def test_threads_outside_of_workers_are_unknown(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv(task.THREADS_VARIABLE, raising=False)
-    assert task.worker_threads() is None
+def test_local_workers_share_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.sched_getaffinity", lambda pid: set(range(16)), raising=False)
+    assert (local_config().workers, local_config().threads) == (4, 4)
+    config = read_cluster("local:8")
+    assert not isinstance(config, str)
+    assert (config.engine, config.workers, config.threads) == ("local", 8, 2)
+    many = read_cluster("local:64")
+    assert not isinstance(many, str)
+    assert many.threads == 1
+
+
+def test_files_and_addresses(tmp_path: Path) -> None:
+    file = tmp_path / "slurm.yaml"
+    file.write_text(
+        "engine: slurm\nworkers: 16\nthreads: 8\nmemory: 16GB\nwalltime: 2h\noptions: {queue: short}\n"
+    )
+    config = read_cluster(str(file))
+    assert not isinstance(config, str)
+    assert (config.engine, config.workers, config.memory, config.walltime) == ("slurm", 16, 16e9, 7200.0)
+    assert config.options == {"queue": "short"}
+    assert read_cluster("tcp://scheduler:8786") == "tcp://scheduler:8786"
+
+
+@pytest.mark.parametrize("where", ["lokal", "local:0", "local:", "local:-1", "http://x", ""])
+def test_other_words_are_refused(where: str) -> None:
+    with pytest.raises(UsageError, match="is no cluster"):
+        read_cluster(where)

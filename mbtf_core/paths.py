@@ -1,9 +1,10 @@
-"""Suggestions for misspelt names of files and options; special files are refused."""
+"""Paths and URLs that users give: suggestions for misspelt names, special files, object stores."""
 
 from __future__ import annotations
 
 import difflib
 import os
+import re
 import stat
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -13,6 +14,8 @@ from mbtf_core.errors import InputError
 _SPECIAL = {stat.S_IFIFO: "pipe", stat.S_IFSOCK: "socket", stat.S_IFCHR: "device", stat.S_IFBLK: "device"}
 # Smallest similarity, in [0, 1], of a suggested name.
 _LEAST = 0.6
+# pathlib joins the slashes of a URL. One letter is the drive of a Windows path.
+_URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):/{1,3}(.*)", re.DOTALL)
 
 
 def suggest_path(path: Path, wanted: Callable[[Path], bool] | None = None) -> str:
@@ -65,3 +68,12 @@ def refuse_special(path: Path) -> None:
         return
     if kind is not None:
         raise InputError(f"is a {kind}, not a regular file", where=path, hint="save its content in a file")
+
+
+def split_url(folder: object) -> tuple[str, str] | None:
+    """(protocol, rest) of a URL, also of one that pathlib has changed to ``s3:/bucket``; None for a path. The
+    rest has the form that pathlib gives it, so that a text and a path name the same folder."""
+    match = _URL.fullmatch(str(folder))
+    if match is None:
+        return None
+    return match[1].lower(), "/".join(part for part in match[2].split("/") if part not in ("", "."))

@@ -1,1 +1,0 @@
-"""Perspective pictures of a tile: cameras, and stored references."""
