@@ -64,24 +64,6 @@ def local_error(picture: F32, value_a: F32, value_b: F32) -> NDArray[np.float64]
     return np.sqrt(np.maximum(squared, 0.0))
 
 
-def hemisphere(view: Mapping[str, float], light: Mapping[str, float]) -> str:
-    """The hemisphere from above with the view (square) and the light (disk), as an ``<svg>`` element."""
-
-    def position(d: Mapping[str, float]) -> tuple[float, float]:
-        r = 20.0 * math.cos(math.radians(d["elevation"]))
-        a = math.radians(d["azimuth"])
-        return r * math.cos(a), -r * math.sin(a)
-
-    (vx, vy), (lx, ly) = position(view), position(light)
-    return (
-        '<svg viewBox="-24 -24 48 48" aria-hidden="true">'
-        '<g fill="none" stroke="currentColor" opacity=".35"><circle r="20"/><circle r="10"/>'
-        '<path d="M-20 0H20M0-20V20" stroke-width=".6"/></g>'
-        f'<rect x="{vx - 3.4:.2f}" y="{vy - 3.4:.2f}" width="6.8" height="6.8" rx="1" fill="var(--accent)"/>'
-        f'<circle cx="{lx:.2f}" cy="{ly:.2f}" r="3.9" fill="#e69f00"/></svg>'
-    )
-
-
 def picture_section(
     folder: Path, comparison: Mapping[str, Any], exposure: float, gallery: Gallery
 ) -> dict[str, Any]:
@@ -95,7 +77,7 @@ def picture_section(
 
     Returns
     -------
-    groups : per view and light: title, diagram, blocks of figures
+    groups : per view and light: title, places in the hemisphere, blocks of figures
     scenes : of the viewer, plain data
     color_bars : of local error, HDR-FLIP and signed difference
     """
@@ -116,7 +98,9 @@ def picture_section(
             maps["signed"][file] = (pictures[file] - mean).mean(axis=-1) / white
         key = (picture["view"], picture["light"])
         if not groups or groups[-1]["key"] != key:
-            group = {"key": key, "diagram": hemisphere(*key), "blocks": []}
+            # Places in the unit disk: cosine of the elevation, and azimuth.
+            places = [(math.cos(math.radians(d["elevation"])), d["azimuth"]) for d in key]
+            group = {"key": key, "places": places, "blocks": []}
             group["title"] = f"View {direction(key[0])}  ·  light {direction(key[1])}"
             group["short"] = [f"view {short_direction(key[0])}", f"light {short_direction(key[1])}"]
             groups.append(group)

@@ -87,8 +87,7 @@ def _grouping(
         row = [label, f"{count:,}"]
         for fit, group in groups.items():
             found = None if group is None else estimate(group["unexplained"])
-            finite = found is not None and math.isfinite(found.value) and math.isfinite(found.error)
-            series[fit].append((found.value, found.error) if found is not None and finite else None)
+            series[fit].append(None if found is None else (found.value, found.error))
             row += ("–", "–") if group is None else data_errors(group)
         rows.append(row)
     svg = points(labels, series, axis, UNEXPLAINED, f"{UNEXPLAINED} {title}")
