@@ -19,6 +19,7 @@ from support.measured_files import write_hdf5
 from mbtf_core.errors import InputError
 from mbtf_gen.measured.exported import export_neumip, export_neural_btf
 from mbtf_gen.measured.hdf5 import NeumipQueries, NeuralBtf
+from mbtf_gen.measured.open import open_measured
 
 TEXELS = files.ROWS * files.COLUMNS
 FIELDS = ("u", "sigma", "omega_i", "omega_o", "value")
@@ -244,6 +245,23 @@ def test_what_cannot_be_exported(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="learns from shuffled queries"):
         export_neumip(slices, tmp_path / "a.hdf5")
     assert not (tmp_path / "a.hdf5").exists()
+
+
+def test_files_of_no_known_kind(tmp_path: Path) -> None:
+    for content, message in (
+        (b"", "known kind"),
+        (b"hello", "known kind"),
+        (b"!ABC", "DFMF08FCR"),
+        (b"PK", "zip"),
+    ):
+        (tmp_path / "a").write_bytes(content)
+        with pytest.raises(InputError) as caught:
+            open_measured(tmp_path / "a")
+        assert message in caught.value.message
+    with pytest.raises(InputError, match="without 'ground_color'"):
+        open_measured(write_hdf5(tmp_path / "a", {"other": np.zeros(3)}))
+    with pytest.raises(InputError, match="no such file"):
+        open_measured(tmp_path / "none")
 
 
 def samples() -> dict[str, bytes]:
