@@ -26,7 +26,6 @@ from mbtf_gen.engine.runtime import (
     CUDA_VARIANT,
     check_llvm,
     chosen_llvm,
-    load_mitsuba,
     prove,
     shipped_llvm,
 )
@@ -45,11 +44,8 @@ def all_checks() -> list[Check]:
     """Every part of the machine, in the order in which they are reported."""
     return [
         Check("Python", _python),
-        Check("LLVM", _llvm, hint=f"{_REINSTALL} karellen-llvm-core"),
+        Check("Mitsuba", _mitsuba, hint=f"{_REINSTALL} mitsuba==3.9.1 karellen-llvm-core"),
         Check("CUDA", _cuda, required=False),
-        Check(
-            "Mitsuba", _in_child(use_mitsuba), hint=f"see LLVM; if that works, {_REINSTALL} mitsuba==3.9.1"
-        ),
         Check("PyTorch", _in_child(use_torch), hint=f"{_REINSTALL} torch==2.13.0"),
         Check("Drawing", _in_child(use_drawing), required=False, hint=_OPENGL),
         Check("Kernel cache", _in_child(use_kernel_cache), required=False, hint=_CACHE),
@@ -74,7 +70,7 @@ def _python(_: int) -> Finding:
     return Finding("ok", f"{found}{free / 1e9:.1f} GB free in {Path.cwd()}")
 
 
-def _llvm(_: int) -> Finding:
+def _mitsuba(_: int) -> Finding:
     library = chosen_llvm()
     # Tested again: a cached result does not show the state of today.
     outcome = prove(CPU_VARIANT)
@@ -85,7 +81,8 @@ def _llvm(_: int) -> Finding:
     origin = "set by the user"
     if library is None or library == str(shipped_llvm()):
         origin = "of the system" if library is None else "of the installation"
-    return Finding("ok", f"{numbers} {origin}, ran test kernels, {library or 'found by Dr.Jit'}")
+    programs = f"{version('mitsuba')} with Dr.Jit {version('drjit')} and LLVM {numbers} {origin}"
+    return Finding("ok", f"{programs} ({library or 'found by Dr.Jit'}) ran test kernels")
 
 
 def _cuda(_: int) -> Finding:
@@ -96,29 +93,6 @@ def _cuda(_: int) -> Finding:
 
 
 # The functions below run in child processes.
-
-
-def use_mitsuba() -> Iterator[dict[str, str]]:
-    """Mitsuba renders a sphere: a convex body of albedo 0.5 under constant radiance 1 has radiance 0.5."""
-    mi = load_mitsuba(CPU_VARIANT)
-    import drjit as dr
-
-    look_at = mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0])
-    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}
-    scene = {
-        "type": "scene",
-        "integrator": {"type": "path"},
-        "light": {"type": "constant"},
-        "shape": {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": 0.5}},
-        "sensor": {"type": "orthographic", "to_world": look_at.scale([0.5, 0.5, 1]), "film": film},
-    }
-    mean = float(dr.mean(mi.render(mi.load_dict(scene), spp=16).array)[0])
-    if not abs(mean - 0.5) < 0.01:
-        raise EngineError(f"a test image has the mean {mean:.3f} instead of 0.5")
-    yield {
-        "found": f"{version('mitsuba')} with Dr.Jit {version('drjit')}, rendered a test image with "
-        f"{dr.thread_count()} threads"
-    }
 
 
 def use_torch() -> Iterator[dict[str, str]]:

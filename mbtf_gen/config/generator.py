@@ -98,6 +98,17 @@ NormalMode = Literal["residual", "absolute", "off"]
 
 Count = Annotated[str, BeforeValidator(_count)]
 Resolution = Annotated[int, AfterValidator(_power_of_two)]
+Seed = Annotated[int, Field(ge=0, lt=1 << 63, description="root seed of all random numbers"), Flag("--seed")]
+TestCount = Annotated[
+    Count,
+    Field(description="test queries, in total or per texel of the finest level"),
+    Flag("--test-queries", "N|N/texel"),
+]
+MinCos = Annotated[
+    float,
+    Field(gt=0, lt=1, description="smallest cosine of light and view directions to the normal"),
+    Flag("--min-cos"),
+]
 Paths = Annotated[int, Field(ge=2, le=1 << 20), AfterValidator(_even)]
 
 
@@ -152,9 +163,7 @@ class QueriesSection(Settings):
     train: Annotated[Count, Flag("--queries", "N|N/texel")] = Field(
         "100/texel", description="training queries, in total or per texel of the finest level"
     )
-    test: Annotated[Count, Flag("--test-queries", "N|N/texel")] = Field(
-        "8192", description="test queries, in total or per texel of the finest level"
-    )
+    test: TestCount = "8192"
     spp: Annotated[Paths, Flag("--spp")] = Field(
         4, description="mean number of paths per training query, both estimates together (even)"
     )
@@ -178,9 +187,7 @@ class QueriesSection(Settings):
         "from the map's width",
     )
     mixture: MixtureSection = MixtureSection()
-    min_cos: Annotated[float, Flag("--min-cos")] = Field(
-        0.1, gt=0, lt=1, description="smallest cosine of light and view directions to the normal"
-    )
+    min_cos: MinCos = 0.1
     layout: Annotated[Layout, Flag("--layout")] = Field(
         "shuffled",
         description="shuffled queries; images that share one light, view and footprint each; or slices: "
@@ -263,9 +270,7 @@ class GeneratorConfig(Settings):
     transport: TransportSection = TransportSection()
     effects: EffectsSection = EffectsSection()
     output: OutputSection = OutputSection()
-    seed: Annotated[int, Flag("--seed")] = Field(
-        0, ge=0, lt=1 << 63, description="root seed of all random numbers"
-    )
+    seed: Seed = 0
 
     def hash(self, inputs: dict[str, str]) -> str:
         """SHA-256 of everything that determines the data: options, and digests of the input files by role."""

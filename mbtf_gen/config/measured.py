@@ -10,7 +10,7 @@ from mbtf_core.app.options import Flag
 from mbtf_core.config.settings import Settings
 from mbtf_core.data.schema import SCHEMA_VERSION
 from mbtf_core.files.atomic import data_sha256
-from mbtf_gen.config.generator import Count, OutputSection
+from mbtf_gen.config.generator import Count, MinCos, OutputSection, Seed, TestCount
 
 Cosine = Literal["auto", "included", "excluded"]
 
@@ -21,15 +21,8 @@ class MeasuredQueriesSection(Settings):
     train: Annotated[Count, Flag("--queries", "N|N/texel")] = Field(
         "400/texel", description="training queries, in total or per texel of the finest level"
     )
-    test: Annotated[Count, Flag("--test-queries", "N|N/texel")] = Field(
-        "8192", description="test queries, in total or per texel of the finest level"
-    )
-    min_cos: Annotated[float, Flag("--min-cos")] = Field(
-        0.1,
-        gt=0,
-        lt=1,
-        description="smallest cosine of light and view directions to the normal",
-    )
+    test: TestCount = "8192"
+    min_cos: MinCos = 0.1
 
 
 class ImportConfig(Settings):
@@ -47,9 +40,7 @@ class ImportConfig(Settings):
         description="factor on all values; 0.3183 where a white Lambert plane is stored as 1",
     )
     output: OutputSection = OutputSection()
-    seed: Annotated[int, Flag("--seed")] = Field(
-        0, ge=0, lt=1 << 63, description="root seed of all random numbers"
-    )
+    seed: Seed = 0
 
     def hash(self, inputs: dict[str, str]) -> str:
         """SHA-256 of everything that determines the data: options, and digests of the input files."""

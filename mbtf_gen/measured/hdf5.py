@@ -124,21 +124,46 @@ def floats(found: Any, start: int, stop: int) -> NDArray[np.float64]:
 
 
 class NeumipQueries:
-    """An opened file; see :class:`~mbtf_gen.measured.interface.MeasuredQueries`.
+    """A data set of NeuMIP, opened; its numbers stay on disk.
 
     Attributes
     ----------
-    count : int
-        Queries of the file.
-    base_radius : float or None
-        Sigma of the finest level in tile widths; None where neither the file nor its shape says it.
+    count : queries of the file
+    base_radius : sigma of the finest level in tile widths; None where neither the file nor its shape says it
+
+    Raises
+    ------
+    InputError : not HDF5, a data set is missing or has another shape, or it is the rendering of a scene
     """
 
-    def __init__(self, path: Path, shape: tuple[int, ...], light: str, base_radius: float | None) -> None:
-        self.path, self.base_radius = path, base_radius
-        self._light = light
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with opened(path) as file:
+            if "ground_valid" in file:
+                what = "is the rendering of a scene (it has 'ground_valid'), not queries"
+                raise InputError(what, where=path)
+            self._light = LIGHT if LIGHT in file or _OTHER_LIGHT not in file else _OTHER_LIGHT
+            shape: tuple[int, ...] | None = None
+            for name, channels in CHANNELS.items():
+                stored = self._light if name == LIGHT else name
+                found = data_set(file, stored, path).shape
+                shape = found[:-1] if shape is None else shape
+                if len(found) not in (2, 3, 4) or found != (*shape, channels):
+                    raise InputError(
+                        f"has the shape {found} of '{stored}'; {(*shape, channels)} is expected", where=path
+                    )
+            assert shape is not None
+            base = file.attrs.get("base_radius", 0.5 / shape[2] if len(shape) == 3 else None)
         self._each = math.prod(shape[1:])
         self.count = shape[0] * self._each
+        if self._each > MOST_OF_IMAGE:
+            raise InputError(f"has images of more than {MOST_OF_IMAGE:,} queries", where=path)
+        try:
+            self.base_radius = None if base is None else float(base)
+        except (TypeError, ValueError):
+            self.base_radius = math.nan
+        if self.base_radius is not None and not 0.0 < self.base_radius < math.inf:
+            raise InputError("has an attribute 'base_radius' that is not a positive number", where=path)
 
     def read(self, start: int, stop: int) -> QueryBlock:
         """Queries from `start` to before `stop`, those left out that cannot be used."""
@@ -183,104 +208,48 @@ class NeumipQueries:
         return rows[start - first * self._each : stop - first * self._each]
 
 
-def read_neumip(path: str | Path) -> NeumipQueries:
-    """Open a data set of NeuMIP; its numbers stay on disk.
-
-    Parameters
-    ----------
-    path : str or Path
-
-    Returns
-    -------
-    NeumipQueries
+class NeuralBtf(ImageBtf):
+    """A capture of NeuralBTF, opened; of an image the rows from the first to the last texel are read.
 
     Raises
     ------
-    InputError : not HDF5, a data set is missing or has another shape, or it is the rendering of a scene
+    InputError : not HDF5, a data set is missing or has another shape, or a direction is NaN
     """
-    path = Path(path)
-    with opened(path) as file:
-        if "ground_valid" in file:
-            raise InputError("is the rendering of a scene (it has 'ground_valid'), not queries", where=path)
-        light = LIGHT if LIGHT in file or _OTHER_LIGHT not in file else _OTHER_LIGHT
-        shape: tuple[int, ...] | None = None
-        for name, channels in CHANNELS.items():
-            stored = light if name == LIGHT else name
-            found = data_set(file, stored, path).shape
-            shape = found[:-1] if shape is None else shape
-            if len(found) not in (2, 3, 4) or found != (*shape, channels):
-                raise InputError(
-                    f"has the shape {found} of '{stored}'; {(*shape, channels)} is expected", where=path
-                )
-        assert shape is not None
-        if math.prod(shape[1:]) > MOST_OF_IMAGE:
-            raise InputError(f"has images of more than {MOST_OF_IMAGE:,} queries", where=path)
-        base = file.attrs.get("base_radius")
-    if base is None:
-        return NeumipQueries(path, shape, light, 0.5 / shape[2] if len(shape) == 3 else None)
-    try:
-        radius = float(base)
-    except (TypeError, ValueError):
-        radius = math.nan
-    if not 0.0 < radius < math.inf:
-        raise InputError("has an attribute 'base_radius' that is not a positive number", where=path)
-    return NeumipQueries(path, shape, light, radius)
 
-
-class NeuralBtf(ImageBtf):
-    """An opened capture of NeuralBTF; of an image the rows from the first to the last texel are read."""
-
-    def __init__(self, path: Path, shape: tuple[int, int, int], light: F32, view: F32) -> None:
+    def __init__(self, path: Path) -> None:
+        directions = {}
+        with opened(path) as file:
+            shape = data_set(file, COLOR, path).shape
+            if len(shape) != 4 or shape[3] != 3:
+                raise InputError(f"has the shape {shape} of '{COLOR}'; (N, H, W, 3) is expected", where=path)
+            check_texels(shape[1], shape[2], path)
+            if shape[0] > MOST_PAIRS:
+                raise InputError(f"claims {shape[0]:,} images", where=path)
+            for name in (LIGHT, VIEW):
+                found = data_set(file, name, path)
+                if found.shape != (shape[0], 2):
+                    near = found.shape == (*shape[:3], 2)
+                    raise InputError(
+                        f"has the shape {found.shape} of '{name}'; {(shape[0], 2)} is expected",
+                        where=path,
+                        hint="captures with a direction for each pixel are not read" if near else "",
+                    )
+                xy = floats(found, 0, shape[0])
+                if not np.isfinite(xy).all() or (xy * xy).sum(axis=-1).max() > 1.0 + 1e-3:
+                    raise InputError(
+                        f"has numbers in '{name}' that are not x and y of unit vectors", where=path
+                    )
+                directions[name] = from_plane(xy)
         self._shape = shape
-        super().__init__(path, *shape[1:], light, view)
+        super().__init__(path, shape[1], shape[2], directions[LIGHT], directions[VIEW])
 
     def _opened(self) -> AbstractContextManager[Any]:
         return opened(self.path)
 
     def _texels(self, file: Any, number: int, row: I64, column: I64) -> F32:
         color, first = data_set(file, COLOR, self.path), int(row.min())
-        if color.shape != (*self._shape, 3):
+        if color.shape != self._shape:
             raise InputError("has changed while it was read", where=self.path)
         part = np.asarray(color[number, first : int(row.max()) + 1])[row - first, column]
         with np.errstate(over="ignore", invalid="ignore"):
             return part.astype(np.float32)
-
-
-def read_neural_btf(path: str | Path) -> NeuralBtf:
-    """Open a capture; its images stay on disk.
-
-    Parameters
-    ----------
-    path : str or Path
-
-    Returns
-    -------
-    NeuralBtf
-
-    Raises
-    ------
-    InputError : not HDF5, a data set is missing or has another shape, or a direction is NaN
-    """
-    path = Path(path)
-    directions = {}
-    with opened(path) as file:
-        shape = data_set(file, COLOR, path).shape
-        if len(shape) != 4 or shape[3] != 3:
-            raise InputError(f"has the shape {shape} of '{COLOR}'; (N, H, W, 3) is expected", where=path)
-        check_texels(shape[1], shape[2], path)
-        if shape[0] > MOST_PAIRS:
-            raise InputError(f"claims {shape[0]:,} images", where=path)
-        for name in (LIGHT, VIEW):
-            found = data_set(file, name, path)
-            if found.shape != (shape[0], 2):
-                near = found.shape == (*shape[:3], 2)
-                raise InputError(
-                    f"has the shape {found.shape} of '{name}'; {(shape[0], 2)} is expected",
-                    where=path,
-                    hint="captures with a direction for each pixel are not read" if near else "",
-                )
-            xy = floats(found, 0, shape[0])
-            if not np.isfinite(xy).all() or (xy * xy).sum(axis=-1).max() > 1.0 + 1e-3:
-                raise InputError(f"has numbers in '{name}' that are not x and y of unit vectors", where=path)
-            directions[name] = from_plane(xy)
-    return NeuralBtf(path, shape[:3], directions[LIGHT], directions[VIEW])

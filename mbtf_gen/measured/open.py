@@ -6,10 +6,10 @@ from pathlib import Path
 
 from mbtf_core.errors import InputError
 from mbtf_core.paths import refuse_special, suggest_path
-from mbtf_gen.measured.hdf5 import COLOR, MAGIC, RADIUS, opened, read_neumip, read_neural_btf
+from mbtf_gen.measured.hdf5 import COLOR, MAGIC, RADIUS, NeumipQueries, NeuralBtf, opened
 from mbtf_gen.measured.interface import MeasuredBtf, MeasuredQueries
-from mbtf_gen.measured.ubo2003 import read_ubo2003
-from mbtf_gen.measured.ubo2014 import read_ubo2014
+from mbtf_gen.measured.ubo2003 import Ubo2003
+from mbtf_gen.measured.ubo2014 import Ubo2014
 
 _ZIP = b"PK"
 _KNOWN = (
@@ -35,7 +35,7 @@ def open_measured(path: str | Path) -> MeasuredBtf | MeasuredQueries:
     """
     path = Path(path)
     if path.is_dir():
-        return read_ubo2003(path)
+        return Ubo2003(path)
     refuse_special(path)
     try:
         with path.open("rb") as stream:
@@ -45,13 +45,13 @@ def open_measured(path: str | Path) -> MeasuredBtf | MeasuredQueries:
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", where=path) from None
     if start.startswith(b"!"):
-        return read_ubo2014(path)
+        return Ubo2014(path)
     if start.startswith(_ZIP):
-        return read_ubo2003(path)
+        return Ubo2003(path)
     if start != MAGIC:
         raise InputError("is not a measured BTF of a known kind", where=path, hint=f"known are {_KNOWN}")
     with opened(path) as file:
         names = set(file)
     if COLOR not in names:
         raise InputError(f"is an HDF5 file without '{COLOR}'", where=path, hint=f"known are {_KNOWN}")
-    return read_neumip(path) if RADIUS in names or "ground_valid" in names else read_neural_btf(path)
+    return NeumipQueries(path) if RADIUS in names or "ground_valid" in names else NeuralBtf(path)

@@ -41,13 +41,38 @@ _LINEAR = srgb_to_linear(np.arange(256) / 255.0).astype(np.float32)
 
 
 class Ubo2003(ImageBtf):
-    """An opened set of photographs."""
+    """Photographs in a folder, which may have sub-folders, or in a zip archive. Nothing is unpacked to disk.
 
-    def __init__(
-        self, path: Path, names: list[str], angles: NDArray[np.float64], content: Callable[[str], bytes]
-    ) -> None:
-        self.path, self._names, self._content = path, names, content
-        radians = np.deg2rad(angles)
+    Raises
+    ------
+    InputError : no image is named by its directions, two have the same, there are too many, or the first
+        cannot be decoded
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        names, self._content = _folder(path) if path.is_dir() else _archive(path)
+        table: dict[tuple[float, float, float, float], str] = {}
+        for name in names:
+            angles = angles_of(name)
+            if angles is None:
+                continue
+            if max(angles[0], angles[2]) > 180 or max(angles[1], angles[3]) > 720:
+                raise InputError(f"'{_short(name)}' has angles out of range", where=path)
+            if angles in table:
+                raise InputError(
+                    f"has two images of the same directions: '{_short(table[angles])}' and '{_short(name)}'",
+                    where=path,
+                )
+            table[angles] = name
+        if not table:
+            raise InputError(
+                "has no JPG or PNG images that are named by their directions",
+                where=path,
+                hint="a name has the angles of the light and the viewer: tl015 pl060 tv030 pv090.jpg",
+            )
+        self._names = [table[angles] for angles in sorted(table)]
+        radians = np.deg2rad(sorted(table))
         light, view = from_angles(radians[:, 0], radians[:, 1]), from_angles(radians[:, 2], radians[:, 3])
         super().__init__(path, 0, 0, light, view)
         if not len(self._number):
@@ -96,48 +121,6 @@ def angles_of(name: str) -> tuple[float, float, float, float] | None:
         return None
     tl, pl, tv, pv = (float(numbers[0]) for numbers in found)
     return tl, pl, tv, pv
-
-
-def read_ubo2003(path: str | Path) -> Ubo2003:
-    """Open a folder or a zip archive of photographs; nothing is unpacked to disk.
-
-    Parameters
-    ----------
-    path : the folder may have sub-folders; links are not followed out of it
-
-    Returns
-    -------
-    Ubo2003
-
-    Raises
-    ------
-    InputError
-        No image is named by its directions, two have the same, there are too many, or the first cannot be
-        decoded.
-    """
-    path = Path(path)
-    names, content = _folder(path) if path.is_dir() else _archive(path)
-    table: dict[tuple[float, float, float, float], str] = {}
-    for name in names:
-        angles = angles_of(name)
-        if angles is None:
-            continue
-        if max(angles[0], angles[2]) > 180 or max(angles[1], angles[3]) > 720:
-            raise InputError(f"'{_short(name)}' has angles out of range", where=path)
-        if angles in table:
-            raise InputError(
-                f"has two images of the same directions: '{_short(table[angles])}' and '{_short(name)}'",
-                where=path,
-            )
-        table[angles] = name
-    if not table:
-        raise InputError(
-            "has no JPG or PNG images that are named by their directions",
-            where=path,
-            hint="a name has the angles of the light and the viewer: tl015 pl060 tv030 pv090.jpg",
-        )
-    keys = sorted(table)
-    return Ubo2003(path, [table[key] for key in keys], np.array(keys), content)
 
 
 def _short(name: str) -> str:

@@ -96,17 +96,26 @@ class _Cursor:
 
 
 class Ubo2014(MeasuredBtf):
-    """An opened DFMF file; of no image more than the texels that are asked for is computed."""
+    """A DFMF file, opened; its factors stay on disk, and of no image more than the asked texels is computed.
+
+    Raises
+    ------
+    InputError : not a DFMF file, truncated, inconsistent, or of a kind that cannot be converted to RGB
+    """
 
     at_once = 1 << 20
 
-    def __init__(
-        self, path: Path, header: _Header, pairs: list[NDArray[Any]], texels: list[NDArray[Any]]
-    ) -> None:
+    def __init__(self, path: Path) -> None:
+        try:
+            with path.open("rb") as stream:
+                cursor = _Cursor(stream, path)
+                self._header = header = _read_header(cursor)
+                self._pairs, self._texels = _map_factors(cursor, header)
+        except OSError as error:
+            raise InputError(f"cannot be read ({error.strerror})", where=path) from None
         view = np.repeat(header.view, header.lights, axis=0)
         super().__init__(path, header.rows, header.columns, header.light, view)
         self.cosine = header.cosine
-        self._header, self._pairs, self._texels = header, pairs, texels
 
     def _values(self, number: I64, texel: I64) -> F32:
         channels = np.empty((len(number), 3), np.float32)
@@ -131,32 +140,6 @@ def _widened(factors: NDArray[Any], values: int) -> NDArray[Any]:
     if values < 2 * len(factors) or factors.size > _MOST_WIDENED:
         return factors
     return factors.astype(np.float32)
-
-
-def read_ubo2014(path: str | Path) -> Ubo2014:
-    """Open a DFMF file; its factors stay on disk.
-
-    Parameters
-    ----------
-    path : str or Path
-
-    Returns
-    -------
-    Ubo2014
-
-    Raises
-    ------
-    InputError : not a DFMF file, truncated, inconsistent, or of a kind that cannot be converted to RGB
-    """
-    path = Path(path)
-    try:
-        with path.open("rb") as stream:
-            cursor = _Cursor(stream, path)
-            header = _read_header(cursor)
-            pairs, texels = _map_factors(cursor, header)
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
-    return Ubo2014(path, header, pairs, texels)
 
 
 def _read_header(cursor: _Cursor) -> _Header:

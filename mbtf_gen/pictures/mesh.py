@@ -79,21 +79,8 @@ def tiled_mesh(material: Tile, tiles: int, exposure: float) -> TiledMesh:
 
 
 def draw(tiles: TiledMesh, camera: Camera, omega_i: NDArray[np.float64], path: Path) -> str:
-    """Draw the mesh under light from `omega_i`, in a child process.
-
-    Parameters
-    ----------
-    tiles : the mesh
-    camera : the camera
-    omega_i : (3,) float array
-        Direction towards the light.
-    path : PNG to write
-
-    Returns
-    -------
-    str
-        Reason of a failure, or "".
-    """
+    """Draw the mesh under light from `omega_i` (3,) as a PNG, in a child process; returns the reason of a
+    failure, or ""."""
     forward, _, up = camera.frame()
     target = camera.position + camera.distance * forward
     view = {

@@ -132,7 +132,7 @@ def draw_preview(
                 if "fault" not in facts:
                     folder.keep(name, [file], facts)
             bar.advance(1)
-            found[name] = {"file": file, "kept": kept, **facts}
+            found[name] = {"file": file, "kept": kept} | {k: v for k, v in facts.items() if k != "of"}
             return found[name]
 
         if scene is not None:

@@ -46,20 +46,8 @@ def shard_writers(
 ) -> dict[str, Callable[[Path], Stored]]:
     """What writes each file of :func:`published_names` to a path, atomically.
 
-    Parameters
-    ----------
-    shard : the shard
-    arrays : dict of str to float32 array
-        Its arrays.
-    form : {"parquet", "webdataset", "npz"}
-        Form of the files.
-    described : ``unit`` and ``meaning`` of each array
-
-    Returns
-    -------
-    dict of str to callable
-        The bytes of Parquet and tar files depend on the arrays, their names and the library alone. A writer
-        raises a PartialError where the disk is full or the folder cannot be written.
+    The bytes of Parquet and tar files depend on the arrays, on `described`, their units and meanings, and on
+    the library alone.
     """
     first, *rest = published_names(shard, form)
     if form == "npz":

@@ -44,16 +44,7 @@ def mean_image(x: F64, y: F64, value: F64, rows: int, columns: int) -> F64:
 def tile_images(arrays: Arrays, aspect: float) -> dict[str, F64]:
     """Mean value by position, of views within 32° of the normal and of fine footprints, under some lights.
 
-    Parameters
-    ----------
-    arrays : dict of str to float32 array
-        Queries.
-    aspect : height of the tile over its width
-
-    Returns
-    -------
-    dict of str to (rows, columns, 3) array
-        Title → image in 1/sr, row 0 at ``v → 1``.
+    Images (rows, columns, 3) in 1/sr by title, row 0 at ``v → 1``, of a tile of this height over its width.
     """
     u, light, view, value = _queries(arrays)
     above = view[:, 2] > _FROM_ABOVE
@@ -69,14 +60,9 @@ def tile_images(arrays: Arrays, aspect: float) -> dict[str, F64]:
 
 
 def brdf_image(arrays: Arrays) -> F64:
-    """Mean value over the tile by direction of view, of lights 35° to 65° above the plane.
+    """Mean value (n, n, 3) over the tile by direction of view, of lights 35° to 65° above the plane, in 1/sr.
 
-    Both directions are turned about the normal until the light lies on the right.
-
-    Returns
-    -------
-    (n, n, 3) array
-        In 1/sr; x and y of ω_o from -1 to 1, y upwards.
+    Both directions are turned about the normal until the light lies on the right; y of ω_o is upwards.
     """
     _, light, view, value = _queries(arrays)
     elevation = np.degrees(np.arcsin(np.clip(light[:, 2], 0.0, 1.0)))
@@ -105,24 +91,7 @@ def displayed(image: F64) -> NDArray[np.uint8]:
 
 
 def write_picture(arrays: Arrays, aspect: float, geometry: Geometry | None, path: Path) -> Stored:
-    """Write the contact sheet of a data set, atomically.
-
-    Parameters
-    ----------
-    arrays : dict of str to float32 array
-        Training queries.
-    aspect : height of the tile over its width
-    geometry : of the data set
-    path : PNG to write
-
-    Returns
-    -------
-    Stored
-
-    Raises
-    ------
-    PartialError : the disk is full or the folder cannot be written
-    """
+    """Write the contact sheet of training queries and of a geometry as a PNG, atomically."""
     from matplotlib.figure import Figure
 
     panels = [(title, image, (0, 1, 0, aspect)) for title, image in tile_images(arrays, aspect).items()]

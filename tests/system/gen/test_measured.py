@@ -18,6 +18,7 @@ LINES = {
     "again": "import felt.btf --queries 300 --test-queries 20 --min-cos 0.2 -o felt --json",
     "verify": "verify felt",
     "zip": "import photographs.zip --cosine excluded --queries 300 -o photographs",
+    "folder": "import folder --cosine excluded --queries 300 -o photographs_of_folder",
     "silent": "import photographs.zip -o silent",
     "no format": "import text.btf -o none",
     "missing": "import missing.btf -o none",
@@ -59,7 +60,9 @@ def test_an_import_is_a_data_set(work: Path, done: dict[str, Done]) -> None:
     assert done["import"].result()["splits"] == {"train": 160, "test": 20}
     assert done["again"].code == done["verify"].code == 0
     assert Dataset.open(work / "felt").load("train")["value_a"].min() > 0
-    assert done["zip"].code == 0, done["zip"].err
+    # The kind of a file is told by its content.
+    for name in ("zip", "folder"):
+        assert done[name].code == 0, done[name].err
 
 
 @pytest.mark.parametrize("name", ["silent", "no format", "missing", "wrong layout", "exists"])

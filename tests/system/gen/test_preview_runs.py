@@ -61,7 +61,6 @@ def batch(work: Path) -> dict[str, Done]:
     lines = {
         "tilted": f"preview maps -o tilted --tiles 1 {FAST} --json",
         "side": f"preview maps -o side --tiles 1 --view 50,30 --light 70,0 {FAST} --json",
-        "two": f"preview maps -o two {FAST}",
         "flat": f"preview flat.npy -o flat {FAST}",
         "again": f"preview maps -o tilted --tiles 1 {FAST} --json",
         "changed": f"preview maps -o tilted --tiles 2 {FAST}",
@@ -71,10 +70,6 @@ def batch(work: Path) -> dict[str, Done]:
         "data": "preview data -o data-pictures --size 64 --spp 2 --json",
         "lonely": "preview lonely -o lonely-pictures --json",
         "settled": "preview data -o nowhere --min-cos 0.2",
-        "settled too": "preview data -o nowhere --set queries.min_cos=0.2",
-        "block": "preview maps -o nowhere --tiles 9",
-        "horizon": "preview maps -o nowhere --view 3,0",
-        "below": "preview maps -o nowhere --light -3,0",
     }
     return run_named(lines, work)
 
@@ -150,6 +145,12 @@ def test_plots_of_a_data_set_are_of_its_stored_queries(batch: dict[str, Done], w
     pictures = {Path(p["file"]).stem: p for p in batch["data"].result()["pictures"]}
     assert list(pictures) == ["mesh", "beauty", "queries"]
     assert "5000 of 5000 training queries stored in data" in pictures["queries"]["shows"]
+
+
+def test_a_data_set_is_shown_as_it_is(batch: dict[str, Done], work: Path) -> None:
+    assert batch["settled"].code == 2
+    assert "--min-cos: data holds a data set, whose configuration is fixed" in batch["settled"].err
+    assert not (work / "nowhere").exists()
 
 
 def test_queries_can_be_seen_without_their_material(batch: dict[str, Done], work: Path) -> None:

@@ -18,7 +18,8 @@ from support.measured_files import write_hdf5
 
 from mbtf_core.errors import InputError
 from mbtf_gen.measured.exported import export_neumip, export_neural_btf
-from mbtf_gen.measured.hdf5 import read_neumip, read_neural_btf
+from mbtf_gen.measured.hdf5 import NeumipQueries, NeuralBtf
+from mbtf_gen.measured.open import open_measured
 
 TEXELS = files.ROWS * files.COLUMNS
 FIELDS = ("u", "sigma", "omega_i", "omega_o", "value")
@@ -38,7 +39,7 @@ def stored(shape: tuple[int, ...] = (2, 3, 4), dtype: Any = np.float16) -> dict[
 
 
 def test_conventions(tmp_path: Path) -> None:
-    data = read_neumip(write_hdf5(tmp_path / "a.hdf5", stored(), base_radius=1 / 64))
+    data = NeumipQueries(write_hdf5(tmp_path / "a.hdf5", stored(), base_radius=1 / 64))
     assert (data.count, data.base_radius) == (24, 1 / 64)
     # Query 17 is image 1, row 1, column 1; the range begins and ends within images.
     queries = data.read(7, 20)
@@ -60,8 +61,8 @@ def test_conventions(tmp_path: Path) -> None:
 def test_a_flat_file_with_the_other_name(tmp_path: Path) -> None:
     arrays = stored((24,), np.float32)
     arrays["ground_light_dir"] = arrays.pop("ground_light")
-    flat = read_neumip(write_hdf5(tmp_path / "a.hdf5", arrays)).read(5, 9)
-    images = read_neumip(write_hdf5(tmp_path / "b.hdf5", stored())).read(5, 9)
+    flat = NeumipQueries(write_hdf5(tmp_path / "a.hdf5", arrays)).read(5, 9)
+    images = NeumipQueries(write_hdf5(tmp_path / "b.hdf5", stored())).read(5, 9)
     for name in ("query", *FIELDS):
         np.testing.assert_array_equal(flat[name], images[name])
 
@@ -70,7 +71,7 @@ def test_positions_wrap_and_a_radius_of_zero_is_a_texel(tmp_path: Path) -> None:
     arrays = stored()
     arrays["ground_camera_target_loc"][0, 0, 0] = [1.0, -1.25]
     arrays["ground_camera_query_radius"][:] = 0
-    queries = read_neumip(write_hdf5(tmp_path / "a.hdf5", arrays)).read(0, 1)
+    queries = NeumipQueries(write_hdf5(tmp_path / "a.hdf5", arrays)).read(0, 1)
     np.testing.assert_array_equal(queries["u"], [[0, 0.875]])
     assert queries["sigma"].tolist() == [0.5 / 4]
 
@@ -83,7 +84,7 @@ def test_unusable_queries_are_left_out(tmp_path: Path) -> None:
     arrays["ground_camera_dir"][0, 1, 0] = [1, 0]
     arrays["ground_camera_query_radius"][0, 1, 1] = -1
     arrays["ground_camera_target_loc"][0, 1, 2, 0] = np.nan
-    queries = read_neumip(write_hdf5(tmp_path / "a.hdf5", arrays)).read(0, 9)
+    queries = NeumipQueries(write_hdf5(tmp_path / "a.hdf5", arrays)).read(0, 9)
     assert queries["query"].tolist() == [0, 7, 8]
     assert {len(queries[name]) for name in FIELDS} == {3}
 
@@ -107,13 +108,13 @@ def changed(**new: Any) -> dict[str, Any]:
 )
 def test_refused(arrays: dict[str, np.ndarray], message: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=message):
-        read_neumip(write_hdf5(tmp_path / "a.hdf5", arrays))
+        NeumipQueries(write_hdf5(tmp_path / "a.hdf5", arrays))
 
 
 @pytest.mark.parametrize("radius", [-1.0, np.nan, "x", [1.0, 2.0]])
 def test_base_radius_is_a_positive_number(radius: Any, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="base_radius"):
-        read_neumip(write_hdf5(tmp_path / "a.hdf5", stored(), base_radius=radius))
+        NeumipQueries(write_hdf5(tmp_path / "a.hdf5", stored(), base_radius=radius))
 
 
 def test_numbers_that_are_not_in_the_file(tmp_path: Path) -> None:
@@ -123,32 +124,32 @@ def test_numbers_that_are_not_in_the_file(tmp_path: Path) -> None:
     with h5py.File(path, "r+") as file:
         file["ground_color"] = h5py.ExternalLink(elsewhere.name, "ground_color")
     with pytest.raises(InputError, match="of its own"):
-        read_neumip(path)
+        NeumipQueries(path)
     with h5py.File(path, "r+") as file:
         del file["ground_color"]
         file.create_dataset("ground_color", shape, "f4", external=[(str(elsewhere), 0, 288)])
     with pytest.raises(InputError, match="of its own"):
-        read_neumip(path)
+        NeumipQueries(path)
     with h5py.File(path, "r+") as file:
         del file["ground_color"]
         file.create_dataset("ground_color", shape, "f4")
     with pytest.raises(InputError, match="stores 0 of the 288 bytes"):
-        read_neumip(path)
+        NeumipQueries(path)
     with h5py.File(path, "r+") as file:
         del file["ground_color"]
         file.create_dataset("ground_color", shape, "f4", chunks=(1, 3, 4, 3))[0] = 1
     with pytest.raises(InputError, match="stores 1 of the 2 chunks"):
-        read_neumip(path)
+        NeumipQueries(path)
     with h5py.File(path, "r+") as file:
         del file["ground_color"]
         file.create_dataset("ground_color", (10**9, 3, 4, 3), "f4", chunks=(10**7, 3, 4, 3))
     with pytest.raises(InputError, match="too large"):
-        read_neumip(path)
+        NeumipQueries(path)
     with pytest.raises(InputError, match="no such file"):
-        read_neumip(tmp_path / "c.hdf5")
+        NeumipQueries(tmp_path / "c.hdf5")
     (tmp_path / "d.hdf5").write_bytes(elsewhere.read_bytes()[:-100])
     with pytest.raises(InputError, match="cannot be read as HDF5"):
-        read_neumip(tmp_path / "d.hdf5")
+        NeumipQueries(tmp_path / "d.hdf5")
 
 
 def pairs() -> tuple[np.ndarray, np.ndarray]:
@@ -166,7 +167,7 @@ def images() -> dict[str, np.ndarray]:
 
 
 def test_images_of_the_known_function(tmp_path: Path) -> None:
-    btf = read_neural_btf(write_hdf5(tmp_path / "a.hdf5", images()))
+    btf = NeuralBtf(write_hdf5(tmp_path / "a.hdf5", images()))
     assert (btf.rows, btf.columns, btf.left_out, btf.cosine) == (files.ROWS, files.COLUMNS, 1, None)
     assert len(btf.light) == 8
     order = np.random.default_rng(2).permutation(8 * TEXELS)
@@ -198,17 +199,17 @@ def test_images_that_are_refused(name: str, array: Any, message: str | None, tmp
     arrays = {key: a for key, a in (images() | {name: array}).items() if a is not None}
     path = write_hdf5(tmp_path / "a.hdf5", arrays)
     if message is None:
-        assert read_neural_btf(path).left_out == 9
+        assert NeuralBtf(path).left_out == 9
         return
     with pytest.raises(InputError) as caught:
-        read_neural_btf(path)
+        NeuralBtf(path)
     assert message in caught.value.message
 
 
 def test_nan_values_are_refused_where_they_are_used(tmp_path: Path) -> None:
     arrays = images()
     arrays["ground_color"][0, 1, 1, 1] = np.nan
-    btf = read_neural_btf(write_hdf5(tmp_path / "a.hdf5", arrays))
+    btf = NeuralBtf(write_hdf5(tmp_path / "a.hdf5", arrays))
     btf.values(np.array([0]), np.array([0]))
     with pytest.raises(InputError, match="NaN or infinite"):
         btf.values(np.array([0, 0]), np.array([0, files.COLUMNS + 1]))
@@ -222,7 +223,7 @@ def test_an_export_for_neumip(tmp_path: Path) -> None:
     assert export_neumip(data, tmp_path / "a.hdf5") == 256
     with h5py.File(tmp_path / "a.hdf5") as file:
         assert {file[name].shape[:-1] for name in file} == {(1, 16, 16)}
-    found = read_neumip(tmp_path / "a.hdf5")
+    found = NeumipQueries(tmp_path / "a.hdf5")
     assert (found.count, found.base_radius) == (256, 0.5 / (1 << data.lattice.finest))
     queries, whole = found.read(0, 256), data.load("train")
     np.testing.assert_array_equal(queries["sigma"], whole["sigma"][:256])
@@ -246,6 +247,23 @@ def test_what_cannot_be_exported(tmp_path: Path) -> None:
     assert not (tmp_path / "a.hdf5").exists()
 
 
+def test_files_of_no_known_kind(tmp_path: Path) -> None:
+    for content, message in (
+        (b"", "known kind"),
+        (b"hello", "known kind"),
+        (b"!ABC", "DFMF08FCR"),
+        (b"PK", "zip"),
+    ):
+        (tmp_path / "a").write_bytes(content)
+        with pytest.raises(InputError) as caught:
+            open_measured(tmp_path / "a")
+        assert message in caught.value.message
+    with pytest.raises(InputError, match="without 'ground_color'"):
+        open_measured(write_hdf5(tmp_path / "a", {"other": np.zeros(3)}))
+    with pytest.raises(InputError, match="no such file"):
+        open_measured(tmp_path / "none")
+
+
 def samples() -> dict[str, bytes]:
     with tempfile.TemporaryDirectory() as folder:
         plain, chunks = Path(folder, "plain.hdf5"), Path(folder, "chunks.hdf5")
@@ -267,13 +285,13 @@ def test_a_damaged_file(data: st.DataObject, tmp_path_factory: pytest.TempPathFa
     path = tmp_path_factory.getbasetemp() / "damaged.hdf5"
     path.write_bytes(content)
     if name == "images.hdf5":
-        btf = loads_or_refuses(lambda: read_neural_btf(path))
+        btf = loads_or_refuses(lambda: NeuralBtf(path))
         if btf is not None and len(btf.light):
             texels = np.arange(min(btf.rows * btf.columns, 50))
             values = loads_or_refuses(lambda: btf.values(np.zeros_like(texels), texels))
             assert values is None or np.isfinite(values).all()
         return
-    found = loads_or_refuses(lambda: read_neumip(path))
+    found = loads_or_refuses(lambda: NeumipQueries(path))
     queries = None if found is None else loads_or_refuses(lambda: found.read(0, 30))
     if queries is not None:
         assert all(np.isfinite(queries[name]).all() for name in FIELDS)

@@ -14,7 +14,7 @@ from support import measured_files as files
 from support.fuzzing import damaged, examples, loads_or_refuses
 
 from mbtf_core.errors import InputError
-from mbtf_gen.measured.ubo2003 import Ubo2003, angles_of, read_ubo2003
+from mbtf_gen.measured.ubo2003 import Ubo2003, angles_of
 
 UP = files.unit([(0, 0)])[0]
 
@@ -33,19 +33,19 @@ def check(btf: Ubo2003) -> None:
 
 
 def test_a_folder(tmp_path: Path) -> None:
-    check(read_ubo2003(files.write_folder(tmp_path, files.photographs())))
+    check(Ubo2003(files.write_folder(tmp_path, files.photographs())))
 
 
 @pytest.mark.parametrize("method", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
 def test_an_archive(method: int, tmp_path: Path) -> None:
     (tmp_path / "a.zip").write_bytes(files.zipped(files.photographs() | {"read me.txt": b"hello"}, method))
-    check(read_ubo2003(tmp_path / "a.zip"))
+    check(Ubo2003(tmp_path / "a.zip"))
 
 
 def test_png_is_exact(tmp_path: Path) -> None:
     light, view = files.unit([(30, 20)])[0], files.unit([(45, 60)])[0]
     name = "tl030_pl020_tv045_pv060.png"
-    btf = read_ubo2003(files.write_folder(tmp_path, {name: files.encoded(light, view, "PNG")}))
+    btf = Ubo2003(files.write_folder(tmp_path, {name: files.encoded(light, view, "PNG")}))
     c = files.codes(light, view).reshape(-1, 3) / 255
     linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
     texels = np.arange(16 * 24)
@@ -71,7 +71,7 @@ def test_names(name: str, angles: tuple[float, ...] | None) -> None:
 
 
 def test_each_image_is_decoded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    btf = read_ubo2003(files.write_folder(tmp_path, files.photographs()))
+    btf = Ubo2003(files.write_folder(tmp_path, files.photographs()))
     seen = []
     decoded = btf._decoded
     monkeypatch.setattr(btf, "_decoded", lambda number: seen.append(number) or decoded(number))
@@ -102,12 +102,12 @@ def test_refused(content: dict[str, bytes], message: str, zipped: bool, tmp_path
     else:
         path = files.write_folder(tmp_path / "a", content)
     with pytest.raises(InputError, match=message):
-        read_ubo2003(path)
+        Ubo2003(path)
 
 
 def test_sizes_differ(tmp_path: Path) -> None:
     other = {"tl010 pl000 tv000 pv000.jpg": files.encoded(UP, UP, rows=8)}
-    btf = read_ubo2003(files.write_folder(tmp_path, good() | other))
+    btf = Ubo2003(files.write_folder(tmp_path, good() | other))
     with pytest.raises(InputError, match="24 x 8 texels, other images 24 x 16"):
         btf.values(np.array([1]), np.array([0]))
 
@@ -116,24 +116,24 @@ def test_archives_that_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.zip"
     path.write_bytes(files.zipped({"tl000 pl000 tv000 pv000.jpg": bytes(10**7)}, zipfile.ZIP_DEFLATED))
     with pytest.raises(InputError, match="claims 10,000,000 bytes in"):
-        read_ubo2003(path)
+        Ubo2003(path)
     path.write_bytes(files.zipped(good())[:-30])
     with pytest.raises(InputError, match="not a valid zip archive"):
-        read_ubo2003(path)
+        Ubo2003(path)
     with pytest.raises(InputError, match="No such file"):
-        read_ubo2003(tmp_path / "b.zip")
+        Ubo2003(tmp_path / "b.zip")
 
 
 def test_links_out_of_the_folder_are_not_followed(tmp_path: Path) -> None:
     (tmp_path / "secret.jpg").write_bytes(files.encoded(UP, UP))
     folder = files.write_folder(tmp_path / "a", good())
     os.symlink(tmp_path / "secret.jpg", folder / "tl010 pl000 tv000 pv000.jpg")
-    assert len(read_ubo2003(folder).light) == 1
+    assert len(Ubo2003(folder).light) == 1
 
 
 def test_names_that_climb_out_of_an_archive_are_harmless(tmp_path: Path) -> None:
     (tmp_path / "a.zip").write_bytes(files.zipped(good("../../tl000 pl000 tv000 pv000.jpg")))
-    assert read_ubo2003(tmp_path / "a.zip").rows == 16
+    assert Ubo2003(tmp_path / "a.zip").rows == 16
     assert [p.name for p in tmp_path.iterdir()] == ["a.zip"]
 
 
@@ -150,7 +150,7 @@ def test_a_damaged_archive(data: st.DataObject, folder: Path) -> None:
     _, content = data.draw(damaged(samples))
     path = folder / "a.zip"
     path.write_bytes(content)
-    btf = loads_or_refuses(lambda: read_ubo2003(path))
+    btf = loads_or_refuses(lambda: Ubo2003(path))
     if btf is not None:
         pairs = np.arange(len(btf.light))
         loads_or_refuses(lambda: btf.values(pairs, np.zeros_like(pairs)))

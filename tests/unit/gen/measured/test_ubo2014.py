@@ -14,7 +14,7 @@ from support import measured_files as files
 from support.fuzzing import damaged, examples, loads_or_refuses
 
 from mbtf_core.errors import InputError
-from mbtf_gen.measured.ubo2014 import Ubo2014, read_ubo2014
+from mbtf_gen.measured.ubo2014 import Ubo2014
 
 PAIRS, TEXELS = 9, files.ROWS * files.COLUMNS
 
@@ -22,7 +22,7 @@ PAIRS, TEXELS = 9, files.ROWS * files.COLUMNS
 def opened(folder: Path, content: bytes) -> Ubo2014:
     path = folder / "a.btf"
     path.write_bytes(content)
-    return read_ubo2014(path)
+    return Ubo2014(path)
 
 
 def all_values(btf: Ubo2014) -> tuple[np.ndarray, np.ndarray]:
@@ -73,7 +73,7 @@ def test_another_reader_reads_the_same_factors(tmp_path: Path) -> None:
     meta, data = module.read_ubo_btf_dfmf(str(path))
     # Of view 1, light 2: its rows are `view · lights + light`, its columns row-major.
     pictures = np.stack([data.SxV[c] @ data.U[c][1 * 3 + 2] for c in range(3)], axis=-1)
-    btf = read_ubo2014(path)
+    btf = Ubo2014(path)
     ours = btf.values(np.full(TEXELS, 5), np.arange(TEXELS))
     np.testing.assert_allclose(ours, pictures, rtol=1e-5)
     np.testing.assert_allclose(np.array(meta.views_3d)[:3], btf.view[::3], atol=1e-6)

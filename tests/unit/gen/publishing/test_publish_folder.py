@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
-from support.datasets import edit, write_dataset
+from support.datasets import write_dataset
 from support.published import contents, publish, small
 
 from mbtf_core.errors import EngineError, InputError, UsageError
@@ -32,29 +33,21 @@ def test_the_same_command_gives_the_same_bytes(form: str, shards: Path, tmp_path
     assert contents(first) == contents(second)
 
 
-def stop(patch: pytest.MonkeyPatch, number: int, written: bool) -> None:
-    """Interrupt the next run before its file of this number, or once it is `written` but not recorded."""
-    add, left = module.OutputFolder.add, iter(range(number))
+def test_an_interrupted_run_resumes(shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After each of its files, once that is written but not recorded."""
+    whole, add = contents(publish(shards, tmp_path / "whole", form="webdataset")), module.OutputFolder.add
+    for number in range(len(whole) - 1):
+        left = iter(range(number))
 
-    def stopping(folder: module.OutputFolder, name: str, write: Callable[[Path], Stored]) -> Stored:
-        if next(left, None) is None:
-            if written:
+        def stopping(folder: Any, name: str, write: Any, left: Iterator[int] = left) -> Stored:
+            if next(left, None) is None:
                 (folder.path / name).parent.mkdir(exist_ok=True)
                 write(folder.path / name)
-            raise KeyboardInterrupt
-        return add(folder, name, write)
+                raise KeyboardInterrupt
+            return add(folder, name, write)
 
-    patch.setattr(module.OutputFolder, "add", stopping)
-
-
-@pytest.mark.parametrize("written", [False, True])
-def test_an_interrupted_run_resumes(
-    written: bool, shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    whole = contents(publish(shards, tmp_path / "whole", form="webdataset"))
-    for number in range(len(whole) - 1):
         with monkeypatch.context() as patch:
-            stop(patch, number, written)
+            patch.setattr(module.OutputFolder, "add", stopping)
             with pytest.raises(KeyboardInterrupt):
                 publish(shards, tmp_path / "cut", form="webdataset")
         publish(shards, tmp_path / "cut", form="webdataset")
@@ -84,12 +77,6 @@ def test_damage_is_found_before_anything_is_written(shards: Path, tmp_path: Path
     with pytest.raises(InputError, match=r"train-00001\.npz: has changed since it was written"):
         publish(shards, tmp_path / "card", form="webdataset")
     assert not (tmp_path / "card").exists()
-
-
-def test_a_data_set_without_its_completion_is_refused(shards: Path, tmp_path: Path) -> None:
-    edit(shards / "manifest.json", lambda manifest: manifest.update(complete=False))
-    with pytest.raises(InputError, match="is not complete"):
-        publish(shards, tmp_path / "card", form="webdataset")
 
 
 def test_a_full_disk_is_said_before(shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -73,7 +73,10 @@ def test_the_recipe_makes_the_same_data(with_maps: bool, tmp_path: Path) -> None
     generation.generate(GeneratorConfig.model_validate({"material": str(maps), **SMALL}), tmp_path / "data")
     card = tmp_path / "card"
     Publication.prepare(tmp_path / "data", CONFIG, with_maps=with_maps).write(card)
-    assert (card / "recipe/material").exists() is with_maps
+    copied = {str(p.relative_to(card / "recipe")) for p in card.glob("recipe/material/**/*.*")}
+    # Maps of one name are all copied.
+    names = ("material.yaml", "height/map.npy", "roughness/map.npy", "base_color/color.png")
+    assert copied == ({f"material/{name}" for name in names} if with_maps else set())
     maps.rename(tmp_path / "moved")
     made = remade(card, tmp_path / "made", None if with_maps else tmp_path / "moved")
     assert digest_faults(made, card / "recipe/digests.json") == []
@@ -116,20 +119,6 @@ def test_digests_of_another_data_set(tmp_path: Path) -> None:
     assert found == ["belongs to another configuration, or was made from other maps"]
     with pytest.raises(InputError, match=r"publish\.json: is damaged"):
         digest_faults(Dataset.open(tmp_path / "b"), tmp_path / "card/publish.json")
-
-
-@pytest.mark.usefixtures("engine")
-def test_maps_of_one_name_are_all_copied(tmp_path: Path) -> None:
-    maps = write_maps(tmp_path / "maps")
-    generation.generate(GeneratorConfig.model_validate({"material": str(maps), **SMALL}), tmp_path / "data")
-    Publication.prepare(tmp_path / "data", CONFIG, with_maps=True).write(tmp_path / "card")
-    copy = tmp_path / "card/recipe/material"
-    maps_of = {str(p.relative_to(copy)) for p in copy.rglob("*.*")}
-    assert maps_of == {"material.yaml", "height/map.npy", "roughness/map.npy", "base_color/color.png"}
-    original, found = load_material(maps), load_material(copy)
-    assert found.digests == original.digests
-    np.testing.assert_array_equal(found.height, original.height)
-    np.testing.assert_array_equal(found.maps["roughness"], original.maps["roughness"])
 
 
 @pytest.mark.usefixtures("engine")
