@@ -77,11 +77,9 @@ class RunForecaster:
     def speed(self) -> tuple[float, float]:
         """Seconds of starting the generator, and of a path."""
         from mbtf_gen.forecast import forecast
-        from mbtf_gen.planning.run_plan import plan_effects
-        from mbtf_gen.planning.run_plan import allocate
 
         job = Job.of(self.recipe.generate, self.material)
-        found = forecast(job, allocate(job, plan_effects(job, pilots=False)), seconds=1.0)
+        found = forecast(job, seconds=1.0)
         return found.start, found.query_seconds / self.recipe.generate.queries.spp
 
     def of(

@@ -195,11 +195,9 @@ class RunRunner:
 def forecast_seconds(config: GeneratorConfig) -> float:
     """Seconds of a training query, by a forecast."""
     from mbtf_gen.forecast import forecast
-    from mbtf_gen.planning.run_plan import plan_effects
-    from mbtf_gen.planning.run_plan import allocate
 
     job = Job.load(config)
-    return max(forecast(job, allocate(job, plan_effects(job, pilots=False))).query_seconds, _CHEAPEST)
+    return max(forecast(job).query_seconds, _CHEAPEST)
 
 
 def _flat(options: dict[str, Any], prefix: str = "") -> dict[str, Any]:
