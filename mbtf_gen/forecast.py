@@ -18,7 +18,7 @@ from mbtf_core.stats import pooled_error
 from mbtf_core.units import clock, expectation, size_text
 from mbtf_gen.job import Job, data_bytes, most_paths, planned_paths, split_queries, split_spp, split_target
 from mbtf_gen.planning.adaptive import estimate_shard
-from mbtf_gen.planning.run_plan import RunPlan
+from mbtf_gen.planning.run_plan import RunPlan, allocate, plan_effects
 from mbtf_gen.planning.simulation import build_estimator, pilot_queries
 from mbtf_gen.render.estimates import Estimates, Stream, Target
 
@@ -72,14 +72,15 @@ class Forecast:
         )
 
 
-def forecast(job: Job, plan: RunPlan, seconds: float = 2.0) -> Forecast:
+def forecast(job: Job, plan: RunPlan | None = None, seconds: float = 2.0) -> Forecast:
     """Trace a small part of the training split and extrapolate.
 
     Parameters
     ----------
-    job, plan : the run
+    job, plan : the run; by default with the plan that needs no pilots
     seconds : time of the pilot at most, after its first pieces
     """
+    plan = plan or allocate(job, plan_effects(job, pilots=False))
     began = time.perf_counter()
     estimator = build_estimator(job, plan.effects)
     spp, target = split_spp(job.config, "train"), split_target(job.config, "train")

@@ -92,7 +92,7 @@ class RunForecaster:
         from mbtf_gen.planning.run_plan import allocate, plan_effects
 
         job = Job.of(self.recipe.generate, self.material)
-        found = forecast(job, allocate(job, plan_effects(job, pilots=False)), seconds=1.0)
+        found = forecast(job, seconds=1.0)
         return found.start, found.query_seconds / self.recipe.generate.queries.spp
 
     def of(

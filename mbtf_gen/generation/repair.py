@@ -118,12 +118,7 @@ def _manifest(folder: DataFolder) -> tuple[dict[str, Any] | None, list[Fault]]:
         found = folder.read_checksummed(MANIFEST_NAME)
     except InputError as error:
         return None, [Fault(MANIFEST_NAME, error.what, _AGAIN)]
-    if "measured" in Dataset.open(folder).manifest:
-        raise InputError(
-            "holds measured data, which cannot be generated again",
-            where=folder,
-            hint="remove the damaged files, then run the same mbtf-gen import again",
-        )
+    Dataset.open(folder)  # says whether another version wrote it
     return found, []
 
 
@@ -137,6 +132,12 @@ def _job(folder: DataFolder, manifest: dict[str, Any] | None, material: str | No
             source, stored = folder.at(CONFIG_NAME), read_yaml(path)
     else:
         raise InputError(f"neither {MANIFEST_NAME} nor {CONFIG_NAME} can be read", where=folder, hint=_AGAIN)
+    if "material" not in stored:
+        raise InputError(
+            "holds measured data, which cannot be generated again",
+            where=folder,
+            hint="remove the damaged files, then run the same mbtf-gen import again",
+        )
     moved = {} if material is None else {"material": material}
     config = build(GeneratorConfig, {**stored, **moved}, source=source)
     if not Path(config.material).exists():

@@ -86,6 +86,7 @@ class Metallic(ReflectionLayer):
 
     name, description = "metallic", "metallic"
     scale, text = math.inf, "metallic up to {:.2g}"
+    lacking = "no metal anywhere"
 
 
 class Clearcoat(ReflectionLayer):

@@ -12,7 +12,6 @@ import pytest
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
-from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.schema import Queries
 from mbtf_core.files.atomic import write_checksummed
 from mbtf_gen.config.generator import GeneratorConfig
@@ -144,12 +143,6 @@ def test_resumed_and_sliced_runs_follow_the_plan_of_the_manifest(
     generate(config, out, slice_index=2, slice_count=2)
     assert recorder.plans[-1] == stored
     assert json.loads((out / "manifest.json").read_text())["effects"] == stored.to_manifest()
-
-
-def test_shards_store_the_transmittance(config: GeneratorConfig, recorder: Recorder, tmp_path: Path) -> None:
-    generate(config, tmp_path / "out")
-    data = Dataset.open(tmp_path / "out").load("train")
-    np.testing.assert_array_equal(data["transmittance"], data["u"][:, 0])
 
 
 def test_what_passed_is_the_view_rays_alone() -> None:

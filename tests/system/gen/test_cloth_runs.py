@@ -30,8 +30,6 @@ LINES = {
     "inspect": "inspect cloth.yaml --json",
     "reference": "reference cloth.yaml --view 50,20 --tiles-across 1 --size 24 --spp 8 -o reference",
     "preview": "preview cloth.yaml -o preview --size 64 --spp 4 --set queries.train=3000",
-    "height scale": "cloth.yaml --height-scale 0.2 -o other",
-    "no fibers": "cloth.yaml --effects -parallax -o other",
 }
 
 

@@ -1,11 +1,9 @@
-"""Whole runs of ``mbtf-gen``: forms of the command, resuming, kills, slices, layouts, formats, pictures."""
+"""Whole runs of ``mbtf-gen``: forms of the command, slices, layouts, formats, pictures."""
 
 from __future__ import annotations
 
 import json
 import shutil
-import signal
-import time
 from pathlib import Path
 
 import numpy as np
@@ -22,11 +20,10 @@ from mbtf_core.data.verify import verify
 
 Arrays = dict[str, NDArray[np.float32]]
 
-# 16 texels across, 8 down; shards of 64 queries, so that there is much to interrupt.
+# 16 texels across, 8 down.
 MAP = (8, 16)
 SMALL = "--queries 16/texel --test-queries 200 --test-spp 8 --set output.shard_queries=64"
 COMMAND = f"maps {SMALL}".split()
-SHARDS = 16 * 8 * 16 // 64 + 4
 PICTURES = "reference maps -o pictures --view 50,20 --light 60,80 --tiles-across 0.5,2 --size 24"
 
 
@@ -85,36 +82,6 @@ def test_the_data_set_is_intact_and_sane(whole: Path) -> None:
         # Halves are two estimates, not one.
         assert np.mean(arrays["value_a"] != arrays["value_b"]) > 0.3
     assert (whole / "config.yaml").read_text().startswith("version: 2\nmaterial: maps\n")
-
-
-def finished_shards(folder: Path) -> int:
-    return sum(path.with_suffix(".npz").exists() for path in folder.glob("t*-*.json"))
-
-
-def test_kills_at_any_instant_and_the_same_command_give_the_same_data(work: Path, whole: Path) -> None:
-    out = work / "killed"
-    line = [*COMMAND, "-o", "killed"]
-    counts = [0]
-    for more in (1, 6):
-        process = start(line, work)
-        give_up = time.monotonic() + 120
-        while finished_shards(out) < counts[-1] + more:
-            assert process.poll() is None, process.communicate()[1]
-            assert time.monotonic() < give_up
-            time.sleep(0.001)
-        process.send_signal(signal.SIGKILL)
-        assert finished(process).code == -signal.SIGKILL
-        counts.append(finished_shards(out))
-    assert counts[1] < counts[2] < SHARDS, "killed too late to show anything"
-    assert json.loads((out / "manifest.json").read_text())["complete"] is False
-    done = finished(start([*line, "--json"], work))
-    assert done.code == 0, done.err
-    # Finished shards were kept.
-    made = json.loads(done.out)["paths"]
-    assert 0 < made < 2048 * 4 + 200 * 8
-    assert verify(out) == []
-    assert equal(out, whole)
-    assert not list(out.glob(".*.tmp"))
 
 
 def test_slices_written_at_once_and_merged_are_the_whole(work: Path, whole: Path) -> None:

@@ -15,12 +15,8 @@ from mbtf_core.data.dataset import Dataset
 LINES = {
     "generate": "pebbles.glb --resolution 16 --queries 40/texel --test-queries 256 -o data --json",
     "verify": "verify data",
-    "plan": "plan pebbles.glb --resolution 16 --queries 40/texel",
-    "inspect": "inspect pebbles.glb",
     "reference": "reference pebbles.glb --view 50,20 --tiles-across 1 --size 24 --spp 8 -o reference",
     "preview": "preview pebbles.glb -o preview --size 64 --spp 4 --set queries.train=3000",
-    "tracer": "pebbles.glb --tracer mesh -o other",
-    "missing": "missing.glb -o other",
 }
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,14 +19,16 @@ from mbtf_core.data.geometry import Geometry
 from mbtf_core.data.shard_files import read_shard
 from mbtf_core.data.verify import verify
 from mbtf_core.errors import InputError, PartialError
+from mbtf_gen.cli.generate import describe
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.generation import folder
 from mbtf_gen.generation import repair as repairs
 from mbtf_gen.generation import run as generation
-from mbtf_gen.generation.manifest import finish
+from mbtf_gen.generation.manifest import Summary, finish
 from mbtf_gen.generation.run import generate, unfinished
-from mbtf_gen.job import Job, split_queries
+from mbtf_gen.generation.shard_record import ShardStatistics
+from mbtf_gen.job import Job
 from mbtf_gen.planning.effects_plan import EffectsPlan
 from mbtf_gen.planning.simulation import geometry_of
 
@@ -278,18 +282,13 @@ def test_paths_left_are_those_of_unfinished_shards(
     with pytest.raises(KeyboardInterrupt):
         generate(config, out)
     engine.fail_at = None
-    left = left_of(job, out)
-    assert left == 240
+    assert left_of(job, out) == 240
     seen: list[tuple[float, float | None]] = []
-    done = generate(config, out, progress=lambda done, note, total: seen.append((done, total)))
-    assert done.paths == left
+    generate(config, out, progress=lambda done, note, total: seen.append((done, total)))
     # Finished shards do not count, so that the time left is not underestimated.
     assert seen == [(80, 240), (120, 240), (240, 240)]
     assert left_of(job, out) == 0
     assert len(unfinished(job, out, overwrite=True)) == len(job.shards)
-    image = Job.prepare(changed(config, queries={"layout": "image"}))
-    assert split_queries(image, "train") == 4 * 32
-    assert left_of(image, out) == 4 * 32 * 2 + 32 * 4
 
 
 def test_the_sidecar_describes_the_shard(config: GeneratorConfig, out: Path) -> None:
@@ -308,3 +307,29 @@ def test_the_sidecar_describes_the_shard(config: GeneratorConfig, out: Path) -> 
     assert manifest["summary"]["paths"] == 320
     assert manifest["levels"]["mixture"] == {"log_uniform": 0.6, "finest": 0.4}
     assert manifest["splits"]["train"]["queries"] == 100
+
+
+COUNTS: dict[str, Any] = {"queries": 1000, "splits": {"train": 900, "test": 100}, "paths": 8000}
+COUNTS |= dict.fromkeys(("lost", "capped", "nonfinite", "writing_seconds", "waiting_seconds"), 0)
+TIMES: dict[str, Any] = {"seconds": 4.0, "shard_seconds": 20.0, "paths_per_second": 2000.0}
+VALUES: dict[str, Any] = {"mean_value": [0.1] * 3, "relative_error": 0.5, "effects": [], "target": None}
+SUMMARY = Summary(folder="shards", complete=True, **COUNTS, **TIMES, **VALUES)
+
+
+def test_halving_the_error_takes_three_times_the_seconds_so_far() -> None:
+    # Of all runs: this one may have resumed most of them. Unfinished and exact runs have no marginal cost.
+    assert "50.0% of the mean; halving it would take about 1:00 more" in describe(SUMMARY)
+    for summary in (replace(SUMMARY, complete=False), replace(SUMMARY, relative_error=0.0)):
+        assert "halving" not in describe(summary)
+
+
+@pytest.mark.parametrize(
+    ("count", "paths", "refused"), [(4, 1, False), (5, 4_999_999, True), (5, 5_000_000, False)]
+)
+def test_one_sample_in_a_million_may_be_nonfinite(count: int, paths: int, refused: bool) -> None:
+    statistics = ShardStatistics()
+    quarantined = {"nonfinite_samples": count, "lost_rays": 0, "capped_rays": 0, "nonfinite_at": []}
+    record = {"file": "test-00000.npz", "split": "test", "queries": 1, "paths": paths, "seconds": 0.0}
+    statistics.add({**record, "quarantined": quarantined, "target": None})
+    with pytest.raises(PartialError) if refused else contextlib.nullcontext():
+        statistics.refuse_nonfinite(paths, Path("out"))

@@ -152,25 +152,3 @@ def test_the_run_that_ends_last_finishes_the_data_set(
     assert engine.estimated == [("train", 0), ("train", 2), ("test", 0), *[("train", 1)] * (not finished)]
     assert contents(out) == contents(whole)
     assert not list(out.glob(".*"))
-
-
-def test_a_shard_finished_before_its_lock_is_not_rendered(
-    config: GeneratorConfig, engine: Formula, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, out: Path
-) -> None:
-    """Between the check of a shard and its lock another process may finish it and release the lock."""
-    whole = tmp_path / "whole"
-    generate(config, whole)
-    engine.estimated.clear()
-    take = generation.take_lock
-
-    def late(path: Path) -> Any:
-        if path.name == FILES[1]:
-            for name in (path.name, sidecar_of(path).name):
-                shutil.copy(whole / name, out / name)
-        return take(path)
-
-    monkeypatch.setattr(generation, "take_lock", late)
-    assert generate(config, out).complete
-    assert engine.estimated == [("train", 0), ("train", 2), ("test", 0)]
-    assert contents(out) == contents(whole)
-    assert not list(out.glob(".*"))

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict
-
 import numpy as np
 import pytest
-from conftest import RunPython
 from numpy.typing import NDArray
 
 from mbtf_core.data.lattice import Lattice
@@ -143,49 +139,6 @@ def test_counts_of_a_query_do_not_depend_on_the_others(fitted: Allocation) -> No
     some = q.take(slice(7, 9))
     assert (fitted.deviation(some) == fitted.deviation(q)[7:9]).all()
     assert (fitted.counts(some, SPP) == fitted.counts(q, SPP)[7:9]).all()
-
-
-# Counts by a manifest's weights, and by a pilot of its own for a target error; prints NumPy's features in use
-# and the digest of all bits, those of the expectations too, where the last bit shows.
-CODE = """
-import hashlib, json, sys
-import numpy as np
-from pydantic import TypeAdapter
-from mbtf_gen.planning.adaptive import round_up, needed_paths
-from mbtf_gen.planning.sample_allocation import Allocation
-from mbtf_gen.render.estimates import Estimates
-from mbtf_core.data.lattice import Lattice
-from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan
-n = 20000
-allocation = TypeAdapter(Allocation).validate_json(sys.argv[1])
-q = QueryPlan(Lattice(6), LevelMixture(0.6, 0.4), 0.1, "shuffled", 0, n).draw("train", 3, n)
-rng = np.random.Generator(np.random.Philox(5))
-a, b, v = (0.3 * rng.random((n, k), dtype=np.float32) for k in (3, 3, 1))
-pilot = Estimates(a, b, None, 0, 0, 0, 0, path_variance=v[:, 0])
-expected = allocation.deviation(q), allocation.tile_mean(q)
-needed, scale = needed_paths(pilot, 16, *expected, 0.05)
-h = hashlib.sha256()
-for array in (*expected, needed, scale, allocation.counts(q, 16), round_up(needed, 1000)):
-    h.update(array.tobytes())
-found = np.show_config(mode="dicts")["SIMD Extensions"].get("found", [])
-print(json.dumps({"found": found, "digest": h.hexdigest()}))
-"""
-
-
-def test_counts_do_not_depend_on_the_processors_features(fitted: Allocation, run_python: RunPython) -> None:
-    def counted(features: list[str] | None) -> tuple[list[str], str]:
-        disabled = None if features is None else " ".join(features)
-        done = run_python("-c", CODE, json.dumps(asdict(fitted)), NPY_DISABLE_CPU_FEATURES=disabled)
-        assert done.returncode == 0, done.stderr
-        answer = json.loads(done.stdout)
-        return answer["found"], answer["digest"]
-
-    found, digest = counted(None)
-    if not found:
-        pytest.skip("NumPy uses no optional features of this processor")
-    left, again = counted(found)
-    assert len(left) < len(found)
-    assert again == digest
 
 
 def test_no_noise_and_little_noise() -> None:
