@@ -143,9 +143,10 @@ def evaluate(material: Material, shards: str | Path | DataFolder) -> dict[str, d
     Returns
     -------
     dict
-        ``errors``: those of values (:func:`split_errors`) by split, ``test``, ``held_out_queries``,
-        ``held_out_directions`` and ``training``; ``transmittance``: its errors by split, where both material
-        and data have one. A fit states the same (:attr:`FitResult.errors <mbtf_fit.FitResult>`).
+        ``errors``: those of values by split, ``test``, ``held_out_queries``, ``held_out_directions`` and
+        ``training``; ``transmittance``: its errors by split, where both material and data have one. The same
+        plain data as in ``material.json``: estimates with ``value``, ``error`` and ``n``, among them the
+        ``unexplained`` variance (1 - R²).
 
     Raises
     ------

@@ -27,17 +27,17 @@ Width = Annotated[float, Field(gt=0, le=1e4)]
 class SheetSection(Settings):
     """The contact sheet: a column per view and light, a row per width of the field of view."""
 
-    views: Annotated[Directions, Flag("--view", "ELEVATION,AZIMUTH")] = Field(
+    view: Annotated[Directions, Flag("--view", "ELEVATION,AZIMUTH")] = Field(
         [Direction(elevation=70, azimuth=-90), Direction(elevation=30, azimuth=-90)],
-        description="directions towards the camera in degrees, or a single one; default: two views",
+        description="direction of the camera in degrees; default: two views",
     )
-    lights: Annotated[Directions, Flag("--light", "ELEVATION,AZIMUTH")] = Field(
+    light: Annotated[Directions, Flag("--light", "ELEVATION,AZIMUTH")] = Field(
         [
             Direction(elevation=65, azimuth=60),
             Direction(elevation=35, azimuth=180),
             Direction(elevation=20, azimuth=15),
         ],
-        description="directions towards the light in degrees, or a single one; default: three lights",
+        description="direction of the light in degrees; default: three lights",
     )
     tiles_across: Annotated[list[Width], BeforeValidator(parse_numbers), Flag("--tiles-across", "1,2,4")] = (
         Field(
@@ -76,7 +76,7 @@ class MaterialPreviewConfig(Settings):
     @model_validator(mode="after")
     def _fits(self) -> Self:
         sheet, turn = self.sheet, self.turntable
-        panels = len(sheet.views) * len(sheet.lights) * len(sheet.tiles_across)
+        panels = len(sheet.view) * len(sheet.light) * len(sheet.tiles_across)
         if max(panels * sheet.size**2, turn.frames * turn.size**2) > MOST_PIXELS:
             raise ValueError(f"asks for more than {MOST_PIXELS:,} pixels; use smaller or fewer pictures")
         return self

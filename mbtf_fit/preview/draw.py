@@ -28,7 +28,7 @@ def draw(
     """
     keep_on_interruption(f"the finished pictures are kept in {path}")
     sheet, turn, asked = config.sheet, config.turntable, config.exposure
-    counts = len(sheet.views), len(sheet.lights), len(sheet.tiles_across)
+    counts = len(sheet.view), len(sheet.light), len(sheet.tiles_across)
     pixels = counts[0] * counts[1] * counts[2] * sheet.size**2
     pixels += 0 if sheet_only else turn.frames * turn.size**2
     check_space(path, PNG_BYTES * pixels, "reduce --size or --frames, or choose another folder with -o")

@@ -33,14 +33,14 @@ def panels(evaluator: Evaluator, section: SheetSection) -> F32:
     UsageError : a view shows the horizon
     """
     aspect = evaluator.lattice.aspect
-    lights = [from_angles(light.elevation, light.azimuth) for light in section.lights]
+    lights = [from_angles(light.elevation, light.azimuth) for light in section.light]
     size, target = section.size, (0.5, 0.5 * aspect)
     pictures = []
-    for view, light, tiles_across in product(section.views, lights, section.tiles_across):
+    for view, light, tiles_across in product(section.view, lights, section.tiles_across):
         camera = Camera(view.elevation, view.azimuth, tiles_across, target, rows=size, columns=size)
         q = camera.queries(light, aspect).flat()
         pictures.append(evaluator.evaluate(q.u, q.sigma, q.omega_i, q.omega_o))
-    lead = (len(section.views), len(lights), len(section.tiles_across))
+    lead = (len(section.view), len(lights), len(section.tiles_across))
     return np.stack(pictures).reshape(*lead, size, size, 3)
 
 
@@ -62,7 +62,7 @@ def contact_sheet(values: F32, section: SheetSection, exposure: float) -> NDArra
         for light in range(lights):
             # A wider gap separates views.
             left = MARGIN + (view * lights + light) * pitch + view * GAP
-            text = f"{_caption('view', section.views[view])}\n{_caption('light', section.lights[light])}"
+            text = f"{_caption('view', section.view[view])}\n{_caption('light', section.light[light])}"
             draw.multiline_text((left + 1, MARGIN), text, INK, font, spacing=2)
             for row in range(widths):
                 picture = Image.fromarray(to_display(values[view, light, row], exposure))

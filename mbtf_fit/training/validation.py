@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mbtf_core.data.dataset import Dataset
-from mbtf_core.stats import Estimate, level_groups, unexplained_variance
+from mbtf_core.stats import Estimate, by_group, level_groups, unexplained_variance
 from mbtf_core.units import clock
 from mbtf_fit.data.loader import Partition, load_split
 from mbtf_fit.data.queries import ShardQueries
@@ -52,15 +52,9 @@ def finite(number: float | None) -> float | None:
 
 def errors_by_level(trainer: Trainer, queries: ShardQueries) -> dict[str, float | None]:
     """Unexplained variance by nearest level; None where it is undefined."""
-    predicted = trainer.predict(queries)
     level = level_groups(queries.sigma, trainer.model.lattice.finest)
-    out = {}
-    for s in np.unique(level):
-        rows = level == s
-        arrays = (predicted[rows], queries.value_a[rows], queries.value_b[rows])
-        value = unexplained_variance(*arrays).value
-        out[str(s)] = finite(value)
-    return out
+    values = trainer.predict(queries), queries.value_a, queries.value_b
+    return {str(s): finite(e.value) for s, e in by_group(unexplained_variance, level, *values).items()}
 
 
 def history_record(trainer: Trainer, subset: ShardQueries) -> dict[str, Any]:

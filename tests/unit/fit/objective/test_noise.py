@@ -47,17 +47,6 @@ def test_variance_by_level_and_elevation_is_found(wild: int) -> None:
             assert found[group].mean() / variance[group].mean() == pytest.approx(1.0, abs=0.25)
 
 
-def test_the_lower_of_light_and_view_decides() -> None:
-    """Whichever it is: twice the variance that both being high have."""
-    queries, _, _ = noisy()
-    model = NoiseModel.of(queries, LATTICE, 0.05)
-    steep, low = (torch.tensor([[x, 0.0, (1 - x * x) ** 0.5]]) for x in (0.3, 0.99))
-    at = torch.full((1, 3), 0.05), torch.tensor([0.1])
-    high = float(model.variance(*at, steep, steep)[0, 0])
-    for light, view in ((low, steep), (steep, low), (low, low)):
-        assert float(model.variance(*at, light, view)[0, 0]) / high == pytest.approx(2.0, rel=0.25)
-
-
 def test_data_without_noise_have_none() -> None:
     queries, _, _ = noisy(2000)
     quiet = replace(queries, value_b=queries.value_a)

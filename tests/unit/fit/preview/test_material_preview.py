@@ -28,8 +28,8 @@ from mbtf_fit.backends.mitsuba.stored_material import read_material  # noqa: E40
 from mbtf_fit.preview import sheet, turntable  # noqa: E402
 
 SECTION = SheetSection(
-    views=[Direction(elevation=70, azimuth=-90), Direction(elevation=35, azimuth=20)],
-    lights=[Direction(elevation=60, azimuth=0), Direction(elevation=30, azimuth=120)],
+    view=[Direction(elevation=70, azimuth=-90), Direction(elevation=35, azimuth=20)],
+    light=[Direction(elevation=60, azimuth=0), Direction(elevation=30, azimuth=120)],
     tiles_across=[0.5, 2.0, 9.0],
     size=64,
 )
@@ -45,7 +45,7 @@ def test_pictures_are_ordered_by_view_light_and_width(model: str, tmp_path: Path
     pixels = sheet.contact_sheet(values, SECTION, exposure)
     pitch = 64 + sheet.GAP
     for view, light, row in np.ndindex(2, 2, 3):
-        v, i = SECTION.views[view], SECTION.lights[light]
+        v, i = SECTION.view[view], SECTION.light[light]
         camera = Camera(v.elevation, v.azimuth, SECTION.tiles_across[row], (0.5, 1.0), 64, 64)
         queries = camera.queries(from_angles(i.elevation, i.azimuth), 2.0).flat()
         wanted = material.predict(queries).reshape(64, 64, 3)  # type: ignore[arg-type]
@@ -139,10 +139,10 @@ def test_a_white_plate_and_a_white_sheet_have_one_exposure(tmp_path: Path) -> No
 def test_view_and_light_replace_those_of_the_sheet() -> None:
     """Spelled as in ``mbtf-gen reference``."""
     config = resolve(
-        MaterialPreviewConfig, flags={"material": "m", "sheet.views": "60,-90", "sheet.lights": "45,30"}
+        MaterialPreviewConfig, flags={"material": "m", "sheet.view": "60,-90", "sheet.light": "45,30"}
     )
-    assert config.sheet.views == [Direction(elevation=60, azimuth=-90)]
-    assert config.sheet.lights == [Direction(elevation=45, azimuth=30)]
+    assert config.sheet.view == [Direction(elevation=60, azimuth=-90)]
+    assert config.sheet.light == [Direction(elevation=45, azimuth=30)]
 
 
 def test_bad_input_of_previews_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -188,15 +188,6 @@ def test_visibility_is_that_of_shadow_rays(level: float) -> None:
     assert float((found - wanted).square().mean()) < 0.25 * float(wanted.var())
 
 
-def test_a_surface_survives_its_tensors() -> None:
-    known = rough_surface(LATTICE)
-    again = KnownSurface.from_tensors(known.tensors(), LATTICE)
-    arrays = queries(200)
-    torch.testing.assert_close(
-        hints_of(again, *arrays, places=4), hints_of(known, *arrays, places=4), atol=0, rtol=0
-    )
-
-
 @pytest.mark.parametrize(("given", "shape"), [((12, 16), (12, 16)), ((15, 9), (8, 6)), ((6, 8), (20, 31))])
 @pytest.mark.parametrize("wave", [(0, 1), (2, 0), (1, -2)])
 def test_a_wave_keeps_its_phase_and_the_gaussian_share_of_its_amplitude(

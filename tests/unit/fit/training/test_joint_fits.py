@@ -182,14 +182,17 @@ def test_a_fit_does_not_replace_what_it_starts_from(data: dict[str, Path], tmp_p
     assert Decoder.find(tmp_path / "m").sha256 == before
 
 
-def test_another_network_is_another_fit(data: dict[str, Path], tmp_path: Path) -> None:
-    wanted = single_config(steps=3, decoder=str(tmp_path / "m"))
+@pytest.mark.parametrize("option", ["decoder", "init_from"])
+def test_another_material_to_start_from_is_another_fit(
+    data: dict[str, Path], tmp_path: Path, option: str
+) -> None:
+    wanted = single_config(steps=3, **{option: str(tmp_path / "m")})
     fit(single_config(steps=3), data["waves"], tmp_path / "m")
-    fit(wanted, data["stripes"], tmp_path / "n")
-    assert fit(wanted, data["stripes"], tmp_path / "n").resumed
+    fit(wanted, data["third"], tmp_path / "n")
+    assert fit(wanted, data["third"], tmp_path / "n").resumed
     fit(single_config(steps=4), data["waves"], tmp_path / "m", overwrite=True)
     with pytest.raises(InputError, match="holds a fit of another configuration"):
-        fit(wanted, data["stripes"], tmp_path / "n")
+        fit(wanted, data["third"], tmp_path / "n")
 
 
 class Killed(BaseException):

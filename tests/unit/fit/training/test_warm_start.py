@@ -48,18 +48,6 @@ def test_textures_and_offset_are_copied(folders: tuple[Path, Path], tmp_path: Pa
     assert not torch.allclose(weights["own"]["pyramid.3"], weights["taken"]["pyramid.3"], atol=0.01)
 
 
-def test_another_initial_material_is_another_fit(folders: tuple[Path, Path], tmp_path: Path) -> None:
-    images, _ = folders
-    shuffled = write_data(tmp_path / "s", parallax, train=1000)
-    fit(config("neumip", None), shuffled, tmp_path / "first")
-    wanted = config("hierarchical", tmp_path / "first")
-    fit(wanted, images, tmp_path / "m")
-    assert fit(wanted, images, tmp_path / "m").resumed
-    fit(config("neumip", None, 5), shuffled, tmp_path / "first", overwrite=True)
-    with pytest.raises(InputError, match="holds a fit of another configuration"):
-        fit(wanted, images, tmp_path / "m")
-
-
 @pytest.mark.parametrize(
     ("network", "lost"), [({"channels": 5}, "pyramid.0"), ({"offset": "direct"}, "offset_network")]
 )
