@@ -147,7 +147,8 @@ _FRAMES = """
     const nodes = mean.latest.read(0, 0, width, height);
     let sum = 0;
     for (let k = 0; k < nodes.length; k += 4) sum += nodes[k];
-    return [milliseconds.slice(1), viewer.content.materials[0].blocks ? sum / (width * height) : 0];
+    const traced = viewer.content.materials[0].source.includes("TRACED");
+    return [milliseconds.slice(1), traced ? sum / (width * height) : 0];
 """
 
 

@@ -257,7 +257,7 @@ def test_damaged_pages_say_so(driver: Any, tmp_path: Path) -> None:
     content = material_content(tmp_path / "material")[0]
     short = json.loads(json.dumps(content))
     short["textures"]["pyramid"]["data"] = short["textures"]["pyramid"]["data"][:400]
-    shader = {**content, "source": content["source"].replace("vec3 stage2", "vec4 stage2", 1)}
+    shader = {**content, "source": content["source"].replace("float3 stage2", "float4 stage2", 1)}
     for damaged, what in ((short, ""), (shader, "refused a shader"), ({**content, "weights": "?"}, "")):
         page = Page(driver, write_page({"materials": [damaged]}, "damaged"), tmp_path)
         page.until(lambda page=page: not page.message().startswith("Loading"))

@@ -15,9 +15,9 @@ from support.shader_cases import CASES, make
 from mbtf_core.app.console import run
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import EngineError
+from mbtf_fit.backends.shader.compiler import TARGETS, SlangCompiler
+from mbtf_fit.backends.shader.slang import ENTRY, module_of
 from mbtf_fit.cli.app import app
-from mbtf_fit.shaders.compiler import TARGETS, SlangCompiler
-from mbtf_fit.shaders.slang import ENTRY, module_of, translate
 
 
 class Device:
@@ -261,8 +261,3 @@ def test_a_module_with_a_fault_says_where(tmp_path: Path) -> None:
     module.write_text("float4 f() { return nothing; }")
     with pytest.raises(EngineError, match="Slang makes no hlsl of it"):
         SlangCompiler().compile(module, "f", "hlsl")
-
-
-def test_reads_of_textures_become_reads_of_the_buffer() -> None:
-    found = translate("x = mix(texelFetch(a, ivec3(f(b, 1), k), 0).xy, vec2(0.0), 0.5);")
-    assert found == "x = lerp(texel(a, int3(f(b, 1), k)).xy, float2(0.0), 0.5);"
