@@ -15,8 +15,7 @@ from support.shader_cases import CASES, make
 from mbtf_core.app.console import run
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import EngineError
-from mbtf_fit.backends.shader.compiler import TARGETS, SlangCompiler
-from mbtf_fit.backends.shader.slang import ENTRY, module_of
+from mbtf_fit.backends.shader.slang import ENTRY, TARGETS, SlangCompiler, module_of
 from mbtf_fit.cli.app import app
 
 
