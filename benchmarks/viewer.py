@@ -172,7 +172,7 @@ def measure(driver: Any, folder: Path, size: tuple[int, int], frames: int) -> di
         "material": folder.name,
         "texels": material.lattice.shape()[1],
         "megabytes": len(html.encode()) / 1e6,
-        "rounding": rounding.relative,
+        "rounding": rounding,
         "first_picture_s": first,
         "software_ms": float(np.median(milliseconds)),
         "visited_nodes": visited,
@@ -183,8 +183,8 @@ def measure(driver: Any, folder: Path, size: tuple[int, int], frames: int) -> di
 def describe(f: dict[str, Any], size: str) -> str:
     """Figures of one material as text."""
     return (
-        f"{f['material']}, {f['texels']} texels: page {f['megabytes']:.2f} MB (rounding {f['rounding']:.4f} "
-        f"of the rms value), first picture {f['first_picture_s']:.1f} s, {f['software_ms']:.0f} ms per frame "
+        f"{f['material']}, {f['texels']} texels: page {f['megabytes']:.2f} MB ({f['rounding']}), "
+        f"first picture {f['first_picture_s']:.1f} s, {f['software_ms']:.0f} ms per frame "
         f"of {size} in software\n  per pixel {f['arithmetic']:.0f} operations, {f['fetches']:.0f} fetches, "
         f"{f['visited_nodes']:.1f} nodes; estimate {f['estimated_fps']:.0f} frames/s"
     )

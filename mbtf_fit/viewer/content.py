@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,29 +23,6 @@ TOLERANCE = 1e-2
 # Bits per number of the textures, the best first, and the bytes that textures may take in a page. With 6 bits
 # the error is still below a tenth of that of a good fit.
 _BITS, _SMALL = (8, 7, 6), 4.8e6
-
-
-@dataclass(frozen=True)
-class Rounding:
-    """Difference of a page's rounded textures from the material, on its conformance queries.
-
-    Attributes
-    ----------
-    bits : per number of the textures
-    rms, largest : in 1/sr
-    relative : rms over the root mean square value; 0 where all values are 0
-    """
-
-    bits: int
-    rms: float
-    largest: float
-    relative: float
-
-    def __str__(self) -> str:
-        return (
-            f"textures of {self.bits} bits: rms error {self.rms:.2g} 1/sr ({self.relative:.2g} of the rms "
-            f"value), largest {self.largest:.2g} 1/sr"
-        )
 
 
 def encode(array: NDArray[Any]) -> str:
@@ -124,12 +101,15 @@ def as_read(material: Material, packed: dict[str, PackedTexture]) -> Material:
     )
 
 
-def rounding(material: Material, read: Material, bits: int) -> Rounding:
-    """Error of a page's textures."""
+def _rounding(material: Material, read: Material, bits: int) -> str:
+    """Error of a page's textures on the conformance queries, in words."""
     exact = material.conformance["rgb"].astype(np.float64)
     difference = read.conformance["rgb"].astype(np.float64) - exact
     rms, power = float(np.sqrt((difference**2).mean())), float(np.sqrt((exact**2).mean()))
-    return Rounding(bits, rms, float(np.abs(difference).max()), rms / power if power else 0.0)
+    return (
+        f"textures of {bits} bits: rms error {rms:.2g} 1/sr ({rms / power if power else 0.0:.2g} of the rms "
+        f"value), largest {float(np.abs(difference).max()):.2g} 1/sr"
+    )
 
 
 def content_of(material: Material, name: str, packed: dict[str, PackedTexture]) -> dict[str, Any]:
@@ -175,27 +155,19 @@ def _image(image: TexelImage) -> dict[str, Any]:
     return {**out, "half": image.half, "shift": NODE_SHIFT}
 
 
-def material_content(folder: Path, name: str | None = None) -> tuple[dict[str, Any], Rounding]:
-    """What a page holds of a material.
+def material_content(folder: Path, name: str | None = None) -> tuple[dict[str, Any], str]:
+    """What a page holds of a material, as JSON, and the error of its textures in words.
 
     Parameters
     ----------
-    folder : Path
-        Folder made by ``mbtf-fit``.
-    name : str, optional
-        Shown in the page; the folder's name by default.
-
-    Returns
-    -------
-    (dict, Rounding)
-        JSON of the page, and the error of its textures.
+    folder : made by ``mbtf-fit``
+    name : shown in the page; the folder's name by default
 
     Raises
     ------
-    InputError
-        The material is missing or corrupt, or of a model that the viewer does not evaluate.
+    InputError : the material is missing or corrupt, or has an operation that shaders do not have
     """
     material = Material.load(folder)
     packed, bits = _fitting(material)
     content = content_of(material, name or folder.resolve().name, packed)
-    return content, rounding(material, as_read(material, packed), bits)
+    return content, _rounding(material, as_read(material, packed), bits)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any, NamedTuple
 
-from mbtf_fit.backends.shader.images import F32, Layout, TexelImage, Weights
+from mbtf_fit.backends.shader.images import F32, Layout, TexelImage
 from mbtf_fit.backends.shader.syntax import Syntax
 from mbtf_fit.ops import Backend
 
@@ -104,7 +104,8 @@ class Code:
     fields : what stage 1 leaves for stage 2, members of the structure ``Seen``
     bodies : statements of stage 1 and of stage 2
     lit : whether the current operation depends on the light, so that its code is part of stage 2
-    images, weights : numbers that the shader reads
+    images : by the names of their tensors
+    weights : vectors (n, 4) of the networks' layers
     lobe : of a surface that lights are sampled by, known in stage 1: normal (3) and α² (1); None for none
     """
 
@@ -121,7 +122,7 @@ class Code:
         self.bodies: tuple[list[str], list[str]] = ([], [])
         self.lit = False
         self.images: dict[str, TexelImage] = {}
-        self.weights = Weights()
+        self.weights: list[F32] = []
         self.lobe: str | None = None
         self.precise, self._kept = precise, kept
         self._included: set[str] = set()
@@ -201,15 +202,12 @@ class Code:
         """A tensor ()."""
         return float(self.tensors[tensor])
 
-    def levels(self, texture: str) -> list[F32]:
-        """Levels of a texture, coarsest first."""
-        count = sum(key.rpartition(".")[0] == texture for key in self.tensors)
-        return [self.tensors[f"{texture}.{level}"] for level in range(count)]
-
-    def image(self, source: str, levels: Sequence[F32], layout: Layout, half: bool = False) -> TexelImage:
+    def image(self, source: str, layout: Layout = "plain", half: bool = False) -> TexelImage:
         """The image of a texture, or of one tensor; whether half precision suffices."""
         if source not in self.images:
             self.include("textures")
+            levels = [t for name, t in self.tensors.items() if name.rpartition(".")[0] == source]
+            levels = [self.tensors[f"{source}.{s}"] for s in range(len(levels))] or [self.tensors[source]]
             self.images[source] = TexelImage(self.name(source), source, layout, tuple(levels), half)
         return self.images[source]
 

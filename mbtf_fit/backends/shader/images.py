@@ -8,7 +8,7 @@ width + x``.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -70,6 +70,7 @@ class TexelImage:
             out[: len(nodes)] = nodes
             return out.reshape(1, -1, width, 4)
         levels = [_adjacent(t) for t in self.levels] if self.layout == "horizons" else self.levels
+        levels = [t.reshape(-1, *t.shape[-2:]) for t in levels]
         width, height = max(t.shape[1] for t in levels), sum(t.shape[0] for t in levels)
         layers = -(-levels[0].shape[2] // 4)
         stacked, start = np.zeros((height, width, 4 * layers), np.float32), 0
@@ -88,29 +89,14 @@ def _adjacent(horizons: F32) -> F32:
     return both.reshape(*mean.shape[:2], 4 * mean.shape[2])
 
 
-@dataclass
-class Weights:
-    """Weights of the networks: for each four outputs of a layer their biases, then, for each four inputs, the
-    columns of a 4 × 4 matrix."""
-
-    vectors: list[F32] = field(default_factory=list)
-
-    def add(self, weight: F32, bias: F32) -> int:
-        """Append a layer and return the index of its first vector."""
-        first = sum(map(len, self.vectors))
-        outputs, inputs = (-(-n // 4) for n in weight.shape)
-        padded = np.zeros((4 * outputs, 4 * inputs), np.float32)
-        padded[: weight.shape[0], : weight.shape[1]] = weight
-        biases = np.zeros(4 * outputs, np.float32)
-        biases[: len(bias)] = bias
-        columns = padded.reshape(outputs, 4, 4 * inputs).transpose(0, 2, 1)
-        both = np.concatenate([biases.reshape(outputs, 1, 4), columns], 1)
-        self.vectors.append(both.reshape(-1, 4))
-        return first
-
-    def array(self) -> F32:
-        """All vectors (n, 4); one of zeros where there is no network."""
-        return np.concatenate(self.vectors or [np.zeros((1, 4), np.float32)])
+def layer_vectors(weight: F32, bias: F32) -> F32:
+    """Weights of a layer as vectors (n, 4): for each four outputs their biases, then, for each four inputs,
+    the columns of a 4 × 4 matrix."""
+    outputs, inputs = (-(-n // 4) for n in weight.shape)
+    padded = np.zeros((4 * outputs, 1 + 4 * inputs), np.float32)
+    padded[: len(bias), 0] = bias
+    padded[: weight.shape[0], 1 : 1 + weight.shape[1]] = weight
+    return padded.reshape(outputs, 4, -1).transpose(0, 2, 1).reshape(-1, 4)
 
 
 def buffer_of(images: Sequence[TexelImage], weights: F32) -> tuple[list[str], int, F32]:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-import numpy as np
-
 from mbtf_fit import ops
 from mbtf_fit.backends.shader.backend import SHADER, Code, Value, in_fours
+from mbtf_fit.backends.shader.images import layer_vectors
 from mbtf_fit.backends.shader.syntax import number, vector
 from mbtf_fit.ops.constants import GLOSSY_CHANNELS, LEAK
 
@@ -28,8 +27,7 @@ FUNCTIONS = {
 
 @SHADER.implements(ops.Lookup)
 def _lookup(op: ops.Lookup, code: Code, u: Value, level: Value | None) -> str | Value:
-    half = op.textures not in code.precise
-    image = code.image(op.textures, code.levels(op.textures), "plain", half)
+    image = code.image(op.textures, half=op.textures not in code.precise)
     layers = image.layers
     if level is None:
         read = f"bilinear({image}, {code.let('Corners', f'corners({image.level(0)}, {u})')}, {{k}})"
@@ -64,7 +62,7 @@ def _offset(op: ops.Offset, code: Code, u: Value, r: Value, omega_o: Value) -> s
 @SHADER.implements(ops.Trace)
 def _trace(op: ops.Trace, code: Code, u: Value, level: Value, omega_o: Value) -> tuple[Value, Value]:
     code.include("heights")
-    nodes = code.image(op.heights, [code.tensors[op.heights]], "nodes")
+    nodes = code.image(op.heights, "nodes")
     rows, columns = nodes.levels[0].shape[:2]
     logarithms = ", ".join(str((n - 1).bit_length()) for n in (columns, rows))
     count = len(op.places)
@@ -97,8 +95,8 @@ def _displace(op: ops.Displace, code: Code, u: Value, z: Value, level: Value, om
 def _shade(op: ops.Shade, code: Code, hits: Value, level: Value, omega_i: Value, omega_o: Value) -> Value:
     code.include("textures")
     code.include("shading")
-    maps = code.image(op.maps, code.levels(op.maps), "maps")
-    horizons = code.image(op.horizons, code.levels(op.horizons), "horizons")
+    maps = code.image(op.maps, "maps")
+    horizons = code.image(op.horizons, "horizons")
     glossy = maps.levels[0].shape[2] == GLOSSY_CHANNELS
     count, width = len(hits) // 2, code.scalar(op.light_width)
     with code.stage_of(hits, level):
@@ -211,7 +209,8 @@ def _network(op: ops.Network, code: Code, x: Sequence[Value]) -> Value:
     code.fill(h, read.vectors(), len(read))
     for n in range(len(op.hidden) + 1):
         weight, bias = (code.tensors[f"{op.weights}.{n}.{name}"] for name in ("weight", "bias"))
-        first, (outputs, inputs) = code.weights.add(weight, bias), (-(-size // 4) for size in weight.shape)
+        first, (outputs, inputs) = sum(map(len, code.weights)), (-(-size // 4) for size in weight.shape)
+        code.weights.append(layer_vectors(weight, bias))
         hidden = n < len(op.hidden)
         out = code.variable("float4", "h" if hidden else op.output, outputs)
         # Unrolled code is slower in software rendering, and takes long to compile.
@@ -273,9 +272,8 @@ def _divide_by_cosine(op: ops.DivideByCosine, code: Code, x: Value, omega: Value
 
 @SHADER.implements(ops.Calibrate)
 def _calibrate(op: ops.Calibrate, code: Code, level: Value, omega: Value) -> str:
-    factors = code.tensors[op.factors]
-    _, levels, knots, _ = factors.shape
-    table = code.image(op.factors, [np.concatenate([*factors])], "rows")
+    _, levels, knots, _ = code.tensors[op.factors].shape
+    table = code.image(op.factors, "rows")
     return f"interpolated({table}, int2({knots}, {levels}), {op.table * levels}, {level}, {omega[2:]})"
 
 

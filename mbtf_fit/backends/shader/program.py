@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
 from mbtf_fit import ops
 from mbtf_fit.backends.shader import operations as _implementations  # noqa: F401
 from mbtf_fit.backends.shader.backend import SHADER, Code, Value
@@ -13,7 +15,8 @@ from mbtf_fit.backends.shader.syntax import Syntax, number
 from mbtf_fit.material.material import Material
 from mbtf_fit.ops.operation import INPUTS, output_names, parse, reached_from, sizes_of
 
-TRANSMITTANCE = "transmittance"
+# Image of its coefficients.
+TRANSMITTANCE = "material.transmittance"
 
 
 @dataclass(frozen=True)
@@ -26,13 +29,11 @@ class Program:
         ``transmittance(u, sigma, omega_o)``, without the declarations of images
     images : in the order of their declarations
     weights : vectors (n, 4) of the networks
-    sampled : whether ``sampled_lobe(seen)`` gives a lobe, by which lights are sampled
     """
 
     code: str
     images: list[TexelImage]
     weights: F32
-    sampled: bool
 
 
 def program_of(material: Material, syntax: Syntax) -> Program:
@@ -48,6 +49,9 @@ def program_of(material: Material, syntax: Syntax) -> Program:
     read = {parse(r)[0] for op in operations if op.output in lit for r in op.inputs()}
     last = operations[-1].output
     tensors = {name: t.cpu().float().numpy() for name, t in material.model.weights().items()}
+    if material.transmittance is not None:
+        levels = enumerate(material.transmittance.levels)
+        tensors |= {f"{TRANSMITTANCE}.{s}": texels for s, texels in levels}
     code = Code(syntax, tensors, {*read, last}, _moving(operations))
     values = {
         name: Value.of(name if name.startswith("omega") else f"seen.{name}", size, name == "omega_i")
@@ -85,9 +89,11 @@ def program_of(material: Material, syntax: Syntax) -> Program:
         "}",
         *through,
     ]
+    # WebGL has no empty uniforms.
+    weights = np.concatenate(code.weights or [np.zeros((1, 4), np.float32)])
     if code.lobe is not None:
-        text.append(f"float4 sampled_lobe(Seen seen) {{ return {code.lobe}; }}")
-    return Program("\n".join(text), [*code.images.values()], code.weights.array(), code.lobe is not None)
+        text += ["#define SAMPLED_LOBE", f"float4 sampled_lobe(Seen seen) {{ return {code.lobe}; }}"]
+    return Program("\n".join(text), [*code.images.values()], weights)
 
 
 def _moving(operations: list[ops.Operation]) -> set[str]:
@@ -111,7 +117,7 @@ def _transmittance(material: Material, code: Code, level: str) -> list[str]:
     """Function of the transparent fraction of the footprint (mbtf_fit.material.transmittance)."""
     body = ["  return 0.0;"]
     if material.transmittance is not None:
-        image = code.image(TRANSMITTANCE, material.transmittance.levels, "plain", half=False)
+        image = code.image(TRANSMITTANCE)
         body = [
             f"  Pair p = {code.pair(image, level, 'u - floor(u)')};",
             f"  float4 a = blended({image}, p, 0), b = blended({image}, p, 1);",

@@ -50,7 +50,6 @@ def module_of(material: Material) -> tuple[str, F32]:
     own = [
         SLANG.prologue,
         f"#define WEIGHT(i) material_texels[{first} + (i)]",
-        *(["#define SAMPLED_LOBE"] if program.sampled else []),
         f"CONSTANT float MIN_COS = {number(least)};",
         *(SLANG.image.format(name=i, place=p) for i, p in zip(program.images, places, strict=True)),
         program.code,

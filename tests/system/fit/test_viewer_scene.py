@@ -39,12 +39,13 @@ def page(driver: Any, tmp_path_factory: pytest.TempPathFactory) -> Page:
     """Materials of aspects ½ and 1, two squares and a sky; nothing is drawn unless a test asks for it."""
     folder = tmp_path_factory.mktemp("scene")
     make("calibrated", folder / "half")
+    make("relief", folder / "relief")
     square(folder / "square")
     (folder / "squares.obj").write_text(SQUARES)
     sky = np.zeros((*SKY, 3), np.float32)
     sky[SPOT] = COLOR
     content = {
-        "materials": [material_content(folder / name)[0] for name in ("half", "square")],
+        "materials": [material_content(folder / name)[0] for name in ("half", "square", "relief")],
         "mesh": mesh_content(folder / "squares.obj"),
         "environment": {"name": "spot", "shape": list(SKY), "data": encode(sky)},
     }
@@ -84,6 +85,32 @@ def ray(page: Page, camera: Camera, x: float, y: float) -> F64:
     across, along = np.floor(x * columns) + 0.5 - columns / 2, np.floor((1 - y) * rows) + 0.5 - rows / 2
     d = forward + pitch * (across * right + along * up)
     return np.asarray(d / np.linalg.norm(d), np.float64)
+
+
+@pytest.mark.parametrize(("elevation", "azimuth", "across"), [(90, -90, 0.5), (50, -90, 4), (25, 30, 90)])
+@pytest.mark.parametrize("case", ["relief", "calibrated"])
+def test_pictures_are_those_of_the_same_camera(
+    page: Page, tmp_path: Path, case: str, elevation: float, azimuth: float, across: float
+) -> None:
+    """Pixel by pixel: positions, footprints, frames, orientation, and the light's cosine."""
+    light, color = from_angles(40.0, 20.0), np.array([1, 0.5, 0.25])
+    lights = [{"direction": light.tolist(), "color": color.tolist(), "intensity": 2}]
+    page.set(
+        {
+            "camera": view(elevation, azimuth, across, 0.5, 0.5),
+            "lights": lights,
+            "material": ["calibrated", "square", "relief"].index(case),
+        }
+    )
+    found = page.picture(24, 32)
+    camera = Camera(elevation, azimuth, across, rows=24, columns=32)
+    expected = evaluate(make(case, tmp_path / "material"), camera, light) * light[2] * 2.0 * color
+    # Derivatives are those of 2 x 2 pixels, so levels differ a little within the pixel.
+    difference = np.abs(found[..., :3] - expected)
+    assert np.median(difference) < 0.01 * expected.mean()
+    assert difference.mean() < 0.08 * expected.mean()
+    assert found[..., :3].mean((0, 1)) == pytest.approx(expected.mean((0, 1)), rel=0.01, abs=1e-4)
+    assert (found[..., 3] == 1).all()
 
 
 @pytest.mark.parametrize("first", [0, 1])
