@@ -113,20 +113,19 @@ def test_pictures_are_those_of_the_same_camera(
     assert (found[..., 3] == 1).all()
 
 
-@pytest.mark.parametrize("first", [0, 1])
-def test_each_side_has_the_tile_of_its_material(page: Page, tmp_path: Path, first: int) -> None:
+def test_each_side_has_the_tile_of_its_material(page: Page, tmp_path: Path) -> None:
     materials = [make("calibrated", tmp_path / "half"), square(tmp_path / "square")]
     light = from_angles(40.0, 20.0)
     page.set(
         {
             "camera": view(90, -90, 2, 0.5, 0.5),
             "lights": [{**LIGHT, "direction": light.tolist()}],
-            "material": first,
-            "against": f"material {1 - first}",
+            "material": 1,
+            "against": "material 0",
             "divide": 0.5,
         }
     )
-    for side, material in enumerate((materials[first], materials[1 - first])):
+    for side, material in enumerate(materials[::-1]):
         part = slice(16 * side, 16 * (side + 1))
         found = page.picture(24, 32, side)[:, part, :3]
         expected = evaluate(material, Camera(90, -90, 2, rows=24, columns=32), light)[:, part] * light[2]
