@@ -1,4 +1,4 @@
-"""Meshes with texture coordinates as shapes."""
+"""Textures and meshes of a page; the browser tests compare what the page reads of them."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import pytest
 
 from mbtf_core.errors import InputError
 from mbtf_fit.viewer.extras import read_shape
+from mbtf_fit.viewer.textures import pack
 
 
 def test_a_mesh_is_centered_with_z_up(tmp_path: Path) -> None:
@@ -49,3 +50,23 @@ def test_bad_meshes_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr("mbtf_fit.viewer.extras.MOST_TRIANGLES", 0)
     with pytest.raises(InputError, match="1 triangles, more than 0"):
         read_shape(tmp_path / "good.obj")
+
+
+@pytest.mark.parametrize("alike", [False, True])
+@pytest.mark.parametrize("bits", [6, 16])
+def test_texels_are_rounded_to_their_range(bits: int, alike: bool) -> None:
+    random = np.random.default_rng(0)
+    levels = [random.normal(size=(rows, 2 * rows, 3)).astype(np.float32) * (1, 10, 0) for rows in (1, 2, 7)]
+    levels[2][3, 4, 0] = 40.0
+    packed = pack([np.asarray(texels, np.float32) for texels in levels], bits, alike=alike)
+    for found, given in zip(packed.levels, levels, strict=True):
+        step = np.ptp(given, axis=(0, 1)) / (2**bits - 1)
+        assert (np.abs(found - given) <= 0.5001 * step + 1e-5).all()
+
+
+def test_smooth_textures_compress_well() -> None:
+    x = np.linspace(0, 6, 128)
+    smooth = np.sin(x)[:, None, None] * np.cos(x)[None, :, None] * np.ones(2)
+    assert len(pack([smooth.astype(np.float32)]).description["data"]) < 0.5 * smooth.size
+    with pytest.raises(InputError, match="not finite"):
+        pack([np.full((2, 2, 1), np.inf, np.float32)])
