@@ -146,7 +146,8 @@ _FRAMES = """
     const nodes = mean.latest.read(0, 0, width, height);
     let sum = 0;
     for (let k = 0; k < nodes.length; k += 4) sum += nodes[k];
-    return [milliseconds.slice(1), viewer.content.materials[0].blocks ? sum / (width * height) : 0];
+    const traced = viewer.content.materials[0].source.includes("TRACED");
+    return [milliseconds.slice(1), traced ? sum / (width * height) : 0];
 """
 
 
@@ -170,7 +171,7 @@ def measure(driver: Any, folder: Path, size: tuple[int, int], frames: int) -> di
         "material": folder.name,
         "texels": material.lattice.shape()[1],
         "megabytes": len(html.encode()) / 1e6,
-        "rounding": rounding.relative,
+        "rounding": rounding,
         "first_picture_s": first,
         "software_ms": float(np.median(milliseconds)),
         "visited_nodes": visited,
@@ -181,8 +182,8 @@ def measure(driver: Any, folder: Path, size: tuple[int, int], frames: int) -> di
 def describe(f: dict[str, Any], size: str) -> str:
     """Figures of one material as text."""
     return (
-        f"{f['material']}, {f['texels']} texels: page {f['megabytes']:.2f} MB (rounding {f['rounding']:.4f} "
-        f"of the rms value), first picture {f['first_picture_s']:.1f} s, {f['software_ms']:.0f} ms per frame "
+        f"{f['material']}, {f['texels']} texels: page {f['megabytes']:.2f} MB ({f['rounding']}), "
+        f"first picture {f['first_picture_s']:.1f} s, {f['software_ms']:.0f} ms per frame "
         f"of {size} in software\n  per pixel {f['arithmetic']:.0f} operations, {f['fetches']:.0f} fetches, "
         f"{f['visited_nodes']:.1f} nodes; estimate {f['estimated_fps']:.0f} frames/s"
     )

@@ -89,6 +89,7 @@ class RunForecaster:
     def speed(self) -> tuple[float, float]:
         """Seconds of starting the generator, and of a path."""
         from mbtf_gen.forecast import forecast
+
         job = Job.of(self.recipe.generate, self.material)
         found = forecast(job, seconds=1.0)
         return found.start, found.query_seconds / self.recipe.generate.queries.spp

@@ -60,6 +60,7 @@ def export_material(
     """
     from mbtf_core.files.atomic import file_sha256, write_text
     from mbtf_core.files.folders import OutputFolder, owned
+    from mbtf_fit.backends.shader.slang import FILE_NAMES, write_module
     from mbtf_fit.material.export import LAYERS_NAME, TEXTURES_NAME, to_half, write_layers, write_textures
     from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME
     from mbtf_fit.material.interchange.documents import WRITERS
@@ -68,7 +69,6 @@ def export_material(
     from mbtf_fit.material.interchange.write import Interchange, write_interchange
     from mbtf_fit.material.material import Material, export
     from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME
-    from mbtf_fit.shaders.slang import FILE_NAMES, write_module
     from mbtf_fit.viewer.page import PAGE_NAME
 
     wanted = list(dict.fromkeys(to or ["exr", "json"]))

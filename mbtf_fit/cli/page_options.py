@@ -79,7 +79,7 @@ class PageOptions:
             **({} if self.shape is None else {"mesh": mesh_content(self.shape)}),
             **({} if self.environment is None else {"environment": environment_content(self.environment)}),
         }
-        return write_page(content, materials[0][0]["name"]), str(materials[0][1])
+        return write_page(content, materials[0][0]["name"]), materials[0][1]
 
 
 PAGE_OPTIONS = PageOptions()

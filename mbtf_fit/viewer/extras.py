@@ -8,31 +8,29 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.errors import InputError, reason
 from mbtf_core.images.environment import read_environment
 from mbtf_core.images.resample import resample
+from mbtf_core.paths import suggest_path
 from mbtf_core.pictures import Camera, read_references
 from mbtf_fit.viewer.content import encode
-from mbtf_fit.viewer.shape import read_shape
 from mbtf_fit.viewer.textures import pack
 
+F64 = NDArray[np.float64]
+# Suffixes of files of meshes, and their most triangles.
+MESH_FILES, MOST_TRIANGLES = (".glb", ".gltf", ".ply", ".obj"), 200_000
 # Rows of an environment, and pixels along the longer side of a reference picture, in a page.
 _ENVIRONMENT_ROWS, _PICTURE_SIZE = 64, 512
 
 
 def mesh_content(path: Path) -> dict[str, Any]:
-    """A mesh with texture coordinates (:func:`~mbtf_fit.viewer.shape.read_shape`) as JSON of a page."""
-    shape = read_shape(path)
-    arrays = {
-        "positions": shape.positions,
-        "normals": shape.normals,
-        "tangents": shape.tangents,
-        "uvs": shape.uv,
-    }
+    """A mesh with texture coordinates (:func:`read_shape`) as JSON of a page."""
+    arrays, faces, unit = read_shape(path)
     return {
         "name": path.stem,
         **{name: encode(array.astype(np.float32)) for name, array in arrays.items()},
-        "indices": encode(shape.faces.astype(np.uint32)),
-        "unit": shape.unit,
+        "indices": encode(faces.astype(np.uint32)),
+        "unit": unit,
     }
 
 
@@ -45,22 +43,14 @@ def environment_content(path: Path) -> dict[str, Any]:
 def picture_content(
     name: str, value: NDArray[np.float32], camera: Camera, light: NDArray[np.floating[Any]]
 ) -> dict[str, Any]:
-    """A path-traced picture of the plane, at most 512 pixels along each side.
+    """A path-traced picture of the plane, at most 512 pixels along each side, as JSON.
 
     Parameters
     ----------
-    name : str
-        Shown in the page.
-    value : (rows, columns, 3) array
-        M in 1/sr.
-    camera : Camera
-        That of the picture.
-    light : (3,) array
-        Direction towards the light.
-
-    Returns
-    -------
-    dict
+    name : shown in the page
+    value : (rows, columns, 3) array of M in 1/sr
+    camera : that of the picture
+    light : direction (3,) towards the light
     """
     rows, columns = value.shape[:2]
     shrink = max(1, -(-max(rows, columns) // _PICTURE_SIZE))
@@ -91,3 +81,101 @@ def pictures_content(folder: Path) -> list[dict[str, Any]]:
 def tiles_text(count: float) -> str:
     """A number of tiles in words."""
     return "1 tile" if count == 1 else f"{count:g} tiles"
+
+
+def read_shape(path: Path) -> tuple[dict[str, F64], NDArray[np.int64], float]:
+    """A mesh with texture coordinates, centered, of radius 1, with z up.
+
+    Parameters
+    ----------
+    path : OBJ, PLY, glTF or GLB file, with y up
+
+    Returns
+    -------
+    arrays : ``positions`` and ``normals`` (n, 3); ``tangents`` (n, 4), unit vectors along u and the hand of
+        their frames (:func:`tangents`); ``uvs`` (n, 2)
+    faces : (m, 3)
+    unit : factor on the positions that gives one texture unit the length 1 on average
+
+    Raises
+    ------
+    InputError : the file cannot be read, has no texture coordinates, or too many triangles
+    """
+    import trimesh
+
+    if path.suffix.lower() not in MESH_FILES:
+        raise InputError(f"'{path.suffix}' is not a mesh", where=path, hint=f"give {', '.join(MESH_FILES)}")
+    if not path.is_file():
+        raise InputError("no such file", where=path, hint=suggest_path(path))
+    try:
+        mesh = trimesh.load_mesh(path)
+        vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+        normals = np.asarray(mesh.vertex_normals, np.float64)
+        uv = getattr(mesh.visual, "uv", None)
+    except Exception as error:  # whatever its readers raise
+        raise InputError(f"cannot be read as a mesh ({reason(error)})", where=path) from None
+    if not len(faces) or not np.isfinite(vertices).all():
+        raise InputError("has no triangles of finite vertices", where=path)
+    if uv is None or len(uv) != len(vertices):
+        raise InputError(
+            "has no texture coordinates, which place the material", where=path, hint="unwrap the mesh first"
+        )
+    if len(faces) > MOST_TRIANGLES:
+        raise InputError(
+            f"has {len(faces):,} triangles, more than {MOST_TRIANGLES:,}", where=path, hint="simplify it"
+        )
+    uv = np.nan_to_num(np.asarray(uv, np.float64))
+    center = (vertices.min(0) + vertices.max(0)) / 2
+    radius = float(np.linalg.norm(vertices - center, axis=1).max())
+    # Files have y up.
+    vertices = (vertices - center)[:, [0, 2, 1]] * (1, -1, 1) / (radius or 1.0)
+    normals = _unit(normals[:, [0, 2, 1]] * (1, -1, 1))
+    area, textured = _areas(vertices, uv, faces)
+    if textured <= 0:
+        raise InputError("has texture coordinates without an area", where=path, hint="unwrap the mesh first")
+    unit = float(np.sqrt(textured / area)) if area > 0 else 1.0
+    arrays = {
+        "positions": vertices,
+        "normals": normals,
+        "tangents": tangents(vertices, normals, uv, faces),
+        "uvs": uv,
+    }
+    return arrays, faces, unit
+
+
+def _unit(vectors: F64) -> F64:
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.where(length > 0, vectors / np.where(length > 0, length, 1.0), (0.0, 0.0, 1.0))
+
+
+def _areas(vertices: F64, uv: F64, faces: NDArray[np.int64]) -> tuple[float, float]:
+    """Area of all triangles in space, and in the texture."""
+    a, b = (vertices[faces[:, k]] - vertices[faces[:, 0]] for k in (1, 2))
+    s, t = (uv[faces[:, k]] - uv[faces[:, 0]] for k in (1, 2))
+    flat = np.abs(s[:, 0] * t[:, 1] - s[:, 1] * t[:, 0])
+    return float(np.linalg.norm(np.cross(a, b), axis=1).sum() / 2), float(flat.sum() / 2)
+
+
+def tangents(vertices: F64, normals: F64, uv: F64, faces: NDArray[np.int64]) -> F64:
+    """Unit tangents ∂p/∂u at vertices, and the hand of their frames: (n, 4).
+
+    The hand is 1 where the normal, ∂p/∂u and ∂p/∂v form a right-handed frame (t × b = n), otherwise -1.
+    """
+    a, b = (vertices[faces[:, k]] - vertices[faces[:, 0]] for k in (1, 2))
+    s, t = (uv[faces[:, k]] - uv[faces[:, 0]] for k in (1, 2))
+    area = (s[:, 0] * t[:, 1] - s[:, 1] * t[:, 0])[:, None]
+    # Weighted by the area in the texture.
+    sign = np.sign(area)
+    along_u = sign * (a * t[:, 1:] - b * s[:, 1:])
+    along_v = sign * (b * s[:, :1] - a * t[:, :1])
+    sums = np.zeros((2, *vertices.shape))
+    for k in range(3):
+        np.add.at(sums[0], faces[:, k], along_u)
+        np.add.at(sums[1], faces[:, k], along_v)
+    n = _unit(normals)
+    tangent = sums[0] - n * (n * sums[0]).sum(1, keepdims=True)
+    some = np.linalg.norm(tangent, axis=1) > 1e-12
+    other = np.cross(n, np.where(np.abs(n[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]))
+    tangent = _unit(np.where(some[:, None], tangent, other))
+    hand = np.where((np.cross(n, tangent) * sums[1]).sum(1) < 0, -1.0, 1.0)
+    return np.concatenate([tangent, hand[:, None]], 1)

@@ -31,15 +31,12 @@ class LiveView:
 
     Parameters
     ----------
-    title : str
-        Of the page.
-    port : int
-        0 for a free one.
+    title : of the page
+    port : 0 for a free one
 
     Attributes
     ----------
-    url : str
-        Address of the page, on this machine alone.
+    url : address of the page, on this machine alone
     """
 
     def __init__(self, title: str, port: int = 0) -> None:

@@ -29,15 +29,6 @@ _SCRIPTS = (
     "live.js",
     "main.js",
 )
-_SHADERS = (
-    "screen.vert",
-    "queries.frag",
-    "directions.frag",
-    "scene.vert",
-    "scene.frag",
-    "accumulate.frag",
-    "display.frag",
-)
 
 
 def _read(name: str) -> str:
@@ -55,20 +46,14 @@ def write_page(content: Mapping[str, Any], title: str, *, live: bool = False) ->
 
     Parameters
     ----------
-    content : mapping
-        ``materials``, and optionally ``pictures``, ``mesh`` and ``environment``
-        (:mod:`mbtf_fit.viewer.content`).
-    title : str
-        Shown by the browser.
-    live : bool
-        The page may connect to the server that sent it.
-
-    Returns
-    -------
-    str
+    content : ``materials``, and optionally ``pictures``, ``mesh`` and ``environment``
+        (:mod:`mbtf_fit.viewer.content`, :mod:`mbtf_fit.viewer.extras`)
+    title : shown by the browser
+    live : whether the page may connect to the server that sent it
     """
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
-    shaders = {name: _read(name) for name in _SHADERS}
+    names = sorted(file.name for file in files(__package__).joinpath("page").iterdir())
+    shaders = {name: _read(name) for name in names if name.endswith((".vert", ".frag"))}
     script = 'const CONTENT = JSON.parse(document.getElementById("content").textContent);\n'
     # Our own files: nothing in them is escaped.
     return environment.from_string(_read("viewer.html")).render(

@@ -62,21 +62,13 @@ class PageServer:
 
     Parameters
     ----------
-    html : str
-        The page.
-    port : int
-        0 for a free one.
-    messages : Messages, optional
-        Sent to the page as server-sent events at the path ``events``.
-
-    Attributes
-    ----------
-    url : str
+    html : the page
+    port : 0 for a free one
+    messages : sent to the page as server-sent events at the path ``events``
 
     Raises
     ------
-    UsageError
-        The port is in use or not allowed.
+    UsageError : the port is in use or not allowed
     """
 
     def __init__(self, html: str, port: int = 0, messages: Messages | None = None) -> None:

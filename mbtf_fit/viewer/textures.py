@@ -29,11 +29,9 @@ class PackedTexture:
 
     Attributes
     ----------
-    description : dict
-        ``shapes`` (rows, columns) of each level, coarsest first; ``channels``; ``bits``; ``alike``;
-        ``low`` and ``step`` by level and channel; ``data``, the stream in base64.
-    levels : tuple of (rows, columns, channels) arrays
-        What a reader gets.
+    description : ``shapes`` (rows, columns) of each level, coarsest first; ``channels``; ``bits``; ``alike``;
+        ``low`` and ``step`` by level and channel; ``data``, the stream in base64
+    levels : (rows, columns, channels) arrays that a reader gets
     """
 
     description: dict[str, Any]
@@ -56,23 +54,14 @@ def pack(levels: Sequence[F32], bits: int = 8, effort: int = 9, *, alike: bool =
 
     Parameters
     ----------
-    levels : sequence of (rows, columns, channels) arrays
-        Coarsest first.
-    bits : int
-        Per number, up to 16.
-    effort : int
-        Of the compression, 1 to 9.
-    alike : bool
-        Neighboring channels are alike.
-
-    Returns
-    -------
-    PackedTexture
+    levels : (rows, columns, channels) arrays, coarsest first
+    bits : per number, up to 16
+    effort : of the compression, 1 to 9
+    alike : whether neighboring channels are alike
 
     Raises
     ------
-    InputError
-        A number is not finite.
+    InputError : a number is not finite
     """
     largest = (1 << bits) - 1
     lows: list[list[float]] = []

@@ -20,7 +20,7 @@ from mbtf_fit.surface.known import KnownSurface
 
 from .known_surfaces import geometry, rough_surface
 
-_TRAINING = {"steps": 0, "batch": 1, "seconds": 0.0, "device": "cpu", "threads": 1, "errors": {}}
+TRAINING = {"steps": 0, "batch": 1, "seconds": 0.0, "device": "cpu", "threads": 1, "errors": {}}
 
 
 def write_material(
@@ -84,7 +84,7 @@ def write_material(
     built.load_weights(tensors)
     folder.mkdir(parents=True, exist_ok=True)
     stated = {"hash": "0" * 64, **data}
-    return export(built, config, folder, data=stated, training=_TRAINING, transmittance=transmittance)
+    return export(built, config, folder, data=stated, training=TRAINING, transmittance=transmittance)
 
 
 def flat(lattice: Lattice, value: tuple[float, float, float]) -> KnownSurface:

@@ -8,10 +8,13 @@ from typing import Any
 import torch
 
 from mbtf_core.data.lattice import Lattice
-from mbtf_fit.material.material import Material
+from mbtf_fit import ops
+from mbtf_fit.config import FitConfig
+from mbtf_fit.material.material import Material, export
 from mbtf_fit.material.transmittance import Transmittance
+from mbtf_fit.pytorch.material import NeuralMaterial
 
-from .plugin_materials import net, write_material
+from .plugin_materials import TRAINING, net, write_material
 
 BANDS = {"position": 3, "direction": 2, "direction_pi": False, "raw": True}
 CASES: dict[str, dict[str, Any]] = {
@@ -35,10 +38,41 @@ CASES: dict[str, dict[str, Any]] = {
     "rainer2019": {"model": "rainer2019"},
 }
 
+# Operations that no model of the papers has, and values of more than four numbers.
+LISTS: dict[str, list[ops.Operation]] = {
+    "texel lobe": [
+        ops.Lookup("texel", "u", "level", "lobes", 7),
+        ops.Transform("base", "texel[0:3]", "sigmoid"),
+        ops.Transform("half", "texel[3:4]", "sigmoid"),
+        ops.Transform("alpha", "texel[4:5]", "sigmoid"),
+        ops.Transform("alpha2", "alpha", "square", scale=1.5),
+        ops.Lobe("value", "base", "half", "alpha2", "texel[5:7]", "omega_i", "omega_o"),
+    ],
+    "constant light": [ops.Lookup("color", "u", None, "map", 3), ops.Transform("value", "color", "softplus")],
+    "wide values": [
+        ops.Lookup("texel", "u", "level", "lobes", 10),
+        ops.Frequencies("waves", "omega_i[0:2]", None, 2, pi=False, attenuated=True),
+        ops.Matrix("wide", "waves", tuple(tuple(0.1 * (i - j) for j in range(8)) for i in range(5))),
+        ops.Gate("gated", "wide", "texel[2:7]", "texel[5:10]", floor=0.2),
+        ops.Standardize("scaled", "gated", "texel[0:5]", "wide"),
+        ops.Transform("positive", "scaled", "softplus"),
+        ops.DivideByCosine("lit", "positive", "omega_i", 0.3),
+        ops.Product("squares", ("lit", "positive")),
+        ops.Matrix("value", "squares", ((0.2, 0.0, 0.0, 0.0, 0.1), (0.0, 0.2, 0.1, 0.0, 0.0), (0.1,) * 5)),
+    ],
+}
+CASES |= {case: {} for case in LISTS}
+
 
 def make(case: str, folder: Path) -> Material:
     """A material of random weights on a tile that is half as high as wide."""
     lattice, generator = Lattice(4, 0.5), torch.Generator().manual_seed(0)
+    if case in LISTS:
+        model = NeuralMaterial(lattice, LISTS[case])
+        for textures in model.textures():
+            torch.nn.init.normal_(textures.texels, std=0.5, generator=generator)
+        folder.mkdir(parents=True)
+        return export(model, FitConfig(), folder, data={"hash": "0" * 64}, training=TRAINING)
     options = {"finest": 4, "aspect": 0.5, **CASES[case]}
     if case == "calibrated":
         options["weights"] = {"calibration": 0.7 + 0.6 * torch.rand((2, 5, 6, 3), generator=generator)}

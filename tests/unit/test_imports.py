@@ -73,9 +73,9 @@ mbtf_fit.material
 mbtf_fit.evaluation
 mbtf_fit.training
 mbtf_fit.backends.mitsuba
+mbtf_fit.backends.shader
 mbtf_fit.preview
 mbtf_fit.viewer
-mbtf_fit.shaders
 mbtf_fit.cli
 mbtf_fit
 mbtf_pipeline.recipe

@@ -108,11 +108,11 @@ function horizonLayers(azimuths) {
 }
 
 // Nodes of a periodic height field: each cell's surface, then the highest vertex of blocks of 2, 4, … cells
-// (mbtf_gen/geometry/height_planes.py). Row 0 of the heights is the side v → 1, row 0 of the nodes v → 0.
-function nodesOf({ rows, columns, planes: [heights] }, blocks, shift) {
+// (mbtf_core/height_planes.py). Row 0 of the heights is the side v → 1, row 0 of the nodes v → 0.
+function nodesOf([{ rows, columns, planes: [heights] }], shift) {
   const z = (i, j) => Math.min(0, heights[(rows - 1 - ((j + rows) % rows)) * columns + (i % columns)]);
-  const [lastStart, lastStride] = blocks.length ? blocks[0] : [rows * columns, 0];
-  const size = lastStart + lastStride * Math.ceil(rows / 2),
+  const [wide, tall] = [columns, rows].map((n) => 32 - Math.clz32(n - 1)),
+    size = rows * columns + (Math.min(wide, tall) ? 2 ** (wide + tall - 1) : 0),
     width = 1 << shift,
     height = Math.ceil(size / width);
   const data = new Float32Array(4 * width * height);
@@ -127,7 +127,9 @@ function nodesOf({ rows, columns, planes: [heights] }, blocks, shift) {
       tops[n] = Math.max(a, right, up, across);
     }
   let [w, h] = [columns, rows];
-  for (const [start, stride] of blocks) {
+  for (let level = 1; level <= Math.min(wide, tall); level++) {
+    const start = rows * columns + 2 ** (wide + tall - 2 * level),
+      stride = 2 ** (wide - level);
     const [nextW, nextH] = [Math.ceil(w / 2), Math.ceil(h / 2)],
       next = new Float32Array(nextW * nextH);
     for (let j = 0; j < nextH; j++)

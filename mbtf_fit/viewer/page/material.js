@@ -3,9 +3,23 @@
 const HEAD =
   "#version 300 es\nprecision highp float;\nprecision highp int;\nprecision highp sampler2D;\nprecision highp sampler2DArray;\n";
 
+// Textures of an image's levels, by its layout (mbtf_fit/backends/shader/images.py).
+const layered = (layers) => (gl, image, levels) =>
+  layeredTexture(gl, stack(levels, layers(levels[0].planes.length)), image.half);
+const IMAGES = {
+  plain: layered(plainLayers),
+  maps: layered(mapLayers),
+  horizons: layered((channels) => horizonLayers(channels / 2)),
+  nodes: (gl, image, levels) => {
+    const { width, height, data } = nodesOf(levels, image.shift);
+    return tableTexture(gl, width, height, data);
+  },
+  rows: (gl, image) => tableTexture(gl, image.width, image.height, floatsOf(image.data)),
+};
+
 class Material {
   constructor(gl, content) {
-    Object.assign(this, { gl, content, programs: {} });
+    Object.assign(this, { gl, content, programs: {}, textures: {} });
     this.name = content.name;
   }
 
@@ -14,37 +28,10 @@ class Material {
       names = Object.keys(content.textures);
     const unpacked = await Promise.all(names.map((name) => unpack(content.textures[name])));
     const levels = Object.fromEntries(names.map((name, k) => [name, unpacked[k]]));
-    const layered = (name, layers, half) => layeredTexture(gl, stack(levels[name], layers), half);
-    const channels = (name) => content.textures[name].channels;
-    self.textures = { pyramid_texture: layered("pyramid", plainLayers(channels("pyramid")), true) };
-    if (levels.offset_texture)
-      self.textures.offset_texture = layered(
-        "offset_texture",
-        plainLayers(channels("offset_texture")),
-        false,
-      );
-    if (levels.transmittance)
-      self.textures.transmittance_texture = layered("transmittance", plainLayers(6), false);
-    if (levels["surface.maps"]) {
-      self.textures.map_texture = layered("surface.maps", mapLayers(channels("surface.maps")), false);
-      self.textures.horizon_texture = layered(
-        "surface.horizons",
-        horizonLayers(channels("surface.horizons") / 2),
-        false,
-      );
-      const nodes = nodesOf(levels["surface.heights"][0], content.blocks, content.node_shift);
-      self.textures.node_texture = tableTexture(gl, nodes.width, nodes.height, nodes.data);
-    }
-    if (content.calibration) self._calibrate(content.calibration);
+    for (const image of content.images)
+      self.textures[image.name] = IMAGES[image.layout](gl, image, levels[image.texture]);
     self._weigh(floatsOf(content.weights));
     return self;
-  }
-
-  _calibrate({ shape: [tables, levels, knots], data }) {
-    const given = floatsOf(data),
-      padded = new Float32Array(4 * tables * levels * knots);
-    for (let k = 0; k < given.length / 3; k++) padded.set(given.subarray(3 * k, 3 * k + 3), 4 * k);
-    this.textures.calibration_texture = tableTexture(this.gl, knots, tables * levels, padded);
   }
 
   // Weights are uniforms where they fit, which is faster; otherwise a texture.

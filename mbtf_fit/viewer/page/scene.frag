@@ -64,7 +64,7 @@ void main() {
     if (light.z <= 0.0) continue;
     sum += radiance * light.z * stage2(seen, raised(light), omega_o);
   }
-#ifdef PLACES
+#ifdef TRACED
   if (shown == 3) { color = vec4(visited); return; }
 #endif
   color = vec4(sum, 1.0 - transmittance(uv_there, sigma, omega_o));

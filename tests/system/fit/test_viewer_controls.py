@@ -264,32 +264,6 @@ def test_the_picture_turns_with_the_azimuth_up_to_the_top(page: Page) -> None:
     page.js(STATE + "Object.assign(viewer.pictures[0].camera, { elevation: 50, azimuth: -90 })")
 
 
-@pytest.mark.parametrize("size", [(1000, 360), (400, 800)])
-def test_shapes_fit_the_picture(page: Page, size: tuple[int, int]) -> None:
-    width, height = size
-    metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
-    page.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
-    try:
-        page.set(FLAT)
-        page.js(STATE + "viewer.layout()")
-        for shape in ("sphere", "cloth"):
-            page.choose("shape", shape)
-            w, h = page.js(STATE + "return [renderer.canvas.width, renderer.canvas.height]")
-            covered = page.picture(60, round(60 * w / h))[..., 3] > 0
-            rows, columns = np.flatnonzero(covered.any(1)), np.flatnonzero(covered.any(0))
-            assert not covered[[0, -1]].any()
-            assert not covered[:, [0, -1]].any()
-            share = max(np.ptp(rows) / covered.shape[0], np.ptp(columns) / covered.shape[1])
-            assert 0.8 < share < 0.95
-            # With more tiles the shape is as large.
-            page.choose("tiles", 4)
-            again = page.picture(60, round(60 * w / h))[..., 3] > 0
-            assert (again != covered).mean() < 0.03
-    finally:
-        page.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
-        page.js(STATE + "viewer.layout()")
-
-
 def test_the_far_side_of_a_sphere_gets_no_light(page: Page) -> None:
     """Also at its silhouette, where interpolated normals may point away from the viewer."""
     lit = 0
@@ -308,34 +282,21 @@ def test_the_far_side_of_a_sphere_gets_no_light(page: Page) -> None:
 
 
 def test_values_of_links_are_brought_into_their_range(page: Page) -> None:
+    light = {"direction": [0, 0, 0], "color": [2, -1, 0.5], "intensity": 1e9}
     page.set(
         {
             "camera": {"tiles_across": -3, "elevation": -500, "target": [1e9, 0, 0], "azimuth": "x"},
-            "shape": "nope",
-            "tiles": 1e9,
-            "lights": [
-                {"direction": [0, 0, 0], "color": [2, -1, 0.5], "intensity": 1e9},
-                {"direction": [0.3, 0, 0.4]},
-                *[{}] * 9,
-            ],
+            "lights": [light, {"direction": [0.3, 0, 0.4]}, *[{}] * 9],
             "environment": {"name": "nope", "intensity": -1, "angle": 700},
-            "exposure": 50,
-            "divide": 4,
-            "material": 7,
-            "against": "material 7",
+            **{"shape": "nope", "tiles": 1e9, "exposure": 50, "divide": 4},
+            **{"material": 7, "against": "material 7"},
         }
     )
     camera = "[camera.tiles_across, camera.elevation, camera.azimuth, camera.target]"
     assert page.js(STATE + f"return {camera}") == [0.05, 2, -90, [1000, 0, 0]]
     found = page.js(STATE + "return state")
-    assert [found[key] for key in ("shape", "tiles", "exposure", "divide", "material", "against")] == [
-        "plane",
-        64,
-        10,
-        0.98,
-        2,
-        "none",
-    ]
+    kept = {"shape": "plane", "tiles": 64, "exposure": 10, "divide": 0.98, "material": 2, "against": "none"}
+    assert kept.items() <= found.items()
     assert found["environment"] == {"name": "none", "intensity": 0, "angle": 180}
     first, second = found["lights"][:2]
     assert (len(found["lights"]), first["color"], first["intensity"]) == (4, [1, 0, 0.5], 16)

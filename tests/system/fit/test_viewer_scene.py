@@ -39,12 +39,13 @@ def page(driver: Any, tmp_path_factory: pytest.TempPathFactory) -> Page:
     """Materials of aspects ½ and 1, two squares and a sky; nothing is drawn unless a test asks for it."""
     folder = tmp_path_factory.mktemp("scene")
     make("calibrated", folder / "half")
+    make("relief", folder / "relief")
     square(folder / "square")
     (folder / "squares.obj").write_text(SQUARES)
     sky = np.zeros((*SKY, 3), np.float32)
     sky[SPOT] = COLOR
     content = {
-        "materials": [material_content(folder / name)[0] for name in ("half", "square")],
+        "materials": [material_content(folder / name)[0] for name in ("half", "square", "relief")],
         "mesh": mesh_content(folder / "squares.obj"),
         "environment": {"name": "spot", "shape": list(SKY), "data": encode(sky)},
     }
@@ -86,20 +87,45 @@ def ray(page: Page, camera: Camera, x: float, y: float) -> F64:
     return np.asarray(d / np.linalg.norm(d), np.float64)
 
 
-@pytest.mark.parametrize("first", [0, 1])
-def test_each_side_has_the_tile_of_its_material(page: Page, tmp_path: Path, first: int) -> None:
+@pytest.mark.parametrize(("elevation", "azimuth", "across"), [(90, -90, 0.5), (50, -90, 4), (25, 30, 90)])
+@pytest.mark.parametrize("case", ["relief", "calibrated"])
+def test_pictures_are_those_of_the_same_camera(
+    page: Page, tmp_path: Path, case: str, elevation: float, azimuth: float, across: float
+) -> None:
+    """Pixel by pixel: positions, footprints, frames, orientation, and the light's cosine."""
+    light, color = from_angles(40.0, 20.0), np.array([1, 0.5, 0.25])
+    lights = [{"direction": light.tolist(), "color": color.tolist(), "intensity": 2}]
+    page.set(
+        {
+            "camera": view(elevation, azimuth, across, 0.5, 0.5),
+            "lights": lights,
+            "material": ["calibrated", "square", "relief"].index(case),
+        }
+    )
+    found = page.picture(24, 32)
+    camera = Camera(elevation, azimuth, across, rows=24, columns=32)
+    expected = evaluate(make(case, tmp_path / "material"), camera, light) * light[2] * 2.0 * color
+    # Derivatives are those of 2 x 2 pixels, so levels differ a little within the pixel.
+    difference = np.abs(found[..., :3] - expected)
+    assert np.median(difference) < 0.01 * expected.mean()
+    assert difference.mean() < 0.08 * expected.mean()
+    assert found[..., :3].mean((0, 1)) == pytest.approx(expected.mean((0, 1)), rel=0.01, abs=1e-4)
+    assert (found[..., 3] == 1).all()
+
+
+def test_each_side_has_the_tile_of_its_material(page: Page, tmp_path: Path) -> None:
     materials = [make("calibrated", tmp_path / "half"), square(tmp_path / "square")]
     light = from_angles(40.0, 20.0)
     page.set(
         {
             "camera": view(90, -90, 2, 0.5, 0.5),
             "lights": [{**LIGHT, "direction": light.tolist()}],
-            "material": first,
-            "against": f"material {1 - first}",
+            "material": 1,
+            "against": "material 0",
             "divide": 0.5,
         }
     )
-    for side, material in enumerate((materials[first], materials[1 - first])):
+    for side, material in enumerate(materials[::-1]):
         part = slice(16 * side, 16 * (side + 1))
         found = page.picture(24, 32, side)[:, part, :3]
         expected = evaluate(material, Camera(90, -90, 2, rows=24, columns=32), light)[:, part] * light[2]

@@ -17,29 +17,20 @@ from mbtf_core.app.console import run
 from mbtf_core.errors import UsageError
 from mbtf_fit.cli.app import app
 from mbtf_fit.viewer import live
-from mbtf_fit.viewer.extras import tiles_text
 from mbtf_fit.viewer.page import safe_json, write_page
-from mbtf_fit.viewer.server import Messages, PageServer
+from mbtf_fit.viewer.server import PageServer
 
 
-def test_a_page_loads_nothing(tmp_path: Path) -> None:
+def test_a_page_loads_nothing_and_has_the_same_bytes_again(tmp_path: Path) -> None:
     write_material(tmp_path / "material", model="relief")
-    assert (
-        run(app, ["export", str(tmp_path / "material"), "--to", "web", "-o", str(tmp_path / "page"), "-q"])
-        == 0
-    )
-    html = (tmp_path / "page" / "viewer.html").read_text()
-    assert loads(html).external == []
-    assert "default-src 'none'" in html
-    assert "connect-src 'none'" in html
-
-
-def test_the_same_page_again_has_the_same_bytes(tmp_path: Path) -> None:
-    write_material(tmp_path / "material")
     words = ["export", str(tmp_path / "material"), "--to", "web", "-q", "-o"]
     for name in ("a", "b", "b"):
         assert run(app, [*words, str(tmp_path / name)]) == 0
-    assert (tmp_path / "a" / "viewer.html").read_bytes() == (tmp_path / "b" / "viewer.html").read_bytes()
+    html = (tmp_path / "a" / "viewer.html").read_text()
+    assert html == (tmp_path / "b" / "viewer.html").read_text()
+    assert loads(html).external == []
+    assert "default-src 'none'" in html
+    assert "connect-src 'none'" in html
 
 
 def test_text_cannot_end_the_script() -> None:
@@ -66,10 +57,6 @@ def test_what_cannot_be_shown_is_refused(tmp_path: Path, capsys: pytest.CaptureF
         assert what in error
         assert "Traceback" not in error
     assert run(app, ["export", str(tmp_path / "mlp"), "--to", "web", *out, "-q"]) == 0
-
-
-def test_one_tile_is_singular() -> None:
-    assert [tiles_text(count) for count in (0.5, 1, 1.0, 3)] == ["0.5 tiles", "1 tile", "1 tile", "3 tiles"]
 
 
 def test_only_this_machine_gets_the_page() -> None:
@@ -106,24 +93,6 @@ def test_ctrl_c_ends_the_service(tmp_path: Path) -> None:
         assert (process.returncode, errors) == (0, "")
     finally:
         process.kill()
-
-
-def test_a_reader_gets_the_latest_messages_and_the_end() -> None:
-    messages = Messages()
-    messages.send("curve", 1, "a")
-    messages.send("stages", 2)
-    messages.send("curve", 3, "a")
-    messages.send("curve", 4, "b")
-    reader = messages.read()
-    found = [next(reader) for _ in range(3)]
-    assert found == [
-        ("stages", '{"name":"","content":2}'),
-        ("curve", '{"name":"a","content":3}'),
-        ("curve", '{"name":"b","content":4}'),
-    ]
-    messages.send("end", 5)
-    messages.close()
-    assert list(reader) == [("end", '{"name":"","content":5}')]
 
 
 def test_a_loss_that_is_not_finite_is_shown_as_undefined(monkeypatch: pytest.MonkeyPatch) -> None:

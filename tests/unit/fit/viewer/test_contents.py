@@ -1,4 +1,4 @@
-"""Meshes with texture coordinates as shapes."""
+"""Textures and meshes of a page; the browser tests compare what the page reads of them."""
 
 from __future__ import annotations
 
@@ -8,21 +8,8 @@ import numpy as np
 import pytest
 
 from mbtf_core.errors import InputError
-from mbtf_fit.viewer.shape import read_shape, tangents
-
-
-@pytest.mark.parametrize("mirrored", [False, True])
-def test_tangents_follow_the_texture(mirrored: bool) -> None:
-    """Of a plane whose u runs along (3, 4, 0) / 5, and whose v along the normal's cross product with it."""
-    along, across = np.array([0.6, 0.8, 0.0]), np.array([-0.8, 0.6, 0.0])
-    uv = np.array([[0, 0], [2, 0], [0, 1], [2, 1]], np.float64)
-    vertices = uv[:, :1] * along + uv[:, 1:] * across
-    faces = np.array([[0, 1, 2], [1, 3, 2]])
-    if mirrored:
-        uv = uv * (1, -1)
-    found = tangents(vertices, np.tile([0.0, 0.0, 1.0], (4, 1)), uv, faces)
-    np.testing.assert_allclose(found[:, :3], np.tile(along, (4, 1)), atol=1e-12)
-    assert (found[:, 3] == (-1 if mirrored else 1)).all()
+from mbtf_fit.viewer.extras import read_shape
+from mbtf_fit.viewer.textures import pack
 
 
 def test_a_mesh_is_centered_with_z_up(tmp_path: Path) -> None:
@@ -32,17 +19,17 @@ def test_a_mesh_is_centered_with_z_up(tmp_path: Path) -> None:
     lines = [f"v {x} {y} {z}" for x, y, z in corners]
     lines += ["vt 0 0", "vt 0.5 0", "vt 0.5 0.5", "vt 0 0.5", "vn 0 1 0"]
     path.write_text("\n".join([*lines, "f 1/1/1 2/2/1 3/3/1", "f 1/1/1 3/3/1 4/4/1"]) + "\n")
-    shape = read_shape(path)
-    positions = shape.positions
+    shape, _, unit = read_shape(path)
+    positions = shape["positions"]
     assert np.linalg.norm(positions, axis=1) == pytest.approx(np.ones(len(positions)), abs=1e-6)
     np.testing.assert_allclose(positions[:, 2], 0, atol=1e-7)
-    np.testing.assert_allclose(shape.normals, np.tile([0, 0, 1], (len(positions), 1)), atol=1e-6)
+    np.testing.assert_allclose(shape["normals"], np.tile([0, 0, 1], (len(positions), 1)), atol=1e-6)
     # The texture's v runs along the file's -z, which is our y.
-    uv = shape.uv
+    uv = shape["uvs"]
     np.testing.assert_allclose(np.sign(positions[:, 1]), np.sign(uv[:, 1] - 0.25))
-    assert (shape.tangents[:, 3] == 1).all()
+    assert (shape["tangents"][:, 3] == 1).all()
     # Half a texture unit is as long as the square's side √2.
-    assert shape.unit == pytest.approx(0.5 / np.sqrt(2))
+    assert unit == pytest.approx(0.5 / np.sqrt(2))
 
 
 def test_bad_meshes_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -60,6 +47,26 @@ def test_bad_meshes_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     with pytest.raises(InputError, match="no such file"):
         read_shape(tmp_path / "nothing.obj")
     (tmp_path / "good.obj").write_text(plain + "vt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n")
-    monkeypatch.setattr("mbtf_fit.viewer.shape.MOST_TRIANGLES", 0)
+    monkeypatch.setattr("mbtf_fit.viewer.extras.MOST_TRIANGLES", 0)
     with pytest.raises(InputError, match="1 triangles, more than 0"):
         read_shape(tmp_path / "good.obj")
+
+
+@pytest.mark.parametrize("alike", [False, True])
+@pytest.mark.parametrize("bits", [6, 16])
+def test_texels_are_rounded_to_their_range(bits: int, alike: bool) -> None:
+    random = np.random.default_rng(0)
+    levels = [random.normal(size=(rows, 2 * rows, 3)).astype(np.float32) * (1, 10, 0) for rows in (1, 2, 7)]
+    levels[2][3, 4, 0] = 40.0
+    packed = pack([np.asarray(texels, np.float32) for texels in levels], bits, alike=alike)
+    for found, given in zip(packed.levels, levels, strict=True):
+        step = np.ptp(given, axis=(0, 1)) / (2**bits - 1)
+        assert (np.abs(found - given) <= 0.5001 * step + 1e-5).all()
+
+
+def test_smooth_textures_compress_well() -> None:
+    x = np.linspace(0, 6, 128)
+    smooth = np.sin(x)[:, None, None] * np.cos(x)[None, :, None] * np.ones(2)
+    assert len(pack([smooth.astype(np.float32)]).description["data"]) < 0.5 * smooth.size
+    with pytest.raises(InputError, match="not finite"):
+        pack([np.full((2, 2, 1), np.inf, np.float32)])

@@ -9,15 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.plugin_materials import write_material
 from support.shader_cases import CASES, make
 
 from mbtf_core.app.console import run
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import EngineError
+from mbtf_fit.backends.shader.slang import ENTRY, TARGETS, SlangCompiler, module_of
 from mbtf_fit.cli.app import app
-from mbtf_fit.shaders.compiler import TARGETS, SlangCompiler
-from mbtf_fit.shaders.slang import ENTRY, module_of, translate
+from mbtf_fit.material.format import QUERY
 
 
 class Device:
@@ -41,6 +40,17 @@ class Device:
             data=np.ascontiguousarray(array, np.float32),
         )
 
+    def values(self, texels: np.ndarray, queries: tuple[Any, ...]) -> np.ndarray:
+        """Values and transmittance (n, 4) of queries."""
+        u, sigma, omega_i, omega_o = queries
+        numbers = np.concatenate([u, sigma[:, None], omega_i, omega_o], 1)
+        inputs = {
+            "query_count": len(u),
+            "queries": self.buffer(numbers.reshape(-1)),
+            "material_texels": self.buffer(texels),
+        }
+        return self.run(ENTRY, len(u), 4, inputs, "values")
+
     def run(self, entry: str, count: int, width: int, inputs: dict[str, Any], output: str) -> np.ndarray:
         program = self._device.load_program("material.slang", [entry])
         out = self.buffer(np.zeros((count, width), np.float32))
@@ -53,20 +63,13 @@ class Device:
 def test_values_are_those_of_the_material(case: str, tmp_path: Path) -> None:
     material = make(case, tmp_path / "material")
     module, texels = module_of(material)
-    device = Device(module, tmp_path / "module")
     q = material.conformance
-    queries = np.concatenate([q["u"], q["sigma"][:, None], q["omega_i"], q["omega_o"]], 1)
-    inputs = {
-        "query_count": len(queries),
-        "queries": device.buffer(queries.reshape(-1)),
-        "material_texels": device.buffer(texels),
-    }
-    found = device.run(ENTRY, len(queries), 4, inputs, "values")
+    found = Device(module, tmp_path / "module").values(texels, tuple(q[name] for name in QUERY))
     deviation = np.abs(found[:, :3] - q["rgb"]) / np.maximum(1.0, q["rgb"])
     assert q["rgb"].std() > 0.005
     # A traced ray may miss an edge.
     assert (deviation.max(1) > 1e-4).sum() <= 2
-    through = np.zeros(len(queries))
+    through = np.zeros(len(found))
     if material.transmittance is not None:
         through = material.transmittance.evaluate(*(q[k] for k in ("u", "sigma", "omega_o")))
         assert through.std() > 0.1
@@ -92,13 +95,7 @@ def test_directions_below_the_plane_and_the_data(tmp_path: Path) -> None:
     q, below = material.conformance, np.array([1, 1, -1], np.float32)
     for factors in ((below, 1), (1, below), (np.array([1, 1, 0], np.float32), 1)):
         omega_i, omega_o = q["omega_i"] * factors[0], q["omega_o"] * factors[1]
-        queries = np.concatenate([q["u"], q["sigma"][:, None], omega_i, omega_o], 1)
-        inputs = {
-            "query_count": len(queries),
-            "queries": device.buffer(queries.reshape(-1)),
-            "material_texels": device.buffer(texels),
-        }
-        assert (device.run(ENTRY, len(queries), 4, inputs, "values")[:, :3] == 0).all()
+        assert (device.values(texels, (q["u"], q["sigma"], omega_i, omega_o))[:, :3] == 0).all()
     directions = from_angles(np.array([90.0, 30.0, 10.0, 0.1, -30.0]), np.full(5, 30.0)).astype(np.float32)
     inputs = {"query_count": 5, "queries": device.buffer(directions.reshape(-1))}
     found = device.run("raise_directions", 5, 4, inputs, "values")
@@ -137,7 +134,7 @@ def _cells(omega: np.ndarray) -> np.ndarray:
     return np.asarray(8 * row + column)
 
 
-@pytest.mark.parametrize("case", ["relief", "calibrated"])
+@pytest.mark.parametrize("case", ["relief", "texel lobe", "calibrated"])
 def test_lights_are_sampled_by_their_density(case: str, tmp_path: Path) -> None:
     """The density integrates to 1, and is that of the samples: their moments, their counts in cells."""
     material = make(case, tmp_path / "material")
@@ -219,11 +216,9 @@ def test_other_languages(tmp_path: Path) -> None:
 def test_what_cannot_be_written_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write_material(tmp_path / "patches", model="hierarchical")
     make("calibrated", tmp_path / "good")
     out = ["-o", str(tmp_path / "out")]
     for words, code, what in (
-        (["patches", "--to", "slang"], 3, "operation 'neighborhood'"),
         (["good", "--shader-target", "hlsl"], 2, "--shader-target: is an option of shaders"),
         (["good", "--to", "slang", "--to", "web", "--half"], 2, "--half: has no meaning for pages"),
     ):
@@ -261,8 +256,3 @@ def test_a_module_with_a_fault_says_where(tmp_path: Path) -> None:
     module.write_text("float4 f() { return nothing; }")
     with pytest.raises(EngineError, match="Slang makes no hlsl of it"):
         SlangCompiler().compile(module, "f", "hlsl")
-
-
-def test_reads_of_textures_become_reads_of_the_buffer() -> None:
-    found = translate("x = mix(texelFetch(a, ivec3(f(b, 1), k), 0).xy, vec2(0.0), 0.5);")
-    assert found == "x = lerp(texel(a, int3(f(b, 1), k)).xy, float2(0.0), 0.5);"

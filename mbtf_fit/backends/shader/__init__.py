@@ -1,0 +1,1 @@
+"""Materials as shaders, in GLSL and in Slang: one function per operation."""

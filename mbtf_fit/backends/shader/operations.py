@@ -1,0 +1,282 @@
+"""The operations in shaders: one function each, with the equations of :mod:`mbtf_fit.ops`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from mbtf_fit import ops
+from mbtf_fit.backends.shader.backend import SHADER, Code, Value, in_fours
+from mbtf_fit.backends.shader.images import layer_vectors
+from mbtf_fit.backends.shader.syntax import number, vector
+from mbtf_fit.ops.constants import GLOSSY_CHANNELS, LEAK
+
+PER_WIDTH = "float2(1.0, ASPECT)"
+ACTIVATIONS = {"relu": "max({0}, 0.0)", "leaky-relu": f"max({{0}}, {LEAK} * {{0}})", "sine": "sin({0})"}
+FUNCTIONS = {
+    "identity": "{0}",
+    "exp": "exp({0})",
+    "expm1": "(exp({0}) - 1.0)",
+    "log1p": "log(1.0 + {0})",
+    "softplus": "(max({0}, 0.0) + log(1.0 + exp(-abs({0}))))",
+    "sigmoid": "(1.0 / (1.0 + exp(-({0}))))",
+    "fourth-root": "({0} * abs({0} * {0} * {0}))",
+    "square": "({0} * {0})",
+}
+
+
+@SHADER.implements(ops.Lookup)
+def _lookup(op: ops.Lookup, code: Code, u: Value, level: Value | None) -> str | Value:
+    image = code.image(op.textures, half=op.textures not in code.precise)
+    layers = image.layers
+    if level is None:
+        read = f"bilinear({image}, {code.let('Corners', f'corners({image.level(0)}, {u})')}, {{k}})"
+    else:
+        pair = code.let("Pair", code.pair(image, str(level), str(u)), "pair")
+        read = f"blended({image}, {pair}, {{k}})"
+    if level is None or op.blending == "blend":
+        out = code.variable("float4", op.output, layers)
+        code.write(f"for (int k = 0; k < {layers}; k++) {out}[k] = {read.format(k='k')};")
+        return Value.of_array(out, op.channels, code.lit)
+    # Even and odd levels keep their order.
+    out = code.variable("float4", op.output, 2 * layers)
+    odd = code.let("int", f"min(int({level}), {max(len(image.levels) - 2, 0)}) & 1", "odd")
+    code.write(
+        f"for (int k = 0; k < {layers}; k++) {{",
+        f"  {out}[{odd} * {layers} + k] = (1.0 - {pair}.weight) * bilinear({image}, {pair}.coarse, k);",
+        f"  {out}[(1 - {odd}) * {layers} + k] = {pair}.weight * bilinear({image}, {pair}.fine, k);",
+        "}",
+    )
+    both = Value.of_array(out, 4 * layers + op.channels, code.lit)
+    return both[: op.channels] + both[4 * layers :]
+
+
+@SHADER.implements(ops.Offset)
+def _offset(op: ops.Offset, code: Code, u: Value, r: Value, omega_o: Value) -> str:
+    moved = f"{number(op.scale)} * {r}"
+    if len(r) == 1:
+        moved += f" / max({omega_o[2:]}, {number(op.grazing)}) * {omega_o[:2]}"
+    return f"{u} + {moved} / {PER_WIDTH}"
+
+
+@SHADER.implements(ops.Trace)
+def _trace(op: ops.Trace, code: Code, u: Value, level: Value, omega_o: Value) -> tuple[Value, Value]:
+    code.include("heights")
+    nodes = code.image(op.heights, "nodes")
+    rows, columns = nodes.levels[0].shape[:2]
+    logarithms = ", ".join(str((n - 1).bit_length()) for n in (columns, rows))
+    count = len(op.places)
+    grid = f"Grid(int2({columns}, {rows}), int2({logarithms}), ASPECT)"
+    places = code.constants("float2", "places", [vector(place) for place in op.places])
+    mean, hits = code.variable("float", op.output), code.variable("float2", op.hits, count)
+    code.write(
+        f"{mean} = 0.0;",
+        f"for (int k = 0; k < {count}; k++) {{",
+        f"  float2 at = place_of({u}, {level}, {places}[k], {omega_o}, ASPECT);",
+        f"  float z = trace({nodes}, {grid}, {op.crossings}, at, {omega_o});",
+        f"  {hits}[k] = displaced(at, z, {omega_o}, ASPECT);",
+        f"  {mean} += z / {number(count)};",
+        "}",
+    )
+    return Value.of(mean, 1, code.lit), Value.of_array(hits, 2 * count, code.lit, width=2)
+
+
+@SHADER.implements(ops.Displace)
+def _displace(op: ops.Displace, code: Code, u: Value, z: Value, level: Value, omega_o: Value) -> str:
+    code.include("heights")
+    last = len(code.tensors[op.weights]) - 1
+    weights = code.constants("float", "level_weights", [number(w) for w in code.tensors[op.weights]])
+    s = code.let("int", f"max(min(int({level}), {last - 1}), 0)")
+    weight = f"lerp({weights}[{s}], {weights}[min({s} + 1, {last})], {level} - float({s}))"
+    return f"displaced({u}, {weight} * {z}, {omega_o}, ASPECT)"
+
+
+@SHADER.implements(ops.Shade)
+def _shade(op: ops.Shade, code: Code, hits: Value, level: Value, omega_i: Value, omega_o: Value) -> Value:
+    code.include("textures")
+    code.include("shading")
+    maps = code.image(op.maps, "maps")
+    horizons = code.image(op.horizons, "horizons")
+    glossy = maps.levels[0].shape[2] == GLOSSY_CHANNELS
+    count, width = len(hits) // 2, code.scalar(op.light_width)
+    with code.stage_of(hits, level):
+        places = code.variable("Place", "places", count, kept=True)
+        at, finer = code.variable("float2", "at", count, kept=False), f"{level} + {number(op.finer)}"
+        p, q = (code.pair(image, finer, f"{at}[k]") for image in (maps, horizons))
+        code.write(
+            *(f"{at}[{k}] = {hits[2 * k : 2 * k + 2]};" for k in range(count)),
+            f"for (int k = 0; k < {count}; k++) {{",
+            f"  Pair p = {p}, q = {q};",
+            f"  {places}[k] = place_at({maps}, p, q, {number(width**2)}, {vector(op.alpha2)});",
+            "}",
+        )
+        if glossy and not code.lit:
+            code.lobe = f"float4({places}[0].normal, {places}[0].alpha2)"
+    value = "at.base / PI"
+    if glossy:
+        f0 = f"lerp(float3({', '.join(3 * [number(code.scalar(op.dielectric))])}), at.base, at.metallic)"
+        least = vector((op.least_light, op.least_view))
+        lobe = f"ggx({f0}, at.alpha2, at.normal, {least}, {omega_i}, {omega_o})"
+        value = f"(1.0 - at.metallic) * {value} + {lobe}"
+    hints, core = code.variable("float3", op.output), code.variable("float3", op.output)
+    blur = f"{number((op.light_blur * width) ** 2)}, {number(op.least_variance)}"
+    code.write(
+        f"{hints} = float3(0.0, 0.0, 0.0);",
+        f"{core} = float3(0.0, 0.0, 0.0);",
+        f"for (int k = 0; k < {count}; k++) {{",
+        f"  Place at = {places}[k];",
+        f"  float seen_from = visibility({horizons}, {horizons.layers}, at.horizons, {blur}, {omega_i});",
+        f"  float irradiance = seen_from * max(dot(at.normal, {omega_i}), 0.0) / {omega_i[2:]};",
+        f"  {hints} += float3(irradiance, at.normal.xy) / {number(count)};",
+        f"  {core} += irradiance * ({value}) / {number(count)};",
+        "}",
+    )
+    return Value.of(hints, 3, code.lit) + Value.of(core, 3, code.lit)
+
+
+@SHADER.implements(ops.Lobe)
+def _lobe(
+    op: ops.Lobe,
+    code: Code,
+    base_color: Value,
+    specular: Value,
+    alpha2: Value,
+    slopes: Value,
+    omega_i: Value,
+    omega_o: Value,
+) -> str:
+    code.include("shading")
+    with code.stage_of(alpha2, slopes):
+        normal = code.variable("float3", "normal", kept=True)
+        roughness = code.variable("float", "alpha2", kept=True)
+        code.write(
+            f"{normal} = normalize(float3(-{slopes}, 1.0));",
+            f"{roughness} = max({alpha2}, {number(op.least_alpha2)});",
+        )
+        if not code.lit:
+            code.lobe = f"float4({normal}, {roughness})"
+    f0 = str(specular) if len(specular) == 3 else f"float3({specular}, {specular}, {specular})"
+    least = vector((op.least_light, op.least_view))
+    irradiance = f"max(dot({normal}, {omega_i}), 0.0) / {omega_i[2:]}"
+    lobe = f"ggx({f0}, {roughness}, {normal}, {least}, {omega_i}, {omega_o})"
+    return f"{irradiance} * ({base_color} / PI + {lobe})"
+
+
+@SHADER.implements(ops.HalfVector)
+def _half_vector(op: ops.HalfVector, code: Code, omega_i: Value, omega_o: Value) -> str:
+    return f"normalize({omega_i} + {omega_o})"
+
+
+@SHADER.implements(ops.Rotate)
+def _rotate(op: ops.Rotate, code: Code, axis: Value, omega: Value) -> str:
+    code.include("shading")
+    if len(axis) == 3:
+        return f"rotate_to_z({axis}, {omega})"
+    return f"rotate_to_z(float3({axis}, sqrt(max(0.0, 1.0 - dot({axis}, {axis})))), {omega})"
+
+
+@SHADER.implements(ops.Stereographic)
+def _stereographic(op: ops.Stereographic, code: Code, omega: Value) -> str:
+    return f"{omega[:2]} / (1.0 + {omega[2:]})"
+
+
+@SHADER.implements(ops.Position)
+def _position(op: ops.Position, code: Code, u: Value) -> str:
+    return f"2.0 * ({u} - floor({u})) - 1.0"
+
+
+@SHADER.implements(ops.Frequencies)
+def _frequencies(op: ops.Frequencies, code: Code, x: Value, level: Value | None) -> list[str]:
+    spread = Value.of("", len(x))
+    if level is not None:
+        spread = Value.of(code.let("float2", f"exp2(-{level}) / {PER_WIDTH}", "spread"), 2)
+    sines, cosines = [], []
+    for c, s in zip(x.scalars(), spread.scalars(), strict=True):
+        for k in range(op.bands):
+            frequency = number(2.0**k * (math.pi if op.pi else 1.0))
+            factor = f"{number(2.0**-k)} * " if op.attenuated else ""
+            if level is not None:
+                factor += f"exp(-0.5 * {frequency} * {frequency} * {s} * {s}) * "
+            sines.append(f"{factor}sin({frequency} * {c})")
+            cosines.append(f"{factor}cos({frequency} * {c})")
+    return in_fours([*(x.scalars() if op.raw else []), *sines, *cosines])
+
+
+@SHADER.implements(ops.Network)
+def _network(op: ops.Network, code: Code, x: Sequence[Value]) -> Value:
+    read = Value(tuple(n for value in x for n in value.numbers))
+    h = code.variable("float4", "h", len(read.vectors()), kept=False)
+    code.fill(h, read.vectors(), len(read))
+    for n in range(len(op.hidden) + 1):
+        weight, bias = (code.tensors[f"{op.weights}.{n}.{name}"] for name in ("weight", "bias"))
+        first, (outputs, inputs) = sum(map(len, code.weights)), (-(-size // 4) for size in weight.shape)
+        code.weights.append(layer_vectors(weight, bias))
+        hidden = n < len(op.hidden)
+        out = code.variable("float4", "h" if hidden else op.output, outputs)
+        # Unrolled code is slower in software rendering, and takes long to compile.
+        code.write(
+            f"for (int o = 0; o < {outputs}; o++) {{",
+            f"  int at = {first} + o * {1 + 4 * inputs};",
+            "  float4 sum = WEIGHT(at);",
+            f"  for (int i = 0; i < {inputs}; i++) {{",
+            f"    float4 x = {h}[i];",
+            "    int k = at + 4 * i;",
+            "    sum += WEIGHT(k + 1) * x.x + WEIGHT(k + 2) * x.y;",
+            "    sum += WEIGHT(k + 3) * x.z + WEIGHT(k + 4) * x.w;",
+            "  }",
+            f"  {out}[o] = {ACTIVATIONS[op.activation].format('sum') if hidden else 'sum'};",
+            "}",
+        )
+        h = out
+    return Value.of_array(h, op.outputs, code.lit)
+
+
+@SHADER.implements(ops.Transform)
+def _transform(op: ops.Transform, code: Code, x: Value) -> list[str]:
+    scale = op.scale
+    if op.divisor is not None:
+        divisor = code.scalar(op.divisor)
+        scale *= 1.0 / divisor if divisor > 0 else 0.0
+    factor = "" if op.factor is None else f"{number(code.scalar(op.factor))} * "
+    argument = "{}" if scale == 1.0 else f"({number(scale)} * {{}})"
+    return [factor + FUNCTIONS[op.function].format(argument.format(v)) for v in x.vectors()]
+
+
+@SHADER.implements(ops.Matrix)
+def _matrix(op: ops.Matrix, code: Code, x: Value) -> list[str]:
+    terms = [[number(a) for a in row] for row in op.rows]
+    return in_fours([" + ".join(f"{a} * {n}" for a, n in zip(t, x.scalars(), strict=True)) for t in terms])
+
+
+@SHADER.implements(ops.Gate)
+def _gate(op: ops.Gate, code: Code, gate: Value, x: Value, plus: Value | None) -> list[str]:
+    gates = gate.vectors() if len(gate) > 1 else [str(gate)] * len(x.vectors())
+    addends = [""] * len(gates) if plus is None else [f" + {v}" for v in plus.vectors()]
+    if op.unit is not None and not code.scalar(op.unit) > 0:
+        zeros = in_fours(["0.0"] * len(x))
+        return [zero + addend for zero, addend in zip(zeros, addends, strict=True)]
+    shares = (f"({number(op.floor)} + {number(op.scale)} / (1.0 + exp(-{g})))" for g in gates)
+    return [f"{s} * {v}{a}" for s, v, a in zip(shares, x.vectors(), addends, strict=True)]
+
+
+@SHADER.implements(ops.Standardize)
+def _standardize(op: ops.Standardize, code: Code, x: Value, mean: Value, deviation: Value) -> list[str]:
+    parts = zip(mean.vectors(), deviation.vectors(), x.vectors(), strict=True)
+    return [f"{m} + {d} * {v}" for m, d, v in parts]
+
+
+@SHADER.implements(ops.DivideByCosine)
+def _divide_by_cosine(op: ops.DivideByCosine, code: Code, x: Value, omega: Value) -> list[str]:
+    return [f"{v} / max({omega[2:]}, {number(op.least)})" for v in x.vectors()]
+
+
+@SHADER.implements(ops.Calibrate)
+def _calibrate(op: ops.Calibrate, code: Code, level: Value, omega: Value) -> str:
+    _, levels, knots, _ = code.tensors[op.factors].shape
+    table = code.image(op.factors, "rows")
+    return f"interpolated({table}, int2({knots}, {levels}), {op.table * levels}, {level}, {omega[2:]})"
+
+
+@SHADER.implements(ops.Product)
+def _product(op: ops.Product, code: Code, x: Sequence[Value]) -> list[str]:
+    return [" * ".join(parts) for parts in zip(*(value.vectors() for value in x), strict=True)]

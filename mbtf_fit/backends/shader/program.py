@@ -1,0 +1,129 @@
+"""A material's shader: the code of its operations, as functions of a position and directions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from mbtf_fit import ops
+from mbtf_fit.backends.shader import operations as _implementations  # noqa: F401
+from mbtf_fit.backends.shader.backend import SHADER, Code, Value
+from mbtf_fit.backends.shader.images import F32, TexelImage
+from mbtf_fit.backends.shader.syntax import Syntax, number
+from mbtf_fit.material.material import Material
+from mbtf_fit.ops.operation import INPUTS, output_names, parse, reached_from, sizes_of
+
+# Image of its coefficients.
+TRANSMITTANCE = "material.transmittance"
+
+
+@dataclass(frozen=True)
+class Program:
+    """Code, and the numbers that it reads.
+
+    Attributes
+    ----------
+    code : functions ``stage1(u, sigma, omega_o)``, ``stage2(seen, omega_i, omega_o)`` and
+        ``transmittance(u, sigma, omega_o)``, without the declarations of images
+    images : in the order of their declarations
+    weights : vectors (n, 4) of the networks
+    """
+
+    code: str
+    images: list[TexelImage]
+    weights: F32
+
+
+def program_of(material: Material, syntax: Syntax) -> Program:
+    """The shader of a material.
+
+    Raises
+    ------
+    InputError : it has an operation that shaders do not have
+    """
+    operations = material.model.stored_operations()
+    SHADER.check(operations)
+    lit = reached_from(operations, "omega_i")
+    read = {parse(r)[0] for op in operations if op.output in lit for r in op.inputs()}
+    last = operations[-1].output
+    tensors = {name: t.cpu().float().numpy() for name, t in material.model.weights().items()}
+    if material.transmittance is not None:
+        levels = enumerate(material.transmittance.levels)
+        tensors |= {f"{TRANSMITTANCE}.{s}": texels for s, texels in levels}
+    code = Code(syntax, tensors, {*read, last}, _moving(operations))
+    values = {
+        name: Value.of(name if name.startswith("omega") else f"seen.{name}", size, name == "omega_i")
+        for name, size in INPUTS.items()
+    }
+    sizes = sizes_of(operations)
+    for op in operations:
+        code.lit = op.output in lit
+        found = SHADER[op](op, code, *(_argument(getattr(op, name), values) for name in op.value_fields()))
+        results = found if isinstance(found, tuple) else (found,)
+        for name, result in zip(output_names(op), results, strict=True):
+            values[name] = code.result(name, sizes[name], result)
+    level = f"clamp(-log2(2.0 * sigma), 0.0, {material.lattice.finest}.0)"
+    through = _transmittance(material, code, level)
+    text = [
+        "CONSTANT float PI = 3.14159265358979;",
+        f"CONSTANT float ASPECT = {number(material.lattice.aspect)};",
+        *code.globals,
+        "// What does not depend on the light (stage 1).",
+        "struct Seen {",
+        *(f"  {field}" for field in ("float2 u;", "float level;", *code.fields)),
+        "};",
+        "Seen stage1(float2 u, float sigma, float3 omega_o) {",
+        "  Seen seen;",
+        "  seen.u = u - floor(u);",
+        f"  seen.level = {level};",
+        *code.bodies[0],
+        "  return seen;",
+        "}",
+        "// Value for light from omega_i (stage 2), at least 0; 0 below the plane.",
+        "float3 stage2(Seen seen, float3 omega_i, float3 omega_o) {",
+        "  if (min(omega_i.z, omega_o.z) <= 0.0) return float3(0.0, 0.0, 0.0);",
+        *code.bodies[1],
+        f"  return max({values[last]}, float3(0.0, 0.0, 0.0));",
+        "}",
+        *through,
+    ]
+    # WebGL has no empty uniforms.
+    weights = np.concatenate(code.weights or [np.zeros((1, 4), np.float32)])
+    if code.lobe is not None:
+        text += ["#define SAMPLED_LOBE", f"float4 sampled_lobe(Seen seen) {{ return {code.lobe}; }}"]
+    return Program("\n".join(text), [*code.images.values()], weights)
+
+
+def _moving(operations: list[ops.Operation]) -> set[str]:
+    """Textures whose features move lookups."""
+    lookups = [op for op in operations if isinstance(op, ops.Lookup)]
+    positions = {parse(op.u)[0] for op in lookups}
+    return {op.textures for op in lookups if positions & reached_from(operations, op.output)}
+
+
+def _argument(field: str | tuple[str, ...] | None, values: Mapping[str, Value]) -> object:
+    """What an operation's field refers to: a value, or a list of them."""
+    if field is None:
+        return None
+    if not isinstance(field, str):
+        return [_argument(reference, values) for reference in field]
+    name, part = parse(field)
+    return values[name][part]
+
+
+def _transmittance(material: Material, code: Code, level: str) -> list[str]:
+    """Function of the transparent fraction of the footprint (mbtf_fit.material.transmittance)."""
+    body = ["  return 0.0;"]
+    if material.transmittance is not None:
+        image = code.image(TRANSMITTANCE)
+        body = [
+            f"  Pair p = {code.pair(image, level, 'u - floor(u)')};",
+            f"  float4 a = blended({image}, p, 0), b = blended({image}, p, 1);",
+            "  float2 w = omega_o.xy;",
+            "  float sum = a.x + dot(a.yz, w) + a.w * w.x * w.x + b.x * w.x * w.y + b.y * w.y * w.y;",
+            "  return clamp(sum, 0.0, 1.0);",
+        ]
+    head = "float transmittance(float2 u, float sigma, float3 omega_o) {"
+    return ["// Transparent fraction of the footprint.", head, *body, "}"]
