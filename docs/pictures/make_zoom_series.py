@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from mbtf_core.color import auto_exposure, brightness, to_display
 from mbtf_core.data.shard_files import read_exr
 from mbtf_core.directions import from_angles
-from mbtf_core.color import auto_exposure, brightness, to_display
 from mbtf_core.pictures import Camera
 from mbtf_gen.engine.runtime import load_mitsuba
 

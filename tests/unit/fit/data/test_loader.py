@@ -137,7 +137,7 @@ def test_nothing_to_train_on_is_refused(tmp_path: Path) -> None:
 def test_rows_that_contradict_the_sidecar_are_refused(tmp_path: Path) -> None:
     folder = write_data(tmp_path / "d", parallax, train=100, shards=1)
     edit(folder / "train-00000.json", lambda record: record.update(rows=90))
-    with pytest.raises(InputError, match=r"train-00000.*has 90 rows, manifest.json says 100"):
+    with pytest.raises(InputError, match=r"train-00000.*has the rows 90, manifest.json says 100"):
         partition(folder)
     edit(folder / "manifest.json", lambda m: m["splits"]["train"]["shards"][0].update(rows=90))
     with pytest.raises(InputError, match=r"train-00000.*has 100 rows, its sidecar says 90"):
