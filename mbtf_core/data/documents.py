@@ -165,21 +165,16 @@ def read_sidecar(folder: DataFolder, entry: ShardEntry, config_hash: str) -> dic
         check_document(_Sidecar, record, folder.at(sidecar), "")
     except InputError as error:
         raise InputError(f"has a corrupt sidecar: {error.what}", where=where) from None
-    found = {key: record.get(key) for key in ("split", "index", "rows", "bytes")}
-    fault = ""
     if record.get("format") != FORMAT_NAME or record.get("config_hash") != config_hash:
-        fault = f"belongs to another data set than {MANIFEST_NAME}"
-    elif record.get("file") != entry.file:
-        fault = f"has the sidecar of {record.get('file')}"
-    elif (found["split"], found["index"]) != (entry.split, entry.index):
-        listed = f"{MANIFEST_NAME} lists it as {entry.split} {entry.index}"
-        fault = f"is shard {found['split']} {found['index']}, {listed}"
-    elif found["rows"] != entry.rows:
-        fault = f"has {found['rows']} rows, {MANIFEST_NAME} says {entry.rows}"
-    elif found["bytes"] != size:
-        fault = f"has {size} bytes, its sidecar says {found['bytes']}"
-    if fault:
-        raise InputError(fault, where=where)
+        raise InputError(f"belongs to another data set than {MANIFEST_NAME}", where=where)
+    if record.get("file") != entry.file:
+        raise InputError(f"has the sidecar of {record.get('file')}", where=where)
+    for key, listed in (("split", entry.split), ("index", entry.index), ("rows", entry.rows)):
+        if record.get(key) != listed:
+            what = f"has the {key} {record.get(key)}, {MANIFEST_NAME} says {listed}"
+            raise InputError(what, where=where)
+    if record.get("bytes") != size:
+        raise InputError(f"has {size} bytes, its sidecar says {record.get('bytes')}", where=where)
     return record
 
 
@@ -241,17 +236,12 @@ def sidecar(
 def upload_waiting(
     folder: DataFolder, entries: Sequence[ShardEntry], config_hash: str, plan: str
 ) -> list[str]:
-    """Upload the shards that earlier runs could not upload and that the data set lacks.
+    """Upload the shards that earlier runs could not upload and that the data set lacks; returns their names.
 
     Parameters
     ----------
     entries : all shards of the data set
     config_hash, plan : digests of configuration and run plan that the shards must have
-
-    Returns
-    -------
-    list of str
-        Files that were uploaded.
 
     Raises
     ------

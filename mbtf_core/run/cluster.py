@@ -267,7 +267,7 @@ def _open_workers(where: str, note: Callable[[str], None]) -> Iterator[DaskRunne
             note(f"cluster: waiting for the first worker, at most {format_duration(config.start_timeout)}")
         cluster.wait(f"--cluster {where}")
         name, count = address or config.engine, f"{cluster.workers} worker{'s' * (cluster.workers != 1)}"
-        note(f"cluster: {name}, {count}{' so far' * (name != 'local')}")
+        note(f"cluster: {name}, {count}{' so far' * (name != 'local')}, dashboard {client.dashboard_link}")
         yield cluster
 
 

@@ -47,7 +47,7 @@ class Runner:
         ----------
         function : of a module; see :mod:`mbtf_core.run.task`
         items : read as workers become free
-        independent : A failure that concerns files or options says nothing about the other items
+        independent : a failure that concerns files or options says nothing about the other items
         ahead : items that are read before workers are free for them, beyond two for each worker
 
         Raises

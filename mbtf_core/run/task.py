@@ -93,18 +93,8 @@ def packed(function: TaskFunction, item: Item) -> tuple[bytes, str, str]:
 
 
 def run_task(call: bytes, expected: str, folder: str) -> dict[str, Any]:
-    """Run a task on a worker.
-
-    Parameters
-    ----------
-    call, expected, folder
-        From :func:`packed`. The task runs in the working folder, where this machine has it.
-
-    Returns
-    -------
-    dict
-        The fields of :class:`Result` except for the name.
-    """
+    """Run a task on a worker, with the arguments that :func:`packed` made, in the working folder where this
+    machine has it; returns the fields of :class:`Result` except for the name."""
     worker = {"worker": f"{socket.gethostname()}:{os.getpid()}"}
     installed = version("mbtf")
     if installed != expected:

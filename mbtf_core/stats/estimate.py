@@ -127,7 +127,7 @@ def by_group(function: Callable[..., Estimate], groups: ArrayLike, *arrays: Arra
 
     Parameters
     ----------
-    function : A function of this package that takes arrays and returns an Estimate
+    function : a function of this package that takes arrays and returns an Estimate
     groups : (n,) int array_like
         Labels; rows with negative labels are ignored.
     *arrays : (n, ...) array_like

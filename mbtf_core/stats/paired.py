@@ -163,7 +163,7 @@ def unexplained_variance(prediction: ArrayLike, a: ArrayLike, b: ArrayLike) -> E
 
     Raises
     ------
-    InputError : A number is NaN or infinite
+    InputError : a number is NaN or infinite
     ValueError : shapes differ
     """
     p, first, second = _with_prediction(prediction, a, b)

@@ -129,11 +129,11 @@ FOREIGN: dict[str, tuple[Callable[[Path, Path, str], object], str]] = {
     "manifest": (lambda d, o, s: shutil.copy(o / "manifest.json", d), "belongs to another data set"),
     "index": (
         lambda d, o, s: edit(d / "train-00001.json", lambda record: record.update(index=2)),
-        "is shard train 2, manifest.json lists it as train 1",
+        "has the index 2, manifest.json says 1",
     ),
     "split": (
         lambda d, o, s: edit(d / "train-00001.json", lambda record: record.update(split="test")),
-        "is shard test 1, manifest.json lists it as train 1",
+        "has the split test, manifest.json says train",
     ),
     "negative sigma": (lambda d, o, s: _change(d, s, "sigma", _times(-1)), "'sigma' holds numbers that"),
     "long vectors": (lambda d, o, s: _change(d, s, "omega_i", _times(1.001)), "'omega_i' holds vectors that"),

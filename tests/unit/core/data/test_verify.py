@@ -129,7 +129,7 @@ def test_a_doubled_shard_is_found(copy: Path) -> None:
     shutil.copy(sidecar_of(shard(copy, 1)), sidecar_of(shard(copy, 0)))
     assert faults(copy)[shard(copy, 0).name] == f"has the sidecar of {shard(copy, 1).name}"
     edit(sidecar_of(shard(copy, 0)), lambda record: record.update(file=shard(copy, 0).name))
-    assert "is shard train 1, manifest.json lists it as train 0" in faults(copy)[shard(copy, 0).name]
+    assert "has the index 1, manifest.json says 0" in faults(copy)[shard(copy, 0).name]
     edit(sidecar_of(shard(copy, 0)), lambda record: record.update(index=0))
     # Which of the two is the copy, nobody knows.
     assert faults(copy) == {
