@@ -29,7 +29,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
 
@@ -243,13 +243,16 @@ class NeuralBtf(ImageBtf):
         self._shape = shape
         super().__init__(path, shape[1], shape[2], directions[LIGHT], directions[VIEW])
 
-    def _opened(self) -> AbstractContextManager[Any]:
-        return opened(self.path)
+    @contextmanager
+    def _opened(self) -> Iterator[Any]:
+        with opened(self.path) as file:
+            color = data_set(file, COLOR, self.path)
+            if color.shape != self._shape:
+                raise InputError("has changed while it was read", where=self.path)
+            yield color
 
     def _texels(self, file: Any, number: int, row: I64, column: I64) -> F32:
-        color, first = data_set(file, COLOR, self.path), int(row.min())
-        if color.shape != self._shape:
-            raise InputError("has changed while it was read", where=self.path)
-        part = np.asarray(color[number, first : int(row.max()) + 1])[row - first, column]
+        first = int(row.min())
+        part = np.asarray(file[number, first : int(row.max()) + 1])[row - first, column]
         with np.errstate(over="ignore", invalid="ignore"):
             return part.astype(np.float32)
