@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from mbtf_core.app.console import run
 from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.errors import UsageError
 from mbtf_core.units import format_duration, parse_duration
@@ -99,3 +100,23 @@ def test_hash_covers_data_and_options_but_not_the_device() -> None:
 def test_a_held_out_direction_lies_on_the_disk(direction: tuple[float, float]) -> None:
     with pytest.raises(ValueError, match="within the unit disk"):
         FitConfig.model_validate({"held_out": {"direction": direction}})
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("", "no shards given"),
+        ("a --many b", "--many replaces the argument SHARDS"),
+        ("--many a --dry-run", "--dry-run takes one data set"),
+        ("--many a --live", "--live shows one fit"),
+        ("a --processes 2", "--processes requires --many"),
+        ("a --cluster local", "--cluster requires --many"),
+        ("--many a --processes 2 --cluster local", "--cluster sets the processes"),
+        ("--many a --processes 0", "--processes must be positive"),
+    ],
+)
+def test_one_fit_and_several_have_options_of_their_own(
+    line: str, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(app, line.split()) == 2
+    assert message in capsys.readouterr().err
