@@ -26,7 +26,7 @@ from mbtf_core.app.options import (
 from mbtf_core.errors import InputError, PartialError, UsageError
 from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.units import expectation, format_duration
-from mbtf_fit.cli.page_options import Live, live_view
+from mbtf_fit.cli.view import Live, live_view
 from mbtf_fit.config import DECODER_MODELS, DEFAULT_MODEL, FIBER_MODEL, FitConfig, ModelName
 from mbtf_fit.formatting import describe_fit, fits_table
 

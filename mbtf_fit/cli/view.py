@@ -1,20 +1,53 @@
-"""``mbtf-fit view``: a material in the browser."""
+"""``mbtf-fit view``: a material in the browser, and the page that shows the progress of other commands."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
 
 from mbtf_core.app.console import CONSOLE, Console
+from mbtf_core.app.options import Switch
 from mbtf_core.run.signals import served_until_interruption
-from mbtf_fit.cli.page_options import PAGE_OPTIONS, PageOptions
+from mbtf_fit.cli.export import SectionFlags, flags_of
+from mbtf_fit.export.web import PageOptions, make_page
+
+if TYPE_CHECKING:
+    from mbtf_fit.viewer.live import LiveView
+
+Live = Annotated[Switch, Parameter(help="Show the progress in the browser while the command runs.")]
+
+
+@contextmanager
+def live_view(title: str, wanted: bool, console: Console) -> Iterator[LiveView | None]:
+    """A page that shows the progress of a command until it ends; None where it is not wanted."""
+    if not wanted:
+        yield None
+        return
+    from mbtf_fit.viewer.live import LiveView
+
+    live = LiveView(title)
+    console.note(f"open in a browser: {live.url}")
+    try:
+        yield live
+    finally:
+        live.close()
+
+
+@flags_of(PageOptions)
+class PageFlags(SectionFlags):
+    """What the page shows besides the material."""
 
 
 def view(
     material: Path,
     /,
     *,
-    options: PageOptions = PAGE_OPTIONS,
+    flags: PageFlags = PageFlags(),  # noqa: B008
     port: int = 0,
     console: Console = CONSOLE,
 ) -> None:
@@ -33,7 +66,7 @@ def view(
     """
     from mbtf_fit.viewer.server import PageServer
 
-    html, precision = options.page(material)
+    html, precision = make_page(material, flags.section(PageOptions))
     server = PageServer(html, port)
     console.note(precision)
     with served_until_interruption():

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import BaseModel, Field
 
@@ -18,7 +18,7 @@ from mbtf_fit.material.material import Material
 
 EXPORT_NAME = "export.json"
 _FORMAT = "mbtf-export"
-_SCHEMA = 2
+_SCHEMA = 3
 
 
 class ExportSource(BaseModel):
@@ -29,17 +29,13 @@ class ExportSource(BaseModel):
     material : SHA-256 of the description of the exported material
     to : formats, in alphabetical order
     half : whether weights and texels are rounded to 16 bits
-    shader_target : languages that the shader module is compiled to, in alphabetical order
-    level : level of maps; None for the finest
-    page : option of the page → SHA-256 of the files that it names
+    options : those of the formats that were given; of a file its SHA-256
     """
 
     material: str
     to: list[str]
     half: bool
-    shader_target: list[str] = []
-    level: int | None = None
-    page: dict[str, list[str]] = {}
+    options: dict[str, Any] = {}
 
 
 class _Record(BaseModel):

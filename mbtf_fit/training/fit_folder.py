@@ -14,7 +14,6 @@ from mbtf_core.files.digest import data_sha256
 from mbtf_core.files.folders import ELSEWHERE, check_folder, make_folder, other_configuration
 from mbtf_fit.config import FitConfig
 from mbtf_fit.material.decoder import DECODER_NAME, Decoder
-from mbtf_fit.material.export import LAYERS_NAME, TEXTURES_NAME
 from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME, read_description
 from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME
 from mbtf_fit.training.checkpoint import CHECKPOINT_NAME
@@ -73,7 +72,7 @@ def claim(out: Path, identity: dict[str, Any], config: FitConfig, overwrite: boo
         # it is replaced, so that a killed process leaves the folder of a fit.
         for name in (
             *(DESCRIPTION_NAME, DECODER_NAME, CONFIG_NAME, HISTORY_NAME, CHECKPOINT_NAME),
-            *(WEIGHTS_NAME, TRANSMITTANCE_NAME, LAYERS_NAME, TEXTURES_NAME),
+            *(WEIGHTS_NAME, TRANSMITTANCE_NAME, "layers.json", "textures.exr"),
         ):
             (out / name).unlink(missing_ok=True)
     make_folder(out)

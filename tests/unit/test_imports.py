@@ -78,6 +78,7 @@ mbtf_fit.backends.mitsuba
 mbtf_fit.preview
 mbtf_fit.viewer
 mbtf_fit.shaders
+mbtf_fit.export
 mbtf_fit.cli
 mbtf_fit
 mbtf_pipeline.recipe
