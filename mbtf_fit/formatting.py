@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from mbtf_core.exposure import describe_exposure, white_of
 from mbtf_core.units import clock
 
 SPLIT_NAMES = {
@@ -33,6 +32,8 @@ _SIGNIFICANT = 2.0
 def visibility(split: Mapping[str, Any]) -> tuple[str, str | None]:
     """PSNR as text, and a word of :data:`VISIBILITY`, of the errors of a split; where the error is below its
     own uncertainty, lower bounds. None without an error."""
+    from mbtf_core.exposure import white_of
+
     mse, error = split["mse"]["value"], split["mse"]["error"]
     # Materials of earlier versions record no exposure.
     if mse is None or error is None or "exposure" not in split:
@@ -57,6 +58,8 @@ def summarize_errors(
 ) -> list[str]:
     """Three lines, and advice: unexplained variance (where defined) and PSNR of the first split, and the
     other splits. `foreign`: the errors are of the data of another material."""
+    from mbtf_core.exposure import describe_exposure
+
     first = headline(errors)
     split, of = errors[first], f"of {errors[first]['n']} {SPLIT_NAMES[first]}"
     lines = []

@@ -7,7 +7,6 @@ from pathlib import Path
 from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.options import Options, Output, Overwrite, PathText, Switch, options_from
 from mbtf_core.errors import UsageError
-from mbtf_core.files.folders import owned
 from mbtf_fit.preview.config import MaterialPreviewConfig
 
 
@@ -41,6 +40,7 @@ def preview(
     mp4
         Write the turntable as MP4, too; needs ffmpeg or the extra 'video'.
     """
+    from mbtf_core.files.folders import owned
     from mbtf_fit.preview.command import draw
 
     if sheet_only and mp4:

@@ -1,41 +1,14 @@
-"""``mbtf-fit view``: a material in the browser, and the page that shows the progress of other commands."""
+"""``mbtf-fit view``: a material in the browser."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-from cyclopts import Parameter
 
 from mbtf_core.app.console import CONSOLE, Console
-from mbtf_core.app.options import Switch
 from mbtf_core.run.signals import served_until_interruption
 from mbtf_fit.cli.export import SectionFlags, flags_of
 from mbtf_fit.export.web import PageOptions, make_page
-
-if TYPE_CHECKING:
-    from mbtf_fit.viewer.live import LiveView
-
-Live = Annotated[Switch, Parameter(help="Show the progress in the browser while the command runs.")]
-
-
-@contextmanager
-def live_view(title: str, wanted: bool, console: Console) -> Iterator[LiveView | None]:
-    """A page that shows the progress of a command until it ends; None where it is not wanted."""
-    if not wanted:
-        yield None
-        return
-    from mbtf_fit.viewer.live import LiveView
-
-    live = LiveView(title)
-    console.note(f"open in a browser: {live.url}")
-    try:
-        yield live
-    finally:
-        live.close()
 
 
 @flags_of(PageOptions)

@@ -14,7 +14,7 @@ class ShaderOptions(Settings):
 
     shader_target: list[Target] | None = Field(
         None,
-        description="another language that Slang compiles the module to; needs the extra 'shaders'. Repeatable",
+        description="another language that Slang compiles the module to (extra 'shaders'). Repeatable",
     )
 
 

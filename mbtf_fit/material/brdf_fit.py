@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mbtf_core.data.lattice import texel_centers
+from mbtf_fit.material.material import Material
 from mbtf_fit.material.reference_values import (
     LEAST_OPACITY,
     direction_pairs,
@@ -44,7 +45,6 @@ from mbtf_fit.material.reference_values import (
     solid_values,
     steep_views,
 )
-from mbtf_fit.material.material import Material
 
 F64 = NDArray[np.float64]
 # F0 of a dielectric of refractive index 1.5.
@@ -58,8 +58,8 @@ _PRIOR = torch.tensor([0.0, 0.0, 1.0, 0.0, 0.5, 0.5, 0.5])
 _WEAK, _SUPPORT = torch.tensor([1e-4, 1e-4, 3e-4, 3e-4, 1e-5, 1e-5, 1e-5]), 0.1
 # ε in units of the mean; decrease of the objective, as a share, at which a texel is done; steps.
 _DARK, _DONE, _STEPS = 0.3, 1e-4, 20
-# Starts, of which the best dielectric and the best metal are minimized: roughness; that of narrow lobes, which
-# only the second pairs resolve.
+# Roughness of the starts, of which the best dielectric and the best metal are minimized, and of a narrow lobe,
+# which only the second pairs resolve.
 _STARTS, _NARROW = (0.35, 0.6, 1.0), 0.2
 # Views that all texels share, and those of the highlights; lights per view of either, fewer for models that
 # read a neighborhood.
@@ -196,7 +196,7 @@ class _Problem:
 
     def linearized(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """The residuals (n, 3k), and their derivatives (n, 7, 3k) by the parameters."""
-        n, _, k = self.target.shape
+        k = self.target.shape[2]
         # Each pair has a copy of the parameters, so that the gradient of a sum is that of its terms.
         lobes = x.T[:4, :, None].repeat(1, 1, k).requires_grad_()
         coefficients = reflectance(lobes, self.dielectric, self.pairs)

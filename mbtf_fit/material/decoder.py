@@ -17,7 +17,7 @@ from mbtf_core.config.settings import build, check_document, check_schema
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import read_json, write_json
 from mbtf_core.suggest import suggest_path
-from mbtf_fit.config import DECODER_MODELS, FitConfig
+from mbtf_fit.config import FitConfig, decoder_models
 from mbtf_fit.material.format import (
     DESCRIPTION_NAME,
     WEIGHTS_NAME,
@@ -109,11 +109,10 @@ class Decoder:
                 hint="make both with: mbtf-fit --many SHARDS SHARDS --shared-decoder -o FOLDER",
             )
         config = build(FitConfig, description["config"], source=str(path))
-        if config.model not in DECODER_MODELS:
-            raise InputError(
-                f"has the network of {config.model}; only those of {' and '.join(DECODER_MODELS)} are shared",
-                where=found,
-            )
+        shared = decoder_models()
+        if config.model not in shared:
+            what = f"has the network of {config.model}; only those of {' and '.join(shared)} are shared"
+            raise InputError(what, where=found)
         return cls(found, description["weights"]["sha256"], config)
 
     def options(self) -> dict[str, Any]:

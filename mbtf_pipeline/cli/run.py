@@ -22,7 +22,7 @@ from mbtf_core.app.options import (
 from mbtf_core.errors import PartialError, UsageError
 from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.units import clock
-from mbtf_fit.cli.view import Live, live_view
+from mbtf_fit.cli.live import Live, live_view
 
 if TYPE_CHECKING:
     from mbtf_pipeline.run import RunResult

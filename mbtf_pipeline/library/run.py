@@ -16,7 +16,7 @@ from mbtf_core.files.folders import check_folder, owned
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item, Result
 from mbtf_core.units import format_duration
-from mbtf_fit.config import DECODER_MODELS, SHARED_PRESET, FitConfig
+from mbtf_fit.config import SHARED_PRESET, FitConfig, decoder_models
 from mbtf_fit.material.decoder import DECODER_FOLDER
 from mbtf_pipeline.library.entries import Entry, LibraryRecipe
 from mbtf_pipeline.library.library_page import library_page
@@ -251,7 +251,7 @@ def _same_fits(done: Iterable[Entry]) -> list[tuple[Entry, str]]:
     groups: dict[str, dict[str, tuple[Entry, str]]] = {}
     for entry in done:
         for name, config in entry.recipe.fit.items() if entry.recipe is not None else ():
-            if config.model in DECODER_MODELS and config.decoder is None and config.init_from is None:
+            if config.model in decoder_models() and config.decoder is None and config.init_from is None:
                 groups.setdefault(data_sha256(_untimed(config)), {}).setdefault(entry.name, (entry, name))
     return list(max(groups.values(), key=len, default={}).values())
 
