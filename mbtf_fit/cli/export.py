@@ -99,8 +99,7 @@ def export_material(
     from mbtf_core.files.folders import owned
     from mbtf_fit.material.export_folder import ExportClaim, ExportSource, claimed
     from mbtf_fit.material.format import DESCRIPTION_NAME
-    from mbtf_fit.material.half import to_half
-    from mbtf_fit.material.material import Material
+    from mbtf_fit.material.material import Material, to_half
 
     wanted = [targets()[name] for name in dict.fromkeys(to or ["exr", "json"])]
     for target in targets().values():

@@ -58,8 +58,8 @@ _PRIOR = torch.tensor([0.0, 0.0, 1.0, 0.0, 0.5, 0.5, 0.5])
 _WEAK, _SUPPORT = torch.tensor([1e-4, 1e-4, 3e-4, 3e-4, 1e-5, 1e-5, 1e-5]), 0.1
 # ε in units of the mean; decrease of the objective, as a share, at which a texel is done; steps.
 _DARK, _DONE, _STEPS = 0.3, 1e-4, 20
-# Roughness of the starts, of which the best dielectric and the best metal are minimized, and of a narrow lobe,
-# which only the second pairs resolve.
+# Roughness of the starts, of which the best dielectric and the best metal are minimized, and of a narrow
+# lobe, which only the second pairs resolve.
 _STARTS, _NARROW = (0.35, 0.6, 1.0), 0.2
 # Views that all texels share, and those of the highlights; lights per view of either, fewer for models that
 # read a neighborhood.

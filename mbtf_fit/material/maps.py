@@ -36,8 +36,8 @@ from mbtf_fit.ops.constants import DIELECTRIC, GLOSSY_CHANNELS, HEIGHTS, MAPS
 F64 = NDArray[np.float64]
 # Least roughness: smaller lobes are narrower than those that data are made with.
 _LEAST_ALPHA2 = 1e-4
-# Pairs of light and view whose tile means are compared, how many are evaluated at once, and at how many texels
-# along a side; most factor on the base color.
+# Pairs of light and view whose tile means are compared, how many are evaluated at once, and at how many
+# texels along a side; most factor on the base color.
 _PAIRS, _AT_ONCE, _TEXELS, _MOST_FACTOR = 512, 32, 128, 64.0
 # Steep views, lights of each, and texels along a side, whose values are compared one by one.
 _VIEWS, _LIGHTS, _COMPARED_TEXELS = 16, 4, 64

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from mbtf_core.errors import InputError
-from mbtf_fit.material.storage import read_tensors, write_tensors
+from mbtf_fit.material.format import read_tensors, write_tensors
 from mbtf_fit.training.loop import TrainingProgress
 from mbtf_fit.training.trainer import Trainer
 

@@ -24,7 +24,7 @@ from mbtf_fit.evaluation import evaluate_splits
 from mbtf_fit.material.decoder import Decoder
 from mbtf_fit.material.format import DESCRIPTION_NAME
 from mbtf_fit.material.material import Material, export
-from mbtf_fit.material.transmittance_fit import evaluate_transmittance, fit_transmittance
+from mbtf_fit.material.transmittance import evaluate_transmittance, fit_transmittance
 from mbtf_fit.models.model import Model, Preparation
 from mbtf_fit.models.registry import MODELS, material_of
 from mbtf_fit.objective.noise import NoiseModel, typical_value

@@ -89,7 +89,7 @@ def test_one_export_does_not_mix_with_another(
     for words, what in (
         (["--to", "slang"], "to: ['web'] -> ['slang']"),
         ([], "to: ['web'] -> ['exr', 'json']"),
-        (["--to", "web", "--environment", str(sky)], "page.environment"),
+        (["--to", "web", "--environment", str(sky)], "environment"),
     ):
         assert run(app, ["export", str(source), *words, *out]) == 3
         message = capsys.readouterr().err

@@ -20,7 +20,6 @@ from mbtf_fit.material.material import Material
 from mbtf_fit.material.reference_values import (
     direction_pairs,
     followed,
-    highlight_pairs,
     steep_views,
     tile_means,
 )
@@ -185,25 +184,13 @@ def test_values_are_divided_by_what_the_view_meets(tmp_path: Path) -> None:
     np.testing.assert_allclose(maps.evaluate(*direction_pairs(8, 0.5))[0], 0.25 * value, rtol=0.01)
 
 
-@pytest.mark.parametrize(
-    "model", ["neumip", "neumip-baseline", "hierarchical", "rainer2019", "rainer2020", "neumip+"]
-)
+@pytest.mark.parametrize("model", ["neumip", "hierarchical", "rainer2020", "neumip+"])
 def test_every_model_has_maps(tmp_path: Path, model: str) -> None:
     material = write_material(tmp_path, model=model, finest=2, brightness=0.1)
     maps = scale_color(material, fitted(material, 2))
     for values in (maps.base_color, maps.roughness, maps.metallic, maps.opacity):
         assert ((values >= 0) & (values <= 1)).all()
     assert np.isfinite(maps.slopes).all()
-
-
-def test_a_constant_network_is_a_lambert_plane(tmp_path: Path) -> None:
-    value = (0.05, 0.1, 0.25)
-    material = write_material(tmp_path, constant=value, aspect=0.5)
-    maps = scale_color(material, fitted(material, 1))
-    assert maps.roughness.shape == (1, 2)
-    np.testing.assert_allclose(maps.base_color[0, 1], math.pi * np.array(value), rtol=2e-3)
-    np.testing.assert_allclose(maps.normals[..., 2], 1, atol=1e-4)
-    assert maps.dielectric == 0
 
 
 def test_views_follow_the_offset(tmp_path: Path) -> None:
@@ -217,20 +204,6 @@ def test_views_follow_the_offset(tmp_path: Path) -> None:
         found = at[:, k] + material.offset(at[:, k], np.tile(view, (20, 1))) / size
         np.testing.assert_allclose(found, seen, atol=2e-3)
     assert np.abs(at - u[:, None]).max() > 0.005
-
-
-def test_highlights_are_at_the_normals() -> None:
-    slopes = np.array([[0.0, 0.0], [0.4, -0.2]], np.float32)
-    views = steep_views(64)
-    light = highlight_pairs(slopes, views, 0.1)
-    half = light + views
-    half /= np.linalg.norm(half, axis=-1, keepdims=True)
-    normals = np.concatenate([-slopes, np.ones((2, 1))], 1)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    angle = np.degrees(np.arccos(np.clip((half * normals[:, None]).sum(-1), -1, 1)))
-    assert (angle < 3).mean(1).min() > 0.25
-    assert angle.max() < 35
-    assert light[..., 2].min() >= 0.1 - 1e-9
 
 
 def test_values_of_the_maps_are_those_of_the_specification(tmp_path: Path) -> None:

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from support.known_surfaces import geometry
 from support.plugin_materials import write_material
 
@@ -19,7 +18,7 @@ from mbtf_core.errors import UsageError
 from mbtf_fit import Material
 from mbtf_fit.material.maps import Maps, knows_surface, make_maps, scale_color, surface_maps
 from mbtf_fit.material.reference_values import direction_pairs, tile_means
-from mbtf_fit.surface.known import KnownSurface, ggx
+from mbtf_fit.surface.known import KnownSurface
 
 
 def known(folder: Path, **options: object) -> Material:
@@ -85,27 +84,6 @@ def one_texel(**changes: object) -> Maps:
         np.zeros((2, 2)),
     )
     return replace(flat, **changes)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("metallic", [0.0, 0.6, 1.0])
-def test_values_are_those_of_the_lobe(metallic: float) -> None:
-    """Against the GGX of the known surface; the dielectric's diffuse part is what Fresnel's term leaves."""
-    light, view = from_angles(50.0, 20.0), from_angles(35.0, 160.0)
-    slopes, base = np.array([[[0.3, -0.2]]]), np.array([0.8, 0.5, 0.2])
-    maps = one_texel(slopes=slopes, metallic=np.full((1, 1), metallic), base_color=base[None, None])
-    n = maps.normals[0, 0]
-    i, o, normal = (torch.from_numpy(np.asarray(x, np.float64))[None] for x in (light, view, n))
-    cosines = [torch.tensor([[float(n @ w)]], dtype=torch.float64) for w in (light, view)]
-    alpha2 = torch.tensor([[0.5**4]], dtype=torch.float64)
-
-    def lobe(f0: np.ndarray) -> np.ndarray:
-        return ggx(torch.from_numpy(f0)[None], alpha2, normal, *cosines, i, o)[0].numpy()
-
-    half = (light + view) / np.linalg.norm(light + view)
-    fresnel = 0.04 + 0.96 * (1 - view @ half) ** 5
-    dielectric = lobe(np.full(3, 0.04)) + (1 - fresnel) * base / math.pi
-    expected = ((1 - metallic) * dielectric + metallic * lobe(base)) * (n @ light) / light[2]
-    np.testing.assert_allclose(maps.evaluate(light[None], view[None])[0, 0], expected, rtol=1e-10)
 
 
 def test_surfaces_that_face_away_are_black() -> None:

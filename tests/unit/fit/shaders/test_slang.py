@@ -224,8 +224,8 @@ def test_what_cannot_be_written_is_refused(
     out = ["-o", str(tmp_path / "out")]
     for words, code, what in (
         (["patches", "--to", "slang"], 3, "operation 'neighborhood'"),
-        (["good", "--shader-target", "hlsl"], 2, "--shader-target: is an option of shaders"),
-        (["good", "--to", "slang", "--to", "web", "--half"], 2, "--half: has no meaning for pages"),
+        (["good", "--shader-target", "hlsl"], 2, "--shader-target: is an option of slang"),
+        (["good", "--to", "slang", "--to", "web", "--half"], 2, "--half: has no meaning for web"),
     ):
         assert run(app, ["export", str(tmp_path / words[0]), *words[1:], *out]) == code
         assert what in capsys.readouterr().err
