@@ -227,15 +227,6 @@ def test_data_that_were_read_before_give_the_same_fit(fitted: FitResult, data: P
     assert other.errors["held_out_queries"]["unexplained"]["n"] == 7
 
 
-def test_the_same_fit_again_is_left_as_it_is(data: Path, tmp_path: Path) -> None:
-    out = tmp_path / "m"
-    fit(config(3), data, out)
-    before = (out / "weights.safetensors").stat().st_mtime_ns
-    again = fit(config(3), data, out)
-    assert again.resumed
-    assert (out / "weights.safetensors").stat().st_mtime_ns == before
-
-
 def test_another_configuration_is_refused_with_its_differences(data: Path, tmp_path: Path) -> None:
     out = tmp_path / "m"
     fit(config(3), data, out)
