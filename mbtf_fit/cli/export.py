@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import asdict, make_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Optional, TypeVar
 
 from cyclopts import Parameter
 
@@ -50,9 +50,10 @@ def flags_of(*kinds: type[Settings]) -> Callable[[type[F]], type[F]]:
     fields: list[tuple[str, Any, None]] = []
     for kind in kinds:
         for key, field in kind.model_fields.items():
-            text = f"{field.description or ''}."
-            shown = Parameter(help=text[:1].upper() + text[1:], group=kind.__name__.removesuffix("Options"))
-            fields.append((key, Annotated[field.annotation, shown], None))
+            text, group = f"{field.description or ''}.", kind.__name__.removesuffix("Options")
+            default = False if field.default is None else str(field.default)
+            shown = Parameter(help=text[:1].upper() + text[1:], group=group, show_default=default)
+            fields.append((key, Annotated[Optional[field.annotation], shown], None))  # noqa: UP045
 
     def decorate(cls: type[F]) -> type[F]:
         names = {"__module__": cls.__module__, "__doc__": cls.__doc__}
