@@ -79,8 +79,3 @@ def targets() -> dict[str, ExportTarget]:
     )
     found = (module.TARGET for module in modules if hasattr(module, "TARGET"))
     return {target.name: target for target in found}
-
-
-def sections() -> set[type[Settings]]:
-    """The sections of options of all targets."""
-    return {target.options for target in targets().values() if target.options is not None}
