@@ -25,24 +25,18 @@ F64 = NDArray[np.float64]
 
 
 FILTERED = {"raw": True, "band_attenuation": True, "footprint_filtered": True}
+# Every model's operations are read in test_read_material.py; these differ in what the files hold.
 CASES: dict[str, dict[str, Any]] = {
-    "baseline": {"model": "neumip-baseline"},
     "calibrated": {},
     "with holes": {},
-    "neumip": {},
-    "concatenated": net(blending="concatenate", activation="sine", output_transform="softplus"),
     "hierarchical": {"model": "hierarchical"},
     "eleven channels": {
         "model": "hierarchical",
         **net(decoder="mlp", channels=11, encoding={"raw": True, "direction_xyz": True}),
     },
+    "neumip": {},
     "learned heights": {"model": "neumip+", "glossy": False},
     "calibrated relief": {"model": "relief"},
-    "relief, four places": {
-        "model": "relief",
-        "glossy": False,
-        **net(relief={"places": 4}, encoding={"half_vector": False}),
-    },
     "encoded": net(encoding={"position": 4, "direction": 2, "direction_pi": False, **FILTERED}),
 }
 
