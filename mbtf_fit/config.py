@@ -11,26 +11,23 @@ from pydantic import Field, model_validator
 
 from mbtf_core.app.options import Flag, Quality
 from mbtf_core.config.settings import Settings, deep_merge, leaves
-from mbtf_core.data.lattice import Lattice
 from mbtf_core.files.atomic import data_sha256
 from mbtf_core.units import parse_duration
-from mbtf_fit.models.model import SPECIAL
-from mbtf_fit.models.registry import MODELS, defaults_of, with_option
+from mbtf_fit.models import NAMES
 from mbtf_fit.sections import DataSection, HeldOutSection, NetworkSection, TrainingSection
 
 if TYPE_CHECKING:
+    from mbtf_core.data.lattice import Lattice
     from mbtf_fit.pytorch.material import NeuralMaterial
 
     ModelName = str
 else:
-    ModelName = Literal[tuple(MODELS)]
+    ModelName = Literal[NAMES]
 
 # The best of them where the data set has a geometry.
 DEFAULT_MODEL = "relief"
 # The best of them for fibers, which have none.
 FIBER_MODEL = "neumip+"
-# Models whose network materials can share; the last one needs no geometry.
-DECODER_MODELS = sorted(with_option("decoder"), reverse=True)
 # Defaults of fits that share a network: each batch is of one material, so that the gradients of the network
 # scatter more (docs/results/models.md, "Shared networks").
 SHARED_PRESET: dict[str, Any] = {"training": {"batch": 1 << 14, "learning_rate": 0.01}}
@@ -74,6 +71,8 @@ class FitConfig(Settings):
         """Fill unset keys with the model's defaults."""
         if not isinstance(data, Mapping):
             return data
+        from mbtf_fit.models.registry import defaults_of
+
         name = data.get("model", cls.model_fields["model"].default)
         preset = defaults_of(name) if isinstance(name, str) else {}
         training = data.get("training")
@@ -83,6 +82,9 @@ class FitConfig(Settings):
 
     @model_validator(mode="after")
     def _consistent(self) -> FitConfig:
+        from mbtf_fit.models.model import SPECIAL
+        from mbtf_fit.models.registry import MODELS, defaults_of, with_option
+
         mine = dict(leaves(self.model_dump()))
         usual = dict(leaves(deep_merge(_GENERAL, defaults_of(self.model))))
         for key in SPECIAL:
@@ -128,6 +130,13 @@ _GENERAL = {
     "network": NetworkSection().model_dump(),
     "training": TrainingSection().model_dump(),
 }
+
+
+def decoder_models() -> list[str]:
+    """Models whose network materials can share; the last one needs no geometry."""
+    from mbtf_fit.models.registry import with_option
+
+    return sorted(with_option("decoder"), reverse=True)
 
 
 def build_model(name: str, lattice: Lattice, **network: Any) -> NeuralMaterial:

@@ -27,7 +27,7 @@ from mbtf_core.stats import (
 from mbtf_fit.data.loader import MAX_HELD_OUT_OF_IMAGES, SAMPLE, Partition, load_split, load_training
 from mbtf_fit.data.queries import ShardQueries, mean_value
 from mbtf_fit.formatting import visibility
-from mbtf_fit.material.transmittance_fit import evaluate_transmittance, has_transmittance
+from mbtf_fit.material.transmittance import evaluate_transmittance, has_transmittance
 
 if TYPE_CHECKING:
     from mbtf_fit.material.material import Material

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from mbtf_core.color import describe_exposure, white_of
 from mbtf_core.units import clock
 
 SPLIT_NAMES = {
@@ -31,6 +30,8 @@ _SIGNIFICANT = 2.0
 def visibility(split: Mapping[str, Any]) -> tuple[str, str | None]:
     """PSNR as text, and a word of :data:`VISIBILITY`, of the errors of a split; where the error is below its
     own uncertainty, lower bounds. None without an error."""
+    from mbtf_core.color import white_of
+
     mse, error = split["mse"]["value"], split["mse"]["error"]
     if mse is None or error is None:
         return "PSNR unknown", None
@@ -58,6 +59,8 @@ def report_errors(
 ) -> list[str]:
     """Three lines, and advice: unexplained variance (where defined) and PSNR of the first split, and those of
     other splits; if `verbose` a table, too. `foreign`: the errors are of the data of another material."""
+    from mbtf_core.color import describe_exposure
+
     first = headline(errors)
     split, of = errors[first], f"of {errors[first]['n']} {SPLIT_NAMES[first]}"
     lines = []

@@ -1,17 +1,27 @@
-"""Command line of ``mbtf-fit``."""
+"""Command line of ``mbtf-fit``. A command is imported when it runs; its help is read from its file."""
 
 from __future__ import annotations
 
+import ast
+from pathlib import Path
+
 from mbtf_core.app.console import new_app
-from mbtf_fit.cli.evaluate import evaluate
-from mbtf_fit.cli.export import export_material
 from mbtf_fit.cli.fit import fit
-from mbtf_fit.cli.info import info
-from mbtf_fit.cli.preview import preview
-from mbtf_fit.cli.view import view
+
+_COMMANDS = {
+    **{name: name for name in ("evaluate", "preview", "view", "info")},
+    "export": "export_material",
+}
+
+
+def _description(module: str, function: str) -> str:
+    """What the docstring of a function says before its parameters."""
+    tree = ast.parse(Path(__file__).with_name(f"{module}.py").read_text())
+    nodes = (n for n in tree.body if isinstance(n, ast.FunctionDef) and n.name == function)
+    return (ast.get_docstring(next(nodes)) or "").partition("\n\nParameters\n")[0]
+
 
 app = new_app("mbtf-fit", "Fit neural materials to multi-resolution BTF (MBTF) data.")
 app.default(fit)
-for command in (evaluate, preview, view, info):
-    app.command(command)
-app.command(export_material, name="export")
+for name, function in _COMMANDS.items():
+    app.command(f"mbtf_fit.cli.{name}:{function}", name=name, help=_description(name, function))

@@ -26,8 +26,8 @@ from mbtf_core.app.options import (
 from mbtf_core.errors import InputError, PartialError, UsageError
 from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.units import expectation, format_duration
-from mbtf_fit.cli.page_options import Live, live_view
-from mbtf_fit.config import DECODER_MODELS, DEFAULT_MODEL, FIBER_MODEL, FitConfig, ModelName
+from mbtf_fit.cli.live import Live, live_view
+from mbtf_fit.config import DEFAULT_MODEL, FIBER_MODEL, FitConfig, ModelName, decoder_models
 from mbtf_fit.formatting import describe_fit, fits_table
 
 if TYPE_CHECKING:
@@ -225,7 +225,7 @@ def _model_for(shards: Sequence[Path | DataFolder]) -> ModelName:
         known = True
     if known:
         return DEFAULT_MODEL
-    return FIBER_MODEL if len(shards) == 1 else DECODER_MODELS[-1]
+    return FIBER_MODEL if len(shards) == 1 else decoder_models()[-1]
 
 
 def _fit_many(

@@ -7,7 +7,6 @@ from pathlib import Path
 from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.options import Options, Output, Overwrite, PathText, Switch, options_from
 from mbtf_core.errors import UsageError
-from mbtf_core.files.folders import owned
 from mbtf_fit.preview.config import MaterialPreviewConfig
 
 
@@ -38,6 +37,7 @@ def preview(
     sheet_only
         Draw no turntable.
     """
+    from mbtf_core.files.folders import owned
     from mbtf_fit.preview.draw import draw
 
     if material is None and options.config is None:

@@ -7,14 +7,20 @@ from pathlib import Path
 
 from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.run.signals import served_until_interruption
-from mbtf_fit.cli.page_options import PAGE_OPTIONS, PageOptions
+from mbtf_fit.cli.export import SectionFlags, flags_of
+from mbtf_fit.export.web import PageOptions, make_page
+
+
+@flags_of(PageOptions)
+class PageFlags(SectionFlags):
+    """What the page shows besides the material."""
 
 
 def view(
     material: Path,
     /,
     *,
-    options: PageOptions = PAGE_OPTIONS,
+    flags: PageFlags = PageFlags(),  # noqa: B008
     port: int = 0,
     console: Console = CONSOLE,
 ) -> None:
@@ -33,7 +39,7 @@ def view(
     """
     from mbtf_fit.viewer.server import PageServer
 
-    html, precision = options.page(material)
+    html, precision = make_page(material, flags.section(PageOptions))
     server = PageServer(html, port)
     console.note(precision)
     with served_until_interruption():

@@ -10,20 +10,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import BaseModel, Field
+from pydantic import Field
 
-from mbtf_core.config.settings import build, check_document, check_schema, leaves
+from mbtf_core.config.settings import build, leaves
 from mbtf_core.errors import InputError
-from mbtf_core.files.atomic import read_json, write_json
+from mbtf_core.files.atomic import write_json
 from mbtf_core.paths import suggest_path
-from mbtf_fit.config import DECODER_MODELS, FitConfig
+from mbtf_fit.config import FitConfig, decoder_models
 from mbtf_fit.material.format import (
     DESCRIPTION_NAME,
     WEIGHTS_NAME,
-    check_digest,
+    Described,
+    read_described,
     read_description,
+    read_tensors,
+    write_tensors,
 )
-from mbtf_fit.material.storage import read_tensors, write_tensors
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -37,15 +39,9 @@ DECODER_NAME = "decoder.json"
 DECODER_FOLDER = "decoder"
 
 
-class _File(BaseModel):
-    sha256: str
-
-
-class _Description(BaseModel):
+class _Description(Described):
     """Keys of ``decoder.json`` that readers require."""
 
-    weights: _File
-    config: dict[str, Any]
     materials: Annotated[list[str], Field(min_length=1)]
 
 
@@ -92,12 +88,7 @@ class Decoder:
         found = next((place for place in places if (place / DECODER_NAME).is_file()), None)
         if found is not None:
             path = found / DECODER_NAME
-            description = read_json(path)
-            if description.get("format") != FORMAT_NAME:
-                raise InputError(f"does not describe a shared network ({FORMAT_NAME})", where=path)
-            check_schema(description, SCHEMA_VERSION, path, "fit it again with this version of mbtf-fit")
-            check_document(_Description, description, path, "fit it again, or copy it again")
-            check_digest(found / WEIGHTS_NAME, description["weights"], DECODER_NAME)
+            description, _ = read_described(path, FORMAT_NAME, SCHEMA_VERSION, _Description)
         elif (folder / DESCRIPTION_NAME).is_file():
             found, path = folder, folder / DESCRIPTION_NAME
             description, _ = read_description(folder)
@@ -108,11 +99,10 @@ class Decoder:
                 hint="make both with: mbtf-fit --many SHARDS SHARDS --shared-decoder -o FOLDER",
             )
         config = build(FitConfig, description["config"], source=str(path))
-        if config.model not in DECODER_MODELS:
-            raise InputError(
-                f"has the network of {config.model}; only those of {' and '.join(DECODER_MODELS)} are shared",
-                where=found,
-            )
+        shared = decoder_models()
+        if config.model not in shared:
+            what = f"has the network of {config.model}; only those of {' and '.join(shared)} are shared"
+            raise InputError(what, where=found)
         return cls(found, description["weights"]["sha256"], config)
 
     def options(self) -> dict[str, Any]:

@@ -1,13 +1,14 @@
-"""Format of material folders: names, schema, conventions, and checks of a reader.
+"""Format of material folders: names, schema, conventions, files of tensors, and checks of a reader.
 
 Does not import PyTorch, so that renderers can read a material without it.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,9 +16,12 @@ from pydantic import BaseModel, Field
 
 from mbtf_core.config.settings import check_document, check_schema
 from mbtf_core.data.lattice import MAX_LEVEL, Lattice
-from mbtf_core.errors import InputError
-from mbtf_core.files.atomic import file_sha256, read_json
-from mbtf_core.paths import suggest_path
+from mbtf_core.errors import InputError, reason
+from mbtf_core.files.atomic import Stored, file_sha256, read_json, write_chunks
+from mbtf_core.paths import refuse_special, suggest_path
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 FORMAT_NAME = "mbtf-material"
 SCHEMA_VERSION = 3
@@ -29,12 +33,21 @@ DEFAULT_MIN_COS = 0.1
 CONFORMANCE_COUNT = 256
 CONFORMANCE = {"u": (2,), "sigma": (), "omega_i": (3,), "omega_o": (3,), "rgb": (3,)}
 QUERY = tuple(CONFORMANCE)[:-1]
+# Where the header of a file of tensors has JSON data.
+_KEY = "mbtf"
 # Hint for a damaged material.
 AGAIN = "copy the folder again, or fit again"
 
 
 class _File(BaseModel):
     sha256: str
+
+
+class Described(BaseModel):
+    """Keys that ``material.json`` and ``decoder.json`` share, of those that readers require."""
+
+    weights: _File
+    config: dict[str, Any]
 
 
 class _Weights(_File):
@@ -67,11 +80,10 @@ class _Data(BaseModel):
     min_cos: Annotated[float, Field(strict=True, gt=0, lt=1)] = DEFAULT_MIN_COS
 
 
-class _Description(BaseModel):
+class _Description(Described):
     """Keys of ``material.json`` that readers require; it has more."""
 
     model: str
-    config: dict[str, Any]
     operations: list[dict[str, Any]]
     weights: _Weights
     levels: _Levels
@@ -98,12 +110,24 @@ def read_description(folder: Path) -> tuple[dict[str, Any], Path]:
             where=folder,
             hint="make a material with: mbtf-fit SHARDS -o FOLDER",
         )
+    return read_described(path, FORMAT_NAME, SCHEMA_VERSION, _Description)
+
+
+def read_described(
+    path: Path, format_name: str, version: int, model: type[Described]
+) -> tuple[dict[str, Any], Path]:
+    """Content of a description, validated, and the path of the weights beside it, with their digest verified.
+
+    Raises
+    ------
+    InputError : corrupt, or of another format or schema
+    """
     description = read_json(path, AGAIN)
-    if description.get("format") != FORMAT_NAME:
-        raise InputError(f"does not describe a material ({FORMAT_NAME})", where=path, hint=AGAIN)
-    check_schema(description, SCHEMA_VERSION, path, "fit it again with this version of mbtf-fit")
-    check_document(_Description, description, path, AGAIN)
-    return description, check_digest(folder / WEIGHTS_NAME, description["weights"])
+    if description.get("format") != format_name:
+        raise InputError(f"is not of the format {format_name}", where=path, hint=AGAIN)
+    check_schema(description, version, path, "fit it again with this version of mbtf-fit")
+    check_document(model, description, path, AGAIN)
+    return description, check_digest(path.with_name(WEIGHTS_NAME), description["weights"], path.name)
 
 
 def check_digest(path: Path, stated: Mapping[str, Any], by: str = DESCRIPTION_NAME) -> Path:
@@ -147,6 +171,39 @@ def check_conformance(
         if out[name].shape != (description["conformance"]["count"], *width):
             raise InputError(f"its tensor '{tensor}' has the shape {out[name].shape}", where=weights)
     return out
+
+
+def write_tensors(path: Path, tensors: dict[str, Tensor], data: dict[str, Any]) -> Stored:
+    """Write tensors, and JSON data in the file's header.
+
+    Raises
+    ------
+    PartialError : the disk is full or the folder cannot be written
+    """
+    from safetensors.torch import save
+
+    plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    return write_chunks(path, [save(plain, metadata={_KEY: json.dumps(data)})])
+
+
+def read_tensors(path: Path, framework: str = "pt") -> tuple[dict[str, Any], dict[str, Any]]:
+    """Read a safetensors file: (PyTorch tensors, or NumPy arrays of the framework ``np``; data).
+
+    Raises
+    ------
+    InputError : missing or corrupt
+    """
+    from safetensors import SafetensorError, safe_open
+
+    refuse_special(path)
+    try:
+        with safe_open(path, framework=framework) as file:
+            data = json.loads((file.metadata() or {}).get(_KEY, "{}"))
+            return {name: file.get_tensor(name) for name in file.keys()}, data  # noqa: SIM118
+    except FileNotFoundError:
+        raise InputError("no such file", where=path) from None
+    except (SafetensorError, OSError, TypeError, ValueError, RecursionError) as error:
+        raise InputError(f"cannot be read as tensors ({reason(error)})", where=path) from None
 
 
 MATERIAL_CONVENTIONS = {

@@ -7,24 +7,32 @@ polynomial in the view's projection onto the plane,
     T(u, σ, ω_o) = clamp(c_0 + c_1 x + c_2 y + c_3 x² + c_4 x y + c_5 y², 0, 1),  (x, y) = ω_o.xy
 
 with bilinear interpolation in a level and linear interpolation between levels, like the features.
-:mod:`mbtf_fit.material.transmittance_fit` fits them.
+
+The coefficients of a level are the least-squares fit to the queries around each texel, in closed form. Ridge
+regression regularizes them towards the next coarser level where queries are few.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mbtf_core.data.dataset import Dataset, Shard
 from mbtf_core.data.lattice import Lattice, level_of_sigma
+from mbtf_core.data.shard_files import Arrays, check_values
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import Stored, write_chunks
-from mbtf_fit.material.format import check_digest, lattice_of
-from mbtf_fit.material.storage import read_tensors
+from mbtf_core.stats import Estimate, mean_estimate
+from mbtf_fit.material.format import check_digest, lattice_of, read_tensors
+
+if TYPE_CHECKING:
+    from mbtf_fit.data.streaming import Selection
 
 TRANSMITTANCE_NAME = "transmittance.safetensors"
 COEFFICIENTS = 6
@@ -35,6 +43,17 @@ FORMULA = (
     "neural offset), blended by level like the features; a view from below has the transmittance of the "
     "opposite view from above; values are premultiplied: reflected light only, without transmitted light"
 )
+
+# Weight of the coarser level in queries; at the coarsest level, that of the coefficient 0.
+_PRIOR, _FIRST_PRIOR = 4.0, 1e-3
+# Trailing axes of the arrays that are read.
+_TRAILING = {"u": (2,), "sigma": (), "omega_o": (3,), "transmittance": (), "spp": ()}
+# Queries and texels per block; most queries of a split that are evaluated.
+_BLOCK, _TEXELS, _EVALUATED = 1 << 16, 1 << 16, 1 << 18
+# Training queries per texel of the finest level, at most; three times as many lower the error by 3 %.
+_PER_TEXEL = 128
+# Upper triangle of a texel's matrix.
+_FIRST, _SECOND = np.triu_indices(COEFFICIENTS)
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -115,3 +134,157 @@ def read_transmittance(folder: Path, description: Mapping[str, Any]) -> Transmit
             raise InputError("does not hold the levels that material.json describes", where=path)
         levels.append(np.asarray(array, np.float32))
     return Transmittance(lattice, levels)
+
+
+def has_transmittance(data: Dataset) -> bool:
+    """Whether a data set has a transmittance."""
+    return "transmittance" in data.manifest.get("arrays", {})
+
+
+def _blocks(shard: Shard, chosen: NDArray[np.bool_] | None = None) -> Iterator[Arrays]:
+    """Blocks of arrays (n, ...) of the chosen rows of a shard, or of all."""
+    arrays = shard.map(_TRAILING)
+    check_values(arrays, shard.where)
+    count = len(arrays["sigma"])
+    rows = np.arange(count) if chosen is None else np.flatnonzero(chosen)
+    step = max(1, _BLOCK * max(count, 1) // max(arrays["sigma"].size, 1))
+    for start in range(0, len(rows), step):
+        part = rows[start : start + step]
+        yield {name: arrays[name][part].reshape(-1, *shape) for name, shape in _TRAILING.items()}
+
+
+class _Sums:
+    """Normal equations of a level's texels: upper triangles of their matrices, then right-hand sides."""
+
+    def __init__(self, lattice: Lattice, level: int) -> None:
+        self.lattice, self.level = lattice, level
+        self.sums = np.zeros((lattice.texels(level), len(_FIRST) + COEFFICIENTS))
+
+    def add(self, u: F32, level: F64, products: F64) -> None:
+        """Add queries at `u` (n, 2), fractional levels (n,), with their terms (n, 27) of the sums."""
+        import torch
+
+        from mbtf_fit.surface.lookup import add_up
+
+        near = np.flatnonzero(np.abs(level - self.level) < 1.0)
+        texel, share = corners(u[near], self.lattice.shape(self.level))
+        share *= (1.0 - np.abs(level[near] - self.level))[:, None]
+        # Most texels of a fine level have no query here.
+        found = np.zeros(len(self.sums), bool)
+        found[texel] = True
+        index = (np.cumsum(found) - 1)[texel]
+        places, shares, values = map(torch.from_numpy, (index, share, products[near]))
+        self.sums[found] += add_up(places, shares, values, int(found.sum())).numpy()
+
+    def solve(self, levels: list[F32]) -> None:
+        """Solve for the texels of the level and write them to `levels`, whose coarser level is complete."""
+        out = levels[self.level].reshape(-1, COEFFICIENTS)
+        ridge = _PRIOR if self.level else _FIRST_PRIOR
+        for start in range(0, len(out), _TEXELS):
+            part = slice(start, min(start + _TEXELS, len(out)))
+            prior = _from_coarser(levels, self.lattice, self.level, np.arange(part.start, part.stop))
+            matrix = np.empty((len(prior), COEFFICIENTS, COEFFICIENTS))
+            for k, (a, b) in enumerate(zip(_FIRST, _SECOND, strict=True)):
+                matrix[:, a, b] = matrix[:, b, a] = self.sums[part, k]
+            matrix += ridge * np.eye(COEFFICIENTS)
+            right = self.sums[part, len(_FIRST) :] + ridge * prior
+            out[part] = np.linalg.solve(matrix, right[..., None])[..., 0]
+
+
+def _from_coarser(levels: list[F32], lattice: Lattice, level: int, texel: NDArray[np.int64]) -> F64:
+    """Coefficients (n, 6) of the level before, at texels (n,) of a level; zero for the first."""
+    if level == 0:
+        return np.zeros((len(texel), COEFFICIENTS))
+    rows, columns = lattice.shape(level)
+    row, column = np.divmod(texel, columns)
+    u = np.stack([(column + 0.5) / columns, 1.0 - (row + 0.5) / rows], -1)
+    at, share = corners(u, lattice.shape(level - 1))
+    out: F64 = (levels[level - 1].reshape(-1, COEFFICIENTS)[at] * share[..., None]).sum(1)
+    return out
+
+
+def _first(selection: Selection, count: float) -> Iterator[Arrays]:
+    """Blocks of the first selected rows, until they are as many as `count`; rows are in random order."""
+    for path, chosen in selection.masks():
+        for block in _blocks(path, chosen):
+            yield block
+            count -= len(block["sigma"])
+            if count <= 0:
+                return
+
+
+def fit_transmittance(data: Dataset, selection: Selection) -> Transmittance | None:
+    """Fit the transmittance to the training queries, the rows of `selection`; None for an opaque material."""
+    if not has_transmittance(data):
+        return None
+    lattice = data.lattice
+    levels = [np.zeros((*lattice.shape(s), COEFFICIENTS), np.float32) for s in range(lattice.finest + 1)]
+    sums = [_Sums(lattice, s) for s in range(lattice.finest + 1)]
+    # Rows of slices are texels, of which none may be left out.
+    most = math.inf if data.layout == "slices" else _PER_TEXEL * lattice.texels(lattice.finest)
+    for block in _first(selection, most):
+        level = np.clip(level_of_sigma(block["sigma"].astype(np.float64)), 0.0, lattice.finest)
+        terms = basis(block["omega_o"])
+        right = terms * block["transmittance"].astype(np.float64)[:, None]
+        products = np.concatenate([terms[:, _FIRST] * terms[:, _SECOND], right], 1)
+        for part in sums:
+            part.add(block["u"], level, products)
+    for part in sums:
+        part.solve(levels)
+    return Transmittance(lattice, levels)
+
+
+@dataclass(frozen=True)
+class TransmittanceError:
+    """Error of a transmittance model on queries.
+
+    Attributes
+    ----------
+    n : queries
+    mse : mean squared difference from the data, including their noise: each query has a single estimate
+    noise : upper bound of the noise in it, ``t (1 - t) / (paths - 1)``, the variance of independent paths;
+        stratified paths have less
+    variance : of the data's transmittance, noise included
+    """
+
+    n: int
+    mse: Estimate
+    noise: Estimate
+    variance: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        estimates = {"mse": self.mse.as_dict(), "noise": self.noise.as_dict()}
+        return {"n": self.n, **estimates, "variance": self.variance}
+
+
+def evaluate_transmittance(
+    model: Transmittance, data: Dataset, selection: Selection
+) -> dict[str, TransmittanceError]:
+    """Errors on ``test``, ``held_out`` and ``training`` queries: the first 262 144 of each; a split without
+    queries is left out."""
+    sets: dict[str, Iterator[Arrays]] = {}
+    if "test" in data.splits:
+        sets["test"] = (block for shard in data.shards("test") for block in _blocks(shard))
+    sets["held_out"] = (block for shard, chosen in selection.masks() for block in _blocks(shard, ~chosen))
+    sets["training"] = (block for shard, chosen in selection.masks() for block in _blocks(shard, chosen))
+    found = {name: _error(model, blocks) for name, blocks in sets.items()}
+    return {name: error for name, error in found.items() if error is not None}
+
+
+def _error(model: Transmittance, blocks: Iterator[Arrays]) -> TransmittanceError | None:
+    squares, noises, values = [], [], []
+    left = _EVALUATED
+    for block in blocks:
+        part = {name: array[:left] for name, array in block.items()}
+        t = part["transmittance"].astype(np.float64)
+        squares.append((model.evaluate(part["u"], part["sigma"], part["omega_o"]) - t) ** 2)
+        noises.append(t * (1.0 - t) / np.maximum(part["spp"].astype(np.float64) - 1.0, 1.0))
+        values.append(t)
+        left -= len(t)
+        if left <= 0:
+            break
+    if not values:
+        return None
+    square, noise, value = (np.concatenate(parts) for parts in (squares, noises, values))
+    return TransmittanceError(len(value), mean_estimate(square), mean_estimate(noise), float(value.var()))

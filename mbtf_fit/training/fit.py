@@ -27,7 +27,7 @@ from mbtf_fit.formatting import format_estimate
 from mbtf_fit.material.decoder import DECODER_NAME, Decoder, write_decoder
 from mbtf_fit.material.format import DESCRIPTION_NAME
 from mbtf_fit.material.material import Material, export
-from mbtf_fit.material.transmittance_fit import evaluate_transmittance, fit_transmittance
+from mbtf_fit.material.transmittance import evaluate_transmittance, fit_transmittance
 from mbtf_fit.models.registry import MODELS
 from mbtf_fit.training.fit_folder import (
     append_history,

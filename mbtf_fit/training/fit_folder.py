@@ -12,7 +12,6 @@ from mbtf_core.files.atomic import data_sha256, write_text
 from mbtf_core.files.folders import OutputFolder, OutputKind
 from mbtf_fit.config import FitConfig
 from mbtf_fit.material.decoder import DECODER_NAME, Decoder
-from mbtf_fit.material.export import LAYERS_NAME, TEXTURES_NAME
 from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME, read_description
 from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME
 from mbtf_fit.training.loop import CHECKPOINT_NAME
@@ -22,7 +21,7 @@ FIT = OutputKind("fit.json", "mbtf-fit", 3, "a fit")
 # The description goes first: without it nothing counts as a finished material.
 _FILES = (
     *(DESCRIPTION_NAME, DECODER_NAME, HISTORY_NAME, CHECKPOINT_NAME),
-    *(WEIGHTS_NAME, TRANSMITTANCE_NAME, LAYERS_NAME, TEXTURES_NAME),
+    *(WEIGHTS_NAME, TRANSMITTANCE_NAME, "layers.json", "textures.exr"),
 )
 
 

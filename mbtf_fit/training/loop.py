@@ -23,7 +23,7 @@ from torch import Tensor
 
 from mbtf_core.errors import EngineError, InputError
 from mbtf_core.run.task import worker_threads
-from mbtf_fit.material.storage import read_tensors, write_tensors
+from mbtf_fit.material.format import read_tensors, write_tensors
 from mbtf_fit.objective.parallel import Workers
 from mbtf_fit.training.trainer import Trainer, TrainingProgress
 

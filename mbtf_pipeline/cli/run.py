@@ -24,7 +24,7 @@ from mbtf_core.app.options import (
 from mbtf_core.errors import InputError, MbtfError, PartialError, UsageError
 from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.units import clock
-from mbtf_fit.cli.page_options import Live, live_view
+from mbtf_fit.cli.live import Live, live_view
 
 if TYPE_CHECKING:
     from mbtf_pipeline.collection.run import CollectionResult

@@ -76,6 +76,7 @@ mbtf_fit.backends.mitsuba
 mbtf_fit.backends.shader
 mbtf_fit.preview
 mbtf_fit.viewer
+mbtf_fit.export
 mbtf_fit.cli
 mbtf_fit
 mbtf_pipeline.recipe

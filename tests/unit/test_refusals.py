@@ -32,6 +32,8 @@ CANDIDATES = ("no-such-value", "1.5.5", "-1e300", "1e300", "nan", "{no: such}")
 # Modules of configurations that the commands load when they run.
 MODULES = (
     "mbtf_core.run.workers",
+    "mbtf_fit.cli.export",
+    "mbtf_fit.cli.preview",
     "mbtf_gen.tile.fibers.cloth_file",
     "mbtf_gen.tile.maps.material_file",
     "mbtf_gen.tile.mesh_file",

@@ -20,8 +20,8 @@ from mbtf_fit.material.format import (
     check_conformance,
     lattice_of,
     read_description,
+    read_tensors,
 )
-from mbtf_fit.material.storage import read_tensors
 from mbtf_fit.material.transmittance import read_transmittance
 from mbtf_fit.ops import Operation, read_operations
 

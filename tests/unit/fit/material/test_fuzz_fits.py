@@ -18,7 +18,7 @@ from support.fuzzing import altered, damaged, examples, loads_or_refuses
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import file_sha256
 from mbtf_fit import FitConfig, Material, fit, read_history
-from mbtf_fit.material.storage import read_tensors
+from mbtf_fit.material.format import read_tensors
 
 CONFIG = FitConfig.model_validate(
     {"training": {"steps": 2, "batch": 50, "warmup": 1}, "network": {"channels": 2, "width": 4, "layers": 2}}

@@ -214,15 +214,6 @@ def test_the_history_records_the_training(fitted: FitResult) -> None:
     assert {"seconds", "loss", "unexplained", "unexplained_error", "queries_per_second"} <= set(history[-1])
 
 
-def test_the_same_fit_again_is_left_as_it_is(data: Path, tmp_path: Path) -> None:
-    out = tmp_path / "m"
-    fit(config(3), data, out)
-    before = (out / "weights.safetensors").stat().st_mtime_ns
-    again = fit(config(3), data, out)
-    assert again.resumed
-    assert (out / "weights.safetensors").stat().st_mtime_ns == before
-
-
 def test_another_configuration_is_refused_with_its_differences(data: Path, tmp_path: Path) -> None:
     out = tmp_path / "m"
     fit(config(3), data, out)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,6 @@ import pytest
 from support.fit_data import constant, random_queries, write_data
 from support.fuzzing import check_message
 from support.image_data import write_images
-from support.plugin_materials import write_material
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.lattice import Lattice
@@ -21,8 +19,13 @@ from mbtf_fit.data.loader import load_training
 from mbtf_fit.data.streaming import Selection
 from mbtf_fit.evaluation import evaluate
 from mbtf_fit.material.format import read_description
-from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME, Transmittance, read_transmittance
-from mbtf_fit.material.transmittance_fit import evaluate_transmittance, fit_transmittance
+from mbtf_fit.material.transmittance import (
+    TRANSMITTANCE_NAME,
+    Transmittance,
+    evaluate_transmittance,
+    fit_transmittance,
+    read_transmittance,
+)
 from mbtf_fit.sections import HeldOutSection
 from mbtf_fit.training.fit import fit
 
@@ -158,18 +161,6 @@ def test_errors_include_the_noise_and_its_bound(tmp_path: Path) -> None:
         few = 0.2 if error["n"] < 5000 else 0.05
         assert error["mse"]["value"] == pytest.approx(noise, rel=few)
         assert error["variance"] == pytest.approx(noise, rel=few)
-
-
-def test_a_description_that_does_not_say_which_file_is_refused(tmp_path: Path) -> None:
-    write_material(
-        tmp_path, finest=0, transmittance=Transmittance(Lattice(0), [np.zeros((1, 1, 6), np.float32)])
-    )
-    whole = json.loads((tmp_path / "material.json").read_text())
-    for holes in ({}, [], "x", {"sha256": 5}):
-        (tmp_path / "material.json").write_text(json.dumps(whole | {"transmittance": holes}))
-        with pytest.raises(InputError, match="is damaged") as caught:
-            read_transmittance(tmp_path, read_description(tmp_path)[0])
-        check_message(caught.value)
 
 
 def test_opposite_views_have_the_same_transmittance() -> None:

@@ -219,8 +219,8 @@ def test_what_cannot_be_written_is_refused(
     make("calibrated", tmp_path / "good")
     out = ["-o", str(tmp_path / "out")]
     for words, code, what in (
-        (["good", "--shader-target", "hlsl"], 2, "--shader-target: is an option of shaders"),
-        (["good", "--to", "slang", "--to", "web", "--half"], 2, "--half: has no meaning for pages"),
+        (["good", "--shader-target", "hlsl"], 2, "--shader-target: is an option of slang"),
+        (["good", "--to", "slang", "--to", "web", "--half"], 2, "--half: has no meaning for web"),
     ):
         assert run(app, ["export", str(tmp_path / words[0]), *words[1:], *out]) == code
         assert what in capsys.readouterr().err

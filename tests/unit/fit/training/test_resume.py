@@ -136,7 +136,7 @@ def test_ctrl_c_loses_no_step(shards: Path, tmp_path: Path, monkeypatch: pytest.
     with pytest.raises(KeyboardInterrupt):
         fit(budget, shards, tmp_path / "m")
     assert signal.getsignal(signal.SIGINT) == before
-    from mbtf_fit.material.storage import read_tensors
+    from mbtf_fit.material.format import read_tensors
 
     _, data = read_tensors(tmp_path / "m" / "checkpoint.safetensors")
     assert data["step"] == 7

@@ -48,7 +48,7 @@ def test_what_cannot_be_shown_is_refused(tmp_path: Path, capsys: pytest.CaptureF
     for words, code, what in (
         (["export", str(tmp_path / "patches"), "--to", "web", *out], 3, "operation 'neighborhood'"),
         (["view", str(tmp_path / "nothing")], 3, "no such"),
-        (["export", str(tmp_path / "good"), "--shape", "x.obj", *out], 2, "--shape: is an option of pages"),
+        (["export", str(tmp_path / "good"), "--shape", "x.obj", *out], 2, "--shape: is an option of web"),
         (["export", str(tmp_path / "good"), "--to", "web", "--against", "x", *out], 3, "x"),
         (["view", str(tmp_path / "good"), "--port", "99999"], 2, "--port: cannot listen at port 99999"),
     ):

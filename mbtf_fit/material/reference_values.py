@@ -1,44 +1,46 @@
-"""Values of a neural material that its maps are fitted to and compared with."""
+"""Values of a neural material that maps are fitted to and compared with, and their lights and views."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 from torch.quasirandom import SobolEngine
 
 from mbtf_core.data.lattice import sigma_of_level
 from mbtf_core.directions import from_projected_disk, normalize
+from mbtf_fit.material.format import DEFAULT_MIN_COS
 from mbtf_fit.material.material import Material
 
-F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
-# Positions of the footprint of the whole tile.
-_POSITIONS = 16
+# Positions along a side, for the footprint of the whole tile.
+_SIDE = 4
 # Tangents of the angles between half vectors and the normal, around highlights.
 _HIGHLIGHT = (0.01, 0.6)
 # Iterations of the search for a point that a view sees.
 _ITERATIONS = 4
+# Least divisor of values.
+LEAST_OPACITY = 0.05
 
 
 @contextmanager
-def one_thread_each() -> Iterator[int]:
-    """PyTorch with one thread per operation, as small ones lose time waiting. Yields the usual number."""
+def one_thread_each() -> Iterator[None]:
+    """PyTorch with one thread per operation, as small ones lose time waiting."""
     count = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        yield count
+        yield
     finally:
         torch.set_num_threads(count)
 
 
 def least_cosine(material: Material) -> float:
     """Least cosine of the directions of the material's data."""
-    return float(material.description["data"].get("min_cos", 0.1))
+    return float(material.description["data"].get("min_cos", DEFAULT_MIN_COS))
 
 
 def _sobol(dimensions: int, count: int, seed: int) -> F64:
@@ -52,9 +54,8 @@ def direction_pairs(count: int, least: float, seed: int = 0) -> tuple[F64, F64]:
     points = _sobol(4, count, seed)
     radius = np.sqrt((1.0 - least**2) * points[:, [0, 2]])
     angle = 2.0 * np.pi * points[:, [1, 3]]
-    disk = np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1)
-    omega = from_projected_disk(disk)
-    return np.asarray(omega[:, 0], np.float64), np.asarray(omega[:, 1], np.float64)
+    omega = from_projected_disk(np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1))
+    return omega[:, 0], omega[:, 1]
 
 
 def steep_views(count: int, sine: float = 0.7, seed: int = 0) -> F64:
@@ -62,12 +63,7 @@ def steep_views(count: int, sine: float = 0.7, seed: int = 0) -> F64:
 
     Maps have no parallax. Steep views show the same points of a surface, wherever its heights are.
     """
-    return inclined(direction_pairs(count, 0.0, seed)[1], sine)
-
-
-def inclined(omega: F64, factor: float) -> F64:
-    """Directions (..., 3) whose sines to the normal are scaled."""
-    return from_projected_disk(factor * omega[..., :2])
+    return from_projected_disk(sine * direction_pairs(count, 0.0, seed)[1][:, :2])
 
 
 def followed(material: Material, u: F64, views: F64) -> F64:
@@ -85,23 +81,11 @@ def followed(material: Material, u: F64, views: F64) -> F64:
     return at.reshape(n, m, 2)
 
 
-def highlight_pairs(slopes: F32, views: F64, least: float) -> F64:
-    """Lights whose half vectors with given views are close to the normals of texels.
+def highlight_pairs(slopes: F64, views: F64, least: float) -> F64:
+    """Lights (n, k, 3) whose half vectors with views (k, 3) are close to the normals of slopes (n, 2).
 
     The half vectors' angles to the normal are log-uniform in their tangent, so that some are within the
-    highlight of every roughness. Lights below the least cosine are raised to it.
-
-    Parameters
-    ----------
-    slopes : (n, 2) array
-        Slopes of the normals.
-    views : (k, 3) array
-    least : float
-        Least cosine of the lights.
-
-    Returns
-    -------
-    (n, k, 3) array
+    highlight of every roughness. Lights whose cosine is below `least` are raised to it.
     """
     points = _sobol(2, len(views), 2)
     low, high = np.log(_HIGHLIGHT)
@@ -122,45 +106,44 @@ def highlight_pairs(slopes: F32, views: F64, least: float) -> F64:
     return normalize(light)
 
 
-def texel_values(material: Material, level: int, u: F64, omega_i: F64, omega_o: F64) -> tuple[F32, F32]:
-    """Values of a material at positions for pairs of directions, and what the views meet of it.
+def texel_values(material: Material, level: int, u: F64, omega_i: F64, omega_o: F64) -> tuple[F64, F64]:
+    """Values of a material with the footprint of a level, and what the views meet of it.
 
     Parameters
     ----------
-    u : (n, 2) or (n, k, 2) array
+    material : Material
+    level : int
+    u : (n, k, 2) array
         Positions, uv.
     omega_i, omega_o : (k, 3) or (n, k, 3) arrays
 
     Returns
     -------
     values : (n, k, 3) array
-        In 1/sr, with the footprint of the level.
+        In 1/sr.
     opacity : (n, k) array
         One less the transmittance.
     """
-    n, k = len(u), omega_i.shape[-2]
-    sigma = np.full(n * k, float(sigma_of_level(level)), np.float32)
-
-    def rows(array: F64) -> F32:
-        # A copy: PyTorch warns of memory that cannot be written.
-        size = array.shape[-1]
-        return np.array(np.broadcast_to(array, (n, k, size)), np.float32).reshape(-1, size)
-
-    at, light, view = rows(u if u.ndim == 3 else u[:, None]), rows(omega_i), rows(omega_o)
-    values = material.evaluate(at, sigma, light, view).reshape(n, k, 3)
+    n, k = u.shape[:2]
+    light, view = (np.broadcast_to(omega, (n, k, 3)).reshape(-1, 3) for omega in (omega_i, omega_o))
+    at, sigma = u.reshape(-1, 2), np.full(n * k, float(sigma_of_level(level)))
+    values = material.evaluate(at, sigma, light, view).reshape(n, k, 3).astype(np.float64)
     if material.transmittance is None:
-        return values, np.ones((n, k), np.float32)
-    return values, 1.0 - material.transmittance.evaluate(at, sigma, view).reshape(n, k)
+        return values, np.ones((n, k))
+    return values, 1.0 - material.transmittance.evaluate(at, sigma, view).reshape(n, k).astype(np.float64)
+
+
+def solid_values(material: Material, level: int, u: F64, omega_i: F64, omega_o: F64) -> tuple[Tensor, F64]:
+    """Values (n, 3, k) of what the views meet, and the most (n,) that one meets; see :func:`texel_values`."""
+    values, opacity = texel_values(material, level, u, omega_i, omega_o)
+    solid = values / np.maximum(opacity, LEAST_OPACITY)[..., None]
+    return torch.from_numpy(solid).float().transpose(1, 2).contiguous(), opacity.max(1)
 
 
 def tile_means(material: Material, omega_i: F64, omega_o: F64) -> F64:
-    """Mean reflectance (n, 3) of the tile by the neural material: that of the footprint of the whole tile, at
-    some positions."""
-    n = len(omega_i)
-    side = round(math.sqrt(_POSITIONS))
-    grid = (np.stack(np.meshgrid(*2 * [np.arange(side)]), -1).reshape(-1, 2) + 0.5) / side
-    u = np.repeat(grid, n, 0)
-    sigma = np.full(len(u), float(sigma_of_level(0)))
-    light, view = (np.tile(omega, (len(grid), 1)) for omega in (omega_i, omega_o))
-    value = material.evaluate(u, sigma, light, view)
-    return np.asarray(value.reshape(len(grid), n, 3).mean(0), np.float64)
+    """Mean reflectance (n, 3) of the tile for pairs of directions: that of the footprint of the whole tile,
+    at some positions."""
+    u = (np.stack(np.meshgrid(*2 * [np.arange(_SIDE)]), -1).reshape(-1, 1, 2) + 0.5) / _SIDE
+    values, _ = texel_values(material, 0, np.tile(u, (1, len(omega_i), 1)), omega_i, omega_o)
+    mean: F64 = values.mean(0)
+    return mean

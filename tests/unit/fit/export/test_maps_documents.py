@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,9 +16,7 @@ from mbtf_core.app.console import run
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.data.lattice import Lattice
 from mbtf_fit.cli.app import app
-from mbtf_fit.material.interchange.agreement import fit_color
-from mbtf_fit.material.interchange.documents import refractive_index
-from mbtf_fit.material.interchange.maps import surface_maps
+from mbtf_fit.material.maps import scale_color, surface_maps
 from mbtf_fit.material.material import Material
 from mbtf_fit.material.transmittance import Transmittance
 
@@ -35,6 +34,17 @@ def exported(folder: Path, **options: object) -> Path:
 @pytest.fixture(scope="module")
 def glossy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return exported(tmp_path_factory.mktemp("glossy"))
+
+
+def read_materialx(folder: Path) -> Any:
+    """The document, valid against the library of MaterialX."""
+    mx = pytest.importorskip("MaterialX")
+    document, library = mx.createDocument(), mx.createDocument()
+    mx.readFromXmlFile(document, str(folder / "material.mtlx"))
+    mx.loadLibraries(mx.getDefaultDataLibraryFolders(), mx.getDefaultDataSearchPath(), library)
+    document.importLibrary(library)
+    assert document.validate() == (True, "")
+    return document
 
 
 def f0(out: Path) -> float:
@@ -60,7 +70,7 @@ def test_images_hold_the_maps(glossy: Path) -> None:
     image = Image.open(glossy / "base_color.png")
     assert image.mode == "RGB"
     # The fitted color, not that of the surface.
-    fitted, _ = fit_color(Material.load(glossy.parent / "material"), maps)
+    fitted = scale_color(Material.load(glossy.parent / "material"), maps)
     color = srgb_to_linear(np.asarray(image, np.float64) / 255)
     np.testing.assert_allclose(color, fitted.base_color, atol=0.01)
 
@@ -111,32 +121,22 @@ def test_usd(glossy: Path) -> None:
     bound, _ = UsdShade.MaterialBindingAPI(mesh).ComputeBoundMaterial()
     surface = bound.ComputeSurfaceSource()[0]
     assert surface.GetIdAttr().Get() == "UsdPreviewSurface"
-    spaces = {
-        "diffuseColor": "sRGB",
-        "normal": "raw",
-        "roughness": "raw",
-        "metallic": "raw",
-        "displacement": "raw",
-    }
-    for name, space in spaces.items():
-        source, channel, _ = surface.GetInput(name).GetConnectedSource()
-        texture = UsdShade.Shader(source.GetPrim())
-        assert texture.GetIdAttr().Get() == "UsdUVTexture"
-        assert texture.GetInput("sourceColorSpace").Get() == space
-        assert texture.GetInput("wrapS").Get() == "repeat"
-        assert Path(texture.GetInput("file").Get().resolvedPath).is_file()
-        assert texture.GetOutput(channel), name
     connections = {
-        "diffuseColor": ("base_color.png", "rgb"),
-        "normal": ("normal.png", "rgb"),
-        "roughness": ("roughness_metallic.png", "g"),
-        "metallic": ("roughness_metallic.png", "b"),
-        "displacement": ("height.png", "r"),
+        "diffuseColor": ("base_color.png", "rgb", "sRGB"),
+        "normal": ("normal.png", "rgb", "raw"),
+        "roughness": ("roughness_metallic.png", "g", "raw"),
+        "metallic": ("roughness_metallic.png", "b", "raw"),
+        "displacement": ("height.png", "r", "raw"),
     }
     for name, expected in connections.items():
         source, channel, _ = surface.GetInput(name).GetConnectedSource()
-        file = UsdShade.Shader(source.GetPrim()).GetInput("file").Get().path
-        assert (Path(file).name, channel) == expected
+        texture = UsdShade.Shader(source.GetPrim())
+        file = Path(texture.GetInput("file").Get().resolvedPath)
+        assert file.is_file()
+        assert (file.name, channel, texture.GetInput("sourceColorSpace").Get()) == expected
+        assert texture.GetIdAttr().Get() == "UsdUVTexture"
+        assert texture.GetInput("wrapS").Get() == "repeat"
+        assert texture.GetOutput(channel), name
     points = np.array(UsdGeom.Mesh(mesh).GetPointsAttr().Get())
     st = np.array(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").Get())
     # The origin of texture coordinates is at the lower left.
@@ -156,11 +156,7 @@ def test_usd(glossy: Path) -> None:
 
 def test_materialx(glossy: Path) -> None:
     mx = pytest.importorskip("MaterialX")
-    document, library = mx.createDocument(), mx.createDocument()
-    mx.readFromXmlFile(document, str(glossy / "material.mtlx"))
-    mx.loadLibraries(mx.getDefaultDataLibraryFolders(), mx.getDefaultDataSearchPath(), library)
-    document.importLibrary(library)
-    assert document.validate() == (True, "")
+    document = read_materialx(glossy)
     (material,) = document.getMaterialNodes()
     (surface,) = mx.getShaderNodes(material, "surfaceshader")
     assert surface.getCategory() == "gltf_pbr"
@@ -188,8 +184,8 @@ def test_materialx(glossy: Path) -> None:
     np.testing.assert_allclose(extremes, [heights.min(), heights.max()], atol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["müller", "日本", 'a\'b "c"'])
-def test_names_outside_of_ascii(tmp_path: Path, name: str) -> None:
+def test_names_outside_of_ascii(tmp_path: Path) -> None:
+    name = '日本 a\'b "c"'
     pxr = pytest.importorskip("pxr.Usd")
     write_material(tmp_path / name, model="relief", finest=2)
     out = tmp_path / "out"
@@ -218,11 +214,7 @@ def test_a_surface_without_gloss_with_holes(tmp_path: Path) -> None:
     assert material["extensions"] == {"KHR_materials_specular": {"specularFactor": 0.0}}
     assert "int inputs:useSpecularWorkflow = 1" in (out / "material.usda").read_text()
     mx = pytest.importorskip("MaterialX")
-    read, library = mx.createDocument(), mx.createDocument()
-    mx.readFromXmlFile(read, str(out / "material.mtlx"))
-    mx.loadLibraries(mx.getDefaultDataLibraryFolders(), mx.getDefaultDataSearchPath(), library)
-    read.importLibrary(library)
-    assert read.validate() == (True, "")
+    read = read_materialx(out)
     (surface,) = mx.getShaderNodes(read.getMaterialNodes()[0], "surfaceshader")
     assert surface.getInput("specular").getValue() == 0
     assert surface.getInput("alpha_mode").getValue() == 2
@@ -242,26 +234,15 @@ def test_a_model_that_knows_no_surface_has_no_heights(
     maps = reported["maps"]
     assert (maps["source"], maps["level"]) == ("fit", 3)
     assert maps["dielectric_f0"] in (0, 0.04)
-    np.testing.assert_allclose(maps["after"], 1, rtol=1e-3)
-    assert maps["points"] > 0
+    assert maps["unexplained"]["value"] > 0
+    assert maps["unexplained"]["error"] > 0
     for name in ("material.gltf", "material.usda", "material.mtlx"):
         assert "height" not in (out / name).read_text()
         assert "displacement" not in (out / name).read_text()
     mx = pytest.importorskip("MaterialX")
-    document, library = mx.createDocument(), mx.createDocument()
-    mx.readFromXmlFile(document, str(out / "material.mtlx"))
-    mx.loadLibraries(mx.getDefaultDataLibraryFolders(), mx.getDefaultDataSearchPath(), library)
-    document.importLibrary(library)
-    assert document.validate() == (True, "")
+    document = read_materialx(out)
     (material,) = document.getMaterialNodes()
     assert not mx.getShaderNodes(material, "displacementshader")
-    pytest.importorskip("pxr")
-    from pxr import Usd, UsdShade
-
-    stage = Usd.Stage.Open(str(out / "material.usda"))
-    bound, _ = UsdShade.MaterialBindingAPI(stage.GetPrimAtPath("/Tile/Plane")).ComputeBoundMaterial()
-    assert bound.ComputeSurfaceSource()[0].GetIdAttr().Get() == "UsdPreviewSurface"
-    assert not bound.ComputeDisplacementSource()[0]
 
 
 def test_the_same_export_again_has_the_same_bytes(glossy: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -269,7 +250,7 @@ def test_the_same_export_again_has_the_same_bytes(glossy: Path, capsys: pytest.C
     assert len(before) == 8
     words = [word for name in FORMATS for word in ("--to", name)]
     assert run(app, ["export", str(glossy.parent / "material"), *words, "-o", str(glossy)]) == 0
-    assert "mean reflectance of the maps" in capsys.readouterr().out
+    assert "unexplained variance against the material" in capsys.readouterr().out
     assert {path.name: path.read_bytes() for path in glossy.iterdir()} == before
 
 
@@ -277,15 +258,10 @@ def test_options_of_maps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     write_material(tmp_path / "relief", model="relief")
     out = ["-o", str(tmp_path / "out")]
     for words, code, what in (
-        (["relief", "--level", "1"], 2, "--level: is an option of maps"),
+        (["relief", "--level", "1"], 2, "--level: is an option of gltf, materialx, usd"),
         (["relief", "--to", "usd", "--level", "9"], 2, "has the levels 0 to 3"),
     ):
         assert run(app, ["export", str(tmp_path / words[0]), *words[1:], *out]) == code
         assert what in capsys.readouterr().err
     assert run(app, ["export", str(tmp_path / "relief"), "--to", "usd", "--level", "1", *out, "-q"]) == 0
     assert Image.open(tmp_path / "out" / "normal.png").size == (2, 2)
-
-
-def test_the_refractive_index_of_glass() -> None:
-    assert refractive_index(0.04) == pytest.approx(1.5)
-    assert refractive_index(0.0) == 1

@@ -8,24 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from support.known_surfaces import geometry
 from support.plugin_materials import write_material
 
+from mbtf_core.app.console import Console
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import UsageError
 from mbtf_fit import Material
-from mbtf_fit.material.interchange.agreement import fit_color
-from mbtf_fit.material.interchange.maps import (
-    Maps,
-    evaluate_maps,
-    knows_surface,
-    level_of,
-    surface_maps,
-)
-from mbtf_fit.material.interchange.values import direction_pairs, tile_means
-from mbtf_fit.surface.known import KnownSurface, ggx
+from mbtf_fit.material.maps import Maps, knows_surface, make_maps, scale_color, surface_maps
+from mbtf_fit.material.reference_values import direction_pairs, tile_means
+from mbtf_fit.surface.known import KnownSurface
 
 
 def known(folder: Path, **options: object) -> Material:
@@ -39,13 +32,10 @@ def test_a_flat_lambert_tile_keeps_its_color(tmp_path: Path) -> None:
     """Its base color is π times its value."""
     value = (0.05, 0.1, 0.25)
     material = write_material(tmp_path, model="relief", constant=value)
-    maps, agreement = fit_color(material, surface_maps(material, 3))
-    np.testing.assert_allclose(
-        maps.base_color, np.broadcast_to(math.pi * np.array(value), maps.base_color.shape), rtol=2e-3
-    )
-    np.testing.assert_allclose(agreement.before, 1, rtol=1e-3)
-    np.testing.assert_allclose(agreement.after, 1, rtol=1e-3)
-    assert agreement.spread < 1e-3
+    maps = scale_color(material, surface_maps(material, 3))
+    expected = np.broadcast_to(math.pi * np.array(value), maps.base_color.shape)
+    np.testing.assert_allclose(maps.base_color, expected, rtol=2e-3)
+    np.testing.assert_allclose(surface_maps(material, 3).base_color, expected, rtol=2e-3)
     assert (maps.metallic == 0).all()
     assert (maps.roughness == 1).all()
     assert maps.dielectric == 0
@@ -78,8 +68,7 @@ def test_rows_and_opacity(tmp_path: Path) -> None:
     assert not np.array_equal(maps.heights, maps.heights[::-1])
     omega_i, omega_o = (from_angles(e, a)[None] for e, a in ((50.0, 20.0), (35.0, 160.0)))
     half = replace(maps, opacity=np.full_like(maps.roughness, 0.5))
-    whole = evaluate_maps(maps, omega_i, omega_o)
-    np.testing.assert_allclose(evaluate_maps(half, omega_i, omega_o), 0.5 * whole)
+    np.testing.assert_allclose(half.evaluate(omega_i, omega_o), 0.5 * maps.evaluate(omega_i, omega_o))
 
 
 def one_texel(**changes: object) -> Maps:
@@ -97,32 +86,11 @@ def one_texel(**changes: object) -> Maps:
     return replace(flat, **changes)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("metallic", [0.0, 0.6, 1.0])
-def test_values_are_those_of_the_lobe(metallic: float) -> None:
-    """Against the GGX of the known surface; the dielectric's diffuse part is what Fresnel's term leaves."""
-    light, view = from_angles(50.0, 20.0), from_angles(35.0, 160.0)
-    slopes, base = np.array([[[0.3, -0.2]]]), np.array([0.8, 0.5, 0.2])
-    maps = one_texel(slopes=slopes, metallic=np.full((1, 1), metallic), base_color=base[None, None])
-    n = maps.normals[0, 0]
-    i, o, normal = (torch.from_numpy(np.asarray(x, np.float64))[None] for x in (light, view, n))
-    cosines = [torch.tensor([[float(n @ w)]], dtype=torch.float64) for w in (light, view)]
-    alpha2 = torch.tensor([[0.5**4]], dtype=torch.float64)
-
-    def lobe(f0: np.ndarray) -> np.ndarray:
-        return ggx(torch.from_numpy(f0)[None], alpha2, normal, *cosines, i, o)[0].numpy()
-
-    half = (light + view) / np.linalg.norm(light + view)
-    fresnel = 0.04 + 0.96 * (1 - view @ half) ** 5
-    dielectric = lobe(np.full(3, 0.04)) + (1 - fresnel) * base / math.pi
-    expected = ((1 - metallic) * dielectric + metallic * lobe(base)) * (n @ light) / light[2]
-    np.testing.assert_allclose(evaluate_maps(maps, light[None], view[None])[0, 0, 0], expected, rtol=1e-10)
-
-
 def test_surfaces_that_face_away_are_black() -> None:
     maps = one_texel(slopes=np.array([[[3.0, 0.0]]]))
     away, towards, up = from_angles(10.0, 0.0), from_angles(30.0, 180.0), np.array([0.0, 0.0, 1.0])
     lights, views = np.stack([away, up, towards]), np.stack([up, away, up])
-    values = evaluate_maps(maps, lights, views)[0, 0]
+    values = maps.evaluate(lights, views)[0]
     assert (values[:2] == 0).all()
     assert (values[2] > 0).all()
 
@@ -140,20 +108,19 @@ def test_directions_are_cosine_weighted() -> None:
 def test_the_mean_reflectance_is_that_of_the_network(tmp_path: Path) -> None:
     """With other lights and views than those of the fit, on a surface whose network differs from its maps."""
     material = write_material(tmp_path, model="relief", finest=4, brightness=0.0, contrast=0.2)
-    plain = surface_maps(material, 4)
-    maps, agreement = fit_color(material, plain)
-    np.testing.assert_allclose(agreement.after, 1, rtol=0.01)
-    assert np.abs(agreement.before - 1).max() > 0.05
+    maps = surface_maps(material, 4)
     light, view = direction_pairs(512, 0.1, seed=1)
-    ours = evaluate_maps(maps, light, view).mean((0, 1, 2))
-    np.testing.assert_allclose(ours / tile_means(material, light, view).mean(0), 1, rtol=0.06)
+    target = tile_means(material, light, view).mean(0)
+    assert np.abs(maps.evaluate(light, view).mean((0, 1)) / target - 1).max() > 0.05
+    scaled = scale_color(material, maps)
+    np.testing.assert_allclose(scaled.evaluate(light, view).mean((0, 1)) / target, 1, rtol=0.06)
 
 
 def test_levels_that_are_missing_are_refused(tmp_path: Path) -> None:
     assert not knows_surface(write_material(tmp_path / "neumip"))
     material = write_material(tmp_path / "relief", model="relief")
     assert knows_surface(material)
-    assert level_of(material) == 3
+    assert make_maps(material, None, Console(quiet=True))[0].level == 3
     for level in (-1, 4):
         with pytest.raises(UsageError, match="has the levels 0 to 3"):
-            level_of(material, level)
+            make_maps(material, level, Console(quiet=True))

@@ -12,6 +12,7 @@ from support.plugin_materials import write_material
 
 from mbtf_core.app.console import run
 from mbtf_fit.cli.app import app
+from mbtf_fit.export import targets
 from mbtf_fit.material.material import Material
 
 
@@ -89,7 +90,7 @@ def test_one_export_does_not_mix_with_another(
     for words, what in (
         (["--to", "slang"], "to: ['web'] -> ['slang']"),
         ([], "to: ['web'] -> ['exr', 'json']"),
-        (["--to", "web", "--environment", str(sky)], "page.environment"),
+        (["--to", "web", "--environment", str(sky)], "environment"),
     ):
         assert run(app, ["export", str(source), *words, *out]) == 3
         message = capsys.readouterr().err
@@ -98,6 +99,16 @@ def test_one_export_does_not_mix_with_another(
     assert stamps(tmp_path / "out") == before
     assert run(app, ["export", str(source), "--to", "slang", *out, "--overwrite"]) == 0
     assert set(os.listdir(tmp_path / "out")) == {"export.json", "material.slang", "material.bin"}
+
+
+@pytest.mark.parametrize("name", targets())
+def test_a_target_names_all_files_that_it_writes(source: Path, tmp_path: Path, name: str) -> None:
+    if name in (libraries := {"gltf": "pygltflib", "usd": "pxr", "materialx": "MaterialX"}):
+        pytest.importorskip(libraries[name])
+    assert run(app, ["export", str(source), "--to", name, "-o", str(tmp_path / "out"), "-q"]) == 0
+    written = set(os.listdir(tmp_path / "out")) - {"export.json"}
+    assert written
+    assert written <= set(targets()[name].files)
 
 
 def test_a_failed_export_claims_nothing(source: Path, tmp_path: Path) -> None:

@@ -1,0 +1,112 @@
+"""Maps as images, and what the documents that name them have in common."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from pydantic import Field
+
+from mbtf_core.config.settings import Settings
+from mbtf_core.errors import EngineError
+from mbtf_core.files.atomic import write_chunks, write_text
+from mbtf_fit.export import Export
+
+if TYPE_CHECKING:
+    from mbtf_fit.material.maps import Maps
+
+BASE_COLOR, NORMAL, ORM, HEIGHT = "base_color.png", "normal.png", "roughness_metallic.png", "height.png"
+IMAGE_NAMES = (BASE_COLOR, NORMAL, ORM, HEIGHT)
+
+
+class MapOptions(Settings):
+    """Options of maps."""
+
+    level: int | None = Field(None, description="level of the maps; default: the finest")
+
+
+def write_document(
+    export: Export,
+    options: MapOptions,
+    name: str,
+    text: Callable[[Maps, str, dict[str, Any]], str],
+    module: str,
+    package: str,
+) -> list[str]:
+    """Write the maps of a material as images, once for all documents of an export, and a document.
+
+    Parameters
+    ----------
+    export : Export
+    options : MapOptions
+    name : str
+        Of the document.
+    text : callable
+        Of maps, the material's name, and plain data that identify the neural material and the maps.
+    module, package : str
+        The library that makes the document, and what installs it.
+
+    Returns
+    -------
+    list of str
+        Names of the files.
+
+    Raises
+    ------
+    UsageError
+        The material has no such level.
+    EngineError
+        The library is not installed.
+    PartialError
+        The folder cannot be written.
+    """
+    if importlib.util.find_spec(module) is None:
+        raise EngineError(f"{package} is not installed", where=name, hint="pip install 'mbtf[maps]'")
+    if "maps" not in export.shared:
+        from mbtf_fit.material.maps import make_maps
+
+        maps, unexplained = make_maps(export.material, options.level, export.console)
+        export.shared["maps"] = maps, write_images(maps, export.folder)
+        export.notes.append(f"{maps}; unexplained variance against the material {unexplained}")
+        export.report["maps"] = {**maps.as_dict(), "unexplained": unexplained.as_dict()}
+    maps, images = export.shared["maps"]
+    described = {
+        "neural_material": Path(os.path.relpath(export.source, export.folder)).as_posix(),
+        "model": export.material.config.model,
+        "weights_sha256": export.material.description["weights"]["sha256"],
+        "level": maps.level,
+        **({} if maps.heights is None else {"height_range_in_tile_widths": round(maps.height_range, 9)}),
+    }
+    write_text(export.folder / name, text(maps, export.source.resolve().name, described))
+    return [*images, name]
+
+
+def write_images(maps: Maps, folder: Path) -> list[str]:
+    """Write maps as PNG, colors in sRGB, all other numbers linear, and return their names.
+
+    - ``base_color.png``: with opacity as its alpha where there are holes.
+    - ``normal.png``: normals n as (n + 1) / 2; x along u, which is right in the image, y along v, up.
+    - ``roughness_metallic.png``: green roughness, blue metallic, red 1.
+    - ``height.png``: 16 bits, 0 the lowest and 65535 the highest vertex; the range is in the document. Models
+      that know no surface have none.
+    """
+    import imagecodecs
+
+    from mbtf_core.color import linear_to_srgb
+
+    color = linear_to_srgb(maps.base_color)
+    if maps.has_holes:
+        color = np.concatenate([color, maps.opacity[..., None]], -1)
+    packed = np.stack([np.ones_like(maps.roughness), maps.roughness, maps.metallic], -1)
+    images = {BASE_COLOR: color, NORMAL: 0.5 * maps.normals + 0.5, ORM: packed}
+    if maps.heights is not None:
+        images[HEIGHT] = (maps.heights - maps.heights.min()) / (maps.height_range or 1.0)
+    for name, image in images.items():
+        kind = np.uint16 if name == HEIGHT else np.uint8
+        pixels = np.rint(np.clip(image, 0.0, 1.0) * np.iinfo(kind).max).astype(kind)
+        write_chunks(folder / name, [imagecodecs.png_encode(pixels, level=9)])
+    return list(images)

@@ -1,0 +1,56 @@
+"""A material without its textures as JSON: ``material.json`` with the numbers of the tensors."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+
+from mbtf_core.files.atomic import write_text
+from mbtf_fit.export import Export, ExportTarget
+
+LAYERS_NAME = "layers.json"
+_SCHEMA = 4
+
+
+def _numbers(array: Any) -> Any:
+    """Nested lists of decimals that single precision reads as exactly these numbers."""
+    stored = np.asarray(array, np.float32)
+    return float(str(stored[()])) if stored.ndim == 0 else [_numbers(row) for row in stored]
+
+
+def write(export: Export, options: None) -> list[str]:
+    """Write what evaluates a material, but for its textures: its operations, the tensors that they name, and
+    the conformance queries with their expected values, that of the transmittance included."""
+    from mbtf_fit.material.material import describe_model
+    from mbtf_fit.material.transmittance import FORMULA
+
+    material = export.material
+    weights, expected = material.model.weights(), dict(material.conformance)
+    through = material.transmittance
+    if through is not None:
+        expected["transmittance"] = through.evaluate(*(expected[k] for k in ("u", "sigma", "omega_o")))
+    document = {
+        "format": "mbtf-layers",
+        "schema": _SCHEMA,
+        "precision": "float16" if export.half else "float32",
+        **describe_model(material.model),
+        "textures": [name for name, tensor in weights.items() if tensor.ndim == 3],
+        "tensors": {name: _numbers(tensor.cpu()) for name, tensor in weights.items() if tensor.ndim != 3},
+        **({} if through is None else {"transmittance": FORMULA}),
+        "conformance": {
+            **{name: _numbers(array) for name, array in expected.items()},
+            "tolerance": material.description["conformance"]["tolerance"],
+        },
+    }
+    write_text(export.folder / LAYERS_NAME, json.dumps(document, indent=1))
+    return [LAYERS_NAME]
+
+
+TARGET = ExportTarget(
+    "json",
+    "the operations and all tensors but the textures, with conventions and queries with expected values",
+    [LAYERS_NAME],
+    write,
+)

@@ -1,0 +1,33 @@
+"""A copy of a material, in a folder of its own."""
+
+from __future__ import annotations
+
+from mbtf_fit.export import Export, ExportTarget
+
+_NAMES = ["weights.safetensors", "material.json", "transmittance.safetensors"]
+
+
+def write(export: Export, options: None) -> list[str]:
+    """Write a material folder, unless the folder holds it already."""
+    from mbtf_fit.material.material import export as write_material
+
+    material, description = export.material, export.material.description
+    if not export.complete:
+        write_material(
+            material.model,
+            material.config,
+            export.folder,
+            data=description["data"],
+            training=description["training"],
+            half=export.half,
+            transmittance=material.transmittance,
+        )
+    return _NAMES if material.transmittance is not None else _NAMES[:2]
+
+
+TARGET = ExportTarget(
+    "material",
+    "another material folder, in a folder of its own; the same command again keeps it",
+    _NAMES,
+    write,
+)

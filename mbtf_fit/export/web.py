@@ -1,0 +1,71 @@
+"""A page that shows a material in a browser, without a network."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pydantic import Field
+
+from mbtf_core.config.settings import Settings
+from mbtf_core.files.atomic import write_text
+from mbtf_fit.export import Export, ExportTarget
+
+PAGE_NAME = "viewer.html"
+
+
+class PageOptions(Settings):
+    """What a page shows besides the material."""
+
+    against: list[Path] | None = Field(
+        None, description="another material to compare with in the page. Repeatable"
+    )
+    reference: Path | None = Field(
+        None, description="folder of mbtf-gen reference to compare with in the page"
+    )
+    shape: Path | None = Field(
+        None, description="mesh with texture coordinates, as another shape of the page"
+    )
+    environment: Path | None = Field(
+        None, description="picture of the surroundings (EXR, HDR, PNG), as light in the page"
+    )
+
+
+def make_page(material: Path, options: PageOptions) -> tuple[str, str]:
+    """HTML of the page of a material folder, and a line about its precision.
+
+    Raises
+    ------
+    InputError
+        A material or another file is at fault.
+    """
+    from mbtf_fit.viewer.content import material_content
+    from mbtf_fit.viewer.extras import environment_content, mesh_content, pictures_content
+    from mbtf_fit.viewer.page import write_page
+
+    materials = [material_content(folder) for folder in (material, *(options.against or []))]
+    content = {
+        "materials": [held for held, _ in materials],
+        **({} if options.reference is None else {"pictures": pictures_content(options.reference)}),
+        **({} if options.shape is None else {"mesh": mesh_content(options.shape)}),
+        **({} if options.environment is None else {"environment": environment_content(options.environment)}),
+    }
+    return write_page(content, materials[0][0]["name"]), str(materials[0][1])
+
+
+def write(export: Export, options: PageOptions) -> list[str]:
+    """Write the page."""
+    html, precision = make_page(export.source, options)
+    write_text(export.folder / PAGE_NAME, html)
+    export.notes.append(precision)
+    return [PAGE_NAME]
+
+
+TARGET = ExportTarget(
+    "web",
+    "a page that shows the material in a browser, without a network",
+    [PAGE_NAME],
+    write,
+    PageOptions,
+    # Its textures have 8 bits or fewer.
+    rounds=False,
+)

@@ -1,1 +1,0 @@
-"""Materials as maps for programs that evaluate no networks: glTF, USD, MaterialX."""
