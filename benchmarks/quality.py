@@ -35,7 +35,7 @@ from mbtf_core.units import clock
 from mbtf_fit.config import FITTER, FitConfig, best_at
 from mbtf_gen.config.generator import GENERATOR, RESOLUTION, GeneratorConfig
 from mbtf_pipeline.recipe import COMPARE
-from mbtf_pipeline.run_folder import machine
+from mbtf_pipeline.stages import machine
 
 STORED = Path(__file__).with_name("quality_measured.json")
 FORMAT, SCHEMA = "mbtf-quality", 2

@@ -37,8 +37,7 @@ from mbtf_fit.config import FitConfig, best_options, build_model
 from mbtf_fit.material.material import Material, export
 from mbtf_fit.ops.constants import PLACES
 from mbtf_fit.surface.known import KnownSurface
-from mbtf_fit.viewer.content import material_content
-from mbtf_fit.viewer.page import write_page
+from mbtf_fit.viewer.page import material_content, write_page
 
 F32 = NDArray[np.float32]
 SIZE, SECONDS, FRAMES_PER_SECOND = 5.0, 2.0, 30.0

@@ -21,16 +21,23 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.compare.compare import COMPARISON_NAME, COMPARISON_SCHEMA
 from mbtf_pipeline.recipe import Recipe, read_resolved
 from mbtf_pipeline.report.report import LAYOUT
-from mbtf_pipeline.run_folder import COMPARE, FITS, REPORT, RUN, SHARDS, VIEWER, clear, write_run_record
 from mbtf_pipeline.stages import (
+    COMPARE,
+    FITS,
     FORCED,
     NOT_RUN,
+    REPORT,
+    RUN,
+    SHARDS,
+    VIEWER,
     Decision,
     Stage,
     StageResult,
+    clear,
     decide,
     read_stamp,
     run_stages,
+    write_run_record,
 )
 
 if TYPE_CHECKING:

@@ -27,7 +27,7 @@ from mbtf_gen.job import Job, planned_paths, split_queries
 from mbtf_pipeline.compare.image_files import scenes
 from mbtf_pipeline.recipe import Recipe, preset_recipe
 from mbtf_pipeline.run import COMPARE_STAGE, data_sets, fit_stage, layout_of, survey
-from mbtf_pipeline.run_folder import RUN, write_run_record
+from mbtf_pipeline.stages import RUN, write_run_record
 
 # Seconds of loading the programs, and of comparison and report besides the paths of their images.
 _START, _COMPARE = 2.5, 5.0

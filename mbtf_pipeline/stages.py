@@ -1,4 +1,5 @@
-"""Stages that run only if their inputs have changed, decided by content and not by date.
+"""The folder of a run, and its stages, which run only if their inputs have changed, decided by content and not
+by date.
 
 The key of a stage is a hash of its resolved configuration, the digests of its input files, the digests of
 the outputs of the stages it needs, and a schema version. After a stage has run, a stamp is written
@@ -10,6 +11,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -19,6 +21,8 @@ from typing import Any, NamedTuple
 
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import data_sha256, file_sha256, read_json, write_json
+from mbtf_core.files.folders import OutputKind
+from mbtf_pipeline.recipe import Recipe, write_recipe
 
 STAMP_FORMAT = "mbtf-stage"
 # Part of every key; raised when a stage produces different outputs from the same inputs.
@@ -219,3 +223,36 @@ def _run(folder: Path, stage: Stage, decision: Decision) -> Stamp:
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, {"format": STAMP_FORMAT, "schema": STAGE_SCHEMA, **vars(stamp)})
     return stamp
+
+
+RUN = OutputKind("run.json", "mbtf-run", 2, "a run")
+SHARDS, FITS, COMPARE, REPORT = "shards", "fits", "compare", "report.html"
+VIEWER = "viewer.html"
+
+
+def clear(folder: Path) -> None:
+    """Remove a sub-folder of a run with everything in it."""
+    if folder.exists():
+        shutil.rmtree(folder)
+
+
+def write_run_record(folder: Path, recipe: Recipe, command: str) -> None:
+    """Write the resolved recipe and the command into the run's folder."""
+    RUN.write(folder, {"name": recipe.name, "command": command, "machine": machine()})
+    write_recipe(recipe, folder)
+
+
+def machine() -> dict[str, str]:
+    """Versions of the software that results depend on, and the system."""
+    import os
+    import platform
+    from importlib.metadata import PackageNotFoundError, version
+
+    out = {"python": platform.python_version()}
+    for name in ("mbtf", "mitsuba", "drjit", "torch", "numpy", "scipy", "trimesh", "flip-evaluator"):
+        try:
+            out[name] = version(name)
+        except PackageNotFoundError:
+            out[name] = "not installed"
+    out["system"] = f"{platform.system()} {platform.machine()}, {os.cpu_count()} processors"
+    return out

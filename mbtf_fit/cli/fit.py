@@ -125,7 +125,7 @@ def _fit_one(
     """Fit a data set, watched by whoever asks for it."""
     from mbtf_fit.material.format import DESCRIPTION_NAME
     from mbtf_fit.training.fit import fit
-    from mbtf_fit.training.tensorboard import EventLog
+    from mbtf_fit.training.fit_folder import EventLog
 
     finished = not overwrite and (output / DESCRIPTION_NAME).exists()
     if not finished:

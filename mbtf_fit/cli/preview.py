@@ -38,7 +38,7 @@ def preview(
         Draw no turntable.
     """
     from mbtf_core.files.folders import owned
-    from mbtf_fit.preview.draw import draw
+    from mbtf_fit.preview.sheet import draw
 
     if material is None and options.config is None:
         raise UsageError("no material given", hint="mbtf-fit preview material/ -o preview/")

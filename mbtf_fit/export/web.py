@@ -38,9 +38,8 @@ def make_page(material: Path, options: PageOptions) -> tuple[str, str]:
     InputError
         A material or another file is at fault.
     """
-    from mbtf_fit.viewer.content import material_content
     from mbtf_fit.viewer.extras import environment_content, mesh_content, pictures_content
-    from mbtf_fit.viewer.page import write_page
+    from mbtf_fit.viewer.page import material_content, write_page
 
     materials = [material_content(folder) for folder in (material, *(options.against or []))]
     content = {

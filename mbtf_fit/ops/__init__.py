@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from mbtf_fit.ops.backend import Backend
-from mbtf_fit.ops.displace import Displace, Offset, Trace
-from mbtf_fit.ops.encode import Frequencies, HalfVector, Position, Rotate, Stereographic
-from mbtf_fit.ops.lookup import Lookup, Neighborhood
-from mbtf_fit.ops.network import Inception, Network
-from mbtf_fit.ops.operation import Operation, read_operations, sizes_of, stages
+from mbtf_fit.ops.lookup import Displace, Lookup, Neighborhood, Offset, Trace
+from mbtf_fit.ops.network import Frequencies, HalfVector, Inception, Network, Position, Rotate, Stereographic
+from mbtf_fit.ops.operation import Backend, Operation, read_operations, sizes_of, stages
 from mbtf_fit.ops.shade import Lobe, Shade
 from mbtf_fit.ops.value import Calibrate, DivideByCosine, Gate, Matrix, Product, Standardize, Transform
 

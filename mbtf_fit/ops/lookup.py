@@ -1,12 +1,13 @@
-"""Textures: lookups in learned pyramids, and the neighborhood of a query."""
+"""Textures, and where they are read: lookups in learned pyramids, the neighborhood of a query, parallax."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal
 
-from mbtf_fit.ops.operation import Operation, TextureName, Value
+from mbtf_fit.ops.constants import GRAZING, MAX_CROSSINGS, OFFSET_SCALE
+from mbtf_fit.ops.operation import Operation, TensorName, TextureName, Value
 
 
 @dataclass(frozen=True)
@@ -57,3 +58,93 @@ class Neighborhood(Operation):
 
     def size(self, sizes: Sequence[int]) -> int:
         return 2
+
+
+@dataclass(frozen=True)
+class Offset(Operation):
+    """Neural offset of a position (NeuMIP, equations 7 and 8), a length in tile widths.
+
+    Of a depth r (1), ``u' = u + scale r / max(ω_o,z, grazing) · ω_o,xy / (1, aspect)``; of a vector r (2),
+    ``u' = u + scale r / (1, aspect)``.
+
+    Attributes
+    ----------
+    u, r, omega_o : position (2), output of a network (1 or 2), view (3)
+    """
+
+    u: Value
+    r: Value
+    omega_o: Value
+    scale: float = OFFSET_SCALE
+    grazing: float = GRAZING
+
+    def size(self, sizes: Sequence[int]) -> int:
+        if sizes[1] > 2:
+            raise ValueError(f"offset '{self.output}' reads {sizes[1]} numbers in place of 1 or 2")
+        return 2
+
+
+@dataclass(frozen=True)
+class Trace(Operation):
+    """Intersections of view rays with a periodic height field (relief mapping: Policarpo et al., I3D 2005).
+
+    Rays start at the places ``x_j = u + 2^-l / 2 · (o_j,x ⊥a + o_j,y a) / (1, aspect)`` of the footprint,
+    where a is the unit vector of the view's azimuth, (1, 0) of a vertical view, and ⊥a = (-a_y, a_x). z_j is
+    the height of the first point, from above, of the line ``x_j + t ω_o`` on the surface; its uv is ``x_j +
+    z_j / ω_o,z · ω_o,xy / (1, aspect)``. The output is the mean of z_j.
+
+    The heights are those of vertices at texel centers, linear on the two triangles of each cell, which meet
+    where ``x + y = 1`` (x along u, y along v, from 0 to 1). A ray that crosses the border of the grid more
+    often than `crossings` times stops there.
+
+    Attributes
+    ----------
+    hits : name of the uv (2 per place) of the intersections
+    u, level, omega_o : position (2), fractional level (1), view (3)
+    heights : tensor (rows, columns, 1) in tile widths, at most 0
+    places : offsets o_j across and along the view's azimuth, in σ
+    """
+
+    hits: Annotated[str, "second output"]
+    u: Value
+    level: Value
+    omega_o: Value
+    heights: TensorName
+    places: tuple[tuple[float, float], ...] = ((0.0, 0.0),)
+    crossings: int = MAX_CROSSINGS
+
+    def size(self, sizes: Sequence[int]) -> int:
+        return 1
+
+    def results(self, sizes: Sequence[int]) -> dict[str, int]:
+        if not self.places:
+            raise ValueError(f"trace '{self.output}' has no places")
+        return {self.output: 1, self.hits: 2 * len(self.places)}
+
+
+@dataclass(frozen=True)
+class Displace(Operation):
+    """Displacement of a position by a height: ``u' = u + w_l z / ω_o,z · ω_o,xy / (1, aspect)``.
+
+    w_l is a learned weight of each level, linear between levels.
+
+    Attributes
+    ----------
+    u, z, level, omega_o : position (2), height (1), fractional level (1), view (3)
+    weights : tensor (levels,)
+    learned : in training, the texture of learned heights that the gradient of z flows to
+        (:mod:`mbtf_fit.models.learned_relief`); never stored
+    """
+
+    u: Value
+    z: Value
+    level: Value
+    omega_o: Value
+    weights: TensorName
+    learned: TextureName | None = None
+
+    def size(self, sizes: Sequence[int]) -> int:
+        return 2
+
+    def stored(self) -> Displace:
+        return replace(self, learned=None)

@@ -1,4 +1,4 @@
-"""Operations: a model is an ordered list of them.
+"""Operations: a model is an ordered list of them, which back ends implement by their types.
 
 An operation computes one or two named values from others. Every list starts from the values
 
@@ -17,12 +17,14 @@ name of an operation in files, and its keys there, are those of the dataclass.""
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
-from typing import Annotated, Any, ClassVar, get_args, get_type_hints
+from typing import Annotated, Any, ClassVar, Generic, TypeVar, get_args, get_type_hints
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
+
+from mbtf_core.errors import InputError
 
 Value = Annotated[str, "value"]
 Values = tuple[Value, ...]
@@ -212,3 +214,55 @@ def needed_for(
             out.append(operation)
             missing |= {parse(reference)[0] for reference in operation.inputs()} - set(given)
     return out[::-1]
+
+
+F = TypeVar("F", bound=Callable[..., object])
+
+
+class Backend(Generic[F]):
+    """Implementations of operations::
+
+        BACKEND: Backend[...] = Backend("the Mitsuba plugin")
+
+        @BACKEND.implements(Lookup)
+        def lookup(op: Lookup, ...): ...
+
+    Parameters
+    ----------
+    name : what error messages call it
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self._functions: dict[type[Operation], F] = {}
+
+    def implements(self, kind: type[Operation]) -> Callable[[F], F]:
+        """Register the decorated function as the implementation of an operation."""
+
+        def register(function: F) -> F:
+            self._functions[kind] = function
+            return function
+
+        return register
+
+    def __getitem__(self, operation: Operation) -> F:
+        """The implementation of an operation.
+
+        Raises
+        ------
+        InputError : there is none
+        """
+        function = self._functions.get(type(operation))
+        if function is None:
+            raise InputError(f"{self.name} does not support the operation '{operation.kind()}'")
+        return function
+
+    def check(self, operations: Iterable[Operation]) -> None:
+        """Refuse a list with an operation that is not implemented.
+
+        Raises
+        ------
+        InputError : names the first one
+        """
+        for operation in operations:
+            self[operation]

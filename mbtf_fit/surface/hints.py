@@ -17,7 +17,7 @@ from mbtf_fit.native.library import (
     kernel,
 )
 from mbtf_fit.ops.constants import HINTS
-from mbtf_fit.ops.displace import Trace
+from mbtf_fit.ops.lookup import Trace
 from mbtf_fit.ops.shade import Shade
 from mbtf_fit.surface.known import KnownSurface
 from mbtf_fit.surface.lookup import Packing

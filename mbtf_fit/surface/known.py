@@ -40,7 +40,7 @@ from mbtf_fit.ops.constants import (
     LIGHT_WIDTH,
     MAPS,
 )
-from mbtf_fit.ops.displace import Trace
+from mbtf_fit.ops.lookup import Trace
 from mbtf_fit.ops.shade import Shade
 from mbtf_fit.surface.heightfield import DeviceCopies, HeightfieldTracer
 from mbtf_fit.surface.lookup import Packing, lookup

@@ -13,7 +13,7 @@ from mbtf_core.images.environment import read_environment
 from mbtf_core.images.resample import resample
 from mbtf_core.paths import suggest_path
 from mbtf_core.pictures import Camera, read_references
-from mbtf_fit.viewer.content import encode
+from mbtf_fit.viewer.page import encode
 from mbtf_fit.viewer.textures import pack
 
 F64 = NDArray[np.float64]

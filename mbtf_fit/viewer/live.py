@@ -16,8 +16,7 @@ from mbtf_fit.material.material import Material, conformance_queries, conformanc
 from mbtf_fit.training.fit import Observer
 from mbtf_fit.training.trainer import Trainer
 from mbtf_fit.training.validation import errors_by_level, finite
-from mbtf_fit.viewer.content import content_of, material_content, pack_textures
-from mbtf_fit.viewer.page import write_page
+from mbtf_fit.viewer.page import content_of, material_content, pack_textures, write_page
 from mbtf_fit.viewer.server import Messages, PageServer
 
 # Largest share of the training time that pictures of the material may take; seconds between two of them.

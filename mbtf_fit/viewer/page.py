@@ -1,14 +1,28 @@
-"""The page: one HTML file that holds everything, and opens without a server or a network."""
+"""The page: one HTML file that holds everything, and opens without a server or a network; and what it holds of a
+material."""
 
 from __future__ import annotations
 
+import base64
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 import jinja2
+import numpy as np
+import torch
 from markupsafe import Markup
+from numpy.typing import NDArray
+
+from mbtf_fit.backends.shader.images import NODE_SHIFT, Layout, TexelImage
+from mbtf_fit.backends.shader.program import TRANSMITTANCE, program_of
+from mbtf_fit.backends.shader.syntax import GLSL
+from mbtf_fit.material.format import DEFAULT_MIN_COS, QUERY
+from mbtf_fit.material.material import Material, conformance_values
+from mbtf_fit.viewer.textures import F32, PackedTexture, pack
 
 PAGE_NAME = "viewer.html"
 # Parts of the script, in the order of their use.
@@ -47,7 +61,7 @@ def write_page(content: Mapping[str, Any], title: str, *, live: bool = False) ->
     Parameters
     ----------
     content : ``materials``, and optionally ``pictures``, ``mesh`` and ``environment``
-        (:mod:`mbtf_fit.viewer.content`, :mod:`mbtf_fit.viewer.extras`)
+        (:mod:`mbtf_fit.viewer.page`, :mod:`mbtf_fit.viewer.extras`)
     title : shown by the browser
     live : whether the page may connect to the server that sent it
     """
@@ -63,3 +77,158 @@ def write_page(content: Mapping[str, Any], title: str, *, live: bool = False) ->
         content=Markup(safe_json({**content, "shaders": shaders})),
         script=Markup(script + "\n".join(_read(name) for name in _SCRIPTS)),
     )
+
+
+# Largest deviation from the material that a page may have, times max(1, value); that of half precision.
+TOLERANCE = 1e-2
+# Bits per number of the textures, the best first, and the bytes that textures may take in a page. With 6 bits
+# the error is still below a tenth of that of a good fit.
+_BITS, _SMALL = (8, 7, 6), 4.8e6
+
+
+def encode(array: NDArray[Any]) -> str:
+    """Bytes of an array in base64."""
+    return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()
+
+
+def _rounded(image: TexelImage) -> list[F32]:
+    """Levels of an image as they are rounded: in place of second moments the standard deviation, which needs
+    fewer bits."""
+    levels = [texels.copy() for texels in image.levels]
+    for texels in levels:
+        for mean, square in _moments(image.layout, texels):
+            square[:] = np.sqrt(np.maximum(square - mean, 0.0))
+    return levels
+
+
+def _restored(layout: Layout, texels: F32) -> F32:
+    """Inverse of :func:`_rounded`. Rounding may not lift a surface above the reference plane."""
+    texels = np.minimum(texels, 0.0) if layout == "nodes" else texels.copy()
+    for mean, square in _moments(layout, texels):
+        square[:] = square**2 + mean
+    return texels
+
+
+def _moments(layout: Layout, texels: F32) -> list[tuple[F32, F32]]:
+    """Squared means, and the second moments, as views of the texels."""
+    if layout == "maps":
+        return [((texels[..., :2] ** 2).sum(-1), texels[..., 2])]
+    if layout == "horizons":
+        count = texels.shape[2] // 2
+        return [(texels[..., :count] ** 2, texels[..., count:])]
+    return []
+
+
+def pack_textures(material: Material, bits: int = 8, effort: int = 9) -> dict[str, PackedTexture]:
+    """All textures by name, with so many bits per number; heights have 12."""
+    images = program_of(material, GLSL).images
+    return {
+        image.source: pack(
+            _rounded(image),
+            12 if image.layout == "nodes" else bits,
+            effort,
+            alike=image.layout == "horizons",
+        )
+        for image in images
+        if image.layout != "rows"
+    }
+
+
+def _fitting(material: Material) -> tuple[dict[str, PackedTexture], int]:
+    """Textures of the most bits with which a page stays small, or of the fewest; and these bits."""
+    for bits in _BITS:
+        packed = pack_textures(material, bits)
+        if sum(len(texture.description["data"]) for texture in packed.values()) <= _SMALL:
+            break
+    return packed, bits
+
+
+def as_read(material: Material, packed: dict[str, PackedTexture]) -> Material:
+    """The material with the textures that a page holds."""
+    weights = material.model.weights()
+    for image in program_of(material, GLSL).images:
+        if image.source in packed and image.source != TRANSMITTANCE:
+            for level, texels in enumerate(packed[image.source].levels):
+                name = image.source if image.layout == "nodes" else f"{image.source}.{level}"
+                weights[name] = torch.from_numpy(_restored(image.layout, texels))
+    model = material.model.empty_copy()
+    model.load_weights(weights)
+    transmittance = material.transmittance
+    if transmittance is not None:
+        transmittance = replace(transmittance, levels=list(packed[TRANSMITTANCE].levels))
+    rgb = conformance_values(model, material.conformance)
+    return replace(
+        material, model=model, conformance={**material.conformance, "rgb": rgb}, transmittance=transmittance
+    )
+
+
+def _rounding(material: Material, read: Material, bits: int) -> str:
+    """Error of a page's textures on the conformance queries, in words."""
+    exact = material.conformance["rgb"].astype(np.float64)
+    difference = read.conformance["rgb"].astype(np.float64) - exact
+    rms, power = float(np.sqrt((difference**2).mean())), float(np.sqrt((exact**2).mean()))
+    return (
+        f"textures of {bits} bits: rms error {rms:.2g} 1/sr ({rms / power if power else 0.0:.2g} of the rms "
+        f"value), largest {float(np.abs(difference).max()):.2g} 1/sr"
+    )
+
+
+def content_of(material: Material, name: str, packed: dict[str, PackedTexture]) -> dict[str, Any]:
+    """What a page holds of a material with these textures, as JSON.
+
+    Raises
+    ------
+    InputError : it has an operation that shaders do not have
+    """
+    program = program_of(material, GLSL)
+    known, conformance = material.description, material.conformance
+    training = known["training"]
+    kinds = ((image, "TABLE" if image.is_table else "IMAGE") for image in program.images)
+    uniforms = [GLSL.image.format(kind=kind, name=image) for image, kind in kinds]
+    return {
+        "name": name,
+        "model": material.config.model,
+        "aspect": material.lattice.aspect,
+        "finest": material.lattice.finest,
+        "min_cos": known["data"].get("min_cos", DEFAULT_MIN_COS),
+        "source": "\n".join([GLSL.prologue, *uniforms, program.code]),
+        "weights": encode(program.weights),
+        "images": [_image(image) for image in program.images],
+        "textures": {name: texture.description for name, texture in packed.items()},
+        "conformance": {q: encode(conformance[q]) for q in (*QUERY, "rgb")},
+        "tolerance": TOLERANCE,
+        "facts": {
+            "levels": f"0 to {material.lattice.finest}",
+            "network weights": sum(p.numel() for p in material.model.parameter_groups()[1]),
+            "texels": sum(p.numel() for p in material.model.parameter_groups()[0]),
+            "training steps": training.get("steps"),
+            "training time in s": training.get("seconds"),
+        },
+    }
+
+
+def _image(image: TexelImage) -> dict[str, Any]:
+    """What a page knows of an image besides its texels."""
+    out: dict[str, Any] = {"name": image.name, "texture": image.source, "layout": image.layout}
+    if image.layout == "rows":
+        _, height, width, _ = (texels := image.texels()).shape
+        return {**out, "width": width, "height": height, "data": encode(texels)}
+    return {**out, "half": image.half, "shift": NODE_SHIFT}
+
+
+def material_content(folder: Path, name: str | None = None) -> tuple[dict[str, Any], str]:
+    """What a page holds of a material, as JSON, and the error of its textures in words.
+
+    Parameters
+    ----------
+    folder : made by ``mbtf-fit``
+    name : shown in the page; the folder's name by default
+
+    Raises
+    ------
+    InputError : the material is missing or corrupt, or has an operation that shaders do not have
+    """
+    material = Material.load(folder)
+    packed, bits = _fitting(material)
+    content = content_of(material, name or folder.resolve().name, packed)
+    return content, _rounding(material, as_read(material, packed), bits)

@@ -18,7 +18,7 @@ from mbtf_core.data.lattice import Lattice
 from mbtf_core.data.schema import Layout, Queries, SliceDirections
 from mbtf_core.stats import level_groups
 from mbtf_gen.sampling.exact_math import exp2, sincos_turns
-from mbtf_gen.sampling.rng import Purpose, numpy_generator
+from mbtf_gen.sampling.sobol import Purpose, numpy_generator
 
 F32 = NDArray[np.float32]
 # (angle to the normal in degrees, directions on that circle) of the BTF database Bonn 2003: Sattler, Sarlette
@@ -105,7 +105,7 @@ class QueryPlan:
         """Sample `rows` queries (shuffled layout), images (image layout) or positions (slices layout) of a
         shard.
 
-        The split is ``train``, ``test``, or a stream of :mod:`mbtf_gen.sampling.rng`. Leading axes are
+        The split is ``train``, ``test``, or a stream of :mod:`mbtf_gen.sampling.sobol`. Leading axes are
         ``(rows,)``, or ``(rows, height, width)`` of images. Slices are ``(rows, n²)``, one at the center of
         each texel of the finest level; those of other splits hold one query, as of the shuffled layout.
         """

@@ -12,11 +12,9 @@ from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import data_sha256, file_sha256
 from mbtf_gen.tile.fiber_tile import FiberScattering, FiberTile
 from mbtf_gen.tile.fibers.cloth_file import ClothFile, YarnEntry
-from mbtf_gen.tile.fibers.curve_files import read_curves
-from mbtf_gen.tile.fibers.curves import F64, Curve
-from mbtf_gen.tile.fibers.weave import knitted_lines, parse_draft, woven_lines
+from mbtf_gen.tile.fibers.curves import F64, Curve, read_curves
+from mbtf_gen.tile.fibers.weave import knitted_lines, parse_draft, read_pattern, woven_lines
 from mbtf_gen.tile.fibers.yarn import YARNS, CrossSection, YarnModel, count_segments, fibers_of, roughness_of
-from mbtf_gen.tile.fibers.yarn_pattern import read_pattern
 
 # Defaults that depend on the structure.
 _WOVEN_WIDTH, _WOVEN_HEIGHT, _KNITTED_WIDTH = 0.95, 0.6, 0.45

@@ -45,7 +45,7 @@ def cost(
     from mbtf_core.run.signals import keep_on_interruption
     from mbtf_core.units import asked_duration
     from mbtf_pipeline.collection.recipes import load
-    from mbtf_pipeline.cost.analysis import pareto_front
+    from mbtf_pipeline.cost.measurement import pareto_front
     from mbtf_pipeline.cost.page import write_page
     from mbtf_pipeline.cost.study import run_study
     from mbtf_pipeline.recipe import Recipe

@@ -14,7 +14,7 @@ from mbtf_pipeline.collection.recipes import Published, first_known
 from mbtf_pipeline.compare.image_files import read_picture
 from mbtf_pipeline.compare.unmodified_mitsuba import MAX_STANDARD_ERRORS, MIN_BLOCKS, verdict
 from mbtf_pipeline.report.images import displacements
-from mbtf_pipeline.run_folder import COMPARE
+from mbtf_pipeline.stages import COMPARE
 from mbtf_pipeline.tables import (
     Cell,
     Column,

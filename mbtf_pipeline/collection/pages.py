@@ -21,7 +21,7 @@ from mbtf_pipeline.compare.perceptual_metrics import weights_file
 from mbtf_pipeline.report.embed import file_uri
 from mbtf_pipeline.report.plots import ERROR_BAR_NOTE
 from mbtf_pipeline.report.report import render
-from mbtf_pipeline.run_folder import REPORT, VIEWER
+from mbtf_pipeline.stages import REPORT, VIEWER
 from mbtf_pipeline.tables import estimate, estimate_text
 
 # Sub-folders of the runs, and of the CSV files.

@@ -21,7 +21,7 @@ from mbtf_pipeline.collection.pages import RUNS, write_page
 from mbtf_pipeline.collection.recipes import Collection, PaperRecipe, Planned
 from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.run import generate_data, run_recipe, slices_folder
-from mbtf_pipeline.run_folder import COMPARE, machine
+from mbtf_pipeline.stages import COMPARE, machine
 
 COLLECTION = OutputKind("collection.json", "mbtf-collection", 1, "a library or paper")
 

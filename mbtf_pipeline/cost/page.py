@@ -10,8 +10,7 @@ from typing import Any
 
 from mbtf_core.files.atomic import write_text
 from mbtf_core.units import clock
-from mbtf_pipeline.cost.analysis import extrapolation, pareto_front
-from mbtf_pipeline.cost.measurement import Measurement
+from mbtf_pipeline.cost.measurement import Measurement, extrapolation, pareto_front
 from mbtf_pipeline.cost.study import Study
 from mbtf_pipeline.report.plots import Series, plot
 from mbtf_pipeline.report.report import render

@@ -26,7 +26,6 @@ from mbtf_core.stats import Estimate
 from mbtf_core.units import expectation
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
-from mbtf_pipeline.cost.analysis import combined, seed_deviation
 from mbtf_pipeline.cost.generator import benchmark_of, generator_configurations, path_seconds
 from mbtf_pipeline.cost.measurement import (
     HALF_WIDTH,
@@ -35,7 +34,9 @@ from mbtf_pipeline.cost.measurement import (
     Configuration,
     Measurement,
     MeasurementFolder,
+    combined,
     measure,
+    seed_deviation,
 )
 from mbtf_pipeline.cost.runs import (
     FEWEST_SEEDS,
@@ -48,7 +49,7 @@ from mbtf_pipeline.cost.runs import (
     test_set,
 )
 from mbtf_pipeline.recipe import Recipe
-from mbtf_pipeline.run_folder import machine
+from mbtf_pipeline.stages import machine
 
 STUDY = OutputKind("study.json", "mbtf-cost", 2, "a cost study")
 CONFIG_NAME = "generate.yaml"

@@ -27,7 +27,7 @@ from mbtf_pipeline.report.embed import (
     linear_uri,
     map_uri,
 )
-from mbtf_pipeline.run_folder import COMPARE
+from mbtf_pipeline.stages import COMPARE
 from mbtf_pipeline.tables import (
     decibel,
     direction,

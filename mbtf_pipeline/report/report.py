@@ -27,7 +27,7 @@ from mbtf_pipeline.report.sections import (
     time_tables,
     training_context,
 )
-from mbtf_pipeline.run_folder import COMPARE, FITS, REPORT, RUN, SHARDS, VIEWER
+from mbtf_pipeline.stages import COMPARE, FITS, REPORT, RUN, SHARDS, VIEWER
 
 # Raised when the report or the viewer's page changes; part of the stage's key.
 LAYOUT = 13
@@ -123,8 +123,7 @@ def write_viewer(folder: Path, title: str, comparison: Mapping[str, Any]) -> Non
     comparison : mapping
         Content of ``comparison.json``.
     """
-    from mbtf_fit.viewer.content import material_content
-    from mbtf_fit.viewer.page import write_page
+    from mbtf_fit.viewer.page import material_content, write_page
 
     path = folder / VIEWER
     materials = []

@@ -18,8 +18,7 @@ from mbtf_gen.tile.inspection import USES
 from mbtf_gen.tile.loading import latest_material
 from mbtf_pipeline.report.embed import U8, Pixels, data_uri, shrink
 from mbtf_pipeline.report.plots import Series, plot, points
-from mbtf_pipeline.run_folder import FITS
-from mbtf_pipeline.stages import read_stamp
+from mbtf_pipeline.stages import FITS, read_stamp
 from mbtf_pipeline.tables import data_errors, estimate
 
 UNEXPLAINED = "unexplained variance"

@@ -82,7 +82,7 @@ mbtf_fit
 mbtf_pipeline.recipe
 mbtf_pipeline.stages
 mbtf_pipeline.compare
-mbtf_pipeline.run_folder
+mbtf_pipeline.stages
 mbtf_pipeline.tables
 mbtf_pipeline.report
 mbtf_pipeline.run
@@ -165,7 +165,7 @@ def test_imports_run_downwards() -> None:
             "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import mbtf_gen.job",
             True,
         ),
-        ("mbtf_gen.planning.a", "from mbtf_gen.render.estimates import Stream", False),
+        ("mbtf_gen.planning.a", "from mbtf_gen.render.estimator import Stream", False),
         ("mbtf_core.a", "from mbtf_gen.config import presets", True),
         ("mbtf_fit.data.a", "from mbtf_core.errors import InputError", False),
         ("mbtf_fit.data.a", "from mbtf_gen.tile import protocol", True),

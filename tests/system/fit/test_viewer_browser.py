@@ -21,9 +21,8 @@ from mbtf_fit import fit
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.training.trainer import Trainer
-from mbtf_fit.viewer.content import as_read, encode, material_content, pack_textures
 from mbtf_fit.viewer.live import LiveView
-from mbtf_fit.viewer.page import write_page
+from mbtf_fit.viewer.page import as_read, encode, material_content, pack_textures, write_page
 
 
 def test_values_are_those_of_the_material(driver: Any, tmp_path: Path) -> None:

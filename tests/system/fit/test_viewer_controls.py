@@ -14,9 +14,8 @@ from mbtf_core.data.lattice import Lattice
 from mbtf_core.directions import from_angles
 from mbtf_core.pictures import Camera
 from mbtf_fit.material.transmittance import Transmittance
-from mbtf_fit.viewer.content import material_content
 from mbtf_fit.viewer.extras import picture_content
-from mbtf_fit.viewer.page import write_page
+from mbtf_fit.viewer.page import material_content, write_page
 
 # Values of constant materials; half of the light passes through the last.
 VALUES = {"dim": 0.1, "bright": 0.3, "veil": 0.2}

@@ -16,9 +16,8 @@ from mbtf_core.color import linear_to_srgb
 from mbtf_core.directions import from_angles
 from mbtf_core.pictures import Camera
 from mbtf_fit.material.material import Material
-from mbtf_fit.viewer.content import as_read, encode, material_content, pack_textures
 from mbtf_fit.viewer.extras import mesh_content
-from mbtf_fit.viewer.page import write_page
+from mbtf_fit.viewer.page import as_read, encode, material_content, pack_textures, write_page
 
 F64 = NDArray[np.float64]
 ASPECT = 0.5

@@ -11,8 +11,7 @@ from support.fit_data import parallax, write_data
 from mbtf_core.errors import UsageError
 from mbtf_fit.config import FitConfig
 from mbtf_fit.training.fit import fit
-from mbtf_fit.training.fit_folder import read_history
-from mbtf_fit.training.tensorboard import EventLog
+from mbtf_fit.training.fit_folder import EventLog, read_history
 
 
 def test_event_files_hold_the_history(tmp_path: Path) -> None:

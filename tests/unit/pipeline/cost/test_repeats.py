@@ -12,8 +12,7 @@ from support.fake_runs import TRUE, FakeRuns, MemoryStore, conditions, run
 
 from mbtf_core.run.runner import Runner
 from mbtf_core.stats import Estimate
-from mbtf_pipeline.cost.analysis import combined, seed_deviation
-from mbtf_pipeline.cost.measurement import HALF_WIDTH, NORMAL, Measurement
+from mbtf_pipeline.cost.measurement import HALF_WIDTH, NORMAL, Measurement, combined, seed_deviation
 from mbtf_pipeline.cost.runs import MOST_SEEDS, Run
 from mbtf_pipeline.cost.study import Measurements
 

@@ -22,14 +22,19 @@ from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item, Result, packed, run_task
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.cost import study as module
-from mbtf_pipeline.cost.analysis import extrapolation, pareto_front
 from mbtf_pipeline.cost.generator import GeneratorBenchmark, GeneratorConfiguration
-from mbtf_pipeline.cost.measurement import Conditions, Measurement, MeasurementFolder
+from mbtf_pipeline.cost.measurement import (
+    Conditions,
+    Measurement,
+    MeasurementFolder,
+    extrapolation,
+    pareto_front,
+)
 from mbtf_pipeline.cost.page import to_csv
 from mbtf_pipeline.cost.runs import MOST_SEEDS, TEST, Run, disk_bytes
 from mbtf_pipeline.cost.study import Measurements
 from mbtf_pipeline.recipe import load_recipe
-from mbtf_pipeline.run_folder import machine
+from mbtf_pipeline.stages import machine
 
 RECIPE = ROOT / "pipelines" / "quickstart.yaml"
 ONE = Estimate(1.0, 0.1, 4)

@@ -16,8 +16,8 @@ from mbtf_core.errors import InputError, MbtfError
 from mbtf_gen.config.generator import GeometrySection
 from mbtf_gen.tile.fiber_tile import FiberTile
 from mbtf_gen.tile.fibers.cloth_file import CURVE_FILES
-from mbtf_gen.tile.fibers.curve_files import read_curves
-from mbtf_gen.tile.fibers.yarn_pattern import read_pattern
+from mbtf_gen.tile.fibers.curves import read_curves
+from mbtf_gen.tile.fibers.weave import read_pattern
 from mbtf_gen.tile.loading import load_material
 
 PYP = """*pattern
