@@ -1,5 +1,5 @@
-"""The folder of a run, and its stages, which run only if their inputs have changed, decided by content and not
-by date.
+"""The folder of a run, and its stages, which run only if their inputs have changed, decided by content and
+not by date.
 
 The key of a stage is a hash of its resolved configuration, the digests of its input files, the digests of
 the outputs of the stages it needs, and a schema version. After a stage has run, a stamp is written

@@ -1,4 +1,5 @@
-"""The pictures of ``mbtf-fit preview``, and the contact sheet: a plane of the material for several views, lights and widths of the field of view.
+"""The pictures of ``mbtf-fit preview``, and the contact sheet: a plane of the material for several views,
+lights and widths of the field of view.
 
 A pixel is the material's value M for a single query, as in ``mbtf-gen reference --kind query``; the light has
 unit irradiance on the plane.

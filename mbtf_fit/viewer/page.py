@@ -1,5 +1,5 @@
-"""The page: one HTML file that holds everything, and opens without a server or a network; and what it holds of a
-material."""
+"""The page: one HTML file that holds everything, and opens without a server or a network; and what it holds of
+a material."""
 
 from __future__ import annotations
 

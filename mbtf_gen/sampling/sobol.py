@@ -1,4 +1,5 @@
-r"""Random streams, and low-discrepancy points inside kernels: Owen-scrambled Sobol' points, padded pair by pair.
+r"""Random streams, and low-discrepancy points inside kernels: Owen-scrambled Sobol' points, padded
+pair by pair.
 
 The paths of one half of a query are the points 0, 1, 2, … of one randomized sequence; half, query, shard and
 root seed select the randomization, so halves are independent and values do not depend on how paths are

@@ -1,5 +1,5 @@
-"""What a cost study measures: configurations, time and error of each, the files that keep them, and what follows:
-error bars of seeds, the Pareto front."""
+"""What a cost study measures: configurations, time and error of each, the files that keep them, and what
+follows: error bars of seeds, the Pareto front."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Lookups in Dr.Jit kernels, and where they are read (:mod:`mbtf_fit.ops.lookup`): textures, parallax, tables of
-calibration factors."""
+"""Lookups in Dr.Jit kernels, and where they are read (:mod:`mbtf_fit.ops.lookup`): textures, parallax, tables
+of calibration factors."""
 
 from __future__ import annotations
 
