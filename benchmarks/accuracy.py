@@ -48,7 +48,7 @@ from mbtf_gen.planning.adaptive import estimate_shard, round_up
 from mbtf_gen.planning.run_plan import plan_run, reference_plan
 from mbtf_gen.planning.sample_allocation import measure_allocation
 from mbtf_gen.planning.simulation import build_estimator
-from mbtf_gen.render.estimator import Estimates, Stream, Target
+from mbtf_gen.render.estimates import Estimates, Stream, Target
 
 TEXTURES = ("rock_cliff", "knit_fabric", "metal_plate")
 RESOLUTION = 128

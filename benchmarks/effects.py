@@ -33,7 +33,7 @@ from mbtf_gen.planning.bounds import Change
 from mbtf_gen.planning.effects_plan import EffectsPlan, without
 from mbtf_gen.planning.run_plan import PILOT_ROULETTE, SMALL_RUN, measured, plan_effects
 from mbtf_gen.planning.simulation import build_estimator
-from mbtf_gen.render.estimator import Estimates, Stream
+from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.tile.loading import load_material
 from mbtf_gen.tile.protocol import Tile
 

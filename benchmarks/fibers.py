@@ -40,7 +40,8 @@ PER_FIBER = 100
 
 def generator_run(material: Path, count: int, spp: int) -> Callable[[int], None]:
     """A function of the run's number that traces `count` queries."""
-    from mbtf_gen.render.estimator import Estimator, Stream
+    from mbtf_gen.render.estimates import Stream
+    from mbtf_gen.render.estimator import Estimator
     from mbtf_gen.render.path_tracer import Transport
     from mbtf_gen.render.scene import build_scene
     from mbtf_gen.sampling.light_kernel import LightKernel

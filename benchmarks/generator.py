@@ -91,7 +91,8 @@ def generator_run(
     material: Tile, grid: HeightGrid, count: int, spp: int, tracer: Tracer = "heightfield"
 ) -> Run:
     """A function of the run's number that traces `count` queries."""
-    from mbtf_gen.render.estimator import Estimator, Stream
+    from mbtf_gen.render.estimates import Stream
+    from mbtf_gen.render.estimator import Estimator
     from mbtf_gen.render.path_tracer import Transport
     from mbtf_gen.render.scene import build_scene
     from mbtf_gen.sampling.light_kernel import LightKernel
@@ -236,7 +237,8 @@ def measure_speed(material: Tile, arguments: argparse.Namespace) -> int:
 
 def measure_steps(material: Tile, arguments: argparse.Namespace) -> int:
     """Time per path with one step of light transport after the other."""
-    from mbtf_gen.render.estimator import Estimator, Stream
+    from mbtf_gen.render.estimates import Stream
+    from mbtf_gen.render.estimator import Estimator
     from mbtf_gen.render.path_tracer import Transport
     from mbtf_gen.render.scene import build_scene
     from mbtf_gen.sampling.light_kernel import LightKernel

@@ -124,7 +124,7 @@ def estimate(device: str, sizes: str, shards: str, out: str) -> Answers:
     from mbtf_gen.generation.folder import read_run_plan
     from mbtf_gen.job import Job
     from mbtf_gen.planning.simulation import build_estimator
-    from mbtf_gen.render.estimator import Stream
+    from mbtf_gen.render.estimates import Stream
 
     wanted = Sizes.read(sizes)
     data = Dataset.open(shards)

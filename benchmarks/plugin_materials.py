@@ -145,7 +145,7 @@ def energies(material: Path, shards: Path, evaluator: Any) -> list[dict[str, flo
     from mbtf_gen.job import Job
     from mbtf_gen.planning.run_plan import reference_plan
     from mbtf_gen.planning.simulation import build_estimator
-    from mbtf_gen.render.estimator import Stream
+    from mbtf_gen.render.estimates import Stream
 
     config = GeneratorConfig.model_validate(Dataset.open(shards).manifest["config"])
     job = Job.load(config)

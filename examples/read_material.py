@@ -86,9 +86,9 @@ class Material:
 
     def evaluate(self, u, sigma, omega_i, omega_o):
         level = np.clip(-np.log2(2.0 * sigma), 0, self.finest)[:, None]
-        return np.array([self.value(*query) for query in zip(u, level, omega_i, omega_o, strict=True)])
+        return np.array([*map(self.evaluate_query, u, level, omega_i, omega_o)])
 
-    def value(self, *query):
+    def evaluate_query(self, *query):
         self.values = dict(zip(("u", "level", "omega_i", "omega_o"), map(np.float64, query), strict=True))
         for fields in map(dict, self.operations):
             kind, name = fields.pop("operation"), fields.pop("output")

@@ -20,7 +20,7 @@ from mbtf_gen.job import Job, data_bytes, most_paths, planned_paths, split_queri
 from mbtf_gen.planning.adaptive import estimate_shard
 from mbtf_gen.planning.run_plan import RunPlan, allocate, plan_effects
 from mbtf_gen.planning.simulation import build_estimator, pilot_queries
-from mbtf_gen.render.estimator import Estimates, Stream, Target
+from mbtf_gen.render.estimates import Estimates, Stream, Target
 
 # Paths of one piece of the pilot.
 _PIECE_PATHS = 1 << 19

@@ -15,7 +15,7 @@ from mbtf_core.data.schema import SPLITS, ShardEntry, Split
 from mbtf_core.data.shard_files import row_bytes
 from mbtf_core.errors import InputError, UsageError
 from mbtf_gen.config.generator import GeneratorConfig, count_queries
-from mbtf_gen.render.estimator import TARGET_PILOT_SPP, Target
+from mbtf_gen.render.estimates import TARGET_PILOT_SPP, Target
 from mbtf_gen.sampling.query_sampler import (
     F32,
     UBO2003_COUNT,

@@ -180,7 +180,8 @@ def _estimates(
     """Estimates of M at n queries; each round has its own random numbers. Footprints with σ of four tile
     widths cover the tile evenly: their values are tile means."""
     load_mitsuba()
-    from mbtf_gen.render.estimator import Estimator, Stream
+    from mbtf_gen.render.estimates import Stream
+    from mbtf_gen.render.estimator import Estimator
     from mbtf_gen.render.path_tracer import Transport
     from mbtf_gen.render.scene import build_scene
 

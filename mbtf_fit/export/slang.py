@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from mbtf_core.config.settings import Settings
-from mbtf_fit.backends.shader.slang import ENDINGS, Target
+from mbtf_fit.backends.shader.syntax import ENDINGS, Target
 from mbtf_fit.export import Export, ExportTarget
 
 

@@ -1,5 +1,4 @@
-"""The page: one HTML file that holds everything, and opens without a server or a network; and what it holds of
-a material."""
+"""The page: one HTML file that holds everything, and opens without a server or a network; its content."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ from mbtf_gen.job import shard_entries
 from mbtf_gen.measured.interface import MeasuredBtf, MeasuredQueries, QueryBlock
 from mbtf_gen.measured.open import open_measured
 from mbtf_gen.measured.ubo2003 import SUFFIXES
-from mbtf_gen.sampling.sobol import Purpose, numpy_generator
+from mbtf_gen.sampling.rng import Purpose, numpy_generator
 
 I64 = NDArray[np.int64]
 

@@ -33,7 +33,7 @@ from mbtf_gen.job import Job, most_paths, planned_paths, received_job, split_spp
 from mbtf_gen.planning.adaptive import estimate_shard
 from mbtf_gen.planning.run_plan import RunPlan, plan_run
 from mbtf_gen.planning.simulation import build_estimator
-from mbtf_gen.render.estimator import Estimates, Stream
+from mbtf_gen.render.estimates import Estimates, Stream
 
 # Called with the paths so far, a note, and the paths expected in all (None: not known yet).
 ProgressCallback = Callable[[float, str, float | None], None]

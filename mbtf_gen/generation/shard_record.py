@@ -16,7 +16,7 @@ from mbtf_core.data.schema import ShardEntry
 from mbtf_core.data.shard_files import Arrays, write_shard
 from mbtf_core.errors import PartialError
 from mbtf_core.files.atomic import Stored
-from mbtf_gen.render.estimator import Estimates
+from mbtf_gen.render.estimates import Estimates
 
 # A run fails beyond this share of non-finite samples, but never for so few: with one expected, more than four
 # occur by chance once in 300 runs.

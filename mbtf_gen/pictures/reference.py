@@ -133,7 +133,7 @@ def render_reference(
     ------
     UsageError : the picture shows the horizon
     """
-    from mbtf_gen.render.estimator import Stream
+    from mbtf_gen.render.estimates import Stream
 
     queries = camera.queries(omega_i, estimator.tile.aspect)
     source = _camera_rays(camera, estimator) if kind == "pixel" else None

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from mbtf_core.data.documents import TargetReached
 from mbtf_core.data.schema import Queries
 from mbtf_gen.planning.sample_allocation import FEWEST, Allocation, mean_values
-from mbtf_gen.render.estimator import TARGET_PILOT_SPP, Estimates, Stream, Target
+from mbtf_gen.render.estimates import TARGET_PILOT_SPP, Estimates, Stream, Target
 
 F64 = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_gen.render.estimator import Estimates
+from mbtf_gen.render.estimates import Estimates
 from mbtf_gen.sampling.light_kernel import LightKernel
 from mbtf_gen.tile.heights import HeightGrid, height_slopes
 

@@ -19,7 +19,7 @@ from mbtf_gen.planning.effects_plan import EffectsPlan, consistent, without
 from mbtf_gen.planning.sample_allocation import Allocation, measure_allocation
 from mbtf_gen.planning.scene import EffectDecision, EffectsRequest, PlanScene
 from mbtf_gen.planning.simulation import build_estimator, pilot_queries
-from mbtf_gen.render.estimator import Estimates, Stream
+from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.sampling.light_kernel import LightKernel
 
 # Runs of fewer paths end before a pilot has paid for itself.

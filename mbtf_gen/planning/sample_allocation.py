@@ -28,7 +28,7 @@ from mbtf_core.data.schema import Queries
 from mbtf_gen.job import Job
 from mbtf_gen.planning.effects_plan import EffectsPlan
 from mbtf_gen.planning.simulation import build_estimator, pilot_queries
-from mbtf_gen.render.estimator import Estimates, Stream
+from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.sampling import exact_math as exact
 
 F64 = NDArray[np.float64]

@@ -16,7 +16,7 @@ from mbtf_gen.engine.runtime import CPU_VARIANT
 from mbtf_gen.job import Job
 from mbtf_gen.planning.effects import EFFECTS
 from mbtf_gen.planning.effects_plan import EffectsPlan
-from mbtf_gen.render.estimator import Estimates, Stream
+from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.tile.heights import height_slopes
 
 

@@ -7,7 +7,6 @@ number in the shard, so values do not depend on how queries are grouped into lau
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import drjit as dr
@@ -15,16 +14,18 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.data.documents import BadSample, TargetReached
+from mbtf_core.data.documents import BadSample
 from mbtf_core.data.schema import Queries
 from mbtf_core.directions import check_unit
 from mbtf_core.errors import PartialError
 from mbtf_gen.engine.types import Color3f, Float, Float64, Point2f, Ray3f, UInt32, padded
 from mbtf_gen.render.directional_light import DirectionalLight
+from mbtf_gen.render.estimates import MOST_LOCATED, Estimates, Stream
 from mbtf_gen.render.path_tracer import PathTracer, Transport
 from mbtf_gen.render.scene import CLEARANCE, TileScene
 from mbtf_gen.sampling.light_kernel import LightKernel
-from mbtf_gen.sampling.sobol import Purpose, SobolSampler, sequence, stream_key, stream_number
+from mbtf_gen.sampling.rng import Purpose, stream_key, stream_number
+from mbtf_gen.sampling.sobol import SobolSampler, sequence
 
 # Paths per launch: enough to fill any machine, few enough to fit into memory.
 LAUNCH_PATHS = 1 << 20
@@ -360,76 +361,3 @@ def _sum_of(x: Float, lane: UInt32, end: UInt32) -> Float64:
         total += mi.Float64(dr.gather(mi.Float, x, lane))
         lane += 1
     return total
-
-
-# Non-finite samples whose location is kept.
-MOST_LOCATED = 8
-# Paths of each query's own pilot under a target error.
-TARGET_PILOT_SPP = 16
-
-
-@dataclass(frozen=True)
-class Target:
-    """Standard error that every value is to reach.
-
-    Attributes
-    ----------
-    error : relative to max(value, tile mean)
-    max_spp : paths that a query gets at most, without its pilot
-    """
-
-    error: float
-    max_spp: int
-
-
-@dataclass(frozen=True)
-class Estimates:
-    """Estimates of a batch of queries.
-
-    Attributes
-    ----------
-    value_a, value_b : (n, 3) float32 array
-        Independent halves of spp/2 paths each, in 1/sr.
-    transmittance : (n,) float32 array or None
-        Fraction of the view rays that the opacity mask transmits; None without a mask.
-    paths, lost, capped : int
-        Paths traced, rays that passed through the surface without a hit, and rays that reached the cap on
-        crossings.
-    nonfinite, bad_samples : int, tuple of BadSample
-        Number of non-finite samples, which were drawn again, and the first ``MOST_LOCATED`` of them.
-    spp : (n,) int64 array or None
-        Paths of each query, both halves together; None where all have the same number.
-    path_variance : (n,) float32 array or None
-        Sample variance of each query's single paths, mean over channels, if requested.
-    target : TargetReached or None
-        Error reached under a target error.
-    """
-
-    value_a: NDArray[np.float32]
-    value_b: NDArray[np.float32]
-    transmittance: NDArray[np.float32] | None
-    paths: int
-    lost: int
-    capped: int
-    nonfinite: int
-    bad_samples: tuple[BadSample, ...] = ()
-    spp: NDArray[np.int64] | None = None
-    path_variance: NDArray[np.float32] | None = None
-    target: TargetReached | None = None
-
-
-@dataclass(frozen=True)
-class Stream:
-    """Random numbers to use: those of a shard under a root seed.
-
-    Attributes
-    ----------
-    root, split, shard : root seed; split of the shard; number of the shard in the split
-    first_pass : number of the first pass. Every pass draws all paths anew; later passes replace non-finite
-        samples
-    """
-
-    root: int
-    split: str
-    shard: int
-    first_pass: int = 0

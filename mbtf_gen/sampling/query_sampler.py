@@ -18,7 +18,7 @@ from mbtf_core.data.lattice import Lattice
 from mbtf_core.data.schema import Layout, Queries, SliceDirections
 from mbtf_core.stats import level_groups
 from mbtf_gen.sampling.exact_math import exp2, sincos_turns
-from mbtf_gen.sampling.sobol import Purpose, numpy_generator
+from mbtf_gen.sampling.rng import Purpose, numpy_generator
 
 F32 = NDArray[np.float32]
 # (angle to the normal in degrees, directions on that circle) of the BTF database Bonn 2003: Sattler, Sarlette

@@ -29,7 +29,7 @@ from mbtf_gen.job import Job, split_spp, split_target
 from mbtf_gen.planning.adaptive import estimate_shard
 from mbtf_gen.planning.run_plan import allocate, plan_effects
 from mbtf_gen.planning.simulation import build_estimator
-from mbtf_gen.render.estimator import Stream
+from mbtf_gen.render.estimates import Stream
 from mbtf_gen.tile.protocol import Tile
 from mbtf_pipeline.cost.measurement import HALF_WIDTH, NORMAL, Conditions, Configuration, Measurement
 

@@ -23,7 +23,7 @@ from mbtf_gen.generation.manifest import finish
 from mbtf_gen.generation.run import ShardRun
 from mbtf_gen.job import Job, split_spp
 from mbtf_gen.planning.run_plan import RunPlan, reference_plan
-from mbtf_gen.render.estimator import Estimates
+from mbtf_gen.render.estimates import Estimates
 
 F32 = NDArray[np.float32]
 NOISE = 0.05

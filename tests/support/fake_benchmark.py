@@ -11,7 +11,7 @@ import pytest
 from mbtf_core.data.schema import Queries
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.run import Job
-from mbtf_gen.render.estimator import Estimates, Stream
+from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 from mbtf_pipeline.cost.generator import GeneratorBenchmark
 

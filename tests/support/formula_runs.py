@@ -17,7 +17,7 @@ from support.datasets import formula
 load_mitsuba()
 
 from mbtf_core.data.documents import BadSample  # noqa: E402
-from mbtf_gen.render.estimator import Estimates  # noqa: E402
+from mbtf_gen.render.estimates import Estimates  # noqa: E402
 
 SMALL = {
     "queries": {"train": "100", "test": "30", "spp": 2, "test_spp": 4},

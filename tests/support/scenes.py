@@ -16,7 +16,8 @@ from support.paths import ROOT
 mi = load_mitsuba()
 
 from mbtf_core.data.schema import Queries  # noqa: E402
-from mbtf_gen.render.estimator import Estimates, Estimator, Stream  # noqa: E402
+from mbtf_gen.render.estimates import Estimates, Stream  # noqa: E402
+from mbtf_gen.render.estimator import Estimator  # noqa: E402
 from mbtf_gen.render.path_tracer import Transport  # noqa: E402
 from mbtf_gen.render.scene import build_scene, register_plugins  # noqa: E402
 from mbtf_gen.sampling.light_kernel import LightKernel  # noqa: E402

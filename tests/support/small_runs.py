@@ -16,8 +16,8 @@ from mbtf_core.app.console import run
 from mbtf_core.data.schema import Queries
 from mbtf_gen.cli.app import app
 from mbtf_gen.planning.simulation import ClosedForm
-from mbtf_gen.render.estimator import Estimates, Stream
-from mbtf_gen.sampling.sobol import Purpose, numpy_generator
+from mbtf_gen.render.estimates import Estimates, Stream
+from mbtf_gen.sampling.rng import Purpose, numpy_generator
 
 
 def noisy_plane(self: ClosedForm, queries: Queries, spp: int, stream: Stream) -> Estimates:

@@ -8,25 +8,16 @@ import importlib.util
 from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import Literal, get_args
+from typing import get_args
 
 from mbtf_core.errors import EngineError, reason
 from mbtf_core.files.atomic import write_chunks, write_text
 from mbtf_fit.backends.shader.images import F32, buffer_of
 from mbtf_fit.backends.shader.program import program_of
-from mbtf_fit.backends.shader.syntax import SLANG, number
+from mbtf_fit.backends.shader.syntax import ENDINGS, SLANG, Target, number
 from mbtf_fit.material.format import DEFAULT_MIN_COS
 from mbtf_fit.material.material import Material
 
-Target = Literal["hlsl", "glsl", "wgsl", "metal", "cuda", "cpp"]
-ENDINGS: dict[Target, str] = {
-    "hlsl": ".hlsl",
-    "glsl": ".comp",
-    "wgsl": ".wgsl",
-    "metal": ".metal",
-    "cuda": ".cu",
-    "cpp": ".cpp",
-}
 TARGETS: tuple[Target, ...] = get_args(Target)
 MODULE_NAME, TEXELS_NAME = "material.slang", "material.bin"
 FILE_NAMES = (

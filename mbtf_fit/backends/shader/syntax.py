@@ -9,8 +9,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
+
+# Languages that Slang compiles to, and the endings of their files.
+Target = Literal["hlsl", "glsl", "wgsl", "metal", "cuda", "cpp"]
+ENDINGS: dict[Target, str] = {
+    "hlsl": ".hlsl",
+    "glsl": ".comp",
+    "wgsl": ".wgsl",
+    "metal": ".metal",
+    "cuda": ".cu",
+    "cpp": ".cpp",
+}
 
 
 @dataclass(frozen=True)

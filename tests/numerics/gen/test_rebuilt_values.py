@@ -23,7 +23,7 @@ from mbtf_gen.job import Job
 from mbtf_gen.planning.run_plan import reference_plan
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.bsdf.surface import SurfaceParts
-from mbtf_gen.render.estimator import Stream
+from mbtf_gen.render.estimates import Stream
 
 Array = NDArray[np.float64]
 ROWS, COLUMNS, MESH, SCALE = 30, 40, 12, 2.0

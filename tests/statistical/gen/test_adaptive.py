@@ -25,7 +25,7 @@ from mbtf_gen.planning.adaptive import estimate_shard
 from mbtf_gen.planning.run_plan import plan_effects, plan_run
 from mbtf_gen.planning.sample_allocation import Allocation, fit_allocation
 from mbtf_gen.planning.simulation import build_estimator
-from mbtf_gen.render.estimator import Estimates, Stream, Target
+from mbtf_gen.render.estimates import Estimates, Stream, Target
 from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan
 
 load_mitsuba()

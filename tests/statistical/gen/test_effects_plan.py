@@ -19,7 +19,7 @@ from mbtf_gen.planning.effects import EFFECTS
 from mbtf_gen.planning.effects_plan import EffectsPlan, without
 from mbtf_gen.planning.run_plan import plan_effects
 from mbtf_gen.planning.simulation import build_estimator, pilot_queries
-from mbtf_gen.render.estimator import Estimates, Stream
+from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 
 QUERIES, SPP = 16384, 8

@@ -22,7 +22,7 @@ from mbtf_gen.job import Job
 from mbtf_gen.planning.effects_plan import EffectsPlan, without
 from mbtf_gen.planning.run_plan import RunPlan, plan_effects
 from mbtf_gen.planning.simulation import build_estimator, pilot_queries
-from mbtf_gen.render.estimator import Estimates, Stream
+from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 
 load_mitsuba()

@@ -24,7 +24,7 @@ from support.scenes import (
 )
 
 from mbtf_core.errors import InputError
-from mbtf_gen.render.estimator import MOST_LOCATED
+from mbtf_gen.render.estimates import MOST_LOCATED
 
 
 def estimator(launch: int = 1 << 20, **options: Any) -> Estimator:

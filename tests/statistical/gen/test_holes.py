@@ -11,7 +11,8 @@ from support.mitsuba_blocks import GRIDS, SPP, block, mitsuba_halves, random_que
 from support.scenes import HeightGrid, LightKernel, direction, directional, flat, mi, queries, rocks
 
 from mbtf_core.stats import aggregate_test, elevation_groups, mean_of_halves
-from mbtf_gen.render.estimator import Estimator, Stream
+from mbtf_gen.render.estimates import Stream
+from mbtf_gen.render.estimator import Estimator
 from mbtf_gen.render.path_tracer import Transport
 from mbtf_gen.render.scene import TileScene, build_scene
 

@@ -15,7 +15,7 @@ from mbtf_gen.job import Job
 from mbtf_gen.planning.bounds import Change
 from mbtf_gen.planning.run_plan import plan_effects, reference_plan
 from mbtf_gen.planning.simulation import build_estimator, pilot_queries
-from mbtf_gen.render.estimator import Stream
+from mbtf_gen.render.estimates import Stream
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 from mbtf_gen.tile.heights import HeightGrid, height_slopes, residual_slopes
 from mbtf_gen.tile.loading import load_material

@@ -10,7 +10,8 @@ from support.chi_square import Rectangle, chi_square_test, uniformity
 from support.scenes import mi, queries
 
 from mbtf_core.stats import mean_estimate, t_test
-from mbtf_gen.sampling.sobol import Purpose, sequence, stream_key, stream_number
+from mbtf_gen.sampling.rng import Purpose, stream_key, stream_number
+from mbtf_gen.sampling.sobol import sequence
 
 N = 1 << 18
 CENTER = np.array([0.9, 0.05])

@@ -13,7 +13,7 @@ from mbtf_gen.job import Job
 from mbtf_gen.planning.bounds import Change
 from mbtf_gen.planning.run_plan import reference_plan
 from mbtf_gen.planning.simulation import build_estimator, pilot_queries
-from mbtf_gen.render.estimator import Estimates, Stream
+from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 from mbtf_gen.tile.heights import height_slopes
 from mbtf_gen.tile.loading import load_material

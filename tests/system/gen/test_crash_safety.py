@@ -25,7 +25,7 @@ from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.schema import Queries, ShardEntry
 from mbtf_core.data.verify import verify
 from mbtf_gen.planning.simulation import ClosedForm
-from mbtf_gen.render.estimator import Estimates, Stream
+from mbtf_gen.render.estimates import Estimates, Stream
 
 ERRORS = (errno.EIO, errno.ENOSPC, errno.EACCES, errno.EMFILE)
 PARTIAL_OR_INPUT = (3, 4)

@@ -22,7 +22,7 @@ from mbtf_gen.job import Job, split_target
 from mbtf_gen.planning import sample_allocation
 from mbtf_gen.planning.run_plan import RunPlan, allocate, plan_effects
 from mbtf_gen.planning.simulation import pilot_queries
-from mbtf_gen.render.estimator import Estimates, Stream
+from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 
 RATE = 1e6

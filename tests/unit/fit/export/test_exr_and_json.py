@@ -81,7 +81,8 @@ class Reader(read_material.Material):  # type: ignore[misc, name-defined]
         known = self.document["conformance"]
         u, sigma, omega_o = (np.array(known[k]) for k in ("u", "sigma", "omega_o"))
         level = np.clip(-np.log2(2 * sigma), 0, self.finest)
-        c = self.lookup(u, level[:, None], "transmittance")
+        at = zip(u, level[:, None], strict=True)
+        c = np.array([self.lookup(p, s, "transmittance") for p, s in at])
         x, y = omega_o[:, 0], omega_o[:, 1]
         return np.asarray(np.clip((c * np.stack([x**0, x, y, x * x, x * y, y * y], -1)).sum(-1), 0, 1))
 

@@ -17,7 +17,7 @@ from mbtf_gen.planning.sample_allocation import (
     fit_allocation,
     fit_log_linear,
 )
-from mbtf_gen.render.estimator import Estimates
+from mbtf_gen.render.estimates import Estimates
 from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan
 
 SPP = 16

@@ -23,7 +23,7 @@ from mbtf_gen.sampling.exact_math import exp2, sincos_turns
 from mbtf_core.data.lattice import Lattice
 from mbtf_gen.planning.adaptive import needed_paths, round_up
 from mbtf_gen.planning.sample_allocation import Allocation
-from mbtf_gen.render.estimator import Estimates
+from mbtf_gen.render.estimates import Estimates
 from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan
 h = hashlib.sha256()
 for layout, lattice, rows in (("shuffled", Lattice(5, 0.75), 5000), ("image", Lattice(4, 1.0), 7)):

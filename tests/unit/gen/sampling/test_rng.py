@@ -11,7 +11,7 @@ from support.chi_square import uniformity
 
 from mbtf_core.stats import holm
 from mbtf_gen.engine.runtime import load_mitsuba
-from mbtf_gen.sampling.sobol import MAX_SHARDS, Purpose, numpy_generator, stream_key, stream_number
+from mbtf_gen.sampling.rng import MAX_SHARDS, Purpose, numpy_generator, stream_key, stream_number
 
 mi = load_mitsuba()
 

@@ -11,7 +11,7 @@ from support.chi_square import uniformity
 
 from mbtf_core.stats import holm, mean_estimate, t_test
 from mbtf_gen.engine.runtime import load_mitsuba
-from mbtf_gen.sampling.sobol import Purpose, stream_key, stream_number
+from mbtf_gen.sampling.rng import Purpose, stream_key, stream_number
 
 mi = load_mitsuba()
 

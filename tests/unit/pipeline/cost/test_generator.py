@@ -15,7 +15,7 @@ from mbtf_core.data.schema import Queries
 from mbtf_core.errors import InputError
 from mbtf_core.stats import Estimate
 from mbtf_gen.planning.run_plan import plan_effects
-from mbtf_gen.render.estimator import Estimates, Stream
+from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_pipeline.cost import generator as module
 from mbtf_pipeline.cost.generator import (
     PATHS,
