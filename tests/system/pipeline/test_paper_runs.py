@@ -89,7 +89,7 @@ def test_tables_contain_the_measured_numbers(made: Path) -> None:
     assert [r["verdict"] for r in table(made, "independence")] == ["inconclusive"]
     for fit in ("neumip", "hierarchical"):
         begun = json.loads((run_folder / "fits" / fit / "fit.json").read_text())
-        assert begun["config"]["training"]["steps"] == 4
+        assert begun["depends"]["training"]["steps"] == 4
 
 
 def test_the_page_is_self_contained_and_names_the_size(made: Path) -> None:
