@@ -34,7 +34,7 @@ def cost(
     recipe
         YAML file; its material and generator are studied.
     time
-        Time of the study: 90s, 2min, 1h.
+        Time budget: 90s, 2min, 1h.
     refine
         Additional time: repeats runs with further seeds until their 95 % intervals are within ±10 %.
     seed
