@@ -48,8 +48,8 @@ def test_inputs_exist_and_no_output_folder_belongs_to_two_commands() -> None:
             output = output_of(words)
             written = [after for flag, after in pairwise(words) if flag == "--write"]
             for word in words[1:]:
-                known = word in (output, *written) or word.startswith(tuple(made)) or (ROOT / word).exists()
-                if not known and word.endswith(("/", ".txt", ".yaml")):
+                new = word not in (output, *written) and word not in made and not (ROOT / word).exists()
+                if new and word.endswith(("/", ".txt", ".yaml")):
                     faults.append(f"{shown.where}: {shown.text}: nothing made {word}")
             if output and made.setdefault(output, configuration(shown.text)) != configuration(shown.text):
                 faults.append(f"{shown.where}: {shown.text}: {output} is that of {made[output]}")

@@ -175,7 +175,12 @@ def test_a_flag_sets_the_key_that_it_is_named_after() -> None:
     assert len(found) > 20
     for flag, key in found:
         name = flag.removeprefix("--").replace("-", "_")
-        named = name in (key.rpartition(".")[2], key.replace(".", "_"))
+        # A flag that may be repeated has the singular of its key.
+        named = name in (
+            key.rpartition(".")[2].removesuffix("s"),
+            key.rpartition(".")[2],
+            key.replace(".", "_"),
+        )
         assert key == OTHER_NAMES[flag] if flag in OTHER_NAMES else named, (flag, key)
 
 
@@ -189,9 +194,10 @@ def test_an_option_has_one_help_and_one_meaning() -> None:
                     if name.startswith("--"):
                         helps.setdefault(name, set()).add(argument.parameter.help)
             for option in getattr(options_of(command.default_command), "table", ()):
-                keys.setdefault(option.flag, set()).add(option.key.rpartition(".")[2])
-    # Paths per query or per pixel; only data sets are written to URLs.
-    assert len(helps.pop("--spp")) == 2
+                keys.setdefault(option.flag, set()).add(option.key.rpartition(".")[2].removesuffix("s"))
+    # Paths per query or per pixel; directions of a picture or of a contact sheet.
+    assert {len(helps.pop(name)) for name in ("--spp", "--view", "--light")} == {2}
+    # Only data sets are written to URLs.
     assert helps.pop("--output") == {"Output folder.", "Output folder or URL."}
     assert {name: found for name, found in helps.items() if len(found) > 1 or not all(found)} == {}
     assert {flag: found for flag, found in keys.items() if len(found) > 1} == {}
