@@ -195,8 +195,8 @@ def test_an_option_has_one_help_and_one_meaning() -> None:
                         helps.setdefault(name, set()).add(argument.parameter.help)
             for option in getattr(options_of(command.default_command), "table", ()):
                 keys.setdefault(option.flag, set()).add(option.key.rpartition(".")[2].removesuffix("s"))
-    # Paths per query or per pixel; directions of a picture or of a contact sheet.
-    assert {len(helps.pop(name)) for name in ("--spp", "--view", "--light")} == {2}
+    # Paths per query or per pixel.
+    assert len(helps.pop("--spp")) == 2
     # Only data sets are written to URLs.
     assert helps.pop("--output") == {"Output folder.", "Output folder or URL."}
     assert {name: found for name, found in helps.items() if len(found) > 1 or not all(found)} == {}

@@ -234,3 +234,12 @@ def test_shipped_recipes_are_valid_and_quick_is_smaller(path: Path) -> None:
         assert int(small.generate.queries.test) <= int(large.generate.queries.test)
         assert (small.generate.queries.resolution or 99) < (large.generate.queries.resolution or 0)
         assert small.fit.keys() == large.fit.keys()
+
+
+def test_the_shipped_library_has_its_assets() -> None:
+    file = ROOT / "pipelines" / "library.yaml"
+    found = recipes.load(file)
+    assert isinstance(found, Collection)
+    planned, skipped = found.plan(file)
+    assert len(planned) >= 5
+    assert not skipped
