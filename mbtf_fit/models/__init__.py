@@ -6,11 +6,15 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-
-def _names() -> tuple[str, ...]:
-    """Names of the models, read from the text of their files: to import them takes longer than a help."""
-    texts = (path.read_text() for path in sorted(Path(__file__).parent.glob("*.py")))
-    return tuple(name for text in texts for name in re.findall(r'^    name = "(.+)"$', text, re.MULTILINE))
+# A class's line that gives its name, alone or before others.
+_NAME = re.compile(r'^    name(?:, \w+)* = "([^"]+)"', re.MULTILINE)
 
 
-NAMES = _names()
+def names_in(text: str) -> list[str]:
+    """Names of the models that a file declares, read from its text: to import it takes longer than a help."""
+    return _NAME.findall(text)
+
+
+NAMES = tuple(
+    name for path in sorted(Path(__file__).parent.glob("*.py")) for name in names_in(path.read_text())
+)

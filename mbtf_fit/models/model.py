@@ -71,7 +71,8 @@ class Preparation:
 class Model:
     """A model: what it computes, and how it is trained. An object accompanies one training.
 
-    Subclasses in files of this folder are found by their `name`; a file is a model of its own.
+    Subclasses in files of this folder are found by their `name`, a line that begins with ``name = "``; a
+    file is a model of its own.
 
     Attributes
     ----------

@@ -11,8 +11,8 @@ Deviations from the paper:
 - The decoder has the 3 outputs of the paper's text. Its weight count of 3332 is that of 6 outputs (in the
   published code: YUV and a gate; ``network.output_channels: 6``); with 3 it is 3254.
 - No final ReLU in training: the gradient of an output below zero would vanish. Materials clamp at inference.
-- Values are ``unit · (exp(x) - 1)`` with the data's mean as the unit, so that training does not depend on the
-  brightness of the material; the paper's unit is 1.
+- Values are ``unit · (exp(x) - 1)`` with a robust mean of the data as the unit, so that training does not
+  depend on the brightness of the material; the paper's unit is 1.
 - The offset network's output r is scaled by 0.1 and the offset texture starts at zero, as in the published
   code.
 - The tile may be non-square, r is a length in tile widths: the v-component is divided by the aspect.
