@@ -1,4 +1,5 @@
-"""A measured number with its standard error, and statistics by group: levels of detail, elevation bands."""
+"""A measured number with its standard error, and statistics by group: levels of detail, elevation bands.
+Estimates that are pooled from two halves are in :mod:`mbtf_core.stats.paired`."""
 
 from __future__ import annotations
 
