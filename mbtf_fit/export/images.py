@@ -1,4 +1,4 @@
-"""Maps as images (base color, normal, roughness and metallic in one, height), and what the documents that name them have in common."""
+"""Maps as images (base color, normal, roughness and metallic in one, height), and what documents share."""
 
 from __future__ import annotations
 
