@@ -47,3 +47,10 @@ def test_a_peak_at_the_plane_is_not_displaced(plane_below: object) -> None:
     np.testing.assert_allclose(found, 0, atol=1e-6)
     slanted = traced_offset(plane_below, u, from_angles(30, 0))  # type: ignore[arg-type]
     assert np.abs(slanted).max() < 1e-4
+
+
+def test_correlation() -> None:
+    x = np.linspace(0, 1, 50, dtype=np.float32)
+    assert _regression(x, 3 * x - 2) == pytest.approx({"correlation": 1.0, "slope": 3.0})
+    assert _regression(x, -x) == pytest.approx({"correlation": -1.0, "slope": -1.0})
+    assert _regression(np.zeros_like(x), x) == {"correlation": None, "slope": None}
