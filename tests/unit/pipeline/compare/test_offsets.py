@@ -8,7 +8,7 @@ import pytest
 from mbtf_core.directions import from_angles
 from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.tile.heights import HeightGrid
-from mbtf_pipeline.compare.offsets import towards_view, traced_offset
+from mbtf_pipeline.compare.offsets import _regression, towards_view, traced_offset
 from mbtf_pipeline.recipe import SceneView
 
 DEPTH = 0.05
