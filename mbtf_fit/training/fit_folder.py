@@ -18,6 +18,7 @@ from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.material.decoder import DECODER_NAME, Decoder
 from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME, read_description
 from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME
+from mbtf_fit.models.registry import MODELS
 from mbtf_fit.training.loop import CHECKPOINT_NAME
 from mbtf_fit.training.trainer import Trainer
 from mbtf_fit.training.validation import errors_by_level
@@ -46,6 +47,10 @@ def identity_of(config: FitConfig, data: Dataset, group: Sequence[Dataset] = ())
     training = config.training.model_copy(update={"materials": others})
     located = config.model_copy(update={"training": training})
     config_hash = located.hash(data_sha256({**described, "files": files}))
+    # A model whose file has changed is another one.
+    operations = MODELS[config.model].operations(data.lattice, config.network)
+    model = data_sha256([operation.as_json() for operation in operations])
+    config_hash += f"-{model}"
     if config.init_from is not None:
         description, _ = read_description(Path(config.init_from))
         config_hash += f"-{description['weights']['sha256']}"
@@ -58,6 +63,7 @@ def identity_of(config: FitConfig, data: Dataset, group: Sequence[Dataset] = ())
     return {
         "config_hash": config_hash,
         "config": config.fields(),
+        "operations": model,
         "data": {**described, **directions, "shards": lengths, "inputs": data.manifest.get("inputs", {})},
     }
 
@@ -75,7 +81,7 @@ def claim(out: Path, identity: dict[str, Any], config: FitConfig, overwrite: boo
     OutputFolder.claim(
         out,
         FIT,
-        {**identity["config"], "data": identity["data"]},
+        {**identity["config"], "operations": identity["operations"], "data": identity["data"]},
         _FILES,
         config=config.model_dump(mode="json"),
         digest=identity["config_hash"],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from mbtf_fit import FitConfig, FitResult, Material, evaluate, fit, read_history
 from mbtf_fit.data.loader import load_training
 from mbtf_fit.evaluation import split_errors
 from mbtf_fit.material.material import conformance_queries, export
+from mbtf_fit.models.registry import MODELS
 from mbtf_fit.training.trainer import prepare_trainer
 
 
@@ -225,6 +227,17 @@ def test_another_configuration_is_refused_with_its_differences(data: Path, tmp_p
     with pytest.raises(InputError, match=r"data\.hash: .* -> "):
         fit(config(3), other, out)
     assert fit(config(4), data, out, overwrite=True).history[-1]["step"] == 4
+
+
+def test_a_changed_model_is_another_fit(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out, before = tmp_path / "m", MODELS["neumip"].operations
+    fit(config(3), data, out)
+    assert fit(config(3), data, out).resumed
+    doubled = [*before(Lattice(3, 0.5), config().network)]
+    doubled[-1] = dataclasses.replace(doubled[-1], scale=2.0)  # type: ignore[call-arg]
+    monkeypatch.setattr(MODELS["neumip"], "operations", lambda lattice, network: doubled)
+    with pytest.raises(InputError, match="of another configuration: operations"):
+        fit(config(3), data, out)
 
 
 def test_a_folder_of_other_files_is_never_touched(data: Path, tmp_path: Path) -> None:
