@@ -125,7 +125,7 @@ def is_worker(process: Any) -> bool:
         return False
 
 
-@pytest.mark.parametrize("kills", [6, pytest.param(100, marks=[pytest.mark.slow, pytest.mark.timeout(3600)])])
+@pytest.mark.parametrize("kills", [4, pytest.param(100, marks=[pytest.mark.slow, pytest.mark.timeout(3600)])])
 def test_killed_workers_and_commands_lose_nothing(kills: int, tmp_path: Path) -> None:
     import psutil
 
