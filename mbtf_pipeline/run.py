@@ -241,16 +241,16 @@ def _manifest_digest(shards: Path) -> str:
 
 def _unfinished(out: Path, config: FitConfig, shards: Path) -> bool:
     """Whether a folder contains this fit from an interrupted run."""
-    from mbtf_core.data.schema import MANIFEST_NAME
-    from mbtf_fit.training.fit_folder import FIT
+    from mbtf_core.data.dataset import Dataset
+    from mbtf_fit.training.fit_folder import FIT, identity_of
 
     try:
-        record, manifest = FIT.read(out), read_json(shards / MANIFEST_NAME)
+        record = FIT.read(out)
+        return (
+            record is not None and record["hash"] == identity_of(config, Dataset.open(shards))["config_hash"]
+        )
     except InputError:
         return False
-    known = {} if record is None else record["depends"]
-    data = known.pop("data", {})
-    return data.get("hash") == manifest.get("config_hash") and known == config.fields()
 
 
 def _material_inputs(recipe: Recipe) -> dict[str, str]:
