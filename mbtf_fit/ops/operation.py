@@ -39,6 +39,10 @@ _KINDS: dict[str, type[Operation]] = {}
 _REFERENCE = re.compile(r"(\w+)(?:\[(\d+):(\d+)\])?")
 
 
+# A value of a back end.
+V = TypeVar("V")
+
+
 @dataclass(frozen=True)
 class Operation:
     """One step of a model.
@@ -73,9 +77,28 @@ class Operation:
         """The values that it reads, with ranges, in the order of the fields."""
         return self.named("value")
 
-    def value_fields(self) -> list[str]:
-        """Names of the fields that name values."""
-        return _fields_of(self.kind(), "value")
+    def arguments(self, read: Callable[[str, slice], V]) -> list[V | list[V] | None]:
+        """What its fields say of values, in their order.
+
+        Parameters
+        ----------
+        read : of a name and a range, the value of a back end
+
+        Returns
+        -------
+        list
+            A value for a field with one name, a list for several, None for a field that is left out.
+        """
+        out: list[V | list[V] | None] = []
+        for name in _fields_of(self.kind(), "value"):
+            found = getattr(self, name)
+            if found is None:
+                out.append(None)
+            elif isinstance(found, str):
+                out.append(read(*parse(found)))
+            else:
+                out.append([read(*parse(reference)) for reference in found])
+        return out
 
     def named(self, kind: str) -> list[str]:
         """What fields of a kind name: ``value``, ``tensor``, ``texture`` or ``network``."""

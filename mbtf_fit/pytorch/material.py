@@ -130,7 +130,7 @@ class NeuralMaterial(nn.Module):
             self._plans[key] = needed_for(self.operations, wanted, [*given])
         run, values = Execution(self, grid), dict(given)
         for op in self._plans[key]:
-            arguments = [_argument(getattr(op, name), values) for name in op.value_fields()]
+            arguments: list[object] = [*op.arguments(lambda name, part: _read(values, name, part))]
             if not isinstance(op, ops.Inception):
                 arguments = _aligned(arguments)
             found = PYTORCH[op](op, run, *arguments)
@@ -374,13 +374,8 @@ def _first_outputs(operations: Sequence[ops.Operation]) -> dict[str, dict[int, f
     return out
 
 
-def _argument(field: str | tuple[str, ...] | None, values: Mapping[str, Tensor]) -> object:
-    """What an operation's field refers to: a tensor, or a list of tensors."""
-    if field is None:
-        return None
-    if not isinstance(field, str):
-        return [_argument(reference, values) for reference in field]
-    name, part = parse(field)
+def _read(values: Mapping[str, Tensor], name: str, part: slice) -> Tensor:
+    """Some numbers of a value; all of them as they are."""
     return values[name] if part == slice(None) else values[name][:, part]
 
 

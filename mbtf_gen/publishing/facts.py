@@ -19,8 +19,6 @@ from mbtf_core.stats import Estimate, mean_estimate, pooled_relative_error
 from mbtf_gen.config.publish import PublishConfig
 from mbtf_gen.measured.exported import mean_of
 
-# Folder of the shards.
-DATA = "data"
 TAGS = (
     *("btf", "mbtf", "brdf", "reflectance", "appearance", "material", "rendering", "computer-graphics"),
     *("neural-materials", "level-of-detail"),

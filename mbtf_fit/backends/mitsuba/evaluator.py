@@ -16,7 +16,7 @@ from mbtf_fit.backends.mitsuba.stored_material import F32, StoredMaterial
 from mbtf_fit.backends.mitsuba.textures import Textures
 from mbtf_fit.material.format import DESCRIPTION_NAME
 from mbtf_fit.ops import Operation, sizes_of, stages
-from mbtf_fit.ops.operation import output_names, parse
+from mbtf_fit.ops.operation import output_names
 from mbtf_gen.engine.types import Color3f, Float, Point2f, Vector3f
 
 # Values by name.
@@ -110,16 +110,6 @@ class Evaluator:
 def _run(steps: Sequence[tuple[Operation, Step]], values: Values) -> Values:
     """`values`, and those that the steps of operations compute."""
     for op, step in steps:
-        found = step(*(_argument(getattr(op, name), values) for name in op.value_fields()))
+        found = step(*op.arguments(lambda name, part: values[name][part]))
         values.update(zip(output_names(op), found if isinstance(found, tuple) else (found,), strict=True))
     return values
-
-
-def _argument(field: str | tuple[str, ...] | None, values: Values) -> Numbers | list[Numbers] | None:
-    """What an operation's field refers to: a value, or several."""
-    if field is None:
-        return None
-    if not isinstance(field, str):
-        return [_argument(reference, values) for reference in field]
-    name, part = parse(field)
-    return values[name][part]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,7 +59,7 @@ def program_of(material: Material, syntax: Syntax) -> Program:
     sizes = sizes_of(operations)
     for op in operations:
         code.lit = op.output in lit
-        found = SHADER[op](op, code, *(_argument(getattr(op, name), values) for name in op.value_fields()))
+        found = SHADER[op](op, code, *op.arguments(lambda name, part: values[name][part]))
         results = found if isinstance(found, tuple) else (found,)
         for name, result in zip(output_names(op), results, strict=True):
             values[name] = code.result(name, sizes[name], result)
@@ -101,16 +100,6 @@ def _moving(operations: list[ops.Operation]) -> set[str]:
     lookups = [op for op in operations if isinstance(op, ops.Lookup)]
     positions = {parse(op.u)[0] for op in lookups}
     return {op.textures for op in lookups if positions & reached_from(operations, op.output)}
-
-
-def _argument(field: str | tuple[str, ...] | None, values: Mapping[str, Value]) -> object:
-    """What an operation's field refers to: a value, or a list of them."""
-    if field is None:
-        return None
-    if not isinstance(field, str):
-        return [_argument(reference, values) for reference in field]
-    name, part = parse(field)
-    return values[name][part]
 
 
 def _transmittance(material: Material, code: Code, level: str) -> list[str]:

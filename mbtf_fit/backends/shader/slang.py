@@ -20,11 +20,6 @@ from mbtf_fit.material.material import Material
 
 TARGETS: tuple[Target, ...] = get_args(Target)
 MODULE_NAME, TEXELS_NAME = "material.slang", "material.bin"
-FILE_NAMES = (
-    MODULE_NAME,
-    TEXELS_NAME,
-    *(str(Path(MODULE_NAME).with_suffix(end)) for end in ENDINGS.values()),
-)
 ENTRY = "evaluate_queries"
 
 
