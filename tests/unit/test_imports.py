@@ -34,6 +34,7 @@ mbtf_core.files
 mbtf_core.run
 mbtf_core.app
 mbtf_core.images
+mbtf_core.meshes
 mbtf_core.data
 mbtf_core.stats
 mbtf_core.pictures

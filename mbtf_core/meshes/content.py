@@ -1,0 +1,89 @@
+"""What a file of triangles holds: shapes, what they reflect, and the files that it refers to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+Wrap = Literal["repeat", "mirror", "clamp"]
+
+
+@dataclass(frozen=True)
+class Texture:
+    """An image that is placed on a shape by its texture coordinates.
+
+    Attributes
+    ----------
+    pixels : (h, w) or (h, w, 3) float32 array
+        Linear Rec.709 colors or numbers, factors of the file not applied. Row 0 is the top, v → 1.
+    wrap : (Wrap, Wrap)
+        What lies beyond [0, 1] along u and along v.
+    nearest : bool
+        Whether the file asks for texels without interpolation.
+    to_uv : (2, 3) float64 array
+        Texture coordinates (v up) of the image from (u, v, 1) of the shape (v up).
+    """
+
+    pixels: NDArray[np.float32]
+    wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
+    nearest: bool = False
+    to_uv: F64 = field(default_factory=lambda: np.eye(2, 3))
+
+
+# A number, a linear color (3,), or a texture with the factor on it.
+Value = float | F64 | tuple[Texture, float | F64]
+
+
+@dataclass(frozen=True)
+class MeshShape:
+    """Triangles of one material.
+
+    Attributes
+    ----------
+    name : str
+        Its name in the file.
+    vertices : (n, 3) float64 array
+        Positions in the file's units and axes, nodes of scenes applied.
+    faces : (m, 3) int64 array
+        Vertices of each triangle, counterclockwise seen from outside.
+    uv : (n, 2) float64 array or None
+        Texture coordinates, v up.
+    colors : (n, 3) float64 array or None
+        Linear Rec.709 factors of the vertices on the base color.
+    values : dict of str to Value
+        What the file says of its material, by role of a ``material.yaml`` (``base_color``, ``roughness``, …);
+        defaults of the format included. A role that is missing was not given.
+    """
+
+    name: str
+    vertices: F64
+    faces: NDArray[np.int64]
+    uv: F64 | None = None
+    colors: F64 | None = None
+    values: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class MeshContent:
+    """All that was read from a file of triangles.
+
+    Attributes
+    ----------
+    shapes : list of MeshShape
+    files : dict of str to Path
+        Files besides the first that were read, by the name that refers to them: buffers, materials, images.
+    up : {"y", "z"} or None
+        Axis that points up by the definition of the format; None where it has none.
+    warnings : list of str
+        What the file has that is not used, one line each, without its path.
+    """
+
+    shapes: list[MeshShape]
+    files: dict[str, Path] = field(default_factory=dict)
+    up: Literal["y", "z"] | None = None
+    warnings: list[str] = field(default_factory=list)
