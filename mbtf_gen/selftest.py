@@ -59,7 +59,7 @@ class KnownAnswer:
         self.cases: dict[str, Case] = {}
 
     def __call__(self, round_number: int) -> Finding:
-        """Measure once more, and judge the means."""
+        """Measure once more, and compare the means."""
         n = round_number
         for name, new in self.measure(n).items():
             old = self.cases.get(name, Case(0.0))
