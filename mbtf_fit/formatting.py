@@ -23,6 +23,8 @@ VISIBILITY = (
     (26.0, "visible"),
     (-math.inf, "clearly visible"),
 )
+# The word where queries are too few or too noisy for another.
+UNRESOLVED = "unresolved"
 # Standard errors of a significant difference from zero.
 _SIGNIFICANT = 2.0
 
@@ -41,8 +43,8 @@ def visibility(split: Mapping[str, Any]) -> tuple[str, str | None]:
         return "PSNR infinite", VISIBILITY[0][1]
     psnr = 10.0 * math.log10(white_of(split["exposure"]) ** 2 / squared)
     word = next(word for least, word in VISIBILITY if psnr >= least)
-    bound = not resolved and word != VISIBILITY[0][1]
-    return f"PSNR {'' if resolved else 'above '}{psnr:.1f} dB", f"at most {word}" if bound else word
+    clear = resolved or word == VISIBILITY[0][1]
+    return f"PSNR {'' if resolved else 'above '}{psnr:.1f} dB", word if clear else UNRESOLVED
 
 
 def headline(errors: Mapping[str, Any]) -> str:
@@ -70,7 +72,9 @@ def report_errors(
     text, word = visibility(split)
     if word is not None:
         shown = describe_exposure(split["exposure"])
-        lines.append(f"{text} {'' if lines else of + ' '}at {shown}: {word} beside the reference")
+        seen = f"{word} beside the reference"
+        seen = "these queries do not resolve the error" if word == UNRESOLVED else seen
+        lines.append(f"{text} {'' if lines else of + ' '}at {shown}: {seen}")
     others = [
         f"{SPLIT_NAMES[name]} {format_estimate(found['unexplained'])}"
         for name, found in errors.items()
@@ -80,23 +84,29 @@ def report_errors(
         through = next(iter(transmittance.values()))
         others.append(f"rms error of transmittance {max(0.0, through['mse']['value']) ** 0.5:.3f}")
     lines += [", ".join(others)] if others else []
-    return [*lines, *_remarks(split, foreign), *(_table_of(errors) if verbose else [])]
+    return [*lines, *_remarks(errors, foreign), *(_table_of(errors) if verbose else [])]
 
 
-def _remarks(split: Mapping[str, Any], foreign: bool) -> list[str]:
+def _remarks(errors: Mapping[str, Any], foreign: bool) -> list[str]:
     """Notes on an undefined or large error."""
-    found = []
+    found, split = [], errors[headline(errors)]
     value, measured = split["unexplained"]["value"], bool(split.get("includes_noise"))
     if value is None:
         why = "these values do not vary" if measured else "the noise exceeds the variance of these values"
         found.append(f"undefined unexplained variance: {why}")
     if measured:
         found.append("these errors include the noise of the data, which have one value per query")
-    if value is not None and value >= 1 and not foreign:
+    if value is None or value < 1 or foreign:
+        return found
+    own = errors["training"]["unexplained"]["value"] if "training" in errors else None
+    if own is not None and own >= 1:
+        advice = "as the training queries are so too, the fit has not converged"
+    elif measured:
+        advice = "import more queries (mbtf-gen import --queries)"
+    else:
         advice = "generate more queries (mbtf-gen --queries), more paths per query (--spp), or a wider light "
-        advice = "import more queries (mbtf-gen import --queries)" if measured else f"{advice}(--light-width)"
-        found.append(f"above 1: worse than the mean value; {advice}")
-    return found
+        advice += "(--light-width)"
+    return [*found, f"above 1: worse than the mean value; {advice}"]
 
 
 def _table_of(errors: Mapping[str, Any]) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
@@ -23,6 +23,7 @@ from mbtf_core.app.options import (
     Verbose,
     options_from,
 )
+from mbtf_core.app.progress import Progress
 from mbtf_core.errors import InputError, PartialError, UsageError
 from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.units import expectation, format_duration
@@ -130,7 +131,6 @@ def _fit_one(
     finished = not overwrite and (output / DESCRIPTION_NAME).exists()
     if not finished:
         _announce(config, [shards], output, f"{shards} -> {output}: {config.model}", console)
-    keep_on_interruption(f"the last checkpoint is kept in {output}")
     with (
         nullcontext() if tensorboard is None else EventLog(tensorboard) as log,
         live_view(str(output), live, console) as shown,
@@ -148,7 +148,7 @@ def _fit_one(
             shards,
             output,
             overwrite=overwrite,
-            progress=lambda fraction, note: bar.update(round(100 * fraction, 1), note),
+            progress=_training_progress(bar, output),
             observe=observe if observers else None,
         )
         if shown is not None:
@@ -158,6 +158,17 @@ def _fit_one(
     summary = result.as_dict()
     cost = [result.marginal_cost.describe()] if result.marginal_cost is not None else []
     console.report(summary, "\n".join([describe_fit(summary, verbose), *cost]))
+
+
+def _training_progress(bar: Progress, folder: Path) -> Callable[[float, str], None]:
+    """Progress of a fit whose checkpoint lies in a folder."""
+
+    def update(fraction: float, note: str) -> None:
+        # Before the first report there is no checkpoint.
+        keep_on_interruption(f"the last checkpoint is kept in {folder}")
+        bar.update(round(100 * fraction, 1), note)
+
+    return update
 
 
 def _announce(
@@ -257,7 +268,6 @@ def _fit_many(
     decoder = output / DECODER_FOLDER
     what = f"{len(shards)} data sets -> {output}: {config.model} with a shared network"
     _announce(config, shards, output, what, console)
-    keep_on_interruption(f"the last checkpoint is kept in {decoder}")
     with console.progress(total=100, label="fitting", unit="%") as bar:
         results = fit_jointly(
             config,
@@ -265,7 +275,7 @@ def _fit_many(
             folders,
             decoder,
             overwrite=overwrite,
-            progress=lambda fraction, note: bar.update(round(100 * fraction, 1), note),
+            progress=_training_progress(bar, decoder),
         )
     fits = [fitted.as_dict() for fitted in results]
     outcomes = [

@@ -78,6 +78,10 @@ _MIDDLE = (0.35, 0.65)
 _SIGNIFICANT = 2.0
 # More doublings of the time than these count as never.
 _MOST_DOUBLINGS = 12.0
+# Fewer steps leave the error of every model falling, whatever its last records say.
+_FEWEST_STEPS = 1000
+# Largest reduction of the error by the last doubling of the time that counts as none.
+_FLAT = 0.1
 
 
 @dataclass(frozen=True)
@@ -87,22 +91,31 @@ class MarginalCost:
     Attributes
     ----------
     halving : seconds of training that would halve the error if every doubling of the time divided it as the
-        last one did; infinite where that one was not significant, None where the history does not say. The
-        learning rate falls towards the end, which favors the last doubling, so this is a lower bound
+        last one did; infinite where that one reduced it by a tenth at most, error bar included; None where
+        the history does not say. The learning rate falls towards the end, which favors the last doubling, so
+        this is a lower bound
     noise_share : share of the error on queries without training that is overfitting to the noise of the
         training queries; None where it is not significant
+    steps : number of training steps where they are too few to say more; else None
     """
 
     halving: float | None
     noise_share: float | None
+    steps: int | None = None
 
-    def as_dict(self) -> dict[str, float | None]:
+    def as_dict(self) -> dict[str, float | int | None]:
         """Plain data for JSON, which has no infinite numbers."""
         finite = self.halving is not None and math.isfinite(self.halving)
-        return {"halving": self.halving if finite else None, "noise_share": self.noise_share}
+        return {
+            "halving": self.halving if finite else None,
+            "noise_share": self.noise_share,
+            "steps": self.steps,
+        }
 
     def describe(self) -> str:
         """One line, or two, without another number for the error."""
+        if self.steps is not None:
+            return f"{self.steps} steps are few: train longer (--time)"
         lines = []
         if self.halving == math.inf:
             lines.append("longer training alone would hardly reduce the error")
@@ -121,6 +134,9 @@ def marginal_cost_of(
 ) -> MarginalCost | None:
     """Marginal cost of a finished fit, from the records of its history, its errors by split, and the variance
     of the noise of training values in 1/sr² (None: unknown); None where nothing is resolved."""
+    steps = history[-1].get("step") if history else None
+    if steps is not None and steps < _FEWEST_STEPS:
+        return MarginalCost(None, None, steps)
     share, halving = _noise_share(errors, noise), _halving(history)
     return None if share is None and halving is None else MarginalCost(halving, share)
 
@@ -134,8 +150,11 @@ def _halving(history: list[dict[str, Any]]) -> float | None:
     before, after = half["unexplained"], last["unexplained"]
     spread = math.hypot(half["unexplained_error"], last["unexplained_error"])
     # Both records are of the same queries, so this test is conservative.
-    if after <= 0 or before - after <= _SIGNIFICANT * spread:
-        return math.inf
+    if before - after <= _SIGNIFICANT * spread:
+        flat = before - after + _SIGNIFICANT * spread <= _FLAT * before
+        return math.inf if flat else None
+    if after <= 0:
+        return None
     doublings = math.log(2.0) / math.log(before / after) * math.log2(last["seconds"] / half["seconds"])
     never = doublings >= _MOST_DOUBLINGS
     return math.inf if never else float(last["seconds"] * (2.0**doublings - 1.0))

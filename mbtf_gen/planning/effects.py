@@ -122,7 +122,8 @@ class NormalMap(Effect):
         rms = float(np.sqrt(np.mean(np.sum(slopes**2, axis=-1))))
         text = f"adds slopes of {np.degrees(np.arctan(rms)):.2g}° (RMS)"
         if scene.normal_mode == "residual" and not scene.flat:
-            text += f"; {100.0 * share:.0f} % of the mesh's slopes are also in the map and are counted once"
+            part = "" if share > 0.995 else f"{100.0 * share:.0f} % of "
+            text += f"; {part}the mesh's slopes are also in the map and are counted once"
         if rms == 0.0:
             return self.decision(False, text, 0.0)
         return self.decision(True, text, scene.bounds.normal if scene.bounds else None, "pilot")

@@ -123,6 +123,8 @@ def _bound_text(effect: EffectDecision) -> str:
         return "0 (exact)"
     if effect.reason == "bound" or not effect.on:
         return f"< {_percent(effect.bias_bound)}"
+    if effect.bias_bound >= 1.0:
+        return "over 100 %"
     if effect.error:
         if effect.bias_bound < 2.0 * effect.error:
             return f"< {_percent(effect.bias_bound + 2 * effect.error)}"

@@ -41,8 +41,8 @@ def oddities(found: Mapping[str, Any]) -> list[str]:
         out.append(f"the mesh keeps {kept:.0%} of the map's RMS slope; --mesh {columns} keeps all")
     albedo = found["albedo"] or {"share_above": 0.0, "share_below": 0.0}
     low, high = ALBEDO_RANGE
-    if albedo["share_above"] > 0:
-        out.append(f"{albedo['share_above']:.2%} of the albedo lies above {high}: brighter than snow")
+    if albedo["share_above"] > 1e-3:
+        out.append(f"{albedo['share_above']:.1%} of the albedo lies above {high}: brighter than snow")
     if albedo["share_below"] > 0.5:
         out.append(f"{albedo['share_below']:.0%} of the albedo lies below {low}: blacker than coal")
     return out

@@ -30,7 +30,7 @@ def split(mse: float, error: float, unexplained: float | None = 0.16) -> dict[st
         (1e-2, 1e-4, "PSNR 20.0 dB", "clearly visible"),
         # An error below its own uncertainty, which may be negative.
         (-1e-5, 2e-5, "PSNR above 45.2 dB", "not visible"),
-        (0.0, 5e-4, "PSNR above 30.0 dB", "at most visible"),
+        (0.0, 5e-4, "PSNR above 30.0 dB", "unresolved"),
         (0.0, 0.0, "PSNR infinite", "not visible"),
     ],
 )
@@ -76,5 +76,9 @@ def test_errors_above_1_give_advice(value: float, advice: str) -> None:
     assert advice in report_errors(found, None)[-1]
     # The data of another material say nothing of the number of queries.
     assert "above 1" not in report_errors(found, None, foreign=True)[-1]
+    # Queries that the fit has learned from are no better: it has not learned them yet.
+    undertrained = report_errors(found | {"training": split(1e-3, 1e-5, value)}, None)[-1]
+    assert ("not converged" in undertrained) == bool(advice)
+    assert "not converged" not in report_errors(found | {"training": split(1e-3, 1e-5, 0.9)}, None)[-1]
     found["test"]["includes_noise"] = True
     assert ("mbtf-gen import --queries" in report_errors(found, None)[-1]) == bool(advice)

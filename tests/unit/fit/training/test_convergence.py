@@ -38,14 +38,26 @@ def test_halving_follows_the_power_law(power: float) -> None:
     assert found.halving == pytest.approx(80.0 * (2 ** (1 / power) - 1), rel=1e-6)
 
 
-def test_insignificant_improvements_give_no_estimate() -> None:
-    found = cost(history(0.25, error=0.03), {})
+def test_only_a_flat_curve_says_that_longer_training_is_useless() -> None:
+    found = cost(history(0.02), {})
     assert found.halving == math.inf
     assert found.as_dict()["halving"] is None
     assert "would hardly reduce the error" in found.describe()
     assert cost(history(-0.2), {}).halving == math.inf
+    # Too noisy to see a difference: neither sentence is known to be true.
+    assert marginal_cost_of(history(0.25, error=0.03), {}) is None
+    assert marginal_cost_of(history(0.02, error=0.03), {}) is None
     # Hardly falling at all: more years than anyone has, or than a number holds.
     assert cost(history(1e-4, error=1e-9), {}).halving == math.inf
+
+
+def test_few_steps_ask_for_more_whatever_the_curve_shows() -> None:
+    for power in (0.0, 0.5):
+        records = [r | {"step": round(146 * r["fraction"])} for r in history(power)]
+        found = cost(records, errors(0.25, 0.15), 0.3)
+        assert found.describe().startswith("146 steps are few: train longer")
+        assert found.noise_share is None
+    assert cost([r | {"step": 2000} for r in history(0.5)], {}).steps is None
 
 
 def test_half_of_the_distance_to_the_training_error_is_overfitting() -> None:
