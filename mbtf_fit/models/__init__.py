@@ -1,13 +1,17 @@
-"""Models: one file each, found by :mod:`mbtf_fit.models.registry`. No file imports PyTorch before it
-trains."""
+"""Models: one file each, or classes of other packages, found by :mod:`mbtf_fit.models.registry`. No file
+imports PyTorch before it trains."""
 
 from __future__ import annotations
 
 import re
+from importlib.metadata import entry_points
 from pathlib import Path
 
 # A class's line that gives its name, alone or before others.
 _NAME = re.compile(r'^    name(?:, \w+)* = "([^"]+)"', re.MULTILINE)
+
+FOREIGN = {point.name: point for point in entry_points(group="mbtf.models")}
+"""Entry points of other packages that give a model, by its name."""
 
 
 def names_in(text: str) -> list[str]:
@@ -15,6 +19,8 @@ def names_in(text: str) -> list[str]:
     return _NAME.findall(text)
 
 
-NAMES = tuple(
-    name for path in sorted(Path(__file__).parent.glob("*.py")) for name in names_in(path.read_text())
+NAMES = (
+    *(name for path in sorted(Path(__file__).parent.glob("*.py")) for name in names_in(path.read_text())),
+    *FOREIGN,
 )
+"""The models by name. Every file of this folder is read, so that a new model is one new file."""

@@ -1,4 +1,5 @@
-"""The models of this folder by name: every file is read, so that a new model is one new file."""
+"""The models by name: those of this folder, whose every file is read, so that a new model is one new file,
+and those of other packages, which declare them as entry points of the group ``mbtf.models``."""
 
 from __future__ import annotations
 
@@ -8,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import mbtf_fit.models
 from mbtf_core.data.lattice import Lattice
+from mbtf_core.errors import InputError, reason
+from mbtf_fit.models import FOREIGN
 from mbtf_fit.models.model import Model
 from mbtf_fit.sections import NetworkSection
 
@@ -24,7 +27,25 @@ def _find() -> dict[str, type[Model]]:
             own = isinstance(item, type) and issubclass(item, Model) and item.__module__ == entry.name
             if own and "name" in vars(item):
                 found[item.name] = item
+    for name, point in FOREIGN.items():
+        try:
+            model = point.load()
+        except Exception as error:  # whatever the code of others raises
+            raise _unusable(name, reason(error)) from error
+        if not (isinstance(model, type) and issubclass(model, Model) and getattr(model, "name", "") == name):
+            raise _unusable(name, f"{point.value} is no model of this name")
+        if name in found:
+            raise _unusable(name, "a model of this project has the same name")
+        found[name] = model
     return found
+
+
+def _unusable(name: str, why: str) -> InputError:
+    return InputError(
+        f"cannot be used ({why})",
+        where=f"entry point '{name}' of mbtf.models",
+        hint="correct or uninstall its package",
+    )
 
 
 MODELS = _find()
