@@ -36,18 +36,11 @@ CASES: dict[str, dict[str, Any]] = {
     "learned heights": {"model": "neumip+"},
     "black": {"model": "relief", "weights": {"unit": torch.zeros(())}},
     "rainer2019": {"model": "rainer2019"},
+    "svbrdf": {"model": "svbrdf"},
 }
 
 # Operations that no model of the papers has, and values of more than four numbers.
 LISTS: dict[str, list[ops.Operation]] = {
-    "texel lobe": [
-        ops.Lookup("texel", "u", "level", "lobes", 7),
-        ops.Transform("base", "texel[0:3]", "sigmoid"),
-        ops.Transform("half", "texel[3:4]", "sigmoid"),
-        ops.Transform("alpha", "texel[4:5]", "sigmoid"),
-        ops.Transform("alpha2", "alpha", "square", scale=1.5),
-        ops.Lobe("value", "base", "half", "alpha2", "texel[5:7]", "omega_i", "omega_o"),
-    ],
     "constant light": [ops.Lookup("color", "u", None, "map", 3), ops.Transform("value", "color", "softplus")],
     "wide values": [
         ops.Lookup("texel", "u", "level", "lobes", 10),

@@ -75,6 +75,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "learned heights": {"model": "neumip+", "aspect": 0.5, "glossy": False},
     "rainer2019": {"model": "rainer2019", "aspect": 0.5},
     "rainer2020": {"model": "rainer2020"},
+    "svbrdf": {"model": "svbrdf"},
     "relief, six outputs": {"model": "relief", **net(output_channels=6, oversampling=1)},
 }
 UNROLLED = ("neumip", "fourth root", "encoded", "relief")

@@ -134,7 +134,7 @@ def _cells(omega: np.ndarray) -> np.ndarray:
     return np.asarray(8 * row + column)
 
 
-@pytest.mark.parametrize("case", ["relief", "texel lobe", "calibrated"])
+@pytest.mark.parametrize("case", ["relief", "svbrdf", "calibrated"])
 def test_lights_are_sampled_by_their_density(case: str, tmp_path: Path) -> None:
     """The density integrates to 1, and is that of the samples: their moments, their counts in cells."""
     material = make(case, tmp_path / "material")

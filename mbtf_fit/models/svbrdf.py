@@ -1,0 +1,49 @@
+"""SVBRDF: the material that engines have, a spatially varying BRDF without a network.
+
+A texel of every level has a base color, a share of metal, a roughness and the slopes of a normal (the
+metallic workflow: Burley, *Physically Based Shading at Disney*, SIGGRAPH courses 2012). It has neither
+parallax nor shadows, and one lobe per texel: a baseline for all that does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+from mbtf_core.data.lattice import Lattice
+from mbtf_fit.models.model import Model
+from mbtf_fit.ops import Gate, Lobe, Lookup, Matrix, Operation, Transform
+from mbtf_fit.sections import NetworkSection
+
+# Reflectance of dielectrics at normal incidence.
+_DIELECTRIC = 0.04
+
+
+class Svbrdf(Model):
+    """A diffuse and a GGX lobe per texel."""
+
+    name = "svbrdf"
+    description = "a diffuse and a GGX lobe per texel, without a network"
+    defaults: ClassVar[Mapping[str, Any]] = {
+        "network": {"offset": "none"},
+        "training": {"texture_learning_rate": 0.1},
+    }
+    takes = ("init_from",)
+
+    @classmethod
+    def operations(cls, lattice: Lattice, network: NetworkSection) -> list[Operation]:
+        metal = "texel[3:4]"
+        return [
+            Lookup("texel", "u", "level", "features", channels=7),
+            # (S1) b, m, r = σ(texel); diffuse color (1 - m) b, F0 = m b + 0.04 (1 - m), α = r²
+            Transform("base_color", "texel[0:3]", "sigmoid"),
+            Transform("dielectric", metal, scale=-1.0),
+            Gate("diffuse", "dielectric", "base_color"),
+            Transform("share", "dielectric", "sigmoid"),
+            Matrix("reflectance", "share", rows=((_DIELECTRIC,),) * 3),
+            Gate("f0", metal, "base_color", "reflectance"),
+            Transform("roughness", "texel[4:5]", "sigmoid"),
+            Transform("alpha", "roughness", "square"),
+            Transform("alpha2", "alpha", "square"),
+            Lobe("value", "diffuse", "f0", "alpha2", "texel[5:7]", "omega_i", "omega_o"),
+        ]

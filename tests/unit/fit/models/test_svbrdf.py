@@ -1,0 +1,47 @@
+"""The model `svbrdf` recovers the parameters of surfaces that it can describe."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from support.fit_data import F32, write_data
+
+from mbtf_fit.config import FitConfig
+from mbtf_fit.training.fit import fit
+
+BASE_COLOR = np.array([0.6, 0.3, 0.1])
+
+
+def brdf(omega_i: F32, omega_o: F32, metallic: float, roughness: float) -> NDArray[np.float64]:
+    """A plane of the metallic workflow (Burley 2012), by the formulas of Walter et al. 2007: D·G·F / (4 cos
+    cos), separable masking and shadowing."""
+    half = omega_i.astype(np.float64) + omega_o
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    alpha2 = roughness**4
+    d = alpha2 / (np.pi * (half[:, 2] ** 2 * (alpha2 - 1) + 1) ** 2)
+    f0 = metallic * BASE_COLOR + 0.04 * (1 - metallic)
+    schlick = (1 - np.sum(half * omega_o, axis=1))[:, None] ** 5
+    fresnel = f0 + (1 - f0) * schlick
+    shadow = 1.0
+    for omega in (omega_i, omega_o):
+        cos = omega[:, 2].astype(np.float64)
+        shadow = shadow * 2 * cos / (cos + np.sqrt(alpha2 + (1 - alpha2) * cos**2))
+    specular = fresnel * (d * shadow / (4 * omega_i[:, 2] * omega_o[:, 2]))[:, None]
+    return (1 - metallic) * BASE_COLOR / np.pi + specular
+
+
+@pytest.mark.parametrize(("metallic", "roughness"), [(0.0, 0.5), (1.0, 0.4)])
+def test_a_plane_is_recovered(metallic: float, roughness: float, tmp_path: Path) -> None:
+    shards = write_data(
+        tmp_path / "shards", lambda *at: brdf(*at[2:], metallic, roughness), train=4000, test=1000, finest=1
+    )
+    training = {"steps": 200, "batch": 1000, "texture_learning_rate": 0.2}
+    config = FitConfig.model_validate({"model": "svbrdf", "training": training, "device": "cpu"})
+    weights = fit(config, shards, tmp_path / "material").material.model.weights()
+    texels = np.concatenate([w.reshape(-1, 7) for name, w in weights.items() if "features" in name])
+    found = 1 / (1 + np.exp(-texels[:, :5]))
+    assert found == pytest.approx(np.tile([*BASE_COLOR, metallic, roughness], (len(found), 1)), abs=0.06)
+    assert np.abs(texels[:, 5:]).max() < 0.02
