@@ -9,6 +9,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.errors import InputError
+
 F64 = NDArray[np.float64]
 Wrap = Literal["repeat", "mirror", "clamp"]
 
@@ -58,6 +60,10 @@ class MeshShape:
     values : dict of str to Value
         What the file says of its material, by role of a ``material.yaml`` (``base_color``, ``roughness``, …);
         defaults of the format included. A role that is missing was not given.
+    faults : dict of str to InputError
+        Why the file's value of a role cannot be used, to be raised unless another value takes its place.
+    normals : (n, 3) float64 array or None
+        Unit normals of the vertices, which smooth shapes of viewers; tiles reflect with their triangles'.
     """
 
     name: str
@@ -66,6 +72,8 @@ class MeshShape:
     uv: F64 | None = None
     colors: F64 | None = None
     values: dict[str, Any] = field(default_factory=dict)
+    faults: dict[str, InputError] = field(default_factory=dict)
+    normals: F64 | None = None
 
 
 @dataclass(frozen=True)

@@ -215,13 +215,21 @@ class Parallax(Displacement):
     name, description, alters_tile = "parallax", "parallax and masking", True
     switch = "displacement"
 
+    def propose(self, scene: PlanScene) -> EffectDecision:
+        """On where the tile is no height field: no plane has its gaps and its parts, even if it is flat."""
+        if scene.tile.grid is None:
+            text = f"{scene.tile.kind}, {100.0 * scene.tile.thickness:.2g} % of the tile's width thick"
+            return self.decision(True, text, present=False)
+        return super().propose(scene)
+
+    def reference(self, scene: PlanScene) -> EffectDecision:
+        """The same, and on for all height fields that are not flat."""
+        return self.propose(scene) if scene.tile.grid is None else super().reference(scene)
+
     def on_displaced(self, scene: PlanScene) -> EffectDecision:
         """Off where the sum of the bounds of all effects of displacement is small enough."""
-        thickness, bounds = 100.0 * scene.tile.thickness, scene.bounds
-        if scene.tile.grid is None:
-            text = f"{scene.tile.kind}, {thickness:.2g} % of the tile's width thick"
-            return self.decision(True, text, present=False)
-        text = f"displacement range {thickness:.2g} % of the tile's width"
+        bounds = scene.bounds
+        text = f"displacement range {100.0 * scene.tile.thickness:.2g} % of the tile's width"
         if bounds is None:
             return self.decision(True, text, None, "pilot")
         bounces = bounce_bound(scene) if bounds.parallax <= scene.left else 0.0
