@@ -96,7 +96,7 @@ class Companions:
         return np.asarray(srgb_to_linear(rgb) if srgb else rgb, np.float32)
 
     def share(self, name: str, channel: str | None = None) -> NDArray[np.float32]:
-        """Numbers (h, w) of an image, of one of its channels or of its luminance; errors as of :meth:`color`."""
+        """Numbers (h, w) of an image, of a channel or of its luminance; errors as of :meth:`color`."""
         image = self._image(name, channel)
         numbers, warnings = gray(image)
         self.warnings += warnings

@@ -35,15 +35,14 @@ def parse(text: bytes, kind: type) -> NDArray[Any] | None:
 
 def words_per_line(text: bytes) -> NDArray[np.int64]:
     """Number of words of each line; all lines end with a line break."""
-    if not text:
-        return np.zeros(0, np.int64)
-    return np.add.reduceat(_word_starts(text), _line_starts(text), dtype=np.int64)
+    ends = np.flatnonzero(_codes(text) == ord("\n"))
+    return np.diff(np.searchsorted(_word_starts(text), ends), prepend=0)
 
 
 def slashes_per_word(text: bytes) -> NDArray[np.int64]:
-    """Number of slashes in each word, of which there are some."""
-    starts = np.flatnonzero(_word_starts(text))
-    return np.add.reduceat(_codes(text) == ord("/"), starts, dtype=np.int64)
+    """Number of slashes in each word."""
+    slashes = np.flatnonzero(_codes(text) == ord("/"))
+    return np.diff(np.searchsorted(slashes, _word_starts(text)), append=len(slashes))
 
 
 def read_bytes(path: Path) -> bytes:
@@ -67,12 +66,9 @@ def _codes(text: bytes) -> NDArray[np.uint8]:
     return np.frombuffer(text, np.uint8)
 
 
-def _word_starts(text: bytes) -> NDArray[np.bool_]:
+def _word_starts(text: bytes) -> NDArray[np.int64]:
+    """Places of the first characters of all words."""
     blank = _codes(text) <= ord(" ")
     starts = ~blank
     starts[1:] &= blank[:-1]
-    return starts
-
-
-def _line_starts(text: bytes) -> NDArray[np.int64]:
-    return np.concatenate([[0], np.flatnonzero(_codes(text[:-1]) == ord("\n")) + 1])
+    return np.flatnonzero(starts)

@@ -16,7 +16,7 @@ from mbtf_core.meshes.companions import Companions
 from mbtf_core.meshes.content import F64, MeshContent, MeshShape
 from mbtf_core.meshes.mtl import Material, as_text, material_values, read_mtl
 from mbtf_core.meshes.numbers import parse, read_bytes, slashes_per_word, words_per_line
-from mbtf_core.meshes.parts import part_of
+from mbtf_core.meshes.parts import groups_of, part_of
 from mbtf_core.meshes.polygons import UNCUT, triangulate
 from mbtf_core.paths import suggest_name
 
@@ -56,10 +56,8 @@ def read_obj(path: Path) -> MeshContent:
     materials = _Materials(path, lines.libraries, companions)
     material, of_object = lines.runs[run[polygon], 4:].T
     # Triangles of one material, without and with texture coordinates.
-    key = 2 * material + (corners[triangles, 1] >= 0).all(axis=1)
-    order = np.argsort(key, kind="stable")
     shapes = []
-    for group in np.split(order, np.flatnonzero(np.diff(key[order])) + 1):
+    for group in groups_of(2 * material + (corners[triangles, 1] >= 0).all(axis=1)):
         name = lines.materials[material[group[0]]]
         values, faults = materials.of(name)
         arrays = _arrays(corners[triangles[group]], positions, colors, uv, normals)
@@ -279,11 +277,11 @@ def _indices(text: bytes, count: int | None) -> I64 | None:
     """Numbers (count, 3) of corners ``v``, ``v/vt``, ``v//vn`` or ``v/vt/vn``, 0 for what is left out; None
     where they have another form."""
     text = text.replace(b"//", b"/0/")
-    slashes = slashes_per_word(text) if count else None
-    if slashes is not None and (slashes == slashes[0]).all() and slashes[0] <= 2:
+    if count:
+        slashes = slashes_per_word(text)
         width = int(slashes[0]) + 1
-        numbers = parse(text.replace(b"/", b" "), np.int64)
-        if numbers is not None and len(numbers) == count * width:
+        numbers = parse(text.replace(b"/", b" "), np.int64) if (slashes == width - 1).all() else None
+        if numbers is not None and width <= 3 and len(numbers) == count * width:
             out = np.zeros((count, 3), np.int64)
             out[:, :width] = numbers.reshape(count, width)
             return out
@@ -299,7 +297,8 @@ def _arrays(corners: I64, positions: F64, colors: F64 | None, uv: F64, normals: 
     vertex, texture, normal = corners.reshape(-1, 3).T
     key, textured, smooth = vertex, bool((texture >= 0).all()), bool((normal >= 0).all())
     for used, number, count in ((textured, texture, len(uv)), (smooth, normal, len(normals))):
-        if used:
+        # Programs often count all of them alike.
+        if used and not np.array_equal(number, vertex):
             # Numbers of combinations stay small, so that their products do not overflow.
             key = np.unique(key, return_inverse=True)[1] * count + number
     _, first, faces = np.unique(key, return_index=True, return_inverse=True)

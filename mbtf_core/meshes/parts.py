@@ -6,11 +6,19 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
 from mbtf_core.meshes.content import MeshShape
 
+I64 = NDArray[np.int64]
 _HINT = "give {role} in a material.yaml, or correct the file"
+
+
+def groups_of(key: I64) -> list[I64]:
+    """Indices that share a value, for each of the values in ascending order."""
+    order = np.argsort(key, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(key[order])) + 1)
 
 
 def part_of(shape: MeshShape, path: Path, warnings: list[str]) -> MeshShape:
@@ -36,7 +44,7 @@ def part_of(shape: MeshShape, path: Path, warnings: list[str]) -> MeshShape:
         colors = None
     if colors is not None:
         base = values.setdefault("base_color", np.ones(3))
-        if not (np.isfinite(colors).all() and 0.0 <= colors.min() and colors.max() <= 1.0):
+        if not (np.isfinite(colors).all() and colors.min() >= 0.0 and colors.max() <= 1.0):
             what = f"'{shape.name}' has colors of vertices outside [0, 1]"
             faults["base_color"] = InputError(what, where=path, hint=_HINT.format(role="base_color"))
             colors = None

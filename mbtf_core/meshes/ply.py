@@ -12,7 +12,7 @@ from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError
 from mbtf_core.meshes.companions import Companions
 from mbtf_core.meshes.content import F64, MeshContent, MeshShape, Texture
-from mbtf_core.meshes.parts import part_of
+from mbtf_core.meshes.parts import groups_of, part_of
 from mbtf_core.meshes.ply_elements import Element, Elements, read_elements
 from mbtf_core.meshes.polygons import UNCUT, triangulate
 
@@ -56,34 +56,32 @@ def read_ply(path: Path) -> MeshContent:
             where=path,
             hint="convert them to triangles, for example in MeshLab" if strips else "reconstruct a surface",
         )
-    corners = next((name for name in _CORNERS if name in face.lengths), None)
+    corners = next((name for name in _CORNERS if name in face.lists), None)
     if corners is None:
         raise InputError(f"its faces have no list {_CORNERS[0]}", where=path)
-    if any(name not in vertex.columns for name in _POSITION):
+    if not set(_POSITION) <= vertex.columns.keys():
         raise InputError("its vertices have no x, y and z", where=path)
     positions = _stacked(vertex, _POSITION)
-    number, sizes = face.columns[corners].astype(np.float64), face.lengths[corners]
-    if not ((number >= 0) & (number < len(positions))).all():
+    stored, sizes = face.lists[corners]
+    if not ((stored >= 0) & (stored < len(positions))).all():
         raise InputError(f"a face has a vertex that the file lacks; there are {len(positions):,}", where=path)
-    number = number.astype(np.int64)
+    number = stored.astype(np.int64)
     triangles, polygon, uncut = triangulate(positions[number], sizes)
     if not len(triangles):
         raise InputError("has no triangles", where=path)
 
     companions, warnings = Companions(path), _unused(content)
     uv, colors, normals = _uv(vertex, face, number, sizes), _colors(vertex, face, number, sizes), None
-    if set(_NORMAL) <= set(vertex.columns):
+    if set(_NORMAL) <= vertex.columns.keys():
         normals = _stacked(vertex, _NORMAL)[number]
-    textured = np.zeros(len(polygon), bool) if uv is None else np.isfinite(uv[triangles]).all(axis=(1, 2))
-    image = face.columns.get(_IMAGE, np.zeros(face.count)).astype(np.int64)[polygon]
+    placed: NDArray[np.bool_] = np.isfinite(uv).all(axis=1)
+    textured: NDArray[np.bool_] = placed[triangles].all(axis=1)
+    image = np.nan_to_num(face.columns.get(_IMAGE, np.zeros(face.count))).astype(np.int64)[polygon]
     # What faces say of their corners makes vertices of them.
-    vertex_of = (
-        np.arange(len(number)) if {_WEDGE, *_face_colors(vertex, face)} & set(face.columns) else number
-    )
+    split = _WEDGE in face.lists or bool(_face_colors(vertex, face))
+    vertex_of = np.arange(len(number)) if split else number
     shapes = []
-    key = 2 * image + textured
-    order = np.argsort(key, kind="stable")
-    for group in np.split(order, np.flatnonzero(np.diff(key[order])) + 1):
+    for group in groups_of(2 * image + textured):
         own = triangles[group].ravel()
         _, first, faces = np.unique(vertex_of[own], return_index=True, return_inverse=True)
         used = own[first]
@@ -92,7 +90,7 @@ def read_ply(path: Path) -> MeshContent:
             path.name,
             positions[number[used]],
             faces.reshape(-1, 3),
-            uv[used] if uv is not None and textured[group[0]] else None,
+            uv[used] if textured[group[0]] else None,
             None if colors is None else colors[used],
             values,
             faults,
@@ -112,7 +110,7 @@ def _element(content: Elements, name: str, path: Path) -> Element:
 
 def _stacked(element: Element, names: tuple[str, ...]) -> F64:
     """(n, k) numbers of some properties."""
-    return np.stack([element.columns[name].astype(np.float64) for name in names], axis=-1)
+    return np.stack([element.columns[name] for name in names], axis=-1)
 
 
 def _first(element: Element, choices: tuple[tuple[str, ...], ...]) -> tuple[str, ...]:
@@ -120,17 +118,16 @@ def _first(element: Element, choices: tuple[tuple[str, ...], ...]) -> tuple[str,
     return next((names for names in choices if set(names) <= element.columns.keys()), ())
 
 
-def _uv(vertex: Element, face: Element, number: I64, sizes: I64) -> F64 | None:
-    """Texture coordinates (c, 2) of corners, NaN where faces lack them; None without any."""
-    if _WEDGE in face.lengths:
-        out = np.full((len(number), 2), np.nan)
-        lengths = face.lengths[_WEDGE]
+def _uv(vertex: Element, face: Element, number: I64, sizes: I64) -> F64:
+    """Texture coordinates (c, 2) of corners, NaN where they have none."""
+    out = np.full((len(number), 2), np.nan)
+    if _WEDGE in face.lists:
+        numbers, lengths = face.lists[_WEDGE]
         fits = lengths == 2 * sizes
-        numbers = face.columns[_WEDGE].astype(np.float64)[np.repeat(fits, lengths)]
-        out[np.repeat(fits, sizes)] = numbers.reshape(-1, 2)
-        return out
-    names = _first(vertex, _UV)
-    return _stacked(vertex, names)[number] if names else None
+        out[np.repeat(fits, sizes)] = numbers[np.repeat(fits, lengths)].reshape(-1, 2)
+    elif names := _first(vertex, _UV):
+        out = _stacked(vertex, names)[number]
+    return out
 
 
 def _face_colors(vertex: Element, face: Element) -> tuple[str, ...]:
@@ -171,7 +168,7 @@ def _base_color(
 def _unused(content: Elements) -> list[str]:
     """Warnings of what the file has that is not used."""
     vertex, face = content.elements["vertex"], content.elements["face"]
-    wedge = _WEDGE in face.lengths
+    wedge = _WEDGE in face.lists
     used = {
         "vertex": {*_POSITION, *_NORMAL, *_first(vertex, _COLORS), *(() if wedge else _first(vertex, _UV))},
         "face": {*_CORNERS, _WEDGE, _IMAGE, *_face_colors(vertex, face)},
@@ -182,7 +179,7 @@ def _unused(content: Elements) -> list[str]:
             out += [f"its elements '{name}' are not used"] if element.count else []
             continue
         opaque = _MOST.get(element.kind("alpha"), 1.0) if "alpha" in element.columns else None
-        if opaque is not None and (element.columns["alpha"].astype(np.float64) >= opaque).all():
+        if opaque is not None and (element.columns["alpha"] >= opaque).all():
             used[name].add("alpha")
         if unused := [one.name for one in element.properties if one.name not in used[name]]:
             out.append(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,17 +60,17 @@ class Element:
     count : int
         Number of rows.
     properties : list of Property
-    columns : dict of str to array
-        Numbers (count,) of a property; of a list, all of them, one row after the other.
-    lengths : dict of str to (count,) int64 array
-        Lengths of the lists.
+    columns : dict of str to (count,) float64 array
+        Single numbers of the rows.
+    lists : dict of str to (float64 array, (count,) int64 array)
+        Lists: all of their numbers, one row after the other, and their lengths.
     """
 
     name: str
     count: int
     properties: list[Property] = field(default_factory=list)
-    columns: dict[str, NDArray[np.generic]] = field(default_factory=dict)
-    lengths: dict[str, I64] = field(default_factory=dict)
+    columns: dict[str, F64] = field(default_factory=dict)
+    lists: dict[str, tuple[F64, I64]] = field(default_factory=dict)
 
     def kind(self, name: str) -> str:
         """Type of a property."""
@@ -145,12 +145,12 @@ def _header(text: str, path: Path) -> tuple[Literal["", "<", ">"], list[Element]
 class _Body:
     """What follows the header, in cells: numbers of a text, or bytes."""
 
-    def __init__(self, data: bytes, order: str, path: Path) -> None:
+    def __init__(self, data: bytes, order: Literal["", "<", ">"], path: Path) -> None:
         self.order, self.path, self.position = order, path, 0
         cells = np.frombuffer(data, np.uint8) if order else parse(data, np.float64)
         if cells is None:
             raise InputError("has words that are no numbers after its header", where=path)
-        self.cells: NDArray[np.generic] = cells
+        self.cells: NDArray[Any] = cells
 
     @property
     def rest(self) -> int:
@@ -190,9 +190,11 @@ class _Body:
                 if not (lengths == length).all():
                     return False
         for one, length, begin, stop in spans:
-            element.columns[one.name] = self._decoded(rows[:, begin:stop], one.kind)
-            if length is not None:
-                element.lengths[one.name] = np.full(element.count, length)
+            numbers = self._decoded(rows[:, begin:stop], one.kind)
+            if length is None:
+                element.columns[one.name] = numbers
+            else:
+                element.lists[one.name] = numbers, np.full(element.count, length)
         self.position = end
         return True
 
@@ -214,25 +216,27 @@ class _Body:
         if position > len(self.cells):
             raise InputError(_SHORT, where=self.path)
         for one in element.properties:
-            starts, lengths = (np.array(numbers, np.int64) for numbers in places[one.name])
+            first, counts = (np.array(numbers, np.int64) for numbers in places[one.name])
             size = self._size(one.kind)
-            within = np.arange(lengths.sum()) - np.repeat(np.cumsum(lengths) - lengths, lengths)
-            cells = np.repeat(starts, lengths) + within * size
-            element.columns[one.name] = self._decoded(self.cells[cells[:, None] + np.arange(size)], one.kind)
-            if one.length is not None:
-                element.lengths[one.name] = lengths
+            within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+            cells = np.repeat(first, counts) + within * size
+            numbers = self._decoded(self.cells[cells[:, None] + np.arange(size)], one.kind)
+            if one.length is None:
+                element.columns[one.name] = numbers
+            else:
+                element.lists[one.name] = numbers, counts
         self.position = position
 
     def _size(self, kind: str) -> int:
         """Cells of a number."""
         return np.dtype(kind).itemsize if self.order else 1
 
-    def _decoded(self, cells: NDArray[np.generic], kind: str) -> NDArray[np.generic]:
+    def _decoded(self, cells: NDArray[Any], kind: str) -> F64:
         """Numbers of rows of cells."""
-        if not self.order:
-            return cells.ravel()
-        numbers = np.ascontiguousarray(cells).view(np.dtype(kind).newbyteorder(self.order))
-        return numbers.astype(kind).ravel()
+        if self.order != "":
+            stored = np.dtype(kind).newbyteorder(self.order)
+            cells = np.ascontiguousarray(cells).view(stored)
+        return cells.astype(np.float64).ravel()
 
     def _length(self, position: int, kind: str) -> int:
         """Length of the list that starts at a cell."""

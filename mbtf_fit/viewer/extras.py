@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 from mbtf_core.errors import InputError
 from mbtf_core.images.environment import read_environment
 from mbtf_core.images.resample import resample
-from mbtf_core.meshes.content import MeshShape
 from mbtf_core.meshes.read import read_mesh_content
 from mbtf_core.pictures import Camera, read_references
 from mbtf_fit.viewer.page import encode
@@ -147,7 +146,7 @@ def read_shape(path: Path) -> tuple[dict[str, F64], NDArray[np.int64], float]:
 
 
 def _normals(vertices: F64, faces: NDArray[np.int64], same: NDArray[np.int64]) -> F64:
-    """Means (n, 3) of the triangles' normals, weighted by their angles, over vertices of the `same` number."""
+    """Means (n, 3) of the triangles' normals over vertices of the `same` number, weighted by angles."""
     corners = vertices[faces]
     normal = _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), 0.0)
     sums = np.zeros_like(vertices)
