@@ -28,7 +28,7 @@ _NEUTRAL = {"d": 1.0, "tf": 1.0}
 
 
 @dataclass(frozen=True)
-class Material:
+class MtlMaterial:
     """Statements of one material.
 
     Attributes
@@ -73,7 +73,7 @@ def _wanted(count: int) -> str:
     return "a number" if count == 1 else "a color of three numbers"
 
 
-def read_mtl(path: Path, found: dict[str, Material], warnings: list[str]) -> None:
+def read_mtl(path: Path, found: dict[str, MtlMaterial], warnings: list[str]) -> None:
     """Read a file of materials.
 
     Parameters
@@ -93,12 +93,12 @@ def read_mtl(path: Path, found: dict[str, Material], warnings: list[str]) -> Non
     data = read_bytes(path)
     if b"\0" in data:
         raise InputError("is not a text of materials", where=path)
-    current: Material | None = None
+    current: MtlMaterial | None = None
     for number, line in enumerate(as_text(data).splitlines(), 1):
         key, _, rest = line.partition("#")[0].strip().replace("\t", " ").partition(" ")
         rest = rest.strip()
         if key.lower() == "newmtl":
-            current = Material(rest, path)
+            current = MtlMaterial(rest, path)
             if rest in found:
                 warnings.append(f"{path.name}: '{rest}' is there twice; the first one counts")
             else:
@@ -118,7 +118,7 @@ def as_text(data: bytes) -> str:
 
 
 def material_values(
-    material: Material, companions: Companions
+    material: MtlMaterial, companions: Companions
 ) -> tuple[dict[str, Any], dict[str, InputError], list[str]]:
     """What a material says, by role.
 
@@ -126,7 +126,7 @@ def material_values(
 
     Parameters
     ----------
-    material : Material
+    material : MtlMaterial
         The material.
     companions : Companions
         Finds its images, collects them and warnings of them.

@@ -14,7 +14,7 @@ from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError
 from mbtf_core.meshes.companions import Companions
 from mbtf_core.meshes.content import F64, MeshContent, MeshShape
-from mbtf_core.meshes.mtl import Material, as_text, material_values, read_mtl
+from mbtf_core.meshes.mtl import MtlMaterial, as_text, material_values, read_mtl
 from mbtf_core.meshes.numbers import parse, read_bytes, slashes_per_word, words_per_line
 from mbtf_core.meshes.parts import groups_of, part_of
 from mbtf_core.meshes.polygons import UNCUT, triangulate
@@ -206,7 +206,7 @@ class _Materials:
     def __init__(self, path: Path, libraries: Iterable[str], companions: Companions) -> None:
         self.path, self.companions = path, companions
         self.warnings: list[str] = []
-        self._found: dict[str, Material] = {}
+        self._found: dict[str, MtlMaterial] = {}
         self._faults: list[InputError] = []
         self._remarks: dict[str, list[str]] = {}
         self._names: list[str] = []

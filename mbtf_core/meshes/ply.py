@@ -74,8 +74,8 @@ def read_ply(path: Path) -> MeshContent:
     uv, colors, normals = _uv(vertex, face, number, sizes), _colors(vertex, face, number, sizes), None
     if set(_NORMAL) <= vertex.columns.keys():
         normals = _stacked(vertex, _NORMAL)[number]
-    placed: NDArray[np.bool_] = np.isfinite(uv).all(axis=1)
-    textured: NDArray[np.bool_] = placed[triangles].all(axis=1)
+    placed = np.asarray(np.isfinite(uv).all(axis=1))
+    textured = np.asarray(placed[triangles].all(axis=1))
     image = np.nan_to_num(face.columns.get(_IMAGE, np.zeros(face.count))).astype(np.int64)[polygon]
     # What faces say of their corners makes vertices of them.
     split = _WEDGE in face.lists or bool(_face_colors(vertex, face))
