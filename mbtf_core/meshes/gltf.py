@@ -17,11 +17,13 @@ from mbtf_core.errors import InputError
 from mbtf_core.meshes.content import F64, MOST_TRIANGLES, MeshContent, MeshShape
 from mbtf_core.meshes.gltf_buffers import HINTS, READ, GltfFile
 from mbtf_core.meshes.gltf_material import Materials
-from mbtf_core.meshes.gltf_schema import Instancing, Material, Mesh, Node, Primitive
+from mbtf_core.meshes.gltf_schema import GltfInstancing, GltfMaterial, GltfMesh, GltfNode, GltfPrimitive
 
 Faces = NDArray[np.int64]
 
 _STRIP, _FAN = 5, 6
+# Transforms of a node that has none.
+_AT_REST = {"translation": (0.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0, 1.0), "scale": (1.0, 1.0, 1.0)}
 # Largest deviation of a quaternion's length from one; quantized ones deviate by one hundredth.
 _UNIT = 0.05
 # Largest deviation of texture coordinates that follow from others.
@@ -49,7 +51,7 @@ class _Group:
     """
 
     name: str
-    material: Material
+    material: GltfMaterial
     places: dict[int, F64]
     pieces: list[_Piece] = field(default_factory=list)
 
@@ -118,6 +120,7 @@ def _placements(file: GltfFile) -> dict[int, F64]:
     else:
         below = {child for node in nodes for child in node.children}
         roots = [index for index in range(len(nodes)) if index not in below]
+    locals_ = _locals(file)
     found: dict[int, list[F64]] = {}
     seen: set[int] = set()
     waiting = [(index, np.eye(4)) for index in reversed(roots)]
@@ -127,8 +130,7 @@ def _placements(file: GltfFile) -> dict[int, F64]:
         if index in seen:
             raise InputError(f"node {index} has two parents or contains itself", where=file.path)
         seen.add(index)
-        local = _local(node, file, index)
-        matrix = above if local is None else above @ local
+        matrix = above @ locals_[index]
         if node.mesh is not None:
             mesh = file.entry(document.meshes, node.mesh, "meshes")
             _check_pose(node, mesh, file)
@@ -142,7 +144,7 @@ def _placements(file: GltfFile) -> dict[int, F64]:
     return {mesh: np.concatenate(matrices) for mesh, matrices in found.items()}
 
 
-def _check_pose(node: Node, mesh: Mesh, file: GltfFile) -> None:
+def _check_pose(node: GltfNode, mesh: GltfMesh, file: GltfFile) -> None:
     """Refuse poses that bones and weights define."""
     name = node.name or mesh.name
     if node.skin is not None:
@@ -153,51 +155,51 @@ def _check_pose(node: Node, mesh: Mesh, file: GltfFile) -> None:
         raise InputError(f"'{name}' is a blend of morph targets, not read", where=file.path, hint=hint)
 
 
-def _local(node: Node, file: GltfFile, index: int) -> F64 | None:
-    """Matrix (4, 4) of a node; None for one that does not move."""
-    parts = (node.translation, node.rotation, node.scale)
-    if node.matrix is not None:
-        matrix = np.array(node.matrix).reshape(4, 4).T
-        if tuple(matrix[3]) != (0.0, 0.0, 0.0, 1.0) or any(part is not None for part in parts):
-            what = f"node {index} has a matrix that is projective or stands beside other transforms"
-            raise InputError(what, where=file.path)
-        return matrix
-    if all(part is None for part in parts):
-        return None
+def _locals(file: GltfFile) -> F64:
+    """Matrices (nodes, 4, 4) of all nodes relative to their parents."""
+    nodes = file.document.nodes
+    if not nodes:
+        return np.zeros((0, 4, 4))
     translation, rotation, scale = (
-        np.array([default if part is None else part], np.float64)
-        for part, default in zip(parts, ((0, 0, 0), (0, 0, 0, 1), (1, 1, 1)), strict=True)
+        np.array([getattr(node, name) or default for node in nodes], np.float64)
+        for name, default in _AT_REST.items()
     )
-    return _transforms(translation, rotation, scale, file, f"node {index}")[0]
+    out = _transforms(translation, rotation, scale, file)
+    for index, node in enumerate(nodes):
+        if node.matrix is not None:
+            out[index] = np.array(node.matrix).reshape(4, 4).T
+            if out[index, 3].tolist() != [0, 0, 0, 1] or node.translation or node.rotation or node.scale:
+                what = f"node {index} has a matrix that is projective or stands beside other transforms"
+                raise InputError(what, where=file.path)
+    return out
 
 
-def _instance_matrices(file: GltfFile, instancing: Instancing) -> F64:
+def _instance_matrices(file: GltfFile, instancing: GltfInstancing) -> F64:
     """Matrices (k, 4, 4) of instances."""
-    widths = {"TRANSLATION": 3, "ROTATION": 4, "SCALE": 3}
-    given = {
-        name: file.vectors(index, (widths[name],), name)
-        for name, index in instancing.attributes.items()
-        if name in widths
-    }
-    unused = sorted(instancing.attributes.keys() - widths.keys())
+    given, unused = {}, []
+    for name, index in sorted(instancing.attributes.items()):
+        default = _AT_REST.get(name.lower())
+        if default is None:
+            unused.append(name)
+        else:
+            given[name.lower()] = file.vectors(index, (len(default),), name)
     if unused:
         file.warnings.append(f"{', '.join(unused)} of instances are not used")
     counts = {len(values) for values in given.values()}
     if len(counts) != 1:
         raise InputError("has instances of attributes of no or of different lengths", where=file.path)
     count = counts.pop()
-    defaults = {"TRANSLATION": (0.0, 0.0, 0.0), "ROTATION": (0.0, 0.0, 0.0, 1.0), "SCALE": (1.0, 1.0, 1.0)}
     translation, rotation, scale = (
-        given.get(name, np.tile(default, (count, 1))) for name, default in defaults.items()
+        given.get(name, np.tile(default, (count, 1))) for name, default in _AT_REST.items()
     )
-    return _transforms(translation, rotation, scale, file, "an instance")
+    return _transforms(translation, rotation, scale, file)
 
 
-def _transforms(translation: F64, rotation: F64, scale: F64, file: GltfFile, what: str) -> F64:
+def _transforms(translation: F64, rotation: F64, scale: F64, file: GltfFile) -> F64:
     """Matrices (k, 4, 4) from translations (k, 3), quaternions (k, 4) and scales (k, 3)."""
     length = np.linalg.norm(rotation, axis=1, keepdims=True)
     if not (np.abs(length - 1.0) < _UNIT).all():
-        raise InputError(f"{what} has a rotation that is no unit quaternion", where=file.path)
+        raise InputError("has a rotation that is no unit quaternion", where=file.path)
     x, y, z, w = (rotation / length).T
     out = np.zeros((len(translation), 4, 4))
     out[:, 0, :3] = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], axis=-1)
@@ -209,7 +211,7 @@ def _transforms(translation: F64, rotation: F64, scale: F64, file: GltfFile, wha
     return out
 
 
-def _triangles(file: GltfFile, primitive: Primitive) -> tuple[F64, Faces]:
+def _triangles(file: GltfFile, primitive: GltfPrimitive) -> tuple[F64, Faces]:
     """Positions (n, 3) and triangles (m, 3) of a primitive."""
     attributes = primitive.attributes
     if "POSITION" not in attributes:
@@ -236,7 +238,7 @@ def _triangles(file: GltfFile, primitive: Primitive) -> tuple[F64, Faces]:
 
 
 def _attribute(
-    file: GltfFile, primitive: Primitive, name: str, widths: tuple[int, ...], count: int
+    file: GltfFile, primitive: GltfPrimitive, name: str, widths: tuple[int, ...], count: int
 ) -> F64 | None:
     """Numbers (count, width) of a primitive's vertices; None where it lacks them."""
     index = primitive.attributes.get(name)
@@ -248,13 +250,15 @@ def _attribute(
     return values
 
 
-def _texture_coordinates(file: GltfFile, primitive: Primitive, sets: list[int], count: int) -> dict[int, F64]:
+def _texture_coordinates(
+    file: GltfFile, primitive: GltfPrimitive, sets: list[int], count: int
+) -> dict[int, F64]:
     """Texture coordinates (n, 2), v up, of those sets that the primitive has."""
     found = {number: _attribute(file, primitive, f"TEXCOORD_{number}", (2,), count) for number in sets}
     return {number: uv * (1, -1) + (0, 1) for number, uv in found.items() if uv is not None}
 
 
-def _colors(file: GltfFile, primitive: Primitive, material: Material, count: int) -> F64 | None:
+def _colors(file: GltfFile, primitive: GltfPrimitive, material: GltfMaterial, count: int) -> F64 | None:
     """Linear colors (n, 3) of the vertices."""
     colors = _attribute(file, primitive, "COLOR_0", (3, 4), count)
     if "COLOR_1" in primitive.attributes and "COLOR_1 is not used" not in file.warnings:

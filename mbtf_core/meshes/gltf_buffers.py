@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mbtf_core.config.settings import build
 from mbtf_core.errors import InputError, reason
 from mbtf_core.meshes.content import F64, MOST_TRIANGLES
-from mbtf_core.meshes.gltf_schema import Accessor, Document
+from mbtf_core.meshes.gltf_schema import GltfAccessor, GltfDocument
 from mbtf_core.paths import refuse_special, suggest_path
 
 Bytes = NDArray[np.uint8]
@@ -63,7 +63,7 @@ class GltfFile:
 
     Attributes
     ----------
-    document : Document
+    document : GltfDocument
         Its parts that are read.
     extensions : list of str
         Names of all extensions that it uses, sorted.
@@ -100,7 +100,7 @@ class GltfFile:
             hints = dict.fromkeys(HINTS.get(name, f"export it without {name}") for name in lacking)
             what = f"requires {', '.join(lacking)}, which is not read"
             raise InputError(what, where=path, hint="; ".join(hints))
-        self.document = build(Document, data, source=str(path))
+        self.document = build(GltfDocument, data, source=str(path))
         self.extensions = sorted(set(_extensions(data)))
         self._buffers: dict[int, Bytes] = {}
 
@@ -182,7 +182,7 @@ class GltfFile:
             self._buffers[index] = np.frombuffer(content, np.uint8, buffer.byteLength)
         return self._buffers[index]
 
-    def _elements(self, index: int, widths: Sequence[int], what: str) -> tuple[Accessor, NDArray[Any]]:
+    def _elements(self, index: int, widths: Sequence[int], what: str) -> tuple[GltfAccessor, NDArray[Any]]:
         """An accessor and its elements (n, width) as stored, those of a sparse one put in."""
         accessor = self.entry(self.document.accessors, index, "accessors")
         name, width = f"'accessors.{index}'", _WIDTHS.get(accessor.type, 0)

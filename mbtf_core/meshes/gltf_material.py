@@ -20,7 +20,7 @@ from mbtf_core.errors import InputError
 from mbtf_core.images.read import LUMINANCE, decode_image
 from mbtf_core.meshes.content import F64, Texture, Value, Wrap, numbers_of
 from mbtf_core.meshes.gltf_buffers import HINTS, GltfFile
-from mbtf_core.meshes.gltf_schema import Material, MetallicRoughness, Sampler, TextureInfo
+from mbtf_core.meshes.gltf_schema import GltfMaterial, GltfMetallicRoughness, GltfSampler, GltfTextureInfo
 
 _WRAPS: dict[int, Wrap] = {10497: "repeat", 33648: "mirror", 33071: "clamp"}
 _NEAREST = 9728
@@ -39,13 +39,13 @@ class _Source:
     """Where the value of a role comes from: a factor, and channels of a texture."""
 
     factor: float | F64
-    texture: TextureInfo | None = None
+    texture: GltfTextureInfo | None = None
     channels: tuple[int, ...] = _RGB
     encoded: bool = False
     gray: bool = False
 
     @property
-    def placed(self) -> TextureInfo | None:
+    def placed(self) -> GltfTextureInfo | None:
         """Its texture, unless the factor is zero."""
         return self.texture if np.any(self.factor) else None
 
@@ -65,25 +65,25 @@ class Materials:
         self._latest: tuple[int, NDArray[np.floating[Any]]] | None = None
         self._unused: dict[str, None] = {}
 
-    def of(self, index: int | None) -> Material:
+    def of(self, index: int | None) -> GltfMaterial:
         """A material; that of the specification without an index."""
         if index is None:
-            return Material()
+            return GltfMaterial()
         return self.file.entry(self.file.document.materials, index, "materials")
 
-    def uv_sets(self, material: Material) -> list[int]:
+    def uv_sets(self, material: GltfMaterial) -> list[int]:
         """Numbers of the texture coordinates that its textures need, that of the base color first."""
         placed = (source.placed for source in self._sources(material).values())
         return list(dict.fromkeys(texture.uv_set for texture in placed if texture is not None))
 
     def read(
-        self, material: Material, places: Mapping[int, F64]
+        self, material: GltfMaterial, places: Mapping[int, F64]
     ) -> tuple[dict[str, Value], dict[str, InputError]]:
         """What a material reflects.
 
         Parameters
         ----------
-        material : Material
+        material : GltfMaterial
         places : dict of int to (3, 3) array
             Texture coordinates (u, v, 1) of each set from those of the shape, v up. Others are lacking.
 
@@ -117,9 +117,9 @@ class Materials:
                 self.file.warnings.append(text)
         return values, faults
 
-    def _sources(self, material: Material) -> dict[str, _Source]:
+    def _sources(self, material: GltfMaterial) -> dict[str, _Source]:
         """By role."""
-        base, more = material.pbrMetallicRoughness or MetallicRoughness(), material.extensions
+        base, more = material.pbrMetallicRoughness or GltfMetallicRoughness(), material.extensions
         color, alpha = np.array(base.baseColorFactor[:3]), base.baseColorFactor[3]
         rough, coat, sheen = base.metallicRoughnessTexture, more.clearcoat, more.sheen
         found = {"base_color": _Source(color, base.baseColorTexture, encoded=True)}
@@ -147,7 +147,7 @@ class Materials:
             }
         return found
 
-    def _value(self, source: _Source, places: Mapping[int, F64], material: Material) -> Value:
+    def _value(self, source: _Source, places: Mapping[int, F64], material: GltfMaterial) -> Value:
         if (info := source.placed) is None:
             return source.factor
         if info.uv_set not in places:
@@ -159,7 +159,7 @@ class Materials:
             )
         document = self.file.document
         texture = self.file.entry(document.textures, info.index, "textures")
-        sampler = Sampler()
+        sampler = GltfSampler()
         if texture.sampler is not None:
             sampler = self.file.entry(document.samplers, texture.sampler, "samplers")
         if texture.source is None:
@@ -209,7 +209,7 @@ class Materials:
         return self._latest[1]
 
 
-def _specular(material: Material) -> _Source:
+def _specular(material: GltfMaterial) -> _Source:
     """The dielectric lobe: its F0 is ``min(1, c·((n-1)/(n+1))²)·w`` with the color c, the weight w and the
     index of refraction n."""
     index, lobe = material.extensions.ior.ior, material.extensions.specular
@@ -221,7 +221,7 @@ def _specular(material: Material) -> _Source:
     return _Source(factor, lobe.specularTexture, _A)
 
 
-def _transform(info: TextureInfo) -> F64:
+def _transform(info: GltfTextureInfo) -> F64:
     """Matrix (3, 3) of ``KHR_texture_transform``, v down. Its rotation turns the image clockwise."""
     given = info.extensions.transform
     c, s = np.cos(given.rotation), np.sin(given.rotation)
@@ -229,9 +229,9 @@ def _transform(info: TextureInfo) -> F64:
     return np.array([[*scaled[0], given.offset[0]], [*scaled[1], given.offset[1]], [0.0, 0.0, 1.0]])
 
 
-def _unused(material: Material) -> Iterator[str]:
+def _unused(material: GltfMaterial) -> Iterator[str]:
     """What of a material is not used, or not exactly, in words."""
-    base, more = material.pbrMetallicRoughness or MetallicRoughness(), material.extensions
+    base, more = material.pbrMetallicRoughness or GltfMetallicRoughness(), material.extensions
     if material.normalTexture is not None or more.clearcoat.clearcoatNormalTexture is not None:
         yield "normal textures are not used"
     if material.occlusionTexture is not None:

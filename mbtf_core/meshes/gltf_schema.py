@@ -27,21 +27,21 @@ class _Object(BaseModel):
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
 
 
-class Asset(_Object):
+class GltfAsset(_Object):
     """Version of the format."""
 
     version: str
     minVersion: str | None = None
 
 
-class Buffer(_Object):
+class GltfBuffer(_Object):
     """Bytes of a file, of a data URI, or of the GLB's own chunk."""
 
     byteLength: Size
     uri: str | None = None
 
 
-class BufferView(_Object):
+class GltfBufferView(_Object):
     """A part of a buffer."""
 
     buffer: Index
@@ -50,7 +50,7 @@ class BufferView(_Object):
     byteStride: Index = 0
 
 
-class SparseIndices(_Object):
+class GltfSparseIndices(_Object):
     """Elements that a sparse accessor replaces."""
 
     bufferView: Index
@@ -58,22 +58,22 @@ class SparseIndices(_Object):
     componentType: int
 
 
-class SparseValues(_Object):
+class GltfSparseValues(_Object):
     """Their values."""
 
     bufferView: Index
     byteOffset: Index = 0
 
 
-class Sparse(_Object):
+class GltfSparse(_Object):
     """Replaced elements of an accessor."""
 
     count: Size
-    indices: SparseIndices
-    values: SparseValues
+    indices: GltfSparseIndices
+    values: GltfSparseValues
 
 
-class Accessor(_Object):
+class GltfAccessor(_Object):
     """An array in a buffer view; zeros without one."""
 
     bufferView: Index | None = None
@@ -82,10 +82,10 @@ class Accessor(_Object):
     normalized: bool = False
     count: Size
     type: str
-    sparse: Sparse | None = None
+    sparse: GltfSparse | None = None
 
 
-class Image(_Object):
+class GltfImage(_Object):
     """A PNG or JPEG file, or one in a buffer view."""
 
     uri: str | None = None
@@ -93,7 +93,7 @@ class Image(_Object):
     name: str = ""
 
 
-class Sampler(_Object):
+class GltfSampler(_Object):
     """How a texture is looked up."""
 
     magFilter: int | None = None
@@ -101,7 +101,7 @@ class Sampler(_Object):
     wrapT: Literal[33071, 33648, 10497] = 10497
 
 
-class Texture(_Object):
+class GltfTexture(_Object):
     """An image and its sampler."""
 
     source: Index | None = None
@@ -109,7 +109,7 @@ class Texture(_Object):
     extensions: dict[str, Any] = {}
 
 
-class TextureTransform(_Object):
+class GltfTextureTransform(_Object):
     """``KHR_texture_transform``."""
 
     offset: tuple[Number, Number] = (0.0, 0.0)
@@ -118,18 +118,18 @@ class TextureTransform(_Object):
     texCoord: Index | None = None
 
 
-class TextureExtensions(_Object):
+class GltfTextureExtensions(_Object):
     """Extensions of a reference to a texture."""
 
-    transform: TextureTransform = Field(TextureTransform(), alias="KHR_texture_transform")
+    transform: GltfTextureTransform = Field(GltfTextureTransform(), alias="KHR_texture_transform")
 
 
-class TextureInfo(_Object):
+class GltfTextureInfo(_Object):
     """A reference to a texture, and the texture coordinates that place it."""
 
     index: Index
     texCoord: Index = 0
-    extensions: TextureExtensions = TextureExtensions()
+    extensions: GltfTextureExtensions = GltfTextureExtensions()
 
     @property
     def uv_set(self) -> int:
@@ -138,74 +138,74 @@ class TextureInfo(_Object):
         return self.texCoord if own is None else own
 
 
-class MetallicRoughness(_Object):
+class GltfMetallicRoughness(_Object):
     """The base layer."""
 
     baseColorFactor: tuple[Share, Share, Share, Share] = (1.0, 1.0, 1.0, 1.0)
-    baseColorTexture: TextureInfo | None = None
+    baseColorTexture: GltfTextureInfo | None = None
     metallicFactor: Share = 1.0
     roughnessFactor: Share = 1.0
-    metallicRoughnessTexture: TextureInfo | None = None
+    metallicRoughnessTexture: GltfTextureInfo | None = None
 
 
-class Clearcoat(_Object):
+class GltfClearcoat(_Object):
     """``KHR_materials_clearcoat``."""
 
     clearcoatFactor: Share = 0.0
-    clearcoatTexture: TextureInfo | None = None
+    clearcoatTexture: GltfTextureInfo | None = None
     clearcoatRoughnessFactor: Share = 0.0
-    clearcoatRoughnessTexture: TextureInfo | None = None
+    clearcoatRoughnessTexture: GltfTextureInfo | None = None
     clearcoatNormalTexture: Any = None
 
 
-class Sheen(_Object):
+class GltfSheen(_Object):
     """``KHR_materials_sheen``."""
 
     sheenColorFactor: Color = (0.0, 0.0, 0.0)
-    sheenColorTexture: TextureInfo | None = None
+    sheenColorTexture: GltfTextureInfo | None = None
     sheenRoughnessFactor: Share = 0.0
-    sheenRoughnessTexture: TextureInfo | None = None
+    sheenRoughnessTexture: GltfTextureInfo | None = None
 
 
-class Specular(_Object):
+class GltfSpecular(_Object):
     """``KHR_materials_specular``."""
 
     specularFactor: Share = 1.0
-    specularTexture: TextureInfo | None = None
+    specularTexture: GltfTextureInfo | None = None
     specularColorFactor: tuple[NotNegative, NotNegative, NotNegative] = (1.0, 1.0, 1.0)
-    specularColorTexture: TextureInfo | None = None
+    specularColorTexture: GltfTextureInfo | None = None
 
 
-class Ior(_Object):
+class GltfIor(_Object):
     """``KHR_materials_ior``; 0 stands for a reflectance of 1."""
 
     ior: NotNegative = 1.5
 
 
-class MaterialExtensions(_Object):
+class GltfMaterialExtensions(_Object):
     """Extensions of a material that are read."""
 
-    clearcoat: Clearcoat = Field(Clearcoat(), alias="KHR_materials_clearcoat")
-    sheen: Sheen = Field(Sheen(), alias="KHR_materials_sheen")
-    specular: Specular = Field(Specular(), alias="KHR_materials_specular")
-    ior: Ior = Field(Ior(), alias="KHR_materials_ior")
+    clearcoat: GltfClearcoat = Field(GltfClearcoat(), alias="KHR_materials_clearcoat")
+    sheen: GltfSheen = Field(GltfSheen(), alias="KHR_materials_sheen")
+    specular: GltfSpecular = Field(GltfSpecular(), alias="KHR_materials_specular")
+    ior: GltfIor = Field(GltfIor(), alias="KHR_materials_ior")
     specular_glossiness: Any = Field(None, alias="KHR_materials_pbrSpecularGlossiness")
 
 
-class Material(_Object):
+class GltfMaterial(_Object):
     """What a surface reflects."""
 
     name: str = ""
-    pbrMetallicRoughness: MetallicRoughness | None = None
+    pbrMetallicRoughness: GltfMetallicRoughness | None = None
     normalTexture: Any = None
     occlusionTexture: Any = None
     emissiveFactor: tuple[NotNegative, NotNegative, NotNegative] = (0.0, 0.0, 0.0)
     alphaMode: Literal["OPAQUE", "MASK", "BLEND"] = "OPAQUE"
     alphaCutoff: NotNegative = 0.5
-    extensions: MaterialExtensions = MaterialExtensions()
+    extensions: GltfMaterialExtensions = GltfMaterialExtensions()
 
 
-class Primitive(_Object):
+class GltfPrimitive(_Object):
     """Triangles, lines or points of one material."""
 
     attributes: dict[str, Index]
@@ -215,27 +215,27 @@ class Primitive(_Object):
     extensions: dict[str, Any] = {}
 
 
-class Mesh(_Object):
+class GltfMesh(_Object):
     """What a node shows."""
 
     name: str = ""
-    primitives: list[Primitive]
+    primitives: list[GltfPrimitive]
     weights: list[Number] = []
 
 
-class Instancing(_Object):
+class GltfInstancing(_Object):
     """``EXT_mesh_gpu_instancing``."""
 
     attributes: dict[str, Index]
 
 
-class NodeExtensions(_Object):
+class GltfNodeExtensions(_Object):
     """Extensions of a node that are read."""
 
-    instancing: Instancing | None = Field(None, alias="EXT_mesh_gpu_instancing")
+    instancing: GltfInstancing | None = Field(None, alias="EXT_mesh_gpu_instancing")
 
 
-class Node(_Object):
+class GltfNode(_Object):
     """A place in the scene."""
 
     name: str = ""
@@ -247,29 +247,29 @@ class Node(_Object):
     mesh: Index | None = None
     skin: Index | None = None
     weights: list[Number] = []
-    extensions: NodeExtensions = NodeExtensions()
+    extensions: GltfNodeExtensions = GltfNodeExtensions()
 
 
-class Scene(_Object):
+class GltfScene(_Object):
     """Nodes that are shown together."""
 
     nodes: list[Index] = []
 
 
-class Document(_Object):
+class GltfDocument(_Object):
     """A glTF document."""
 
-    asset: Asset
+    asset: GltfAsset
     extensionsRequired: list[str] = []
-    accessors: list[Accessor] = []
+    accessors: list[GltfAccessor] = []
     animations: list[Any] = []
-    buffers: list[Buffer] = []
-    bufferViews: list[BufferView] = []
-    images: list[Image] = []
-    materials: list[Material] = []
-    meshes: list[Mesh] = []
-    nodes: list[Node] = []
-    samplers: list[Sampler] = []
+    buffers: list[GltfBuffer] = []
+    bufferViews: list[GltfBufferView] = []
+    images: list[GltfImage] = []
+    materials: list[GltfMaterial] = []
+    meshes: list[GltfMesh] = []
+    nodes: list[GltfNode] = []
+    samplers: list[GltfSampler] = []
     scene: Index | None = None
-    scenes: list[Scene] = []
-    textures: list[Texture] = []
+    scenes: list[GltfScene] = []
+    textures: list[GltfTexture] = []
