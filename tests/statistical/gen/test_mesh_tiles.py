@@ -47,7 +47,7 @@ def tile_of(plates: list[NDArray[np.float64]], colors: list[float], aspect: floa
         np.concatenate([faces + 4 * k for k in range(len(plates))]),
         np.zeros((4 * len(plates), 2)),
         np.repeat(np.arange(len(plates)), 2),
-        [MeshPart(str(k), np.full(3, c)) for k, c in enumerate(colors)],
+        [MeshPart(str(k), {"base_color": np.full(3, c)}) for k, c in enumerate(colors)],
     )
 
 
@@ -116,7 +116,7 @@ def test_white_bodies_above_a_grid_return_all_light() -> None:
         faces,
         np.zeros((len(vertices), 2)),
         np.zeros(len(faces), int),
-        [MeshPart("w", np.ones(3))],
+        [MeshPart("w", {"base_color": np.ones(3)})],
     )
     e = traced(tile, None, tile_mean_queries(UP, direction(30, 20), 2000), 64)
     total = 0.5 * (e.value_a + e.value_b)[:, 0] + e.transmittance
