@@ -95,9 +95,12 @@ class Companions:
             )
         return np.asarray(srgb_to_linear(rgb) if srgb else rgb, np.float32)
 
-    def share(self, name: str, channel: str | None = None) -> NDArray[np.float32]:
-        """Numbers (h, w) of an image, of a channel or of its luminance; errors as of :meth:`color`."""
+    def share(self, name: str, channel: str | None = None, *, alpha: bool = False) -> NDArray[np.float32]:
+        """Numbers (h, w) of an image: a channel, its alpha where it is asked for and not all 1, or its
+        luminance; errors as of :meth:`color`."""
         image = self._image(name, channel)
+        if alpha and image.pixels.shape[2] in (2, 4) and np.any(image.pixels[..., -1] != 1.0):
+            image = self._image(name, "A")
         numbers, warnings = gray(image)
         self.warnings += warnings
         _check_range(numbers[..., None], image.path)

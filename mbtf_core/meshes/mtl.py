@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,18 +12,26 @@ import numpy as np
 
 from mbtf_core.errors import InputError
 from mbtf_core.meshes.companions import Companions
-from mbtf_core.meshes.content import Texture
+from mbtf_core.meshes.content import Texture, numbers_of
 from mbtf_core.meshes.numbers import read_bytes
 
 # Numbers after options of images, at most; all other options take one word.
 _NUMBERS = {"-o": 3, "-s": 3, "-t": 3, "-mm": 2}
 _CHANNELS = {"r": "R", "g": "G", "b": "B", "m": "A", "l": None}
 # Statements that change nothing alone: ambient light, the choice of a renderer's formula, and parameters of
-# layers that are reported with their weight (Ks, Pc, aniso).
-_IDLE = {"ka", "illum", "sharpness", "ni", "ns", "pcr", "anisor", "map_ka", "map_aat"}
-_USED = {"kd", "map_kd", "pr", "map_pr", "pm", "map_pm"}
-# Values with which a statement says nothing; 0 for others.
-_NEUTRAL = {"d": 1.0, "tf": 1.0}
+# layers that are reported with their weight (Ks, aniso).
+_IDLE = {"ka", "illum", "sharpness", "ni", "ns", "anisor", "map_ka", "map_aat"}
+# Role of each statement, and of the image with the prefix map_.
+_ROLES = {
+    "base_color": "Kd",
+    "roughness": "Pr",
+    "metallic": "Pm",
+    "clearcoat": "Pc",
+    "clearcoat_roughness": "Pcr",
+    "sheen": "Ps",
+    "opacity": "d",
+}
+_USED = {"tr", *(prefix + key.lower() for key in _ROLES.values() for prefix in ("", "map_"))}
 
 
 @dataclass(frozen=True)
@@ -122,7 +129,7 @@ def material_values(
 ) -> tuple[dict[str, Any], dict[str, InputError], list[str]]:
     """What a material says, by role.
 
-    ``Kd`` is linear and multiplies ``map_Kd``; so do ``Pr`` and ``Pm`` with their maps.
+    ``Kd`` is linear and multiplies ``map_Kd``, as other numbers multiply their images.
 
     Parameters
     ----------
@@ -142,7 +149,7 @@ def material_values(
     faults: dict[str, InputError] = {}
     remarks: list[str] = []
 
-    def read(role: str, key: str, one: Any, load: Callable[[str, str | None], Any]) -> None:
+    def read(role: str, key: str, one: Any) -> None:
         image = material.statements.get(f"map_{key.lower()}")
         try:
             factor = material.number(key.lower(), np.size(one))
@@ -155,18 +162,24 @@ def material_values(
                 remarks.append(f"{' '.join(options.unused)} of map_{key} is not used")
             if factor is not None and not np.any(factor):
                 remarks.append(f"{key} 0 makes map_{key} black")
-            texture = Texture(
-                load(options.name, options.channel), (options.wrap, options.wrap), to_uv=options.to_uv
-            )
+            if role == "base_color":
+                pixels = companions.color(options.name)
+            else:
+                pixels = companions.share(options.name, options.channel, alpha=role == "opacity")
+            texture = Texture(pixels, (options.wrap, options.wrap), to_uv=options.to_uv)
             values[role] = texture, one if factor is None else factor
         except InputError as fault:
             faults[role] = fault
 
-    read("base_color", "Kd", np.ones(3), lambda name, channel: companions.color(name))
-    read("roughness", "Pr", 1.0, companions.share)
-    read("metallic", "Pm", 1.0, companions.share)
+    for role, key in _ROLES.items():
+        read(role, key, np.ones(3) if role == "base_color" else 1.0)
     if "base_color" not in {*values, *faults}:
         remarks.append("there is neither Kd nor map_Kd")
+    for role in ("clearcoat", "sheen"):
+        if not isinstance(values.get(role), tuple) and not values.get(role):
+            values.pop(role, None)
+            values.pop(f"{role}_roughness", None)
+    _transparency(material, values, remarks)
     keys = material.statements.keys() - _USED - _IDLE
     unused = sorted(material.statements[key][0] for key in keys if _says(key, material.statements[key][1]))
     if unused:
@@ -174,10 +187,22 @@ def material_values(
     return values, faults, remarks
 
 
+def _transparency(material: MtlMaterial, values: dict[str, Any], remarks: list[str]) -> None:
+    """Opacity that hides nothing is left out; ``Tr`` is its complement, where there is no ``d``."""
+    if "opacity" not in values and "tr" in material.statements:
+        through = material.number("tr")
+        if through == 1.0:
+            remarks.append("Tr 1, which would hide it, is not used")
+        else:
+            values["opacity"] = 1.0 - through
+    if np.ndim(numbers_of(values.get("opacity", 1.0))) == 0 and values.get("opacity", 1.0) == 1.0:
+        values.pop("opacity", None)
+
+
 def _says(key: str, text: str) -> bool:
     """Whether a statement has another value than that of no effect."""
     numbers = [_number(word) for word in text.split()]
-    return any(number != _NEUTRAL.get(key, 0.0) for number in numbers)
+    return any(number != (1.0 if key == "tf" else 0.0) for number in numbers)
 
 
 @dataclass

@@ -16,7 +16,7 @@ from mbtf_core.meshes.companions import Companions
 from mbtf_core.meshes.content import F64, MeshContent, MeshShape
 from mbtf_core.meshes.mtl import MtlMaterial, as_text, material_values, read_mtl
 from mbtf_core.meshes.numbers import parse, read_bytes, slashes_per_word, words_per_line
-from mbtf_core.meshes.parts import groups_of, part_of
+from mbtf_core.meshes.parts import groups_of, with_colors
 from mbtf_core.meshes.polygons import UNCUT, triangulate
 from mbtf_core.paths import suggest_name
 
@@ -63,7 +63,7 @@ def read_obj(path: Path) -> MeshContent:
         arrays = _arrays(corners[triangles[group]], positions, colors, uv, normals)
         name = name or lines.objects[of_object[group[0]]] or path.name
         shape = MeshShape(name, **arrays, values=values, faults=faults)
-        shapes.append(part_of(shape, path, materials.warnings))
+        shapes.append(with_colors(shape, path, materials.warnings))
     warnings = [*lines.warnings, *([UNCUT.format(uncut)] if uncut else []), *materials.all_warnings()]
     return MeshContent(shapes, companions.files, None, [*warnings, *companions.warnings])
 

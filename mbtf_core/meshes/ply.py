@@ -12,7 +12,7 @@ from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError
 from mbtf_core.meshes.companions import Companions
 from mbtf_core.meshes.content import F64, MeshContent, MeshShape, Texture
-from mbtf_core.meshes.parts import groups_of, part_of
+from mbtf_core.meshes.parts import groups_of, with_colors
 from mbtf_core.meshes.ply_elements import Element, Elements, read_elements
 from mbtf_core.meshes.polygons import UNCUT, triangulate
 
@@ -96,7 +96,7 @@ def read_ply(path: Path) -> MeshContent:
             faults,
             None if normals is None else normals[used],
         )
-        shapes.append(part_of(shape, path, warnings))
+        shapes.append(with_colors(shape, path, warnings))
     if uncut:
         warnings.append(UNCUT.format(uncut))
     return MeshContent(shapes, companions.files, None, [*warnings, *companions.warnings])

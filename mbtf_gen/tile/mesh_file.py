@@ -16,6 +16,7 @@ from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import data_sha256, file_sha256
 from mbtf_core.meshes.content import MOST_TRIANGLES, MeshShape, Value, numbers_of
 from mbtf_core.meshes.read import read_mesh_content
+from mbtf_core.meshes.up_axis import y_seems_up
 from mbtf_gen.config.generator import Positive, Resolution, Rgb, Share, no_tiling
 from mbtf_gen.tile.maps.material_file import LOBES, ROLES
 from mbtf_gen.tile.mesh_textures import with_one_wrap, with_vertex_colors
@@ -74,7 +75,10 @@ def read_mesh(spec: MeshFile, folder: Path) -> MeshTile:
     shapes = [_shape(shape, spec, path) for shape in content.shapes]
     vertices, faces, uv, part = _joined(shapes, path)
     parts = [MeshPart(shape.name, shape.values) for shape in shapes]
-    up = spec.up or content.up or "z"
+    up = spec.up or content.up
+    warnings = [f"{path}: {text}" for text in content.warnings]
+    if up is None and y_seems_up(vertices, faces):
+        warnings.append(f"{path}: it looks like y is up: if so, give 'up: y' in a material.yaml")
     if up == "y":
         vertices = vertices[:, [0, 2, 1]] * (1.0, -1.0, 1.0)
     used = vertices[np.unique(faces)]
@@ -82,7 +86,9 @@ def read_mesh(spec: MeshFile, folder: Path) -> MeshTile:
     width, height = spec.period or (high[0] - low[0], high[1] - low[1])
     if not (width > 0 and height > 0):
         raise InputError(
-            "has no extent along both sides of the tile", where=path, hint="check 'up', or give 'period'"
+            "has no extent along both sides of the tile",
+            where=path,
+            hint="if y is up, give 'up: y' in a material.yaml; else give 'period'",
         )
     over = (high - low)[:2] / (width, height) - 1.0
     if over.max() > _BEYOND:
@@ -104,7 +110,7 @@ def read_mesh(spec: MeshFile, folder: Path) -> MeshTile:
             "settings": data_sha256(spec.model_dump(mode="json", exclude={"mesh"})),
         },
         warnings=(
-            *(f"{path}: {text}" for text in content.warnings),
+            *warnings,
             *([f"{path}: {what}: the tile may have a seam; check 'period'"] if seam else ()),
         ),
         notes=(
