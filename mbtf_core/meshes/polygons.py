@@ -108,7 +108,8 @@ def _ears(p: F64) -> I64 | None:
             return None
         out.append(left[[ear - 1, ear, (ear + 1) % len(left)]])
         left = np.delete(left, ear)
-    return np.array([*out, left])
+    a, b, c = p[left]
+    return None if _cross(b - a, c - b) < -_FLAT else np.array([*out, left])
 
 
 def _within(points: F64, a: F64, b: F64, c: F64) -> bool:
