@@ -190,7 +190,7 @@ def test_instances_are_placed_within_their_node(tmp_path: Path) -> None:
     found = content_of(builder, tmp_path)
     (shape,) = found.shapes
     turned = 2 * TRIANGLE[:, [2, 1, 0]] * (1, 1, -1)
-    expected = np.concatenate([TRIANGLE + (1, 100, 0), turned + (0, 100, 5)])
+    expected = np.concatenate([np.add(TRIANGLE, (1, 100, 0)), np.add(turned, (0, 100, 5))])
     assert shape.vertices == pytest.approx(expected, abs=1e-5)
     assert shape.faces.tolist() == [[0, 1, 2], [3, 4, 5]]
     assert ["_ID" in text for text in found.warnings] == [True]
