@@ -1,4 +1,4 @@
-"""What the tile of a mesh makes of its materials: colors of vertices, wrap modes, layers, overrides, companions."""
+"""What the tile of a mesh makes of its materials: vertex colors, wrap modes, layers, companions."""
 
 from __future__ import annotations
 
@@ -209,7 +209,7 @@ def with_companions(folder: Path) -> Path:
     builder.add("images", {"uri": "wood.png"})
     builder.add("textures", {"source": 0})
     builder.plate(builder.material({"baseColorTexture": {"index": 0}}))
-    builder.node(builder.mesh(SQUARE + (0, 0.25, 0)))
+    builder.node(builder.mesh(np.add(SQUARE, (0, 0.25, 0))))
     (folder / "wood.png").write_bytes(png(np.full((2, 2, 3), 128, np.uint8)))
     return builder.write(folder / "a.gltf")
 
