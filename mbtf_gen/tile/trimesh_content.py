@@ -27,7 +27,10 @@ def read_by_trimesh(path: Path) -> MeshContent:
     found = [_shape(str(name), shape) for name, shape in shapes if len(getattr(shape, "faces", ()))]
     if not found:
         raise InputError("has no triangles", where=path)
-    return MeshContent(found)
+    names = [
+        line.split()[1].decode() for line in path.read_bytes().splitlines() if line.startswith(b"mtllib ")
+    ]
+    return MeshContent(found, {name: path.parent / name for name in names if (path.parent / name).is_file()})
 
 
 def _shape(name: str, shape: Any) -> MeshShape:
