@@ -38,6 +38,7 @@ class _Piece:
     faces: Faces
     uv: dict[int, F64]
     colors: F64 | None
+    normals: F64 | None
 
 
 @dataclass
@@ -96,10 +97,11 @@ def read_gltf(path: Path) -> MeshContent:
             places = _related(uv, np.unique(faces))
             # One matrix for all primitives, unless several sets of coordinates are placed on one.
             own = (number, position) if len(places) > 1 else None
-            key = (primitive.material, tuple(places), colors is None, own)
+            normals = _attribute(file, primitive, "NORMAL", (3,), len(vertices))
+            key = (primitive.material, tuple(places), colors is None, normals is None, own)
             name = material.name or mesh.name or "part"
             group = groups.setdefault(key, _Group(name, material, places))
-            group.pieces.append(_instances(_Piece(vertices, faces, uv, colors), matrices))
+            group.pieces.append(_instances(_Piece(vertices, faces, uv, colors, normals), matrices))
     shapes = [_shape(group, materials) for group in groups.values()]
     if others:
         file.warnings.append("points and lines are not used")
@@ -294,6 +296,14 @@ def _instances(piece: _Piece, matrices: F64) -> _Piece:
     with np.errstate(over="ignore", invalid="ignore"):
         placed = np.einsum("kij,nj->kni", matrices[:, :3, :3], piece.vertices) + matrices[:, None, :3, 3]
         mirrored = np.linalg.det(matrices[:, :3, :3]) < 0
+        normals = piece.normals
+        if normals is not None:
+            # The inverse transpose up to a positive factor, of flat matrices too.
+            rows = matrices[:, :3, :3]
+            inverse = np.cross(np.roll(rows, -1, axis=1), np.roll(rows, -2, axis=1))
+            inverse[mirrored] *= -1
+            normals = np.einsum("kij,nj->kni", inverse, normals).reshape(-1, 3)
+            normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     faces = np.repeat(piece.faces[None], copies, axis=0)
     faces[mirrored] = faces[mirrored][..., ::-1]
     faces += count * np.arange(copies)[:, None, None]
@@ -302,6 +312,7 @@ def _instances(piece: _Piece, matrices: F64) -> _Piece:
         faces.reshape(-1, 3),
         {number: np.tile(uv, (copies, 1)) for number, uv in piece.uv.items()},
         None if piece.colors is None else np.tile(piece.colors, (copies, 1)),
+        normals,
     )
 
 
@@ -312,6 +323,7 @@ def _shape(group: _Group, materials: Materials) -> MeshShape:
     values, faults = materials.read(group.material, group.places)
     first = next(iter(group.places), None)
     colors = [piece.colors for piece in pieces if piece.colors is not None]
+    normals = [piece.normals for piece in pieces if piece.normals is not None]
     return MeshShape(
         group.name,
         np.concatenate([piece.vertices for piece in pieces]),
@@ -320,4 +332,5 @@ def _shape(group: _Group, materials: Materials) -> MeshShape:
         np.concatenate(colors) if colors else None,
         values,
         faults,
+        np.concatenate(normals) if normals else None,
     )

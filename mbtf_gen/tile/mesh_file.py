@@ -22,6 +22,8 @@ from mbtf_gen.tile.maps.material_file import LOBES, ROLES
 from mbtf_gen.tile.mesh_textures import with_one_wrap, with_vertex_colors
 from mbtf_gen.tile.mesh_tile import F64, MeshPart, MeshTile
 
+# The roles of files that a mesh names begin with it.
+COMPANION = "mesh."
 # Part of the period by which triangles may reach beyond it.
 _BEYOND = 1.0
 _GRAY = 0.5
@@ -99,7 +101,7 @@ def read_mesh(spec: MeshFile, folder: Path) -> MeshTile:
         )
     placed = (vertices - (low[0], low[1], high[2])) / width
     tile = MeshTile(height / width, placed, faces, uv, part, parts)
-    files = {"mesh": path, **{f"mesh.{name}": file for name, file in content.files.items()}}
+    files = {"mesh": path, **{f"{COMPANION}{name}": file for name, file in content.files.items()}}
     _, seam = tile.open_edges()
     what = f"{seam} edges at the border have no partner on the opposite side"
     return replace(

@@ -154,7 +154,7 @@ TEXT = ply({"vertex": (XYZ, SQUARE), "face": ([CORNERS], TRIANGLES)})
         (TEXT.replace(b"list uchar", b"list float"), "header"),
         (TEXT.replace(b"float x", b"float y"), "twice"),
         (TEXT.replace(b"float x", b"float a"), "x, y and z"),
-        (TEXT.replace(b"float x", b"list uchar float x"), "complete"),
+        (TEXT.replace(b"float x", b"list uchar float x"), "x, y and z"),
         (TEXT.replace(b"end_header", b"end"), "header"),
         (b"", "empty"),
         (b"obj", "header"),

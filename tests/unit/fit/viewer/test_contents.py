@@ -81,6 +81,24 @@ def test_vertices_are_smooth_unless_the_file_has_normals(tmp_path: Path) -> None
     )
 
 
+def test_normals_of_gltf_are_turned_with_its_nodes(tmp_path: Path) -> None:
+    """A sphere that a node stretches and mirrors; its normals are those of the ellipsoid."""
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    visual = trimesh.visual.TextureVisuals(uv=ball.vertices[:, :2])
+    ball = trimesh.Trimesh(
+        ball.vertices, ball.faces, vertex_normals=ball.vertices, process=False, visual=visual
+    )
+    scene = trimesh.Scene()
+    stretch = np.diag([-1.0, 2.0, 3.0, 1.0])
+    scene.add_geometry(ball, transform=stretch)
+    (tmp_path / "a.glb").write_bytes(scene.export(file_type="glb", include_normals=True))
+    shape, _, _ = read_shape(tmp_path / "a.glb")
+    # Files have y up; the ellipsoid has the radii 1, 3, 2 along our axes.
+    normals = shape["positions"] / np.square([1.0, 3.0, 2.0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    np.testing.assert_allclose(shape["normals"], normals, atol=1e-5)
+
+
 def test_a_missing_material_is_no_fault_of_a_shape(tmp_path: Path) -> None:
     text = "mtllib gone.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
     (tmp_path / "a.obj").write_text(text)
