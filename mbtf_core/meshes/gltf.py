@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
 from mbtf_core.meshes.content import F64, MOST_TRIANGLES, MeshContent, MeshShape
-from mbtf_core.meshes.gltf_buffers import HINTS, READ, GltfFile
+from mbtf_core.meshes.gltf_buffers import FLOAT, HINTS, READ, GltfFile
 from mbtf_core.meshes.gltf_material import Materials
 from mbtf_core.meshes.gltf_schema import GltfInstancing, GltfMaterial, GltfMesh, GltfNode, GltfPrimitive
 
 Faces = NDArray[np.int64]
 
 _STRIP, _FAN = 5, 6
+_CUT = "colors of vertices outside of [0, 1] are clamped"
 # Transforms of a node that has none.
 _AT_REST = {"translation": (0.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0, 1.0), "scale": (1.0, 1.0, 1.0)}
 # Largest deviation of a quaternion's length from one; quantized ones deviate by one hundredth.
@@ -32,7 +33,7 @@ _SAME_UV = 1e-5
 
 @dataclass
 class _Piece:
-    """A primitive as the scene places it."""
+    """Triangles of a primitive."""
 
     vertices: F64
     faces: Faces
@@ -85,23 +86,24 @@ def read_gltf(path: Path) -> MeshContent:
             if primitive.mode < 4:
                 others = True
                 continue
-            vertices, faces = _triangles(file, primitive)
-            total += len(faces) * len(matrices)
+            material = materials.of(primitive.material)
+            try:
+                piece = _piece(file, primitive, material, materials.uv_sets(material) or [0])
+            except InputError as error:
+                what = f"'meshes.{number}.primitives.{position}': {error.what}"
+                raise InputError(what, where=error.where, hint=error.hint) from None
+            total += len(piece.faces) * len(matrices)
             if total > MOST_TRIANGLES:
                 raise InputError(f"has {total:,} triangles, more than {MOST_TRIANGLES:,}", where=path)
-            if not len(faces):
+            if not len(piece.faces):
                 continue
-            material = materials.of(primitive.material)
-            uv = _texture_coordinates(file, primitive, materials.uv_sets(material) or [0], len(vertices))
-            colors = _colors(file, primitive, material, len(vertices))
-            places = _related(uv, np.unique(faces))
+            places = _related(piece.uv, np.unique(piece.faces))
             # One matrix for all primitives, unless several sets of coordinates are placed on one.
             own = (number, position) if len(places) > 1 else None
-            normals = _attribute(file, primitive, "NORMAL", (3,), len(vertices))
-            key = (primitive.material, tuple(places), colors is None, normals is None, own)
+            key = (primitive.material, tuple(places), piece.colors is None, piece.normals is None, own)
             name = material.name or mesh.name or "part"
             group = groups.setdefault(key, _Group(name, material, places))
-            group.pieces.append(_instances(_Piece(vertices, faces, uv, colors, normals), matrices))
+            group.pieces.append(_instances(piece, matrices))
     shapes = [_shape(group, materials) for group in groups.values()]
     if others:
         file.warnings.append("points and lines are not used")
@@ -115,7 +117,7 @@ def _placements(file: GltfFile) -> dict[int, F64]:
     """Matrices (k, 4, 4) of each mesh of the default scene, one per instance."""
     document = file.document
     nodes, scenes = document.nodes, document.scenes
-    if scenes:
+    if scenes or document.scene is not None:
         if document.scene is None and len(scenes) > 1:
             file.warnings.append(f"of {len(scenes)} scenes the first is used; none is the default")
         roots = list(file.entry(scenes, document.scene or 0, "scenes").nodes)
@@ -200,8 +202,10 @@ def _instance_matrices(file: GltfFile, instancing: GltfInstancing) -> F64:
 def _transforms(translation: F64, rotation: F64, scale: F64, file: GltfFile) -> F64:
     """Matrices (k, 4, 4) from translations (k, 3), quaternions (k, 4) and scales (k, 3)."""
     length = np.linalg.norm(rotation, axis=1, keepdims=True)
-    if not (np.abs(length - 1.0) < _UNIT).all():
-        raise InputError("has a rotation that is no unit quaternion", where=file.path)
+    wrong = ~(np.abs(length[:, 0] - 1.0) < _UNIT)
+    if wrong.any():
+        text = ", ".join(f"{number:g}" for number in rotation[wrong][0])
+        raise InputError(f"the rotation {text} is no unit quaternion", where=file.path)
     x, y, z, w = (rotation / length).T
     out = np.zeros((len(translation), 4, 4))
     out[:, 0, :3] = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], axis=-1)
@@ -211,6 +215,14 @@ def _transforms(translation: F64, rotation: F64, scale: F64, file: GltfFile) -> 
     out[:, :3, 3] = translation
     out[:, 3, 3] = 1.0
     return out
+
+
+def _piece(file: GltfFile, primitive: GltfPrimitive, material: GltfMaterial, sets: list[int]) -> _Piece:
+    """A primitive as its file stores it."""
+    vertices, faces = _triangles(file, primitive)
+    uv = _texture_coordinates(file, primitive, sets, len(vertices))
+    colors = _colors(file, primitive, material, len(vertices))
+    return _Piece(vertices, faces, uv, colors, _attribute(file, primitive, "NORMAL", (3,), len(vertices)))
 
 
 def _triangles(file: GltfFile, primitive: GltfPrimitive) -> tuple[F64, Faces]:
@@ -267,6 +279,11 @@ def _colors(file: GltfFile, primitive: GltfPrimitive, material: GltfMaterial, co
         file.warnings.append("COLOR_1 is not used")
     if colors is None:
         return None
+    accessor = file.document.accessors[primitive.attributes["COLOR_0"]]
+    if not accessor.normalized and accessor.componentType != FLOAT:
+        raise InputError("COLOR_0 holds integers that are not normalized", where=file.path)
+    if not ((colors >= 0.0) & (colors <= 1.0)).all() and _CUT not in file.warnings:
+        file.warnings.append(_CUT)
     if material.alphaMode != "OPAQUE" and (colors[:, 3:] != 1.0).any():
         hint = "bake it into the texture of the base color"
         raise InputError("has vertices with alpha, which is not read", where=file.path, hint=hint)

@@ -25,6 +25,7 @@ T = TypeVar("T")
 
 _MAGIC, _JSON, _BINARY = b"glTF", 0x4E4F534A, 0x004E4942
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+FLOAT = 5126
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 # Elements of an accessor without data of its own, which its count alone would allocate.
 _MOST_ELEMENTS = 3 * MOST_TRIANGLES

@@ -55,6 +55,8 @@ def _atlas(corners: F64) -> tuple[NDArray[np.float32], F64]:
     columns = int(np.ceil(np.sqrt(count)))
     rows = -(-count // columns)
     blocks = np.zeros((rows * columns, 4, 3), np.float32)
+    # So that the mean of the texels is about that of the surface.
+    blocks[count:] = corners.mean(axis=(0, 1))
     blocks[:count, :3] = corners
     blocks[:count, 3] = corners[:, 1] + corners[:, 2] - corners[:, 0]
     pixels = blocks.reshape(rows, columns, 2, 2, 3).swapaxes(1, 2).reshape(2 * rows, 2 * columns, 3)

@@ -150,6 +150,13 @@ class MeshTile(Tile):
         widths = (width for part in self.parts for width in lobe_widths(part.maps))
         return min([2.0, *widths]), "narrowest lobe"
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the triangles and of the textures."""
+        values = [value for part in self.parts for value in part.maps.values()]
+        textures = {id(v[0].pixels): v[0].pixels.nbytes for v in values if isinstance(v, tuple)}
+        return self.vertices.nbytes + self.faces.nbytes + self.uv.nbytes + sum(textures.values())
+
     def properties(self) -> dict[str, Any]:
         """Number of triangles, for the manifest."""
         return {"triangles": len(self.faces)}

@@ -270,6 +270,7 @@ def changed(change: Callable[[dict[str, Any]], object]) -> GltfBuilder:
 REFUSED: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "index": (lambda d: d["nodes"][0].update(mesh=7), "meshes.7"),
     "negative index": (lambda d: d["nodes"][0].update(mesh=-1), "nodes.0.mesh"),
+    "scene": (lambda d: d.update(scene=2, scenes=[{"nodes": [0]}]), "scenes.2"),
     "cycle": (lambda d: (d["nodes"][0].update(children=[0]), d.update(scenes=[{"nodes": [0]}])), "node 0"),
     "two parents": (lambda d: d["nodes"].extend([{"children": [0]}, {"children": [0]}]), "node 0"),
     "count": (lambda d: d["accessors"][0].update(count=300_000_000), "300,000,000"),

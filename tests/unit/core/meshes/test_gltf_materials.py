@@ -285,9 +285,12 @@ def test_vertex_colors_are_clamped_and_linear(tmp_path: Path) -> None:
     assert shape.colors is not None
     assert shape.colors[0] == pytest.approx([0, 128 / 255, 1])
     builder = GltfBuilder().plate(COLOR_0=np.array([[2, -1, 0.5]] * 4, np.float32))
-    shape = shape_of(builder, tmp_path)
-    assert shape.colors is not None
-    assert shape.colors[0].tolist() == [1, 0, 0.5]
+    found = content_of(builder, tmp_path)
+    assert found.shapes[0].colors is not None
+    assert found.shapes[0].colors[0].tolist() == [1, 0, 0.5]
+    assert any("clamped" in text for text in found.warnings)
+    with pytest.raises(InputError, match="normalized"):
+        content_of(GltfBuilder().plate(COLOR_0=codes), tmp_path)
 
 
 def test_alpha_of_vertices_is_refused_where_it_counts(tmp_path: Path) -> None:
