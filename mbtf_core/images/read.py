@@ -9,8 +9,9 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
+import tempfile
 import warnings as python_warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NoReturn
@@ -146,6 +147,32 @@ def read_image(
     if bad.any():
         raise InputError(f"{count_and_first(bad)} NaN or infinite", where=path)
     return image
+
+
+def decode_image(content: bytes, kinds: Container[str], where: Path) -> Image:
+    """Decode an image that is not in a file of its own.
+
+    Parameters
+    ----------
+    content : the bytes of an image file
+    kinds : accepted formats, such as ``PNG`` and ``JPEG``
+    where : where it comes from, for messages
+
+    Raises
+    ------
+    InputError : it has another format, or as :func:`read_image`
+    """
+    kind = next((kind for magic, kind in _MAGIC.items() if content.startswith(magic)), None)
+    if kind is None or kind not in kinds:
+        raise InputError(f"is no image that is read ({kind or 'unknown data'})", where=where)
+    suffix = next(suffix for suffix, name in _KINDS.items() if name == kind)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"image{suffix}"
+        path.write_bytes(content)
+        try:
+            return replace(read_image(path), path=where)
+        except InputError as error:
+            raise InputError(error.what, where=where, hint=error.hint) from None
 
 
 def count_and_first(bad: NDArray[np.bool_]) -> str:

@@ -6,19 +6,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from mbtf_core.errors import InputError, reason
+from mbtf_core.errors import InputError
 from mbtf_core.images.environment import read_environment
 from mbtf_core.images.resample import resample
-from mbtf_core.paths import suggest_path
+from mbtf_core.meshes.read import read_mesh_content
 from mbtf_core.pictures import Camera, read_references
 from mbtf_fit.viewer.page import encode
 from mbtf_fit.viewer.textures import pack
 
 F64 = NDArray[np.float64]
-# Suffixes of files of meshes, and their most triangles.
-MESH_FILES, MOST_TRIANGLES = (".glb", ".gltf", ".ply", ".obj"), 200_000
+# Triangles of a mesh in a page, at most.
+MOST_TRIANGLES = 200_000
 # Rows of an environment, and pixels along the longer side of a reference picture, in a page.
 _ENVIRONMENT_ROWS, _PICTURE_SIZE = 64, 512
 
@@ -99,32 +99,34 @@ def read_shape(path: Path) -> tuple[dict[str, F64], NDArray[np.int64], float]:
 
     Raises
     ------
-    InputError : the file cannot be read, has no texture coordinates, or too many triangles
+    InputError : the file cannot be read, a part has no texture coordinates, or there are too many triangles
     """
-    import trimesh
-
-    if path.suffix.lower() not in MESH_FILES:
-        raise InputError(f"'{path.suffix}' is not a mesh", where=path, hint=f"give {', '.join(MESH_FILES)}")
-    if not path.is_file():
-        raise InputError("no such file", where=path, hint=suggest_path(path))
-    try:
-        mesh = trimesh.load_mesh(path)
-        vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-        normals = np.asarray(mesh.vertex_normals, np.float64)
-        uv = getattr(mesh.visual, "uv", None)
-    except Exception as error:  # whatever its readers raise
-        raise InputError(f"cannot be read as a mesh ({reason(error)})", where=path) from None
+    shapes = read_mesh_content(path).shapes
+    counts = [len(shape.vertices) for shape in shapes]
+    starts = np.cumsum([0, *counts[:-1]])
+    faces = np.concatenate([shape.faces + start for shape, start in zip(shapes, starts, strict=True)])
+    vertices = np.concatenate([shape.vertices for shape in shapes])
     if not len(faces) or not np.isfinite(vertices).all():
         raise InputError("has no triangles of finite vertices", where=path)
-    if uv is None or len(uv) != len(vertices):
+    bare = [shape.name for shape in shapes if shape.uv is None]
+    if bare:
         raise InputError(
-            "has no texture coordinates, which place the material", where=path, hint="unwrap the mesh first"
+            f"'{bare[0]}' has no texture coordinates, which place the material",
+            where=path,
+            hint="unwrap that part, or leave it out" if len(bare) < len(shapes) else "unwrap the mesh first",
         )
+    uv = np.concatenate([shape.uv for shape in shapes if shape.uv is not None])
     if len(faces) > MOST_TRIANGLES:
         raise InputError(
             f"has {len(faces):,} triangles, more than {MOST_TRIANGLES:,}", where=path, hint="simplify it"
         )
-    uv = np.nan_to_num(np.asarray(uv, np.float64))
+    uv = np.nan_to_num(uv)
+    # Vertices of a part at one position and one place of the texture share their frame.
+    part = np.repeat(np.arange(len(shapes)), counts)
+    _, same = np.unique(np.column_stack([vertices, uv, part]), axis=0, return_inverse=True)
+    smooth = np.split(_normals(vertices, faces, same), starts[1:])
+    given = [shape.normals for shape in shapes]
+    normals = np.concatenate([n if own is None else own for own, n in zip(given, smooth, strict=True)])
     center = (vertices.min(0) + vertices.max(0)) / 2
     radius = float(np.linalg.norm(vertices - center, axis=1).max())
     # Files have y up.
@@ -137,15 +139,27 @@ def read_shape(path: Path) -> tuple[dict[str, F64], NDArray[np.int64], float]:
     arrays = {
         "positions": vertices,
         "normals": normals,
-        "tangents": tangents(vertices, normals, uv, faces),
+        "tangents": tangents(vertices, normals, uv, faces, same),
         "uvs": uv,
     }
     return arrays, faces, unit
 
 
-def _unit(vectors: F64) -> F64:
+def _normals(vertices: F64, faces: NDArray[np.int64], same: NDArray[np.int64]) -> F64:
+    """Means (n, 3) of the triangles' normals over vertices of the `same` number, weighted by angles."""
+    corners = vertices[faces]
+    normal = _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), 0.0)
+    sums = np.zeros_like(vertices)
+    for k in range(3):
+        a, b = (_unit(corners[:, (k + by) % 3] - corners[:, k], 0.0) for by in (1, 2))
+        angle = np.arccos(np.clip((a * b).sum(axis=1), -1.0, 1.0))
+        np.add.at(sums, same[faces[:, k]], normal * angle[:, None])
+    return _unit(sums)[same]
+
+
+def _unit(vectors: F64, otherwise: ArrayLike = (0.0, 0.0, 1.0)) -> F64:
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return np.where(length > 0, vectors / np.where(length > 0, length, 1.0), (0.0, 0.0, 1.0))
+    return np.where(length > 0, vectors / np.where(length > 0, length, 1.0), otherwise)
 
 
 def _areas(vertices: F64, uv: F64, faces: NDArray[np.int64]) -> tuple[float, float]:
@@ -156,8 +170,9 @@ def _areas(vertices: F64, uv: F64, faces: NDArray[np.int64]) -> tuple[float, flo
     return float(np.linalg.norm(np.cross(a, b), axis=1).sum() / 2), float(flat.sum() / 2)
 
 
-def tangents(vertices: F64, normals: F64, uv: F64, faces: NDArray[np.int64]) -> F64:
-    """Unit tangents ∂p/∂u at vertices, and the hand of their frames: (n, 4).
+def tangents(vertices: F64, normals: F64, uv: F64, faces: NDArray[np.int64], same: NDArray[np.int64]) -> F64:
+    """Unit tangents ∂p/∂u at vertices, means over those of the `same` number, and the hand of their frames:
+    (n, 4).
 
     The hand is 1 where the normal, ∂p/∂u and ∂p/∂v form a right-handed frame (t × b = n), otherwise -1.
     """
@@ -170,8 +185,9 @@ def tangents(vertices: F64, normals: F64, uv: F64, faces: NDArray[np.int64]) -> 
     along_v = sign * (b * s[:, :1] - a * t[:, :1])
     sums = np.zeros((2, *vertices.shape))
     for k in range(3):
-        np.add.at(sums[0], faces[:, k], along_u)
-        np.add.at(sums[1], faces[:, k], along_v)
+        np.add.at(sums[0], same[faces[:, k]], along_u)
+        np.add.at(sums[1], same[faces[:, k]], along_v)
+    sums = sums[:, same]
     n = _unit(normals)
     tangent = sums[0] - n * (n * sums[0]).sum(1, keepdims=True)
     some = np.linalg.norm(tangent, axis=1) > 1e-12

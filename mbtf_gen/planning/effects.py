@@ -44,21 +44,19 @@ class ReflectionLayer(Effect):
     unit: ClassVar[float] = 1.0
     lacking: ClassVar[str] = "no map"
 
-    def weight(self, scene: PlanScene) -> float:
-        """Largest weight; 0 without a map."""
-        return float(np.max(scene.tile.maps.get(self.name, 0.0)))
-
     def propose(self, scene: PlanScene) -> EffectDecision:
         """On where the weight is positive somewhere; a faint layer's bias is measured."""
         if scene.tile.bsdf_type is not None:
             text = f"the material's own BSDF '{scene.tile.bsdf_type}', not analyzed"
             return self.decision(False, text, 0.0, present=False)
-        weight = self.weight(scene)
+        weight = scene.tile.weight(self.name)
         if weight <= 0.0:
             return self.decision(False, self.lacking, 0.0, present=False)
         strength, text = weight * self.scale, self.text.format(weight * self.unit)
         if scene.pilots is None or strength >= FAINT or not scene.is_auto(self.name):
             return self.decision(True, text)
+        if self.name not in scene.tile.maps:
+            return self.decision(True, text)  # of a part of a mesh
         # Noise would hide its effect, so a pilot measures the layer at full strength, and the result is
         # scaled down.
         bound = FAINT_CAUTION * strength * scene.pilots.change_of_layer(self.name, strength).bound()
@@ -101,10 +99,6 @@ class Sheen(ReflectionLayer):
 
     name, description = "sheen", "sheen"
     text = "weight up to {:.2g}"
-
-    def weight(self, scene: PlanScene) -> float:
-        """Largest weight times the largest channel of its color."""
-        return super().weight(scene) * float(np.max(scene.tile.maps.get("sheen_color", 1.0)))
 
 
 class NormalMap(Effect):
@@ -216,13 +210,21 @@ class Parallax(Displacement):
     name, description, alters_tile = "parallax", "parallax and masking", True
     switch = "displacement"
 
+    def propose(self, scene: PlanScene) -> EffectDecision:
+        """On where the tile is no height field: no plane has its gaps and its parts, even if it is flat."""
+        if scene.tile.grid is None:
+            text = f"{scene.tile.kind}, {100.0 * scene.tile.thickness:.2g} % of the tile's width thick"
+            return self.decision(True, text, present=False)
+        return super().propose(scene)
+
+    def reference(self, scene: PlanScene) -> EffectDecision:
+        """The same, and on for all height fields that are not flat."""
+        return self.propose(scene) if scene.tile.grid is None else super().reference(scene)
+
     def on_displaced(self, scene: PlanScene) -> EffectDecision:
         """Off where the sum of the bounds of all effects of displacement is small enough."""
-        thickness, bounds = 100.0 * scene.tile.thickness, scene.bounds
-        if scene.tile.grid is None:
-            text = f"{scene.tile.kind}, {thickness:.2g} % of the tile's width thick"
-            return self.decision(True, text, present=False)
-        text = f"displacement range {thickness:.2g} % of the tile's width"
+        bounds = scene.bounds
+        text = f"displacement range {100.0 * scene.tile.thickness:.2g} % of the tile's width"
         if bounds is None:
             return self.decision(True, text, None, "pilot")
         bounces = bounce_bound(scene) if bounds.parallax <= scene.left else 0.0

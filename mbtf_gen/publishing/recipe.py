@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,8 @@ from mbtf_core.data.schema import CONFIG_NAME, MANIFEST_NAME
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import checksummed
 from mbtf_gen.tile.loading import described, load_material
+from mbtf_gen.tile.mesh_file import COMPANION
+from mbtf_gen.tile.protocol import Tile
 
 # Folders of the recipe and of the material in the published folder.
 RECIPE, MATERIAL = "recipe", "recipe/material"
@@ -70,9 +71,15 @@ def recipe_files(data: Dataset, *, with_maps: bool, moved: Path | None) -> dict[
     path = Path(data.manifest["config"]["material"]) if moved is None else moved
     hint = "name it: --material PATH; or leave out --with-maps"
     try:
-        check_inputs(data, path, "has changed since the data set was made", hint)
+        tile = check_inputs(data, path, "has changed since the data set was made", hint)
     except InputError as error:
         raise InputError(error.what, where=error.where, hint=error.hint or hint) from None
+    if any(role.startswith(COMPANION) for role in tile.files):
+        raise InputError(
+            "names other files, which are not copied",
+            where=tile.files["mesh"],
+            hint="leave out --with-maps; a .glb holds everything in one file",
+        )
     spec, folder, _ = described(path)
     files: dict[str, Content] = {}
     document = _copied(spec.model_dump(mode="json", exclude_unset=True), folder, "", files)
@@ -84,11 +91,12 @@ def recipe_files(data: Dataset, *, with_maps: bool, moved: Path | None) -> dict[
     }
 
 
-def check_inputs(data: Dataset, material: Path, what: str, hint: str) -> None:
-    """Refuse a material that is not the one that a data set was generated from."""
+def check_inputs(data: Dataset, material: Path, what: str, hint: str) -> Tile:
+    """The material, refused if it is not the one that a data set was generated from."""
     tile = load_material(material, data.manifest["config"]["geometry"]["make_tileable"])
     if tile.digests != data.manifest["inputs"]:
         raise InputError(what, where=material, hint=hint)
+    return tile
 
 
 def _copied(node: dict[str, Any], folder: Path, role: str, files: dict[str, Content]) -> dict[str, Any]:
@@ -100,23 +108,6 @@ def _copied(node: dict[str, Any], folder: Path, role: str, files: dict[str, Cont
             out[key] = _copied(value, folder, f"{role}{key}/", files)
         elif key in _NAMES and isinstance(value, str):
             source = folder / value
-            if _has_companions(source):
-                raise InputError(
-                    "names other files, which the digests do not cover",
-                    where=source,
-                    hint="leave out --with-maps; a .glb holds everything in one file",
-                )
             out[key] = f"{role or f'{key}/'}{source.name}"
             files[out[key]] = source
     return out
-
-
-def _has_companions(path: Path) -> bool:
-    """Whether a mesh consists of several files."""
-    if path.suffix.lower() == ".obj":
-        return any(line.startswith(b"mtllib") for line in path.read_bytes().splitlines())
-    if path.suffix.lower() == ".gltf":
-        document = json.loads(path.read_bytes())
-        parts = [*document.get("buffers", []), *document.get("images", [])]
-        return any(not str(part.get("uri", "data:")).startswith("data:") for part in parts)
-    return False

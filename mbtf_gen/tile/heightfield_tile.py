@@ -30,11 +30,11 @@ from mbtf_gen.tile.inspection import ALBEDO_RANGE, inspection_text, oddities
 from mbtf_gen.tile.maps.checks import Codes, suggestion_warning
 from mbtf_gen.tile.maps.discovery import Convention
 from mbtf_gen.tile.maps.map_loader import Color, MapFacts
-from mbtf_gen.tile.maps.material_file import LOBES, REFLECTING, ROLES
+from mbtf_gen.tile.maps.material_file import LOBES, ROLES
 from mbtf_gen.tile.maps.normal_map import NormalFit
 from mbtf_gen.tile.maps.tiling import Seam, broken
 from mbtf_gen.tile.protocol import REFLECTION, Tile, displacement_fault
-from mbtf_gen.tile.reflectance import plugin_dictionary
+from mbtf_gen.tile.reflectance import in_use, lobe_widths, plugin_dictionary
 from mbtf_gen.tile.tracers.protocol import TileGeometry
 
 # Displacement range, in tile widths, above which a default height scale is probably wrong.
@@ -167,16 +167,7 @@ class HeightFieldTile(Tile):
         """Mitsuba dictionary of the reflectance, of all effects but opacity by default."""
         if self.bsdf is not None:
             return dict(self.bsdf)
-        names = ["base_color", "roughness"]
-        for effect in (*REFLECTING, "opacity"):
-            weight = self.maps.get(effect)
-            if (
-                effect in on
-                and weight is not None
-                and (effect != "metallic" or np.any(np.asarray(weight) > 0))
-            ):
-                names += [name for name, role in ROLES.items() if role.effect == effect]
-        maps = {name: self.maps[name] for name in names if name in self.maps}
+        maps = in_use(self.maps, on)
         if slopes is not None:
             maps["slopes"] = np.concatenate([slopes, np.zeros_like(slopes[..., :1])], axis=-1)
         return plugin_dictionary(maps)
@@ -226,12 +217,7 @@ class HeightFieldTile(Tile):
         """(width in radians, what it is of) of the narrowest lobe; None where a BSDF replaces the maps."""
         if self.bsdf is not None:
             return None
-        widths = [
-            role.lobe(float(np.min(np.asarray(self.maps[name]))))
-            for name, role in ROLES.items()
-            if role.lobe is not None and name in self.maps
-        ]
-        return min([2.0, *widths]), "narrowest lobe"
+        return min([2.0, *lobe_widths(self.maps)]), "narrowest lobe"
 
     def properties(self) -> dict[str, Any]:
         """Sizes of map and mesh, and the height scale, for the manifest."""

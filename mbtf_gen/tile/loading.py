@@ -13,13 +13,14 @@ from mbtf_core.data.schema import Tiling
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import file_sha256
 from mbtf_core.images.read import SUFFIXES, is_image
+from mbtf_core.meshes.read import MESH_FILES
 from mbtf_core.paths import suggest_path
 from mbtf_gen.tile.assembly import assemble, retiled
 from mbtf_gen.tile.cloth import cloth_tile
 from mbtf_gen.tile.fibers.cloth_file import CLOTH_KEYS, CURVE_FILES, ClothFile
 from mbtf_gen.tile.maps.discovery import FoundMaps, find_maps, unpack
 from mbtf_gen.tile.maps.material_file import MaterialFile
-from mbtf_gen.tile.mesh_file import MESH_FILES, MeshFile, read_mesh
+from mbtf_gen.tile.mesh_file import MeshFile, read_mesh
 from mbtf_gen.tile.protocol import Tile
 
 Described = MaterialFile | ClothFile | MeshFile

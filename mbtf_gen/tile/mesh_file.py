@@ -1,31 +1,36 @@
-"""Triangle meshes from files: ``.glb``, ``.gltf``, ``.ply`` and ``.obj``, read by trimesh."""
+"""Triangle meshes from files as tiles."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from mbtf_core.color import srgb_to_linear
 from mbtf_core.config.settings import FileName, Settings
 from mbtf_core.data.schema import Tiling
-from mbtf_core.errors import InputError, reason
+from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import data_sha256, file_sha256
+from mbtf_core.meshes.content import MOST_TRIANGLES, MeshShape, Value, numbers_of
+from mbtf_core.meshes.read import read_mesh_content
+from mbtf_core.meshes.up_axis import y_seems_up
 from mbtf_gen.config.generator import Positive, Resolution, Rgb, Share, no_tiling
+from mbtf_gen.tile.maps.material_file import LOBES, ROLES
+from mbtf_gen.tile.mesh_textures import with_one_wrap, with_vertex_colors
 from mbtf_gen.tile.mesh_tile import F64, MeshPart, MeshTile
 
-MESH_FILES = (".glb", ".gltf", ".ply", ".obj")
-# glTF files have y up, others z.
-_Y_UP = (".glb", ".gltf")
-# Triangles of one tile: with Mitsuba's and Embree's own data they take about 150 bytes each.
-MOST_TRIANGLES = 20_000_000
+# The roles of files that a mesh names begin with it.
+COMPANION = "mesh."
 # Part of the period by which triangles may reach beyond it.
 _BEYOND = 1.0
 _GRAY = 0.5
+# Largest values of roles beyond 1: a specular of this has F0 = 1.
+_MOST = {"specular": 12.5}
+# Roles that a material file may replace.
+_GIVEN = ("base_color", "roughness", "metallic")
 
 
 class MeshFile(Settings):
@@ -68,10 +73,14 @@ def read_mesh(spec: MeshFile, folder: Path) -> MeshTile:
         The file cannot be read, or its triangles are no tile.
     """
     path = folder / spec.mesh
-    shapes = _shapes(path)
+    content = read_mesh_content(path)
+    shapes = [_shape(shape, spec, path) for shape in content.shapes]
     vertices, faces, uv, part = _joined(shapes, path)
-    parts = [_part(shape, spec, name) for name, shape in shapes]
-    up = spec.up or ("y" if path.suffix.lower() in _Y_UP else "z")
+    parts = [MeshPart(shape.name, shape.values) for shape in shapes]
+    up = spec.up or content.up
+    warnings = [f"{path}: {text}" for text in content.warnings]
+    if up is None and y_seems_up(vertices, faces):
+        warnings.append(f"{path}: it looks like y is up: if so, give 'up: y' in a material.yaml")
     if up == "y":
         vertices = vertices[:, [0, 2, 1]] * (1.0, -1.0, 1.0)
     used = vertices[np.unique(faces)]
@@ -79,7 +88,9 @@ def read_mesh(spec: MeshFile, folder: Path) -> MeshTile:
     width, height = spec.period or (high[0] - low[0], high[1] - low[1])
     if not (width > 0 and height > 0):
         raise InputError(
-            "has no extent along both sides of the tile", where=path, hint="check 'up', or give 'period'"
+            "has no extent along both sides of the tile",
+            where=path,
+            hint="if y is up, give 'up: y' in a material.yaml; else give 'period'",
         )
     over = (high - low)[:2] / (width, height) - 1.0
     if over.max() > _BEYOND:
@@ -90,16 +101,20 @@ def read_mesh(spec: MeshFile, folder: Path) -> MeshTile:
         )
     placed = (vertices - (low[0], low[1], high[2])) / width
     tile = MeshTile(height / width, placed, faces, uv, part, parts)
+    files = {"mesh": path, **{f"{COMPANION}{name}": file for name, file in content.files.items()}}
     _, seam = tile.open_edges()
     what = f"{seam} edges at the border have no partner on the opposite side"
     return replace(
         tile,
-        files={"mesh": path},
+        files=files,
         digests={
-            "mesh": file_sha256(path),
+            **{role: file_sha256(file) for role, file in files.items()},
             "settings": data_sha256(spec.model_dump(mode="json", exclude={"mesh"})),
         },
-        warnings=(f"{path}: {what}: the tile may have a seam; check 'period'",) if seam else (),
+        warnings=(
+            *warnings,
+            *([f"{path}: {what}: the tile may have a seam; check 'period'"] if seam else ()),
+        ),
         notes=(
             f"mesh: {len(tile.faces):,} triangles in {len(tile.parts)} parts of {path.name}, "
             f"{tile.thickness:.3g} tile widths thick",
@@ -108,101 +123,84 @@ def read_mesh(spec: MeshFile, folder: Path) -> MeshTile:
     )
 
 
-def _shapes(path: Path) -> list[tuple[str, Any]]:
-    """Meshes of a file, with their places in the scene applied."""
-    import trimesh
-
-    if path.suffix.lower() not in MESH_FILES:
-        raise InputError(f"'{path.suffix}' is not a mesh", where=path, hint=f"give {', '.join(MESH_FILES)}")
-    if not path.is_file():
-        raise InputError("no such file", where=path)
+def _shape(shape: MeshShape, spec: MeshFile, path: Path) -> MeshShape:
+    """A shape with the reflectance of the material file, else of its own, complete and checked, and without
+    triangles that have no area."""
+    given = {role: getattr(spec, role) for role in _GIVEN if getattr(spec, role) is not None}
+    for role, fault in shape.faults.items():
+        if role not in given:
+            raise fault
+    vertices, faces = shape.vertices, shape.faces
+    if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
+        raise InputError(f"'{shape.name}' has a triangle of vertices that it lacks", where=path)
+    used = vertices[np.unique(faces)]
+    if not np.isfinite(used).all() or np.abs(used).max(initial=0.0) > 1e15:
+        raise InputError(f"'{shape.name}' has vertices that are not finite numbers below 1e15", where=path)
+    edges = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
+    faces = faces[np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) > 0]
+    found = replace(
+        shape,
+        faces=faces,
+        colors=None if "base_color" in given or not len(faces) else shape.colors,
+        values={**shape.values, **{role: np.asarray(value) for role, value in given.items()}},
+    )
     try:
-        scene = trimesh.load_scene(path, process=False)
-        shapes = [(shape.metadata.get("name", "mesh"), shape) for shape in scene.dump()]
-    except Exception as error:  # whatever its readers raise
-        raise InputError(f"cannot be read as a mesh ({reason(error)})", where=path) from None
-    found = [(str(name), shape) for name, shape in shapes if len(getattr(shape, "faces", ()))]
-    if not found:
-        raise InputError("has no triangles", where=path)
-    return found
+        found = with_vertex_colors(found)
+        values = _complete(found.values)
+        for role, value in values.items():
+            _check(found, role, value)
+        uv = found.uv
+        if uv is not None and len(found.faces):
+            reached = uv[np.unique(found.faces)]
+            values = {role: with_one_wrap(value, reached, shape.name) for role, value in values.items()}
+    except InputError as error:
+        raise InputError(error.what, where=error.where or path, hint=error.hint) from None
+    return replace(found, values=values)
 
 
-def _joined(shapes: list[tuple[str, Any]], path: Path) -> tuple[F64, NDArray[np.int_], F64, NDArray[np.int_]]:
-    """(vertices, faces, texture coordinates, part of each face) of all shapes, checked."""
-    total = sum(len(shape.faces) for _, shape in shapes)
-    if total > MOST_TRIANGLES:
-        raise InputError(f"has {total:,} triangles, more than {MOST_TRIANGLES:,}", where=path)
-    vertices, faces, uvs, part, start = [], [], [], [], 0
-    for number, (name, shape) in enumerate(shapes):
-        own, corners = np.asarray(shape.vertices, np.float64), np.asarray(shape.faces, np.int64)
-        if corners.min() < 0 or corners.max() >= len(own):
-            raise InputError(f"'{name}' has a triangle of vertices that it lacks", where=path)
-        if not np.isfinite(own[np.unique(corners)]).all() or np.abs(own).max() > 1e15:
-            raise InputError(f"'{name}' has vertices that are not finite numbers below 1e15", where=path)
-        edges = own[corners[:, 1:]] - own[corners[:, :1]]
-        solid = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) > 0
-        uv = getattr(shape.visual, "uv", None)
-        uv = np.zeros((len(own), 2)) if uv is None else np.asarray(uv, np.float64)
-        vertices.append(own)
-        uvs.append(np.where(np.isfinite(uv), uv, 0.0))
-        faces.append(corners[solid] + start)
-        part.append(np.full(int(solid.sum()), number))
-        start += len(own)
-    if not sum(map(len, faces)):
+def _complete(values: dict[str, Value]) -> dict[str, Value]:
+    """Values of a shape with those that others need: a glossy lobe has all of its parameters."""
+    defaults: dict[str, Value] = {"base_color": np.full(3, _GRAY)}
+    if values.keys() & LOBES.keys():
+        defaults |= LOBES
+    for name, role in ROLES.items():
+        if role.effect in values and role.default is not None:
+            defaults[name] = role.default
+    return {**defaults, **values}
+
+
+def _check(shape: MeshShape, role: str, value: Value) -> None:
+    """Refuse numbers out of range, and textures that nothing places."""
+    most = _MOST.get(role, 1.0)
+    if isinstance(value, tuple):
+        used = None if shape.uv is None else shape.uv[np.unique(shape.faces)]
+        if used is None or not np.isfinite(used).all() or not np.isfinite(value[0].to_uv).all():
+            raise InputError(f"'{shape.name}' has no valid texture coordinates for its {role}")
+        # Texels beyond what a triangle shows may be out of range.
+        value = value[1]
+    numbers = numbers_of(value)
+    if not (np.isfinite(numbers).all() and numbers.min() >= 0.0 and numbers.max() <= most):
+        text = ", ".join(f"{number:g}" for number in numbers.ravel())
+        raise InputError(f"'{shape.name}' has the {role} {text}, not within 0 and {most:g}")
+
+
+def _joined(shapes: list[MeshShape], path: Path) -> tuple[F64, NDArray[np.int_], F64, NDArray[np.int_]]:
+    """(vertices, faces, texture coordinates, part of each face) of all shapes."""
+    counts = [len(shape.faces) for shape in shapes]
+    if not sum(counts):
         raise InputError("has no triangles with an area", where=path)
-    return tuple(np.concatenate(a) for a in (vertices, faces, uvs, part))  # type: ignore[return-value]
-
-
-def _part(shape: Any, spec: MeshFile, name: str) -> MeshPart:
-    """Reflectance of one shape: that of the material file, else of the mesh file."""
-    material = getattr(shape.visual, "material", None)
-    color = _color(material) if spec.base_color is None else np.array(spec.base_color)
-    roughness, metallic = _glossiness(material)
-    if spec.roughness is not None:
-        roughness = spec.roughness
-    if spec.metallic is not None:
-        metallic = spec.metallic
-    if roughness is None and metallic is None:
-        return MeshPart(name, color)
-    return MeshPart(
-        name, color, 0.5 if roughness is None else roughness, 0.0 if metallic is None else metallic
-    )
-
-
-def _color(material: Any) -> F64:
-    """Linear color of a material of trimesh: its image times its factor, or one of the two."""
-    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
-    factor = getattr(material, "baseColorFactor", None)
-    linear = np.ones(3) if factor is None else _shares(factor)[:3]
-    if image is not None:
-        return np.asarray(srgb_to_linear(_pixels(image)[..., :3]), np.float64) * linear
-    if factor is not None:
-        return linear
-    diffuse = getattr(material, "diffuse", None)
+    if sum(counts) > MOST_TRIANGLES:
+        raise InputError(f"has {sum(counts):,} triangles, more than {MOST_TRIANGLES:,}", where=path)
+    starts = np.cumsum([0, *(len(shape.vertices) for shape in shapes[:-1])])
     return (
-        np.full(3, _GRAY) if diffuse is None else np.asarray(srgb_to_linear(_shares(diffuse)[:3]), np.float64)
+        np.concatenate([shape.vertices for shape in shapes]),
+        np.concatenate([shape.faces + start for shape, start in zip(shapes, starts, strict=True)]),
+        np.concatenate([_placing(shape) for shape in shapes]),
+        np.repeat(np.arange(len(shapes)), counts),
     )
 
 
-def _glossiness(material: Any) -> tuple[F64 | float | None, F64 | float | None]:
-    """(roughness, metallic) of a glTF material; its texture has them in the green and the blue channel."""
-    texture = getattr(material, "metallicRoughnessTexture", None)
-    factors = [getattr(material, name, None) for name in ("roughnessFactor", "metallicFactor")]
-    if texture is None:
-        return factors[0], factors[1]
-    pixels = _pixels(texture)
-    rough, metal = (
-        np.clip(pixels[..., k] * (1.0 if f is None else f), 0.0, 1.0)
-        for k, f in zip((1, 2), factors, strict=True)
-    )
-    return rough, metal
-
-
-def _pixels(image: Any) -> F64:
-    return np.asarray(image.convert("RGB"), np.float64) / 255.0
-
-
-def _shares(color: Any) -> F64:
-    """A color in [0, 1]; trimesh has some as integers up to 255."""
-    array = np.asarray(color)
-    return np.clip(array.astype(np.float64) / (255.0 if array.dtype.kind in "iu" else 1.0), 0.0, 1.0)
+def _placing(shape: MeshShape) -> F64:
+    """Texture coordinates (n, 2), of a shape without textures zeros."""
+    textured = any(isinstance(value, tuple) for value in shape.values.values())
+    return np.zeros((len(shape.vertices), 2)) if shape.uv is None or not textured else shape.uv

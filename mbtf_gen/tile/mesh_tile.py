@@ -10,12 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.meshes.content import Value, numbers_of
 from mbtf_gen.config.generator import GeometrySection
-from mbtf_gen.tile.protocol import Tile
-from mbtf_gen.tile.reflectance import reflectance
+from mbtf_gen.tile.maps.material_file import LOBES, REFLECTING, ROLES
+from mbtf_gen.tile.protocol import REFLECTION, Tile, layer_weight
+from mbtf_gen.tile.reflectance import in_use, lobe_widths, plugin_dictionary
 from mbtf_gen.tile.tracers.protocol import TileGeometry
 
 F64 = NDArray[np.float64]
+# Weights of a part that are described, in words of their roles.
+_TOLD = ("metallic", "clearcoat", "sheen", "opacity")
 # Distance in tile widths within which vertices count as one.
 _SAME = 1e-5
 
@@ -28,16 +32,13 @@ class MeshPart:
     ----------
     name : str
         Its name in the file.
-    base_color : (h, w, 3) or (3,) float64 array
-        Linear Rec.709 in [0, 1]. Row 0 of maps is the side ``v → 1``.
-    roughness, metallic : (h, w) float64 array, float or None
-        In [0, 1]; None for a Lambert surface.
+    maps : dict of str to Value
+        Numbers, colors and textures by role (:data:`~mbtf_gen.tile.maps.material_file.ROLES`), ``base_color``
+        among them, and ``opacity_cutoff``. Textures have the same wrap mode along both axes.
     """
 
     name: str
-    base_color: F64
-    roughness: F64 | float | None = None
-    metallic: F64 | float | None = None
+    maps: Mapping[str, Value]
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ class MeshTile(Tile):
     @cached_property
     def thickness(self) -> float:
         """Height of the triangles' slab, in tile widths."""
-        return -float(self.vertices[self.faces, 2].min())
+        return 0.0 - float(self.vertices[self.faces, 2].min())
 
     def copies(self) -> tuple[NDArray[np.int_], F64]:
         """(number, shift (k, 3)) of all triangles that reach into the box [0, 1] x [0, aspect], moved there
@@ -120,16 +121,41 @@ class MeshTile(Tile):
         return len(alone), int(on_border.sum())
 
     def surface(
-        self, on: Collection[str] = (), slopes: NDArray[np.float64] | None = None
+        self, on: Collection[str] = REFLECTION, slopes: NDArray[np.float64] | None = None
     ) -> list[dict[str, Any]]:
-        """Mitsuba dictionaries of the parts."""
-        return [reflectance(part.base_color, part.roughness, part.metallic) for part in self.parts]
+        """Mitsuba dictionaries of the parts, holes included."""
+        return [plugin_dictionary(in_use(part.maps, {*on, "opacity"})) for part in self.parts]
 
     @property
     def base_color(self) -> F64:
-        """Mean (3,) over the parts of their mean colors."""
-        colors = [np.asarray(p.base_color).reshape(-1, 3).mean(axis=0) for p in self.parts]
-        return np.asarray(np.mean(colors, axis=0))
+        """Smallest and largest color (2, parts, 3) of each part."""
+        colors = [numbers_of(part.maps["base_color"]).reshape(-1, 3) for part in self.parts]
+        return np.stack([[color.min(axis=0) for color in colors], [color.max(axis=0) for color in colors]])
+
+    def weight(self, effect: str) -> float:
+        """Largest weight of a layer of the reflection in any part."""
+        return max(layer_weight(part.maps, effect) for part in self.parts)
+
+    @property
+    def bsdf_type(self) -> None:
+        """None: there are maps."""
+
+    @property
+    def is_lambert(self) -> bool:
+        """Whether all parts are Lambert, without layers above."""
+        return not any({*REFLECTING, *LOBES} & part.maps.keys() for part in self.parts)
+
+    def narrowest_lobe(self) -> tuple[float, str]:
+        """(width in radians, what it is of) of the narrowest lobe of any part."""
+        widths = (width for part in self.parts for width in lobe_widths(part.maps))
+        return min([2.0, *widths]), "narrowest lobe"
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the triangles and of the textures."""
+        values = [value for part in self.parts for value in part.maps.values()]
+        textures = {id(v[0].pixels): v[0].pixels.nbytes for v in values if isinstance(v, tuple)}
+        return self.vertices.nbytes + self.faces.nbytes + self.uv.nbytes + sum(textures.values())
 
     def properties(self) -> dict[str, Any]:
         """Number of triangles, for the manifest."""
@@ -150,9 +176,7 @@ class MeshTile(Tile):
                 {
                     "name": part.name,
                     "triangles": int(np.count_nonzero(self.part == number)),
-                    "base_color": np.asarray(part.base_color).reshape(-1, 3).mean(axis=0).tolist(),
-                    "roughness": None if part.roughness is None else float(np.mean(part.roughness)),
-                    "metallic": None if part.metallic is None else float(np.mean(part.metallic)),
+                    **{role: _mean(part.maps[role]) for role in ROLES if role in part.maps},
                 }
                 for number, part in enumerate(self.parts)
             ],
@@ -171,11 +195,17 @@ class MeshTile(Tile):
             f"{closed}",
         ]
         for part in found["parts"]:
-            color = " ".join(f"{c:.2f}" for c in part["base_color"])
-            gloss = "Lambert" if part["roughness"] is None else f"mean roughness {part['roughness']:.2f}"
-            metal = f", metallic {part['metallic']:.2f}" if part["metallic"] else ""
+            color = " ".join(f"{c:.2g}" for c in part["base_color"])
+            gloss = f"mean roughness {part['roughness']:.2f}" if "roughness" in part else "Lambert"
+            rest = "".join(f", {name} {part[name]:.2g}" for name in _TOLD if part.get(name))
             lines.append(
-                f"part     {part['name']}: {part['triangles']:,} triangles, mean color {color}, "
-                f"{gloss}{metal}"
+                f"part     {part['name']}: {part['triangles']:,} triangles, mean color {color}, {gloss}{rest}"
             )
         return "\n".join([*lines, *(f"warning  {text}" for text in found["warnings"])])
+
+
+def _mean(value: Value) -> float | list[float]:
+    """Mean number or color of a value."""
+    numbers = numbers_of(value)
+    mean = numbers if numbers.ndim < 2 else numbers.mean(axis=(0, 1))
+    return mean.tolist() if mean.ndim else float(mean)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.data.schema import Tiling
 from mbtf_core.errors import InputError, UsageError
+from mbtf_core.meshes.content import numbers_of
 from mbtf_gen.config.generator import GeometrySection, NormalMode
 from mbtf_gen.tile.heights import HeightGrid
 from mbtf_gen.tile.maps.map_loader import Color
@@ -162,6 +163,10 @@ class Tile(ABC):
     def base_color(self) -> Color:
         """(h, w, 3) or (3,) linear color, of tiles without maps their mean."""
 
+    def weight(self, effect: str) -> float:
+        """Largest weight of a layer of the reflection; 0 where the tile lacks it."""
+        return layer_weight(self.maps, effect)
+
     @property
     def images(self) -> Mapping[str, Any]:
         """Maps and constants by role, heights included, to show them."""
@@ -226,6 +231,13 @@ class Tile(ABC):
     def warnings_in_use(self) -> tuple[str, ...]:
         """Warnings, those that depend on the options included."""
         return self.warnings
+
+
+def layer_weight(maps: Mapping[str, Any], effect: str) -> float:
+    """Largest weight of a layer in some maps and constants by role; its color counts."""
+    weight = float(np.max(numbers_of(maps.get(effect, 0.0))))
+    color = maps.get(f"{effect}_color")
+    return weight if color is None else weight * float(np.max(numbers_of(color)))
 
 
 def displacement_fault(found: float, limit: float) -> tuple[str, str] | None:

@@ -35,7 +35,7 @@ class SurfaceBSDF(mi.BSDF):
 
     Plugin parameters are the names of :data:`DEFAULTS` and :data:`TERMS`, each a texture or a number. The
     simulated terms are those whose parameters are given. Opacity is only supported by the generator's own
-    loop.
+    loop; with the number ``opacity_cutoff`` it is 0 below that and else 1.
     """
 
     def __init__(self, props: Properties) -> None:
@@ -44,7 +44,7 @@ class SurfaceBSDF(mi.BSDF):
         textures = {name: props.get_texture(name, number) for name, number in DEFAULTS.items()}
         textures |= {name: props.get_texture(name) for name in given}
         parts = SurfaceParts(bool(props.get("diffuse", True)), **dict.fromkeys(given, True))
-        self.surface = Surface(parts, textures)
+        self.surface = Surface(parts, textures, float(props.get("opacity_cutoff", 0.0)))
         flags = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
         if parts.specular or parts.metallic or parts.clearcoat:
             flags |= mi.BSDFFlags.GlossyReflection
@@ -91,11 +91,17 @@ class SurfaceBSDF(mi.BSDF):
 class PartSurface:
     """Surfaces of several parts, with the interface of one; interactions name their part."""
 
-    transmits = False
-
     def __init__(self, parts: Sequence[Surface]) -> None:
         self.surfaces = parts
-        self.parts = SurfaceParts()
+        self.transmits = any(surface.transmits for surface in parts)
+        self.parts = SurfaceParts(opacity=self.transmits)
+
+    def opacity(self, si: SurfaceInteraction3f) -> Float:
+        """Probability that a surface interaction stops a ray."""
+        out = self.surfaces[0].opacity(si)
+        for number, surface in enumerate(self.surfaces[1:], 1):
+            out = dr.select(si.prim_index == number, surface.opacity(si), out)
+        return out
 
     def at(self, si: SurfaceInteraction3f, towards_viewer: Vector3f) -> PartSurfacePoint:
         """The surfaces at surface interactions."""

@@ -147,6 +147,8 @@ class Surface:
     textures : dict of str to Texture
         Mitsuba textures by the names of ``mbtf_surface``. Those that no term needs may be missing. ``slopes``
         are residual slopes along x and y, which are added to those of the geometry.
+    cutoff : float
+        Opacity from which the surface is opaque, and below which it is a hole; 0 for partial opacity.
 
     Attributes
     ----------
@@ -154,8 +156,9 @@ class Surface:
         Whether rays may be below the surface.
     """
 
-    def __init__(self, parts: SurfaceParts, textures: dict[str, Texture]) -> None:
+    def __init__(self, parts: SurfaceParts, textures: dict[str, Texture], cutoff: float = 0.0) -> None:
         self.parts = parts
+        self.cutoff = cutoff
         self.textures = textures
         self.transmits = parts.opacity
         glossy = parts.specular or parts.metallic or parts.clearcoat
@@ -168,7 +171,10 @@ class Surface:
 
     def opacity(self, si: SurfaceInteraction3f) -> Float:
         """Probability that a surface interaction stops a ray, from the opacity mask."""
-        return self.textures["opacity"].eval_1(si)
+        if not self.parts.opacity:
+            return mi.Float(1.0)
+        opacity = self.textures["opacity"].eval_1(si)
+        return dr.select(opacity >= self.cutoff, 1.0, 0.0) if self.cutoff > 0.0 else opacity
 
 
 class SurfacePoint:

@@ -25,6 +25,10 @@ from support.scenes import (
 )
 
 from mbtf_core.stats import mean_of_halves
+from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.job import Job
+from mbtf_gen.planning.run_plan import plan_effects, reference_plan
+from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.tile.heights import tile_mesh
 from mbtf_gen.tile.loading import load_material
 from mbtf_gen.tile.mesh_tile import MeshPart, MeshTile
@@ -47,8 +51,12 @@ def tile_of(plates: list[NDArray[np.float64]], colors: list[float], aspect: floa
         np.concatenate([faces + 4 * k for k in range(len(plates))]),
         np.zeros((4 * len(plates), 2)),
         np.repeat(np.arange(len(plates)), 2),
-        [MeshPart(str(k), np.full(3, c)) for k, c in enumerate(colors)],
+        [MeshPart(str(k), {"base_color": np.full(3, c)}) for k, c in enumerate(colors)],
     )
+
+
+def job_of(tile: MeshTile, mode: str) -> Job:
+    return Job.of(GeneratorConfig.model_validate({"material": "m", "effects": {"mode": mode}}), tile)
 
 
 def traced(tile: MeshTile, light: LightKernel | None, q: Any, spp: int = 16) -> Any:
@@ -66,6 +74,29 @@ def test_a_plate_of_two_colors_and_a_hole_is_the_mean_of_its_parts() -> None:
         assert abs(found.value - (0.5 * 0.8 + 0.25 * 0.2) / np.pi) < 4.0 * found.error
         assert found.error < 0.005
         assert e.transmittance.mean() == pytest.approx(0.25, abs=0.006)
+
+
+@pytest.mark.parametrize("mode", ["auto", "none"])
+@pytest.mark.parametrize("gap", [0.0, 0.5])
+def test_a_flat_mesh_is_lambert_with_its_gap_and_its_parts(gap: float, mode: str) -> None:
+    # Two colors side by side, as seen by narrow footprints; the rest of the tile is open.
+    edge = 0.5 * (1.0 - gap)
+    tile = tile_of([plate((0, 0), (edge, 1)), plate((edge, 0), (2 * edge, 1))], [0.8, 0.2])
+    for plan in (plan_effects(job_of(tile, mode)), reference_plan(job_of(tile, mode))):
+        u = np.array([0.25 * edge, 0.75 * edge, 1.5 * edge, 0.5 + 0.6 * edge])
+        light, view = direction(20, 60), direction(35, 200)
+        q = queries(np.stack([u, np.full(4, 0.5)], axis=-1), 0.01 * edge, light, view, 4)
+        e = build_estimator(job_of(tile, mode), plan).estimate(q, 64, Stream(1, "test", 0))
+        expected = np.array([0.8, 0.8, 0.2, 0.0 if gap else 0.2]) / np.pi
+        # Sampling of the BSDF too has variance where it is on.
+        np.testing.assert_allclose(e.value_a[:, 0], expected, rtol=0.1)
+        assert e.transmittance.tolist() == [0.0, 0.0, 0.0, 1.0 if gap else 0.0]
+        mean = build_estimator(job_of(tile, mode), plan).estimate(
+            tile_mean_queries(light, view, 4000), 16, Stream(1, "test", 0)
+        )
+        assert mean.transmittance.mean() == pytest.approx(gap, abs=0.01)
+        found = mean_of_halves(mean.value_a[:, 0], mean.value_b[:, 0])
+        assert abs(found.value - (1.0 - gap) * 0.5 / np.pi) < 4.0 * found.error
 
 
 def test_a_plate_below_another_is_seen_through_its_gap_and_lit_from_aside() -> None:
@@ -116,7 +147,7 @@ def test_white_bodies_above_a_grid_return_all_light() -> None:
         faces,
         np.zeros((len(vertices), 2)),
         np.zeros(len(faces), int),
-        [MeshPart("w", np.ones(3))],
+        [MeshPart("w", {"base_color": np.ones(3)})],
     )
     e = traced(tile, None, tile_mean_queries(UP, direction(30, 20), 2000), 64)
     total = 0.5 * (e.value_a + e.value_b)[:, 0] + e.transmittance
@@ -155,3 +186,21 @@ def test_textures_are_the_right_way_round(tmp_path: Path) -> None:
     for row, color in zip(value, np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]]), strict=True):
         assert (row[color == 1] > 0.2).all()
         assert (row[color == 0] < 0.1).all()
+
+
+def test_an_obj_file_has_its_image_as_often_as_its_material_says(tmp_path: Path) -> None:
+    # White where u < 1/2 and v > 1/2, which is the top left of the image.
+    pixels = np.zeros((16, 16, 3), np.uint8)
+    pixels[:8, :8] = 255
+    Image.fromarray(pixels).save(tmp_path / "corner.png")
+    (tmp_path / "a.mtl").write_text("newmtl m\nKd 0.5 0.5 0.5\nmap_Kd -s 2 1 1 -o 0 0.5 0 corner.png\n")
+    square = "v 0 0 0\nv 3 0 0\nv 3 3 0\nv 0 3 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
+    (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{square}usemtl m\nf 1/1 2/2 3/3 4/4\n")
+    tile = load_material(tmp_path / "a.obj")
+    assert isinstance(tile, MeshTile)
+    u, v = np.meshgrid((0.125, 0.375, 0.625, 0.875), (0.25, 0.75))
+    q = queries(np.stack([u.ravel(), v.ravel()], axis=-1), 0.005, direction(60, 10), direction(50, 80), 8)
+    e = traced(tile, LightKernel(1.0), q)
+    # Twice along u; moved by half of the image along v.
+    expected = 0.5 / np.pi * np.array([[1, 0, 1, 0], [0, 0, 0, 0]]).ravel()
+    np.testing.assert_allclose(e.value_a[:, 1], expected, atol=0.01)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from mbtf_core.errors import InputError
 from mbtf_fit.viewer.extras import read_shape
@@ -37,19 +38,71 @@ def test_bad_meshes_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     for name, text, what in (
         ("none.obj", plain + "f 1 2 3\n", "no texture coordinates"),
         ("flat.obj", plain + "vt 0 0\nf 1/1 2/1 3/1\n", "without an area"),
-        ("empty.obj", "v 0 0 0\n", "cannot be read|no triangles"),
-        ("text.glb", "no mesh", "cannot be read"),
+        (
+            "parts.obj",
+            plain + "vt 0 0\nvt 1 0\nvt 0 1\nusemtl Body\nf 1/1 2/2 3/3\nusemtl Glass\nf 1 2 3\n",
+            "'Glass' has no texture coordinates",
+        ),
+        ("empty.obj", "v 0 0 0\n", "no triangles"),
+        ("text.glb", "no mesh", ""),
         ("mesh.txt", "", "is not a mesh"),
     ):
         (tmp_path / name).write_text(text)
-        with pytest.raises(InputError, match=what):
+        with pytest.raises(InputError) as error:
             read_shape(tmp_path / name)
+        assert what in error.value.what
     with pytest.raises(InputError, match="no such file"):
         read_shape(tmp_path / "nothing.obj")
     (tmp_path / "good.obj").write_text(plain + "vt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n")
     monkeypatch.setattr("mbtf_fit.viewer.extras.MOST_TRIANGLES", 0)
     with pytest.raises(InputError, match="1 triangles, more than 0"):
         read_shape(tmp_path / "good.obj")
+
+
+def test_vertices_are_smooth_unless_the_file_has_normals(tmp_path: Path) -> None:
+    """A box, whose corners have three faces each; one place of the texture makes them one vertex."""
+    box = trimesh.creation.box()
+    lines = ["v {} {} {}".format(*point) for point in box.vertices]
+    lines += ["vt {} {}".format(*point) for point in box.vertices[:, :2]]
+    faces = [[f"{n + 1}/{n + 1}" for n in face] for face in box.faces]
+    (tmp_path / "a.obj").write_text("\n".join([*lines, *(f"f {' '.join(face)}" for face in faces)]) + "\n")
+    turned = (1, -1, 1)
+    shape, _, _ = read_shape(tmp_path / "a.obj")
+    expected = box.vertex_normals[:, [0, 2, 1]] * turned
+    near = np.linalg.norm(shape["normals"][:, None] - expected, axis=2).min(axis=1)
+    np.testing.assert_allclose(near, 0, atol=1e-6)
+    assert len(shape["normals"]) == 8
+    lines += ["vn {} {} {}".format(*normal) for normal in box.face_normals]
+    given = [" ".join(f"{corner}/{k + 1}" for corner in face) for k, face in enumerate(faces)]
+    (tmp_path / "a.obj").write_text("\n".join([*lines, *(f"f {face}" for face in given)]) + "\n")
+    shape, faces, _ = read_shape(tmp_path / "a.obj")
+    np.testing.assert_array_equal(
+        shape["normals"][faces], np.repeat((box.face_normals[:, [0, 2, 1]] * turned)[:, None], 3, axis=1)
+    )
+
+
+def test_normals_of_gltf_are_turned_with_its_nodes(tmp_path: Path) -> None:
+    """A sphere that a node stretches and mirrors; its normals are those of the ellipsoid."""
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    visual = trimesh.visual.TextureVisuals(uv=ball.vertices[:, :2])
+    ball = trimesh.Trimesh(
+        ball.vertices, ball.faces, vertex_normals=ball.vertices, process=False, visual=visual
+    )
+    scene = trimesh.Scene()
+    stretch = np.diag([-1.0, 2.0, 3.0, 1.0])
+    scene.add_geometry(ball, transform=stretch)
+    (tmp_path / "a.glb").write_bytes(scene.export(file_type="glb", include_normals=True))
+    shape, _, _ = read_shape(tmp_path / "a.glb")
+    # Files have y up; the ellipsoid has the radii 1, 3, 2 along our axes.
+    normals = shape["positions"] / np.square([1.0, 3.0, 2.0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    np.testing.assert_allclose(shape["normals"], normals, atol=1e-5)
+
+
+def test_a_missing_material_is_no_fault_of_a_shape(tmp_path: Path) -> None:
+    text = "mtllib gone.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
+    (tmp_path / "a.obj").write_text(text)
+    assert len(read_shape(tmp_path / "a.obj")[1]) == 1
 
 
 @pytest.mark.parametrize("alike", [False, True])

@@ -139,8 +139,12 @@ def test_the_material_file_replaces_the_reflectance(tmp_path: Path) -> None:
     path = tmp_path / "m.yaml"
     path.write_text("mesh: a.ply\nbase_color: [0.1, 0.2, 0.3]\nroughness: 0.4\n")
     (part,) = shape_of(path).parts
-    assert np.asarray(part.base_color).tolist() == [0.1, 0.2, 0.3]
-    assert (part.roughness, part.metallic) == (0.4, 0.0)
+    assert np.asarray(part.maps["base_color"]).tolist() == [0.1, 0.2, 0.3]
+    assert {name: float(part.maps[name]) for name in ("roughness", "metallic", "specular")} == {
+        "roughness": 0.4,
+        "metallic": 0.0,
+        "specular": 0.5,
+    }
     digests = load_material(path).digests
     path.write_text("mesh: a.ply\nbase_color: [0.1, 0.2, 0.3]\nroughness: 0.5\n")
     assert load_material(path).digests != digests

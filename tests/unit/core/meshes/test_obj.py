@@ -1,0 +1,318 @@
+"""OBJ files against hand-made numbers, trimesh and Mitsuba's own loader."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from numpy.typing import NDArray
+from PIL import Image
+
+from mbtf_core.errors import InputError
+from mbtf_core.meshes.content import MeshContent, MeshShape, Texture
+from mbtf_core.meshes.obj import read_obj
+from mbtf_core.meshes.polygons import triangulate
+from mbtf_core.meshes.up_axis import y_seems_up
+
+SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nvn 0 0 1\n"
+FACES = "f 1/1 2/2 3/3\nf 1/1 3/3 4/4\n"
+# Red, green and, below, blue and white.
+QUAD = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]], np.uint8)
+
+
+def read(folder: Path, text: str, **files: str) -> MeshContent:
+    """An OBJ file, beside others: ``a_mtl`` is ``a.mtl``."""
+    for name, content in files.items():
+        (folder / name.replace("_", ".")).write_text(content)
+    (folder / "a.obj").write_text(text)
+    return read_obj(folder / "a.obj")
+
+
+def with_material(folder: Path, text: str) -> MeshContent:
+    return read(folder, f"mtllib a.mtl\n{SQUARE}usemtl m\n{FACES}", a_mtl=f"newmtl m\n{text}\n")
+
+
+def texture_of(content: MeshContent, role: str = "base_color") -> tuple[Texture, Any]:
+    (shape,) = content.shapes
+    assert not shape.faults
+    texture, factor = shape.values[role]
+    return texture, factor
+
+
+def corners(shape: MeshShape) -> NDArray[np.float64]:
+    """Corners (m, 3, 3) of the triangles."""
+    return shape.vertices[shape.faces]
+
+
+@pytest.mark.parametrize(
+    "faces",
+    [
+        "f 1 2 3\nf 1 3 4",
+        "f 1/1 2/2 3/3\nf 1/1 3/3 4/4",
+        "f 1//1 2//1 3//1\nf 1//1 3//1 4//1",
+        "f 1/1/1 2/2/1 3/3/1\nf 1/1/1 3/3/1 4/4/1",
+        "f -4/-4/-1 -3/-3/-1 -2/-2/-1\nf -4/-4/-1 -2/-2/-1 -1/-1/-1",
+        "f 1/1 2/2/1 3/3/\nf 1 3//1 4",
+        "\tf  1/1 2/2 \\\n3/3 4/4 # a square\r",
+    ],
+)
+def test_all_forms_of_faces(tmp_path: Path, faces: str) -> None:
+    shapes = read(tmp_path, SQUARE + faces + "\n").shapes
+    found = np.concatenate([corners(shape) for shape in shapes])
+    square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
+    order = np.argsort(found[:, 1, 1])
+    np.testing.assert_array_equal(found[order], square[[[0, 1, 2], [0, 2, 3]]])
+    for shape in shapes:
+        if shape.uv is not None:
+            np.testing.assert_array_equal(shape.uv, shape.vertices[:, :2])
+        if shape.normals is not None:
+            np.testing.assert_array_equal(shape.normals, np.tile([0, 0, 1], (len(shape.normals), 1)))
+    textured = [shape.uv is not None for shape in shapes]
+    assert textured == (
+        [False, True] if faces.endswith("4") and "/3/" in faces else [("1/1" in faces) or ("-4/" in faces)]
+    )
+
+
+def test_negative_numbers_count_from_the_face(tmp_path: Path) -> None:
+    triangle = "v {0} 0 0\nv {1} 0 0\nv {0} 1 0\nf -3 -2 -1\n"
+    (shape,) = read(tmp_path, triangle.format(0, 1) + triangle.format(5, 6)).shapes
+    np.testing.assert_array_equal(corners(shape)[:, :, 0], [[0, 1, 0], [5, 6, 5]])
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("f 0 1 2", "lacks"),
+        ("f 1 2 5", "lacks"),
+        ("f 1 2 -5", "lacks"),
+        ("f 1/9 2/2 3/3", "lacks"),
+        ("f 1 2 x", "numbers"),
+        ("f 1/1/1/1 2 3", "numbers"),
+        ("f 1 2", "no triangles"),
+        ("v 1 2\nf 1 2 3", "x, y, z"),
+        ("v 0,5 0 0\nf 1 2 3", "numbers"),
+        ("f 1 2 99999999999999999999999", "lacks"),
+        ("\0", "text"),
+    ],
+)
+def test_faults_are_refused_with_their_line(tmp_path: Path, text: str, says: str) -> None:
+    with pytest.raises(InputError, match=says) as error:
+        read(tmp_path, SQUARE + text + "\n")
+    if says in ("lacks", "numbers", "x, y, z"):
+        assert "line 10" in str(error.value.where)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_polygons_are_cut_exactly(turned: bool) -> None:
+    rng = np.random.default_rng(0)
+    rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0] if turned else np.eye(3)
+    star = 2 * np.pi * np.arange(20) / 20
+    radius = np.where(np.arange(20) % 2, 1.0, 0.3)
+    polygons = [
+        [[0, 0], [1, 0], [1, 1]],
+        [[0, 0], [1, 0], [1, 1], [0, 1]],
+        # An arrow, an L whose corner lies on a diagonal, and a frame whose hole is joined by a bridge.
+        [[0, 0], [1, 0.3], [2, 0], [1, 2]],
+        [[0, 0], [2, 0], [2, 1], [1, 1], [1, 2], [0, 2]],
+        [[0, 0], [3, 0], [3, 3], [0, 3], [0, 0], [1, 1], [1, 2], [2, 2], [2, 1], [1, 1]],
+        np.stack([radius * np.cos(star), radius * np.sin(star)], axis=-1),
+    ]
+    areas = [0.5, 1, 1.7, 3, 8, 10 * 0.3 * np.sin(np.pi / 10)]
+    points = np.concatenate([np.pad(np.array(p, float), ((0, 0), (0, 1))) @ rotation.T + 5 for p in polygons])
+    triangles, polygon, uncut = triangulate(points, np.array([len(p) for p in polygons]))
+    assert uncut == 0
+    corner = points[triangles]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]) / 2
+    # Unsigned areas add up only if no triangles overlap; all turn the same way.
+    found = np.bincount(polygon, np.linalg.norm(normal, axis=1))
+    np.testing.assert_allclose(found, areas, rtol=1e-9)
+    assert (normal @ rotation[:, 2] > -1e-12).all()
+    crossing = np.array([[0, 0, 0], [1, 1, 0], [1, 0, 0], [0, 2, 0], [-1, 1, 0]], float)
+    assert triangulate(crossing, np.array([5]))[2] == 1
+
+
+def test_trimesh_and_mitsuba_read_the_same(tmp_path: Path) -> None:
+    from mbtf_gen.engine.runtime import load_mitsuba
+
+    mi = load_mitsuba()
+    sphere = trimesh.creation.uv_sphere(count=(6, 8))
+    sphere.visual = trimesh.visual.TextureVisuals(
+        uv=np.random.default_rng(0).random((len(sphere.vertices), 2))
+    )
+    sphere.export(tmp_path / "a.obj")
+    (shape,) = read_obj(tmp_path / "a.obj").shapes
+    assert shape.uv is not None
+    np.testing.assert_allclose(corners(shape), sphere.triangles, atol=1e-7)
+    np.testing.assert_allclose(shape.uv[shape.faces], sphere.visual.uv[sphere.faces], atol=1e-7)
+    params = mi.traverse(mi.load_dict({"type": "obj", "filename": str(tmp_path / "a.obj")}))
+    faces = np.array(params["faces"]).reshape(-1, 3)
+    np.testing.assert_allclose(
+        np.array(params["vertex_positions"]).reshape(-1, 3)[faces], corners(shape), atol=1e-6
+    )
+    texture = np.array(params["vertex_texcoords"]).reshape(-1, 2)[faces]
+    # Mitsuba's v points down.
+    np.testing.assert_allclose(texture * (1, -1) + (0, 1), shape.uv[shape.faces], atol=1e-6)
+
+
+def test_parts_are_those_of_materials_and_of_texture_coordinates(tmp_path: Path) -> None:
+    faces = "usemtl b\nf 1/1 2/2 3/3\nusemtl a\nf 1 3 4\nusemtl b\nf 1 2 3\n"
+    content = read(
+        tmp_path,
+        f"mtllib my own.mtl other.mtl\n{SQUARE}{faces}",
+        **{
+            "my own_mtl": "newmtl a\nKd .1 .2 .3\n",
+            "other_mtl": "# of Blender\nnewmtl b\n  kd 0.5\nPr 0.25\nPm 1\n",
+        },
+    )
+    found = {(shape.name, shape.uv is not None): shape for shape in content.shapes}
+    assert found.keys() == {("b", True), ("b", False), ("a", False)}
+    assert found["a", False].values["base_color"].tolist() == [0.1, 0.2, 0.3]
+    for textured in (False, True):
+        values = found["b", textured].values
+        assert values["base_color"].tolist() == [0.5, 0.5, 0.5]
+        assert (values["roughness"], values["metallic"]) == (0.25, 1.0)
+    assert content.files == {name: tmp_path / name for name in ("my own.mtl", "other.mtl")}
+    assert content.up is None
+
+
+@pytest.mark.parametrize(
+    ("text", "matrix", "wrap"),
+    [
+        ("my quad.png", [[1, 0, 0], [0, 1, 0]], "repeat"),
+        ("-s 4 2 1 my quad.png", [[4, 0, 0], [0, 2, 0]], "repeat"),
+        ("-o 0.25 0.5 -s 3 my quad.png", [[3, 0, 0.25], [0, 1, 0.5]], "repeat"),
+        ("-clamp on -blendu on -mm 0 1 my quad.png", [[1, 0, 0], [0, 1, 0]], "clamp"),
+        ('"MY Quad.png"', [[1, 0, 0], [0, 1, 0]], "repeat"),
+        ("C:\\textures\\my quad.png", [[1, 0, 0], [0, 1, 0]], "repeat"),
+        ("..\\a\\my quad.png", [[1, 0, 0], [0, 1, 0]], "repeat"),
+    ],
+)
+def test_images_are_found_and_placed(tmp_path: Path, text: str, matrix: Any, wrap: str) -> None:
+    Image.fromarray(QUAD).save(tmp_path / "my quad.png")
+    content = with_material(tmp_path, f"Kd 0.5 0.25 1\nmap_Kd {text}")
+    texture, factor = texture_of(content)
+    np.testing.assert_array_equal(texture.pixels, QUAD / 255)
+    np.testing.assert_array_equal(texture.to_uv, matrix)
+    assert texture.wrap == (wrap, wrap)
+    assert factor.tolist() == [0.5, 0.25, 1.0]
+    assert tmp_path / "my quad.png" in content.files.values()
+    assert len(content.warnings) == ("\\" in text)
+
+
+def test_colors_of_images_are_srgb_and_numbers_are_linear(tmp_path: Path) -> None:
+    Image.fromarray(np.full((1, 1, 3), 188, np.uint8)).save(tmp_path / "a.png")
+    leaf = np.zeros((1, 2, 4), np.uint8)
+    leaf[0, 1] = 255
+    Image.fromarray(leaf).save(tmp_path / "leaf.png")
+    content = with_material(
+        tmp_path, "map_Kd a.png\nmap_Pr -imfchan g a.png\nPm 0.5\nmap_Pm a.png\nmap_d leaf.png"
+    )
+    assert texture_of(content)[0].pixels == pytest.approx(0.5029, abs=1e-4)
+    for role, factor in (("roughness", 1.0), ("metallic", 0.5)):
+        assert texture_of(content, role)[0].pixels == pytest.approx(188 / 255)
+        assert texture_of(content, role)[1] == factor
+    assert texture_of(content, "opacity")[0].pixels.tolist() == [[0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("text", "role", "says"),
+    [
+        ("map_Kd gone.png", "base_color", "gone.png"),
+        ("map_Kd a.mtl", "base_color", "image"),
+        ("map_Kd -s x a.png", "base_color", "-s"),
+        ("Kd nan 0 0", "base_color", "nan"),
+        ("Kd 1e9 0 0", "base_color", "1e9"),
+        ("Kd 0 -0.5 0", "base_color", "-0.5"),
+        ("Kd xyz 1 1 1", "base_color", "xyz"),
+        ("Kd 1 1 1\nmap_Pr gone.png", "roughness", "gone.png"),
+        ("Kd 1 1 1\nPm 2", "metallic", "2"),
+        ("Kd 1 1 1\nd -halo 0.5", "opacity", "halo"),
+    ],
+)
+def test_values_that_cannot_be_read_are_faults(tmp_path: Path, text: str, role: str, says: str) -> None:
+    (shape,) = with_material(tmp_path, text).shapes
+    assert shape.faults.keys() == {role}
+    assert says in shape.faults[role].message
+
+
+@pytest.mark.parametrize(
+    ("use", "library", "says"),
+    [("ghost", "a.mtl", "'ghost'"), ("m", "gone.mtl", "gone.mtl"), ("mm", "a.mtl", "did you mean 'm'")],
+)
+def test_materials_that_are_not_there(tmp_path: Path, use: str, library: str, says: str) -> None:
+    text = f"mtllib {library}\n{SQUARE}usemtl {use}\n{FACES}"
+    (shape,) = read(tmp_path, text, a_mtl="newmtl m\nKd 1 1 1\n").shapes
+    assert says in shape.faults["base_color"].message
+    # Where no file is named, there is only a warning.
+    content = read(tmp_path, f"{SQUARE}usemtl {use}\n{FACES}")
+    assert not content.shapes[0].faults
+    assert f"'{use}'" in content.warnings[0]
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (
+            "Ks 0.5 0.5 0.5\nNs 250\nKe 1 0 0\nmap_Bump n.png\nnorm n.png\naniso 0.5",
+            "Ke Ks aniso map_Bump norm",
+        ),
+        ("map_Kd -bm 2 -texres 4 a.png", "-bm -texres"),
+        ("Kd 0 0 0\nmap_Kd a.png", "Kd black"),
+        ("newmtl m\nKd 0 0 0", "twice"),
+        ("Tr 1", "Tr"),
+    ],
+)
+def test_what_is_not_used_is_said(tmp_path: Path, text: str, says: str) -> None:
+    Image.fromarray(QUAD).save(tmp_path / "a.png")
+    text = text if "Kd" in text.split()[0] else f"Kd 1 1 1\n{text}"
+    (warning,) = with_material(tmp_path, text).warnings
+    for word in says.split():
+        assert word in warning
+
+
+def test_statements_of_no_effect_are_silent(tmp_path: Path) -> None:
+    blender = "Ns 250\nKa 1 1 1\nKd 0.8 0.8 0.8\nKs 0 0 0\nKe 0 0 0\nNi 1.45\nd 1\nillum 2\nPr 0.5\nPm 0\n"
+    blender += "Ps 0\nPc 0\nPcr 0.03\naniso 0\nanisor 0"
+    content = with_material(tmp_path, blender)
+    assert content.warnings == []
+    assert content.shapes[0].values.keys() == {"base_color", "roughness", "metallic"}
+    layers = with_material(tmp_path, "Kd 1 1 1\nPc 0.5\nPcr 0.2\nPs 0.3\nTr 0.25").shapes[0].values
+    assert (layers["clearcoat"], layers["clearcoat_roughness"], layers["sheen"]) == (0.5, 0.2, 0.3)
+    assert layers["opacity"] == 0.75
+
+
+def test_colors_of_vertices_are_srgb_factors(tmp_path: Path) -> None:
+    colored = "v 0 0 0 1 0 0\nv 1 0 0 0.5 0.5 0.5\nv 0 1 0 0 0 1\nf 1 2 3\n"
+    (shape,) = read(tmp_path, colored).shapes
+    assert shape.colors is not None
+    np.testing.assert_allclose(shape.colors, [[1, 0, 0], [0.2140] * 3, [0, 0, 1]], atol=1e-4)
+    assert shape.values["base_color"].tolist() == [1, 1, 1]
+    white = (
+        colored.replace("1 0 0\n", "1 1 1\n").replace("0.5 0.5 0.5", "1 1 1").replace("0 0 1\n", "1 1 1\n")
+    )
+    assert read(tmp_path, white).shapes[0].colors is None
+    assert "base_color" in read(tmp_path, colored.replace("0.5 0.5 0.5", "255 0 0")).shapes[0].faults
+    content = read(tmp_path, colored.replace(" 0.5 0.5 0.5", ""))
+    assert "white" in content.warnings[0]
+    content = read(tmp_path, f"mtllib a.mtl\nusemtl m\n{colored}", a_mtl="newmtl m\nKd 0.5 0.5 0.5\n")
+    assert "multiplies" in content.warnings[0]
+
+
+def test_y_up_is_noticed() -> None:
+    rng = np.random.default_rng(0)
+    n = 8
+    x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, n)))
+    index = np.arange(n * n).reshape(n, n)
+    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
+    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    for height in (0.0, 0.1, 0.4):
+        sheet = np.stack([x, y, height * rng.random(n * n)], axis=-1)
+        assert not y_seems_up(sheet, faces)
+        assert y_seems_up(sheet[:, [0, 2, 1]], faces)
+    # Upright blades on a strip that is narrow along y.
+    blades = np.array([[0, 0, 0], [0.1, 0, 0], [0.05, 0, 1], [3, 0.3, 0], [3, 0.31, 0], [3, 0.3, 1]])
+    floor = np.array([[0, 0, 0], [3, 0, 0], [3, 0.4, 0]])
+    assert not y_seems_up(np.concatenate([blades, floor]), np.arange(9).reshape(3, 3))

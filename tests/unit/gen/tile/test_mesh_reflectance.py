@@ -1,0 +1,240 @@
+"""What the tile of a mesh makes of its materials: vertex colors, wrap modes, layers, companions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.gltf_files import SQUARE, SQUARE_UV, GltfBuilder, png
+from support.scenes import mi
+
+from mbtf_core.errors import InputError
+from mbtf_core.meshes.content import MeshShape, Texture, numbers_of
+from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.job import Job
+from mbtf_gen.planning.run_plan import plan_effects, reference_plan
+from mbtf_gen.tile.loading import latest_material, load_material
+from mbtf_gen.tile.mesh_textures import with_one_wrap, with_vertex_colors
+from mbtf_gen.tile.mesh_tile import MeshPart, MeshTile
+from mbtf_gen.tile.reflectance import plugin_dictionary
+
+LAYERS = {
+    "KHR_materials_clearcoat": {"clearcoatFactor": 0.5},
+    "KHR_materials_sheen": {"sheenColorFactor": [0.5, 0, 0], "sheenRoughnessFactor": 0.5},
+}
+
+
+def tile_at(path: Path) -> MeshTile:
+    tile = load_material(path)
+    assert isinstance(tile, MeshTile)
+    return tile
+
+
+def tile_of(builder: GltfBuilder, folder: Path, yaml: str = "") -> MeshTile:
+    builder.write(folder / "a.glb")
+    (folder / "m.yaml").write_text(f"mesh: a.glb\nperiod: [1, 1]\n{yaml}")
+    return tile_at(folder / "m.yaml")
+
+
+def looked_up(value: Any, uv: np.ndarray) -> np.ndarray:
+    """Colors (n, 3) of texture coordinates (n, 2), v up, as Mitsuba looks them up."""
+    texture = mi.load_dict(plugin_dictionary({"base_color": value})["base_color"])
+    si = mi.SurfaceInteraction3f()
+    si.uv = mi.Point2f(uv[:, 0], 1.0 - uv[:, 1])
+    return np.array(texture.eval(si)).T
+
+
+def part_of(tile: MeshTile, number: int = 0) -> MeshPart:
+    return tile.parts[number]
+
+
+def test_varying_colors_of_vertices_are_interpolated_linearly() -> None:
+    rng = np.random.default_rng(0)
+    count = 7
+    shape = MeshShape(
+        "a",
+        rng.random((9, 3)),
+        rng.integers(0, 9, (count, 3)),
+        None,
+        rng.random((9, 3)),
+        {"base_color": np.array([1.0, 0.5, 0.25])},
+    )
+    found = with_vertex_colors(shape)
+    assert found.uv is not None
+    weights = rng.dirichlet((1, 1, 1), 200)
+    # Corners and points on edges as well.
+    weights[:3], weights[3:6] = np.eye(3), (1 - np.eye(3)) / 2
+    for t in range(count):
+        assert found.vertices[found.faces[t]].tolist() == shape.vertices[shape.faces[t]].tolist()
+        uv = weights @ found.uv[found.faces[t]]
+        assert shape.colors is not None
+        expected = weights @ shape.colors[shape.faces[t]] * (1, 0.5, 0.25)
+        assert looked_up(found.values["base_color"], uv) == pytest.approx(expected, abs=2e-5)
+
+
+def test_equal_colors_of_vertices_are_a_factor(tmp_path: Path) -> None:
+    builder = GltfBuilder()
+    texture = {"index": builder.texture(np.full((1, 1, 3), 255, np.uint8))}
+    material = builder.material({"baseColorTexture": texture, "baseColorFactor": [0.5, 1, 1, 1]})
+    builder.plate(material, COLOR_0=np.array([[0.5, 0.25, 1]] * 4, np.float32))
+    found = numbers_of(part_of(tile_of(builder, tmp_path)).maps["base_color"])
+    assert found[0, 0] == pytest.approx([0.25, 0.25, 1])
+    builder.plate(material, COLOR_0=np.array([[0.5, 0.25, 1]] * 3 + [[0, 0, 0]], np.float32))
+    with pytest.raises(InputError, match="colors") as error:
+        tile_of(builder, tmp_path)
+    assert "bake" in error.value.hint
+    # A color of the material file replaces both.
+    tile = tile_of(builder, tmp_path, "base_color: 0.3\n")
+    assert np.asarray(part_of(tile).maps["base_color"]).tolist() == [0.3] * 3
+
+
+FOLDED = {
+    "repeat": lambda x: x - np.floor(x),
+    "mirror": lambda x: 1.0 - np.abs((x % 2.0) - 1.0),
+    "clamp": lambda x: np.clip(x, 0.0, 1.0),
+}
+
+
+def texel(pixels: np.ndarray, u: np.ndarray, v: np.ndarray, wrap: tuple[str, str]) -> np.ndarray:
+    """Bilinear look-up at (u, v), v up: the fold is that of texel numbers."""
+    rows, columns = pixels.shape[:2]
+    x, y = u * columns - 0.5, (1 - v) * rows - 0.5
+    out = np.zeros((len(u), 3))
+    for i in (0, 1):
+        for j in (0, 1):
+            column, row = np.floor(x) + i, np.floor(y) + j
+            weight = (1 - np.abs(x - column)) * (1 - np.abs(y - row))
+            number = []
+            for index, size, mode in ((column, columns, wrap[0]), (row, rows, wrap[1])):
+                folded = FOLDED[mode]((index + 0.5) / size) * size - 0.5
+                number.append(np.clip(np.rint(folded), 0, size - 1).astype(int))
+            out += weight[:, None] * pixels[number[1], number[0]]
+    return out
+
+
+@pytest.mark.parametrize("u", FOLDED)
+@pytest.mark.parametrize("v", FOLDED)
+def test_wrap_modes(u: Any, v: Any) -> None:
+    rng = np.random.default_rng(0)
+    pixels = rng.random((3, 5, 3)).astype(np.float32)
+    to_uv = np.array([[0.8, 0.3, 0.1], [-0.2, 1.1, 0.4]])
+    value = (Texture(pixels, (u, v), False, to_uv), np.array([1.0, 0.5, 0.25]))
+    uv = rng.uniform(-2, 3, (400, 2))
+    found = with_one_wrap(value, uv, "a")
+    assert len(set(found[0].wrap)) == 1
+    x, y = (uv @ to_uv[:, :2].T + to_uv[:, 2]).T
+    expected = texel(pixels, x, y, (u, v)) * (1, 0.5, 0.25)
+    assert looked_up(found, uv) == pytest.approx(expected, abs=1e-4)
+
+
+def test_a_clamped_texture_that_reaches_too_far_is_refused() -> None:
+    texture = Texture(np.zeros((512, 512, 3), np.float32), ("clamp", "repeat"))
+    with pytest.raises(InputError, match="clamped"):
+        with_one_wrap((texture, np.ones(3)), np.array([[0.0, 0.0], [1000.0, 1.0]]), "a")
+
+
+def test_nearest_texels_are_not_interpolated(tmp_path: Path) -> None:
+    builder = GltfBuilder()
+    pixels = np.zeros((1, 2, 3), np.uint8)
+    pixels[0, 1] = 255
+    texture = {"index": builder.texture(pixels, {"magFilter": 9728})}
+    builder.plate(builder.material({"baseColorTexture": texture}))
+    value = part_of(tile_of(builder, tmp_path)).maps["base_color"]
+    uv = np.array([[0.01, 0.5], [0.49, 0.5], [0.51, 0.5], [0.99, 0.5]])
+    assert looked_up(value, uv)[:, 0].tolist() == [0, 0, 1, 1]
+
+
+def plans(tile: MeshTile, mode: str = "auto") -> tuple[set[str], set[str]]:
+    """Reflections that a run and a reference picture simulate."""
+    config = GeneratorConfig.model_validate({"material": "m", "effects": {"mode": mode}})
+    job = Job.of(config, tile)
+    names = {"specular", "metallic", "clearcoat", "sheen"}
+    return tuple(  # type: ignore[return-value]
+        set(plan.names_on) & names for plan in (plan_effects(job, pilots=False), reference_plan(job))
+    )
+
+
+def test_effects_are_those_of_the_parts(tmp_path: Path) -> None:
+    builder = GltfBuilder()
+    builder.plate(builder.material({"metallicFactor": 0}))
+    assert plans(tile_of(builder, tmp_path)) == ({"specular"}, {"specular"})
+    # Another part has layers and metal.
+    builder.plate(builder.material({}, extensions=LAYERS))
+    tile = tile_of(builder, tmp_path)
+    everything = {"specular", "metallic", "clearcoat", "sheen"}
+    assert plans(tile) == (everything, everything)
+    assert plans(tile, "-clearcoat")[0] == everything - {"clearcoat"}
+    first, second = tile.surface()
+    assert not first.keys() & {"clearcoat", "sheen", "metallic"}
+    assert second.keys() >= {"clearcoat", "clearcoat_roughness", "sheen", "sheen_color", "sheen_roughness"}
+    assert "clearcoat" not in tile.surface(("specular", "sheen"))[1]
+    # The coat is a mirror.
+    assert tile.narrowest_lobe()[0] == 0.0
+
+
+def test_a_lambert_mesh_has_no_reflections(tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 1\nv 0 1 1\nf 1 2 3\nf 1 3 4\n")
+    tile = tile_at(tmp_path / "a.obj")
+    assert tile.is_lambert
+    assert plans(tile) == (set(), set())
+    assert tile.surface()[0].keys() == {"type", "base_color"}
+
+
+def test_a_fault_of_a_role_counts_unless_it_is_given(tmp_path: Path) -> None:
+    builder = GltfBuilder()
+    builder.add("images", {"uri": "gone.png"})
+    builder.add("textures", {"source": 0})
+    builder.plate(builder.material({"baseColorTexture": {"index": 0}, "metallicFactor": 0}))
+    with pytest.raises(InputError, match="no such file") as error:
+        tile_of(builder, tmp_path)
+    assert error.value.where == str(tmp_path / "gone.png")
+    assert part_of(tile_of(builder, tmp_path, "base_color: 0.2\n")).maps["metallic"] == 0
+
+
+def test_texture_coordinates_that_are_not_numbers_are_refused(tmp_path: Path) -> None:
+    uv = SQUARE_UV.copy()
+    uv[0, 0] = np.nan
+    builder = GltfBuilder()
+    texture = {"index": builder.texture(np.zeros((2, 2, 3), np.uint8))}
+    builder.plate(builder.material({"baseColorTexture": texture}), TEXCOORD_0=uv)
+    with pytest.raises(InputError, match="texture coordinates"):
+        tile_of(builder, tmp_path)
+
+
+def with_companions(folder: Path) -> Path:
+    """A mesh of three files."""
+    builder = GltfBuilder()
+    builder.add("images", {"uri": "wood.png"})
+    builder.add("textures", {"source": 0})
+    builder.plate(builder.material({"baseColorTexture": {"index": 0}}))
+    builder.node(builder.mesh(np.add(SQUARE, (0, 0.25, 0))))
+    (folder / "wood.png").write_bytes(png(np.full((2, 2, 3), 128, np.uint8)))
+    return builder.write(folder / "a.gltf")
+
+
+@pytest.mark.parametrize("changed", ["wood.png", "a.bin", "a.gltf"])
+def test_each_companion_is_part_of_the_material(tmp_path: Path, changed: str) -> None:
+    path = with_companions(tmp_path)
+    before = latest_material(path)
+    assert before.files.keys() == {"mesh", "mesh.wood.png", "mesh.a.bin"}
+    assert before.digests.keys() == {*before.files, "settings"}
+    assert latest_material(path) is before
+    content = (tmp_path / changed).read_bytes()
+    if changed == "wood.png":
+        content = png(np.full((2, 2, 3), 129, np.uint8))
+    else:
+        content += b" "
+    (tmp_path / changed).write_bytes(content)
+    after = latest_material(path)
+    assert [role for role in before.digests if before.digests[role] != after.digests[role]] == [
+        {"wood.png": "mesh.wood.png", "a.bin": "mesh.a.bin", "a.gltf": "mesh"}[changed]
+    ]
+
+
+def test_warnings_name_the_file(tmp_path: Path) -> None:
+    builder = GltfBuilder().plate()
+    builder.document["animations"] = [{}]
+    tile = tile_of(builder, tmp_path)
+    assert any(text.startswith(f"{tmp_path / 'a.glb'}: ") and "animations" in text for text in tile.warnings)
