@@ -257,7 +257,8 @@ def loose_ends(tile: FiberTile) -> int:
             loose += len(low) + len(high)
             continue
         other, box = 1 - axis, [(1.0, tile.aspect)[1 - axis], 0.0]
-        places = [np.column_stack([side[:, other] % box[0], side[:, 2]]) for side in (low, high)]
+        # The remainder of -1e-17 is the period itself.
+        places = [np.column_stack([side[:, other] % box[0] % box[0], side[:, 2]]) for side in (low, high)]
         near, index = cKDTree(places[1], boxsize=box).query(places[0], distance_upper_bound=_AT_BORDER)
         # Each end continues at most one of the other side.
         loose += len(low) + len(high) - 2 * len(np.unique(index[np.isfinite(near)]))
