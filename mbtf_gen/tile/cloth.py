@@ -58,6 +58,7 @@ def cloth_tile(spec: ClothFile, folder: Path) -> FiberTile:
     # What the defaults stand for changes the data as well.
     settings = spec.model_dump(mode="json", exclude={"pattern", "curves"})
     settings["scattering"] = asdict(tile.scattering)
+    settings["longest_segment"] = LONGEST_SEGMENT
     settings["yarns"] = [asdict(YARNS[entry.type]) for entry in (spec.yarn, spec.weft) if entry is not None]
     digests["settings"] = data_sha256(settings)
     kind = next(key for key in ("weave", "knit", "pattern", "curves") if getattr(spec, key) is not None)
@@ -71,20 +72,22 @@ def cloth_tile(spec: ClothFile, folder: Path) -> FiberTile:
 
 def _fibers(spec: ClothFile, folder: Path) -> FiberTile:
     rng = np.random.default_rng(spec.seed)
+    where = folder
     if spec.curves is not None:
         return _of_curves(spec, folder / spec.curves)
     if spec.pattern is not None:
-        aspect, yarns = _of_pattern(spec, folder / spec.pattern)
+        where = folder / spec.pattern
+        aspect, yarns = _of_pattern(spec, where)
     elif spec.knit is not None:
         aspect, yarns = _knitted(spec)
     else:
         aspect, yarns = _woven(spec)
-    _check_aspect(aspect, folder)
+    _check_aspect(aspect, where)
     total = sum(count_segments(line, section, _model(entry)) for line, section, entry, _ in yarns)
     if not total <= MOST_SEGMENTS:
         raise InputError(
             f"would have {total:.2g} fiber segments, more than {MOST_SEGMENTS:,}",
-            where=folder,
+            where=where,
             hint="take fewer repeats or fibers, or wider yarns",
         )
     curves: list[Curve] = []
@@ -94,7 +97,7 @@ def _fibers(spec: ClothFile, folder: Path) -> FiberTile:
         curves += fibers
         kind += [color] * len(fibers)
     colors = [spec.yarn.color] if spec.weft is None else [spec.yarn.color, spec.weft.color]
-    return _settled(aspect, curves, np.array(kind), np.array(colors), spec, folder)
+    return _settled(aspect, curves, np.array(kind), np.array(colors), spec, where)
 
 
 _Yarn = tuple[Curve, CrossSection, YarnEntry, int]

@@ -11,7 +11,7 @@ import logging
 import os
 import struct
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
@@ -33,6 +33,7 @@ _KINDS = {b"C0": "Catmull-Rom curves", b"PL": "polylines"}
 _OTHERS = {b"C1": "chordal Catmull-Rom curves", b"C5": "centripetal Catmull-Rom curves"}
 # Most control points of a tile: they take 1.5 GB while they are read.
 MOST_POINTS = 4_000_000
+MOST_CURVES = 250_000
 # Bytes of a line of text; a longer one has more than four numbers.
 _LONGEST_LINE = 1 << 12
 # Largest coordinate; squares of larger ones are beyond float32.
@@ -40,13 +41,29 @@ _MOST = 1e15
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[BinaryIO]:
+def opened(path: Path) -> Iterator[BinaryIO]:
+    """A file to read; what the system refuses is an InputError."""
     refuse_special(path)
     try:
         with path.open("rb") as stream:
             yield stream
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+
+
+def lines(stream: BinaryIO) -> Iterator[tuple[int, bytes]]:
+    """Lines and their numbers, from 1, without a byte order mark. Those that are too long come in pieces."""
+    for number, line in enumerate(iter(lambda: stream.readline(_LONGEST_LINE), b""), 1):
+        yield number, line.removeprefix(codecs.BOM_UTF8) if number == 1 else line
+
+
+def numbers(words: Sequence[bytes]) -> list[float]:
+    """Numbers of words; none where a word is no number."""
+    try:
+        # Python takes 1_000 for a thousand.
+        return [float(word.replace(b"_", b"?")) for word in words]
+    except ValueError:
+        return []
 
 
 def read_curves(path: Path) -> tuple[list[Curve], float]:
@@ -69,7 +86,7 @@ def read_curves(path: Path) -> tuple[list[Curve], float]:
     InputError
         The file is unreadable or truncated, of another kind, or its numbers are no curves.
     """
-    with _opened(path) as stream:
+    with opened(path) as stream:
         if path.suffix.lower() == ".bcc":
             curves, deviation = _bcc(stream, path)
         else:
@@ -104,9 +121,7 @@ def _bcc(stream: BinaryIO, path: Path) -> tuple[list[Curve], float]:
     if length != _HEADER.size + size * (curves + 3 * points):
         what = f"has {length:,} bytes, not those of {curves:,} curves with {points:,} points"
         raise InputError(what, where=path, hint=_COMPLETE)
-    if points > MOST_POINTS or curves > MOST_POINTS:
-        what = f"has {curves:,} curves with {points:,} points, more than {MOST_POINTS:,}"
-        raise InputError(what, where=path, hint="save fewer curves, or fewer points of each")
+    _check_counts(curves, points, path)
     data = stream.read()
     integers, floats = np.frombuffer(data, f"<i{size}"), np.frombuffer(data, f"<f{size}")
     out: list[Curve | None] = [None] * curves
@@ -196,35 +211,32 @@ def _deviation(control: F64, around: F64, kind: bytes) -> float:
 def _text(stream: BinaryIO, path: Path) -> list[Curve]:
     out: list[Curve] = []
     run: list[list[float]] = []
-    number = points = 0
-    while True:
-        line = stream.readline(_LONGEST_LINE)
-        number += 1
-        words = line.removeprefix(codecs.BOM_UTF8 if number == 1 else b"").split()
-        if not words:
-            if run:
-                out.append(_curve(np.array(run), len(out), path))
-                run = []
-            if not line:
-                return out
-            continue
-        try:
-            # Python takes 1_000 for a thousand.
-            row = [float(word) for word in words if b"_" not in word]
-        except ValueError:
-            row = []
-        if len(row) != 4 or len(words) != 4:
-            shown = reason(line[:40].decode("utf-8", "replace").strip())
-            what = f"line {number} is not x, y, z and radius: '{shown}'"
-            hint = "a line holds four numbers, separated by blanks; empty lines separate curves"
-            raise InputError(what, where=path, hint=hint)
-        points += 1
-        if points > MOST_POINTS:
-            raise InputError(f"has more than {MOST_POINTS:,} points", where=path, hint="save fewer curves")
-        run.append(row)
+    points = 0
+    for number, line in lines(stream):
+        words = line.split()
+        if words:
+            run.append(numbers(words))
+            points += 1
+            if len(run[-1]) != 4:
+                shown = reason(line[:40].decode("utf-8", "replace"))
+                what = f"line {number} is not x, y, z and radius: '{shown}'"
+                hint = "a line holds four numbers, separated by blanks; empty lines separate curves"
+                raise InputError(what, where=path, hint=hint)
+        elif run:
+            out.append(_curve(run, len(out), path))
+            run = []
+        _check_counts(len(out), points, path)
+    return [*out, _curve(run, len(out), path)] if run else out
 
 
-def _curve(control: F64, number: int, path: Path) -> Curve:
+def _check_counts(curves: int, points: int, path: Path) -> None:
+    if points > MOST_POINTS or curves > MOST_CURVES:
+        what = f"has {curves:,} curves with {points:,} points, more than {MOST_CURVES:,} with {MOST_POINTS:,}"
+        raise InputError(what, where=path, hint="save fewer curves, or fewer points of each")
+
+
+def _curve(run: list[list[float]], number: int, path: Path) -> Curve:
+    control = np.array(run)
     if len(control) < LEAST_POINTS:
         what = f"curve {number} has {len(control)} points, fewer than {LEAST_POINTS}"
         raise InputError(what, where=path)
