@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import data_sha256, file_sha256
 from mbtf_gen.tile.fiber_tile import FiberScattering, FiberTile
 from mbtf_gen.tile.fibers.cloth_file import ClothFile, YarnEntry
-from mbtf_gen.tile.fibers.curves import F64, Curve, read_curves
+from mbtf_gen.tile.fibers.curve_file import read_curves
+from mbtf_gen.tile.fibers.curves import F64, LONGEST_SEGMENT, THINNEST, Bundle, Curve
 from mbtf_gen.tile.fibers.weave import knitted_lines, parse_draft, read_pattern, woven_lines
 from mbtf_gen.tile.fibers.yarn import YARNS, CrossSection, YarnModel, count_segments, fibers_of, roughness_of
 
@@ -26,6 +27,8 @@ _AT_BORDER = 2e-3
 _MOST_CROSSINGS = 1 << 16
 # Periods that one fiber may reach over.
 _MOST_PERIODS = 16
+# Longer side of a tile over the shorter one.
+_MOST_ASPECT = 64
 # Spline segments of one period: they take two gigabytes.
 MOST_SEGMENTS = 4_000_000
 
@@ -55,6 +58,7 @@ def cloth_tile(spec: ClothFile, folder: Path) -> FiberTile:
     # What the defaults stand for changes the data as well.
     settings = spec.model_dump(mode="json", exclude={"pattern", "curves"})
     settings["scattering"] = asdict(tile.scattering)
+    settings["longest_segment"] = LONGEST_SEGMENT
     settings["yarns"] = [asdict(YARNS[entry.type]) for entry in (spec.yarn, spec.weft) if entry is not None]
     digests["settings"] = data_sha256(settings)
     kind = next(key for key in ("weave", "knit", "pattern", "curves") if getattr(spec, key) is not None)
@@ -63,30 +67,27 @@ def cloth_tile(spec: ClothFile, folder: Path) -> FiberTile:
         f"fibers: {len(tile.curves):,} with {tile.segments:,} segments ({kind}{named}), "
         f"{tile.thickness:.3g} tile widths thick"
     )
-    warnings: tuple[str, ...] = ()
-    if kind == "curves" and (loose := loose_ends(tile)):
-        what = f"{loose} ends at the border have no partner on the opposite side"
-        warnings = (f"{files[kind]}: {what}: the tile has a seam; check 'period'",)
-    return replace(
-        tile, files=files, digests=digests, warnings=warnings, notes=(note,), resolution=spec.resolution
-    )
+    return replace(tile, files=files, digests=digests, notes=(note,), resolution=spec.resolution)
 
 
 def _fibers(spec: ClothFile, folder: Path) -> FiberTile:
     rng = np.random.default_rng(spec.seed)
+    where = folder
     if spec.curves is not None:
         return _of_curves(spec, folder / spec.curves)
     if spec.pattern is not None:
-        aspect, yarns = _of_pattern(spec, folder / spec.pattern)
+        where = folder / spec.pattern
+        aspect, yarns = _of_pattern(spec, where)
     elif spec.knit is not None:
         aspect, yarns = _knitted(spec)
     else:
         aspect, yarns = _woven(spec)
+    _check_aspect(aspect, where)
     total = sum(count_segments(line, section, _model(entry)) for line, section, entry, _ in yarns)
     if not total <= MOST_SEGMENTS:
         raise InputError(
             f"would have {total:.2g} fiber segments, more than {MOST_SEGMENTS:,}",
-            where=folder,
+            where=where,
             hint="take fewer repeats or fibers, or wider yarns",
         )
     curves: list[Curve] = []
@@ -96,8 +97,7 @@ def _fibers(spec: ClothFile, folder: Path) -> FiberTile:
         curves += fibers
         kind += [color] * len(fibers)
     colors = [spec.yarn.color] if spec.weft is None else [spec.yarn.color, spec.weft.color]
-    tile = FiberTile.settled(aspect, curves, np.array(kind), np.array(colors), _scattering(spec))
-    return _checked(tile, folder)
+    return _settled(aspect, curves, np.array(kind), np.array(colors), spec, where)
 
 
 _Yarn = tuple[Curve, CrossSection, YarnEntry, int]
@@ -135,19 +135,48 @@ def _of_pattern(spec: ClothFile, path: Path) -> tuple[float, list[_Yarn]]:
     return pattern.aspect, [(line, section, spec.yarn, 0) for line in lines]
 
 
-def _checked(tile: FiberTile, where: Path) -> FiberTile:
-    """The tile, unless fibers are thicker than a period or reach over many: tracing would never end."""
-    size = np.array([1.0, tile.aspect])
-    for curve in tile.curves:
-        points = curve.unrolled()
-        reach = np.ptp(points[:, :2], axis=0) + 2.0 * points[:, 3].max()
-        if not (reach <= _MOST_PERIODS * size).all():
-            raise InputError(
-                f"a fiber reaches over {np.max(reach / size):.3g} periods, more than {_MOST_PERIODS}",
-                where=where,
-                hint="check radii, widths and the period",
-            )
-    return tile
+def _check_aspect(aspect: float, where: Path) -> None:
+    if not 1 / _MOST_ASPECT <= aspect <= _MOST_ASPECT:
+        raise InputError(
+            f"the tile would be 1 x {aspect:.4g}; a side may be {_MOST_ASPECT} times as long as the other",
+            where=where,
+            hint="check the period, or the rows of the weave",
+        )
+
+
+def _settled(
+    aspect: float, curves: list[Curve], kind: NDArray[np.int_], colors: F64, spec: ClothFile, where: Path
+) -> FiberTile:
+    """The tile with its fibers below the reference plane, unless they are too thick, too thin, or too many to
+    be traced."""
+    bundle, size = Bundle(curves), np.array([1.0, aspect])
+    points, starts = bundle.points, bundle.starts
+    span = np.maximum.reduceat(points[:, :2], starts) - np.minimum.reduceat(points[:, :2], starts)
+    reach = (span + 2.0 * np.maximum.reduceat(points[:, 3:], starts)) / size
+    # Tracing would never end.
+    if not reach.max() <= _MOST_PERIODS:
+        raise InputError(
+            f"a fiber reaches over {reach.max():.3g} periods, more than {_MOST_PERIODS}",
+            where=where,
+            hint="check radii, widths and the period",
+        )
+    low, high = bundle.heights()
+    radius, least = points[:, 3].min(), THINNEST * max(1.0, aspect, high - low)
+    if radius < least:
+        raise InputError(
+            f"a fiber has a radius of {radius:.2g} tile widths; rays miss those thinner than {least:.2g}",
+            where=where,
+            hint="set a larger 'yarn.radius', which is a factor, or make a smaller tile",
+        )
+    total = float(np.exp2(bundle.halvings()) @ np.bincount(bundle.owner))
+    if total > MOST_SEGMENTS:
+        raise InputError(
+            f"has {total:.3g} fiber segments of at most {LONGEST_SEGMENT:g} radii, more than "
+            f"{MOST_SEGMENTS:,}",
+            where=where,
+            hint="take fewer or thicker fibers, or a smaller tile",
+        )
+    return FiberTile.settled(aspect, curves, kind, colors, _scattering(spec))
 
 
 def _section(entry: YarnEntry, space: float, width: float, height: float, flat: bool) -> CrossSection:
@@ -177,8 +206,10 @@ def _scattering(spec: ClothFile) -> FiberScattering:
 
 
 def _of_curves(spec: ClothFile, path: Path) -> FiberTile:
-    curves = read_curves(path)
-    low, high = _bounds(curves)
+    curves, deviation = read_curves(path)
+    bundle = Bundle(curves)
+    ends = np.concatenate([bundle.at(v)[0][:, :3] for v in (0.0, 1.0)])
+    low, high = ends.min(axis=0), ends.max(axis=0)
     width, height = spec.period or (high[0] - low[0], high[1] - low[1])
     if not (width > 0 and height > 0):
         raise InputError("its curves have no extent along x or y", where=path, hint="give their 'period'")
@@ -188,6 +219,7 @@ def _of_curves(spec: ClothFile, path: Path) -> FiberTile:
             where=path,
             hint="check 'period'",
         )
+    _check_aspect(height / width, path)
     radius = _CURVE_RADIUS * spec.yarn.radius
     out = []
     for curve in curves:
@@ -195,24 +227,30 @@ def _of_curves(spec: ClothFile, path: Path) -> FiberTile:
         control[:, :3] = (control[:, :3] - low) / width
         control[:, 3] = np.where(control[:, 3] > 0, control[:, 3] / width * spec.yarn.radius, radius)
         out.append(replace(curve, control=control))
-    kind = np.zeros(len(out), int)
     colors = np.array([spec.yarn.color])
-    return _checked(FiberTile.settled(height / width, out, kind, colors, _scattering(spec)), path)
-
-
-def _bounds(curves: Sequence[Curve]) -> tuple[F64, F64]:
-    points = np.concatenate([curve.at(np.arange(len(curve.windows()) + 1.0))[0][:, :3] for curve in curves])
-    return points.min(axis=0), points.max(axis=0)
+    tile = _settled(height / width, out, np.zeros(len(out), int), colors, spec, path)
+    warnings = []
+    if deviation / width > radius:
+        what = f"splines deviate from its curves by up to {deviation / width:.2g} tile widths"
+        warnings.append(f"{path}: {what}, more than the radius; give more points")
+    if loose := loose_ends(tile):
+        what = f"{loose} ends at the border have no partner on the opposite side"
+        warnings.append(f"{path}: {what}: the tile has a seam; check 'period'")
+    return replace(tile, warnings=tuple(warnings))
 
 
 def loose_ends(tile: FiberTile) -> int:
     """Number of curves' ends on the tile's border that no end on the opposite side continues."""
-    ends = [c.at(np.array([0.0, len(c.windows())])) for c in tile.curves if c.shift is None]
-    if not ends:
+    opened = [curve for curve in tile.curves if curve.shift is None]
+    if not opened:
         return 0
     from scipy.spatial import cKDTree
 
-    end, slope = (np.concatenate([both[k] for both in ends]) for k in (0, 1))
+    bundle = Bundle(opened)
+    start = bundle.starts - 3 * np.arange(len(opened))
+    stop = np.append(start[1:], len(bundle.owner)) - 1
+    sides = zip(bundle.at(0.0), bundle.at(1.0), strict=True)
+    end, slope = (np.concatenate([first[start], last[stop]]) for first, last in sides)
     loose = 0
     for axis, size in enumerate((1.0, tile.aspect)):
         # A curve crosses the border that it runs towards.
@@ -222,7 +260,8 @@ def loose_ends(tile: FiberTile) -> int:
             loose += len(low) + len(high)
             continue
         other, box = 1 - axis, [(1.0, tile.aspect)[1 - axis], 0.0]
-        places = [np.column_stack([side[:, other] % box[0], side[:, 2]]) for side in (low, high)]
+        # The remainder of -1e-17 is the period itself.
+        places = [np.column_stack([side[:, other] % box[0] % box[0], side[:, 2]]) for side in (low, high)]
         near, index = cKDTree(places[1], boxsize=box).query(places[0], distance_upper_bound=_AT_BORDER)
         # Each end continues at most one of the other side.
         loose += len(low) + len(high) - 2 * len(np.unique(index[np.isfinite(near)]))

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_gen.config.generator import GeometrySection
-from mbtf_gen.tile.fibers.curves import F64, Curve, copies
+from mbtf_gen.tile.fibers.curves import F64, Bundle, Curve
 from mbtf_gen.tile.protocol import REFLECTION, Tile
 from mbtf_gen.tile.tracers.protocol import TileGeometry
 
@@ -91,25 +91,30 @@ class FiberTile(Tile):
         colors: F64,
         scattering: FiberScattering = FiberScattering(),
     ) -> FiberTile:
-        """The tile with its fibers moved up or down until the highest touches the reference plane."""
-        top = max(curve.heights()[1] for curve in curves)
+        """The tile with its fibers moved up or down until the highest touches the reference plane. Segments
+        that are long for their radius are halved."""
+        fine = []
+        for curve, times in zip(curves, Bundle(curves).halvings(), strict=True):
+            for _ in range(times):
+                curve = curve.halved()
+            fine.append(curve)
+        _, top = Bundle(fine).heights()
         down = np.array([0.0, 0.0, -top])
-        return cls(aspect, [curve.moved(down) for curve in curves], yarn, colors, scattering)
+        return cls(aspect, [curve.moved(down) for curve in fine], yarn, colors, scattering)
 
     @cached_property
     def thickness(self) -> float:
         """Height of the fibers' slab, in tile widths."""
-        return -min(curve.heights()[0] for curve in self.curves)
+        return 0.0 - Bundle(self.curves).heights()[0]
 
     @property
     def segments(self) -> int:
         """Number of spline segments of one period."""
-        return sum(len(curve.unrolled()) - 3 for curve in self.curves)
+        return sum(len(curve.control) - (3 if curve.shift is None else 0) for curve in self.curves)
 
     def runs(self) -> tuple[list[F64], NDArray[np.int_]]:
         """Runs of control points (m, 4) that reach into the box [0, 1] x [0, aspect], with their fibers."""
-        found = [(run, k) for k, curve in enumerate(self.curves) for run in copies(curve, (1.0, self.aspect))]
-        return [run for run, _ in found], np.array([k for _, k in found])
+        return Bundle(self.curves).copies((1.0, self.aspect))
 
     def trace(self, unit: float, below: bool = False) -> TileGeometry:
         """The fibers as rays meet them."""
@@ -187,8 +192,9 @@ class FiberTile(Tile):
         """Statistics as plain data; lengths are in tile widths."""
         self.configured(options)
         radii = np.concatenate([curve.control[:, 3] for curve in self.curves])
-        slopes = [curve.at(np.arange(4 * len(curve.windows())) / 4.0)[1] for curve in self.curves]
-        length = sum(float(np.linalg.norm(slope[:, :3], axis=1).sum()) / 4.0 for slope in slopes)
+        bundle = Bundle(self.curves)
+        slopes = [bundle.at(v)[1][:, :3] for v in (0.0, 0.25, 0.5, 0.75)]
+        length = float(np.mean([np.linalg.norm(slope, axis=1).sum() for slope in slopes]))
         volume = np.pi * float(np.mean(radii**2)) * length / (self.aspect * self.thickness)
         return {
             "resolution": self.lattice(finest).shape()[1],

@@ -12,7 +12,7 @@ from mbtf_gen.config.generator import Positive, Resolution, Rgb, no_tiling
 from mbtf_gen.tile.fibers.yarn import YarnName
 
 # Files that can be given in place of a material file, by suffix, with the key that names them there.
-CURVE_FILES = {".pyp": "pattern", ".bcc": "curves", ".curves": "curves"}
+CURVE_FILES = {".pyp": "pattern", ".bcc": "curves", ".curves": "curves", ".txt": "curves"}
 # Exactly one of them describes the cloth.
 CLOTH_KEYS = {"weave", "knit", "pattern", "curves"}
 
@@ -78,7 +78,9 @@ class ClothFile(Settings):
     )
     knit: KnitEntry | None = Field(None, description="a stockinette")
     pattern: FileName | None = Field(None, description="a periodic yarn pattern (.pyp)")
-    curves: FileName | None = Field(None, description="fibers as curves: .bcc, or Mitsuba's text (.curves)")
+    curves: FileName | None = Field(
+        None, description="fibers as curves: .bcc, or text of Mitsuba's bsplinecurve (.curves, .txt)"
+    )
     repeat: Annotated[int, Field(ge=1, le=64)] = Field(
         1, description="repeats of a weave along each side of the tile, with other fibers each"
     )

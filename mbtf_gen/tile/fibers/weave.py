@@ -11,11 +11,13 @@ import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
+from mbtf_gen.tile.fibers.curve_file import lines, numbers, opened
 from mbtf_gen.tile.fibers.curves import F64, LEAST_POINTS, Curve
 
 Draft = NDArray[np.bool_]
@@ -146,8 +148,8 @@ def knitted_lines(stitches: int, rows: int, aspect: float) -> list[Curve]:
 _SECTIONS = {"*pattern": 4, "*Q": 4, "*E": 4}
 # Periods that a yarn may reach over.
 _MOST_PERIODS = 16
-# Vertices of a pattern, which bounds what a damaged file may claim.
-_MOST_VERTICES = 10_000_000
+# Vertices of a pattern; each has some hundred segments of fibers.
+_MOST_VERTICES = 100_000
 
 
 @dataclass(frozen=True)
@@ -195,11 +197,8 @@ def read_pattern(path: Path) -> YarnPattern:
     InputError
         The file is unreadable or truncated, a number is not finite, or edges do not form closed yarns.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot be read as text: {error}", where=path) from None
-    rows = _sections(text, path)
+    with opened(path) as stream:
+        rows = _sections(stream, path)
     for name in _SECTIONS:
         if not rows.get(name):
             raise InputError(f"has no section '{name}'", where=path, hint="check that the file is complete")
@@ -228,30 +227,34 @@ def read_pattern(path: Path) -> YarnPattern:
     return YarnPattern(py / px, radius / px, px, tuple(yarns))
 
 
-def _sections(text: str, path: Path) -> dict[str, list[list[float]]]:
+def _sections(stream: BinaryIO, path: Path) -> dict[str, list[list[float]]]:
     """Rows of numbers of the sections that are read."""
     rows: dict[str, list[list[float]]] = {}
     section = ""
-    for number, line in enumerate(text.splitlines(), 1):
-        words = line.split("#")[0].split()
+    for number, line in lines(stream):
+        words = line.split(b"#")[0].split()
         if not words:
             continue
-        if words[0].startswith("*"):
-            section = words[0]
+        if words[0].startswith(b"*"):
+            section = words[0].decode("latin-1")
             continue
         if section not in _SECTIONS:
             continue
-        try:
-            values = [float(word) for word in words]
-        except ValueError:
-            values = []
+        values = numbers(words)
         if len(values) != _SECTIONS[section] or not all(map(math.isfinite, values)):
             raise InputError(
                 f"line {number} is not {_SECTIONS[section]} finite numbers",
                 where=path,
                 hint="check that the file is complete",
             )
-        rows.setdefault(section, []).append(values)
+        found = rows.setdefault(section, [])
+        found.append(values)
+        if len(found) > _MOST_VERTICES:
+            raise InputError(
+                f"has more than {_MOST_VERTICES:,} vertices",
+                where=path,
+                hint="save a smaller period, or fewer vertices",
+            )
     return rows
 
 

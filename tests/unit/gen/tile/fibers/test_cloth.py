@@ -13,6 +13,7 @@ from mbtf_core.errors import InputError, MbtfError, UsageError
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
 from mbtf_gen.tile.fiber_tile import FiberScattering, FiberTile, absorption
+from mbtf_gen.tile.fibers.curves import Bundle
 from mbtf_gen.tile.loading import load_material
 
 # Sum of all control points and radii of the basket weave.
@@ -44,7 +45,7 @@ def test_a_weave_has_the_yarns_of_its_draft(tmp_path: Path) -> None:
     assert len(found.curves) == 4 * 5 * 5
     assert np.bincount(found.yarn).tolist() == [60, 40]
     assert found.colors[1].tolist() == [0.2, 0.2, 0.2]
-    assert max(curve.heights()[1] for curve in found.curves) == pytest.approx(0.0, abs=1e-12)
+    assert Bundle(found.curves).heights()[1] == pytest.approx(0.0, abs=1e-12)
     repeated = fibers(tmp_path, "weave: plain\nrepeat: 3\nyarn: {fibers: 2, flyaways: 0}\n")
     assert len(repeated.curves) == 12 * 4 * 2
 

@@ -16,7 +16,7 @@ from mbtf_core.errors import InputError, MbtfError
 from mbtf_gen.config.generator import GeometrySection
 from mbtf_gen.tile.fiber_tile import FiberTile
 from mbtf_gen.tile.fibers.cloth_file import CURVE_FILES
-from mbtf_gen.tile.fibers.curves import read_curves
+from mbtf_gen.tile.fibers.curve_file import read_curves
 from mbtf_gen.tile.fibers.weave import read_pattern
 from mbtf_gen.tile.loading import load_material
 
@@ -121,7 +121,7 @@ def test_a_bcc_has_open_and_closed_curves_through_its_points(tmp_path: Path) -> 
     path = tmp_path / "a.bcc"
     for up in (2, 1):
         path.write_bytes(bcc([(points, False), (ring, True)], up))
-        first, second = read_curves(path)
+        (first, second), _ = read_curves(path)
         order = [0, 1, 2] if up == 2 else [2, 0, 1]
         assert first.shift is None
         assert second.shift is not None
@@ -153,7 +153,7 @@ def test_the_deviation_from_catmull_rom_curves_is_told(
 def test_text_has_control_points_and_radii(tmp_path: Path) -> None:
     path = tmp_path / "a.curves"
     path.write_text(CURVES)
-    first, second = read_curves(path)
+    (first, second), _ = read_curves(path)
     assert (len(first.control), len(second.control)) == (4, 5)
     assert second.control[4].tolist() == [4, 1, 0, 0.2]
 

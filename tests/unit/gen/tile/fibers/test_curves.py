@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline
 
-from mbtf_gen.tile.fibers.curves import Curve, closed_frames, copies, interpolating, level_frames
+from mbtf_gen.tile.fibers.curves import Bundle, Curve, closed_frames, interpolating, level_frames
 
 SHIFT = np.array([1.0, 0.0, 0.0])
 
@@ -50,7 +50,7 @@ def test_copies_cover_the_box_exactly(aspect: float, kind: str) -> None:
     curve = wavy(shift=shift)
     if kind == "open":
         curve = Curve(curve.unrolled())
-    runs = list(copies(curve, (1.0, aspect)))
+    runs, _ = Bundle([curve]).copies((1.0, aspect))
     segments = np.concatenate(
         [np.lib.stride_tricks.sliding_window_view(run, 4, axis=0).transpose(0, 2, 1) for run in runs]
     )
@@ -86,5 +86,5 @@ def test_frames_close_and_turn_little() -> None:
 def test_heights_bound_the_tube() -> None:
     t = 2.0 * np.pi * np.arange(16) / 16
     ring = Curve.through(np.column_stack([0.1 * np.cos(t), np.zeros(16), 0.1 * np.sin(t)]), 0.02, np.zeros(3))
-    low, high = ring.heights()
+    low, high = Bundle([ring]).heights()
     assert (low, high) == pytest.approx((-0.12, 0.12), abs=1e-4)
