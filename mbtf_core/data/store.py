@@ -21,15 +21,19 @@ from typing import Any, Protocol, TypeVar
 from urllib.parse import unquote
 
 from mbtf_core.errors import EngineError, InputError, PartialError, UsageError, reason
-from mbtf_core.files.atomic import create_file, remove_file, write_chunks
+from mbtf_core.files.atomic import create_file, file_sha256, remove_file, write_chunks
 from mbtf_core.files.folders import make_folder
 from mbtf_core.paths import refuse_special, split_url
+from mbtf_core.timeouts import NoAnswer, call_within
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
 
-# Seconds from the first failure of a request to the last attempt; the environment variable overrides them.
-PATIENCE_VARIABLE, PATIENCE_SECONDS = "MBTF_STORE_PATIENCE", 60.0
+# Seconds in which a request must be answered, and from its first failure to its last attempt; the environment
+# variable overrides them.
+PATIENCE_VARIABLE, PATIENCE_SECONDS = "MBTF_STORE_PATIENCE", 30.0
+# An answer may take a second at least. So many bytes may take as long again.
+_LEAST_SECONDS, _BLOCK_BYTES = 1.0, 8 << 20
 # First pause between two attempts, and the longest one; each is twice as long as the one before.
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.5, 10.0
 # Packages of protocols that the extra `stores` leaves out.
@@ -124,7 +128,7 @@ class LocalStore:
 
 class ObjectStore:
     """The objects of one folder of an object store; see :class:`Store`. A request whose connection drops is
-    tried again with growing pauses until the patience ends.
+    tried again with growing pauses until the patience ends. One that is not answered is given up.
 
     Parameters
     ----------
@@ -134,10 +138,19 @@ class ObjectStore:
     ------
     EngineError : the package of the protocol is not installed
     InputError : the URL is invalid
+    PartialError : the store does not answer
     """
 
     def __init__(self, url: str) -> None:
         self.url = url
+        try:
+            self.patience = float(os.environ.get(PATIENCE_VARIABLE) or PATIENCE_SECONDS)
+        except ValueError:
+            raise UsageError("must be a number of seconds", where=PATIENCE_VARIABLE) from None
+        # Set once the patience has ended: requests of other threads do not wait for it again.
+        self._lost = threading.Event()
+        # Bytes of objects, as last listed.
+        self._sizes: dict[str, int] = {}
         try:
             import fsspec
         except ImportError:
@@ -148,7 +161,8 @@ class ObjectStore:
             ) from None
         protocol = url.partition("://")[0]
         try:
-            self._files, root = fsspec.url_to_fs(url, use_listings_cache=False)
+            # Some protocols connect at once.
+            self._files, root = self._answer(url, 0, lambda: fsspec.url_to_fs(url, use_listings_cache=False))
         except ImportError as error:
             package = "'mbtf[stores]'" if protocol in ("s3", "s3a") else _PACKAGES.get(protocol)
             hint = f"pip install {package}" if package else "install it with pip"
@@ -157,18 +171,30 @@ class ObjectStore:
             raise InputError(f"cannot be opened ({reason(error)})", where=url) from None
         self._root = str(root).rstrip("/")
         _quiet(self._files)
-        try:
-            self.patience = float(os.environ.get(PATIENCE_VARIABLE) or PATIENCE_SECONDS)
-        except ValueError:
-            raise UsageError("must be a number of seconds", where=PATIENCE_VARIABLE) from None
-        # Set once the patience has ended: requests of other threads do not wait for it again.
-        self._lost = threading.Event()
 
     def _at(self, name: str) -> str:
         return f"{self._root}/{name}"
 
-    def _request(self, name: str, function: Callable[[], T]) -> T:
+    def _answer(self, where: str, size: int, function: Callable[[], T]) -> T:
+        """Result of one attempt, which moves so many bytes; a PartialError where it is not answered."""
+        patience = _LEAST_SECONDS if self._lost.is_set() else max(self.patience, _LEAST_SECONDS)
+        try:
+            return call_within(patience * (1 + size / _BLOCK_BYTES), function)
+        except NoAnswer as error:
+            self._lost.set()
+            raise PartialError(
+                f"the store does not answer ({reason(error)})",
+                where=where,
+                hint=f"check the endpoint and the network, or wait longer: {PATIENCE_VARIABLE}=300",
+            ) from None
+
+    def _request(self, name: str, function: Callable[[], T], size: int = 0) -> T:
         """Result of a request, tried again where the connection fails.
+
+        Parameters
+        ----------
+        name : of the object; empty for the folder
+        size : bytes that the request moves
 
         Raises
         ------
@@ -180,12 +206,14 @@ class ObjectStore:
         pause, give_up = _FIRST_PAUSE, 0.0
         while True:
             try:
-                result = function()
+                result = self._answer(where, size, function)
                 self._lost.clear()
                 return result
             except (FileNotFoundError, FileExistsError):
                 # The store has answered.
                 self._lost.clear()
+                raise
+            except PartialError:
                 raise
             except Exception as error:
                 if _is_refusal(error):
@@ -226,11 +254,13 @@ class ObjectStore:
             if name and parent.lstrip("/") == self._root.lstrip("/"):
                 is_folder = info["type"] == "directory"
                 out[name + "/" * is_folder] = StoredFile(int(info.get("size") or 0), _tag(info))
+        self._sizes = {name: file.size for name, file in out.items()}
         return out
 
     def read(self, name: str) -> bytes:
         """Content of an object; a FileNotFoundError where there is none."""
-        return bytes(self._request(name, lambda: self._files.cat_file(self._at(name))))
+        size = self._sizes.get(name, 0)
+        return bytes(self._request(name, lambda: self._files.cat_file(self._at(name)), size))
 
     def write(self, name: str, content: bytes, *, new: bool = False) -> bool:
         """Write an object whole; False where `new`, and another one has that name.
@@ -256,7 +286,7 @@ class ObjectStore:
             self._files.pipe_file(self._at(name), content)
 
         try:
-            self._request(name, request)
+            self._request(name, request, len(content))
         except FileExistsError:
             # An attempt whose answer was lost may have written it.
             return self.read(name) == content
@@ -276,7 +306,7 @@ class FileCache:
     """Whole files by their SHA-256, which all processes of a user share: at most `limit` bytes of them, but
     at least the few that were fetched last.
 
-    A file is complete once it has its name, and never changes. The files that were used least recently make
+    A file is complete once it has its name. One that has changed since is read again. The files that were used least recently make
     room for new ones. A mapped file stays readable after it has been removed.
 
     Parameters
@@ -291,9 +321,11 @@ class FileCache:
         self._guard = threading.Lock()
         self._locks: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
         self._recent: deque[str] = deque(maxlen=_KEPT)
+        # Files whose digest this process has checked, as they were then.
+        self._checked: dict[str, tuple[int, ...]] = {}
 
     def fetch(self, sha256: str, suffix: str, size: int, read: Callable[[], bytes]) -> Path:
-        """The file with a digest; read and checked if it is missing.
+        """The file with a digest; read if it is missing or damaged.
 
         Parameters
         ----------
@@ -316,9 +348,10 @@ class FileCache:
                     self._recent.remove(path.name)
                 self._recent.append(path.name)
             with contextlib.suppress(OSError):
-                if path.stat().st_size == size:
+                if path.stat().st_size == size and self._is_intact(path, sha256):
                     # Its age is the time since it was used.
                     os.utime(path)
+                    self._checked[path.name] = _state(path)
                     return path
             make_folder(self.folder)
             self._make_room(size)
@@ -326,7 +359,12 @@ class FileCache:
             if hashlib.sha256(content).hexdigest() != sha256:
                 raise InputError("has changed since it was written (SHA-256 differs)")
             write_chunks(path, [content])
+            self._checked[path.name] = _state(path)
             return path
+
+    def _is_intact(self, path: Path, sha256: str) -> bool:
+        """Whether a cached file has its digest; it is read once, and again after each change."""
+        return self._checked.get(path.name) == _state(path) or file_sha256(path) == sha256
 
     def _make_room(self, size: int) -> None:
         """Remove files until `size` bytes more fit."""
@@ -349,6 +387,12 @@ class FileCache:
                 with contextlib.suppress(OSError):
                     os.unlink(self.folder / name)
                     total -= bytes_
+
+
+def _state(path: Path) -> tuple[int, ...]:
+    """Changes when a file is replaced or written to."""
+    stat = path.stat()
+    return stat.st_ino, stat.st_size, stat.st_mtime_ns
 
 
 def open_store(where: str | Path) -> Store:

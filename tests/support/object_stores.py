@@ -79,6 +79,25 @@ class Proxy:
 
 
 @contextlib.contextmanager
+def silent_server() -> Iterator[int]:
+    """Port of a server on the loopback interface that accepts connections and never answers."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        accepted: list[socket.socket] = []
+
+        def accept() -> None:
+            with contextlib.suppress(OSError):
+                while True:
+                    accepted.append(listener.accept()[0])
+
+        threading.Thread(target=accept, daemon=True).start()
+        try:
+            yield int(listener.getsockname()[1])
+        finally:
+            for connection in accepted:
+                connection.close()
+
+
+@contextlib.contextmanager
 def s3_server(folder: Path) -> Iterator[Proxy]:
     """An empty bucket behind a proxy. This process and its children find it, and have a cache of their own in
     `folder`."""

@@ -52,6 +52,19 @@ def test_the_files_fetched_last_stay(tmp_path: Path) -> None:
     assert not fetch(cache, 8)
 
 
+def test_a_damaged_copy_is_downloaded_again(tmp_path: Path) -> None:
+    fetch(FileCache(tmp_path), 1)
+    (path,) = tmp_path.iterdir()
+    kept = FileCache(tmp_path)
+    assert not fetch(kept, 1)
+    # Another process has not read it yet; this one sees that it has changed.
+    for cache in (FileCache(tmp_path), kept):
+        path.write_bytes(b"x" + content(1)[1:])
+        os.utime(path, (1, 1))
+        assert fetch(cache, 1)
+        assert not fetch(cache, 1)
+
+
 def test_another_digest_is_refused(tmp_path: Path) -> None:
     cache = FileCache(tmp_path)
     with pytest.raises(InputError, match="SHA-256"):

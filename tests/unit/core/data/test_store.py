@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support.object_stores import memory_store
+from support.object_stores import memory_store, silent_server
 
 import mbtf_core.data.store
 from mbtf_core.data.store import ObjectStore
@@ -154,6 +154,34 @@ def test_a_store_that_is_gone_is_given_up(store: ObjectStore, monkeypatch: pytes
     store._files.left = 0
     assert store.list() == {}
     assert not store._lost.is_set()
+
+
+def test_a_store_that_never_answers_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip(
+        "s3fs", reason="no s3fs; to enable: pip install 'mbtf[stores]'"
+    ).S3FileSystem.clear_instance_cache()
+    with silent_server() as port:
+        for name, value in (("ACCESS_KEY_ID", "x"), ("SECRET_ACCESS_KEY", "x"), ("DEFAULT_REGION", "x")):
+            monkeypatch.setenv(f"AWS_{name}", value)
+        monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{port}")
+        monkeypatch.setenv("MBTF_STORE_PATIENCE", "1")
+        store = ObjectStore("s3://bucket/data")
+        for request in (store.list, lambda: store.read("a"), lambda: store.write("a", b"one", new=True)):
+            with pytest.raises(PartialError, match=r"s3://bucket/data.*not answer") as caught:
+                request()
+            assert "MBTF_STORE_PATIENCE" in caught.value.hint
+
+
+def test_large_objects_may_take_longer(store: ObjectStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    limits = []
+    monkeypatch.setattr(
+        mbtf_core.data.store, "call_within", lambda limit, call: limits.append(limit) or call()
+    )
+    content = bytes(16 << 20)
+    store.write("a", content)
+    store.list()
+    assert store.read("a") == content
+    assert limits == [180.0, 60.0, 180.0]
 
 
 NoCredentialsError = type("NoCredentialsError", (Exception,), {})
