@@ -39,6 +39,7 @@ from numpy.typing import NDArray
 from mbtf_core.errors import InputError, MbtfError, reason
 from mbtf_core.paths import refuse_special, suggest_path
 from mbtf_gen.measured.interface import (
+    COMPLETE,
     F32,
     HORIZON,
     I64,
@@ -57,6 +58,8 @@ _OTHER_LIGHT = "ground_light_dir"
 CHANNELS = {COLOR: 3, PLACE: 2, RADIUS: 1, VIEW: 2, LIGHT: 2}
 # Most queries of an image of NeuMIP, which is read as a whole.
 MOST_OF_IMAGE = 1 << 24
+# Filters that every HDF5 library has: deflate (gzip), shuffle, Fletcher's checksum; and LZF of h5py.
+_FILTERS = (1, 2, 3, 32000)
 # Largest chunk, which is the least that the library decompresses at a time.
 _MOST_CHUNK_BYTES = 1 << 28
 
@@ -80,9 +83,7 @@ def opened(path: Path) -> Iterator[Any]:
     except MbtfError:
         raise
     except Exception as error:  # a damaged file may make the library raise anything
-        raise InputError(
-            f"cannot be read as HDF5 ({reason(error)})", where=path, hint="check that the file is complete"
-        ) from None
+        raise InputError(f"cannot be read as HDF5 ({reason(error)})", where=path, hint=COMPLETE) from None
 
 
 def data_set(file: Any, name: str, path: Path) -> Any:
@@ -103,8 +104,12 @@ def data_set(file: Any, name: str, path: Path) -> Any:
         raise InputError(f"has {found.dtype} numbers in '{name}'; floats are expected", where=path)
     if not found.shape or min(found.shape) < 1:
         raise InputError(f"has the shape {found.shape} of '{name}'", where=path)
-    if found.compression not in (None, "gzip", "lzf"):
-        raise InputError(f"has '{name}' compressed by '{found.compression}'", where=path)
+    properties = found.id.get_create_plist()
+    filters = [properties.get_filter(k) for k in range(properties.get_nfilters())]
+    foreign = next((f for f in filters if f[0] not in _FILTERS), None)
+    if foreign is not None:
+        what = f"has '{name}' stored by the HDF5 filter {foreign[0]} ({reason(foreign[3].decode('latin-1'))})"
+        raise InputError(what, where=path, hint="store it with gzip or without: h5repack -f GZIP=4 IN OUT")
     if found.chunks is None:
         unit, total, stored = "bytes", found.size * found.dtype.itemsize, found.id.get_storage_size()
     else:

@@ -249,8 +249,10 @@ def test_what_cannot_be_exported(tmp_path: Path) -> None:
 
 def test_files_of_no_known_kind(tmp_path: Path) -> None:
     for content, message in (
-        (b"", "known kind"),
+        (b"", "is empty"),
         (b"hello", "known kind"),
+        (b"\xef\xbb\xbf\n <!DOCTYPE html><title>Quota exceeded", "web page"),
+        (b"Rar!\x1a\x07\x00", "unpack it"),
         (b"!ABC", "DFMF08FCR"),
         (b"PK", "zip"),
     ):
