@@ -57,11 +57,11 @@ _OTHER_LIGHT = "ground_light_dir"
 # Numbers of a query of NeuMIP.
 CHANNELS = {COLOR: 3, PLACE: 2, RADIUS: 1, VIEW: 2, LIGHT: 2}
 # Most queries of an image of NeuMIP, which is read as a whole.
-MOST_OF_IMAGE = 1 << 24
-# Filters that every HDF5 library has: deflate (gzip), shuffle, Fletcher's checksum; and LZF of h5py.
-_FILTERS = (1, 2, 3, 32000)
+MOST_OF_IMAGE = 1 << 22
 # Largest chunk, which is the least that the library decompresses at a time.
 _MOST_CHUNK_BYTES = 1 << 28
+# Largest size of the numbers of a data set: as a ratio to the size of the file, and what any file may have.
+_MOST_RATIO, _ANY_FILE_BYTES = 100, 1 << 26
 
 
 @contextmanager
@@ -78,7 +78,8 @@ def opened(path: Path) -> Iterator[Any]:
     if not path.is_file():
         raise InputError("no such file", where=path, hint=suggest_path(path))
     try:
-        with h5py.File(path, "r") as file:
+        # A chunk that images share is decompressed once.
+        with h5py.File(path, "r", rdcc_nbytes=_MOST_CHUNK_BYTES) as file:
             yield file
     except MbtfError:
         raise
@@ -104,9 +105,13 @@ def data_set(file: Any, name: str, path: Path) -> Any:
         raise InputError(f"has {found.dtype} numbers in '{name}'; floats are expected", where=path)
     if not found.shape or min(found.shape) < 1:
         raise InputError(f"has the shape {found.shape} of '{name}'", where=path)
+    size, stored = found.size * found.dtype.itemsize, path.stat().st_size
+    if size > _MOST_RATIO * stored + _ANY_FILE_BYTES:
+        what = f"claims {size:,} bytes of '{name}' in a file of {stored:,}"
+        raise InputError(what, where=path, hint=COMPLETE)
     properties = found.id.get_create_plist()
     filters = [properties.get_filter(k) for k in range(properties.get_nfilters())]
-    foreign = next((f for f in filters if f[0] not in _FILTERS), None)
+    foreign = next((f for f in filters if not h5py.h5z.filter_avail(f[0])), None)
     if foreign is not None:
         what = f"has '{name}' stored by the HDF5 filter {foreign[0]} ({reason(foreign[3].decode('latin-1'))})"
         raise InputError(what, where=path, hint="store it with gzip or without: h5repack -f GZIP=4 IN OUT")
