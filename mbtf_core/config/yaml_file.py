@@ -13,7 +13,10 @@ from mbtf_core.errors import InputError, reason
 from mbtf_core.paths import refuse_special, suggest_path
 
 # Bounds on the length, the depth and (because of YAML's aliases) the number of values of a configuration.
-_MAX_CHARACTERS = 1 << 18
+_MAX_CHARACTERS = 1 << 17
+# The reader takes up to a millisecond for each line, colon and comma, and for each key that is merged (<<).
+_MAX_MARKS = 10_000
+_MAX_MERGED = 200_000
 _MAX_DEPTH = 100
 _MAX_VALUES = 100_000
 _TOO_DEEP = f"is nested more than {_MAX_DEPTH} levels deep"
@@ -39,26 +42,29 @@ def read_yaml(path: Path) -> Any:
     InputError : the file is missing, unreadable, not YAML, or not a mapping
     """
     from ruamel.yaml.error import MarkedYAMLError
+    from ruamel.yaml.reader import ReaderError
 
-    refuse_special(path)
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise InputError("no such file", where=path, hint=suggest_path(path, _is_yaml)) from None
-    except UnicodeDecodeError as error:
-        raise InputError(f"is not UTF-8 text (byte {error.start})", where=path) from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"cannot be read ({getattr(error, 'strerror', error)})", where=path) from None
+    text = _text_of(path)
     if len(text) > _MAX_CHARACTERS:
         raise InputError(f"is too long: more than {_MAX_CHARACTERS:,} characters", where=path)
-    if _bracket_depth(text) > _MAX_DEPTH:
-        raise InputError(_TOO_DEEP, where=path)
+    marks = sum(text.count(mark) for mark in ("\n", ":", ","))
+    if marks > _MAX_MARKS:
+        raise InputError(f"is too long: more than {_MAX_MARKS:,} lines, colons and commas", where=path)
+    if "<<" in text and text.count("*") * marks > _MAX_MERGED:
+        raise InputError("merges (<<) too many keys", where=path)
+    bracket = _deep_bracket(text)
+    if bracket is not None:
+        raise InputError(_TOO_DEEP, where=_place(path, text, bracket))
     try:
         data = _yaml().load(text)
     except MarkedYAMLError as error:
         mark = error.problem_mark
         line = f":{mark.line + 1}" if mark is not None else ""
         raise InputError(f"not valid YAML ({reason(error.problem)})", where=f"{path}{line}") from None
+    except ReaderError as error:
+        what = f"has the control character U+{ord(text[error.position]):04X}"
+        where = _place(path, text, error.position)
+        raise InputError(what, where=where, hint="save it as UTF-8 text") from None
     except RecursionError:
         raise InputError(_TOO_DEEP, where=path) from None
     except Exception as error:  # the reader turns scalars into numbers and dates, and may raise anything
@@ -71,13 +77,45 @@ def read_yaml(path: Path) -> Any:
     return data
 
 
-def _bracket_depth(text: str) -> int:
-    """How deep brackets are nested: the reader's time grows with the square of it."""
-    depth = deepest = 0
+def _text_of(path: Path) -> str:
+    """Text of a file, at most about as much as is read of a configuration.
+
+    Raises
+    ------
+    InputError : the file is missing, unreadable or not UTF-8
+    """
+    refuse_special(path)
+    try:
+        with path.open("rb") as stream:
+            # A character takes at most four bytes.
+            content = stream.read(4 * _MAX_CHARACTERS + 4)
+    except FileNotFoundError:
+        raise InputError("no such file", where=path, hint=suggest_path(path, _is_yaml)) from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot be read ({getattr(error, 'strerror', error)})", where=path) from None
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        if len(content) > 4 * _MAX_CHARACTERS:
+            raise InputError("is too long for a configuration", where=path) from None
+        line = content.count(b"\n", 0, error.start) + 1
+        what, where = f"is not UTF-8 text (byte {error.start})", f"{path}:{line}"
+        raise InputError(what, where=where, hint="save it as UTF-8 text") from None
+
+
+def _place(path: Path, text: str, position: int) -> str:
+    line = text.count("\n", 0, position) + 1
+    return f"{path}:{line}"
+
+
+def _deep_bracket(text: str) -> int | None:
+    """Where brackets are nested too deeply: the reader's time grows with the square of their depth."""
+    depth = 0
     for bracket in re.finditer(r"[\[\]{}]", text):
         depth += 1 if bracket[0] in "[{" else -1
-        deepest = max(deepest, depth)
-    return deepest
+        if depth > _MAX_DEPTH:
+            return bracket.start()
+    return None
 
 
 def _check_tree(data: Any, where: object) -> None:
@@ -88,26 +126,32 @@ def _check_tree(data: Any, where: object) -> None:
     InputError : nested too deeply, repeated through aliases (or holding itself), keys that are no text, or
         tags of some program's own
     """
-    waiting: list[tuple[Any, int]] = [(data, 1)]
+    # Each value with its depth and the line of the last key on the way to it.
+    waiting: list[tuple[Any, int, int | None]] = [(data, 1, None)]
     seen = 0
     while waiting:
-        value, depth = waiting.pop()
+        value, depth, line = waiting.pop()
+        place = where if line is None else f"{where}:{line}"
         seen += 1
         if depth > _MAX_DEPTH or seen > _MAX_VALUES:
             what = _TOO_DEEP if depth > _MAX_DEPTH else f"holds more than {_MAX_VALUES:,} values"
-            raise InputError(what, where=where, hint="each alias (*name) counts in full")
+            raise InputError(what, where=place, hint="each alias (*name) counts in full")
         tag = getattr(getattr(value, "tag", None), "value", None)
         if tag is not None and str(tag).removeprefix("tag:yaml.org,2002:") not in _TAGS:
-            raise InputError(f"holds the tag '{tag}'", where=where, hint="use plain values")
+            raise InputError(f"holds the tag '{tag}'", where=place, hint="use plain values")
         if isinstance(value, Mapping):
+            lines = getattr(getattr(value, "lc", None), "data", None) or {}
             for key, inner in value.items():
+                own = lines[key][0] + 1 if key in lines else line
                 if not isinstance(key, str):
                     raise InputError(
-                        f"key {shortened(key)} is not text", where=where, hint="put it in quotes"
+                        f"key {shortened(key)} is not text",
+                        where=where if own is None else f"{where}:{own}",
+                        hint="put it in quotes",
                     )
-                waiting.append((inner, depth + 1))
+                waiting.append((inner, depth + 1, own))
         elif isinstance(value, Sequence | Set) and not isinstance(value, str | bytes):
-            waiting += ((inner, depth + 1) for inner in value)
+            waiting += ((inner, depth + 1, line) for inner in value)
 
 
 def shortened(value: Any) -> str:

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.color import srgb_to_linear
-from mbtf_core.errors import InputError, reason
+from mbtf_core.errors import InputError
+from mbtf_core.images.radiance import read_radiance
 from mbtf_core.images.read import SUFFIXES, read_image
 from mbtf_core.images.resample import resample
-from mbtf_core.paths import suggest_path
 
 _RADIANCE = ".hdr"
 
@@ -36,6 +36,20 @@ def read_environment(path: Path, most_rows: int) -> NDArray[np.float32]:
     ------
     InputError : the file cannot be read
     """
+    pixels = read_linear(path)
+    rows = min(most_rows, pixels.shape[0])
+    columns = min(max(1, round(rows * pixels.shape[1] / pixels.shape[0])), pixels.shape[1])
+    small = np.asarray(resample(pixels, rows, columns), np.float32)
+    return np.maximum(small, np.float32(0.0))
+
+
+def read_linear(path: Path) -> NDArray[np.float64]:
+    """Linear RGB (H, W, 3) of an EXR, HDR, PNG, JPG, TIFF or npy file; integers are sRGB, gray becomes RGB.
+
+    Raises
+    ------
+    InputError : the file cannot be read, or a pixel is NaN or infinite
+    """
     suffix = path.suffix.lower()
     if path.is_file() and suffix not in (_RADIANCE, *SUFFIXES):
         raise InputError(
@@ -43,11 +57,7 @@ def read_environment(path: Path, most_rows: int) -> NDArray[np.float32]:
             where=path,
             hint=f"use one of {', '.join((_RADIANCE, *SUFFIXES))}",
         )
-    pixels = _radiance(path) if suffix == _RADIANCE else _pixels(path)
-    rows = min(most_rows, pixels.shape[0])
-    columns = min(max(1, round(rows * pixels.shape[1] / pixels.shape[0])), pixels.shape[1])
-    small = np.asarray(resample(pixels, rows, columns), np.float32)
-    return np.maximum(small, np.float32(0.0))
+    return read_radiance(path) if suffix == _RADIANCE else _pixels(path)
 
 
 def _pixels(path: Path) -> NDArray[np.float64]:
@@ -55,18 +65,3 @@ def _pixels(path: Path) -> NDArray[np.float64]:
     pixels = np.asarray(image.pixels, np.float64)
     pixels = pixels[..., :3] if pixels.shape[2] >= 3 else np.repeat(pixels[..., :1], 3, 2)
     return np.asarray(pixels if image.bits is None else srgb_to_linear(pixels), np.float64)
-
-
-def _radiance(path: Path) -> NDArray[np.float64]:
-    """A Radiance picture (RGBE)."""
-    import imagecodecs
-
-    if not path.is_file():
-        raise InputError("no such file", where=path, hint=suggest_path(path))
-    try:
-        pixels = np.asarray(imagecodecs.rgbe_decode(path.read_bytes()), np.float64)
-    except Exception as error:  # whatever the decoder raises
-        raise InputError(f"cannot be read as a Radiance picture ({reason(error)})", where=path) from None
-    if pixels.ndim != 3 or pixels.shape[2] != 3 or not np.isfinite(pixels).all():
-        raise InputError("is not a picture of three colors", where=path)
-    return pixels

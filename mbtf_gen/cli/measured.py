@@ -61,6 +61,8 @@ def import_measured(
     keep_on_interruption(f"the shards that are finished are kept in {folder}")
     with console.progress(total=total, label="importing", unit="queries") as bar:
         summary = run(job, folder, overwrite=overwrite, progress=bar.update)
+    if job.negative:
+        console.note(f"warning: {job.negative} of the queries have negative values, which are kept")
     console.report(asdict(summary), describe(summary))
 
 

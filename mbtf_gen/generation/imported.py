@@ -68,11 +68,13 @@ class Import(ABC):
     divides_by_cosine : whether stored values include the cosine of the light
     facts : the manifest's key ``measured``
     notes : what is left out, in words
+    negative : queries with a negative value among those that this run has written
     """
 
     lattice: Lattice
     facts: dict[str, Any]
     notes: list[str]
+    negative = 0
 
     def __init__(self, path: Path, config: ImportConfig, source: object, cosine: bool | None) -> None:
         self.path, self.config, self.format = path, config, type(source).__name__
@@ -319,6 +321,7 @@ def import_measured(
         for entry, arrays in job.shards(finished):
             if arrays is not None and not finished(entry):
                 store_shard(folder, entry, arrays, job.config_hash, plan, job.config.seed)
+                job.negative += int((arrays["value_a"] < 0.0).any(axis=-1).sum())
             written += entry.rows
             if progress is not None:
                 progress(written)

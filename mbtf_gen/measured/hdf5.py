@@ -39,6 +39,7 @@ from numpy.typing import NDArray
 from mbtf_core.errors import InputError, MbtfError, reason
 from mbtf_core.paths import refuse_special, suggest_path
 from mbtf_gen.measured.interface import (
+    COMPLETE,
     F32,
     HORIZON,
     I64,
@@ -56,9 +57,11 @@ _OTHER_LIGHT = "ground_light_dir"
 # Numbers of a query of NeuMIP.
 CHANNELS = {COLOR: 3, PLACE: 2, RADIUS: 1, VIEW: 2, LIGHT: 2}
 # Most queries of an image of NeuMIP, which is read as a whole.
-MOST_OF_IMAGE = 1 << 24
+MOST_OF_IMAGE = 1 << 22
 # Largest chunk, which is the least that the library decompresses at a time.
 _MOST_CHUNK_BYTES = 1 << 28
+# Largest size of the numbers of a data set: as a ratio to the size of the file, and what any file may have.
+_MOST_RATIO, _ANY_FILE_BYTES = 100, 1 << 26
 
 
 @contextmanager
@@ -75,14 +78,13 @@ def opened(path: Path) -> Iterator[Any]:
     if not path.is_file():
         raise InputError("no such file", where=path, hint=suggest_path(path))
     try:
-        with h5py.File(path, "r") as file:
+        # A chunk that images share is decompressed once.
+        with h5py.File(path, "r", rdcc_nbytes=_MOST_CHUNK_BYTES) as file:
             yield file
     except MbtfError:
         raise
     except Exception as error:  # a damaged file may make the library raise anything
-        raise InputError(
-            f"cannot be read as HDF5 ({reason(error)})", where=path, hint="check that the file is complete"
-        ) from None
+        raise InputError(f"cannot be read as HDF5 ({reason(error)})", where=path, hint=COMPLETE) from None
 
 
 def data_set(file: Any, name: str, path: Path) -> Any:
@@ -103,8 +105,16 @@ def data_set(file: Any, name: str, path: Path) -> Any:
         raise InputError(f"has {found.dtype} numbers in '{name}'; floats are expected", where=path)
     if not found.shape or min(found.shape) < 1:
         raise InputError(f"has the shape {found.shape} of '{name}'", where=path)
-    if found.compression not in (None, "gzip", "lzf"):
-        raise InputError(f"has '{name}' compressed by '{found.compression}'", where=path)
+    size, stored = found.size * found.dtype.itemsize, path.stat().st_size
+    if size > _MOST_RATIO * stored + _ANY_FILE_BYTES:
+        what = f"claims {size:,} bytes of '{name}' in a file of {stored:,}"
+        raise InputError(what, where=path, hint=COMPLETE)
+    properties = found.id.get_create_plist()
+    filters = [properties.get_filter(k) for k in range(properties.get_nfilters())]
+    foreign = next((f for f in filters if not h5py.h5z.filter_avail(f[0])), None)
+    if foreign is not None:
+        what = f"has '{name}' stored by the HDF5 filter {foreign[0]} ({reason(foreign[3].decode('latin-1'))})"
+        raise InputError(what, where=path, hint="store it with gzip or without: h5repack -f GZIP=4 IN OUT")
     if found.chunks is None:
         unit, total, stored = "bytes", found.size * found.dtype.itemsize, found.id.get_storage_size()
     else:

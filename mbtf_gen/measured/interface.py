@@ -27,6 +27,8 @@ HORIZON = 1e-4
 MOST_PAIRS = 10_000_000
 MOST_TEXELS = 1 << 26
 MOST_ACROSS = 1 << MAX_LEVEL
+# Hint for a damaged file.
+COMPLETE = "check that the file is complete"
 
 
 class MeasuredBtf(ABC):

@@ -12,9 +12,15 @@ from mbtf_gen.measured.ubo2003 import Ubo2003
 from mbtf_gen.measured.ubo2014 import Ubo2014
 
 _ZIP = b"PK"
+# Other archives, and single compressed files.
+_PACKED = (b"Rar!", b"7z\xbc\xaf", b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"\x28\xb5\x2f\xfd")
 _KNOWN = (
     "a .btf file (Bonn, DFMF), a folder or zip of photographs named by angles, or HDF5 of NeuMIP or NeuralBTF"
 )
+# UTIA's groups of images, and its tables of one texel.
+_UTIA = (".big", ".bin")
+# The first bytes, which tell what a file is.
+_START = 1 << 10
 
 
 def open_measured(path: str | Path) -> MeasuredBtf | MeasuredQueries:
@@ -39,7 +45,7 @@ def open_measured(path: str | Path) -> MeasuredBtf | MeasuredQueries:
     refuse_special(path)
     try:
         with path.open("rb") as stream:
-            start = stream.read(8)
+            start = stream.read(_START)
     except FileNotFoundError:
         raise InputError("no such file", where=path, hint=suggest_path(path)) from None
     except OSError as error:
@@ -48,10 +54,28 @@ def open_measured(path: str | Path) -> MeasuredBtf | MeasuredQueries:
         return Ubo2014(path)
     if start.startswith(_ZIP):
         return Ubo2003(path)
-    if start != MAGIC:
-        raise InputError("is not a measured BTF of a known kind", where=path, hint=f"known are {_KNOWN}")
+    if not start.startswith(MAGIC):
+        raise _unknown(path, start)
     with opened(path) as file:
         names = set(file)
     if COLOR not in names:
         raise InputError(f"is an HDF5 file without '{COLOR}'", where=path, hint=f"known are {_KNOWN}")
     return NeumipQueries(path) if RADIUS in names or "ground_valid" in names else NeuralBtf(path)
+
+
+def _unknown(path: Path, start: bytes) -> InputError:
+    """What a file is that no reader is for."""
+    text = start.removeprefix(b"\xef\xbb\xbf").lstrip().lower()
+    if not start:
+        return InputError("is empty", where=path, hint="download it again")
+    if text.startswith((b"<!doctype", b"<html", b"<?xml")):
+        return InputError("is a web page, not a measured BTF", where=path, hint="download the file again")
+    if start.startswith(_PACKED):
+        return InputError("is an archive that is not read", where=path, hint="unpack it and give the folder")
+    if path.suffix.lower() in _UTIA:
+        return InputError(
+            "is a file of UTIA, which is not read",
+            where=path,
+            hint="export its images with UTIA's tools, and name them by angles: tl015_pl060_tv030_pv090.png",
+        )
+    return InputError("is not a measured BTF of a known kind", where=path, hint=f"known are {_KNOWN}")

@@ -4,20 +4,25 @@ The BTF Database Bonn of 2003 (Sattler, Sarlette and Klein 2003, "Efficient and 
 cloth") has 81 lights and 81 views, 256 x 256 texels, as archives of JPEG images. Each name has four angles in
 degrees: ``00001 tl000 pl000 tv000 pv000.jpg`` has the light's polar angle and azimuth, then the viewer's. The
 separators, the order and the folders vary (UTIA: ``tv000_pv000/tl000_pl000_tv000_pv000.png``); the four
-letters do not. The readers btf-extractor and btf-rendering, and UTIA's description, agree on this.
+letters do not. The readers btf-extractor and btf-rendering, and UTIA's description, agree on this. The
+archives ATRIUM of Bonn name HDR photographs in the same way.
 
-Nothing says these three: the codes are taken as sRGB; azimuths run from the images' right side to their top;
-and whether the values include the cosine of the light is left open (plain photographs do).
+Nothing says these three: codes of 8 or 16 bits are taken as sRGB, floats as linear; azimuths run from the
+images' right side to their top; and whether the values include the cosine of the light is left open (plain
+photographs do).
 """
 
 from __future__ import annotations
 
 import io
+import os
 import re
+import tempfile
 import warnings as python_warnings
 import zipfile
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -25,19 +30,27 @@ from numpy.typing import NDArray
 
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError, reason
+from mbtf_core.images.environment import read_linear
 from mbtf_core.paths import refuse_special
-from mbtf_gen.measured.interface import I64, ImageBtf, check_texels, from_angles
+from mbtf_gen.measured.interface import COMPLETE, I64, ImageBtf, check_texels, from_angles
 
-SUFFIXES = (".jpg", ".jpeg", ".png")
+SUFFIXES = (".jpg", ".jpeg", ".png", ".exr", ".hdr")
 _ANGLES = tuple(
     re.compile(rf"(?<![a-z]){letters}(\d{{1,3}}(?:\.\d+)?)") for letters in ("tl", "pl", "tv", "pv")
 )
+_EXAMPLE = "a name has the angles of the light and the viewer: tl015 pl060 tv030 pv090.jpg"
+# Files of other readers, which may lie in a folder or an archive.
+_WHOLE = (".hdf5", ".h5", ".btf", ".zip")
 _MOST_FILES = 200_000
 # Largest file of an image, and the largest ratio to its compressed size in an archive.
 _MOST_BYTES = 1 << 28
 _MOST_RATIO = 100
+# Where a PNG file has its bits per channel.
+_PNG_BITS = 24
 # Linear values of the codes.
 _LINEAR = srgb_to_linear(np.arange(256) / 255.0).astype(np.float32)
+
+Content = Callable[[str], bytes]
 
 
 class Ubo2003(ImageBtf):
@@ -51,7 +64,7 @@ class Ubo2003(ImageBtf):
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        names, self._content = _folder(path) if path.is_dir() else _archive(path)
+        names = _files_in(path) if path.is_dir() else _members_of(path)
         table: dict[tuple[float, float, float, float], str] = {}
         for name in names:
             angles = angles_of(name)
@@ -63,59 +76,87 @@ class Ubo2003(ImageBtf):
                 raise InputError(
                     f"has two images of the same directions: '{_short(table[angles])}' and '{_short(name)}'",
                     where=path,
+                    hint="keep one of them",
                 )
             table[angles] = name
         if not table:
-            raise InputError(
-                "has no JPG or PNG images that are named by their directions",
-                where=path,
-                hint="a name has the angles of the light and the viewer: tl015 pl060 tv030 pv090.jpg",
-            )
+            raise _without_photographs(names, path)
         self._names = [table[angles] for angles in sorted(table)]
         radians = np.deg2rad(sorted(table))
         light, view = from_angles(radians[:, 0], radians[:, 1]), from_angles(radians[:, 2], radians[:, 3])
         super().__init__(path, 0, 0, light, view)
         if not len(self._number):
             raise InputError("has no image with light and view above the horizon", where=path)
-        self.rows, self.columns = self._decoded(int(self._number[0])).shape[:2]
+        with self._opened() as content:
+            self.rows, self.columns = self._decoded(content, int(self._number[0])).shape[:2]
 
-    def _texels(self, file: Any, number: int, row: I64, column: I64) -> NDArray[np.float32]:
-        codes = self._decoded(number)
-        if codes.shape[:2] != (self.rows, self.columns):
+    @contextmanager
+    def _opened(self) -> Iterator[Content]:
+        """A function that returns the content of an image by its name."""
+        if self.path.is_dir():
+            yield lambda name: _read_file(self.path / name)
+        else:
+            with _archive(self.path) as archive:
+                yield lambda name: _read_member(archive, name, self.path)
+
+    def _texels(self, file: Content, number: int, row: I64, column: I64) -> NDArray[np.float32]:
+        pixels = self._decoded(file, number)
+        if pixels.shape[:2] != (self.rows, self.columns):
             raise InputError(
-                f"'{self._names[number]}' has {codes.shape[1]} x {codes.shape[0]} texels,"
+                f"'{_short(self._names[number])}' has {pixels.shape[1]} x {pixels.shape[0]} texels,"
                 f" other images {self.columns} x {self.rows}",
                 where=self.path,
             )
-        return _LINEAR[codes[row, column]]
+        found = pixels[row, column]
+        return _LINEAR[found] if found.dtype == np.uint8 else found.astype(np.float32)
 
-    def _decoded(self, number: int) -> NDArray[np.uint8]:
-        """Codes (H, W, 3) of an image; gray becomes RGB."""
-        from PIL import Image as Pillow
-
+    def _decoded(self, content: Content, number: int) -> NDArray[Any]:
+        """An image (H, W, 3): 8-bit sRGB codes, or linear floats; gray becomes RGB."""
         name = self._names[number]
-        content = self._content(name)
+        data = content(name)
         try:
-            with python_warnings.catch_warnings():
-                python_warnings.simplefilter("ignore")
-                with Pillow.open(io.BytesIO(content), formats=["JPEG", "PNG"]) as picture:
-                    check_texels(picture.height, picture.width, self.path)
-                    if picture.mode not in ("RGB", "L"):
-                        raise InputError(f"'{name}' has the pixel mode '{picture.mode}'", where=self.path)
-                    return np.asarray(picture.convert("RGB"))
-        except InputError:
-            raise
+            pixels = _codes(data) if _is_8_bit(name, data) else _floats(name, data)
+            check_texels(pixels.shape[0], pixels.shape[1], self.path)
+        except InputError as error:
+            raise InputError(f"'{_short(name)}' {error.what}", where=self.path, hint=error.hint) from None
         except Exception as error:  # a damaged file may make the decoder raise anything
-            raise InputError(
-                f"'{_short(name)}' cannot be decoded ({reason(error)})", where=self.path
-            ) from None
+            what = f"'{_short(name)}' cannot be decoded ({reason(error)})"
+            raise InputError(what, where=self.path, hint=COMPLETE) from None
+        return pixels
+
+
+def _is_8_bit(name: str, data: bytes) -> bool:
+    suffix = PurePosixPath(name.lower()).suffix
+    return suffix.startswith(".jp") or (suffix == ".png" and data[_PNG_BITS : _PNG_BITS + 1] != b"\x10")
+
+
+def _codes(data: bytes) -> NDArray[np.uint8]:
+    from PIL import Image as Pillow
+
+    with python_warnings.catch_warnings():
+        python_warnings.simplefilter("ignore")
+        with Pillow.open(io.BytesIO(data), formats=["JPEG", "PNG"]) as picture:
+            check_texels(picture.height, picture.width, Path())
+            if picture.mode not in ("RGB", "L"):
+                raise InputError(f"has the pixel mode '{picture.mode}'", hint="save it as gray or RGB")
+            return np.asarray(picture.convert("RGB"))
+
+
+def _floats(name: str, data: bytes) -> NDArray[np.float64]:
+    # The library for EXR reads files only.
+    with tempfile.TemporaryDirectory(prefix="mbtf-") as folder:
+        path = Path(folder, "image").with_suffix(PurePosixPath(name).suffix)
+        path.write_bytes(data)
+        return read_linear(path)
 
 
 def angles_of(name: str) -> tuple[float, float, float, float] | None:
     """Polar angle and azimuth of the light, then of the viewer, in degrees; None of other names."""
     stem = name.replace("\\", "/").rsplit("/", 1)[-1].lower()
-    if not stem.endswith(SUFFIXES):
-        return None
+    return _angles_in(stem) if stem.endswith(SUFFIXES) else None
+
+
+def _angles_in(stem: str) -> tuple[float, float, float, float] | None:
     found = [pattern.findall(stem) for pattern in _ANGLES]
     if any(len(numbers) != 1 for numbers in found):
         return None
@@ -127,59 +168,98 @@ def _short(name: str) -> str:
     return name if len(name) <= 80 else f"...{name[-77:]}"
 
 
-def _folder(path: Path) -> tuple[list[str], Callable[[str], bytes]]:
+def _without_photographs(names: Sequence[str], path: Path) -> InputError:
+    """What is wrong with files of which none is a photograph named by its directions."""
+    whole = [name for name in names if name.lower().endswith(_WHOLE)]
+    if whole:
+        kinds = " or ".join(sorted({PurePosixPath(name.lower()).suffix for name in whole}))
+        hint = f"give one of its {len(whole)} files {kinds}, such as '{_short(whole[0])}'"
+        hint = hint if len(whole) > 1 else f"give its file '{_short(whole[0])}'"
+        unpacked = "" if path.is_dir() else "unpack it and "
+        return InputError(
+            "has no images that are named by their directions", where=path, hint=unpacked + hint
+        )
+    named = [name for name in names if _angles_in(name.replace("\\", "/").rsplit("/", 1)[-1].lower())]
+    if named:
+        return InputError(
+            f"names files by directions whose format is not read, such as '{_short(named[0])}'",
+            where=path,
+            hint=f"convert them to one of {', '.join(SUFFIXES)}",
+        )
+    what = "has no images that are named by their directions"
+    what += f", but files such as '{_short(names[0])}'" if names else ""
+    return InputError(what, where=path, hint=f"{', '.join(SUFFIXES)} are read; {_EXAMPLE}")
+
+
+def _files_in(path: Path) -> list[str]:
+    """All files of a folder; links that lead out of it are left out."""
     names = []
-    root = path.resolve()
-    for file in path.rglob("*"):
-        if file.suffix.lower() in SUFFIXES and file.resolve().is_relative_to(root):
+    # Unlike `resolve`, it does not refuse links without an end.
+    root = os.path.realpath(path)
+    for number, file in enumerate(path.rglob("*")):
+        if number >= _MOST_FILES:
+            raise InputError(f"has more than {_MOST_FILES:,} files", where=path)
+        if not file.is_dir() and Path(os.path.realpath(file)).is_relative_to(root):
             names.append(file.relative_to(path).as_posix())
-        if len(names) > _MOST_FILES:
-            raise InputError(f"has more than {_MOST_FILES:,} images", where=path)
-
-    def content(name: str) -> bytes:
-        file = path / name
-        refuse_special(file)
-        try:
-            if file.stat().st_size > _MOST_BYTES:
-                raise InputError(f"has more than {_MOST_BYTES:,} bytes", where=file)
-            return file.read_bytes()
-        except OSError as error:
-            raise InputError(f"cannot be read ({error.strerror})", where=file) from None
-
-    return names, content
+    return sorted(names)
 
 
-def _archive(path: Path) -> tuple[list[str], Callable[[str], bytes]]:
+def _read_file(path: Path) -> bytes:
     refuse_special(path)
     try:
-        with zipfile.ZipFile(path) as archive:
-            entries = archive.infolist()
+        if path.stat().st_size > _MOST_BYTES:
+            raise InputError(f"has more than {_MOST_BYTES:,} bytes", where=path)
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+
+
+def _archive(path: Path) -> zipfile.ZipFile:
+    refuse_special(path)
+    try:
+        return zipfile.ZipFile(path)
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", where=path) from None
     except Exception as error:  # a damaged archive may make the library raise anything
-        raise InputError(f"is not a valid zip archive ({reason(error)})", where=path) from None
+        # The table of contents is at its end.
+        what = f"is not a valid zip archive ({reason(error)})"
+        raise InputError(what, where=path, hint=COMPLETE) from None
+
+
+def _members_of(path: Path) -> list[str]:
+    """All files of an archive."""
+    with _archive(path) as archive:
+        entries = archive.infolist()
     if len(entries) > _MOST_FILES:
         raise InputError(f"has more than {_MOST_FILES:,} files", where=path)
-    by_name: dict[str, zipfile.ZipInfo] = {}
+    entries = [e for e in entries if not e.is_dir() and not e.filename.startswith("__MACOSX/")]
     for entry in entries:
-        if angles_of(entry.filename) is None or entry.filename.startswith("__MACOSX/"):
+        if angles_of(entry.filename) is None:
             continue
-        name = entry.filename
+        name = _short(entry.filename)
+        if entry.flag_bits & 1:
+            raise InputError(
+                f"'{name}' is encrypted", where=path, hint="unpack the archive and give the folder"
+            )
         if entry.file_size > min(_MOST_BYTES, _MOST_RATIO * entry.compress_size + 10_000):
             raise InputError(
-                f"'{_short(name)}' claims {entry.file_size:,} bytes in {entry.compress_size:,}", where=path
+                f"'{name}' claims {entry.file_size:,} bytes in {entry.compress_size:,}", where=path
             )
-        by_name[name] = entry
+    return [entry.filename for entry in entries]
 
-    def content(name: str) -> bytes:
-        entry = by_name[name]
-        try:
-            with zipfile.ZipFile(path) as archive, archive.open(entry) as stream:
-                data = stream.read(entry.file_size + 1)
-        except Exception as error:  # a damaged archive may make the library raise anything
-            raise InputError(f"'{_short(name)}' cannot be unpacked ({reason(error)})", where=path) from None
-        if len(data) != entry.file_size:
-            raise InputError(f"'{_short(name)}' has another size than the archive claims", where=path)
-        return data
 
-    return list(by_name), content
+def _read_member(archive: zipfile.ZipFile, name: str, path: Path) -> bytes:
+    try:
+        entry = archive.getinfo(name)
+        with archive.open(entry) as stream:
+            data = stream.read(entry.file_size + 1)
+    except NotImplementedError as error:
+        what, hint = f"'{_short(name)}' cannot be unpacked ({reason(error)})", "unpack it and give the folder"
+        raise InputError(what, where=path, hint=hint) from None
+    except Exception as error:  # a damaged archive may make the library raise anything
+        what = f"'{_short(name)}' cannot be unpacked ({reason(error)})"
+        raise InputError(what, where=path, hint=COMPLETE) from None
+    if len(data) != entry.file_size:
+        what = f"'{_short(name)}' has another size than the archive claims"
+        raise InputError(what, where=path, hint=COMPLETE)
+    return data

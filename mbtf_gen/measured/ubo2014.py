@@ -31,10 +31,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
-from mbtf_gen.measured.interface import F32, I64, MOST_PAIRS, MeasuredBtf, check_texels, from_angles
+from mbtf_gen.measured.interface import COMPLETE, F32, I64, MOST_PAIRS, MeasuredBtf, check_texels, from_angles
 
 MAGIC = b"!DFMF08FCR"
-_COMPLETE = "check that the file is complete"
 _TEXTS = 3 * 80
 _TYPES = {2: "<f2", 4: "<f4", 8: "<f8"}
 _MOST_COMPONENTS = 65_536
@@ -74,7 +73,7 @@ class _Cursor:
     def skip(self, count: int, what: str) -> None:
         """Move on; refuse files that end before."""
         if count > self.size - self.at:
-            raise InputError(f"ends within {what}", where=self.path, hint=_COMPLETE)
+            raise InputError(f"ends within {what}", where=self.path, hint=COMPLETE)
         self.at += count
 
     def bytes(self, count: int, what: str) -> bytes:
@@ -182,7 +181,7 @@ def _read_meta(cursor: _Cursor) -> bool | None:
             cursor.skip(cursor.integer(what), what)
     if cursor.at != start + size:
         raise InputError(
-            f"has a header of {cursor.at - start} bytes that claims {size}", where=cursor.path, hint=_COMPLETE
+            f"has a header of {cursor.at - start} bytes that claims {size}", where=cursor.path, hint=COMPLETE
         )
     return cosine
 
@@ -193,7 +192,7 @@ def _read_directions(cursor: _Cursor) -> tuple[F32, F32, int]:
     views = cursor.integer(what)
     # A view takes at least 12 bytes.
     if not 1 <= views <= (cursor.size - cursor.at) // 12:
-        raise InputError(f"claims {views:,} views", where=cursor.path, hint=_COMPLETE)
+        raise InputError(f"claims {views:,} views", where=cursor.path, hint=COMPLETE)
     lights = None
     view, light = [], []
     for number in range(views):

@@ -142,7 +142,9 @@ def test_numbers_that_are_not_in_the_file(tmp_path: Path) -> None:
         NeumipQueries(path)
     with h5py.File(path, "r+") as file:
         del file["ground_color"]
-        file.create_dataset("ground_color", (10**9, 3, 4, 3), "f4", chunks=(10**7, 3, 4, 3))
+        file.create_dataset(
+            "ground_color", (10, 3, 4, 3), "f4", chunks=(10**7, 3, 4, 3), maxshape=(None, 3, 4, 3)
+        )
     with pytest.raises(InputError, match="too large"):
         NeumipQueries(path)
     with pytest.raises(InputError, match="no such file"):
@@ -215,6 +217,32 @@ def test_nan_values_are_refused_where_they_are_used(tmp_path: Path) -> None:
         btf.values(np.array([0, 0]), np.array([0, files.COLUMNS + 1]))
 
 
+def test_a_filter_that_is_not_installed_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "a.hdf5"
+    with h5py.File(path, "w") as file:
+        for name, array in images().items():
+            file.create_dataset(name, data=array, compression="gzip")
+    content = path.read_bytes()
+    assert NeuralBtf(path).rows == files.ROWS
+    # The number of a filter lies eight bytes before its name.
+    changed = content.replace(b"\1\0\x08\0\1\0\1\0deflate\0", b"\1\x7d\x08\0\1\0\1\0blosc\0\0\0")
+    assert changed != content
+    path.write_bytes(changed)
+    with pytest.raises(InputError, match=r"the HDF5 filter 32001 \(blosc\)"):
+        NeuralBtf(path)
+
+
+def test_numbers_that_a_file_cannot_have(tmp_path: Path) -> None:
+    path = tmp_path / "a.hdf5"
+    with h5py.File(path, "w") as file:
+        shape = (30, 512, 512, 3)
+        color = file.create_dataset("ground_color", shape, np.float32, chunks=shape, compression="gzip")
+        color[...] = 0.0
+        file["ground_light"] = file["ground_camera_dir"] = np.zeros((30, 2), np.float32)
+    with pytest.raises(InputError, match="claims 94,371,840 bytes"):
+        NeuralBtf(path)
+
+
 def test_an_export_for_neumip(tmp_path: Path) -> None:
     """All that fills whole images, in the order of the shards; the program reads single precision too."""
     data = write_dataset(
@@ -249,8 +277,10 @@ def test_what_cannot_be_exported(tmp_path: Path) -> None:
 
 def test_files_of_no_known_kind(tmp_path: Path) -> None:
     for content, message in (
-        (b"", "known kind"),
+        (b"", "is empty"),
         (b"hello", "known kind"),
+        (b"\xef\xbb\xbf\n <!DOCTYPE html><title>Quota exceeded", "web page"),
+        (b"Rar!\x1a\x07\x00", "unpack it"),
         (b"!ABC", "DFMF08FCR"),
         (b"PK", "zip"),
     ):

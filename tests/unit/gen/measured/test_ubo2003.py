@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from support import measured_files as files
 from support.fuzzing import damaged, examples, loads_or_refuses
 
@@ -54,6 +55,75 @@ def test_png_is_exact(tmp_path: Path) -> None:
     np.testing.assert_allclose(btf.view[0], view, atol=1e-6)
 
 
+NAME = "tl030_pl020_tv045_pv060"
+LINEAR = np.array([[[0.25, 1.5, 0.003], [8.0, 0.5, 0.0]], [[1.0, 2.0, 4.0], [0.125, 0.75, 3.0]]], np.float32)
+
+
+def radiance(linear: NDArray[np.float32], header: bytes = b"FORMAT=32-bit_rle_rgbe\n") -> bytes:
+    """A Radiance picture: a mantissa of 8 bits for each color, and an exponent for all three."""
+    mantissa, exponent = np.frexp(linear.max(axis=-1))
+    codes = np.floor(linear * (256 * mantissa / linear.max(axis=-1))[..., None])
+    pixels = np.concatenate([codes, exponent[..., None] + 128], axis=-1).astype(np.uint8)
+    size = b"\n-Y %d +X %d\n" % linear.shape[:2]
+    return b"#?RADIANCE\n" + header + size + pixels.tobytes()
+
+
+def exr(tmp_path: Path, linear: NDArray[np.float32]) -> bytes:
+    import OpenEXR
+
+    OpenEXR.File({}, {"RGB": linear}).write(str(tmp_path / "a.exr"))
+    return (tmp_path / "a.exr").read_bytes()
+
+
+def values_of(path: Path) -> NDArray[np.float32]:
+    """All values of the only pair, as an image."""
+    btf = Ubo2003(path)
+    values = btf.values(np.zeros(btf.rows * btf.columns, np.int64), np.arange(btf.rows * btf.columns))
+    return values.reshape(btf.rows, btf.columns, 3)
+
+
+@pytest.mark.parametrize("suffix", ["hdr", "HDR", "exr"])
+@pytest.mark.parametrize("zipped", [False, True])
+def test_photographs_of_floats_are_linear(suffix: str, zipped: bool, tmp_path: Path) -> None:
+    content = exr(tmp_path, LINEAR) if suffix == "exr" else radiance(LINEAR)
+    path = files.write_folder(tmp_path / "folder", {f"tv/{NAME}.{suffix}": content})
+    if zipped:
+        path = tmp_path / "a.zip"
+        path.write_bytes(files.zipped({f"CEILING/{NAME}.{suffix}": content}))
+    # The colors of a Radiance pixel are rounded to 1/128 of the largest.
+    atol = 0 if suffix == "exr" else LINEAR.max(axis=-1, keepdims=True) / 128
+    assert (np.abs(values_of(path) - LINEAR) <= atol).all()
+
+
+def test_a_radiance_header(tmp_path: Path) -> None:
+    path = tmp_path / f"{NAME}.hdr"
+    path.write_bytes(radiance(LINEAR))
+    plain = values_of(tmp_path)
+    path.write_bytes(radiance(LINEAR, b"EXPOSURE=2\nFORMAT=32-bit_rle_rgbe\nEXPOSURE= 4.0\n"))
+    np.testing.assert_allclose(values_of(tmp_path), plain / 8)
+    for header, message in (
+        (b"FORMAT=32-bit_rle_xyze\n", "stores XYZ"),
+        (b"EXPOSURE=0\n", "exposure"),
+        (b"EXPOSURE=nan\n", "exposure"),
+    ):
+        path.write_bytes(radiance(LINEAR, header))
+        with pytest.raises(InputError, match=message):
+            Ubo2003(tmp_path)
+    path.write_bytes(radiance(LINEAR).replace(b"-Y 2 +X 2", b"-Y 60000 +X 60000"))
+    with pytest.raises(InputError, match="claims 60000 x 60000 pixels"):
+        Ubo2003(tmp_path)
+
+
+def test_png_of_16_bits(tmp_path: Path) -> None:
+    import imagecodecs
+
+    codes = np.array([[[0, 1000, 65535], [40000, 40001, 20]]], np.uint16)
+    content = {f"{NAME}.png": imagecodecs.png_encode(codes)}
+    c = codes / 65535
+    linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+    np.testing.assert_allclose(values_of(files.write_folder(tmp_path, content)), linear, rtol=1e-5)
+
+
 @pytest.mark.parametrize(
     ("name", "angles"),
     [
@@ -74,7 +144,9 @@ def test_each_image_is_decoded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     btf = Ubo2003(files.write_folder(tmp_path, files.photographs()))
     seen = []
     decoded = btf._decoded
-    monkeypatch.setattr(btf, "_decoded", lambda number: seen.append(number) or decoded(number))
+    monkeypatch.setattr(
+        btf, "_decoded", lambda content, number: seen.append(number) or decoded(content, number)
+    )
     btf.values(np.array([3, 1, 3, 1, 3]), np.arange(5))
     # Their numbers in the folder, of which one is left out before.
     assert seen == [1, 4]
@@ -92,6 +164,10 @@ def good(name: str = "tl000 pl000 tv000 pv000.jpg") -> dict[str, bytes]:
         ({"tl200 pl000 tv000 pv000.jpg": b""}, "angles out of range"),
         ({"tl095 pl000 tv000 pv000.jpg": b""}, "above the horizon"),
         (good() | good("b/tl000 pl000 tv000 pv000.jpg"), "the same directions"),
+        ({"b/full.hdf5": b"", "b/random.hdf5": b"", "a.txt": b""}, "give one of its 2 files .hdf5"),
+        ({"carpet.btf": b""}, "give its file 'carpet.btf'"),
+        ({f"{NAME}.bmp": b""}, "convert them to one of .jpg"),
+        ({"manifest.json": b"{}", "data/R/a2.png": b""}, "files such as"),
     ],
 )
 @pytest.mark.parametrize("zipped", [False, True])
@@ -117,8 +193,19 @@ def test_archives_that_are_refused(tmp_path: Path) -> None:
     path.write_bytes(files.zipped({"tl000 pl000 tv000 pv000.jpg": bytes(10**7)}, zipfile.ZIP_DEFLATED))
     with pytest.raises(InputError, match="claims 10,000,000 bytes in"):
         Ubo2003(path)
-    path.write_bytes(files.zipped(good())[:-30])
-    with pytest.raises(InputError, match="not a valid zip archive"):
+    whole = files.zipped(good())
+    for cut in (4, 40, len(whole) // 2, len(whole) - 30, len(whole) - 1):
+        path.write_bytes(whole[:cut])
+        with pytest.raises(InputError, match="check that the file is complete"):
+            Ubo2003(path)
+    # A byte within the image: its checksum differs.
+    path.write_bytes(whole[:200] + bytes([whole[200] ^ 1]) + whole[201:])
+    with pytest.raises(InputError, match="check that the file is complete"):
+        Ubo2003(path)
+    # The flag of encryption, in the table at the end.
+    at = whole.index(b"PK\1\2") + 8
+    path.write_bytes(whole[:at] + bytes([whole[at] | 1]) + whole[at + 1 :])
+    with pytest.raises(InputError, match="is encrypted"):
         Ubo2003(path)
     with pytest.raises(InputError, match="No such file"):
         Ubo2003(tmp_path / "b.zip")
@@ -129,6 +216,9 @@ def test_links_out_of_the_folder_are_not_followed(tmp_path: Path) -> None:
     folder = files.write_folder(tmp_path / "a", good())
     os.symlink(tmp_path / "secret.jpg", folder / "tl010 pl000 tv000 pv000.jpg")
     assert len(Ubo2003(folder).light) == 1
+    (folder / "tl020 pl000 tv000 pv000.jpg").symlink_to("tl020 pl000 tv000 pv000.jpg")
+    with pytest.raises(InputError, match="cannot be read"):
+        Ubo2003(folder).values(np.array([1]), np.array([0]))
 
 
 def test_names_that_climb_out_of_an_archive_are_harmless(tmp_path: Path) -> None:
