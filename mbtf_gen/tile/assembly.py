@@ -29,7 +29,8 @@ from mbtf_gen.tile.maps.checks import (
     refuse_color,
     seam_warning,
 )
-from mbtf_gen.tile.maps.discovery import Convention, FoundMaps, normal_convention
+from mbtf_gen.tile.maps.discovery import FoundMaps
+from mbtf_gen.tile.maps.file_names import Convention, normal_convention
 from mbtf_gen.tile.maps.map_loader import MapLoader
 from mbtf_gen.tile.maps.material_file import LOBES, ROLES, MaterialFile, NormalEntry, layers_above
 from mbtf_gen.tile.maps.normal_map import NormalFit, fit_normals

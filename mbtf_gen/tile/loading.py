@@ -130,7 +130,7 @@ def described(path: Path) -> tuple[Described, Path, FoundMaps]:
         if described is not None:
             return _read(described), path, FoundMaps()
         found = find_maps(path)
-        spec = MaterialFile.model_validate({role: str(file.name) for role, file in found.maps.items()})
+        spec = MaterialFile.model_validate({role: one.entry for role, one in found.maps.items()})
         return spec, path, found
     if not path.exists():
         raise InputError("no such file or folder", where=path, hint=suggest_path(path))
@@ -153,9 +153,10 @@ def described(path: Path) -> tuple[Described, Path, FoundMaps]:
     spec = MaterialFile.model_validate({"height": path.name})
     notes = []
     with contextlib.suppress(InputError):
-        others = {role: file for role, file in find_maps(path.parent).maps.items() if file != path}
+        found = find_maps(path.parent)
+        others = {role: one.path for role, one in found.maps.items() if one.path != path}
         if others and "height" not in others:
-            names = ", ".join(file.name for file in others.values())
+            names = ", ".join(dict.fromkeys(file.name for file in others.values()))
             notes = [
                 f"only the heights of {path.name} are used; for {names} too, give the folder {path.parent}"
             ]

@@ -58,7 +58,7 @@ def find_materials(path: Path) -> list[Path]:
 def _in_folder(folder: Path) -> list[Path]:
     """A folder that is a material, or the materials in it; their runs say whether they are usable."""
     from mbtf_core.images.read import is_image
-    from mbtf_gen.tile.maps.discovery import role_of
+    from mbtf_gen.tile.maps.file_names import role_of
 
     inside = [path for path in sorted(folder.iterdir()) if not path.name.startswith((".", "_"))]
     files = {path.name for path in inside if path.is_file()}

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
 from mbtf_core.images.read import Image
-from mbtf_gen.tile.maps.discovery import Convention
+from mbtf_gen.tile.maps.file_names import Convention
 from mbtf_gen.tile.maps.normal_map import NormalFit
 from mbtf_gen.tile.maps.tiling import Seam, broken
 

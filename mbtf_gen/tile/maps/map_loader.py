@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError
 from mbtf_core.images.read import ColorSpace, Image, count_and_first, gray, read_image
-from mbtf_gen.tile.maps.discovery import role_of
+from mbtf_gen.tile.maps.file_names import role_of
 from mbtf_gen.tile.maps.material_file import ColorEntry, HeightEntry, NormalEntry, ShareEntry
 
 Color = NDArray[np.floating[Any]]
@@ -169,16 +169,21 @@ class MapLoader:
         return space
 
     def normals(self, entry: NormalEntry) -> NDArray[np.float32]:
-        """(h, w, 3) unit vectors read as OpenGL, y along v: 2·pixel - 1, or signed floats as they are."""
+        """(h, w, 3) unit vectors read as OpenGL, y along v: 2·pixel - 1, or signed floats as they are; z of
+        maps that store only x and y is √(1 - x² - y²)."""
         image = self.image("normal", entry)
-        if image.pixels.shape[2] < 3:
-            raise InputError("is gray; a normal map has three channels", where=image.path)
-        stored = image.pixels[..., :3].astype(np.float32)
+        stored, kept = components(image)
+        if kept:
+            self.notes.append(f"normal map: {image.path.name} stores {kept}; z = √(1 - x² - y²)")
+        elif image.pixels.shape[2] == 4 and np.any(image.pixels[..., 3] != 1.0):
+            self.warnings.append(f"{image.path}: the alpha channel of the normal map is not used")
         signed = image.bits is None and float(stored[..., :2].min()) < _SIGNED
         vectors = stored if signed else 2.0 * stored - 1.0
         long = np.any(np.abs(vectors) > _LONGEST, axis=-1)
         if long.any():
             raise InputError(f"{count_and_first(long)} no normal", where=image.path, hint=_NORMALS)
+        if kept:
+            return with_z(vectors)
         length = np.linalg.norm(vectors, axis=-1, keepdims=True)
         below = float(np.mean(vectors[..., 2] <= 0))
         if below > _STRAY:
