@@ -167,9 +167,7 @@ def _sources(path: Path, name: MapName, warnings: list[str]) -> list[Source]:
     alpha = any(source.channel == "A" for source in name.content)
     stored = [s for s in name.content if s.channel != "A" or _has_alpha(path)]
     if alpha and len(stored) < len(name.content) and name.content[-1].role != "opacity":
-        warnings.append(
-            f"{path}: has no alpha channel, where its name promises gloss: roughness is missing"
-        )
+        warnings.append(f"{path}: has no alpha channel, where gloss is expected: roughness is missing")
     return stored
 
 

@@ -62,8 +62,8 @@ _OCCLUSION = ("occlusion", "ambientocclusion", "ao")
 # Words of Unity: metallic in red, smoothness (1 - roughness) in alpha.
 SMOOTHNESS_IN_ALPHA = ("maskmap", "mads", "metallicsmoothness", "metallicgloss", "metallicglossiness")
 _NAME_IT = "name it in a material.yaml to use it"
-_LAYERS = ("emissive", "emission", "specular", "subsurface", "scattering", "transmission", "translucency")
-_LAYERS += ("coat", "clearcoat", "sheen", "fuzz")
+_LAYERS = ("coat", "clearcoat", "sheen", "fuzz", "emissive", "emission", "specular")
+_LAYERS += ("subsurface", "scattering", "transmission", "translucency")
 _SPACES = ("bent", "object", "objectspace", "world", "worldspace", "detail")
 _CONVENTIONS: dict[str, Convention] = {
     **dict.fromkeys(("gl", "ogl", "opengl", "normalgl", "normalogl"), "gl"),

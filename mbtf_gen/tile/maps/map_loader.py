@@ -14,6 +14,7 @@ from mbtf_core.errors import InputError
 from mbtf_core.images.read import ColorSpace, Image, count_and_first, gray, read_image
 from mbtf_gen.tile.maps.file_names import role_of
 from mbtf_gen.tile.maps.material_file import ColorEntry, HeightEntry, NormalEntry, ShareEntry
+from mbtf_gen.tile.maps.normal_encoding import height_of, stored_xy
 
 Color = NDArray[np.floating[Any]]
 Share = NDArray[np.float64] | float | None
@@ -24,6 +25,8 @@ _SIGNED = -0.05
 # Largest component of a normal in any encoding, with rounding.
 _LONGEST = 1.5
 _NORMALS = "its pixels are (n+1)/2, or the components of n themselves in a float image"
+# Formats whose two channels are gray and alpha.
+_GRAY_AND_ALPHA = (".png", ".tga")
 # Fraction of normals pointing into the surface above which a warning is given.
 _STRAY = 1e-4
 _FileEntry = HeightEntry | ColorEntry | ShareEntry | NormalEntry
@@ -172,18 +175,24 @@ class MapLoader:
         """(h, w, 3) unit vectors read as OpenGL, y along v: 2·pixel - 1, or signed floats as they are; z of
         maps that store only x and y is √(1 - x² - y²)."""
         image = self.image("normal", entry)
-        stored, kept = components(image)
-        if kept:
-            self.notes.append(f"normal map: {image.path.name} stores {kept}; z = √(1 - x² - y²)")
-        elif image.pixels.shape[2] == 4 and np.any(image.pixels[..., 3] != 1.0):
-            self.warnings.append(f"{image.path}: the alpha channel of the normal map is not used")
+        stored = image.pixels.astype(np.float32)
+        if image.pixels.shape[2] == 2 and image.path.suffix.lower() in _GRAY_AND_ALPHA:
+            # Gray pictures of maps that store x in alpha.
+            stored = stored[..., ::-1]
+        if stored.shape[2] == 1 or (stored.shape[2] == 2 and np.ptp(stored[..., 0]) == 0):
+            raise InputError("is gray; a normal map has two channels or more", where=image.path)
         signed = image.bits is None and float(stored[..., :2].min()) < _SIGNED
         vectors = stored if signed else 2.0 * stored - 1.0
+        two = stored_xy(vectors)
+        if two is not None:
+            vectors = np.concatenate([two[0], height_of(two[0])[..., None]], axis=-1)
+            self.warnings.append(f"{image.path}: stores {two[1]} only; z = √(1 - x² - y²) is used")
+        elif vectors.shape[2] == 4 and np.any(image.pixels[..., 3] != 1.0):
+            self.warnings.append(f"{image.path}: the alpha channel of the normal map is not used")
+        vectors = vectors[..., :3]
         long = np.any(np.abs(vectors) > _LONGEST, axis=-1)
         if long.any():
             raise InputError(f"{count_and_first(long)} no normal", where=image.path, hint=_NORMALS)
-        if kept:
-            return with_z(vectors)
         length = np.linalg.norm(vectors, axis=-1, keepdims=True)
         below = float(np.mean(vectors[..., 2] <= 0))
         if below > _STRAY:
