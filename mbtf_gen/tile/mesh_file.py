@@ -15,6 +15,7 @@ from mbtf_core.config.settings import FileName, Settings
 from mbtf_core.data.schema import Tiling
 from mbtf_core.errors import InputError, reason
 from mbtf_core.files.atomic import data_sha256, file_sha256
+from mbtf_core.paths import named_file
 from mbtf_gen.config.generator import Positive, Resolution, Rgb, Share, no_tiling
 from mbtf_gen.tile.mesh_tile import F64, MeshPart, MeshTile
 
@@ -67,7 +68,7 @@ def read_mesh(spec: MeshFile, folder: Path) -> MeshTile:
     InputError
         The file cannot be read, or its triangles are no tile.
     """
-    path = folder / spec.mesh
+    path = named_file(folder, spec.mesh)
     shapes = _shapes(path)
     vertices, faces, uv, part = _joined(shapes, path)
     parts = [_part(shape, spec, name) for name, shape in shapes]

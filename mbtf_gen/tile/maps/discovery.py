@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from itertools import takewhile
 from pathlib import Path
@@ -27,10 +27,12 @@ from mbtf_gen.tile.maps.file_names import (
 
 _ARCHIVES = (".zip", ".7z", ".rar", ".tar", ".tgz", ".gz")
 # Suffixes of image formats, and of materials of other programs, that are not read.
-_UNREAD = (".astc", ".avif", ".basis", ".crn", ".dds", ".gif", ".hdr", ".heic", ".iff", ".jfif", ".jp2")
-_UNREAD += (".jxl", ".jxr", ".ktx", ".ktx2", ".mxr", ".pcx", ".pfm", ".pgm", ".pic", ".ppm", ".psb", ".psd")
-_UNREAD += (".pvr", ".r16", ".r32", ".raw", ".rgb", ".sbs", ".sbsar", ".sgi", ".svg", ".sxr", ".tex", ".tx")
-_UNREAD += (".vtf", ".webp", ".xcf")
+_UNREAD = (
+    *(".astc", ".avif", ".basis", ".crn", ".dds", ".gif", ".hdr", ".heic", ".iff", ".jfif", ".jp2", ".jxl"),
+    *(".jxr", ".ktx", ".ktx2", ".mxr", ".pcx", ".pfm", ".pgm", ".pic", ".ppm", ".psb", ".psd", ".pvr"),
+    *(".r16", ".r32", ".raw", ".rgb", ".sbs", ".sbsar", ".sgi", ".svg", ".sxr", ".tex", ".tx", ".vtf"),
+    *(".webp", ".xcf"),
+)
 # Names listed in a message.
 _LISTED = 6
 # A name that YAML reads as text without quotes.
@@ -62,12 +64,14 @@ class FoundMaps:
 
     Attributes
     ----------
-    maps : map of each role
+    maps : file of each role
+    entries : entry of a material file of each role, which names the channel of a packed map
     unused : reason why an image is not used, by file name
     notes, warnings : messages for the user
     """
 
-    maps: dict[Role, FoundMap] = field(default_factory=dict)
+    maps: dict[Role, Path] = field(default_factory=dict)
+    entries: dict[Role, Any] = field(default_factory=dict)
     unused: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
@@ -94,8 +98,8 @@ def find_maps(folder: Path) -> FoundMaps:
 
     Leading words that all names share are ignored, unless only they denote a height map: of ``Metal004.png``
     and ``Metal004_Color.png`` the former is a picture of the material. Of several files of one map, a file of
-    its own is preferred to a channel of a packed map, an OpenGL normal map to a DirectX one, 16 bits to 8, and
-    the first variant to others.
+    its own is preferred to a channel of a packed map, OpenGL normals to DirectX ones, 16 bits to 8, and the
+    first variant to others.
 
     Raises
     ------
@@ -123,7 +127,8 @@ def find_maps(folder: Path) -> FoundMaps:
             candidates.setdefault(source.role, []).append(FoundMap(path, name, source))
     reasons: dict[Path, str] = {}
     chosen = {role: _choose(given, reasons) for role, given in candidates.items()}
-    maps = {role: given[0] for role, given in chosen.items()}
+    maps = {role: given[0].path for role, given in chosen.items()}
+    entries = {role: given[0].entry for role, given in chosen.items()}
     several = [
         f"{role} ({_listed(m.path.name for m in given)})" for role, given in chosen.items() if len(given) > 1
     ]
@@ -131,14 +136,14 @@ def find_maps(folder: Path) -> FoundMaps:
         raise InputError(
             f"two maps or more of {' and of '.join(several)}",
             where=folder,
-            hint="remove all but one of each, or say which is meant in a material.yaml, such as "
-            + material_line(maps),
+            hint="remove all but one of each, or say which is meant in a material.yaml: "
+            + _on_one_line({role: entries[role] for role in WORDS if role in entries}),
         )
-    used = {found.path for found in maps.values()}
     metalness = any(name.workflow == "metalness" for name in names.values())
-    notes = [f"{role}: 1 - {m.path.name}" for role, m in maps.items() if m.source.invert]
-    unused, lost = {}, []
-    for path in (p for p in files if p not in used):
+    notes = [f"{role}: 1 - {m.path.name}" for role, (m,) in chosen.items() if m.source.invert]
+    unused: dict[str, str] = {}
+    lost: list[str] = []
+    for path in (p for p in files if p not in maps.values()):
         name = names[path]
         missing = False
         if isinstance(name.content, Unused):
@@ -152,12 +157,12 @@ def find_maps(folder: Path) -> FoundMaps:
         unused[path.name] = reason
         (lost if missing else notes).append(f"{path.name} is not used: {reason}")
     warnings += [f"{folder}: {text}" for text in ("; ".join(lost), unread) if text]
-    if (hole := maps.get("opacity")) is not None and hole.name.word == "mask":
+    if "opacity" in maps and names[maps["opacity"]].word == "mask":
         warnings.append(
-            f"{hole.path}: is used as opacity, 0 for a hole, for its name says no more than 'mask'; "
+            f"{maps['opacity']}: is used as opacity, 0 for a hole, for its name says no more than 'mask'; "
             "remove it if it is another mask"
         )
-    return FoundMaps(maps, unused, notes, warnings)
+    return FoundMaps(maps, entries, unused, notes, warnings)
 
 
 def _sources(path: Path, name: MapName, warnings: list[str]) -> list[Source]:
@@ -191,15 +196,11 @@ def _choose(given: list[FoundMap], reasons: dict[Path, str]) -> list[FoundMap]:
     return given
 
 
-def material_line(maps: Mapping[Role, FoundMap]) -> str:
-    """A material file of maps, on one line."""
-
-    def shown(value: Any) -> str:
-        if isinstance(value, dict):
-            return f"{{{', '.join(f'{key}: {shown(inner)}' for key, inner in value.items())}}}"
-        return value if isinstance(value, str) and _PLAIN.fullmatch(value) else json.dumps(value)
-
-    return shown({role: maps[role].entry for role in WORDS if role in maps})
+def _on_one_line(value: Any) -> str:
+    """Plain data as YAML."""
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{key}: {_on_one_line(inner)}' for key, inner in value.items())}}}"
+    return value if isinstance(value, str) and _PLAIN.fullmatch(value) else json.dumps(value)
 
 
 def unpack(path: Path) -> str:

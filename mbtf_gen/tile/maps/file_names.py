@@ -62,8 +62,10 @@ _OCCLUSION = ("occlusion", "ambientocclusion", "ao")
 # Words of Unity: metallic in red, smoothness (1 - roughness) in alpha.
 SMOOTHNESS_IN_ALPHA = ("maskmap", "mads", "metallicsmoothness", "metallicgloss", "metallicglossiness")
 _NAME_IT = "name it in a material.yaml to use it"
-_LAYERS = ("coat", "clearcoat", "sheen", "fuzz", "emissive", "emission", "specular")
-_LAYERS += ("subsurface", "scattering", "transmission", "translucency")
+_LAYERS = (
+    *("coat", "clearcoat", "sheen", "fuzz", "emissive", "emission", "specular"),
+    *("subsurface", "scattering", "transmission", "translucency"),
+)
 _SPACES = ("bent", "object", "objectspace", "world", "worldspace", "detail")
 _CONVENTIONS: dict[str, Convention] = {
     **dict.fromkeys(("gl", "ogl", "opengl", "normalgl", "normalogl"), "gl"),
@@ -73,7 +75,7 @@ _CONVENTIONS: dict[str, Convention] = {
 _WORKFLOWS = ("metalness", "specular")
 _PIECE = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
 # In the pieces of a name, joined by blanks: 16 bits, as in ``DISP16``; a variant, as in ``COL_VAR2`` or
-# ``col_02``, whose number is no depth, no resolution and no tile of a UDIM set; what does not tell maps apart.
+# ``col_02``, whose number is no depth, resolution or tile of a UDIM set; what does not tell maps apart.
 _DEEP = re.compile(r"^16\b(?! k)(?: bit\b)?|\b16 bit\b")
 _VARIANT = re.compile(r"^(?:var(?:iant|iation)? )?(?!(?:8|16|32)\b)(\d{1,2})\b(?! k| bit)")
 _TAG = re.compile(rf"\b(?:\d+ (?:k|bit)|{'|'.join(_CONVENTIONS)})\b")
@@ -117,10 +119,12 @@ def _unused() -> dict[str, Unused]:
     derived = Unused("it follows from the heights", lost=False)
     out |= dict.fromkeys(("cavity", "curvature", "position", "edge"), derived)
     out |= dict.fromkeys(("preview", "thumb", "thumbnail", "render"), Unused("it is a picture", lost=False))
-    out |= dict.fromkeys(("specular", "spec", "specularlevel", "clearcoat", "sheen"), Unused(_NAME_IT))
-    foreign = ("emissive", "emission", "refl", "reflection", "fuzz", "translucency", "translucent", "scatter")
-    foreign += ("transmission", "subsurface", "sss", "scattering", "anisotropy", "ior", "coat")
-    out |= dict.fromkeys(foreign, Unused("mbtf has no such map"))
+    foreign = Unused("mbtf has no such map")
+    out |= dict.fromkeys(_LAYERS, foreign)
+    out |= dict.fromkeys(
+        ("refl", "reflection", "translucent", "scatter", "sss", "anisotropy", "ior"), foreign
+    )
+    out |= dict.fromkeys(("specular", "spec", "clearcoat", "sheen"), Unused(_NAME_IT))
     out |= dict.fromkeys(("transparency",), Unused("as opacity it may be inverted; " + _NAME_IT))
     # Two orders are in use.
     unclear = Unused("name its channels in a material.yaml, as in roughness: {file: …, channel: G}")

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError
 from mbtf_core.images.read import ColorSpace, Image, count_and_first, gray, read_image
+from mbtf_core.paths import named_file
+from mbtf_gen.tile.maps.checks import refuse_color
 from mbtf_gen.tile.maps.file_names import role_of
 from mbtf_gen.tile.maps.material_file import ColorEntry, HeightEntry, NormalEntry, ShareEntry
 from mbtf_gen.tile.maps.normal_encoding import height_of, stored_xy
@@ -43,6 +45,7 @@ class MapFacts:
     names : their names, where the file has others
     low, high : smallest and largest stored number of these channels, without alpha
     colorspace : in which the numbers were read
+    inverted : whether 1 - x of them is used
     """
 
     file: Path
@@ -54,6 +57,7 @@ class MapFacts:
     low: float
     high: float
     colorspace: ColorSpace = "linear"
+    inverted: bool = False
 
 
 class MapLoader:
@@ -79,7 +83,7 @@ class MapLoader:
 
     def image(self, role: str, entry: _FileEntry, space: ColorSpace = "linear") -> Image:
         """Read the file of a role, of one pixel or of the heights' aspect."""
-        path = self.folder / str(entry.file)
+        path = named_file(self.folder, str(entry.file))
         image = read_image(path, entry.channel, lambda label: role_of(label) == role)
         count = image.pixels.shape[2]
         used = image.pixels[..., :-1] if count in (2, 4) else image.pixels
@@ -122,13 +126,17 @@ class MapLoader:
         if entry.file is None:
             self.settings[role] = entry.value
             return entry.value
-        numbers, warnings = gray(self.image(role, entry, entry.colorspace))
+        image = self.image(role, entry, entry.colorspace)
+        if role == "opacity":
+            refuse_color(image, "opacity")
+        numbers, warnings = gray(image)
         self.warnings += warnings
         numbers = self._within(role, numbers, (numbers < -_ROUNDING) | (numbers > 1 + _ROUNDING))
         if entry.colorspace == "srgb":
             numbers = np.asarray(srgb_to_linear(numbers), np.float64)
         if entry.invert:
             numbers = 1.0 - numbers
+            self.facts[role] = replace(self.facts[role], inverted=True)
         if entry.colorspace == "srgb" or entry.invert:
             self.settings[f"{role}.encoding"] = [entry.colorspace, entry.invert]
         return float(numbers[0, 0]) if numbers.shape == (1, 1) else numbers
@@ -144,7 +152,8 @@ class MapLoader:
         pixels = image.pixels
         if pixels.shape[2] in (2, 4) and np.any(pixels[..., -1] != 1.0):
             self.warnings.append(
-                f"{image.path}: the alpha channel of the {role.replace('_', ' ')} is not used"
+                f"{image.path}: the alpha channel of the {role.replace('_', ' ')} is not used; for holes, "
+                f"write opacity: {{file: {image.path.name}, channel: A}}"
             )
         rgb = pixels[..., :3] if pixels.shape[2] > 2 else np.repeat(pixels[..., :1], 3, axis=2)
         rgb = self._within(role, rgb, np.any((rgb < -_ROUNDING) | (rgb > 1 + _ROUNDING), axis=-1))
