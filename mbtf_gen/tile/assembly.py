@@ -68,7 +68,7 @@ def assemble(spec: MaterialFile, folder: Path, found: FoundMaps, tile: Tiling) -
         load.notes.append(f"surface: glossy{'; default ' + filled if filled else ''}")
     maps["base_color"] = np.full(3, _DEFAULT_COLOR)
     if spec.base_color is not None:
-        maps["base_color"] = load.color("base_color", spec.base_color)
+        maps["base_color"] = load.color("base_color", spec.base_color, spec.opacity)
     elif spec.bsdf is None:
         load.notes.append(f"base color: {_DEFAULT_COLOR} gray, none is given")
     convention, fit = None, None

@@ -44,8 +44,8 @@ def refuse_color(image: Image, role: Literal["height", "opacity"]) -> None:
     raise InputError(
         f"is colored{' like a normal map' if normals else ''}; {kind} is gray",
         where=image.path,
-        hint=f"if one of its channels is meant, name it in a material.yaml: {role}: {{file: {image.path.name}, "
-        f"channel: {channel}}}{more}",
+        hint="if one of its channels is meant, say so in a material.yaml: "
+        f"{role}: {{file: {image.path.name}, channel: {channel}}}{more}",
     )
 
 

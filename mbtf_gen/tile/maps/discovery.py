@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import takewhile
 from pathlib import Path
@@ -139,30 +139,42 @@ def find_maps(folder: Path) -> FoundMaps:
             hint="remove all but one of each, or say which is meant in a material.yaml: "
             + _on_one_line({role: entries[role] for role in WORDS if role in entries}),
         )
-    metalness = any(name.workflow == "metalness" for name in names.values())
     notes = [f"{role}: 1 - {m.path.name}" for role, (m,) in chosen.items() if m.source.invert]
-    unused: dict[str, str] = {}
-    lost: list[str] = []
-    for path in (p for p in files if p not in maps.values()):
-        name = names[path]
-        missing = False
-        if isinstance(name.content, Unused):
-            reason, missing = name.content.reason, name.content.lost
-            missing = missing and not (metalness and name.workflow == "specular")
-        elif name.content is None:
-            # A picture of the material is named like it, but so may be its color.
-            reason, missing = "its name matches no map", not name.bare or "base_color" not in maps
-        else:
-            reason = reasons.get(path, "")
-        unused[path.name] = reason
-        (lost if missing else notes).append(f"{path.name} is not used: {reason}")
-    warnings += [f"{folder}: {text}" for text in ("; ".join(lost), unread) if text]
+    rest = {path: name for path, name in names.items() if path not in maps.values()}
+    unused, lost = _left_out(rest, reasons, maps)
+    notes += [f"{path.name} is not used: {why}" for path, why in unused.items() if path not in lost]
+    by_reason: dict[str, list[str]] = {}
+    for path in lost:
+        by_reason.setdefault(unused[path], []).append(path.name)
+    texts = [f"{_listed(given)} ({reason})" for reason, given in by_reason.items()]
+    warnings += [f"{folder}: not used: {'; '.join(texts)}"] if texts else []
+    warnings += [f"{folder}: {unread}"] if unread else []
     if "opacity" in maps and names[maps["opacity"]].word == "mask":
         warnings.append(
             f"{maps['opacity']}: is used as opacity, 0 for a hole, for its name says no more than 'mask'; "
             "remove it if it is another mask"
         )
-    return FoundMaps(maps, entries, unused, notes, warnings)
+    return FoundMaps(maps, entries, {path.name: why for path, why in unused.items()}, notes, warnings)
+
+
+def _left_out(
+    names: Mapping[Path, MapName], reasons: Mapping[Path, str], maps: Container[Role]
+) -> tuple[dict[Path, str], list[Path]]:
+    """Why files are not used, and those of them that the material may lack."""
+    metalness = any("metalness workflow" in reason for reason in reasons.values())
+    out, lost = {}, []
+    for path, name in names.items():
+        missing = False
+        if isinstance(name.content, Unused):
+            out[path], missing = name.content.reason, name.content.lost
+            missing = missing and not (metalness and name.workflow == "specular")
+        elif name.content is None:
+            # A picture of the material is named like it, but so may be its color.
+            out[path], missing = "its name matches no map", not name.bare or "base_color" not in maps
+        else:
+            out[path] = reasons.get(path, "it has no alpha channel")
+        lost += [path] if missing else []
+    return out, lost
 
 
 def _sources(path: Path, name: MapName, warnings: list[str]) -> list[Source]:

@@ -42,7 +42,7 @@ class Unused:
 # Words of file names that denote a map.
 WORDS: dict[Role, tuple[str, ...]] = {
     "height": ("height", "heightmap", "displacement", "disp"),
-    "base_color": ("basecolor", "basecolour", "albedo", "color", "colour", "col"),
+    "base_color": ("basecolor", "basecolour", "albedo", "color", "colour", "col", "basemap"),
     "roughness": ("roughness", "rough", "rgh"),
     "metallic": ("metallic", "metalness", "metal"),
     "normal": ("normal", "normals", "nor", "nrm", "norm", "normalgl", "normalogl", "normaldx"),
@@ -73,7 +73,7 @@ _CONVENTIONS: dict[str, Convention] = {
 }
 # The last words of files for a workflow; the other one's files are left out.
 _WORKFLOWS = ("metalness", "specular")
-_PIECE = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
+_PIECE = re.compile(r"OpenGL|DirectX|[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
 # In the pieces of a name, joined by blanks: 16 bits, as in ``DISP16``; a variant, as in ``COL_VAR2`` or
 # ``col_02``, whose number is no depth, resolution or tile of a UDIM set; what does not tell maps apart.
 _DEEP = re.compile(r"^16\b(?! k)(?: bit\b)?|\b16 bit\b")
@@ -122,7 +122,7 @@ def _unused() -> dict[str, Unused]:
     foreign = Unused("mbtf has no such map")
     out |= dict.fromkeys(_LAYERS, foreign)
     out |= dict.fromkeys(
-        ("refl", "reflection", "translucent", "scatter", "sss", "anisotropy", "ior"), foreign
+        ("refl", "reflection", "translucent", "scatter", "sss", "thickness", "anisotropy", "ior"), foreign
     )
     out |= dict.fromkeys(("specular", "spec", "clearcoat", "sheen"), Unused(_NAME_IT))
     out |= dict.fromkeys(("transparency",), Unused("as opacity it may be inverted; " + _NAME_IT))
@@ -133,7 +133,9 @@ def _unused() -> dict[str, Unused]:
     smooth = Unused("in its alpha may be gloss, in a material.yaml {file: …, channel: A, invert: true}")
     out |= dict.fromkeys(("specularsmoothness", "speculargloss", "specularglossiness"), smooth)
     contents = ("color", "roughness", "gloss", "normal", "weight", "opacity", "level", "mask")
-    out |= {a + b: Unused(_NAME_IT) for a, b in product(_LAYERS, contents) if a + b not in out}
+    out |= {a + b: foreign for a, b in product(_LAYERS, contents) if a + b not in out}
+    usable = product(("coat", "clearcoat", "sheen"), ("color", "roughness", "weight", "opacity"))
+    out |= {a + b: Unused(_NAME_IT) for a, b in (*usable, ("specular", "level"))}
     normals = Unused("it is no tangent-space normal map of the surface")
     out |= {space + word: normals for space, word in product(_SPACES, ("normal", "normals"))}
     return out | dict.fromkeys(("normalbump", "normalobject", "normaldetail"), normals)

@@ -141,8 +141,8 @@ class MapLoader:
             self.settings[f"{role}.encoding"] = [entry.colorspace, entry.invert]
         return float(numbers[0, 0]) if numbers.shape == (1, 1) else numbers
 
-    def color(self, role: str, entry: ColorEntry) -> Color:
-        """(h, w, 3) or (3,) linear color."""
+    def color(self, role: str, entry: ColorEntry, holes: ShareEntry | None = None) -> Color:
+        """(h, w, 3) or (3,) linear color; `holes` may be in the alpha channel of its file."""
         if entry.file is None:
             value = np.asarray(entry.value, np.float64)
             value = np.asarray(srgb_to_linear(value) if entry.colorspace == "srgb" else value)
@@ -150,7 +150,8 @@ class MapLoader:
             return value
         image = self.image(role, entry)
         pixels = image.pixels
-        if pixels.shape[2] in (2, 4) and np.any(pixels[..., -1] != 1.0):
+        alpha = pixels.shape[2] in (2, 4) and (holes is None or holes.file != entry.file)
+        if alpha and np.any(pixels[..., -1] != 1.0):
             self.warnings.append(
                 f"{image.path}: the alpha channel of the {role.replace('_', ' ')} is not used; for holes, "
                 f"write opacity: {{file: {image.path.name}, channel: A}}"
