@@ -14,7 +14,7 @@ from mbtf_core.app.options import Quality
 from mbtf_core.config.settings import Settings, explicit_options, resolve
 from mbtf_core.config.yaml_file import dump_yaml, line_of, read_yaml
 from mbtf_core.errors import InputError
-from mbtf_core.paths import named_file, suggest_path
+from mbtf_core.paths import named_file
 from mbtf_fit.config import DEFAULT_MODEL, FitConfig, fitter_options
 from mbtf_gen.config.generator import RESOLUTION, GeneratorConfig, Paths, generator_options
 from mbtf_gen.config.pictures import EXPOSURE, Exposure
@@ -213,8 +213,7 @@ def load_recipe(
         raise InputError(
             f"material '{written}' does not exist",
             where="--set generate.material" if assigned else f"{path}:{line}" if line else path,
-            hint=suggest_path(material)
-            or f"searched for {os.path.abspath(material)}"
+            hint=f"searched for {os.path.abspath(material)}"
             + ("" if assigned else f"; edit 'generate.material' in {path}"),
         )
     generate = recipe.generate.model_copy(update={"material": os.path.normpath(material)})

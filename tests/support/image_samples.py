@@ -60,9 +60,7 @@ def tgas() -> dict[str, bytes]:
     """TGA files by name, with and without run lengths."""
     kinds = [name for name in pictures() if name in ("L", "LA", "RGB", "RGBA", "P")]
     runs: list[dict[str, object]] = [{}, {"compression": "tga_rle"}]
-    return {
-        f"{name}{len(run)}.tga": _saved(pictures()[name], "TGA", **run) for name in kinds for run in runs
-    }
+    return {f"{name}{len(run)}.tga": _saved(pictures()[name], "TGA", **run) for name in kinds for run in runs}
 
 
 def bmps() -> dict[str, bytes]:

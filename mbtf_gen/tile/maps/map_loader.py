@@ -186,11 +186,12 @@ class MapLoader:
         maps that store only x and y is √(1 - x² - y²)."""
         image = self.image("normal", entry)
         stored = image.pixels.astype(np.float32)
-        if image.pixels.shape[2] == 2 and image.path.suffix.lower() in _GRAY_AND_ALPHA:
-            # Gray pictures of maps that store x in alpha.
-            stored = stored[..., ::-1]
-        if stored.shape[2] == 1 or (stored.shape[2] == 2 and np.ptp(stored[..., 0]) == 0):
+        gray_and_alpha = stored.shape[2] == 2 and image.path.suffix.lower() in _GRAY_AND_ALPHA
+        if stored.shape[2] == 1 or (gray_and_alpha and np.ptp(stored[..., 1]) == 0):
             raise InputError("is gray; a normal map has two channels or more", where=image.path)
+        if gray_and_alpha:
+            # x is in alpha.
+            stored = stored[..., ::-1]
         signed = image.bits is None and float(stored[..., :2].min()) < _SIGNED
         vectors = stored if signed else 2.0 * stored - 1.0
         two = stored_xy(vectors)
