@@ -172,7 +172,7 @@ def _left_out(
             # A picture of the material is named like it, but so may be its color.
             out[path], missing = "its name matches no map", not name.bare or "base_color" not in maps
         else:
-            out[path] = reasons.get(path, "it has no alpha channel")
+            out[path] = reasons.get(path, "its alpha channel is missing")
         lost += [path] if missing else []
     return out, lost
 
@@ -184,14 +184,18 @@ def _sources(path: Path, name: MapName, warnings: list[str]) -> list[Source]:
     alpha = any(source.channel == "A" for source in name.content)
     stored = [s for s in name.content if s.channel != "A" or _has_alpha(path)]
     if alpha and len(stored) < len(name.content) and name.content[-1].role != "opacity":
-        warnings.append(f"{path}: has no alpha channel, where gloss is expected: roughness is missing")
+        warnings.append(
+            f"{path}: has no alpha channel, or one of 1 only, where gloss is expected: roughness is missing"
+        )
     return stored
 
 
 def _has_alpha(path: Path) -> bool:
-    """Whether an image has an alpha channel, or cannot be read, which its use reports."""
+    """Whether an image has an alpha channel that is not 1 everywhere, as programs write it that know no other;
+    or cannot be read, which its use reports."""
     with contextlib.suppress(InputError):
-        return read_image(path).pixels.shape[2] in (2, 4)
+        pixels = read_image(path).pixels
+        return pixels.shape[2] in (2, 4) and bool((pixels[..., -1] != 1.0).any())
     return True
 
 

@@ -134,10 +134,12 @@ class TestScalars:
         )
         assert load_material(write(heights, text)).digests == material.digests
         (heights / "material.yaml").unlink()
-        png(path, codes[..., :3], 2, 8)
-        material = load_material(heights)
-        assert "no alpha channel" in material.warnings[0]
-        assert np.array_equal(np.rint(255 * np.asarray(material.maps["metallic"])), codes[..., 0])
+        for stored, color in ((codes[..., :3], 2), (codes | [0, 0, 0, 255], 6)):
+            png(path, stored, color, 8)
+            material = load_material(heights)
+            assert "no alpha channel" in material.warnings[0]
+            assert np.array_equal(np.rint(255 * np.asarray(material.maps["metallic"])), codes[..., 0])
+            assert material.maps["roughness"] == 0.5
 
     def test_a_mask(self, heights: Path) -> None:
         codes = rng().integers(0, 256, (8, 16, 4))
