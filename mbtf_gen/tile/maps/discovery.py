@@ -185,7 +185,7 @@ def _sources(path: Path, name: MapName, warnings: list[str]) -> list[Source]:
     stored = [s for s in name.content if s.channel != "A" or _has_alpha(path)]
     if alpha and len(stored) < len(name.content) and name.content[-1].role != "opacity":
         warnings.append(
-            f"{path}: has no alpha channel, or one of 1 only, where gloss is expected: roughness is missing"
+            f"{path}: has no alpha channel, or one of 1 only, for its gloss: roughness is missing"
         )
     return stored
 
