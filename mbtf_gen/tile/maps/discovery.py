@@ -14,6 +14,7 @@ from typing import Any
 from mbtf_core.errors import InputError
 from mbtf_core.images.read import SUFFIXES, is_image, read_image
 from mbtf_gen.tile.maps.file_names import (
+    SMOOTHNESS_IN_ALPHA,
     WEAK_WORDS,
     WORDS,
     MapName,
@@ -121,9 +122,8 @@ def find_maps(folder: Path) -> FoundMaps:
         shared = 0
     names = {path: read_name(path.name, shared) for path in files}
     candidates: dict[Role, list[FoundMap]] = {}
-    warnings: list[str] = []
     for path, name in names.items():
-        for source in _sources(path, name, warnings):
+        for source in _sources(path, name):
             candidates.setdefault(source.role, []).append(FoundMap(path, name, source))
     reasons: dict[Path, str] = {}
     chosen = {role: _choose(given, reasons) for role, given in candidates.items()}
@@ -147,8 +147,12 @@ def find_maps(folder: Path) -> FoundMaps:
     for path in lost:
         by_reason.setdefault(unused[path], []).append(path.name)
     texts = [f"{_listed(given)} ({reason})" for reason, given in by_reason.items()]
-    warnings += [f"{folder}: not used: {'; '.join(texts)}"] if texts else []
+    warnings = [f"{folder}: not used: {'; '.join(texts)}"] if texts else []
     warnings += [f"{folder}: {unread}"] if unread else []
+    if "roughness" not in maps:
+        glossless = (path for path, name in names.items() if name.word.startswith(SMOOTHNESS_IN_ALPHA))
+        what = "has no alpha channel, or one of 1 only, for its gloss: roughness is missing"
+        warnings += [f"{path}: {what}" for path in glossless]
     if "opacity" in maps and names[maps["opacity"]].word == "mask":
         warnings.append(
             f"{maps['opacity']}: is used as opacity, 0 for a hole, for its name says no more than 'mask'; "
@@ -177,22 +181,15 @@ def _left_out(
     return out, lost
 
 
-def _sources(path: Path, name: MapName, warnings: list[str]) -> list[Source]:
+def _sources(path: Path, name: MapName) -> list[Source]:
     """What a file stores; something in an alpha channel only where the file has one."""
-    if not isinstance(name.content, tuple):
-        return []
-    alpha = any(source.channel == "A" for source in name.content)
-    stored = [s for s in name.content if s.channel != "A" or _has_alpha(path)]
-    if alpha and len(stored) < len(name.content) and name.content[-1].role != "opacity":
-        warnings.append(
-            f"{path}: has no alpha channel, or one of 1 only, for its gloss: roughness is missing"
-        )
-    return stored
+    content = name.content if isinstance(name.content, tuple) else ()
+    return [source for source in content if source.channel != "A" or _has_alpha(path)]
 
 
 def _has_alpha(path: Path) -> bool:
-    """Whether an image has an alpha channel that is not 1 everywhere, as programs write it that know no other;
-    or cannot be read, which its use reports."""
+    """Whether an image has an alpha channel that is not 1 everywhere, as programs fill one that they do not
+    need; or cannot be read, which its use reports."""
     with contextlib.suppress(InputError):
         pixels = read_image(path).pixels
         return pixels.shape[2] in (2, 4) and bool((pixels[..., -1] != 1.0).any())

@@ -60,7 +60,10 @@ LETTERS = ("arm", "orm", "rma", "mra", "mro", "rmo", "amr", "aorm", "mrao", "rma
 _LETTER: dict[str, Role] = {"r": "roughness", "m": "metallic"}
 _OCCLUSION = ("occlusion", "ambientocclusion", "ao")
 # Words of Unity: metallic in red, smoothness (1 - roughness) in alpha.
-SMOOTHNESS_IN_ALPHA = ("maskmap", "mads", "metallicsmoothness", "metallicgloss", "metallicglossiness")
+SMOOTHNESS_IN_ALPHA = (
+    *("maskmap", "mads", "metallicsmoothness", "metalsmoothness"),
+    *("metallicgloss", "metallicglossiness"),
+)
 _NAME_IT = "name it in a material.yaml to use it"
 _LAYERS = (
     *("coat", "clearcoat", "sheen", "fuzz", "emissive", "emission", "specular"),
@@ -131,7 +134,7 @@ def _unused() -> dict[str, Unused]:
     packed = ("roughnessmetallic", "roughnessmetalness", "ord", "packed")
     out |= dict.fromkeys(packed, unclear)
     smooth = Unused("in its alpha may be gloss, in a material.yaml {file: …, channel: A, invert: true}")
-    out |= dict.fromkeys(("specularsmoothness", "speculargloss", "specularglossiness"), smooth)
+    out |= dict.fromkeys(("specularsmoothness", "speculargloss", "specularglossiness", "specgloss"), smooth)
     contents = ("color", "roughness", "gloss", "normal", "weight", "opacity", "level", "mask")
     out |= {a + b: foreign for a, b in product(_LAYERS, contents) if a + b not in out}
     usable = product(("coat", "clearcoat", "sheen"), ("color", "roughness", "weight", "opacity"))

@@ -129,6 +129,9 @@ class MapLoader:
         image = self.image(role, entry, entry.colorspace)
         if role == "opacity":
             refuse_color(image, "opacity")
+            spread = np.ptp(image.pixels, axis=(0, 1))
+            if len(spread) in (2, 4) and spread[-1] > 0 and not spread[:-1].any():
+                image = self.image(role, entry.model_copy(update={"channel": "A"}), entry.colorspace)
         numbers, warnings = gray(image)
         self.warnings += warnings
         numbers = self._within(role, numbers, (numbers < -_ROUNDING) | (numbers > 1 + _ROUNDING))

@@ -154,6 +154,15 @@ class TestScalars:
         assert np.array_equal(np.rint(255 * np.asarray(material.maps["opacity"])), codes[..., 0])
         assert any("'mask'" in warning for warning in material.warnings)
 
+    @pytest.mark.parametrize("channels", [2, 4])
+    def test_a_mask_in_alpha_alone(self, heights: Path, channels: int) -> None:
+        codes = np.full((8, 16, channels), 255)
+        codes[..., -1] = rng().integers(0, 256, (8, 16))
+        png(heights / "leaf_alpha.png", codes, {2: 4, 4: 6}[channels], 8)
+        material = load_material(heights)
+        assert np.array_equal(np.rint(255 * np.asarray(material.maps["opacity"])), codes[..., -1])
+        assert material.warnings == ()
+
     def test_holes_in_the_alpha_of_a_color(self, heights: Path) -> None:
         codes = rng().integers(0, 256, (8, 16, 4))
         path = png(heights / "leaf_AlbedoTransparency.png", codes, 6, 8)
