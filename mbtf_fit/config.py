@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from mbtf_core.app.options import Flag, Quality
-from mbtf_core.config.settings import Settings, deep_merge, leaves
+from mbtf_core.config.settings import LocalName, Settings, deep_merge, leaves
 from mbtf_core.files.atomic import data_sha256
 from mbtf_core.units import parse_duration
 from mbtf_fit.models import NAMES
@@ -46,10 +46,10 @@ class FitConfig(Settings):
 
     version: Literal[2] = 2
     model: Annotated[ModelName, Flag("--model")] = Field(DEFAULT_MODEL, description="model to fit")
-    init_from: Annotated[str | None, Flag("--init-from", "FOLDER")] = Field(
+    init_from: Annotated[LocalName | None, Flag("--init-from", "FOLDER")] = Field(
         None, description="folder of a material that initializes textures and offset"
     )
-    decoder: Annotated[str | None, Flag("--decoder", "FOLDER")] = Field(
+    decoder: Annotated[LocalName | None, Flag("--decoder", "FOLDER")] = Field(
         None,
         description="folder of a shared network, or of a material, whose network is kept: the fit trains "
         "textures alone",

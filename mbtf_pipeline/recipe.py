@@ -14,6 +14,7 @@ from mbtf_core.app.options import Quality
 from mbtf_core.config.settings import Settings, explicit_options, resolve
 from mbtf_core.config.yaml_file import dump_yaml, line_of, read_yaml
 from mbtf_core.errors import InputError
+from mbtf_core.paths import named_file
 from mbtf_fit.config import DEFAULT_MODEL, FitConfig, fitter_options
 from mbtf_gen.config.generator import RESOLUTION, GeneratorConfig, Paths, generator_options
 from mbtf_gen.config.pictures import EXPOSURE, Exposure
@@ -203,9 +204,10 @@ def load_recipe(
         raise InputError("is a folder, not a recipe", where=path, hint="give a YAML file in it")
     recipe = resolve(Recipe, file=path, presets=presets, assignments=assignments)
     assigned = any(a.partition("=")[0].strip() == "generate.material" for a in assignments)
-    written = Path(recipe.generate.material)
+    written = recipe.generate.material
     # By its words, as it is used below: folders of the path may be links.
-    material = written if assigned else Path(os.path.normpath(path.parent / written))
+    material = named_file(Path() if assigned else path.parent, written)
+    material = material if assigned else Path(os.path.normpath(material))
     if not material.exists():
         line = None if assigned else line_of(read_yaml(path), ("generate", "material"))
         raise InputError(

@@ -26,7 +26,7 @@ from pydantic import (
 
 from mbtf_core.config.yaml_file import line_of, parse_value, read_yaml, shortened
 from mbtf_core.errors import InputError, MbtfError, UsageError
-from mbtf_core.paths import suggest_name
+from mbtf_core.paths import named_file, suggest_name
 
 _COMMAND_LINE = "command line"
 
@@ -86,6 +86,15 @@ def _file_name(name: str) -> str:
 
 # The name of a file, or a path to it.
 FileName = Annotated[str, Field(min_length=1), AfterValidator(_file_name)]
+
+
+def _separated(name: str) -> str:
+    path = named_file(Path(), name)
+    return name if path == Path(name) else str(path)
+
+
+# The same, relative to the current folder.
+LocalName = Annotated[FileName, AfterValidator(_separated)]
 
 
 def _known_keys(model: type[BaseModel], location: Sequence[str | int]) -> list[str]:

@@ -60,7 +60,12 @@ def read_yaml(path: Path) -> Any:
     except MarkedYAMLError as error:
         mark = error.problem_mark
         line = f":{mark.line + 1}" if mark is not None else ""
-        raise InputError(f"not valid YAML ({reason(error.problem)})", where=f"{path}{line}") from None
+        hint = "in double quotes, a backslash begins an escape: write slashes" * (
+            "escape" in str(error.problem)
+        )
+        raise InputError(
+            f"not valid YAML ({reason(error.problem)})", where=f"{path}{line}", hint=hint
+        ) from None
     except ReaderError as error:
         what = f"has the control character U+{ord(text[error.position]):04X}"
         where = _place(path, text, error.position)

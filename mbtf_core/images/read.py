@@ -1,4 +1,4 @@
-"""Images as arrays: EXR, PNG, JPG, TIFF and npy, decoded without loss.
+"""Images as arrays: EXR, PNG, JPG, TIFF, TGA, BMP and npy, decoded without loss.
 
 Integer images become ``code / largest code``; float images keep their numbers. The material decides which
 maps are sRGB; no color space is applied here.
@@ -42,6 +42,8 @@ _KINDS = {
     ".jpeg": "JPEG",
     ".tif": "TIFF",
     ".tiff": "TIFF",
+    ".tga": "TGA",
+    ".bmp": "BMP",
     ".npy": "NPY",
 }
 _MAGIC = {
@@ -52,6 +54,7 @@ _MAGIC = {
     b"MM\x00*": "TIFF",
     b"II+\x00": "TIFF",
     b"MM\x00+": "TIFF",
+    b"BM": "BMP",
     b"\x93NUMPY": "NPY",
 }
 # Photometric interpretations of TIFF that are read as stored.
@@ -126,7 +129,7 @@ def read_image(
 
     Parameters
     ----------
-    path : EXR, PNG, JPG, TIFF or npy file
+    path : EXR, PNG, JPG, TIFF, TGA, BMP or npy file
     channel : a channel or layer of an EXR file; R, G, B, A or Y of other formats. None: see
         :func:`~mbtf_core.images.exr.choose_channels`
     prefer : predicate on the layer names of an EXR file, for files of several layers
@@ -205,7 +208,9 @@ def _kind(path: Path) -> str:
         )
     if not start:
         raise InputError("is empty", where=path)
-    found = next((kind for magic, kind in _MAGIC.items() if start.startswith(magic)), None)
+    # A TGA file has no first bytes of its own.
+    unmarked = "TGA" if named == "TGA" else None
+    found = next((kind for magic, kind in _MAGIC.items() if start.startswith(magic)), unmarked)
     if found is None:
         raise InputError(f"is not a valid {named} image", where=path)
     if found != named:
@@ -281,7 +286,7 @@ def _from_pillow(path: Path, kind: str) -> Image:
     from PIL import Image as Pillow
 
     codes: NDArray[Any] | None = None
-    if kind != "JPEG":
+    if kind in ("PNG", "TIFF"):
         codes = _deep_png(path) if kind == "PNG" else _read_tiff(path)
     if codes is not None:
         return replace(_decoded(codes, path), tags=_tags(path, kind))

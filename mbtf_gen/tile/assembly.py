@@ -16,7 +16,7 @@ from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import data_sha256, file_sha256
 from mbtf_core.images.read import MAX_PIXELS, gray
 from mbtf_core.images.resample import dequantize
-from mbtf_core.paths import suggest_path
+from mbtf_core.paths import named_file, suggest_path
 from mbtf_gen.tile.heightfield_tile import MAPS, HeightFieldTile
 from mbtf_gen.tile.maps.checks import (
     Codes,
@@ -29,7 +29,8 @@ from mbtf_gen.tile.maps.checks import (
     refuse_color,
     seam_warning,
 )
-from mbtf_gen.tile.maps.discovery import Convention, FoundMaps, normal_convention
+from mbtf_gen.tile.maps.discovery import FoundMaps
+from mbtf_gen.tile.maps.file_names import Convention, normal_convention
 from mbtf_gen.tile.maps.map_loader import MapLoader
 from mbtf_gen.tile.maps.material_file import LOBES, ROLES, MaterialFile, NormalEntry, layers_above
 from mbtf_gen.tile.maps.normal_map import NormalFit, fit_normals
@@ -67,7 +68,7 @@ def assemble(spec: MaterialFile, folder: Path, found: FoundMaps, tile: Tiling) -
         load.notes.append(f"surface: glossy{'; default ' + filled if filled else ''}")
     maps["base_color"] = np.full(3, _DEFAULT_COLOR)
     if spec.base_color is not None:
-        maps["base_color"] = load.color("base_color", spec.base_color)
+        maps["base_color"] = load.color("base_color", spec.base_color, spec.opacity)
     elif spec.bsdf is None:
         load.notes.append(f"base color: {_DEFAULT_COLOR} gray, none is given")
     convention, fit = None, None
@@ -156,7 +157,7 @@ def _heights(spec: MaterialFile, load: MapLoader) -> tuple[NDArray[np.float64], 
     """Stored heights, their codes, and the factor to tile widths."""
     entry = spec.height
     image = load.image("height", entry, entry.colorspace)
-    refuse_color(image)
+    refuse_color(image, "height")
     height, warnings = gray(image)
     load.warnings += warnings
     largest = float(np.abs(height).max())
@@ -208,7 +209,7 @@ def _bsdf(tree: dict[str, Any], load: MapLoader) -> tuple[dict[str, Any], dict[s
 
 def _bsdf_file(name: str, load: MapLoader) -> Path:
     try:
-        path = (load.folder / name).resolve()
+        path = named_file(load.folder, name).resolve()
         found = path.is_file()
     except (OSError, ValueError):
         raise InputError("the bsdf names a file whose name is not valid", where=load.folder) from None

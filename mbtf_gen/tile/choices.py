@@ -13,6 +13,7 @@ from mbtf_core.data.schema import Tiling
 from mbtf_core.errors import UsageError
 from mbtf_core.files.atomic import write_text
 from mbtf_core.files.folders import make_folder
+from mbtf_core.paths import named_file
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 from mbtf_gen.tile.loading import described
@@ -120,7 +121,7 @@ def write_material_file(path: Path, material: Tile, config: GeneratorConfig) -> 
         if isinstance(node, dict):
             return {name: moved(value, name) for name, value in node.items()}
         names_file = key in ("file", "filename") and isinstance(node, str)
-        return Path(os.path.relpath(source / node, target)).as_posix() if names_file else node
+        return Path(os.path.relpath(named_file(source, node), target)).as_posix() if names_file else node
 
     # Plain types, without what a YAML reader attaches.
     data = moved(json.loads(json.dumps(spec.model_dump(mode="json", exclude_defaults=True))))

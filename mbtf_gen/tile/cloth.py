@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import data_sha256, file_sha256
+from mbtf_core.paths import named_file
 from mbtf_gen.tile.fiber_tile import FiberScattering, FiberTile
 from mbtf_gen.tile.fibers.cloth_file import ClothFile, YarnEntry
 from mbtf_gen.tile.fibers.curve_file import read_curves
@@ -53,7 +54,11 @@ def cloth_tile(spec: ClothFile, folder: Path) -> FiberTile:
         A file is unreadable, its curves do not tile, or there are too many fibers.
     """
     tile = _fibers(spec, folder)
-    files = {key: folder / name for key in ("pattern", "curves") if (name := getattr(spec, key)) is not None}
+    files = {
+        key: named_file(folder, name)
+        for key in ("pattern", "curves")
+        if (name := getattr(spec, key)) is not None
+    }
     digests = {role: file_sha256(path) for role, path in files.items()}
     # What the defaults stand for changes the data as well.
     settings = spec.model_dump(mode="json", exclude={"pattern", "curves"})
@@ -74,9 +79,9 @@ def _fibers(spec: ClothFile, folder: Path) -> FiberTile:
     rng = np.random.default_rng(spec.seed)
     where = folder
     if spec.curves is not None:
-        return _of_curves(spec, folder / spec.curves)
+        return _of_curves(spec, named_file(folder, spec.curves))
     if spec.pattern is not None:
-        where = folder / spec.pattern
+        where = named_file(folder, spec.pattern)
         aspect, yarns = _of_pattern(spec, where)
     elif spec.knit is not None:
         aspect, yarns = _knitted(spec)

@@ -28,7 +28,7 @@ from mbtf_gen.tile.heights import (
 )
 from mbtf_gen.tile.inspection import ALBEDO_RANGE, inspection_text, oddities
 from mbtf_gen.tile.maps.checks import Codes, suggestion_warning
-from mbtf_gen.tile.maps.discovery import Convention
+from mbtf_gen.tile.maps.file_names import Convention
 from mbtf_gen.tile.maps.map_loader import Color, MapFacts
 from mbtf_gen.tile.maps.material_file import LOBES, ROLES
 from mbtf_gen.tile.maps.normal_map import NormalFit

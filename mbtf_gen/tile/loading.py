@@ -14,7 +14,7 @@ from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import file_sha256
 from mbtf_core.images.read import SUFFIXES, is_image
 from mbtf_core.meshes.read import MESH_FILES
-from mbtf_core.paths import suggest_path
+from mbtf_core.paths import named_file, suggest_path
 from mbtf_gen.tile.assembly import assemble, retiled
 from mbtf_gen.tile.cloth import cloth_tile
 from mbtf_gen.tile.fibers.cloth_file import CLOTH_KEYS, CURVE_FILES, ClothFile
@@ -126,12 +126,13 @@ def described(path: Path) -> tuple[Described, Path, FoundMaps]:
     InputError
         Nothing usable is at the path.
     """
+    path = named_file(Path(), str(path))
     if path.is_dir():
         described = next((path / name for name in _YAML if (path / name).is_file()), None)
         if described is not None:
             return _read(described), path, FoundMaps()
         found = find_maps(path)
-        spec = MaterialFile.model_validate({role: str(file.name) for role, file in found.maps.items()})
+        spec = MaterialFile.model_validate(found.entries)
         return spec, path, found
     if not path.exists():
         raise InputError("no such file or folder", where=path, hint=suggest_path(path))
@@ -156,7 +157,7 @@ def described(path: Path) -> tuple[Described, Path, FoundMaps]:
     with contextlib.suppress(InputError):
         others = {role: file for role, file in find_maps(path.parent).maps.items() if file != path}
         if others and "height" not in others:
-            names = ", ".join(file.name for file in others.values())
+            names = ", ".join(dict.fromkeys(file.name for file in others.values()))
             notes = [
                 f"only the heights of {path.name} are used; for {names} too, give the folder {path.parent}"
             ]

@@ -17,6 +17,7 @@ from mbtf_core.files.atomic import data_sha256, file_sha256
 from mbtf_core.meshes.content import MOST_TRIANGLES, MeshShape, Value, numbers_of
 from mbtf_core.meshes.read import read_mesh_content
 from mbtf_core.meshes.up_axis import y_seems_up
+from mbtf_core.paths import named_file
 from mbtf_gen.config.generator import Positive, Resolution, Rgb, Share, no_tiling
 from mbtf_gen.tile.maps.material_file import LOBES, ROLES
 from mbtf_gen.tile.mesh_textures import with_one_wrap, with_vertex_colors
@@ -72,7 +73,7 @@ def read_mesh(spec: MeshFile, folder: Path) -> MeshTile:
     InputError
         The file cannot be read, or its triangles are no tile.
     """
-    path = folder / spec.mesh
+    path = named_file(folder, spec.mesh)
     content = read_mesh_content(path)
     shapes = [_shape(shape, spec, path) for shape in content.shapes]
     vertices, faces, uv, part = _joined(shapes, path)

@@ -12,6 +12,7 @@ from typing import Any
 
 from mbtf_core.config.yaml_file import read_yaml
 from mbtf_core.errors import InputError, UsageError, reason
+from mbtf_core.paths import named_file
 
 # Files in a folder of materials that are materials.
 _SUFFIXES = {".yaml", ".yml", ".pyp", ".bcc", ".curves", ".glb", ".gltf", ".ply", ".obj"}
@@ -52,13 +53,14 @@ def find_materials(path: Path) -> list[Path]:
         raise InputError(f"cannot be read as a list ({reason(error)})", where=path) from None
     if any("\0" in line for line in lines):
         raise InputError("is no list of paths: it holds null characters", where=path)
-    return [Path(os.path.normpath(path.parent / line)) for line in lines if line and not line.startswith("#")]
+    named = (named_file(path.parent, line) for line in lines if line and not line.startswith("#"))
+    return [Path(os.path.normpath(material)) for material in named]
 
 
 def _in_folder(folder: Path) -> list[Path]:
     """A folder that is a material, or the materials in it; their runs say whether they are usable."""
     from mbtf_core.images.read import is_image
-    from mbtf_gen.tile.maps.discovery import role_of
+    from mbtf_gen.tile.maps.file_names import role_of
 
     inside = [path for path in sorted(folder.iterdir()) if not path.name.startswith((".", "_"))]
     files = {path.name for path in inside if path.is_file()}
@@ -67,7 +69,7 @@ def _in_folder(folder: Path) -> list[Path]:
         return [folder]
     documents = {path: _document(path) for path in inside if path.suffix.lower() in _YAML and path.is_file()}
     texts = {text for document in documents.values() for text in _texts(document) if "\0" not in text}
-    parts = {os.path.normpath(folder / text) for text in texts}
+    parts = {os.path.normpath(named_file(folder, text)) for text in texts}
     out: list[Path] = []
     for path in inside:
         if path.is_dir():

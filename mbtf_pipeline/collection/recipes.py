@@ -12,6 +12,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from mbtf_core.config.settings import FileName, Settings, build, deep_merge, resolve
 from mbtf_core.config.yaml_file import read_yaml
 from mbtf_core.errors import InputError, MbtfError
+from mbtf_core.paths import named_file
 from mbtf_core.units import Duration
 from mbtf_fit.config import DEFAULT_MODEL, FIBER_MODEL
 from mbtf_pipeline.collection.materials import find_materials, name_materials
@@ -145,7 +146,7 @@ class Collection(Settings):
                 where = f"{file}: materials.{name}"
                 raise InputError("has no path", where=where, hint="add generate.material")
         return {
-            name: Path(os.path.normpath(file.parent / str(layer.generate["material"])))
+            name: Path(os.path.normpath(named_file(file.parent, str(layer.generate["material"]))))
             for name, layer in self.materials.items()
         }
 
@@ -227,7 +228,7 @@ class LibraryRecipe(Collection):
 
     def paths(self, file: Path) -> dict[str, Path]:
         """Those in `library` in its order, of one folder by name, and further ones."""
-        listed = [path for text in self.library for path in find_materials(file.parent / text)]
+        listed = [path for text in self.library for path in find_materials(named_file(file.parent, text))]
         own = {name: layer for name, layer in self.materials.items() if "material" in layer.generate}
         found = dict(zip(name_materials(listed, own), listed, strict=True))
         for name in self.materials.keys() - own.keys() - found.keys():

@@ -56,6 +56,19 @@ def _png16() -> bytes:
     return png(COLUMNS, ROWS, 16, 2, zlib.compress(lines))
 
 
+def tgas() -> dict[str, bytes]:
+    """TGA files by name, with and without run lengths."""
+    kinds = [name for name in pictures() if name in ("L", "LA", "RGB", "RGBA", "P")]
+    runs: list[dict[str, object]] = [{}, {"compression": "tga_rle"}]
+    return {f"{name}{len(run)}.tga": _saved(pictures()[name], "TGA", **run) for name in kinds for run in runs}
+
+
+def bmps() -> dict[str, bytes]:
+    """BMP files by name."""
+    kinds = [name for name in pictures() if name in ("L", "RGB", "RGBA", "P", "1")]
+    return {f"{name}.bmp": _saved(pictures()[name], "BMP") for name in kinds}
+
+
 def pngs() -> dict[str, bytes]:
     """PNG files by name."""
     kinds = ("L", "LA", "RGB", "RGBA", "P", "1", "I;16")

@@ -6,28 +6,30 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
 from mbtf_core.images.read import Image
-from mbtf_gen.tile.maps.discovery import Convention
+from mbtf_gen.tile.maps.file_names import Convention
 from mbtf_gen.tile.maps.normal_map import NormalFit
 from mbtf_gen.tile.maps.tiling import Seam, broken
 
 CONVENTION_NAMES: dict[Convention, str] = {"gl": "OpenGL", "dx": "DirectX"}
 # Mean spread of the channels, relative to the largest number, beyond which an image is a color picture.
 _COLORED = 0.02
+# What a colored mask may be.
+_MASK_MAP = "; if it is Unity's mask map, of metallic (R) and smoothness (A), name the file MaskMap"
 # Levels, and codes between them, that 8-bit heights in a 16-bit file have.
 _FEW_LEVELS, _FAR_APART = 1024, 16.0
 # Ratio of a height scale to the one that the normal map suggests, above which a warning is given.
 _FAR_OFF = 1.5
 
 
-def refuse_color(image: Image) -> None:
-    """Refuse a color image as a height map: channels that differ by more than 2 % on average."""
+def refuse_color(image: Image, role: Literal["height", "opacity"]) -> None:
+    """Refuse a color image as a gray map: channels that differ by more than 2 % on average."""
     if image.pixels.shape[2] < 3:
         return
     rgb = image.pixels[..., :3].astype(np.float64)
@@ -36,11 +38,14 @@ def refuse_color(image: Image) -> None:
         return
     red, green, blue = rgb.mean(axis=(0, 1))
     normals = abs(red - 0.5) < 0.1 and abs(green - 0.5) < 0.1 and blue > 0.7
+    kind, channel, more = "a height map", "R", ""
+    if role == "opacity":
+        kind, channel, more = "an opacity map", "A" if image.pixels.shape[2] == 4 else "R", _MASK_MAP
     raise InputError(
-        f"is colored{' like a normal map' if normals else ''}; a height map is gray",
+        f"is colored{' like a normal map' if normals else ''}; {kind} is gray",
         where=image.path,
-        hint="if one of its channels stores the heights, name it in a material.yaml: "
-        f"height: {{file: {image.path.name}, channel: R}}",
+        hint="if one of its channels is meant, say so in a material.yaml: "
+        f"{role}: {{file: {image.path.name}, channel: {channel}}}{more}",
     )
 
 

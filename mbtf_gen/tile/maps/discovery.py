@@ -1,54 +1,62 @@
-"""Recognition of maps by the file names that texture libraries customarily use."""
+"""Recognition of the maps in a folder by their file names."""
 
 from __future__ import annotations
 
 import contextlib
+import json
 import re
+from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import takewhile
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 from mbtf_core.errors import InputError
-from mbtf_core.images.read import SUFFIXES, is_image
+from mbtf_core.images.read import SUFFIXES, is_image, read_image
+from mbtf_gen.tile.maps.file_names import (
+    SMOOTHNESS_IN_ALPHA,
+    WEAK_WORDS,
+    WORDS,
+    MapName,
+    Role,
+    Source,
+    Unused,
+    read_name,
+    role_of,
+    tokens,
+)
 
-Role = Literal["height", "base_color", "roughness", "metallic", "normal", "opacity"]
-Convention = Literal["gl", "dx"]
-
-# Words of file names that denote a map.
-WORDS: dict[Role, tuple[str, ...]] = {
-    "height": ("height", "heightmap", "displacement", "disp", "bump"),
-    "base_color": ("basecolor", "basecolour", "albedo", "color", "colour", "col", "diffuse", "diff"),
-    "roughness": ("roughness", "rough", "rgh"),
-    "metallic": ("metallic", "metalness", "metal"),
-    "normal": ("normal", "normals", "nor", "nrm", "normalgl", "normaldx"),
-    "opacity": ("opacity", "alpha", "mask"),
-}
-_ROLES: dict[str, Role] = {word: role for role, words in WORDS.items() for word in words}
-# Words of packed maps → their channels of roughness and metallic.
-_PACKED = {
-    **dict.fromkeys(("arm", "orm", "metallicroughness", "roughnessmetallic"), ("G", "B")),
-    "rma": ("R", "G"),
-}
-_GLOSS = ("gloss", "glossiness")
-# Words of maps that are known but not used, and the reason.
-UNUSED: dict[str, str] = {
-    **dict.fromkeys(("ao", "occlusion"), "the simulation computes ambient occlusion"),
-    **dict.fromkeys(_PACKED, "name its channels in a material.yaml, as in roughness: {file: …, channel: G}"),
-    **dict.fromkeys(("specular", "spec"), "name it in a material.yaml to use it"),
-    **dict.fromkeys(_GLOSS, "in a material.yaml it is roughness: {file: …, invert: true}"),
-    **dict.fromkeys(("emissive", "emission", "preview", "thumb"), "mbtf does not use it"),
-}
-# Neighboring words that are one.
-_JOINED = {
-    (first, second): "metallicroughness" if second == "roughness" else "roughnessmetallic"
-    for metal in ("metallic", "metalness")
-    for first, second in ((metal, "roughness"), ("roughness", metal))
-}
 _ARCHIVES = (".zip", ".7z", ".rar", ".tar", ".tgz", ".gz")
+# Suffixes of image formats, and of materials of other programs, that are not read.
+_UNREAD = (
+    *(".astc", ".avif", ".basis", ".crn", ".dds", ".gif", ".hdr", ".heic", ".iff", ".jfif", ".jp2", ".jxl"),
+    *(".jxr", ".ktx", ".ktx2", ".mxr", ".pcx", ".pfm", ".pgm", ".pic", ".ppm", ".psb", ".psd", ".pvr"),
+    *(".r16", ".r32", ".raw", ".rgb", ".sbs", ".sbsar", ".sgi", ".svg", ".sxr", ".tex", ".tx", ".vtf"),
+    *(".webp", ".xcf"),
+)
 # Names listed in a message.
 _LISTED = 6
-_PIECE = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
+# A name that YAML reads as text without quotes.
+_PLAIN = re.compile(r"[A-Za-z_][\w./-]*")
+
+
+@dataclass(frozen=True)
+class FoundMap:
+    """A file, or a channel of it, that stores a map."""
+
+    path: Path
+    name: MapName
+    source: Source
+
+    @property
+    def entry(self) -> str | dict[str, Any]:
+        """The entry of a material file."""
+        options: dict[str, Any] = {}
+        if self.source.channel is not None:
+            options["channel"] = self.source.channel
+        if self.source.invert:
+            options["invert"] = True
+        return {"file": self.path.name, **options} if options else self.path.name
 
 
 @dataclass(frozen=True)
@@ -58,38 +66,26 @@ class FoundMaps:
     Attributes
     ----------
     maps : file of each role
+    entries : entry of a material file of each role, which names the channel of a packed map
     unused : reason why an image is not used, by file name
     notes, warnings : messages for the user
     """
 
     maps: dict[Role, Path] = field(default_factory=dict)
+    entries: dict[Role, Any] = field(default_factory=dict)
     unused: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
 
-def tokens(name: str) -> list[str]:
-    """Words of a file name without suffix, lower case: split at ``_ - .``, blanks, digits and camelCase."""
-    return [piece.lower() for piece in _PIECE.findall(Path(name).stem)]
-
-
-def role_of(name: str, shared: int = 0) -> Role | None:
-    """Role of a file by the **last** word of its name that denotes a map, without `shared` leading words.
-
-    ``metal_plate_disp.png`` contains heights and ``rock_height_mask.png`` opacity. None without such a word,
-    or where it denotes a map that is not used.
-    """
-    return _ROLES.get(_last_word(name, shared) or "")
-
-
-def _last_word(name: str, shared: int = 0) -> str | None:
-    words = tokens(name)[shared:]
-    for i in reversed(range(len(words))):
-        if i and (words[i - 1], words[i]) in _JOINED:
-            return _JOINED[words[i - 1], words[i]]
-        if words[i] in _ROLES or words[i] in UNUSED:
-            return words[i]
-    return None
+# How one of several files of a map is chosen, in this order: what is smallest, and why others are left out.
+_CHOICES: tuple[tuple[Callable[[FoundMap], int], str], ...] = (
+    (lambda m: m.name.workflow == "specular", "{} is of the metalness workflow"),
+    (lambda m: m.source.rank, "{} is used"),
+    (lambda m: m.name.convention != "gl", "{} is the normal map"),
+    (lambda m: not m.name.deep, "{}, of 16 bits, is used"),
+    (lambda m: m.name.variant, "{} is the first variant"),
+)
 
 
 def _shared_words(names: list[str]) -> int:
@@ -98,61 +94,126 @@ def _shared_words(names: list[str]) -> int:
     return sum(1 for _ in takewhile(lambda words: len(set(words)) == 1, columns)) if len(names) > 1 else 0
 
 
-def normal_convention(name: str) -> Convention | None:
-    """``gl`` or ``dx`` if a normal map's name contains it."""
-    words = set(tokens(name))
-    if words & {"gl", "opengl", "normalgl"}:
-        return "gl"
-    return "dx" if words & {"dx", "directx", "normaldx"} else None
-
-
 def find_maps(folder: Path) -> FoundMaps:
     """Find the maps in a folder, without its subfolders.
 
     Leading words that all names share are ignored, unless only they denote a height map: of ``Metal004.png``
-    and ``Metal004_Color.png`` the former is a picture of the material. An OpenGL normal map is preferred.
+    and ``Metal004_Color.png`` the former is a picture of the material. Of several files of one map, a file of
+    its own is preferred to a channel of a packed map, OpenGL normals to DirectX ones, 16 bits to 8, and the
+    first variant to others.
 
     Raises
     ------
     InputError
-        The folder is unreadable, has no image or no height map, or two candidates for one map.
+        The folder is unreadable, has no image or no height map, or several candidates for a map.
     """
     files = _images(folder)
+    unread = _unread(folder, files)
     if not files:
         raise InputError(
-            "the folder contains no image",
+            "the folder contains no image that is read",
             where=folder,
-            hint=_elsewhere(folder) or f"a height map is required ({', '.join(SUFFIXES)})",
+            hint=_elsewhere(folder) or unread or f"a height map is required ({', '.join(SUFFIXES)})",
         )
     shared = _shared_words([p.name for p in files])
     if not any(role_of(p.name, shared) == "height" for p in files):
         if not any(role_of(p.name) == "height" for p in files):
-            raise _no_heights(folder, files, shared)
+            raise _no_heights(folder, files, shared, unread)
         shared = 0
-    candidates: dict[Role, list[Path]] = {}
-    unused: dict[str, str] = {}
-    for path in files:
-        word = _last_word(path.name, shared)
-        if word in _ROLES:
-            candidates.setdefault(_ROLES[word], []).append(path)
+    names = {path: read_name(path.name, shared) for path in files}
+    candidates: dict[Role, list[FoundMap]] = {}
+    for path, name in names.items():
+        for source in _sources(path, name):
+            candidates.setdefault(source.role, []).append(FoundMap(path, name, source))
+    reasons: dict[Path, str] = {}
+    chosen = {role: _choose(given, reasons) for role, given in candidates.items()}
+    maps = {role: given[0].path for role, given in chosen.items()}
+    entries = {role: given[0].entry for role, given in chosen.items()}
+    several = [
+        f"{role} ({_listed(m.path.name for m in given)})" for role, given in chosen.items() if len(given) > 1
+    ]
+    if several:
+        raise InputError(
+            f"two maps or more of {' and of '.join(several)}",
+            where=folder,
+            hint="remove all but one of each, or say which is meant in a material.yaml: "
+            + _on_one_line({role: entries[role] for role in WORDS if role in entries}),
+        )
+    notes = [f"{role}: 1 - {m.path.name}" for role, (m,) in chosen.items() if m.source.invert]
+    rest = {path: name for path, name in names.items() if path not in maps.values()}
+    unused, lost = _left_out(rest, reasons, maps)
+    notes += [f"{path.name} is not used: {why}" for path, why in unused.items() if path not in lost]
+    by_reason: dict[str, list[str]] = {}
+    for path in lost:
+        by_reason.setdefault(unused[path], []).append(path.name)
+    texts = [f"{_listed(given)} ({reason})" for reason, given in by_reason.items()]
+    warnings = [f"{folder}: not used: {'; '.join(texts)}"] if texts else []
+    warnings += [f"{folder}: {unread}"] if unread else []
+    if "roughness" not in maps:
+        glossless = (path for path, name in names.items() if name.word.startswith(SMOOTHNESS_IN_ALPHA))
+        what = "has no alpha channel, or one of 1 only, for its gloss: roughness is missing"
+        warnings += [f"{path}: {what}" for path in glossless]
+    if "opacity" in maps and names[maps["opacity"]].word == "mask":
+        warnings.append(
+            f"{maps['opacity']}: is used as opacity, 0 for a hole, for its name says no more than 'mask'; "
+            "remove it if it is another mask"
+        )
+    return FoundMaps(maps, entries, {path.name: why for path, why in unused.items()}, notes, warnings)
+
+
+def _left_out(
+    names: Mapping[Path, MapName], reasons: Mapping[Path, str], maps: Container[Role]
+) -> tuple[dict[Path, str], list[Path]]:
+    """Why files are not used, and those of them that the material may lack."""
+    metalness = any("metalness workflow" in reason for reason in reasons.values())
+    out, lost = {}, []
+    for path, name in names.items():
+        missing = False
+        if isinstance(name.content, Unused):
+            out[path], missing = name.content.reason, name.content.lost
+            missing = missing and not (metalness and name.workflow == "specular")
+        elif name.content is None:
+            # A picture of the material is named like it, but so may be its color.
+            out[path], missing = "its name matches no map", not name.bare or "base_color" not in maps
         else:
-            unused[path.name] = UNUSED.get(word or "", "its name matches no map")
-    normals = candidates.get("normal", [])
-    gl = [p for p in normals if normal_convention(p.name) == "gl"]
-    if len(normals) > 1 and len(gl) == 1:
-        candidates["normal"] = gl
-        unused |= {p.name: f"{gl[0].name} is the normal map" for p in normals if p != gl[0]}
-    for role, paths in candidates.items():
-        if len(paths) > 1:
-            raise InputError(
-                f"two maps of {role}: {paths[0].name} and {paths[1].name}",
-                where=folder,
-                hint="remove one, or say which is meant in a material.yaml",
-            )
-    maps = {role: paths[0] for role, paths in candidates.items()}
-    lost = (_lost_warning(folder / name, _last_word(name, shared), maps) for name in unused)
-    notes = [f"{name} is not used: {why}" for name, why in unused.items()]
-    return FoundMaps(maps, unused, notes, [text for text in lost if text is not None])
+            out[path] = reasons.get(path, "its alpha channel is missing")
+        lost += [path] if missing else []
+    return out, lost
+
+
+def _sources(path: Path, name: MapName) -> list[Source]:
+    """What a file stores; something in an alpha channel only where the file has one."""
+    content = name.content if isinstance(name.content, tuple) else ()
+    return [source for source in content if source.channel != "A" or _has_alpha(path)]
+
+
+def _has_alpha(path: Path) -> bool:
+    """Whether an image has an alpha channel that is not 1 everywhere, as programs fill one that they do not
+    need; or cannot be read, which its use reports."""
+    with contextlib.suppress(InputError):
+        pixels = read_image(path).pixels
+        return pixels.shape[2] in (2, 4) and bool((pixels[..., -1] != 1.0).any())
+    return True
+
+
+def _choose(given: list[FoundMap], reasons: dict[Path, str]) -> list[FoundMap]:
+    """The preferred one of several files of a map; all where their names do not say that they are of one
+    map. Adds the reasons why the others are not used."""
+    if any(found.name.rest != given[0].name.rest for found in given):
+        return given
+    for key, reason in _CHOICES:
+        best = min(map(key, given))
+        first = next(found for found in given if key(found) == best)
+        reasons |= {m.path: reason.format(first.path.name) for m in given if key(m) != best}
+        given = [found for found in given if key(found) == best]
+    return given
+
+
+def _on_one_line(value: Any) -> str:
+    """Plain data as YAML."""
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{key}: {_on_one_line(inner)}' for key, inner in value.items())}}}"
+    return value if isinstance(value, str) and _PLAIN.fullmatch(value) else json.dumps(value)
 
 
 def unpack(path: Path) -> str:
@@ -181,34 +242,26 @@ def _elsewhere(folder: Path) -> str:
     return next(filter(None, map(unpack, content)), "")
 
 
-def _no_heights(folder: Path, files: list[Path], shared: int) -> InputError:
-    def listed(names: list[str]) -> str:
-        return ", ".join(names[:_LISTED]) + (", …" if len(names) > _LISTED else "")
+def _unread(folder: Path, files: list[Path]) -> str:
+    """Images of formats that are not read, where no other format of them lies beside; empty without one."""
+    stems = {path.stem.lower() for path in files}
+    names = [p.name for p in _content(folder) if p.suffix.lower() in _UNREAD and p.stem.lower() not in stems]
+    return f"not read: {_listed(names)}; save them as PNG, TIFF or EXR" if names else ""
 
-    nameless = [p.name for p in files if _last_word(p.name, shared) is None]
-    hint = f"its name must contain one of: {', '.join(WORDS['height'])}; or name it in a material.yaml"
+
+def _listed(names: Iterable[str]) -> str:
+    shown = list(names)
+    return ", ".join(shown[:_LISTED]) + (f" and {len(shown) - _LISTED} more" if len(shown) > _LISTED else "")
+
+
+def _no_heights(folder: Path, files: list[Path], shared: int, unread: str) -> InputError:
+    nameless = [p.name for p in files if read_name(p.name, shared).content is None]
+    words = (*WORDS["height"], *WEAK_WORDS["height"])
+    hint = f"its name must contain one of: {', '.join(words)}; or name it in a material.yaml"
     if nameless:
-        hint += f" (their names match no map: {listed(nameless)})"
+        hint += f" (their names match no map: {_listed(nameless)})"
     return InputError(
-        f"no height map among {listed([p.name for p in files])}",
+        f"no height map among {_listed(p.name for p in files)}",
         where=folder,
-        hint=_elsewhere(folder) or hint,
-    )
-
-
-def _lost_warning(path: Path, word: str | None, maps: dict[Role, Path]) -> str | None:
-    """The warning that an unused image contains a missing map."""
-    options: dict[Role, str] = {}
-    if word in _PACKED:
-        roughness, metallic = _PACKED[word]
-        options = {"roughness": f"channel: {roughness}", "metallic": f"channel: {metallic}"}
-    elif word in _GLOSS:
-        options = {"roughness": "invert: true"}
-    entries = [f"{r}: {{file: {path.name}, {option}}}" for r, option in options.items() if r not in maps]
-    if not entries:
-        return None
-    lambert = "roughness" not in maps and "metallic" not in maps
-    return (
-        f"{path}: is not used, {'so that the surface is Lambert' if lambert else 'and its map is missing'}; "
-        f"a material.yaml that names all maps can use it: {', '.join(entries)}"
+        hint=_elsewhere(folder) or (f"{unread}; {hint}" if unread else hint),
     )

@@ -12,8 +12,11 @@ from numpy.typing import NDArray
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError
 from mbtf_core.images.read import ColorSpace, Image, count_and_first, gray, read_image
-from mbtf_gen.tile.maps.discovery import role_of
+from mbtf_core.paths import named_file
+from mbtf_gen.tile.maps.checks import refuse_color
+from mbtf_gen.tile.maps.file_names import role_of
 from mbtf_gen.tile.maps.material_file import ColorEntry, HeightEntry, NormalEntry, ShareEntry
+from mbtf_gen.tile.maps.normal_encoding import height_of, stored_xy
 
 Color = NDArray[np.floating[Any]]
 Share = NDArray[np.float64] | float | None
@@ -24,6 +27,8 @@ _SIGNED = -0.05
 # Largest component of a normal in any encoding, with rounding.
 _LONGEST = 1.5
 _NORMALS = "its pixels are (n+1)/2, or the components of n themselves in a float image"
+# Formats whose two channels are gray and alpha.
+_GRAY_AND_ALPHA = (".png", ".tga")
 # Fraction of normals pointing into the surface above which a warning is given.
 _STRAY = 1e-4
 _FileEntry = HeightEntry | ColorEntry | ShareEntry | NormalEntry
@@ -40,6 +45,7 @@ class MapFacts:
     names : their names, where the file has others
     low, high : smallest and largest stored number of these channels, without alpha
     colorspace : in which the numbers were read
+    inverted : whether 1 - x of them is used
     """
 
     file: Path
@@ -51,6 +57,7 @@ class MapFacts:
     low: float
     high: float
     colorspace: ColorSpace = "linear"
+    inverted: bool = False
 
 
 class MapLoader:
@@ -76,7 +83,7 @@ class MapLoader:
 
     def image(self, role: str, entry: _FileEntry, space: ColorSpace = "linear") -> Image:
         """Read the file of a role, of one pixel or of the heights' aspect."""
-        path = self.folder / str(entry.file)
+        path = named_file(self.folder, str(entry.file))
         image = read_image(path, entry.channel, lambda label: role_of(label) == role)
         count = image.pixels.shape[2]
         used = image.pixels[..., :-1] if count in (2, 4) else image.pixels
@@ -119,19 +126,26 @@ class MapLoader:
         if entry.file is None:
             self.settings[role] = entry.value
             return entry.value
-        numbers, warnings = gray(self.image(role, entry, entry.colorspace))
+        image = self.image(role, entry, entry.colorspace)
+        if role == "opacity":
+            refuse_color(image, "opacity")
+            spread = np.ptp(image.pixels, axis=(0, 1))
+            if len(spread) in (2, 4) and spread[-1] > 0 and not spread[:-1].any():
+                image = self.image(role, entry.model_copy(update={"channel": "A"}), entry.colorspace)
+        numbers, warnings = gray(image)
         self.warnings += warnings
         numbers = self._within(role, numbers, (numbers < -_ROUNDING) | (numbers > 1 + _ROUNDING))
         if entry.colorspace == "srgb":
             numbers = np.asarray(srgb_to_linear(numbers), np.float64)
         if entry.invert:
             numbers = 1.0 - numbers
+            self.facts[role] = replace(self.facts[role], inverted=True)
         if entry.colorspace == "srgb" or entry.invert:
             self.settings[f"{role}.encoding"] = [entry.colorspace, entry.invert]
         return float(numbers[0, 0]) if numbers.shape == (1, 1) else numbers
 
-    def color(self, role: str, entry: ColorEntry) -> Color:
-        """(h, w, 3) or (3,) linear color."""
+    def color(self, role: str, entry: ColorEntry, holes: ShareEntry | None = None) -> Color:
+        """(h, w, 3) or (3,) linear color; `holes` may be in the alpha channel of its file."""
         if entry.file is None:
             value = np.asarray(entry.value, np.float64)
             value = np.asarray(srgb_to_linear(value) if entry.colorspace == "srgb" else value)
@@ -139,9 +153,11 @@ class MapLoader:
             return value
         image = self.image(role, entry)
         pixels = image.pixels
-        if pixels.shape[2] in (2, 4) and np.any(pixels[..., -1] != 1.0):
+        alpha = pixels.shape[2] in (2, 4) and (holes is None or holes.file != entry.file)
+        if alpha and np.any(pixels[..., -1] != 1.0):
             self.warnings.append(
-                f"{image.path}: the alpha channel of the {role.replace('_', ' ')} is not used"
+                f"{image.path}: the alpha channel of the {role.replace('_', ' ')} is not used; for holes, "
+                f"write opacity: {{file: {image.path.name}, channel: A}}"
             )
         rgb = pixels[..., :3] if pixels.shape[2] > 2 else np.repeat(pixels[..., :1], 3, axis=2)
         rgb = self._within(role, rgb, np.any((rgb < -_ROUNDING) | (rgb > 1 + _ROUNDING), axis=-1))
@@ -169,13 +185,25 @@ class MapLoader:
         return space
 
     def normals(self, entry: NormalEntry) -> NDArray[np.float32]:
-        """(h, w, 3) unit vectors read as OpenGL, y along v: 2·pixel - 1, or signed floats as they are."""
+        """(h, w, 3) unit vectors read as OpenGL, y along v: 2·pixel - 1, or signed floats as they are; z of
+        maps that store only x and y is √(1 - x² - y²)."""
         image = self.image("normal", entry)
-        if image.pixels.shape[2] < 3:
-            raise InputError("is gray; a normal map has three channels", where=image.path)
-        stored = image.pixels[..., :3].astype(np.float32)
+        stored = image.pixels.astype(np.float32)
+        gray_and_alpha = stored.shape[2] == 2 and image.path.suffix.lower() in _GRAY_AND_ALPHA
+        if stored.shape[2] == 1 or (gray_and_alpha and np.ptp(stored[..., 1]) == 0):
+            raise InputError("is gray; a normal map has two channels or more", where=image.path)
+        if gray_and_alpha:
+            # x is in alpha.
+            stored = stored[..., ::-1]
         signed = image.bits is None and float(stored[..., :2].min()) < _SIGNED
         vectors = stored if signed else 2.0 * stored - 1.0
+        two = stored_xy(vectors)
+        if two is not None:
+            vectors = np.concatenate([two[0], height_of(two[0])[..., None]], axis=-1)
+            self.warnings.append(f"{image.path}: stores {two[1]} only; z = √(1 - x² - y²) is used")
+        elif vectors.shape[2] == 4 and np.any(image.pixels[..., 3] != 1.0):
+            self.warnings.append(f"{image.path}: the alpha channel of the normal map is not used")
+        vectors = vectors[..., :3]
         long = np.any(np.abs(vectors) > _LONGEST, axis=-1)
         if long.any():
             raise InputError(f"{count_and_first(long)} no normal", where=image.path, hint=_NORMALS)

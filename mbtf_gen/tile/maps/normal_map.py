@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from mbtf_core.images.resample import resample
 from mbtf_gen.tile.heights import HeightGrid, height_slopes, normal_slopes
-from mbtf_gen.tile.maps.discovery import Convention
+from mbtf_gen.tile.maps.file_names import Convention
 
 Array = NDArray[np.floating[Any]]
 Turned = Literal["height", "normal"] | None

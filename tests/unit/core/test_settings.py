@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import pytest
 from pydantic import Field
 
-from mbtf_core.config.settings import Settings, build, differences, in_short, resolve
+from mbtf_core.config.settings import LocalName, Settings, build, differences, in_short, resolve
 from mbtf_core.config.yaml_file import dump_yaml, read_yaml
 from mbtf_core.errors import InputError, UsageError
 
@@ -193,3 +193,17 @@ def test_differences_lead_with_settings_and_shorten_digests() -> None:
     ]
     assert in_short(changes, 2) == "spp: 4 -> 8; width: unset -> 2.0; and 2 more"
     assert in_short(changes, 4) == "; ".join(changes)
+
+
+def test_backslashes_separate_where_no_such_file_exists(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Reader(Settings):
+        folder: LocalName
+
+    (tmp_path / "fits" / "a").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    for name in ("fits\\a", "fits/a"):
+        assert Path(Reader(folder=name).folder) == Path("fits/a")
+    for name in ("s3://bucket/a", "fits\\b"):
+        assert Reader(folder=name).folder == name

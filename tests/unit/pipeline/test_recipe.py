@@ -45,12 +45,13 @@ def written(folder: Path, text: str) -> Path:
 
 
 def test_the_material_is_relative_to_the_recipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = written(tmp_path, SINGLE)
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     monkeypatch.chdir(elsewhere)
-    recipe = load_recipe(Path("..") / path.name)
-    assert Path(recipe.generate.material).samefile(tmp_path / "maps" / "height.npy")
+    for text in (SINGLE, SINGLE.replace("maps/height.npy", "maps\\height.npy")):
+        path = written(tmp_path, text)
+        recipe = load_recipe(Path("..") / path.name)
+        assert Path(recipe.generate.material).samefile(tmp_path / "maps" / "height.npy")
     assert recipe.folder == Path("out") / "small"
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.fuzzing import damaged, examples, loads_or_refuses, with_checksums
-from support.image_samples import exrs, jpgs, npys, pngs, tiffs
+from support.image_samples import bmps, exrs, jpgs, npys, pngs, tgas, tiffs
 
 from mbtf_core.images.read import read_image
 
@@ -23,7 +23,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def samples(folder: Path) -> dict[str, dict[str, bytes]]:
     """Suffix → name → content."""
-    return {"png": pngs(), "jpg": jpgs(), "tif": tiffs(), "npy": npys(), "exr": exrs(folder)}
+    out = {"png": pngs(), "jpg": jpgs(), "tif": tiffs(), "npy": npys(), "exr": exrs(folder)}
+    return {**out, "tga": tgas(), "bmp": bmps()}
 
 
 def read(folder: Path, name: str, content: bytes) -> None:
@@ -37,13 +38,13 @@ def read(folder: Path, name: str, content: bytes) -> None:
         assert np.isfinite(image.pixels).all()
 
 
-@pytest.mark.parametrize("kind", ["png", "jpg", "tif", "npy", "exr"])
+@pytest.mark.parametrize("kind", ["png", "jpg", "tif", "npy", "exr", "tga", "bmp"])
 def test_the_undamaged_files(kind: str, samples: dict[str, dict[str, bytes]], folder: Path) -> None:
     for name, content in samples[kind].items():
         read(folder, name, content)
 
 
-@pytest.mark.parametrize("kind", ["png", "jpg", "tif", "npy", "exr"])
+@pytest.mark.parametrize("kind", ["png", "jpg", "tif", "npy", "exr", "tga", "bmp"])
 @given(data=st.data())
 @examples(200)
 def test_a_damaged_image(
@@ -55,7 +56,7 @@ def test_a_damaged_image(
     read(folder, name, content)
 
 
-@pytest.mark.parametrize("kind", ["png", "jpg", "tif", "exr"])
+@pytest.mark.parametrize("kind", ["png", "jpg", "tif", "exr", "tga", "bmp"])
 def test_decoders_say_nothing(
     kind: str, samples: dict[str, dict[str, bytes]], folder: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError
 from mbtf_gen.tile.loading import load_material
-from mbtf_gen.tile.maps.discovery import normal_convention, role_of
+from mbtf_gen.tile.maps.file_names import normal_convention, role_of
 
 
 def rng() -> np.random.Generator:

@@ -7,6 +7,7 @@ from pathlib import Path
 from support.paths import ROOT
 
 from mbtf_gen.tile.loading import load_material
+from mbtf_gen.tile.maps.file_names import GLOSS_WORDS, LETTERS, SMOOTHNESS_IN_ALPHA, WEAK_WORDS, WORDS
 
 DOCUMENT = (ROOT / "docs/reference/material-yaml.md").read_text()
 
@@ -26,3 +27,9 @@ def test_the_example_is_valid(tmp_path: Path) -> None:
     material = load_material(tmp_path)
     assert np.array_equal(material.height, layers["displacement.Y"])
     assert material.height_scale == 0.12
+
+
+def test_every_word_is_listed() -> None:
+    words = [word for table in (WORDS, WEAK_WORDS) for words in table.values() for word in words]
+    for word in (*words, *GLOSS_WORDS, *LETTERS, *SMOOTHNESS_IN_ALPHA):
+        assert f"`{word}`" in DOCUMENT.lower(), word

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -118,6 +119,63 @@ class TestScalars:
             digests.add(material.digests["settings"])
         assert len(digests) == 3
 
+    def test_a_mask_map_is_metallic_and_smoothness(self, heights: Path) -> None:
+        codes = rng().integers(0, 256, (8, 16, 4))
+        path = png(heights / "Rock_MaskMap.png", codes, 6, 8)
+        material = load_material(heights)
+        assert np.array_equal(np.rint(255 * np.asarray(material.maps["metallic"])), codes[..., 0])
+        assert np.array_equal(np.rint(255 * (1 - np.asarray(material.maps["roughness"]))), codes[..., 3])
+        assert "opacity" not in material.maps
+        assert material.warnings == ()
+        # Named in a material file, the same map gives the same data.
+        text = (
+            "height: height.npy\nroughness: {file: Rock_MaskMap.png, channel: A, invert: true}\n"
+            "metallic: {file: Rock_MaskMap.png, channel: R}\n"
+        )
+        assert load_material(write(heights, text)).digests == material.digests
+        (heights / "material.yaml").unlink()
+        for stored, color in ((codes[..., :3], 2), (codes | [0, 0, 0, 255], 6)):
+            png(path, stored, color, 8)
+            material = load_material(heights)
+            assert "no alpha channel" in material.warnings[0]
+            assert np.array_equal(np.rint(255 * np.asarray(material.maps["metallic"])), codes[..., 0])
+            assert material.maps["roughness"] == 0.5
+
+    def test_a_mask(self, heights: Path) -> None:
+        codes = rng().integers(0, 256, (8, 16, 4))
+        for name in ("rock_mask.png", "rock_opacity.png"):
+            path = png(heights / name, codes, 6, 8)
+            with pytest.raises(InputError, match="an opacity map is gray") as caught:
+                load_material(heights)
+            assert "channel: A" in caught.value.hint
+            path.unlink()
+        png(heights / "rock_mask.png", codes[..., :1], 0, 8)
+        material = load_material(heights)
+        assert np.array_equal(np.rint(255 * np.asarray(material.maps["opacity"])), codes[..., 0])
+        assert any("'mask'" in warning for warning in material.warnings)
+
+    @pytest.mark.parametrize("channels", [2, 4])
+    def test_a_mask_in_alpha_alone(self, heights: Path, channels: int) -> None:
+        codes = np.full((8, 16, channels), 255)
+        codes[..., -1] = rng().integers(0, 256, (8, 16))
+        png(heights / "leaf_alpha.png", codes, {2: 4, 4: 6}[channels], 8)
+        material = load_material(heights)
+        assert np.array_equal(np.rint(255 * np.asarray(material.maps["opacity"])), codes[..., -1])
+        assert material.warnings == ()
+
+    def test_holes_in_the_alpha_of_a_color(self, heights: Path) -> None:
+        codes = rng().integers(0, 256, (8, 16, 4))
+        path = png(heights / "leaf_AlbedoTransparency.png", codes, 6, 8)
+        material = load_material(heights)
+        assert np.array_equal(np.rint(255 * np.asarray(material.maps["opacity"])), codes[..., 3])
+        assert material.warnings == ()
+        png(path, codes[..., :3], 2, 8)
+        assert "opacity" not in load_material(heights).maps
+        path.unlink()
+        png(heights / "leaf_albedo.png", codes, 6, 8)
+        (warning,) = load_material(heights).warnings
+        assert "channel: A" in warning
+
 
 class TestColor:
     def color(self, folder: Path, option: str, *chunks: tuple[bytes, bytes]) -> HeightFieldTile:
@@ -163,6 +221,47 @@ class TestNormals:
         codes = np.full((8, 16, 3), 100)
         png(heights / "normal.png", codes, 2, 8)
         assert any("100.00% of its normals point into" in w for w in load_material(heights).warnings)
+
+
+class TestNamesOfFiles:
+    """Names with the separators of Windows, and names that YAML's double quotes have changed."""
+
+    @pytest.mark.parametrize("name", ["maps\\rough.png", "'maps\\rough.png'", '"maps\\\\rough.png"'])
+    def test_backslashes_separate(self, heights: Path, name: str) -> None:
+        codes = rng().integers(0, 256, (8, 16, 1))
+        (heights / "maps").mkdir()
+        png(heights / "maps" / "rough.png", codes, 0, 8)
+        path = write(heights, f"height: height.npy\nroughness: {name}\n")
+        expected = {"height": "height.npy", "roughness": "maps/rough.png"}
+        files = load_material(path).files
+        assert {role: file.relative_to(heights).as_posix() for role, file in files.items()} == expected
+
+    @pytest.mark.skipif(os.sep != "/", reason="backslashes are separators")
+    def test_a_name_with_a_backslash(self, heights: Path) -> None:
+        (heights / "maps").mkdir()
+        codes = rng().integers(0, 256, (8, 16, 1))
+        png(heights / "maps" / "rough.png", codes, 0, 8)
+        png(heights / "maps\\rough.png", 255 - codes, 0, 8)
+        material = load_material(write(heights, "height: height.npy\nroughness: maps\\rough.png\n"))
+        assert np.array_equal(np.rint(255 * np.asarray(material.maps["roughness"])), 255 - codes[..., 0])
+
+    @pytest.mark.skipif(os.sep != "/", reason="paths of Windows are valid")
+    @pytest.mark.parametrize(
+        ("name", "hint"),
+        [
+            ('"maps\\rough.png"', "'maps/rough.png'"),
+            ('"maps\\Normal.png"', "'maps/Normal.png'"),
+            ("C:\\Users\\me\\rough.png", "path of Windows"),
+            ("C:/Users/me/rough.png", "path of Windows"),
+            ("C:\\Users\\me\\height.npy", "did you mean 'height.npy'?"),
+            ('"C:\\Users\\me\\rough.png"', "backslash"),
+            ('"maps\\metal.png"', "backslash"),
+        ],
+    )
+    def test_what_to_write(self, heights: Path, name: str, hint: str) -> None:
+        with pytest.raises(InputError) as caught:
+            load_material(write(heights, f"height: height.npy\nroughness: {name}\n"))
+        assert hint in caught.value.hint
 
 
 def test_orientation_is_ignored_with_a_warning(heights: Path) -> None:

@@ -6,11 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from support.height_maps import Floats, fractal, normals_of, save_heights, save_normals
 from support.paths import ROOT
 
 from mbtf_core.images.read import gray, read_image
+from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 from mbtf_gen.tile.loading import load_material
+from mbtf_gen.tile.maps.normal_encoding import stored_xy
 from mbtf_gen.tile.maps.normal_map import SYMMETRIES, NormalFit, fit_normals
 
 # What undoes each symmetry.
@@ -175,3 +178,80 @@ class TestMaterial:
         (warning,) = load_material(folder).warnings
         assert "upside down" in warning
         assert "negative --height-scale" in warning
+
+
+class TestTwoChannels:
+    """Maps without z: the normals, and the height scale that they suggest, are those of the whole map."""
+
+    SCALE = 0.15
+
+    def stored(self) -> NDArray[np.uint8]:
+        return np.rint((normals_of(fractal(64, 64), self.SCALE) + 1) * 127.5).astype(np.uint8)
+
+    def material(self, folder: Path, codes: NDArray[np.uint8], name: str = "normal.png") -> HeightFieldTile:
+        from PIL import Image as Pillow
+
+        save_heights(folder / "height.png", fractal(64, 64))
+        Pillow.fromarray(codes).save(folder / name)
+        return load_material(folder)
+
+    def check(self, material: HeightFieldTile) -> None:
+        (warning,) = material.warnings
+        assert "√(1 - x² - y²)" in warning
+        expected = normals_of(fractal(64, 64), self.SCALE)
+        assert np.abs(material.maps["normal"] - expected).max() < 0.02
+        assert material.normal_fit is not None
+        assert material.normal_fit.scale == pytest.approx(self.SCALE, rel=0.01)
+
+    @pytest.mark.parametrize("blue", [0, 1, 128, 255])
+    def test_constant_blue(self, tmp_path: Path, blue: int) -> None:
+        codes = self.stored()
+        codes[..., 2] = blue
+        self.check(self.material(tmp_path, codes))
+
+    def test_something_else_in_blue(self, tmp_path: Path) -> None:
+        codes = self.stored()
+        codes[..., 2] = 255 * fractal(64, 64, seed=8)
+        self.check(self.material(tmp_path, codes))
+
+    @pytest.mark.parametrize("rest", [0, 255, "green"])
+    def test_x_in_alpha(self, tmp_path: Path, rest: int | str) -> None:
+        x, y, _ = np.moveaxis(self.stored(), -1, 0)
+        other = y if rest == "green" else np.full_like(y, rest)
+        self.check(self.material(tmp_path, np.dstack([other, y, other, x])))
+
+    def test_x_in_alpha_of_a_gray_picture(self, tmp_path: Path) -> None:
+        x, y, _ = np.moveaxis(self.stored(), -1, 0)
+        self.check(self.material(tmp_path, np.dstack([y, x])))
+
+    def test_two_channels_of_floats(self, tmp_path: Path) -> None:
+        save_heights(tmp_path / "height.png", fractal(64, 64))
+        np.save(tmp_path / "normal.npy", normals_of(fractal(64, 64), self.SCALE)[..., :2])
+        self.check(load_material(tmp_path))
+
+    def test_flat_ones_point_up(self, tmp_path: Path) -> None:
+        for blue in (0, 128):
+            codes = np.full((64, 64, 3), (128, 128, blue), np.uint8)
+            normal = self.material(tmp_path, codes).maps["normal"]
+            assert normal == pytest.approx(np.broadcast_to((0, 0, 1), normal.shape), abs=0.01)
+
+    @pytest.mark.parametrize("quality", [50, 75, 95])
+    def test_jpg(self, tmp_path: Path, quality: int) -> None:
+        """Its rounding of a whole map is not taken for a missing z."""
+        from PIL import Image as Pillow
+
+        save_heights(tmp_path / "height.png", fractal(64, 64))
+        for scale in (0.005, 0.05, 0.5):
+            codes = np.rint((normals_of(fractal(64, 64), scale) + 1) * 127.5).astype(np.uint8)
+            Pillow.fromarray(codes).save(tmp_path / "normal.jpg", quality=quality)
+            assert not any("√" in warning for warning in load_material(tmp_path).warnings)
+
+    def test_whole_maps_are_read_as_they_are(self, tmp_path: Path) -> None:
+        """A height in alpha is mentioned; a groove, whose blue is constant, stores its z."""
+        codes = self.stored()
+        height = np.rint(255 * fractal(64, 64)).astype(np.uint8)
+        (warning,) = self.material(tmp_path, np.dstack([codes, height])).warnings
+        assert "alpha channel" in warning
+        x = np.where(np.arange(64) % 16 < 8, 0.6, -0.6) * np.ones((64, 1))
+        groove = np.stack([x, np.zeros_like(x), np.full_like(x, 0.8)], axis=-1)
+        assert stored_xy(np.rint((groove + 1) * 127.5) / 127.5 - 1) is None
