@@ -12,7 +12,7 @@ import numpy as np
 
 from mbtf_core.errors import InputError
 from mbtf_core.meshes.companions import Companions
-from mbtf_core.meshes.content import Texture, numbers_of
+from mbtf_core.meshes.content import Texture
 from mbtf_core.meshes.numbers import read_bytes
 
 # Numbers after options of images, at most; all other options take one word.
@@ -191,12 +191,16 @@ def _transparency(material: MtlMaterial, values: dict[str, Any], remarks: list[s
     """Opacity that hides nothing is left out; ``Tr`` is its complement, where there is no ``d``."""
     if "opacity" not in values and "tr" in material.statements:
         through = material.number("tr")
+        values["opacity"] = 1.0 - through
         if through == 1.0:
+            # Some programs write the opacity itself.
             remarks.append("Tr 1, which would hide it, is not used")
-        else:
-            values["opacity"] = 1.0 - through
-    if np.ndim(numbers_of(values.get("opacity", 1.0))) == 0 and values.get("opacity", 1.0) == 1.0:
-        values.pop("opacity", None)
+            del values["opacity"]
+    opacity = values.get("opacity")
+    if opacity == 1.0:
+        del values["opacity"]
+    elif opacity == 0.0:
+        remarks.append("d 0 hides it")
 
 
 def _says(key: str, text: str) -> bool:

@@ -58,11 +58,13 @@ def read_obj(path: Path) -> MeshContent:
     # Triangles of one material, without and with texture coordinates.
     shapes = []
     for group in groups_of(2 * material + (corners[triangles, 1] >= 0).all(axis=1)):
-        name = lines.materials[material[group[0]]]
+        name, part = lines.materials[material[group[0]]], lines.objects[of_object[group[0]]]
         values, faults = materials.of(name)
         arrays = _arrays(corners[triangles[group]], positions, colors, uv, normals)
-        name = name or lines.objects[of_object[group[0]]] or path.name
-        shape = MeshShape(name, **arrays, values=values, faults=faults)
+        if name and part and arrays["uv"] is None and len(uv):
+            # Where only some triangles lack texture coordinates, people look for their object.
+            name = f"{part}, {name}"
+        shape = MeshShape(name or part or path.name, **arrays, values=values, faults=faults)
         shapes.append(with_colors(shape, path, materials.warnings))
     warnings = [*lines.warnings, *([UNCUT.format(uncut)] if uncut else []), *materials.all_warnings()]
     return MeshContent(shapes, companions.files, None, [*warnings, *companions.warnings])

@@ -7,14 +7,17 @@ from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
+_Point = tuple[float, float]
 # Corners of a concave polygon; the time to clip its ears grows with the square of their number.
-MOST_CORNERS = 5000
+MOST_CORNERS = 2000
 # A corner turns inward if the sine of its angle is below minus this.
 _STRAIGHT = 1e-9
 # Twice the area of a triangle that counts as 0, of a polygon that is about 1 long.
 _FLAT = 1e-12
 # Warning of polygons that are not cut.
-UNCUT = "{:,} polygons cross themselves: their triangles may overlap"
+UNCUT = (
+    f"{{:,}} polygons cross themselves or are concave with over {MOST_CORNERS:,} corners: they may overlap"
+)
 
 
 @np.errstate(all="ignore")
@@ -94,30 +97,38 @@ def _flattened(corners: F64, normal: F64) -> F64:
 
 def _ears(p: F64) -> I64 | None:
     """Triangles (n - 2, 3) of a simple polygon (n, 2); None where it crosses itself."""
-    left = np.arange(len(p))
-    out = []
+    # Polygons are small and many: Python's numbers are faster than arrays.
+    points: list[_Point] = [(x, y) for x, y in p.tolist()]
+    left, out = list(range(len(points))), []
+
+    def around(k: int) -> tuple[int, int, int]:
+        return left[k - 1], left[k], left[(k + 1) % len(left)]
+
+    turns = {left[k]: _turn(*(points[i] for i in around(k))) for k in range(len(left))}
     while len(left) > 3:
-        here = p[left]
-        back, onward = np.roll(here, 1, axis=0), np.roll(here, -1, axis=0)
-        turn = _cross(here - back, onward - here)
+        inward = [points[i] for i in left if turns[i] <= _FLAT]
         # Corners on a straight line come last: their triangles have no area.
-        ears = [*np.flatnonzero(turn > _FLAT), *np.flatnonzero(np.abs(turn) <= _FLAT)]
-        inward = here[turn <= _FLAT]
-        ear = next((e for e in ears if not _within(inward, back[e], here[e], onward[e])), None)
+        ears = [k for k, i in enumerate(left) if turns[i] > _FLAT]
+        ears += [k for k, i in enumerate(left) if abs(turns[i]) <= _FLAT]
+        ear = next((k for k in ears if not _within(inward, *(points[i] for i in around(k)))), None)
         if ear is None:
             return None
-        out.append(left[[ear - 1, ear, (ear + 1) % len(left)]])
-        left = np.delete(left, ear)
-    a, b, c = p[left]
-    return None if _cross(b - a, c - b) < -_FLAT else np.array([*out, left])
+        out.append(around(ear))
+        del left[ear]
+        for k in (ear - 1, ear % len(left)):
+            turns[left[k]] = _turn(*(points[i] for i in around(k)))
+    return None if turns[left[1]] < -_FLAT else np.array([*out, tuple(left)])
 
 
-def _within(points: F64, a: F64, b: F64, c: F64) -> bool:
+def _within(points: list[_Point], a: _Point, b: _Point, c: _Point) -> bool:
     """Whether a triangle, its border included, has any of the points, other than its own corners."""
-    inside = np.all([_cross(v - u, points - u) >= -_FLAT for u, v in ((a, b), (b, c), (c, a))], axis=0)
-    own = np.any([(points == corner).all(axis=1) for corner in (a, b, c)], axis=0)
-    return bool((inside & ~own).any())
+    return any(
+        _turn(a, b, q) >= -_FLAT and _turn(b, c, q) >= -_FLAT and _turn(c, a, q) >= -_FLAT
+        for q in points
+        if q not in (a, b, c)
+    )
 
 
-def _cross(a: F64, b: F64) -> F64:
-    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
+def _turn(a: _Point, b: _Point, c: _Point) -> float:
+    """Twice the area of a triangle; positive if it turns to the left."""
+    return (b[0] - a[0]) * (c[1] - b[1]) - (b[1] - a[1]) * (c[0] - b[0])

@@ -263,6 +263,7 @@ def test_materials_that_are_not_there(tmp_path: Path, use: str, library: str, sa
         ("Kd 0 0 0\nmap_Kd a.png", "Kd black"),
         ("newmtl m\nKd 0 0 0", "twice"),
         ("Tr 1", "Tr"),
+        ("d 0", "d hides"),
     ],
 )
 def test_what_is_not_used_is_said(tmp_path: Path, text: str, says: str) -> None:

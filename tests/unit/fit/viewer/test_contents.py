@@ -40,8 +40,8 @@ def test_bad_meshes_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         ("flat.obj", plain + "vt 0 0\nf 1/1 2/1 3/1\n", "without an area"),
         (
             "parts.obj",
-            plain + "vt 0 0\nvt 1 0\nvt 0 1\nusemtl Body\nf 1/1 2/2 3/3\nusemtl Glass\nf 1 2 3\n",
-            "'Glass' has no texture coordinates",
+            plain + "vt 0 0\nvt 1 0\nvt 0 1\no Box\nusemtl m\nf 1/1 2/2 3/3\no Lid\nf 1 2 3\n",
+            "'Lid, m' has no texture coordinates",
         ),
         ("empty.obj", "v 0 0 0\n", "no triangles"),
         ("text.glb", "no mesh", ""),
