@@ -72,7 +72,8 @@ class MeshTile(Tile):
     @cached_property
     def thickness(self) -> float:
         """Height of the triangles' slab, in tile widths."""
-        return -float(self.vertices[self.faces, 2].min())
+        # Not minus zero.
+        return 0.0 - float(self.vertices[self.faces, 2].min())
 
     def copies(self) -> tuple[NDArray[np.int_], F64]:
         """(number, shift (k, 3)) of all triangles that reach into the box [0, 1] x [0, aspect], moved there
