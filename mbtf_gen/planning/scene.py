@@ -176,8 +176,8 @@ class PlanScene:
 
     @property
     def flat(self) -> bool:
-        """Whether nothing is displaced."""
-        return self.tile.thickness == 0.0
+        """Whether nothing is displaced: the point of a ray follows from the height map's plane alone."""
+        return self.tile.grid is not None and self.tile.thickness == 0.0
 
     def is_auto(self, name: str) -> bool:
         """Whether the plan decides on an effect, because the user requests nothing of it."""

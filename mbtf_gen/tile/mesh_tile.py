@@ -73,6 +73,7 @@ class MeshTile(Tile):
     @cached_property
     def thickness(self) -> float:
         """Height of the triangles' slab, in tile widths."""
+        # Not minus zero.
         return 0.0 - float(self.vertices[self.faces, 2].min())
 
     def copies(self) -> tuple[NDArray[np.int_], F64]:

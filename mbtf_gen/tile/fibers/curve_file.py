@@ -7,6 +7,7 @@ splines through the same points.
 from __future__ import annotations
 
 import codecs
+import itertools
 import logging
 import os
 import struct
@@ -212,7 +213,7 @@ def _text(stream: BinaryIO, path: Path) -> list[Curve]:
     out: list[Curve] = []
     run: list[list[float]] = []
     points = 0
-    for number, line in lines(stream):
+    for number, line in itertools.chain(lines(stream), [(0, b"")]):
         words = line.split()
         if words:
             run.append(numbers(words))
@@ -226,7 +227,7 @@ def _text(stream: BinaryIO, path: Path) -> list[Curve]:
             out.append(_curve(run, len(out), path))
             run = []
         _check_counts(len(out), points, path)
-    return [*out, _curve(run, len(out), path)] if run else out
+    return out
 
 
 def _check_counts(curves: int, points: int, path: Path) -> None:

@@ -181,6 +181,32 @@ def test_thin_fibers_do_not_shadow_themselves() -> None:
         assert error < 0.01
 
 
+@pytest.mark.parametrize(("radius", "loss"), [(1e-3, 3e-4), (1e-4, 3e-4), (2e-5, 1e-3), (THINNEST, 2e-3)])
+@pytest.mark.parametrize("view", [(90, 0), (60, 30), (20, 20), (5, 45)])
+def test_rays_hit_thin_fibers(view: tuple[float, float], radius: float, loss: float) -> None:
+    """As many rays as pass the axis of a long straight fiber at less than its radius."""
+    points = np.arange(4)[:, None] / 4 * ALONG_X + (0.0, 0.95, 0.0)
+    curve = Curve.through(points, radius, ALONG_X)
+    geometry = FiberTile.settled(1.0, [curve], np.zeros(1, int), np.array([GRAY])).trace(32.0)
+    rng, n = np.random.default_rng(0), 1 << 17
+    d = -direction(*view)
+    across = np.cross(d, ALONG_X)
+    across /= np.linalg.norm(across)
+    axis = np.array([0.0, 0.45, -radius])
+    aim = (
+        axis + np.outer(rng.random(n) - 0.5, ALONG_X) + np.outer(3.0 * radius * (rng.random(n) - 0.5), across)
+    )
+    above = np.outer((aim[:, 2] - 1e-3) / d[2], d)
+    o, d = (32.0 * (aim - above)).astype(np.float32), d.astype(np.float32)
+    ray = mi.Ray3f(mi.Point3f(o.T), mi.Vector3f(*(mi.Float(float(x)) for x in d)))
+    si, *_ = geometry.closest_hit(ray, mi.Mask(np.ones(n, bool)), 1000)
+    # In double precision, from the rounded rays.
+    across = np.cross(d.astype(np.float64), ALONG_X)
+    expected = np.abs((o - 32.0 * axis) @ across) < 32.0 * radius * np.linalg.norm(across)
+    assert 0.6 < expected.mean() < 0.7
+    assert abs(np.count_nonzero(si.is_valid()) / np.count_nonzero(expected) - 1.0) < loss
+
+
 def test_diffuse_tubes_are_reciprocal() -> None:
     # The scattering model of Chiang et al. is not: its absorption depends on the view alone.
     tile = felt(80, 0.012)

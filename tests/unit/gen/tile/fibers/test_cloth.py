@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from support.paths import ASSETS
 
 from mbtf_core.errors import InputError, MbtfError, UsageError
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.job import Job
+from mbtf_gen.job import Job, received_job
 from mbtf_gen.tile.fiber_tile import FiberScattering, FiberTile, absorption
 from mbtf_gen.tile.fibers.curves import Bundle
 from mbtf_gen.tile.loading import load_material
@@ -87,6 +88,8 @@ def test_every_option_changes_the_digest(tmp_path: Path) -> None:
         ("weave: plain\nyarn: {width: 0.00001}\n", "segments"),
         ("weave: plain\nyarn: {flyaways: 100, width: 0.001}\n", "segments"),
         ("weave: plain\nyarn: {width: 1000000}\n", "periods"),
+        ("weave: plain\nyarn: {radius: 0.001, fibers: 2}\n", "thinner"),
+        ("weave: |\n" + "  X\n" * 100, "times as long"),
         ("weave: plain\nfiber: {roughness: 0.01}\n", "roughness"),
         ("knit: {aspect: 0.5}\n", "aspect"),
         ("curves: a.curves\nyarn: {flyaways: 2}\n", "flyaways"),
@@ -124,6 +127,55 @@ def test_curves_that_do_not_repeat_are_noted(tmp_path: Path) -> None:
     for name, count in (("a", 0), ("b", 1)):
         path = write(tmp_path, f"curves: {name}.curves\nperiod: [1, 1]\n")
         assert len(load_material(path).warnings) == count
+
+
+def test_ends_beside_the_corner_have_partners(tmp_path: Path) -> None:
+    """The remainder of -1e-17 by a period is the period."""
+    rows = ("".join(f"{x / 4} {y} 0 .01\n" for x in range(-1, 6)) for y in ("-1e-17", "0.5"))
+    (tmp_path / "a.curves").write_text("\n".join(rows))
+    path = write(tmp_path, "curves: a.curves\nperiod: [1, 1]\n")
+    assert load_material(path).warnings == ()
+
+
+@pytest.mark.parametrize(("radius", "accepted"), [("1.01e-5", True), ("0.99e-5", False)])
+def test_the_smallest_radius_is_named(tmp_path: Path, radius: str, accepted: bool) -> None:
+    (tmp_path / "a.curves").write_text("".join(f"{x / 4} 0.5 0 {radius}\n" for x in range(-1, 6)))
+    path = write(tmp_path, "curves: a.curves\nperiod: [1, 1]\n")
+    if accepted:
+        # Segments of at most a hundred radii.
+        assert load_material(path).segments >= 1000
+        return
+    with pytest.raises(InputError, match="1e-05"):
+        load_material(path)
+
+
+@pytest.mark.parametrize("key", ["curves", "pattern"])
+def test_a_changed_file_is_another_data_set(tmp_path: Path, key: str) -> None:
+    """Also for workers, which receive the configuration and its hash."""
+    file = tmp_path / "fibers.txt"
+    lines = {
+        "curves": [f"{x / 4} 0.5 0 .01" for x in range(-1, 6)],
+        "pattern": ["*pattern", "4 4 .5 4", "*Q", *(f"{x} 1 0 0" for x in range(4)), "*E"]
+        + [f"{k} {(k + 1) % 4} {int(k == 3)} 0" for k in range(4)],
+    }[key]
+    file.write_text("\n".join(lines))
+    period = "period: [1, 1]\n" if key == "curves" else "yarn: {fibers: 2, flyaways: 0}\n"
+    config = GeneratorConfig.model_validate(
+        {"material": str(write(tmp_path, f"{key}: fibers.txt\n{period}"))}
+    )
+    job = Job.load(config)
+    assert set(job.material.digests) == {key, "settings"}
+    sent = pickle.dumps(job)
+    assert pickle.loads(sent).config_hash == job.config_hash
+    received_job.cache_clear()
+    # As many bytes as before.
+    file.write_text("\n".join(lines).replace("0.5 0 .01", "0.4 0 .01").replace("1 1 0 0", "1 1 1 0"))
+    assert Job.load(config).config_hash != job.config_hash
+    with pytest.raises(InputError, match="differ"):
+        pickle.loads(sent)
+    file.unlink()
+    with pytest.raises(InputError, match="cannot be read"):
+        Job.load(config)
 
 
 def test_neighbors_do_not_hide_a_seam(tmp_path: Path) -> None:

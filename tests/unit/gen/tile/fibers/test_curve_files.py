@@ -15,6 +15,7 @@ from support.paths import ROOT
 from mbtf_core.errors import InputError, MbtfError
 from mbtf_gen.config.generator import GeometrySection
 from mbtf_gen.tile.fiber_tile import FiberTile
+from mbtf_gen.tile.fibers import curve_file, weave
 from mbtf_gen.tile.fibers.cloth_file import CURVE_FILES
 from mbtf_gen.tile.fibers.curve_file import read_curves
 from mbtf_gen.tile.fibers.weave import read_pattern
@@ -37,19 +38,15 @@ CURVES = "0 0 0 .1\n1 0 0 .1\n2 0 0 .1\n3 0 0 .1\n\n\n0 1 0 .2\n1 1 0 .2\n2 1 0 
 
 
 def bcc(lines: list[tuple[np.ndarray, bool]], up: int = 2, **changes: object) -> bytes:
-    fields: dict[str, object] = {
-        "magic": b"BCC",
-        "sizes": 0x44,
-        "kind": b"C",
-        "spline": b"0",
-        "dimensions": 3,
-    }
+    fields: dict[str, object] = {"magic": b"BCC", "sizes": 0x44, "kind": b"C0", "dimensions": 3}
     fields |= {"up": up, "curves": len(lines), "points": sum(len(p) for p, _ in lines)} | changes
-    header = struct.pack("<3sBccBBQQ40s", *fields.values(), b"test")
-    body = b"".join(
-        struct.pack("<i", -len(p) if closed else len(p)) + p.astype("<f4").tobytes() for p, closed in lines
+    header = struct.pack("<3sB2sBBQQ40s", *fields.values(), b"test")
+    size = 8 if fields["sizes"] == 0x88 else 4
+    counts = [np.array(-len(p) if closed else len(p), f"<i{size}") for p, closed in lines]
+    body = (
+        count.tobytes() + p.astype(f"<f{size}").tobytes() for count, (p, _) in zip(counts, lines, strict=True)
     )
-    return header + body
+    return header + b"".join(body)
 
 
 def fails(path: Path, read: object = read_curves) -> str:
@@ -106,6 +103,9 @@ def test_published_patterns(name: str) -> None:
         ("3 0 1 0", "3 0 90 0", "periods"),
         ("0.0005 0.0005 0 0", "0.0005 1e200 0 0", "periods"),
         ("0.0015 0.0005 0.0002 0", "0.0005 0.0005 0 0", "same place"),
+        ("0.0003 1", "-0.0003 1", "positive"),
+        ("0.0003 1", "nan 1", "line 2"),
+        ("0.0003 1", "1_0 1", "line 2"),
     ],
 )
 def test_damaged_patterns_are_refused(tmp_path: Path, old: str, new: str, says: str) -> None:
@@ -150,11 +150,100 @@ def test_the_deviation_from_catmull_rom_curves_is_told(
     assert 10.0 < found[0] / found[1] < 22.0
 
 
+def test_a_bcc_may_hold_polylines(tmp_path: Path) -> None:
+    """Two points are a straight piece. Around the unit circle, the spline is the circle, up to fourth order,
+    so it deviates from n chords by their height 1 - cos(π/n)."""
+    t = 2.0 * np.pi * np.arange(32) / 32
+    ring = np.column_stack([np.cos(t), np.sin(t), 0.0 * t])
+    piece = np.array([[0.0, 1.0, 2.0], [3.0, 5.0, 4.0]])
+    path = tmp_path / "a.bcc"
+    path.write_bytes(bcc([(ring, True), (piece, False)], kind=b"PL"))
+    (circle, line), deviation = read_curves(path)
+    assert np.abs(circle.at(np.arange(33.0))[0][:, :3] - np.concatenate([ring, ring[:1]])).max() < 1e-6
+    at = line.at(np.linspace(0.0, 1.0, 5))[0][:, :3]
+    assert np.abs(at - np.linspace(piece[0], piece[1], 5)).max() < 1e-6
+    assert deviation == pytest.approx(1.0 - np.cos(np.pi / 32), rel=0.02)
+    # Of a zigzag, the middles of the pieces lie on the spline, other points do not.
+    zigzag = np.column_stack([np.arange(40.0), np.arange(40) % 2, np.zeros(40)])
+    path.write_bytes(bcc([(zigzag, False)], kind=b"PL"))
+    (curve,), deviation = read_curves(path)
+    t = np.arange(0.05, 39.0, 0.1)
+    gap = curve.at(t)[0][:, :2] - zigzag[t.astype(int), :2]
+    away = np.abs(gap[:, 1] - np.where(t % 2 < 1, gap[:, 0], -gap[:, 0])) / np.sqrt(2.0)
+    assert deviation == pytest.approx(away.max(), rel=0.1)
+    assert "more than the radius" in load_material(path).warnings[0]
+
+
+def test_a_bcc_may_hold_numbers_of_eight_bytes(tmp_path: Path) -> None:
+    points = np.random.default_rng(0).random((6, 3))
+    path = tmp_path / "a.bcc"
+    path.write_bytes(bcc([(points, False), (points[:5], True)], sizes=0x88))
+    (first, second), _ = read_curves(path)
+    assert np.abs(first.at(np.arange(6.0))[0][:, :3] - points).max() < 1e-14
+    assert second.shift is not None
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"kind": b"C5"}, "centripetal"),
+        ({"kind": b"B3"}, "'B3'"),
+        ({"dimensions": 2}, "2 dimensions"),
+        ({"up": 3}, "number 3"),
+        ({"sizes": 0x48}, "size code"),
+        ({"curves": 300_000_000}, "300,000,000 curves"),
+        ({"points": 1 << 63}, "points"),
+        ({"magic": b"BBC"}, "not a .bcc"),
+    ],
+)
+def test_a_bcc_of_another_kind_is_refused_by_its_header(
+    tmp_path: Path, changes: dict[str, object], says: str
+) -> None:
+    path = tmp_path / "a.bcc"
+    path.write_bytes(bcc([(np.random.default_rng(0).random((6, 3)), False)], **changes))  # type: ignore[arg-type]
+    assert says in fails(path)
+
+
+@pytest.mark.parametrize("count", [7, -7, 5, -(1 << 31), 0, 3])
+def test_counts_of_points_must_be_those_of_the_header(tmp_path: Path, count: int) -> None:
+    whole = bytearray(bcc([(np.random.default_rng(0).random((6, 3)), False)] * 2))
+    at = 64 + 4 + 6 * 12
+    whole[at : at + 4] = struct.pack("<i", count)
+    path = tmp_path / "a.bcc"
+    path.write_bytes(whole)
+    assert "curve" in fails(path)
+
+
+def test_what_is_too_large_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(curve_file, "MOST_CURVES", 1)
+    monkeypatch.setattr(weave, "_MOST_VERTICES", 3)
+    (tmp_path / "a.bcc").write_bytes(bcc([(np.random.default_rng(0).random((6, 3)), False)] * 2))
+    (tmp_path / "a.curves").write_text(CURVES)
+    (tmp_path / "a.pyp").write_text(PYP)
+    for name, read in (("a.bcc", read_curves), ("a.curves", read_curves), ("a.pyp", read_pattern)):
+        assert "more than" in fails(tmp_path / name, read)
+
+
+def test_many_curves_are_those_of_many_files(tmp_path: Path) -> None:
+    """Curves are solved in groups of equal length; they keep their order and their own points."""
+    rng = np.random.default_rng(3)
+    lines = [(rng.random((4 + k % 3, 3)), bool(k % 2)) for k in range(20)]
+    path = tmp_path / "a.bcc"
+    path.write_bytes(bcc(lines))
+    together, _ = read_curves(path)
+    for line, curve in zip(lines, together, strict=True):
+        path.write_bytes(bcc([line]))
+        (alone,), _ = read_curves(path)
+        assert (curve.shift is None) == (alone.shift is None)
+        assert np.abs(curve.control - alone.control).max() < 1e-12
+
+
 def test_text_has_control_points_and_radii(tmp_path: Path) -> None:
-    path = tmp_path / "a.curves"
-    path.write_text(CURVES)
+    path = tmp_path / "a.txt"
+    path.write_bytes(b"\xef\xbb\xbf" + CURVES.replace("\n", "\r\n").encode())
     (first, second), _ = read_curves(path)
     assert (len(first.control), len(second.control)) == (4, 5)
+    assert len(load_material(path).curves) == 2
     assert second.control[4].tolist() == [4, 1, 0, 0.2]
 
 
@@ -165,6 +254,9 @@ def test_text_has_control_points_and_radii(tmp_path: Path) -> None:
         ("a.curves", CURVES.replace("2 0 0 .1", "2 0 x .1"), "line 3"),
         ("a.curves", CURVES.replace("2 0 0 .1", "2 0 inf .1"), "finite"),
         ("a.curves", CURVES.replace("2 0 0 .1", "2 0 0 0"), "radius"),
+        ("a.curves", CURVES.replace(" ", ", "), "line 1"),
+        ("a.curves", CURVES.replace("2 0 0 .1", "2 0 0 1_0"), "line 3"),
+        ("a.curves", CURVES.replace("2 0 0 .1", "2 0 0 .1 " * 4000), "line 3"),
         ("a.curves", CURVES.replace("3 0 0 .1\n", ""), "fewer than 4"),
         ("a.curves", "", "no curves"),
         ("a.bcc", "BCC", "too short"),

@@ -88,3 +88,32 @@ def test_heights_bound_the_tube() -> None:
     ring = Curve.through(np.column_stack([0.1 * np.cos(t), np.zeros(16), 0.1 * np.sin(t)]), 0.02, np.zeros(3))
     low, high = Bundle([ring]).heights()
     assert (low, high) == pytest.approx((-0.12, 0.12), abs=1e-4)
+
+
+@pytest.mark.parametrize("closed", [True, False])
+def test_a_halved_curve_is_the_same(closed: bool) -> None:
+    curve = wavy(7) if closed else Curve(np.random.default_rng(4).random((9, 4)))
+    fine = curve.halved()
+    t = np.linspace(0.0, len(curve.windows()), 100)
+    assert len(fine.windows()) == 2 * len(curve.windows())
+    assert np.abs(fine.at(2.0 * t)[0] - curve.at(t)[0]).max() < 1e-12
+
+
+def test_a_bundle_holds_the_segments_of_its_curves() -> None:
+    curves = [wavy(7), Curve(np.random.default_rng(4).random((9, 4))), wavy(5, 1)]
+    bundle = Bundle(curves)
+    found = bundle.at(0.3)
+    expected = [curve.at(np.arange(len(curve.windows())) + 0.3) for curve in curves]
+    assert bundle.owner.tolist() == [0] * 7 + [1] * 6 + [2] * 5
+    for k in range(2):
+        assert np.abs(found[k] - np.concatenate([both[k] for both in expected])).max() < 1e-12
+
+
+def test_segments_are_halved_until_they_are_short_for_their_radius() -> None:
+    thin, thick = (Curve.through(wavy(8).at(np.arange(8.0))[0][:, :3], r, SHIFT) for r in (1e-4, 0.1))
+    times = Bundle([thin, thick]).halvings()
+    assert times[1] == 0
+    for _ in range(times[0]):
+        thin = thin.halved()
+    length = np.linalg.norm(thin.at(np.arange(len(thin.windows())) + 0.5)[1][:, :3], axis=1)
+    assert 25e-4 < length.max() < 100e-4
