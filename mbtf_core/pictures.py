@@ -215,7 +215,7 @@ class ReferenceImage:
 
 def pictures_of(command: str) -> OutputKind:
     """Pictures that a command writes, such as ``mbtf-gen reference``."""
-    return OutputKind("pictures.json", command.replace(" ", "-"), 3, f"pictures of {command}")
+    return OutputKind("pictures.json", command.replace(" ", "-"), 4, f"pictures of {command}")
 
 
 def claim_pictures(

@@ -306,8 +306,8 @@ class FileCache:
     """Whole files by their SHA-256, which all processes of a user share: at most `limit` bytes of them, but
     at least the few that were fetched last.
 
-    A file is complete once it has its name. One that has changed since is read again. The files that were used least recently make
-    room for new ones. A mapped file stays readable after it has been removed.
+    A file is complete once it has its name. One that has changed since is read again. The files that were
+    used least recently make room for new ones. A mapped file stays readable after it has been removed.
 
     Parameters
     ----------

@@ -2,12 +2,14 @@
 
 A command owns its folder while it writes there. It writes its record first, such as ``manifest.json``: the
 folder is then its own, whatever instant the process is killed at. Files that the record does not list belong
-to others and are never touched.
+to others and are never touched. Nor is a file that has changed since it was written, unless the user asks to
+replace it.
 """
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import re
 import shutil
@@ -20,15 +22,16 @@ from pydantic import AfterValidator, BaseModel
 
 from mbtf_core.config.settings import check_document, check_schema, differences, in_short
 from mbtf_core.config.yaml_file import dump_yaml
-from mbtf_core.errors import InputError, LockedError, PartialError
+from mbtf_core.errors import InputError, LockedError, PartialError, unwritable
 from mbtf_core.files.atomic import (
     TEMPORARY,
     Stored,
     data_sha256,
+    file_sha256,
     read_json,
     remove_file,
+    write_chunks,
     write_json,
-    write_text,
 )
 from mbtf_core.locks import lock_owner, take_lock
 from mbtf_core.units import size_text
@@ -39,6 +42,8 @@ _LEFTOVER = re.compile(rf"\..+(?:{TEMPORARY}|\.lock)")
 ELSEWHERE = "choose another folder with -o"
 # Beside the record: the resolved options, which a command can be given again.
 CONFIG_NAME = "config.yaml"
+# Last line of a document, which tells whether the others are as they were written.
+_SEALS = {".yaml": "# sha256 of the lines above: {}\n", ".html": "<!-- sha256 of the lines above: {} -->\n"}
 
 
 def cache_folder() -> Path:
@@ -141,6 +146,47 @@ def make_folder(folder: Path) -> None:
         raise InputError(f"cannot be created ({error.strerror})", where=folder) from None
 
 
+def write_document(path: Path, text: str, *, overwrite: bool = False) -> None:
+    """Write a text that users may edit, atomically; its last line is a comment with a digest of the others.
+
+    Parameters
+    ----------
+    path : of a suffix ``.yaml`` or ``.html``
+    overwrite : replace it also if it has been edited
+
+    Raises
+    ------
+    InputError : there is a file that has been edited, or that is not of this program
+    PartialError : it cannot be written
+    """
+    body = text if text.endswith("\n") else f"{text}\n"
+    content = body.encode()
+    if not overwrite:
+        _refuse_edited(path)
+    write_chunks(path, [content, _SEALS[path.suffix].format(hashlib.sha256(content).hexdigest()).encode()])
+
+
+def _refuse_edited(path: Path) -> None:
+    """An InputError if there is a document that is not as :func:`write_document` wrote it."""
+    try:
+        body, _, last = path.read_bytes()[:-1].rpartition(b"\n")
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+    if last + b"\n" != _SEALS[path.suffix].format(hashlib.sha256(body + b"\n").hexdigest()).encode():
+        raise changed(path)
+
+
+def changed(path: Path) -> InputError:
+    """Error for a file that the user, or a fault of the disk, has changed."""
+    return InputError(
+        "has been edited, or damaged, since it was written, and would be replaced",
+        where=path,
+        hint="move it away and run the same command again; --overwrite, where there is one, replaces all",
+    )
+
+
 def other_configuration(
     folder: object, what: str, old: Mapping[str, Any], new: Mapping[str, Any]
 ) -> InputError:
@@ -185,7 +231,7 @@ _Name = Annotated[str, AfterValidator(_inside)]
 
 
 class _Item(BaseModel):
-    files: dict[_Name, int]
+    files: dict[_Name, Stored]
     facts: dict[str, Any]
 
 
@@ -300,10 +346,8 @@ class OutputFolder:
             folder._save()
         if config is not None:
             folder._claim.insert(0, CONFIG_NAME)
-            file, text = path / CONFIG_NAME, dump_yaml(config)
             remove_unfinished(path, [CONFIG_NAME])
-            if not file.exists() or file.read_text(encoding="utf-8") != text:
-                write_text(file, text)
+            write_document(path / CONFIG_NAME, dump_yaml(config), overwrite=overwrite)
         return folder
 
     def __enter__(self) -> OutputFolder:
@@ -316,30 +360,67 @@ class OutputFolder:
                 remove_file(self.path / name)
 
     def _save(self) -> None:
-        self._kind.write(self.path, self._record.model_dump())
+        # In whichever order the items are made, possibly again.
+        items = dict(sorted(self._record.items.items()))
+        self._kind.write(self.path, self._record.model_copy(update={"items": items}).model_dump())
 
     def finished(self, name: str) -> dict[str, Any] | None:
-        """Facts stored by :meth:`keep`, if all files of the item exist with their full size."""
+        """Facts stored by :meth:`keep`, if all files of the item are there as they were written. An item that
+        lacks a file is to be made again.
+
+        Raises
+        ------
+        InputError : a file has changed
+        """
         item = self._record.items.get(name)
         if item is None:
             return None
-        for file, size in item.files.items():
-            path = self.path / file
-            if not path.is_file() or path.stat().st_size != size:
-                return None
-        return item.facts
+        there = [file for file in item.files if (self.path / file).is_file()]
+        for file in there:
+            if self._stored(file) != item.files[file]:
+                raise changed(self.path / file)
+        if len(there) == len(item.files):
+            return item.facts
+        # If this process is killed, its files may have other bytes than the record says.
+        del self._record.items[name]
+        self._save()
+        return None
+
+    def _stored(self, file: str) -> Stored:
+        path = self.path / file
+        try:
+            return Stored(path.stat().st_size, file_sha256(path))
+        except OSError as error:
+            raise unwritable(path, error) from None
 
     def keep(self, name: str, files: Iterable[Path], facts: Mapping[str, Any]) -> None:
         """Record an item as finished: its files, which lie in the folder, and plain data about it."""
-        sizes = {path.relative_to(self.path).as_posix(): path.stat().st_size for path in files}
-        self._record.items[name] = _Item(files=sizes, facts=dict(facts))
+        names = [path.relative_to(self.path).as_posix() for path in files]
+        self._keep(name, {file: self._stored(file) for file in names}, facts)
+
+    def _keep(self, name: str, files: dict[str, Stored], facts: Mapping[str, Any]) -> None:
+        self._record.items[name] = _Item(files=files, facts=dict(facts))
         self._save()
 
     def add(self, name: str, write: Callable[[Path], Stored]) -> Stored:
-        """Write a file with ``write(path)``, atomically, unless it is finished; its size and digest."""
-        path, known = self.path / name, self.finished(name)
-        if known is None:
+        """Write a file with ``write(path)``, atomically, unless it is finished; its size and digest.
+
+        Raises
+        ------
+        InputError : it has changed since it was written
+        PartialError : it cannot be written
+        """
+        if self.finished(name) is None:
+            path = self.path / name
+            if not self.path.is_dir():
+                # Made anew, it would lack the files before.
+                raise PartialError("has vanished", where=self.path, hint="run the same command again")
             make_folder(path.parent)
-            known = {"sha256": write(path).sha256}
-            self.keep(name, [path], known)
-        return Stored(path.stat().st_size, known["sha256"])
+            self._keep(name, {name: write(path)}, {})
+        return self._record.items[name].files[name]
+
+    def check_added(self, names: Iterable[str]) -> None:
+        """A PartialError if a file that was added has vanished meanwhile."""
+        for name in names:
+            if not (self.path / name).is_file():
+                raise PartialError("has vanished", where=self.path / name, hint="run the same command again")

@@ -8,43 +8,35 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import re
-import shutil
-import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from importlib.metadata import version
 from typing import Any
 from uuid import uuid4
 
 from mbtf_core.errors import InputError, PartialError, UsageError, reason
+from mbtf_core.run.batch import site_preload, submitted_jobs
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import GPUS_VARIABLE, THREADS_VARIABLE, Item, Result, TaskFunction, packed, run_task
-from mbtf_core.run.workers import MEMORY, PRELOAD, ClusterConfig, read_cluster
+from mbtf_core.run.workers import MEMORY, ClusterConfig, read_cluster
+from mbtf_core.timeouts import NoAnswer, call_within
 from mbtf_core.units import format_duration
 
+# Seconds in which a client of a silent scheduler closes.
+_LAST_SECONDS = 1.0
 # Tasks that the scheduler knows at a time, beyond those that run.
 _AHEAD = 256
+# Interval at which a result is waited for.
+_POLL_SECONDS = 0.02
 # Seconds between two looks at the workers.
 _LOOK_SECONDS = 2.0
 # The same until the first one has started.
 _START_SECONDS = 0.1
 # A task whose files another process works on is tried at this interval, until locks of dead ones have ended.
 _PAUSE_SECONDS, _LOCKED_SECONDS = 10.0, 420.0
-# Seconds in which a scheduler must answer.
-_CONNECT_SECONDS = 30.0
 _RESUMES = "the same command goes on with the rest"
-# Class of dask-jobqueue, and the command that submits a job.
-_SYSTEMS = {
-    "slurm": ("SLURMCluster", "sbatch"),
-    "pbs": ("PBSCluster", "qsub"),
-    "sge": ("SGECluster", "qsub"),
-    "lsf": ("LSFCluster", "bsub"),
-    "oar": ("OARCluster", "oarsub"),
-    "htcondor": ("HTCondorCluster", "condor_submit"),
-}
 
 
 class DaskRunner(Runner):
@@ -66,11 +58,15 @@ class DaskRunner(Runner):
         # A task that asks for a GPU waits for ever where no worker states one.
         self._gpus = False
         self._ended = threading.Event()
+        # Why nothing can be expected any more, as last seen.
+        self._fault = ""
         self._watch = threading.Thread(target=self._observe, name="cluster", daemon=True)
 
     def close(self) -> None:
-        """Stop to observe the workers."""
+        """Stop to observe the workers, and leave the scheduler."""
         self._ended.set()
+        with contextlib.suppress(Exception):
+            self._client.close(timeout=_LAST_SECONDS if self._fault else self._config.timeout)
 
     def wait(self, where: str) -> None:
         """Wait for the first worker, and observe the workers from then on.
@@ -79,6 +75,7 @@ class DaskRunner(Runner):
         ------
         InputError : none has started within the time of the configuration, or the batch system refuses the
             jobs; names the option of `where`
+        OSError : the scheduler does not answer
         """
         limit = self._config.start_timeout
         until = time.monotonic() + limit
@@ -97,24 +94,37 @@ class DaskRunner(Runner):
         self._watch.start()
 
     def _look(self) -> None:
-        try:
-            # Of all workers; older versions know no other answer.
-            found = self._client.scheduler_info(n_workers=-1)["workers"]
-        except TypeError:
-            found = self._client.scheduler_info()["workers"]
+        found = call_within(self._config.timeout, self._listed)
         self.workers = len(found)
         self._gpus = any("GPU" in worker["resources"] for worker in found.values())
 
+    def _listed(self) -> dict[str, Any]:
+        """All workers."""
+        try:
+            found: dict[str, Any] = self._client.scheduler_info(n_workers=-1)["workers"]
+        except TypeError:
+            # Older versions know no other answer.
+            found = self._client.scheduler_info()["workers"]
+        return found
+
     def _observe(self) -> None:
         """Keep the number of workers; says when none is left."""
+        alone, limit = 0.0, self._config.start_timeout
         while not self._ended.wait(_LOOK_SECONDS):
             before = self.workers
             try:
                 self._look()
+            except NoAnswer as error:
+                self._fault = reason(error)
+                continue
             except Exception:  # the tasks report it
                 continue
+            alone = 0.0 if self.workers else alone + _LOOK_SECONDS
+            self._fault = f"no worker within {format_duration(limit)}" if alone > limit else ""
             if before and not self.workers and not self._ended.is_set():
-                self._note("cluster: no worker is left; waiting for new ones")
+                self._note(
+                    f"cluster: no worker is left; waiting for new ones, at most {format_duration(limit)}"
+                )
 
     def map(
         self,
@@ -162,9 +172,12 @@ class DaskRunner(Runner):
                     submit(item)
                 if not pending:
                     return
+                while not done.has_ready():
+                    self._check()
+                    time.sleep(_POLL_SECONDS)
                 future = next(done)
                 item = pending.pop(future.key)
-                result = _result(item, future)
+                result = self._result(item, future)
                 if result.fatal and not independent:
                     hint = result.hint or "files must lie at the same place on every machine"
                     raise InputError(result.error, where=f"{item.name} on {result.worker}", hint=hint)
@@ -178,21 +191,32 @@ class DaskRunner(Runner):
         finally:
             # What runs is finished by its worker, and found by the next command.
             with contextlib.suppress(Exception):
-                self._client.cancel(list(done.futures))
+                self._check()
+                call_within(self._config.timeout, lambda: self._client.cancel(list(done.futures)))
 
+    def _check(self) -> None:
+        """An OSError where nothing can be expected any more."""
+        if self._fault:
+            raise OSError(self._fault)
 
-def _result(item: Item, future: Any) -> Result:
-    from distributed import KilledWorker
+    def _result(self, item: Item, future: Any) -> Result:
+        """How the item of a future ended; an OSError where the scheduler has."""
+        from distributed import KilledWorker
 
-    if future.status == "cancelled":
-        raise OSError("the scheduler has ended")
-    error = future.exception()
-    if isinstance(error, KilledWorker):
-        text = "its worker died each time: out of memory, killed, or crashed"
-        return Result(item.name, error=text)
-    if error is not None:
-        return Result(item.name, error=f"{type(error).__name__}: {reason(error)}")
-    return Result(item.name, **future.result())
+        if future.status == "cancelled":
+            raise OSError("the scheduler has ended")
+        error = future.exception()
+        if isinstance(error, KilledWorker):
+            text = "its worker died each time: out of memory, killed, or crashed"
+            return Result(item.name, error=text)
+        if error is not None:
+            return Result(item.name, error=f"{type(error).__name__}: {reason(error)}")
+        while True:
+            try:
+                return Result(item.name, **future.result(timeout=self._config.timeout))
+            except TimeoutError:
+                # It is computed again where its worker has died.
+                self._check()
 
 
 @contextlib.contextmanager
@@ -223,10 +247,7 @@ def open_runner(
 @contextlib.contextmanager
 def _open_workers(where: str, note: Callable[[str], None]) -> Iterator[DaskRunner]:
     """Workers for the tasks of a block; see :func:`open_runner`."""
-    found = read_cluster(where)
-    address = found if isinstance(found, str) else None
-    # Of workers that the user has started, only retries and times are ours.
-    config = ClusterConfig(start_timeout=60.0) if isinstance(found, str) else found
+    config = read_cluster(where)
     try:
         import dask
         from distributed import Client
@@ -237,7 +258,7 @@ def _open_workers(where: str, note: Callable[[str], None]) -> Iterator[DaskRunne
     # Tornado prints the traceback of a job that cannot be submitted.
     for name in [*names, "tornado.application"]:
         logging.getLogger(name).setLevel(logging.CRITICAL)
-    settings = {
+    settings: dict[str, Any] = {
         # A worker that dies is started again; its task counts the deaths.
         "distributed.scheduler.allowed-failures": config.retries,
         "distributed.worker.multiprocessing-method": "spawn",
@@ -245,37 +266,50 @@ def _open_workers(where: str, note: Callable[[str], None]) -> Iterator[DaskRunne
         "distributed.scheduler.worker-saturation": 1.0,
         **{f"distributed.worker.memory.{name}": value for name, value in MEMORY.items()},
         "distributed.logging.distributed": "critical",
-        "distributed.comm.timeouts.connect": f"{_CONNECT_SECONDS}s",
     }
+    if config.engine == "local":
+        # Dask gives up a worker that takes longer to start again, without another in its place.
+        settings["distributed.deploy.lost-worker-timeout"] = "1d"
+    limit = format_duration(config.timeout)
     refused: list[str] = []
     with contextlib.ExitStack() as stack:
         stack.enter_context(dask.config.set(settings))
-        if address is not None:
-            note(f"cluster: connecting to {address}, at most {_CONNECT_SECONDS:.0f} s")
+        if config.address is not None:
+            note(f"cluster: connecting to {config.address}, at most {limit}")
         try:
-            started = stack.enter_context(_started(config, refused)) if address is None else address
-            client = stack.enter_context(Client(started, timeout=_CONNECT_SECONDS, set_as_default=False))
+            started = config.address or stack.enter_context(_started(config, refused, note))
+            # Dask's own time limit leaves out the first answer; its error is the better one.
+            client = call_within(
+                config.timeout, lambda: Client(started, timeout=0.8 * config.timeout, set_as_default=False)
+            )
             cluster = DaskRunner(client, config, note, refused)
             stack.callback(cluster.close)
+            if config.engine != "local" or config.address is not None:
+                until = format_duration(config.start_timeout)
+                note(f"cluster: waiting for the first worker, at most {until}")
+            cluster.wait(f"--cluster {where}")
         except (OSError, ValueError, TypeError, ImportError, RuntimeError) as error:
             own = version("distributed")
-            hint = "" if address is None else f"start one with: dask scheduler, of Dask {own} as this command"
+            hint = f"start one with: dask scheduler, of Dask {own} as this command"
+            if isinstance(error, NoAnswer):
+                hint = "see whether it hangs; to wait longer, name a file with 'address' and 'timeout'"
             raise InputError(
-                f"cannot be used ({reason(error)})", where=f"--cluster {where}", hint=hint
+                f"cannot be used ({reason(error)})",
+                where=f"--cluster {where}",
+                hint="" if config.address is None else hint,
             ) from None
-        if config.engine != "local" or address is not None:
-            note(f"cluster: waiting for the first worker, at most {format_duration(config.start_timeout)}")
-        cluster.wait(f"--cluster {where}")
-        name, count = address or config.engine, f"{cluster.workers} worker{'s' * (cluster.workers != 1)}"
+        name = config.address or config.engine
+        count = f"{cluster.workers} worker{'s' * (cluster.workers != 1)}"
         note(f"cluster: {name}, {count}{' so far' * (name != 'local')}, dashboard {client.dashboard_link}")
         yield cluster
 
 
-def _started(config: ClusterConfig, refused: list[str]) -> Any:
+def _started(config: ClusterConfig, refused: list[str], note: Callable[[str], None]) -> Any:
     """A Dask cluster, which ends its workers when its block ends."""
     environment = {THREADS_VARIABLE: str(config.threads), "OMP_NUM_THREADS": str(config.threads)}
     if config.engine != "local":
-        return _submitted_jobs(config, environment, refused)
+        return submitted_jobs(config, environment, refused, note)
+    import dask
     from distributed import LocalCluster
     from distributed.system import MEMORY_LIMIT
 
@@ -289,79 +323,11 @@ def _started(config: ClusterConfig, refused: list[str]) -> Any:
         dashboard_address="127.0.0.1:0",
         host="127.0.0.1",
         env={**environment, **gpus},
-        resources={"GPU": config.gpus} if config.gpus else {},
-        preload=[PRELOAD],
+        # Without ours, those of the user's configuration.
+        resources={**dask.config.get("distributed.worker.resources"), "GPU": config.gpus}
+        if config.gpus
+        else None,
+        preload=site_preload(),
         silence_logs=logging.CRITICAL,
         **config.options,
     )
-
-
-@contextlib.contextmanager
-def _submitted_jobs(
-    config: ClusterConfig, environment: Mapping[str, str], refused: list[str]
-) -> Iterator[Any]:
-    """Workers as jobs of a batch system, canceled when the block ends; `refused` gets the reasons why jobs
-    cannot be submitted."""
-    handler = signal.getsignal(signal.SIGINT)
-    import dask_jobqueue
-
-    # Its import lets Ctrl-C end the program as if all were done.
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGINT, handler)
-
-    name, command = _SYSTEMS[config.engine]
-    if shutil.which(command) is None:
-        raise OSError(f"this machine has no command {command}")
-    hours, rest = divmod(int(config.walltime), 3600)
-    # One task at a time, which has the threads.
-    extra = ["--nthreads", "1", "--preload", PRELOAD]
-    if config.gpus:
-        extra += ["--resources", f"GPU={config.gpus}"]
-    # Workers end before the batch system ends them, one after the other.
-    extra += ["--lifetime", f"{max(60, int(0.9 * config.walltime))}s", "--lifetime-stagger", "60s"]
-    memory = {f"DASK_DISTRIBUTED__WORKER__MEMORY__{key.upper()}": str(v) for key, v in MEMORY.items()}
-    own = dict(config.options)
-    exports = [f"export {key}={value}" for key, value in {**environment, **memory}.items()]
-    options: dict[str, Any] = {
-        "cores": config.threads,
-        "processes": 1,
-        "memory": f"{int(config.memory or 2e9 * config.threads)}B",
-        "walltime": f"{hours:02d}:{rest // 60:02d}:{rest % 60:02d}",
-        # What a site needs comes on top.
-        "worker_extra_args": [*extra, *own.pop("worker_extra_args", [])],
-        "job_script_prologue": [*own.pop("job_script_prologue", []), *exports],
-        "log_directory": "worker-logs",
-        **own,
-    }
-    system = getattr(dask_jobqueue, name)
-    try:
-        cluster = system(job_cls=_reporting(system.job_cls, refused), **options)
-    except (TypeError, ValueError) as error:
-        # Its text goes on with all the options.
-        unknown = re.search(r"unexpected keyword argument '(\w+)'", str(error))
-        if unknown is None:
-            raise
-        raise ValueError(f"options: {name} has no option '{unknown[1]}'") from None
-    try:
-        # Unlike scale(), this replaces workers that have ended.
-        cluster.adapt(minimum=config.workers, maximum=config.workers)
-        yield cluster
-    finally:
-        # Jobs that were never submitted cannot be closed.
-        with contextlib.suppress(Exception):
-            cluster.close()
-
-
-def _reporting(job: Any, refused: list[str]) -> Any:
-    """A class of jobs that also reports why one cannot be submitted."""
-
-    class Reporting(job):
-        async def start(self) -> None:
-            try:
-                await super().start()
-            except Exception as error:
-                # dask-jobqueue appends what the command has printed.
-                refused.append(reason(str(error).rpartition("stderr:")[2], 300))
-                raise
-
-    return Reporting

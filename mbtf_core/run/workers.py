@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, PositiveInt
+from pydantic import Field, PositiveInt, field_validator, model_validator
 
 from mbtf_core.config.settings import Settings, resolve
 from mbtf_core.errors import UsageError
@@ -18,8 +18,11 @@ Engine = Literal["local", "slurm", "pbs", "sge", "lsf", "oar", "htcondor"]
 PRELOAD = "mbtf_core.run.task"
 # A renderer's memory is not Dask's to spill; what exceeds the limit is restarted.
 MEMORY = {"target": False, "spill": False, "pause": False}
-# Cores that one renderer uses well.
-_CORES_EACH = 4
+# Cores that one renderer uses well; bytes that a worker takes at least.
+_CORES_EACH, _LEAST_MEMORY = 4, 2e8
+_ADDRESS = re.compile(r"(tcp|tls|ucx)://.+")
+# What is ours of workers that the user has started.
+_OF_SCHEDULERS = {"address", "retries", "timeout", "start_timeout"}
 
 
 class ClusterConfig(Settings):
@@ -30,6 +33,7 @@ class ClusterConfig(Settings):
     threads: PositiveInt = Field(1, description="threads of a worker")
     memory: Size | None = Field(
         None,
+        ge=_LEAST_MEMORY,
         description="memory of a worker; one that exceeds it is restarted; default: an equal share of this "
         "machine's, or 2 GB per thread of a batch system",
     )
@@ -38,10 +42,29 @@ class ClusterConfig(Settings):
     retries: int = Field(
         5, ge=0, description="how often a task is started again after its worker died or failed"
     )
-    start_timeout: Duration = Field(600.0, gt=0, description="time to wait for the first worker")
+    start_timeout: Duration = Field(600.0, gt=0, description="time to wait for a worker while there is none")
+    timeout: Duration = Field(30.0, gt=0, description="time in which the scheduler must answer")
     options: dict[str, Any] = Field(
         {}, description="further arguments of the dask-jobqueue class, such as queue and account"
     )
+    address: str | None = Field(
+        None,
+        description="of a scheduler that you have started, such as tcp://scheduler:8786, with its workers",
+    )
+
+    @field_validator("address")
+    @classmethod
+    def _is_address(cls, address: str | None) -> str | None:
+        if address is not None and _ADDRESS.fullmatch(address) is None:
+            raise ValueError("must be such as tcp://scheduler:8786")
+        return address
+
+    @model_validator(mode="after")
+    def _has_one_origin(self) -> ClusterConfig:
+        others = sorted(self.model_fields_set - _OF_SCHEDULERS)
+        if self.address is not None and others:
+            raise ValueError(f"{', '.join(others)} cannot go with address, whose workers you have started")
+        return self
 
 
 def local_config(workers: int | None = None) -> ClusterConfig:
@@ -51,18 +74,18 @@ def local_config(workers: int | None = None) -> ClusterConfig:
     return ClusterConfig(workers=count, threads=max(1, cores // count))
 
 
-def read_cluster(where: str) -> ClusterConfig | str:
-    """Meaning of ``--cluster``: a configuration, or the address of a scheduler.
+def read_cluster(where: str) -> ClusterConfig:
+    """Meaning of ``--cluster``.
 
     Raises
     ------
-    UsageError : it is none of these
+    UsageError : it is no cluster
     InputError : the file is at fault
     """
     if match := re.fullmatch(r"local(?::([1-9]\d{0,3}))?", where):
         return local_config(None if match[1] is None else int(match[1]))
-    if re.fullmatch(r"(tcp|tls|ucx)://.+", where):
-        return where
+    if _ADDRESS.fullmatch(where):
+        return ClusterConfig(address=where, start_timeout=60.0)
     path = Path(where)
     if path.suffix.lower() not in (".yaml", ".yml"):
         hint = "use local, local:4, a YAML file, or tcp://scheduler:8786"

@@ -7,7 +7,7 @@ from pathlib import Path
 from pydantic import Field
 
 from mbtf_core.config.settings import Settings
-from mbtf_core.files.atomic import write_text
+from mbtf_core.files.folders import write_document
 from mbtf_fit.export import Export, ExportTarget
 
 PAGE_NAME = "viewer.html"
@@ -54,7 +54,7 @@ def make_page(material: Path, options: PageOptions) -> tuple[str, str]:
 def write(export: Export, options: PageOptions) -> list[str]:
     """Write the page."""
     html, precision = make_page(export.source, options)
-    write_text(export.folder / PAGE_NAME, html)
+    write_document(export.folder / PAGE_NAME, html)
     export.notes.append(precision)
     return [PAGE_NAME]
 

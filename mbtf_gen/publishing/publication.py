@@ -35,7 +35,7 @@ from mbtf_gen.publishing.recipe import (
     recipe_files,
 )
 
-PUBLICATION = OutputKind("publish.json", "mbtf-publication", 2, "a published data set")
+PUBLICATION = OutputKind("publish.json", "mbtf-publication", 3, "a published data set")
 # Bytes of picture, card and documents.
 _DOCUMENT_BYTES = 4 << 20
 # Queries of a split that the statistics are of, at most.
@@ -199,6 +199,7 @@ class Publication:
             facts = Facts(self.data, self.config, self.name, samples, dict(sorted(files.items())), self.maps)
             for name, text in ((CARD_NAME, card_text(facts)), (CROISSANT_NAME, croissant_text(facts))):
                 files[name] = folder.add(name, partial(_store, text.encode()))
+            folder.check_added(files)
             return dict(sorted(files.items()))
 
     def _write_shards(

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.files.atomic import write_text
+from mbtf_core.files.folders import write_document
 from mbtf_core.units import clock
 from mbtf_pipeline.collection.check_tables import independence, offsets, timing, weights
 from mbtf_pipeline.collection.error_tables import ablations, levels, methods, zooms
@@ -52,14 +53,14 @@ def write_page(folder: Path, record: Mapping[str, Any]) -> tuple[Path, list[Path
     """
     if "tables" not in record["recipe"]:
         page = folder / "library.html"
-        write_text(page, library_page(record, folder / RUNS))
+        write_document(page, library_page(record, folder / RUNS))
         return page, []
     html, tables = paper_page(record, folder / RUNS)
     (folder / TABLES).mkdir(exist_ok=True)
     for name, text in tables.items():
         write_text(folder / TABLES / f"{name}.csv", text)
     page = folder / "paper.html"
-    write_text(page, html)
+    write_document(page, html)
     return page, [folder / TABLES / f"{name}.csv" for name in tables]
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.files.atomic import write_text
+from mbtf_core.files.folders import write_document
 from mbtf_core.units import clock
 from mbtf_pipeline.cost.measurement import Measurement, extrapolation, pareto_front
 from mbtf_pipeline.cost.study import Study
@@ -146,5 +147,5 @@ def write_page(study: Study) -> Path:
         deviation=None if study.deviation is None else f"{study.deviation.scaled(100.0)} %",
         seeds=round(max((m.details.get("seeds", 0.0) for m in study.measurements), default=0.0)),
     )
-    write_text(study.folder / PAGE_NAME, html)
+    write_document(study.folder / PAGE_NAME, html)
     return study.folder / PAGE_NAME

@@ -18,8 +18,8 @@ from typing import Any
 
 from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.errors import InputError, PartialError
-from mbtf_core.files.atomic import read_json, write_text
-from mbtf_core.files.folders import ELSEWHERE, OutputKind, check_space, owned
+from mbtf_core.files.atomic import read_json
+from mbtf_core.files.folders import ELSEWHERE, OutputKind, check_space, owned, write_document
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item, worker_threads
 from mbtf_core.stats import Estimate
@@ -291,7 +291,7 @@ def run_study(
             "machine": there.value,
         }
         STUDY.write(folder, description)
-        write_text(folder / CONFIG_NAME, dump_yaml(config.model_dump(mode="json")))
+        write_document(folder / CONFIG_NAME, dump_yaml(config.model_dump(mode="json")))
         measurements = Measurements(conditions, MeasurementFolder(folder, conditions), runner, note)
         configurations = list(generator_configurations(benchmark))
         # Configurations take longer than their share where kernels are compiled; workers start anew.

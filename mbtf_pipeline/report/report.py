@@ -12,7 +12,8 @@ from mbtf_core.color import describe_exposure
 from mbtf_core.config.settings import check_schema
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import InputError
-from mbtf_core.files.atomic import read_json, write_text
+from mbtf_core.files.atomic import read_json
+from mbtf_core.files.folders import write_document
 from mbtf_core.pictures import Camera
 from mbtf_pipeline.compare.compare import COMPARISON_NAME, COMPARISON_SCHEMA
 from mbtf_pipeline.compare.image_files import read_picture
@@ -107,7 +108,7 @@ def write_report(folder: Path, recipe: Recipe, stages: Sequence[str]) -> None:
         )
         if len(html.encode()) <= recipe.report.max_megabytes * 1e6:
             break
-    write_text(folder / REPORT, html)
+    write_document(folder / REPORT, html)
 
 
 def write_viewer(folder: Path, title: str, comparison: Mapping[str, Any]) -> None:
@@ -135,7 +136,7 @@ def write_viewer(folder: Path, title: str, comparison: Mapping[str, Any]) -> Non
     if not materials:
         path.unlink(missing_ok=True)
         return
-    write_text(path, write_page({"materials": materials, "pictures": run_pictures(folder)}, title))
+    write_document(path, write_page({"materials": materials, "pictures": run_pictures(folder)}, title))
 
 
 def run_pictures(folder: Path) -> list[dict[str, Any]]:

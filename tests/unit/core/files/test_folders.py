@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
 import resource
@@ -24,6 +25,7 @@ from mbtf_core.files.folders import (
     make_folder,
     owned,
     remove_unfinished,
+    write_document,
 )
 from mbtf_core.units import expectation
 
@@ -127,14 +129,53 @@ def listing(path: Path) -> dict[str, bytes]:
 def test_the_same_configuration_keeps_what_is_finished(tmp_path: Path) -> None:
     make(claim(tmp_path / "out"), "a.exr", "a.png")
     record = json.loads((tmp_path / "out/pictures.json").read_text())
-    assert record["items"] == {"a": {"files": {"a.exr": 7, "a.png": 7}, "facts": {"noise": 0.5}}}
+    stored = {"bytes": 7, "sha256": hashlib.sha256(b"picture").hexdigest()}
+    assert record["items"] == {"a": {"files": {"a.exr": stored, "a.png": stored}, "facts": {"noise": 0.5}}}
     again = claim(tmp_path / "out")
     assert again.finished("a") == {"noise": 0.5}
     assert again.finished("b") is None
-    (again.path / "a.png").write_bytes(b"pict")
-    assert again.finished("a") is None
     (again.path / "a.png").unlink()
     assert again.finished("a") is None
+    # Killed while it is made again: its files may have other bytes now.
+    (again.path / "a.exr").write_bytes(b"other")
+    assert claim(tmp_path / "out").finished("a") is None
+
+
+@pytest.mark.parametrize("name", ["a.exr", "a.png", "config.yaml"])
+def test_a_changed_file_is_replaced_on_request_only(tmp_path: Path, name: str) -> None:
+    out = tmp_path / "out"
+    make(claim(out), "a.exr", "a.png")
+    content = (out / name).read_bytes()
+    # Its size and its date are those of before.
+    edited = bytes([content[0] ^ 1]) + content[1:]
+    (out / name).write_bytes(edited)
+    before = listing(out)
+    with pytest.raises(InputError, match=rf"{name}: has been edited, or damaged") as caught:
+        claim(out).finished("a")
+    assert "--overwrite" in caught.value.hint
+    assert listing(out) == before
+    make(claim(out, overwrite=True), "a.exr", "a.png")
+    assert (out / name).read_bytes() == content
+    # Options that do not determine the content change the configuration.
+    (out / name).unlink()
+    folder = claim(out, height="0f")
+    assert name == "config.yaml" or folder.finished("a") is None
+
+
+def test_documents_are_replaced_unless_they_were_edited(tmp_path: Path) -> None:
+    for suffix, first, second in ((".yaml", "a: 1", "a: 2\n"), (".html", "<p>1</p>", "<p>2</p>\n")):
+        path = tmp_path / f"page{suffix}"
+        write_document(path, first)
+        write_document(path, second)
+        text = path.read_text()
+        assert text.startswith(second)
+        for edit in (text.replace("2", "3", 1), f"{text}\n", f"{text}more", text.splitlines()[0], ""):
+            path.write_text(edit)
+            with pytest.raises(InputError, match="has been edited"):
+                write_document(path, first)
+            assert path.read_text() == edit
+        write_document(path, second, overwrite=True)
+        assert path.read_text() == text
 
 
 def test_another_configuration_is_refused_with_what_differs(tmp_path: Path) -> None:

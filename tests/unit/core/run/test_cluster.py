@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import json
 import os
+import re
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+import threading
+import warnings
+from collections.abc import Callable, Iterator
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from support import run_tasks
+from support.object_stores import silent_server
 
 from mbtf_core.errors import InputError, PartialError, UsageError
 from mbtf_core.run import cluster as module
@@ -120,30 +126,77 @@ def test_without_dask_one_line_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
         pass
 
 
-def test_a_scheduler_that_is_not_there_is_bad_input(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_CONNECT_SECONDS", 1.0)
+def scheduler_file(folder: Path, address: str) -> str:
+    """A file that names a scheduler, which must answer within a second."""
+    path = folder / "scheduler.yaml"
+    path.write_text(f"address: {address}\ntimeout: 1s\n")
+    return str(path)
+
+
+def test_a_scheduler_that_is_not_there_is_bad_input(tmp_path: Path) -> None:
     pytest.importorskip("distributed")
     with (
         pytest.raises(InputError, match=r"tcp://127\.0\.0\.1:9") as caught,
-        open_runner("tcp://127.0.0.1:9", lambda line: None),
+        open_runner(scheduler_file(tmp_path, "tcp://127.0.0.1:9"), lambda line: None),
     ):
         pass
     assert "dask scheduler" in caught.value.hint
 
 
-def test_a_scheduler_that_ends_leaves_resumable_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_CONNECT_SECONDS", 1.0)
-    distributed = pytest.importorskip("distributed")
+def test_a_scheduler_that_never_answers_is_given_up(tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
     with (
-        distributed.LocalCluster(
-            n_workers=1, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0"
-        ) as started,
-        open_runner(started.scheduler_address, lambda line: None) as opened,
+        silent_server() as port,
+        pytest.raises(InputError, match="no answer within 1 s") as caught,
+        open_runner(scheduler_file(tmp_path, f"tcp://127.0.0.1:{port}"), lambda line: None),
     ):
+        pass
+    assert "timeout" in caught.value.hint
+
+
+@pytest.fixture
+def one_worker() -> Iterator[Any]:
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0"
+    ) as started:
+        yield started
+
+
+def test_a_scheduler_that_ends_leaves_resumable_work(one_worker: Any, tmp_path: Path) -> None:
+    with open_runner(scheduler_file(tmp_path, one_worker.scheduler_address), lambda line: None) as opened:
         results = opened.map(run_tasks.double, (Item(f"x{i}", {"x": i}) for i in range(10**6)))
         next(results)
-        started.close()
+        one_worker.close()
         with pytest.raises(PartialError, match="the cluster is lost"):
+            list(results)
+
+
+def test_a_scheduler_that_hangs_leaves_resumable_work(one_worker: Any, tmp_path: Path) -> None:
+    """Its connections stay open."""
+    answers = threading.Event()
+    try:
+        with open_runner(scheduler_file(tmp_path, one_worker.scheduler_address), lambda line: None) as opened:
+            results = opened.map(run_tasks.double, (Item(f"x{i}", {"x": i}) for i in range(10**6)))
+            next(results)
+            one_worker.loop.add_callback(answers.wait)
+            with pytest.raises(PartialError, match=r"the cluster is lost .no answer within 1 s"):
+                list(results)
+    finally:
+        answers.set()
+
+
+def test_a_cluster_without_workers_is_not_waited_for_for_ever(
+    one_worker: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_LOOK_SECONDS", 0.2)
+    path = tmp_path / "scheduler.yaml"
+    path.write_text(f"address: {one_worker.scheduler_address}\nstart_timeout: 1s\n")
+    with open_runner(str(path), lambda line: None) as opened:
+        results = opened.map(run_tasks.double, (Item(f"x{i}", {"x": i}) for i in range(10**6)))
+        next(results)
+        one_worker.scale(0)
+        with pytest.raises(PartialError, match=r"the cluster is lost .no worker within 1s"):
             list(results)
 
 
@@ -182,7 +235,7 @@ def test_jobs_of_batch_systems(monkeypatch: pytest.MonkeyPatch) -> None:
             walltime=7200,
             options=own,  # type: ignore[arg-type]
         )
-        with module._started(config, []):
+        with module._started(config, [], print):
             pass
     for script in scripts:
         lines = script.splitlines()
@@ -198,6 +251,110 @@ def test_jobs_of_batch_systems(monkeypatch: pytest.MonkeyPatch) -> None:
             assert words in script
     assert "--cpus-per-task=8" in scripts[0]
     assert "-p short" in scripts[0]
+
+
+@pytest.fixture
+def job_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., list[str]]]:
+    """Lines of the job that options, and a file of Dask's configuration, ask for; then those for the user."""
+    dask_jobqueue = pytest.importorskip("dask_jobqueue")
+    import dask
+
+    found: list[str] = []
+    monkeypatch.setattr("shutil.which", lambda command: f"/usr/bin/{command}")
+    monkeypatch.setattr(
+        dask_jobqueue.SLURMCluster,
+        "adapt",
+        lambda self, **numbers: found.extend(self.job_script().splitlines()),
+    )
+
+    def lines(site: str = "", **options: Any) -> list[str]:
+        (tmp_path / "site.yaml").write_text(site)
+        found.clear()
+        site_config = dask.config.collect(paths=[str(tmp_path / "site.yaml")], env={})
+        with dask.config.set(dask.config.merge(dask.config.config, site_config)):
+            config = ClusterConfig(engine="slurm", options={"interface": "lo", **options})
+            with warnings.catch_warnings(), module._started(config, [], found.append):
+                warnings.simplefilter("error")
+        return found
+
+    yield lines
+    assert not (tmp_path / "worker-logs").exists()
+
+
+OURS = f"export {task.THREADS_VARIABLE}=1"
+SITE = """
+jobqueue:
+  slurm:
+    job-script-prologue: [module load site]
+    job-extra-directives: ['--constraint=site']
+    worker-extra-args: [--local-directory, /site]
+    log-directory: SITE_LOGS
+    account: site
+distributed: {worker: {preload: [site_module]}}
+"""
+
+
+def test_what_a_site_configures_is_kept(
+    job_of: Callable[..., list[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    logs = str(tmp_path / "logs")
+    job = job_of(SITE.replace("SITE_LOGS", logs))
+    assert job.index("module load site") < job.index(OURS)
+    assert {"#SBATCH --constraint=site", "#SBATCH -A site"} <= set(job)
+    assert f"#SBATCH -o {logs}/dask-worker-%J.out" in job
+    words = job[-1].split()
+    assert [w for b, w in pairwise(words) if b == "--preload"] == ["site_module", task.__name__]
+    assert words[words.index("--local-directory") + 1] == "/site"
+    # As in dask-jobqueue, an option replaces what is configured.
+    job = job_of(SITE.replace("SITE_LOGS", logs), job_script_prologue=["module load mine"], account="mine")
+    assert job.index("module load mine") < job.index(OURS)
+    assert "module load site" not in job
+    assert {"#SBATCH --constraint=site", "#SBATCH -A mine"} <= set(job)
+
+
+@pytest.mark.parametrize("where", ["options", "site"])
+def test_old_names_of_options_are_understood(
+    job_of: Callable[..., list[str]], where: str, tmp_path: Path
+) -> None:
+    old = {
+        "project": "graphics",
+        "job_extra": ["--qos=low"],
+        "env_extra": ["module load python"],
+        "header_skip": ["--mem"],
+        "extra": ["--local-directory", "/scratch"],
+        "log_directory": str(tmp_path / "logs"),
+    }
+    if where == "options":
+        job = job_of(**old)
+    else:
+        job = job_of(json.dumps({"jobqueue": {"slurm": {k.replace("_", "-"): v for k, v in old.items()}}}))
+    assert job.index("module load python") < job.index(OURS)
+    assert {"#SBATCH -A graphics", "#SBATCH --qos=low"} <= set(job)
+    assert not any("--mem=" in line for line in job)
+    assert "--local-directory /scratch" in job[-1]
+
+
+def test_one_line_in_place_of_a_list(job_of: Callable[..., list[str]], tmp_path: Path) -> None:
+    logs = str(tmp_path / "logs")
+    job = job_of(env_extra="module load x", job_extra="--qos=low", header_skip="--mem", log_directory=logs)
+    assert {"module load x", "#SBATCH --qos=low", OURS} <= set(job)
+    assert "#SBATCH -n 1" in job
+
+
+def test_options_that_would_be_ignored_are_refused_or_named(
+    job_of: Callable[..., list[str]], tmp_path: Path
+) -> None:
+    with pytest.raises(ValueError, match=r"'env_extra' is the old name of 'job_script_prologue'"):
+        job_of(env_extra=["a"], job_script_prologue=["b"])
+    for key, ours in (("cores", "threads"), ("walltime", "walltime"), ("processes", "workers")):
+        with pytest.raises(ValueError, match=rf"'{key}' follows from '{ours}'"):
+            job_of(**{key: "02:00:00"})
+    site = "jobqueue: {slurm: {cores: 24, memory: 120GB, walltime: '00:30:00'}}"
+    (line,) = (x for x in job_of(site, log_directory=str(tmp_path / "logs")) if x.startswith("cluster:"))
+    assert "cores, memory of Dask's jobqueue.slurm" in line
+    assert "threads, memory" in line
+    assert "walltime" not in line
 
 
 def test_unknown_options_of_a_batch_system_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -231,10 +388,8 @@ def test_local_workers_share_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("os.sched_getaffinity", lambda pid: set(range(16)), raising=False)
     assert (local_config().workers, local_config().threads) == (4, 4)
     config = read_cluster("local:8")
-    assert not isinstance(config, str)
     assert (config.engine, config.workers, config.threads) == ("local", 8, 2)
     many = read_cluster("local:64")
-    assert not isinstance(many, str)
     assert many.threads == 1
 
 
@@ -244,10 +399,41 @@ def test_files_and_addresses(tmp_path: Path) -> None:
         "engine: slurm\nworkers: 16\nthreads: 8\nmemory: 16GB\nwalltime: 2h\noptions: {queue: short}\n"
     )
     config = read_cluster(str(file))
-    assert not isinstance(config, str)
     assert (config.engine, config.workers, config.memory, config.walltime) == ("slurm", 16, 16e9, 7200.0)
     assert config.options == {"queue": "short"}
-    assert read_cluster("tcp://scheduler:8786") == "tcp://scheduler:8786"
+    config = read_cluster("tcp://scheduler:8786")
+    assert (config.address, config.timeout) == ("tcp://scheduler:8786", 30.0)
+    file.write_text("address: tcp://scheduler:8786\ntimeout: 2min\n")
+    config = read_cluster(str(file))
+    assert (config.address, config.timeout) == ("tcp://scheduler:8786", 120.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        ("address: tcp://a:1\nworkers: 3", "workers cannot go with address"),
+        ("address: scheduler:8786", "tcp://scheduler:8786"),
+        ("memory: 16", "memory"),
+        ("timeout: 0s", "timeout"),
+        ("engine: [slurm", "site.yaml"),
+        ("\x00\x01\xff", "site.yaml"),
+        ("slurm", "site.yaml"),
+    ],
+)
+def test_files_that_are_at_fault(tmp_path: Path, text: str, word: str) -> None:
+    file = tmp_path / "site.yaml"
+    file.write_text(text, "latin-1")
+    with pytest.raises(InputError, match=re.escape(word)):
+        read_cluster(str(file))
+
+
+@pytest.mark.parametrize("target", ["/dev/zero", "/dev/null", "folder", "fifo"])
+def test_files_that_are_none(tmp_path: Path, target: str) -> None:
+    (tmp_path / "folder").mkdir()
+    os.mkfifo(tmp_path / "fifo")
+    (tmp_path / "site.yaml").symlink_to(target)
+    with pytest.raises(InputError, match=r"site\.yaml"):
+        read_cluster(str(tmp_path / "site.yaml"))
 
 
 @pytest.mark.parametrize("where", ["lokal", "local:0", "local:", "local:-1", "http://x", ""])

@@ -11,7 +11,7 @@ import pytest
 from support.datasets import write_dataset
 from support.published import contents, publish, small
 
-from mbtf_core.errors import EngineError, InputError, UsageError
+from mbtf_core.errors import EngineError, InputError, PartialError, UsageError
 from mbtf_core.files.atomic import Stored
 from mbtf_gen.config.publish import PublishConfig
 from mbtf_gen.publishing import publication as module
@@ -53,6 +53,41 @@ def test_an_interrupted_run_resumes(shards: Path, tmp_path: Path, monkeypatch: p
         publish(shards, tmp_path / "cut", form="webdataset")
         assert contents(tmp_path / "cut") == whole
         shutil.rmtree(tmp_path / "cut")
+
+
+def test_what_has_changed_is_replaced_on_request_only(shards: Path, tmp_path: Path) -> None:
+    card = publish(shards, tmp_path / "card", form="webdataset")
+    whole = contents(card)
+    for name in ("README.md", "croissant.json", "data/train-00000.tar"):
+        content = bytearray(whole[name])
+        content[len(content) // 2] ^= 1
+        (card / name).write_bytes(content)
+        with pytest.raises(InputError, match=f"{name}: has been edited, or damaged"):
+            publish(shards, card, form="webdataset")
+        assert (card / name).read_bytes() == content
+        (card / name).unlink()
+        publish(shards, card, form="webdataset")
+        assert contents(card) == whole
+    (card / "README.md").write_text("mine")
+    Publication.prepare(shards, CONFIG).write(card, overwrite=True)
+    assert contents(card) == whole
+
+
+@pytest.mark.parametrize("below", ["", "data"])
+@pytest.mark.parametrize("before", ["data/train-00000.tar", "README.md"])
+def test_a_folder_that_vanishes_is_one_line(
+    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: str, below: str
+) -> None:
+    add = module.OutputFolder.add
+
+    def vanishing(folder: Any, name: str, write: Any) -> Stored:
+        if name == before:
+            shutil.rmtree(folder.path / below)
+        return add(folder, name, write)
+
+    monkeypatch.setattr(module.OutputFolder, "add", vanishing)
+    with pytest.raises(PartialError, match="vanished"):
+        publish(shards, tmp_path / "card", form="webdataset")
 
 
 def test_other_options_are_refused_and_replace(shards: Path, tmp_path: Path) -> None:
