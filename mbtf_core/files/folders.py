@@ -31,6 +31,7 @@ from mbtf_core.files.atomic import (
     write_text,
 )
 from mbtf_core.locks import lock_owner, take_lock
+from mbtf_core.paths import refuse_special
 from mbtf_core.units import size_text
 
 # Names of temporary files and locks, such as a killed process leaves.
@@ -302,6 +303,7 @@ class OutputFolder:
             folder._claim.insert(0, CONFIG_NAME)
             file, text = path / CONFIG_NAME, dump_yaml(config)
             remove_unfinished(path, [CONFIG_NAME])
+            refuse_special(file)
             if not file.exists() or file.read_text(encoding="utf-8") != text:
                 write_text(file, text)
         return folder

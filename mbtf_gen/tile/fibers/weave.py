@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
+from mbtf_core.paths import refuse_special
 from mbtf_gen.tile.fibers.curves import F64, LEAST_POINTS, Curve
 
 Draft = NDArray[np.bool_]
@@ -195,6 +196,7 @@ def read_pattern(path: Path) -> YarnPattern:
     InputError
         The file is unreadable or truncated, a number is not finite, or edges do not form closed yarns.
     """
+    refuse_special(path)
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
