@@ -103,6 +103,12 @@ def refuse_special(path: Path) -> None:
         raise InputError(f"is a {kind}, not a regular file", where=path, hint="save its content in a file")
 
 
+def real_path(path: str | Path) -> Path:
+    """The absolute path without symbolic links; unlike ``Path.resolve``, it does not fail at links without an
+    end, which whoever opens the file refuses."""
+    return Path(os.path.realpath(path))
+
+
 def split_url(folder: object) -> tuple[str, str] | None:
     """(protocol, rest) of a URL, also of one that pathlib has changed to ``s3:/bucket``; None for a path. The
     rest has the form that pathlib gives it, so that a text and a path name the same folder."""

@@ -34,6 +34,7 @@ from mbtf_core.files.atomic import (
     write_json,
 )
 from mbtf_core.locks import lock_owner, take_lock
+from mbtf_core.paths import refuse_special
 from mbtf_core.units import size_text
 
 # Names of temporary files and locks, such as a killed process leaves.
@@ -168,6 +169,7 @@ def write_document(path: Path, text: str, *, overwrite: bool = False) -> None:
 
 def _refuse_edited(path: Path) -> None:
     """An InputError if there is a document that is not as :func:`write_document` wrote it."""
+    refuse_special(path)
     try:
         body, _, last = path.read_bytes()[:-1].rpartition(b"\n")
     except FileNotFoundError:

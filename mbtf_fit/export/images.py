@@ -14,6 +14,7 @@ from pydantic import Field
 from mbtf_core.config.settings import Settings
 from mbtf_core.errors import EngineError
 from mbtf_core.files.atomic import write_chunks, write_text
+from mbtf_core.paths import real_path
 from mbtf_fit.export import Export
 
 if TYPE_CHECKING:
@@ -81,7 +82,7 @@ def write_document(
         "level": maps.level,
         **({} if maps.heights is None else {"height_range_in_tile_widths": round(maps.height_range, 9)}),
     }
-    write_text(export.folder / name, text(maps, export.source.resolve().name, described))
+    write_text(export.folder / name, text(maps, real_path(export.source).name, described))
     return [*images, name]
 
 

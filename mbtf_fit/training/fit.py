@@ -17,6 +17,7 @@ from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.lattice import level_of_sigma
 from mbtf_core.errors import InputError, PartialError
 from mbtf_core.files.folders import ELSEWHERE, owned
+from mbtf_core.paths import real_path
 from mbtf_core.run.signals import stop_on_interruption
 from mbtf_core.stats import pooled_variance
 from mbtf_fit.config import FitConfig
@@ -135,7 +136,7 @@ def _check_folder(config: FitConfig, out: Path) -> None:
         read.append(network.folder)
     if config.init_from is not None:
         read.append(Path(config.init_from))
-    if out.resolve() in (folder.resolve() for folder in read):
+    if real_path(out) in map(real_path, read):
         raise InputError("holds what the fit starts from", where=out, hint=ELSEWHERE)
 
 

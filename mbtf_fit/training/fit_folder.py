@@ -13,6 +13,7 @@ from mbtf_core.data.dataset import Dataset
 from mbtf_core.errors import UsageError
 from mbtf_core.files.atomic import data_sha256, write_text
 from mbtf_core.files.folders import OutputFolder, OutputKind
+from mbtf_core.paths import refuse_special
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.material.decoder import DECODER_NAME, Decoder
@@ -91,6 +92,7 @@ def claim(out: Path, identity: dict[str, Any], config: FitConfig, overwrite: boo
 
 def append_history(folder: Path, record: dict[str, Any]) -> None:
     """Add a record to the history of a fit."""
+    refuse_special(folder / HISTORY_NAME)
     with (folder / HISTORY_NAME).open("a", encoding="utf-8") as stream:
         stream.write(json.dumps(record) + "\n")
 
@@ -131,6 +133,7 @@ def read_history(folder: str | Path) -> list[dict[str, Any]]:
             Training throughput.
     """
     path = Path(folder) / HISTORY_NAME
+    refuse_special(path)
     out = []
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []:
         try:

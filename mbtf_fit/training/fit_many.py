@@ -9,6 +9,7 @@ from typing import Any
 
 from mbtf_core.data.dataset import is_dataset
 from mbtf_core.errors import InputError, UsageError
+from mbtf_core.paths import real_path
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item
 from mbtf_fit.config import FitConfig
@@ -36,9 +37,9 @@ def find_data(arguments: Sequence[Path]) -> list[Path]:
 
 def name_materials(shards: Sequence[Path], out: Path) -> list[Path]:
     """A folder in `out` for each data set, with its name; equal names are prefixed by the parent's name."""
-    names = [path.resolve().name for path in shards]
+    names = [real_path(path).name for path in shards]
     often = Counter(names)
-    parts = [path.resolve().parts[-2:] for path in shards]
+    parts = [real_path(path).parts[-2:] for path in shards]
     names = [name if often[name] == 1 else "-".join(p) for name, p in zip(names, parts, strict=True)]
     for name, count in Counter(names).items():
         if count > 1:

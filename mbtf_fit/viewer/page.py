@@ -16,6 +16,7 @@ import torch
 from markupsafe import Markup
 from numpy.typing import NDArray
 
+from mbtf_core.paths import real_path
 from mbtf_fit.backends.shader.images import NODE_SHIFT, Layout, TexelImage
 from mbtf_fit.backends.shader.program import TRANSMITTANCE, program_of
 from mbtf_fit.backends.shader.syntax import GLSL
@@ -229,5 +230,5 @@ def material_content(folder: Path, name: str | None = None) -> tuple[dict[str, A
     """
     material = Material.load(folder)
     packed, bits = _fitting(material)
-    content = content_of(material, name or folder.resolve().name, packed)
+    content = content_of(material, name or real_path(folder).name, packed)
     return content, _rounding(material, as_read(material, packed), bits)

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import json
+import logging
+import sys
 import threading
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
-from mbtf_core.errors import UsageError
+from mbtf_core.errors import UsageError, reason
 
 HOST = "127.0.0.1"
 _LOCAL = (HOST, "localhost")
 # Seconds without a message after which an empty one finds out whether the page is still open.
 _SILENCE = 15.0
+
+_log = logging.getLogger(__name__)
 
 
 class Messages:
@@ -57,6 +61,16 @@ class Messages:
                 yield kind, text
 
 
+class _Server(ThreadingHTTPServer):
+    """A thread for each request, which the end of the program ends."""
+
+    daemon_threads = True
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        # Browsers leave in the middle of an answer.
+        _log.debug("a request failed: %s", reason(sys.exception()))
+
+
 class PageServer:
     """Serves one page at a port of this machine until :meth:`close`.
 
@@ -77,7 +91,7 @@ class PageServer:
         class Handler(BaseHTTPRequestHandler):
             def do_GET(self) -> None:
                 # Another site that a browser takes for this machine gets nothing.
-                local = self.headers.get("Host", "").rpartition(":")[0] in _LOCAL
+                local = self.headers.get("Host", "").partition(":")[0].lower() in _LOCAL
                 path = self.path.partition("?")[0]
                 if local and path == "/":
                     self._answer("text/html; charset=utf-8")
@@ -95,26 +109,22 @@ class PageServer:
                 self.end_headers()
 
             def _stream(self, messages: Messages) -> None:
-                try:
-                    for message in messages.read():
-                        text = ": \n\n" if message is None else f"event: {message[0]}\ndata: {message[1]}\n\n"
-                        self.wfile.write(text.encode())
-                        self.wfile.flush()
-                except OSError:
-                    """The page was closed."""
+                for message in messages.read():
+                    text = ": \n\n" if message is None else f"event: {message[0]}\ndata: {message[1]}\n\n"
+                    self.wfile.write(text.encode())
+                    self.wfile.flush()
 
             def log_message(self, *_: object) -> None:
                 """Requests are not logged."""
 
         try:
-            self._server = ThreadingHTTPServer((HOST, port), Handler)
+            self._server = _Server((HOST, port), Handler)
         except (OSError, OverflowError) as error:
             raise UsageError(
                 f"cannot listen at port {port} ({getattr(error, 'strerror', None) or error})",
                 where="--port",
                 hint="leave it out for a free port",
             ) from None
-        self._server.daemon_threads = True
         self.url = f"http://{HOST}:{self._server.server_address[1]}/"
         threading.Thread(target=self._server.serve_forever, daemon=True).start()
 

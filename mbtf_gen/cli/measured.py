@@ -9,6 +9,7 @@ from typing import Literal
 from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.options import DataOutput, Options, Overwrite, PathText, options_from
 from mbtf_core.errors import UsageError
+from mbtf_core.paths import real_path
 from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.units import size_text
 from mbtf_gen.cli.generate import describe
@@ -44,7 +45,7 @@ def import_measured(
     from mbtf_gen.generation.imported import import_measured as run
 
     folder = DataFolder.open(output)
-    inside = folder.local is not None and Path(measured).resolve() in (folder.local / "x").resolve().parents
+    inside = folder.local is not None and real_path(measured) in real_path(folder.local / "x").parents
     if Path(measured).is_dir() and inside:
         raise UsageError("is inside the measured folder", where=f"-o {output}", hint="choose another folder")
     job = Import.prepare(Path(measured), options.resolve())
@@ -91,10 +92,10 @@ def export(
     from mbtf_gen.measured.exported import export_neumip, export_neural_btf
 
     folder = DataFolder.open(shards)
-    inside = folder.local is not None and folder.local.resolve() in file.resolve().parents
+    inside = folder.local is not None and real_path(folder.local) in real_path(file).parents
     if file.is_dir() or inside:
         raise UsageError("is a folder, or inside the data set", where=file, hint="choose another name")
-    if not file.resolve().parent.is_dir():
+    if not real_path(file).parent.is_dir():
         raise UsageError("the folder does not exist", where=file.parent)
     if file.exists() and not overwrite:
         raise UsageError("exists", where=file, hint="choose another name, or --overwrite")

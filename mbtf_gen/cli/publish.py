@@ -8,6 +8,7 @@ from pathlib import Path
 from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.options import Options, Output, Overwrite, PathText, Switch, options_from
 from mbtf_core.errors import UsageError
+from mbtf_core.paths import real_path
 from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.units import size_text
 from mbtf_gen.config.publish import PublishConfig
@@ -53,7 +54,7 @@ def publish(
     from mbtf_core.data.folder import DataFolder
 
     data = DataFolder.open(shards)
-    if data.local is not None and data.local.resolve() in (output.resolve(), *output.resolve().parents):
+    if data.local is not None and real_path(data.local) in (real_path(output), *real_path(output).parents):
         raise UsageError("is the data set, or inside it", where=f"-o {output}", hint="choose another folder")
     from mbtf_gen.publishing.publication import Publication
 

@@ -15,7 +15,6 @@ photographs do).
 from __future__ import annotations
 
 import io
-import os
 import re
 import tempfile
 import warnings as python_warnings
@@ -31,7 +30,7 @@ from numpy.typing import NDArray
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError, reason
 from mbtf_core.images.environment import read_linear
-from mbtf_core.paths import refuse_special
+from mbtf_core.paths import real_path, refuse_special
 from mbtf_gen.measured.interface import COMPLETE, I64, ImageBtf, check_texels, from_angles
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".exr", ".hdr")
@@ -194,12 +193,11 @@ def _without_photographs(names: Sequence[str], path: Path) -> InputError:
 def _files_in(path: Path) -> list[str]:
     """All files of a folder; links that lead out of it are left out."""
     names = []
-    # Unlike `resolve`, it does not refuse links without an end.
-    root = os.path.realpath(path)
+    root = real_path(path)
     for number, file in enumerate(path.rglob("*")):
         if number >= _MOST_FILES:
             raise InputError(f"has more than {_MOST_FILES:,} files", where=path)
-        if not file.is_dir() and Path(os.path.realpath(file)).is_relative_to(root):
+        if not file.is_dir() and real_path(file).is_relative_to(root):
             names.append(file.relative_to(path).as_posix())
     return sorted(names)
 

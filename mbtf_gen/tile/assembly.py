@@ -16,7 +16,7 @@ from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import data_sha256, file_sha256
 from mbtf_core.images.read import MAX_PIXELS, gray
 from mbtf_core.images.resample import dequantize
-from mbtf_core.paths import named_file, suggest_path
+from mbtf_core.paths import named_file, real_path, suggest_path
 from mbtf_gen.tile.heightfield_tile import MAPS, HeightFieldTile
 from mbtf_gen.tile.maps.checks import (
     Codes,
@@ -209,7 +209,7 @@ def _bsdf(tree: dict[str, Any], load: MapLoader) -> tuple[dict[str, Any], dict[s
 
 def _bsdf_file(name: str, load: MapLoader) -> Path:
     try:
-        path = named_file(load.folder, name).resolve()
+        path = real_path(named_file(load.folder, name))
         found = path.is_file()
     except (OSError, ValueError):
         raise InputError("the bsdf names a file whose name is not valid", where=load.folder) from None

@@ -13,7 +13,7 @@ from mbtf_core.data.schema import Tiling
 from mbtf_core.errors import UsageError
 from mbtf_core.files.atomic import write_text
 from mbtf_core.files.folders import make_folder
-from mbtf_core.paths import named_file
+from mbtf_core.paths import named_file, real_path
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 from mbtf_gen.tile.loading import described
@@ -115,7 +115,7 @@ def write_material_file(path: Path, material: Tile, config: GeneratorConfig) -> 
     # The tile of a material file is a height field.
     choices = choose(spec, cast(HeightFieldTile, material), config)
     make_folder(path.parent)
-    source, target = folder.resolve(), path.parent.resolve()
+    source, target = real_path(folder), real_path(path.parent)
 
     def moved(node: Any, key: str = "") -> Any:
         if isinstance(node, dict):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -128,7 +129,7 @@ def described(path: Path) -> tuple[Described, Path, FoundMaps]:
     """
     path = named_file(Path(), str(path))
     if path.is_dir():
-        described = next((path / name for name in _YAML if (path / name).is_file()), None)
+        described = next((path / name for name in _YAML if os.path.lexists(path / name)), None)
         if described is not None:
             return _read(described), path, FoundMaps()
         found = find_maps(path)

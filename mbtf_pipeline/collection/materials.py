@@ -12,7 +12,7 @@ from typing import Any
 
 from mbtf_core.config.yaml_file import read_yaml
 from mbtf_core.errors import InputError, UsageError, reason
-from mbtf_core.paths import named_file
+from mbtf_core.paths import named_file, real_path
 
 # Files in a folder of materials that are materials.
 _SUFFIXES = {".yaml", ".yml", ".pyp", ".bcc", ".curves", ".glb", ".gltf", ".ply", ".obj"}
@@ -73,7 +73,7 @@ def _in_folder(folder: Path) -> list[Path]:
     out: list[Path] = []
     for path in inside:
         if path.is_dir():
-            loops = path.is_symlink() and folder.resolve().is_relative_to(path.resolve())
+            loops = path.is_symlink() and real_path(folder).is_relative_to(real_path(path))
             if not loops and not any((path / name).is_file() for name in _RECORDS):
                 out += _in_folder(path)
         elif path.suffix.lower() in _SUFFIXES and not (

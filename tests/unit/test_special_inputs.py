@@ -15,12 +15,19 @@ from support.fit_data import constant, write_data
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("special")
     np.save(made / "heights.npy", np.random.default_rng(0).random((4, 8)))
-    for suffix in ("npy", "exr", "yaml"):
+    for suffix in ("npy", "exr", "yaml", "pyp", "hdr", "zip"):
         os.mkfifo(made / f"pipe.{suffix}")
     links = {"zero.png": "/dev/zero", "zero.yaml": "/dev/zero", "lost.npy": "nowhere/heights.npy"}
     for name, target in {**links, "loop.npy": "loop.npy", "loop.yaml": "loop.yaml"}.items():
         (made / name).symlink_to(target)
     (made / "piped.yaml").write_text("height: heights.npy\nroughness: pipe.npy\n")
+    # Maps and descriptions of a folder that are no files.
+    for name in ("lost_map", "piped_description"):
+        (made / name).mkdir()
+        np.save(made / name / "height.npy", np.zeros((4, 8)))
+    (made / "lost_map/roughness.png").symlink_to("nowhere.png")
+    os.mkfifo(made / "piped_description/material.yaml")
+    (made / "loop").symlink_to("loop")
     shards = write_data(made / "shards", constant(0.2), train=100, test=20, shards=1)
     (shards / "train-00000.npz").unlink()
     os.mkfifo(shards / "train-00000.npz")
@@ -45,7 +52,12 @@ def message(words: list[str]) -> str:
         *(f"mbtf-gen inspect pipe.{suffix}" for suffix in ("npy", "exr", "yaml")),
         *(f"mbtf-gen inspect {name}" for name in ("zero.png", "zero.yaml", "piped.yaml")),
         *(f"mbtf-gen inspect {name}" for name in ("loop.npy", "loop.yaml", "lost.npy")),
+        *(f"mbtf-gen inspect {name}" for name in ("pipe.pyp", "lost_map", "piped_description")),
         "mbtf-gen plan heights.npy --config pipe.yaml",
+        "mbtf-gen import pipe.zip -o imported",
+        "mbtf-gen import heights.npy -o loop/imported",
+        "mbtf-gen publish shards --license CC0-1.0 -o loop/card",
+        "mbtf-fit shards --steps 1 -o loop",
         "mbtf-pipeline run pipe.yaml",
         "mbtf-gen verify shards",
         "mbtf-fit shards --steps 1",

@@ -229,7 +229,7 @@ def _content(folder: Path) -> list[Path]:
 
 
 def _images(folder: Path) -> list[Path]:
-    return [p for p in _content(folder) if p.is_file() and is_image(p)]
+    return [p for p in _content(folder) if not p.is_dir() and is_image(p)]
 
 
 def _elsewhere(folder: Path) -> str:

@@ -5,8 +5,11 @@ from __future__ import annotations
 import http.client
 import json
 import signal
+import socket
+import struct
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -78,6 +81,33 @@ def test_only_this_machine_gets_the_page() -> None:
             PageServer("", port)
     finally:
         server.close()
+
+
+def test_a_browser_may_leave_in_the_middle_of_an_answer(
+    capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("DEBUG")
+    page = "x" * (1 << 24)
+    server = PageServer(page)
+    try:
+        address = ("127.0.0.1", int(server.url.rstrip("/").rpartition(":")[2]))
+        with socket.create_connection(address, timeout=10) as browser:
+            # Closing it resets the connection.
+            browser.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            browser.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            assert browser.recv(100)
+        for _ in range(500):
+            if caplog.records:
+                break
+            time.sleep(0.02)
+        assert "a request failed" in caplog.text
+        connection = http.client.HTTPConnection(*address, timeout=10)
+        # The name alone is what a browser sends at port 80.
+        connection.request("GET", "/", headers={"Host": "localhost"})
+        assert connection.getresponse().read() == page.encode()
+    finally:
+        server.close()
+    assert capfd.readouterr().err == ""
 
 
 def test_ctrl_c_ends_the_service(tmp_path: Path) -> None:
