@@ -150,11 +150,8 @@ def find_maps(folder: Path) -> FoundMaps:
     notes = [f"{role}: 1 - {m.path.name}" for role, (m,) in chosen.items() if m.source.invert]
     rest = {path: name for path, name in names.items() if path not in maps.values()}
     unused, lost = _left_out(rest, reasons, maps)
-    notes += [f"{path.name} is not used: {why}" for path, why in unused.items() if path not in lost]
-    by_reason: dict[str, list[str]] = {}
-    for path in lost:
-        by_reason.setdefault(unused[path], []).append(path.name)
-    texts = [f"{_listed(given)} ({reason})" for reason, given in by_reason.items()]
+    notes += [f"{path.name} is not used: {why}" for path, why in unused.items() if why not in lost]
+    texts = [f"{_listed(given)} ({reason})" for reason, given in lost.items()]
     warnings = [f"{folder}: not used: {'; '.join(texts)}"] if texts else []
     warnings += [f"{folder}: {unread}"] if unread else []
     if "roughness" not in maps:
@@ -171,10 +168,11 @@ def find_maps(folder: Path) -> FoundMaps:
 
 def _left_out(
     names: Mapping[Path, MapName], reasons: Mapping[Path, str], maps: Container[Role]
-) -> tuple[dict[Path, str], list[Path]]:
-    """Why files are not used, and those of them that the material may lack."""
+) -> tuple[dict[Path, str], dict[str, list[str]]]:
+    """Why files are not used, and the names of those that the material may lack by reason."""
     metalness = any("metalness workflow" in reason for reason in reasons.values())
-    out, lost = {}, []
+    out: dict[Path, str] = {}
+    lost: dict[str, list[str]] = {}
     for path, name in names.items():
         missing = False
         if isinstance(name.content, Unused):
@@ -185,7 +183,8 @@ def _left_out(
             out[path], missing = "its name matches no map", not name.bare or "base_color" not in maps
         else:
             out[path] = reasons.get(path, "its alpha channel is missing")
-        lost += [path] if missing else []
+        if missing:
+            lost.setdefault(out[path], []).append(path.name)
     return out, lost
 
 
