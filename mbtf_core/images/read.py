@@ -60,6 +60,8 @@ _MAGIC = {
 # Photometric interpretations of TIFF that are read as stored.
 _GRAY, _RGB = 1, 2
 _SHORT = "cannot be read as a TIFF image (file ends early)"
+# Compressions of BMP, whose decoder is slow and fills whatever a small file leaves out.
+_RUN_LENGTHS = (1, 2)
 # Channels of PNG color types of more than one channel.
 _PNG_COLORS = {2: 3, 4: 2, 6: 4}
 SUFFIXES = tuple(_KINDS)
@@ -295,6 +297,8 @@ def _from_pillow(path: Path, kind: str) -> Image:
             python_warnings.simplefilter("ignore")
             with Pillow.open(path, formats=[kind]) as picture:
                 _check_size(picture.height, picture.width, path)
+                if kind == "BMP" and picture.info.get("compression") in _RUN_LENGTHS:
+                    raise InputError("has run lengths", where=path, hint="save it without compression")
                 picture.load()
                 return replace(_from_picture(picture, path), tags=_tags_of(picture.info, picture.getexif()))
     except Pillow.DecompressionBombError:

@@ -79,13 +79,20 @@ class FoundMaps:
 
 
 # How one of several files of a map is chosen, in this order: what is smallest, and why others are left out.
-_CHOICES: tuple[tuple[Callable[[FoundMap], int], str], ...] = (
+_Choice = tuple[Callable[[FoundMap], int], str]
+_CHOICES: tuple[_Choice, ...] = (
     (lambda m: m.name.workflow == "specular", "{} is of the metalness workflow"),
     (lambda m: m.source.rank, "{} is used"),
     (lambda m: m.name.convention != "gl", "{} is the normal map"),
     (lambda m: not m.name.deep, "{}, of 16 bits, is used"),
-    (lambda m: m.name.variant, "{} is the first variant"),
 )
+
+
+def _variant_choice(candidates: Iterable[list[FoundMap]]) -> _Choice:
+    """The choice of the first variant that all maps with variants have; none where there is no such one."""
+    numbers = [{m.name.variant for m in given} for given in candidates if any(m.name.variant for m in given)]
+    first = min(set.intersection(*numbers), default=None) if numbers else None
+    return (lambda m: m.name.variant != first, "{} is the first variant")
 
 
 def _shared_words(names: list[str]) -> int:
@@ -126,7 +133,8 @@ def find_maps(folder: Path) -> FoundMaps:
         for source in _sources(path, name):
             candidates.setdefault(source.role, []).append(FoundMap(path, name, source))
     reasons: dict[Path, str] = {}
-    chosen = {role: _choose(given, reasons) for role, given in candidates.items()}
+    choices = (*_CHOICES, _variant_choice(candidates.values()))
+    chosen = {role: _choose(given, choices, reasons) for role, given in candidates.items()}
     maps = {role: given[0].path for role, given in chosen.items()}
     entries = {role: given[0].entry for role, given in chosen.items()}
     several = [
@@ -142,11 +150,8 @@ def find_maps(folder: Path) -> FoundMaps:
     notes = [f"{role}: 1 - {m.path.name}" for role, (m,) in chosen.items() if m.source.invert]
     rest = {path: name for path, name in names.items() if path not in maps.values()}
     unused, lost = _left_out(rest, reasons, maps)
-    notes += [f"{path.name} is not used: {why}" for path, why in unused.items() if path not in lost]
-    by_reason: dict[str, list[str]] = {}
-    for path in lost:
-        by_reason.setdefault(unused[path], []).append(path.name)
-    texts = [f"{_listed(given)} ({reason})" for reason, given in by_reason.items()]
+    notes += [f"{path.name} is not used: {why}" for path, why in unused.items() if why not in lost]
+    texts = [f"{_listed(given)} ({reason})" for reason, given in lost.items()]
     warnings = [f"{folder}: not used: {'; '.join(texts)}"] if texts else []
     warnings += [f"{folder}: {unread}"] if unread else []
     if "roughness" not in maps:
@@ -163,10 +168,11 @@ def find_maps(folder: Path) -> FoundMaps:
 
 def _left_out(
     names: Mapping[Path, MapName], reasons: Mapping[Path, str], maps: Container[Role]
-) -> tuple[dict[Path, str], list[Path]]:
-    """Why files are not used, and those of them that the material may lack."""
+) -> tuple[dict[Path, str], dict[str, list[str]]]:
+    """Why files are not used, and the names of those that the material may lack by reason."""
     metalness = any("metalness workflow" in reason for reason in reasons.values())
-    out, lost = {}, []
+    out: dict[Path, str] = {}
+    lost: dict[str, list[str]] = {}
     for path, name in names.items():
         missing = False
         if isinstance(name.content, Unused):
@@ -177,7 +183,8 @@ def _left_out(
             out[path], missing = "its name matches no map", not name.bare or "base_color" not in maps
         else:
             out[path] = reasons.get(path, "its alpha channel is missing")
-        lost += [path] if missing else []
+        if missing:
+            lost.setdefault(out[path], []).append(path.name)
     return out, lost
 
 
@@ -196,12 +203,12 @@ def _has_alpha(path: Path) -> bool:
     return True
 
 
-def _choose(given: list[FoundMap], reasons: dict[Path, str]) -> list[FoundMap]:
+def _choose(given: list[FoundMap], choices: Iterable[_Choice], reasons: dict[Path, str]) -> list[FoundMap]:
     """The preferred one of several files of a map; all where their names do not say that they are of one
     map. Adds the reasons why the others are not used."""
     if any(found.name.rest != given[0].name.rest for found in given):
         return given
-    for key, reason in _CHOICES:
+    for key, reason in choices:
         best = min(map(key, given))
         first = next(found for found in given if key(found) == best)
         reasons |= {m.path: reason.format(first.path.name) for m in given if key(m) != best}

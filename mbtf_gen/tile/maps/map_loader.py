@@ -199,7 +199,8 @@ class MapLoader:
         vectors = stored if signed else 2.0 * stored - 1.0
         two = stored_xy(vectors)
         if two is not None:
-            vectors = np.concatenate([two[0], height_of(two[0])[..., None]], axis=-1)
+            xy = vectors[..., two[0]]
+            vectors = np.concatenate([xy, height_of(xy)[..., None]], axis=-1)
             self.warnings.append(f"{image.path}: stores {two[1]} only; z = √(1 - x² - y²) is used")
         elif vectors.shape[2] == 4 and np.any(image.pixels[..., 3] != 1.0):
             self.warnings.append(f"{image.path}: the alpha channel of the normal map is not used")

@@ -200,6 +200,24 @@ class TestSites:
         }
 
     @pytest.mark.parametrize(
+        ("names", "expected"),
+        [
+            ("col_1 col_2 disp_2", "col_2 disp_2"),
+            ("col_1 col_2 disp_1 disp_2", "col_1 disp_1"),
+            ("col col_VAR2 disp", "col disp"),
+            ("col_1 col_2 disp_3", None),
+        ],
+    )
+    def test_variants_go_together(self, names: str, expected: str | None, tmp_path: Path) -> None:
+        fill(tmp_path, *(f"x_{name}.png" for name in names.split()))
+        if expected is None:
+            with pytest.raises(InputError, match="two maps or more of base_color"):
+                find_maps(tmp_path)
+        else:
+            files = {path.name for path in find_maps(tmp_path).maps.values()}
+            assert files == {f"x_{name}.png" for name in expected.split()}
+
+    @pytest.mark.parametrize(
         "names",
         ["a_disp16.png b_disp.png", "x_col.1001.png x_col.1002.png x_disp.png", "a_bump.png b_disp.png"],
     )
