@@ -114,7 +114,7 @@ def write_claims(folder: Path, beside: Path) -> dict[str, str]:
     claims: dict[str, tuple[bytes, str]] = {
         "gray.png": (png(SIDE, SIDE, 8, 0, lines), "claims 60000 x 60000 pixels"),
         "cap.png": (png(11000, 11000, 8, 6, lines), "cannot hold 11000 x 11000 pixels"),
-        "side.jpg": (_jpg(SIDE), "claims more than 134,217,728 pixels"),
+        "side.jpg": (_jpg(SIDE), "claims 60000 x 60000 pixels"),
         "side.tif": (_tiff(*_gray(SIDE, SIDE)), "claims 60000 x 60000 pixels"),
         "cap.tif": (_tiff(*_gray(11000, 11000)), "cannot hold 11000 x 11000 pixels"),
         "big.tif": (_tiff(*_gray(SIDE, SIDE), big=True), "claims 60000 x 60000 pixels"),

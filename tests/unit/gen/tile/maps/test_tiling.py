@@ -142,11 +142,12 @@ class TestMaterial:
         with pytest.raises(InputError, match="textures of its bsdf"):
             load_material(folder, "mirror")
 
-    def test_size_is_bounded(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("mbtf_gen.tile.assembly.MAX_PIXELS", 4 * 72 * 96 - 1)
+    def test_size_is_bounded(self, folder: Path) -> None:
         with pytest.raises(InputError, match="more than 27,647 pixels"):
-            load_material(folder, "mirror")
-        assert load_material(folder, "blend").height.shape == (72, 96)
+            load_material(folder, "mirror", 4 * 72 * 96 - 1)
+        assert load_material(folder, "blend", 4 * 72 * 96 - 1).height.shape == (72, 96)
+        with pytest.raises(InputError, match="96 x 72 pixels; at most 6,911"):
+            load_material(folder, max_pixels=72 * 96 - 1)
 
 
 def test_jobs_use_it(tmp_path: Path) -> None:
