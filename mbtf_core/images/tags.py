@@ -84,7 +84,9 @@ def pillow_tags(info: Mapping[Any, Any], exif: Mapping[int, Any], path: Path | N
     elif "srgb" in info:
         color = ("srgb", None, None)
     elif primaries is not None or isinstance(gamma, float):
-        color = _gamma(gamma if isinstance(gamma, float) else None, primaries or REC709)
+        # PNG stores white first.
+        red_first = (*primaries[2:], *primaries[:2]) if primaries is not None else REC709
+        color = _gamma(gamma if isinstance(gamma, float) else None, red_first)
     return Tags(*color, _upright(exif.get(_ORIENTATION, 1)))
 
 
