@@ -27,6 +27,8 @@ from mbtf_core.paths import refuse_special, suggest_path
 
 # Gray images stored as color JPG come back with channels that differ by rounding.
 _GRAY_CODES = 2
+# Scans of a JPG, which take time for the whole picture each; progressive ones have about ten.
+_MOST_SCANS = 100
 
 # Rec.709 luminance of linear RGB.
 LUMINANCE = (0.2126, 0.7152, 0.0722)
@@ -230,6 +232,10 @@ def _from_pillow(path: Path, kind: str, max_pixels: int) -> Image:
         codes, tags = read_tiff(path, max_pixels)
     elif kind == "PNG":
         codes = _deep_png(path, max_pixels)
+    elif (scans := path.read_bytes().count(b"\xff\xda")) > _MOST_SCANS:
+        raise InputError(
+            f"has {scans} scans; at most {_MOST_SCANS} are read", where=path, hint="save it anew"
+        )
     # Pillow's own limit of the size is checked where it guesses formats, not here.
     reader: Any = {
         "PNG": PngImagePlugin.PngImageFile,

@@ -140,8 +140,9 @@ class GeometrySection(Settings):
     max_pixels: int = Field(
         MAX_PIXELS,
         ge=1,
-        le=2**31,
-        description="largest map that is read, in pixels; reading takes up to 40 bytes of memory for each",
+        le=1 << 31,
+        description="largest map that is read, in pixels; loading takes about 30 bytes of memory for each, "
+        "60 for 8-bit heights",
     )
     mesh: Annotated[int | None, Flag("--mesh")] = Field(
         None, ge=1, le=8192, description="mesh cells across the tile; default: the map's width, at most 512"

@@ -254,8 +254,9 @@ class MapLoader:
         if excess <= 0:
             return numbers
         allowed = max(image.excess, _ROUNDING)
-        if excess > _ROUNDING:
-            outside = (numbers < -_ROUNDING) | (numbers > 1 + _ROUNDING)
+        slack = 0.0 if image.compression else _ROUNDING
+        if excess > slack:
+            outside = (numbers < -slack) | (numbers > 1 + slack)
             bad = outside if outside.ndim == 2 else outside.any(axis=-1)
             what = f"{count_and_first(bad)} outside [0, 1]"
             if excess > allowed:

@@ -35,7 +35,7 @@ def test_lossy_exr_is_clamped_with_one_warning(folder: Path, compression: str) -
     rough = exr(folder / "rough.exr", {"Y": stripes()}, **head)
     exr(folder / "diff.exr", {name: stripes(0.0, 0.02) for name in "RGB"}, **head)
     (stored,) = OpenEXR.File(str(rough), separate_channels=True).parts[0].channels.values()
-    outside = (stored.pixels > 1 + 1e-6) | (stored.pixels < -1e-6)
+    outside = (stored.pixels > 1) | (stored.pixels < 0)
     assert outside.any()
     material = load_material(folder)
     assert material.maps["roughness"] == pytest.approx(np.clip(stored.pixels, 0, 1))
