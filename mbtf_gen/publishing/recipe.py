@@ -13,6 +13,7 @@ from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.schema import CONFIG_NAME, MANIFEST_NAME
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import checksummed
+from mbtf_core.images.limits import MAX_PIXELS
 from mbtf_gen.tile.loading import described, load_material
 
 # Folders of the recipe and of the material in the published folder.
@@ -86,7 +87,8 @@ def recipe_files(data: Dataset, *, with_maps: bool, moved: Path | None) -> dict[
 
 def check_inputs(data: Dataset, material: Path, what: str, hint: str) -> None:
     """Refuse a material that is not the one that a data set was generated from."""
-    tile = load_material(material, data.manifest["config"]["geometry"]["make_tileable"])
+    geometry = data.manifest["config"]["geometry"]
+    tile = load_material(material, geometry["make_tileable"], geometry.get("max_pixels", MAX_PIXELS))
     if tile.digests != data.manifest["inputs"]:
         raise InputError(what, where=material, hint=hint)
 
