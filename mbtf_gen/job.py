@@ -66,7 +66,10 @@ class Job:
         InputError
             The material cannot be used.
         """
-        return cls.of(config, latest_material(config.material, config.geometry.make_tileable))
+        return cls.of(
+            config,
+            latest_material(config.material, config.geometry.make_tileable, config.geometry.max_pixels),
+        )
 
     @classmethod
     def of(cls, config: GeneratorConfig, material: Tile) -> Job:

@@ -256,7 +256,8 @@ def _unfinished(out: Path, config: FitConfig, shards: Path) -> bool:
 def _material_inputs(recipe: Recipe) -> dict[str, str]:
     from mbtf_gen.tile.loading import latest_material
 
-    return dict(latest_material(recipe.generate.material).digests)
+    largest = recipe.generate.geometry.max_pixels
+    return dict(latest_material(recipe.generate.material, max_pixels=largest).digests)
 
 
 @contextmanager

@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError
 from mbtf_core.images.radiance import read_radiance
-from mbtf_core.images.read import SUFFIXES, read_image
+from mbtf_core.images.read import SUFFIXES, linear_rgb, read_image
 from mbtf_core.images.resample import resample
 
 _RADIANCE = ".hdr"
@@ -24,7 +23,7 @@ def read_environment(path: Path, most_rows: int) -> NDArray[np.float32]:
 
     Parameters
     ----------
-    path : EXR, HDR, PNG, JPG, TIFF or npy file; 8-bit colors are sRGB
+    path : EXR, HDR, PNG, JPG, TIFF or npy file; integers are sRGB, unless the file declares another space
     most_rows : larger pictures are averaged down to so many rows
 
     Returns
@@ -43,7 +42,7 @@ def read_environment(path: Path, most_rows: int) -> NDArray[np.float32]:
     return np.maximum(small, np.float32(0.0))
 
 
-def read_linear(path: Path) -> NDArray[np.float64]:
+def read_linear(path: Path) -> NDArray[np.float32]:
     """Linear RGB (H, W, 3) of an EXR, HDR, PNG, JPG, TIFF or npy file; integers are sRGB, gray becomes RGB.
 
     Raises
@@ -57,11 +56,4 @@ def read_linear(path: Path) -> NDArray[np.float64]:
             where=path,
             hint=f"use one of {', '.join((_RADIANCE, *SUFFIXES))}",
         )
-    return read_radiance(path) if suffix == _RADIANCE else _pixels(path)
-
-
-def _pixels(path: Path) -> NDArray[np.float64]:
-    image = read_image(path)
-    pixels = np.asarray(image.pixels, np.float64)
-    pixels = pixels[..., :3] if pixels.shape[2] >= 3 else np.repeat(pixels[..., :1], 3, 2)
-    return np.asarray(pixels if image.bits is None else srgb_to_linear(pixels), np.float64)
+    return linear_rgb(read_radiance(path) if suffix == _RADIANCE else read_image(path))

@@ -16,14 +16,23 @@ from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError, reason, unwritable
 from mbtf_core.files.atomic import Stored, write_through
+from mbtf_core.images.limits import check_size
 from mbtf_core.paths import suggest_name
 
 # Limit of the numbers in all channels of all parts, in multiples of the largest image.
 _MOST_CHANNELS = 4
+# Of a number, at most; headers of the library do not tell half from float.
+_BYTES = 4
 # Tiles may be larger than the image, up to this.
 _TILE_PIXELS = 1 << 20
 # Channels of one image, in order; Y comes after XYZ, which contains a Y.
 _SETS = ("RGB", "XYZ", "Y")
+# Rounding of half floats just above 1.
+_HALF = 2.0**-10
+# How far lossy compression may move numbers of [0, 1] out of that range. Measured on noise and edges: DWA at
+# its default level 45 by 0.013, in proportion to the level; B44 by 2e-5.
+_DWA_LEVEL, _DWA_PER_LEVEL, _DWA_MOST = 45.0, 1e-3, 0.25
+_PXR24 = 2.0**-15
 
 
 @contextlib.contextmanager
@@ -63,18 +72,40 @@ def read_channels(path: Path, max_pixels: int) -> dict[str, NDArray[Any]]:
     InputError : the file is damaged, larger than `max_pixels`, deep, subsampled or cropped (data window
         unlike the display window), or two channels have one name
     """
+    return read_layers(path, max_pixels)[0]
+
+
+def read_layers(path: Path, max_pixels: int) -> tuple[dict[str, NDArray[Any]], dict[str, dict[str, Any]]]:
+    """:func:`read_channels`, and the header of the part of each channel."""
     parts = _read(path, max_pixels)
-    if len(parts) == 1:
-        return parts[0][1]
     out: dict[str, NDArray[Any]] = {}
+    heads: dict[str, dict[str, Any]] = {}
     for number, (head, channels) in enumerate(parts):
         part = str(head.get("name", f"part{number}"))
         for name, pixels in channels.items():
-            full = name if name.startswith(f"{part}.") else f"{part}.{name}"
+            full = name if len(parts) == 1 or name.startswith(f"{part}.") else f"{part}.{name}"
             if full in out:
                 raise InputError(f"two channels are named '{full}'", where=path)
-            out[full] = pixels
-    return out
+            out[full], heads[full] = pixels, head
+    return out, heads
+
+
+def lossy_excess(header: Mapping[str, Any], dtype: np.dtype[Any]) -> tuple[float, str]:
+    """By how much a file may exceed the range of the numbers that were saved, and the compression that does.
+
+    Parameters
+    ----------
+    header : of the part
+    dtype : type of the channels; half floats exceed by their rounding
+    """
+    name = header["compression"].name.removesuffix("_COMPRESSION")
+    rounding = _HALF if dtype.itemsize == 2 else 0.0
+    if name in ("DWAA", "DWAB"):
+        level = float(header.get("dwaCompressionLevel", _DWA_LEVEL))
+        return min(_DWA_PER_LEVEL * max(level, _DWA_LEVEL), _DWA_MOST), name
+    if name in ("B44", "B44A"):
+        return rounding, name
+    return (max(rounding, _PXR24), name) if name == "PXR24" else (rounding, "")
 
 
 def read_parts(path: Path, max_pixels: int) -> dict[str, tuple[dict[str, Any], dict[str, NDArray[Any]]]]:
@@ -113,9 +144,11 @@ def _read(
         raise InputError(
             f"claims {numbers:,} numbers; at most {_MOST_CHANNELS * max_pixels:,} are read", where=path
         )
+    if sizes and not cropped:
+        check_size(path, *sizes[0], max_pixels, numbers * _BYTES // (sizes[0][0] * sizes[0][1]))
     try:
         with silenced(), OpenEXR.File(os.fspath(path), separate_channels=True) as file:
-            parts = [{n: np.array(c.pixels) for n, c in part.channels.items()} for part in file.parts]
+            parts = [{n: np.asarray(c.pixels) for n, c in part.channels.items()} for part in file.parts]
     except Exception:
         raise broken from None
     if not heads or len(parts) != len(heads):
@@ -134,8 +167,7 @@ def _checked_size(head: dict[str, Any], path: Path, max_pixels: int, cropped: bo
         raise InputError("deep EXR images are not supported", where=path, hint="flatten the image")
     window, shown = (tuple(int(n) for n in np.ravel(head[name])) for name in ("dataWindow", "displayWindow"))
     columns, rows = window[2] - window[0] + 1, window[3] - window[1] + 1
-    if rows * columns > max_pixels:
-        raise InputError(f"claims {columns} x {rows} pixels; at most {max_pixels:,} are read", where=path)
+    check_size(path, rows, columns, max_pixels)
     if window != shown and not cropped:
         raise InputError(
             "data window and display window differ: a cropped tile", where=path, hint="crop the image"

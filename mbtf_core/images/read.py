@@ -1,36 +1,35 @@
 """Images as arrays: EXR, PNG, JPG, TIFF, TGA, BMP and npy, decoded without loss.
 
-Integer images become ``code / largest code``; float images keep their numbers. The material decides which
-maps are sRGB; no color space is applied here.
+Integer images become ``code / largest code``; float images keep their numbers. Color spaces are applied on
+request (:func:`linear_rgb`), as the material decides which maps are colors.
 """
 
 from __future__ import annotations
 
 import contextlib
-import io
-import logging
 import tempfile
 import warnings as python_warnings
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Callable, Container
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, NoReturn
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError, reason
-from mbtf_core.images.exr import check_floats, choose_channels, read_channels, silenced
+from mbtf_core.images.color_spaces import ColorSpace, srgb
+from mbtf_core.images.exr import check_floats, choose_channels, lossy_excess, read_layers, silenced
+from mbtf_core.images.limits import MAX_PIXELS, check_size
+from mbtf_core.images.tags import NO_TAGS, Tags, exr_tags, pillow_tags
+from mbtf_core.images.tiff import read_tiff
 from mbtf_core.paths import refuse_special, suggest_path
 
-# Largest image that is allocated (11 585² pixels), whatever size a header claims.
-MAX_PIXELS = 2**27
-
-# Upper bound of the compression of these formats (PNG reaches 1032 : 1, with 8 pixels in a byte).
-_PIXELS_PER_BYTE = 1 << 14
-
 # Gray images stored as color JPG come back with channels that differ by rounding.
-_GRAY_CODES = 2.0 / 255.0
+_GRAY_CODES = 2
+# Scans of a JPG, which take time for the whole picture each; progressive ones have about ten.
+_MOST_SCANS = 100
 
 # Rec.709 luminance of linear RGB.
 LUMINANCE = (0.2126, 0.7152, 0.0722)
@@ -57,40 +56,11 @@ _MAGIC = {
     b"BM": "BMP",
     b"\x93NUMPY": "NPY",
 }
-# Photometric interpretations of TIFF that are read as stored.
-_GRAY, _RGB = 1, 2
-_SHORT = "cannot be read as a TIFF image (file ends early)"
 # Compressions of BMP, whose decoder is slow and fills whatever a small file leaves out.
 _RUN_LENGTHS = (1, 2)
 # Channels of PNG color types of more than one channel.
 _PNG_COLORS = {2: 3, 4: 2, 6: 4}
 SUFFIXES = tuple(_KINDS)
-
-
-ColorSpace = Literal["srgb", "linear"]
-
-# Stored gammas of the known spaces (sRGB: 1/2.2), and the tolerance of their comparison.
-_GAMMAS: dict[ColorSpace, float] = {"srgb": 0.45455, "linear": 1.0}
-_SLACK = 0.005
-
-
-@dataclass(frozen=True)
-class Tags:
-    """Metadata of an image file.
-
-    Attributes
-    ----------
-    space : declared color space, if supported
-    foreign : unsupported declaration, such as ``color profile 'Display P3'``
-    orientation : of EXIF; 1 is upright
-    """
-
-    space: ColorSpace | None = None
-    foreign: str | None = None
-    orientation: int = 1
-
-
-NO_TAGS = Tags()
 
 
 @dataclass(frozen=True)
@@ -99,24 +69,44 @@ class Image:
 
     Attributes
     ----------
-    pixels : (H, W, C) float64 (C = 1) or float32 array
+    stored : (H, W, C) uint8, uint16 or float array
         Row 0 is the top; C = 1 gray, 2 gray and alpha, 3 RGB, 4 RGBA; all finite.
-    bits : 8 or 16 for integer files, whose pixels are code / largest code; None for floats
     path : the file
-    tags : color space and orientation that the file declares; not applied here
+    tags : what the file declares; not applied here
     channels : names of the selected channels; empty where the file has no others
+    excess : by how much the file's compression and number format may move floats out of their range
+    compression : its name, where it changes numbers; else empty
     """
 
-    pixels: NDArray[np.floating[Any]]
-    bits: int | None
+    stored: NDArray[Any]
     path: Path
     tags: Tags = NO_TAGS
     channels: tuple[str, ...] = ()
+    excess: float = 0.0
+    compression: str = ""
+
+    @property
+    def bits(self) -> int | None:
+        """8 or 16 for integer files, whose pixels are code / largest code; None for floats."""
+        return None if self.stored.dtype.kind == "f" else 8 * self.stored.dtype.itemsize
+
+    @property
+    def white(self) -> int:
+        """The largest code, which is 1; 1 for floats."""
+        return 1 if self.bits is None else 2**self.bits - 1
+
+    @cached_property
+    def pixels(self) -> NDArray[np.floating[Any]]:
+        """(H, W, C) float64 (C = 1) or float32 array of the numbers."""
+        dtype = np.float64 if self.stored.shape[2] == 1 else np.float32
+        if self.bits is None:
+            return self.stored.astype(dtype, copy=False)
+        return np.divide(self.stored, self.white, dtype=dtype)
 
     @property
     def shape(self) -> tuple[int, int]:
         """(rows, columns)."""
-        return self.pixels.shape[0], self.pixels.shape[1]
+        return self.stored.shape[0], self.stored.shape[1]
 
 
 def is_image(path: Path) -> bool:
@@ -125,7 +115,10 @@ def is_image(path: Path) -> bool:
 
 
 def read_image(
-    path: str | Path, channel: str | None = None, prefer: Callable[[str], bool] | None = None
+    path: str | Path,
+    channel: str | None = None,
+    prefer: Callable[[str], bool] | None = None,
+    max_pixels: int = MAX_PIXELS,
 ) -> Image:
     """Decode an image file.
 
@@ -135,22 +128,22 @@ def read_image(
     channel : a channel or layer of an EXR file; R, G, B, A or Y of other formats. None: see
         :func:`~mbtf_core.images.exr.choose_channels`
     prefer : predicate on the layer names of an EXR file, for files of several layers
+    max_pixels : larger images are refused
 
     Raises
     ------
-    InputError : the file is missing, empty, damaged, truncated, unsupported, larger than ``MAX_PIXELS``, or
+    InputError : the file is missing, empty, damaged, truncated, unsupported, larger than `max_pixels`, or
         not of the format of its suffix; the channel is missing; or pixels are NaN or infinite
     """
     path = Path(path)
     kind = _kind(path)
     if kind == "EXR":
-        image = _from_exr(path, channel, prefer)
+        image = _from_exr(path, channel, prefer, max_pixels)
     else:
-        image = _from_npy(path) if kind == "NPY" else _from_pillow(path, kind)
+        image = _from_npy(path, max_pixels) if kind == "NPY" else _from_pillow(path, kind, max_pixels)
         image = image if channel is None else _pick(image, channel)
-    bad = ~np.isfinite(image.pixels).all(axis=-1)
-    if bad.any():
-        raise InputError(f"{count_and_first(bad)} NaN or infinite", where=path)
+    if image.bits is None and not (finite := np.isfinite(image.stored).all(axis=-1)).all():
+        raise InputError(f"{count_and_first(~finite)} NaN or infinite", where=path, hint="fill them first")
     return image
 
 
@@ -221,55 +214,37 @@ def _kind(path: Path) -> str:
     return found
 
 
-def _check_size(rows: int, columns: int, path: Path) -> None:
-    if rows * columns > MAX_PIXELS:
-        raise InputError(f"claims {columns} x {rows} pixels; at most {MAX_PIXELS:,} are read", where=path)
-    if rows * columns <= 0:
-        raise InputError("contains no pixels", where=path)
-    size = path.stat().st_size
-    if rows * columns > _PIXELS_PER_BYTE * size:
-        raise InputError(f"is cut short: {size} bytes cannot hold {columns} x {rows} pixels", where=path)
-
-
-def _decoded(numbers: NDArray[Any], path: Path) -> Image:
+def _decoded(numbers: NDArray[Any], path: Path, **known: Any) -> Image:
     """Image of floats, uint8 or uint16, (H, W) or (H, W, C)."""
     stacked = numbers if numbers.ndim == 3 else numbers[..., None]
-    dtype = np.float64 if stacked.shape[2] == 1 else np.float32
-    if stacked.dtype.kind != "f":
-        bits = 8 * stacked.dtype.itemsize
-        return Image(np.divide(stacked, 2**bits - 1, dtype=dtype), bits, path)
-    # Numbers beyond the range of float32 become infinite, which is reported later.
-    with np.errstate(over="ignore", invalid="ignore"):
-        return Image(stacked.astype(dtype), None, path)
+    stacked = stacked.astype(stacked.dtype.newbyteorder("="), copy=False)
+    if stacked.dtype.kind == "f" and stacked.shape[2] > 1 and stacked.dtype.itemsize > 4:
+        # Numbers beyond the range of float32 become infinite, which is reported later.
+        with np.errstate(over="ignore", invalid="ignore"):
+            stacked = stacked.astype(np.float32)
+    return Image(stacked, path, **known)
 
 
-def _from_exr(path: Path, channel: str | None, prefer: Callable[[str], bool] | None) -> Image:
-    channels = read_channels(path, MAX_PIXELS)
+def _from_exr(path: Path, channel: str | None, prefer: Callable[[str], bool] | None, limit: int) -> Image:
+    channels, headers = read_layers(path, limit)
     names = choose_channels(list(channels), path, channel, prefer)
     check_floats({name: channels[name] for name in names}, path)
-    image = _decoded(np.stack([channels[n] for n in names], axis=-1), path)
-    return replace(image, channels=tuple(names) if len(channels) > len(names) else ())
+    image = _decoded(np.stack([channels[n] for n in names], axis=-1), path, tags=exr_tags(headers[names[0]]))
+    excess, compression = lossy_excess(headers[names[0]], image.stored.dtype)
+    several = tuple(names) if len(channels) > len(names) else ()
+    return replace(image, channels=several, excess=excess, compression=compression)
 
 
 def _pick(image: Image, channel: str) -> Image:
     """One channel of an image by its letter."""
-    names = {1: "Y", 2: "YA", 3: "RGB", 4: "RGBA"}[image.pixels.shape[2]]
+    names = {1: "Y", 2: "YA", 3: "RGB", 4: "RGBA"}[image.stored.shape[2]]
     if channel.upper() not in tuple(names):
         raise InputError(f"has no channel '{channel}'", where=image.path, hint=f"it has {', '.join(names)}")
     index = names.index(channel.upper())
-    numbers = _exact(image.pixels[..., index], image.bits)
-    return replace(image, pixels=numbers[..., None], channels=(names[index],))
+    return replace(image, stored=image.stored[..., index : index + 1], channels=(names[index],))
 
 
-def _exact(numbers: NDArray[np.floating[Any]], bits: int | None) -> NDArray[np.float64]:
-    """Exact fractions code / largest code from their single-precision values."""
-    if bits is None:
-        return numbers.astype(np.float64)
-    largest = 2**bits - 1
-    return np.rint(numbers.astype(np.float64) * largest) / largest
-
-
-def _from_npy(path: Path) -> Image:
+def _from_npy(path: Path, max_pixels: int) -> Image:
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except Exception:  # a damaged header may make the parser raise anything, its bytes included
@@ -277,48 +252,60 @@ def _from_npy(path: Path) -> Image:
         raise InputError(what, where=path) from None
     if array.ndim not in (2, 3) or (array.ndim == 3 and not 1 <= array.shape[2] <= 4):
         raise InputError(f"has the shape {array.shape}; (H, W) or (H, W, 1..4) is expected", where=path)
-    _check_size(array.shape[0], array.shape[1], path)
+    check_size(path, array.shape[0], array.shape[1], max_pixels)
     if array.dtype.kind == "f" or array.dtype in (np.uint8, np.uint16):
-        return _decoded(array, path)
+        return _decoded(np.array(array), path)
     raise InputError(f"contains {array.dtype} numbers; uint8, uint16 or floats are expected", where=path)
 
 
-def _from_pillow(path: Path, kind: str) -> Image:
-    import PIL
-    from PIL import Image as Pillow
+def _from_pillow(path: Path, kind: str, max_pixels: int) -> Image:
+    from PIL import BmpImagePlugin, JpegImagePlugin, PngImagePlugin, TgaImagePlugin, TiffImagePlugin
 
-    codes: NDArray[Any] | None = None
-    if kind in ("PNG", "TIFF"):
-        codes = _deep_png(path) if kind == "PNG" else _read_tiff(path)
-    if codes is not None:
-        return replace(_decoded(codes, path), tags=_tags(path, kind))
+    codes, tags = None, None
+    if kind == "TIFF":
+        codes, tags = read_tiff(path, max_pixels)
+    elif kind == "PNG":
+        codes = _deep_png(path, max_pixels)
+    elif kind == "JPEG" and (scans := path.read_bytes().count(b"\xff\xda")) > _MOST_SCANS:
+        raise InputError(
+            f"has {scans} scans; at most {_MOST_SCANS} are read", where=path, hint="save it anew"
+        )
+    # Pillow's own limit of the size is checked where it guesses formats, not here.
+    reader: Any = {
+        "PNG": PngImagePlugin.PngImageFile,
+        "JPEG": JpegImagePlugin.JpegImageFile,
+        "TIFF": TiffImagePlugin.TiffImageFile,
+        "TGA": TgaImagePlugin.TgaImageFile,
+        "BMP": BmpImagePlugin.BmpImageFile,
+    }[kind]
     try:
         with python_warnings.catch_warnings(), silenced() if kind == "TIFF" else contextlib.nullcontext():
             python_warnings.simplefilter("ignore")
-            with Pillow.open(path, formats=[kind]) as picture:
-                _check_size(picture.height, picture.width, path)
-                if kind == "BMP" and picture.info.get("compression") in _RUN_LENGTHS:
-                    raise InputError("has run lengths", where=path, hint="save it without compression")
-                picture.load()
-                return replace(_from_picture(picture, path), tags=_tags_of(picture.info, picture.getexif()))
-    except Pillow.DecompressionBombError:
-        raise InputError(f"claims more than {MAX_PIXELS:,} pixels", where=path) from None
+            if tags is None or codes is None:
+                with reader(path) as picture:
+                    check_size(path, picture.height, picture.width, max_pixels, len(picture.getbands()))
+                    if kind == "BMP" and picture.info.get("compression") in _RUN_LENGTHS:
+                        raise InputError("has run lengths", where=path, hint="save it without compression")
+                    codes = _codes(picture, path) if codes is None else codes
+                    png = path if kind == "PNG" else None
+                    tags = tags or pillow_tags(picture.info, picture.getexif(), png)
     except InputError:
         raise
     except Exception as error:  # a damaged file may make the decoder raise anything
-        fault = "its header is damaged" if isinstance(error, PIL.UnidentifiedImageError) else reason(error)
+        fault = "its header is damaged" if isinstance(error, SyntaxError) else reason(error)
         raise InputError(f"cannot be read as a {kind} image ({fault})", where=path) from None
+    return _decoded(codes, path, tags=tags)
 
 
-def _deep_png(path: Path) -> NDArray[np.uint16] | None:
+def _deep_png(path: Path, max_pixels: int) -> NDArray[np.uint16] | None:
     """Codes (H, W, C) of a 16-bit color PNG, of which Pillow keeps the upper eight bits; None of others."""
     with path.open("rb") as stream:
         head = stream.read(33)
     if len(head) < 33 or head[12:16] != b"IHDR":
         return None
     columns, rows = int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
-    _check_size(rows, columns, path)
     channels = _PNG_COLORS.get(head[25])
+    check_size(path, rows, columns, max_pixels, (channels or 1) * (2 if head[24] == 16 else 1))
     if head[24] != 16 or channels is None:
         return None
     import imagecodecs
@@ -332,73 +319,17 @@ def _deep_png(path: Path) -> NDArray[np.uint16] | None:
     return np.ascontiguousarray(codes.reshape(rows, columns, -1)[..., :channels])
 
 
-def _read_tiff(path: Path) -> NDArray[Any] | None:
-    """The first image of a TIFF file, (H, W, C), C = 1..4, as stored: uint8, uint16 or floats, however
-    compressed. None for kinds that Pillow reads: palettes, single bits, inverted gray, YCbCr."""
-    import tifffile
-
-    # The library logs faults that its exception already reports.
-    logging.getLogger("tifffile").setLevel(logging.CRITICAL)
-    try:
-        with tifffile.TiffFile(path) as file:
-            page: Any = file.pages[0]
-            rows, columns = int(page.imagelength), int(page.imagewidth)
-            _check_size(rows, columns, path)
-            channels = int(page.samplesperpixel)
-            if page.photometric not in (_GRAY, _RGB) or page.dtype is None:
-                return None
-            if page.bitspersample != 8 * page.dtype.itemsize:
-                return None if page.bitspersample < 8 else _refuse(f"{page.bitspersample}-bit", path)
-            if page.dtype.kind == "f" or page.dtype in (np.uint8, np.uint16):
-                if not 1 <= channels <= 4 or page.imagedepth != 1:
-                    raise InputError(f"has {channels} channels; 1 to 4 are expected", where=path)
-                # Missing strips or tiles of a truncated file would be read as zeros.
-                ends = (o + n for o, n in zip(page.dataoffsets, page.databytecounts, strict=True))
-                if not page.is_contiguous and any(end > path.stat().st_size for end in ends):
-                    raise InputError(_SHORT, where=path)
-                array = page.asarray(maxworkers=1)
-            elif page.dtype.kind in "ui" and page.dtype.itemsize > 1:
-                _refuse(page.dtype.name, path)
-            else:
-                return None
-    except InputError:
-        raise
-    except Exception as error:  # a damaged file may make the decoder raise anything
-        raise InputError(f"cannot be read as a TIFF image ({reason(error)})", where=path) from None
-    if page.planarconfig == 2 and channels > 1:
-        array = np.moveaxis(array.reshape(channels, rows, columns), 0, -1)
-    if array.size != rows * columns * channels:
-        raise InputError(_SHORT, where=path)
-    return array.reshape(rows, columns, channels)
-
-
-def _refuse(kind: str, path: Path) -> NoReturn:
-    raise InputError(f"contains {kind} numbers", where=path, hint="save it as 8 or 16 bits or as floats")
-
-
-def _tags(path: Path, kind: str) -> Tags:
-    """Tags of a file whose pixels another reader has decoded; none where they cannot be read."""
-    from PIL import Image as Pillow
-
-    try:
-        with python_warnings.catch_warnings(), silenced():
-            python_warnings.simplefilter("ignore")
-            with Pillow.open(path, formats=[kind]) as picture:
-                return _tags_of(picture.info, picture.getexif())
-    except Exception:  # what the library does not know may make it raise anything
-        return NO_TAGS
-
-
-def _from_picture(picture: Any, path: Path) -> Image:
+def _codes(picture: Any, path: Path) -> NDArray[Any]:
+    """Decoded pixels (H, W) or (H, W, C) of a picture that Pillow has opened."""
     mode = picture.mode
     plain = {"P": "RGBA" if "transparency" in picture.info else "RGB", "PA": "RGBA", "1": "L", "YCbCr": "RGB"}
     deep = mode.startswith("I;16") or (mode == "I" and picture.format == "PNG")
-    if mode in plain:
-        picture = picture.convert(plain[mode])
-    if deep or picture.mode in ("L", "LA", "RGB", "RGBA", "F"):
-        numbers = np.asarray(picture)
-        return _decoded(numbers.astype(np.uint16) if deep else numbers, path)
-    raise InputError(f"has the unsupported pixel mode '{mode}'", where=path, hint="save it as gray or RGB")
+    if not deep and mode not in (*plain, "L", "LA", "RGB", "RGBA", "F"):
+        raise InputError(
+            f"has the unsupported pixel mode '{mode}'", where=path, hint="save it as gray or RGB"
+        )
+    numbers = np.asarray(picture.convert(plain[mode]) if mode in plain else picture)
+    return numbers.astype(np.uint16) if deep else numbers
 
 
 def gray(image: Image) -> tuple[NDArray[np.float64], list[str]]:
@@ -416,53 +347,55 @@ def gray(image: Image) -> tuple[NDArray[np.float64], list[str]]:
     values : (H, W) float64 array
     warnings : list of str
     """
-    pixels, warnings = image.pixels, []
-    if pixels.shape[2] in (2, 4) and np.any(pixels[..., -1] != 1.0):
+    pixels, warnings = image.stored, []
+    if pixels.shape[2] in (2, 4) and np.any(pixels[..., -1] != image.white):
         warnings.append(f"{image.path}: its alpha channel is not used")
     rgb = pixels[..., : 3 if pixels.shape[2] > 2 else 1]
-    spread = float(np.max(rgb.max(axis=-1) - rgb.min(axis=-1)))
+    first = np.asarray(rgb[..., 0], np.float64)
+    spread = 0.0 if rgb.shape[2] == 1 else float(np.max(rgb.max(axis=-1) - rgb.min(axis=-1)))
     if spread == 0.0:
-        return _exact(rgb[..., 0], image.bits), warnings
+        return first / image.white, warnings
     tolerance = _GRAY_CODES if image.bits == 8 else 1e-4 * float(np.abs(rgb).max())
     if spread > tolerance:
         warnings.append(
             f"{image.path}: is colored where one number per pixel is expected; its luminance is used"
         )
-    return rgb.astype(np.float64) @ np.asarray(LUMINANCE), warnings
+    values = LUMINANCE[0] * first
+    for weight, channel in zip(LUMINANCE[1:], (rgb[..., 1], rgb[..., 2]), strict=True):
+        values += weight * channel.astype(np.float64)
+    return values / image.white, warnings
 
 
-def _tags_of(info: Mapping[Any, Any], exif: Mapping[int, Any]) -> Tags:
-    """Tags from the metadata that Pillow read.
+def linear_rgb(image: Image, space: ColorSpace | None = None) -> NDArray[np.float32]:
+    """Linear Rec.709 colors of an image; gray is repeated, alpha dropped.
 
-    The profile takes precedence over the ``sRGB`` chunk, and that over ``gAMA`` (PNG specification, third
-    edition, 4.3). A gamma of 1 means linear, 1/2.2 sRGB; a profile whose description names sRGB means sRGB.
-    Other profiles and gammas are reported, not applied.
+    Parameters
+    ----------
+    image : Image
+    space : color space of the numbers; None: as the file declares, else sRGB for integers, linear for floats
+
+    Returns
+    -------
+    (H, W, 3) float32 array
+        Not clamped: colors of wider primaries may leave [0, 1].
     """
-    from PIL import ExifTags
-
-    orientation = exif.get(ExifTags.Base.Orientation, 1)
-    turned = orientation if orientation in range(1, 9) else 1
-    space: ColorSpace | None = None
-    foreign = None
-    gamma = info.get("gamma")
-    if info.get("icc_profile"):
-        name = _profile_name(info["icc_profile"])
-        space, foreign = ("srgb", None) if "srgb" in name.lower() else (None, f"color profile '{name}'")
-    elif "srgb" in info:
-        space = "srgb"
-    elif isinstance(gamma, float) and gamma > 0:
-        space = next((s for s, g in _GAMMAS.items() if abs(gamma - g) < _SLACK), None)
-        foreign = None if space else f"gamma of {gamma:g}"
-    return Tags(space, foreign, turned)
-
-
-def _profile_name(profile: bytes) -> str:
-    """Description of an ICC profile, one line."""
-    from PIL import ImageCms
-
-    try:
-        text = ImageCms.getProfileDescription(ImageCms.ImageCmsProfile(io.BytesIO(profile)))
-    except Exception:  # a damaged profile may make the library raise anything
-        return "unreadable"
-    printable = "".join(c for c in " ".join(text.split()) if c.isprintable())
-    return printable[:60] or "without a name"
+    declared = image.tags.declared if space is None else None
+    space = space or image.tags.space or ("linear" if image.bits is None else "srgb")
+    curves = declared.curves if declared is not None else (srgb,) if space == "srgb" else ()
+    rgb = image.stored[..., :3] if image.stored.shape[2] > 2 else image.stored[..., :1]
+    out = np.empty((*image.shape, 3), np.float32)
+    # A curve of codes is a table.
+    codes = None if image.bits is None else np.arange(image.white + 1) / image.white
+    for k in range(3):
+        channel = rgb[..., k % rgb.shape[2]]
+        curve = curves[k % len(curves)] if curves else None
+        if codes is not None:
+            table = codes if curve is None else curve(codes)
+            out[..., k] = table.astype(np.float32)[channel]
+        else:
+            out[..., k] = channel if curve is None else curve(channel.astype(np.float64))
+    if declared is not None and declared.matrix is not None:
+        matrix = declared.matrix.T.astype(np.float32)
+        for row in out:
+            row[...] = row @ matrix
+    return out

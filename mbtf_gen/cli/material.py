@@ -55,13 +55,14 @@ def inspect(
     from mbtf_gen.tile.loading import load_material
 
     geometry, finest = resolved.geometry, resolved.queries.finest
-    loaded = load_material(resolved.material, geometry.make_tileable)
+    loaded = load_material(resolved.material, geometry.make_tileable, geometry.max_pixels)
     outputs: dict[str, Any] = {}
     if write is not None:
         choices = write_material_file(write, loaded, resolved)
         outputs["written"] = {"file": write, "choices": {name: asdict(c) for name, c in choices.items()}}
         # What follows describes the material as other commands will use it.
-        loaded, finest = replace(load_material(write), unused=loaded.unused), None
+        written = load_material(write, max_pixels=geometry.max_pixels)
+        loaded, finest = replace(written, unused=loaded.unused), None
         geometry = geometry.model_copy(update={"height_scale": None})
     if export is not None:
         grid = loaded.configured(geometry).grid

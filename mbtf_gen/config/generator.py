@@ -18,6 +18,7 @@ from mbtf_core.data.lattice import MAX_LEVEL
 from mbtf_core.data.schema import SCHEMA_VERSION, ArrayFormat, Layout, SliceDirections, Tiling
 from mbtf_core.errors import UsageError
 from mbtf_core.files.atomic import data_sha256
+from mbtf_core.images.limits import MAX_PIXELS
 from mbtf_gen.sampling.light_kernel import MAX_WIDTH_DEG, MIN_WIDTH_DEG
 
 # Largest height scale.
@@ -135,6 +136,13 @@ class GeometrySection(Settings):
     )
     max_displacement: float = Field(
         100.0, gt=0, le=1e6, description="largest accepted displacement range, in tile widths"
+    )
+    max_pixels: int = Field(
+        MAX_PIXELS,
+        ge=1,
+        le=1 << 31,
+        description="largest map that is read, in pixels; loading takes about 30 bytes of memory for each, "
+        "60 for 8-bit heights",
     )
     mesh: Annotated[int | None, Flag("--mesh")] = Field(
         None, ge=1, le=8192, description="mesh cells across the tile; default: the map's width, at most 512"
@@ -274,8 +282,8 @@ class GeneratorConfig(Settings):
 
     def hash(self, inputs: dict[str, str]) -> str:
         """SHA-256 of everything that determines the data: options, and digests of the input files by role."""
-        # The limit does not change the data.
-        fields = self.model_dump(exclude={"material": True, "geometry": {"max_displacement"}})
+        # The limits do not change the data.
+        fields = self.model_dump(exclude={"material": True, "geometry": {"max_displacement", "max_pixels"}})
         return data_sha256({"schema": SCHEMA_VERSION, "inputs": inputs, **fields})
 
 

@@ -146,7 +146,7 @@ def _floats(name: str, data: bytes) -> NDArray[np.float64]:
     with tempfile.TemporaryDirectory(prefix="mbtf-") as folder:
         path = Path(folder, "image").with_suffix(PurePosixPath(name).suffix)
         path.write_bytes(data)
-        return read_linear(path)
+        return np.asarray(read_linear(path), np.float64)
 
 
 def angles_of(name: str) -> tuple[float, float, float, float] | None:

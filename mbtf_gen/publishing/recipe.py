@@ -12,6 +12,7 @@ from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.schema import CONFIG_NAME, MANIFEST_NAME
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import checksummed
+from mbtf_core.images.limits import MAX_PIXELS
 from mbtf_gen.tile.loading import described, load_material
 from mbtf_gen.tile.mesh_file import COMPANION
 from mbtf_gen.tile.protocol import Tile
@@ -93,7 +94,8 @@ def recipe_files(data: Dataset, *, with_maps: bool, moved: Path | None) -> dict[
 
 def check_inputs(data: Dataset, material: Path, what: str, hint: str) -> Tile:
     """The material, refused if it is not the one that a data set was generated from."""
-    tile = load_material(material, data.manifest["config"]["geometry"]["make_tileable"])
+    geometry = data.manifest["config"]["geometry"]
+    tile = load_material(material, geometry["make_tileable"], geometry.get("max_pixels", MAX_PIXELS))
     if tile.digests != data.manifest["inputs"]:
         raise InputError(what, where=material, hint=hint)
     return tile

@@ -14,7 +14,7 @@ from mbtf_core.color import srgb_to_linear
 from mbtf_core.data.schema import Tiling
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import data_sha256, file_sha256
-from mbtf_core.images.read import MAX_PIXELS, gray
+from mbtf_core.images.read import count_and_first, gray
 from mbtf_core.images.resample import dequantize
 from mbtf_core.paths import named_file, real_path, suggest_path
 from mbtf_gen.tile.heightfield_tile import MAPS, HeightFieldTile
@@ -31,7 +31,7 @@ from mbtf_gen.tile.maps.checks import (
 )
 from mbtf_gen.tile.maps.discovery import FoundMaps
 from mbtf_gen.tile.maps.file_names import Convention, normal_convention
-from mbtf_gen.tile.maps.map_loader import MapLoader
+from mbtf_gen.tile.maps.map_loader import FILL, MapLoader
 from mbtf_gen.tile.maps.material_file import LOBES, ROLES, MaterialFile, NormalEntry, layers_above
 from mbtf_gen.tile.maps.normal_map import NormalFit, fit_normals
 from mbtf_gen.tile.maps.tiling import BAND, retile, seams
@@ -44,9 +44,11 @@ _MOST = 1e15
 _DEFAULT_COLOR = 0.5
 
 
-def assemble(spec: MaterialFile, folder: Path, found: FoundMaps, tile: Tiling) -> HeightFieldTile:
-    """The tile of a material file and the maps found in a folder."""
-    load = MapLoader(folder, found.notes)
+def assemble(
+    spec: MaterialFile, folder: Path, found: FoundMaps, tile: Tiling, max_pixels: int
+) -> HeightFieldTile:
+    """The tile of a material file and the maps found in a folder, of at most `max_pixels` pixels each."""
+    load = MapLoader(folder, found.notes, max_pixels)
     load.warnings += found.warnings
     height, codes, scale = _heights(spec, load)
     rounding = 0.0 if codes is None else codes.rounding / (2 ** (load.facts["height"].bits or 8) - 1)
@@ -113,8 +115,8 @@ def assemble(spec: MaterialFile, folder: Path, found: FoundMaps, tile: Tiling) -
     )
 
 
-def retiled(material: HeightFieldTile, tile: Literal["mirror", "blend"]) -> HeightFieldTile:
-    """The tile with all its maps mirrored or blended."""
+def retiled(material: HeightFieldTile, tile: Literal["mirror", "blend"], max_pixels: int) -> HeightFieldTile:
+    """The tile with all its maps mirrored or blended, of at most `max_pixels` pixels each."""
     folder = material.files["height"].parent
     if any(role.startswith("bsdf.") for role in material.files):
         raise InputError(
@@ -122,11 +124,11 @@ def retiled(material: HeightFieldTile, tile: Literal["mirror", "blend"]) -> Heig
             where=folder,
             hint="use --make-tileable none, or give maps in place of the bsdf",
         )
-    if tile == "mirror" and any(4 * f.rows * f.columns > MAX_PIXELS for f in material.facts.values()):
+    if tile == "mirror" and any(4 * f.rows * f.columns > max_pixels for f in material.facts.values()):
         raise InputError(
-            f"mirrored maps would have more than {MAX_PIXELS:,} pixels",
+            f"mirrored maps would have more than {max_pixels:,} pixels",
             where=folder,
-            hint="use smaller maps, or --make-tileable blend",
+            hint="use smaller maps, --make-tileable blend, or a larger geometry.max_pixels",
         )
     note = f"tile: edges blended over {BAND:g} of the tile"
     if tile == "mirror":
@@ -160,15 +162,16 @@ def _heights(spec: MaterialFile, load: MapLoader) -> tuple[NDArray[np.float64], 
     refuse_color(image, "height")
     height, warnings = gray(image)
     load.warnings += warnings
-    largest = float(np.abs(height).max())
-    if largest > _MOST:
-        raise InputError(f"stores heights up to {largest:.4g}; at most {_MOST:g} are read", where=image.path)
+    far = np.abs(height) > _MOST
+    if far.any():
+        what = f"{count_and_first(far)} beyond {_MOST:g}, as where data are missing"
+        raise InputError(what, where=image.path, hint=FILL)
     default = _FLOAT_SCALE if image.bits is None else _INTEGER_SCALE
     scale = default if entry.scale is None else entry.scale
     codes, step = None, None
     if image.bits is not None:
         white = 2**image.bits - 1
-        codes = code_use(np.rint(height * white))
+        codes = code_use(image.stored[..., 0] if image.stored.shape[2] < 3 else np.rint(height * white))
         step = coarse_step(codes, image.bits)
         if step is not None and codes.levels > 1:
             load.warnings.append(level_warning(image.path, codes, image.bits, step, entry.dequantize))

@@ -6,13 +6,14 @@ import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, cast, get_args
 
 from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.data.schema import Tiling
 from mbtf_core.errors import UsageError
 from mbtf_core.files.atomic import write_text
 from mbtf_core.files.folders import make_folder
+from mbtf_core.images.color_spaces import ColorSpace
 from mbtf_core.paths import named_file, real_path
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
@@ -47,17 +48,20 @@ def choose(spec: MaterialFile, material: HeightFieldTile, config: GeneratorConfi
         By dotted key; without those that nothing decides.
     """
     out = {
-        "height.scale": _height_scale(spec, material, config.geometry.height_scale),
         "make_tileable": _tiling(spec, material, config.geometry.make_tileable),
     }
+    if (scale := _height_scale(spec, material, config.geometry.height_scale)) is not None:
+        out = {"height.scale": scale, **out}
     if material.normal_convention is not None:
         shown = material.normal_fit is not None and material.normal_fit.convention is not None
         source = "as the heights' slopes show" if shown else "by its name or assumed"
         asked = spec.normal is not None and spec.normal.convention is not None
         out["normal.convention"] = Choice(material.normal_convention, _FILE if asked else source)
     if (color := spec.base_color) is not None and color.file is not None:
-        source = _FILE if color.colorspace is not None else "as its file is read"
-        out["base_color.colorspace"] = Choice(material.facts["base_color"].colorspace, source)
+        source, space = "as its file is read", material.facts["base_color"].colorspace
+        # Another declared space is converted only where none is given.
+        if space in get_args(ColorSpace):
+            out["base_color.colorspace"] = Choice(space, _FILE if color.colorspace is not None else source)
     if (given := config.queries.resolution) is not None:
         out["resolution"] = Choice(given, _GIVEN)
     elif spec.resolution is not None:
@@ -65,7 +69,7 @@ def choose(spec: MaterialFile, material: HeightFieldTile, config: GeneratorConfi
     return out
 
 
-def _height_scale(spec: MaterialFile, material: HeightFieldTile, given: float | None) -> Choice:
+def _height_scale(spec: MaterialFile, material: HeightFieldTile, given: float | None) -> Choice | None:
     if given is not None:
         return Choice(given, _GIVEN)
     if spec.height.scale is not None:
@@ -75,6 +79,8 @@ def _height_scale(spec: MaterialFile, material: HeightFieldTile, given: float | 
         return Choice(
             float(f"{fit.scale:.3g}"), f"suggested by the normal map; the default would be {default:g}"
         )
+    if material.unit_fault() is not None:
+        return None
     return Choice(default, "the default; no normal map suggests one")
 
 

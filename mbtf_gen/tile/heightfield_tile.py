@@ -39,6 +39,8 @@ from mbtf_gen.tile.tracers.protocol import TileGeometry
 
 # Displacement range, in tile widths, above which a default height scale is probably wrong.
 _STEEP = 0.5
+# Range of floats up to which they may be fractions of a tile's width, with what compression adds.
+_NORMALIZED = 1.05
 # Default limit of the mesh cells across the tile.
 DEFAULT_MESH = 512
 # Order of the maps in descriptions and in what makes them tileable.
@@ -112,9 +114,38 @@ class HeightFieldTile(Tile):
         rows = max(1, round(self.aspect * columns))
         heights = resample(self.height, rows, columns, "cubic").astype(np.float64)
         grid = replace(HeightGrid.from_map(heights, self.height_scale, self.aspect), tracer=self.tracer)
-        if fault := displacement_fault(grid.displacement_range, self.max_displacement):
+        if fault := self._fault(grid, self.max_displacement):
             raise InputError(fault[0], where=self.files.get("height"), hint=fault[1])
         return grid
+
+    def _fault(self, grid: HeightGrid, limit: float) -> tuple[str, str] | None:
+        """(what, hint) why generation refuses the heights under a limit of their range, or None."""
+        unit = None if math.isinf(limit) else self.unit_fault()
+        return unit or displacement_fault(grid.displacement_range, limit)
+
+    def unit_fault(self) -> tuple[str, str] | None:
+        """(what, hint) where no height scale is given, and stored heights are no tile widths; else None.
+
+        They differ by more than a tile's width, or the file declares the size of its pixels.
+        """
+        facts = self.facts.get("height")
+        if facts is None or self.height_from != "default":
+            return None
+        extent = facts.high - facts.low
+        if facts.pixel_size is None and (facts.bits is not None or extent <= _NORMALIZED):
+            return None
+        white = 1 if facts.bits is None else 2**facts.bits - 1
+        what = f"heights from {facts.low * white:.5g} to {facts.high * white:.5g} need a height scale"
+        if self.normal_fit is not None and self.normal_fit.fits:
+            return what, f"the normal map suggests --height-scale {self.normal_fit.scale:.3g}"
+        scale = white / (facts.columns * (facts.pixel_size or 1.0))
+        if facts.pixel_size is None:
+            return what, (
+                f"give --height-scale {scale:.4g}, 1 / {facts.columns} columns, where pixels are 1 apart in "
+                "the unit of the heights; 1 where that is the tile's width"
+            )
+        apart = f"its pixels are {facts.pixel_size:.6g} apart"
+        return what, f"give --height-scale {scale:.4g}, as {apart}, where heights have the same unit"
 
     def coarser_grid(self, most: int) -> HeightGrid:
         """:attr:`grid`, or a coarser one of at most so many cells along each side."""
@@ -232,7 +263,7 @@ class HeightFieldTile(Tile):
         return self.at(options.height_scale, options.mesh)._statistics(finest, options.max_displacement)
 
     def _statistics(self, finest: int | None, max_displacement: float) -> dict[str, Any]:
-        fault = displacement_fault(self.thickness, max_displacement)
+        fault = self._fault(self.grid, max_displacement)
         refused = [f"{self.files['height']}: generation refuses it: {'; '.join(fault)}"] if fault else []
         grid = self.grid
         median, high, steepest = slope_angles(grid)
@@ -332,6 +363,7 @@ class HeightFieldTile(Tile):
         elif "normal" in self.files:
             text = suggestion_warning(self.files["normal"], self.normal_fit, self.height_scale)
         extent *= abs(self.height_scale)
-        if text is None and self.height_from == "default" and extent > _STEEP:
+        refused = self.unit_fault() is not None
+        if text is None and self.height_from == "default" and extent > _STEEP and not refused:
             text = f"{path}: the displacement range is {extent:.4g} tile widths; check --height-scale"
         return self.warnings if text is None else (*self.warnings, text)

@@ -91,7 +91,8 @@ def _maps(found: Mapping[str, Any]) -> list[str]:
             continue
         name = Path(facts["file"]).name + (f"[{','.join(facts['names'])}]" if facts["names"] else "")
         depth = "float" if facts["bits"] is None else f"{facts['bits']}-bit"
-        decoded = ", sRGB decoded" if facts["colorspace"] == "srgb" else ""
+        space = facts["colorspace"]
+        decoded = {"srgb": ", sRGB decoded", "linear": ""}.get(space, f", converted from {space}")
         decoded += ", inverted" if facts["inverted"] else ""
         linear = ", linear" if role == "base_color" and not decoded else ""
         size, kind = f"{facts['columns']}x{facts['rows']}", f"{depth} {_KINDS[facts['channels']]}"

@@ -13,6 +13,7 @@ from mbtf_core.config.yaml_file import read_yaml
 from mbtf_core.data.schema import Tiling
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import file_sha256
+from mbtf_core.images.limits import MAX_PIXELS
 from mbtf_core.images.read import SUFFIXES, is_image
 from mbtf_core.meshes.read import MESH_FILES
 from mbtf_core.paths import named_file, suggest_path
@@ -36,7 +37,7 @@ _KEPT_BYTES = 1 << 28
 _kept: tuple[Any, Tile] | None = None
 
 
-def load_material(path: str | Path, tiling: Tiling | None = None) -> Tile:
+def load_material(path: str | Path, tiling: Tiling | None = None, max_pixels: int = MAX_PIXELS) -> Tile:
     """Load a material.
 
     Parameters
@@ -49,6 +50,8 @@ def load_material(path: str | Path, tiling: Tiling | None = None) -> Tile:
         Method for maps that do not tile. ``mirror``: 2 × 2 mirrored copies, a tile of twice the width;
         ``blend``: the edges blended over an eighth of the tile (:mod:`mbtf_gen.tile.maps.tiling`); None:
         that of the material file, else ``none``.
+    max_pixels : int
+        Larger maps are refused.
 
     Returns
     -------
@@ -60,15 +63,15 @@ def load_material(path: str | Path, tiling: Tiling | None = None) -> Tile:
         A file is missing, unreadable or ambiguous, a value is out of range, or aspects differ.
     """
     spec, folder, found = described(Path(path))
-    return _load(spec, folder, found, spec.tiling(tiling))
+    return _load(spec, folder, found, spec.tiling(tiling), max_pixels)
 
 
-def latest_material(path: str | Path, tiling: Tiling | None = None) -> Tile:
+def latest_material(path: str | Path, tiling: Tiling | None = None, max_pixels: int = MAX_PIXELS) -> Tile:
     """:func:`load_material`; maps are not decoded again while the contents of folder and files are the same.
 
     Parameters
     ----------
-    path, tiling : as for ``load_material``
+    path, tiling, max_pixels : as for ``load_material``
 
     Returns
     -------
@@ -87,7 +90,7 @@ def latest_material(path: str | Path, tiling: Tiling | None = None) -> Tile:
     asked = (spec, folder, replace(found, notes=[*found.notes]), method)
     if _kept is not None and _kept[0] == asked and _unchanged(_kept[1]):
         return _kept[1]
-    tile = _load(spec, folder, found, method)
+    tile = _load(spec, folder, found, method, max_pixels)
     _kept = (asked, tile) if tile.nbytes <= _KEPT_BYTES else None
     return tile
 
@@ -100,13 +103,13 @@ def _unchanged(tile: Tile) -> bool:
         return False
 
 
-def _load(spec: Described, folder: Path, found: FoundMaps, tiling: Tiling) -> Tile:
+def _load(spec: Described, folder: Path, found: FoundMaps, tiling: Tiling, max_pixels: int) -> Tile:
     if isinstance(spec, ClothFile):
         return cloth_tile(spec, folder)
     if isinstance(spec, MeshFile):
         return read_mesh(spec, folder)
-    tile = assemble(spec, folder, found, tiling)
-    return tile if tiling == "none" else retiled(tile, tiling)
+    tile = assemble(spec, folder, found, tiling, max_pixels)
+    return tile if tiling == "none" else retiled(tile, tiling, max_pixels)
 
 
 def described(path: Path) -> tuple[Described, Path, FoundMaps]:

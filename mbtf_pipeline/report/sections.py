@@ -165,7 +165,7 @@ def material_section(config: GeneratorConfig, inputs: Mapping[str, str]) -> dict
     nothing = {"maps": [], "warnings": [], "inspection": ""}
     geometry = config.geometry
     try:
-        material = latest_material(config.material, geometry.make_tileable)
+        material = latest_material(config.material, geometry.make_tileable, geometry.max_pixels)
         found = material.inspect(geometry)
         text = material.describe(found, config.material)
     except (MbtfError, OSError) as error:

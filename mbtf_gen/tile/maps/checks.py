@@ -30,9 +30,9 @@ _FAR_OFF = 1.5
 
 def refuse_color(image: Image, role: Literal["height", "opacity"]) -> None:
     """Refuse a color image as a gray map: channels that differ by more than 2 % on average."""
-    if image.pixels.shape[2] < 3:
+    if image.stored.shape[2] < 3:
         return
-    rgb = image.pixels[..., :3].astype(np.float64)
+    rgb = image.pixels[..., :3]
     largest = float(np.abs(rgb).max())
     if largest == 0 or float(np.mean(np.ptp(rgb, axis=-1))) <= _COLORED * largest:
         return
@@ -187,7 +187,8 @@ def code_use(codes: NDArray[Any]) -> Codes:
     The spacing is the slope of the least-squares line through the used codes over their rank, between the
     0.5th and the 99.5th percentile of the texels, if all of these codes lie within 0.75 of the line; else 1.
     """
-    used, counts = np.unique(np.asarray(codes, np.int64), return_counts=True)
+    used, counts = np.unique(codes, return_counts=True)
+    used = used.astype(np.int64)
     levels, low, high = len(used), int(used[0]), int(used[-1])
     below = np.cumsum(counts) / counts.sum()
     inner = used[(below > _TAIL) & (below - counts / counts.sum() < 1.0 - _TAIL)]

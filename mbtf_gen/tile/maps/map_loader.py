@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError
-from mbtf_core.images.read import ColorSpace, Image, count_and_first, gray, read_image
+from mbtf_core.images.color_spaces import ColorSpace
+from mbtf_core.images.limits import MAX_PIXELS
+from mbtf_core.images.read import Image, count_and_first, gray, linear_rgb, read_image
 from mbtf_core.paths import named_file
 from mbtf_gen.tile.maps.checks import refuse_color
 from mbtf_gen.tile.maps.file_names import role_of
@@ -22,6 +24,12 @@ Color = NDArray[np.floating[Any]]
 Share = NDArray[np.float64] | float | None
 
 _ROUNDING = 1e-6
+# Rounding of matrices and profiles, beyond which colors out of Rec.709 are reported.
+_GAMUT = 1e-3
+_RANGE = "its numbers belong into [0, 1]: scale them, or clamp them in an image editor"
+# Numbers that terrains customarily have where there is no data.
+_NO_DATA = (-9999.0, -99999.0, -32768.0, -32767.0, -(2.0**31), 2.0**32 - 1.0)
+FILL = "fill them first, such as by gdal_fillnodata"
 # Float normals this far below 0 are signed, not (n+1)/2.
 _SIGNED = -0.05
 # Largest component of a normal in any encoding, with rounding.
@@ -44,7 +52,8 @@ class MapFacts:
     channels : number of selected channels
     names : their names, where the file has others
     low, high : smallest and largest stored number of these channels, without alpha
-    colorspace : in which the numbers were read
+    colorspace : ``srgb``, ``linear``, or the name of the color space that was converted
+    pixel_size : distance of neighboring columns that the file declares, in meters or its own unit
     inverted : whether 1 - x of them is used
     """
 
@@ -56,12 +65,19 @@ class MapFacts:
     names: tuple[str, ...]
     low: float
     high: float
-    colorspace: ColorSpace = "linear"
+    colorspace: str = "linear"
+    pixel_size: float | None = None
     inverted: bool = False
 
 
 class MapLoader:
     """Reads the maps of one material; collects files, messages and settings.
+
+    Parameters
+    ----------
+    folder : that file names are relative to
+    notes : messages so far
+    max_pixels : larger maps are refused
 
     Attributes
     ----------
@@ -73,8 +89,9 @@ class MapLoader:
         Messages for the user.
     """
 
-    def __init__(self, folder: Path, notes: list[str]) -> None:
+    def __init__(self, folder: Path, notes: list[str], max_pixels: int = MAX_PIXELS) -> None:
         self.folder = folder
+        self.max_pixels = max_pixels
         self.files: dict[str, Path] = {}
         self.facts: dict[str, MapFacts] = {}
         self.warnings: list[str] = []
@@ -84,12 +101,16 @@ class MapLoader:
     def image(self, role: str, entry: _FileEntry, space: ColorSpace = "linear") -> Image:
         """Read the file of a role, of one pixel or of the heights' aspect."""
         path = named_file(self.folder, str(entry.file))
-        image = read_image(path, entry.channel, lambda label: role_of(label) == role)
-        count = image.pixels.shape[2]
-        used = image.pixels[..., :-1] if count in (2, 4) else image.pixels
-        low, high = float(used.min()), float(used.max())
+        image = read_image(path, entry.channel, lambda label: role_of(label) == role, self.max_pixels)
+        self._check_data(role, image)
+        count = image.stored.shape[2]
+        used = image.stored[..., :-1] if count in (2, 4) else image.stored
+        low, high = (float(extreme) / image.white for extreme in (used.min(), used.max()))
+        size = image.tags.pixel_size
         self.files[role] = path
-        self.facts[role] = MapFacts(path, *image.shape, image.bits, count, image.channels, low, high, space)
+        self.facts[role] = MapFacts(
+            path, *image.shape, image.bits, count, image.channels, low, high, space, size
+        )
         if entry.channel is not None:
             self.settings[f"{role}.channel"] = entry.channel
         elif image.channels:
@@ -102,6 +123,29 @@ class MapLoader:
         if image.shape != (1, 1):
             self._check_aspect(path, *image.shape)
         return image
+
+    def _check_data(self, role: str, image: Image) -> None:
+        """Refuse heights without data, by what the file declares or by customary numbers; of others, warn."""
+        nodata = image.tags.nodata
+        if nodata is None and role != "height":
+            return
+        if nodata is None:
+            first = image.stored[..., 0]
+            low, high = float(first.min()), float(first.max())
+            nodata = next((n for n in _NO_DATA if n in (low, high) and image.bits is None), None)
+            if nodata is None:
+                return
+            rest = first[first != nodata]
+            # Heights may be that low, unlike what lies far from all others.
+            if rest.size and np.abs(rest - nodata).min() <= np.ptp(rest):
+                return
+        missing = np.all(image.stored == nodata, axis=-1)
+        if not missing.any():
+            return
+        what = f"{count_and_first(missing)} without data ({nodata:g})"
+        if role == "height":
+            raise InputError(what, where=image.path, hint=FILL)
+        self.warnings.append(f"{image.path}: {what}; they are used as they are")
 
     def _check_aspect(self, path: Path, rows: int, columns: int) -> None:
         height = self.facts["height"]
@@ -129,12 +173,12 @@ class MapLoader:
         image = self.image(role, entry, entry.colorspace)
         if role == "opacity":
             refuse_color(image, "opacity")
-            spread = np.ptp(image.pixels, axis=(0, 1))
+            spread = np.ptp(image.stored, axis=(0, 1))
             if len(spread) in (2, 4) and spread[-1] > 0 and not spread[:-1].any():
                 image = self.image(role, entry.model_copy(update={"channel": "A"}), entry.colorspace)
         numbers, warnings = gray(image)
         self.warnings += warnings
-        numbers = self._within(role, numbers, (numbers < -_ROUNDING) | (numbers > 1 + _ROUNDING))
+        numbers = self._within(image, numbers)
         if entry.colorspace == "srgb":
             numbers = np.asarray(srgb_to_linear(numbers), np.float64)
         if entry.invert:
@@ -152,35 +196,50 @@ class MapLoader:
             self.settings[role] = value.tolist()
             return value
         image = self.image(role, entry)
-        pixels = image.pixels
-        alpha = pixels.shape[2] in (2, 4) and (holes is None or holes.file != entry.file)
-        if alpha and np.any(pixels[..., -1] != 1.0):
+        stored = image.stored
+        alpha = stored.shape[2] in (2, 4) and (holes is None or holes.file != entry.file)
+        if alpha and np.any(stored[..., -1] != image.white):
             self.warnings.append(
                 f"{image.path}: the alpha channel of the {role.replace('_', ' ')} is not used; for holes, "
                 f"write opacity: {{file: {image.path.name}, channel: A}}"
             )
-        rgb = pixels[..., :3] if pixels.shape[2] > 2 else np.repeat(pixels[..., :1], 3, axis=2)
-        rgb = self._within(role, rgb, np.any((rgb < -_ROUNDING) | (rgb > 1 + _ROUNDING), axis=-1))
+        if image.bits is None:
+            count = 3 if stored.shape[2] > 2 else 1
+            image = replace(image, stored=self._within(image, stored[..., :count]))
         space = self._color_space(role, image, entry)
         self.facts[role] = replace(self.facts[role], colorspace=space)
         self.settings[role] = space
-        linear = (srgb_to_linear(rgb) if space == "srgb" else rgb).astype(np.float32)
+        linear = linear_rgb(image, entry.colorspace)
+        outside = np.any((linear < -_GAMUT) | (linear > 1.0 + _GAMUT), axis=-1)
+        if outside.any():
+            self.warnings.append(
+                f"{image.path}: colors of {space} beyond Rec.709 are clamped: "
+                f"{count_and_first(outside)} outside [0, 1], by at most {_excess(linear):.2g}"
+            )
+        np.clip(linear, 0.0, 1.0, out=linear)
         return linear[0, 0] if image.shape == (1, 1) else linear
 
-    def _color_space(self, role: str, image: Image, entry: ColorEntry) -> ColorSpace:
-        """The given color space, else linear if the file declares it, else sRGB for integers."""
-        space: ColorSpace = "linear" if image.bits is None else "srgb"
-        why = "the default for " + ("floats" if image.bits is None else "integers")
+    def _color_space(self, role: str, image: Image, entry: ColorEntry) -> str:
+        """Name of the color space: given, else declared by the file, else by the kind of numbers."""
+        tags = image.tags
+        space, why = ("linear", "floats") if image.bits is None else ("srgb", "integers")
+        why = f"the default for {why}"
         if entry.colorspace is not None:
             space, why = entry.colorspace, "as configured"
-        elif image.tags.space == "linear":
-            space, why = "linear", "according to its gAMA chunk"
-        elif image.tags.foreign is not None:
-            self.warnings.append(
-                f"{image.path}: its {image.tags.foreign} is not applied, it is read as "
-                f"{'sRGB' if space == 'srgb' else 'linear'}; convert it to sRGB"
-            )
-        shown = "sRGB" if space == "srgb" else "linear"
+            if tags.declared is not None:
+                self.warnings.append(
+                    f"{image.path}: its {tags.declared.name} is not applied, as colorspace is given"
+                )
+        elif tags.declared is not None:
+            space, why = tags.declared.name, "as it declares, converted to linear Rec.709"
+        elif tags.space is not None:
+            space, why = tags.space, "as it declares" if tags.space != space else why
+        shown = "sRGB" if space == "srgb" else space
+        if entry.colorspace is None and tags.foreign is not None:
+            what = f"is not applied, it is read as {shown}; convert it to sRGB"
+            if tags.space is not None:
+                what = f"has the numbers of {shown} in spite of its name, and is read as that"
+            self.warnings.append(f"{image.path}: its {tags.foreign} {what}")
         self.notes.append(f"{role.replace('_', ' ')}: {image.path.name} read as {shown} ({why})")
         return space
 
@@ -215,7 +274,27 @@ class MapLoader:
         up = np.array([0.0, 0.0, 1.0], np.float32)
         return np.where(length > 1e-6, vectors / np.maximum(length, 1e-6), up).astype(np.float32)
 
-    def _within(self, role: str, numbers: Any, bad: Any) -> Any:
-        if bad.any():
-            raise InputError(f"{count_and_first(bad)} outside [0, 1]", where=self.files[role])
+    def _within(self, image: Image, numbers: Any) -> Any:
+        """Numbers (H, W) or (H, W, C) in [0, 1], clamped as far as compression and rounding may exceed it."""
+        if image.bits is not None:
+            return numbers
+        excess = _excess(numbers)
+        if excess <= 0:
+            return numbers
+        allowed = max(image.excess, _ROUNDING)
+        slack = 0.0 if image.compression else _ROUNDING
+        if excess > slack:
+            outside = (numbers < -slack) | (numbers > 1 + slack)
+            bad = outside if outside.ndim == 2 else outside.any(axis=-1)
+            what = f"{count_and_first(bad)} outside [0, 1]"
+            if excess > allowed:
+                more = f" by up to {excess:.3g}" if allowed > _ROUNDING else ""
+                raise InputError(f"{what}{more}", where=image.path, hint=_RANGE)
+            cause = f"{image.compression} compression" if image.compression else "the rounding of half floats"
+            self.warnings.append(f"{image.path}: {what}, by at most {excess:.2g}, within {cause}: clamped")
         return np.clip(numbers, 0.0, 1.0)
+
+
+def _excess(numbers: Any) -> float:
+    """By how much numbers leave [0, 1], at most."""
+    return max(-float(numbers.min()), float(numbers.max()) - 1.0)

@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from mbtf_core.config.settings import FileName, Settings
 from mbtf_core.data.schema import Tiling
-from mbtf_core.images.read import ColorSpace
+from mbtf_core.images.color_spaces import ColorSpace
 from mbtf_gen.config.generator import MAX_SCALE, Resolution, Rgb, Share
 
 Channel = Annotated[str, Field(min_length=1)]
@@ -62,7 +62,9 @@ class ColorEntry(_FileOrValue):
 
     value: Rgb | None = Field(None, description="one color, three numbers or one")
     colorspace: ColorSpace | None = Field(
-        None, description="default: srgb for integer images, linear for float images and values"
+        None,
+        description="default: as the file declares, else srgb for integer images, linear for float images; "
+        "linear for values",
     )
 
 

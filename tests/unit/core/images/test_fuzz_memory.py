@@ -78,6 +78,15 @@ def _jpg(side: int) -> bytes:
     return bytes(content)
 
 
+def _scans(count: int) -> bytes:
+    """A progressive JPG whose last scan comes `count` times."""
+    stream = io.BytesIO()
+    Image.new("L", (8, 8)).save(stream, "JPEG", progressive=True)
+    content = stream.getvalue()
+    last = content[content.rindex(b"\xff\xda") : -2]
+    return content[:-2] + last * (count - 1) + content[-2:]
+
+
 def _npy(descr: str, shape: str) -> bytes:
     text = f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}, }}".encode() + b"\n"
     return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text + bytes(64)
@@ -114,7 +123,9 @@ def write_claims(folder: Path, beside: Path) -> dict[str, str]:
     claims: dict[str, tuple[bytes, str]] = {
         "gray.png": (png(SIDE, SIDE, 8, 0, lines), "claims 60000 x 60000 pixels"),
         "cap.png": (png(11000, 11000, 8, 6, lines), "cannot hold 11000 x 11000 pixels"),
-        "side.jpg": (_jpg(SIDE), "claims more than 134,217,728 pixels"),
+        "side.jpg": (_jpg(SIDE), "claims 60000 x 60000 pixels"),
+        "scans.jpg": (_scans(200), "scans; at most 100 are read"),
+        "alike.png": (png(10900, 10900, 16, 6, bytes(20_000)), "0.89 GiB, in 20,0"),
         "side.tif": (_tiff(*_gray(SIDE, SIDE)), "claims 60000 x 60000 pixels"),
         "cap.tif": (_tiff(*_gray(11000, 11000)), "cannot hold 11000 x 11000 pixels"),
         "big.tif": (_tiff(*_gray(SIDE, SIDE), big=True), "claims 60000 x 60000 pixels"),

@@ -177,28 +177,28 @@ def test_kinds_that_would_lose_something_are_refused(tmp_path: Path) -> None:
 class TestGray:
     def test_exact_for_equal_channels(self) -> None:
         codes = rng().integers(0, 256, (4, 5, 1))
-        image = Image((np.repeat(codes, 3, axis=2) / 255).astype(np.float32), 8, Path("x.png"))
+        image = Image(np.repeat(codes, 3, axis=2).astype(np.uint8), Path("x.png"))
         numbers, warnings = gray(image)
         assert np.array_equal(numbers, codes[..., 0] / 255)
         assert warnings == []
         # Rounding of JPG is no color.
-        pixels = np.full((4, 5, 3), 100 / 255, np.float32)
-        pixels[0, 0, 1] = 102 / 255
-        assert gray(Image(pixels, 8, Path("x.jpg")))[1] == []
+        rounded = np.full((4, 5, 3), 100, np.uint8)
+        rounded[0, 0, 1] = 102
+        assert gray(Image(rounded, Path("x.jpg")))[1] == []
 
     def test_color_becomes_luminance_with_a_warning(self) -> None:
-        pixels = np.zeros((4, 5, 3), np.float32)
-        pixels[..., 1] = 0.5
-        numbers, warnings = gray(Image(pixels, 8, Path("x.png")))
-        assert numbers == pytest.approx(0.7152 * 0.5)
+        codes = np.zeros((4, 5, 3), np.uint8)
+        codes[..., 1] = 51
+        numbers, warnings = gray(Image(codes, Path("x.png")))
+        assert numbers == pytest.approx(0.7152 * 0.2)
         assert len(warnings) == 1
         assert "luminance" in warnings[0]
 
     def test_alpha_that_means_something_is_mentioned(self) -> None:
-        pixels = np.ones((4, 5, 2), np.float32)
-        assert gray(Image(pixels, 8, Path("x.png")))[1] == []
-        pixels[0, 0, 1] = 0.5
-        assert "alpha" in gray(Image(pixels, 8, Path("x.png")))[1][0]
+        codes = np.full((4, 5, 2), 255, np.uint8)
+        assert gray(Image(codes, Path("x.png")))[1] == []
+        codes[0, 0, 1] = 128
+        assert "alpha" in gray(Image(codes, Path("x.png")))[1][0]
 
 
 def test_srgb() -> None:

@@ -200,12 +200,14 @@ class TestColor:
             assert material.warnings == ()
             assert any(("read as sRGB" if bent else "read as linear") in note for note in material.notes)
 
-    def test_other_gammas_warn_and_are_not_applied(self, heights: Path) -> None:
+    def test_other_gammas_are_applied_unless_another_space_is_given(self, heights: Path) -> None:
         odd = (b"gAMA", (55556).to_bytes(4, "big"))
         material = self.color(heights, "", odd)
-        (warning,) = material.warnings
-        assert "gamma of 0.55556 is not applied, it is read as sRGB" in warning
-        assert self.color(heights, ", colorspace: linear", odd).warnings == ()
+        assert material.maps["base_color"] == pytest.approx((self.codes / 255) ** 1.8, abs=1e-4)
+        assert material.warnings == ()
+        material = self.color(heights, ", colorspace: linear", odd)
+        assert material.maps["base_color"] == pytest.approx(self.codes / 255, abs=1e-6)
+        assert "gamma of 0.55556 is not applied" in material.warnings[0]
 
 
 class TestNormals:

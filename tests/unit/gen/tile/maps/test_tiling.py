@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from support.height_maps import Floats, fractal, normals_of, save_heights, save_normals
 
+from mbtf_core.app.console import run
 from mbtf_core.data.schema import Tiling
 from mbtf_core.errors import InputError
+from mbtf_gen.cli.app import app
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 from mbtf_gen.tile.loading import load_material
 from mbtf_gen.tile.maps.normal_map import fit_normals
@@ -142,11 +144,12 @@ class TestMaterial:
         with pytest.raises(InputError, match="textures of its bsdf"):
             load_material(folder, "mirror")
 
-    def test_size_is_bounded(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("mbtf_gen.tile.assembly.MAX_PIXELS", 4 * 72 * 96 - 1)
+    def test_size_is_bounded(self, folder: Path) -> None:
         with pytest.raises(InputError, match="more than 27,647 pixels"):
-            load_material(folder, "mirror")
-        assert load_material(folder, "blend").height.shape == (72, 96)
+            load_material(folder, "mirror", 4 * 72 * 96 - 1)
+        assert load_material(folder, "blend", 4 * 72 * 96 - 1).height.shape == (72, 96)
+        with pytest.raises(InputError, match="96 x 72 pixels; at most 6,911"):
+            load_material(folder, max_pixels=72 * 96 - 1)
 
 
 def test_jobs_use_it(tmp_path: Path) -> None:
@@ -158,4 +161,8 @@ def test_jobs_use_it(tmp_path: Path) -> None:
     assert GeneratorConfig.model_validate({"material": "m"}).geometry.make_tileable is None
     job = Job.prepare(GeneratorConfig.model_validate(config))
     assert job.material.height.shape == (96, 96)
+    config["geometry"] = {"max_pixels": 48 * 48 - 1}
+    with pytest.raises(InputError, match="at most 2,303 are read"):
+        Job.prepare(GeneratorConfig.model_validate(config))
+    assert run(app, ["inspect", str(path), "--set", "geometry.max_pixels=2303"]) == 3
     assert job.material.tiling == "mirror"

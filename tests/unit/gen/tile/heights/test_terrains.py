@@ -1,0 +1,135 @@
+"""Terrains: missing data, heights in meters, and files that state the size of their pixels."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from support.image_files import rng
+
+from mbtf_core.app.console import run
+from mbtf_core.errors import InputError
+from mbtf_gen.cli.app import app
+from mbtf_gen.config.generator import GeometrySection
+from mbtf_gen.tile.loading import load_material
+
+DEFAULT = GeometrySection()
+
+
+def hills(rows: int = 32, columns: int = 48) -> np.ndarray:
+    x = 2 * np.pi * np.arange(columns) / columns
+    return np.broadcast_to(600 + 20 * np.sin(x), (rows, columns)).copy()
+
+
+def terrain(path: Path, heights: Any, *tags: tuple[int, int, Any]) -> Path:
+    """A TIFF with extra tags: (code, type, value)."""
+    extra = [(code, kind, 0 if kind == 2 else len(value), value, True) for code, kind, value in tags]
+    tifffile.imwrite(path, heights, extratags=extra)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("dtype", "nodata", "tag"),
+    [
+        ("f4", -9999, None),
+        ("f4", -9999, "-9999"),
+        ("f4", -3.4028234663852886e38, "-3.40282346638529e+38"),
+        ("f4", -3.4e38, None),
+        ("f4", 3.4e38, None),
+        ("f4", 555, "555"),
+        ("i2", -32768, None),
+        ("i2", -32768, "-32768"),
+        ("i4", -(2**31), None),
+        ("u2", 0, "0"),
+    ],
+)
+def test_missing_data_are_refused(tmp_path: Path, dtype: str, nodata: float, tag: str | None) -> None:
+    heights = hills().astype(dtype)
+    heights[3, 5:7] = nodata
+    tags = [] if tag is None else [(42113, 2, tag)]
+    path = terrain(tmp_path / "dem.tif", heights, *tags)
+    (tmp_path / "m.yaml").write_text("height: {file: dem.tif, scale: 0.0001}\n")
+    for given in (path, tmp_path / "m.yaml"):
+        with pytest.raises(InputError, match="2 pixels, the first at column 5, row 3,") as caught:
+            load_material(given)
+        assert "fill" in caught.value.hint
+
+
+def test_low_heights_and_unused_declarations_are_data(tmp_path: Path) -> None:
+    deep = np.linspace(-9999, 4000, 32 * 48).reshape(32, 48)
+    assert load_material(terrain(tmp_path / "sea.tif", deep.astype("i2"))).height.min() == -9999
+    path = terrain(tmp_path / "full.tif", hills().astype("f4"), (42113, 2, "-9999"))
+    assert load_material(path).height == pytest.approx(hills())
+    # Codes of 8 bits are never -9999, whatever that would be modulo 256.
+    codes = np.full((32, 48), -9999 % 256, np.uint8)
+    assert load_material(terrain(tmp_path / "byte.tif", codes, (42113, 2, "-9999"))).height_bits == 8
+
+
+def test_missing_data_of_other_maps_are_mentioned(tmp_path: Path) -> None:
+    np.save(tmp_path / "height.npy", 0.1 * rng().random((32, 48)))
+    codes = np.full((32, 48), 100, np.uint8)
+    codes[2, 4] = 0
+    terrain(tmp_path / "albedo.tif", codes, (42113, 2, "0"))
+    (warning,) = load_material(tmp_path).warnings
+    assert "1 pixel, at column 4, row 2, is without data" in warning
+
+
+def test_heights_in_meters_need_a_scale(tmp_path: Path) -> None:
+    np.save(tmp_path / "dem.npy", hills())
+    material = load_material(tmp_path / "dem.npy")
+    with pytest.raises(InputError, match=r"580 to 620 need a height scale") as caught:
+        _ = material.configured(DEFAULT).grid
+    assert f"{1 / 48:.4g}" in caught.value.hint
+    assert any("generation refuses it" in w for w in material.inspect(DEFAULT)["warnings"])
+    # Given, even as the default, it is what is meant.
+    for scale in (1 / 48, 1.0):
+        given = material.configured(GeometrySection(height_scale=scale))
+        assert given.grid.displacement_range == pytest.approx(40 * scale, rel=1e-3)
+    (tmp_path / "m.yaml").write_text(f"height: {{file: dem.npy, scale: {1 / 48}}}\n")
+    assert load_material(tmp_path / "m.yaml").configured(DEFAULT).grid is not None
+
+
+def test_written_choices_leave_the_scale_open(tmp_path: Path) -> None:
+
+    np.save(tmp_path / "dem.npy", hills())
+    assert run(app, ["inspect", str(tmp_path / "dem.npy"), "--write", str(tmp_path / "m.yaml")]) == 0
+    with pytest.raises(InputError, match="need a height scale"):
+        _ = load_material(tmp_path / "m.yaml").configured(DEFAULT).grid
+
+
+SCALE, TIE, MATRIX, KEYS = 33550, 33922, 34264, 34735
+DEGREES = (KEYS, 3, (1, 1, 0, 1, 1024, 0, 1, 2))
+
+
+@pytest.mark.parametrize(
+    ("dtype", "tags", "scale"),
+    [
+        ("f4", [(SCALE, 12, (30.0, 30.0, 0.0))], 1 / (48 * 30)),
+        # As codes, the unit is 1/65535.
+        ("u2", [(SCALE, 12, (30.0, 30.0, 0.0))], 65535 / (48 * 30)),
+        ("i2", [(MATRIX, 12, (3.0, 4.0, 0, 0, -4.0, 3.0, *[0.0] * 10))], 1 / (48 * 5)),
+        (
+            "i2",
+            [(SCALE, 12, (1 / 3600, 1 / 3600, 0.0)), (TIE, 12, (0, 0, 0, 7.0, 60.0, 0)), DEGREES],
+            3600 / (48 * 111320 * math.cos(math.radians(60))),
+        ),
+    ],
+)
+def test_the_size_of_pixels_gives_the_scale(tmp_path: Path, dtype: str, tags: Any, scale: float) -> None:
+    material = load_material(terrain(tmp_path / "dem.tif", hills().astype(dtype), *tags))
+    with pytest.raises(InputError, match="need a height scale") as caught:
+        _ = material.configured(DEFAULT).grid
+    suggested = float(caught.value.hint.split("--height-scale ")[1].split(",")[0])
+    # The matrix of pixels turned by 37° has columns 5 apart.
+    assert suggested == pytest.approx(scale, rel=1e-3)
+
+
+def test_fractions_of_a_tile_go_on(tmp_path: Path) -> None:
+    np.save(tmp_path / "h.npy", (hills() - 580) / 40)
+    grid = load_material(tmp_path / "h.npy").configured(DEFAULT).grid
+    assert grid is not None
+    assert grid.displacement_range == pytest.approx(1, rel=1e-3)
