@@ -27,12 +27,10 @@ _BYTES = 4
 _TILE_PIXELS = 1 << 20
 # Channels of one image, in order; Y comes after XYZ, which contains a Y.
 _SETS = ("RGB", "XYZ", "Y")
-# Rounding of half floats just above 1.
-_HALF = 2.0**-10
 # How far lossy compression may move numbers of [0, 1] out of that range. Measured on noise and edges: DWA at
 # its default level 45 by 0.013, in proportion to the level; B44 by 2e-5.
 _DWA_LEVEL, _DWA_PER_LEVEL, _DWA_MOST = 45.0, 1e-3, 0.25
-_PXR24 = 2.0**-15
+_LOSSY = {"B44": 2.0**-10, "B44A": 2.0**-10, "PXR24": 2.0**-15}
 
 
 @contextlib.contextmanager
@@ -90,22 +88,13 @@ def read_layers(path: Path, max_pixels: int) -> tuple[dict[str, NDArray[Any]], d
     return out, heads
 
 
-def lossy_excess(header: Mapping[str, Any], dtype: np.dtype[Any]) -> tuple[float, str]:
-    """By how much a file may exceed the range of the numbers that were saved, and the compression that does.
-
-    Parameters
-    ----------
-    header : of the part
-    dtype : type of the channels; half floats exceed by their rounding
-    """
+def lossy_excess(header: Mapping[str, Any]) -> tuple[float, str]:
+    """How far the compression of a part may move numbers out of their range, and its name; 0 if exact."""
     name = header["compression"].name.removesuffix("_COMPRESSION")
-    rounding = _HALF if dtype.itemsize == 2 else 0.0
     if name in ("DWAA", "DWAB"):
         level = float(header.get("dwaCompressionLevel", _DWA_LEVEL))
         return min(_DWA_PER_LEVEL * max(level, _DWA_LEVEL), _DWA_MOST), name
-    if name in ("B44", "B44A"):
-        return rounding, name
-    return (max(rounding, _PXR24), name) if name == "PXR24" else (rounding, "")
+    return (_LOSSY[name], name) if name in _LOSSY else (0.0, "")
 
 
 def read_parts(path: Path, max_pixels: int) -> dict[str, tuple[dict[str, Any], dict[str, NDArray[Any]]]]:

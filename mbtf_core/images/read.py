@@ -74,8 +74,7 @@ class Image:
     path : the file
     tags : what the file declares; not applied here
     channels : names of the selected channels; empty where the file has no others
-    excess : by how much the file's compression and number format may move floats out of their range
-    compression : its name, where it changes numbers; else empty
+    excess, compression : how far lossy compression may move floats out of their range, and its name
     """
 
     stored: NDArray[Any]
@@ -230,7 +229,7 @@ def _from_exr(path: Path, channel: str | None, prefer: Callable[[str], bool] | N
     names = choose_channels(list(channels), path, channel, prefer)
     check_floats({name: channels[name] for name in names}, path)
     image = _decoded(np.stack([channels[n] for n in names], axis=-1), path, tags=exr_tags(headers[names[0]]))
-    excess, compression = lossy_excess(headers[names[0]], image.stored.dtype)
+    excess, compression = lossy_excess(headers[names[0]])
     several = tuple(names) if len(channels) > len(names) else ()
     return replace(image, channels=several, excess=excess, compression=compression)
 

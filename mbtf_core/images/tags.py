@@ -46,6 +46,7 @@ class Tags:
     orientation : of EXIF; 1 is upright
     nodata : number that stands for missing data
     pixel_size : distance of neighboring columns, in meters or the file's own unit
+    unused : what else the file holds, as warnings
     """
 
     space: ColorSpace | None = None
@@ -54,6 +55,7 @@ class Tags:
     orientation: int = 1
     nodata: float | None = None
     pixel_size: float | None = None
+    unused: tuple[str, ...] = ()
 
 
 NO_TAGS = Tags()

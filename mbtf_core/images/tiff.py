@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -15,6 +16,8 @@ from mbtf_core.images.tags import Tags, tiff_tags
 
 # Photometric interpretations that are read here.
 _INVERTED, _GRAY, _RGB = 0, 1, 2
+# Bits of the type of a page.
+_REDUCED, _MASK = 1, 4
 _SHORT = "cannot be read as a TIFF image (file ends early)"
 
 
@@ -44,12 +47,23 @@ def read_tiff(path: Path, max_pixels: int) -> tuple[NDArray[Any] | None, Tags]:
     try:
         with tifffile.TiffFile(path) as file:
             page: Any = file.pages[0]
-            tags = tiff_tags(page.tags)
+            tags = replace(tiff_tags(page.tags), unused=_unused(file))
             return _numbers(page, path, max_pixels), tags
     except InputError:
         raise
     except Exception as error:  # a damaged file may make the decoder raise anything
         raise InputError(f"cannot be read as a TIFF image ({reason(error)})", where=path) from None
+
+
+def _unused(file: Any) -> tuple[str, ...]:
+    """What the second page is, unless the first one in a smaller size."""
+    try:
+        kind = int(file.pages[1].subfiletype)
+    except Exception:  # there is none, or it is damaged, which does not concern the first one
+        return ()
+    if kind & _REDUCED:
+        return ()
+    return ("its mask is not used",) if kind & _MASK else ("only the first of its pages is used",)
 
 
 def _numbers(page: Any, path: Path, max_pixels: int) -> NDArray[Any] | None:

@@ -16,7 +16,7 @@ from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
 from mbtf_core.images.read import LUMINANCE
 from mbtf_core.images.resample import resample
-from mbtf_gen.config.generator import GeometrySection, NormalMode, Tracer
+from mbtf_gen.config.generator import MAX_SCALE, GeometrySection, NormalMode, Tracer
 from mbtf_gen.tile.heights import (
     HeightGrid,
     detail_size,
@@ -144,6 +144,8 @@ class HeightFieldTile(Tile):
                 f"give --height-scale {scale:.4g}, 1 / {facts.columns} columns, where pixels are 1 apart in "
                 "the unit of the heights; 1 where that is the tile's width"
             )
+        if scale > MAX_SCALE:
+            return what, f"save them as floats: as integers they need {scale:.4g}, more than {MAX_SCALE}"
         apart = f"its pixels are {facts.pixel_size:.6g} apart"
         return what, f"give --height-scale {scale:.4g}, as {apart}, where heights have the same unit"
 

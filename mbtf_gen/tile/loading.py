@@ -30,6 +30,13 @@ Described = MaterialFile | ClothFile | MeshFile
 # Files that are imported, not rendered.
 MEASURED_FILES = (".btf", ".h5", ".hdf5")
 
+# Terrains without a header that states their size and type.
+_RAW = (".raw", ".r16", ".r32", ".hgt", ".bil", ".flt")
+_RAW_HINT = (
+    "convert it to a TIFF, such as by gdal_translate, or in Python: "
+    "numpy.save('h.npy', numpy.fromfile(FILE, '<u2').reshape(ROWS, COLUMNS))"
+)
+
 _YAML = ("material.yaml", "material.yml")
 
 # Bytes of the maps up to which the latest tile is kept: a training process has no use for larger ones.
@@ -154,6 +161,7 @@ def described(path: Path) -> tuple[Described, Path, FoundMaps]:
             f"'{path.suffix}' is not a height map",
             where=path,
             hint=unpack(path)
+            or (_RAW_HINT if suffix in _RAW else "")
             or f"give a folder, a .yaml file, or {', '.join((*SUFFIXES, *MESH_FILES, *CURVE_FILES))}",
         )
     spec = MaterialFile.model_validate({"height": path.name})

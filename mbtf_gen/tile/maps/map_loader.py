@@ -23,7 +23,8 @@ from mbtf_gen.tile.maps.normal_encoding import height_of, stored_xy
 Color = NDArray[np.floating[Any]]
 Share = NDArray[np.float64] | float | None
 
-_ROUNDING = 1e-6
+# Rounding of numbers about 1, and of half floats.
+_ROUNDING, _HALF = 1e-6, 2.0**-10
 # Rounding of matrices and profiles, beyond which colors out of Rec.709 are reported.
 _GAMUT = 1e-3
 _RANGE = "its numbers belong into [0, 1]: scale them, or clamp them in an image editor"
@@ -115,6 +116,7 @@ class MapLoader:
             self.settings[f"{role}.channel"] = entry.channel
         elif image.channels:
             self.notes.append(f"{role}: channels {', '.join(image.channels)} of {path.name}")
+        self.warnings += [f"{path}: {text}" for text in image.tags.unused]
         if image.tags.orientation != 1:
             self.warnings.append(
                 f"{path}: its EXIF orientation ({image.tags.orientation}) is ignored, as for every map; "
@@ -281,7 +283,7 @@ class MapLoader:
         excess = _excess(numbers)
         if excess <= 0:
             return numbers
-        allowed = max(image.excess, _ROUNDING)
+        allowed = max(image.excess, _HALF if image.stored.dtype == np.float16 else _ROUNDING)
         slack = 0.0 if image.compression else _ROUNDING
         if excess > slack:
             outside = (numbers < -slack) | (numbers > 1 + slack)

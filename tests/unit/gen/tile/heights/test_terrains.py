@@ -133,3 +133,25 @@ def test_fractions_of_a_tile_go_on(tmp_path: Path) -> None:
     grid = load_material(tmp_path / "h.npy").configured(DEFAULT).grid
     assert grid is not None
     assert grid.displacement_range == pytest.approx(1, rel=1e-3)
+
+
+def test_a_scale_beyond_the_largest_is_not_suggested(tmp_path: Path) -> None:
+    path = terrain(tmp_path / "dem.tif", hills().astype("u2"), (SCALE, 12, (1.0, 1.0, 0.0)))
+    with pytest.raises(InputError, match="need a height scale") as caught:
+        _ = load_material(path).configured(DEFAULT).grid
+    assert "as floats" in caught.value.hint
+
+
+@pytest.mark.parametrize(("kind", "word"), [(4, "mask"), (2, "first"), (1, None)])
+def test_further_pages_are_mentioned(tmp_path: Path, kind: int, word: str | None) -> None:
+    heights = (0.001 * (hills() - 600)).astype("f4")
+    with tifffile.TiffWriter(tmp_path / "h.tif") as file:
+        file.write(heights)
+        # Masks have one bit.
+        second = np.ones((16, 24), bool if kind == 4 else np.uint8)
+        file.write(second, subfiletype=kind, photometric="minisblack")
+    material = load_material(tmp_path / "h.tif")
+    assert material.height == pytest.approx(heights)
+    (*found,) = (w for w in material.warnings if "not used" in w or "is used" in w)
+    assert len(found) == (word is not None)
+    assert all(str(word) in w for w in found)
