@@ -51,6 +51,13 @@ def numbers_of(value: Value) -> NDArray[np.floating[Any]]:
     return np.asarray(value, np.float64)
 
 
+def of_faces(values: F64, faces: NDArray[np.int64]) -> F64:
+    """Those of the vertices' values (n, ...) that triangles (m, 3) use."""
+    used = np.zeros(len(values), bool)
+    used[faces] = True
+    return values[used]
+
+
 @dataclass(frozen=True)
 class MeshShape:
     """Triangles of one material.

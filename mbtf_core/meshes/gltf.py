@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
-from mbtf_core.meshes.content import F64, MOST_TRIANGLES, MeshContent, MeshShape
+from mbtf_core.meshes.content import F64, MOST_TRIANGLES, MeshContent, MeshShape, of_faces
 from mbtf_core.meshes.gltf_buffers import FLOAT, HINTS, READ, GltfFile
 from mbtf_core.meshes.gltf_material import Materials
 from mbtf_core.meshes.gltf_schema import GltfInstancing, GltfMaterial, GltfMesh, GltfNode, GltfPrimitive
@@ -97,7 +97,7 @@ def read_gltf(path: Path) -> MeshContent:
                 raise InputError(f"has {total:,} triangles, more than {MOST_TRIANGLES:,}", where=path)
             if not len(piece.faces):
                 continue
-            places = _related(piece.uv, np.unique(piece.faces))
+            places = _related(piece.uv, piece.faces)
             # One matrix for all primitives, unless several sets of coordinates are placed on one.
             own = (number, position) if len(places) > 1 else None
             key = (primitive.material, tuple(places), piece.colors is None, piece.normals is None, own)
@@ -290,13 +290,13 @@ def _colors(file: GltfFile, primitive: GltfPrimitive, material: GltfMaterial, co
     return np.clip(colors[:, :3], 0.0, 1.0)
 
 
-def _related(uv: Mapping[int, F64], used: NDArray[np.intp]) -> dict[int, F64]:
+def _related(uv: Mapping[int, F64], faces: Faces) -> dict[int, F64]:
     """Matrices (3, 3) that turn texture coordinates (u, v, 1) of the first set into those of each set; sets
     that do not follow from the first by a matrix are left out."""
     out: dict[int, F64] = {}
     first: F64 | None = None
     for number, values in uv.items():
-        own = values[used]
+        own = of_faces(values, faces)
         if first is None:
             first = np.column_stack([own, np.ones(len(own))])
             out[number] = np.eye(3)

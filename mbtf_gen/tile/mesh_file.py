@@ -14,7 +14,7 @@ from mbtf_core.config.settings import FileName, Settings
 from mbtf_core.data.schema import Tiling
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import data_sha256, file_sha256
-from mbtf_core.meshes.content import MOST_TRIANGLES, MeshShape, Value, numbers_of
+from mbtf_core.meshes.content import MOST_TRIANGLES, MeshShape, Value, numbers_of, of_faces
 from mbtf_core.meshes.read import read_mesh_content
 from mbtf_core.meshes.up_axis import y_seems_up
 from mbtf_core.paths import named_file
@@ -84,7 +84,7 @@ def read_mesh(spec: MeshFile, folder: Path) -> MeshTile:
         warnings.append(f"{path}: it looks like y is up: if so, give 'up: y' in a material.yaml")
     if up == "y":
         vertices = vertices[:, [0, 2, 1]] * (1.0, -1.0, 1.0)
-    used = vertices[np.unique(faces)]
+    used = of_faces(vertices, faces)
     low, high = used.min(axis=0), used.max(axis=0)
     width, height = spec.period or (high[0] - low[0], high[1] - low[1])
     if not (width > 0 and height > 0):
@@ -134,7 +134,7 @@ def _shape(shape: MeshShape, spec: MeshFile, path: Path) -> MeshShape:
     vertices, faces = shape.vertices, shape.faces
     if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise InputError(f"'{shape.name}' has a triangle of vertices that it lacks", where=path)
-    used = vertices[np.unique(faces)]
+    used = of_faces(vertices, faces)
     if not np.isfinite(used).all() or np.abs(used).max(initial=0.0) > 1e15:
         raise InputError(f"'{shape.name}' has vertices that are not finite numbers below 1e15", where=path)
     edges = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
@@ -148,12 +148,11 @@ def _shape(shape: MeshShape, spec: MeshFile, path: Path) -> MeshShape:
     try:
         found = with_vertex_colors(found)
         values = _complete(found.values)
+        uv = None if found.uv is None else of_faces(found.uv, found.faces)
         for role, value in values.items():
-            _check(found, role, value)
-        uv = found.uv
-        if uv is not None and len(found.faces):
-            reached = uv[np.unique(found.faces)]
-            values = {role: with_one_wrap(value, reached, shape.name) for role, value in values.items()}
+            _check(shape.name, role, value, uv)
+        if uv is not None and len(uv):
+            values = {role: with_one_wrap(value, uv, shape.name) for role, value in values.items()}
     except InputError as error:
         raise InputError(error.what, where=error.where or path, hint=error.hint) from None
     return replace(found, values=values)
@@ -170,19 +169,18 @@ def _complete(values: dict[str, Value]) -> dict[str, Value]:
     return {**defaults, **values}
 
 
-def _check(shape: MeshShape, role: str, value: Value) -> None:
-    """Refuse numbers out of range, and textures that nothing places."""
+def _check(name: str, role: str, value: Value, uv: F64 | None) -> None:
+    """Refuse numbers out of range, and textures that the texture coordinates of a part do not place."""
     most = _MOST.get(role, 1.0)
     if isinstance(value, tuple):
-        used = None if shape.uv is None else shape.uv[np.unique(shape.faces)]
-        if used is None or not np.isfinite(used).all() or not np.isfinite(value[0].to_uv).all():
-            raise InputError(f"'{shape.name}' has no valid texture coordinates for its {role}")
+        if uv is None or not np.isfinite(uv).all() or not np.isfinite(value[0].to_uv).all():
+            raise InputError(f"'{name}' has no valid texture coordinates for its {role}")
         # Texels beyond what a triangle shows may be out of range.
         value = value[1]
     numbers = numbers_of(value)
     if not (np.isfinite(numbers).all() and numbers.min() >= 0.0 and numbers.max() <= most):
         text = ", ".join(f"{number:g}" for number in numbers.ravel())
-        raise InputError(f"'{shape.name}' has the {role} {text}, not within 0 and {most:g}")
+        raise InputError(f"'{name}' has the {role} {text}, not within 0 and {most:g}")
 
 
 def _joined(shapes: list[MeshShape], path: Path) -> tuple[F64, NDArray[np.int_], F64, NDArray[np.int_]]:

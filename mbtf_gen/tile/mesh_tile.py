@@ -115,8 +115,8 @@ class MeshTile(Tile):
         links = coo_array((np.ones(len(near)), near.T), (len(place), len(place)))
         _, same = connected_components(links, directed=False)
         ends = np.stack([self.faces, np.roll(self.faces, -1, axis=1)], axis=-1).reshape(-1, 2)
-        welded = np.sort(same[ends], axis=1)
-        _, index, count = np.unique(welded, axis=0, return_index=True, return_counts=True)
+        welded = np.sort(same[ends].astype(np.int64), axis=1) @ (len(self.vertices), 1)
+        _, index, count = np.unique(welded, return_index=True, return_counts=True)
         alone = self.vertices[ends[index[count == 1]]][:, :, :2] / size
         on_border = (np.abs(alone - np.rint(alone)) < _SAME).all(axis=1).any(axis=1)
         return len(alone), int(on_border.sum())
