@@ -125,6 +125,8 @@ class _Lines:
                 others.add(_OTHERS[word])
         self.materials = list(known)
         self.runs = np.array(runs, np.int64).reshape(-1, 6)
+        if b"#MRGB " in data:
+            others.add("colors of ZBrush")
         self.warnings = [f"its {', '.join(sorted(others))} are not used"] if others else []
 
     def positions(self) -> tuple[F64, F64 | None]:
