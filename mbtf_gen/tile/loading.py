@@ -52,7 +52,7 @@ def load_material(path: str | Path, tiling: Tiling | None = None, max_pixels: in
     path : str or Path
         A height map, a ``material.yaml``, a folder that contains one or maps with customary names, a mesh
         (``.glb``, ``.gltf``, ``.ply``, ``.obj``), or a file of yarns or fibers (``.pyp``, ``.bcc``,
-        ``.curves``). Other maps beside a height map are ignored.
+        ``.curves``, ``.txt``). Other maps beside a height map are ignored.
     tiling : {"none", "mirror", "blend"} or None
         Method for maps that do not tile. ``mirror``: 2 × 2 mirrored copies, a tile of twice the width;
         ``blend``: the edges blended over an eighth of the tile (:mod:`mbtf_gen.tile.maps.tiling`); None:

@@ -12,6 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mbtf_core.errors import InputError, MbtfError
+from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.job import Job
+from mbtf_gen.planning.run_plan import plan_effects
 from mbtf_gen.tile.loading import load_material
 from mbtf_gen.tile.mesh_tile import MeshTile
 
@@ -148,3 +151,12 @@ def test_the_material_file_replaces_the_reflectance(tmp_path: Path) -> None:
     digests = load_material(path).digests
     path.write_text("mesh: a.ply\nbase_color: [0.1, 0.2, 0.3]\nroughness: 0.5\n")
     assert load_material(path).digests != digests
+
+
+def test_a_flat_mesh_is_zero_thick_and_traced_as_a_mesh(tmp_path: Path) -> None:
+    (tmp_path / "flat.ply").write_text(PLY.replace("0.1", "0"))
+    shape = shape_of(tmp_path / "flat.ply")
+    assert f"{shape.thickness:g}" == "0"
+    config = GeneratorConfig.model_validate({"material": "m"})
+    # Where a ray meets a height map without heights is known, but not the triangle of a mesh.
+    assert "parallax" in {e.name for e in plan_effects(Job.of(config, shape), pilots=False).effects if e.on}

@@ -13,8 +13,9 @@ from support.paths import ASSETS
 from mbtf_core.errors import InputError, MbtfError, UsageError
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job, received_job
+from mbtf_gen.tile.cloth import loose_ends
 from mbtf_gen.tile.fiber_tile import FiberScattering, FiberTile, absorption
-from mbtf_gen.tile.fibers.curves import Bundle
+from mbtf_gen.tile.fibers.curves import Bundle, Curve
 from mbtf_gen.tile.loading import load_material
 
 # Sum of all control points and radii of the basket weave.
@@ -129,12 +130,11 @@ def test_curves_that_do_not_repeat_are_noted(tmp_path: Path) -> None:
         assert len(load_material(path).warnings) == count
 
 
-def test_ends_beside_the_corner_have_partners(tmp_path: Path) -> None:
+def test_ends_beside_the_corner_have_partners() -> None:
     """The remainder of -1e-17 by a period is the period."""
-    rows = ("".join(f"{x / 4} {y} 0 .01\n" for x in range(-1, 6)) for y in ("-1e-17", "0.5"))
-    (tmp_path / "a.curves").write_text("\n".join(rows))
-    path = write(tmp_path, "curves: a.curves\nperiod: [1, 1]\n")
-    assert load_material(path).warnings == ()
+    x = np.arange(-1, 6)[:, None] / 4
+    curves = [Curve(x * [1.0, 0, 0, 0] + [0.0, y, 0.0, 0.01]) for y in (-1e-17, 0.5)]
+    assert loose_ends(FiberTile(1.0, curves, np.zeros(2, int), np.ones((1, 3)))) == 0
 
 
 @pytest.mark.parametrize(("radius", "accepted"), [("1.01e-5", True), ("0.99e-5", False)])
