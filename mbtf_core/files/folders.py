@@ -401,8 +401,10 @@ class OutputFolder:
         self._keep(name, {file: self._stored(file) for file in names}, facts)
 
     def _keep(self, name: str, files: dict[str, Stored], facts: Mapping[str, Any]) -> None:
-        self._record.items[name] = _Item(files=files, facts=dict(facts))
-        self._save()
+        item = _Item(files=files, facts=dict(facts))
+        if self._record.items.get(name) != item:
+            self._record.items[name] = item
+            self._save()
 
     def add(self, name: str, write: Callable[[Path], Stored]) -> Stored:
         """Write a file with ``write(path)``, atomically, unless it is finished; its size and digest.

@@ -129,8 +129,13 @@ def export_material(
     names = dict.fromkeys([DESCRIPTION_NAME, *(name for t in targets().values() for name in t.files)])
     with (
         owned(folder),
-        nullcontext() if beside else OutputFolder.claim(folder, EXPORT, depends, names, overwrite=overwrite),
+        nullcontext()
+        if beside
+        else OutputFolder.claim(folder, EXPORT, depends, names, overwrite=overwrite) as claimed,
     ):
+        if claimed is not None:
+            # Refuses to replace files that have changed.
+            claimed.finished(EXPORT.format)
         written, error = to_half(loaded) if half else (loaded, None)
         export = Export(material, folder, written, half, _is_material(folder), console)
         if error is not None:
@@ -138,6 +143,8 @@ def export_material(
         files: list[str] = []
         for target, section in zip(wanted, options, strict=True):
             files += target.write(export, section)
+        if claimed is not None:
+            claimed.keep(EXPORT.format, [folder / name for name in dict.fromkeys(files)], {})
     sizes = {name: (folder / name).stat().st_size for name in dict.fromkeys(files)}
     lines = [f"{folder / name}: {size / 1e6:.3f} MB" for name, size in sizes.items()]
     report = {"folder": folder, "files": sizes, "half": None if error is None else asdict(error)}

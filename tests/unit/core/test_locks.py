@@ -74,9 +74,10 @@ def test_the_lock_of_a_living_process_is_respected_however_old(shard: Path) -> N
     child = hold(shard)
     try:
         assert json.loads(lock_of(shard).read_text())["process"] == child.pid
-        os.utime(lock_of(shard), (0, 0))
-        with shard_lock(shard) as held:
-            assert not held
+        for date in (0.0, time.time() + 1e6):
+            os.utime(lock_of(shard), (date, date))
+            with shard_lock(shard) as held:
+                assert not held
     finally:
         child.communicate()
     assert not lock_of(shard).exists()
@@ -127,13 +128,48 @@ def test_of_many_that_take_over_at_once_one_gets_it(shard: Path) -> None:
     assert not lock_of(shard).exists()
 
 
-def test_without_advisory_locks(shard: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def no_advisory_locks(monkeypatch: pytest.MonkeyPatch) -> None:
     """The file itself is the lock."""
 
     def unsupported(handle: int, operation: int) -> None:
         raise OSError(errno.ENOSYS, "not implemented")
 
     monkeypatch.setattr("fcntl.flock", unsupported)
+
+
+@pytest.mark.usefixtures("no_advisory_locks")
+@pytest.mark.parametrize(
+    ("age", "free"), [(0, False), (200, False), (400, True), (-200, False), (-400, True), (-1e8, True)]
+)
+def test_dates_of_locks_of_other_machines(
+    shard: Path, monkeypatch: pytest.MonkeyPatch, age: float, free: bool
+) -> None:
+    """Compared with the time of the file system: the clock of this machine is a year behind."""
+    with shard_lock(shard) as held:
+        assert held
+        text = lock_of(shard).read_text().replace(socket.gethostname(), "oak")
+    plant(shard, text, age)
+    now = time.time()
+    monkeypatch.setattr("mbtf_core.locks.time.time", lambda: now - 3e7)
+    with shard_lock(shard) as held:
+        assert held is free
+        assert lock_of(shard).exists()
+    assert lock_of(shard).exists() is not free
+
+
+@pytest.mark.usefixtures("no_advisory_locks")
+def test_a_living_owner_renews_its_lock(shard: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mbtf_core.locks._RENEWAL_SECONDS", 0.01)
+    with shard_lock(shard):
+        os.utime(lock_of(shard), (0, 0))
+        while lock_of(shard).stat().st_mtime == 0:
+            time.sleep(0.01)
+    assert not lock_of(shard).exists()
+
+
+@pytest.mark.usefixtures("no_advisory_locks")
+def test_without_advisory_locks(shard: Path) -> None:
     with shard_lock(shard) as held:
         assert held
         with shard_lock(shard) as second:
@@ -144,9 +180,10 @@ def test_without_advisory_locks(shard: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 def test_lock_owners_are_named(shard: Path) -> None:
     assert lock_owner(shard) is None
-    since = time.time() - 7300
-    plant(shard, json.dumps({"host": "oak", "process": 12, "since": since}))
-    assert lock_owner(shard) == "process 12 on oak, for 2 h"
+    # The clock of its machine may be wrong.
+    for since in (time.time(), time.time() + 1e6):
+        plant(shard, json.dumps({"host": "oak", "process": 12, "since": since}), 7300)
+        assert lock_owner(shard) == "process 12 on oak, for 2 h"
     for text in ("", "{", '{"host": "oak"}', '{"host": "oak", "process": "x", "since": 0}'):
         plant(shard, text)
         assert lock_owner(shard) is None

@@ -52,6 +52,22 @@ def test_an_unfinished_export_is_resumed(source: Path, tmp_path: Path, lost: tup
     assert Material.load(out).deviation() < 1e-4
 
 
+@pytest.mark.parametrize(("to", "name"), [("json", "layers.json"), ("web", "viewer.html")])
+def test_an_edited_file_is_replaced_on_request_only(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], to: str, name: str
+) -> None:
+    out = tmp_path / "out"
+    line = ["export", str(source), "--to", to, "-o", str(out)]
+    assert run(app, line) == 0
+    content = (out / name).read_text()
+    (out / name).write_text(content.replace("mbtf", "mine", 1))
+    assert run(app, line) == 3
+    assert f"{name}: has been edited" in capsys.readouterr().err
+    assert "mine" in (out / name).read_text()
+    assert run(app, [*line, "--overwrite"]) == 0
+    assert (out / name).read_text() == content
+
+
 def test_another_export_is_refused_unless_told(
     source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
