@@ -44,6 +44,7 @@ from mbtf_core.errors import (
     EXIT_OK,
     EXIT_USAGE,
     MbtfError,
+    UsageError,
     printable,
     reason,
 )
@@ -209,6 +210,22 @@ def _library_warnings(shown: bool) -> Iterator[None]:
         yield
 
 
+def _check_tokens(tokens: Sequence[str]) -> None:
+    """Refuse empty arguments, which paths would take as the current folder, and those that are not text.
+
+    Raises
+    ------
+    UsageError : there is one
+    """
+    for before, token in zip(("", *tokens), tokens, strict=False):
+        if token in ("", "--output=", "-o="):
+            where = (token or before).rstrip("=")
+            hint = "check the variable of the shell that it is made from"
+            raise UsageError("is empty", where=where if where.startswith("-") else "an argument", hint=hint)
+        if not token.isascii() and any("\ud800" <= c <= "\udfff" for c in token):
+            raise UsageError("is not UTF-8 text", where=token, hint="rename the file or folder")
+
+
 def run(app: App, argv: Sequence[str] | None = None) -> int:
     """Run a command line and return its exit code; no exception leaves except SystemExit.
 
@@ -235,6 +252,7 @@ def run(app: App, argv: Sequence[str] | None = None) -> int:
             stream.reconfigure(errors="replace")
     try:
         with signals.raising(), _library_warnings(debug):
+            _check_tokens(tokens)
             result = app(tokens)
         # None where it was closed before the start.
         if sys.stdout is not None:

@@ -28,7 +28,7 @@ from dataclasses import dataclass, make_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Generic, Literal, TypeVar, Union
 
-from cyclopts import Parameter
+from cyclopts import Parameter, Token
 from pydantic import BaseModel, TypeAdapter
 from pydantic.fields import FieldInfo
 
@@ -49,6 +49,16 @@ else:
     # A path as it was given, of type str; shells complete it as a file.
     PathText = str | Path
 Switch = Annotated[bool, Parameter(negative="", show_default=False)]
+
+
+def whole_number(kind: object, tokens: Sequence[Token]) -> int:
+    """Converter of options outside configurations: cyclopts itself rounds 8.5 to 8.
+
+    Raises
+    ------
+    ValueError : no whole number
+    """
+    return int(tokens[0].value)
 
 
 def _refuse_url(kind: object, path: Path) -> None:

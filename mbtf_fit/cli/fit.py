@@ -22,6 +22,7 @@ from mbtf_core.app.options import (
     Switch,
     Verbose,
     options_from,
+    whole_number,
 )
 from mbtf_core.app.progress import Progress
 from mbtf_core.errors import InputError, PartialError, UsageError
@@ -48,7 +49,9 @@ def fit(
     quality: QualityOption = None,
     options: FitOptions = FitOptions(),  # noqa: B008
     many: Annotated[list[Path] | None, Parameter(consume_multiple=True)] = None,
-    processes: Annotated[int | None, Parameter(show_default="one per GPU, or 1")] = None,
+    processes: Annotated[
+        int | None, Parameter(converter=whole_number, show_default="one per GPU, or 1")
+    ] = None,
     shared_decoder: Switch = False,
     live: Live = False,
     tensorboard: Annotated[Path | None, Parameter(metavar="FOLDER")] = None,

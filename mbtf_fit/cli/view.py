@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
 
 from mbtf_core.app.console import CONSOLE, Console
+from mbtf_core.app.options import whole_number
 from mbtf_core.run.signals import served_until_interruption
 from mbtf_fit.cli.export import SectionFlags, flags_of
 from mbtf_fit.export.web import PageOptions, make_page
@@ -21,7 +25,7 @@ def view(
     /,
     *,
     flags: PageFlags = PageFlags(),  # noqa: B008
-    port: int = 0,
+    port: Annotated[int, Parameter(converter=whole_number)] = 0,
     console: Console = CONSOLE,
 ) -> None:
     """Show a material in the browser: mbtf-fit view material/

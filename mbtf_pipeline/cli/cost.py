@@ -8,7 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from mbtf_core.app.console import CONSOLE, Console
-from mbtf_core.app.options import ClusterOption, Output, Set, command_line
+from mbtf_core.app.options import ClusterOption, Output, Set, command_line, whole_number
 from mbtf_core.errors import UsageError
 
 
@@ -19,7 +19,7 @@ def cost(
     output: Annotated[Output | None, Parameter(show_default="out/NAME-cost")] = None,
     time: Annotated[str, Parameter(metavar="DURATION")] = "10min",
     refine: Annotated[str | None, Parameter(metavar="DURATION")] = None,
-    seed: Annotated[int | None, Parameter(show_default="the recipe's")] = None,
+    seed: Annotated[int | None, Parameter(converter=whole_number, show_default="the recipe's")] = None,
     cluster: ClusterOption = None,
     assignments: Set = None,
     console: Console = CONSOLE,

@@ -85,3 +85,22 @@ def test_control_characters_are_escaped(
 ) -> None:
     monkeypatch.chdir(folder)
     assert "two\\nlines" in message(["mbtf-gen", *words]) or "\n" not in "".join(words)
+
+
+@pytest.mark.parametrize(
+    ("words", "essential"),
+    [
+        (["mbtf-gen", ""], "is empty"),
+        (["mbtf-gen", "heights.npy", "-o", ""], "-o: is empty"),
+        (["mbtf-gen", "heights.npy", "--output="], "--output: is empty"),
+        (["mbtf-gen", "verify", "caf\udce9"], "not UTF-8"),
+        (["mbtf-fit", "shards", "-o", "caf\udce9"], "not UTF-8"),
+        (["mbtf-fit", "view", "nothing", "--port", "8.5"], "--port"),
+        (["mbtf-fit", "--many", "shards", "shards", "--processes", "1.5"], "--processes"),
+    ],
+)
+def test_arguments_that_mean_something_else(
+    words: list[str], essential: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    assert essential in message(words)
