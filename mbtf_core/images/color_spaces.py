@@ -45,6 +45,8 @@ _CODED = {
 }
 # Tolerance of the comparison of chromaticities, of matrices and of curves.
 _SAME = 2e-3
+# Tolerance of the ends of a curve.
+_ENDS = 0.2
 # Cone responses of Bradford.
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
 # White of the connection space of ICC profiles.
@@ -179,18 +181,29 @@ def from_icc(profile: bytes, name: str) -> DeclaredSpace:
         for i in range(min(count, 200)):
             key, offset, size = struct.unpack_from(">4sII", profile, 132 + 12 * i)
             tags[key] = profile[offset : offset + size]
-        if space == b"GRAY":
-            return DeclaredSpace(printable(name), (_curve(tags[b"kTRC"]),))
-        if space != b"RGB " or connection != b"XYZ ":
+        gray = space == b"GRAY"
+        if not gray and (space != b"RGB " or connection != b"XYZ "):
             raise ValueError("not a matrix")
+        curves = tuple(_curve(tags[key]) for key in ((b"kTRC",) if gray else (b"rTRC", b"gTRC", b"bTRC")))
+        if gray:
+            return DeclaredSpace(printable(name), curves)
         columns = [struct.unpack_from(">3i", tags[key], 8) for key in (b"rXYZ", b"gXYZ", b"bXYZ")]
-        curves = tuple(_curve(tags[key]) for key in (b"rTRC", b"gTRC", b"bTRC"))
         return DeclaredSpace(printable(name), curves, _to_rec709(np.array(columns).T / 65536.0, _D50))
     except (KeyError, struct.error, np.linalg.LinAlgError) as error:
         raise ValueError("damaged, or of another kind") from error
 
 
 def _curve(tag: bytes) -> Curve:
+    """The curve of an element, which rises from about 0 to about 1."""
+    curve = _element(tag)
+    with np.errstate(all="ignore"):
+        ends = curve(np.linspace(0.0, 1.0, 256))[[0, -1]]
+    if not np.abs(ends - (0.0, 1.0)).max() < _ENDS:
+        raise ValueError("no curve")
+    return curve
+
+
+def _element(tag: bytes) -> Curve:
     """A ``curv`` or ``para`` element of an ICC profile (ICC.1:2022, 10.6, 10.18)."""
     if tag[:4] == b"curv":
         (count,) = struct.unpack_from(">I", tag, 8)

@@ -150,6 +150,8 @@ def test_unsupported_declarations_are_named(tmp_path: Path) -> None:
         ((b"cICP", bytes([9, 16, 0, 1])), "cICP chunk"),
         ((b"cICP", bytes([9])), "cICP chunk"),
         ((b"cHRM", bytes(32)), "chromaticities"),
+        ((b"iCCP", b"x\0\0" + zlib.compress(icc("Odd", P3_COLUMNS, para(0, -2.0)))), "color profile 'Odd'"),
+        ((b"iCCP", b"x\0\0" + zlib.compress(icc("P3", P3_COLUMNS, table(2.0, 9)[:20]))), "color profile"),
     ):
         assert what in (read_image(png(tmp_path / "x.png", codes, 2, 8, extra=(chunk,))).tags.foreign or "")
 
