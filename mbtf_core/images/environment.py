@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from pathlib import Path
 
@@ -15,6 +16,8 @@ from mbtf_core.images.read import SUFFIXES, Image, linear_rgb, read_image
 from mbtf_core.images.resample import resample
 from mbtf_core.images.tags import Tags
 from mbtf_core.paths import suggest_path
+
+_log = logging.getLogger(__name__)
 
 _RADIANCE = ".hdr"
 # Header of a Radiance picture whose first row is the top one, and its line of primaries.
@@ -49,11 +52,18 @@ def read_environment(path: Path, most_rows: int) -> NDArray[np.float32]:
             where=path,
             hint=f"use one of {', '.join((_RADIANCE, *SUFFIXES))}",
         )
-    pixels = _radiance(path) if suffix == _RADIANCE else linear_rgb(read_image(path))
+    pixels = _radiance(path) if suffix == _RADIANCE else _picture(path)
     rows = min(most_rows, pixels.shape[0])
     columns = min(max(1, round(rows * pixels.shape[1] / pixels.shape[0])), pixels.shape[1])
     small = np.asarray(resample(pixels, rows, columns), np.float32)
     return np.maximum(small, np.float32(0.0))
+
+
+def _picture(path: Path) -> NDArray[np.float32]:
+    image = read_image(path)
+    if image.tags.foreign is not None and image.tags.space is None:
+        _log.warning("%s: its %s is not applied; convert it to sRGB", path, image.tags.foreign)
+    return linear_rgb(image)
 
 
 def _radiance(path: Path) -> NDArray[np.float32]:
