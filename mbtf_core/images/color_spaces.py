@@ -23,13 +23,14 @@ Curve = Callable[[F64], F64]
 
 # Chromaticities x, y of red, green, blue and white.
 REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+ADOBE_RGB = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.3290)
 _PRIMARIES = {
     "Rec.2020": (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290),
     "Display P3": (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290),
     "DCI-P3": (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.314, 0.351),
     "ACEScg": (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767),
     "ACES2065-1": (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767),
-    "Adobe RGB (1998)": (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.3290),
+    "Adobe RGB (1998)": ADOBE_RGB,
     "Rec.601 (625 lines)": (0.64, 0.33, 0.29, 0.60, 0.15, 0.06, 0.3127, 0.3290),
     "Rec.601 (525 lines)": (0.630, 0.340, 0.310, 0.595, 0.155, 0.070, 0.3127, 0.3290),
 }
@@ -45,6 +46,8 @@ _CODED = {
 }
 # Tolerance of the comparison of chromaticities, of matrices and of curves.
 _SAME = 2e-3
+# Tolerance of the ends of a curve.
+_ENDS = 0.2
 # Cone responses of Bradford.
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
 # White of the connection space of ICC profiles.
@@ -179,18 +182,29 @@ def from_icc(profile: bytes, name: str) -> DeclaredSpace:
         for i in range(min(count, 200)):
             key, offset, size = struct.unpack_from(">4sII", profile, 132 + 12 * i)
             tags[key] = profile[offset : offset + size]
-        if space == b"GRAY":
-            return DeclaredSpace(printable(name), (_curve(tags[b"kTRC"]),))
-        if space != b"RGB " or connection != b"XYZ ":
+        gray = space == b"GRAY"
+        if not gray and (space != b"RGB " or connection != b"XYZ "):
             raise ValueError("not a matrix")
+        curves = tuple(_curve(tags[key]) for key in ((b"kTRC",) if gray else (b"rTRC", b"gTRC", b"bTRC")))
+        if gray:
+            return DeclaredSpace(printable(name), curves)
         columns = [struct.unpack_from(">3i", tags[key], 8) for key in (b"rXYZ", b"gXYZ", b"bXYZ")]
-        curves = tuple(_curve(tags[key]) for key in (b"rTRC", b"gTRC", b"bTRC"))
         return DeclaredSpace(printable(name), curves, _to_rec709(np.array(columns).T / 65536.0, _D50))
     except (KeyError, struct.error, np.linalg.LinAlgError) as error:
         raise ValueError("damaged, or of another kind") from error
 
 
 def _curve(tag: bytes) -> Curve:
+    """The curve of an element, which rises from about 0 to about 1."""
+    curve = _element(tag)
+    with np.errstate(all="ignore"):
+        ends = curve(np.linspace(0.0, 1.0, 256))[[0, -1]]
+    if not np.abs(ends - (0.0, 1.0)).max() < _ENDS:
+        raise ValueError("no curve")
+    return curve
+
+
+def _element(tag: bytes) -> Curve:
     """A ``curv`` or ``para`` element of an ICC profile (ICC.1:2022, 10.6, 10.18)."""
     if tag[:4] == b"curv":
         (count,) = struct.unpack_from(">I", tag, 8)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,8 @@ from mbtf_core.errors import InputError
 from mbtf_core.images.radiance import read_radiance
 from mbtf_core.images.read import SUFFIXES, linear_rgb, read_image
 from mbtf_core.images.resample import resample
+
+_log = logging.getLogger(__name__)
 
 _RADIANCE = ".hdr"
 
@@ -56,4 +59,7 @@ def read_linear(path: Path) -> NDArray[np.float32]:
             where=path,
             hint=f"use one of {', '.join((_RADIANCE, *SUFFIXES))}",
         )
-    return linear_rgb(read_radiance(path) if suffix == _RADIANCE else read_image(path))
+    image = read_radiance(path) if suffix == _RADIANCE else read_image(path)
+    if image.tags.foreign is not None and image.tags.space is None:
+        _log.warning("%s: its %s is not applied; convert it to sRGB", path, image.tags.foreign)
+    return linear_rgb(image)

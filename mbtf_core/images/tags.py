@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.images.color_spaces import (
+    ADOBE_RGB,
     REC709,
     ColorSpace,
     Curve,
@@ -26,7 +27,8 @@ from mbtf_core.images.color_spaces import (
 # Stored gammas of the known spaces (sRGB: 1/2.2), and the tolerance of their comparison.
 _GAMMAS: dict[ColorSpace, float] = {"srgb": 0.45455, "linear": 1.0}
 _SLACK = 0.005
-# Tags of TIFF and GeoTIFF.
+# Tags of EXIF, TIFF and GeoTIFF.
+_INTEROPERABILITY = 0xA005
 _ORIENTATION, _WHITE, _PRIMARIES, _PROFILE = 274, 318, 319, 34675
 _PIXEL_SCALE, _TIE_POINT, _TRANSFORMATION, _KEYS, _NODATA = 33550, 33922, 34264, 34735, 42113
 # Key of the model type, its value for degrees, and meters of a degree of latitude.
@@ -63,11 +65,11 @@ NO_TAGS = Tags()
 _Color = tuple[ColorSpace | None, DeclaredSpace | None, str | None]
 
 
-def pillow_tags(info: Mapping[Any, Any], exif: Mapping[int, Any], path: Path | None = None) -> Tags:
+def pillow_tags(info: Mapping[Any, Any], exif: Any, path: Path | None = None) -> Tags:
     """Tags from the metadata that Pillow read.
 
     ``cICP`` takes precedence over the profile, that over the ``sRGB`` chunk, and that over ``gAMA`` and
-    ``cHRM`` (PNG specification, third edition, 4.3).
+    ``cHRM`` (PNG specification, third edition, 4.3). Cameras declare Adobe RGB in EXIF (DCF 2.0).
 
     Parameters
     ----------
@@ -89,6 +91,8 @@ def pillow_tags(info: Mapping[Any, Any], exif: Mapping[int, Any], path: Path | N
         # PNG stores white first.
         red_first = (*primaries[2:], *primaries[:2]) if primaries is not None else REC709
         color = _gamma(gamma if isinstance(gamma, float) else None, red_first)
+    elif _is_adobe_rgb(exif):
+        color = _color(from_chromaticities(ADOBE_RGB, *[power(2.19921875)] * 3))
     return Tags(*color, _upright(exif.get(_ORIENTATION, 1)))
 
 
@@ -118,6 +122,13 @@ def exr_tags(header: Mapping[str, Any]) -> Tags:
         return Tags(foreign="chromaticities attribute (no color space)")
     # Numbers are linear by the format; files of Rec.709 need no mention.
     return NO_TAGS if declared.known else Tags(declared=declared)
+
+
+def _is_adobe_rgb(exif: Any) -> bool:
+    try:
+        return bool(exif.get_ifd(_INTEROPERABILITY).get(1) == "R03")
+    except Exception:  # damaged metadata may make the library raise anything
+        return False
 
 
 def _color(declared: DeclaredSpace) -> _Color:

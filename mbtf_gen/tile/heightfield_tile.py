@@ -41,6 +41,8 @@ from mbtf_gen.tile.tracers.protocol import TileGeometry
 _STEEP = 0.5
 # Range of floats up to which they may be fractions of a tile's width, with what compression adds.
 _NORMALIZED = 1.05
+# Median slope in degrees that such fractions do not have, and a scale for them: that of integers.
+_CLIFFS, _CUSTOMARY = 80.0, 0.05
 # Default limit of the mesh cells across the tile.
 DEFAULT_MESH = 512
 # Order of the maps in descriptions and in what makes them tileable.
@@ -109,34 +111,44 @@ class HeightFieldTile(Tile):
 
     @cached_property
     def grid(self) -> HeightGrid:
-        """The heights, resampled to the grid of the mesh; an InputError where their range is too large."""
+        """The heights, resampled to the grid of the mesh; an InputError where generation refuses them."""
+        if fault := self._fault(self.max_displacement):
+            raise InputError(fault[0], where=self.files.get("height"), hint=fault[1])
+        return self._resampled
+
+    @cached_property
+    def _resampled(self) -> HeightGrid:
         columns = min(self.height.shape[1], DEFAULT_MESH) if self.mesh is None else self.mesh
         rows = max(1, round(self.aspect * columns))
         heights = resample(self.height, rows, columns, "cubic").astype(np.float64)
-        grid = replace(HeightGrid.from_map(heights, self.height_scale, self.aspect), tracer=self.tracer)
-        if fault := self._fault(grid, self.max_displacement):
-            raise InputError(fault[0], where=self.files.get("height"), hint=fault[1])
-        return grid
+        return replace(HeightGrid.from_map(heights, self.height_scale, self.aspect), tracer=self.tracer)
 
-    def _fault(self, grid: HeightGrid, limit: float) -> tuple[str, str] | None:
+    def _fault(self, limit: float) -> tuple[str, str] | None:
         """(what, hint) why generation refuses the heights under a limit of their range, or None."""
         unit = None if math.isinf(limit) else self.unit_fault()
-        return unit or displacement_fault(grid.displacement_range, limit)
+        return unit or displacement_fault(self._resampled.displacement_range, limit)
 
     def unit_fault(self) -> tuple[str, str] | None:
         """(what, hint) where no height scale is given, and stored heights are no tile widths; else None.
 
-        They differ by more than a tile's width, or the file declares the size of its pixels.
+        They differ by more than a tile's width; or by more than half of it, with slopes of over 80° at half
+        of the surface and no normal map that agrees; or the file declares the size of its pixels.
         """
         facts = self.facts.get("height")
         if facts is None or self.height_from != "default":
             return None
         extent = facts.high - facts.low
-        if facts.pixel_size is None and (facts.bits is not None or extent <= _NORMALIZED):
+        if facts.pixel_size is None and (facts.bits is not None or extent <= _STEEP):
             return None
         white = 1 if facts.bits is None else 2**facts.bits - 1
         what = f"heights from {facts.low * white:.5g} to {facts.high * white:.5g} need a height scale"
-        if self.normal_fit is not None and self.normal_fit.fits:
+        fits = self.normal_fit is not None and self.normal_fit.fits
+        if facts.pixel_size is None and extent <= _NORMALIZED:
+            steep = 0.0 if fits else slope_angles(self._resampled)[0]
+            what = f"{what}: half of the surface would be steeper than {steep:.1f}°"
+            hint = f"give one, such as --height-scale {_CUSTOMARY}, or 1 where heights are in tile widths"
+            return (what, hint) if steep > _CLIFFS else None
+        if self.normal_fit is not None and fits:
             return what, f"the normal map suggests --height-scale {self.normal_fit.scale:.3g}"
         scale = white / (facts.columns * (facts.pixel_size or 1.0))
         if facts.pixel_size is None:
@@ -265,7 +277,7 @@ class HeightFieldTile(Tile):
         return self.at(options.height_scale, options.mesh)._statistics(finest, options.max_displacement)
 
     def _statistics(self, finest: int | None, max_displacement: float) -> dict[str, Any]:
-        fault = self._fault(self.grid, max_displacement)
+        fault = self._fault(max_displacement)
         refused = [f"{self.files['height']}: generation refuses it: {'; '.join(fault)}"] if fault else []
         grid = self.grid
         median, high, steepest = slope_angles(grid)

@@ -33,7 +33,7 @@ MEASURED_FILES = (".btf", ".h5", ".hdf5")
 # Terrains without a header that states their size and type.
 _RAW = (".raw", ".r16", ".r32", ".hgt", ".bil", ".flt")
 _RAW_HINT = (
-    "convert it to a TIFF, such as by gdal_translate, or in Python: "
+    "convert it to a PNG of 16 bits or a TIFF, such as by gdal_translate, or in Python: "
     "numpy.save('h.npy', numpy.fromfile(FILE, '<u2').reshape(ROWS, COLUMNS))"
 )
 

@@ -12,6 +12,13 @@ from mbtf_core.errors import InputError
 from mbtf_core.images.environment import read_environment
 
 
+def test_a_profile_that_is_not_applied_is_mentioned(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    picture = Image.fromarray(np.full((2, 4, 3), 188, np.uint8))
+    picture.save(tmp_path / "sky.png", icc_profile=b"broken")
+    read_environment(tmp_path / "sky.png", 64)
+    assert "color profile 'unreadable'" in caplog.text
+
+
 def test_surroundings_are_linear_and_small(tmp_path: Path) -> None:
     sky = np.zeros((200, 400, 3), np.float32)
     sky[:100] = (0.25, 0.5, 4.0)

@@ -128,6 +128,19 @@ def test_the_size_of_pixels_gives_the_scale(tmp_path: Path, dtype: str, tags: An
     assert suggested == pytest.approx(scale, rel=1e-3)
 
 
+def test_fractions_that_are_cliffs_need_a_scale(tmp_path: Path) -> None:
+    for factor, refused in ((1.0, True), (0.45, False)):
+        np.save(tmp_path / "noise.npy", factor * rng().random((64, 64)))
+        material = load_material(tmp_path / "noise.npy")
+        # Differences of neighbors are 1/3 on average, at 64 per tile width: over 80° but for 0.27.
+        assert (material.unit_fault() is not None) == refused
+        assert material.at(height_scale=1.0).unit_fault() is None
+    np.save(tmp_path / "noise.npy", rng().random((64, 64)))
+    with pytest.raises(InputError, match="steeper than 8") as caught:
+        _ = load_material(tmp_path / "noise.npy").configured(DEFAULT).grid
+    assert "--height-scale 0.05" in caught.value.hint
+
+
 def test_fractions_of_a_tile_go_on(tmp_path: Path) -> None:
     np.save(tmp_path / "h.npy", (hills() - 580) / 40)
     grid = load_material(tmp_path / "h.npy").configured(DEFAULT).grid
