@@ -1,6 +1,6 @@
 """What the readers make of inputs with mutations.
 
-    python benchmarks/mutated_inputs.py [--seed N] [--count N] [--only KIND ...] [--keep FOLDER] [--list]
+    python benchmarks/mutated_inputs.py [--seed N] [--count N] [--only KIND ...] [--keep FOLDER]
 
 Small meshes, curves, texture sets, measured BTFs and YAML files are made here, each with random features and
 faults. A maker knows what a right reading is, by its own arithmetic or another library. A reading is
@@ -22,11 +22,12 @@ import multiprocessing
 import os
 import shutil
 import tempfile
+import threading
 import time
 import traceback
 import warnings
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -160,10 +161,10 @@ class Worker:
         return None
 
 
-def shared(jobs: list[tuple[str, list[int]]], folder: Path, keep: Path | None) -> list[dict[str, Any]]:
-    """All inputs, read by workers in turn; bad ones are printed and kept."""
-    import threading
-
+def shared(
+    jobs: list[tuple[str, list[int]]], folder: Path, keep: Path | None, shown: Collection[str]
+) -> list[dict[str, Any]]:
+    """All inputs, read by workers in turn; those of some classes are printed and kept."""
     rows: list[dict[str, Any]] = []
     lock = threading.Lock()
     waiting = iter(jobs)
@@ -188,7 +189,7 @@ def shared(jobs: list[tuple[str, list[int]]], folder: Path, keep: Path | None) -
                 worker = Worker()
             with lock:
                 rows.append({"kind": kind, "seed": seed, "class": found[0], "detail": found[1], "text": text})
-                if found[0] in BAD:
+                if found[0] in shown:
                     print(f"{kind} {seed}: {found[0]}: {found[1]} [{text}]", flush=True)
                     if keep is not None and place.exists():
                         shutil.copytree(place, keep / f"{kind} {place.name} {found[0]}", dirs_exist_ok=True)
@@ -210,6 +211,7 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0, help="number of the first input of each kind")
     parser.add_argument("--only", nargs="+", choices=KINDS, help="kinds; default: all")
     parser.add_argument("--keep", type=Path, help="folder for the inputs that are read badly")
+    parser.add_argument("--show", nargs="+", default=BAD, help="classes that are printed and kept")
     options = parser.parse_args()
     numbers = range(options.first, options.first + options.count)
     names = list(KINDS)
@@ -217,7 +219,7 @@ def main() -> int:
     jobs = [(kind, [options.seed, names.index(kind), n]) for n in numbers for kind in kinds]
     began = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
-        rows = shared(jobs, Path(folder), options.keep)
+        rows = shared(jobs, Path(folder), options.keep, options.show)
     figures: dict[str, Any] = {"inputs": len(rows), "seconds": round(time.perf_counter() - began, 1)}
     figures |= {"all": dict(Counter(row["class"] for row in rows))}
     for kind in kinds:

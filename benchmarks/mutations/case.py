@@ -176,6 +176,9 @@ def seen(tile: Any) -> list[tuple[float, F64, dict[str, F64]] | None]:
                 values[name] = np.array(texture.eval(at)).ravel() if color else np.array(texture.eval_1(at))
             elif not isinstance(value, str):
                 values[name] = np.asarray(value)
+        if "opacity" in values:
+            cutoff = values.get("opacity_cutoff", 0.0)
+            values["opacity"] = np.where(cutoff == 0, values["opacity"], values["opacity"] >= cutoff)
         out.append((z, values.pop("base_color"), values))
     return out
 

@@ -138,7 +138,7 @@ def make(rng: Rng, folder: Path) -> Case:
             c, s = np.cos(angle), np.sin(angle)
             to_uv = np.column_stack([np.array([[c, s], [-s, c]]) * scale, offset])
         pbr["baseColorTexture"] = info
-    gloss = None
+    gloss, opacity = None, {}
     if d.chance(0.25, "metallicRoughnessTexture"):
         gloss = rng.integers(30, 255, 3).astype(np.uint8)
         images.append({"bufferView": w.view(encoded(np.tile(gloss, (4, 4, 1)))), "mimeType": "image/png"})
@@ -170,9 +170,10 @@ def make(rng: Rng, folder: Path) -> Case:
         mode = d.pick(("BLEND", "MASK"), "alphaMode")
         pbr["baseColorFactor"] = [*factor, 0.25]
         material["alphaMode"] = mode
+        opacity = {"opacity": 0.25 if mode == "BLEND" else 0.0}
         tell = ("alpha", "transparent", "opacity")
     if d.chance(0.1, "no material"):
-        material, texture, gloss, tell = {}, None, None, ()
+        material, texture, gloss, opacity, tell = {}, None, None, {}, ()
         factor, rough, metal = np.ones(3), 1.0, 1.0
 
     # Topology.
@@ -226,8 +227,8 @@ def make(rng: Rng, folder: Path) -> Case:
         if texture is not None:
             u, v = to_uv @ [*(weights @ coordinates[faces[number]]), 1.0]
             color = color * looked_up(texture, u, 1.0 - v, wrap, nearest)
-        expected.append(((z - high[2]) / (high - low)[0], color, {"roughness": rough, "metallic": metal}))
-    return Case(path, ", ".join(d.words), lambda tile: agree(tile, expected, 4e-3), bool(refuse), tell, valid=not tell)
+        expected.append(((z - high[2]) / (high - low)[0], color, {"roughness": rough, "metallic": metal} | opacity))
+    return Case(path, ", ".join(d.words), lambda tile: agree(tile, expected, 4e-3), bool(refuse), tell, bool(opacity), not tell)
 
 
 def _place(node: dict[str, Any], placed: F64, w: Writer, attributes: dict[str, int], d: Draws) -> None:
@@ -252,11 +253,11 @@ def _place(node: dict[str, Any], placed: F64, w: Writer, attributes: dict[str, i
 def _break(document: dict[str, Any], d: Draws) -> bool:
     """Make the document invalid where every reader must refuse; whether it did."""
     kind = d.pick(("count", "view", "index", "factor", "nan", "cycle", "buffer", "type"), "broken:")
-    accessor = document["accessors"][0]
+    accessor = document["accessors"][document["meshes"][0]["primitives"][0]["attributes"]["POSITION"]]
     if kind == "count":
         accessor["count"] = d.pick((300_000_000, 1_000_000, -1, 10**18))
     elif kind == "view":
-        document["bufferViews"][0]["byteOffset"] = d.pick((10**9, -16, 10**15))
+        document["bufferViews"][accessor["bufferView"]]["byteOffset"] = d.pick((10**9, -16, 10**15))
     elif kind == "index":
         document["meshes"][0]["primitives"][0]["attributes"]["POSITION"] = d.pick((99, -1, "a", 10**30))
     elif kind in ("factor", "nan"):

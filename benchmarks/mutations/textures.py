@@ -16,7 +16,7 @@ from mutations.case import Case, Draws, F64, Rng, damaged, encoded, linear, quar
 # their channels; "-x" is 1 - x; "dx" a normal map with green down; "" is not used.
 _STYLES: dict[str, dict[str, str]] = {
     "ambientCG": {"{b}_{r}-JPG_Color.jpg": "color", "{b}_{r}-JPG_Displacement.jpg": "height",
-                  "{b}_{r}-JPG_NormalGL.jpg": "normal", "{b}_{r}-JPG_NormalDX.jpg": "", "{b}.png": "",
+                  "{b}_{r}-JPG_NormalGL.jpg": "normal", "{b}_{r}-JPG_NormalDX.jpg": "dx", "{b}.png": "",
                   "{b}_{r}-JPG_Roughness.jpg": "rough", "{b}_{r}-JPG_AmbientOcclusion.jpg": "",
                   "{b}_{r}-JPG_Metalness.jpg": "metal"},
     "Poly Haven": {"{b}_diff_{r}.jpg": "color", "{b}_disp_{r}.png": "height", "{b}_nor_gl_{r}.png": "normal",
