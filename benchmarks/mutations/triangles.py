@@ -212,7 +212,7 @@ def _body(form: str, columns: list[tuple[str, str, Any]], faces: Any, index: str
         text.append(" ".join(f"{v:.9g}" for v in whole))
         out += struct.pack(order + "".join(codes[c[0]] for c in columns), *whole)
     for face in faces:
-        pairs = [] if uv is None else uv[face].ravel().tolist()
+        pairs = [] if uv is None else uv[np.minimum(face, len(uv) - 1)].ravel().tolist()
         text.append(f"3 {' '.join(map(str, face))}" + (f" 6 {' '.join(f'{p:.9g}' for p in pairs)}" if pairs else ""))
         out += struct.pack(f"{order}B3{codes[index]}", 3, *map(int, face))
         out += struct.pack(f"{order}B6f", 6, *pairs) if pairs else b""
