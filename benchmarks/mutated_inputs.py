@@ -34,7 +34,7 @@ from typing import Any
 
 import numpy as np
 from common import finish, parser_of, start
-from mutations import archives, curves, documents, gltf, textures, triangles
+from mutations import archives, bombs, curves, documents, gltf, textures, triangles
 from mutations.case import Case
 
 from mbtf_core.errors import MbtfError, reason
@@ -54,6 +54,7 @@ KINDS = {
     "measured": archives.make,
     "measured bytes": archives.damage,
     "yaml": documents.make,
+    "bombs": bombs.make,
 }
 BAD = ("wrong", "traceback", "noise", "slow", "large")
 SECONDS, BYTES = 30.0, 2 << 30
