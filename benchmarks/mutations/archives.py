@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from mutations.case import Case, Draws, F64, Rng, damaged, encoded, linear
+from mutations.case import F64, Case, Draws, Rng, damaged, encoded, linear
 
 SUFFIXES = (".zip", ".btf", ".hdf5", ".photographs")
 
 
 def values(path: Path) -> tuple[F64, F64, F64]:
-    """(values (n, 3), light (n, 3), viewer (n, 3)) as our reader reads them: of images all texels, pair by pair."""
+    """(values, light, viewer), (n, 3) each, as our reader reads them: all texels of each pair."""
     from mbtf_gen.measured.open import open_measured
 
     found: Any = open_measured(path)
@@ -52,9 +52,19 @@ def _photographs(d: Draws, folder: Path) -> Case:
     """UBO2003: names hold the angles; 8-bit sRGB."""
     rng = d.rng
     angles = [(tl, pl, tv, pv) for tl, pl in ((0, 0), (30, 60)) for tv, pv in ((15, 90), (45, 300), (95, 10))]
-    how = d.pick(("twice", "other size", "names", "HTML", "text inside", "alpha", "16-bit")) if d.chance(0.35) else ""
+    how = (
+        d.pick(("twice", "other size", "names", "HTML", "text inside", "alpha", "16-bit"))
+        if d.chance(0.35)
+        else ""
+    )
     d.words.append(how)
-    form = d.pick(("{:05d} tl{:03d} pl{:03d} tv{:03d} pv{:03d}", "{:05d}_tl{:03d}_pl{:03d}_tv{:03d}_pv{:03d}", "tv{3:03d}_pv{4:03d}/tl{1:03d}_pl{2:03d}_tv{3:03d}_pv{4:03d}"))
+    form = d.pick(
+        (
+            "{:05d} tl{:03d} pl{:03d} tv{:03d} pv{:03d}",
+            "{:05d}_tl{:03d}_pl{:03d}_tv{:03d}_pv{:03d}",
+            "tv{3:03d}_pv{4:03d}/tl{1:03d}_pl{2:03d}_tv{3:03d}_pv{4:03d}",
+        )
+    )
     kind = d.pick(("PNG", "JPEG"))
     files: dict[str, bytes] = {}
     wanted, light, view = [], [], []
@@ -67,7 +77,11 @@ def _photographs(d: Draws, folder: Path) -> Case:
         shown = codes[:8] if how == "other size" and number == 1 else codes
         if how == "alpha":
             shown = np.concatenate([codes, codes[..., :1] // 2], axis=-1)
-        files[name] = encoded(shown, kind if how != "alpha" else "PNG", **({"quality": 100} if kind == "JPEG" and how != "alpha" else {}))
+        files[name] = encoded(
+            shown,
+            kind if how != "alpha" else "PNG",
+            **({"quality": 100} if kind == "JPEG" and how != "alpha" else {}),
+        )
         if how == "text inside" and number == 1:
             files[name] = b"no image"
         if how == "16-bit":
@@ -79,9 +93,14 @@ def _photographs(d: Draws, folder: Path) -> Case:
             light.append(np.tile(_unit(tl, pl), (256, 1)))
             view.append(np.tile(_unit(tv, pv), (256, 1)))
     if how == "twice":
-        files["more/" + list(files)[0].rsplit("/", 1)[-1]] = list(files.values())[1]
+        files["more/" + next(iter(files)).rsplit("/", 1)[-1]] = list(files.values())[1]
     if d.chance(0.3, "other files"):
-        files |= {"readme.txt": b"x", "__MACOSX/._x.jpg": b"x", "Thumbs.db": b"x", "calibration.png": encoded(np.zeros((4, 4, 3), np.uint8))}
+        files |= {
+            "readme.txt": b"x",
+            "__MACOSX/._x.jpg": b"x",
+            "Thumbs.db": b"x",
+            "calibration.png": encoded(np.zeros((4, 4, 3), np.uint8)),
+        }
     if d.chance(0.3, "a folder above"):
         files = {f"MATERIAL/{name}": content for name, content in files.items()}
     if d.chance(0.3, "unpacked"):
@@ -96,9 +115,11 @@ def _photographs(d: Draws, folder: Path) -> Case:
                 archive.writestr(name, content)
         if how == "HTML":
             path.write_bytes(b"<!DOCTYPE html><html>quota exceeded</html>")
-    refuse = how in ("twice", "other size", "names", "HTML", "text inside") and not (how == "HTML" and path.is_dir())
-    tables = [np.concatenate(a) for a in (wanted, light, view)]
-    return Case(path, ", ".join(d.words), lambda read: _agree(read, *tables, 0.02), refuse, valid=not how)  # type: ignore[misc]
+    refuse = how in ("twice", "other size", "names", "HTML", "text inside") and not (
+        how == "HTML" and path.is_dir()
+    )
+    table, lights, views = (np.concatenate(a) for a in (wanted, light, view))
+    return Case(path, ", ".join(d.words), lambda read: _agree(read, table, lights, views, 0.02), refuse, valid=not how)
 
 
 def _factors(d: Draws, folder: Path) -> Case:
@@ -108,32 +129,72 @@ def _factors(d: Draws, folder: Path) -> Case:
     rows, columns = 3, 4
     grid = np.round(rng.uniform(0, 1, (len(views) * len(lights), rows * columns, 3)), 3)
     width, version = d.pick((4, 8)), d.pick((1, 2, 3, 4), "version")
-    how = d.pick(("views 3e8", "columns 3e8", "components 3e8", "NaN", "angle 9", "model 77", "cut", "longer", "no angle")) if d.chance(0.4) else ""
+    how = (
+        d.pick(
+            (
+                "views 3e8",
+                "columns 3e8",
+                "components 3e8",
+                "NaN",
+                "angle 9",
+                "model 77",
+                "cut",
+                "longer",
+                "no angle",
+            )
+        )
+        if d.chance(0.4)
+        else ""
+    )
     d.words.append(how)
     meta = bytes(240) + struct.pack("<4f", 1, 1, 1, 1)
     meta += struct.pack("<I", 1) if version > 1 else b""
     meta += struct.pack("<I", 6) + b"<xml/>" if version > 2 else b""
-    meta += struct.pack("<I", 3) + b"".join(struct.pack("<I", 1) + c for c in (b"R", b"G", b"B")) if version > 3 else b""
+    meta += (
+        struct.pack("<I", 3) + b"".join(struct.pack("<I", 1) + c for c in (b"R", b"G", b"B"))
+        if version > 3
+        else b""
+    )
     out = b"!DFMF08FCR" + struct.pack("<II", 8 + len(meta), version) + meta
     out += struct.pack("<I", 300_000_000 if how == "views 3e8" else len(views))
     for number, angles in enumerate(views):
         stored = np.deg2rad(angles)
         if number == 1 and how in ("NaN", "angle 9", "no angle"):
             stored = np.array({"NaN": [np.nan, 0], "angle 9": [9.0, 0], "no angle": [np.inf, 0]}[how])
-        out += stored.astype("<f4").tobytes() + struct.pack("<I", len(lights)) + np.deg2rad(lights).astype("<f4").tobytes()
+        out += (
+            stored.astype("<f4").tobytes()
+            + struct.pack("<I", len(lights))
+            + np.deg2rad(lights).astype("<f4").tobytes()
+        )
     out += struct.pack("<III", 300_000_000 if how == "columns 3e8" else columns, rows, 0)
     out += struct.pack("<Ii", 6, 77 if how == "model 77" else 0) + bytes(48)
     for channel in range(3):
         u, s, v = np.linalg.svd(grid[..., channel], full_matrices=False)
-        out += struct.pack("<BIII", width, 300_000_000 if how == "components 3e8" else len(s), *grid.shape[:2])
+        out += struct.pack(
+            "<BIII", width, 300_000_000 if how == "components 3e8" else len(s), *grid.shape[:2]
+        )
         out += b"".join(a.astype(f"<f{width}").tobytes() for a in (s, u, v.T * s))
-    out = out[: int(len(out) * d.number(0.1, 0.99))] if how == "cut" else out + b"abc" if how == "longer" else out
+    out = (
+        out[: int(len(out) * d.number(0.1, 0.99))]
+        if how == "cut"
+        else out + b"abc"
+        if how == "longer"
+        else out
+    )
     path = folder / "m.btf"
     path.write_bytes(out)
     # Row 0 is the top; pairs are view by view.
-    light = np.concatenate([np.repeat(_unit(*zip(*lights, strict=True)), rows * columns, axis=0)] * len(views))
+    light = np.concatenate(
+        [np.repeat(_unit(*zip(*lights, strict=True)), rows * columns, axis=0)] * len(views)
+    )
     view = np.repeat(_unit(*zip(*views, strict=True)), len(lights) * rows * columns, axis=0)
-    return Case(path, ", ".join(d.words), lambda read: _agree(read, grid.reshape(-1, 3), light, view, 1e-3), bool(how), valid=not how)
+    return Case(
+        path,
+        ", ".join(d.words),
+        lambda read: _agree(read, grid.reshape(-1, 3), light, view, 1e-3),
+        bool(how),
+        valid=not how,
+    )
 
 
 def _directions(rng: Rng, count: int) -> F64:
@@ -144,7 +205,11 @@ def _directions(rng: Rng, count: int) -> F64:
 def _neural(d: Draws, folder: Path) -> Case:
     """NeuralBTF: images (N, H, W, 3) with a direction each of light and viewer."""
     rng, n = d.rng, 3
-    light, view, color = _directions(rng, n), _directions(rng, n), rng.uniform(0, 1, (n, 4, 5, 3)).astype("f4")
+    light, view, color = (
+        _directions(rng, n),
+        _directions(rng, n),
+        rng.uniform(0, 1, (n, 4, 5, 3)).astype("f4"),
+    )
     stored = {"ground_light": light[:, :2], "ground_camera_dir": view[:, :2], "ground_color": color}
     return _hdf5(d, folder, stored, color.reshape(-1, 3), np.repeat(light, 20, 0), np.repeat(view, 20, 0))
 
@@ -184,7 +249,7 @@ def _hdf5(d: Draws, folder: Path, stored: dict[str, Any], color: F64, light: F64
                 file.create_dataset(key, data=array[:1])
             elif hurt != "missing":
                 file.create_dataset(key, data=array, **options)
-    # A direction longer than 1 is left out of queries: whoever leaves out some of the values says so elsewhere.
+    # Queries with a direction longer than 1 are left out, which the import reports.
     undecided = how == "long direction" and len(stored) == 5
     check = (lambda _: None) if undecided else (lambda read: _agree(read, color, light, view, 2e-3))
     return Case(path, ", ".join(d.words), check, bool(how) and how != "long direction", valid=not how)
@@ -196,4 +261,8 @@ def damage(rng: Rng, folder: Path) -> Case:
     if case.path.is_file():
         case.path.write_bytes(damaged(case.path.read_bytes(), d))
     right = case.check
-    return Case(case.path, f"{case.text}; {', '.join(d.words)}", lambda read: True if not case.refuse and right(read) else None)
+    return Case(
+        case.path,
+        f"{case.text}; {', '.join(d.words)}",
+        lambda read: True if not case.refuse and right(read) else None,
+    )

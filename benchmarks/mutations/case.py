@@ -158,7 +158,8 @@ def seen(tile: Any) -> list[tuple[float, F64, dict[str, F64]] | None]:
     """(z, color, other parameters) of a mesh tile at PLACES, as its own Mitsuba dictionaries describe it."""
     import mitsuba as mi
 
-    surfaces, out = tile.surface(), []
+    surfaces = tile.surface()
+    out: list[Any] = []
     for x, y in PLACES:
         found = hit(tile.vertices, tile.faces, x, y * tile.aspect)
         if found is None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +9,15 @@ import numpy as np
 
 from mutations.case import Case, Draws, Rng
 
-# Numbers in [0, 1] as they are written, and what YAML 1.2 (core schema) takes them for; None: not a number there.
+# Numbers as they are written, and what YAML 1.2 (core schema) takes them for; None: none in [0, 1].
 _WRITTEN: dict[str, float | None] = {
-    "0.25": 0.25, ".25": 0.25, "2.5e-1": 0.25, "25e-2": 0.25, "+0.25": 0.25, "1": 1.0, "0": 0.0, "-0.0": 0.0, "1.": 1.0,
-    "0,25": None, "25%": None, "on": None, "1/4": None, "'0.25'": None, ".nan": None, ".inf": None, "1e400": None, "-0.25": None,
-    "1.5": None, "0x1": 1.0, "[0.25]": None, "{}": None, "null": None, "~": None, "true": None, "": None, "0.25 # note": 0.25,
-    "!!float 0.25": 0.25, "!!python/name:os.system": None, "1:30": None, "0_1": None, "2024-01-01": None,
-}  # fmt: skip
+    **dict.fromkeys(("0.25", ".25", "2.5e-1", "25e-2", "+0.25", "0.25 # note", "!!float 0.25"), 0.25),
+    **dict.fromkeys(("1", "1.", "0x1"), 1.0),
+    **dict.fromkeys(("0", "-0.0"), 0.0),
+    **dict.fromkeys(("0,25", "25%", "on", "true", "1/4", "'0.25'", "[0.25]", "{}", "null", "~", "")),
+    **dict.fromkeys((".nan", ".inf", "1e400", "-0.25", "1.5", "1:30", "0_1", "2024-01-01")),
+    **dict.fromkeys(("!!python/name:os.system",)),
+}
 _TEXTS = {
     "duplicate": "height: h.npy\nroughness: 0.25\nroughness: 0.75\n",
     "unknown key": "height: h.npy\nroughnes: 0.25\n",
@@ -53,20 +54,22 @@ def make(rng: Rng, folder: Path) -> Case:
         path.write_bytes(text.replace("\n", "\r\n").encode() if name == "CRLF" else text.encode(name))
         return Case(path, name, lambda tile: tile.maps["roughness"] == 0.25)
     if kind == "cloth":
-        key, value = d.pick({"yarn: {color: %s}": "", "yarn: {radius: %s}": "", "repeat: %s": "", "fiber: {ior: %s}": ""}), d.pick((math.nan, -1, 1e9, 10**30, "x"))
-        path.write_text(f"weave: plain\n{key % (value if isinstance(value, str) else repr(value).replace('nan', '.nan'))}\n")
+        key = d.pick(("yarn: {color: *}", "yarn: {radius: *}", "repeat: *", "fiber: {ior: *}"))
+        path.write_text(f"weave: plain\n{key.replace('*', d.pick(('.nan', '-1', '1e9', '1' + 30 * '0', 'x')))}\n")
         return Case(path, path.read_text(), refuse=True)
     if kind == "scale":
         written = d.pick(("0.5", "-0.5", "1e3", "1e30", ".nan", "0", "x"), "scale")
         path.write_text(f"height: {{file: h.npy, scale: {written}}}\n")
-        wanted = float(written) if written[0] in "-01" else math.nan
+        wanted = float(written) if written[0] in "-01" else float("nan")
         return Case(path, written, lambda tile: tile.height_scale == wanted, not abs(wanted) < 1e6)
     written = d.pick(_WRITTEN, "written")
     number = _WRITTEN[written]
     if kind == "color":
         path.write_text(f"height: h.npy\nbase_color: [0.5, {written.split(' #')[0]}, 0.125]\n")
     else:
-        path.write_text(f"height: h.npy\n{d.pick(('roughness', 'metallic', 'clearcoat', 'sheen'), 'key')}: {written}\n")
+        path.write_text(
+            f"height: h.npy\n{d.pick(('roughness', 'metallic', 'clearcoat', 'sheen'), 'key')}: {written}\n"
+        )
     # Who reads a number in quotes, or an empty key as one that was not given, does no harm.
     harmless = written in ("null", "~", "", "'0.25'", "0x1", "0_1", "[0.25]")
     key = "base_color" if kind == "color" else d.words[-1].split()[-1]

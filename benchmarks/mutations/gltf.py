@@ -10,8 +10,21 @@ from typing import Any
 
 import numpy as np
 
-from mutations.case import PLACES, Case, Draws, F64, Rng, agree, damaged, encoded, hit, linear, looked_up
-from mutations.case import patch, quarters
+from mutations.case import (
+    F64,
+    PLACES,
+    Case,
+    Draws,
+    Rng,
+    agree,
+    damaged,
+    encoded,
+    hit,
+    linear,
+    looked_up,
+    patch,
+    quarters,
+)
 
 _TYPES = {"b": 5120, "B": 5121, "h": 5122, "H": 5123, "I": 5125, "f": 5126}
 _SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
@@ -110,7 +123,9 @@ def make(rng: Rng, folder: Path) -> Case:
     if d.chance(0.7):
         codes = quarters(rng)
         kind = d.pick(("png", "png", "jpeg"))
-        content = encoded(codes, kind.upper(), **({"quality": 100, "subsampling": 0} if kind == "jpeg" else {}))
+        content = encoded(
+            codes, kind.upper(), **({"quality": 100, "subsampling": 0} if kind == "jpeg" else {})
+        )
         if kind == "jpeg":
             import io
 
@@ -124,21 +139,28 @@ def make(rng: Rng, folder: Path) -> Case:
         if d.chance(0.3):
             wrap = (d.pick(_WRAPS), d.pick(_WRAPS))
             nearest = d.chance(0.3)
-            samplers.append({"wrapS": _WRAPS[wrap[0]], "wrapT": _WRAPS[wrap[1]]} | ({"magFilter": 9728} if nearest else {}))
+            samplers.append(
+                {"wrapS": _WRAPS[wrap[0]], "wrapT": _WRAPS[wrap[1]]}
+                | ({"magFilter": 9728} if nearest else {})
+            )
             textures[0]["sampler"] = 0
             d.words.append(f"sampler {wrap} {'nearest' if nearest else ''}")
         if d.chance(0.35, "KHR_texture_transform"):
             offset, angle = rng.uniform(-1, 1, 2).round(2), d.pick((0.0, 0.0, d.number(-2, 2)))
             scale = rng.uniform(0.4, 3, 2).round(2) * d.pick((1, 1, -1))
             info["extensions"] = {
-                "KHR_texture_transform": {"offset": offset.tolist(), "rotation": angle, "scale": scale.tolist()}
+                "KHR_texture_transform": {
+                    "offset": offset.tolist(),
+                    "rotation": angle,
+                    "scale": scale.tolist(),
+                }
             }
             used.add("KHR_texture_transform")
             # The extension's matrices: translation, rotation, scale.
             c, s = np.cos(angle), np.sin(angle)
             to_uv = np.column_stack([np.array([[c, s], [-s, c]]) * scale, offset])
         pbr["baseColorTexture"] = info
-    gloss, opacity = None, {}
+    gloss, opacity = None, dict[str, float]()
     if d.chance(0.25, "metallicRoughnessTexture"):
         gloss = rng.integers(30, 255, 3).astype(np.uint8)
         images.append({"bufferView": w.view(encoded(np.tile(gloss, (4, 4, 1)))), "mimeType": "image/png"})
@@ -150,9 +172,9 @@ def make(rng: Rng, folder: Path) -> Case:
         varying = d.chance(0.5)
         colors = rng.uniform(0, 1, (len(vertices) if varying else 1, 3)) * np.ones((len(vertices), 1))
         kind = d.pick("fBH", f"{'varying' if varying else 'uniform'} COLOR_0 of type")
-        most = {"f": 1.0, "B": 255.0, "H": 65535.0}[kind]
-        colors = colors.astype(np.float32).astype(float) if kind == "f" else np.round(colors * most) / most
-        attributes["COLOR_0"] = w.accessor(colors * most, kind, normalized=kind != "f")
+        largest = {"f": 1.0, "B": 255.0, "H": 65535.0}[kind]
+        colors = colors.astype(np.float32).astype(float) if kind == "f" else np.round(colors * largest) / largest
+        attributes["COLOR_0"] = w.accessor(colors * largest, kind, normalized=kind != "f")
     if d.chance(0.2):
         name = d.pick(_IGNORED, "extension")
         material["extensions"] = {name: _IGNORED[name]}
@@ -187,7 +209,9 @@ def make(rng: Rng, folder: Path) -> Case:
         primitives = []
         for a, b, c in faces:
             order = [a, b, c]
-            primitives.append(primitive | {"indices": w.accessor(order, "H"), "mode": 6 if how == "fan" else 5})
+            primitives.append(
+                primitive | {"indices": w.accessor(order, "H"), "mode": 6 if how == "fan" else 5}
+            )
     else:
         primitive["indices"] = w.accessor(faces.ravel(), d.pick("BHI"))
         if how == "more":
@@ -213,22 +237,36 @@ def make(rng: Rng, folder: Path) -> Case:
         "accessors": w.accessors,
         "bufferViews": w.views,
     }
-    optional = {"materials": [material] if material else [], "images": images, "textures": textures}
+    optional: dict[str, Any] = {"materials": [material] if material else [], "images": images, "textures": textures}
     optional |= {"samplers": samplers, "extensionsUsed": sorted(used), "extensionsRequired": required}
     document |= {name: value for name, value in optional.items() if value}
     refuse = "EXT_unheard_of" in required or (d.chance(0.2) and _break(document, d))
     path = _write(document, w.data, folder, d)
 
     low, high = vertices.min(0), vertices.max(0)
-    expected = []
+    expected: list[Any] = []
     for x, y in PLACES:
-        number, weights, z = hit(vertices, faces, *(low[:2] + (x, y) * (high - low)[:2])) or (0, np.ones(3), 0.0)
+        number, weights, z = hit(vertices, faces, *(low[:2] + (x, y) * (high - low)[:2])) or (
+            0,
+            np.ones(3),
+            0.0,
+        )
         color = factor * (weights @ colors[faces[number]])
         if texture is not None:
             u, v = to_uv @ [*(weights @ coordinates[faces[number]]), 1.0]
             color = color * looked_up(texture, u, 1.0 - v, wrap, nearest)
-        expected.append(((z - high[2]) / (high - low)[0], color, {"roughness": rough, "metallic": metal} | opacity))
-    return Case(path, ", ".join(d.words), lambda tile: agree(tile, expected, 4e-3), bool(refuse), tell, bool(opacity), not tell)
+        expected.append(
+            ((z - high[2]) / (high - low)[0], color, {"roughness": rough, "metallic": metal} | opacity)
+        )
+    return Case(
+        path,
+        ", ".join(d.words),
+        lambda tile: agree(tile, expected, 4e-3),
+        bool(refuse),
+        tell,
+        bool(opacity),
+        not tell,
+    )
 
 
 def _place(node: dict[str, Any], placed: F64, w: Writer, attributes: dict[str, int], d: Draws) -> None:
@@ -277,12 +315,14 @@ def _break(document: dict[str, Any], d: Draws) -> bool:
 def _write(document: dict[str, Any], data: bytes, folder: Path, d: Draws) -> Path:
     """As GLB, or as .gltf beside its buffer or with the buffer inside."""
     form = d.pick(("glb", "glb", "gltf", "data"))
-    buffers = [{"byteLength": len(data)}]
+    buffers: list[dict[str, Any]] = [{"byteLength": len(data)}]
     if form == "glb":
         text = json.dumps({"buffers": buffers} | document).encode()
         text += b" " * (-len(text) % 4)
         data += b"\0" * (-len(data) % 4)
-        chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data
+        chunks = (
+            struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data
+        )
         (folder / "tile.glb").write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
         return folder / "tile.glb"
     d.words.append("." + form)

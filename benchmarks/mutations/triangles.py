@@ -8,8 +8,21 @@ from typing import Any
 
 import numpy as np
 
-from mutations.case import PLACES, Case, Draws, F64, Rng, agree, damaged, encoded, hit, linear, looked_up
-from mutations.case import patch, quarters
+from mutations.case import (
+    F64,
+    PLACES,
+    Case,
+    Draws,
+    Rng,
+    agree,
+    damaged,
+    encoded,
+    hit,
+    linear,
+    looked_up,
+    patch,
+    quarters,
+)
 
 _REPEAT = ("repeat", "repeat")
 # Statements of materials that tiles do not use.
@@ -33,7 +46,13 @@ def obj(rng: Rng, folder: Path) -> Case:
     codes = quarters(rng)
     texture, to_uv, wrap = None, np.eye(2, 3), _REPEAT
     factor = np.array([d.number(0, 1), d.number(0, 1), d.number(0, 0.05)])
-    mtl = ["# a comment", "newmtl other", "Kd 0.1 0.2 0.3", "newmtl m", f"Kd {factor[0]} {factor[1]} {factor[2]}"]
+    mtl = [
+        "# a comment",
+        "newmtl other",
+        "Kd 0.1 0.2 0.3",
+        "newmtl m",
+        f"Kd {factor[0]} {factor[1]} {factor[2]}",
+    ]
     tell: tuple[str, ...] = ()
     refuse = unless = False
     if d.chance(0.6):
@@ -45,7 +64,9 @@ def obj(rng: Rng, folder: Path) -> Case:
             factor, mtl[4] = np.ones(3), "Kd 1 1 1"
         written = name
         if name == "sub/map.png":
-            written = d.pick(("sub/map.png", "sub\\map.png", "C:\\Users\\me\\sub\\map.png", "Sub/MAP.png"), "written")
+            written = d.pick(
+                ("sub/map.png", "sub\\map.png", "C:\\Users\\me\\sub\\map.png", "Sub/MAP.png"), "written"
+            )
         options = ""
         if d.chance(0.4):
             s, o = rng.uniform(0.5, 4, 2).round(2), rng.uniform(-1, 1, 2).round(2)
@@ -71,7 +92,12 @@ def obj(rng: Rng, folder: Path) -> Case:
     if (colors < 1).any():
         rows = [f"{row} {r:g} {g:g} {b:g}" for row, (r, g, b) in zip(rows, colors, strict=True)]
         unless, tell = not tell, tell or ("vertex color", "colors of")
-    lines = ["mtllib my tile.mtl", "o tile", *(f"v {row}" for row in rows), *(f"vt {a:g} {b:g}" for a, b in uv)]
+    lines = [
+        "mtllib my tile.mtl",
+        "o tile",
+        *(f"v {row}" for row in rows),
+        *(f"vt {a:g} {b:g}" for a, b in uv),
+    ]
     lines += ["vn 0 0 1", "usemtl m", "s 1"]
     corners: Any = faces
     if form == "squares":
@@ -83,7 +109,9 @@ def obj(rng: Rng, folder: Path) -> Case:
             words.append(f"{i}/{i}/1" if form == "v/vt/vn" else f"{i}/{i}")
         lines.append("f " + " ".join(words))
     if d.chance(0.2):
-        how = d.pick(("index 99", "NaN", "no mtl", "Kd 1e9", "Kd nan", "usemtl ghost", "text", "f 0"), "broken:")
+        how = d.pick(
+            ("index 99", "NaN", "no mtl", "Kd 1e9", "Kd nan", "usemtl ghost", "text", "f 0"), "broken:"
+        )
         refuse = how not in ("no mtl", "usemtl ghost", "text")
         if how == "index 99":
             lines.append("f 99/1 1/1 2/2")
@@ -101,7 +129,7 @@ def obj(rng: Rng, folder: Path) -> Case:
             return _obj(folder, lines, mtl, Case(folder / "tile.obj", ", ".join(d.words)))
         else:
             mtl, tell, unless = [], (".mtl",), False
-    expected = []
+    expected: list[Any] = []
     for x, y in PLACES:
         number, weights, z = hit(vertices, faces, x, y) or (0, np.ones(3), 0.0)
         color = factor * (weights @ colors[faces[number]])
@@ -131,7 +159,7 @@ def ply(rng: Rng, folder: Path) -> Case:
     form = d.pick(("ascii", "binary_little_endian", "binary_big_endian"), "form")
     kind = d.pick(("float", "double"))
     header = ["ply", f"format {form} 1.0", "comment made by hand"]
-    columns = [(kind, name, vertices[:, k]) for k, name in enumerate("xyz")]
+    columns: list[Any] = [(kind, name, vertices[:, k]) for k, name in enumerate("xyz")]
     tell: tuple[str, ...] = ()
     wedge = False
     color: F64 = np.full((len(vertices), 3), 0.5)
@@ -151,7 +179,9 @@ def ply(rng: Rng, folder: Path) -> Case:
     elif what == "color":
         whole = rng.integers(0, 256, (len(vertices), 3))
         named = d.pick(("uchar", "float"), "colors of type")
-        color = linear(whole / 255.0) if named == "uchar" else (whole / 255.0).astype(np.float32).astype(float)
+        color = (
+            linear(whole / 255.0) if named == "uchar" else (whole / 255.0).astype(np.float32).astype(float)
+        )
         values = whole if named == "uchar" else whole / 255.0
         columns += [(named, name, values[:, k]) for k, name in enumerate(("red", "green", "blue"))]
         if d.chance(0.3):
@@ -161,7 +191,10 @@ def ply(rng: Rng, folder: Path) -> Case:
         columns.insert(int(rng.integers(len(columns))), ("short", "quality", np.arange(len(vertices))))
     count = d.pick((len(faces), 300_000_000, 2**31 - 1), "claimed faces") if d.chance(0.1) else len(faces)
     header += [f"element vertex {len(vertices)}", *(f"property {t} {n}" for t, n, _ in columns)]
-    header += [f"element face {count}", f"property list uchar {d.pick(('int', 'uint', 'ushort'), 'index')} vertex_indices"]
+    header += [
+        f"element face {count}",
+        f"property list uchar {d.pick(('int', 'uint', 'ushort'), 'index')} vertex_indices",
+    ]
     index = header[-1].split()[3]
     if wedge:
         header.append("property list uchar float texcoord")
@@ -184,7 +217,7 @@ def ply(rng: Rng, folder: Path) -> Case:
     path = folder / "tile.ply"
     path.write_bytes("\n".join(header).encode() + b"\n" + body)
     vertices, faces = patch_of(columns, vertices), faces
-    expected = []
+    expected: list[Any] = []
     for x, y in PLACES if not refuse else ():
         number, weights, z = hit(vertices, faces, x, y) or (0, np.ones(3), 0.0)
         value = weights @ color[faces[number]]
@@ -208,12 +241,16 @@ def _body(form: str, columns: list[tuple[str, str, Any]], faces: Any, index: str
     text: list[str] = []
     out = b""
     for row in zip(*(c[2] for c in columns), strict=True):
-        whole = [int(v) if c[0] in ("short", "uchar") else float(v) for c, v in zip(columns, row, strict=True)]
+        whole = [
+            int(v) if c[0] in ("short", "uchar") else float(v) for c, v in zip(columns, row, strict=True)
+        ]
         text.append(" ".join(f"{v:.9g}" for v in whole))
         out += struct.pack(order + "".join(codes[c[0]] for c in columns), *whole)
     for face in faces:
         pairs = [] if uv is None else uv[np.minimum(face, len(uv) - 1)].ravel().tolist()
-        text.append(f"3 {' '.join(map(str, face))}" + (f" 6 {' '.join(f'{p:.9g}' for p in pairs)}" if pairs else ""))
+        text.append(
+            f"3 {' '.join(map(str, face))}" + (f" 6 {' '.join(f'{p:.9g}' for p in pairs)}" if pairs else "")
+        )
         out += struct.pack(f"{order}B3{codes[index]}", 3, *map(int, face))
         out += struct.pack(f"{order}B6f", 6, *pairs) if pairs else b""
     return ("\n".join(text) + "\n").encode() if form == "ascii" else out
