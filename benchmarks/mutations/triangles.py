@@ -25,7 +25,7 @@ from mutations.case import (
 )
 
 _REPEAT = ("repeat", "repeat")
-# Statements of materials that tiles do not use.
+# Statements of materials that may be used or not, and words of the warning.
 _IGNORED = {
     "Ke 1 0 0": ("ke", "emi"),
     "map_Bump bump.png": ("bump", "normal"),
@@ -55,6 +55,7 @@ def obj(rng: Rng, folder: Path) -> Case:
     ]
     tell: tuple[str, ...] = ()
     refuse = unless = False
+    opacity: F64 | None = None
     if d.chance(0.6):
         name = d.pick(("map.png", "my map.png", "sub/map.png"), "map")
         (folder / "sub").mkdir()
@@ -82,16 +83,19 @@ def obj(rng: Rng, folder: Path) -> Case:
             tell = ("map.png",)
     if d.chance(0.2):
         name = d.pick(_IGNORED, "ignored")
-        (folder / "bump.png").write_bytes(encoded(quarters(rng)))
+        gray = quarters(rng)[..., 0]
+        (folder / "bump.png").write_bytes(encoded(gray))
         mtl.append(name)
-        tell = tell or _IGNORED[name]
+        if not tell:
+            tell, unless = _IGNORED[name], "d" in name.split()[0].split("_")
+            opacity = {"d 0.3": np.full((1, 1), 0.3), "map_d bump.png": gray / 255.0}.get(name)
     colors = np.ones((len(vertices), 3))
     if texture is None and d.chance(0.25, "vertex colors"):
         colors = rng.uniform(0, 1, (len(vertices), 3)).round(3)
     rows = [f"{x:g} {y:g} {z:g}" for x, y, z in vertices]
     if (colors < 1).any():
         rows = [f"{row} {r:g} {g:g} {b:g}" for row, (r, g, b) in zip(rows, colors, strict=True)]
-        unless, tell = not tell, tell or ("vertex color", "colors of")
+        unless, tell = unless or not tell, tell or ("vertex color", "colors of")
     lines = [
         "mtllib my tile.mtl",
         "o tile",
@@ -136,7 +140,11 @@ def obj(rng: Rng, folder: Path) -> Case:
         if texture is not None:
             u, v = to_uv @ [*(weights @ uv[faces[number]]), 1.0]
             color = color * looked_up(texture, u, v, wrap)
-        expected.append((z - vertices[:, 2].max(), color, {}))
+        more = {}
+        if opacity is not None:
+            u, v = weights @ uv[faces[number]]
+            more = {"opacity": looked_up(opacity[..., None], u, v, _REPEAT)}
+        expected.append((z - vertices[:, 2].max(), color, more))
     right = lambda tile: agree(tile, expected)  # noqa: E731
     valid = not refuse and (unless or not tell)
     case = Case(folder / "tile.obj", ", ".join(d.words), right, refuse, tell, unless, valid)
