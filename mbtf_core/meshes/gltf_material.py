@@ -62,6 +62,7 @@ class Materials:
     def __init__(self, file: GltfFile) -> None:
         self.file = file
         self._maps: dict[tuple[Any, ...], NDArray[np.float32]] = {}
+        self._sets: dict[int | None, list[int]] = {}
         self._latest: tuple[int, NDArray[np.floating[Any]]] | None = None
         self._unused: dict[str, None] = {}
 
@@ -71,10 +72,14 @@ class Materials:
             return GltfMaterial()
         return self.file.entry(self.file.document.materials, index, "materials")
 
-    def uv_sets(self, material: GltfMaterial) -> list[int]:
-        """Numbers of the texture coordinates that its textures need, that of the base color first."""
-        placed = (source.placed for source in self._sources(material).values())
-        return list(dict.fromkeys(texture.uv_set for texture in placed if texture is not None))
+    def uv_sets(self, index: int | None) -> list[int]:
+        """Numbers of the texture coordinates that its textures need, that of the base color first; 0 without
+        textures."""
+        if index not in self._sets:
+            placed = (source.placed for source in self._sources(self.of(index)).values())
+            found = dict.fromkeys(texture.uv_set for texture in placed if texture is not None)
+            self._sets[index] = list(found) or [0]
+        return self._sets[index]
 
     def read(
         self, material: GltfMaterial, places: Mapping[int, F64]
