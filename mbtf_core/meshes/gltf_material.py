@@ -188,7 +188,7 @@ class Materials:
             colors = pixels.shape[2] - (pixels.shape[2] in (2, 4))
             opaque = source.channels == _A and colors == pixels.shape[2]
             channels = [colors if c == 3 else min(c, colors - 1) for c in source.channels]
-            out = np.ones((*pixels.shape[:2], 1)) if opaque else pixels[..., channels]
+            out = np.ones((*pixels.shape[:2], 1)) if opaque else pixels.astype(np.float32)[..., channels]
             if source.encoded:
                 out = srgb_to_linear(out)
             out = out @ np.asarray(LUMINANCE) if source.gray else out if len(channels) > 1 else out[..., 0]
