@@ -47,7 +47,8 @@ def numbers_of(value: Value) -> NDArray[np.floating[Any]]:
     """Numbers (...) or colors (..., 3) that a value takes, its factor applied."""
     if isinstance(value, tuple):
         texture, factor = value
-        return texture.pixels * np.asarray(factor, np.float32)
+        same = np.all(np.asarray(factor) == 1.0)
+        return texture.pixels if same else texture.pixels * np.asarray(factor, np.float32)
     return np.asarray(value, np.float64)
 
 

@@ -88,7 +88,7 @@ def read_gltf(path: Path) -> MeshContent:
                 continue
             material = materials.of(primitive.material)
             try:
-                piece = _piece(file, primitive, material, materials.uv_sets(material) or [0])
+                piece = _piece(file, primitive, material, materials.uv_sets(primitive.material))
             except InputError as error:
                 what = f"'meshes.{number}.primitives.{position}': {error.what}"
                 raise InputError(what, where=error.where, hint=error.hint) from None

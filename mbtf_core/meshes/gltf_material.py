@@ -62,6 +62,7 @@ class Materials:
     def __init__(self, file: GltfFile) -> None:
         self.file = file
         self._maps: dict[tuple[Any, ...], NDArray[np.float32]] = {}
+        self._sets: dict[int | None, list[int]] = {}
         self._latest: tuple[int, NDArray[np.floating[Any]]] | None = None
         self._unused: dict[str, None] = {}
 
@@ -71,10 +72,14 @@ class Materials:
             return GltfMaterial()
         return self.file.entry(self.file.document.materials, index, "materials")
 
-    def uv_sets(self, material: GltfMaterial) -> list[int]:
-        """Numbers of the texture coordinates that its textures need, that of the base color first."""
-        placed = (source.placed for source in self._sources(material).values())
-        return list(dict.fromkeys(texture.uv_set for texture in placed if texture is not None))
+    def uv_sets(self, index: int | None) -> list[int]:
+        """Numbers of the texture coordinates that its textures need, that of the base color first; 0 without
+        textures."""
+        if index not in self._sets:
+            placed = (source.placed for source in self._sources(self.of(index)).values())
+            found = dict.fromkeys(texture.uv_set for texture in placed if texture is not None)
+            self._sets[index] = list(found) or [0]
+        return self._sets[index]
 
     def read(
         self, material: GltfMaterial, places: Mapping[int, F64]
@@ -183,7 +188,7 @@ class Materials:
             colors = pixels.shape[2] - (pixels.shape[2] in (2, 4))
             opaque = source.channels == _A and colors == pixels.shape[2]
             channels = [colors if c == 3 else min(c, colors - 1) for c in source.channels]
-            out = np.ones((*pixels.shape[:2], 1)) if opaque else pixels[..., channels]
+            out = np.ones((*pixels.shape[:2], 1)) if opaque else pixels.astype(np.float32)[..., channels]
             if source.encoded:
                 out = srgb_to_linear(out)
             out = out @ np.asarray(LUMINANCE) if source.gray else out if len(channels) > 1 else out[..., 0]

@@ -22,6 +22,8 @@ F64 = NDArray[np.float64]
 _TOLD = ("metallic", "clearcoat", "sheen", "opacity")
 # Distance in tile widths within which vertices count as one.
 _SAME = 1e-5
+# Side of the cells that hold one vertex each in this comparison.
+_CELL = _SAME / 4
 
 
 @dataclass(frozen=True)
@@ -111,9 +113,14 @@ class MeshTile(Tile):
         size = np.array([1.0, self.aspect])
         place = np.column_stack([self.vertices[:, :2] % size, self.vertices[:, 2]])
         place[:, :2] = np.where(place[:, :2] < size, place[:, :2], 0.0)
-        near = cKDTree(place, boxsize=[*size, 0.0]).query_pairs(_SAME, output_type="ndarray")
-        links = coo_array((np.ones(len(near)), near.T), (len(place), len(place)))
-        _, same = connected_components(links, directed=False)
+        # One vertex of each cell: the pairs of many at one place would be as many as its square.
+        i, j, k = np.moveaxis(np.floor((place - place.min(axis=0)) / _CELL).astype(np.int64), -1, 0)
+        _, first, cell = np.unique(
+            (i * (j.max() + 1) + j) * (k.max() + 1) + k, return_index=True, return_inverse=True
+        )
+        near = cKDTree(place[first], boxsize=[*size, 0.0]).query_pairs(_SAME, output_type="ndarray")
+        links = coo_array((np.ones(len(near)), near.T), (len(first), len(first)))
+        same = connected_components(links, directed=False)[1][cell]
         ends = np.stack([self.faces, np.roll(self.faces, -1, axis=1)], axis=-1).reshape(-1, 2)
         welded = np.sort(same[ends].astype(np.int64), axis=1) @ (len(self.vertices), 1)
         _, index, count = np.unique(welded, return_index=True, return_counts=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -78,6 +79,16 @@ def test_a_period_that_does_not_fit_is_noted(tmp_path: Path) -> None:
     path.write_text("mesh: a.ply\nperiod: [0.3, 1]\n")
     with pytest.raises(InputError, match="periods"):
         load_material(path)
+
+
+def test_corners_at_one_place_are_one(tmp_path: Path) -> None:
+    bumps().export(tmp_path / "a.ply")
+    shape = shape_of(tmp_path / "a.ply")
+    corners = shape.vertices[shape.faces].reshape(-1, 3)
+    noise = np.random.default_rng(0).uniform(-4e-7, 4e-7, corners.shape)
+    faces = np.arange(len(corners)).reshape(-1, 3)
+    for moved, edges in ((corners + noise, 0), (corners + 100 * noise, 3 * len(faces))):
+        assert replace(shape, vertices=moved, faces=faces).open_edges()[0] == pytest.approx(edges, abs=10)
 
 
 def test_copies_cover_what_reaches_over_the_border(tmp_path: Path) -> None:
