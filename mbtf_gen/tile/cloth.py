@@ -111,7 +111,8 @@ _Yarn = tuple[Curve, CrossSection, YarnEntry, int]
 def _woven(spec: ClothFile) -> tuple[float, list[_Yarn]]:
     draft = parse_draft(spec.weave or "")
     if draft.size * spec.repeat**2 > _MOST_CROSSINGS:
-        raise InputError(f"would have more than {_MOST_CROSSINGS:,} crossings", hint="take fewer repeats")
+        what = f"would have more than {_MOST_CROSSINGS:,} crossings"
+        raise InputError(what, where="weave", hint="take fewer repeats")
     draft = np.tile(draft, (spec.repeat, spec.repeat))
     rows, columns = draft.shape
     warp, weft = spec.yarn, spec.weft or spec.yarn

@@ -32,7 +32,7 @@ _COMPLETE = "check that the file is complete"
 _SIZES = {0x44: 4, 0x88: 8}
 _KINDS = {b"C0": "Catmull-Rom curves", b"PL": "polylines"}
 _OTHERS = {b"C1": "chordal Catmull-Rom curves", b"C5": "centripetal Catmull-Rom curves"}
-# Most control points of a tile: they take 1.5 GB while they are read.
+# Most control points of a file, and curves: they take 1.9 GB while they are read.
 MOST_POINTS = 4_000_000
 MOST_CURVES = 250_000
 # Bytes of a line of text; a longer one has more than four numbers.
