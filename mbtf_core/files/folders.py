@@ -366,9 +366,9 @@ class OutputFolder:
         items = dict(sorted(self._record.items.items()))
         self._kind.write(self.path, self._record.model_copy(update={"items": items}).model_dump())
 
-    def finished(self, name: str) -> dict[str, Any] | None:
+    def finished(self, name: str, **wanted: Any) -> dict[str, Any] | None:
         """Facts stored by :meth:`keep`, if all files of the item are there as they were written. An item that
-        lacks a file is to be made again.
+        lacks a file, or has other facts than `wanted`, is to be made again.
 
         Raises
         ------
@@ -381,7 +381,7 @@ class OutputFolder:
         for file in there:
             if self._stored(file) != item.files[file]:
                 raise changed(self.path / file)
-        if len(there) == len(item.files):
+        if len(there) == len(item.files) and wanted.items() <= item.facts.items():
             return item.facts
         # If this process is killed, its files may have other bytes than the record says.
         del self._record.items[name]

@@ -130,8 +130,8 @@ def draw(
             f"{turn.spp} paths per pixel"
         )
     # The exposure in use, by picture; the turntable has that of the sheet.
-    found = {name: folder.finished(name) for name in shows}
-    kept = {name: facts is not None and facts["of"] == asked for name, facts in found.items()}
+    found = {name: folder.finished(name, of=asked) for name in shows}
+    kept = {name: facts is not None for name, facts in found.items()}
     exposure = (found[SHEET_NAME] or {}).get("exposure", 0.0)
     if not all(kept.values()):
         exposure = _draw_missing(config, folder, kept, exposure, console)

@@ -125,9 +125,9 @@ def draw_preview(
 
         def draw(name: str, maker: Callable[[Path], dict[str, Any]]) -> dict[str, Any]:
             """Facts of a picture, which is drawn unless it is finished."""
-            file, facts = path / f"{name}.png", folder.finished(name)
-            kept = facts is not None and facts.get("of") == states[name]
-            if facts is None or not kept:
+            file, facts = path / f"{name}.png", folder.finished(name, of=states[name])
+            kept = facts is not None
+            if facts is None:
                 facts = {**maker(file), "of": states[name]}
                 if "fault" not in facts:
                     folder.keep(name, [file], facts)

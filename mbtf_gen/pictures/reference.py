@@ -245,7 +245,7 @@ def render_references(
         if exposure is None:
             exposure = auto_exposure([facts["brightness"] for facts in known.values()])
         for name in known:
-            if folder.finished(f"{name}.png") != {"exposure": exposure}:
+            if folder.finished(f"{name}.png", exposure=exposure) is None:
                 png = write_display(folder.path / name, read_value(folder.path / f"{name}.exr"), exposure)
                 folder.keep(f"{name}.png", [png], {"exposure": exposure})
     pictures = [

@@ -139,6 +139,11 @@ def test_the_same_configuration_keeps_what_is_finished(tmp_path: Path) -> None:
     # Killed while it is made again: its files may have other bytes now.
     (again.path / "a.exr").write_bytes(b"other")
     assert claim(tmp_path / "out").finished("a") is None
+    make(claim(tmp_path / "out"), "a.exr", "a.png")
+    assert claim(tmp_path / "out").finished("a", noise=0.5) == {"noise": 0.5}
+    assert claim(tmp_path / "out").finished("a", noise=0.4) is None
+    (again.path / "a.exr").write_bytes(b"other")
+    assert claim(tmp_path / "out").finished("a") is None
 
 
 @pytest.mark.parametrize("name", ["a.exr", "a.png", "config.yaml"])
