@@ -61,8 +61,10 @@ def report_errors(
     other splits; if `verbose` a table, too. `foreign`: the errors are of the data of another material."""
     from mbtf_core.color import describe_exposure
 
+    if not errors:
+        return ["errors unknown"]
     first = headline(errors)
-    split, of = errors[first], f"of {errors[first]['n']} {SPLIT_NAMES[first]}"
+    split, of = errors[first], f"of {errors[first]['n']} {SPLIT_NAMES.get(first, first)}"
     lines = []
     if split["unexplained"]["value"] is not None:
         value = format_estimate(split["unexplained"])
@@ -72,7 +74,7 @@ def report_errors(
         shown = describe_exposure(split["exposure"])
         lines.append(f"{text} {'' if lines else of + ' '}at {shown}: {word} beside the reference")
     others = [
-        f"{SPLIT_NAMES[name]} {format_estimate(found['unexplained'])}"
+        f"{SPLIT_NAMES.get(name, name)} {format_estimate(found['unexplained'])}"
         for name, found in errors.items()
         if name != first
     ]
@@ -101,7 +103,7 @@ def _remarks(split: Mapping[str, Any], foreign: bool) -> list[str]:
 
 def _table_of(errors: Mapping[str, Any]) -> list[str]:
     """A table of unexplained variance: overall, by level and by lowest cosine; a column per split."""
-    rows = [["unexplained variance", *(SPLIT_NAMES[name] for name in errors)]]
+    rows = [["unexplained variance", *(SPLIT_NAMES.get(name, name) for name in errors)]]
     rows.append(["all", *(format_estimate(split["unexplained"]) for split in errors.values())])
     for grouping, label in (("levels", "level"), ("elevations", "cosine")):
         groups = {group for split in errors.values() for group in split[grouping]}
