@@ -239,7 +239,7 @@ def read_weights(path: Path, framework: str = "pt") -> dict[str, Any]:
             what = f"its tensor '{name}' has numbers of another type than 16, 32 or 64-bit floats"
             raise InputError(what, where=path, hint=AGAIN)
         if not np.isfinite(array).all():
-            raise InputError(f"its tensor '{name}' has NaN or infinite numbers", where=path, hint=AGAIN)
+            raise InputError(f"its tensor '{name}' has numbers that are not finite", where=path, hint=AGAIN)
     return tensors
 
 

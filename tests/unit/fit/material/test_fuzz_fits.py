@@ -103,8 +103,8 @@ def odd_tensors(whole: Path) -> dict[str, tuple[dict[str, torch.Tensor], str]]:
         "flat queries": ({**good, "conformance.rgb": torch.zeros(256)}, "has the shape (256,)"),
         "integers": ({**good, name: good[name].view(torch.int32)}, "another type"),
         "bfloat16": ({**good, name: good[name].bfloat16()}, "another type"),
-        "NaN": ({**good, name: good[name] * math.nan}, "NaN or infinite"),
-        "infinite": ({**good, name: good[name] / 0.0}, "NaN or infinite"),
+        "NaN": ({**good, name: good[name] * math.nan}, "not finite"),
+        "infinite": ({**good, name: good[name] / 0.0}, "not finite"),
         "many": ({**good, **{f"t{k}": torch.zeros(0) for k in range(10_000)}}, "more than 10,000 tensors"),
     }
 
