@@ -63,8 +63,10 @@ def report_errors(
     other splits; if `verbose` a table, too. `foreign`: the errors are of the data of another material."""
     from mbtf_core.color import describe_exposure
 
+    if not errors:
+        return ["errors unknown"]
     first = headline(errors)
-    split, of = errors[first], f"of {errors[first]['n']} {SPLIT_NAMES[first]}"
+    split, of = errors[first], f"of {errors[first]['n']} {SPLIT_NAMES.get(first, first)}"
     lines = []
     if split["unexplained"]["value"] is not None:
         value = format_estimate(split["unexplained"])
@@ -76,7 +78,7 @@ def report_errors(
         seen = "these queries do not resolve the error" if word == UNRESOLVED else seen
         lines.append(f"{text} {'' if lines else of + ' '}at {shown}: {seen}")
     others = [
-        f"{SPLIT_NAMES[name]} {format_estimate(found['unexplained'])}"
+        f"{SPLIT_NAMES.get(name, name)} {format_estimate(found['unexplained'])}"
         for name, found in errors.items()
         if name != first
     ]
@@ -111,7 +113,7 @@ def _remarks(errors: Mapping[str, Any], foreign: bool) -> list[str]:
 
 def _table_of(errors: Mapping[str, Any]) -> list[str]:
     """A table of unexplained variance: overall, by level and by lowest cosine; a column per split."""
-    rows = [["unexplained variance", *(SPLIT_NAMES[name] for name in errors)]]
+    rows = [["unexplained variance", *(SPLIT_NAMES.get(name, name) for name in errors)]]
     rows.append(["all", *(format_estimate(split["unexplained"]) for split in errors.values())])
     for grouping, label in (("levels", "level"), ("elevations", "cosine")):
         groups = {group for split in errors.values() for group in split[grouping]}

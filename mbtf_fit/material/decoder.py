@@ -23,7 +23,7 @@ from mbtf_fit.material.format import (
     Described,
     read_described,
     read_description,
-    read_tensors,
+    read_weights,
     write_tensors,
 )
 
@@ -111,7 +111,7 @@ class Decoder:
 
     def tensors(self) -> dict[str, Tensor]:
         """Tensors of the network, by their names in a material."""
-        return read_tensors(self.folder / WEIGHTS_NAME)[0]
+        return read_weights(self.folder / WEIGHTS_NAME)
 
     def check(self, config: FitConfig) -> None:
         """Refuse a fit of another model or architecture.

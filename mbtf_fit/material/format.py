@@ -35,6 +35,8 @@ CONFORMANCE = {"u": (2,), "sigma": (), "omega_i": (3,), "omega_o": (3,), "rgb": 
 QUERY = tuple(CONFORMANCE)[:-1]
 # Where the header of a file of tensors has JSON data.
 _KEY = "mbtf"
+# Most tensors of a file, each of which takes a call.
+_MOST_TENSORS = 10_000
 # Hint for a damaged material.
 AGAIN = "copy the folder again, or fit again"
 
@@ -67,13 +69,25 @@ class _Conformance(BaseModel):
     count: int
 
 
+class _Estimate(BaseModel):
+    value: float | None
+    error: float | None
+
+
+class _Errors(BaseModel):
+    n: int
+    mse: _Estimate
+    unexplained: _Estimate
+    exposure: Annotated[float, Field(ge=-1000, le=1000)]
+
+
 class _Training(BaseModel):
     steps: int
     batch: int
     seconds: float
     device: str
     threads: int
-    errors: dict[str, Any]
+    errors: dict[str, _Errors]
 
 
 class _Data(BaseModel):
@@ -199,11 +213,34 @@ def read_tensors(path: Path, framework: str = "pt") -> tuple[dict[str, Any], dic
     try:
         with safe_open(path, framework=framework) as file:
             data = json.loads((file.metadata() or {}).get(_KEY, "{}"))
+            if len(file.keys()) > _MOST_TENSORS:
+                raise InputError(f"has more than {_MOST_TENSORS:,} tensors", where=path)
             return {name: file.get_tensor(name) for name in file.keys()}, data  # noqa: SIM118
     except FileNotFoundError:
         raise InputError("no such file", where=path) from None
     except (SafetensorError, OSError, TypeError, ValueError, RecursionError) as error:
         raise InputError(f"cannot be read as tensors ({reason(error)})", where=path) from None
+
+
+def read_weights(path: Path, framework: str = "pt") -> dict[str, Any]:
+    """Tensors of a material, as :func:`read_tensors`.
+
+    Raises
+    ------
+    InputError : missing or corrupt, or a tensor has other numbers than finite floats
+    """
+    tensors, _ = read_tensors(path, framework)
+    for name, tensor in tensors.items():
+        try:
+            array = np.asarray(tensor)
+        except TypeError:  # a type that NumPy lacks
+            array = np.empty(0, np.bool_)
+        if array.dtype.kind != "f":
+            what = f"its tensor '{name}' has numbers of another type than 16, 32 or 64-bit floats"
+            raise InputError(what, where=path, hint=AGAIN)
+        if not np.isfinite(array).all():
+            raise InputError(f"its tensor '{name}' has numbers that are not finite", where=path, hint=AGAIN)
+    return tensors
 
 
 MATERIAL_CONVENTIONS = {

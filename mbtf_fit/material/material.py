@@ -32,7 +32,7 @@ from mbtf_fit.material.format import (
     check_conformance,
     lattice_of,
     read_description,
-    read_tensors,
+    read_weights,
     write_tensors,
 )
 from mbtf_fit.material.inference import evaluate_in_chunks, predict
@@ -119,7 +119,7 @@ class Material:
             model = NeuralMaterial(lattice, read_operations(description["operations"]), config.model)
         except ValueError as error:
             raise InputError(str(error), where=weights.with_name(DESCRIPTION_NAME), hint=AGAIN) from None
-        tensors, _ = read_tensors(weights)
+        tensors = read_weights(weights)
         conformance = check_conformance(tensors, description, weights)
         model.load_weights({n: t for n, t in tensors.items() if not n.startswith("conformance.")})
         model.to(device).requires_grad_(False)

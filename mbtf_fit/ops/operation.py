@@ -35,6 +35,9 @@ NetworkName = Annotated[str, "network"]
 # Values that every list starts from, and their sizes.
 INPUTS = {"u": 2, "level": 1, "omega_i": 3, "omega_o": 3}
 
+# Most operations of a list that is read.
+_MOST_OPERATIONS = 1000
+
 _KINDS: dict[str, type[Operation]] = {}
 _REFERENCE = re.compile(r"(\w+)(?:\[(\d+):(\d+)\])?")
 
@@ -153,6 +156,8 @@ def read_operations(data: Any) -> list[Operation]:
     """
     if not isinstance(data, list):
         raise ValueError("operations are no list")
+    if len(data) > _MOST_OPERATIONS:
+        raise ValueError(f"has more than {_MOST_OPERATIONS} operations")
     out = []
     for k, entry in enumerate(data):
         given = dict(entry) if isinstance(entry, Mapping) else {}
@@ -183,11 +188,15 @@ def sizes_of(operations: Sequence[Operation]) -> dict[str, int]:
 
     Raises
     ------
-    ValueError : an operation reads an unknown value, or one of a wrong size
+    ValueError : an operation reads an unknown value, or one of a wrong size, or a value is computed twice
     """
     sizes = dict(INPUTS)
     for operation in operations:
-        sizes |= operation.results(input_sizes(operation, sizes))
+        found = operation.results(input_sizes(operation, sizes))
+        again = next((name for name in found if name in sizes), None)
+        if again is not None:
+            raise ValueError(f"'{again}' is computed twice")
+        sizes |= found
     if not operations or sizes[operations[-1].output] != 3:
         raise ValueError("the last operation gives no color")
     return sizes

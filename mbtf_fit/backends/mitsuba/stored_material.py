@@ -20,7 +20,7 @@ from mbtf_fit.material.format import (
     check_conformance,
     lattice_of,
     read_description,
-    read_tensors,
+    read_weights,
 )
 from mbtf_fit.material.transmittance import read_transmittance
 from mbtf_fit.ops import Operation, read_operations
@@ -94,7 +94,7 @@ def read_material(folder: str | Path) -> StoredMaterial:
         operations = read_operations(description["operations"])
     except ValueError as error:
         raise InputError(str(error), where=folder / DESCRIPTION_NAME, hint=AGAIN) from None
-    tensors, _ = read_tensors(weights, "np")
+    tensors = read_weights(weights, "np")
     transmittance = read_transmittance(folder, description)
     return StoredMaterial(
         folder,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 from pathlib import Path
 from typing import Any
@@ -100,11 +101,20 @@ def odd_tensors(whole: Path) -> dict[str, tuple[dict[str, torch.Tensor], str]]:
         "another shape": ({**good, name: torch.zeros(1)}, no_fit),
         "few queries": ({**good, "conformance.u": torch.zeros(3, 2)}, "has the shape (3, 2)"),
         "flat queries": ({**good, "conformance.rgb": torch.zeros(256)}, "has the shape (256,)"),
+        "integers": ({**good, name: good[name].view(torch.int32)}, "another type"),
+        "bfloat16": ({**good, name: good[name].bfloat16()}, "another type"),
+        "NaN": ({**good, name: good[name] * math.nan}, "not finite"),
+        "infinite": ({**good, name: good[name] / 0.0}, "not finite"),
+        "many": ({**good, **{f"t{k}": torch.zeros(0) for k in range(10_000)}}, "more than 10,000 tensors"),
     }
 
 
 @pytest.mark.parametrize(
-    "case", ["none", "no weights", "one too many", "another shape", "few queries", "flat queries"]
+    "case",
+    [
+        *("none", "no weights", "one too many", "another shape", "few queries", "flat queries"),
+        *("integers", "bfloat16", "NaN", "infinite", "many"),
+    ],
 )
 def test_odd_tensors(case: str, whole: Path, folder: Path) -> None:
     tensors, message = odd_tensors(whole)[case]
@@ -129,6 +139,30 @@ def test_descriptions_larger_than_the_weights(key: str, value: Any, whole: Path,
         description["levels"]["finest"] = 8
     write(folder, whole, json.dumps(description), None)
     with pytest.raises(InputError, match="too small for the levels"):
+        Material.load(folder)
+
+
+def test_odd_operations(whole: Path, folder: Path) -> None:
+    description = json.loads((whole / DESCRIPTION).read_text())
+    good = description["operations"]
+    square = {"operation": "transform", "x": "u", "function": "square"}
+    for operations, message in (
+        ([*good, good[-1]], "is computed twice"),
+        ([{**square, "output": "level"}, *good], "is computed twice"),
+        ([{**square, "output": "a", "x": "b"}, {**square, "output": "b", "x": "a"}, *good], "'b'"),
+        ([*({**square, "output": f"x{k}"} for k in range(1000)), *good], "more than 1000 operations"),
+    ):
+        write(folder, whole, json.dumps({**description, "operations": operations}), None)
+        with pytest.raises(InputError, match=message):
+            Material.load(folder)
+
+
+@pytest.mark.parametrize("errors", [[], {"test": [1]}, {"test": {"n": 1}}])
+def test_odd_errors(errors: Any, whole: Path, folder: Path) -> None:
+    description = json.loads((whole / DESCRIPTION).read_text())
+    description["training"]["errors"] = errors
+    write(folder, whole, json.dumps(description), None)
+    with pytest.raises(InputError, match=r"training\.errors"):
         Material.load(folder)
 
 

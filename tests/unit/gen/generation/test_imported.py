@@ -98,6 +98,16 @@ def test_options_of_values(opened: Open, tmp_path: Path) -> None:
         opened(Images(), queries={"min_cos": 0.9999})
 
 
+def test_negative_values_are_kept_and_counted(opened: Open, tmp_path: Path) -> None:
+    listed = Listed(1000)
+    listed.arrays["value"][::10, 1] = -0.25
+    job = opened(listed, queries={"train": "900", "test": "100"})
+    import_measured(job, tmp_path / "shards")
+    data = Dataset.open(tmp_path / "shards")
+    stored = sum(int((data.load(split)["value_a"] == -0.25).sum()) for split in ("train", "test"))
+    assert job.negative == stored == 100
+
+
 def test_an_interrupted_import_resumes_with_the_same_bytes(opened: Open, tmp_path: Path) -> None:
     queries = {"train": "20/texel", "test": "100"}
     import_measured(opened(Images(), queries=queries), tmp_path / "whole")
