@@ -350,19 +350,22 @@ def gray(image: Image) -> tuple[NDArray[np.float64], list[str]]:
     if pixels.shape[2] in (2, 4) and np.any(pixels[..., -1] != image.white):
         warnings.append(f"{image.path}: its alpha channel is not used")
     rgb = pixels[..., : 3 if pixels.shape[2] > 2 else 1]
-    first = np.asarray(rgb[..., 0], np.float64)
+    # Large maps: no more copies than needed.
+    values = rgb[..., 0].astype(np.float64)
     spread = 0.0 if rgb.shape[2] == 1 else float(np.max(rgb.max(axis=-1) - rgb.min(axis=-1)))
     if spread == 0.0:
-        return first / image.white, warnings
+        values /= image.white
+        return values, warnings
     tolerance = _GRAY_CODES if image.bits == 8 else 1e-4 * float(np.abs(rgb).max())
     if spread > tolerance:
         warnings.append(
             f"{image.path}: is colored where one number per pixel is expected; its luminance is used"
         )
-    values = LUMINANCE[0] * first
+    values *= LUMINANCE[0]
     for weight, channel in zip(LUMINANCE[1:], (rgb[..., 1], rgb[..., 2]), strict=True):
         values += weight * channel.astype(np.float64)
-    return values / image.white, warnings
+    values /= image.white
+    return values, warnings
 
 
 def linear_rgb(image: Image, space: ColorSpace | None = None) -> NDArray[np.float32]:

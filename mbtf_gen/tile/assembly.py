@@ -162,8 +162,8 @@ def _heights(spec: MaterialFile, load: MapLoader) -> tuple[NDArray[np.float64], 
     refuse_color(image, "height")
     height, warnings = gray(image)
     load.warnings += warnings
-    far = np.abs(height) > _MOST
-    if far.any():
+    if max(-float(height.min()), float(height.max())) > _MOST:
+        far = np.abs(height) > _MOST
         what = f"{count_and_first(far)} beyond {_MOST:g}, as where data are missing"
         raise InputError(what, where=image.path, hint=FILL)
     default = _FLOAT_SCALE if image.bits is None else _INTEGER_SCALE

@@ -20,6 +20,8 @@ Array = NDArray[np.floating[Any]]
 _LIMIT = 1.5
 # Lines along an axis below which no percentile of the interior exists.
 _FEWEST = 16
+# Lines that are compared at once.
+_BLOCK = 256
 
 
 @dataclass(frozen=True)
@@ -58,10 +60,21 @@ def seams(height: Array, rounding: float = 0.0) -> tuple[Seam, ...]:
     for name, axis in axes:
         if height.shape[axis] >= _FEWEST:
             # The step behind the last line is the seam's.
-            steps = np.sqrt(np.mean((np.roll(height, -1, axis) - height) ** 2, axis=1 - axis))
+            steps = _steps(np.moveaxis(height, axis, 0))
             interior = max(float(np.percentile(steps[:-1], 99)), rounding)
             out.append(Seam(name, float(steps[-1]), interior))
     return tuple(out)
+
+
+def _steps(lines: Array) -> NDArray[np.float64]:
+    """Root mean square of the step from each line (first axis) to the next one, in blocks that fit memory."""
+    size = len(lines)
+    out = np.empty(size)
+    for start in range(0, size, _BLOCK):
+        stop = min(start + _BLOCK, size)
+        block = lines[np.arange(start, stop + 1) % size]
+        out[start:stop] = np.sqrt(np.mean(np.diff(block, axis=0) ** 2, axis=1))
+    return out
 
 
 def broken(seam: Seam) -> bool:
