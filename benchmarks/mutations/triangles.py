@@ -35,8 +35,8 @@ _IGNORED = {
 
 
 def obj(rng: Rng, folder: Path) -> Case:
-    """A bumpy tile as OBJ, z up, with a material file. Kd is linear and multiplies its map; colors of vertices
-    are sRGB, as in most files."""
+    """A bumpy tile as OBJ, z up, with a material file. Kd is linear and multiplies its map; colors of
+    vertices are sRGB, as in most files."""
     d = Draws(rng)
     vertices, faces = patch(rng)
     form = d.pick(("v/vt", "v/vt/vn", "negative", "squares"))
