@@ -119,7 +119,8 @@ def _photographs(d: Draws, folder: Path) -> Case:
         how == "HTML" and path.is_dir()
     )
     table, lights, views = (np.concatenate(a) for a in (wanted, light, view))
-    return Case(path, ", ".join(d.words), lambda read: _agree(read, table, lights, views, 0.02), refuse, valid=not how)
+    right = lambda read: _agree(read, table, lights, views, 0.02)  # noqa: E731
+    return Case(path, ", ".join(d.words), right, refuse, valid=not how)
 
 
 def _factors(d: Draws, folder: Path) -> Case:

@@ -157,9 +157,7 @@ _BOMBS: dict[str, Callable[[], Any]] = {
     "polygon.obj of 20 000 corners": lambda: _comb(lambda k: k * (20_000 - k) / 1e8),
     "comb.obj of 20 000 teeth": lambda: _comb(lambda k: k % 2 + (k % 7) / 10),
     "faces.obj of one triangle": lambda: _TRIANGLE + "f 1 2 3\n" * 120_000,
-    "groups.obj": lambda: (
-        _TRIANGLE + "".join(f"usemtl m{k}\nf 1 2 3\n" for k in range(30_000))
-    ),
+    "groups.obj": lambda: _TRIANGLE + "".join(f"usemtl m{k}\nf 1 2 3\n" for k in range(30_000)),
     "faces.ply of 3e8": lambda: _ply(
         f"{_HEAD} 300000000\nproperty list uchar int vertex_indices\n", bytes(100)
     ),

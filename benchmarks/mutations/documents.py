@@ -55,7 +55,8 @@ def make(rng: Rng, folder: Path) -> Case:
         return Case(path, name, lambda tile: tile.maps["roughness"] == 0.25)
     if kind == "cloth":
         key = d.pick(("yarn: {color: *}", "yarn: {radius: *}", "repeat: *", "fiber: {ior: *}"))
-        path.write_text(f"weave: plain\n{key.replace('*', d.pick(('.nan', '-1', '1e9', '1' + 30 * '0', 'x')))}\n")
+        value = d.pick((".nan", "-1", "1e9", "1" + 30 * "0", "x"))
+        path.write_text(f"weave: plain\n{key.replace('*', value)}\n")
         return Case(path, path.read_text(), refuse=True)
     if kind == "scale":
         written = d.pick(("0.5", "-0.5", "1e3", "1e30", ".nan", "0", "x"), "scale")

@@ -173,7 +173,8 @@ def make(rng: Rng, folder: Path) -> Case:
         colors = rng.uniform(0, 1, (len(vertices) if varying else 1, 3)) * np.ones((len(vertices), 1))
         kind = d.pick("fBH", f"{'varying' if varying else 'uniform'} COLOR_0 of type")
         largest = {"f": 1.0, "B": 255.0, "H": 65535.0}[kind]
-        colors = colors.astype(np.float32).astype(float) if kind == "f" else np.round(colors * largest) / largest
+        exact = np.round(colors * largest) / largest
+        colors = colors.astype(np.float32).astype(float) if kind == "f" else exact
         attributes["COLOR_0"] = w.accessor(colors * largest, kind, normalized=kind != "f")
     if d.chance(0.2):
         name = d.pick(_IGNORED, "extension")
@@ -237,7 +238,8 @@ def make(rng: Rng, folder: Path) -> Case:
         "accessors": w.accessors,
         "bufferViews": w.views,
     }
-    optional: dict[str, Any] = {"materials": [material] if material else [], "images": images, "textures": textures}
+    optional: dict[str, Any] = {"images": images, "textures": textures}
+    optional["materials"] = [material] if material else []
     optional |= {"samplers": samplers, "extensionsUsed": sorted(used), "extensionsRequired": required}
     document |= {name: value for name, value in optional.items() if value}
     refuse = "EXT_unheard_of" in required or (d.chance(0.2) and _break(document, d))

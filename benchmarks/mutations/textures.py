@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
+import json
 import struct
 import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import json
 
 from mutations.case import F64, Case, Draws, Rng, damaged, encoded, linear, quarters
 
-# Of each style the form of its file names, {b} being the material's name, {r} its resolution and {m} the map,
-# and the maps. Packed maps name their channels; "-x" is 1 - x; "dx" a normal map with green down; "" is not used.
+# Of each style the form of its file names, {b} being the material's name, {r} its resolution and {m} the
+# map, and the maps. Packed maps name their channels; "-x" is 1 - x; "dx" a normal map with green down; "" is
+# not used.
 _STYLES: dict[str, tuple[str, str]] = {
     "ambientCG": (
         "{b}_{r}-JPG_{m}.jpg",
-        "Color=color Displacement=height NormalGL=normal NormalDX=dx Roughness=rough AmbientOcclusion= Metalness=metal",
+        "Color=color Displacement=height NormalGL=normal NormalDX=dx Roughness=rough Metalness=metal AO=",
     ),
     "Poly Haven": ("{b}_{m}_{r}.png", "diff=color disp=height nor_gl=normal rough=rough ao="),
     "Poly Haven arm": ("{b}_{m}_{r}.png", "diff=color disp=height arm=,rough,metal"),
@@ -35,7 +36,7 @@ _STYLES: dict[str, tuple[str, str]] = {
     ),
     "Substance": (
         "{b}_{m}.png",
-        "Base_Color=color Height=height Normal_OpenGL=normal Roughness=rough Metallic=metal Mixed_AO= Emissive=",
+        "Base_Color=color Height=height Normal_OpenGL=normal Roughness=rough Metallic=metal Mixed_AO=",
     ),
     "Substance packed": (
         "{b}_{m}.png",

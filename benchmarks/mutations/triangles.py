@@ -35,7 +35,8 @@ _IGNORED = {
 
 
 def obj(rng: Rng, folder: Path) -> Case:
-    """A bumpy tile as OBJ, z up, with a material file; colors are linear, Kd multiplies its map."""
+    """A bumpy tile as OBJ, z up, with a material file. Kd is linear and multiplies its map; colors of
+    vertices are sRGB, as in most files."""
     d = Draws(rng)
     vertices, faces = patch(rng)
     form = d.pick(("v/vt", "v/vt/vn", "negative", "squares"))
@@ -136,7 +137,7 @@ def obj(rng: Rng, folder: Path) -> Case:
     expected: list[Any] = []
     for x, y in PLACES:
         number, weights, z = hit(vertices, faces, x, y) or (0, np.ones(3), 0.0)
-        color = factor * (weights @ colors[faces[number]])
+        color = factor * (weights @ linear(colors)[faces[number]])
         if texture is not None:
             u, v = to_uv @ [*(weights @ uv[faces[number]]), 1.0]
             color = color * looked_up(texture, u, v, wrap)
