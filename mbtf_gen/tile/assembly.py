@@ -40,6 +40,8 @@ from mbtf_gen.tile.maps.tiling import BAND, retile, seams
 _INTEGER_SCALE, _FLOAT_SCALE = 0.05, 1.0
 # Largest stored height; squares of larger ones are beyond float32.
 _MOST = 1e15
+# Pixels of quantized heights that are smoothed whatever their file's size, and those of each byte.
+_SMOOTHED, _SMOOTHED_PER_BYTE = 1 << 24, 64
 # Linear gray where no base color is given.
 _DEFAULT_COLOR = 0.5
 
@@ -176,6 +178,7 @@ def _heights(spec: MaterialFile, load: MapLoader) -> tuple[NDArray[np.float64], 
         if step is not None and codes.levels > 1:
             load.warnings.append(level_warning(image.path, codes, image.bits, step, entry.dequantize))
             if entry.dequantize:
+                _check_smoothed(height.size, image.path)
                 height = dequantize(height, step / white)
     load.settings["height"] = [scale, step if entry.dequantize else None]
     if entry.colorspace == "srgb":
@@ -184,6 +187,17 @@ def _heights(spec: MaterialFile, load: MapLoader) -> tuple[NDArray[np.float64], 
     kind = "floats" if image.bits is None else f"{image.bits}-bit integers"
     load.notes.append(f"heights: {image.path.name}, {image.shape[1]} x {image.shape[0]} {kind}")
     return height, codes, scale
+
+
+def _check_smoothed(pixels: int, path: Path) -> None:
+    """Refuse a large map of a small file, whose smoothing takes gigabytes: 60 bytes per pixel."""
+    size = path.stat().st_size
+    if pixels > max(_SMOOTHED, _SMOOTHED_PER_BYTE * size):
+        raise InputError(
+            f"has {pixels:,} pixels in {size:,} bytes, almost all of which are alike",
+            where=path,
+            hint=f"reduce it, or write height: {{file: {path.name}, dequantize: false}}",
+        )
 
 
 def _bsdf(tree: dict[str, Any], load: MapLoader) -> tuple[dict[str, Any], dict[str, Any]]:

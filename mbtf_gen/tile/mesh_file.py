@@ -110,7 +110,8 @@ def read_mesh(spec: MeshFile, folder: Path) -> MeshTile:
         files=files,
         digests={
             **{role: file_sha256(file) for role, file in files.items()},
-            "settings": data_sha256(spec.model_dump(mode="json", exclude={"mesh"})),
+            # The number rises when the same file is read as another material.
+            "settings": data_sha256([2, spec.model_dump(mode="json", exclude={"mesh"})]),
         },
         warnings=(
             *warnings,

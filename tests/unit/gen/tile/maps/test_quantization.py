@@ -6,8 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from support.height_maps import Floats, fractal, rms, save_heights, slopes
 
+from mbtf_core.errors import InputError
 from mbtf_core.images.resample import dequantize
 from mbtf_gen.tile.loading import load_material
 from mbtf_gen.tile.maps.checks import code_use
@@ -114,3 +116,15 @@ class TestMaterial:
         material = load_material(path)
         assert "not smoothed (dequantize: false)" in material.warnings[0]
         assert np.array_equal(np.rint(material.height * 255), material.height * 255)
+
+
+def test_large_maps_of_small_files_are_not_smoothed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Smoothing takes 60 bytes per pixel: a file of kilobytes would take gigabytes."""
+    monkeypatch.setattr("mbtf_gen.tile.assembly._SMOOTHED", 1 << 12)
+    path = tmp_path / "h.png"
+    Image.fromarray(np.repeat(np.arange(128, dtype=np.uint8)[:, None] // 64, 128, axis=1)).save(path)
+    assert path.stat().st_size * 64 < 128**2
+    with pytest.raises(InputError, match="almost all"):
+        load_material(path)
+    (tmp_path / "material.yaml").write_text("height: {file: h.png, dequantize: false}\n")
+    assert load_material(tmp_path).height.shape == (128, 128)
