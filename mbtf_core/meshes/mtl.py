@@ -162,6 +162,8 @@ def material_values(
                 remarks.append(f"{' '.join(options.unused)} of map_{key} is not used")
             if factor is not None and not np.any(factor):
                 remarks.append(f"{key} 0 makes map_{key} black")
+            elif factor is not None and np.min(factor) < 1.0 and role == "base_color":
+                remarks.append(f"{key} {material.statements[key.lower()][1]} darkens map_{key}")
             if role == "base_color":
                 pixels = companions.color(options.name)
             else:

@@ -1,6 +1,8 @@
-"""Which axis of a mesh seems to point up, where its format does not say it."""
+"""Which axis of a mesh seems to point up."""
 
 from __future__ import annotations
+
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,22 +11,25 @@ from numpy.typing import NDArray
 _THIN = 0.5
 
 
-def y_seems_up(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> bool:
-    """Whether triangles look like a sheet that lies in the plane of x and z.
+def seems_up(axis: Literal["y", "z"], vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> bool:
+    """Whether triangles look like a sheet that lies in the plane of x and the other axis.
 
-    It is thin along y, and most of its area faces along y rather than z.
+    It is thin along the axis, and most of its area faces along it rather than along the other one.
 
     Parameters
     ----------
+    axis : {"y", "z"}
+        The axis in question.
     vertices : (n, 3) float64 array
         Positions in the axes of the file.
     faces : (m, 3) int64 array
         Vertices of each triangle.
     """
     corners = vertices[faces]
-    along_x, along_y, along_z = np.ptp(corners.reshape(-1, 3), axis=0)
-    if along_y >= _THIN * min(along_x, along_z):
+    up, other = (1, 2) if axis == "y" else (2, 1)
+    extent = np.ptp(corners.reshape(-1, 3), axis=0)
+    if extent[up] >= _THIN * min(extent[0], extent[other]):
         return False
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    _, facing_y, facing_z = np.abs(normals).sum(axis=0)
-    return bool(facing_y > facing_z)
+    facing = np.abs(normals).sum(axis=0)
+    return bool(facing[up] > facing[other])

@@ -84,6 +84,8 @@ def _power_of_two(resolution: int) -> int:
 
 
 def _gray(value: Any) -> Any:
+    if isinstance(value, str):
+        raise ValueError("must be one number or three")
     return (value, value, value) if isinstance(value, int | float) and not isinstance(value, bool) else value
 
 

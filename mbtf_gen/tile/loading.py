@@ -158,7 +158,7 @@ def described(path: Path) -> tuple[Described, Path, FoundMaps]:
         raise InputError("is a measured BTF", where=path, hint=f"import it: mbtf-gen import {path}")
     if not is_image(path):
         raise InputError(
-            f"'{path.suffix}' is not a height map",
+            f"'{path.suffix}' is not read",
             where=path,
             hint=unpack(path)
             or (_RAW_HINT if suffix in _RAW else "")

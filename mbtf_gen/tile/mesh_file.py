@@ -16,7 +16,7 @@ from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import data_sha256, file_sha256
 from mbtf_core.meshes.content import MOST_TRIANGLES, MeshShape, Value, numbers_of, of_faces
 from mbtf_core.meshes.read import read_mesh_content
-from mbtf_core.meshes.up_axis import y_seems_up
+from mbtf_core.meshes.up_axis import seems_up
 from mbtf_core.paths import named_file
 from mbtf_gen.config.generator import Positive, Resolution, Rgb, Share, no_tiling
 from mbtf_gen.tile.maps.material_file import LOBES, ROLES
@@ -80,8 +80,11 @@ def read_mesh(spec: MeshFile, folder: Path) -> MeshTile:
     parts = [MeshPart(shape.name, shape.values) for shape in shapes]
     up = spec.up or content.up
     warnings = [f"{path}: {text}" for text in content.warnings]
-    if up is None and y_seems_up(vertices, faces):
-        warnings.append(f"{path}: it looks like y is up: if so, give 'up: y' in a material.yaml")
+    other: Literal["y", "z"] = "z" if up == "y" else "y"
+    if spec.up is None and seems_up(other, vertices, faces):
+        warnings.append(f"{path}: it looks like {other} is up: if so, give 'up: {other}' in a material.yaml")
+    if spec.base_color is None and any(map(_lacks_image, content.shapes)):
+        warnings.append(f"{path}: has texture coordinates, but names no image: the color is {_GRAY:g}")
     if up == "y":
         vertices = vertices[:, [0, 2, 1]] * (1.0, -1.0, 1.0)
     used = of_faces(vertices, faces)
@@ -182,6 +185,12 @@ def _check(name: str, role: str, value: Value, uv: F64 | None) -> None:
     if not (np.isfinite(numbers).all() and numbers.min() >= 0.0 and numbers.max() <= most):
         text = ", ".join(f"{number:g}" for number in numbers.ravel())
         raise InputError(f"'{name}' has the {role} {text}, not within 0 and {most:g}")
+
+
+def _lacks_image(shape: MeshShape) -> bool:
+    """Whether texture coordinates have nothing to place."""
+    colored = shape.colors is not None or "base_color" in {*shape.values, *shape.faults}
+    return shape.uv is not None and not colored and bool(np.ptp(shape.uv) > 0)
 
 
 def _joined(shapes: list[MeshShape], path: Path) -> tuple[F64, NDArray[np.int_], F64, NDArray[np.int_]]:

@@ -13,6 +13,7 @@ from typing import Any
 
 from mbtf_core.errors import InputError
 from mbtf_core.images.read import SUFFIXES, is_image, read_image
+from mbtf_core.meshes.read import MESH_FILES
 from mbtf_gen.tile.maps.file_names import (
     SMOOTHNESS_IN_ALPHA,
     WEAK_WORDS,
@@ -240,8 +241,10 @@ def _images(folder: Path) -> list[Path]:
 
 
 def _elsewhere(folder: Path) -> str:
-    """Hint at another place of the maps: an archive, or a subfolder with a height map."""
+    """Hint at what else is there: a mesh, a subfolder with a height map, or an archive."""
     content = _content(folder)
+    if mesh := next((p for p in content if p.suffix.lower() in MESH_FILES), None):
+        return f"did you mean '{mesh}'?"
     for below in (p for p in content if p.is_dir()):
         with contextlib.suppress(InputError):
             if any(role_of(p.name) == "height" for p in _images(below)):

@@ -16,7 +16,7 @@ from mbtf_core.images.limits import MAX_PIXELS
 from mbtf_core.images.read import Image, count_and_first, gray, linear_rgb, read_image
 from mbtf_core.paths import named_file
 from mbtf_gen.tile.maps.checks import refuse_color
-from mbtf_gen.tile.maps.file_names import role_of
+from mbtf_gen.tile.maps.file_names import role_of, tokens
 from mbtf_gen.tile.maps.material_file import ColorEntry, HeightEntry, NormalEntry, ShareEntry
 from mbtf_gen.tile.maps.normal_encoding import height_of, stored_xy
 
@@ -27,6 +27,8 @@ Share = NDArray[np.float64] | float | None
 _ROUNDING, _HALF = 1e-6, 2.0**-10
 # Rounding of matrices and profiles, beyond which colors out of Rec.709 are reported.
 _GAMUT = 1e-3
+# Words of file names that say another color space, which files often do not declare.
+_FOREIGN_NAMES = {"aces", "acescg"}
 _RANGE = "its numbers belong into [0, 1]: scale them, or clamp them in an image editor"
 # Numbers that terrains customarily have where there is no data.
 _NO_DATA = (-9999.0, -99999.0, -32768.0, -32767.0, -(2.0**31), 2.0**32 - 1.0)
@@ -242,6 +244,12 @@ class MapLoader:
             if tags.space is not None:
                 what = f"has the numbers of {shown} in spite of its name, and is read as that"
             self.warnings.append(f"{image.path}: its {tags.foreign} {what}")
+        named = _FOREIGN_NAMES.intersection(tokens(image.path.name))
+        if named and entry.colorspace is None and (tags.space, tags.declared, tags.foreign) == (None,) * 3:
+            self.warnings.append(
+                f"{image.path}: its name says {min(named)}, but it declares no color space, and is read as "
+                f"{shown}; if it is not, convert it"
+            )
         self.notes.append(f"{role.replace('_', ' ')}: {image.path.name} read as {shown} ({why})")
         return space
 
