@@ -7,7 +7,7 @@ faults. A maker knows what a right reading is, by its own arithmetic. A reading 
 
 - ``right``; ``refused`` in at most two lines; ``undecided``: damaged bytes were read, and nobody knows;
 - ``wrong``: read as something else without a warning, or read although the format forbids it;
-- ``traceback``: an exception that is not ours; ``noise``: another library writes to standard error;
+- ``traceback``: an exception that is not ours, or a message of more than two lines;
 - ``slow``: over 30 s of processor time; ``large``: over 2 GiB.
 
 ``refused valid`` counts the refusals of inputs that the formats allow. ``--keep`` stores the inputs that are
@@ -16,7 +16,6 @@ read badly, one folder each. The last line is one JSON object.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import multiprocessing
 import os
@@ -27,7 +26,6 @@ import time
 import traceback
 import warnings
 from collections import Counter
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -53,7 +51,7 @@ MAKERS: dict[str, Maker] = {
 }
 DAMAGED = {f"damaged {name}": damaged(maker) for name, maker in MAKERS.items()}
 KINDS = {**MAKERS, **DAMAGED, "bombs": bombs.make}
-BAD = ("wrong", "traceback", "noise", "slow", "large")
+BAD = ("wrong", "traceback", "slow", "large")
 SECONDS, BYTES = 30.0, 2 << 30
 WORKERS = 2
 
@@ -62,6 +60,7 @@ def classified(case: Case) -> tuple[str, str]:
     """(class, detail) of one input."""
     from mbtf_gen.tile.loading import load_material
 
+    result: Any
     try:
         if case.path.suffix in archives.SUFFIXES:
             result, said = archives.read(case.path), ""
@@ -73,7 +72,7 @@ def classified(case: Case) -> tuple[str, str]:
         right = not case.refuse and case.check(result)
     except MbtfError as error:
         if error.message.count("\n") > 1 or len(error.message) > 1000:
-            return "noise", f"a message of {len(error.message)} characters: {error.message[:300]}"
+            return "traceback", f"a message of {len(error.message)} characters: {error.message[:300]}"
         return "refused valid" if case.valid else "refused", reason(error)
     except MemoryError:
         return "large", "MemoryError"
@@ -92,19 +91,6 @@ def classified(case: Case) -> tuple[str, str]:
     return ("right", "") if right or told else ("wrong", "other values")
 
 
-@contextlib.contextmanager
-def diverted(stream: int, path: Path) -> Iterator[None]:
-    """Send what libraries write to a stream to a file."""
-    kept = os.dup(stream)
-    with path.open("wb") as file:
-        os.dup2(file.fileno(), stream)
-    try:
-        yield
-    finally:
-        os.dup2(kept, stream)
-        os.close(kept)
-
-
 def work(pipe: Connection) -> None:
     """Make and read inputs, one after the other, as the other end asks."""
     import mitsuba as mi
@@ -117,16 +103,10 @@ def work(pipe: Connection) -> None:
         draws = Draws(np.random.default_rng(seed), seed[-1])
         case = KINDS[kind](draws, folder)
         pipe.send(", ".join(filter(None, draws.words)))
-        told = folder.with_suffix(".stderr")
         began = time.process_time()
-        with diverted(2, told):
-            found = classified(case)
-        if (took := time.process_time() - began) > SECONDS:
-            found = "slow", f"{took:.0f} s"
-        noise = told.read_text(errors="replace").strip()
-        if noise and found[0] not in BAD:
-            found = "noise", f"{found[0]}; on standard error: {noise[:200]}"
-        pipe.send((*found, took))
+        found = classified(case)
+        seconds = time.process_time() - began
+        pipe.send((*(("slow", "") if seconds > SECONDS else found), seconds))
 
 
 class Worker:
@@ -150,6 +130,7 @@ class Worker:
                 row["MiB"] = max(row["MiB"], int(pages) * os.sysconf("SC_PAGE_SIZE") >> 20)
                 if row["MiB"] > BYTES >> 20 or time.perf_counter() - began > 4 * SECONDS:
                     self.process.kill()
+                    self.process.join()
                     name = "large" if row["MiB"] > BYTES >> 20 else "slow"
                     return row | {"class": name, "detail": "", "seconds": time.perf_counter() - began}
             name, detail, seconds = self.pipe.recv()

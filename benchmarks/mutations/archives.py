@@ -54,7 +54,7 @@ def _unit(angles: Any) -> F64:
 def make(d: Draws, folder: Path) -> Case:
     """One of the kinds, with variations of what writers do and faults."""
     maker = d.pick((_photographs, _factors, _hdf5, _hdf5))
-    return maker(d, folder)  # type: ignore[no-any-return]
+    return maker(d, folder)
 
 
 def _photographs(d: Draws, folder: Path) -> Case:
@@ -101,8 +101,8 @@ def _photographs(d: Draws, folder: Path) -> Case:
                 archive.writestr(name, content)
         if how == "HTML":
             path.write_bytes(b"<!DOCTYPE html><html>quota exceeded</html>")
-    light, view = (_unit(a) for a in zip(*angles, strict=True))
-    return _case(path, light, view, images[:-1], how, 0.02, how not in ("alpha", "16-bit"))
+    lights, views = (_unit(a) for a in zip(*angles, strict=True))
+    return _case(path, lights, views, images[:-1], how, 0.02, how not in ("alpha", "16-bit"))
 
 
 def _factors(d: Draws, folder: Path) -> Case:

@@ -19,20 +19,9 @@ F64 = NDArray[np.float64]
 class Case:
     """An input.
 
-    Attributes
-    ----------
-    path : Path
-        What is given to the reader.
-    check : function
-        Whether a reading, the reader's result, is right; None where nobody knows.
-    refuse : bool
-        Whether only a refusal is right.
-    tell : tuple of str
-        Words, one of which a warning must have.
-    unless : bool
-        Whether nothing needs to be said where the reading is right.
-    valid : bool
-        Whether the input follows its format and uses only what is documented as read.
+    `check` says whether a reading, the reader's result, is right, and None where nobody knows; `refuse` that
+    only a refusal is right; `tell` are words, one of which a warning must have, even of a right reading where
+    not `unless`. An input is `valid` that follows its format and uses only what is documented as read.
     """
 
     path: Path
@@ -83,7 +72,7 @@ def damaged(maker: Maker) -> Maker:
     def make(d: Draws, folder: Path) -> Case:
         case = maker(d, folder)
         files = [p for p in sorted(folder.rglob("*")) if p.is_file() and p.name != "material.yaml"]
-        file = d.pick(files if case.path.suffix != ".yaml" or len(files) else [case.path])
+        file = d.pick(files)
         data = bytearray(file.read_bytes() or b" ")
         at = int(d.rng.integers(len(data)))
         how = d.pick(("cut", "bits", "ones", "zeros", "twice"), f"{file.name}:")
@@ -135,20 +124,10 @@ def wrapped(i: int, size: int, how: str) -> int:
 
 @dataclass
 class Look:
-    """A mesh as its maker wrote it, z up: what a reading is compared with.
+    """A mesh as its maker wrote it, z up, and what it reflects; colors are linear.
 
-    Attributes
-    ----------
-    vertices, faces, uv : array
-        (n, 3), (m, 3), and (n, 2) as in the file.
-    factor, colors, texture : array
-        Linear color (3,), its factors at vertices (n, 3), and a texture (H, W, 3).
-    to_uv : array
-        From the file's coordinates to those of the texture, v up, (2, 3).
-    wrap, nearest : (str, str), bool
-        How the texture goes on along u and v, and whether its texels are not blended.
-    more : dict
-        Other parameters: numbers, or textures (H, W, 1) without `to_uv`.
+    `to_uv` (2, 3) takes the file's coordinates to those of the texture, v up; `more` are other parameters,
+    numbers or textures (H, W, 1) without `to_uv`.
     """
 
     vertices: F64
@@ -170,7 +149,8 @@ class Look:
         if self.colors is not None:
             color = color * (weights @ self.colors[self.faces[number]])
         if self.texture is not None:
-            color = color * looked_up(self.texture, *(self.to_uv @ (u, v, 1)), self.wrap, self.nearest)
+            s, t = self.to_uv @ (u, v, 1)
+            color = color * looked_up(self.texture, s, t, self.wrap, self.nearest)
         more = {k: looked_up(m, u, v) if np.ndim(m) else m for k, m in self.more.items()}
         return {"z": (z - high[2]) / (high - low)[0], "base_color": color, **more}
 

@@ -100,7 +100,7 @@ def pattern(d: Draws, folder: Path) -> Case:
     """Wavy yarns along x as a periodic yarn pattern, in a material file of few fibers."""
     px, py, radius, each = d.between(0.5, 3), d.between(0.5, 3), d.between(0.01, 0.03), 12
     s, n = (np.arange(each) + 0.5) / each, int(d.rng.integers(1, 4))
-    rows, edges = [], []
+    rows, edges = list[list[float]](), list[list[float]]()
     for yarn in range(n):
         rows += [[px * t, (yarn + 0.5) / n * py, 0.05 * px * np.sin(2 * np.pi * t), 0.0] for t in s]
         first = yarn * each

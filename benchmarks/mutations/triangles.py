@@ -100,6 +100,7 @@ def ply(d: Draws, folder: Path) -> Case:
     form = d.pick(("ascii", "binary_little_endian", "binary_big_endian"), "form")
     header = ["ply", f"format {form} 1.0", "comment made by hand"]
     kind = d.pick(("float", "double"))
+    stored: Any = vertices
     columns: list[Any] = [(kind, name, vertices[:, k]) for k, name in enumerate("xyz")]
     tell: tuple[str, ...] = ()
     corners = False
@@ -119,16 +120,16 @@ def ply(d: Draws, folder: Path) -> Case:
     elif what == "color":
         whole, look.factor = d.rng.integers(0, 256, (len(vertices), 3)), np.ones(3)
         if d.chance(0.5, "8-bit colors"):
-            stored, look.colors = ("uchar", whole), linear(whole / 255.0)
+            look.colors, kind, stored = linear(whole / 255.0), "uchar", whole
         else:
-            stored, look.colors = ("float", whole / 255.0), whole / 255.0
-        columns += [(stored[0], name, stored[1][:, k]) for k, name in enumerate(("red", "green", "blue"))]
+            look.colors, kind, stored = whole / 255.0, "float", whole / 255.0
+        columns += [(kind, name, stored[:, k]) for k, name in enumerate(("red", "green", "blue"))]
         tell = ("vertex color", "colors of")
     if d.chance(0.3, "a property more"):
         columns.insert(int(d.rng.integers(len(columns))), ("short", "quality", np.arange(len(vertices))))
     how = d.fault(0.2, "300000000", "2147483647", "NaN", "index 99", "no faces")
     if how == "NaN":
-        columns[0][2][5] = np.nan
+        vertices[5, 0] = np.nan
     elif how == "index 99":
         faces[3, 1] = 99
     elif how == "no faces":
