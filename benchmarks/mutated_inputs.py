@@ -45,7 +45,6 @@ MAKERS: dict[str, Maker] = {
     "textures": textures.make,
     "images": images.make,
     "curves": curves.make,
-    "yarns": curves.pattern,
     "measured": archives.make,
     "yaml": documents.make,
 }

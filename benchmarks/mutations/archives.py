@@ -60,15 +60,9 @@ def make(d: Draws, folder: Path) -> Case:
 def _photographs(d: Draws, folder: Path) -> Case:
     """UBO2003: names hold the angles; 8-bit sRGB."""
     angles = [((tl, pl), (tv, pv)) for tl, pl in ((0, 0), (30, 60)) for tv, pv in ((15, 90), (45, 300))]
-    how = d.fault(0.35, "twice", "other size", "names", "HTML", "text inside", "alpha", "16-bit")
-    form = d.pick(
-        (
-            "{0:05d} tl{1:03d} pl{2:03d} tv{3:03d} pv{4:03d}",
-            "{0:05d}_tl{1:03d}_pl{2:03d}_tv{3:03d}_pv{4:03d}",
-            "tv{3:03d}_pv{4:03d}/tl{1:03d}_pl{2:03d}_tv{3:03d}_pv{4:03d}",
-        ),
-        "names",
-    )
+    how = d.fault(0.35, "twice", "other size", "names", "text inside", "alpha", "16-bit")
+    folders = "tv{3:03d}_pv{4:03d}/" if d.chance(0.3, "in folders") else "{0:05d}_"
+    form = folders + d.pick("_ ", "between").join(("tl{1:03d}", "pl{2:03d}", "tv{3:03d}", "pv{4:03d}"))
     kind = d.pick(("PNG", "JPEG"), "images") if how not in ("alpha", "16-bit") else "PNG"
     files: dict[str, bytes] = {}
     images = []
@@ -87,20 +81,15 @@ def _photographs(d: Draws, folder: Path) -> Case:
     if d.chance(0.3, "other files"):
         files |= dict.fromkeys(("readme.txt", "__MACOSX/._x.jpg", "Thumbs.db"), b"x")
         files["calibration.png"] = encoded(np.zeros((4, 4, 3), np.uint8))
-    if d.chance(0.3, "a folder above"):
-        files = {f"MATERIAL/{name}": content for name, content in files.items()}
-    path = folder / "m.zip"
-    if how != "HTML" and d.chance(0.3, "unpacked"):
-        path = folder / "m.photographs"
-        for name, content in files.items():
-            (path / name).parent.mkdir(parents=True, exist_ok=True)
-            (path / name).write_bytes(content)
-    else:
-        with zipfile.ZipFile(path, "w", d.pick((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))) as archive:
-            for name, content in files.items():
-                archive.writestr(name, content)
-        if how == "HTML":
-            path.write_bytes(b"<!DOCTYPE html><html>quota exceeded</html>")
+    above = "MATERIAL/" if d.chance(0.3, "a folder above") else ""
+    path = folder / ("m.photographs" if d.chance(0.3, "unpacked") else "m.zip")
+    for name, content in files.items():
+        if path.suffix == ".zip":
+            with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive:
+                archive.writestr(above + name, content)
+        else:
+            (path / above / name).parent.mkdir(parents=True, exist_ok=True)
+            (path / above / name).write_bytes(content)
     lights, views = (_unit(a) for a in zip(*angles, strict=True))
     return _case(path, lights, views, images[:-1], how, 0.02, how not in ("alpha", "16-bit"))
 
@@ -142,9 +131,8 @@ def _hdf5(d: Draws, folder: Path) -> Case:
 
     queries = d.chance(0.5, "queries")
     n = 24 if queries else 3
-    light, view = (
-        _unit(np.column_stack([d.rng.uniform(0, 78, n), d.rng.uniform(0, 360, n)])) for _ in range(2)
-    )
+    angles = d.rng.uniform((0, 0), (78, 360), (2, n, 2))
+    light, view = map(_unit, angles)
     color = d.rng.uniform(0, 1, (n, 3) if queries else (n, 4, 5, 3)).astype("f4")
     stored = {"ground_light": light[:, :2], "ground_camera_dir": view[:, :2], "ground_color": color}
     if queries:

@@ -113,15 +113,6 @@ def encoded(codes: NDArray[Any], kind: str = "PNG", **options: Any) -> bytes:
     return stream.getvalue()
 
 
-def wrapped(i: int, size: int, how: str) -> int:
-    """Number of a texel in a row that repeats, is mirrored, or ends."""
-    if how == "clamp":
-        return min(max(i, 0), size - 1)
-    if how == "mirror":
-        return min(i % (2 * size), 2 * size - 1 - i % (2 * size))
-    return i % size
-
-
 @dataclass
 class Look:
     """A mesh as its maker wrote it, z up, and what it reflects; colors are linear.
@@ -176,8 +167,14 @@ def looked_up(
     for j in (math.floor(y), math.floor(y) + 1):
         for i in (math.floor(x), math.floor(x) + 1):
             weight = max(1 - abs(x - i), 0) * max(1 - abs(y - j), 0)
-            total += weight * texture[wrapped(j, rows, wrap[1]), wrapped(i, columns, wrap[0])]
+            total += weight * texture[_in_range(j, rows, wrap[1]), _in_range(i, columns, wrap[0])]
     return total
+
+
+def _in_range(i: int, size: int, how: str) -> int:
+    if how == "clamp":
+        return min(max(i, 0), size - 1)
+    return min(i % (2 * size), 2 * size - 1 - i % (2 * size)) if how == "mirror" else i % size
 
 
 def patch(rng: np.random.Generator) -> tuple[F64, NDArray[np.int_]]:

@@ -1,4 +1,4 @@
-"""Curves (.curves and .bcc) and periodic yarns (.pyp)."""
+"""Curves as text (.curves) and as binary collections (.bcc)."""
 
 from __future__ import annotations
 
@@ -63,8 +63,8 @@ def _text(runs: list[F64], folder: Path, d: Draws) -> Case:
     text = "\ufeff" * (style == "BOM") + ("\r\n" if style == "CRLF" else "\n").join(lines)
     (folder / "f.curves").write_bytes(text.encode())
     through = [(p[:-2] + 4 * p[1:-1] + p[2:]) / 6 for p in runs]
-    check = lambda tile: _agree(tile, through, radii)  # noqa: E731
-    return Case(folder / "f.curves", check, how not in ("", "comment"), valid=not how)
+    refuse = how not in ("", "comment")
+    return Case(folder / "f.curves", lambda tile: _agree(tile, through, radii), refuse, valid=not how)
 
 
 def _bcc(runs: list[F64], folder: Path, d: Draws) -> Case:
@@ -86,48 +86,7 @@ def _bcc(runs: list[F64], folder: Path, d: Draws) -> Case:
         data += struct.pack("<q" if sizes & 0x80 else "<i", count)
         data += stored.astype("<f8" if sizes & 0x08 else "<f4").tobytes()
     (folder / "f.bcc").write_bytes(data)
-    check = lambda tile: _agree(tile, runs, 0.002 * _width(runs))  # noqa: E731
+    radii = np.full(len(runs), 0.002 * np.ptp(np.concatenate(runs)[:, 0]))
     valid = not how and kind == b"0" and sizes == 0x44
-    return Case(folder / "f.bcc", check, bool(how) or kind == b"\0", valid=valid)
-
-
-def _width(runs: list[F64]) -> F64:
-    """Extent along x, for each curve."""
-    return np.full(len(runs), np.ptp(np.concatenate(runs)[:, 0]))
-
-
-def pattern(d: Draws, folder: Path) -> Case:
-    """Wavy yarns along x as a periodic yarn pattern, in a material file of few fibers."""
-    px, py, radius, each = d.between(0.5, 3), d.between(0.5, 3), d.between(0.01, 0.03), 12
-    s, n = (np.arange(each) + 0.5) / each, int(d.rng.integers(1, 4))
-    rows, edges = list[list[float]](), list[list[float]]()
-    for yarn in range(n):
-        rows += [[px * t, (yarn + 0.5) / n * py, 0.05 * px * np.sin(2 * np.pi * t), 0.0] for t in s]
-        first = yarn * each
-        edges += [[first + k, first + (k + 1) % each, int(k == each - 1), 0] for k in range(each)]
-    head = {"px": px, "py": py, "radius": radius, "n": len(rows)}
-    how = d.fault(0.35, "NaN", "radius -1", "px 0", "edge 999", "half edge", "no *E", "open")
-    if how == "NaN":
-        rows[3][1] = np.nan
-    elif how in ("radius -1", "px 0"):
-        head[how.split()[0]] = float(how.split()[1])
-    elif how == "edge 999":
-        edges[2][1] = 999
-    elif how == "half edge":
-        edges[2][1] += 0.5
-    elif how == "open":
-        edges.pop()
-    sections: dict[str, Any] = {"*pattern # px py radius n": [list(head.values())], "*Q # x y z t": rows}
-    sections |= {"*E # v0 v1 dx dy": edges} if how != "no *E" else {}
-    text = ""
-    for name, lines in {**sections, "*RL": [[0.1]] * len(rows)}.items():
-        text += "\n".join([name, *(" ".join(f"{v:.9g}" for v in row) for row in lines), "", ""])
-    (folder / "p.pyp").write_text(text)
-    (folder / "material.yaml").write_text("pattern: p.pyp\nyarn: {fibers: 3, flyaways: 0}\n")
-
-    def check(tile: Any) -> bool:
-        mean = np.mean([c.control[:, 1].mean() % tile.aspect for c in tile.curves]) / tile.aspect
-        thick = tile.thickness / (0.1 + 2 * radius / px)
-        return abs(tile.aspect - py / px) < 1e-6 and abs(mean - 0.5) < 0.1 and 0.5 < thick < 2
-
-    return Case(folder / "material.yaml", check, bool(how), valid=not how)
+    refuse = bool(how) or kind == b"\0"
+    return Case(folder / "f.bcc", lambda tile: _agree(tile, runs, radii), refuse, valid=valid)

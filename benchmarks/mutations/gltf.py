@@ -21,16 +21,8 @@ _WRAPS = {"repeat": 10497, "mirror": 33648, "clamp": 33071}
 _OPTIONAL: tuple[tuple[dict[str, Any], str], ...] = (
     ({"extensions": {"KHR_materials_transmission": {"transmissionFactor": 1.0}}}, "transmission"),
     ({"extensions": {"KHR_materials_unlit": {}}}, "unlit"),
-    ({"extensions": {"KHR_materials_iridescence": {"iridescenceFactor": 1.0}}}, "iridescence"),
     ({"extensions": {"KHR_materials_anisotropy": {"anisotropyStrength": 0.9}}}, "anisotropy"),
-    (
-        {"extensions": {"KHR_materials_diffuse_transmission": {"diffuseTransmissionFactor": 0.8}}},
-        "diffuse_transmission",
-    ),
-    (
-        {"extensions": {"KHR_materials_pbrSpecularGlossiness": {"diffuseFactor": [1, 0, 0, 1]}}},
-        "pbrSpecularGlossiness",
-    ),
+    ({"extensions": {"KHR_materials_pbrSpecularGlossiness": {"glossinessFactor": 0}}}, "Glossiness"),
     ({"emissiveFactor": [1.0, 0.5, 0.0]}, "emissi"),
     ({"normalTexture": {"index": 0}}, "normal"),
 )
@@ -164,13 +156,13 @@ def make(d: Draws, folder: Path) -> Case:
         del primitive["material"]
         look.factor, look.texture, tell, look.more = np.ones(3), None, (), {"roughness": 1.0, "metallic": 1.0}
 
-    how = d.pick(("list", "list", "list", "fan", "strip", "more"), "triangles:")
-    if how in ("fan", "strip"):
-        mode = {"mode": 6 if how == "fan" else 5}
-        primitives = [primitive | mode | {"indices": w.accessor(face, "H")} for face in faces]
-    else:
+    how = d.pick(("list", "list", "list", "fans", "strips"), "triangles:")
+    if how == "list":
         primitives = [primitive | {"indices": w.accessor(faces.ravel(), d.pick("BHI"))}]
-    if how == "more":
+    else:
+        mode = {"mode": 6 if how == "fans" else 5}
+        primitives = [primitive | mode | {"indices": w.accessor(face, "H")} for face in faces]
+    if d.chance(0.15, "lines"):
         primitives.append({"attributes": attributes, "mode": 1})
         tell = tell or ("lines", "triangles")
     second = d.chance(0.1, "two scenes")
@@ -187,8 +179,10 @@ def make(d: Draws, folder: Path) -> Case:
         "extensionsRequired": required,
         **w.document,
     }
-    document = {name: value for name, value in document.items() if value not in ([], ())}
-    refused |= d.chance(0.2) and _break(document, d)
+    document = {name: value for name, value in document.items() if value != []}
+    if d.chance(0.2) and "material" in primitive:
+        refused = True
+        _break(document, d)
     path = _write(document, w.data, folder, d)
     return Case(path, look.is_read_as, refused, tell, "opacity" in look.more, not refused and not tell)
 
@@ -209,29 +203,22 @@ def _moved(placed: F64, node: dict[str, Any], d: Draws) -> F64:
     return np.stack([stored[:, 0], stored[:, 2], -stored[:, 1]], axis=1)
 
 
-def _break(document: dict[str, Any], d: Draws) -> bool:
-    """Make the document invalid where every reader must refuse; whether it did."""
-    kind = d.pick(("count", "view", "index", "metallicFactor", "cycle", "buffer", "type"), "broken:")
+def _break(document: dict[str, Any], d: Draws) -> None:
+    """Make the document invalid where every reader must refuse."""
     attributes = document["meshes"][0]["primitives"][0]["attributes"]
     accessor = document["accessors"][attributes["POSITION"]]
-    if kind == "count":
-        accessor["count"] = d.pick((300_000_000, 1_000_000, -1, 10**18))
-    elif kind == "view":
-        document["bufferViews"][accessor["bufferView"]]["byteOffset"] = d.pick((10**9, -16, 10**15))
-    elif kind == "index":
-        attributes["POSITION"] = d.pick((99, -1, "a", 10**30))
-    elif kind == "cycle":
-        document["nodes"][0]["children"] = [0]
-    elif kind == "buffer":
-        document["buffers"] = [{"byteLength": 10**12}]
-    elif kind == "type":
-        accessor["type"] = d.pick(("VEC9", 5, "SCALAR"))
-    elif "material" in document["meshes"][0]["primitives"][0]:
-        value = d.pick((1e9, -0.5, [1], "x", float("nan")))
-        document["materials"][0]["pbrMetallicRoughness"]["metallicFactor"] = value
-    else:
-        return False
-    return True
+    entry, key, values = d.pick(
+        (
+            (accessor, "count", (300_000_000, 1_000_000, -1, 10**18)),
+            (accessor, "type", ("VEC9", 5, "SCALAR")),
+            (document["bufferViews"][accessor["bufferView"]], "byteOffset", (10**9, -16, 10**15)),
+            (attributes, "POSITION", (99, -1, "a", 10**30)),
+            (document["nodes"][0], "children", ([0],)),
+            (document, "buffers", ([{"byteLength": 10**12}],)),
+            (document["materials"][0]["pbrMetallicRoughness"], "metallicFactor", (-0.5, [1], "x", np.nan)),
+        )
+    )
+    entry[key] = d.pick(values, key)
 
 
 def _write(document: dict[str, Any], data: bytes, folder: Path, d: Draws) -> Path:

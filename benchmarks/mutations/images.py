@@ -74,11 +74,10 @@ def height(d: Draws, folder: Path) -> Case:
     else:
         import tifffile
 
-        options: dict[str, Any] = {}
+        packed = {"compression": "deflate", "predictor": True}
+        options: Any = d.pick(({}, packed, {"tile": (16, 16)}, {"bigtiff": True}, {"byteorder": ">"}), "with")
         if kind == "tif16":
             array: Any = whole.astype("u2")
-            packed = {"compression": "deflate", "predictor": True}
-            options = d.pick(({}, packed, {"tile": (16, 16)}, {"bigtiff": True}, {"byteorder": ">"}), "with")
         elif kind == "tif int16":
             array, tell = (whole // 2 - 9000).astype("i2"), ("signed", "int16")
         elif kind == "tif uint32":
@@ -92,7 +91,7 @@ def height(d: Draws, folder: Path) -> Case:
             array[2, 5:9] = number = d.pick((-9999.0, -32768.0, -3.4028234663852886e38))
             tell, refuse = ("nodata",), True
             tags = [(42113, "s", 0, f"{number:g}", True)]
-            options["extratags"] = tags if d.chance(0.5, "tagged") else []
+            options = {"extratags": tags if d.chance(0.5, "tagged") else []}
         tifffile.imwrite(path, array, photometric="minisblack", **options)
         values = values if kind == "tif16" else array.astype(float)
         tolerance = 1.0 if "int" in kind else tolerance
