@@ -13,36 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
-Rng = np.random.Generator
-# What a check finds: whether a reading is right, and None where nobody knows.
-Check = Callable[[Any], bool | None]
 
 
 @dataclass
 class Case:
     """An input.
 
-    Attributes
-    ----------
-    path : Path
-        What is given to the reader.
-    text : str
-        Its mutations in words.
-    check : Check
-        Whether a reading, the reader's result, is right.
-    refuse : bool
-        Whether only a refusal is right.
-    tell : tuple of str
-        Words, one of which a warning must have.
-    unless : bool
-        Whether nothing needs to be said where the reading is right.
-    valid : bool
-        Whether the input follows its format and uses only what is documented as read.
+    `check` says whether a reading, the reader's result, is right, and None where nobody knows; `refuse` that
+    only a refusal is right; `tell` are words, one of which a warning must have, even of a right reading where
+    not `unless`. An input is `valid` that follows its format and uses only what is documented as read.
     """
 
     path: Path
-    text: str
-    check: Check = lambda _: None
+    check: Callable[[Any], bool | None] = lambda _: None
     refuse: bool = False
     tell: tuple[str, ...] = ()
     unless: bool = False
@@ -51,9 +34,10 @@ class Case:
 
 @dataclass
 class Draws:
-    """Random choices, described as they are made."""
+    """Random choices, described as they are made; `number` is that of the input."""
 
-    rng: Rng
+    rng: np.random.Generator
+    number: int = 0
     words: list[str] = field(default_factory=list)
 
     def chance(self, share: float, words: str = "") -> bool:
@@ -70,12 +54,41 @@ class Draws:
             self.words.append(f"{name} {chosen}")
         return chosen
 
-    def number(self, low: float, high: float, name: str = "") -> float:
+    def fault(self, share: float, *options: str) -> str:
+        """One of several faults in a share of all cases, else nothing."""
+        return str(self.pick(options, "fault")) if self.chance(share) else ""
+
+    def between(self, low: float, high: float) -> float:
         """A number with three digits."""
-        drawn = float(f"{self.rng.uniform(low, high):.3g}")
-        if name:
-            self.words.append(f"{name} {drawn:g}")
-        return drawn
+        return float(f"{self.rng.uniform(low, high):.3g}")
+
+
+Maker = Callable[[Draws, Path], Case]
+
+
+def damaged(maker: Maker) -> Maker:
+    """A maker of the inputs of another one with damaged bytes, of which nobody knows the right reading."""
+
+    def make(d: Draws, folder: Path) -> Case:
+        case = maker(d, folder)
+        files = [p for p in sorted(folder.rglob("*")) if p.is_file() and p.name != "material.yaml"]
+        file = d.pick(files)
+        data = bytearray(file.read_bytes() or b" ")
+        at = int(d.rng.integers(len(data)))
+        how = d.pick(("cut", "bits", "ones", "zeros", "twice"), f"{file.name}:")
+        if how == "cut":
+            del data[at:]
+        elif how == "bits":
+            for place in d.rng.integers(len(data), size=3):
+                data[place] ^= 1 << int(d.rng.integers(8))
+        elif how == "twice":
+            data[at:at] = data[at : at + 16]
+        else:
+            data[at : at + 4] = b"\xff\xff\xff\x7f" if how == "ones" else bytes(4)
+        file.write_bytes(data)
+        return Case(case.path)
+
+    return make
 
 
 def linear(codes: Any) -> F64:
@@ -84,23 +97,68 @@ def linear(codes: Any) -> F64:
     return np.where(x <= 0.04045, x / 12.92, ((np.maximum(x, 0) + 0.055) / 1.055) ** 2.4)
 
 
-def quarters(rng: Rng, size: int = 16) -> NDArray[np.uint8]:
-    """8-bit codes (size, size, 3): four quarters of different colors."""
-    colors = rng.integers(20, 250, (2, 2, 3)).astype(np.uint8)
-    return np.repeat(np.repeat(colors, size // 2, axis=0), size // 2, axis=1)
+def quarters(rng: np.random.Generator) -> NDArray[np.uint8]:
+    """8-bit codes (16, 16, 3): four quarters of different colors."""
+    return np.kron(rng.integers(20, 250, (2, 2, 3)), np.ones((8, 8, 1))).astype(np.uint8)
 
 
 def encoded(codes: NDArray[Any], kind: str = "PNG", **options: Any) -> bytes:
-    """An image file of 8-bit codes."""
+    """An image file of 8-bit codes; JPEG of its best quality."""
     from PIL import Image
 
     stream = io.BytesIO()
+    if kind == "JPEG":
+        options |= {"quality": 100, "subsampling": 0}
     Image.fromarray(codes).save(stream, kind, **options)
     return stream.getvalue()
 
 
-def looked_up(texture: F64, u: float, v: float, wrap: tuple[str, str], nearest: bool = False) -> F64:
-    """Value of a texture (H, W, 3) at (u, v), v up, as OpenGL defines it: bilinear, or the nearest texel."""
+@dataclass
+class Look:
+    """A mesh as its maker wrote it, z up, and what it reflects; colors are linear.
+
+    `to_uv` (2, 3) takes the file's coordinates to those of the texture, v up; `more` are other parameters,
+    numbers or textures (H, W, 1) without `to_uv`.
+    """
+
+    vertices: F64
+    faces: NDArray[np.int_]
+    uv: F64
+    factor: F64 = field(default_factory=lambda: np.ones(3))
+    colors: F64 | None = None
+    texture: F64 | None = None
+    to_uv: F64 = field(default_factory=lambda: np.eye(2, 3))
+    wrap: tuple[str, str] = ("repeat", "repeat")
+    nearest: bool = False
+    more: dict[str, Any] = field(default_factory=dict)
+
+    def at(self, x: float, y: float) -> dict[str, Any]:
+        """Height below the highest point, color and other parameters at a place in [0, 1]²."""
+        low, high = self.vertices.min(axis=0), self.vertices.max(axis=0)
+        number, weights, z = hit(self.vertices, self.faces, *(low + (x, y, 0) * (high - low))[:2])
+        color, (u, v) = self.factor, weights @ self.uv[self.faces[number]]
+        if self.colors is not None:
+            color = color * (weights @ self.colors[self.faces[number]])
+        if self.texture is not None:
+            s, t = self.to_uv @ (u, v, 1)
+            color = color * looked_up(self.texture, s, t, self.wrap, self.nearest)
+        more = {k: looked_up(m, u, v) if np.ndim(m) else m for k, m in self.more.items()}
+        return {"z": (z - high[2]) / (high - low)[0], "base_color": color, **more}
+
+    def is_read_as(self, tile: Any) -> bool:
+        """Whether a mesh tile is the same, off the edges of triangles and quarters."""
+        for x, y in ((0.23, 0.19), (0.81, 0.28), (0.33, 0.71), (0.68, 0.87), (0.11, 0.56)):
+            found = seen(tile, x, y * tile.aspect)
+            for name, value in self.at(x, y).items():
+                if np.abs(found.get(name, 0.0) - value).max() > (1e-4 if name == "z" else 4e-3):
+                    return False
+        return True
+
+
+def looked_up(
+    texture: F64, u: float, v: float, wrap: tuple[str, str] = ("repeat", "repeat"), nearest: bool = False
+) -> F64:
+    """Value of a texture (H, W, C) at (u, v), v up, as OpenGL defines it: bilinear, or the nearest texel."""
     rows, columns = texture.shape[:2]
     x, y = u * columns - 0.5, (1.0 - v) * rows - 0.5
     if nearest:
@@ -108,26 +166,18 @@ def looked_up(texture: F64, u: float, v: float, wrap: tuple[str, str], nearest: 
     total = np.zeros(texture.shape[2])
     for j in (math.floor(y), math.floor(y) + 1):
         for i in (math.floor(x), math.floor(x) + 1):
-            weight = (1 - abs(x - i)) * (1 - abs(y - j))
-            if weight > 0:
-                total += weight * texture[_wrapped(j, rows, wrap[1]), _wrapped(i, columns, wrap[0])]
+            weight = max(1 - abs(x - i), 0) * max(1 - abs(y - j), 0)
+            total += weight * texture[_in_range(j, rows, wrap[1]), _in_range(i, columns, wrap[0])]
     return total
 
 
-def _wrapped(i: int, size: int, how: str) -> int:
+def _in_range(i: int, size: int, how: str) -> int:
     if how == "clamp":
         return min(max(i, 0), size - 1)
-    if how == "mirror":
-        i %= 2 * size
-        return i if i < size else 2 * size - 1 - i
-    return i % size
+    return min(i % (2 * size), 2 * size - 1 - i % (2 * size)) if how == "mirror" else i % size
 
 
-# Places (x, y) in the tile at which readings are compared, off all edges of triangles and quarters.
-PLACES = ((0.23, 0.19), (0.81, 0.28), (0.33, 0.71), (0.68, 0.87), (0.11, 0.56))
-
-
-def patch(rng: Rng) -> tuple[F64, NDArray[np.int64]]:
+def patch(rng: np.random.Generator) -> tuple[F64, NDArray[np.int_]]:
     """Vertices (16, 3) and triangles (18, 3) of a bumpy unit square whose border is level, z up."""
     x, y = (a.ravel() / 3.0 for a in np.meshgrid(np.arange(4), np.arange(4)))
     inside = (x > 0) & (x < 1) & (y > 0) & (y < 1)
@@ -137,78 +187,36 @@ def patch(rng: Rng) -> tuple[F64, NDArray[np.int64]]:
     return np.stack([x, y, z], axis=1), faces
 
 
-def hit(vertices: F64, faces: NDArray[Any], x: float, y: float) -> tuple[int, F64, float] | None:
-    """(triangle, barycentric weights, z) of the highest triangle over (x, y); None where there is none."""
-    found = None
+def hit(vertices: F64, faces: NDArray[Any], x: float, y: float) -> tuple[int, F64, float]:
+    """(triangle, barycentric weights, z) of the highest triangle over (x, y); z is -inf without one."""
+    found = 0, np.ones(3), -np.inf
     for number, (a, b, c) in enumerate(vertices[faces]):
         sides = np.array([(b - a)[:2], (c - a)[:2]]).T
         if abs(np.linalg.det(sides)) < 1e-14:
             continue
         s, t = np.linalg.solve(sides, (x, y) - a[:2])
-        if s < -1e-9 or t < -1e-9 or s + t > 1 + 1e-9:
-            continue
         weights = np.array([1 - s - t, s, t])
         z = float(weights @ (a[2], b[2], c[2]))
-        if found is None or z > found[2]:
+        if weights.min() > -1e-9 and z > found[2]:
             found = number, weights, z
     return found
 
 
-def seen(tile: Any) -> list[tuple[float, F64, dict[str, F64]] | None]:
-    """(z, color, other parameters) of a mesh tile at PLACES, as its own Mitsuba dictionaries describe it."""
+def seen(tile: Any, x: float, y: float) -> dict[str, Any]:
+    """z, color and other parameters of a mesh tile, as its own Mitsuba dictionaries describe it."""
     import mitsuba as mi
 
-    surfaces = tile.surface()
-    out: list[Any] = []
-    for x, y in PLACES:
-        found = hit(tile.vertices, tile.faces, x, y * tile.aspect)
-        if found is None:
-            out.append(None)
-            continue
-        number, weights, z = found
-        at = mi.SurfaceInteraction3f()
-        u, v = weights @ tile.uv[tile.faces[number]]
-        at.uv = mi.Point2f(u, 1.0 - v)  # row 0 of bitmaps is at v = 0 there
-        values = {}
-        for name, value in surfaces[int(tile.part[number])].items():
-            if isinstance(value, dict):
-                texture = mi.load_dict(value)
-                color = name.endswith("color")
-                values[name] = np.array(texture.eval(at)).ravel() if color else np.array(texture.eval_1(at))
-            elif not isinstance(value, str):
-                values[name] = np.asarray(value)
-        if "opacity" in values:
-            cutoff = values.get("opacity_cutoff", 0.0)
-            values["opacity"] = np.where(cutoff == 0, values["opacity"], values["opacity"] >= cutoff)
-        out.append((z, values.pop("base_color"), values))
-    return out
-
-
-def agree(tile: Any, expected: list[tuple[float, F64, dict[str, Any]]], tolerance: float = 2e-3) -> bool:
-    """Whether a mesh tile has the expected heights (its highest point is 0), colors and parameters."""
-    for found, wanted in zip(seen(tile), expected, strict=True):
-        if found is None or abs(found[0] - wanted[0]) > 1e-4:
-            return False
-        if np.abs(found[1] - wanted[1]).max() > tolerance:
-            return False
-        for name, value in wanted[2].items():
-            if np.abs(found[2].get(name, np.zeros(())) - value).max() > tolerance:
-                return False
-    return True
-
-
-def damaged(data: bytes, draws: Draws, start: int = 0) -> bytes:
-    """The bytes, cut, extended, or with some replaced from `start` on."""
-    rng, out = draws.rng, bytearray(data)
-    how = draws.pick(("cut", "flip", "ones", "zeros", "twice"), "bytes")
-    at = int(rng.integers(start, len(out)))
-    if how == "cut":
-        return bytes(out[:at])
-    if how == "flip":
-        for _ in range(int(rng.integers(1, 4))):
-            out[int(rng.integers(start, len(out)))] ^= 1 << int(rng.integers(8))
-    elif how == "twice":
-        out[at:at] = out[at : at + 16]
-    else:
-        out[at : at + 4] = b"\xff\xff\xff\x7f" if how == "ones" else bytes(4)
-    return bytes(out)
+    number, weights, z = hit(tile.vertices, tile.faces, x, y)
+    at = mi.SurfaceInteraction3f()
+    u, v = weights @ tile.uv[tile.faces[number]]
+    at.uv = mi.Point2f(u, 1.0 - v)  # row 0 of bitmaps is at v = 0 there
+    values: dict[str, Any] = {"z": z}
+    for name, value in tile.surface()[int(tile.part[number])].items():
+        if isinstance(value, dict):
+            texture = mi.load_dict(value)
+            value = np.array(texture.eval(at)).ravel() if name.endswith("color") else texture.eval_1(at)
+        if not isinstance(value, str):
+            values[name] = np.asarray(value)
+    if values.get("opacity_cutoff", 0.0) != 0:
+        values["opacity"] = values["opacity"] >= values["opacity_cutoff"]
+    return values

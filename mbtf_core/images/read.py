@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import tempfile
 import warnings as python_warnings
-from collections.abc import Callable, Container
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError, reason
 from mbtf_core.images.color_spaces import ColorSpace, srgb
 from mbtf_core.images.exr import check_floats, choose_channels, lossy_excess, read_layers, silenced
@@ -30,6 +31,8 @@ from mbtf_core.paths import refuse_special, suggest_path
 _GRAY_CODES = 2
 # Scans of a JPG, which take time for the whole picture each; progressive ones have about ten.
 _MOST_SCANS = 100
+# Rows of pixels that are converted at a time.
+_ROWS = 256
 
 # Rec.709 luminance of linear RGB.
 LUMINANCE = (0.2126, 0.7152, 0.0722)
@@ -101,6 +104,18 @@ class Image:
         if self.bits is None:
             return self.stored.astype(dtype, copy=False)
         return np.divide(self.stored, self.white, dtype=dtype)
+
+    def linear(self, channels: Sequence[int], encoded: bool = False) -> NDArray[np.float32]:
+        """(H, W, C) float32 array of some channels, decoded from sRGB where asked.
+
+        It takes some rows at a time: whole copies of a large image would need gigabytes.
+        """
+        out = np.empty((*self.shape, len(channels)), np.float32)
+        for first in range(0, len(out), _ROWS):
+            rows = slice(first, first + _ROWS)
+            numbers = self.stored[rows][..., list(channels)] / np.float64(self.white)
+            out[rows] = srgb_to_linear(numbers.astype(np.float32)) if encoded else numbers
+        return out
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError
 from mbtf_core.images.read import Image, count_and_first, gray, read_image
 
@@ -82,24 +81,24 @@ class Companions:
             The image is missing, unreadable, or not within [0, 1].
         """
         image = self._image(name)
-        pixels = image.pixels
-        if pixels.shape[2] in (2, 4) and np.any(pixels[..., -1] != 1.0):
+        channels = image.stored.shape[2]
+        if channels in (2, 4) and np.any(image.stored[..., -1] != image.white):
             self.warnings.append(f"{image.path.name}: its alpha channel is not used")
-        rgb = pixels[..., :3] if pixels.shape[2] > 2 else np.repeat(pixels[..., :1], 3, axis=2)
-        _check_range(rgb, image.path)
+        if image.bits is None:
+            _check_range(image.stored[..., :3] if channels > 2 else image.stored[..., :1], image.path)
         srgb = image.bits is not None and image.tags.space != "linear"
         if image.tags.foreign is not None:
             self.warnings.append(
                 f"{image.path.name}: its {image.tags.foreign} is not applied, it is read as "
                 f"{'sRGB' if srgb else 'linear'}"
             )
-        return np.asarray(srgb_to_linear(rgb) if srgb else rgb, np.float32)
+        return image.linear((0, 1, 2) if channels > 2 else (0, 0, 0), srgb)
 
     def share(self, name: str, channel: str | None = None, *, alpha: bool = False) -> NDArray[np.float32]:
         """Numbers (h, w) of an image: a channel, its alpha where it is asked for and not all 1, or its
         luminance; errors as of :meth:`color`."""
         image = self._image(name, channel)
-        if alpha and image.pixels.shape[2] in (2, 4) and np.any(image.pixels[..., -1] != 1.0):
+        if alpha and image.stored.shape[2] in (2, 4) and np.any(image.stored[..., -1] != image.white):
             image = self._image(name, "A")
         numbers, warnings = gray(image)
         self.warnings += warnings

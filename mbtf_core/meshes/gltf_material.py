@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError
-from mbtf_core.images.read import LUMINANCE, decode_image
+from mbtf_core.images.read import LUMINANCE, Image, decode_image
 from mbtf_core.meshes.content import F64, Texture, Value, Wrap, numbers_of
 from mbtf_core.meshes.gltf_buffers import HINTS, GltfFile
 from mbtf_core.meshes.gltf_schema import GltfMaterial, GltfMetallicRoughness, GltfSampler, GltfTextureInfo
@@ -63,7 +62,7 @@ class Materials:
         self.file = file
         self._maps: dict[tuple[Any, ...], NDArray[np.float32]] = {}
         self._sets: dict[int | None, list[int]] = {}
-        self._latest: tuple[int, NDArray[np.floating[Any]]] | None = None
+        self._latest: tuple[int, Image] | None = None
         self._unused: dict[str, None] = {}
 
     def of(self, index: int | None) -> GltfMaterial:
@@ -183,20 +182,21 @@ class Materials:
         """Linear colors (h, w, 3) or numbers (h, w) of some channels of an image."""
         key = (image, source.channels, source.encoded, source.gray)
         if key not in self._maps:
-            pixels = self._image(image)
+            decoded = self._image(image)
             # Gray images have the same number in all channels.
-            colors = pixels.shape[2] - (pixels.shape[2] in (2, 4))
-            opaque = source.channels == _A and colors == pixels.shape[2]
-            channels = [colors if c == 3 else min(c, colors - 1) for c in source.channels]
-            out = np.ones((*pixels.shape[:2], 1)) if opaque else pixels.astype(np.float32)[..., channels]
-            if source.encoded:
-                out = srgb_to_linear(out)
-            out = out @ np.asarray(LUMINANCE) if source.gray else out if len(channels) > 1 else out[..., 0]
+            count = decoded.stored.shape[2]
+            colors = count - (count in (2, 4))
+            if source.channels == _A and colors == count:
+                out = np.ones((*decoded.shape, 1), np.float32)
+            else:
+                channels = [colors if c == 3 else min(c, colors - 1) for c in source.channels]
+                out = decoded.linear(channels, source.encoded)
+            out = out @ np.asarray(LUMINANCE) if source.gray else out if out.shape[2] > 1 else out[..., 0]
             self._maps[key] = np.ascontiguousarray(out, np.float32)
         return self._maps[key]
 
-    def _image(self, index: int) -> NDArray[np.floating[Any]]:
-        """Pixels (h, w, channels) as stored, in [0, 1]."""
+    def _image(self, index: int) -> Image:
+        """An image of the file."""
         if self._latest is None or self._latest[0] != index:
             image = self.file.entry(self.file.document.images, index, "images")
             where = Path(f"{self.file.path}: image {index}")
@@ -210,7 +210,7 @@ class Materials:
             decoded = decode_image(content, ("PNG", "JPEG"), where)
             if decoded.tags.orientation != 1:
                 self.file.warnings.append(f"image {index} is not turned as its EXIF data ask")
-            self._latest = index, decoded.pixels
+            self._latest = index, decoded
         return self._latest[1]
 
 
