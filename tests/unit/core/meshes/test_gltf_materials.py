@@ -284,6 +284,13 @@ def test_alpha(
     assert shape.values.get("opacity_cutoff") == (0.5 if mode == "MASK" and expected else None)
 
 
+def test_images_without_alpha_are_opaque(tmp_path: Path) -> None:
+    builder = GltfBuilder()
+    texture = {"index": builder.texture(np.full((1, 1, 3), 51, np.uint8))}
+    base = {"baseColorTexture": texture, "baseColorFactor": [1, 1, 1, 0.5]}
+    assert numbers(shape_of(plate_of(base, builder, alphaMode="BLEND"), tmp_path), "opacity") == [[0.5]]
+
+
 def test_vertex_colors_are_clamped_and_linear(tmp_path: Path) -> None:
     builder = GltfBuilder()
     codes = np.array([[0, 128, 255, 255]] * 4, np.uint8)
