@@ -205,8 +205,9 @@ def test_images_are_found_and_placed(tmp_path: Path, text: str, matrix: Any, wra
 
 def test_colors_of_images_are_srgb_and_numbers_are_linear(tmp_path: Path) -> None:
     Image.fromarray(np.full((1, 1, 3), 188, np.uint8)).save(tmp_path / "a.png")
-    leaf = np.zeros((1, 2, 4), np.uint8)
-    leaf[0, 1] = 255
+    # White everywhere, the first texel transparent.
+    leaf = np.full((1, 2, 4), 255, np.uint8)
+    leaf[0, 0, 3] = 0
     Image.fromarray(leaf).save(tmp_path / "leaf.png")
     content = with_material(
         tmp_path, "map_Kd a.png\nmap_Pr -imfchan g a.png\nPm 0.5\nmap_Pm a.png\nmap_d leaf.png"
@@ -326,6 +327,13 @@ def test_colors_of_vertices_are_srgb_factors(tmp_path: Path) -> None:
     assert "white" in content.warnings[0]
     content = read(tmp_path, f"mtllib a.mtl\nusemtl m\n{colored}", a_mtl="newmtl m\nKd 0.5 0.5 0.5\n")
     assert "multiplies" in content.warnings[0]
+
+
+def test_weights_of_vertices_are_those_of_curves_alone(tmp_path: Path) -> None:
+    text = "v 1 0 0 2\nv 3 0 0 2\nv 3 4 0 2\nf 1 2 3\n"
+    (shape,) = read(tmp_path, text).shapes
+    assert shape.vertices.tolist() == [[1, 0, 0], [3, 0, 0], [3, 4, 0]]
+    assert shape.colors is None
 
 
 def test_y_up_is_noticed() -> None:
