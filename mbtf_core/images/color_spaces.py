@@ -183,7 +183,8 @@ def from_icc(profile: bytes, name: str) -> DeclaredSpace:
             key, offset, size = struct.unpack_from(">4sII", profile, 132 + 12 * i)
             tags[key] = profile[offset : offset + size]
         gray = space == b"GRAY"
-        if not gray and (space != b"RGB " or connection != b"XYZ "):
+        # Curves to Lab are those of the lightness.
+        if connection != b"XYZ " or space not in (b"GRAY", b"RGB "):
             raise ValueError("not a matrix")
         curves = tuple(_curve(tags[key]) for key in ((b"kTRC",) if gray else (b"rTRC", b"gTRC", b"bTRC")))
         if gray:

@@ -9,10 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
-from mbtf_core.images.read import Image, count_and_first, gray, read_image
+from mbtf_core.images.read import Image, count_and_first, gray, linear_rgb, read_image
 
 # Part of 1 by which numbers of an image may leave [0, 1].
 _ROUNDING = 1e-6
+# The same of converted colors, beyond which it is said.
+_GAMUT = 1e-3
 
 
 class Companions:
@@ -73,7 +75,8 @@ class Companions:
         )
 
     def color(self, name: str) -> NDArray[np.float32]:
-        """Linear colors (h, w, 3) of an image; integers are sRGB unless the file says that they are linear.
+        """Linear Rec.709 colors (h, w, 3) of an image, from the color space that it declares; without one,
+        integers are sRGB. Colors beyond Rec.709 are clamped, with a warning.
 
         Raises
         ------
@@ -81,18 +84,21 @@ class Companions:
             The image is missing, unreadable, or not within [0, 1].
         """
         image = self._image(name)
-        channels = image.stored.shape[2]
-        if channels in (2, 4) and np.any(image.stored[..., -1] != image.white):
+        stored = image.stored
+        if stored.shape[2] in (2, 4) and np.any(stored[..., -1] != image.white):
             self.warnings.append(f"{image.path.name}: its alpha channel is not used")
         if image.bits is None:
-            _check_range(image.stored[..., :3] if channels > 2 else image.stored[..., :1], image.path)
-        srgb = image.bits is not None and image.tags.space != "linear"
+            _check_range(stored[..., : 3 if stored.shape[2] > 2 else 1], image.path)
         if image.tags.foreign is not None:
+            srgb = (image.tags.space or ("linear" if image.bits is None else "srgb")) == "srgb"
             self.warnings.append(
                 f"{image.path.name}: its {image.tags.foreign} is not applied, it is read as "
                 f"{'sRGB' if srgb else 'linear'}"
             )
-        return image.linear((0, 1, 2) if channels > 2 else (0, 0, 0), srgb)
+        rgb = linear_rgb(image)
+        if rgb.min() < -_GAMUT or rgb.max() > 1.0 + _GAMUT:
+            self.warnings.append(f"{image.path.name}: its colors beyond Rec.709 are clamped")
+        return np.clip(rgb, 0.0, 1.0, out=rgb)
 
     def share(self, name: str, channel: str | None = None, *, alpha: bool = False) -> NDArray[np.float32]:
         """Numbers (h, w) of an image: a channel, its alpha where it is asked for and not all 1, or its

@@ -218,7 +218,7 @@ def _specular(material: GltfMaterial) -> _Source:
     """The dielectric lobe: its F0 is ``min(1, c·((n-1)/(n+1))²)·w`` with the color c, the weight w and the
     index of refraction n."""
     index, lobe = material.extensions.ior.ior, material.extensions.specular
-    reflectance = ((index - 1.0) / (index + 1.0)) ** 2 if index > 0 else 1.0
+    reflectance = ((index - 1.0) / (index + 1.0)) ** 2  # 1 for the index 0, as the extension demands
     color = float(np.dot(lobe.specularColorFactor, LUMINANCE))
     factor = min(1.0, reflectance * color) * lobe.specularFactor / _SPECULAR_REFLECTANCE
     if lobe.specularColorTexture is not None:

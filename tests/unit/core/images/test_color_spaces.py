@@ -15,7 +15,7 @@ from PIL import ImageCms
 from support.image_files import P3_COLUMNS, SRGB_COLUMNS, SRGB_CURVE, exr, icc, png, rng
 
 from mbtf_core.color import linear_to_srgb, srgb_to_linear
-from mbtf_core.images.color_spaces import from_chromaticities
+from mbtf_core.images.color_spaces import adaptation, from_chromaticities, from_cicp
 from mbtf_core.images.environment import read_environment
 from mbtf_core.images.read import linear_rgb, read_image
 
@@ -26,6 +26,9 @@ FROM_P3 = [[1.2249, -0.2249, 0.0], [-0.0421, 1.0421, 0.0], [-0.0196, -0.0786, 1.
 REC2020 = (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290)
 # ITU-R BT.2087.
 FROM_REC2020 = [[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]]
+# IEC 61966-2-1.
+TO_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+D65 = TO_XYZ.sum(axis=1)
 P3_CHRM = (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290)
 
 
@@ -40,6 +43,10 @@ def para(kind: int, *numbers: float) -> bytes:
         + struct.pack(">HH", kind, 0)
         + struct.pack(f">{len(numbers)}i", *(round(65536 * n) for n in numbers))
     )
+
+
+def white_xyz(xy: tuple[float, float]) -> np.ndarray:
+    return np.array([xy[0], xy[1], 1.0 - xy[0] - xy[1]]) / xy[1]
 
 
 def chrm(values: tuple[float, ...]) -> tuple[bytes, bytes]:
@@ -104,6 +111,10 @@ def test_profiles_of_gray_and_of_floats(tmp_path: Path) -> None:
     Pillow.fromarray(codes).save(tmp_path / "g.png", icc_profile=icc("Gray 1.8", (), para(0, 1.8), gray=True))
     expected = np.repeat((codes[..., None] / 255.0) ** 1.8, 3, axis=2)
     assert linear_rgb(read_image(tmp_path / "g.png")) == pytest.approx(expected, abs=1e-4)
+    # A curve to Lab is one of lightness.
+    lab = icc("L*", (), para(0, 1.0), gray=True).replace(b"GRAYXYZ ", b"GRAYLab ")
+    Pillow.fromarray(codes).save(tmp_path / "g.png", icc_profile=lab)
+    assert read_image(tmp_path / "g.png").tags.foreign is not None
     # Another library than Pillow reads floats of three channels.
     numbers = rng().random((8, 8, 3)).astype(np.float32)
     profile = icc("P3 linear", P3_COLUMNS, para(0, 1.0))
@@ -128,6 +139,7 @@ SRGB_ICC = (b"iCCP", b"x\0\0" + zlib.compress(icc("sRGB", SRGB_COLUMNS, SRGB_CUR
         (((b"cICP", bytes([1, 13, 0, 1])), P3_ICC), False, None),
         ((P3_ICC, SRGB), True, None),
         ((SRGB, chrm(P3_CHRM)), False, None),
+        ((SRGB, (b"gAMA", (100000).to_bytes(4, "big"))), False, None),
         ((chrm(P3_CHRM),), True, None),
         ((chrm(P3_CHRM), GAMMA), True, 2.2),
         ((chrm(P3_CHRM), (b"gAMA", (100000).to_bytes(4, "big"))), True, 1.0),
@@ -144,6 +156,57 @@ def test_precedence_of_png(
     assert found == pytest.approx(expected, abs=2e-3)
 
 
+@pytest.mark.parametrize(
+    ("primaries", "transfer", "code", "expected"),
+    [
+        # ITU-R BT.709-6 encodes 0.5 as 0.705515 and 0.01 as 0.045.
+        (1, 1, 0.705515, 0.5),
+        (1, 14, 0.045, 0.01),
+        (1, 4, 0.5, 0.217638),
+        (1, 5, 0.5, 0.143587),
+        (1, 8, 0.5, 0.5),
+        (1, 13, 0.5, 0.214041),
+    ],
+)
+def test_curves_of_cicp(tmp_path: Path, primaries: int, transfer: int, code: float, expected: float) -> None:
+    codes = np.full((2, 2, 3), round(65535 * code))
+    chunk = (b"cICP", bytes([primaries, transfer, 0, 1]))
+    found = linear_rgb(read_image(png(tmp_path / "x.png", codes, 2, 16, extra=(chunk,))))
+    assert found == pytest.approx(expected, abs=2e-5)
+
+
+@pytest.mark.parametrize(
+    ("code", "xy"),
+    [
+        # Green of ITU-T H.273.
+        (5, (0.29, 0.60)),
+        (6, (0.310, 0.595)),
+        (7, (0.310, 0.595)),
+        (9, (0.170, 0.797)),
+        (11, (0.265, 0.690)),
+        (12, (0.265, 0.690)),
+    ],
+)
+def test_primaries_of_cicp(code: int, xy: tuple[float, float]) -> None:
+    matrix = from_cicp(bytes([code, 8, 0, 1])).matrix
+    assert matrix is not None
+    white = (0.314, 0.351) if code == 11 else (0.3127, 0.3290)
+    # Columns in XYZ, from the white of Rec.709 to the own one.
+    x, y, z = (adaptation(D65, white_xyz(white)) @ TO_XYZ @ matrix)[:, 1]
+    assert (x / (x + y + z), y / (x + y + z)) == pytest.approx(xy, abs=2e-3)
+    assert matrix.sum(axis=1) == pytest.approx(np.ones(3), abs=1e-4)
+
+
+def test_curves_of_profiles_are_constant_below_their_start(tmp_path: Path) -> None:
+    # Of the kinds 1 and 2, (aX + b)^g + c from -b/a on, and c below (ICC.1:2022, table 68).
+    ramp = np.linspace(0.0, 1.0, 256)
+    for curve, offset in ((para(1, 2.0, 1.25, -0.25), 0.0), (para(2, 2.0, 1.25, -0.25, 0.1), 0.1)):
+        expected = np.where(ramp >= 0.2, (1.25 * ramp - 0.25) ** 2, 0.0) + offset
+        profile = icc("Gray", (), curve, gray=True)
+        Pillow.fromarray(np.arange(256, dtype=np.uint8)[None]).save(tmp_path / "g.png", icc_profile=profile)
+        assert linear_rgb(read_image(tmp_path / "g.png"))[0, :, 0] == pytest.approx(expected, abs=1e-4)
+
+
 def test_unsupported_declarations_are_named(tmp_path: Path) -> None:
     codes = rng().integers(0, 256, (4, 4, 3))
     for chunk, what in (
@@ -152,6 +215,10 @@ def test_unsupported_declarations_are_named(tmp_path: Path) -> None:
         ((b"cHRM", bytes(32)), "chromaticities"),
         ((b"iCCP", b"x\0\0" + zlib.compress(icc("Odd", P3_COLUMNS, para(0, -2.0)))), "color profile 'Odd'"),
         ((b"iCCP", b"x\0\0" + zlib.compress(icc("P3", P3_COLUMNS, table(2.0, 9)[:20]))), "color profile"),
+        # Of video, not of full range.
+        ((b"cICP", bytes([12, 13, 0, 0])), "cICP chunk"),
+        # Of Y'CbCr.
+        ((b"cICP", bytes([12, 13, 1, 1])), "cICP chunk"),
     ):
         assert what in (read_image(png(tmp_path / "x.png", codes, 2, 8, extra=(chunk,))).tags.foreign or "")
 

@@ -141,10 +141,11 @@ def test_strides_offsets_and_sparse_elements(tmp_path: Path) -> None:
     uv = builder.add("accessors", {**of, "byteOffset": 16, "type": "VEC2"})
     builder.node(builder.mesh(position, TEXCOORD_0=uv))
     # The second mesh moves two corners of zeros.
+    values = np.array([9, 5, 0, 0, 0, 0, 6])  # from the second one on
     sparse = {
         "count": 2,
-        "indices": {"bufferView": builder.view(bytes([1, 2])), "componentType": 5121},
-        "values": {"bufferView": builder.view(np.array([[5, 0, 0], [0, 0, 6]], "<f4").tobytes())},
+        "indices": {"bufferView": builder.view(bytes([0, 1, 2])), "byteOffset": 1, "componentType": 5121},
+        "values": {"bufferView": builder.view(values.astype("<f4").tobytes()), "byteOffset": 4},
     }
     zeros = builder.add("accessors", {"componentType": 5126, "count": 3, "type": "VEC3", "sparse": sparse})
     builder.node(builder.mesh(zeros, None))

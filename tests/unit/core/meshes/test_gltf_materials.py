@@ -203,13 +203,18 @@ def test_layers_have_their_channels(tmp_path: Path) -> None:
         "clearcoatRoughnessFactor": 0.25,
         "clearcoatRoughnessTexture": texture,
     }
-    sheen = {"sheenColorFactor": [1, 0.5, 0], "sheenRoughnessFactor": 0.5, "sheenRoughnessTexture": texture}
+    sheen = {
+        "sheenColorFactor": [1, 0.5, 0],
+        "sheenColorTexture": {"index": builder.texture(np.array([[[128, 128, 255]]], np.uint8))},
+        "sheenRoughnessFactor": 0.5,
+        "sheenRoughnessTexture": texture,
+    }
     extensions = {"KHR_materials_clearcoat": clearcoat, "KHR_materials_sheen": sheen}
     shape = shape_of(plate_of({}, builder, extensions=extensions), tmp_path)
     assert numbers(shape, "clearcoat") == [[0.1]]
     assert numbers(shape, "clearcoat_roughness") == [[0.1]]
     assert numbers(shape, "sheen") == 1.0
-    assert numbers(shape, "sheen_color") == [1, 0.5, 0]
+    assert numbers_of(shape.values["sheen_color"])[0, 0] == pytest.approx([CODES[128], CODES[128] / 2, 0])
     assert numbers(shape, "sheen_roughness") == [[0.4]]
 
 
@@ -233,6 +238,8 @@ def test_layers_of_zero_weight_are_none_and_a_bare_clear_coat_is_smooth(tmp_path
         (1.5, {"specularColorFactor": [1, 0, 0]}, 0.2126 * 0.5, True),
         (1.5, {"specularFactor": 0.25}, 0.125, True),
         (1.0, {}, 0.0, True),
+        # The product of color and F0 is 1 at most, before the weight.
+        (0, {"specularColorFactor": [2, 2, 2], "specularFactor": 0.5}, 6.25, True),
     ],
 )
 def test_dielectrics(
@@ -275,6 +282,13 @@ def test_alpha(
     shape = shape_of(plate_of(base, builder, alphaMode=mode), tmp_path)
     assert (numbers(shape, "opacity") if "opacity" in shape.values else None) == expected
     assert shape.values.get("opacity_cutoff") == (0.5 if mode == "MASK" and expected else None)
+
+
+def test_images_without_alpha_are_opaque(tmp_path: Path) -> None:
+    builder = GltfBuilder()
+    texture = {"index": builder.texture(np.full((1, 1, 3), 51, np.uint8))}
+    base = {"baseColorTexture": texture, "baseColorFactor": [1, 1, 1, 0.5]}
+    assert numbers(shape_of(plate_of(base, builder, alphaMode="BLEND"), tmp_path), "opacity") == [[0.5]]
 
 
 def test_vertex_colors_are_clamped_and_linear(tmp_path: Path) -> None:

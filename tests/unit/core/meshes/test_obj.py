@@ -10,6 +10,7 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 from PIL import Image
+from support.image_files import P3_COLUMNS, SRGB_CURVE, exr, icc
 
 from mbtf_core.errors import InputError
 from mbtf_core.meshes.content import MeshContent, MeshShape, Texture
@@ -204,8 +205,9 @@ def test_images_are_found_and_placed(tmp_path: Path, text: str, matrix: Any, wra
 
 def test_colors_of_images_are_srgb_and_numbers_are_linear(tmp_path: Path) -> None:
     Image.fromarray(np.full((1, 1, 3), 188, np.uint8)).save(tmp_path / "a.png")
-    leaf = np.zeros((1, 2, 4), np.uint8)
-    leaf[0, 1] = 255
+    # White everywhere, the first texel transparent.
+    leaf = np.full((1, 2, 4), 255, np.uint8)
+    leaf[0, 0, 3] = 0
     Image.fromarray(leaf).save(tmp_path / "leaf.png")
     content = with_material(
         tmp_path, "map_Kd a.png\nmap_Pr -imfchan g a.png\nPm 0.5\nmap_Pm a.png\nmap_d leaf.png"
@@ -215,6 +217,25 @@ def test_colors_of_images_are_srgb_and_numbers_are_linear(tmp_path: Path) -> Non
         assert texture_of(content, role)[0].pixels == pytest.approx(188 / 255)
         assert texture_of(content, role)[1] == factor
     assert texture_of(content, "opacity")[0].pixels.tolist() == [[0, 1]]
+
+
+def test_colors_of_images_are_converted_from_the_space_that_they_declare(tmp_path: Path) -> None:
+    picture = Image.fromarray(QUAD)
+    picture.save(tmp_path / "a.png", icc_profile=icc("P3", P3_COLUMNS, SRGB_CURVE))
+    content = with_material(tmp_path, "map_Kd a.png\nPr 0.5\nmap_Pm -imfchan g a.png")
+    # Of Display P3; its red and its green are beyond Rec.709.
+    expected = [[[1, 0, 0], [0, 1, 0]], [[0, 0, 1], [1, 1, 1]]]
+    assert texture_of(content)[0].pixels == pytest.approx(np.array(expected), abs=1e-3)
+    assert any("Rec.709" in text for text in content.warnings)
+    assert texture_of(content, "metallic")[0].pixels.tolist() == [[0, 1], [0, 1]]
+    numbers = np.full((2, 2), 0.5, np.float32)
+    channels = {"R": numbers, "G": 0.5 * numbers, "B": 0.5 * numbers}
+    exr(tmp_path / "a.exr", channels, chromaticities=(0.68, 0.32, 0.265, 0.69, 0.15, 0.06, 0.3127, 0.329))
+    content = with_material(tmp_path, "map_Kd a.exr")
+    # Apple's P3 to Rec.709: 1.2249, -0.0421, -0.0196 in the column of red.
+    found = texture_of(content)[0].pixels[0, 0]
+    assert found == pytest.approx(np.array([0.5562, 0.2395, 0.2451]), abs=1e-3)
+    assert not content.warnings
 
 
 @pytest.mark.parametrize(
@@ -306,6 +327,13 @@ def test_colors_of_vertices_are_srgb_factors(tmp_path: Path) -> None:
     assert "white" in content.warnings[0]
     content = read(tmp_path, f"mtllib a.mtl\nusemtl m\n{colored}", a_mtl="newmtl m\nKd 0.5 0.5 0.5\n")
     assert "multiplies" in content.warnings[0]
+
+
+def test_weights_of_vertices_are_those_of_curves_alone(tmp_path: Path) -> None:
+    text = "v 1 0 0 2\nv 3 0 0 2\nv 3 4 0 2\nf 1 2 3\n"
+    (shape,) = read(tmp_path, text).shapes
+    assert shape.vertices.tolist() == [[1, 0, 0], [3, 0, 0], [3, 4, 0]]
+    assert shape.colors is None
 
 
 def test_y_up_is_noticed() -> None:

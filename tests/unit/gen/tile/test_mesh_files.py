@@ -71,6 +71,18 @@ def test_files_hold_the_same_tile(tmp_path: Path, suffix: str) -> None:
     assert load_material(tmp_path / f"a{suffix}").warnings == ()
 
 
+def test_corners_are_placed_by_the_axis_the_bounds_and_the_width(tmp_path: Path) -> None:
+    rows = ((1, 5, -1), (3, 5, -1), (3, 6, -5), (1, 5, -5), (100, 100, 100))
+    text = "".join(f"v {x} {y} {z}\n" for x, y, z in rows)
+    (tmp_path / "a.obj").write_text(f"{text}f 1 2 3\nf 1 3 4\n")
+    (tmp_path / "m.yaml").write_text("mesh: a.obj\nup: y\n")
+    shape = shape_of(tmp_path / "m.yaml")
+    # Two wide along x and four along -z, one high; no face uses the last vertex.
+    corners = np.array([(0, 0, -0.5), (1, 0, -0.5), (1, 2, 0), (0, 2, -0.5)])
+    assert shape.vertices[shape.faces] == pytest.approx(corners[[[0, 1, 2], [0, 2, 3]]])
+    assert (shape.aspect, shape.thickness) == (2, 0.5)
+
+
 def test_a_period_that_does_not_fit_is_noted(tmp_path: Path) -> None:
     bumps().export(tmp_path / "a.ply")
     path = tmp_path / "m.yaml"

@@ -15,6 +15,7 @@ from mbtf_core.meshes.content import MeshShape, Texture, numbers_of
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
 from mbtf_gen.planning.run_plan import plan_effects, reference_plan
+from mbtf_gen.render.scene import load_surface
 from mbtf_gen.tile.loading import latest_material, load_material
 from mbtf_gen.tile.mesh_textures import with_one_wrap, with_vertex_colors
 from mbtf_gen.tile.mesh_tile import MeshPart, MeshTile
@@ -144,6 +145,22 @@ def test_nearest_texels_are_not_interpolated(tmp_path: Path) -> None:
     value = part_of(tile_of(builder, tmp_path)).maps["base_color"]
     uv = np.array([[0.01, 0.5], [0.49, 0.5], [0.51, 0.5], [0.99, 0.5]])
     assert looked_up(value, uv)[:, 0].tolist() == [0, 0, 1, 1]
+
+
+def test_each_part_has_its_opacity(tmp_path: Path) -> None:
+    builder = GltfBuilder()
+    pixels = np.full((1, 2, 4), 255, np.uint8)
+    pixels[0, 0, 3] = 254
+    cut = {"baseColorTexture": {"index": builder.texture(pixels, {"magFilter": 9728})}}
+    builder.plate(builder.material())
+    builder.plate(builder.material(cut, alphaMode="MASK", alphaCutoff=1.0))
+    builder.plate(builder.material({"baseColorFactor": [1, 1, 1, 0.25]}, alphaMode="BLEND"))
+    surface = load_surface(tile_of(builder, tmp_path).surface())
+    si = mi.SurfaceInteraction3f()
+    si.prim_index = mi.UInt32([0, 1, 1, 2])
+    si.uv = mi.Point2f([0.25, 0.25, 0.75, 0.5], 0.5)
+    # An alpha that is equal to the cutoff is opaque.
+    assert np.array(surface.opacity(si)) == pytest.approx([1, 0, 1, 0.25])
 
 
 def plans(tile: MeshTile, mode: str = "auto") -> tuple[set[str], set[str]]:

@@ -111,7 +111,12 @@ DEGREES = (KEYS, 3, (1, 1, 0, 1, 1024, 0, 1, 2))
         ("f4", [(SCALE, 12, (30.0, 30.0, 0.0))], 1 / (48 * 30)),
         # As codes, the unit is 1/65535.
         ("u2", [(SCALE, 12, (30.0, 30.0, 0.0))], 65535 / (48 * 30)),
-        ("i2", [(MATRIX, 12, (3.0, 4.0, 0, 0, -4.0, 3.0, *[0.0] * 10))], 1 / (48 * 5)),
+        ("i2", [(MATRIX, 12, (3.0, 8.0, 0, 0, -4.0, 6.0, *[0.0] * 10))], 1 / (48 * 5)),
+        (
+            "i2",
+            [(MATRIX, 12, (1 / 3600, 0, 0, 7.0, 0, -1 / 3600, 0, 60.0, *[0.0] * 8)), DEGREES],
+            3600 / (48 * 111320 * math.cos(math.radians(60))),
+        ),
         (
             "i2",
             [(SCALE, 12, (1 / 3600, 1 / 3600, 0.0)), (TIE, 12, (0, 0, 0, 7.0, 60.0, 0)), DEGREES],
@@ -124,7 +129,7 @@ def test_the_size_of_pixels_gives_the_scale(tmp_path: Path, dtype: str, tags: An
     with pytest.raises(InputError, match="need a height scale") as caught:
         _ = material.configured(DEFAULT).grid
     suggested = float(caught.value.hint.split("--height-scale ")[1].split(",")[0])
-    # The matrix of pixels turned by 37° has columns 5 apart.
+    # The matrix of pixels turned by 53°, not square, has columns 5 apart.
     assert suggested == pytest.approx(scale, rel=1e-3)
 
 
