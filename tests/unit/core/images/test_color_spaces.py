@@ -200,8 +200,11 @@ def test_primaries_of_cicp(code: int, xy: tuple[float, float]) -> None:
 def test_curves_of_profiles_are_constant_below_their_start(tmp_path: Path) -> None:
     # Of the kinds 1 and 2, (aX + b)^g + c from -b/a on, and c below (ICC.1:2022, table 68).
     ramp = np.linspace(0.0, 1.0, 256)
-    for curve, offset in ((para(1, 2.0, 1.25, -0.25), 0.0), (para(2, 2.0, 1.25, -0.25, 0.1), 0.1)):
-        expected = np.where(ramp >= 0.2, (1.25 * ramp - 0.25) ** 2, 0.0) + offset
+    for curve, expected in (
+        (para(1, 2.0, 1.25, -0.25), np.maximum(1.25 * ramp - 0.25, 0.0) ** 2),
+        (para(2, 2.0, 1.25, -0.25, 0.1), np.maximum(1.25 * ramp - 0.25, 0.0) ** 2 + 0.1),
+        (para(1, 2.0, 0.8, 0.2), (0.8 * ramp + 0.2) ** 2),
+    ):
         profile = icc("Gray", (), curve, gray=True)
         Pillow.fromarray(np.arange(256, dtype=np.uint8)[None]).save(tmp_path / "g.png", icc_profile=profile)
         assert linear_rgb(read_image(tmp_path / "g.png"))[0, :, 0] == pytest.approx(expected, abs=1e-4)

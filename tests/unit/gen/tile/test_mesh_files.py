@@ -11,6 +11,7 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.gltf_files import TWO_TRIANGLES, GltfBuilder
 
 from mbtf_core.errors import InputError, MbtfError
 from mbtf_gen.config.generator import GeneratorConfig
@@ -72,14 +73,14 @@ def test_files_hold_the_same_tile(tmp_path: Path, suffix: str) -> None:
 
 
 def test_corners_are_placed_by_the_axis_the_bounds_and_the_width(tmp_path: Path) -> None:
-    rows = ((1, 5, -1), (3, 5, -1), (3, 6, -5), (1, 5, -5), (100, 100, 100))
-    text = "".join(f"v {x} {y} {z}\n" for x, y, z in rows)
-    (tmp_path / "a.obj").write_text(f"{text}f 1 2 3\nf 1 3 4\n")
-    (tmp_path / "m.yaml").write_text("mesh: a.obj\nup: y\n")
-    shape = shape_of(tmp_path / "m.yaml")
-    # Two wide along x and four along -z, one high; no face uses the last vertex.
+    # No face uses the last vertex; y is up in glTF.
+    rows = np.array(((1, 5, -1), (3, 5, -1), (3, 6, -5), (1, 5, -5), (100, 100, 100)), np.float32)
+    builder = GltfBuilder()
+    builder.node(builder.mesh(rows))
+    shape = shape_of(builder.write(tmp_path / "a.glb"))
+    # Two wide along x and four along -z, one high.
     corners = np.array([(0, 0, -0.5), (1, 0, -0.5), (1, 2, 0), (0, 2, -0.5)])
-    assert shape.vertices[shape.faces] == pytest.approx(corners[[[0, 1, 2], [0, 2, 3]]])
+    assert shape.vertices[shape.faces] == pytest.approx(corners[TWO_TRIANGLES.reshape(-1, 3)])
     assert (shape.aspect, shape.thickness) == (2, 0.5)
 
 

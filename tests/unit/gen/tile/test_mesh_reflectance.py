@@ -180,6 +180,8 @@ def test_effects_are_those_of_the_parts(tmp_path: Path) -> None:
     # Another part has layers and metal.
     builder.plate(builder.material({}, extensions=LAYERS))
     tile = tile_of(builder, tmp_path)
+    # The color of the sheen, 1/2 at most, counts.
+    assert (tile.weight("metallic"), tile.weight("sheen")) == (1.0, 0.5)
     everything = {"specular", "metallic", "clearcoat", "sheen"}
     assert plans(tile) == (everything, everything)
     assert plans(tile, "-clearcoat")[0] == everything - {"clearcoat"}

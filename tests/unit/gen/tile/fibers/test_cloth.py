@@ -137,6 +137,15 @@ def test_ends_beside_the_corner_have_partners() -> None:
     assert loose_ends(FiberTile(1.0, curves, np.zeros(2, int), np.ones((1, 3)))) == 0
 
 
+@pytest.mark.parametrize(("yarn", "factor"), [("", 1.0), ("yarn: {radius: 3}\n", 3.0)])
+def test_radii_of_files_are_divided_by_the_width_of_the_period(
+    tmp_path: Path, yarn: str, factor: float
+) -> None:
+    (tmp_path / "a.curves").write_text("".join(f"{x / 2} 1 0 .02\n" for x in range(-1, 6)))
+    (curve,) = load_material(write(tmp_path, f"curves: a.curves\nperiod: [2, 1]\n{yarn}")).curves
+    assert curve.control[:, 3] == pytest.approx(factor * 0.01)
+
+
 @pytest.mark.parametrize(("radius", "accepted"), [("1.01e-5", True), ("0.99e-5", False)])
 def test_the_smallest_radius_is_named(tmp_path: Path, radius: str, accepted: bool) -> None:
     (tmp_path / "a.curves").write_text("".join(f"{x / 4} 0.5 0 {radius}\n" for x in range(-1, 6)))
