@@ -36,9 +36,9 @@ def color_map() -> NDArray[np.float32]:
 
 
 def textured(pixels: NDArray[np.float32]) -> dict[str, Any]:
-    from mbtf_gen.tile.reflectance import reflectance
+    from mbtf_gen.tile.reflectance import plugin_dictionary
 
-    return reflectance(pixels)
+    return plugin_dictionary({"base_color": pixels})
 
 
 def test_color_at_texel_centers_is_the_texel() -> None:

@@ -73,7 +73,8 @@ def test_the_plan_measures_multiple_scattering(done: dict[str, Done]) -> None:
     assert " on " in lines["opacity"]
     assert " on " in lines["fiber transmission"]
     # Most of the light has passed through a fiber.
-    assert float(lines["fiber transmission"].split()[3]) > 20.0
+    bound = lines["fiber transmission"].split()[3]
+    assert bound == "over" or float(bound) > 20.0
     (opaque,) = [line for line in done["opaque"].out.splitlines() if line.startswith("fiber transmission")]
     assert " off " in opaque
     assert "forced" in opaque

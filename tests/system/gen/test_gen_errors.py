@@ -19,7 +19,7 @@ INPUT, USAGE = 3, 2
 INPUT_CASES = {
     "nowhere.exr": ["nowhere.exr", "no such file"],
     "text.exr": ["text.exr", "EXR"],
-    "notes.txt": ["'.txt'", ".exr"],
+    "notes.doc": ["'.doc'", ".exr"],
     "nan.npy": ["nan.npy", "3 pixels, the first at column 5, row 2"],
     "aspects": ["base_color.npy", "8 x 4", "8 x 8", "aspect"],
     "empty": ["empty", "no image"],
@@ -53,6 +53,7 @@ def write_inputs(folder: Path) -> None:
     heights = np.random.default_rng(0).random((4, 8))
     np.save(folder / "heights.npy", heights)
     (folder / "notes.txt").write_text("no image")
+    (folder / "notes.doc").write_text("no image")
     (folder / "text.exr").write_text("no image")
     spoilt = heights.copy()
     spoilt[2, 5] = spoilt[3, 0] = spoilt[3, 7] = np.nan

@@ -137,7 +137,7 @@ def test_connections_that_are_cut(tmp_path: Path, proxy: Proxy) -> None:
 def test_a_store_that_is_gone(tmp_path: Path, proxy: Proxy, monkeypatch: pytest.MonkeyPatch) -> None:
     """One line, exit code 4, and the same command resumes; nothing is rendered twice."""
     expected = generated(tmp_path, train=400)
-    monkeypatch.setenv("MBTF_STORE_PATIENCE", "1")
+    monkeypatch.setenv("MBTF_STORE_PATIENCE", "4")
     words = [sys.executable, "-c", _CODE, "mbtf-gen", "", *line_at(tmp_path, train=400)]
     paths = os.pathsep.join(filter(None, sys.path))
     running = subprocess.Popen(
@@ -209,14 +209,15 @@ def test_workers_upload_their_shards(tmp_path: Path, proxy: Proxy, monkeypatch: 
     line = f"{tmp_path}/maps --queries 16/texel --test-queries 200 --test-spp 8 -q".split()
     line += ["--set", "output.shard_queries=512", "-o"]
     assert call(*line, tmp_path / "local").code == 0
-    monkeypatch.setenv("MBTF_STORE_PATIENCE", "1")
+    monkeypatch.setenv("MBTF_STORE_PATIENCE", "4")
     assert call(*line, URL, "--slice", "1/5").code == 0
     # Workers can list the store, but not upload to it.
     proxy.cut_after = 20_000
     done = call(*line, URL, "--cluster", "local:2")
     assert done.code == 4, done.err
     assert "shard(s) failed" in done.err
-    assert "the store cannot be reached" in done.err
+    # Whether the connection or the time ends first.
+    assert "the store cannot be reached" in done.err or "no answer" in done.err
     proxy.cut_after = None
     done = call(*line, URL, "--cluster", "local:2")
     assert done.code == 0, done.err

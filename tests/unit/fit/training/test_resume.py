@@ -95,7 +95,7 @@ def test_a_fit_killed_at_random_steps_ends_with_the_same_bits(
     assert steps[-1] == STEPS
 
 
-@pytest.mark.parametrize("at", ["unlink", "write_json", "write_text"])
+@pytest.mark.parametrize("at", ["unlink", "write_json", "write_document"])
 def test_a_fit_killed_while_it_replaces_another_is_repeated(
     shards: Path, whole: FitResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: str
 ) -> None:
