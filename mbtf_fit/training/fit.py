@@ -55,11 +55,9 @@ from mbtf_fit.training.validation import (
     validation_subset,
 )
 
-# Seconds of training between two validations, and between two checkpoints.
-_REPORT_SECONDS = 2.0
+# Seconds of training between two validations of so many materials, and between two checkpoints.
+_REPORT_SECONDS, _VALIDATED = 2.0, 4
 _CHECKPOINT_SECONDS = 15.0
-# Materials that are validated in that interval.
-_VALIDATED = 4
 
 # Called with the record of a validation, the trainer, and the queries of the validation.
 Observer = Callable[[dict[str, Any], Trainer, ShardQueries], None]
