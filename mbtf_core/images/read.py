@@ -93,6 +93,11 @@ class Image:
         return None if self.stored.dtype.kind == "f" else 8 * self.stored.dtype.itemsize
 
     @property
+    def space(self) -> ColorSpace:
+        """That of the file if supported, else that of its kind: sRGB for integers, linear for floats."""
+        return self.tags.space or ("linear" if self.bits is None else "srgb")
+
+    @property
     def white(self) -> int:
         """The largest code, which is 1; 1 for floats."""
         return 1 if self.bits is None else 2**self.bits - 1
@@ -397,7 +402,7 @@ def linear_rgb(image: Image, space: ColorSpace | None = None) -> NDArray[np.floa
         Not clamped: colors of wider primaries may leave [0, 1].
     """
     declared = image.tags.declared if space is None else None
-    space = space or image.tags.space or ("linear" if image.bits is None else "srgb")
+    space = space or image.space
     curves = declared.curves if declared is not None else (srgb,) if space == "srgb" else ()
     rgb = image.stored[..., :3] if image.stored.shape[2] > 2 else image.stored[..., :1]
     out = np.empty((*image.shape, 3), np.float32)

@@ -55,10 +55,8 @@ class Companions:
         """
         if name in self.files:
             return self.files[name]
-        folder, parts = (
-            self.path.parent,
-            [part for part in re.split(r"[\\/]+", name) if part not in ("", ".")],
-        )
+        folder = self.path.parent
+        parts = [part for part in re.split(r"[\\/]+", name) if part not in ("", ".")]
         places = [folder / name, *(folder.joinpath(*parts[skipped:]) for skipped in range(len(parts)))]
         for number, place in enumerate(places):
             found = _in_any_case(place, folder)
@@ -90,10 +88,9 @@ class Companions:
         if image.bits is None:
             _check_range(stored[..., : 3 if stored.shape[2] > 2 else 1], image.path)
         if image.tags.foreign is not None:
-            srgb = (image.tags.space or ("linear" if image.bits is None else "srgb")) == "srgb"
+            shown = "sRGB" if image.space == "srgb" else image.space
             self.warnings.append(
-                f"{image.path.name}: its {image.tags.foreign} is not applied, it is read as "
-                f"{'sRGB' if srgb else 'linear'}"
+                f"{image.path.name}: its {image.tags.foreign} is not applied, it is read as {shown}"
             )
         rgb = linear_rgb(image)
         if rgb.min() < -_GAMUT or rgb.max() > 1.0 + _GAMUT:

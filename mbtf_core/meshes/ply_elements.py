@@ -171,25 +171,25 @@ class _Body:
 
     def _read_alike(self, element: Element) -> bool:
         """Read rows at once, if all are as long as the first one."""
-        spans, width = [], 0
+        ranges, width = [], 0
         for one in element.properties:
             length = None
             if one.length is not None:
                 length = self._length(self.position + width, one.length)
                 width += self._size(one.length)
             end = width + self._size(one.kind) * (1 if length is None else length)
-            spans.append((one, length, width, end))
+            ranges.append((one, length, width, end))
             width = end
         if element.count * width > self.rest:
             return False
         end = self.position + element.count * width
         rows = self.cells[self.position : end].reshape(element.count, width)
-        for one, length, begin, _ in spans:
+        for one, length, begin, _ in ranges:
             if one.length is not None:
                 lengths = self._decoded(rows[:, begin - self._size(one.length) : begin], one.length)
                 if not (lengths == length).all():
                     return False
-        for one, length, begin, stop in spans:
+        for one, length, begin, stop in ranges:
             numbers = self._decoded(rows[:, begin:stop], one.kind)
             if length is None:
                 element.columns[one.name] = numbers
