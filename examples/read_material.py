@@ -68,11 +68,27 @@ def normal(slopes):
     return unit(join(-slopes, np.ones(1)))
 
 
+def fresnel(f0, h, omega_o):
+    return f0 + (1 - f0) * np.clip(1 - omega_o @ h, 0, 1) ** 5
+
+
 def ggx(f0, alpha2, n, omega_i, omega_o, least):
     h, cosines = unit(omega_i + omega_o), np.maximum([n @ omega_i, n @ omega_o], least)
     facets = alpha2 / (np.pi * (max(0, n @ h) ** 2 * (alpha2 - 1) + 1) ** 2)
     masking = 2 * cosines.prod() * np.sqrt(1 + alpha2 * (1 / cosines**2 - 1)).sum()
-    return (f0 + (1 - f0) * np.clip(1 - omega_o @ h, 0, 1) ** 5) * facets / masking
+    return fresnel(f0, h, omega_o) * facets / masking
+
+
+def shown(omega, center, matrix):
+    p = omega[2] - center @ omega[:2]
+    return (p + np.sqrt(p**2 + omega[:2] @ matrix @ omega[:2])) / 2
+
+
+def doubled_scatter(center, moments):
+    xx, xy, yy = moments - np.outer(center, center)[[0, 0, 1], [0, 1, 1]]
+    xx, yy = max(0, xx), max(0, yy)
+    xy = np.clip(xy, -np.sqrt(xx * yy), np.sqrt(xx * yy))
+    return 2 * np.array([[xx, xy], [xy, yy]])
 
 
 class Material:
@@ -132,7 +148,7 @@ class Material:
         return u + np.interp(level, range(len(weights)), weights) * z * omega_o[:2] / omega_o[2] / self.scale
 
     def shade(self, hits, level, omega_i, omega_o, maps, horizons, light_width, dielectric, finer, light_blur,
-              least_light, least_view, least_variance, alpha2):  # fmt: skip
+              least_view, least_variance, alpha2):  # fmt: skip
         hints = []
         for hit in hits.reshape(-1, 2):
             known, horizon = (self.lookup(hit, level + finer, textures) for textures in (maps, horizons))
@@ -141,14 +157,22 @@ class Material:
             mean, square = (np.interp(azimuth * count, range(count), x, period=count) for x in moments)
             variance = max(0, square - mean**2) + (light_blur * light_width) ** 2
             over = (np.arcsin(omega_i[2]) - mean) / np.sqrt(2 * max(variance, least_variance))
-            n, base, metal = normal(known[:2]), known[3:6], known[7:].sum()
-            core = (1 - metal) * base / np.pi
-            if len(known) == 8:
-                spread = max(0, known[2] - known[:2] @ known[:2]) + light_width**2
-                f0, a2 = dielectric + metal * (base - dielectric), np.clip(known[6] + spread, *alpha2)
-                core = core + ggx(f0, a2, n, omega_i, omega_o, [least_light, least_view])
-            irradiance = (0.5 + 0.5 * erf(over)) * max(0, n @ omega_i) / omega_i[2:]
-            hints.append(join(irradiance, n[:2], irradiance * core))
+            light, c, n, base = (0.5 + 0.5 * erf(over)) / omega_i[2], known[:2], normal(known[:2]), known[5:8]
+            spread = doubled_scatter(c, known[2:5])
+            irradiance = light * n[2] * shown(omega_i, c, spread)
+            core = irradiance * base / np.pi
+            if len(known) == 10:
+                a2, metal = np.clip(known[8], *alpha2), known[9]
+                middle = (1 - a2) / (1 + a2 * c @ c) * c
+                facets = a2 * (1 + c @ c) / (1 + a2 * c @ c) * (np.eye(2) + np.outer(middle, c)) + spread
+                h, widened = unit(omega_i + omega_o), facets + np.eye(2) * light_width**2 / 2
+                g = h[:2] + h[2] * middle
+                density = 1 / (h[2] ** 2 + g @ np.linalg.solve(widened, g)) ** 2
+                density = density / (np.pi * np.sqrt(np.linalg.det(widened)))
+                lobe = density / (4 * max(shown(omega_o, middle, facets), least_view))
+                f = fresnel(dielectric + metal * (base - dielectric), h, omega_o)
+                core = (1 - metal) * core + light * f * lobe
+            hints.append(np.array([irradiance, *n[:2], *core]))
         return np.mean(hints, 0)
 
     def lobe(

@@ -1,7 +1,7 @@
 r"""Maps of the metallic-roughness model of glTF 2.0 for a material.
 
-They are those of the surface that the model traces. Slopes below the texels of a level widen the lobe (LEAN
-mapping, Olano and Baker 2010). Maps of models that know no surface are fitted to their values
+They are those of the surface that the model traces. The scatter of slopes below the texels of a level widens
+the lobe (:mod:`mbtf_fit.surface.slopes`). Maps of models that know no surface are fitted to their values
 (:mod:`~mbtf_fit.material.brdf_fit`). Maps show no shadows, interreflection or parallax of their own. Their
 base color is therefore scaled until the mean reflectance of the tile, over cosine-weighted lights and views,
 is that of the neural material.
@@ -147,12 +147,13 @@ def surface_maps(material: Material, level: int) -> Maps:
     """Maps of a level that a material knows of its surface (:func:`knows_surface`)."""
     weights = material.model.weights()
     maps = weights[f"{MAPS}.{level}"].cpu().double().numpy()
-    slopes, square, base = maps[..., :2], maps[..., 2], maps[..., 3:6]
+    slopes, base = maps[..., :2], maps[..., 5:8]
     glossy = maps.shape[2] == GLOSSY_CHANNELS
     alpha2, metallic = (
-        (maps[..., 6], maps[..., 7]) if glossy else (np.ones_like(square), np.zeros_like(square))
+        (maps[..., 8], maps[..., 9]) if glossy else (np.ones_like(base[..., 0]), np.zeros_like(base[..., 0]))
     )
-    alpha2 = alpha2 + np.maximum(square - (slopes**2).sum(-1), 0.0)
+    # Facets are isotropic: the mean of both axes of 2C.
+    alpha2 = alpha2 + np.maximum(maps[..., 2] + maps[..., 4] - (slopes**2).sum(-1), 0.0)
     return Maps(
         level,
         material.lattice.aspect,

@@ -19,13 +19,13 @@ GATE = 0.1
 HINTS = 7
 # Factor of the irradiance under the logarithm.
 IRRADIANCE_SCALE = 4.0
-# Channels of the maps: slopes (x, y), their squared length, base color (RGB); of a glossy surface besides α²
-# and metallic.
-DIFFUSE_CHANNELS, GLOSSY_CHANNELS = 6, 8
+# Channels of the maps: center of the slopes (x, y), moments about 0 (xx, xy, yy), base color (RGB); of glossy
+# surfaces besides α² and metallic.
+DIFFUSE_CHANNELS, GLOSSY_CHANNELS = 8, 10
 # Azimuths of the horizons; share of the light kernel's width (RMS per axis) that blurs them.
 AZIMUTHS, LIGHT_BLUR = 16, 0.8
-# Smallest cosines of light and view to a normal, bounds of the lobe's α², least variance of horizons.
-LEAST_LIGHT, LEAST_VIEW, ALPHA2, LEAST_VARIANCE = 0.01, 0.05, (1e-4, 4.0), 1e-8
+# Smallest cosines of light and view to a normal, bounds of a lobe's own α², least variance of horizons.
+LEAST_LIGHT, LEAST_VIEW, ALPHA2, LEAST_VARIANCE = 0.01, 0.05, (1e-4, 1.0), 1e-8
 # Tile borders that a view ray may cross; a ray at a cosine of 1e-4 crosses more above deep surfaces.
 MAX_CROSSINGS = 64
 # Offsets of the places from the footprint's center, across and along the view's azimuth, in σ; levels that

@@ -13,18 +13,31 @@ from mbtf_fit.ops.operation import Operation, TensorName, TextureName, Value
 class Shade(Operation):
     r"""Hints of the known surface (6): irradiance e, normal (x, y) and core (RGB), means over intersections.
 
-    Maps and horizons are read at the level ``l + finer``. Maps hold slopes s (2), the mean q of their squared
-    length, base color b (3); of glossy surfaces besides α² and metallic m. The normal is
-    ``n = (-s_x, -s_y, 1) / ‖·‖``. Horizons hold, for equidistant azimuths from +u towards +v, the mean h of
+    Maps and horizons are read at the level ``l + finer``. Maps hold, of the slopes below the footprint, the
+    center c (2) and the moments q (xx, xy, yy) of ``c cᵀ + C`` with the scatter C
+    (:mod:`mbtf_fit.surface.slopes`), then base color b (3); of glossy surfaces besides α² and metallic m.
+    C is read with variances of at least 0 and a correlation within ±1. The normal is
+    ``n = (-c_x, -c_y, 1) / ‖·‖``. Horizons hold, for equidistant azimuths from +u towards +v, the mean h of
     the horizon's elevation in the first half of the channels, the mean of its square in the second half,
     both linear between azimuths; v is their variance. The light is visible from the share
 
         (R2) V = Φ((asin ω_i,z - h) / √max(v + (light_blur · light_width)², least_variance)).
 
-    Irradiance: ``e = V max(0, n·ω_i) / ω_i,z``, 1 on the reference plane. Core, in 1/sr: ``e b/π``, or of a
-    glossy surface ``e ((1-m) b/π + GGX)`` with ``F0 = (1-m) dielectric + m b`` and ``α² = clamp(α² + max(0,
-    q - ‖s‖²) + light_width², alpha2)`` (LEAN mapping: Olano and Baker 2010; GGX: Walter et al. 2007;
-    Fresnel: Schlick 1994), the cosines of light and view at least `least_light` and `least_view`.
+    Facets whose slopes have the center c and the matrix A show to a direction ω, per area of the reference
+    plane, the area (Heitz 2014)
+
+        (R4) P(ω; c, A) = (p + √(p² + ω_xyᵀ A ω_xy)) / 2,    p = ω_z - c·ω_xy.
+
+    Irradiance: ``e = V n_z P(ω_i; c, 2C) / ω_i,z``, 1 on the reference plane. Core, in 1/sr: ``e b/π``, or of
+    a glossy surface ``e (1-m) b/π`` and the light that the visible facets reflect,
+
+        (R5) V F D(h) / (4 ω_i,z max(P(ω_o; c', A'), least_view)),
+
+    with ``F0 = (1-m) dielectric + m b`` (Fresnel: Schlick 1994), the half vector h, and ``D(h) = 1 / (π √det
+    B (h_z² + gᵀ B⁻¹ g)²)``, ``g = h_xy + h_z c'`` (GGX: Walter et al. 2007). GGX facets of α² about n are, in
+    slopes of the plane, such facets about κ c with ``ρ (I + κ c cᵀ)``, where ``κ = (1-α²) / (1 + α² ‖c‖²)``
+    and ``ρ = α² (1 + ‖c‖²) / (1 + α² ‖c‖²)``. Below a footprint ``c' = κ c``, ``A' = ρ (I + κ c cᵀ) + 2C``,
+    and the light widens them to ``B = A' + light_width²/2 I``. α² is clamped to `alpha2`.
 
     Attributes
     ----------
@@ -44,7 +57,6 @@ class Shade(Operation):
     dielectric: TensorName
     finer: float = 0.0
     light_blur: float = LIGHT_BLUR
-    least_light: float = LEAST_LIGHT
     least_view: float = LEAST_VIEW
     least_variance: float = LEAST_VARIANCE
     alpha2: tuple[float, float] = ALPHA2

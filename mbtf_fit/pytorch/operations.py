@@ -17,7 +17,7 @@ from mbtf_core.data.lattice import Lattice
 from mbtf_fit import ops
 from mbtf_fit.ops.constants import FIRST_DEPTH, HEIGHT_SCALE, LEAST_FACING
 from mbtf_fit.pytorch.textures import FeatureTextures
-from mbtf_fit.surface.known import KnownSurface, ggx
+from mbtf_fit.surface.known import KnownSurface
 from mbtf_fit.surface.lookup import coarse_level, lookup
 
 # Of each function its code, and the x whose value is 1; 0 for expm1.
@@ -154,6 +154,33 @@ def _shade(
     return run.material.known.shading(op, hits, level, omega_i, omega_o)
 
 
+def _ggx(
+    f0: Tensor,
+    alpha2: Tensor,
+    normal: Tensor,
+    light: Tensor,
+    view: Tensor,
+    omega_i: Tensor,
+    omega_o: Tensor,
+) -> Tensor:
+    """BRDF (n, 3) of GGX facets of reflectance F0 (n, 3) and α² (n, 1) (Walter et al. 2007; Schlick 1994).
+
+    Parameters
+    ----------
+    light, view : (n, 1) cosines of light and view to the normal, greater than 0
+    """
+    half = torch.nn.functional.normalize(omega_i + omega_o, dim=1)
+    cosine = (normal * half).sum(1, keepdim=True).clamp_min(0.0)
+    facets = alpha2 / (math.pi * (cosine.square() * (alpha2 - 1.0) + 1.0).square())
+
+    def masking(c: Tensor) -> Tensor:
+        return (1.0 + alpha2 * (1.0 / c.square() - 1.0)).sqrt()
+
+    schlick = (1.0 - (omega_o * half).sum(1, keepdim=True).clamp(0.0, 1.0)) ** 5
+    fresnel = f0 + (1.0 - f0) * schlick
+    return fresnel * facets / (2.0 * (masking(light) + masking(view)) * light * view)
+
+
 @PYTORCH.implements(ops.Lobe)
 def _lobe(
     op: ops.Lobe,
@@ -169,7 +196,7 @@ def _lobe(
     light = (normal * omega_i).sum(1, keepdim=True)
     view = (normal * omega_o).sum(1, keepdim=True).clamp_min(op.least_view)
     alpha2, f0 = alpha2.clamp_min(op.least_alpha2), specular.expand(-1, 3)
-    lobe = ggx(f0, alpha2, normal, light.clamp_min(op.least_light), view, omega_i, omega_o)
+    lobe = _ggx(f0, alpha2, normal, light.clamp_min(op.least_light), view, omega_i, omega_o)
     return light.clamp_min(0.0) / omega_i[:, 2:] * (base_color / math.pi + lobe)
 
 

@@ -77,8 +77,7 @@ def compute_hints(
     description.places, description.finer = places, shade.finer
     description.offsets[: 2 * places] = [x for offset in trace.places for x in offset]
     description.light_width, description.light_blur = surface.light_width, shade.light_blur
-    description.dielectric = surface.dielectric
-    description.least_light, description.least_view = shade.least_light, shade.least_view
+    description.dielectric, description.least_view = surface.dielectric, shade.least_view
     description.alpha2[:] = shade.alpha2
 
     def task(start: int) -> None:

@@ -1,19 +1,21 @@
 r"""Hints: what the geometry of a data set tells about a query before anything is learned.
 
 For a query (u, σ, ω_i, ω_o) the view rays of one or more places of the footprint are traced to the heights.
-At each intersection, maps filtered to the footprint give the normal n̄, base color, metallic, and the
-roughness of a GGX lobe, widened by the variance of the slopes below the footprint (LEAN mapping, Olano and
-Baker 2010). The light is visible from a share V of the footprint: the elevation of the horizon in
-the light's azimuth has the mean h and the variance s² there, and for normally distributed horizons
+At each intersection, maps filtered to the footprint give base color, metallic, roughness, and the
+distribution of slopes (:mod:`mbtf_fit.surface.slopes`). The light is visible from a share V of the footprint:
+the elevation of the horizon in the light's azimuth has the mean h and the variance s² there, and for normally
+distributed horizons
 
     V = Φ((elevation of ω_i - h) / √(s² + w²)),    w = 0.8 times the light kernel's width.
 
 The hints of a query are means over its places:
 
 - the height z of the intersection, which gives the displacement ``z/ω_o,z · ω_o,xy``;
-- the irradiance ``e = V max(0, n̄·ω_i) / ω_i,z`` of the visible surface, 1 on the reference plane;
+- the irradiance e of the visible surface, 1 on the reference plane;
 - the normal's x and y;
-- the core ``e · f(n̄, ω_i, ω_o)`` in 1/sr: light that is scattered once, where f is diffuse plus GGX.
+- the core in 1/sr: light that is scattered once, diffusely and by GGX facets.
+
+:mod:`mbtf_fit.ops.shade` has their equations.
 """
 
 from __future__ import annotations
@@ -44,6 +46,7 @@ from mbtf_fit.ops.lookup import Trace
 from mbtf_fit.ops.shade import Shade
 from mbtf_fit.surface.heightfield import DeviceCopies, HeightfieldTracer
 from mbtf_fit.surface.lookup import Packing, lookup
+from mbtf_fit.surface.slopes import slope_distributions
 
 if TYPE_CHECKING:
     from mbtf_core.data.geometry import Geometry
@@ -98,13 +101,12 @@ class KnownSurface:
         rows, columns = (max(a, b) for a, b in zip(lattice.shape(), angles.shape, strict=False))
         if (rows, columns) != tuple(angles.shape[:2]):
             angles = torch.from_numpy(np.asarray(resample(angles.numpy(), rows, columns), np.float32))
-        maps = torch.from_numpy(np.concatenate(_channels(geometry), -1))
-        horizons = torch.cat([angles, angles.square()], -1)
         finer = Lattice(lattice.finest + 1, lattice.aspect)
+        horizons = torch.cat([angles, angles.square()], -1)
         return cls(
             lattice,
             torch.from_numpy(geometry.heights.copy()),
-            tuple(prefiltered_levels(maps, finer)),
+            tuple(_map_levels(geometry, finer)),
             tuple(prefiltered_levels(horizons, lattice)),
             math.radians(light_width),
             DIELECTRIC_F0 * float(np.mean(0.0 if geometry.specular is None else geometry.specular)),
@@ -209,22 +211,30 @@ class KnownSurface:
     def _shade(self, op: Shade, hit: Tensor, level: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
         """Irradiance, normal and core (n, 6) at surface points."""
         maps = lookup(self._map_copies.on(hit.device), self.map_table[1], hit, level)
-        slopes, square, base = maps[:, :2], maps[:, 2:3], maps[:, 3:6]
-        normal = torch.nn.functional.normalize(torch.cat([-slopes, torch.ones_like(slopes[:, :1])], 1), dim=1)
-        light = (normal * omega_i).sum(1, keepdim=True)
-        visibility = self.visibility(op, hit, level, omega_i)
-        irradiance = visibility * light.clamp_min(0.0) / omega_i[:, 2:]
-        value = base / math.pi
+        center, base = maps[:, :2], maps[:, 5:8]
+        spread = _spread(center, maps[:, 2:5])
+        normal = torch.nn.functional.normalize(torch.cat([-center, torch.ones_like(center[:, :1])], 1), dim=1)
+        light = self.visibility(op, hit, level, omega_i) / omega_i[:, 2:]
+        irradiance = light * normal[:, 2:] * _shown(omega_i, center, spread)
+        core = irradiance * base / math.pi
         if self.glossy:
-            metallic = maps[:, 7:8]
-            variance = (square - slopes.square().sum(1, keepdim=True)).clamp_min(0.0)
-            alpha2 = (maps[:, 6:7] + variance + self.light_width**2).clamp(*op.alpha2)
+            alpha2, metallic = maps[:, 8:9].clamp(*op.alpha2), maps[:, 9:10]
+            # (R5)
+            length2 = center.square().sum(1, keepdim=True)
+            kappa, rho = (1.0 - alpha2, alpha2 * (1.0 + length2))
+            kappa, rho = (x / (1.0 + alpha2 * length2) for x in (kappa, rho))
+            x, y = center.split(1, 1)
+            own = torch.cat([1.0 + kappa * x * x, kappa * x * y, 1.0 + kappa * y * y], 1)
+            facets = rho * own + spread
+            facing = _shown(omega_o, kappa * center, facets).clamp_min(op.least_view)
+            widening = facets.new_tensor([1.0, 0.0, 1.0]) * (0.5 * self.light_width**2)
+            half = torch.nn.functional.normalize(omega_i + omega_o, dim=1)
+            density = slope_density(half, kappa * center, facets + widening)
             f0 = torch.lerp(base.new_tensor(self.dielectric), base, metallic)
-            light = light.clamp_min(op.least_light)
-            view = (normal * omega_o).sum(1, keepdim=True).clamp_min(op.least_view)
-            lobe = ggx(f0, alpha2, normal, light, view, omega_i, omega_o)
-            value = (1.0 - metallic) * value + lobe
-        return torch.cat([irradiance, normal[:, :2], irradiance * value], 1)
+            schlick = (1.0 - (omega_o * half).sum(1, keepdim=True).clamp(0.0, 1.0)) ** 5
+            fresnel = f0 + (1.0 - f0) * schlick
+            core = (1.0 - metallic) * core + light * fresnel * density / (4.0 * facing)
+        return torch.cat([irradiance, normal[:, :2], core], 1)
 
     def visibility(self, op: Shade, hit: Tensor, level: Tensor, omega_i: Tensor) -> Tensor:
         """Share (n, 1) of footprints at surface points from which the light is visible."""
@@ -259,44 +269,65 @@ def surface_bytes(lattice: Lattice) -> int:
     return 4 * (maps + 2 * AZIMUTHS * sum(lattice.texels(s) for s in range(lattice.finest + 1)))
 
 
-def ggx(
-    f0: Tensor,
-    alpha2: Tensor,
-    normal: Tensor,
-    light: Tensor,
-    view: Tensor,
-    omega_i: Tensor,
-    omega_o: Tensor,
-) -> Tensor:
-    """BRDF (n, 3) of GGX facets of reflectance F0 (n, 3) and α² (n, 1) (Walter et al. 2007; Schlick 1994).
+def slope_density(half: Tensor, center: Tensor, matrix: Tensor) -> Tensor:
+    """Density D(h) (n, 1) of facets per area of the reference plane (Walter et al. 2007).
 
     Parameters
     ----------
-    light, view : (n, 1) cosines of light and view to the normal, greater than 0
+    half : (n, 3) unit vectors
+    center : (n, 2) center of the slopes
+    matrix : (n, 3) A (xx, xy, yy)
     """
-    half = torch.nn.functional.normalize(omega_i + omega_o, dim=1)
-    cosine = (normal * half).sum(1, keepdim=True).clamp_min(0.0)
-    facets = alpha2 / (math.pi * (cosine.square() * (alpha2 - 1.0) + 1.0).square())
-
-    def masking(c: Tensor) -> Tensor:
-        return (1.0 + alpha2 * (1.0 / c.square() - 1.0)).sqrt()
-
-    schlick = (1.0 - (omega_o * half).sum(1, keepdim=True).clamp(0.0, 1.0)) ** 5
-    fresnel = f0 + (1.0 - f0) * schlick
-    return fresnel * facets / (2.0 * (masking(light) + masking(view)) * light * view)
+    xx, xy, yy = matrix.split(1, 1)
+    x, y = (half[:, :2] + half[:, 2:] * center).split(1, 1)
+    determinant = xx * yy - xy * xy
+    inside = half[:, 2:].square() + (yy * x * x - 2.0 * xy * x * y + xx * y * y) / determinant
+    return 1.0 / (math.pi * determinant.sqrt() * inside.square())
 
 
-def _channels(geometry: Geometry) -> list[np.ndarray]:
-    """Maps (h, w, c) of a geometry, in the order of the channels."""
-    square = geometry.slope_moments[..., 0] + geometry.slope_moments[..., 2]
+def _shown(omega: Tensor, center: Tensor, matrix: Tensor) -> Tensor:
+    """(R4) Area (n, 1) that facets show to directions, per area of the reference plane; A (n, 3)."""
+    x, y, z = omega.split(1, 1)
+    p = z - (center * omega[:, :2]).sum(1, keepdim=True)
+    square = torch.cat([x * x, 2.0 * x * y, y * y], 1)
+    return 0.5 * (p + (p * p + (matrix * square).sum(1, keepdim=True)).clamp_min(1e-20).sqrt())
+
+
+def _spread(center: Tensor, moments: Tensor) -> Tensor:
+    """2C (n, 3) of centers and moments."""
+    x, y = center.split(1, 1)
+    xx, xy, yy = (moments - torch.cat([x * x, x * y, y * y], 1)).split(1, 1)
+    xx, yy = xx.clamp_min(0.0), yy.clamp_min(0.0)
+    most = (xx * yy).sqrt()
+    return 2.0 * torch.cat([xx, xy.clamp(-most, most), yy], 1)
+
+
+def _map_levels(geometry: Geometry, lattice: Lattice) -> list[Tensor]:
+    """Filtered maps (rows, columns, channels) of a geometry for all levels of a lattice."""
     base = geometry.base_color
     if base is None:
-        base = np.full((*square.shape, 3), UNKNOWN_COLOR, np.float32)
-    out = [geometry.slopes, square[..., None], base]
+        base = np.full((*geometry.slopes.shape[:2], 3), UNKNOWN_COLOR, np.float32)
+    rest = [base]
     if geometry.roughness is not None and geometry.metallic is not None:
         # α = roughness².
-        out += [geometry.roughness[..., None] ** 4, geometry.metallic[..., None]]
-    return out
+        rest += [geometry.roughness[..., None] ** 4, geometry.metallic[..., None]]
+    filtered = prefiltered_levels(torch.from_numpy(np.concatenate(rest, -1)), lattice)
+    return [
+        torch.cat(
+            [
+                slope_distributions(
+                    geometry.slopes,
+                    geometry.slope_moments,
+                    lattice.aspect,
+                    lattice.shape(level),
+                    lookup_sigma(level, lattice.shape(level)[1]),
+                ),
+                others,
+            ],
+            -1,
+        )
+        for level, others in enumerate(filtered)
+    ]
 
 
 def _take(tensors: Mapping[str, Tensor], name: str, shape: tuple[int | None, ...]) -> Tensor:

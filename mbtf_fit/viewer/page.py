@@ -92,30 +92,31 @@ def encode(array: NDArray[Any]) -> str:
 
 
 def _rounded(image: TexelImage) -> list[F32]:
-    """Levels of an image as they are rounded: in place of second moments the standard deviation, which needs
-    fewer bits."""
+    """Levels of an image as they are rounded: in place of second moments the standard deviation or the
+    covariance, which need fewer bits."""
     levels = [texels.copy() for texels in image.levels]
     for texels in levels:
-        for mean, square in _moments(image.layout, texels):
-            square[:] = np.sqrt(np.maximum(square - mean, 0.0))
+        for square, product, is_variance in _moments(image.layout, texels):
+            square[:] = np.sqrt(np.maximum(square - product, 0.0)) if is_variance else square - product
     return levels
 
 
 def _restored(layout: Layout, texels: F32) -> F32:
     """Inverse of :func:`_rounded`. Rounding may not lift a surface above the reference plane."""
     texels = np.minimum(texels, 0.0) if layout == "nodes" else texels.copy()
-    for mean, square in _moments(layout, texels):
-        square[:] = square**2 + mean
+    for square, product, is_variance in _moments(layout, texels):
+        square[:] = (square**2 if is_variance else square) + product
     return texels
 
 
-def _moments(layout: Layout, texels: F32) -> list[tuple[F32, F32]]:
-    """Squared means, and the second moments, as views of the texels."""
+def _moments(layout: Layout, texels: F32) -> list[tuple[F32, F32, bool]]:
+    """Second moments as views of the texels, the product of their means, and whether both means are one."""
     if layout == "maps":
-        return [((texels[..., :2] ** 2).sum(-1), texels[..., 2])]
+        x, y, xx, xy, yy = np.moveaxis(texels[..., :5], -1, 0)
+        return [(xx, x * x, True), (xy, x * y, False), (yy, y * y, True)]
     if layout == "horizons":
         count = texels.shape[2] // 2
-        return [(texels[..., :count] ** 2, texels[..., count:])]
+        return [(texels[..., count:], texels[..., :count] ** 2, True)]
     return []
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -36,7 +37,7 @@ def _shade(op: ops.Shade, loader: Loader) -> Step:
         by_group=True,
     )
     width, dielectric = loader.scalar(op.light_width), opaque(loader.scalar(op.dielectric))
-    blur, widening = opaque((op.light_blur * width) ** 2), opaque(width**2)
+    blur, widening = opaque((op.light_blur * width) ** 2), opaque(0.5 * width**2)
 
     def visibility(hit: Point2f, level: Float, omega_i: Vector3f) -> Float:
         """Share of footprints from which the light is visible."""
@@ -53,18 +54,27 @@ def _shade(op: ops.Shade, loader: Loader) -> Step:
         return dr.fma(0.5, dr.erf(deviations), 0.5)
 
     def at(hit: Point2f, found: Numbers, level: Float, omega_i: Vector3f, omega_o: Vector3f) -> Numbers:
-        x, y, square, *rest = found
-        normal, base = _normal(x, y), mi.Color3f(*rest[:3])
-        light = dr.dot(normal, omega_i)
-        irradiance = visibility(hit, level, omega_i) * dr.maximum(light, 0.0) / omega_i.z
-        value = base / math.pi
+        x, y, *moments = found[:5]
+        center, spread, base = mi.Point2f(x, y), _spread(x, y, *moments), mi.Color3f(*found[5:8])
+        length2 = dr.squared_norm(center)
+        upright = dr.rsqrt(1.0 + length2)
+        light = visibility(hit, level, omega_i) / omega_i.z
+        irradiance = light * upright * _shown(omega_i, center, spread)
+        core = irradiance * base / math.pi
         if channels == GLOSSY_CHANNELS:
-            own, metallic = rest[3:]
-            variance = dr.maximum(square - dr.fma(x, x, dr.square(y)), 0.0)
-            alpha2 = dr.clip(own + variance + widening, *op.alpha2)
+            alpha2, metallic = dr.clip(found[8], *op.alpha2), found[9]
+            below = dr.rcp(dr.fma(alpha2, length2, 1.0))
+            kappa, rho = (1.0 - alpha2) * below, alpha2 * (1.0 + length2) * below
+            middle = kappa * center
+            own = (dr.fma(middle.x, x, 1.0), middle.x * y, dr.fma(middle.y, y, 1.0))
+            facets = [dr.fma(rho, a, b) for a, b in zip(own, spread, strict=True)]
+            facing = dr.maximum(_shown(omega_o, middle, facets), op.least_view)
+            half = dr.normalize(omega_i + omega_o)
+            widened = (facets[0] + widening, facets[1], facets[2] + widening)
+            lobe = light * _density(half, middle, widened) / (4.0 * facing)
             f0 = dr.lerp(mi.Color3f(dielectric), base, metallic)
-            value = (1.0 - metallic) * value + _ggx(op, f0, alpha2, normal, omega_i, omega_o)
-        return [irradiance, normal.x, normal.y, *(irradiance * value)]
+            core = (1.0 - metallic) * core + _fresnel(f0, half, omega_o) * lobe
+        return [irradiance, -upright * x, -upright * y, *core]
 
     def step(hits: Numbers, level: Numbers, omega_i: Numbers, omega_o: Numbers) -> Numbers:
         places = [mi.Point2f(*hits[k : k + 2]) for k in range(0, len(hits), 2)]
@@ -96,6 +106,36 @@ def _normal(x: Float, y: Float) -> Normal3f:
     return dr.normalize(mi.Normal3f(-x, -y, 1.0))
 
 
+def _spread(x: Float, y: Float, xx: Float, xy: Float, yy: Float) -> tuple[Float, Float, Float]:
+    """2C (xx, xy, yy) of a center and moments."""
+    xx, xy, yy = dr.fma(-x, x, xx), dr.fma(-x, y, xy), dr.fma(-y, y, yy)
+    xx, yy = dr.maximum(xx, 0.0), dr.maximum(yy, 0.0)
+    most = dr.sqrt(xx * yy)
+    return 2.0 * xx, 2.0 * dr.clip(xy, -most, most), 2.0 * yy
+
+
+def _shown(omega: Vector3f, center: Point2f, matrix: Sequence[Float]) -> Float:
+    """(R4) Area that facets show to a direction, per area of the reference plane."""
+    xx, xy, yy = matrix
+    p = omega.z - center.x * omega.x - center.y * omega.y
+    square = xx * dr.square(omega.x) + 2.0 * xy * omega.x * omega.y + yy * dr.square(omega.y)
+    return 0.5 * (p + dr.safe_sqrt(dr.fma(p, p, square)))
+
+
+def _density(half: Vector3f, center: Point2f, matrix: Sequence[Float]) -> Float:
+    """Density D(h) of facets per area of the reference plane (Walter et al. 2007)."""
+    xx, xy, yy = matrix
+    x, y = dr.fma(half.z, center.x, half.x), dr.fma(half.z, center.y, half.y)
+    determinant = xx * yy - xy * xy
+    square = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / determinant
+    return 1.0 / (math.pi * dr.sqrt(determinant) * dr.square(dr.fma(half.z, half.z, square)))
+
+
+def _fresnel(f0: Color3f, half: Vector3f, omega: Vector3f) -> Color3f:
+    """Schlick 1994."""
+    return f0 + (1.0 - f0) * (1.0 - dr.clip(dr.dot(omega, half), 0.0, 1.0)) ** 5
+
+
 def _adjacent_azimuths(horizons: F32) -> F32:
     """Horizons (rows, columns, 2n), means and then squares, as n groups of four: mean and square of an
     azimuth, and of the next one."""
@@ -105,7 +145,7 @@ def _adjacent_azimuths(horizons: F32) -> F32:
 
 
 def _ggx(
-    op: ops.Shade | ops.Lobe,
+    op: ops.Lobe,
     f0: Color3f,
     alpha2: Float,
     normal: Normal3f,
@@ -119,5 +159,4 @@ def _ggx(
     cosine = dr.maximum(dr.dot(normal, half), 0.0)
     facets = alpha2 / (math.pi * dr.square(dr.fma(dr.square(cosine), alpha2 - 1.0, 1.0)))
     masking = sum(dr.sqrt(dr.fma(alpha2, dr.rcp(dr.square(c)) - 1.0, 1.0)) for c in (light, view))
-    schlick = (1.0 - dr.clip(dr.dot(omega_o, half), 0.0, 1.0)) ** 5
-    return (f0 + (1.0 - f0) * schlick) * facets / (2.0 * masking * light * view)
+    return _fresnel(f0, half, omega_o) * facets / (2.0 * masking * light * view)

@@ -99,39 +99,42 @@ def _shade(op: ops.Shade, code: Code, hits: Value, level: Value, omega_i: Value,
     horizons = code.image(op.horizons, "horizons")
     glossy = maps.levels[0].shape[2] == GLOSSY_CHANNELS
     count, width = len(hits) // 2, code.scalar(op.light_width)
-    with code.stage_of(hits, level):
+    with code.stage_of(hits, level, omega_o):
         places = code.variable("Place", "places", count, kept=True)
         at, finer = code.variable("float2", "at", count, kept=False), f"{level} + {number(op.finer)}"
         p, q = (code.pair(image, finer, f"{at}[k]") for image in (maps, horizons))
+        given = f"{omega_o}, {number(0.5 * width**2)}, {number(op.least_view)}, {vector(op.alpha2)}"
         code.write(
             *(f"{at}[{k}] = {hits[2 * k : 2 * k + 2]};" for k in range(count)),
             f"for (int k = 0; k < {count}; k++) {{",
             f"  Pair p = {p}, q = {q};",
-            f"  {places}[k] = place_at({maps}, p, q, {number(width**2)}, {vector(op.alpha2)});",
+            f"  {places}[k] = "
+            + (f"glossy_place_at({maps}, p, q, {given});" if glossy else f"place_at({maps}, p, q);"),
             "}",
         )
         if glossy and not code.lit:
-            code.lobe = f"float4({places}[0].normal, {places}[0].alpha2)"
-    value = "at.base / PI"
+            facets = f"{places}[0].facets"
+            code.lobe = f"float4(normal_of({places}[0]), min(0.5 * ({facets}.x + {facets}.z), 1.0))"
+    core = "irradiance * at.base / PI"
     if glossy:
-        f0 = f"lerp(float3({', '.join(3 * [number(code.scalar(op.dielectric))])}), at.base, at.metallic)"
-        least = vector((op.least_light, op.least_view))
-        lobe = f"ggx({f0}, at.alpha2, at.normal, {least}, {omega_i}, {omega_o})"
-        value = f"(1.0 - at.metallic) * {value} + {lobe}"
-    hints, core = code.variable("float3", op.output), code.variable("float3", op.output)
+        lobe = f"reflected(at, {number(code.scalar(op.dielectric))}, {omega_i}, {omega_o})"
+        core = f"(1.0 - at.metallic) * {core} + light * {lobe}"
+    hints, sum_ = code.variable("float3", op.output), code.variable("float3", op.output)
     blur = f"{number((op.light_blur * width) ** 2)}, {number(op.least_variance)}"
     code.write(
         f"{hints} = float3(0.0, 0.0, 0.0);",
-        f"{core} = float3(0.0, 0.0, 0.0);",
+        f"{sum_} = float3(0.0, 0.0, 0.0);",
         f"for (int k = 0; k < {count}; k++) {{",
         f"  Place at = {places}[k];",
-        f"  float seen_from = visibility({horizons}, {horizons.layers}, at.horizons, {blur}, {omega_i});",
-        f"  float irradiance = seen_from * max(dot(at.normal, {omega_i}), 0.0) / {omega_i[2:]};",
-        f"  {hints} += float3(irradiance, at.normal.xy) / {number(count)};",
-        f"  {core} += irradiance * ({value}) / {number(count)};",
+        "  float3 normal = normal_of(at);",
+        f"  float light = visibility({horizons}, {horizons.layers}, at.horizons, {blur}, {omega_i})"
+        f" / {omega_i[2:]};",
+        f"  float irradiance = light * normal.z * shown_area({omega_i}, at.center, at.spread);",
+        f"  {hints} += float3(irradiance, normal.xy) / {number(count)};",
+        f"  {sum_} += ({core}) / {number(count)};",
         "}",
     )
-    return Value.of(hints, 3, code.lit) + Value.of(core, 3, code.lit)
+    return Value.of(hints, 3, code.lit) + Value.of(sum_, 3, code.lit)
 
 
 @SHADER.implements(ops.Lobe)

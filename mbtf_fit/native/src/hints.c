@@ -5,8 +5,9 @@
 
 #define EXPORT __attribute__((visibility("default")))
 #define PI 3.14159265f
-/* Channels of the maps: slopes (x, y), their squared length, base color; squared alpha, metallic of glossy ones. */
-#define GLOSSY 8
+/* Channels of the maps: center of the slopes (x, y), moments (xx, xy, yy), base color; squared alpha, metallic of
+ * glossy ones. */
+#define GLOSSY 10
 /* Rays that are traced before the first of them is shaded. */
 #define AHEAD 8
 
@@ -80,7 +81,26 @@ static float visibility(const mbtf_surface *s, const place *p, const float *ligh
     return 0.5f + 0.5f * erff((elevation - mean) / sqrtf(2.0f * (total > 1e-8f ? total : 1e-8f)));
 }
 
-static float masking(float alpha2, float c) { return sqrtf(1.0f + alpha2 * (1.0f / (c * c) - 1.0f)); }
+/* Symmetric 2 x 2 matrix. */
+typedef struct {
+    float xx, xy, yy;
+} matrix;
+
+/* Area that facets about a center show to a direction, per area of the reference plane. */
+static float shown(const float *w, float cx, float cy, matrix a) {
+    const float p = w[2] - cx * w[0] - cy * w[1];
+    const float square = p * p + a.xx * w[0] * w[0] + 2.0f * a.xy * w[0] * w[1] + a.yy * w[1] * w[1];
+    return 0.5f * (p + sqrtf(square > 0.0f ? square : 0.0f));
+}
+
+/* Twice the scatter of the slopes. */
+static matrix spread(const float *m) {
+    matrix a = {m[2] - m[0] * m[0], m[3] - m[0] * m[1], m[4] - m[1] * m[1]};
+    a.xx = a.xx > 0.0f ? a.xx : 0.0f;
+    a.yy = a.yy > 0.0f ? a.yy : 0.0f;
+    const float most = sqrtf(a.xx * a.yy);
+    return (matrix){2.0f * a.xx, 2.0f * clamped(a.xy, -most, most), 2.0f * a.yy};
+}
 
 /* Adds irradiance, normal (x, y) and core at a surface point. */
 static void shade(const mbtf_surface *s, const hit *h, const float *i, const float *o, float *sum) {
@@ -90,36 +110,40 @@ static void shade(const mbtf_surface *s, const hit *h, const float *i, const flo
         const float *row = s->maps.table + h->maps.rows[k] * channels;
         for (int c = 0; c < channels; c++) m[c] += h->maps.weights[k] * row[c];
     }
-    const float size = 1.0f / sqrtf(m[0] * m[0] + m[1] * m[1] + 1.0f);
-    const float nx = -m[0] * size, ny = -m[1] * size, nz = size;
-    float light = nx * i[0] + ny * i[1] + nz * i[2];
-    const float irradiance = visibility(s, &h->horizons, i) * (light > 0.0f ? light : 0.0f) / i[2];
-    float value[3];
-    for (int c = 0; c < 3; c++) value[c] = m[3 + c] / PI;
+    const float length2 = m[0] * m[0] + m[1] * m[1], nz = 1.0f / sqrtf(length2 + 1.0f);
+    matrix a = spread(m);
+    const float light = visibility(s, &h->horizons, i) / i[2];
+    const float irradiance = light * nz * shown(i, m[0], m[1], a);
+    float core[3];
+    for (int c = 0; c < 3; c++) core[c] = irradiance * m[5 + c] / PI;
     if (channels == GLOSSY) {
-        const float rest2 = m[2] - (m[0] * m[0] + m[1] * m[1]), variance = rest2 > 0.0f ? rest2 : 0.0f;
-        const float alpha2 = clamped(m[6] + variance + s->light_width * s->light_width, s->alpha2[0], s->alpha2[1]);
-        light = light > s->least_light ? light : s->least_light;
-        float view = nx * o[0] + ny * o[1] + nz * o[2];
-        view = view > s->least_view ? view : s->least_view;
+        const float alpha2 = clamped(m[8], s->alpha2[0], s->alpha2[1]), below = 1.0f / (1.0f + alpha2 * length2);
+        const float kappa = (1.0f - alpha2) * below, rho = alpha2 * (1.0f + length2) * below;
+        const float cx = kappa * m[0], cy = kappa * m[1];
+        a.xx += rho * (1.0f + cx * m[0]);
+        a.xy += rho * cx * m[1];
+        a.yy += rho * (1.0f + cy * m[1]);
+        const float facing = shown(o, cx, cy, a);
+        a.xx += 0.5f * s->light_width * s->light_width;
+        a.yy += 0.5f * s->light_width * s->light_width;
         float hx = i[0] + o[0], hy = i[1] + o[1], hz = i[2] + o[2];
         const float length = sqrtf(hx * hx + hy * hy + hz * hz);
         hx /= length, hy /= length, hz /= length;
-        const float cosine = clamped(nx * hx + ny * hy + nz * hz, 0.0f, 2.0f);
-        const float inside = cosine * cosine * (alpha2 - 1.0f) + 1.0f;
-        const float facets = alpha2 / (PI * inside * inside);
+        const float gx = hx + hz * cx, gy = hy + hz * cy, determinant = a.xx * a.yy - a.xy * a.xy;
+        const float inside = hz * hz + (a.yy * gx * gx - 2.0f * a.xy * gx * gy + a.xx * gy * gy) / determinant;
+        const float density = 1.0f / (PI * sqrtf(determinant) * inside * inside);
         const float rest = 1.0f - clamped(o[0] * hx + o[1] * hy + o[2] * hz, 0.0f, 1.0f);
         const float schlick = rest * rest * rest * rest * rest;
-        const float lobe = facets / (2.0f * (masking(alpha2, light) + masking(alpha2, view)) * light * view);
+        const float lobe = light * density / (4.0f * (facing > s->least_view ? facing : s->least_view));
         for (int c = 0; c < 3; c++) {
-            const float f0 = s->dielectric + m[7] * (m[3 + c] - s->dielectric);
-            value[c] = (1.0f - m[7]) * value[c] + (f0 + (1.0f - f0) * schlick) * lobe;
+            const float f0 = s->dielectric + m[9] * (m[5 + c] - s->dielectric);
+            core[c] = (1.0f - m[9]) * core[c] + (f0 + (1.0f - f0) * schlick) * lobe;
         }
     }
     sum[0] += irradiance;
-    sum[1] += nx;
-    sum[2] += ny;
-    for (int c = 0; c < 3; c++) sum[3 + c] += irradiance * value[c];
+    sum[1] -= nz * m[0];
+    sum[2] -= nz * m[1];
+    for (int c = 0; c < 3; c++) sum[3 + c] += core[c];
 }
 
 /* Traces one view ray of a query. */

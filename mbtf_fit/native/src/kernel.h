@@ -10,7 +10,7 @@
 #include <stdint.h>
 
 /* Version of what the functions mean; raised where sizes of structures do not show a change. */
-#define INTERFACE 2
+#define INTERFACE 3
 #define BLOCK 128
 #define MAX_CHANNELS 64
 #define MAX_WIDTH 128
@@ -68,7 +68,7 @@ typedef struct {
     mbtf_textures maps, horizons;
     int32_t places;
     float offsets[2 * MAX_PLACES];
-    float finer, light_width, light_blur, dielectric, least_light, least_view, alpha2[2];
+    float finer, light_width, light_blur, dielectric, least_view, alpha2[2];
 } mbtf_surface;
 
 /* u (n, 2), sigma (n), omega_i and omega_o (n, 3), hints (n, HINTS) for relief. */

@@ -93,7 +93,9 @@ function plainLayers(channels) {
 // Second moments are stored as standard deviations.
 function mapLayers(channels) {
   const layers = plainLayers(channels);
-  layers[0][2] = (p, n) => p[2][n] * p[2][n] + p[0][n] * p[0][n] + p[1][n] * p[1][n];
+  layers[0][2] = (p, n) => p[2][n] * p[2][n] + p[0][n] * p[0][n];
+  layers[0][3] = (p, n) => p[3][n] + p[0][n] * p[1][n];
+  layers[1][0] = (p, n) => p[4][n] * p[4][n] + p[1][n] * p[1][n];
   return layers;
 }
 
