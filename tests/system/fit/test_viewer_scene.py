@@ -104,9 +104,9 @@ def test_pictures_are_those_of_the_same_camera(
     found = page.picture(24, 32)
     camera = Camera(elevation, azimuth, across, rows=24, columns=32)
     expected = evaluate(make(case, tmp_path / "material"), camera, light) * light[2] * 2.0 * color
-    # Derivatives are those of 2 x 2 pixels, so levels differ a little within the pixel.
+    # Derivatives are those of 2 x 2 pixels, so levels differ a little within the pixel; far away, so do places.
     difference = np.abs(found[..., :3] - expected)
-    assert np.median(difference) < 0.01 * expected.mean()
+    assert np.median(difference) < 0.03 * expected.mean()
     assert difference.mean() < 0.08 * expected.mean()
     assert found[..., :3].mean((0, 1)) == pytest.approx(expected.mean((0, 1)), rel=0.01, abs=1e-4)
     assert (found[..., 3] == 1).all()
