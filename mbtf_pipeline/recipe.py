@@ -273,13 +273,18 @@ def preset_recipe(
     return recipe.model_copy(update={"generate": limit_resolution(Job.load(recipe.generate)).config})
 
 
-def write_recipe(recipe: Recipe, folder: Path) -> None:
-    """Write the resolved recipe into a run's folder; it can be run again from there."""
-    from mbtf_core.files.atomic import write_text
+def write_recipe(recipe: Recipe, folder: Path, *, overwrite: bool = False) -> None:
+    """Write the resolved recipe into a run's folder; it can be run again from there.
+
+    Raises
+    ------
+    InputError : there is one that has been edited, unless it is to be overwritten
+    """
+    from mbtf_core.files.folders import write_document
 
     data = recipe.model_dump(mode="json")
     data["generate"]["material"] = os.path.relpath(recipe.generate.material, folder)
-    write_text(folder / RECIPE_NAME, dump_yaml(data))
+    write_document(folder / RECIPE_NAME, dump_yaml(data), overwrite=overwrite)
 
 
 def read_resolved(folder: Path) -> Recipe:

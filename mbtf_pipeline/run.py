@@ -261,11 +261,11 @@ def _material_inputs(recipe: Recipe) -> dict[str, str]:
 
 
 @contextmanager
-def _claimed(recipe: Recipe, folder: Path, command: str) -> Iterator[None]:
+def _claimed(recipe: Recipe, folder: Path, command: str, overwrite: bool = False) -> Iterator[None]:
     """Own the folder of a run in a block, with its records."""
     with owned(folder):
         RUN.check(folder)
-        write_run_record(folder, recipe, command)
+        write_run_record(folder, recipe, command, overwrite=overwrite)
         yield
 
 
@@ -327,11 +327,11 @@ def run_recipe(
     folder = recipe.folder if folder is None else folder
     inputs, count = _material_inputs(recipe), len(data_sets(recipe))
     run = _RecipeRun(recipe, folder, console or Console(quiet=True), live, runner or Runner())
-    with _claimed(recipe, folder, command):
+    with _claimed(recipe, folder, command, force):
         done = run_stages(folder, run.stages(inputs)[:count], force=force, notify=run.show)
         if generated is not None:
             run = replace(run, recipe=generated(recipe))
-            write_run_record(folder, run.recipe, command)
+            write_run_record(folder, run.recipe, command, overwrite=force)
         left = run.stages(inputs)[count:]
         results = run_stages(folder, left, force=force, notify=run.show, before=done)
     viewer, comparison = folder / VIEWER, read_json(folder / COMPARE / COMPARISON_NAME)

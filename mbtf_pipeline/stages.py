@@ -30,6 +30,8 @@ STAGE_SCHEMA = 3
 STAMPS = "stages"
 FORCED = "forced"
 NOT_RUN = "has not run"
+# Outputs that people edit, for example to put them into a paper.
+DOCUMENTS = (".csv", ".html", ".md", ".png", ".svg", ".yaml")
 
 
 @dataclass(frozen=True)
@@ -152,6 +154,16 @@ def decide(folder: Path, stage: Stage, fresh: Sequence[str] = ()) -> Decision:
     return Decision("")
 
 
+def _refuse_edited(folder: Path, stage: Stage) -> None:
+    """An InputError if a document of a stage has been edited since the stage wrote it."""
+    stamp = read_stamp(folder, stage.name)
+    for name, expected in {} if stamp is None else stamp.outputs.items():
+        path = folder / name
+        if path.suffix in DOCUMENTS and path.is_file() and file_sha256(path) != expected:
+            hint = "move it away and run the same command again, or replace it with --force"
+            raise InputError("has been edited, or damaged, and would be replaced", where=path, hint=hint)
+
+
 # Called before each stage with its name, its decision, and None; after it, with its seconds.
 Notify = Callable[[str, Decision, float | None], None]
 
@@ -173,6 +185,8 @@ def run_stages(
     def decided(stage: Stage) -> Decision:
         fresh = [name for name, result in done.items() if result.reason]
         decision = Decision(FORCED) if force else decide(folder, stage, fresh)
+        if decision.reason and not force:
+            _refuse_edited(folder, stage)
         notify(stage.name, decision, None)
         return decision
 
@@ -236,10 +250,11 @@ def clear(folder: Path) -> None:
         shutil.rmtree(folder)
 
 
-def write_run_record(folder: Path, recipe: Recipe, command: str) -> None:
-    """Write the resolved recipe and the command into the run's folder."""
+def write_run_record(folder: Path, recipe: Recipe, command: str, *, overwrite: bool = False) -> None:
+    """Write the resolved recipe and the command into the run's folder; an edited recipe is refused unless it
+    is to be overwritten."""
     RUN.write(folder, {"name": recipe.name, "command": command, "machine": machine()})
-    write_recipe(recipe, folder)
+    write_recipe(recipe, folder, overwrite=overwrite)
 
 
 def machine() -> dict[str, str]:

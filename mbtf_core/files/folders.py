@@ -43,7 +43,8 @@ _LEFTOVER = re.compile(rf"\..+(?:{TEMPORARY}|\.lock)")
 ELSEWHERE = "choose another folder with -o"
 # Beside the record: the resolved options, which a command can be given again.
 CONFIG_NAME = "config.yaml"
-# Last line of a document, which tells whether the others are as they were written.
+# Last line of a document, which tells whether the others are as they were written. The digest of another file
+# is in a hidden file beside it.
 _SEALS = {".yaml": "# sha256 of the lines above: {}\n", ".html": "<!-- sha256 of the lines above: {} -->\n"}
 
 
@@ -148,11 +149,12 @@ def make_folder(folder: Path) -> None:
 
 
 def write_document(path: Path, text: str, *, overwrite: bool = False) -> None:
-    """Write a text that users may edit, atomically; its last line is a comment with a digest of the others.
+    """Write a text that users may edit, atomically. The last line of YAML and HTML is a comment with a digest
+    of the others; of other formats the digest is in a hidden file.
 
     Parameters
     ----------
-    path : of a suffix ``.yaml`` or ``.html``
+    path : Path
     overwrite : replace it also if it has been edited
 
     Raises
@@ -164,19 +166,35 @@ def write_document(path: Path, text: str, *, overwrite: bool = False) -> None:
     content = body.encode()
     if not overwrite:
         _refuse_edited(path)
-    write_chunks(path, [content, _SEALS[path.suffix].format(hashlib.sha256(content).hexdigest()).encode()])
+    digest = hashlib.sha256(content).hexdigest()
+    if path.suffix in _SEALS:
+        write_chunks(path, [content, _SEALS[path.suffix].format(digest).encode()])
+        return
+    # Before the file: killed in between, the file that is there is refused rather than lost.
+    write_chunks(_digest_file(path), [f"{digest}\n".encode()])
+    write_chunks(path, [content])
+
+
+def _digest_file(path: Path) -> Path:
+    return path.with_name(f".{path.name}.sha256")
 
 
 def _refuse_edited(path: Path) -> None:
     """An InputError if there is a document that is not as :func:`write_document` wrote it."""
     refuse_special(path)
     try:
-        body, _, last = path.read_bytes()[:-1].rpartition(b"\n")
+        content = path.read_bytes()
+        if path.suffix in _SEALS:
+            body, _, last = content[:-1].rpartition(b"\n")
+            wanted = _SEALS[path.suffix].format(hashlib.sha256(body + b"\n").hexdigest()).encode()
+            unchanged = last + b"\n" == wanted
+        else:
+            unchanged = _digest_file(path).read_text().strip() == hashlib.sha256(content).hexdigest()
     except FileNotFoundError:
-        return
+        unchanged = not path.exists()
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", where=path) from None
-    if last + b"\n" != _SEALS[path.suffix].format(hashlib.sha256(body + b"\n").hexdigest()).encode():
+    if not unchanged:
         raise changed(path)
 
 

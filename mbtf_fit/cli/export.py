@@ -125,6 +125,11 @@ def export_material(
     # Files of other formats may lie in the material's own folder.
     beside = folder.is_dir() and folder.samefile(material)
     beside = beside and not any(DESCRIPTION_NAME in target.files for target in wanted)
+    if beside and not overwrite:
+        there = next((n for target in wanted for n in target.files if (folder / n).exists()), None)
+        if there is not None:
+            hint = "write to another folder with -o, or replace it with --overwrite"
+            raise InputError("is there already", where=folder / there, hint=hint)
     # The description goes first: without it nothing counts as a finished material.
     names = dict.fromkeys([DESCRIPTION_NAME, *(name for t in targets().values() for name in t.files)])
     with (

@@ -9,7 +9,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.files.atomic import write_text
 from mbtf_core.files.folders import write_document
 from mbtf_core.units import clock
 from mbtf_pipeline.collection.check_tables import independence, offsets, timing, weights
@@ -58,7 +57,7 @@ def write_page(folder: Path, record: Mapping[str, Any]) -> tuple[Path, list[Path
     html, tables = paper_page(record, folder / RUNS)
     (folder / TABLES).mkdir(exist_ok=True)
     for name, text in tables.items():
-        write_text(folder / TABLES / f"{name}.csv", text)
+        write_document(folder / TABLES / f"{name}.csv", text)
     page = folder / "paper.html"
     write_document(page, html)
     return page, [folder / TABLES / f"{name}.csv" for name in tables]

@@ -8,7 +8,6 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.files.atomic import write_text
 from mbtf_core.files.folders import write_document
 from mbtf_core.units import clock
 from mbtf_pipeline.cost.measurement import Measurement, extrapolation, pareto_front
@@ -129,7 +128,7 @@ def _generator_section(found: Sequence[Measurement], png: Path) -> dict[str, Any
 
 def write_page(study: Study) -> Path:
     """Write CSV, page and plots into the study's folder; returns the path of the page."""
-    write_text(study.folder / CSV_NAME, to_csv(study.measurements))
+    write_document(study.folder / CSV_NAME, to_csv(study.measurements))
     sections = {}
     for kind in ("run", *_COMPARISONS):
         found = [m for m in study.measurements if m.study == kind]

@@ -85,7 +85,7 @@ def write_report(folder: Path, recipe: Recipe, stages: Sequence[str]) -> None:
         "offsets": offset_section(folder / COMPARE, comparison["offsets"], gallery),
         "material": material_section(recipe.generate, manifest["inputs"]),
         "command": run["command"],
-        "recipe_yaml": (folder / RECIPE_NAME).read_text(encoding="utf-8"),
+        "recipe_yaml": (folder / RECIPE_NAME).read_text(encoding="utf-8").rpartition("# sha256")[0],
         "provenance": provenance(folder, manifest, comparison["fits"], run["machine"]),
         **error_context(comparison),
         **training_context(fit_folders),

@@ -104,7 +104,7 @@ def test_pictures_are_those_of_the_same_camera(
     found = page.picture(24, 32)
     camera = Camera(elevation, azimuth, across, rows=24, columns=32)
     expected = evaluate(make(case, tmp_path / "material"), camera, light) * light[2] * 2.0 * color
-    # Derivatives are those of 2 x 2 pixels, so levels differ a little within the pixel; far away, so do places.
+    # Derivatives are those of 2 x 2 pixels, so levels differ a little within the pixel, and far away places.
     difference = np.abs(found[..., :3] - expected)
     assert np.median(difference) < 0.03 * expected.mean()
     assert difference.mean() < 0.08 * expected.mean()

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import read_json
 from mbtf_pipeline.stages import (
     Decision,
@@ -125,6 +126,23 @@ def test_a_changed_output_runs_its_stage_and_later_ones(pipeline: Pipeline, dama
     assert pipeline.decisions["fit a"].changed_files == (path,)
     assert "fit-a.txt" in pipeline.decisions["fit a"].reason
     assert pipeline.decisions["compare"].reason == "follows fit a"
+
+
+def test_an_edited_document_is_replaced_if_forced_only(
+    pipeline: Pipeline, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where its stage must run for another reason."""
+    monkeypatch.setattr("mbtf_pipeline.stages.DOCUMENTS", (".txt",))
+    pipeline.run()
+    path = pipeline.file("report")
+    path.write_text("my own words")
+    for option in (1, 2):
+        pipeline.config["report"] = {"option": option}
+        with pytest.raises(InputError, match=r"report\.txt: has been edited"):
+            pipeline.run()
+        assert path.read_text() == "my own words"
+    run_stages(pipeline.folder, pipeline.stages(), force=True)
+    assert path.read_text() != "my own words"
 
 
 def test_dates_and_folder_names_do_not_matter(pipeline: Pipeline, tmp_path: Path) -> None:

@@ -168,7 +168,8 @@ def test_a_changed_file_is_replaced_on_request_only(tmp_path: Path, name: str) -
 
 
 def test_documents_are_replaced_unless_they_were_edited(tmp_path: Path) -> None:
-    for suffix, first, second in ((".yaml", "a: 1", "a: 2\n"), (".html", "<p>1</p>", "<p>2</p>\n")):
+    texts = ((".yaml", "a: 1", "a: 2\n"), (".html", "<p>1</p>", "<p>2</p>\n"), (".csv", "a,1", "a,2\n"))
+    for suffix, first, second in texts:
         path = tmp_path / f"page{suffix}"
         write_document(path, first)
         write_document(path, second)

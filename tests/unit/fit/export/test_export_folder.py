@@ -68,6 +68,21 @@ def test_an_edited_file_is_replaced_on_request_only(
     assert (out / name).read_text() == content
 
 
+def test_a_file_beside_the_material_is_replaced_on_request_only(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    material = tmp_path / "material"
+    shutil.copytree(source, material)
+    line = ["export", str(material), "--to", "json"]
+    assert run(app, line) == 0
+    (material / "layers.json").write_text("mine")
+    assert run(app, line) == 3
+    assert "layers.json: is there already" in capsys.readouterr().err
+    assert (material / "layers.json").read_text() == "mine"
+    assert run(app, [*line, "--overwrite"]) == 0
+    assert "mine" not in (material / "layers.json").read_text()
+
+
 def test_another_export_is_refused_unless_told(
     source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -137,10 +152,10 @@ def test_a_failed_export_claims_nothing(source: Path, tmp_path: Path) -> None:
     assert os.listdir(tmp_path / "notes") == ["notes.txt"]
 
 
-def test_files_in_the_own_folder_are_replaced(source: Path, tmp_path: Path) -> None:
+def test_files_of_formats_may_lie_beside_the_material(source: Path, tmp_path: Path) -> None:
     own = tmp_path / "own"
     shutil.copytree(source, own)
     before = set(os.listdir(own))
-    for words in ([], ["--half"], ["-o", str(own)], ["--to", "slang"]):
+    for words in ([], ["--half", "--overwrite"], ["--to", "slang"]):
         assert run(app, ["export", str(own), "-q", *words]) == 0
     assert set(os.listdir(own)) == before | {"textures.exr", "layers.json", "material.slang", "material.bin"}
