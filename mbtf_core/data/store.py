@@ -162,7 +162,9 @@ class ObjectStore:
         protocol = url.partition("://")[0]
         try:
             # Some protocols connect at once.
-            self._files, root = self._answer(url, 0, lambda: fsspec.url_to_fs(url, use_listings_cache=False))
+            self._files, root = self._answer(
+                url, self._seconds(), lambda: fsspec.url_to_fs(url, use_listings_cache=False)
+            )
         except ImportError as error:
             package = "'mbtf[stores]'" if protocol in ("s3", "s3a") else _PACKAGES.get(protocol)
             hint = f"pip install {package}" if package else "install it with pip"
@@ -175,11 +177,15 @@ class ObjectStore:
     def _at(self, name: str) -> str:
         return f"{self._root}/{name}"
 
-    def _answer(self, where: str, size: int, function: Callable[[], T]) -> T:
-        """Result of one attempt, which moves so many bytes; a PartialError where it is not answered."""
+    def _seconds(self, size: int = 0) -> float:
+        """Seconds after which a request that moves so many bytes is given up."""
         patience = _LEAST_SECONDS if self._lost.is_set() else max(self.patience, _LEAST_SECONDS)
+        return patience * (1 + size / _BLOCK_BYTES)
+
+    def _answer(self, where: str, seconds: float, function: Callable[[], T]) -> T:
+        """Result of one attempt; a PartialError where it is not answered in time."""
         try:
-            return call_within(patience * (1 + size / _BLOCK_BYTES), function)
+            return call_within(seconds, function)
         except NoAnswer as error:
             self._lost.set()
             raise PartialError(
@@ -203,10 +209,15 @@ class ObjectStore:
         PartialError : the store cannot be reached
         """
         where = f"{self.url}/{name}" if name else self.url
-        pause, give_up = _FIRST_PAUSE, 0.0
+        pause, give_up = _FIRST_PAUSE, time.monotonic() + self.patience * (1 + size / _BLOCK_BYTES)
+        failed: Exception | None = None
         while True:
+            seconds = self._seconds(size)
             try:
-                result = self._answer(where, size, function)
+                # Libraries try again by themselves: all attempts together have the time of one.
+                if failed is not None:
+                    seconds = max(give_up - time.monotonic(), _LEAST_SECONDS)
+                result = self._answer(where, seconds, function)
                 self._lost.clear()
                 return result
             except (FileNotFoundError, FileExistsError):
@@ -214,8 +225,11 @@ class ObjectStore:
                 self._lost.clear()
                 raise
             except PartialError:
+                if failed is not None:
+                    raise self._unreachable(where, failed) from None
                 raise
             except Exception as error:
+                failed = error
                 if _is_refusal(error):
                     raise InputError(
                         f"the store refuses it ({reason(error)})",
@@ -223,18 +237,20 @@ class ObjectStore:
                         hint="check the credentials, the endpoint and the name of the bucket",
                     ) from None
                 log.debug("%s: %s", where, reason(error))
-                now = time.monotonic()
-                # The patience begins with the first failure: a request may take long.
-                give_up = give_up or now + (0.0 if self._lost.is_set() else self.patience)
-                if now + pause > give_up:
+                if self._lost.is_set() or time.monotonic() + pause > give_up:
                     self._lost.set()
-                    raise PartialError(
-                        f"the store cannot be reached ({reason(error)})",
-                        where=where,
-                        hint="what is finished is kept; run the same command again",
-                    ) from None
+                    raise self._unreachable(where, error) from None
                 time.sleep(pause)
                 pause = min(2.0 * pause, _LONGEST_PAUSE)
+
+    @staticmethod
+    def _unreachable(where: str, error: Exception) -> PartialError:
+        return PartialError(
+            f"the store cannot be reached ({reason(error)})",
+            where=where,
+            hint="what is finished is kept; run the same command again, "
+            f"or wait longer: {PATIENCE_VARIABLE}=300",
+        )
 
     def list(self) -> dict[str, StoredFile]:
         """All objects and folders, without those in sub-folders; names of folders end with "/"."""

@@ -172,6 +172,19 @@ def test_a_store_that_never_answers_is_given_up(tmp_path: Path, monkeypatch: pyt
             assert "MBTF_STORE_PATIENCE" in caught.value.hint
 
 
+def test_attempts_of_a_library_count(store: ObjectStore) -> None:
+    """One that took all of the time before it failed is not repeated."""
+    store.patience, calls = 0.05, []
+
+    def refused() -> None:
+        calls.append(time.sleep(0.1))
+        raise ConnectionError("refused")
+
+    with pytest.raises(PartialError, match="cannot be reached"):
+        store._request("a", refused)
+    assert len(calls) == 1
+
+
 def test_large_objects_may_take_longer(store: ObjectStore, monkeypatch: pytest.MonkeyPatch) -> None:
     limits = []
     monkeypatch.setattr(
