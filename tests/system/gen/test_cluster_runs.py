@@ -91,6 +91,8 @@ def test_a_finished_data_set_needs_no_cluster(runs: tuple[Path, dict[str, Done]]
 SLURM_WORKERS = "engine: slurm\nworkers: 2\nthreads: 1\nmemory: 2GB\nwalltime: 10min\n"
 
 
+# Workers that die: the next test; what is submitted: `test_cluster`; a real SLURM: `test_slurm_array`.
+@pytest.mark.slow
 def test_jobs_of_slurm_that_are_canceled_are_replaced(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -125,7 +127,7 @@ def is_worker(process: Any) -> bool:
         return False
 
 
-@pytest.mark.parametrize("kills", [4, pytest.param(100, marks=[pytest.mark.slow, pytest.mark.timeout(3600)])])
+@pytest.mark.parametrize("kills", [2, pytest.param(100, marks=[pytest.mark.slow, pytest.mark.timeout(3600)])])
 def test_killed_workers_and_commands_lose_nothing(kills: int, tmp_path: Path) -> None:
     import psutil
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -88,20 +87,13 @@ def test_failures_are_named_and_the_rest_is_kept(folder: Path, capsys: pytest.Ca
     assert record(out)["broken"]["state"] == "done"
     assert weights(out, "flat", "rough") == kept
     assert run(app, ["report", str(out), "-q"]) == 0
-    # A further material trains no other one again.
-    kept = weights(out, "broken", "flat", "rough")
-    shutil.copytree(folder / "materials" / "rough", folder / "materials" / "added")
-    try:
-        assert run(app, line) == 0
-    finally:
-        shutil.rmtree(folder / "materials" / "added")
-    assert record(out)["added"]["state"] == "done"
-    assert weights(out, "broken", "flat", "rough") == kept
 
 
 TWO = RECIPE.replace("[materials]", "[materials/flat, materials/rough]")
 
 
+# Tasks of workers: `test_cluster_runs`, data sets; `test_runner`, results.
+@pytest.mark.slow
 def test_workers_make_the_same_data(folder: Path) -> None:
     pytest.importorskip("distributed", reason="no Dask; to enable: pip install 'mbtf[cluster]'")
     (folder / "two.yaml").write_text(TWO)
