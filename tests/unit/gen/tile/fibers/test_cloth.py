@@ -150,6 +150,14 @@ def test_yarns_keep_what_they_do_not_give_themselves(tmp_path: Path) -> None:
     assert "4 warps and 4 wefts" in shown
 
 
+def test_sequences_begin_at_the_left_and_at_the_top(tmp_path: Path) -> None:
+    text = "weave: plain\nyarn: {fibers: 1, flyaways: 0}\nyarns: {a: 1, b: 0, c: 1, d: 0}\n"
+    found = fibers(tmp_path, text + "warp: a b3\nweft: c d3\n")
+    middle = np.array([curve.control[:, :2].mean(axis=0) for curve in found.curves])
+    assert middle[found.yarn == 0, 0].mean() == pytest.approx(1 / 8, abs=0.02)
+    assert middle[found.yarn == 2, 1].mean() == pytest.approx(7 / 8, abs=0.02)
+
+
 def test_hexadecimal_colors_are_decoded(tmp_path: Path) -> None:
     """IEC 61966-2-1: half of the code is 21.4 % of the light."""
     found = fibers(tmp_path, WEAVE.replace("fibers: 3", "fibers: 3, color: '#7f00FF'"))
