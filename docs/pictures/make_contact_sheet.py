@@ -1,7 +1,7 @@
 """Make docs/pictures/contact_sheet.png: every material of assets/ as a close view and from afar.
 
 One run of ``mbtf-gen reference`` renders each picture; its command is printed. Labels are added here.
-From the repository's root, in ten minutes: ``.venv/bin/python docs/pictures/make_contact_sheet.py``.
+From the repository's root, in half an hour: ``.venv/bin/python docs/pictures/make_contact_sheet.py``.
 """
 
 from __future__ import annotations
@@ -25,24 +25,21 @@ ROWS = (
     ("one tile across, view at 55°, light at 40°", "--view 55,-90 --light 40,140 --tiles-across 1"),
     ("two tiles across, view at 40°, grazing light at 15°", "--view 40,-90 --light 15,150 --tiles-across 2"),
 )
-SIZE, SPP = 248, 256
-# Paths through fibers take twenty times as long.
-CLOTH, CLOTH_SPP = MATERIALS[5:], 64
+SIZE, SPP = 200, 256
 GAP, TITLE, CAPTION = 6, 26, 22
 INK, PAPER = (30, 30, 30), (255, 255, 255)
 
 
-def render(material: str, options: str) -> Image.Image:
-    """One picture, (SIZE, SIZE) pixels.
+def render(material: str, options: str, size: int, spp: int) -> Image.Image:
+    """One picture of a material, (size, size) pixels.
 
     Raises
     ------
     subprocess.CalledProcessError
         If the program fails.
     """
-    words = ["reference", f"assets/{material}", *shlex.split(options)]
-    spp = CLOTH_SPP if material in CLOTH else SPP
-    words += ["--size", str(SIZE), "--spp", str(spp), "--kind", "pixel"]
+    words = ["reference", material, *shlex.split(options)]
+    words += ["--size", str(size), "--spp", str(spp), "--kind", "pixel"]
     print("mbtf-gen", *words, flush=True)
     with tempfile.TemporaryDirectory() as folder:
         output = Path(folder) / "pictures"
@@ -68,7 +65,8 @@ def main() -> None:
             top = above + TITLE + row * (CAPTION + pitch)
             if column == 0:
                 draw.text((2, top + 2), caption, INK, ImageFont.load_default(14))
-            sheet.paste(render(material, options), (column * pitch, top + CAPTION))
+            picture = render(f"assets/{material}", options, SIZE, SPP)
+            sheet.paste(picture, (column * pitch, top + CAPTION))
     sheet.save(Path(__file__).with_name("contact_sheet.png"), optimize=True)
 
 

@@ -81,7 +81,7 @@ def build_scene(
     shape : Tile or HeightGrid
         The shape, in tile widths.
     bsdf : mapping, mitsuba.BSDF or sequence of mapping
-        A Mitsuba dictionary, or a loaded BSDF; one dictionary per part of a mesh.
+        A Mitsuba dictionary, or a loaded BSDF; one dictionary per part of a mesh or kind of yarn.
 
     Returns
     -------
@@ -100,7 +100,7 @@ def load_surface(bsdf: Mapping[str, Any] | BSDF | Sequence[Mapping[str, Any]]) -
     """Surface, PartSurface or MitsubaSurface of what :func:`build_scene` takes; errors as there."""
     register_plugins()
     if isinstance(bsdf, Sequence):
-        return PartSurface([_loaded(part).surface for part in bsdf])
+        return PartSurface([surface_of(_loaded(part)) for part in bsdf])
     return surface_of(_loaded(bsdf) if isinstance(bsdf, Mapping) else bsdf)
 
 

@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import data_sha256, file_sha256
-from mbtf_core.paths import named_file
+from mbtf_core.paths import named_file, suggest_name
 from mbtf_gen.tile.fiber_tile import FiberScattering, FiberTile
 from mbtf_gen.tile.fibers.cloth_file import ClothFile, YarnEntry
 from mbtf_gen.tile.fibers.curve_file import read_curves
-from mbtf_gen.tile.fibers.curves import F64, LONGEST_SEGMENT, THINNEST, Bundle, Curve
-from mbtf_gen.tile.fibers.weave import knitted_lines, parse_draft, read_pattern, woven_lines
+from mbtf_gen.tile.fibers.curves import LONGEST_SEGMENT, THINNEST, Bundle, Curve
+from mbtf_gen.tile.fibers.draft import Weave, colors_of, parse_draft, parse_sequence
+from mbtf_gen.tile.fibers.weave import knitted_lines, read_pattern, woven_lines
 from mbtf_gen.tile.fibers.yarn import YARNS, CrossSection, YarnModel, count_segments, fibers_of, roughness_of
 
 # Defaults that depend on the structure.
@@ -24,8 +25,6 @@ _WOVEN_WIDTH, _WOVEN_HEIGHT, _KNITTED_WIDTH = 0.95, 0.6, 0.45
 _CURVE_RADIUS = 0.002
 # Distance in tile widths within which ends of curves count as the same place.
 _AT_BORDER = 2e-3
-# Crossings of one tile, each of some hundred fiber segments.
-_MOST_CROSSINGS = 1 << 16
 # Periods that one fiber may reach over.
 _MOST_PERIODS = 16
 # Longer side of a tile over the shorter one.
@@ -62,9 +61,9 @@ def cloth_tile(spec: ClothFile, folder: Path) -> FiberTile:
     digests = {role: file_sha256(path) for role, path in files.items()}
     # What the defaults stand for changes the data as well.
     settings = spec.model_dump(mode="json", exclude={"pattern", "curves"})
-    settings["scattering"] = asdict(tile.scattering)
+    settings["scattering"] = [asdict(scattering) for scattering in tile.scattering]
     settings["longest_segment"] = LONGEST_SEGMENT
-    settings["yarns"] = [asdict(YARNS[entry.type]) for entry in (spec.yarn, spec.weft) if entry is not None]
+    settings["types"] = [asdict(YARNS[entry.type]) for entry in _kinds(spec).values()]
     digests["settings"] = data_sha256(settings)
     kind = next(key for key in ("weave", "knit", "pattern", "curves") if getattr(spec, key) is not None)
     named = f" of {files[kind].name}" if kind in files else ""
@@ -75,9 +74,14 @@ def cloth_tile(spec: ClothFile, folder: Path) -> FiberTile:
     return replace(tile, files=files, digests=digests, notes=(note,), resolution=spec.resolution)
 
 
+def _kinds(spec: ClothFile) -> dict[str, YarnEntry]:
+    """Kinds of yarns by name."""
+    return {name: spec.yarn.updated(entry) for name, entry in spec.yarns.items()} or {"yarn": spec.yarn}
+
+
 def _fibers(spec: ClothFile, folder: Path) -> FiberTile:
     rng = np.random.default_rng(spec.seed)
-    where = folder
+    where, woven = folder, None
     if spec.curves is not None:
         return _of_curves(spec, named_file(folder, spec.curves))
     if spec.pattern is not None:
@@ -86,42 +90,77 @@ def _fibers(spec: ClothFile, folder: Path) -> FiberTile:
     elif spec.knit is not None:
         aspect, yarns = _knitted(spec)
     else:
-        aspect, yarns = _woven(spec)
+        woven = _weave(spec)
+        aspect, yarns = _woven(spec, woven)
     _check_aspect(aspect, where)
-    total = sum(count_segments(line, section, _model(entry)) for line, section, entry, _ in yarns)
+    kinds = _kinds(spec)
+    total = sum(count_segments(line, section, _model(kinds[name])) for line, section, name in yarns)
     if not total <= MOST_SEGMENTS:
+        size = "" if woven is None else f" of {len(woven.warp)} warps and {len(woven.weft)} wefts"
         raise InputError(
-            f"would have {total:.2g} fiber segments, more than {MOST_SEGMENTS:,}",
+            f"a tile{size} would have {total:.2g} fiber segments, more than {MOST_SEGMENTS:,}",
             where=where,
-            hint="take fewer repeats or fibers, or wider yarns",
+            hint="take fewer repeats or fibers, shorter sequences, or wider yarns",
         )
     curves: list[Curve] = []
     kind: list[int] = []
-    for line, section, entry, color in yarns:
-        fibers = fibers_of(line, section, _model(entry), rng)
+    for line, section, name in yarns:
+        fibers = fibers_of(line, section, _model(kinds[name]), rng)
         curves += fibers
-        kind += [color] * len(fibers)
-    colors = [spec.yarn.color] if spec.weft is None else [spec.yarn.color, spec.weft.color]
-    return _settled(aspect, curves, np.array(kind), np.array(colors), spec, where)
+        kind += [list(kinds).index(name)] * len(fibers)
+    return replace(_settled(aspect, curves, np.array(kind), spec, where), weave=woven)
 
 
-_Yarn = tuple[Curve, CrossSection, YarnEntry, int]
+# Center line, cross-section, and name of its kind.
+_Yarn = tuple[Curve, CrossSection, str]
 
 
-def _woven(spec: ClothFile) -> tuple[float, list[_Yarn]]:
-    draft = parse_draft(spec.weave or "")
-    if draft.size * spec.repeat**2 > _MOST_CROSSINGS:
-        what = f"would have more than {_MOST_CROSSINGS:,} crossings"
-        raise InputError(what, where="weave", hint="take fewer repeats")
-    draft = np.tile(draft, (spec.repeat, spec.repeat))
-    rows, columns = draft.shape
-    warp, weft = spec.yarn, spec.weft or spec.yarn
-    sections = [_section(entry, 1.0 / columns, _WOVEN_WIDTH, _WOVEN_HEIGHT, True) for entry in (warp, weft)]
+def _weave(spec: ClothFile) -> Weave:
+    """One tile of a woven cloth; checks that all named yarns are used."""
+    text, names = spec.weave or "", list(spec.yarns)
+    draft, blocks = parse_draft(text), colors_of(text)
+    if spec.warp is not None:
+        warp = parse_sequence(spec.warp, "warp")
+        weft = warp if spec.weft is None else parse_sequence(spec.weft, "weft")
+    elif blocks is not None:
+        if len(names) != 2:
+            raise InputError(
+                f"{text.strip()} needs two yarns, or 'warp' and 'weft'",
+                where="yarns",
+                hint="such as yarns: {dark: '#20242f', light: '#e8e2d4'}",
+            )
+        (a, b), (ends, picks) = names, blocks
+        warp, weft = [a] * ends + [b] * ends or [a], [a] * picks + [b] * picks or [b]
+    elif names:
+        raise InputError(
+            "are given, but not their sequence", where="yarns", hint=f"such as warp: {names[0]}4"
+        )
+    else:
+        warp = weft = ["yarn"]
+    known = names or ["yarn"]
+    for key, sequence in (("warp", warp), ("weft", weft)):
+        if unknown := next((name for name in sequence if name not in known), None):
+            what = f"names the yarn '{unknown}', which 'yarns' does not have"
+            hint = suggest_name(unknown, known) or f"it has {', '.join(names) or 'none'}"
+            raise InputError(what, where=key, hint=hint)
+    if unused := next((name for name in known if name not in (*warp, *weft)), None):
+        raise InputError(f"'{unused}' is in neither warp nor weft", where="yarns")
+    return Weave.of(draft, warp, weft, spec.repeat)
+
+
+def _woven(spec: ClothFile, woven: Weave) -> tuple[float, list[_Yarn]]:
+    rows, columns = woven.draft.shape
+    sections = {
+        name: _section(entry, 1.0 / columns, _WOVEN_WIDTH, _WOVEN_HEIGHT, True)
+        for name, entry in _kinds(spec).items()
+    }
     # Square crossings: yarns of both sets are equally far apart.
     aspect = rows / columns
-    lines = woven_lines(draft, aspect, sum(section.height for section in sections))
-    yarns = [(line, sections[0], warp, 0) for line in lines[0]]
-    return aspect, yarns + [(line, sections[1], weft, 0 if spec.weft is None else 1) for line in lines[1]]
+    warp, weft = (np.array([sections[name].height for name in names]) for names in (woven.warp, woven.weft))
+    warps, wefts = woven_lines(woven.draft, aspect, warp + weft[:, None])
+    # From v = 0: the order of the random numbers.
+    lines = zip([*warps, *wefts[::-1]], [*woven.warp, *woven.weft[::-1]], strict=True)
+    return aspect, [(line, sections[name], name) for line, name in lines]
 
 
 def _knitted(spec: ClothFile) -> tuple[float, list[_Yarn]]:
@@ -130,7 +169,7 @@ def _knitted(spec: ClothFile) -> tuple[float, list[_Yarn]]:
     aspect = knit.aspect * knit.rows / knit.stitches
     section = _section(spec.yarn, 0.5 / knit.stitches, _KNITTED_WIDTH, 1.0, False)
     lines = knitted_lines(knit.stitches, knit.rows, aspect)
-    return aspect, [(line, section, spec.yarn, 0) for line in lines]
+    return aspect, [(line, section, "yarn") for line in lines]
 
 
 def _of_pattern(spec: ClothFile, path: Path) -> tuple[float, list[_Yarn]]:
@@ -138,7 +177,7 @@ def _of_pattern(spec: ClothFile, path: Path) -> tuple[float, list[_Yarn]]:
     section = _section(spec.yarn, 2.0 * pattern.radius, 1.0, 1.0, False)
     period = np.array([1.0, pattern.aspect, 0.0])
     lines = [Curve.through(yarn.points, 0.0, np.append(yarn.shift, 0) * period) for yarn in pattern.yarns]
-    return pattern.aspect, [(line, section, spec.yarn, 0) for line in lines]
+    return pattern.aspect, [(line, section, "yarn") for line in lines]
 
 
 def _check_aspect(aspect: float, where: Path) -> None:
@@ -151,7 +190,7 @@ def _check_aspect(aspect: float, where: Path) -> None:
 
 
 def _settled(
-    aspect: float, curves: list[Curve], kind: NDArray[np.int_], colors: F64, spec: ClothFile, where: Path
+    aspect: float, curves: list[Curve], kind: NDArray[np.int_], spec: ClothFile, where: Path
 ) -> FiberTile:
     """The tile with its fibers below the reference plane, unless they are too thick, too thin, or too many to
     be traced."""
@@ -182,7 +221,10 @@ def _settled(
             where=where,
             hint="take fewer or thicker fibers, or a smaller tile",
         )
-    return FiberTile.settled(aspect, curves, kind, colors, _scattering(spec))
+    kinds = _kinds(spec)
+    colors = np.array([entry.color for entry in kinds.values()])
+    scattering = tuple(map(_scattering, kinds.values()))
+    return replace(FiberTile.settled(aspect, curves, kind, colors, scattering), names=tuple(kinds))
 
 
 def _section(entry: YarnEntry, space: float, width: float, height: float, flat: bool) -> CrossSection:
@@ -201,13 +243,13 @@ def _model(entry: YarnEntry) -> YarnModel:
     )
 
 
-def _scattering(spec: ClothFile) -> FiberScattering:
-    fiber, (along, around) = spec.fiber, roughness_of(spec.yarn.type)
+def _scattering(entry: YarnEntry) -> FiberScattering:
+    along, around = roughness_of(entry.type)
     return FiberScattering(
-        along if fiber.roughness is None else fiber.roughness,
-        around if fiber.azimuthal_roughness is None else fiber.azimuthal_roughness,
-        fiber.scale_tilt,
-        fiber.ior,
+        along if entry.roughness is None else entry.roughness,
+        around if entry.azimuthal_roughness is None else entry.azimuthal_roughness,
+        entry.scale_tilt,
+        entry.ior,
     )
 
 
@@ -233,8 +275,7 @@ def _of_curves(spec: ClothFile, path: Path) -> FiberTile:
         control[:, :3] = (control[:, :3] - low) / width
         control[:, 3] = np.where(control[:, 3] > 0, control[:, 3] / width * spec.yarn.radius, radius)
         out.append(replace(curve, control=control))
-    colors = np.array([spec.yarn.color])
-    tile = _settled(height / width, out, np.zeros(len(out), int), colors, spec, path)
+    tile = _settled(height / width, out, np.zeros(len(out), int), spec, path)
     warnings = []
     if deviation / width > radius:
         what = f"splines deviate from its curves by up to {deviation / width:.2g} tile widths"

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_gen.config.generator import GeometrySection
+from mbtf_gen.config.generator import GeometrySection, QueriesSection, count_queries
 from mbtf_gen.tile.fibers.curves import F64, Bundle, Curve
+from mbtf_gen.tile.fibers.draft import Weave
 from mbtf_gen.tile.protocol import REFLECTION, Tile
 from mbtf_gen.tile.tracers.protocol import TileGeometry
 
@@ -21,6 +22,8 @@ from mbtf_gen.tile.tracers.protocol import TileGeometry
 _ABSORPTION = (5.969, -0.215, 2.532, -10.73, 5.574, 0.245)
 # σ_a of fibers without transmission. Light inside a fiber travels 1.5 radii at least, so e⁻¹⁵⁰ of it is left.
 _OPAQUE = 100.0
+# Bytes of a segment while it is traced, and paths per second on two cores: docs/results/cloth.md.
+_BYTES, _PATHS_PER_SECOND = 500, 5e4
 
 
 @dataclass(frozen=True)
@@ -70,8 +73,12 @@ class FiberTile(Tile):
         Color of each fiber.
     colors : (k, 3) float64 array
         Colors of masses of fibers, linear Rec.709 in [0, 1].
-    scattering : FiberScattering
-        The same for all fibers.
+    scattering : tuple of FiberScattering
+        Of the fibers of each color.
+    names : tuple of str
+        Names of the yarns of each color.
+    weave : Weave or None
+        Draft and yarns of woven cloth.
     """
 
     kind = "fibers"
@@ -80,7 +87,9 @@ class FiberTile(Tile):
     curves: Sequence[Curve]
     yarn: NDArray[np.int_]
     colors: F64
-    scattering: FiberScattering = FiberScattering()
+    scattering: tuple[FiberScattering, ...] = (FiberScattering(),)
+    names: tuple[str, ...] = ("yarn",)
+    weave: Weave | None = None
 
     @classmethod
     def settled(
@@ -89,7 +98,7 @@ class FiberTile(Tile):
         curves: Sequence[Curve],
         yarn: NDArray[np.int_],
         colors: F64,
-        scattering: FiberScattering = FiberScattering(),
+        scattering: tuple[FiberScattering, ...] = (FiberScattering(),),
     ) -> FiberTile:
         """The tile with its fibers moved up or down until the highest touches the reference plane. Segments
         that are long for their radius are halved."""
@@ -121,8 +130,15 @@ class FiberTile(Tile):
         from mbtf_gen.tile.tracers.curve_tracer import CurveGeometry
 
         runs, fiber = self.runs()
-        u = (self.yarn[fiber] + 0.5) / len(self.colors)
-        return CurveGeometry.of_runs(runs, u, self.aspect, self.thickness, unit)
+        yarn, distinct = self.yarn[fiber], self._distinct
+        part = np.array([distinct.index(s) for s in self.scattering])[yarn] if len(distinct) > 1 else None
+        u = (yarn + 0.5) / len(self.colors)
+        return CurveGeometry.of_runs(runs, u, part, self.aspect, self.thickness, unit)
+
+    @property
+    def _distinct(self) -> list[FiberScattering]:
+        """The scattering of each part of the surface."""
+        return list(dict.fromkeys(self.scattering))
 
     def mitsuba_shapes(self, unit: float, folder: Path, bsdf: Mapping[str, Any]) -> dict[str, Any]:
         """One shape per color: Mitsuba's own texture coordinates run around the fiber."""
@@ -134,22 +150,23 @@ class FiberTile(Tile):
                     points = self.curves[int(number)].unrolled() - (0.5, 0.5 * self.aspect, 0.0, 0.0)
                     np.savetxt(text, points * unit, fmt="%.9g")
                     text.write("\n")
-            own = replace(self, colors=self.colors[[color]]).surface()
+            own = replace(self, colors=self.colors[[color]], scattering=(self.scattering[color],)).surface()
             out[f"color_{color}"] = {"type": "bsplinecurve", "filename": str(file), "bsdf": own}
         return out
 
     def surface(
         self, on: Collection[str] = REFLECTION, slopes: NDArray[np.float64] | None = None
-    ) -> dict[str, Any]:
-        """Mitsuba dictionary of the scattering of all colors: σ_a is a texture along u. Without the effect
-        ``transmission``, fibers absorb all light that enters them."""
+    ) -> dict[str, Any] | list[dict[str, Any]]:
+        """Mitsuba dictionary of the scattering, or one for each that differs. σ_a of all colors is a texture
+        along u. Without the effect ``transmission``, fibers absorb all light that enters them."""
+        hairs = [self._hair(scattering, "transmission" in on) for scattering in self._distinct]
+        return hairs if len(hairs) > 1 else hairs[0]
+
+    def _hair(self, s: FiberScattering, transmits: bool) -> dict[str, Any]:
         import mitsuba as mi
 
-        s = self.scattering
         sigma_a = absorption(self.colors, s.azimuthal_roughness)
-        pixels = np.asarray(sigma_a if "transmission" in on else np.full_like(sigma_a, _OPAQUE), np.float32)[
-            None
-        ]
+        pixels = np.asarray(sigma_a if transmits else np.full_like(sigma_a, _OPAQUE), np.float32)[None]
         return {
             "type": "hair",
             "sigma_a": {
@@ -182,7 +199,7 @@ class FiberTile(Tile):
 
     def narrowest_lobe(self) -> tuple[float, str]:
         """That of :attr:`FiberScattering.narrowest`."""
-        return self.scattering.narrowest, "narrowest lobe of the fibers"
+        return min(s.narrowest for s in self.scattering), "narrowest lobe of the fibers"
 
     def properties(self) -> dict[str, Any]:
         """Numbers of fibers and segments, for the manifest."""
@@ -207,32 +224,59 @@ class FiberTile(Tile):
                 "length": length,
                 "share_of_volume": volume,
             },
-            "colors": self.colors.tolist(),
-            "scattering": asdict(self.scattering),
+            "yarns": self._yarns(),
+            "weave": None if (w := self.weave) is None else w.properties(),
+            "cost": self._cost(finest),
             "warnings": list(self.warnings),
             "notes": list(self.notes),
         }
 
+    def _yarns(self) -> dict[str, dict[str, Any]]:
+        """Color, scattering and number of fibers of each yarn."""
+        return {
+            name: {
+                "color": color.tolist(),
+                **asdict(scattering),
+                "fibers": int(np.count_nonzero(self.yarn == number)),
+            }
+            for number, (name, color, scattering) in enumerate(
+                zip(self.names, self.colors, self.scattering, strict=True)
+            )
+        }
+
+    def _cost(self, finest: int | None) -> dict[str, float]:
+        """Memory of the fibers in bytes; paths of a data set of the default size, and their seconds."""
+        rows, columns = self.lattice(finest).shape()
+        queries = QueriesSection()
+        paths = queries.spp * count_queries(queries.train, rows * columns)
+        return {"memory": _BYTES * self.segments, "paths": paths, "seconds": paths / _PATHS_PER_SECOND}
+
     def describe(self, found: Mapping[str, Any], name: str) -> str:
         """The data of :meth:`inspect` as text for people."""
-        f, s = found["fibers"], found["scattering"]
+        f, cost = found["fibers"], found["cost"]
         low, high = f["radius"]
         radius = f"{low:.3g}" if low == high else f"{low:.3g} .. {high:.3g}"
-        colors = "; ".join(" ".join(f"{c:.2f}" for c in color) for color in found["colors"])
-        return "\n".join(
-            [
-                f"{name}: tile 1 x {found['aspect']:.4g}, fibers, resolution {found['resolution']}",
-                "",
-                f"fibers      {f['count']:,} of {f['segments']:,} segments, radius {radius}, together "
-                f"{f['length']:.3g} tile widths long",
-                f"cloth       {f['thickness']:.3g} tile widths thick, "
-                f"{f['share_of_volume']:.0%} of it fibers",
-                f"color       {colors}",
-                f"scattering  roughness {s['roughness']:g} along and {s['azimuthal_roughness']:g} around the "
-                f"fiber, scales tilted by {s['scale_tilt']:g}°, index of refraction {s['ior']:g}",
-                *(f"warning     {text}" for text in found["warnings"]),
-            ]
+        lines = [
+            f"{name}: tile 1 x {found['aspect']:.4g}, fibers, resolution {found['resolution']}",
+            "",
+            f"fibers      {f['count']:,} of {f['segments']:,} segments, radius {radius}, together "
+            f"{f['length']:.3g} tile widths long",
+            f"cloth       {f['thickness']:.3g} tile widths thick, {f['share_of_volume']:.0%} of it fibers",
+        ]
+        for key, yarn in found["yarns"].items():
+            color = " ".join(f"{c:.2f}" for c in yarn["color"])
+            lines.append(
+                f"{key[:11]:<11} color {color}, {yarn['fibers']:,} fibers, roughness {yarn['roughness']:g} "
+                f"along and {yarn['azimuthal_roughness']:g} around the fiber, scale tilt "
+                f"{yarn['scale_tilt']:g}°, ior {yarn['ior']:g}"
+            )
+        lines.append(
+            f"cost        {cost['memory'] / 1e9:.2g} GB; {QueriesSection().train} queries: "
+            f"{cost['paths'] / 1e6:.3g} million paths, about {cost['seconds'] / 60.0:.2g} minutes on two "
+            "cores (measure: mbtf-gen plan)"
         )
+        lines += [f"warning     {text}" for text in found["warnings"]]
+        return "\n".join(lines if self.weave is None else [*lines, *self.weave.describe()])
 
 
 def absorption(color: F64, azimuthal_roughness: float) -> F64:

@@ -150,7 +150,7 @@ class Tile(ABC):
     def surface(
         self, on: Collection[str] = REFLECTION, slopes: NDArray[np.float64] | None = None
     ) -> Mapping[str, Any] | Sequence[Mapping[str, Any]]:
-        """Mitsuba dictionary of the reflectance; one per part of a mesh.
+        """Mitsuba dictionary of the reflectance; one per part of a mesh or kind of yarn.
 
         Parameters
         ----------

@@ -91,10 +91,10 @@ class SurfaceBSDF(mi.BSDF):
 class PartSurface:
     """Surfaces of several parts, with the interface of one; interactions name their part."""
 
-    def __init__(self, parts: Sequence[Surface]) -> None:
+    def __init__(self, parts: Sequence[Any]) -> None:
         self.surfaces = parts
         self.transmits = any(surface.transmits for surface in parts)
-        self.parts = SurfaceParts(opacity=self.transmits)
+        self.parts = SurfaceParts(opacity=any(surface.parts.opacity for surface in parts))
 
     def opacity(self, si: SurfaceInteraction3f) -> Float:
         """Probability that a surface interaction stops a ray."""

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+import re
+from collections.abc import Mapping
+from typing import Annotated, Any
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
+from mbtf_core.color import srgb_to_linear
 from mbtf_core.config.settings import FileName, Settings
 from mbtf_core.data.schema import Tiling
 from mbtf_gen.config.generator import Positive, Resolution, Rgb, no_tiling
@@ -15,13 +18,31 @@ from mbtf_gen.tile.fibers.yarn import YarnName
 CURVE_FILES = {".pyp": "pattern", ".bcc": "curves", ".curves": "curves", ".txt": "curves"}
 # Exactly one of them describes the cloth.
 CLOTH_KEYS = {"weave", "knit", "pattern", "curves"}
+# Keys of weaves alone.
+_WOVEN = ("repeat", "yarns", "warp", "weft")
+YarnKey = Annotated[str, Field(pattern=r"^[A-Za-z_]{1,32}$")]
+
+
+def _decoded(value: Any) -> Any:
+    """Linear color of ``#rrggbb``."""
+    if not isinstance(value, str):
+        return value
+    if not re.fullmatch(r"#[0-9A-Fa-f]{6}", value):
+        raise ValueError("must be '#rrggbb' in quotes (sRGB), one linear number, or three")
+    return tuple(float(srgb_to_linear(byte / 255.0)) for byte in bytes.fromhex(value[1:]))
+
+
+# Linear; three numbers, one for gray, or sRGB as #rrggbb.
+Color = Annotated[Rgb, BeforeValidator(_decoded)]
 
 
 class YarnEntry(Settings):
-    """One kind of yarn."""
+    """One kind of yarn, and how its fibers scatter light."""
 
     type: YarnName = Field("cotton2", description="published yarn: its plies, fibers, twist and flyaways")
-    color: Rgb = Field((0.7, 0.7, 0.7), description="color of a mass of its fibers, linear")
+    color: Color = Field(
+        (0.7, 0.7, 0.7), description="color of a mass of its fibers: linear, or sRGB as '#rrggbb'"
+    )
     width: Positive | None = Field(
         None,
         description="width over the distance of neighboring yarns, default 0.95 woven and 0.45 knitted; over "
@@ -39,22 +60,26 @@ class YarnEntry(Settings):
     flyaways: Annotated[float, Field(ge=0, le=100)] = Field(
         1.0, description="factor on the number of loops and hairs of the type"
     )
-
-
-class FiberEntry(Settings):
-    """How fibers scatter light."""
-
     # Mitsuba loses light and overflows below.
     roughness: Annotated[float, Field(ge=0.08, le=1)] | None = Field(
-        None, description="longitudinal roughness; default: that of the yarn's material"
+        None, description="longitudinal roughness of the fibers; default: that of the type's material"
     )
     azimuthal_roughness: Annotated[float, Field(ge=0.02, le=1)] | None = Field(
-        None, description="azimuthal roughness; default: that of the yarn's material"
+        None, description="azimuthal roughness of the fibers; default: that of the type's material"
     )
     scale_tilt: Annotated[float, Field(ge=-10, le=10)] = Field(
-        0.0, description="tilt of the scales in degrees"
+        0.0, description="tilt of the scales of the fibers in degrees"
     )
-    ior: Annotated[float, Field(ge=1.1, le=2)] = Field(1.55, description="index of refraction")
+    ior: Annotated[float, Field(ge=1.1, le=2)] = Field(1.55, description="index of refraction of the fibers")
+
+    def updated(self, other: YarnEntry) -> YarnEntry:
+        """This entry with the keys that another one gives."""
+        return self.model_copy(update={key: getattr(other, key) for key in other.model_fields_set})
+
+
+def _entry(value: Any) -> Any:
+    """A color alone as an entry."""
+    return value if isinstance(value, Mapping | YarnEntry) else {"color": value}
 
 
 class KnitEntry(Settings):
@@ -74,7 +99,8 @@ class ClothFile(Settings):
     weave: str | None = Field(
         None,
         max_length=100_000,
-        description="plain, basket n, twill over/under, satin n/step, or rows of X (warp above) and . (weft)",
+        description="plain, basket n, twill over/under, satin n/step, herringbone over/under width, "
+        "houndstooth, gingham n, denim, or rows of X (warp above) and . (weft above)",
     )
     knit: KnitEntry | None = Field(None, description="a stockinette")
     pattern: FileName | None = Field(None, description="a periodic yarn pattern (.pyp)")
@@ -88,9 +114,19 @@ class ClothFile(Settings):
         None,
         description="width and height of one period of `curves`, in the file's units; default: its bounds",
     )
-    yarn: YarnEntry = Field(YarnEntry(), description="the yarns")
-    weft: YarnEntry | None = Field(None, description="the wefts of a weave, where they differ")
-    fiber: FiberEntry = Field(FiberEntry(), description="how fibers scatter light")
+    yarn: YarnEntry = Field(YarnEntry(), description="all yarns")
+    yarns: dict[YarnKey, Annotated[YarnEntry, BeforeValidator(_entry)]] = Field(
+        {}, max_length=26, description="yarns of a weave by name: colors, or what differs from `yarn`"
+    )
+    warp: str | None = Field(
+        None,
+        max_length=10_000,
+        description="names of the warps' `yarns` from u = 0, with numbers, such as red4 white2; "
+        "red/4 white2 blue/6 reverses at both ends",
+    )
+    weft: str | None = Field(
+        None, max_length=10_000, description="the same of the wefts, from v → 1; default: as the warps"
+    )
     seed: Annotated[int, Field(ge=0, lt=1 << 32)] = Field(0, description="random numbers of the fibers")
     resolution: Resolution = Field(128, description="texels across at the finest level, a power of two")
 
@@ -106,7 +142,9 @@ class ClothFile(Settings):
             raise ValueError(f"'yarn.{min(unused)}' does not apply to 'curves', which are fibers")
         if self.curves is not None and "seed" in self.model_fields_set:
             raise ValueError("'seed' does not apply to 'curves', which are fibers")
-        for key, owner in (("repeat", "weave"), ("weft", "weave"), ("period", "curves")):
+        if self.warp is None and self.weft is not None:
+            raise ValueError("'weft' goes with 'warp'")
+        for key, owner in (*((key, "weave") for key in _WOVEN), ("period", "curves")):
             if key in self.model_fields_set and given != [owner]:
                 raise ValueError(f"'{key}' goes with '{owner}'")
         return self

@@ -37,12 +37,14 @@ class CurveGeometry(PeriodicScene):
     points : control points; radii : at the control points
     first : number of the first of the four control points of each segment
     u : texture coordinate of each segment, which selects its color
+    part : surface of each segment; None for a single one
     """
 
     points: Point3f
     radii: Float
     first: UInt32
     u: Float
+    part: UInt32 | None
     open = True
 
     @classmethod
@@ -50,6 +52,7 @@ class CurveGeometry(PeriodicScene):
         cls,
         runs: list[NDArray[np.float64]],
         u: NDArray[np.float64],
+        part: NDArray[np.int_] | None,
         aspect: float,
         thickness: float,
         unit: float,
@@ -58,7 +61,7 @@ class CurveGeometry(PeriodicScene):
 
         Parameters
         ----------
-        runs, u : control points, and the texture coordinate of each run
+        runs, u, part : control points, texture coordinate and surface of each run
         aspect, thickness : height of the tile over its width; height of the fibers' slab
         unit : scene units per tile width
         """
@@ -85,11 +88,14 @@ class CurveGeometry(PeriodicScene):
             mi.Float(padded(rows[:, 3])),
             mi.UInt32(padded((np.repeat(start, segments) + within).astype(np.uint32))),
             mi.Float(padded(np.repeat(u, segments).astype(np.float32))),
+            None if part is None else mi.UInt32(padded(np.repeat(part, segments).astype(np.uint32))),
         )
 
     def vertex(self, si: SurfaceInteraction3f) -> Vertex:
-        """Position, normal, direction around the fiber, yarn."""
-        return Vertex(mi.Point3f(si.p), mi.Normal3f(si.n), mi.Vector3f(si.sh_frame.s), mi.Point2f(si.uv))
+        """Position, normal, direction around the fiber, color and surface."""
+        part = None if self.part is None else mi.UInt32(si.prim_index)
+        p, n = mi.Point3f(si.p), mi.Normal3f(si.n)
+        return Vertex(p, n, mi.Vector3f(si.sh_frame.s), mi.Point2f(si.uv), part)
 
     def interaction(self, vertex: Vertex, d: Vector3f, valid: Mask) -> SurfaceInteraction3f:
         """Surface interaction at a vertex, in the frame that Mitsuba's ``hair`` expects: x around the fiber,
@@ -101,6 +107,8 @@ class CurveGeometry(PeriodicScene):
         si.sh_frame = mi.Frame3f(vertex.s, dr.cross(n, vertex.s), n)
         si.dp_du, si.dp_dv = vertex.s, si.sh_frame.t
         si.wi = si.to_local(-d)
+        if vertex.part is not None:
+            si.prim_index = vertex.part
         return si
 
     def _located(self, found: Any, segment: Ray3f) -> Any:
@@ -129,7 +137,8 @@ class CurveGeometry(PeriodicScene):
         # Where the radius grows, the tube's surface leans back.
         n = dr.normalize(dr.fma(tangent, -growth / speed, out))
         u = dr.gather(mi.Float, self.u, prim, valid)
-        vertex = Vertex(position, mi.Normal3f(n), dr.cross(tangent, out), mi.Point2f(u, 0.5))
+        part = None if self.part is None else dr.gather(mi.UInt32, self.part, prim, valid)
+        vertex = Vertex(position, mi.Normal3f(n), dr.cross(tangent, out), mi.Point2f(u, 0.5), part)
         return self.interaction(vertex, d, valid)
 
 

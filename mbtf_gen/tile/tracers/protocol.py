@@ -26,7 +26,7 @@ class Vertex:
     ----------
     p, n : position in scene units, unit normal
     s, uv : tangent and texture coordinates; None where they follow from the position
-    part : number of the surface, of those of a mesh; None for a single one
+    part : number of the surface, of those of a mesh or of yarns; None for a single one
     """
 
     p: Point3f

@@ -68,10 +68,11 @@ def test_a_shifted_image_differs(glossy: HeightFieldTile, monkeypatch: pytest.Mo
     assert found.square.value > 10 * found.square.error
 
 
-def test_cloth_of_two_colors_agrees(tmp_path: Path) -> None:
+def test_cloth_of_two_colors_and_roughnesses_agrees(tmp_path: Path) -> None:
     (tmp_path / "cloth.yaml").write_text(
-        "weave: plain\nyarn: {type: rayon1, fibers: 5, radius: 8, flyaways: 0, color: [0.9, 0.3, 0.1]}\n"
-        "weft: {type: rayon1, fibers: 5, radius: 8, flyaways: 0, color: [0.1, 0.3, 0.9]}\n"
+        "weave: plain\nyarn: {type: rayon1, fibers: 5, radius: 8, flyaways: 0}\n"
+        "yarns: {red: {color: [0.9, 0.3, 0.1], roughness: 0.7}, blue: {color: [0.1, 0.3, 0.9], ior: 1.4}}\n"
+        "warp: red\nweft: blue\n"
     )
     described = GeneratorConfig.model_validate({"material": str(tmp_path / "cloth.yaml")})
     (found,) = compare_with_mitsuba(SECTION, described, load_material(tmp_path / "cloth.yaml")).values()

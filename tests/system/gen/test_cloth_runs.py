@@ -15,8 +15,10 @@ from mbtf_core.data.dataset import Dataset
 
 # Loose yarns of few fibers, one and a half times as high as wide.
 CLOTH = """weave: "X.\\n.X\\nXX"
-yarn: {type: silk1, fibers: 6, radius: 4, color: [0.8, 0.5, 0.2], width: 0.7}
-weft: {type: rayon2, fibers: 6, radius: 4, color: 0.3, width: 0.7}
+yarn: {fibers: 6, radius: 4, width: 0.7}
+yarns: {warp: {type: silk1, color: [0.8, 0.5, 0.2]}, weft: {type: rayon2, color: 0.3}}
+warp: warp
+weft: weft
 resolution: 16
 """
 SMALL = "--queries 12/texel --test-queries 256 --test-spp 64 --set output.shard_queries=1000"
@@ -86,7 +88,8 @@ def test_pictures_and_description(work: Path, done: dict[str, Done]) -> None:
         assert done[name].code == 0, done[name].err
     found = done["inspect"].result()
     assert found["aspect"] == 1.5
-    assert len(found["colors"]) == 2
+    assert [yarn["color"][0] for yarn in found["yarns"].values()] == [0.8, 0.3]
+    assert found["weave"]["draft"] == ["X.", ".X", "XX"]
     assert not (work / "preview/mesh.png").exists()
     with Image.open(work / "preview/beauty.png") as picture:
         assert np.asarray(picture).std() > 5

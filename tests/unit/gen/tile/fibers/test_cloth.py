@@ -11,7 +11,7 @@ import pytest
 from support.paths import ASSETS
 
 from mbtf_core.errors import InputError, MbtfError, UsageError
-from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.config.generator import GeneratorConfig, GeometrySection
 from mbtf_gen.job import Job, received_job
 from mbtf_gen.tile.cloth import loose_ends
 from mbtf_gen.tile.fiber_tile import FiberScattering, FiberTile, absorption
@@ -40,7 +40,7 @@ def test_a_weave_has_the_yarns_of_its_draft(tmp_path: Path) -> None:
     found = fibers(
         tmp_path,
         "weave: |\n  X..\n  .X.\nyarn: {fibers: 5, flyaways: 0}\n"
-        "weft: {color: 0.2, fibers: 5, flyaways: 0}\n",
+        "yarns: {a: {}, b: {color: 0.2}}\nwarp: a\nweft: b\n",
     )
     assert found.aspect == pytest.approx(2 / 3)
     # Four plies of five fibers in three warps and two wefts.
@@ -59,17 +59,21 @@ def test_every_option_changes_the_digest(tmp_path: Path) -> None:
         WEAVE.replace("silk1", "silk2"),
         WEAVE + "repeat: 2\n",
         WEAVE + "seed: 1\n",
-        WEAVE + "weft: {type: silk1, fibers: 3}\n",
-        WEAVE + "fiber: {roughness: 0.5}\n",
-        WEAVE + "fiber: {azimuthal_roughness: 0.5}\n",
-        WEAVE + "fiber: {scale_tilt: 1}\n",
-        WEAVE + "fiber: {ior: 1.4}\n",
+        WEAVE + "yarns: {a: 0.5, b: '#808080'}\nwarp: a b\n",
+        WEAVE + "yarns: {a: 0.5, b: '#808080'}\nwarp: a b\nweft: a\n",
         WEAVE + "resolution: 64\n",
         *(
             WEAVE.replace("fibers: 3", change)
             for change in ("fibers: 4", "fibers: 3, color: 0.1", "fibers: 3, width: 0.5")
         ),
-        *(WEAVE.replace("fibers: 3", f"fibers: 3, {c}") for c in ("height: 0.9", "flyaways: 2", "radius: 2")),
+        *(
+            WEAVE.replace("fibers: 3", f"fibers: 3, {key}")
+            for key in ("height: 0.9", "flyaways: 2", "radius: 2", "roughness: 0.5")
+        ),
+        *(
+            WEAVE.replace("fibers: 3", f"fibers: 3, {key}")
+            for key in ("azimuthal_roughness: 0.5", "scale_tilt: 1", "ior: 1.4")
+        ),
     ]
     digests = {str(load_material(write(tmp_path, text)).digests) for text in texts}
     assert len(digests) == len(texts)
@@ -79,7 +83,9 @@ def test_every_option_changes_the_digest(tmp_path: Path) -> None:
     ("text", "says"),
     [
         ("weave: plain\nknit: {}\n", "one of"),
-        ("yarn: {}\nweave: tweed\n", "not a weave"),
+        ("yarn: {}\nweave: tweed\n", "houndstooth"),
+        ("weave: velvet\n", "curves"),
+        ("weave: jersey\n", "knit"),
         ("knit: {}\nrepeat: 2\n", "goes with"),
         ("weave: plain\nyarn: {type: nylon}\n", "type"),
         ("weave: plain\nheight: h.exr\n", "height"),
@@ -91,7 +97,15 @@ def test_every_option_changes_the_digest(tmp_path: Path) -> None:
         ("weave: plain\nyarn: {width: 1000000}\n", "periods"),
         ("weave: plain\nyarn: {radius: 0.001, fibers: 2}\n", "thinner"),
         ("weave: |\n" + "  X\n" * 100, "times as long"),
-        ("weave: plain\nfiber: {roughness: 0.01}\n", "roughness"),
+        ("weave: plain\nyarn: {roughness: 0.01}\n", "roughness"),
+        ("weave: plain\nyarn: {color: '#12345'}\n", "#rrggbb"),
+        ("weave: plain\nyarns: {a: 1}\n", "sequence"),
+        ("weave: plain\nyarns: {red: 1, rest: 0}\nwarp: red\n", "'rest' is in neither"),
+        ("weave: plain\nyarns: {red: 1}\nwarp: rde4\n", "did you mean 'red'"),
+        ("weave: plain\nweft: a\n", "goes with 'warp'"),
+        ("knit: {}\nyarns: {a: 1}\n", "goes with"),
+        ("weave: houndstooth\n", "two yarns"),
+        ("weave: twill 3/1\nyarns: {a: 1, b: 0}\nwarp: a601 b\nweft: a499 b\n", "1204 warps"),
         ("knit: {aspect: 0.5}\n", "aspect"),
         ("curves: a.curves\nyarn: {flyaways: 2}\n", "flyaways"),
         ("curves: a.curves\nseed: 2\n", "seed"),
@@ -100,7 +114,7 @@ def test_every_option_changes_the_digest(tmp_path: Path) -> None:
 def test_faults_are_one_line(tmp_path: Path, text: str, says: str) -> None:
     with pytest.raises(InputError) as error:
         load_material(write(tmp_path, text))
-    assert says in str(error.value)
+    assert says in f"{error.value} {error.value.hint}"
     assert "\n" not in error.value.what
 
 
@@ -111,6 +125,43 @@ def test_options_of_height_maps_are_refused(tmp_path: Path, geometry: dict[str, 
     path = write(tmp_path, WEAVE)
     with pytest.raises(UsageError):
         Job.load(GeneratorConfig.model_validate({"material": str(path), "geometry": geometry}))
+
+
+def test_yarns_keep_what_they_do_not_give_themselves(tmp_path: Path) -> None:
+    text = (
+        "weave: denim\nyarn: {type: silk1, roughness: 0.5, fibers: 3, flyaways: 0, ior: 1.4}\n"
+        "yarns: {blue: '#0000ff', ecru: {color: [0.7, 0.6, 0.5], roughness: 0.2, fibers: 7, radius: 2}}\n"
+    )
+    found = fibers(tmp_path, text)
+    assert found.names == ("blue", "ecru")
+    assert found.colors == pytest.approx(np.array([[0.0, 0.0, 1.0], [0.7, 0.6, 0.5]]))
+    assert [(s.roughness, s.azimuthal_roughness, s.ior) for s in found.scattering] == [
+        (0.5, 0.41, 1.4),
+        (0.2, 0.41, 1.4),
+    ]
+    # Four warps of four plies of three fibers, four wefts of seven, which are twice as thick.
+    assert np.bincount(found.yarn).tolist() == [48, 112]
+    thin, thick = (
+        {float(found.curves[k].control[0, 3]) for k in np.flatnonzero(found.yarn == y)} for y in (0, 1)
+    )
+    assert max(thick) == pytest.approx(2.0 * max(thin))
+    shown = found.describe(found.inspect(GeometrySection()), "cloth.yaml")
+    assert "bbbe" in shown
+    assert "4 warps and 4 wefts" in shown
+
+
+def test_sequences_begin_at_the_left_and_at_the_top(tmp_path: Path) -> None:
+    text = "weave: plain\nyarn: {fibers: 1, flyaways: 0}\nyarns: {a: 1, b: 0, c: 1, d: 0}\n"
+    found = fibers(tmp_path, text + "warp: a b3\nweft: c d3\n")
+    middle = np.array([curve.control[:, :2].mean(axis=0) for curve in found.curves])
+    assert middle[found.yarn == 0, 0].mean() == pytest.approx(1 / 8, abs=0.02)
+    assert middle[found.yarn == 2, 1].mean() == pytest.approx(7 / 8, abs=0.02)
+
+
+def test_hexadecimal_colors_are_decoded(tmp_path: Path) -> None:
+    """IEC 61966-2-1: half of the code is 21.4 % of the light."""
+    found = fibers(tmp_path, WEAVE.replace("fibers: 3", "fibers: 3, color: '#7f00FF'"))
+    assert found.colors[0] == pytest.approx([((127 / 255 + 0.055) / 1.055) ** 2.4, 0.0, 1.0])
 
 
 def test_white_absorbs_nothing_and_darker_colors_more() -> None:

@@ -1,40 +1,13 @@
-"""Drafts, and the center lines of woven and knitted yarns."""
+"""The center lines of woven and knitted yarns."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from mbtf_core.errors import InputError
 from mbtf_gen.tile.fibers.curves import Curve
-from mbtf_gen.tile.fibers.weave import knitted_lines, parse_draft, woven_lines
-
-
-def rows(text: str) -> list[str]:
-    return ["".join("X" if c else "." for c in row) for row in parse_draft(text)]
-
-
-def test_named_drafts_are_those_of_textbooks() -> None:
-    assert rows("plain") == ["X.", ".X"]
-    assert rows("basket 2") == ["XX..", "XX..", "..XX", "..XX"]
-    # 3/1 twill: each warp above three wefts, the steps on a diagonal.
-    assert rows("twill 3/1") == ["XXX.", "XX.X", "X.XX", ".XXX"]
-    # Five-harness satin: one weft above in each row and each column, no two of them adjacent.
-    satin = parse_draft("satin 5/2")
-    below = [int(np.flatnonzero(~row)[0]) for row in satin]
-    assert sorted(below) == [0, 1, 2, 3, 4]
-    assert all(abs(a - b) not in (1, 4) for a, b in zip(below, np.roll(below, -1), strict=True))
-    assert rows("X.X\n.X.") == ["X.X", ".X."]
-
-
-@pytest.mark.parametrize(
-    "text",
-    ["", "basket", "basket 0", "twill 3", "satin 5/1", "satin 6/2", "X.\nX", "X#", "basket 5000", "plain 3"],
-)
-def test_other_texts_are_refused_in_one_line(text: str) -> None:
-    with pytest.raises(InputError) as error:
-        parse_draft(text)
-    assert "\n" not in error.value.what
+from mbtf_gen.tile.fibers.draft import parse_draft
+from mbtf_gen.tile.fibers.weave import knitted_lines, woven_lines
 
 
 def height_at(line: Curve, axis: int, position: float) -> float:
@@ -44,14 +17,16 @@ def height_at(line: Curve, axis: int, position: float) -> float:
 
 def test_the_yarn_of_the_draft_lies_above_at_each_crossing() -> None:
     draft = parse_draft("X..X\nXX..\n.XX.\n..XX\nX.X.")
-    warps, wefts = woven_lines(draft, 1.25, 0.1)
+    apart = 0.1 + 0.01 * np.arange(20).reshape(5, 4)
+    warps, wefts = woven_lines(draft, 1.25, apart)
     for row in range(5):
         # Row 0 is the side v → 1.
         y = 1.25 * (1.0 - (row + 0.5) / 5)
         for column in range(4):
             x = (column + 0.5) / 4
-            warp, weft = height_at(warps[column], 1, y), height_at(wefts[4 - row], 0, x)
-            assert warp - weft == pytest.approx(0.1 if draft[row, column] else -0.1, abs=1e-4)
+            warp, weft = height_at(warps[column], 1, y), height_at(wefts[row], 0, x)
+            expected = apart[row, column] if draft[row, column] else -apart[row, column]
+            assert warp - weft == pytest.approx(expected, abs=2e-4)
 
 
 def distances(a: Curve, b: Curve, period: tuple[float, float]) -> float:
