@@ -13,6 +13,9 @@ from hypothesis import settings
 
 from mbtf_gen.engine.runtime import use_shipped_llvm
 
+# Workers of a test run fill the processors by themselves; a second thread would spend its time waiting.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 # Tests import drjit at the top: before that, as load_mitsuba does, choose the LLVM of the installation.
 use_shipped_llvm()
 

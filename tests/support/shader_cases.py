@@ -18,15 +18,21 @@ from .plugin_materials import TRAINING, net, write_material
 
 BANDS = {"position": 3, "direction": 2, "direction_pi": False, "raw": True}
 CASES: dict[str, dict[str, Any]] = {
-    "neumip-baseline": {"model": "neumip-baseline"},
     "calibrated": {},
     "holes": {},
-    "direct offset, six outputs": net(offset="direct", output_channels=6, activation="leaky-relu"),
+    "direct offset, six outputs": net(
+        offset="direct",
+        output_channels=6,
+        activation="leaky-relu",
+        output_transform="fourth-root",
+        encoding={"direction_xyz": True, "half_vector": True},
+    ),
     "concatenated, softplus": net(blending="concatenate", activation="sine", output_transform="softplus"),
-    "encoded": net(encoding={**BANDS, "band_attenuation": True, "footprint_filtered": True}),
-    "fourth root": net(output_transform="fourth-root", encoding={"direction_xyz": True, "half_vector": True}),
+    "baseline, encoded": {
+        "model": "neumip-baseline",
+        **net(encoding={**BANDS, "band_attenuation": True, "footprint_filtered": True}),
+    },
     "relief": {"model": "relief"},
-    "relief, two places": {"model": "relief", **net(relief={"places": 2})},
     "relief, diffuse, four places": {"model": "relief", "glossy": False, **net(relief={"places": 4})},
     "relief without hints": {"model": "relief", **net(relief={"hints": False}, oversampling=1)},
     "relief without gate": {
@@ -67,7 +73,7 @@ def make(case: str, folder: Path) -> Material:
         folder.mkdir(parents=True)
         return export(model, FitConfig(), folder, data={"hash": "0" * 64}, training=TRAINING)
     options = {"finest": 4, "aspect": 0.5, **CASES[case]}
-    if case == "calibrated":
+    if case in ("calibrated", "holes"):
         options["weights"] = {"calibration": 0.7 + 0.6 * torch.rand((2, 5, 6, 3), generator=generator)}
     if case == "holes":
         shapes = [(*lattice.shape(s), 6) for s in range(5)]

@@ -33,7 +33,7 @@ NAMES = ("rainer2019", "rainer2020")
 
 
 def config(name: str, **training: Any) -> FitConfig:
-    options = {"steps": 300, "batch": 2048, "warmup": 20, **training}
+    options = {"steps": 300, "batch": 1024, "warmup": 20, **training}
     return FitConfig.model_validate({"model": name, "training": options})
 
 
@@ -113,7 +113,7 @@ def test_the_encoder_of_2020_takes_any_set_of_samples() -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_smooth_material_is_learned_and_loads_again(name: str, tmp_path: Path) -> None:
-    shards = write_slices(tmp_path / "data", noise=0.002, finest=4, lights=16)
+    shards = write_slices(tmp_path / "data", noise=0.002, finest=3, lights=12)
     result = fit(config(name), shards, tmp_path / "fit")
     # Queries between the texels and the directions of the slices, at every level.
     assert result.errors["test"]["unexplained"]["value"] < 0.15
@@ -145,8 +145,8 @@ def dark(u: Any, sigma: Any, omega_i: Any, omega_o: Any) -> Any:
 
 def test_a_network_of_other_materials_encodes_a_new_one(tmp_path: Path) -> None:
     own, other = (
-        write_slices(tmp_path / name, function, finest=4, lights=lights)
-        for name, function, lights in (("own", dark, 16), ("other", spots, 14))
+        write_slices(tmp_path / name, function, finest=3, lights=lights)
+        for name, function, lights in (("own", dark, 12), ("other", spots, 10))
     )
     shared = {"materials": [str(other)], "own_material": False}
     result = fit(config("rainer2020", **shared), own, tmp_path / "fit")

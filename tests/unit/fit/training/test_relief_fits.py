@@ -1,4 +1,4 @@
-"""Fits of the model that traces the known heights: from data to a material."""
+"""Fits of the models that trace heights: from data to a material."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ from support.known_surfaces import geometry, rough_heights
 from support.paths import ROOT
 from torch import Tensor
 
+from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.lattice import Lattice
+from mbtf_core.images.resample import resample
 from mbtf_fit import FitConfig, Material, fit
 from mbtf_fit.native import library
 from mbtf_fit.training.fit import FitResult
@@ -105,15 +107,21 @@ def test_another_material_gives_textures_and_depth_weights(shards: Path, tmp_pat
         torch.testing.assert_close(tensor, source[name], atol=1e-6, rtol=0)
 
 
-def test_relief_learns_rendered_rock_sooner_than_neumip(tmp_path: Path) -> None:
-    """After as many steps. Measured: unexplained variances of 0.17 and 0.29, ± 0.01 over seeds."""
+def test_heights_learn_rendered_rock_sooner_than_neumip(tmp_path: Path) -> None:
+    """After as many steps. Measured: unexplained variances of 0.17 and 0.29, ± 0.01 over seeds; of learned
+    heights 0.19, and a correlation of 0.57 with those of the rock."""
     queries = {"resolution": 16, "train": "20000", "spp": 16}
     described = {"material": str(ROOT / "assets" / "cliff_rock"), "queries": queries}
     generate(GeneratorConfig.model_validate(described), tmp_path / "data")
-    errors = {}
-    for model in ("relief", "neumip"):
-        options = config(200, model=model, training={"batch": 2000})
-        errors[model] = fit(options, tmp_path / "data", tmp_path / model).errors["test"]["unexplained"][
-            "value"
-        ]
+    results = {
+        model: fit(config(200, model=model, training={"batch": 2000}), tmp_path / "data", tmp_path / model)
+        for model in ("relief", "neumip+", "neumip")
+    }
+    errors = {model: r.errors["test"]["unexplained"]["value"] for model, r in results.items()}
     assert errors["relief"] < 0.75 * errors["neumip"]
+    assert errors["neumip+"] < 0.8 * errors["neumip"]
+    rock = Dataset.open(tmp_path / "data").geometry()
+    assert rock is not None
+    heights = np.asarray(resample(rock.heights, *Lattice(4).shape()))
+    learned = results["neumip+"].material.model.known.heights.numpy()
+    assert np.corrcoef(learned.ravel(), heights.ravel())[0, 1] > 0.5

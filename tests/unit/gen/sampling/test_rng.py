@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 
+import drjit as dr
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -62,7 +63,10 @@ def points(root: int, number: int, query: NDArray[np.uint32], index: NDArray[np.
 def draws(root: int, number: int, count: int) -> NDArray[np.float64]:
     """(count, LANES) numbers in [0, 1) of the first path of the first `LANES` queries of a stream."""
     sampler = points(root, number, np.arange(LANES, dtype=np.uint32), np.zeros(LANES, np.uint32))
-    return np.array([np.array(sampler.next_1d(), np.float64) for _ in range(count)])
+    numbers = [sampler.next_1d() for _ in range(count)]
+    # One kernel for all of them.
+    dr.eval(numbers)
+    return np.array([np.array(row, np.float64) for row in numbers])
 
 
 BASE = (0, "train", 0, Purpose.PATH, 0, 0)
