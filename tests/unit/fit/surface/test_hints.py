@@ -107,16 +107,32 @@ def test_scattered_slopes_are_anisotropic_facets(compiled: bool) -> None:
     """Mirrors whose slopes have a scatter are GGX facets of twice that scatter, which unmodified Mitsuba
     renders; the light is vertical, and facets mask each other from the viewer alone."""
     known = surface(color=(1.0, 1.0, 1.0), roughness=0.1, metallic=1.0)
-    alpha = np.array([0.5, 0.2])
+    alpha, angle = np.array([0.5, 0.2]), 0.6
+    turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    scatter = turn @ np.diag(alpha**2 / 2) @ turn.T
     maps = tuple(m.clone() for m in known.maps)
     for m in maps:
-        m[..., 2], m[..., 4] = (float(a * a / 2) for a in alpha)
+        m[..., 2:5] = torch.from_numpy(scatter[[0, 0, 1], [0, 1, 1]])
     u, sigma, view, _ = queries(300)
     light = torch.tensor([[0.0, 0.0, 1.0]]).expand(300, 3).contiguous()
     found = hints_of(replace(known, maps=maps), u, sigma, light, view, places=1)[:, 4]
     own = 1e-4  # of roughness 0.1: adds to α²
-    wanted = conductor((*np.sqrt(alpha**2 + own),), light, view)
+    along = torch.cat([view[:, :2] @ torch.from_numpy(turn).float(), view[:, 2:]], 1)
+    wanted = conductor((*np.sqrt(alpha**2 + own),), light, along)
     np.testing.assert_allclose(found.numpy(), wanted, rtol=3e-3)
+
+
+def test_a_wide_light_widens_the_lobe(compiled: bool) -> None:
+    """Half vectors turn by half the light's angle: variances of w²/4 along each axis, twice that in α²."""
+    width, roughness = math.radians(8.0), 0.3
+    metal = geometry(LATTICE, np.zeros((8, 8), np.float32), roughness=roughness, metallic=1.0)
+    known = KnownSurface.of(metal, LATTICE, math.degrees(width))
+    wider = surface(roughness=(roughness**4 + width**2 / 2) ** 0.25, metallic=1.0)
+    u, sigma, light, _ = queries(300)
+    light = torch.nn.functional.normalize(light * torch.tensor([0.3, 0.3, 1.0]), dim=1)
+    up = torch.tensor([[0.0, 0.0, 1.0]]).expand(300, 3).contiguous()
+    found, wanted = (hints_of(k, u, sigma, light, up, places=1) for k in (known, wider))
+    torch.testing.assert_close(found[:, 4:], wanted[:, 4:], rtol=1e-3, atol=1e-5)
 
 
 def test_scattered_slopes_are_lit_like_many_facets(compiled: bool) -> None:
