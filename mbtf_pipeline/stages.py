@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import data_sha256, file_sha256, read_json, write_json
-from mbtf_core.files.folders import OutputKind
+from mbtf_core.files.folders import OutputKind, changed
 from mbtf_pipeline.recipe import Recipe, write_recipe
 
 STAMP_FORMAT = "mbtf-stage"
@@ -30,8 +30,8 @@ STAGE_SCHEMA = 3
 STAMPS = "stages"
 FORCED = "forced"
 NOT_RUN = "has not run"
-# Outputs that people edit, for example to put them into a paper.
-DOCUMENTS = (".csv", ".html", ".md", ".png", ".svg", ".yaml")
+# Outputs that people edit, for example to put them into a paper. Pages guard themselves (write_document).
+DOCUMENTS = (".csv", ".md", ".png", ".svg", ".yaml")
 
 
 @dataclass(frozen=True)
@@ -160,8 +160,7 @@ def _refuse_edited(folder: Path, stage: Stage) -> None:
     for name, expected in {} if stamp is None else stamp.outputs.items():
         path = folder / name
         if path.suffix in DOCUMENTS and path.is_file() and file_sha256(path) != expected:
-            hint = "move it away and run the same command again, or replace it with --force"
-            raise InputError("has been edited, or damaged, and would be replaced", where=path, hint=hint)
+            raise changed(path, "--force")
 
 
 # Called before each stage with its name, its decision, and None; after it, with its seconds.

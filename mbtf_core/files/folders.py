@@ -170,13 +170,27 @@ def write_document(path: Path, text: str, *, overwrite: bool = False) -> None:
     if path.suffix in _SEALS:
         write_chunks(path, [content, _SEALS[path.suffix].format(digest).encode()])
         return
-    # Before the file: killed in between, the file that is there is refused rather than lost.
-    write_chunks(_digest_file(path), [f"{digest}\n".encode()])
+    # Killed between the two, the file is still the one before.
+    before = [file_sha256(path)] if path.is_file() else []
+    write_chunks(_digest_file(path), ["\n".join([digest, *before]).encode()])
     write_chunks(path, [content])
+
+
+def read_document(path: Path) -> str:
+    """Text of a document, without the line of its digest."""
+    text = path.read_text(encoding="utf-8")
+    body, _, last = text[:-1].rpartition("\n")
+    return f"{body}\n" if last.startswith(_SEALS[path.suffix].partition("{}")[0]) else text
 
 
 def _digest_file(path: Path) -> Path:
     return path.with_name(f".{path.name}.sha256")
+
+
+def _digests(path: Path) -> list[str]:
+    """Digests that a file may have: of its last version, and of what was there before."""
+    file = _digest_file(path)
+    return file.read_text().split() if file.exists() else []
 
 
 def _refuse_edited(path: Path) -> None:
@@ -189,21 +203,22 @@ def _refuse_edited(path: Path) -> None:
             wanted = _SEALS[path.suffix].format(hashlib.sha256(body + b"\n").hexdigest()).encode()
             unchanged = last + b"\n" == wanted
         else:
-            unchanged = _digest_file(path).read_text().strip() == hashlib.sha256(content).hexdigest()
+            unchanged = hashlib.sha256(content).hexdigest() in _digests(path)
     except FileNotFoundError:
-        unchanged = not path.exists()
+        return
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", where=path) from None
     if not unchanged:
         raise changed(path)
 
 
-def changed(path: Path) -> InputError:
-    """Error for a file that the user, or a fault of the disk, has changed."""
+def changed(path: Path, replaces: str = "--overwrite, where there is one,") -> InputError:
+    """Error for a file that the user, or a fault of the disk, has changed; names the option that replaces
+    it."""
     return InputError(
         "has been edited, or damaged, since it was written, and would be replaced",
         where=path,
-        hint="move it away and run the same command again; --overwrite, where there is one, replaces all",
+        hint=f"move it away and run the same command again; {replaces} replaces all",
     )
 
 

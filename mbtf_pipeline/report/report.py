@@ -13,7 +13,7 @@ from mbtf_core.config.settings import check_schema
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import read_json
-from mbtf_core.files.folders import write_document
+from mbtf_core.files.folders import read_document, write_document
 from mbtf_core.pictures import Camera
 from mbtf_pipeline.compare.compare import COMPARISON_NAME, COMPARISON_SCHEMA
 from mbtf_pipeline.compare.image_files import read_picture
@@ -85,7 +85,7 @@ def write_report(folder: Path, recipe: Recipe, stages: Sequence[str]) -> None:
         "offsets": offset_section(folder / COMPARE, comparison["offsets"], gallery),
         "material": material_section(recipe.generate, manifest["inputs"]),
         "command": run["command"],
-        "recipe_yaml": (folder / RECIPE_NAME).read_text(encoding="utf-8").rpartition("# sha256")[0],
+        "recipe_yaml": read_document(folder / RECIPE_NAME),
         "provenance": provenance(folder, manifest, comparison["fits"], run["machine"]),
         **error_context(comparison),
         **training_context(fit_folders),

@@ -7,6 +7,7 @@ import hashlib
 import json
 import os
 import resource
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -182,6 +183,27 @@ def test_documents_are_replaced_unless_they_were_edited(tmp_path: Path) -> None:
             assert path.read_text() == edit
         write_document(path, second, overwrite=True)
         assert path.read_text() == text
+
+
+def test_a_document_is_written_again_after_a_kill_between_its_digest_and_itself(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, write = tmp_path / "table.csv", folders.write_chunks
+
+    def killed(to: Path, chunks: Iterable[bytes]) -> object:
+        if to == path:
+            raise KeyboardInterrupt
+        return write(to, chunks)
+
+    for text, again in (("a,1\n", "a,2\n"), ("a,3\n", "a,4\n")):
+        with monkeypatch.context() as patch:
+            patch.setattr(folders, "write_chunks", killed)
+            with pytest.raises(KeyboardInterrupt):
+                write_document(path, text)
+            with pytest.raises(KeyboardInterrupt):
+                write_document(path, again)
+        write_document(path, again)
+        assert path.read_text() == again
 
 
 def test_another_configuration_is_refused_with_what_differs(tmp_path: Path) -> None:
