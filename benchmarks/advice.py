@@ -73,8 +73,7 @@ def judged(before: dict[str, Any], after: dict[str, Any], fewest: int) -> Judgme
     last = before["history"][-1]
     if last["step"] < fewest:
         return Judgment("few", factor, factor * (1.0 - spread) <= FALLS)
-    cost = validation.marginal_cost_of([{**r, "step": None} for r in before["history"]], {})
-    halving = None if cost is None else cost.halving
+    halving = validation._halving(before["history"])
     if halving is None:
         return Judgment("none", factor, True)
     if halving == math.inf:

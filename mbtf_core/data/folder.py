@@ -21,8 +21,9 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+from mbtf_core.data.file_cache import FileCache
 from mbtf_core.data.schema import CONFIG_NAME, GEOMETRY_NAME, MANIFEST_NAME, SPLITS
-from mbtf_core.data.store import FileCache, LocalStore, Store, StoredFile, open_store
+from mbtf_core.data.store import LocalStore, Store, StoredFile, open_store
 from mbtf_core.errors import InputError, MbtfError, PartialError, unwritable
 from mbtf_core.files.atomic import (
     TEMPORARY,

@@ -1,5 +1,4 @@
-"""Where the files of a data set lie: a local folder, or a folder of an object store through fsspec; and the
-cache of the files that were downloaded.
+"""Where the files of a data set lie: a local folder, or a folder of an object store through fsspec.
 
 A store lists, reads, writes once and deletes. Files are written whole: a store shows a file only once all of
 it has arrived.
@@ -8,12 +7,10 @@ it has arrived.
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import logging
 import os
 import threading
 import time
-from collections import defaultdict, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,15 +18,14 @@ from typing import Any, Protocol, TypeVar
 from urllib.parse import unquote
 
 from mbtf_core.errors import EngineError, InputError, PartialError, UsageError, reason
-from mbtf_core.files.atomic import create_file, file_sha256, remove_file, write_chunks
-from mbtf_core.files.folders import make_folder
+from mbtf_core.files.atomic import create_file, remove_file, write_chunks
 from mbtf_core.paths import refuse_special, split_url
 from mbtf_core.timeouts import NoAnswer, call_within
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
 
-# Seconds in which a request must be answered, and from its first failure to its last attempt; the environment
+# Seconds in which a request must be answered, and from its start to its last attempt; the environment
 # variable overrides them.
 PATIENCE_VARIABLE, PATIENCE_SECONDS = "MBTF_STORE_PATIENCE", 30.0
 # An answer may take a second at least. So many bytes may take as long again.
@@ -52,13 +48,6 @@ _REFUSED_CODES = {
 # Answers of S3 to a conditional write: there is such an object, and this store has no such writes. s3fs knows
 # the first one only where the answer names the condition, as that of Amazon does.
 _EXISTS, _UNCONDITIONAL = ("PreconditionFailed", "412"), ("NotImplemented", "501")
-
-# Bytes of a cache by default.
-CACHE_BYTES = 20e9
-# Files that were fetched last and that are never removed: their readers are about to open them.
-_KEPT = 4
-# Seconds after which the unfinished file of another process counts as abandoned.
-_ABANDONED_SECONDS = 86400.0
 
 
 @dataclass(frozen=True)
@@ -212,12 +201,10 @@ class ObjectStore:
         pause, give_up = _FIRST_PAUSE, time.monotonic() + self.patience * (1 + size / _BLOCK_BYTES)
         failed: Exception | None = None
         while True:
-            seconds = self._seconds(size)
+            # Libraries try again by themselves: all attempts together have the time of one.
+            left = self._seconds(size) if failed is None else give_up - time.monotonic()
             try:
-                # Libraries try again by themselves: all attempts together have the time of one.
-                if failed is not None:
-                    seconds = max(give_up - time.monotonic(), _LEAST_SECONDS)
-                result = self._answer(where, seconds, function)
+                result = self._answer(where, max(left, _LEAST_SECONDS), function)
                 self._lost.clear()
                 return result
             except (FileNotFoundError, FileExistsError):
@@ -316,99 +303,6 @@ class ObjectStore:
             self._request(name, lambda: self._files.rm_file(self._at(name)))
         except FileNotFoundError:
             return
-
-
-class FileCache:
-    """Whole files by their SHA-256, which all processes of a user share: at most `limit` bytes of them, but
-    at least the few that were fetched last.
-
-    A file is complete once it has its name. One that has changed since is read again. The files that were
-    used least recently make room for new ones. A mapped file stays readable after it has been removed.
-
-    Parameters
-    ----------
-    folder : made if it is missing
-    limit : in bytes
-    """
-
-    def __init__(self, folder: Path, limit: float = CACHE_BYTES) -> None:
-        self.folder = folder
-        self.limit = limit
-        self._guard = threading.Lock()
-        self._locks: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
-        self._recent: deque[str] = deque(maxlen=_KEPT)
-        # Files whose digest this process has checked, as they were then.
-        self._checked: dict[str, tuple[int, ...]] = {}
-
-    def fetch(self, sha256: str, suffix: str, size: int, read: Callable[[], bytes]) -> Path:
-        """The file with a digest; read if it is missing or damaged.
-
-        Parameters
-        ----------
-        sha256, suffix, size : of the file: in hexadecimal, of its name, in bytes
-        read : returns the content
-
-        Raises
-        ------
-        InputError : what was read has another digest
-        PartialError : the disk is full
-        the errors of `read`
-        """
-        path = self.folder / f"{sha256}{suffix}"
-        with self._guard:
-            lock = self._locks[path.name]
-        # Another thread may be reading it.
-        with lock:
-            with self._guard:
-                if path.name in self._recent:
-                    self._recent.remove(path.name)
-                self._recent.append(path.name)
-            with contextlib.suppress(OSError):
-                if path.stat().st_size == size and self._is_intact(path, sha256):
-                    # Its age is the time since it was used.
-                    os.utime(path)
-                    self._checked[path.name] = _state(path)
-                    return path
-            make_folder(self.folder)
-            self._make_room(size)
-            content = read()
-            if hashlib.sha256(content).hexdigest() != sha256:
-                raise InputError("has changed since it was written (SHA-256 differs)")
-            write_chunks(path, [content])
-            self._checked[path.name] = _state(path)
-            return path
-
-    def _is_intact(self, path: Path, sha256: str) -> bool:
-        """Whether a cached file has its digest; it is read once, and again after each change."""
-        return self._checked.get(path.name) == _state(path) or file_sha256(path) == sha256
-
-    def _make_room(self, size: int) -> None:
-        """Remove files until `size` bytes more fit."""
-        with self._guard:
-            found: list[tuple[float, int, str]] = []
-            with contextlib.suppress(OSError), os.scandir(self.folder) as entries:
-                for entry in entries:
-                    with contextlib.suppress(OSError):
-                        stat = entry.stat()
-                        found.append((stat.st_mtime, stat.st_size, entry.name))
-            total = size + sum(bytes_ for _, bytes_, _ in found)
-            now = time.time()
-            for used, bytes_, name in sorted(found):
-                if name.startswith("."):
-                    removed = now - used > _ABANDONED_SECONDS
-                else:
-                    removed = total > self.limit and name not in self._recent
-                if not removed:
-                    continue
-                with contextlib.suppress(OSError):
-                    os.unlink(self.folder / name)
-                    total -= bytes_
-
-
-def _state(path: Path) -> tuple[int, ...]:
-    """Changes when a file is replaced or written to."""
-    stat = path.stat()
-    return stat.st_ino, stat.st_size, stat.st_mtime_ns
 
 
 def open_store(where: str | Path) -> Store:

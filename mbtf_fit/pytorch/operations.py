@@ -17,7 +17,7 @@ from mbtf_core.data.lattice import Lattice
 from mbtf_fit import ops
 from mbtf_fit.ops.constants import FIRST_DEPTH, HEIGHT_SCALE, LEAST_FACING
 from mbtf_fit.pytorch.textures import FeatureTextures
-from mbtf_fit.surface.known import KnownSurface
+from mbtf_fit.surface.known import KnownSurface, fresnel
 from mbtf_fit.surface.lookup import coarse_level, lookup
 
 # Of each function its code, and the x whose value is 1; 0 for expm1.
@@ -176,9 +176,7 @@ def _ggx(
     def masking(c: Tensor) -> Tensor:
         return (1.0 + alpha2 * (1.0 / c.square() - 1.0)).sqrt()
 
-    schlick = (1.0 - (omega_o * half).sum(1, keepdim=True).clamp(0.0, 1.0)) ** 5
-    fresnel = f0 + (1.0 - f0) * schlick
-    return fresnel * facets / (2.0 * (masking(light) + masking(view)) * light * view)
+    return fresnel(f0, half, omega_o) * facets / (2.0 * (masking(light) + masking(view)) * light * view)
 
 
 @PYTORCH.implements(ops.Lobe)

@@ -221,19 +221,17 @@ class KnownSurface:
             alpha2, metallic = maps[:, 8:9].clamp(*op.alpha2), maps[:, 9:10]
             # (R5)
             length2 = center.square().sum(1, keepdim=True)
-            kappa, rho = (1.0 - alpha2, alpha2 * (1.0 + length2))
-            kappa, rho = (x / (1.0 + alpha2 * length2) for x in (kappa, rho))
-            x, y = center.split(1, 1)
-            own = torch.cat([1.0 + kappa * x * x, kappa * x * y, 1.0 + kappa * y * y], 1)
-            facets = rho * own + spread
-            facing = _shown(omega_o, kappa * center, facets).clamp_min(op.least_view)
+            scale = 1.0 + alpha2 * length2
+            middle, rho = (1.0 - alpha2) / scale * center, alpha2 * (1.0 + length2) / scale
+            (x, y), (p, q) = center.split(1, 1), middle.split(1, 1)
+            facets = rho * torch.cat([1.0 + p * x, p * y, 1.0 + q * y], 1) + spread
+            facing = _shown(omega_o, middle, facets).clamp_min(op.least_view)
             widening = facets.new_tensor([1.0, 0.0, 1.0]) * (0.5 * self.light_width**2)
             half = torch.nn.functional.normalize(omega_i + omega_o, dim=1)
-            density = slope_density(half, kappa * center, facets + widening)
+            density = _slope_density(half, middle, facets + widening)
             f0 = torch.lerp(base.new_tensor(self.dielectric), base, metallic)
-            schlick = (1.0 - (omega_o * half).sum(1, keepdim=True).clamp(0.0, 1.0)) ** 5
-            fresnel = f0 + (1.0 - f0) * schlick
-            core = (1.0 - metallic) * core + light * fresnel * density / (4.0 * facing)
+            lobe = fresnel(f0, half, omega_o) * density / (4.0 * facing)
+            core = (1.0 - metallic) * core + light * lobe
         return torch.cat([irradiance, normal[:, :2], core], 1)
 
     def visibility(self, op: Shade, hit: Tensor, level: Tensor, omega_i: Tensor) -> Tensor:
@@ -269,7 +267,12 @@ def surface_bytes(lattice: Lattice) -> int:
     return 4 * (maps + 2 * AZIMUTHS * sum(lattice.texels(s) for s in range(lattice.finest + 1)))
 
 
-def slope_density(half: Tensor, center: Tensor, matrix: Tensor) -> Tensor:
+def fresnel(f0: Tensor, half: Tensor, omega: Tensor) -> Tensor:
+    """Reflectance (n, 3) of facets with normals `half`, of F0 (n, 3), towards directions (Schlick 1994)."""
+    return f0 + (1.0 - f0) * (1.0 - (omega * half).sum(1, keepdim=True).clamp(0.0, 1.0)) ** 5
+
+
+def _slope_density(half: Tensor, center: Tensor, matrix: Tensor) -> Tensor:
     """Density D(h) (n, 1) of facets per area of the reference plane (Walter et al. 2007).
 
     Parameters

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from mbtf_core.data.store import FileCache
+from mbtf_core.data.file_cache import FileCache
 from mbtf_core.errors import InputError
 
 
