@@ -38,8 +38,8 @@ PIXEL_SIGMA = 0.5
 SMALLEST_COSINE = 0.01
 # Fraction of a picture, along its tighter side, that tiles fill, and its height over its width.
 _FILL, _PROPORTION = 0.94, 0.75
-# What does not change the content of pictures: the name of the material, and how values are displayed.
-_DISPLAY = ("material", "exposure")
+# What does not change the content of pictures: names of inputs, and how values are displayed.
+_DISPLAY = ("material", "shards", "exposure")
 # Of an 8-bit pixel, at most.
 PNG_BYTES = 3
 
@@ -109,6 +109,12 @@ class Camera:
     def pixel_pitch(self) -> float:
         """Distance between pixel centers on the image plane at distance 1."""
         return 2.0 * float(np.tan(np.radians(self.field_of_view) / 2.0)) / self.columns
+
+    @property
+    def pixel_width(self) -> float:
+        """Geometric mean of the sides of the pixel at the image's center on the plane, in tile widths."""
+        slant = float(np.sin(np.radians(self.elevation)))
+        return float(self.distance) * self.pixel_pitch / slant**0.5
 
     def queries(self, omega_i: NDArray[np.float64], aspect: float = 1.0) -> Queries:
         """One query per pixel, leading axes (rows, columns).

@@ -127,6 +127,15 @@ def evaluate_splits(predict: Predict, data: Dataset, partition: Partition) -> di
     return {name: errors for name, errors in found.items() if errors is not None}
 
 
+def foreign_inputs(material: Material, data: Dataset) -> list[str]:
+    """Roles of input files (height, base_color, …) that differ from those of the material's training data,
+    where both record them."""
+    trained = material.description["data"].get("inputs") or {}
+    given = data.manifest.get("inputs") or {}
+    both = sorted({*trained, *given}) if trained and given else []
+    return [role for role in both if trained.get(role) != given.get(role)]
+
+
 def evaluate(material: Material, shards: str | Path | DataFolder) -> dict[str, dict[str, Any]]:
     """Evaluate a fitted material on a data set of any layout.
 

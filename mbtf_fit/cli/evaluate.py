@@ -28,15 +28,11 @@ def evaluate(
     """
     from mbtf_core.data.dataset import Dataset
     from mbtf_core.data.folder import DataFolder
-    from mbtf_fit.evaluation import evaluate
+    from mbtf_fit.evaluation import evaluate, foreign_inputs
     from mbtf_fit.material.material import Material
 
     loaded, folder = Material.load(material), DataFolder.open(shards)
-    # Inputs (height, base_color, …) that differ from those of the training data, where both record them.
-    trained = loaded.description["data"].get("inputs") or {}
-    given = Dataset.open(folder).manifest.get("inputs") or {}
-    both = sorted({*trained, *given}) if trained and given else []
-    foreign = [role for role in both if trained.get(role) != given.get(role)]
+    foreign = foreign_inputs(loaded, Dataset.open(folder))
     if foreign:
         console.note(
             f"warning: {folder} was made from another material than {material} was trained on "

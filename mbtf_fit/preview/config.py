@@ -1,4 +1,4 @@
-"""Options of ``mbtf-fit preview``."""
+"""Options of ``mbtf-fit preview`` and ``mbtf-fit compare``."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from mbtf_core.app.options import Flag
 from mbtf_core.config.settings import Settings
 from mbtf_core.units import parse_numbers
-from mbtf_gen.config.pictures import EXPOSURE, Direction, Exposure
+from mbtf_gen.config.pictures import EXPOSURE, Direction, Exposure, ViewSection
 
 # Limits the memory of sheet and turntable to a gigabyte.
 MOST_PIXELS = 1 << 25
@@ -80,3 +80,12 @@ class MaterialPreviewConfig(Settings):
         if max(panels * sheet.size**2, turn.frames * turn.size**2) > MOST_PIXELS:
             raise ValueError(f"asks for more than {MOST_PIXELS:,} pixels; use smaller or fewer pictures")
         return self
+
+
+class ComparisonConfig(Settings):
+    """Every option of ``mbtf-fit compare``."""
+
+    material: str = Field(description="folder made by mbtf-fit")
+    shards: str = Field(description="folder made by mbtf-gen, or its URL")
+    picture: ViewSection = ViewSection()
+    exposure: Exposure = Field(None, description=EXPOSURE)

@@ -9,11 +9,9 @@ from __future__ import annotations
 
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
 
 from mbtf_core.app.console import Console
 from mbtf_core.color import auto_exposure, brightness, describe_exposure, to_display
@@ -25,11 +23,9 @@ from mbtf_fit.backends.mitsuba.evaluator import Evaluator
 from mbtf_fit.backends.mitsuba.stored_material import F32
 from mbtf_fit.material.format import read_description
 from mbtf_fit.preview.config import MaterialPreviewConfig, SheetSection
+from mbtf_fit.preview.grid import grid, width_label
 from mbtf_gen.config.pictures import Direction
 from mbtf_gen.engine.runtime import load_mitsuba
-
-GAP, MARGIN, CAPTION = 4, 8, 34
-INK, PAPER = (30, 30, 30), (255, 255, 255)
 
 
 def panels(evaluator: Evaluator, section: SheetSection) -> F32:
@@ -58,41 +54,14 @@ def exposure_of(values: F32) -> float:
 
 def contact_sheet(values: F32, section: SheetSection, exposure: float) -> NDArray[np.uint8]:
     """The sheet (rows, columns, 3): a column per view and light, a row per width."""
-    views, lights, widths, size = values.shape[:4]
-    pitch = size + GAP
-    width = 2 * MARGIN + views * lights * pitch - GAP + (views - 1) * GAP
-    height = MARGIN + widths * pitch - GAP + CAPTION + MARGIN
-    sheet = Image.new("RGB", (width, height), PAPER)
-    draw = ImageDraw.Draw(sheet)
-    font = ImageFont.load_default(max(9, min(13, size // 12)))
-    for view in range(views):
-        for light in range(lights):
-            # A wider gap separates views.
-            left = MARGIN + (view * lights + light) * pitch + view * GAP
-            text = f"{_caption('view', section.view[view])}\n{_caption('light', section.light[light])}"
-            draw.multiline_text((left + 1, MARGIN), text, INK, font, spacing=2)
-            for row in range(widths):
-                picture = Image.fromarray(to_display(values[view, light, row], exposure))
-                top = MARGIN + CAPTION + row * pitch
-                sheet.paste(picture, (left, top))
-                if view == light == 0:
-                    across = section.tiles_across[row]
-                    label = f"{across:g} tile{'' if across == 1 else 's'} wide"
-                    _label(draw, (left, top + size), label, font)
-    return np.asarray(sheet)
+    columns = list(product(section.view, section.light))
+    pictures = list(to_display(values, exposure).reshape(len(columns), *values.shape[2:]))
+    captions = [f"{_caption('view', view)}\n{_caption('light', light)}" for view, light in columns]
+    return grid(pictures, captions, list(map(width_label, section.tiles_across)), len(section.light))
 
 
 def _caption(name: str, direction: Direction) -> str:
     return f"{name} {direction.elevation:g}°, {direction.azimuth:g}°"
-
-
-def _label(draw: ImageDraw.ImageDraw, corner: tuple[int, int], text: str, font: Any) -> None:
-    """Text in the lower left corner of a picture, on a white background."""
-    left, bottom = corner
-    box = draw.textbbox((0, 0), text, font=font)
-    top = bottom - (box[3] - box[1]) - 6
-    draw.rectangle((left, top, left + box[2] - box[0] + 6, bottom - 1), PAPER)
-    draw.text((left + 3, top + 3 - box[1]), text, INK, font)
 
 
 SHEET_NAME, GIF_NAME = "sheet.png", "turntable.gif"

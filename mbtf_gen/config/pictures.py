@@ -51,8 +51,8 @@ EXPOSURE = "exposure of the pictures: a value v in 1/sr is shown as 2^EV v; defa
 RENDERING = ("geometry", "light", "transport", "effects", "seed")
 
 
-class ReferenceSection(Settings):
-    """Reference pictures."""
+class ViewSection(Settings):
+    """Path-traced pictures of the plane: one view and light, several widths of the field of view."""
 
     view: Annotated[Direction, Flag("--view", "ELEVATION,AZIMUTH")] = Field(
         Direction(elevation=60, azimuth=-90), description="direction of the camera in degrees"
@@ -65,6 +65,11 @@ class ReferenceSection(Settings):
     )
     size: Annotated[Size, Flag("--size")] = Field(256, description="pixels along each side of a picture")
     spp: Annotated[Paths, Flag("--spp")] = Field(256, description=PATHS_PER_PIXEL)
+
+
+class ReferenceSection(ViewSection):
+    """Reference pictures."""
+
     kind: Annotated[Literal["query", "pixel", "both"], Flag("--kind")] = Field(
         "both", description="values: M at each pixel's footprint (query), or the filtered image (pixel)"
     )

@@ -23,7 +23,12 @@ from mbtf_gen.forecast import announce
 from mbtf_gen.job import Job
 from mbtf_gen.pictures import mesh
 from mbtf_gen.pictures.query_plots import sampled_queries, stored_queries, write_plots
-from mbtf_gen.pictures.reference import picture_estimator, picture_seconds, render_reference
+from mbtf_gen.pictures.reference import (
+    note_fine_pixels,
+    picture_estimator,
+    picture_seconds,
+    render_reference,
+)
 
 
 @dataclass(frozen=True)
@@ -108,6 +113,7 @@ def draw_preview(
         states = {"mesh": config.exposure, "beauty": config.exposure, **states}
         if scene.job.material.grid is None:
             del states["mesh"]
+        note_fine_pixels([scene.camera], scene.job.lattice, console)
         inputs |= scene.job.material.digests
     size = len(states) * PNG_BYTES * config.preview.size**2
     check_space(path, size, "reduce --size, or choose another folder with -o")

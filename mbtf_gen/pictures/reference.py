@@ -7,8 +7,10 @@ A picture is stored as an EXR image with the channels of the shard schema (``u.x
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,11 +19,12 @@ from numpy.typing import NDArray
 
 from mbtf_core.app.console import Console
 from mbtf_core.color import auto_exposure, brightness, describe_exposure
+from mbtf_core.data.lattice import Lattice
 from mbtf_core.data.schema import Queries
 from mbtf_core.data.shard_files import row_bytes
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import PartialError
-from mbtf_core.files.folders import check_space, owned
+from mbtf_core.files.folders import OutputFolder, check_space, owned
 from mbtf_core.pictures import (
     PIXEL_SIGMA,
     PNG_BYTES,
@@ -36,7 +39,7 @@ from mbtf_core.run.cluster import open_runner
 from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.run.task import Item
 from mbtf_core.stats import pooled_relative_error
-from mbtf_gen.config.pictures import ReferenceConfig
+from mbtf_gen.config.pictures import ReferenceConfig, ViewSection
 from mbtf_gen.forecast import announce
 from mbtf_gen.job import Job
 from mbtf_gen.planning.run_plan import reference_plan
@@ -45,6 +48,8 @@ from mbtf_gen.planning.simulation import build_estimator
 if TYPE_CHECKING:
     from mbtf_gen.render.estimator import Estimator
 
+# Pixels that cover less of a texel are finer than the data; 1 but for rounding.
+_TEXEL = 0.99
 _kept: tuple[Job, Any] | None = None
 
 
@@ -164,6 +169,95 @@ def render_picture(job: Job, camera: Camera, omega_i: NDArray[np.float64], **opt
     return render_reference(picture_estimator(job), camera, omega_i, **options)
 
 
+def cameras_of(view: ViewSection) -> list[Camera]:
+    """A camera for each width of the field of view."""
+    direction, size = view.view, view.size
+    return [
+        Camera(direction.elevation, direction.azimuth, across, rows=size, columns=size)
+        for across in view.tiles_across
+    ]
+
+
+def picture_names(view: ViewSection, kinds: Sequence[PixelKind]) -> dict[tuple[Camera, PixelKind], str]:
+    """Names of pictures, without suffix."""
+    pairs = product(cameras_of(view), kinds)
+    return {(camera, kind): f"{kind}-tiles{camera.tiles_across:g}" for camera, kind in pairs}
+
+
+def check_view(job: Job, view: ViewSection, output: Path, kinds: int) -> None:
+    """Refuse pictures that show the horizon (UsageError) or do not fit on the disk (InputError)."""
+    check_space(
+        output,
+        len(view.tiles_across) * kinds * _picture_bytes(job, view),
+        "reduce --size, or choose another folder with -o",
+    )
+    cameras_of(view)[0].queries(from_angles(90, 0))
+
+
+def note_fine_pixels(cameras: Sequence[Camera], lattice: Lattice, console: Console) -> None:
+    """Say it if pixels are smaller than the texels of the finest level."""
+    resolution = lattice.shape()[1]
+    covered = min(camera.pixel_width for camera in cameras) * resolution
+    if covered < _TEXEL:
+        console.note(
+            f"a pixel covers only {covered:.2g} texels of the resolution {resolution}: "
+            "maps and data of that resolution lack such fine detail"
+        )
+
+
+def _picture_bytes(job: Job, view: ViewSection) -> int:
+    return view.size**2 * (row_bytes(job.material.transmits) + PNG_BYTES)
+
+
+def render_missing(
+    folder: OutputFolder,
+    job: Job,
+    view: ViewSection,
+    kinds: Sequence[PixelKind],
+    console: Console,
+    advance: Callable[[float], None],
+    cluster: str | None = None,
+) -> list[str]:
+    """Render the pictures of :func:`picture_names` that a folder lacks, as EXR images, and record their
+    noise and brightness; returns their names.
+
+    Raises
+    ------
+    InputError : a finished picture has changed
+    PartialError : a picture failed; the same command renders the missing ones
+    """
+    names = picture_names(view, kinds)
+    omega_i = from_angles(view.light.elevation, view.light.azimuth)
+    cameras = cameras_of(view)
+    missing = {key: name for key, name in names.items() if folder.finished(name) is None}
+    advance(len(names) - len(missing))
+    items = [
+        Item(
+            name,
+            {
+                **{"job": job, "camera": camera, "omega_i": omega_i, "kind": kind},
+                **{"spp": view.spp, "seed": job.config.seed, "index": cameras.index(camera)},
+            },
+        )
+        for (camera, kind), name in missing.items()
+    ]
+    with open_runner(cluster if missing else None, console.note) as runner:
+        if runner.here and missing:
+            paths, estimator = len(missing) * view.size**2 * view.spp, picture_estimator(job)
+            seconds = partial(picture_seconds, estimator, cameras[0], omega_i, paths)
+            announce(console, paths, seconds, len(missing) * _picture_bytes(job, view))
+        for done in runner.map(render_picture, items):
+            if done.error:
+                hint = "the same command renders the missing pictures"
+                raise PartialError(f"picture {done.name} failed: {done.error}", hint=hint)
+            image = done.value
+            noise = pooled_relative_error(image.value_a.reshape(-1, 3), image.value_b.reshape(-1, 3))
+            facts = {"relative_noise": noise.value, "brightness": brightness(image.value)}
+            folder.keep(done.name, [image.write(folder.path / done.name)], facts)
+            advance(1)
+    return list(missing.values())
+
+
 def render_references(
     config: ReferenceConfig,
     output: Path,
@@ -190,17 +284,10 @@ def render_references(
     PartialError : a picture failed; the same command renders the missing ones
     """
     wanted, job = config.reference, Job.prepare(config)
-    omega_i = from_angles(wanted.light.elevation, wanted.light.azimuth)
     kinds: tuple[PixelKind, ...] = ("query", "pixel") if wanted.kind == "both" else (wanted.kind,)
-    size, pixels = wanted.size, wanted.size**2
-    cameras = [
-        Camera(wanted.view.elevation, wanted.view.azimuth, across, rows=size, columns=size)
-        for across in wanted.tiles_across
-    ]
-    names = {(camera, kind): f"{kind}-tiles{camera.tiles_across:g}" for camera in cameras for kind in kinds}
-    stored = len(names) * pixels * (row_bytes(job.material.transmits) + PNG_BYTES)
-    check_space(output, stored, "reduce --size, or choose another folder with -o")
-    cameras[0].queries(omega_i)  # refuses a view of the horizon, which all cameras share
+    names = picture_names(wanted, kinds)
+    check_view(job, wanted, output, len(kinds))
+    note_fine_pixels(cameras_of(wanted), job.lattice, console)
     keep_on_interruption(f"the finished pictures are kept in {output}")
     with (
         owned(output),
@@ -214,32 +301,7 @@ def render_references(
             inputs=job.material.digests,
             overwrite=overwrite,
         )
-        missing = {key: name for key, name in names.items() if folder.finished(name) is None}
-        bar.advance(len(names) - len(missing))
-        items = [
-            Item(
-                name,
-                {
-                    **{"job": job, "camera": camera, "omega_i": omega_i, "kind": kind},
-                    **{"spp": wanted.spp, "seed": config.seed, "index": cameras.index(camera)},
-                },
-            )
-            for (camera, kind), name in missing.items()
-        ]
-        with open_runner(cluster if missing else None, console.note) as runner:
-            if runner.here and missing:
-                paths, estimator = len(missing) * pixels * wanted.spp, picture_estimator(job)
-                seconds = partial(picture_seconds, estimator, cameras[0], omega_i, paths)
-                announce(console, paths, seconds, stored)
-            for done in runner.map(render_picture, items):
-                if done.error:
-                    hint = "the same command renders the missing pictures"
-                    raise PartialError(f"picture {done.name} failed: {done.error}", hint=hint)
-                image = done.value
-                noise = pooled_relative_error(image.value_a.reshape(-1, 3), image.value_b.reshape(-1, 3))
-                facts = {"relative_noise": noise.value, "brightness": brightness(image.value)}
-                folder.keep(done.name, [image.write(folder.path / done.name)], facts)
-                bar.advance(1)
+        rendered = render_missing(folder, job, wanted, kinds, console, bar.advance, cluster)
         known = {name: folder.finished(name) or {} for name in names.values()}
         exposure = config.exposure
         if exposure is None:
@@ -254,7 +316,7 @@ def render_references(
             "kind": kind,
             "tiles_across": camera.tiles_across,
             "relative_noise": known[name]["relative_noise"],
-            "kept": (camera, kind) not in missing,
+            "kept": name not in rendered,
         }
         for (camera, kind), name in names.items()
     ]

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.color import white_of
+from mbtf_core.palettes import Palette, common_scale
 from mbtf_pipeline.compare.image_files import read_halves, read_map, read_picture
 from mbtf_pipeline.compare.offsets import read_offset, towards_view
 from mbtf_pipeline.compare.perceptual_metrics import available_metrics
@@ -20,10 +21,8 @@ from mbtf_pipeline.recipe import SceneView
 from mbtf_pipeline.report.embed import (
     F32,
     Gallery,
-    Palette,
     Pixels,
     color_bar,
-    common_scale,
     linear_uri,
     map_uri,
 )

@@ -95,7 +95,8 @@ def check_values(command: Any, arguments: dict[str, Any]) -> None:
     if hasattr(options, "table"):
         if options.config is not None and not (ROOT / options.config).exists():
             options = replace(options, config=None)
-        options.resolve(**({"material": "X"} if "material" in options.configuration.model_fields else {}))
+        arguments_of = {"material", "shards"} & options.configuration.model_fields.keys()
+        options.resolve(**dict.fromkeys(arguments_of, "X"))
     if arguments.get("assignments"):
         recipe = ROOT / arguments["recipe"]
         if not recipe.exists():

@@ -76,6 +76,7 @@ mbtf_fit.training
 mbtf_fit.backends.mitsuba
 mbtf_fit.backends.shader
 mbtf_fit.preview
+mbtf_fit.comparison
 mbtf_fit.viewer
 mbtf_fit.export
 mbtf_fit.cli
@@ -101,6 +102,7 @@ FORBIDDEN = {
     "mbtf_fit": {"mitsuba", "drjit", "mbtf_gen"},
     "mbtf_fit.backends.mitsuba": {"torch", "trimesh"},
     "mbtf_fit.preview": {"torch", "trimesh"},
+    "mbtf_fit.comparison": {"mitsuba", "drjit"},
     "mbtf_pipeline": set(),
 }
 

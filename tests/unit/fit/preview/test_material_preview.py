@@ -25,7 +25,7 @@ mbtf_fit.backends.mitsuba.register()
 from mbtf_fit.backends.mitsuba.bsdf import Frame  # noqa: E402
 from mbtf_fit.backends.mitsuba.evaluator import Evaluator  # noqa: E402
 from mbtf_fit.backends.mitsuba.stored_material import read_material  # noqa: E402
-from mbtf_fit.preview import sheet, turntable  # noqa: E402
+from mbtf_fit.preview import grid, sheet, turntable  # noqa: E402
 
 SECTION = SheetSection(
     view=[Direction(elevation=70, azimuth=-90), Direction(elevation=35, azimuth=20)],
@@ -43,15 +43,15 @@ def test_pictures_are_ordered_by_view_light_and_width(model: str, tmp_path: Path
     assert values.shape == (2, 2, 3, 64, 64, 3)
     exposure = sheet.exposure_of(values)
     pixels = sheet.contact_sheet(values, SECTION, exposure)
-    pitch = 64 + sheet.GAP
+    pitch = 64 + grid.GAP
     for view, light, row in np.ndindex(2, 2, 3):
         v, i = SECTION.view[view], SECTION.light[light]
         camera = Camera(v.elevation, v.azimuth, SECTION.tiles_across[row], (0.5, 1.0), 64, 64)
         queries = camera.queries(from_angles(i.elevation, i.azimuth), 2.0).flat()
         wanted = material.predict(queries).reshape(64, 64, 3)  # type: ignore[arg-type]
         np.testing.assert_allclose(values[view, light, row], wanted, rtol=1e-3, atol=1e-4)
-        left = sheet.MARGIN + (2 * view + light) * pitch + view * sheet.GAP
-        top = sheet.MARGIN + sheet.CAPTION + row * pitch
+        left = grid.MARGIN + (2 * view + light) * pitch + view * grid.GAP
+        top = grid.MARGIN + grid.CAPTION + row * pitch
         shown = pixels[top : top + 64, left : left + 64].astype(int)
         difference = np.abs(shown - to_display(wanted, exposure))
         # The first column carries labels below.

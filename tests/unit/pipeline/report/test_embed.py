@@ -10,17 +10,8 @@ import pytest
 from PIL import Image
 
 from mbtf_core.color import to_display
-from mbtf_pipeline.report.embed import (
-    REDUCTIONS,
-    Palette,
-    color_bar,
-    common_scale,
-    indices,
-    linear_uri,
-    map_uri,
-    palette,
-    shrink,
-)
+from mbtf_core.palettes import Palette, common_scale, indices, palette
+from mbtf_pipeline.report.embed import REDUCTIONS, color_bar, linear_uri, map_uri, shrink
 from mbtf_pipeline.report.images import local_error
 
 

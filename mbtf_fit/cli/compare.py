@@ -1,0 +1,45 @@
+"""``mbtf-fit compare``: a material beside its path-traced reference."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mbtf_core.app.console import CONSOLE, Console
+from mbtf_core.app.options import Options, Output, Overwrite, PathText, options_from
+from mbtf_core.errors import UsageError
+from mbtf_fit.preview.config import ComparisonConfig
+
+
+@options_from(ComparisonConfig)
+class ComparisonOptions(Options[ComparisonConfig]):
+    """Options of ``mbtf-fit compare``."""
+
+
+def compare(
+    material: PathText | None = None,
+    shards: PathText | None = None,
+    /,
+    *,
+    output: Output = Path("comparison"),
+    options: ComparisonOptions = ComparisonOptions(),  # noqa: B008
+    overwrite: Overwrite = False,
+    console: Console = CONSOLE,
+) -> None:
+    """Show a fit beside the path-traced reference: mbtf-fit compare material/ shards/
+
+    Writes comparison.png, with columns for the reference, the fit and their difference, and the references
+    as EXR. Prints the errors without the noise of the references.
+
+    Parameters
+    ----------
+    material
+        Folder made by mbtf-fit.
+    shards
+        Folder made by mbtf-gen, or its URL; the tile that it was made from is path-traced.
+    """
+    if options.config is None and (material is None or shards is None):
+        raise UsageError("name a material and its data set", hint="mbtf-fit compare material/ shards/")
+    config = options.resolve(material=material, shards=shards)
+    from mbtf_fit.comparison import compare
+
+    compare(config, output, console, overwrite=overwrite)

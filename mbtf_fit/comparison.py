@@ -1,0 +1,149 @@
+"""``mbtf-fit compare``: a fitted material beside the path-traced tile that its data set was made from.
+
+A pixel is M for one query, as in ``mbtf-gen reference --kind query``, for both.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from mbtf_core.app.console import Console
+from mbtf_core.color import auto_exposure, describe_exposure, to_display, white_of
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.folder import DataFolder
+from mbtf_core.data.shard_files import read_exr
+from mbtf_core.errors import InputError
+from mbtf_core.files.folders import OutputFolder, owned
+from mbtf_core.palettes import common_scale, indices, palette
+from mbtf_core.pictures import claim_pictures, write_png
+from mbtf_core.run.signals import keep_on_interruption
+from mbtf_core.stats import noise_free_mse, unexplained_variance
+from mbtf_fit.evaluation import foreign_inputs
+from mbtf_fit.formatting import format_estimate, visibility
+from mbtf_fit.material.material import Material
+from mbtf_fit.preview.config import ComparisonConfig
+from mbtf_fit.preview.grid import grid, width_label
+from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.job import Job
+from mbtf_gen.pictures.reference import (
+    cameras_of,
+    check_view,
+    note_fine_pixels,
+    picture_names,
+    render_missing,
+)
+
+PICTURE_NAME = "comparison.png"
+_QUERY = ("u", "sigma", "omega_i", "omega_o")
+
+
+def _job_of(data: Dataset) -> Job:
+    """The data set's job, with its material loaded.
+
+    Raises
+    ------
+    InputError : the data are measured, or the material is not there or has changed
+    """
+    if "measured" in data.manifest or data.estimates == 1:
+        raise InputError(
+            "holds measured data, whose surface is unknown",
+            where=data.folder,
+            hint="compare with its queries: mbtf-fit evaluate MATERIAL SHARDS",
+        )
+    try:
+        job = Job.prepare(GeneratorConfig.model_validate(data.manifest["config"]))
+    except InputError as error:
+        hint = error.hint or "the reference is path-traced from it: run this where mbtf-gen ran"
+        raise InputError(error.what, where=error.where, hint=hint) from None
+    if job.material.digests != data.manifest["inputs"]:
+        raise InputError("has changed since the data set was made", where=job.config.material)
+    return job
+
+
+def compare(config: ComparisonConfig, output: Path, console: Console, *, overwrite: bool = False) -> None:
+    """Write references, and one picture of reference, fit and difference; report the errors.
+
+    Parameters
+    ----------
+    config : material, data set, view and light
+    output : the folder
+    console : where progress and results go
+    overwrite : replace the pictures of another configuration
+
+    Raises
+    ------
+    UsageError : the view shows the horizon
+    InputError : the material or the data set cannot be used, or the folder holds something else
+    PartialError : a picture failed; the same command renders the missing ones
+    """
+    material, data = Material.load(config.material), Dataset.open(DataFolder.open(config.shards))
+    job, view = _job_of(data), config.picture
+    if material.lattice.aspect != data.lattice.aspect:
+        what = f"its tile has the aspect {data.lattice.aspect:g}, the material's {material.lattice.aspect:g}"
+        raise InputError(what, where=data.folder)
+    if foreign := foreign_inputs(material, data):
+        differ = f"{', '.join(foreign)} differ{'s' if len(foreign) == 1 else ''}"
+        console.note(f"warning: {config.material} was trained on another material ({differ})")
+    names = picture_names(view, ["query"])
+    check_view(job, view, output, 1)
+    note_fine_pixels(cameras_of(view), data.lattice, console)
+    keep_on_interruption(f"the finished pictures are kept in {output}")
+    with owned(output), console.progress(len(names), "rendering", "pictures") as bar:
+        folder = claim_pictures(
+            output,
+            "mbtf-fit compare",
+            files=[*(f"{name}.exr" for name in names.values()), PICTURE_NAME],
+            config=config.model_dump(mode="json"),
+            inputs={
+                "data set": data.manifest["config_hash"],
+                "weights": material.description["weights"]["sha256"],
+            },
+            overwrite=overwrite,
+        )
+        folder.finished(PICTURE_NAME)  # refuses to replace one that has changed
+        render_missing(folder, job, view, ["query"], console, bar.advance)
+        known = [folder.finished(name) or {} for name in names.values()]
+        exposure = config.exposure
+        if exposure is None:
+            exposure = auto_exposure([facts["brightness"] for facts in known])
+        errors = _draw(folder, material, [*names.values()], view.tiles_across, exposure)
+    pictures, lines = [], [f"{output / PICTURE_NAME}: reference, fit, and fit - reference"]
+    for across, facts, found in zip(view.tiles_across, known, errors, strict=True):
+        pictures.append({"tiles_across": across, "relative_noise": facts["relative_noise"], **found})
+        unexplained = f"unexplained variance {format_estimate(found['unexplained'])}"
+        seen = [unexplained, *filter(None, visibility(found))]
+        noise = f"noise of the reference {facts['relative_noise']:.2%} of the mean value"
+        lines.append(f"{width_label(across)}: {', '.join(seen)}; {noise}")
+    lines.append(describe_exposure(exposure))
+    report = {"file": output / PICTURE_NAME, "exposure": exposure, "foreign_inputs": foreign}
+    console.report({**report, "pictures": pictures}, "\n".join(lines))
+
+
+def _draw(
+    folder: OutputFolder, material: Material, names: list[str], widths: list[float], exposure: float
+) -> list[dict[str, Any]]:
+    """Write the picture; the noise-free errors by width, as :func:`mbtf_fit.formatting.visibility` takes
+    them."""
+    columns: list[list[Any]] = [[], [], []]
+    differences, errors = [], []
+    for name in names:
+        stored = read_exr(folder.path / f"{name}.exr", (*_QUERY, "value_a", "value_b"))
+        stored = {key: array[0] for key, array in stored.items()}
+        shape = stored["value_a"].shape
+        arrays = (stored[key].reshape(-1, *stored[key].shape[2:]) for key in _QUERY)
+        fit = material.evaluate(*arrays)
+        halves = [stored[key].reshape(-1, 3) for key in ("value_a", "value_b")]
+        reference = 0.5 * (halves[0] + halves[1])
+        mse, unexplained = noise_free_mse(fit, *halves), unexplained_variance(fit, *halves)
+        errors.append({"mse": mse.as_dict(), "unexplained": unexplained.as_dict(), "exposure": exposure})
+        columns[0].append(to_display(reference.reshape(shape), exposure))
+        columns[1].append(to_display(fit.reshape(shape), exposure))
+        differences.append((fit - reference).mean(axis=-1).reshape(shape[:2]) / white_of(exposure))
+    scale = common_scale(differences)
+    columns[2] = [palette("signed")[indices(difference / scale, "signed")] for difference in differences]
+    captions = ["reference", "fit", f"fit - reference\n±{scale:.3g} of white"]
+    path = folder.path / PICTURE_NAME
+    write_png(path, grid(columns, captions, list(map(width_label, widths)), 3))
+    folder.keep(PICTURE_NAME, [path], {"exposure": exposure})
+    return errors

@@ -1,0 +1,98 @@
+"""``mbtf-fit compare``: errors and panels of a constant fit of a rough tile, refusals, resumed pictures."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+from PIL import Image
+from support.command_lines import call, fails
+from support.commands import Done
+from support.datasets import edit, write_dataset
+from support.plugin_materials import write_material
+
+from mbtf_core.color import to_display
+from mbtf_fit.preview.grid import CAPTION, GAP, MARGIN
+from mbtf_gen.pictures import reference
+
+VALUE = (0.1, 0.12, 0.15)
+SIZE = 48
+OPTIONS = ["--view", "50,20", "--light", "60,80", "--tiles-across", "1,3", "--spp", "16", "--json"]
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("comparison")
+    write_dataset(folder / "shards", queries={"train": "40", "test": "8"})
+    write_material(folder / "fit", finest=3, aspect=0.5, constant=VALUE)
+    return folder
+
+
+def compare(work: Path, *words: str) -> Done:
+    paths = [str(work / "fit"), str(work / "shards"), "-o", str(work / "out")]
+    return call(["mbtf-fit", "compare", *paths, *OPTIONS, "--size", str(SIZE), *words])
+
+
+def halves(path: Path) -> list[np.ndarray]:
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        channels = {name: channel.pixels for name, channel in file.channels().items()}
+    return [np.stack([channels[f"value_{half}.{color}"] for color in "RGB"], -1) for half in "ab"]
+
+
+def test_errors_and_panels_are_those_of_reference_and_fit(work: Path) -> None:
+    done = compare(work)
+    report = done.result()
+    assert "texels of the resolution 8" in done.err
+    exposure = report["exposure"]
+    image = np.asarray(Image.open(work / "out/comparison.png")).astype(int)
+    # By column and row.
+    pitch = SIZE + GAP
+    panels = image[MARGIN + CAPTION :, MARGIN:][: 2 * pitch, : 3 * pitch].reshape(2, pitch, 3, pitch, 3)
+    for row, (across, found) in enumerate(zip(("1", "3"), report["pictures"], strict=True)):
+        a, b = halves(work / f"out/query-tiles{across}.exr")
+        mse = np.mean((VALUE - a.astype(np.float64)) * (VALUE - b))
+        assert found["mse"]["value"] == pytest.approx(mse, rel=1e-4)
+        spread = ((VALUE - a.astype(np.float64)) * (VALUE - b)).mean(-1)
+        assert found["mse"]["error"] == pytest.approx(spread.std(ddof=1) / SIZE, rel=1e-4)
+        shown, fit, signed = (panels[row, :SIZE, column, :SIZE] for column in range(3))
+        # Labels cover the lower part of the first column.
+        assert np.abs(shown - to_display(0.5 * (a + b), exposure))[: SIZE // 2].max() <= 1
+        assert np.abs(fit - to_display(VALUE, exposure)).max() <= 1
+        brighter = (VALUE - 0.5 * (a + b)).mean(-1)
+        clear = np.abs(brighter) > 0.2 * np.abs(brighter).max()
+        # Orange where the fit is too bright, blue where it is too dark.
+        assert ((signed[..., 0] > signed[..., 2]) == (brighter > 0))[clear].all()
+        assert clear.mean() > 0.3
+
+
+def test_finished_references_are_kept(work: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    compare(work)
+    before = {path.name: path.read_bytes() for path in (work / "out").glob("*.exr")}
+    assert len(before) == 2
+    monkeypatch.setattr(reference, "render_reference", None)
+    assert compare(work, "--exposure", "1").result()["exposure"] == 1
+    assert {path.name: path.read_bytes() for path in (work / "out").glob("*.exr")} == before
+    (work / "out/comparison.png").write_bytes(b"mine")
+    refused = compare(work)
+    assert refused.code == 3
+    assert "comparison.png: has been edited" in json.loads(refused.out)["error"]
+    assert (work / "out/comparison.png").read_bytes() == b"mine"
+
+
+def test_what_cannot_be_path_traced_is_one_line(work: Path, tmp_path: Path) -> None:
+    for name in ("fit", "shards"):
+        shutil.copytree(work / name, tmp_path / name)
+    line = ["compare", str(tmp_path / "fit"), str(tmp_path / "shards"), "-o", str(tmp_path / "out")]
+    assert "name a material and its data set" in fails(2, "compare", str(tmp_path / "fit"))
+    heights, manifest = tmp_path / "moved.npy", tmp_path / "shards/manifest.json"
+    edit(manifest, lambda document: document["config"].update(material=str(heights)))
+    assert "run this where mbtf-gen ran" in fails(3, *line)
+    np.save(heights, np.random.default_rng(1).random((4, 8)))
+    assert "moved.npy: has changed since the data set was made" in fails(3, *line)
+    edit(manifest, lambda document: document.update(estimates=1))
+    assert "holds measured data, whose surface is unknown" in fails(3, *line)
+    assert not (tmp_path / "out").exists()
