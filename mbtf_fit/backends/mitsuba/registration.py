@@ -85,13 +85,17 @@ def _construct(plugin: Any, props: Properties) -> Any:
         raise
 
 
-def load_scene(source: str | Path | Mapping[str, Any], **parameters: Any) -> Scene:
+def load_scene(
+    source: str | Path | Mapping[str, Any], *, clamp_environment: bool = False, **parameters: Any
+) -> Scene:
     """Load and check a scene with fitted materials; errors of the plugins are raised as they are.
 
     Parameters
     ----------
     source : str, Path or mapping
         Path of an XML file, XML text, or a dictionary as for ``mitsuba.load_dict``.
+    clamp_environment : bool
+        Set texels of the environment map that are negative or not finite to 0.
     **parameters
         For Mitsuba's loader: values of the ``$name`` in XML.
 
@@ -126,12 +130,13 @@ def load_scene(source: str | Path | Mapping[str, Any], **parameters: Any) -> Sce
         raise error from None
     if isinstance(scene, mi.Scene):
         check_scene(scene)
-        _check_environment(scene)
+        _check_environment(scene, clamp_environment)
     return scene
 
 
-def _check_environment(scene: Scene) -> None:
-    """Warn of an environment map with texels that are no radiance, such as resampling leaves."""
+def _check_environment(scene: Scene, clamp: bool) -> None:
+    """Set texels of an environment map that are no radiance, such as resampling leaves, to 0, or warn of
+    them."""
     import mitsuba as mi
     import numpy as np
 
@@ -141,10 +146,13 @@ def _check_environment(scene: Scene) -> None:
         return
     texels = np.array(data["data"])
     bad = ~(np.isfinite(texels) & (texels >= 0)).all(axis=-1)
-    if bad.any():
+    if bad.any() and clamp:
+        data["data"] = mi.TensorXf(np.where(np.isfinite(texels), np.maximum(texels, 0.0), 0.0))
+        data.update()
+    elif bad.any():
         _log.warning(
             "the environment map '%s' has texels that are negative or not finite (%.2g %%, the lowest %.3g): "
-            "they darken the picture; set them to 0",
+            "they darken the picture; load_scene(..., clamp_environment=True) sets them to 0",
             emitter.id(),
             100.0 * bad.mean(),
             np.nanmin(texels),

@@ -6,6 +6,7 @@ import logging
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import numpy as np
 import pytest
 import torch
@@ -19,7 +20,7 @@ from mbtf_core.directions import from_angles
 from mbtf_core.errors import InputError, MbtfError, UsageError
 from mbtf_core.pictures import Camera
 from mbtf_fit import Material
-from mbtf_fit.backends.mitsuba import load_scene
+from mbtf_fit.backends.mitsuba import load_scene, registration
 from mbtf_fit.material.transmittance import Transmittance
 
 LIGHT = from_angles(40.0, 20.0)
@@ -272,6 +273,28 @@ def test_environment_maps_with_negative_texels_are_warned_about(
         load_scene({"type": "scene", "sky": {"type": "constant"}})
         load_scene({"type": "scene"})
     assert [("'sky' has texels" in r.message) for r in caplog.records] == [True] * (planted is not None)
+
+
+@pytest.mark.parametrize("planted", [-3.0, np.nan, np.inf])
+def test_clamped_environment_maps_are_those_with_texels_of_zero(
+    planted: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In value and in the density of their sampling, at every texel and between them."""
+    monkeypatch.setattr(registration, "_log", None)
+    skies = []
+    for texel, clamp in ((planted, True), (0.0, False)):
+        texels = np.random.default_rng(0).random((8, 16, 3)).astype(np.float32)
+        texels[2, 3] = texel
+        sky = {"type": "envmap", "bitmap": mi.Bitmap(texels)}
+        skies.append(load_scene({"type": "scene", "sky": sky}, clamp_environment=clamp).environment())
+    directions = np.random.default_rng(1).normal(size=(3, 4096))
+    directions /= np.linalg.norm(directions, axis=0)
+    si, ds = dr.zeros(mi.SurfaceInteraction3f, 4096), dr.zeros(mi.DirectionSample3f, 4096)
+    si.wi, ds.d = mi.Vector3f(-directions), mi.Vector3f(directions)
+    for of in (lambda sky: sky.eval(si), lambda sky: sky.pdf_direction(si, ds)):
+        clamped, zero = (np.array(of(sky)) for sky in skies)
+        np.testing.assert_allclose(clamped, zero, rtol=1e-5, atol=1e-7)
+        assert zero.std() > 0.01
 
 
 def test_a_mesh_without_uv_is_refused(material: tuple[Path, Material], tmp_path: Path) -> None:
