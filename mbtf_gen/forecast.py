@@ -26,6 +26,8 @@ from mbtf_gen.render.estimates import Estimates, Stream, Target
 _PIECE_PATHS = 1 << 19
 # Fewer paths take less than a minute at half a million paths per second.
 LONG_RUN = 30_000_000
+# Likewise through fibers, which scatter light many times.
+LONG_FIBER_RUN = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -125,7 +127,9 @@ def forecast(job: Job, plan: RunPlan | None = None, seconds: float = 2.0) -> For
     )
 
 
-def announce(console: Console, paths: float, seconds: Callable[[], float], size: float) -> None:
+def announce(
+    console: Console, paths: float, seconds: Callable[[], float], size: float, fibers: bool = False
+) -> None:
     """State the expected time and size of a command, unless no machine needs a minute for it.
 
     Parameters
@@ -133,8 +137,9 @@ def announce(console: Console, paths: float, seconds: Callable[[], float], size:
     paths : that it traces
     seconds : measures its duration; called for many paths only
     size : bytes that it writes
+    fibers : whether the paths lead through fibers
     """
-    if paths >= LONG_RUN:
+    if paths >= (LONG_FIBER_RUN if fibers else LONG_RUN):
         console.note(expectation(seconds(), size))
 
 

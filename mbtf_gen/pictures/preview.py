@@ -50,6 +50,7 @@ class _Scene:
             paths,
             lambda: picture_seconds(estimator, self.camera, self.omega_i, paths),
             PNG_BYTES * options.size**2,
+            self.job.material.scatters,
         )
         image = render_reference(
             estimator, self.camera, self.omega_i, kind="pixel", spp=options.spp, seed=self.config.seed

@@ -50,6 +50,8 @@ if TYPE_CHECKING:
 
 # Pixels that cover less of a texel are finer than the data; 1 but for rounding.
 _TEXEL = 0.99
+# Shortest time of a picture that others are extrapolated from; shorter ones leave processors idle.
+_PILOT_SECONDS = 0.5
 _kept: tuple[Job, Any] | None = None
 
 
@@ -96,13 +98,16 @@ def _camera_rays(camera: Camera, estimator: Estimator) -> Any:
 
 
 def picture_seconds(estimator: Estimator, camera: Camera, omega_i: NDArray[np.float64], paths: int) -> float:
-    """Seconds to trace so many paths, measured by a small picture of the same view."""
-    small, spp = replace(camera, rows=64, columns=64), 128
-    seconds = 0.0
-    for _ in range(2):  # the first one compiles
+    """Seconds to trace so many paths, measured by small pictures of the same view, which grow until one takes
+    half a second."""
+    small, seconds = replace(camera, rows=64, columns=64), 0.0
+    render_reference(estimator, small, omega_i, spp=2)  # compiles
+    for spp in (2, 8, 32, 128, 128):
         start = time.perf_counter()
         render_reference(estimator, small, omega_i, spp=spp)
         seconds = time.perf_counter() - start
+        if seconds > _PILOT_SECONDS:
+            break
     return seconds * paths / (small.rows * small.columns * spp)
 
 
@@ -245,7 +250,7 @@ def render_missing(
         if runner.here and missing:
             paths, estimator = len(missing) * view.size**2 * view.spp, picture_estimator(job)
             seconds = partial(picture_seconds, estimator, cameras[0], omega_i, paths)
-            announce(console, paths, seconds, len(missing) * _picture_bytes(job, view))
+            announce(console, paths, seconds, len(missing) * _picture_bytes(job, view), job.material.scatters)
         for done in runner.map(render_picture, items):
             if done.error:
                 hint = "the same command renders the missing pictures"

@@ -12,9 +12,11 @@ import pytest
 from mbtf_core.app.console import CONSOLE, run
 from mbtf_core.data.shard_files import row_bytes
 from mbtf_core.files import folders
+from mbtf_core.pictures import Camera
 from mbtf_gen import forecast
 from mbtf_gen.cli.app import app
 from mbtf_gen.generation import run as generation
+from mbtf_gen.pictures import reference
 
 DRAFT = 400 * 128**2 + 65536
 
@@ -80,13 +82,51 @@ def test_a_long_run_states_time_and_size(
     assert seen == [False]
 
 
-@pytest.mark.parametrize(("paths", "line"), [(3e7, "expected: about 1:15, 27 GB on disk\n"), (2.9e7, "")])
-def test_only_many_paths_are_announced(paths: float, line: str, capsys: pytest.CaptureFixture[str]) -> None:
+LINE = "expected: about 1:15, 27 GB on disk\n"
+
+
+@pytest.mark.parametrize(
+    ("paths", "fibers", "line"), [(3e7, False, LINE), (2.9e7, False, ""), (1e6, True, LINE), (9e5, True, "")]
+)
+def test_only_many_paths_are_announced(
+    paths: float, fibers: bool, line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     def seconds() -> float:
         return 75.0 if line else pytest.fail("a measurement")
 
-    forecast.announce(CONSOLE, paths, seconds, 27e9)
+    forecast.announce(CONSOLE, paths, seconds, 27e9, fibers)
     assert capsys.readouterr().err == line
+
+
+@pytest.mark.parametrize(("rate", "most"), [(3e4, 1e5), (5e5, 8e5), (5e6, 2e6)])
+def test_the_pilot_of_a_picture_is_short_and_exact(
+    monkeypatch: pytest.MonkeyPatch, rate: float, most: float
+) -> None:
+    """At a rate of paths per second, after a compilation of 3 s."""
+    clock, traced = [0.0], [0]
+
+    def render(_: Any, camera: Camera, omega_i: Any, *, spp: int) -> None:
+        paths = camera.rows * camera.columns * spp
+        clock[0] += paths / rate + 3.0 * (not traced[0])
+        traced[0] += paths
+
+    monkeypatch.setattr(reference, "render_reference", render)
+    monkeypatch.setattr(reference, "time", SimpleNamespace(perf_counter=lambda: clock[0]))
+    found = reference.picture_seconds(None, Camera(rows=500), None, 10_000_000)  # type: ignore[arg-type]
+    assert found == pytest.approx(1e7 / rate)
+    assert traced[0] < most
+
+
+def test_pictures_of_fibers_state_their_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "cloth.yaml").write_text("weave: plain\n")
+    monkeypatch.setattr(reference, "picture_estimator", lambda job: None)
+    monkeypatch.setattr(reference, "picture_seconds", lambda *_: 75.0)
+    monkeypatch.setattr(reference, "render_picture", stop)
+    line = ["reference", str(tmp_path / "cloth.yaml"), "--tiles-across", "1", "--kind", "query"]
+    assert run(app, [*line, "--spp", "16", "-o", str(tmp_path / "out")]) == 130
+    assert "expected: about 1:15" in capsys.readouterr().err
 
 
 def test_a_short_run_needs_no_forecast(
