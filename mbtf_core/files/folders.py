@@ -369,19 +369,19 @@ class OutputFolder:
                 raise other_configuration(path, kind.what, old.depends, new.depends)
             for below in {path, *((path / name).parent for name in old.listed)}:
                 if below.is_dir():
-                    remove_unfinished(below, {kind.record, *(Path(name).name for name in old.listed)})
+                    remove_unfinished(below, {Path(name).name for name in old.listed})
             if overwrite:
                 for name in old.listed:
                     remove_file(path / name)
             else:
                 folder._record = old
         make_folder(path)
+        remove_unfinished(path, (kind.record, CONFIG_NAME))
         # The record first, also in place of that of a replaced output.
         if folder._record is new:
             folder._save()
         if config is not None:
             folder._claim.insert(0, CONFIG_NAME)
-            remove_unfinished(path, [CONFIG_NAME])
             write_document(path / CONFIG_NAME, dump_yaml(config), overwrite=overwrite)
         return folder
 

@@ -128,6 +128,8 @@ def copied(source: Path, path: Path, *, link: bool = False) -> Stored:
             temporary.unlink(missing_ok=True)
             os.link(source, temporary)
             os.replace(temporary, path)
+            # A rename does nothing if both names are links to one file already.
+            temporary.unlink(missing_ok=True)
             sync_folder(path.parent)
             return Stored(path.stat().st_size, file_sha256(path))
     with source.open("rb") as stream:

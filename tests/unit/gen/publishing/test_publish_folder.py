@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -31,28 +30,6 @@ def test_the_same_command_gives_the_same_bytes(form: str, shards: Path, tmp_path
     pytest.importorskip("pyarrow")
     first, second = (publish(shards, tmp_path / name, form=form) for name in ("a", "b"))
     assert contents(first) == contents(second)
-
-
-def test_an_interrupted_run_resumes(shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """After each of its files, once that is written but not recorded."""
-    whole, add = contents(publish(shards, tmp_path / "whole", form="webdataset")), module.OutputFolder.add
-    for number in range(len(whole) - 1):
-        left = iter(range(number))
-
-        def stopping(folder: Any, name: str, write: Any, left: Iterator[int] = left) -> Stored:
-            if next(left, None) is None:
-                (folder.path / name).parent.mkdir(exist_ok=True)
-                write(folder.path / name)
-                raise KeyboardInterrupt
-            return add(folder, name, write)
-
-        with monkeypatch.context() as patch:
-            patch.setattr(module.OutputFolder, "add", stopping)
-            with pytest.raises(KeyboardInterrupt):
-                publish(shards, tmp_path / "cut", form="webdataset")
-        publish(shards, tmp_path / "cut", form="webdataset")
-        assert contents(tmp_path / "cut") == whole
-        shutil.rmtree(tmp_path / "cut")
 
 
 def test_what_has_changed_is_replaced_on_request_only(shards: Path, tmp_path: Path) -> None:
