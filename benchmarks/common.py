@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import platform
+import re
 import sys
 import time
 from collections.abc import Callable, Mapping
@@ -90,6 +92,17 @@ def conformance_deviation(evaluator: Any, stored: Any) -> float:
     return float((np.abs(found - expected) / np.maximum(expected, max(expected.mean(), 1e-9))).max())
 
 
+def processor() -> str:
+    """Name of the processor, and the number of its cores that this process may use."""
+    try:
+        found = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text("utf-8"), re.MULTILINE)
+    except OSError:
+        found = None
+    name = found[1] if found else platform.processor() or platform.machine()
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return f"{name}, {cores} cores"
+
+
 def finish(figures: Any, thresholds: Mapping[str, Any], met: bool | None) -> int:
     """Print the last line, one JSON object, and give the exit code.
 
@@ -99,7 +112,8 @@ def finish(figures: Any, thresholds: Mapping[str, Any], met: bool | None) -> int
     thresholds : what the figures are held to, by name
     met : None where the thresholds do not apply to this machine
     """
-    print(json.dumps({"figures": figures, "thresholds": thresholds, "met": met}))
+    line = {"figures": figures, "thresholds": thresholds, "met": met, "processor": processor()}
+    print(json.dumps(line))
     return 1 if met is False else 0
 
 
