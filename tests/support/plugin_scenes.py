@@ -68,10 +68,12 @@ def sensor_of(camera: Camera, spp: int = 1) -> dict[str, Any]:
     }
 
 
-def through_pixel_centers(scene: Any, camera: Camera, integrator: Any) -> NDArray[np.float64]:
-    """What an integrator answers for the rays through the pixels' centers, (rows, columns, 3)."""
-    n = camera.rows * camera.columns
-    index = dr.arange(mi.UInt32, n)
+def through_pixel_centers(
+    scene: Any, camera: Camera, integrator: Any, samples: int = 1
+) -> NDArray[np.float64]:
+    """Means of what an integrator answers for rays through the pixels' centers, (rows, columns, 3)."""
+    n = camera.rows * camera.columns * samples
+    index = dr.arange(mi.UInt32, n) // samples
     at = mi.Point2f(
         (mi.Float(index % camera.columns) + 0.5) / camera.columns,
         (mi.Float(index // camera.columns) + 0.5) / camera.rows,
@@ -80,4 +82,4 @@ def through_pixel_centers(scene: Any, camera: Camera, integrator: Any) -> NDArra
     sampler = mi.load_dict({"type": "independent", "sample_count": 1})
     sampler.seed(0, n)
     value, _, _ = integrator.sample(scene, sampler, ray)
-    return np.array(value, np.float64).T.reshape(camera.rows, camera.columns, 3)
+    return np.array(value, np.float64).T.reshape(camera.rows, camera.columns, samples, 3).mean(2)

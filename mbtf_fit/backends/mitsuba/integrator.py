@@ -5,6 +5,10 @@ width grows per unit of length (Amanatides 1984; Akenine-Möller et al. 2019). T
 sensor's ray differentials of whole pixels. At a hit the projection of the square onto the surface is written
 to ``si.duv_dx`` and ``si.duv_dy``, which Mitsuba's own integrators leave at zero. The curvature of surfaces
 is neglected. The spread of a scattered ray's cone is bounded below by the density of its direction.
+
+At grazing angles a pixel's footprint is an ellipse, while those of materials are round. An elongated Gaussian
+is the mean of narrow ones along its major axis, so every hit on a material looks up one of them at random:
+the mean over samples has the elongated footprint, at the cost of one lookup each.
 """
 
 from __future__ import annotations
@@ -15,7 +19,8 @@ import drjit as dr
 import mitsuba as mi
 
 from mbtf_core.errors import UsageError
-from mbtf_fit.backends.mitsuba.bsdf import check_scene
+from mbtf_core.pictures import PIXEL_SIGMA
+from mbtf_fit.backends.mitsuba.bsdf import MbtfBSDF, check_scene
 from mbtf_fit.backends.mitsuba.names import INTEGRATOR_NAME, footprints_provided, refuse_unknown
 from mbtf_gen.engine.types import (
     DirectionSample3f,
@@ -31,6 +36,8 @@ from mbtf_gen.engine.types import (
     Vector3f,
 )
 
+# Largest ratio of a footprint's radii by default. At 5° above a plane the ratio is 11.
+MAX_ANISOTROPY = 16.0
 # Least spread of a scattered ray's cone, relative to 1/√density, the side of the solid angle per sample.
 SCATTERED = 0.25
 
@@ -59,12 +66,50 @@ def write_footprint(si: SurfaceInteraction3f, ray: Ray3f, width: Float) -> Surfa
     return si
 
 
+def narrow_footprint(
+    si: SurfaceInteraction3f, number: Float, most: Float, active: Mask
+) -> SurfaceInteraction3f:
+    """`si` at a random one of the round footprints whose mean is the elongated footprint.
+
+    Parameters
+    ----------
+    si : with uv partials
+    number : uniform random number
+    most : largest ratio of the radii; of more elongated footprints the minor radius is enlarged
+    active : hits to change
+    """
+    dx, dy = si.duv_dx, si.duv_dy
+    # Squared semi-axes of the image of the unit circle, and the direction of the major one.
+    xx, xy, yy = (
+        dr.square(dx.x) + dr.square(dy.x),
+        dx.x * dx.y + dy.x * dy.y,
+        dr.square(dx.y) + dr.square(dy.y),
+    )
+    mean, difference = 0.5 * (xx + yy), 0.5 * (xx - yy)
+    major = mean + dr.hypot(difference, xy)
+    determinant = dr.square(dx.x * dy.y - dx.y * dy.x)
+    minor = dr.maximum(dr.select(major > 0, determinant / major, 0.0), major / dr.square(most))
+    sin, cos = dr.sincos(0.5 * dr.atan2(xy, difference))
+    normal = dr.sqrt(2.0) * dr.erfinv(dr.clip(2.0 * number - 1.0, -0.999999, 0.999999))
+    step = PIXEL_SIGMA * dr.sqrt(dr.maximum(major - minor, 0.0)) * normal
+    si, side = type(si)(si), dr.sqrt(minor)
+    si.uv[active] = si.uv + step * mi.Vector2f(cos, sin)
+    si.duv_dx[active], si.duv_dy[active] = mi.Vector2f(side, 0.0), mi.Vector2f(0.0, side)
+    return si
+
+
 def camera_cone(ray: Ray3f, samples: int) -> tuple[Float, Float]:
     """(width, spread) of a sensor's ray, whose differentials Mitsuba has divided by √samples."""
     scale = float(samples) ** 0.5
     width = dr.cross(ray.o_x - ray.o, ray.o_y - ray.o)
     spread = dr.cross(ray.d_x - ray.d, ray.d_y - ray.d)
     return tuple(scale * dr.sqrt(dr.abs(dr.dot(area, ray.d))) for area in (width, spread))
+
+
+def materials_of(scene: Scene) -> list[Any]:
+    """The ``mbtf`` materials of a scene's surfaces, each once."""
+    found = {id(bsdf): bsdf for bsdf in (s.bsdf() for s in scene.shapes()) if isinstance(bsdf, MbtfBSDF)}
+    return [*found.values()]
 
 
 def may_transmit(scene: Scene) -> bool:
@@ -81,6 +126,8 @@ class ConePath(mi.SamplingIntegrator):
     max_depth : longest path in segments; 1 shows emitters alone, 2 direct light; -1: no limit (default)
     rr_depth : segments after which Russian roulette begins (default 5)
     hide_emitters : the camera does not see emitters (default false)
+    max_anisotropy : largest ratio of the radii of materials' footprints (default 16); 1: round ones of the
+        same area, which blur at grazing angles
     """
 
     def __init__(self, props: Properties) -> None:
@@ -91,7 +138,11 @@ class ConePath(mi.SamplingIntegrator):
         if depth < -1 or self.rr_depth < 1:
             raise UsageError("max_depth must be at least -1, rr_depth at least 1", where=INTEGRATOR_NAME)
         self.hidden = bool(props.get("hide_emitters", False))
-        refuse_unknown(props, ("max_depth", "rr_depth", "hide_emitters"), INTEGRATOR_NAME)
+        most = float(props.get("max_anisotropy", MAX_ANISOTROPY))
+        self.round, self.anisotropy = most == 1.0, dr.opaque(mi.Float, most)
+        if not 1.0 <= most <= 1024.0:
+            raise UsageError("max_anisotropy must be between 1 and 1024", where=INTEGRATOR_NAME)
+        refuse_unknown(props, ("max_depth", "rr_depth", "hide_emitters", "max_anisotropy"), INTEGRATOR_NAME)
 
     def render(self, scene: Scene, *arguments: Any, **options: Any) -> Any:
         """Render after a check of the scene.
@@ -111,7 +162,8 @@ class ConePath(mi.SamplingIntegrator):
         token = footprints_provided.set(True)
         try:
             cone = (mi.Ray3f(ray), width, spread)
-            return *self._trace(scene, sampler, *cone, mi.Bool(active), may_transmit(scene)), []
+            materials = [] if self.round else materials_of(scene)
+            return *self._trace(scene, sampler, *cone, mi.Bool(active), may_transmit(scene), materials), []
         finally:
             footprints_provided.reset(token)
 
@@ -125,6 +177,7 @@ class ConePath(mi.SamplingIntegrator):
         spread: Float,
         active: Mask,
         transmits: bool,
+        materials: list[Any],
     ) -> tuple[Spectrum, Mask]:
         radiance, throughput = mi.Spectrum(0.0), mi.Spectrum(1.0)
         depth, eta = mi.UInt32(0), mi.Float(1.0)
@@ -148,6 +201,11 @@ class ConePath(mi.SamplingIntegrator):
             # Light from a sampled emitter.
             si = write_footprint(si, ray, width)
             bsdf = si.bsdf()
+            if dr.hint(bool(materials), mode="scalar"):
+                filtered = mi.Bool(False)
+                for material in materials:
+                    filtered |= bsdf == mi.BSDFPtr(material)
+                si = narrow_footprint(si, sampler.next_1d(active), self.anisotropy, filtered)
             smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
             ds, light = scene.sample_emitter_direction(si, sampler.next_2d(active), not transmits, smooth)
             smooth &= ds.pdf > 0

@@ -189,7 +189,7 @@ MODELS = pytest.mark.parametrize(
 def test_a_white_sphere_vanishes_in_a_furnace(model: str, integrator: str, tmp_path: Path) -> None:
     """A material of value 1/π everywhere, with every sampling method."""
     write_material(tmp_path, model=model, constant=(1 / np.pi,) * 3)
-    seen = furnace({"type": "mbtf", "material": str(tmp_path), "networks": "cooperative"}, integrator, 0)
+    seen = furnace({"type": "mbtf", "material": str(tmp_path), "networks": "cooperative"}, integrator, 0, 256)
     np.testing.assert_allclose(seen.mean((0, 1)), 1.0, atol=0.005)
     # Near the silhouette and in the middle alike.
     np.testing.assert_allclose(seen.mean(2)[5:7, 5:7].mean(), 1.0, atol=0.03)

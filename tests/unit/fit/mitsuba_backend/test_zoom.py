@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +21,17 @@ FINEST = 6
 LIGHT = from_angles(60.0, 20.0)
 
 
-def filtered(values: NDArray[np.float64], sigma: float, rows: int) -> NDArray[np.float64]:
-    """A periodic texture (n, n) behind a Gaussian of `sigma` tile widths, at rows x rows texel centers."""
+def filtered(
+    values: NDArray[np.float64], sigma: float, rows: int, longer: float = 1.0, azimuth: float = 0.0
+) -> NDArray[np.float64]:
+    """A periodic texture (n, n), row 0 at the top, behind a Gaussian of `sigma` tile widths, and of so many
+    times as much along an azimuth (degrees), at rows x rows texel centers."""
     n = len(values)
     frequency = np.fft.fftfreq(n, 1.0 / n)
-    passed = np.exp(-2.0 * (np.pi * sigma) ** 2 * (frequency[:, None] ** 2 + frequency**2))
+    angle = np.radians(azimuth)
+    along = np.cos(angle) * frequency - np.sin(angle) * frequency[:, None]
+    square = frequency[:, None] ** 2 + frequency**2 + (longer**2 - 1.0) * along**2
+    passed = np.exp(-2.0 * (np.pi * sigma) ** 2 * square)
     # The center of a coarse texel lies between fine ones.
     shift = np.exp(1j * np.pi * frequency * (1.0 / rows - 1.0 / n))
     spectrum = np.fft.fft2(values) * passed * shift[:, None] * shift
@@ -59,25 +66,59 @@ def material(texture: NDArray[np.float64], tmp_path_factory: pytest.TempPathFact
     return folder
 
 
+def seen(
+    material: Path, camera: Camera, samples: int = 1, **options: Any
+) -> tuple[NDArray[np.float64], Callable[[NDArray[np.float64]], NDArray[np.float64]]]:
+    """What ``mbtf_path`` sees of a plane, and a function that reads a texture at its pixels."""
+    bsdf: Any = {"type": "mbtf", "material": str(material), "sampling": "cosine", "networks": "cooperative"}
+    mesh = plane(bsdf, half=2.0 * camera.tiles_across + 2.0)
+    parts = {"m": mesh, "e": directional(LIGHT), "sensor": sensor_of(camera)}
+    scene = mi.load_dict({"type": "scene", **parts})
+    integrator = mi.load_dict({"type": "mbtf_path", "max_depth": 2, **options})
+    u = camera.queries(LIGHT).u
+
+    def at_pixels(texture: NDArray[np.float64]) -> NDArray[np.float64]:
+        rows = len(texture)
+        row, column = (np.minimum((x * rows).astype(int), rows - 1) for x in (1.0 - u[..., 1], u[..., 0]))
+        return texture[row, column]
+
+    return through_pixel_centers(scene, camera, integrator, samples)[..., 0], at_pixels
+
+
 @pytest.mark.parametrize("tiles_across", [0.25, 1.0, 3.0, 10.0, 30.0, 300.0])
 def test_pixels_are_filtered(material: Path, texture: NDArray[np.float64], tiles_across: float) -> None:
     camera = Camera(
         80.0, -70.0, tiles_across=tiles_across, target=(0.3, 0.6), rows=64, columns=64, field_of_view=6.0
     )
-    bsdf: Any = {"type": "mbtf", "material": str(material), "sampling": "cosine", "networks": "cooperative"}
-    mesh = plane(bsdf, half=2.0 * tiles_across + 2.0)
-    parts = {"m": mesh, "e": directional(LIGHT), "sensor": sensor_of(camera)}
-    scene = mi.load_dict({"type": "scene", **parts})
-    integrator = mi.load_dict({"type": "mbtf_path", "max_depth": 2})
-    found = through_pixel_centers(scene, camera, integrator)[..., 0]
-    queries = camera.queries(LIGHT)
-    sigma = float(np.median(queries.sigma))
-    fine = filtered(texture, max(sigma, 0.5 * 2.0**-FINEST), len(texture))
-    row, column = (
-        np.minimum((x * len(fine)).astype(int), len(fine) - 1)
-        for x in (1.0 - queries.u[..., 1], queries.u[..., 0])
-    )
-    wanted = np.expm1(fine[row, column])
+    found, at_pixels = seen(material, camera, max_anisotropy=1)
+    sigma = float(np.median(camera.queries(LIGHT).sigma))
+    wanted = np.expm1(at_pixels(filtered(texture, max(sigma, 0.5 * 2.0**-FINEST), len(texture))))
     assert found.mean() == pytest.approx(wanted.mean(), rel=0.01)
     # Between two coarse levels a blend is no Gaussian, which little contrast shows.
     assert found.std() == pytest.approx(wanted.std(), rel=0.12, abs=0.025 * wanted.mean())
+
+
+def test_footprints_of_grazing_pixels_are_elongated(material: Path, texture: NDArray[np.float64]) -> None:
+    """A pixel at 15° covers 3.9 times as much along the view as across it."""
+    elevation, azimuth = 15.0, -50.0
+    # The minor radius, half of a pixel's width, is that of level 5.
+    camera = Camera(
+        elevation, azimuth, tiles_across=1.0, target=(0.3, 0.6), rows=32, columns=32, field_of_view=2.0
+    )
+    longer = 1.0 / np.sin(np.radians(elevation))
+
+    def compared(most: float, ratio: float) -> tuple[float, float]:
+        """Contrast over that of the filtered texture, and the RMS difference over its contrast."""
+        found, at_pixels = seen(material, camera, 256, max_anisotropy=most)
+        minor = camera.tiles_across / 64 * longer / ratio
+        wanted = np.expm1(at_pixels(filtered(texture, minor, len(texture), ratio, azimuth)))
+        difference = np.sqrt(np.mean((found - wanted) ** 2))
+        return found.std() / wanted.std(), difference / wanted.std()
+
+    contrast, difference = compared(16.0, longer)
+    assert contrast == pytest.approx(1.0, abs=0.04)
+    assert difference < 0.15
+    # A bound of 2 widens the minor radius; levels are interpolated.
+    contrast, difference = compared(2.0, 2.0)
+    assert contrast == pytest.approx(1.0, abs=0.08)
+    assert difference < 0.15
