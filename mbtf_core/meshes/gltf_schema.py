@@ -31,7 +31,6 @@ class GltfAsset(_Object):
     """Version of the format."""
 
     version: str
-    minVersion: str | None = None
 
 
 class GltfBuffer(_Object):

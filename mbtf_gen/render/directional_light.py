@@ -177,7 +177,3 @@ class SmoothedDirectional(mi.Emitter):
     def bbox(self) -> Any:
         """Empty: the light is at infinity."""
         return mi.ScalarBoundingBox3f()
-
-    def to_string(self) -> str:
-        """Description that Mitsuba prints."""
-        return f"SmoothedDirectional[width = {self.kernel.width_deg} degrees]"

@@ -101,7 +101,3 @@ class QuerySensor(mi.Sensor):
         """As :meth:`sample_ray`, without differentials."""
         ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
         return mi.RayDifferential3f(ray), weight
-
-    def to_string(self) -> str:
-        """Description that Mitsuba prints."""
-        return f"QuerySensor[queries = {dr.width(self.sigma)}]"

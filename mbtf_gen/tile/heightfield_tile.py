@@ -19,8 +19,6 @@ from mbtf_core.images.resample import resample
 from mbtf_gen.config.generator import MAX_SCALE, GeometrySection, NormalMode, Tracer
 from mbtf_gen.tile.heights import (
     HeightGrid,
-    detail_size,
-    repeats,
     residual_slopes,
     rms_slope,
     slope_angles,
@@ -64,8 +62,6 @@ class HeightFieldTile(Tile):
         Colors are linear Rec.709, (h, w, 3) or (3,); shares are (h, w) or one number, both in [0, 1];
         ``normal`` holds unit vectors (h, w, 3), x along u and y along v (OpenGL). Roles that a material lacks
         are missing. Without roughness, metallic and specular the surface is Lambert.
-    height_bits : int or None
-        8 or 16; None for floats.
     height_from : {"default", "material file", "given"}
         Where the height scale comes from.
     mesh : int or None
@@ -92,7 +88,6 @@ class HeightFieldTile(Tile):
     kind = "displaced"
 
     height: NDArray[np.float64]
-    height_bits: int | None = None
     height_from: Literal["default", "material file", "given"] = "default"
     mesh: int | None = None
     tracer: Tracer = "heightfield"
@@ -306,8 +301,6 @@ class HeightFieldTile(Tile):
             "heights": {
                 "codes": None if self.codes is None else asdict(self.codes),
                 "distinct": len(np.unique(self.height)),
-                "detail_texels": detail_size(self.height),
-                "repeats": [repeats(self.height, axis) for axis in (1, 0)],
             },
             "tiling": [{**asdict(s), "ratio": s.ratio, "tiles": not broken(s)} for s in self.seams],
             "albedo": self._albedo(),

@@ -9,11 +9,10 @@ import drjit as dr
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.scenes import HeightGrid, build_scene, lambert, mi, rocks
+from support.scenes import HeightGrid, build_scene, lambert, mesh_of_grid, mi, rocks
 
 from mbtf_gen.config.generator import Tracer
 from mbtf_gen.sampling.sobol import sequence
-from mbtf_gen.tile.heights import mesh_of_grid
 from mbtf_gen.tile.tracers.heightfield_tracer import HeightfieldGeometry
 
 N = 200_000
