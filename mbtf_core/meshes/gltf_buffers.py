@@ -18,7 +18,7 @@ from mbtf_core.config.settings import build
 from mbtf_core.errors import InputError, reason
 from mbtf_core.meshes.content import F64, MOST_TRIANGLES
 from mbtf_core.meshes.gltf_schema import GltfAccessor, GltfDocument
-from mbtf_core.paths import refuse_special, suggest_path
+from mbtf_core.meshes.numbers import read_bytes
 
 Bytes = NDArray[np.uint8]
 T = TypeVar("T")
@@ -83,7 +83,7 @@ class GltfFile:
         self.path = path
         self.files: dict[str, Path] = {}
         self.warnings: list[str] = []
-        content = _content(path)
+        content = read_bytes(path)
         text, self._chunk = _chunks(content, path) if content.startswith(_MAGIC) else (content, None)
         try:
             data = json.loads(text.decode("utf-8-sig"), parse_constant=_refuse_constant)
@@ -161,7 +161,7 @@ class GltfFile:
         try:
             places = [self.path.parent / name for name in names]
             path = next((place for place in places if place.is_file()), places[0])
-            content = _content(path)
+            content = read_bytes(path)
         except ValueError:
             raise InputError(f"names a file that cannot exist ('{uri[:80]}')", where=self.path) from None
         self.files[uri] = path
@@ -223,16 +223,6 @@ class GltfFile:
             what = f"{name} claims {shape[0]:,} elements, more than 'bufferViews.{view}' holds"
             raise InputError(what, where=self.path)
         return np.ndarray(shape, kind, data, offset, (stride, kind.itemsize))
-
-
-def _content(path: Path) -> bytes:
-    refuse_special(path)
-    try:
-        return path.read_bytes()
-    except FileNotFoundError:
-        raise InputError("no such file", where=path, hint=suggest_path(path)) from None
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
 
 
 def _chunks(content: bytes, path: Path) -> tuple[bytes, bytes | None]:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
+from mbtf_core.paths import opened
 
 
 def parse(text: bytes, kind: type) -> NDArray[Any] | None:
@@ -53,10 +54,8 @@ def read_bytes(path: Path) -> bytes:
     InputError
         It cannot be read, or is empty.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+    with opened(path) as stream:
+        data = stream.read()
     if not data:
         raise InputError("is empty", where=path)
     return data

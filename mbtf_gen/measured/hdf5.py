@@ -37,7 +37,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError, MbtfError, reason
-from mbtf_core.paths import refuse_special, suggest_path
 from mbtf_gen.measured.interface import (
     COMPLETE,
     F32,
@@ -65,7 +64,7 @@ _MOST_RATIO, _ANY_FILE_BYTES = 100, 1 << 26
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[Any]:
+def hdf5_file(path: Path) -> Iterator[Any]:
     """The h5py file of a path; whatever the library raises within becomes an InputError.
 
     Raises
@@ -74,9 +73,6 @@ def opened(path: Path) -> Iterator[Any]:
     """
     import h5py
 
-    refuse_special(path)
-    if not path.is_file():
-        raise InputError("no such file", where=path, hint=suggest_path(path))
     try:
         # A chunk that images share is decompressed once.
         with h5py.File(path, "r", rdcc_nbytes=_MOST_CHUNK_BYTES) as file:
@@ -148,7 +144,7 @@ class NeumipQueries:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        with opened(path) as file:
+        with hdf5_file(path) as file:
             if "ground_valid" in file:
                 what = "is the rendering of a scene (it has 'ground_valid'), not queries"
                 raise InputError(what, where=path)
@@ -179,7 +175,7 @@ class NeumipQueries:
         """Queries from `start` to before `stop`, those left out that cannot be used."""
         start, stop = max(start, 0), min(stop, self.count)
         number = np.arange(start, max(start, stop), dtype=np.int64)
-        with opened(self.path) as file:
+        with hdf5_file(self.path) as file:
             part = {
                 name: self._part(
                     data_set(file, self._light if name == LIGHT else name, self.path), start, stop
@@ -228,7 +224,7 @@ class NeuralBtf(ImageBtf):
 
     def __init__(self, path: Path) -> None:
         directions = {}
-        with opened(path) as file:
+        with hdf5_file(path) as file:
             shape = data_set(file, COLOR, path).shape
             if len(shape) != 4 or shape[3] != 3:
                 raise InputError(f"has the shape {shape} of '{COLOR}'; (N, H, W, 3) is expected", where=path)
@@ -255,7 +251,7 @@ class NeuralBtf(ImageBtf):
 
     @contextmanager
     def _opened(self) -> Iterator[Any]:
-        with opened(self.path) as file:
+        with hdf5_file(self.path) as file:
             color = data_set(file, COLOR, self.path)
             if color.shape != self._shape:
                 raise InputError("has changed while it was read", where=self.path)

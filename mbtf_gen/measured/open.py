@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from mbtf_core.errors import InputError
-from mbtf_core.paths import refuse_special, suggest_path
-from mbtf_gen.measured.hdf5 import COLOR, MAGIC, RADIUS, NeumipQueries, NeuralBtf, opened
+from mbtf_core.paths import opened
+from mbtf_gen.measured.hdf5 import COLOR, MAGIC, RADIUS, NeumipQueries, NeuralBtf, hdf5_file
 from mbtf_gen.measured.interface import MeasuredBtf, MeasuredQueries
 from mbtf_gen.measured.ubo2003 import Ubo2003
 from mbtf_gen.measured.ubo2014 import Ubo2014
@@ -42,21 +42,15 @@ def open_measured(path: str | Path) -> MeasuredBtf | MeasuredQueries:
     path = Path(path)
     if path.is_dir():
         return Ubo2003(path)
-    refuse_special(path)
-    try:
-        with path.open("rb") as stream:
-            start = stream.read(_START)
-    except FileNotFoundError:
-        raise InputError("no such file", where=path, hint=suggest_path(path)) from None
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+    with opened(path) as stream:
+        start = stream.read(_START)
     if start.startswith(b"!"):
         return Ubo2014(path)
     if start.startswith(_ZIP):
         return Ubo2003(path)
     if not start.startswith(MAGIC):
         raise _unknown(path, start)
-    with opened(path) as file:
+    with hdf5_file(path) as file:
         names = set(file)
     if COLOR not in names:
         raise InputError(f"is an HDF5 file without '{COLOR}'", where=path, hint=f"known are {_KNOWN}")

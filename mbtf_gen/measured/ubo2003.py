@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError, reason
 from mbtf_core.images.environment import read_linear
-from mbtf_core.paths import real_path, refuse_special
+from mbtf_core.paths import opened, real_path
 from mbtf_gen.measured.interface import COMPLETE, I64, ImageBtf, check_texels, from_angles
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".exr", ".hdr")
@@ -203,21 +203,16 @@ def _files_in(path: Path) -> list[str]:
 
 
 def _read_file(path: Path) -> bytes:
-    refuse_special(path)
-    try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise InputError(f"has more than {_MOST_BYTES:,} bytes", where=path)
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+    with opened(path) as stream:
+        content = stream.read(_MOST_BYTES + 1)
+    if len(content) > _MOST_BYTES:
+        raise InputError(f"has more than {_MOST_BYTES:,} bytes", where=path)
+    return content
 
 
 def _archive(path: Path) -> zipfile.ZipFile:
-    refuse_special(path)
     try:
         return zipfile.ZipFile(path)
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
     except Exception as error:  # a damaged archive may make the library raise anything
         # The table of contents is at its end.
         what = f"is not a valid zip archive ({reason(error)})"

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
-from mbtf_gen.tile.fibers.curve_file import lines, numbers, opened
+from mbtf_core.paths import opened
+from mbtf_gen.tile.fibers.curve_file import lines, numbers
 from mbtf_gen.tile.fibers.curves import F64, LEAST_POINTS, Curve
 from mbtf_gen.tile.fibers.draft import Draft
 
