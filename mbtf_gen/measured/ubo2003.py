@@ -152,12 +152,8 @@ def _floats(name: str, data: bytes) -> NDArray[np.float64]:
 def angles_of(name: str) -> tuple[float, float, float, float] | None:
     """Polar angle and azimuth of the light, then of the viewer, in degrees; None of other names."""
     stem = name.replace("\\", "/").rsplit("/", 1)[-1].lower()
-    return _angles_in(stem) if stem.endswith(SUFFIXES) else None
-
-
-def _angles_in(stem: str) -> tuple[float, float, float, float] | None:
     found = [pattern.findall(stem) for pattern in _ANGLES]
-    if any(len(numbers) != 1 for numbers in found):
+    if not stem.endswith(SUFFIXES) or any(len(numbers) != 1 for numbers in found):
         return None
     tl, pl, tv, pv = (float(numbers[0]) for numbers in found)
     return tl, pl, tv, pv
@@ -169,23 +165,11 @@ def _short(name: str) -> str:
 
 def _without_photographs(names: Sequence[str], path: Path) -> InputError:
     """What is wrong with files of which none is a photograph named by its directions."""
-    whole = [name for name in names if name.lower().endswith(_WHOLE)]
-    if whole:
-        kinds = " or ".join(sorted({PurePosixPath(name.lower()).suffix for name in whole}))
-        hint = f"give one of its {len(whole)} files {kinds}, such as '{_short(whole[0])}'"
-        hint = hint if len(whole) > 1 else f"give its file '{_short(whole[0])}'"
-        unpacked = "" if path.is_dir() else "unpack it and "
-        return InputError(
-            "has no images that are named by their directions", where=path, hint=unpacked + hint
-        )
-    named = [name for name in names if _angles_in(name.replace("\\", "/").rsplit("/", 1)[-1].lower())]
-    if named:
-        return InputError(
-            f"names files by directions whose format is not read, such as '{_short(named[0])}'",
-            where=path,
-            hint=f"convert them to one of {', '.join(SUFFIXES)}",
-        )
     what = "has no images that are named by their directions"
+    if whole := [name for name in names if name.lower().endswith(_WHOLE)]:
+        unpacked = "" if path.is_dir() else "unpack it and "
+        hint = f"{unpacked}give a file in it, such as '{_short(whole[0])}'"
+        return InputError(what, where=path, hint=hint)
     what += f", but files such as '{_short(names[0])}'" if names else ""
     return InputError(what, where=path, hint=f"{', '.join(SUFFIXES)} are read; {_EXAMPLE}")
 
