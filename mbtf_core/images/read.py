@@ -72,8 +72,8 @@ class Image:
 
     Attributes
     ----------
-    stored : (H, W, C) uint8, uint16 or float array
-        Row 0 is the top; C = 1 gray, 2 gray and alpha, 3 RGB, 4 RGBA; all finite.
+    stored : (H, W, C) uint8, uint16 or float array; row 0 is the top; C = 1 gray, 2 gray and alpha, 3 RGB, 4
+        RGBA; all finite
     path : the file
     tags : what the file declares; not applied here
     channels : names of the selected channels; empty where the file has no others

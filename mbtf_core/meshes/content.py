@@ -23,14 +23,11 @@ class Texture:
 
     Attributes
     ----------
-    pixels : (h, w) or (h, w, 3) float32 array
-        Linear Rec.709 colors or numbers, factors of the file not applied. Row 0 is the top, v → 1.
-    wrap : (Wrap, Wrap)
-        What lies beyond [0, 1] along u and along v.
-    nearest : bool
-        Whether the file asks for texels without interpolation.
-    to_uv : (2, 3) float64 array
-        Texture coordinates (v up) of the image from (u, v, 1) of the shape (v up).
+    pixels : (h, w) or (h, w, 3), linear Rec.709 colors or numbers, factors of the file not applied. Row 0 is
+        the top, v → 1.
+    wrap : what lies beyond [0, 1] along u and along v
+    nearest : whether the file asks for texels without interpolation
+    to_uv : (2, 3), texture coordinates (v up) of the image from (u, v, 1) of the shape (v up)
     """
 
     pixels: NDArray[np.float32]
@@ -65,24 +62,17 @@ class MeshShape:
 
     Attributes
     ----------
-    name : str
-        Its name in the file.
-    vertices : (n, 3) float64 array
-        Positions in the file's units and axes, nodes of scenes applied.
-    faces : (m, 3) int64 array
-        Vertices of each triangle, counterclockwise seen from outside.
-    uv : (n, 2) float64 array or None
-        Texture coordinates, v up.
-    colors : (n, 3) float64 array or None
-        Linear Rec.709 factors of the vertices on the base color.
-    values : dict of str to Value
-        What the file says of its material, by role of a ``material.yaml`` (``base_color``, ``roughness``, …);
-        defaults of the format included. A role that is missing was not given. ``opacity`` may have an
-        ``opacity_cutoff`` beside it, below which a point is a hole and above which it is opaque.
-    faults : dict of str to InputError
-        Why a role cannot be read. The tile raises it unless the ``material.yaml`` gives the role.
-    normals : (n, 3) float64 array or None
-        Unit normals of the vertices, which viewers shade with; tiles have those of their triangles.
+    name : its name in the file
+    vertices : (n, 3), positions in the file's units and axes, nodes of scenes applied
+    faces : (m, 3), vertices of each triangle, counterclockwise seen from outside
+    uv : (n, 2), texture coordinates, v up
+    colors : (n, 3), linear Rec.709 factors of the vertices on the base color
+    values : what the file says of its material, by role of a ``material.yaml`` (``base_color``,;
+        ``roughness``, …); defaults of the format included. A role that is missing was not given. ``opacity``
+        may have an ``opacity_cutoff`` beside it, below which a point is a hole and above which it is opaque.
+    faults : why a role cannot be read. The tile raises it unless the ``material.yaml`` gives the role.
+    normals : (n, 3), unit normals of the vertices, which viewers shade with; tiles have those of their
+        triangles
     """
 
     name: str
@@ -102,12 +92,10 @@ class MeshContent:
     Attributes
     ----------
     shapes : list of MeshShape
-    files : dict of str to Path
-        Files besides the first that were read, by the name that refers to them: buffers, materials, images.
-    up : {"y", "z"} or None
-        Axis that points up by the definition of the format; None where it has none.
-    warnings : list of str
-        What the file has that is not used, one line each, without its path.
+    files : files besides the first that were read, by the name that refers to them: buffers, materials,
+        images
+    up : {"y", "z"} or None, axis that points up by the definition of the format; None where it has none
+    warnings : what the file has that is not used, one line each, without its path
     """
 
     shapes: list[MeshShape]

@@ -59,24 +59,18 @@ class GltfFile:
 
     Parameters
     ----------
-    path : Path
-        A ``.gltf`` or ``.glb`` file; its content decides which.
+    path : a ``.gltf`` or ``.glb`` file; its content decides which
 
     Attributes
     ----------
-    document : GltfDocument
-        Its parts that are read.
-    extensions : list of str
-        Names of all extensions that it uses, sorted.
-    files : dict of str to Path
-        Files besides `path` that were read, by URI.
-    warnings : list of str
-        What is not used.
+    document : its parts that are read
+    extensions : names of all extensions that it uses, sorted
+    files : files besides `path` that were read, by URI
+    warnings : what is not used
 
     Raises
     ------
-    InputError
-        It is no glTF 2.0, it is damaged, or it requires an extension that is not read.
+    InputError : it is no glTF 2.0, it is damaged, or it requires an extension that is not read
     """
 
     def __init__(self, path: Path) -> None:
@@ -142,8 +136,7 @@ class GltfFile:
 
         Raises
         ------
-        InputError
-            The file is missing or cannot be read, or the URI is none of a file.
+        InputError : the file is missing or cannot be read, or the URI is none of a file
         """
         if match := _DATA_URI.match(uri):
             try:

@@ -18,10 +18,8 @@ def parse(text: bytes, kind: type) -> NDArray[Any] | None:
 
     Parameters
     ----------
-    text : bytes
-        The words.
-    kind : type
-        Of the numbers, ``np.float64`` or ``np.int64``.
+    text : the words
+    kind : of the numbers, ``np.float64`` or ``np.int64``
     """
     if not text.strip():
         return np.zeros(0, kind)
@@ -51,8 +49,7 @@ def read_bytes(path: Path) -> bytes:
 
     Raises
     ------
-    InputError
-        It cannot be read, or is empty.
+    InputError : it cannot be read, or is empty
     """
     with opened(path) as stream:
         data = stream.read()

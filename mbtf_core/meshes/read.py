@@ -25,8 +25,7 @@ def read_mesh_content(path: Path) -> MeshContent:
 
     Parameters
     ----------
-    path : Path
-        A file whose suffix is among ``MESH_FILES``.
+    path : a file whose suffix is among ``MESH_FILES``
 
     Returns
     -------
@@ -35,8 +34,7 @@ def read_mesh_content(path: Path) -> MeshContent:
 
     Raises
     ------
-    InputError
-        The format is not read, the file is missing or damaged, or it has no triangles.
+    InputError : the format is not read, the file is missing or damaged, or it has no triangles
     """
     reader = _READERS.get(path.suffix.lower())
     if reader is None:

@@ -290,14 +290,10 @@ def import_measured(
 
     Parameters
     ----------
-    job : Import
-        The measured BTF and the options.
-    folder : str or Path
-        Output folder, or a URL.
-    overwrite : bool
-        Replace the folder's data set.
-    progress : callable, optional
-        Called with the number of queries that are written.
+    job : the measured BTF and the options
+    folder : output folder, or a URL
+    overwrite : replace the folder's data set
+    progress : called with the number of queries that are written
 
     Returns
     -------
@@ -306,10 +302,8 @@ def import_measured(
 
     Raises
     ------
-    InputError
-        The file is damaged, or the folder contains something else.
-    PartialError
-        The folder cannot be written, or another process writes to it; the same command resumes.
+    InputError : the file is damaged, or the folder contains something else
+    PartialError : the folder cannot be written, or another process writes to it; the same command resumes
     """
     start = time.perf_counter()
     folder = DataFolder.open(folder)

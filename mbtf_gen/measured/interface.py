@@ -38,17 +38,14 @@ class MeasuredBtf(ABC):
     ----------
     path : the file or folder
     rows, columns : texels of an image; row 0 is the top
-    light, view : (pairs, 3) float32 array
-        Unit vectors of all pairs of the file; those at the horizon or below it are left out.
+    light, view : (pairs, 3), unit vectors of all pairs of the file; those at the horizon or below it are left
+        out
 
     Attributes
     ----------
-    cosine : bool or None
-        Whether the values include the cosine of the light; None: the file does not say.
-    at_once : int
-        Values that one call should read: many where each image is decoded as a whole.
-    left_out : int
-        Pairs that are left out.
+    cosine : whether the values include the cosine of the light; None: the file does not say
+    at_once : values that one call should read: many where each image is decoded as a whole
+    left_out : pairs that are left out
     """
 
     cosine: bool | None = None

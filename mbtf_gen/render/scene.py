@@ -50,14 +50,10 @@ class TileScene:
 
     Attributes
     ----------
-    aspect : float
-        H/W of the tile.
-    unit : float
-        Scene units per tile width.
-    geometry : TileGeometry
-        Geometry in scene units.
-    surface : Surface, PartSurface or MitsubaSurface
-        Reflection, see :mod:`mbtf_gen.render.bsdf.surface`.
+    aspect : H/W of the tile
+    unit : scene units per tile width
+    geometry : geometry in scene units
+    surface : Surface, PartSurface or MitsubaSurface; reflection, see :mod:`mbtf_gen.render.bsdf.surface`
     """
 
     aspect: float
@@ -78,19 +74,13 @@ def build_scene(
 
     Parameters
     ----------
-    shape : Tile or HeightGrid
-        The shape, in tile widths.
-    bsdf : mapping, mitsuba.BSDF or sequence of mapping
-        A Mitsuba dictionary, or a loaded BSDF; one dictionary per part of a mesh or kind of yarn.
-
-    Returns
-    -------
-    TileScene
+    shape : the shape, in tile widths
+    bsdf : mapping, mitsuba.BSDF or sequence of mapping; a Mitsuba dictionary, or a loaded BSDF; one
+        dictionary per part of a mesh or kind of yarn
 
     Raises
     ------
-    InputError
-        Mitsuba rejects the BSDF.
+    InputError : Mitsuba rejects the BSDF
     """
     surface, unit = load_surface(bsdf), unit_of(shape.aspect)
     return TileScene(shape.aspect, unit, shape.trace(unit, surface.transmits), surface)

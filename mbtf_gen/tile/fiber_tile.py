@@ -30,14 +30,10 @@ class FiberScattering:
 
     Attributes
     ----------
-    roughness : float
-        Longitudinal roughness β_M in [0, 1].
-    azimuthal_roughness : float
-        Azimuthal roughness β_N in [0, 1].
-    scale_tilt : float
-        Tilt of the cuticle scales in degrees.
-    ior : float
-        Index of refraction.
+    roughness : longitudinal roughness β_M in [0, 1]
+    azimuthal_roughness : azimuthal roughness β_N in [0, 1]
+    scale_tilt : tilt of the cuticle scales in degrees
+    ior : index of refraction
     """
 
     roughness: float = 0.3

@@ -145,14 +145,11 @@ def residual_slopes(
 
     Parameters
     ----------
-    normal : (h, w, 3) float array
-        Unit vectors, y along v.
-    grid : HeightGrid
-        Heights of the mesh.
-    mode : {"residual", "absolute", "off"}
-        ``residual``: slopes of the map less ``min(c, 1)`` times those of the mesh, so that slopes of both
-        count once and displacement beyond the map's stays. ``absolute``: the map's slopes in place of the
-        mesh's.
+    normal : (h, w, 3), unit vectors, y along v
+    grid : heights of the mesh
+    mode : {"residual", "absolute", "off"}, ``residual``: slopes of the map less ``min(c, 1)`` times those of
+        the mesh, so that slopes of both count once and displacement beyond the map's stays. ``absolute``: the
+        map's slopes in place of the mesh's.
 
     Returns
     -------

@@ -59,19 +59,12 @@ def read_mesh(spec: MeshFile, folder: Path) -> MeshTile:
 
     Parameters
     ----------
-    spec : MeshFile
-        What to read.
-    folder : Path
-        Folder that its file name is relative to.
-
-    Returns
-    -------
-    MeshTile
+    spec : what to read
+    folder : folder that its file name is relative to
 
     Raises
     ------
-    InputError
-        The file cannot be read, or its triangles are no tile.
+    InputError : the file cannot be read, or its triangles are no tile
     """
     path = named_file(folder, spec.mesh)
     content = read_mesh_content(path)

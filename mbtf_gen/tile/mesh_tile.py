@@ -32,11 +32,9 @@ class MeshPart:
 
     Attributes
     ----------
-    name : str
-        Its name in the file.
-    maps : dict of str to Value
-        Numbers, colors and textures by role (:data:`~mbtf_gen.tile.maps.material_file.ROLES`), ``base_color``
-        among them, and ``opacity_cutoff``. Textures have the same wrap mode along both axes.
+    name : its name in the file
+    maps : numbers, colors and textures by role (:data:`~mbtf_gen.tile.maps.material_file.ROLES`),;
+        ``base_color`` among them, and ``opacity_cutoff``. Textures have the same wrap mode along both axes.
     """
 
     name: str

@@ -60,8 +60,7 @@ def read_curves(path: Path) -> tuple[list[Curve], float]:
 
     Parameters
     ----------
-    path : Path
-        A ``.bcc``, else text: control points and radii of uniform cubic B-splines.
+    path : a ``.bcc``, else text: control points and radii of uniform cubic B-splines
 
     Returns
     -------
@@ -72,8 +71,7 @@ def read_curves(path: Path) -> tuple[list[Curve], float]:
 
     Raises
     ------
-    InputError
-        The file is unreadable or truncated, of another kind, or its numbers are no curves.
+    InputError : the file is unreadable or truncated, of another kind, or its numbers are no curves
     """
     with opened(path) as stream:
         if path.suffix.lower() == ".bcc":

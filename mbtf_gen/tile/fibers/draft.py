@@ -182,10 +182,8 @@ class Weave:
 
     Attributes
     ----------
-    draft : (wefts, warps) bool array
-        Whether the warp lies above, row by row from v → 1.
-    warp, weft : tuple of str
-        Names of the yarns, from u = 0, and from v → 1.
+    draft : (wefts, warps), whether the warp lies above, row by row from v → 1
+    warp, weft : names of the yarns, from u = 0, and from v → 1
     """
 
     draft: Draft

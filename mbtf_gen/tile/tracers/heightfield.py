@@ -149,14 +149,10 @@ def surface_interaction(
 
     Parameters
     ----------
-    p, n : Point3f, Normal3f
-        Position in scene units from the tile's center, and unit normal with z > 0.
-    d : Vector3f
-        Directions of the rays.
-    valid : Mask
-        Lanes with a hit. They get t = 0, the others t = ∞; distances are not needed.
-    size : (Float, Float)
-        Lengths of the tile along x and y.
+    p, n : position in scene units from the tile's center, and unit normal with z > 0
+    d : directions of the rays
+    valid : lanes with a hit. They get t = 0, the others t = ∞; distances are not needed.
+    size : lengths of the tile along x and y
     """
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(p))
     si.t = dr.select(valid, mi.Float(0.0), dr.inf)
