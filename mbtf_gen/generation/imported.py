@@ -165,7 +165,6 @@ class ImportOfImages(Import):
         self.notes = [f"{total - len(kept)} of {total} pairs of light and view are left out: too low"]
 
     def count(self, split: Split) -> int:
-        """Queries of a split, at most those of the file."""
         return min(self.requested(split), self.source.rows * self.source.columns * len(self.pairs[split]))
 
     def shards(self, finished: Callable[[ShardEntry], bool]) -> Iterator[tuple[ShardEntry, Arrays | None]]:
@@ -229,7 +228,6 @@ class ImportOfList(Import):
         self.notes = [f"{left_out} of {source.count} queries are left out: {why}"] if left_out else []
 
     def count(self, split: Split) -> int:
-        """Queries of a split, at most those of the file."""
         test = min(self.requested("test"), self.usable // 2)
         return test if split == "test" else min(self.requested("train"), self.usable - test)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import mitsuba as mi
 
@@ -18,6 +18,8 @@ from mbtf_gen.engine.types import BSDF
 from mbtf_gen.render.bsdf.plugin import PartSurface, SurfaceBSDF, surface_of
 from mbtf_gen.render.directional_light import SmoothedDirectional
 from mbtf_gen.render.sensor import QuerySensor
+from mbtf_gen.tile.heights import HeightGrid
+from mbtf_gen.tile.protocol import Tile
 from mbtf_gen.tile.tracers.protocol import TileGeometry
 
 LONG_SIDE = 32.0
@@ -31,17 +33,6 @@ def register_plugins() -> None:
     mi.register_sensor("mbtf_queries", lambda props: QuerySensor(props))
     mi.register_bsdf("mbtf_surface", lambda props: SurfaceBSDF(props))
     mi.register_emitter("mbtf_directional", lambda props: SmoothedDirectional(props))
-
-
-class TracedShape(Protocol):
-    """A tile, or the heights of one."""
-
-    @property
-    def aspect(self) -> float:
-        """H/W of the tile."""
-
-    def trace(self, unit: float, below: bool = False) -> TileGeometry:
-        """The surface as rays meet it, see :meth:`mbtf_gen.tile.protocol.Tile.trace`."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +59,7 @@ def unit_of(aspect: float) -> float:
 
 
 def build_scene(
-    shape: TracedShape, bsdf: Mapping[str, Any] | BSDF | Sequence[Mapping[str, Any]]
+    shape: Tile | HeightGrid, bsdf: Mapping[str, Any] | BSDF | Sequence[Mapping[str, Any]]
 ) -> TileScene:
     """Build the scene of a tile.
 

@@ -107,7 +107,6 @@ class FiberTile(Tile):
 
     @cached_property
     def thickness(self) -> float:
-        """Height of the fibers' slab, in tile widths."""
         return 0.0 - Bundle(self.curves).heights()[0]
 
     @property
@@ -120,7 +119,6 @@ class FiberTile(Tile):
         return Bundle(self.curves).copies((1.0, self.aspect))
 
     def trace(self, unit: float, below: bool = False) -> TileGeometry:
-        """The fibers as rays meet them."""
         from mbtf_gen.tile.tracers.curve_tracer import CurveGeometry
 
         runs, fiber = self.runs()
@@ -183,24 +181,19 @@ class FiberTile(Tile):
 
     @property
     def bsdf_type(self) -> str:
-        """``hair``."""
         return "hair"
 
     @property
     def scatters(self) -> bool:
-        """Light passes through fibers."""
         return True
 
     def narrowest_lobe(self) -> tuple[float, str]:
-        """That of :attr:`FiberScattering.narrowest`."""
         return min(s.narrowest for s in self.scattering), "narrowest lobe of the fibers"
 
     def properties(self) -> dict[str, Any]:
-        """Numbers of fibers and segments, for the manifest."""
         return {"fibers": len(self.curves), "segments": self.segments}
 
     def inspect(self, options: GeometrySection, finest: int | None = None) -> dict[str, Any]:
-        """Statistics as plain data; lengths are in tile widths."""
         self.configured(options)
         radii = np.concatenate([curve.control[:, 3] for curve in self.curves])
         bundle = Bundle(self.curves)
@@ -238,7 +231,6 @@ class FiberTile(Tile):
         }
 
     def describe(self, found: Mapping[str, Any], name: str) -> str:
-        """The data of :meth:`inspect` as text for people."""
         f = found["fibers"]
         low, high = f["radius"]
         radius = f"{low:.3g}" if low == high else f"{low:.3g} .. {high:.3g}"

@@ -67,7 +67,7 @@ class HeightGrid:
         if self.tracer == "heightfield":
             from mbtf_gen.tile.tracers.heightfield_tracer import HeightfieldGeometry
 
-            return HeightfieldGeometry.of(self, unit, below)
+            return HeightfieldGeometry.of(self.z, self.aspect, unit, below)
         if self.z.size > MOST_CELLS:
             raise InputError(
                 f"a mesh of {self.z.size:,} cells is too large for triangles; at most {MOST_CELLS:,} are",
