@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -83,6 +84,13 @@ class MeshShape:
     values: dict[str, Any] = field(default_factory=dict)
     faults: dict[str, InputError] = field(default_factory=dict)
     normals: F64 | None = None
+
+
+def joined(shapes: Sequence[MeshShape]) -> tuple[F64, NDArray[np.int64]]:
+    """Vertices (n, 3) and triangles (m, 3) of all shapes, one after the other."""
+    starts = np.cumsum([0, *(len(shape.vertices) for shape in shapes[:-1])])
+    faces = [shape.faces + start for shape, start in zip(shapes, starts, strict=True)]
+    return np.concatenate([shape.vertices for shape in shapes]), np.concatenate(faces)
 
 
 @dataclass(frozen=True)
