@@ -30,6 +30,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -120,12 +121,13 @@ def mitsuba_run(material: Tile, grid: HeightGrid, count: int, spp: int) -> Run:
     import mitsuba as mi
 
     from mbtf_gen.render.scene import unit_of
-    from mbtf_gen.tile.heights import mesh_of_grid
 
     unit = unit_of(grid.aspect)
     columns = max(1, round((count / grid.aspect) ** 0.5))
     rows = max(1, count // columns)
     half = 0.5 * unit
+    folder = TemporaryDirectory()
+    shapes = material.mitsuba_shapes(unit, Path(folder.name), material.surface())  # type: ignore[arg-type]
     # The camera looks down, its picture exactly as wide as the tile; pixels are square.
     above = mi.ScalarTransform4f().look_at(origin=[0, 0, 10 * unit], target=[0, 0, 0], up=[0, 1, 0])
     scene = mi.load_dict(
@@ -151,9 +153,10 @@ def mitsuba_run(material: Tile, grid: HeightGrid, count: int, spp: int) -> Run:
                 },
             },
             "light": {"type": "directional", "direction": [-0.5, -0.5, -0.707]},
-            "tile": mesh_of_grid(grid, unit, (0, 0), mi.load_dict(material.surface())),
+            **shapes,
         }
     )
+    folder.cleanup()
 
     last: NDArray[np.float64] | None = None
 
@@ -192,7 +195,8 @@ def measure_speed(material: Tile, arguments: argparse.Namespace) -> int:
     """Paths per second in the three ways."""
     import drjit as dr
 
-    grid = material.at(arguments.height_scale, MESH).grid
+    material = material.at(arguments.height_scale, MESH)
+    grid = material.grid
     assert grid is not None
     makers: dict[str, Any] = {
         "generator": generator_run,

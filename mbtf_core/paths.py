@@ -6,8 +6,10 @@ import difflib
 import os
 import re
 import stat
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 from mbtf_core.errors import InputError
 
@@ -101,6 +103,20 @@ def refuse_special(path: Path) -> None:
         return
     if kind is not None:
         raise InputError(f"is a {kind}, not a regular file", where=path, hint="save its content in a file")
+
+
+@contextmanager
+def opened(path: Path, wanted: Callable[[Path], bool] | None = None) -> Iterator[BinaryIO]:
+    """A regular file to read; what the system refuses, now or while it is read, is an InputError. `wanted` is
+    as of :func:`suggest_path`."""
+    refuse_special(path)
+    try:
+        with path.open("rb") as stream:
+            yield stream
+    except FileNotFoundError:
+        raise InputError("no such file", where=path, hint=suggest_path(path, wanted)) from None
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
 
 
 def real_path(path: str | Path) -> Path:

@@ -60,8 +60,8 @@ def check_floats(channels: dict[str, NDArray[Any]], path: Path) -> None:
             raise InputError(f"channel '{name}' stores integers", where=path, hint="save it as half or float")
 
 
-def read_channels(path: Path, max_pixels: int) -> dict[str, NDArray[Any]]:
-    """Channels (H, W) by name of all parts, float16, float32 or uint32.
+def read_layers(path: Path, max_pixels: int) -> tuple[dict[str, NDArray[Any]], dict[str, dict[str, Any]]]:
+    """Channels (H, W) by name of all parts, float16, float32 or uint32, and the header of each one's part.
 
     With several parts, the channels of a part carry its name in front, as layers do.
 
@@ -70,11 +70,6 @@ def read_channels(path: Path, max_pixels: int) -> dict[str, NDArray[Any]]:
     InputError : the file is damaged, larger than `max_pixels`, deep, subsampled or cropped (data window
         unlike the display window), or two channels have one name
     """
-    return read_layers(path, max_pixels)[0]
-
-
-def read_layers(path: Path, max_pixels: int) -> tuple[dict[str, NDArray[Any]], dict[str, dict[str, Any]]]:
-    """:func:`read_channels`, and the header of the part of each channel."""
     parts = _read(path, max_pixels)
     out: dict[str, NDArray[Any]] = {}
     heads: dict[str, dict[str, Any]] = {}
@@ -102,7 +97,7 @@ def read_parts(path: Path, max_pixels: int) -> dict[str, tuple[dict[str, Any], d
 
     Raises
     ------
-    InputError : as :func:`read_channels`, two parts have one name, or a channel stores integers
+    InputError : as :func:`read_layers`, two parts have one name, or a channel stores integers
     """
     out: dict[str, tuple[dict[str, Any], dict[str, NDArray[Any]]]] = {}
     for head, channels in _read(path, max_pixels, cropped=True):

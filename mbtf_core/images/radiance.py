@@ -13,7 +13,7 @@ from mbtf_core.images.color_spaces import from_chromaticities
 from mbtf_core.images.limits import MAX_PIXELS
 from mbtf_core.images.read import Image
 from mbtf_core.images.tags import Tags
-from mbtf_core.paths import refuse_special, suggest_path
+from mbtf_core.paths import opened
 
 # The line of the size of a picture whose first row is the top one. It ends the header; the largest header.
 _SIZE = re.compile(rb"\n-Y +(\d{1,9}) +\+X +(\d{1,9})\n")
@@ -34,11 +34,9 @@ def read_radiance(path: Path) -> Image:
     """
     import imagecodecs
 
-    refuse_special(path)
-    if not path.is_file():
-        raise InputError("no such file", where=path, hint=suggest_path(path))
+    with opened(path) as stream:
+        data = stream.read()
     try:
-        data = path.read_bytes()
         size = _SIZE.search(data[:_MOST_HEADER])
         if size is None:
             raise InputError("is no Radiance picture, or it is turned", where=path, hint="save it again")

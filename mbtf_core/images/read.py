@@ -25,7 +25,7 @@ from mbtf_core.images.exr import check_floats, choose_channels, lossy_excess, re
 from mbtf_core.images.limits import MAX_PIXELS, check_size
 from mbtf_core.images.tags import NO_TAGS, Tags, exr_tags, pillow_tags
 from mbtf_core.images.tiff import read_tiff
-from mbtf_core.paths import refuse_special, suggest_path
+from mbtf_core.paths import opened
 
 # Gray images stored as color JPG come back with channels that differ by rounding.
 _GRAY_CODES = 2
@@ -72,8 +72,8 @@ class Image:
 
     Attributes
     ----------
-    stored : (H, W, C) uint8, uint16 or float array
-        Row 0 is the top; C = 1 gray, 2 gray and alpha, 3 RGB, 4 RGBA; all finite.
+    stored : (H, W, C) uint8, uint16 or float array; row 0 is the top; C = 1 gray, 2 gray and alpha, 3 RGB, 4
+        RGBA; all finite
     path : the file
     tags : what the file declares; not applied here
     channels : names of the selected channels; empty where the file has no others
@@ -206,14 +206,8 @@ def _kind(path: Path) -> str:
     named = _KINDS.get(path.suffix.lower())
     if path.is_dir():
         raise InputError("is a folder, not an image", where=path)
-    refuse_special(path)
-    try:
-        with path.open("rb") as stream:
-            start = stream.read(8)
-    except FileNotFoundError:
-        raise InputError("no such file", where=path, hint=suggest_path(path, is_image)) from None
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+    with opened(path, is_image) as stream:
+        start = stream.read(8)
     if named is None:
         raise InputError(
             f"'{path.suffix}' is not an image format that is read",

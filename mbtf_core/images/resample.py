@@ -32,9 +32,8 @@ def resample(
     ----------
     image : (H, W, ...) float array
     rows, columns : new resolution
-    enlarge : {"linear", "cubic"}
-        Interpolation: the tent, which stays within the range of the data, or the cubic of Keys (1981) with
-        a = -1/2, which has continuous slopes and may overshoot.
+    enlarge : {"linear", "cubic"}, interpolation: the tent, which stays within the range of the data, or the
+        cubic of Keys (1981) with a = -1/2, which has continuous slopes and may overshoot
 
     Returns
     -------

@@ -75,7 +75,7 @@ def pillow_tags(info: Mapping[Any, Any], exif: Any, path: Path | None = None) ->
     ----------
     path : a PNG file, whose ``cICP`` Pillow does not read
     """
-    coded = None if path is None else _png_chunk(path, b"cICP")
+    coded = None if path is None else _cicp_chunk(path)
     gamma, primaries = info.get("gamma"), info.get("chromaticity")
     color: _Color = (None, None, None)
     if coded is not None:
@@ -203,13 +203,13 @@ def _pixel_size(tags: Any) -> float | None:
     return float(size) if 0 < size < math.inf else None
 
 
-def _png_chunk(path: Path, wanted: bytes) -> bytes | None:
-    """Content of a chunk that stands before the pixels of a PNG file, at most 64 bytes of it."""
+def _cicp_chunk(path: Path) -> bytes | None:
+    """Content of the chunk ``cICP`` of a PNG file, at most 64 bytes of it."""
     with path.open("rb") as stream:
         stream.seek(8)
         while len(head := stream.read(8)) == 8:
             size, name = struct.unpack(">I4s", head)
-            if name == wanted:
+            if name == b"cICP":
                 return stream.read(min(size, 64))
             if name in (b"IDAT", b"IEND"):
                 return None

@@ -22,13 +22,11 @@ class Companions:
 
     Parameters
     ----------
-    path : Path
-        The mesh; names are relative to its folder.
+    path : the mesh; names are relative to its folder
 
     Attributes
     ----------
-    files : dict of str to Path
-        What was found, by the name that the mesh gives it.
+    files : what was found, by the name that the mesh gives it
     warnings : list of str
     """
 
@@ -45,13 +43,11 @@ class Companions:
 
         Parameters
         ----------
-        name : str
-            As the mesh or its materials give it.
+        name : as the mesh or its materials give it
 
         Raises
         ------
-        InputError
-            There is none, or several whose names differ in case alone.
+        InputError : there is none, or several whose names differ in case alone
         """
         if name in self.files:
             return self.files[name]
@@ -78,8 +74,7 @@ class Companions:
 
         Raises
         ------
-        InputError
-            The image is missing, unreadable, or not within [0, 1].
+        InputError : the image is missing, unreadable, or not within [0, 1]
         """
         image = self._image(name)
         stored = image.stored

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -23,14 +24,11 @@ class Texture:
 
     Attributes
     ----------
-    pixels : (h, w) or (h, w, 3) float32 array
-        Linear Rec.709 colors or numbers, factors of the file not applied. Row 0 is the top, v → 1.
-    wrap : (Wrap, Wrap)
-        What lies beyond [0, 1] along u and along v.
-    nearest : bool
-        Whether the file asks for texels without interpolation.
-    to_uv : (2, 3) float64 array
-        Texture coordinates (v up) of the image from (u, v, 1) of the shape (v up).
+    pixels : (h, w) or (h, w, 3), linear Rec.709 colors or numbers, factors of the file not applied. Row 0 is
+        the top, v → 1.
+    wrap : what lies beyond [0, 1] along u and along v
+    nearest : whether the file asks for texels without interpolation
+    to_uv : (2, 3), texture coordinates (v up) of the image from (u, v, 1) of the shape (v up)
     """
 
     pixels: NDArray[np.float32]
@@ -65,24 +63,17 @@ class MeshShape:
 
     Attributes
     ----------
-    name : str
-        Its name in the file.
-    vertices : (n, 3) float64 array
-        Positions in the file's units and axes, nodes of scenes applied.
-    faces : (m, 3) int64 array
-        Vertices of each triangle, counterclockwise seen from outside.
-    uv : (n, 2) float64 array or None
-        Texture coordinates, v up.
-    colors : (n, 3) float64 array or None
-        Linear Rec.709 factors of the vertices on the base color.
-    values : dict of str to Value
-        What the file says of its material, by role of a ``material.yaml`` (``base_color``, ``roughness``, …);
-        defaults of the format included. A role that is missing was not given. ``opacity`` may have an
-        ``opacity_cutoff`` beside it, below which a point is a hole and above which it is opaque.
-    faults : dict of str to InputError
-        Why a role cannot be read. The tile raises it unless the ``material.yaml`` gives the role.
-    normals : (n, 3) float64 array or None
-        Unit normals of the vertices, which viewers shade with; tiles have those of their triangles.
+    name : its name in the file
+    vertices : (n, 3), positions in the file's units and axes, nodes of scenes applied
+    faces : (m, 3), vertices of each triangle, counterclockwise seen from outside
+    uv : (n, 2), texture coordinates, v up
+    colors : (n, 3), linear Rec.709 factors of the vertices on the base color
+    values : what the file says of its material, by role of a ``material.yaml`` (``base_color``,;
+        ``roughness``, …); defaults of the format included. A role that is missing was not given. ``opacity``
+        may have an ``opacity_cutoff`` beside it, below which a point is a hole and above which it is opaque.
+    faults : why a role cannot be read. The tile raises it unless the ``material.yaml`` gives the role.
+    normals : (n, 3), unit normals of the vertices, which viewers shade with; tiles have those of their
+        triangles
     """
 
     name: str
@@ -95,6 +86,13 @@ class MeshShape:
     normals: F64 | None = None
 
 
+def joined(shapes: Sequence[MeshShape]) -> tuple[F64, NDArray[np.int64]]:
+    """Vertices (n, 3) and triangles (m, 3) of all shapes, one after the other."""
+    starts = np.cumsum([0, *(len(shape.vertices) for shape in shapes[:-1])])
+    faces = [shape.faces + start for shape, start in zip(shapes, starts, strict=True)]
+    return np.concatenate([shape.vertices for shape in shapes]), np.concatenate(faces)
+
+
 @dataclass(frozen=True)
 class MeshContent:
     """All that was read from a file of triangles.
@@ -102,12 +100,10 @@ class MeshContent:
     Attributes
     ----------
     shapes : list of MeshShape
-    files : dict of str to Path
-        Files besides the first that were read, by the name that refers to them: buffers, materials, images.
-    up : {"y", "z"} or None
-        Axis that points up by the definition of the format; None where it has none.
-    warnings : list of str
-        What the file has that is not used, one line each, without its path.
+    files : files besides the first that were read, by the name that refers to them: buffers, materials,
+        images
+    up : {"y", "z"} or None, axis that points up by the definition of the format; None where it has none
+    warnings : what the file has that is not used, one line each, without its path
     """
 
     shapes: list[MeshShape]

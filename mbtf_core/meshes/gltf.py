@@ -48,8 +48,7 @@ class _Group:
 
     Attributes
     ----------
-    places : dict of int to (3, 3) array
-        Texture coordinates (u, v, 1) of each set from those of the first.
+    places : dict of int to (3, 3) array; texture coordinates (u, v, 1) of each set from those of the first
     """
 
     name: str
@@ -63,17 +62,11 @@ def read_gltf(path: Path) -> MeshContent:
 
     Parameters
     ----------
-    path : Path
-        A ``.gltf`` or ``.glb`` file.
-
-    Returns
-    -------
-    MeshContent
+    path : a ``.gltf`` or ``.glb`` file
 
     Raises
     ------
-    InputError
-        It is damaged, or has what is not read and cannot be left out.
+    InputError : it is damaged, or has what is not read and cannot be left out
     """
     file = GltfFile(path)
     materials = Materials(file)

@@ -18,7 +18,7 @@ from mbtf_core.config.settings import build
 from mbtf_core.errors import InputError, reason
 from mbtf_core.meshes.content import F64, MOST_TRIANGLES
 from mbtf_core.meshes.gltf_schema import GltfAccessor, GltfDocument
-from mbtf_core.paths import refuse_special, suggest_path
+from mbtf_core.meshes.numbers import read_bytes
 
 Bytes = NDArray[np.uint8]
 T = TypeVar("T")
@@ -59,31 +59,25 @@ class GltfFile:
 
     Parameters
     ----------
-    path : Path
-        A ``.gltf`` or ``.glb`` file; its content decides which.
+    path : a ``.gltf`` or ``.glb`` file; its content decides which
 
     Attributes
     ----------
-    document : GltfDocument
-        Its parts that are read.
-    extensions : list of str
-        Names of all extensions that it uses, sorted.
-    files : dict of str to Path
-        Files besides `path` that were read, by URI.
-    warnings : list of str
-        What is not used.
+    document : its parts that are read
+    extensions : names of all extensions that it uses, sorted
+    files : files besides `path` that were read, by URI
+    warnings : what is not used
 
     Raises
     ------
-    InputError
-        It is no glTF 2.0, it is damaged, or it requires an extension that is not read.
+    InputError : it is no glTF 2.0, it is damaged, or it requires an extension that is not read
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.files: dict[str, Path] = {}
         self.warnings: list[str] = []
-        content = _content(path)
+        content = read_bytes(path)
         text, self._chunk = _chunks(content, path) if content.startswith(_MAGIC) else (content, None)
         try:
             data = json.loads(text.decode("utf-8-sig"), parse_constant=_refuse_constant)
@@ -142,8 +136,7 @@ class GltfFile:
 
         Raises
         ------
-        InputError
-            The file is missing or cannot be read, or the URI is none of a file.
+        InputError : the file is missing or cannot be read, or the URI is none of a file
         """
         if match := _DATA_URI.match(uri):
             try:
@@ -161,7 +154,7 @@ class GltfFile:
         try:
             places = [self.path.parent / name for name in names]
             path = next((place for place in places if place.is_file()), places[0])
-            content = _content(path)
+            content = read_bytes(path)
         except ValueError:
             raise InputError(f"names a file that cannot exist ('{uri[:80]}')", where=self.path) from None
         self.files[uri] = path
@@ -223,16 +216,6 @@ class GltfFile:
             what = f"{name} claims {shape[0]:,} elements, more than 'bufferViews.{view}' holds"
             raise InputError(what, where=self.path)
         return np.ndarray(shape, kind, data, offset, (stride, kind.itemsize))
-
-
-def _content(path: Path) -> bytes:
-    refuse_special(path)
-    try:
-        return path.read_bytes()
-    except FileNotFoundError:
-        raise InputError("no such file", where=path, hint=suggest_path(path)) from None
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
 
 
 def _chunks(content: bytes, path: Path) -> tuple[bytes, bytes | None]:

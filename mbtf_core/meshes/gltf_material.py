@@ -54,8 +54,7 @@ class Materials:
 
     Parameters
     ----------
-    file : GltfFile
-        Takes up warnings, and the files of images that are read.
+    file : takes up warnings, and the files of images that are read
     """
 
     def __init__(self, file: GltfFile) -> None:
@@ -88,8 +87,8 @@ class Materials:
         Parameters
         ----------
         material : GltfMaterial
-        places : dict of int to (3, 3) array
-            Texture coordinates (u, v, 1) of each set from those of the shape, v up. Others are lacking.
+        places : dict of int to (3, 3) array; texture coordinates (u, v, 1) of each set from those of the
+            shape, v up. Others are lacking.
 
         Returns
         -------

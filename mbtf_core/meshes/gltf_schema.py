@@ -27,13 +27,6 @@ class _Object(BaseModel):
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
 
 
-class GltfAsset(_Object):
-    """Version of the format."""
-
-    version: str
-    minVersion: str | None = None
-
-
 class GltfBuffer(_Object):
     """Bytes of a file, of a data URI, or of the GLB's own chunk."""
 
@@ -50,27 +43,20 @@ class GltfBufferView(_Object):
     byteStride: Index = 0
 
 
-class GltfSparseIndices(_Object):
-    """Elements that a sparse accessor replaces."""
+class GltfSparsePart(_Object):
+    """Numbers of replaced elements, which have a type of their own, or the elements."""
 
     bufferView: Index
     byteOffset: Index = 0
-    componentType: int
-
-
-class GltfSparseValues(_Object):
-    """Their values."""
-
-    bufferView: Index
-    byteOffset: Index = 0
+    componentType: int = 0
 
 
 class GltfSparse(_Object):
     """Replaced elements of an accessor."""
 
     count: Size
-    indices: GltfSparseIndices
-    values: GltfSparseValues
+    indices: GltfSparsePart
+    values: GltfSparsePart
 
 
 class GltfAccessor(_Object):
@@ -90,7 +76,6 @@ class GltfImage(_Object):
 
     uri: str | None = None
     bufferView: Index | None = None
-    name: str = ""
 
 
 class GltfSampler(_Object):
@@ -259,7 +244,6 @@ class GltfScene(_Object):
 class GltfDocument(_Object):
     """A glTF document."""
 
-    asset: GltfAsset
     extensionsRequired: list[str] = []
     accessors: list[GltfAccessor] = []
     animations: list[Any] = []

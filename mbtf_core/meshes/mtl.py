@@ -40,12 +40,10 @@ class MtlMaterial:
 
     Attributes
     ----------
-    name : str
-        Its name.
-    path : Path
-        Its file.
-    statements : dict of str to (str, str, int)
-        Keyword, the rest of the line and its number, by keyword in lower case.
+    name : its name
+    path : its file
+    statements : dict of str to (str, str, int); keyword, the rest of the line and its number, by keyword in
+        lower case
     """
 
     name: str
@@ -57,8 +55,7 @@ class MtlMaterial:
 
         Raises
         ------
-        InputError
-            It is something else.
+        InputError : it is something else
         """
         if key not in self.statements:
             return None
@@ -85,17 +82,13 @@ def read_mtl(path: Path, found: dict[str, MtlMaterial], warnings: list[str]) -> 
 
     Parameters
     ----------
-    path : Path
-        The file.
-    found : dict of str to Material
-        Materials by name; those of the file are added. Of several of one name the first counts.
-    warnings : list of str
-        Warnings are added.
+    path : the file
+    found : materials by name; those of the file are added. Of several of one name the first counts.
+    warnings : warnings are added
 
     Raises
     ------
-    InputError
-        It cannot be read, or is no text.
+    InputError : it cannot be read, or is no text
     """
     data = read_bytes(path)
     if b"\0" in data:
@@ -133,10 +126,8 @@ def material_values(
 
     Parameters
     ----------
-    material : MtlMaterial
-        The material.
-    companions : Companions
-        Finds its images, collects them and warnings of them.
+    material : the material
+    companions : finds its images, collects them and warnings of them
 
     Returns
     -------

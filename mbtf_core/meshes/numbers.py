@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
+from mbtf_core.paths import opened
 
 
 def parse(text: bytes, kind: type) -> NDArray[Any] | None:
@@ -17,10 +18,8 @@ def parse(text: bytes, kind: type) -> NDArray[Any] | None:
 
     Parameters
     ----------
-    text : bytes
-        The words.
-    kind : type
-        Of the numbers, ``np.float64`` or ``np.int64``.
+    text : the words
+    kind : of the numbers, ``np.float64`` or ``np.int64``
     """
     if not text.strip():
         return np.zeros(0, kind)
@@ -50,13 +49,10 @@ def read_bytes(path: Path) -> bytes:
 
     Raises
     ------
-    InputError
-        It cannot be read, or is empty.
+    InputError : it cannot be read, or is empty
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+    with opened(path) as stream:
+        data = stream.read()
     if not data:
         raise InputError("is empty", where=path)
     return data

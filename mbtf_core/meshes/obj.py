@@ -33,17 +33,11 @@ def read_obj(path: Path) -> MeshContent:
 
     Parameters
     ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    MeshContent
+    path : the file
 
     Raises
     ------
-    InputError
-        The file is no OBJ file, has no triangles, or a polygon has corners that the file lacks.
+    InputError : the file is no OBJ file, has no triangles, or a polygon has corners that the file lacks
     """
     lines = _Lines(path)
     positions, colors = lines.positions()

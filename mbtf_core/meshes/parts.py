@@ -27,12 +27,9 @@ def with_colors(shape: MeshShape, path: Path, warnings: list[str]) -> MeshShape:
 
     Parameters
     ----------
-    shape : MeshShape
-        As it was read.
-    path : Path
-        Its file.
-    warnings : list of str
-        Warnings are added.
+    shape : as it was read
+    path : its file
+    warnings : warnings are added
     """
     colors, base = shape.colors, shape.values.get("base_color")
     if colors is None or np.all(colors == 1.0):

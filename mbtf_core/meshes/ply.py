@@ -35,17 +35,11 @@ def read_ply(path: Path) -> MeshContent:
 
     Parameters
     ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    MeshContent
+    path : the file
 
     Raises
     ------
-    InputError
-        The file is no PLY file, is damaged or cut, or has no triangles.
+    InputError : the file is no PLY file, is damaged or cut, or has no triangles
     """
     content = read_elements(path)
     vertex, face = _element(content, "vertex", path), content.elements.get("face")

@@ -39,10 +39,8 @@ class Property:
     Attributes
     ----------
     name : str
-    kind : str
-        NumPy's name of its type.
-    length : str or None
-        That of the length of a list; None for a single number.
+    kind : NumPy's name of its type
+    length : that of the length of a list; None for a single number
     """
 
     name: str
@@ -57,13 +55,11 @@ class Element:
     Attributes
     ----------
     name : str
-    count : int
-        Number of rows.
+    count : number of rows
     properties : list of Property
-    columns : dict of str to (count,) float64 array
-        Single numbers of the rows.
-    lists : dict of str to (float64 array, (count,) int64 array)
-        Lists: all of their numbers, one row after the other, and their lengths.
+    columns : dict of str to (count,) float64 array; single numbers of the rows
+    lists : dict of str to (float64 array, (count,) int64 array); lists: all of their numbers, one row after
+        the other, and their lengths
     """
 
     name: str
@@ -85,8 +81,7 @@ class Elements:
     ----------
     elements : dict of str to Element
     comments : list of str
-    rest : int
-        Bytes, or numbers of a text, after the last element.
+    rest : bytes, or numbers of a text, after the last element
     """
 
     elements: dict[str, Element]
@@ -99,8 +94,7 @@ def read_elements(path: Path) -> Elements:
 
     Raises
     ------
-    InputError
-        The file is no PLY file, ends early, or claims more rows than it has bytes.
+    InputError : the file is no PLY file, ends early, or claims more rows than it has bytes
     """
     data = read_bytes(path)
     end = re.search(rb"(?:^|[\r\n])end_header[ \t]*(\r\n|\n|\r)", data[:_MOST_HEADER])

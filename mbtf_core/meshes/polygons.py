@@ -28,10 +28,8 @@ def triangulate(points: F64, sizes: I64) -> tuple[I64, I64, int]:
 
     Parameters
     ----------
-    points : (c, 3) float64 array
-        Corners of all polygons, one polygon after the other.
-    sizes : (p,) int64 array
-        Number of corners of each polygon; those of fewer than three have no triangles.
+    points : (c, 3), corners of all polygons, one polygon after the other
+    sizes : (p,), number of corners of each polygon; those of fewer than three have no triangles
 
     Returns
     -------

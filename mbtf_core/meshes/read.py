@@ -10,7 +10,6 @@ from mbtf_core.meshes.content import MeshContent
 from mbtf_core.meshes.gltf import read_gltf
 from mbtf_core.meshes.obj import read_obj
 from mbtf_core.meshes.ply import read_ply
-from mbtf_core.paths import refuse_special, suggest_path
 
 _READERS: dict[str, Callable[[Path], MeshContent]] = {
     ".glb": read_gltf,
@@ -26,8 +25,7 @@ def read_mesh_content(path: Path) -> MeshContent:
 
     Parameters
     ----------
-    path : Path
-        A file whose suffix is among ``MESH_FILES``.
+    path : a file whose suffix is among ``MESH_FILES``
 
     Returns
     -------
@@ -36,15 +34,11 @@ def read_mesh_content(path: Path) -> MeshContent:
 
     Raises
     ------
-    InputError
-        The format is not read, the file is missing or damaged, or it has no triangles.
+    InputError : the format is not read, the file is missing or damaged, or it has no triangles
     """
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
         raise InputError(f"'{path.suffix}' is not a mesh", where=path, hint=f"give {', '.join(MESH_FILES)}")
-    refuse_special(path)
-    if not path.is_file():
-        raise InputError("no such file", where=path, hint=suggest_path(path))
     content = reader(path)
     if not content.shapes:
         raise InputError("has no triangles", where=path)

@@ -18,12 +18,9 @@ def seems_up(axis: Literal["y", "z"], vertices: NDArray[np.float64], faces: NDAr
 
     Parameters
     ----------
-    axis : {"y", "z"}
-        The axis in question.
-    vertices : (n, 3) float64 array
-        Positions in the axes of the file.
-    faces : (m, 3) int64 array
-        Vertices of each triangle.
+    axis : {"y", "z"}, the axis in question
+    vertices : (n, 3), positions in the axes of the file
+    faces : (m, 3), vertices of each triangle
     """
     corners = vertices[faces]
     up, other = (1, 2) if axis == "y" else (2, 1)

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from mbtf_core.errors import InputError
 from mbtf_core.images.environment import read_environment
 from mbtf_core.images.resample import resample
+from mbtf_core.meshes.content import joined
 from mbtf_core.meshes.read import read_mesh_content
 from mbtf_core.pictures import Camera, read_references
 from mbtf_fit.viewer.page import encode
@@ -103,9 +104,7 @@ def read_shape(path: Path) -> tuple[dict[str, F64], NDArray[np.int64], float]:
     """
     shapes = read_mesh_content(path).shapes
     counts = [len(shape.vertices) for shape in shapes]
-    starts = np.cumsum([0, *counts[:-1]])
-    faces = np.concatenate([shape.faces + start for shape, start in zip(shapes, starts, strict=True)])
-    vertices = np.concatenate([shape.vertices for shape in shapes])
+    vertices, faces = joined(shapes)
     if not len(faces) or not np.isfinite(vertices).all():
         raise InputError("has no triangles of finite vertices", where=path)
     bare = [shape.name for shape in shapes if shape.uv is None]
@@ -124,7 +123,7 @@ def read_shape(path: Path) -> tuple[dict[str, F64], NDArray[np.int64], float]:
     # Vertices of a part at one position and one place of the texture share their frame.
     part = np.repeat(np.arange(len(shapes)), counts)
     _, same = np.unique(np.column_stack([vertices, uv, part]), axis=0, return_inverse=True)
-    smooth = np.split(_normals(vertices, faces, same), starts[1:])
+    smooth = np.split(_normals(vertices, faces, same), np.cumsum(counts[:-1]))
     given = [shape.normals for shape in shapes]
     normals = np.concatenate([n if own is None else own for own, n in zip(given, smooth, strict=True)])
     center = (vertices.min(0) + vertices.max(0)) / 2

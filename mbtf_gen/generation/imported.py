@@ -27,7 +27,8 @@ from mbtf_gen.generation.folder import claim_folder
 from mbtf_gen.generation.manifest import Summary, finish, new_manifest
 from mbtf_gen.generation.shard_record import store_shard
 from mbtf_gen.job import shard_entries
-from mbtf_gen.measured.interface import MeasuredBtf, MeasuredQueries, QueryBlock
+from mbtf_gen.measured.hdf5 import NeumipQueries
+from mbtf_gen.measured.interface import MeasuredBtf
 from mbtf_gen.measured.open import open_measured
 from mbtf_gen.measured.ubo2003 import SUFFIXES
 from mbtf_gen.sampling.rng import Purpose, numpy_generator
@@ -164,7 +165,6 @@ class ImportOfImages(Import):
         self.notes = [f"{total - len(kept)} of {total} pairs of light and view are left out: too low"]
 
     def count(self, split: Split) -> int:
-        """Queries of a split, at most those of the file."""
         return min(self.requested(split), self.source.rows * self.source.columns * len(self.pairs[split]))
 
     def shards(self, finished: Callable[[ShardEntry], bool]) -> Iterator[tuple[ShardEntry, Arrays | None]]:
@@ -205,7 +205,7 @@ class ImportOfImages(Import):
 class ImportOfList(Import):
     """A list of queries. Those that are too low or have the footprint of no level are left out."""
 
-    def __init__(self, path: Path, config: ImportConfig, source: MeasuredQueries) -> None:
+    def __init__(self, path: Path, config: ImportConfig, source: NeumipQueries) -> None:
         # Lists are of NeuMIP, which divides by the cosine.
         super().__init__(path, config, source, cosine=False)
         self.source = source
@@ -228,7 +228,6 @@ class ImportOfList(Import):
         self.notes = [f"{left_out} of {source.count} queries are left out: {why}"] if left_out else []
 
     def count(self, split: Split) -> int:
-        """Queries of a split, at most those of the file."""
         test = min(self.requested("test"), self.usable // 2)
         return test if split == "test" else min(self.requested("train"), self.usable - test)
 
@@ -241,7 +240,7 @@ class ImportOfList(Import):
         waiting = self.entries("train")
         read = 0
         for number, (block, usable) in enumerate(self._blocks()):
-            found: Arrays = {name: block[name] for name in MEASURED[:-1]}  # type: ignore[literal-required]
+            found: Arrays = {name: block[name] for name in MEASURED[:-1]}
             found["value_a"] = block["value"] * np.float32(self.config.scale)
             if self.divides_by_cosine:
                 found["value_a"] /= found["omega_i"][:, 2:]
@@ -266,7 +265,7 @@ class ImportOfList(Import):
             self.entries("test"), {n: np.concatenate([part[n] for part in kept]) for n in MEASURED}
         )
 
-    def _blocks(self) -> Iterator[tuple[QueryBlock, I64]]:
+    def _blocks(self) -> Iterator[tuple[Arrays, I64]]:
         """The queries, block by block, and the rows of the usable ones."""
         least, most = (float(sigma_of_level(level)) for level in (MAX_LEVEL, 0))
         for start in range(0, self.source.count, _BLOCK):
@@ -289,14 +288,10 @@ def import_measured(
 
     Parameters
     ----------
-    job : Import
-        The measured BTF and the options.
-    folder : str or Path
-        Output folder, or a URL.
-    overwrite : bool
-        Replace the folder's data set.
-    progress : callable, optional
-        Called with the number of queries that are written.
+    job : the measured BTF and the options
+    folder : output folder, or a URL
+    overwrite : replace the folder's data set
+    progress : called with the number of queries that are written
 
     Returns
     -------
@@ -305,10 +300,8 @@ def import_measured(
 
     Raises
     ------
-    InputError
-        The file is damaged, or the folder contains something else.
-    PartialError
-        The folder cannot be written, or another process writes to it; the same command resumes.
+    InputError : the file is damaged, or the folder contains something else
+    PartialError : the folder cannot be written, or another process writes to it; the same command resumes
     """
     start = time.perf_counter()
     folder = DataFolder.open(folder)

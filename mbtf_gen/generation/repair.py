@@ -38,16 +38,11 @@ class RepairResult:
 
     Attributes
     ----------
-    folder : str
-        The data set.
-    faults : list of Fault
-        Faults before the repair.
-    shards, documents : list of str
-        Shards, and manifest, configuration and geometry, that were generated again.
-    complete : bool
-        Whether all shards are finished now.
-    paths, seconds : int, float
-        Paths traced, and duration of the run.
+    folder : the data set
+    faults : faults before the repair
+    shards, documents : shards, and manifest, configuration and geometry, that were generated again
+    complete : whether all shards are finished now
+    paths, seconds : int, float; paths traced, and duration of the run
     """
 
     folder: str

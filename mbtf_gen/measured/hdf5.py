@@ -31,13 +31,13 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.data.shard_files import Arrays
 from mbtf_core.errors import InputError, MbtfError, reason
-from mbtf_core.paths import refuse_special, suggest_path
 from mbtf_gen.measured.interface import (
     COMPLETE,
     F32,
@@ -45,7 +45,6 @@ from mbtf_gen.measured.interface import (
     I64,
     MOST_PAIRS,
     ImageBtf,
-    QueryBlock,
     check_texels,
     from_plane,
 )
@@ -65,7 +64,7 @@ _MOST_RATIO, _ANY_FILE_BYTES = 100, 1 << 26
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[Any]:
+def hdf5_file(path: Path) -> Iterator[Any]:
     """The h5py file of a path; whatever the library raises within becomes an InputError.
 
     Raises
@@ -74,9 +73,6 @@ def opened(path: Path) -> Iterator[Any]:
     """
     import h5py
 
-    refuse_special(path)
-    if not path.is_file():
-        raise InputError("no such file", where=path, hint=suggest_path(path))
     try:
         # A chunk that images share is decompressed once.
         with h5py.File(path, "r", rdcc_nbytes=_MOST_CHUNK_BYTES) as file:
@@ -148,7 +144,7 @@ class NeumipQueries:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        with opened(path) as file:
+        with hdf5_file(path) as file:
             if "ground_valid" in file:
                 what = "is the rendering of a scene (it has 'ground_valid'), not queries"
                 raise InputError(what, where=path)
@@ -175,11 +171,12 @@ class NeumipQueries:
         if self.base_radius is not None and not 0.0 < self.base_radius < math.inf:
             raise InputError("has an attribute 'base_radius' that is not a positive number", where=path)
 
-    def read(self, start: int, stop: int) -> QueryBlock:
-        """Queries from `start` to before `stop`, those left out that cannot be used."""
-        start, stop = max(start, 0), min(stop, self.count)
-        number = np.arange(start, max(start, stop), dtype=np.int64)
-        with opened(self.path) as file:
+    def read(self, start: int, stop: int) -> Arrays:
+        """Queries from `start` to before `stop`: ``u``, ``sigma``, ``omega_i``, ``omega_o`` and ``value`` in
+        our conventions. Left out are NaN or infinite numbers, directions at the horizon or below it, and
+        footprints without size."""
+        stop = min(stop, self.count)
+        with hdf5_file(self.path) as file:
             part = {
                 name: self._part(
                     data_set(file, self._light if name == LIGHT else name, self.path), start, stop
@@ -192,27 +189,24 @@ class NeumipQueries:
             sigma = part[RADIUS][:, 0]
             if self.base_radius is not None:
                 sigma = np.where(sigma == 0.0, self.base_radius, sigma)
-            out = QueryBlock(
-                query=number,
-                u=u,
-                sigma=sigma.astype(np.float32),
-                omega_i=from_plane(-part[LIGHT]),
-                omega_o=from_plane(-part[VIEW]),
-                value=part[COLOR].astype(np.float32),
-            )
+            out: Arrays = {
+                "u": u,
+                "sigma": sigma.astype(np.float32),
+                "omega_i": from_plane(-part[LIGHT]),
+                "omega_o": from_plane(-part[VIEW]),
+                "value": part[COLOR].astype(np.float32),
+            }
         ok = (out["sigma"] > 0) & np.isfinite(out["sigma"])
         for array in (out["u"], out["value"], out["omega_i"], out["omega_o"]):
             ok &= np.isfinite(array).all(axis=-1)
         ok &= np.minimum(out["omega_i"][:, 2], out["omega_o"][:, 2]) > HORIZON
-        return cast(QueryBlock, {name: cast(F32, array)[ok] for name, array in out.items()})
+        return {name: array[ok] for name, array in out.items()}
 
     def _part(self, found: Any, start: int, stop: int) -> NDArray[np.float64]:
         """Rows (stop - start, channels) of a data set."""
         channels = found.shape[-1]
         if math.prod(found.shape[:-1]) != self.count:
             raise InputError("has changed while it was read", where=self.path)
-        if stop <= start:
-            return np.empty((0, channels))
         first, last = start // self._each, -(-stop // self._each)
         rows = floats(found, first, last).reshape(-1, channels)
         return rows[start - first * self._each : stop - first * self._each]
@@ -228,7 +222,7 @@ class NeuralBtf(ImageBtf):
 
     def __init__(self, path: Path) -> None:
         directions = {}
-        with opened(path) as file:
+        with hdf5_file(path) as file:
             shape = data_set(file, COLOR, path).shape
             if len(shape) != 4 or shape[3] != 3:
                 raise InputError(f"has the shape {shape} of '{COLOR}'; (N, H, W, 3) is expected", where=path)
@@ -255,7 +249,7 @@ class NeuralBtf(ImageBtf):
 
     @contextmanager
     def _opened(self) -> Iterator[Any]:
-        with opened(self.path) as file:
+        with hdf5_file(self.path) as file:
             color = data_set(file, COLOR, self.path)
             if color.shape != self._shape:
                 raise InputError("has changed while it was read", where=self.path)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import Any, Protocol, TypedDict
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,17 +38,14 @@ class MeasuredBtf(ABC):
     ----------
     path : the file or folder
     rows, columns : texels of an image; row 0 is the top
-    light, view : (pairs, 3) float32 array
-        Unit vectors of all pairs of the file; those at the horizon or below it are left out.
+    light, view : (pairs, 3), unit vectors of all pairs of the file; those at the horizon or below it are left
+        out
 
     Attributes
     ----------
-    cosine : bool or None
-        Whether the values include the cosine of the light; None: the file does not say.
-    at_once : int
-        Values that one call should read: many where each image is decoded as a whole.
-    left_out : int
-        Pairs that are left out.
+    cosine : whether the values include the cosine of the light; None: the file does not say
+    at_once : values that one call should read: many where each image is decoded as a whole
+    left_out : pairs that are left out
     """
 
     cosine: bool | None = None
@@ -103,46 +100,6 @@ class ImageBtf(MeasuredBtf):
     @abstractmethod
     def _texels(self, file: Any, number: int, row: I64, column: I64) -> NDArray[Any]:
         """Values (n, 3) of an image at rows and columns (n,)."""
-
-
-class QueryBlock(TypedDict):
-    """Queries in the conventions of our data sets; the fields are parallel arrays.
-
-    Attributes
-    ----------
-    query : (n,) int64 array
-        Number of each query in its file.
-    u : (n, 2) float32 array
-        Position in [0, 1)².
-    sigma : (n,) float32 array
-        Standard deviation of the footprint in tile widths.
-    omega_i, omega_o : (n, 3) float32 array
-        Unit vectors towards the light and the viewer; z > 0.
-    value : (n, 3) float32 array
-        Radiance in 1/sr under an irradiance of 1 on the reference plane; linear RGB.
-    """
-
-    query: I64
-    u: F32
-    sigma: F32
-    omega_i: F32
-    omega_o: F32
-    value: F32
-
-
-class MeasuredQueries(Protocol):
-    """A list of queries."""
-
-    @property
-    def count(self) -> int:
-        """Queries of the file."""
-
-    def read(self, start: int, stop: int) -> QueryBlock:
-        """Queries from `start` to before `stop`.
-
-        Queries that cannot be used are left out: NaN or infinite numbers, a direction at the horizon or
-        below it, a footprint without size. The field `query` has the numbers of the others.
-        """
 
 
 def from_angles(theta: NDArray[np.floating[Any]], phi: NDArray[np.floating[Any]]) -> F32:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from mbtf_core.errors import InputError
-from mbtf_core.paths import refuse_special, suggest_path
-from mbtf_gen.measured.hdf5 import COLOR, MAGIC, RADIUS, NeumipQueries, NeuralBtf, opened
-from mbtf_gen.measured.interface import MeasuredBtf, MeasuredQueries
+from mbtf_core.paths import opened
+from mbtf_gen.measured.hdf5 import COLOR, MAGIC, RADIUS, NeumipQueries, NeuralBtf, hdf5_file
+from mbtf_gen.measured.interface import MeasuredBtf
 from mbtf_gen.measured.ubo2003 import Ubo2003
 from mbtf_gen.measured.ubo2014 import Ubo2014
 
@@ -17,23 +17,12 @@ _PACKED = (b"Rar!", b"7z\xbc\xaf", b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"\x28\xb5\
 _KNOWN = (
     "a .btf file (Bonn, DFMF), a folder or zip of photographs named by angles, or HDF5 of NeuMIP or NeuralBTF"
 )
-# UTIA's groups of images, and its tables of one texel.
-_UTIA = (".big", ".bin")
 # The first bytes, which tell what a file is.
 _START = 1 << 10
 
 
-def open_measured(path: str | Path) -> MeasuredBtf | MeasuredQueries:
+def open_measured(path: str | Path) -> MeasuredBtf | NeumipQueries:
     """Open a measured BTF or a data set of another program.
-
-    Parameters
-    ----------
-    path : str or Path
-
-    Returns
-    -------
-    MeasuredBtf or MeasuredQueries
-        The latter has ``count`` and ``read``.
 
     Raises
     ------
@@ -42,21 +31,15 @@ def open_measured(path: str | Path) -> MeasuredBtf | MeasuredQueries:
     path = Path(path)
     if path.is_dir():
         return Ubo2003(path)
-    refuse_special(path)
-    try:
-        with path.open("rb") as stream:
-            start = stream.read(_START)
-    except FileNotFoundError:
-        raise InputError("no such file", where=path, hint=suggest_path(path)) from None
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+    with opened(path) as stream:
+        start = stream.read(_START)
     if start.startswith(b"!"):
         return Ubo2014(path)
     if start.startswith(_ZIP):
         return Ubo2003(path)
     if not start.startswith(MAGIC):
         raise _unknown(path, start)
-    with opened(path) as file:
+    with hdf5_file(path) as file:
         names = set(file)
     if COLOR not in names:
         raise InputError(f"is an HDF5 file without '{COLOR}'", where=path, hint=f"known are {_KNOWN}")
@@ -72,10 +55,4 @@ def _unknown(path: Path, start: bytes) -> InputError:
         return InputError("is a web page, not a measured BTF", where=path, hint="download the file again")
     if start.startswith(_PACKED):
         return InputError("is an archive that is not read", where=path, hint="unpack it and give the folder")
-    if path.suffix.lower() in _UTIA:
-        return InputError(
-            "is a file of UTIA, which is not read",
-            where=path,
-            hint="export its images with UTIA's tools, and name them by angles: tl015_pl060_tv030_pv090.png",
-        )
     return InputError("is not a measured BTF of a known kind", where=path, hint=f"known are {_KNOWN}")

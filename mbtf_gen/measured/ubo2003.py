@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError, reason
 from mbtf_core.images.environment import read_linear
-from mbtf_core.paths import real_path, refuse_special
+from mbtf_core.paths import opened, real_path
 from mbtf_gen.measured.interface import COMPLETE, I64, ImageBtf, check_texels, from_angles
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".exr", ".hdr")
@@ -152,12 +152,8 @@ def _floats(name: str, data: bytes) -> NDArray[np.float64]:
 def angles_of(name: str) -> tuple[float, float, float, float] | None:
     """Polar angle and azimuth of the light, then of the viewer, in degrees; None of other names."""
     stem = name.replace("\\", "/").rsplit("/", 1)[-1].lower()
-    return _angles_in(stem) if stem.endswith(SUFFIXES) else None
-
-
-def _angles_in(stem: str) -> tuple[float, float, float, float] | None:
     found = [pattern.findall(stem) for pattern in _ANGLES]
-    if any(len(numbers) != 1 for numbers in found):
+    if not stem.endswith(SUFFIXES) or any(len(numbers) != 1 for numbers in found):
         return None
     tl, pl, tv, pv = (float(numbers[0]) for numbers in found)
     return tl, pl, tv, pv
@@ -169,23 +165,11 @@ def _short(name: str) -> str:
 
 def _without_photographs(names: Sequence[str], path: Path) -> InputError:
     """What is wrong with files of which none is a photograph named by its directions."""
-    whole = [name for name in names if name.lower().endswith(_WHOLE)]
-    if whole:
-        kinds = " or ".join(sorted({PurePosixPath(name.lower()).suffix for name in whole}))
-        hint = f"give one of its {len(whole)} files {kinds}, such as '{_short(whole[0])}'"
-        hint = hint if len(whole) > 1 else f"give its file '{_short(whole[0])}'"
-        unpacked = "" if path.is_dir() else "unpack it and "
-        return InputError(
-            "has no images that are named by their directions", where=path, hint=unpacked + hint
-        )
-    named = [name for name in names if _angles_in(name.replace("\\", "/").rsplit("/", 1)[-1].lower())]
-    if named:
-        return InputError(
-            f"names files by directions whose format is not read, such as '{_short(named[0])}'",
-            where=path,
-            hint=f"convert them to one of {', '.join(SUFFIXES)}",
-        )
     what = "has no images that are named by their directions"
+    if whole := [name for name in names if name.lower().endswith(_WHOLE)]:
+        unpacked = "" if path.is_dir() else "unpack it and "
+        hint = f"{unpacked}give a file in it, such as '{_short(whole[0])}'"
+        return InputError(what, where=path, hint=hint)
     what += f", but files such as '{_short(names[0])}'" if names else ""
     return InputError(what, where=path, hint=f"{', '.join(SUFFIXES)} are read; {_EXAMPLE}")
 
@@ -203,21 +187,16 @@ def _files_in(path: Path) -> list[str]:
 
 
 def _read_file(path: Path) -> bytes:
-    refuse_special(path)
-    try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise InputError(f"has more than {_MOST_BYTES:,} bytes", where=path)
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+    with opened(path) as stream:
+        content = stream.read(_MOST_BYTES + 1)
+    if len(content) > _MOST_BYTES:
+        raise InputError(f"has more than {_MOST_BYTES:,} bytes", where=path)
+    return content
 
 
 def _archive(path: Path) -> zipfile.ZipFile:
-    refuse_special(path)
     try:
         return zipfile.ZipFile(path)
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
     except Exception as error:  # a damaged archive may make the library raise anything
         # The table of contents is at its end.
         what = f"is not a valid zip archive ({reason(error)})"

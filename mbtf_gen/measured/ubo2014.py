@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
+from mbtf_core.paths import opened
 from mbtf_gen.measured.interface import COMPLETE, F32, I64, MOST_PAIRS, MeasuredBtf, check_texels, from_angles
 
 MAGIC = b"!DFMF08FCR"
@@ -105,13 +106,10 @@ class Ubo2014(MeasuredBtf):
     at_once = 1 << 20
 
     def __init__(self, path: Path) -> None:
-        try:
-            with path.open("rb") as stream:
-                cursor = _Cursor(stream, path)
-                self._header = header = _read_header(cursor)
-                self._pairs, self._texels = _map_factors(cursor, header)
-        except OSError as error:
-            raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+        with opened(path) as stream:
+            cursor = _Cursor(stream, path)
+            self._header = header = _read_header(cursor)
+            self._pairs, self._texels = _map_factors(cursor, header)
         view = np.repeat(header.view, header.lights, axis=0)
         super().__init__(path, header.rows, header.columns, header.light, view)
         self.cosine = header.cosine

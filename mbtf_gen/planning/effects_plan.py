@@ -72,7 +72,7 @@ class EffectsPlan:
         for e in self.effects:
             first, *rest = textwrap.wrap(e.explanation, _WIDTH - before) or [""]
             state = "on" if e.on else "off"
-            lines.append(f"{EFFECTS[e.name].description:<{_NAME}}{state:<5}{_bound_text(e):<{_BOUND}}{first}")
+            lines.append(f"{EFFECTS[e.name].description:<{_NAME}}{state:<5}{bound_text(e):<{_BOUND}}{first}")
             lines += [" " * before + more for more in rest]
         bound = self.bias_bound
         share = "0 %" if bound == 0 else f"at most {_percent(bound)}"
@@ -115,7 +115,7 @@ def without(plan: EffectsPlan, name: str) -> EffectsPlan:
     return replace(plan, effects=tuple(decided.values()))
 
 
-def _bound_text(effect: EffectDecision) -> str:
+def bound_text(effect: EffectDecision) -> str:
     """The bias bound of leaving an effect out, with its error or as an upper bound."""
     if effect.bias_bound is None:
         return "-"

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import html
 import re
-from collections.abc import Mapping
 from functools import partial
 from importlib.resources import files as resources
 from typing import Any
@@ -17,6 +16,8 @@ import jinja2
 from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.units import size_text
 from mbtf_gen.planning.effects import EFFECTS
+from mbtf_gen.planning.effects_plan import bound_text
+from mbtf_gen.planning.scene import EffectDecision
 from mbtf_gen.publishing.facts import TAGS, Facts
 from mbtf_gen.publishing.formats import SUFFIXES
 
@@ -76,16 +77,6 @@ def front_matter(facts: Facts) -> str:
     return dump_yaml(data)
 
 
-def _bound(effect: Mapping[str, Any]) -> str:
-    """Bias bound of an effect with its standard error, in percent of the mean value."""
-    if not effect["present"]:
-        return ""
-    if effect["bias_bound"] is None:
-        return "not measured"
-    error = f" ± {100 * effect['error']:.1g}" if effect["error"] else ""
-    return f"{100 * effect['bias_bound']:.2g}{error} %"
-
-
 def _grouped(facts: Facts) -> dict[str, list[int]]:
     """Sizes of files: shards by split, files of other folders by folder."""
     groups: dict[str, list[int]] = {}
@@ -121,6 +112,6 @@ def card_text(facts: Facts) -> str:
         shape=", ".join(str(n) for n in (-1, *facts.shapes[split]["value_a"])),
         configuration="" if facts.same_shapes else f'"{split}", ',
         labels={name: effect.description for name, effect in EFFECTS.items()},
-        bound=_bound,
+        bound=lambda effect: bound_text(EffectDecision(**effect)) if effect["present"] else "",
         files=_grouped(facts),
     )

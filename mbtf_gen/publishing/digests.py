@@ -72,10 +72,6 @@ def digest_faults(data: Dataset, path: Path) -> list[str]:
     data : the data set that was made again
     path : ``digests.json`` of the published one
 
-    Returns
-    -------
-    list of str
-
     Raises
     ------
     InputError : the file or a shard cannot be read

@@ -38,18 +38,12 @@ class Facts:
 
     Attributes
     ----------
-    data : Dataset
-        The data set.
-    config : PublishConfig
-        What its publishers say.
-    name : str
-        Name of the published data set.
-    samples : mapping of str to arrays
-        Evenly spaced rows of each split.
-    files : mapping of str to Stored
-        The published files by name.
-    maps : bool
-        Whether the input files of the material are among them.
+    data : the data set
+    config : what its publishers say
+    name : name of the published data set
+    samples : evenly spaced rows of each split
+    files : the published files by name
+    maps : whether the input files of the material are among them
     """
 
     data: Dataset

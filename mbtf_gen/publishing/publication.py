@@ -77,10 +77,6 @@ class Publication:
         with_maps : publish the input files of the material
         material : path of the material, if it was moved
 
-        Returns
-        -------
-        Publication
-
         Raises
         ------
         InputError : the data set is damaged or unfinished, or its material cannot be copied

@@ -58,10 +58,6 @@ def recipe_files(data: Dataset, *, with_maps: bool, moved: Path | None) -> dict[
     with_maps : whether the input files of the material are published
     moved : path of the material, if it is not where the data set was generated from
 
-    Returns
-    -------
-    dict of str to bytes or Path
-
     Raises
     ------
     InputError : the material cannot be read, has changed since, or consists of files that cannot be copied

@@ -45,14 +45,12 @@ class DirectionalLight:
 
     Attributes
     ----------
-    kind : {"lobe", "delta", "constant"}
-        ``constant`` is radiance 1 from above, and from below where rays can pass through the tile.
-    omega_i : Vector3f
-        Direction towards the light.
+    kind : {"lobe", "delta", "constant"}, ``constant`` is radiance 1 from above, and from below where rays can
+        pass through the tile
+    omega_i : direction towards the light
     inverse_irradiance : Float
         1/E(ω_i), with E the irradiance of the lobe on the reference plane.
-    kappa : Float
-        Concentration of the lobe.
+    kappa : concentration of the lobe
     """
 
     kind: Literal["lobe", "delta", "constant"]
@@ -177,7 +175,3 @@ class SmoothedDirectional(mi.Emitter):
     def bbox(self) -> Any:
         """Empty: the light is at infinity."""
         return mi.ScalarBoundingBox3f()
-
-    def to_string(self) -> str:
-        """Description that Mitsuba prints."""
-        return f"SmoothedDirectional[width = {self.kernel.width_deg} degrees]"

@@ -35,21 +35,15 @@ class Estimates:
 
     Attributes
     ----------
-    value_a, value_b : (n, 3) float32 array
-        Independent halves of spp/2 paths each, in 1/sr.
-    transmittance : (n,) float32 array or None
-        Fraction of the view rays that the opacity mask transmits; None without a mask.
-    paths, lost, capped : int
-        Paths traced, rays that passed through the surface without a hit, and rays that reached the cap on
-        crossings.
-    nonfinite, bad_samples : int, tuple of BadSample
-        Number of non-finite samples, which were drawn again, and the first ``MOST_LOCATED`` of them.
-    spp : (n,) int64 array or None
-        Paths of each query, both halves together; None where all have the same number.
-    path_variance : (n,) float32 array or None
-        Sample variance of each query's single paths, mean over channels, if requested.
-    target : TargetReached or None
-        Error reached under a target error.
+    value_a, value_b : (n, 3), independent halves of spp/2 paths each, in 1/sr
+    transmittance : (n,), fraction of the view rays that the opacity mask transmits; None without a mask
+    paths, lost, capped : paths traced, rays that passed through the surface without a hit, and rays that
+        reached the cap on crossings
+    nonfinite, bad_samples : int, tuple of BadSample; number of non-finite samples, which were drawn again,
+        and the first ``MOST_LOCATED`` of them
+    spp : (n,), paths of each query, both halves together; None where all have the same number
+    path_variance : (n,), sample variance of each query's single paths, mean over channels, if requested
+    target : error reached under a target error
     """
 
     value_a: NDArray[np.float32]

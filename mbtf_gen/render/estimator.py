@@ -51,20 +51,15 @@ class Estimator:
 
     Parameters
     ----------
-    tile : TileScene
-        The displaced tile, see :func:`~mbtf_gen.render.scene.build_scene`.
-    light : LightKernel or None
-        Smoothed directional light; None for constant radiance 1, from below as well where rays can pass
-        through the tile (white furnace).
-    transport : Transport
-        Effects that are simulated.
-    launch : int
-        Paths per kernel launch; does not change the values.
+    tile : the displaced tile, see :func:`~mbtf_gen.render.scene.build_scene`
+    light : smoothed directional light; None for constant radiance 1, from below as well where rays can pass
+        through the tile (white furnace)
+    transport : effects that are simulated
+    launch : paths per kernel launch; does not change the values
 
     Attributes
     ----------
-    holes : bool
-        Whether rays can pass through the tile, so that the transmittance is estimated.
+    holes : whether rays can pass through the tile, so that the transmittance is estimated
     """
 
     def __init__(
@@ -95,18 +90,12 @@ class Estimator:
         ----------
         queries : Queries
             n queries, with one leading axis.
-        spp : int or (n,) int64 array
-            Paths per query, both halves together; even.
-        stream : Stream
-            Random numbers to use.
-        source : RaySource, optional
-            Source of the first rays; the query sensor by default.
-        limit : int, optional
-            Largest number of surface interactions of a path; that of the transport by default.
-        roulette : int, optional
-            Interactions before Russian roulette starts; that of the transport by default.
-        path_variance : bool
-            Also estimate the sample variance of single paths.
+        spp : int or (n,) int64 array; paths per query, both halves together; even
+        stream : random numbers to use
+        source : source of the first rays; the query sensor by default
+        limit : largest number of surface interactions of a path; that of the transport by default
+        roulette : interactions before Russian roulette starts; that of the transport by default
+        path_variance : also estimate the sample variance of single paths
 
         Returns
         -------
@@ -115,12 +104,9 @@ class Estimator:
 
         Raises
         ------
-        ValueError
-            A number of paths is odd or zero.
-        InputError
-            A direction is not a unit vector.
-        PartialError
-            Samples stay non-finite after several draws; says which query and which effect.
+        ValueError : a number of paths is odd or zero
+        InputError : a direction is not a unit vector
+        PartialError : samples stay non-finite after several draws; says which query and which effect
         """
         check_unit(queries.omega_i, "omega_i")
         check_unit(queries.omega_o, "omega_o")

@@ -151,15 +151,11 @@ class PathTracer:
 
     Attributes
     ----------
-    tile : TileScene
-        Geometry and reflection.
-    transport : Transport
-        Effects that are simulated.
-    light : DirectionalLight
-        The light of each lane.
-    limit, roulette : UInt32
-        Largest number of surface interactions of a path, and interactions before Russian roulette starts;
-        opaque and of width 1, so that different numbers share the compiled kernel.
+    tile : geometry and reflection
+    transport : effects that are simulated
+    light : the light of each lane
+    limit, roulette : largest number of surface interactions of a path, and interactions before Russian
+        roulette starts; opaque and of width 1, so that different numbers share the compiled kernel
     """
 
     tile: TileScene
@@ -192,10 +188,8 @@ class PathTracer:
 
         Parameters
         ----------
-        ray : Ray3f
-            First rays, in scene units.
-        rng : SobolSampler
-            Random numbers, one sequence per lane.
+        ray : first rays, in scene units
+        rng : random numbers, one sequence per lane
 
         Returns
         -------

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import mitsuba as mi
 
@@ -18,6 +18,8 @@ from mbtf_gen.engine.types import BSDF
 from mbtf_gen.render.bsdf.plugin import PartSurface, SurfaceBSDF, surface_of
 from mbtf_gen.render.directional_light import SmoothedDirectional
 from mbtf_gen.render.sensor import QuerySensor
+from mbtf_gen.tile.heights import HeightGrid
+from mbtf_gen.tile.protocol import Tile
 from mbtf_gen.tile.tracers.protocol import TileGeometry
 
 LONG_SIDE = 32.0
@@ -33,31 +35,16 @@ def register_plugins() -> None:
     mi.register_emitter("mbtf_directional", lambda props: SmoothedDirectional(props))
 
 
-class TracedShape(Protocol):
-    """A tile, or the heights of one."""
-
-    @property
-    def aspect(self) -> float:
-        """H/W of the tile."""
-
-    def trace(self, unit: float, below: bool = False) -> TileGeometry:
-        """The surface as rays meet it, see :meth:`mbtf_gen.tile.protocol.Tile.trace`."""
-
-
 @dataclass(frozen=True)
 class TileScene:
     """A periodic tile as a scene.
 
     Attributes
     ----------
-    aspect : float
-        H/W of the tile.
-    unit : float
-        Scene units per tile width.
-    geometry : TileGeometry
-        Geometry in scene units.
-    surface : Surface, PartSurface or MitsubaSurface
-        Reflection, see :mod:`mbtf_gen.render.bsdf.surface`.
+    aspect : H/W of the tile
+    unit : scene units per tile width
+    geometry : geometry in scene units
+    surface : Surface, PartSurface or MitsubaSurface; reflection, see :mod:`mbtf_gen.render.bsdf.surface`
     """
 
     aspect: float
@@ -72,25 +59,19 @@ def unit_of(aspect: float) -> float:
 
 
 def build_scene(
-    shape: TracedShape, bsdf: Mapping[str, Any] | BSDF | Sequence[Mapping[str, Any]]
+    shape: Tile | HeightGrid, bsdf: Mapping[str, Any] | BSDF | Sequence[Mapping[str, Any]]
 ) -> TileScene:
     """Build the scene of a tile.
 
     Parameters
     ----------
-    shape : Tile or HeightGrid
-        The shape, in tile widths.
-    bsdf : mapping, mitsuba.BSDF or sequence of mapping
-        A Mitsuba dictionary, or a loaded BSDF; one dictionary per part of a mesh or kind of yarn.
-
-    Returns
-    -------
-    TileScene
+    shape : the shape, in tile widths
+    bsdf : mapping, mitsuba.BSDF or sequence of mapping; a Mitsuba dictionary, or a loaded BSDF; one
+        dictionary per part of a mesh or kind of yarn
 
     Raises
     ------
-    InputError
-        Mitsuba rejects the BSDF.
+    InputError : Mitsuba rejects the BSDF
     """
     surface, unit = load_surface(bsdf), unit_of(shape.aspect)
     return TileScene(shape.aspect, unit, shape.trace(unit, surface.transmits), surface)

@@ -22,16 +22,11 @@ def ray_through(point: Point2f, omega_o: Vector3f, unit: Float, aspect: Float, s
 
     Parameters
     ----------
-    point : Point2f
-        Position on the reference plane, uv.
-    omega_o : Vector3f
-        Direction towards the viewer.
-    unit : Float
-        Scene units per tile width.
-    aspect : Float
-        H/W of the tile.
-    start : Float
-        Height above the reference plane at which the ray starts, in scene units.
+    point : position on the reference plane, uv
+    omega_o : direction towards the viewer
+    unit : scene units per tile width
+    aspect : H/W of the tile
+    start : height above the reference plane at which the ray starts, in scene units
     """
     wrapped = point - dr.floor(point)
     plane = mi.Point3f((wrapped.x - 0.5) * unit, (wrapped.y - 0.5) * (unit * aspect), 0.0)
@@ -101,7 +96,3 @@ class QuerySensor(mi.Sensor):
         """As :meth:`sample_ray`, without differentials."""
         ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
         return mi.RayDifferential3f(ray), weight
-
-    def to_string(self) -> str:
-        """Description that Mitsuba prints."""
-        return f"QuerySensor[queries = {dr.width(self.sigma)}]"

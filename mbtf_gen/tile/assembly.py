@@ -101,7 +101,6 @@ def assemble(
         maps={role: maps[role] for role in ROLES if maps.get(role) is not None},
         bsdf=bsdf,
         height_scale=scale,
-        height_bits=load.facts["height"].bits,
         height_from="default" if spec.height.scale is None else "material file",
         files=load.files,
         digests=digests,

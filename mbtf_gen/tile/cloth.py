@@ -38,19 +38,12 @@ def cloth_tile(spec: ClothFile, folder: Path) -> FiberTile:
 
     Parameters
     ----------
-    spec : ClothFile
-        What to make.
-    folder : Path
-        Folder that its file names are relative to.
-
-    Returns
-    -------
-    FiberTile
+    spec : what to make
+    folder : folder that its file names are relative to
 
     Raises
     ------
-    InputError
-        A file is unreadable, its curves do not tile, or there are too many fibers.
+    InputError : a file is unreadable, its curves do not tile, or there are too many fibers
     """
     tile = _fibers(spec, folder)
     files = {

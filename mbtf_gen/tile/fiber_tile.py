@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_gen.config.generator import GeometrySection, QueriesSection, count_queries
+from mbtf_gen.config.generator import GeometrySection
 from mbtf_gen.tile.fibers.curves import F64, Bundle, Curve
 from mbtf_gen.tile.fibers.draft import Weave
 from mbtf_gen.tile.protocol import REFLECTION, Tile
@@ -22,8 +22,6 @@ from mbtf_gen.tile.tracers.protocol import TileGeometry
 _ABSORPTION = (5.969, -0.215, 2.532, -10.73, 5.574, 0.245)
 # σ_a of fibers without transmission. Light inside a fiber travels 1.5 radii at least, so e⁻¹⁵⁰ of it is left.
 _OPAQUE = 100.0
-# Bytes of a segment while it is traced, and paths per second on two cores: docs/results/cloth.md.
-_BYTES, _PATHS_PER_SECOND = 500, 5e4
 
 
 @dataclass(frozen=True)
@@ -32,14 +30,10 @@ class FiberScattering:
 
     Attributes
     ----------
-    roughness : float
-        Longitudinal roughness β_M in [0, 1].
-    azimuthal_roughness : float
-        Azimuthal roughness β_N in [0, 1].
-    scale_tilt : float
-        Tilt of the cuticle scales in degrees.
-    ior : float
-        Index of refraction.
+    roughness : longitudinal roughness β_M in [0, 1]
+    azimuthal_roughness : azimuthal roughness β_N in [0, 1]
+    scale_tilt : tilt of the cuticle scales in degrees
+    ior : index of refraction
     """
 
     roughness: float = 0.3
@@ -113,7 +107,6 @@ class FiberTile(Tile):
 
     @cached_property
     def thickness(self) -> float:
-        """Height of the fibers' slab, in tile widths."""
         return 0.0 - Bundle(self.curves).heights()[0]
 
     @property
@@ -126,7 +119,6 @@ class FiberTile(Tile):
         return Bundle(self.curves).copies((1.0, self.aspect))
 
     def trace(self, unit: float, below: bool = False) -> TileGeometry:
-        """The fibers as rays meet them."""
         from mbtf_gen.tile.tracers.curve_tracer import CurveGeometry
 
         runs, fiber = self.runs()
@@ -189,24 +181,19 @@ class FiberTile(Tile):
 
     @property
     def bsdf_type(self) -> str:
-        """``hair``."""
         return "hair"
 
     @property
     def scatters(self) -> bool:
-        """Light passes through fibers."""
         return True
 
     def narrowest_lobe(self) -> tuple[float, str]:
-        """That of :attr:`FiberScattering.narrowest`."""
         return min(s.narrowest for s in self.scattering), "narrowest lobe of the fibers"
 
     def properties(self) -> dict[str, Any]:
-        """Numbers of fibers and segments, for the manifest."""
         return {"fibers": len(self.curves), "segments": self.segments}
 
     def inspect(self, options: GeometrySection, finest: int | None = None) -> dict[str, Any]:
-        """Statistics as plain data; lengths are in tile widths."""
         self.configured(options)
         radii = np.concatenate([curve.control[:, 3] for curve in self.curves])
         bundle = Bundle(self.curves)
@@ -226,7 +213,6 @@ class FiberTile(Tile):
             },
             "yarns": self._yarns(),
             "weave": None if (w := self.weave) is None else w.properties(),
-            "cost": self._cost(finest),
             "warnings": list(self.warnings),
             "notes": list(self.notes),
         }
@@ -244,16 +230,8 @@ class FiberTile(Tile):
             )
         }
 
-    def _cost(self, finest: int | None) -> dict[str, float]:
-        """Memory of the fibers in bytes; paths of a data set of the default size, and their seconds."""
-        rows, columns = self.lattice(finest).shape()
-        queries = QueriesSection()
-        paths = queries.spp * count_queries(queries.train, rows * columns)
-        return {"memory": _BYTES * self.segments, "paths": paths, "seconds": paths / _PATHS_PER_SECOND}
-
     def describe(self, found: Mapping[str, Any], name: str) -> str:
-        """The data of :meth:`inspect` as text for people."""
-        f, cost = found["fibers"], found["cost"]
+        f = found["fibers"]
         low, high = f["radius"]
         radius = f"{low:.3g}" if low == high else f"{low:.3g} .. {high:.3g}"
         lines = [
@@ -270,11 +248,6 @@ class FiberTile(Tile):
                 f"along and {yarn['azimuthal_roughness']:g} around the fiber, scale tilt "
                 f"{yarn['scale_tilt']:g}°, ior {yarn['ior']:g}"
             )
-        lines.append(
-            f"cost        {cost['memory'] / 1e9:.2g} GB; {QueriesSection().train} queries: "
-            f"{cost['paths'] / 1e6:.3g} million paths, about {cost['seconds'] / 60.0:.2g} minutes on two "
-            "cores (measure: mbtf-gen plan)"
-        )
         lines += [f"warning     {text}" for text in found["warnings"]]
         return "\n".join(lines if self.weave is None else [*lines, *self.weave.describe()])
 

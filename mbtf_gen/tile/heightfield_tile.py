@@ -19,8 +19,6 @@ from mbtf_core.images.resample import resample
 from mbtf_gen.config.generator import MAX_SCALE, GeometrySection, NormalMode, Tracer
 from mbtf_gen.tile.heights import (
     HeightGrid,
-    detail_size,
-    repeats,
     residual_slopes,
     rms_slope,
     slope_angles,
@@ -64,8 +62,6 @@ class HeightFieldTile(Tile):
         Colors are linear Rec.709, (h, w, 3) or (3,); shares are (h, w) or one number, both in [0, 1];
         ``normal`` holds unit vectors (h, w, 3), x along u and y along v (OpenGL). Roles that a material lacks
         are missing. Without roughness, metallic and specular the surface is Lambert.
-    height_bits : int or None
-        8 or 16; None for floats.
     height_from : {"default", "material file", "given"}
         Where the height scale comes from.
     mesh : int or None
@@ -92,7 +88,6 @@ class HeightFieldTile(Tile):
     kind = "displaced"
 
     height: NDArray[np.float64]
-    height_bits: int | None = None
     height_from: Literal["default", "material file", "given"] = "default"
     mesh: int | None = None
     tracer: Tracer = "heightfield"
@@ -162,18 +157,15 @@ class HeightFieldTile(Tile):
         return what, f"give --height-scale {scale:.4g}, as {apart}, where heights have the same unit"
 
     def coarser_grid(self, most: int) -> HeightGrid:
-        """:attr:`grid`, or a coarser one of at most so many cells along each side."""
         if max(self.grid.z.shape) <= most:
             return self.grid
         return self.at(mesh=max(1, min(most, int(most / self.aspect)))).grid
 
     @property
     def thickness(self) -> float:
-        """Largest height difference of the grid, in tile widths."""
         return self.grid.displacement_range
 
     def at(self, height_scale: float | None = None, mesh: int | None = None) -> Self:
-        """The tile at another height scale and resolution of the mesh; None keeps the present ones."""
         given: dict[str, Any] = {} if mesh is None else {"mesh": mesh}
         if height_scale is not None:
             given |= {"height_scale": height_scale, "height_from": "given"}
@@ -185,11 +177,9 @@ class HeightFieldTile(Tile):
         return replace(found, tracer=options.tracer, max_displacement=options.max_displacement)
 
     def trace(self, unit: float, below: bool = False) -> TileGeometry:
-        """The heights as rays meet them."""
         return self.grid.trace(unit, below)
 
     def mitsuba_shapes(self, unit: float, folder: Path, bsdf: Mapping[str, Any]) -> dict[str, Any]:
-        """The triangles of the grid, from a file."""
         mesh = tile_mesh(self.grid)
         mesh.apply_translation([-0.5, -0.5 * self.aspect, 0.0])
         mesh.apply_scale(unit)
@@ -209,7 +199,6 @@ class HeightFieldTile(Tile):
     def surface(
         self, on: Collection[str] = REFLECTION, slopes: NDArray[np.float64] | None = None
     ) -> dict[str, Any]:
-        """Mitsuba dictionary of the reflectance, of all effects but opacity by default."""
         if self.bsdf is not None:
             return dict(self.bsdf)
         maps = in_use(self.maps, on)
@@ -219,53 +208,43 @@ class HeightFieldTile(Tile):
 
     @property
     def base_color(self) -> Color:
-        """(h, w, 3) or (3,) linear color."""
         return np.asarray(self.maps["base_color"])
 
     @property
     def images(self) -> dict[str, Any]:
-        """Maps and constants by role, heights included."""
         return {"height": self.height, **self.maps}
 
     def with_maps(self, **maps: Any) -> Self:
-        """The tile with some maps or constants replaced, and without those that are None."""
         given = {**self.maps, **maps}
         return replace(self, maps={name: value for name, value in given.items() if value is not None})
 
     def normal_slopes(self, mode: NormalMode = "residual") -> tuple[NDArray[np.float64], float] | None:
-        """Slopes that the normal map adds, see :func:`~mbtf_gen.tile.heights.residual_slopes`."""
         if "normal" not in self.maps or self.bsdf is not None or mode == "off":
             return None
         return residual_slopes(self.maps["normal"], self.grid, mode)
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the maps and of the heights."""
         return sum(np.asarray(values).nbytes for values in (self.height, *self.maps.values()))
 
     @property
     def bsdf_type(self) -> str | None:
-        """Type of the BSDF that replaces the maps; None without one."""
         return None if self.bsdf is None else str(self.bsdf["type"])
 
     @property
     def is_lambert(self) -> bool:
-        """Whether the base layer is Lambert because no roughness, metallic or specular is given."""
         return self.bsdf is None and not self.maps.keys() & LOBES.keys()
 
     @property
     def transmits(self) -> bool:
-        """Whether there is an opacity mask."""
         return "opacity" in self.maps
 
     def narrowest_lobe(self) -> tuple[float, str] | None:
-        """(width in radians, what it is of) of the narrowest lobe; None where a BSDF replaces the maps."""
         if self.bsdf is not None:
             return None
         return min([2.0, *lobe_widths(self.maps)]), "narrowest lobe"
 
     def properties(self) -> dict[str, Any]:
-        """Sizes of map and mesh, and the height scale, for the manifest."""
         return {
             "maps_shape": list(self.height.shape),
             "mesh_shape": list(self.grid.z.shape),
@@ -306,8 +285,6 @@ class HeightFieldTile(Tile):
             "heights": {
                 "codes": None if self.codes is None else asdict(self.codes),
                 "distinct": len(np.unique(self.height)),
-                "detail_texels": detail_size(self.height),
-                "repeats": [repeats(self.height, axis) for axis in (1, 0)],
             },
             "tiling": [{**asdict(s), "ratio": s.ratio, "tiles": not broken(s)} for s in self.seams],
             "albedo": self._albedo(),
@@ -357,7 +334,6 @@ class HeightFieldTile(Tile):
         }
 
     def describe(self, found: Mapping[str, Any], name: str) -> str:
-        """The data of :meth:`inspect` as text for people."""
         return inspection_text(found, name)
 
     def summary(self) -> str:
@@ -369,7 +345,6 @@ class HeightFieldTile(Tile):
         )
 
     def warnings_in_use(self) -> tuple[str, ...]:
-        """Warnings, those of the height scale in use included."""
         path, extent = self.files["height"], float(np.ptp(self.height))
         text = None
         if extent == 0:

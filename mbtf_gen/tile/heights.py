@@ -2,8 +2,8 @@
 
 Mesh vertices sit on texel centers of the grid, ``uv = ((i+½)/W, 1-(j+½)/H)``, heights are
 ``z = scale · h - max(scale · h)``, and the cell between the last and the first column (row) closes the
-period. Meshes for other renderers may have an apron of repeated cells around the period, so that a ray near
-its border meets surface on both sides.
+period. A mesh may have an apron of repeated cells around the period, so that a ray near its border meets
+surface on both sides.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class HeightGrid:
         if self.tracer == "heightfield":
             from mbtf_gen.tile.tracers.heightfield_tracer import HeightfieldGeometry
 
-            return HeightfieldGeometry.of(self, unit, below)
+            return HeightfieldGeometry.of(self.z, self.aspect, unit, below)
         if self.z.size > MOST_CELLS:
             raise InputError(
                 f"a mesh of {self.z.size:,} cells is too large for triangles; at most {MOST_CELLS:,} are",
@@ -116,29 +116,6 @@ def tile_mesh(grid: HeightGrid) -> Any:
     return mesh
 
 
-def mesh_of_grid(grid: HeightGrid, unit: float, apron: tuple[int, int], bsdf: Any) -> Any:
-    """Mitsuba mesh of one period of the tile centered on the origin, with `unit` scene units per tile width
-    and an `apron` of (rows, columns) cells on each side, for comparisons with unmodified Mitsuba."""
-    import mitsuba as mi
-
-    vertices = grid_vertices(grid, apron)
-    flat, faces = vertices.reshape(-1, 3), grid_faces(*vertices.shape[:2])
-    props = mi.Properties()
-    props["bsdf"] = bsdf
-    # Interpolated normals lose energy on coarse grids.
-    props["face_normals"] = True
-    mesh = mi.Mesh("tile", len(flat), len(faces), props=props, has_vertex_texcoords=True)
-    params = mi.traverse(mesh)
-    centered = (flat - (0.5, 0.5 * grid.aspect, 0.0)) * unit
-    params["vertex_positions"] = centered.astype(np.float32).ravel()
-    # Mitsuba's bitmaps have row 0 at v = 0, ours at v → 1: its texture coordinates are (u, 1-v).
-    texcoords = np.column_stack([flat[:, 0], 1.0 - flat[:, 1] / grid.aspect])
-    params["vertex_texcoords"] = texcoords.astype(np.float32).ravel()
-    params["faces"] = faces.ravel()
-    params.update()
-    return mesh
-
-
 # Smallest z, a slope of 20, that 8-bit maps resolve.
 _SMALLEST_Z = 0.05
 
@@ -168,14 +145,11 @@ def residual_slopes(
 
     Parameters
     ----------
-    normal : (h, w, 3) float array
-        Unit vectors, y along v.
-    grid : HeightGrid
-        Heights of the mesh.
-    mode : {"residual", "absolute", "off"}
-        ``residual``: slopes of the map less ``min(c, 1)`` times those of the mesh, so that slopes of both
-        count once and displacement beyond the map's stays. ``absolute``: the map's slopes in place of the
-        mesh's.
+    normal : (h, w, 3), unit vectors, y along v
+    grid : heights of the mesh
+    mode : {"residual", "absolute", "off"}, ``residual``: slopes of the map less ``min(c, 1)`` times those of
+        the mesh, so that slopes of both count once and displacement beyond the map's stays. ``absolute``: the
+        map's slopes in place of the mesh's.
 
     Returns
     -------
@@ -195,11 +169,6 @@ def residual_slopes(
     share = carried_share(stated[inner], carried[inner])
     taken = 1.0 if mode == "absolute" else min(share, 1.0)
     return stated - taken * carried, share
-
-
-# A repetition is a peak of the autocorrelation of at least the first value after a dip below the second.
-_PEAK, _DIP = 0.8, 0.5
-_SHORTEST = 4
 
 
 def triangle_slopes(grid: HeightGrid) -> NDArray[np.float64]:
@@ -228,48 +197,3 @@ def rms_slope(grid: HeightGrid) -> float:
     along_u = np.mean((np.roll(grid.z, -1, 1) - grid.z) ** 2) * columns**2
     along_v = np.mean((np.roll(grid.z, -1, 0) - grid.z) ** 2) * (rows / grid.aspect) ** 2
     return float(np.sqrt(along_u + along_v))
-
-
-def autocorrelation(height: NDArray[np.floating[Any]], axis: int) -> NDArray[np.float64]:
-    """Periodic autocorrelation of heights (H, W) at lags 0 … half the size along an axis; 1 at lag 0.
-
-    All zeros beyond lag 0 for constant heights.
-    """
-    size = height.shape[axis]
-    lines = np.moveaxis(np.asarray(height, np.float64), axis, -1)
-    power = np.abs(np.fft.rfft(lines - lines.mean(), axis=-1)) ** 2
-    covariance = np.fft.irfft(power.mean(axis=0), size)[: size // 2 + 1]
-    return covariance / covariance[0] if covariance[0] > 0 else np.eye(1, len(covariance))[0]
-
-
-def detail_size(height: NDArray[np.floating[Any]]) -> float:
-    """Half width of the autocorrelation in texels, interpolated, the smaller one of both axes."""
-    return min(_half_width(autocorrelation(height, axis)) for axis in (0, 1))
-
-
-def _half_width(correlation: NDArray[np.float64]) -> float:
-    below = np.nonzero(correlation < 0.5)[0]
-    if not len(below):
-        return float(len(correlation))
-    before = int(below[0]) - 1
-    drop = correlation[before] - correlation[before + 1]
-    return before + float((correlation[before] - 0.5) / drop)
-
-
-def repeats(height: NDArray[np.floating[Any]], axis: int) -> int:
-    """Number of repetitions of heights (H, W) along an axis within the tile; 1 without repetition.
-
-    Found at the first lag at which the autocorrelation peaks at 0.8 or more after falling below 0.5.
-    """
-    correlation = autocorrelation(height, axis)
-    dip = np.nonzero(correlation < _DIP)[0]
-    if not len(dip):
-        return 1
-    # It is even about half the size, where a map that repeats twice has its peak.
-    beyond = correlation[-1] if height.shape[axis] % 2 else correlation[max(-2, -len(correlation))]
-    inner = correlation[1:]
-    after = np.append(correlation[2:], beyond)
-    peak = (inner >= _PEAK) & (inner >= correlation[:-1]) & (inner >= after)
-    lags = np.nonzero(peak)[0] + 1
-    lags = lags[(lags > dip[0]) & (lags >= _SHORTEST)]
-    return max(1, round(height.shape[axis] / lags[0])) if len(lags) else 1

@@ -120,7 +120,6 @@ def _unused(found: Mapping[str, Any]) -> list[str]:
 
 def _geometry(found: Mapping[str, Any]) -> list[str]:
     g, h, file = found["geometry"], found["heights"], found["maps"]["height"]
-    u, v = h["repeats"]
     out = [
         f"height     scale {g['height_scale']:.4g} ({g['height_scale_from']}), stored {file['low']:.4g} .. "
         f"{file['high']:.4g}, displacement range {g['displacement_range']:.4g} tile widths",
@@ -128,8 +127,6 @@ def _geometry(found: Mapping[str, Any]) -> list[str]:
         f"{g['slope_kept']:.0%} of the map's RMS slope",
         f"slopes     median {g['slope_median_deg']:.1f}°, 99th percentile {g['slope_p99_deg']:.1f}°, "
         f"steepest {g['slope_max_deg']:.1f}°",
-        f"detail     the correlation of heights falls to half within {h['detail_texels']:.1f} texels"
-        + (f"; repeats {u} x {v} times" if max(u, v) > 1 else ""),
     ]
     if (codes := h["codes"]) is not None:
         apart = f", {codes['spacing']:.4g} codes apart" if codes["spacing"] > 1 else ""

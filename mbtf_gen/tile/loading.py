@@ -87,8 +87,7 @@ def latest_material(path: str | Path, tiling: Tiling | None = None, max_pixels: 
 
     Raises
     ------
-    InputError
-        As ``load_material``.
+    InputError : as ``load_material``
     """
     global _kept
     spec, folder, found = described(Path(path))
@@ -124,8 +123,7 @@ def described(path: Path) -> tuple[Described, Path, FoundMaps]:
 
     Parameters
     ----------
-    path : Path
-        As for :func:`load_material`.
+    path : as for :func:`load_material`
 
     Returns
     -------
@@ -134,8 +132,7 @@ def described(path: Path) -> tuple[Described, Path, FoundMaps]:
 
     Raises
     ------
-    InputError
-        Nothing usable is at the path.
+    InputError : nothing usable is at the path
     """
     path = named_file(Path(), str(path))
     if path.is_dir():

@@ -14,7 +14,7 @@ from mbtf_core.config.settings import FileName, Settings
 from mbtf_core.data.schema import Tiling
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import data_sha256, file_sha256
-from mbtf_core.meshes.content import MOST_TRIANGLES, MeshShape, Value, numbers_of, of_faces
+from mbtf_core.meshes.content import MOST_TRIANGLES, MeshShape, Value, joined, numbers_of, of_faces
 from mbtf_core.meshes.read import read_mesh_content
 from mbtf_core.meshes.up_axis import seems_up
 from mbtf_core.paths import named_file
@@ -59,19 +59,12 @@ def read_mesh(spec: MeshFile, folder: Path) -> MeshTile:
 
     Parameters
     ----------
-    spec : MeshFile
-        What to read.
-    folder : Path
-        Folder that its file name is relative to.
-
-    Returns
-    -------
-    MeshTile
+    spec : what to read
+    folder : folder that its file name is relative to
 
     Raises
     ------
-    InputError
-        The file cannot be read, or its triangles are no tile.
+    InputError : the file cannot be read, or its triangles are no tile
     """
     path = named_file(folder, spec.mesh)
     content = read_mesh_content(path)
@@ -200,13 +193,8 @@ def _joined(shapes: list[MeshShape], path: Path) -> tuple[F64, NDArray[np.int_],
         raise InputError("has no triangles with an area", where=path)
     if sum(counts) > MOST_TRIANGLES:
         raise InputError(f"has {sum(counts):,} triangles, more than {MOST_TRIANGLES:,}", where=path)
-    starts = np.cumsum([0, *(len(shape.vertices) for shape in shapes[:-1])])
-    return (
-        np.concatenate([shape.vertices for shape in shapes]),
-        np.concatenate([shape.faces + start for shape, start in zip(shapes, starts, strict=True)]),
-        np.concatenate([_placing(shape) for shape in shapes]),
-        np.repeat(np.arange(len(shapes)), counts),
-    )
+    uv = np.concatenate([_placing(shape) for shape in shapes])
+    return *joined(shapes), uv, np.repeat(np.arange(len(shapes)), counts)
 
 
 def _placing(shape: MeshShape) -> F64:

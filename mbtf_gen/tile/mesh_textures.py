@@ -21,8 +21,7 @@ def with_vertex_colors(shape: MeshShape) -> MeshShape:
 
     Raises
     ------
-    InputError
-        The shape has textures as well.
+    InputError : the shape has textures as well
     """
     if shape.colors is None:
         return shape
@@ -73,8 +72,7 @@ def with_one_wrap(value: Any, uv: F64, name: str) -> Any:
 
     Raises
     ------
-    InputError
-        The image would be too large.
+    InputError : the image would be too large
     """
     if not isinstance(value, tuple) or value[0].wrap[0] == value[0].wrap[1]:
         return value

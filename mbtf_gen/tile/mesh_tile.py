@@ -32,11 +32,9 @@ class MeshPart:
 
     Attributes
     ----------
-    name : str
-        Its name in the file.
-    maps : dict of str to Value
-        Numbers, colors and textures by role (:data:`~mbtf_gen.tile.maps.material_file.ROLES`), ``base_color``
-        among them, and ``opacity_cutoff``. Textures have the same wrap mode along both axes.
+    name : its name in the file
+    maps : numbers, colors and textures by role (:data:`~mbtf_gen.tile.maps.material_file.ROLES`),;
+        ``base_color`` among them, and ``opacity_cutoff``. Textures have the same wrap mode along both axes.
     """
 
     name: str
@@ -74,7 +72,6 @@ class MeshTile(Tile):
 
     @cached_property
     def thickness(self) -> float:
-        """Height of the triangles' slab, in tile widths."""
         # Not minus zero.
         return 0.0 - float(self.vertices[self.faces, 2].min())
 
@@ -95,7 +92,6 @@ class MeshTile(Tile):
         return np.concatenate(faces), np.concatenate(shifts)
 
     def trace(self, unit: float, below: bool = False) -> TileGeometry:
-        """The triangles as rays meet them."""
         from mbtf_gen.tile.tracers.mesh_tracer import MeshTileGeometry
 
         number, shift = self.copies()
@@ -141,7 +137,6 @@ class MeshTile(Tile):
         return np.stack([[color.min(axis=0) for color in colors], [color.max(axis=0) for color in colors]])
 
     def weight(self, effect: str) -> float:
-        """Largest weight of a layer of the reflection in any part."""
         return max(layer_weight(part.maps, effect) for part in self.parts)
 
     @property
@@ -150,27 +145,22 @@ class MeshTile(Tile):
 
     @property
     def is_lambert(self) -> bool:
-        """Whether all parts are Lambert, without layers above."""
         return not any({*REFLECTING, *LOBES} & part.maps.keys() for part in self.parts)
 
     def narrowest_lobe(self) -> tuple[float, str]:
-        """(width in radians, what it is of) of the narrowest lobe of any part."""
         widths = (width for part in self.parts for width in lobe_widths(part.maps))
         return min([2.0, *widths]), "narrowest lobe"
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the triangles and of the textures."""
         values = [value for part in self.parts for value in part.maps.values()]
         textures = {id(v[0].pixels): v[0].pixels.nbytes for v in values if isinstance(v, tuple)}
         return self.vertices.nbytes + self.faces.nbytes + self.uv.nbytes + sum(textures.values())
 
     def properties(self) -> dict[str, Any]:
-        """Number of triangles, for the manifest."""
         return {"triangles": len(self.faces)}
 
     def inspect(self, options: GeometrySection, finest: int | None = None) -> dict[str, Any]:
-        """Statistics as plain data; lengths are in tile widths."""
         self.configured(options)
         edges, seam = self.open_edges()
         return {
@@ -193,7 +183,6 @@ class MeshTile(Tile):
         }
 
     def describe(self, found: Mapping[str, Any], name: str) -> str:
-        """The data of :meth:`inspect` as text for people."""
         edges = found["open_edges"]
         closed = f"{edges} open edges" if edges else "closed: every edge has two triangles"
         lines = [

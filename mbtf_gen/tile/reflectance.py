@@ -25,12 +25,7 @@ def plugin_dictionary(given: Mapping[str, Any]) -> dict[str, Any]:
 
     Parameters
     ----------
-    given : mapping of str to array or float
-        Parameters of the plugin: (H, W) or (H, W, 3) arrays of linear values, numbers, or colors (3,).
-
-    Returns
-    -------
-    dict
+    given : parameters of the plugin: (H, W) or (H, W, 3) arrays of linear values, numbers, or colors (3,)
     """
     return {
         "type": "mbtf_surface",

@@ -88,7 +88,7 @@ def read_channels(path: Path, *sets: Sequence[str]) -> F32:
     """
     from mbtf_core.images import exr
 
-    found = exr.read_channels(path, 1 << 26)
+    found = exr.read_layers(path, 1 << 26)[0]
     names = next((names for names in sets if found.keys() >= set(names)), None)
     if names is None:
         raise InputError(f"has no channels {', '.join(sets[0])}", where=path)

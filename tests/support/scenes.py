@@ -21,7 +21,7 @@ from mbtf_gen.render.estimator import Estimator  # noqa: E402
 from mbtf_gen.render.path_tracer import Transport  # noqa: E402
 from mbtf_gen.render.scene import build_scene, register_plugins  # noqa: E402
 from mbtf_gen.sampling.light_kernel import LightKernel  # noqa: E402
-from mbtf_gen.tile.heights import HeightGrid  # noqa: E402
+from mbtf_gen.tile.heights import HeightGrid, grid_faces, grid_vertices  # noqa: E402
 
 register_plugins()
 
@@ -99,6 +99,27 @@ def estimate(
     """Both halves of M at the queries."""
     estimator = Estimator(build_scene(replace(grid, tracer=tracer), bsdf), light, transport or Transport())
     return estimator.estimate(q, spp, Stream(seed, "test", 0))
+
+
+def mesh_of_grid(grid: HeightGrid, unit: float, apron: tuple[int, int], bsdf: Any) -> Any:
+    """Mitsuba mesh of one period of the tile centered on the origin, with `unit` scene units per tile width
+    and an `apron` of (rows, columns) cells on each side."""
+    vertices = grid_vertices(grid, apron)
+    flat, faces = vertices.reshape(-1, 3), grid_faces(*vertices.shape[:2])
+    props = mi.Properties()
+    props["bsdf"] = bsdf
+    # Interpolated normals lose energy on coarse grids.
+    props["face_normals"] = True
+    mesh = mi.Mesh("tile", len(flat), len(faces), props=props, has_vertex_texcoords=True)
+    params = mi.traverse(mesh)
+    centered = (flat - (0.5, 0.5 * grid.aspect, 0.0)) * unit
+    params["vertex_positions"] = centered.astype(np.float32).ravel()
+    # Mitsuba's bitmaps have row 0 at v = 0, ours at v → 1: its texture coordinates are (u, 1-v).
+    texcoords = np.column_stack([flat[:, 0], 1.0 - flat[:, 1] / grid.aspect])
+    params["vertex_texcoords"] = texcoords.astype(np.float32).ravel()
+    params["faces"] = faces.ravel()
+    params.update()
+    return mesh
 
 
 def direction(elevation: float, azimuth: float) -> NDArray[np.float64]:

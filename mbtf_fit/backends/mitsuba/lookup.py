@@ -13,7 +13,6 @@ from mbtf_fit import ops
 from mbtf_fit.backends.mitsuba.backend import MITSUBA, Loader, Numbers, Step
 from mbtf_fit.material.format import WEIGHTS_NAME
 from mbtf_gen.engine.types import Float, UInt32
-from mbtf_gen.tile.heights import HeightGrid
 from mbtf_gen.tile.tracers.heightfield import HeightField
 from mbtf_gen.tile.tracers.heightfield_tracer import closest_height
 
@@ -75,7 +74,7 @@ def _trace(op: ops.Trace, loader: Loader) -> Step:
     if heights.size == 0 or heights.max() > 0:
         fault = "is empty" if heights.size == 0 else "has heights above the reference plane"
         raise InputError(f"its tensor '{op.heights}' {fault}", where=loader.stored.folder / WEIGHTS_NAME)
-    heightfield = HeightField.of(HeightGrid(heights.astype(np.float64), aspect), 1.0, two_sided=False)
+    heightfield = HeightField.of(heights.astype(np.float64), aspect, 1.0, two_sided=False)
 
     def height(u: Numbers, omega_o: Numbers) -> Float:
         x, y = (c - dr.floor(c) for c in u)

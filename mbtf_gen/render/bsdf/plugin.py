@@ -83,10 +83,6 @@ class SurfaceBSDF(mi.BSDF):
         """Density of a local direction."""
         return self.eval_pdf(ctx, si, wo, active)[1]
 
-    def to_string(self) -> str:
-        """Description that Mitsuba prints."""
-        return f"SurfaceBSDF[{self.surface.parts}]"
-
 
 class PartSurface:
     """Surfaces of several parts, with the interface of one; interactions name their part."""

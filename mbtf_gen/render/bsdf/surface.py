@@ -142,18 +142,14 @@ class Surface:
 
     Parameters
     ----------
-    parts : SurfaceParts
-        Terms that are simulated.
-    textures : dict of str to Texture
-        Mitsuba textures by the names of ``mbtf_surface``. Those that no term needs may be missing. ``slopes``
-        are residual slopes along x and y, which are added to those of the geometry.
-    cutoff : float
-        Opacity from which the surface is opaque, and below which it is a hole; 0 for partial opacity.
+    parts : terms that are simulated
+    textures : Mitsuba textures by the names of ``mbtf_surface``. Those that no term needs may be missing;
+        ``slopes`` are residual slopes along x and y, which are added to those of the geometry.
+    cutoff : opacity from which the surface is opaque, and below which it is a hole; 0 for partial opacity
 
     Attributes
     ----------
-    transmits : bool
-        Whether rays may be below the surface.
+    transmits : whether rays may be below the surface
     """
 
     def __init__(self, parts: SurfaceParts, textures: dict[str, Texture], cutoff: float = 0.0) -> None:

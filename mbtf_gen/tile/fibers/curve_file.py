@@ -13,7 +13,6 @@ import os
 import struct
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
@@ -21,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError, reason
-from mbtf_core.paths import refuse_special
+from mbtf_core.paths import opened
 from mbtf_gen.tile.fibers.curves import F64, LEAST_POINTS, Curve, bases, interpolating
 
 log = logging.getLogger(__name__)
@@ -39,17 +38,6 @@ MOST_CURVES = 250_000
 _LONGEST_LINE = 1 << 12
 # Largest coordinate; squares of larger ones are beyond float32.
 _MOST = 1e15
-
-
-@contextmanager
-def opened(path: Path) -> Iterator[BinaryIO]:
-    """A file to read; what the system refuses is an InputError."""
-    refuse_special(path)
-    try:
-        with path.open("rb") as stream:
-            yield stream
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
 
 
 def lines(stream: BinaryIO) -> Iterator[tuple[int, bytes]]:
@@ -72,8 +60,7 @@ def read_curves(path: Path) -> tuple[list[Curve], float]:
 
     Parameters
     ----------
-    path : Path
-        A ``.bcc``, else text: control points and radii of uniform cubic B-splines.
+    path : a ``.bcc``, else text: control points and radii of uniform cubic B-splines
 
     Returns
     -------
@@ -84,8 +71,7 @@ def read_curves(path: Path) -> tuple[list[Curve], float]:
 
     Raises
     ------
-    InputError
-        The file is unreadable or truncated, of another kind, or its numbers are no curves.
+    InputError : the file is unreadable or truncated, of another kind, or its numbers are no curves
     """
     with opened(path) as stream:
         if path.suffix.lower() == ".bcc":

@@ -34,11 +34,9 @@ class Curve:
 
     Attributes
     ----------
-    control : (n, 4) float64 array
-        Control points x, y, z and their radii, in tile widths.
-    shift : (3,) float64 array or None
-        From the start to the end of a closed curve of n segments; multiples of the period, z is 0. None for
-        an open curve, which has n - 3 segments.
+    control : (n, 4), control points x, y, z and their radii, in tile widths
+    shift : (3,), from the start to the end of a closed curve of n segments; multiples of the period, z is 0;
+        none for an open curve, which has n - 3 segments
     """
 
     control: F64
@@ -91,14 +89,10 @@ class Bundle:
 
     Attributes
     ----------
-    points : (n, 4) float64 array
-        Control points of all segments, curve by curve, see :meth:`Curve.unrolled`.
-    starts : (curves,) int array
-        Row of each curve's first control point.
-    owner : (segments,) int array
-        Curve of each segment.
-    first : (segments,) int array
-        Row of the first of the four control points of each segment.
+    points : (n, 4), control points of all segments, curve by curve, see :meth:`Curve.unrolled`
+    starts : (curves,), row of each curve's first control point
+    owner : (segments,), curve of each segment
+    first : (segments,), row of the first of the four control points of each segment
     """
 
     def __init__(self, curves: Sequence[Curve]) -> None:

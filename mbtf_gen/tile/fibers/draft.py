@@ -182,10 +182,8 @@ class Weave:
 
     Attributes
     ----------
-    draft : (wefts, warps) bool array
-        Whether the warp lies above, row by row from v → 1.
-    warp, weft : tuple of str
-        Names of the yarns, from u = 0, and from v → 1.
+    draft : (wefts, warps), whether the warp lies above, row by row from v → 1
+    warp, weft : names of the yarns, from u = 0, and from v → 1
     """
 
     draft: Draft
@@ -217,10 +215,6 @@ class Weave:
         """Name (wefts, warps) of the yarn above at each crossing: the color-and-weave effect."""
         return np.where(self.draft, np.array(self.warp)[None, :], np.array(self.weft)[:, None])
 
-    def longest_floats(self) -> tuple[int, int]:
-        """Most crossings in a row at which a warp lies above, and a weft, across the tile's border too."""
-        return _longest(self.draft), _longest(~self.draft.T)
-
     def properties(self) -> dict[str, Any]:
         """Draft, sequences, and color-and-weave effect as plain data."""
         return {
@@ -228,13 +222,12 @@ class Weave:
             "warp": list(self.warp),
             "weft": list(self.weft),
             "seen": self.seen().tolist(),
-            "longest_floats": list(self.longest_floats()),
         }
 
     def describe(self) -> list[str]:
         """Lines for people: the draft, and beside it the letters of the yarns above."""
         (rows, columns), letters = self.draft.shape, self.letters()
-        seen, (warp, weft) = self.seen(), self.longest_floats()
+        seen = self.seen()
         shown = min(rows, _SHOWN), min(columns, _SHOWN)
         part = "" if shown == (rows, columns) else f"; the first {shown[1]} x {shown[0]} are shown"
         counts = (
@@ -243,8 +236,7 @@ class Weave:
             for name in letters
         )
         lines = [
-            f"weave       {columns} warps and {rows} wefts in the tile; longest floats: warp {warp}, "
-            f"weft {weft}{part}",
+            f"weave       {columns} warps and {rows} wefts in the tile{part}",
             *(f"            {text}" for text in counts),
             "",
             f"{'draft (X: warp above)':<{max(shown[1], 21)}}   yarn above",
@@ -262,13 +254,3 @@ class Weave:
         if len(set(first)) == len(first):
             return dict(zip(names, first, strict=True))
         return {name: chr(ord("a") + k % 26) for k, name in enumerate(names)}
-
-
-def _longest(above: Draft) -> int:
-    """Most adjacent true elements of a column of a periodic array."""
-    twice = np.concatenate([above, above])
-    run, longest = np.zeros(above.shape[1], int), 0
-    for row in twice:
-        run = np.where(row, run + 1, 0)
-        longest = max(longest, int(run.max()))
-    return min(longest, len(above))

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
-from mbtf_gen.tile.fibers.curve_file import lines, numbers, opened
+from mbtf_core.paths import opened
+from mbtf_gen.tile.fibers.curve_file import lines, numbers
 from mbtf_gen.tile.fibers.curves import F64, LEAST_POINTS, Curve
 from mbtf_gen.tile.fibers.draft import Draft
 
@@ -87,10 +88,8 @@ class YarnLoop:
 
     Attributes
     ----------
-    points : (n, 3) float64 array
-        Vertices in units of the pattern's width, without jumps at its borders.
-    shift : (2,) int array
-        Periods from the start to the end: (1, 0) for a yarn along x, (0, 0) for a ring.
+    points : (n, 3), vertices in units of the pattern's width, without jumps at its borders
+    shift : (2,), periods from the start to the end: (1, 0) for a yarn along x, (0, 0) for a ring
     """
 
     points: F64
@@ -103,12 +102,9 @@ class YarnPattern:
 
     Attributes
     ----------
-    aspect : float
-        Height of the period over its width.
-    radius : float
-        Radius of the yarns.
-    width : float
-        Width of the period in meters.
+    aspect : height of the period over its width
+    radius : radius of the yarns
+    width : width of the period in meters
     yarns : tuple of YarnLoop
     """
 
@@ -123,8 +119,8 @@ def read_pattern(path: Path) -> YarnPattern:
 
     Raises
     ------
-    InputError
-        The file is unreadable or truncated, a number is not finite, or edges do not form closed yarns.
+    InputError : the file is unreadable or truncated, a number is not finite, or edges do not form closed
+        yarns
     """
     with opened(path) as stream:
         rows = _sections(stream, path)

@@ -36,26 +36,18 @@ class YarnModel:
 
     Attributes
     ----------
-    plies, fibers : int
-        Plies of the yarn, fibers of a ply.
-    fiber_radius : float
-        Radius of a fiber.
-    beta, epsilon : float
-        Distribution of the fibers over a ply's cross-section.
-    pitch, ply_pitch : float
-        Length of one turn of fibers around their ply, and of plies around the yarn; negative: clockwise.
-    migration, swing : float
-        R_min and s of the migration.
-    long_axis, short_axis : float
-        Half axes of a ply's cross-section.
-    ply_distance : float
-        Distance of a ply's center from that of the yarn.
-    loops, hairs : float
-        Flyaways per centimeter of a ply.
-    loop_reach, hair_start, hair_rise, hair_length, hair_turn : (float, float)
-        Mean and standard deviation of the distance of a loop from the ply's center, of that of a hair's
-        start, of how much further its end is, of its length along the ply, and of the angle in radians around
-        it.
+    plies, fibers : plies of the yarn, fibers of a ply
+    fiber_radius : radius of a fiber
+    beta, epsilon : distribution of the fibers over a ply's cross-section
+    pitch, ply_pitch : length of one turn of fibers around their ply, and of plies around the yarn; negative:
+        clockwise
+    migration, swing : R_min and s of the migration
+    long_axis, short_axis : half axes of a ply's cross-section
+    ply_distance : distance of a ply's center from that of the yarn
+    loops, hairs : flyaways per centimeter of a ply
+    loop_reach, hair_start, hair_rise, hair_length, hair_turn : mean and standard deviation of the distance of
+        a loop from the ply's center, of that of a hair's start, of how much further its end is, of its length
+        along the ply, and of the angle in radians around it
     """
 
     plies: int
@@ -102,14 +94,10 @@ def fibers_of(line: Curve, section: CrossSection, model: YarnModel, rng: np.rand
 
     Parameters
     ----------
-    line : Curve
-        Closed center line; its radii are not used.
-    section : CrossSection
-        Size of the yarn, which also scales its pitches and its fibers.
-    model : YarnModel
-        Statistics.
-    rng : numpy.random.Generator
-        Random numbers.
+    line : closed center line; its radii are not used
+    section : size of the yarn, which also scales its pitches and its fibers
+    model : statistics
+    rng : random numbers
 
     Returns
     -------

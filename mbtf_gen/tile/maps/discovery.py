@@ -112,8 +112,7 @@ def find_maps(folder: Path) -> FoundMaps:
 
     Raises
     ------
-    InputError
-        The folder is unreadable, has no image or no height map, or several candidates for a map.
+    InputError : the folder is unreadable, has no image or no height map, or several candidates for a map
     """
     files = _images(folder)
     unread = _unread(folder, files)

@@ -84,12 +84,9 @@ class MapLoader:
 
     Attributes
     ----------
-    files, facts : dict
-        File and content of each role.
-    settings : dict
-        Options and constants of each role that change the data, for the digest.
-    warnings, notes : list of str
-        Messages for the user.
+    files, facts : file and content of each role
+    settings : options and constants of each role that change the data, for the digest
+    warnings, notes : messages for the user
     """
 
     def __init__(self, folder: Path, notes: list[str], max_pixels: int = MAX_PIXELS) -> None:

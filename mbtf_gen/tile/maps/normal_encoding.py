@@ -30,8 +30,8 @@ def stored_xy(vectors: Array) -> tuple[list[int], str] | None:
 
     Parameters
     ----------
-    vectors : (H, W, C) array
-        Components of the normals in [-1, 1], C = 2: x and y; 3: RGB; 4: RGBA. Of large maps, some decide.
+    vectors : (H, W, C), components of the normals in [-1, 1], C = 2: x and y; 3: RGB; 4: RGBA. Of large maps,
+        some decide.
 
     Returns
     -------

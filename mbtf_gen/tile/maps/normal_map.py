@@ -51,26 +51,20 @@ class NormalFit:
 
     Attributes
     ----------
-    correlation_u, correlation_v : float
-        Correlation of the slopes along u and along v, of the unchanged images in the OpenGL convention; NaN
-        where either has no slopes.
-    gl, dx : float
-        Correlation over both components of the unchanged images, in the OpenGL and the DirectX convention.
-    convention : {"gl", "dx"} or None
-        The convention with the clearly larger correlation; None if the data do not decide.
-    fits : bool
-        Whether the unchanged images clearly match.
-    misfit : bool
-        Whether they clearly match only after one is rotated or mirrored, or the heights are inverted.
-    image : {"height", "normal"} or None
-        Image to be rotated or mirrored for the best match. With None, a misfit means inverted heights.
-    turn : str
-        How it is to be rotated or mirrored: a key of :data:`SYMMETRIES`, or empty.
-    best : float
-        Correlation of the best match.
-    scale : float
-        Height scale in tile widths (signed) whose slopes fit the normals of the unchanged images best in the
-        better convention (least squares).
+    correlation_u, correlation_v : correlation of the slopes along u and along v, of the unchanged images in
+        the OpenGL convention; NaN where either has no slopes
+    gl, dx : correlation over both components of the unchanged images, in the OpenGL and the DirectX
+        convention
+    convention : {"gl", "dx"} or None, the convention with the clearly larger correlation; None if the data do
+        not decide
+    fits : whether the unchanged images clearly match
+    misfit : whether they clearly match only after one is rotated or mirrored, or the heights are inverted
+    image : {"height", "normal"} or None, image to be rotated or mirrored for the best match. With None, a
+        misfit means inverted heights.
+    turn : how it is to be rotated or mirrored: a key of :data:`SYMMETRIES`, or empty
+    best : correlation of the best match
+    scale : height scale in tile widths (signed) whose slopes fit the normals of the unchanged images best in
+        the better convention (least squares)
     """
 
     correlation_u: float
@@ -109,10 +103,9 @@ def fit_normals(height: Array, normal: Array) -> NormalFit | None:
 
     Parameters
     ----------
-    height : (H, W) array
-        Stored heights.
-    normal : (h, w, 3) array
-        Unit vectors, y along v (OpenGL). Both maps are box-filtered to the coarser resolution.
+    height : (H, W), stored heights
+    normal : (h, w, 3), unit vectors, y along v (OpenGL). Both maps are box-filtered to the coarser
+        resolution.
 
     Returns
     -------

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Protocol, Self
+from typing import Self
 
 import drjit as dr
 import mitsuba as mi
@@ -30,22 +30,6 @@ from mbtf_gen.tile.tracers.protocol import Vertex
 # Ray offset relative to the largest coordinate: a few units in the last place of float32. An offset four
 # times as large made points on a tile of aspect 64 too bright by 0.1 %.
 _RELATIVE_OFFSET = 5.0e-7
-
-
-class Heights(Protocol):
-    """Heights of a tile, as :class:`~mbtf_gen.tile.heights.HeightGrid` holds them."""
-
-    @property
-    def z(self) -> NDArray[np.float64]:
-        """(H, W) heights ≤ 0 in tile widths; row 0 is the side ``v → 1``."""
-
-    @property
-    def aspect(self) -> float:
-        """H/W of the tile."""
-
-    @property
-    def displacement_range(self) -> float:
-        """Largest height difference in tile widths."""
 
 
 @dataclass(frozen=True)
@@ -89,17 +73,18 @@ class HeightField:
     powers: bool
 
     @classmethod
-    def of(cls, grid: Heights, unit: float, two_sided: bool) -> Self:
-        """Height field of a grid; `unit` is the number of scene units per tile width. Rays may be below the
-        surface if it is `two_sided`, as behind an opacity mask."""
+    def of(cls, heights: NDArray[np.float64], aspect: float, unit: float, two_sided: bool) -> Self:
+        """Height field of heights (H, W) ≤ 0 in tile widths, row 0 at ``v → 1``; `aspect` is H/W of the tile,
+        and `unit` the number of scene units per tile width. Rays may be below the surface if it is
+        `two_sided`, as behind an opacity mask."""
         # Row 0 of a map is the side y → max.
-        z = grid.z[::-1] * unit
+        z = heights[::-1] * unit
         rows, columns = z.shape
         columns_log2, rows_log2 = logarithms(z)
         tables = [node_table(z, below) for below in (False, True)[: 1 + two_sided]]
-        size = (unit, unit * grid.aspect)
+        size = (unit, unit * aspect)
         cell = (size[0] / columns, size[1] / rows)
-        extent = max(0.5 * size[0], 0.5 * size[1], grid.displacement_range * unit)
+        extent = max(0.5 * size[0], 0.5 * size[1], float(heights.max() - heights.min()) * unit)
 
         number, count = partial(dr.opaque, mi.Float), partial(dr.opaque, mi.Int32)
         # A copy: NumPy's memory need not have the alignment that reads of whole rows require.
@@ -134,11 +119,9 @@ class HeightField:
         return mi.Ray3f(dr.fma(si.n, side, si.p), d)
 
     def vertex(self, si: SurfaceInteraction3f) -> Vertex:
-        """Position and normal."""
         return Vertex(mi.Point3f(si.p), mi.Normal3f(si.n))
 
     def interaction(self, vertex: Vertex, d: Vector3f, valid: Mask) -> SurfaceInteraction3f:
-        """Surface interaction at a vertex, see :func:`surface_interaction`."""
         return surface_interaction(vertex.p, vertex.n, d, valid, self.size)
 
 
@@ -149,14 +132,10 @@ def surface_interaction(
 
     Parameters
     ----------
-    p, n : Point3f, Normal3f
-        Position in scene units from the tile's center, and unit normal with z > 0.
-    d : Vector3f
-        Directions of the rays.
-    valid : Mask
-        Lanes with a hit. They get t = 0, the others t = ∞; distances are not needed.
-    size : (Float, Float)
-        Lengths of the tile along x and y.
+    p, n : position in scene units from the tile's center, and unit normal with z > 0
+    d : directions of the rays
+    valid : lanes with a hit. They get t = 0, the others t = ∞; distances are not needed.
+    size : lengths of the tile along x and y
     """
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(p))
     si.t = dr.select(valid, mi.Float(0.0), dr.inf)

@@ -316,7 +316,6 @@ class HeightfieldGeometry(HeightField):
         holes: Any = None,
         rng: SobolSampler | None = None,
     ) -> tuple[Mask, UInt32, Mask, Any]:
-        """Which rays are occluded."""
         state, _, rng = _search(self, ray, active, max_crossings, below, holes, rng)
         return state.hit | state.capped, state.crossings, state.capped, rng
 

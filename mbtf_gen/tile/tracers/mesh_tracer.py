@@ -63,7 +63,6 @@ class MeshGeometry(PeriodicScene):
         return cls(**_triangles(placed.reshape(-1, 3), faces, low, (unit, unit * aspect)))
 
     def vertex(self, si: SurfaceInteraction3f) -> Vertex:
-        """Position and normal."""
         return Vertex(mi.Point3f(si.p), mi.Normal3f(si.n))
 
     def interaction(self, vertex: Vertex, d: Vector3f, valid: Mask) -> SurfaceInteraction3f:

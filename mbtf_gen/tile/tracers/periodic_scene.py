@@ -82,7 +82,6 @@ class PeriodicScene(ABC):
         holes: Any = None,
         rng: Any = None,
     ) -> tuple[SurfaceInteraction3f, UInt32, Mask, Any]:
-        """First intersections of rays."""
         state, rng = self._search(ray, active, max_crossings, holes, rng)
         return self._surface(state.at, ray.d, state.hit), state.crossings, state.capped, rng
 
@@ -95,7 +94,6 @@ class PeriodicScene(ABC):
         holes: Any = None,
         rng: Any = None,
     ) -> tuple[Mask, UInt32, Mask, Any]:
-        """Which rays are occluded."""
         state, rng = self._search(ray, active, max_crossings, holes, rng)
         return state.hit | state.capped, state.crossings, state.capped, rng
 
@@ -115,7 +113,6 @@ class PeriodicScene(ABC):
         return si, capped, blocked, shadow_capped
 
     def leave(self, si: SurfaceInteraction3f, d: Vector3f) -> Ray3f:
-        """Ray that starts at a surface point, offset along the normal, in direction d."""
         side = dr.select(dr.dot(si.n, d) < 0, -self.offset, self.offset)
         return mi.Ray3f(dr.fma(si.n, side, si.p), d)
 

@@ -42,8 +42,7 @@ class TileGeometry(Protocol):
 
     Attributes
     ----------
-    open : bool
-        Whether rays can pass through the tile where its surface is opaque.
+    open : whether rays can pass through the tile where its surface is opaque
     """
 
     open: bool
@@ -61,18 +60,13 @@ class TileGeometry(Protocol):
 
         Parameters
         ----------
-        ray : Ray3f
-            Rays in scene units.
-        active : Mask
-            Lanes to trace.
-        max_crossings : int
-            Tile borders that a ray may cross.
-        below : Mask
-            Lanes whose ray starts below the surface.
-        holes : object with a method ``opacity(si)``, optional
-            Gives the probability in [0, 1] that a hit stops the ray. None for opaque surfaces.
-        rng : SobolSampler, optional
-            Random numbers for `holes`.
+        ray : rays in scene units
+        active : lanes to trace
+        max_crossings : tile borders that a ray may cross
+        below : lanes whose ray starts below the surface
+        holes : object with a method ``opacity(si)``, optional; gives the probability in [0, 1] that a hit
+            stops the ray. None for opaque surfaces.
+        rng : random numbers for `holes`
 
         Returns
         -------

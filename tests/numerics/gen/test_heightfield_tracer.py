@@ -9,11 +9,10 @@ import drjit as dr
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.scenes import HeightGrid, build_scene, lambert, mi, rocks
+from support.scenes import HeightGrid, build_scene, lambert, mesh_of_grid, mi, rocks
 
 from mbtf_gen.config.generator import Tracer
 from mbtf_gen.sampling.sobol import sequence
-from mbtf_gen.tile.heights import mesh_of_grid
 from mbtf_gen.tile.tracers.heightfield_tracer import HeightfieldGeometry
 
 N = 200_000
@@ -93,7 +92,7 @@ def test_rays_from_below_meet_the_surface_from_below(grid: HeightGrid) -> None:
     """Hits from below equal those from above on the inverted height field, at mirrored positions."""
     rng = np.random.default_rng(1)
     upside_down = HeightGrid.from_map(grid.z, -1.0, grid.aspect)
-    field, mirrored = (HeightfieldGeometry.of(g, 32.0, True) for g in (grid, upside_down))
+    field, mirrored = (HeightfieldGeometry.of(g.z, g.aspect, 32.0, True) for g in (grid, upside_down))
     o, d = rays(rng, grid, 32.0)
     o[:, 2] = 0.1
     expected = mirrored.closest_hit(ray_of(o, d), mi.Bool(True), 100)[0]
@@ -109,7 +108,7 @@ def test_rays_from_below_meet_the_surface_from_below(grid: HeightGrid) -> None:
 def test_two_rays_at_once_are_as_each_alone() -> None:
     """If one ray ends first, at the cap too, its result does not change while the other continues."""
     grid, rng = rocks(64), np.random.default_rng(2)
-    field = HeightfieldGeometry.of(grid, 32.0, False)
+    field = HeightfieldGeometry.of(grid.z, grid.aspect, 32.0, False)
     n = N // 4
     o, d = (a[:n] for a in rays(rng, grid, 32.0))
     o[:, 2] = -0.5 * 32.0 * grid.displacement_range * rng.random(n)
@@ -186,7 +185,7 @@ def numbers(n: int) -> Any:
 def test_borders_are_counted_through_holes() -> None:
     """Rays through holes cross as many borders as straight lines; the cap ends those that cross more."""
     grid, n = rocks(32), 20_000
-    field = HeightfieldGeometry.of(grid, 32.0, True)
+    field = HeightfieldGeometry.of(grid.z, grid.aspect, 32.0, True)
     rng = np.random.default_rng(3)
     o, d = (a[:n] for a in rays(rng, grid, 32.0))
     o[:, 2] = -0.4 * 32.0 * grid.displacement_range

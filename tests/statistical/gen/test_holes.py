@@ -160,7 +160,7 @@ def test_transmittance_agrees_with_mitsuba(tmp_path: Path) -> None:
 
 def test_pictures_store_the_transmittance(tmp_path: Path) -> None:
     """A picture straight from above shows the holes where the map has them, and stores them."""
-    from mbtf_core.images.exr import read_channels
+    from mbtf_core.images.exr import read_layers
     from mbtf_core.pictures import Camera
     from mbtf_gen.pictures.reference import render_reference
 
@@ -172,4 +172,4 @@ def test_pictures_store_the_transmittance(tmp_path: Path) -> None:
     expected[:, 8:] = 1.0
     np.testing.assert_allclose(image.transmittance[:, [2, 4, 11, 13]], expected[:, [2, 4, 11, 13]])
     exr = image.write(tmp_path / "picture")
-    np.testing.assert_array_equal(read_channels(exr, 10_000)["transmittance"], image.transmittance)
+    np.testing.assert_array_equal(read_layers(exr, 10_000)[0]["transmittance"], image.transmittance)

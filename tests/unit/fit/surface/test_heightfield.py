@@ -12,7 +12,6 @@ from support.scenes import mi
 from mbtf_fit.native import library
 from mbtf_fit.surface import heightfield
 from mbtf_fit.surface.heightfield import HeightfieldTracer, horizons_reference, trace_reference
-from mbtf_gen.tile.heights import HeightGrid
 from mbtf_gen.tile.tracers.heightfield_tracer import HeightfieldGeometry
 
 needs_kernel = pytest.mark.skipif(library.kernel() is None, reason=library.missing_reason() or "kernel")
@@ -38,7 +37,7 @@ def test_kernel_pytorch_and_renderer_agree(shape: tuple[int, int]) -> None:
     cells = torch.from_numpy(tracer._nodes[: heights.size]).view(*shape, 4)
     found = tracer.trace(u, omega)
     torch.testing.assert_close(found, trace_reference(cells, aspect, u, omega), atol=2e-6, rtol=0)
-    field = HeightfieldGeometry.of(HeightGrid(heights.astype(np.float64), aspect), 1.0, False)
+    field = HeightfieldGeometry.of(heights.astype(np.float64), aspect, 1.0, False)
     x, y = ((u - u.floor()).numpy().T - 0.5) * np.array([[1.0], [aspect]], np.float32)
     ray = mi.Ray3f(mi.Point3f(mi.Float(x), mi.Float(y), 0.0), -mi.Vector3f(omega.numpy().T.copy()))
     rendered = np.array(field.closest_hit(ray, mi.Bool(True), 64)[0].p.z)

@@ -164,9 +164,11 @@ def good(name: str = "tl000 pl000 tv000 pv000.jpg") -> dict[str, bytes]:
         ({"tl200 pl000 tv000 pv000.jpg": b""}, "angles out of range"),
         ({"tl095 pl000 tv000 pv000.jpg": b""}, "above the horizon"),
         (good() | good("b/tl000 pl000 tv000 pv000.jpg"), "the same directions"),
-        ({"b/full.hdf5": b"", "b/random.hdf5": b"", "a.txt": b""}, "give one of its 2 files .hdf5"),
-        ({"carpet.btf": b""}, "give its file 'carpet.btf'"),
-        ({f"{NAME}.bmp": b""}, "convert them to one of .jpg"),
+        (
+            {"b/full.hdf5": b"", "b/random.hdf5": b"", "a.txt": b""},
+            "give a file in it, such as 'b/full",
+        ),
+        ({f"{NAME}.bmp": b""}, ".jpg, .jpeg, .png, .exr, .hdr are read"),
         ({"manifest.json": b"{}", "data/R/a2.png": b""}, "files such as"),
     ],
 )

@@ -12,15 +12,7 @@ from support.height_maps import fractal, normals_of, save_heights, save_normals
 from mbtf_core.app.console import run
 from mbtf_gen.cli.app import app
 from mbtf_gen.config.generator import GeometrySection
-from mbtf_gen.tile.heights import (
-    HeightGrid,
-    autocorrelation,
-    detail_size,
-    repeats,
-    rms_slope,
-    slope_angles,
-    triangle_slopes,
-)
+from mbtf_gen.tile.heights import HeightGrid, rms_slope, slope_angles, triangle_slopes
 from mbtf_gen.tile.inspection import inspection_text
 from mbtf_gen.tile.loading import load_material
 
@@ -51,24 +43,6 @@ class TestSlopes:
         median, high, steepest = slope_angles(HeightGrid.from_map(saw, 1.0, 1 / 16))
         expected = np.degrees(np.arctan([0.1 * 64 / 56, 0.1 * 8, 0.1 * 8]))
         assert (median, high, steepest) == pytest.approx(tuple(expected))
-
-    def test_repeats(self) -> None:
-        cell = fractal(16, 16)
-        assert [repeats(np.tile(cell, (3, 5)), axis) for axis in (1, 0)] == [5, 3]
-        assert [repeats(fractal(64, 64), axis) for axis in (1, 0)] == [1, 1]
-        assert repeats(np.zeros((8, 8)), 0) == 1
-        # A ripple on a swell repeats as often as the swell.
-        x = np.arange(96) / 96 * 2 * np.pi
-        assert repeats(np.tile(np.cos(x) + 0.5 * np.cos(16 * x), (4, 1)), 1) == 1
-        assert repeats(np.tile(np.cos(2 * x), (4, 1)), 1) == 2
-
-    def test_detail(self) -> None:
-        noise = np.random.default_rng(0).normal(size=(128, 128))
-        assert detail_size(noise) < 1.0
-        assert detail_size(noise.repeat(4, 0).repeat(4, 1)) == pytest.approx(2.0, abs=0.3)
-        x = np.cos(np.arange(96) / 96 * 2 * np.pi)
-        assert detail_size(np.tile(x, (96, 1))) == pytest.approx(96 / 6, abs=0.1)
-        assert autocorrelation(np.tile(x, (4, 1)), 1)[48] == pytest.approx(-1.0)
 
 
 @pytest.fixture

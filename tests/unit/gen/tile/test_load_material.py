@@ -85,7 +85,7 @@ class TestBareFile:
         heights = rng().random((6, 9))
         material = load_material(npy(tmp_path / "h.npy", heights))
         assert np.array_equal(material.height, heights)
-        assert (material.height_scale, material.height_bits) == (1.0, None)
+        assert (material.height_scale, material.facts["height"].bits) == (1.0, None)
         assert material.aspect == pytest.approx(6 / 9)
         assert material.is_lambert
         assert np.array_equal(material.maps["base_color"], np.full(3, 0.5))
@@ -96,7 +96,7 @@ class TestBareFile:
         numbers = rng().integers(0, 65536, (6, 9)).astype(np.uint16)
         material = load_material(png(tmp_path / "h.png", numbers))
         assert np.array_equal(material.height, numbers / 65535)
-        assert (material.height_scale, material.height_bits) == (0.05, 16)
+        assert (material.height_scale, material.facts["height"].bits) == (0.05, 16)
 
     def test_eight_bits_are_smoothed_within_half_a_code_with_a_warning(self, tmp_path: Path) -> None:
         ramp = np.rint(np.tile(100 + 5 * np.sin(np.arange(64) / 64 * 2 * np.pi), (64, 1))).astype(np.uint8)

@@ -26,7 +26,7 @@ SETS: dict[str, tuple[str, float, tuple[float, float]]] = {
 }
 # Set → parts of its description, separated by semicolons.
 ODDITIES = {
-    "knit_fabric": "8-bit heights with 132 distinct values;repeats 32 x 64;holes 1.2%;--mesh 1024 keeps all",
+    "knit_fabric": "8-bit heights with 132 distinct values;holes 1.2%;--mesh 1024 keeps all",
     "leather_fine": "8-bit heights with 256 distinct values;JPG;--mesh 1024 keeps all",
     "metal_plate": "constant 0.5, 0.5, 0.5",
     "rock_cliff": "8-bit heights with 115 distinct values 2.238 codes apart",

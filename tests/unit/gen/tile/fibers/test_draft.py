@@ -53,15 +53,9 @@ def test_herringbone_reverses_every_so_many_warps_and_breaks_there(width: int) -
 @pytest.mark.parametrize(("n", "step"), [(5, 2), (7, 3), (8, 3)])
 def test_a_satin_has_scattered_crossings_and_floats_of_all_others(n: int, step: int) -> None:
     weave = named(f"satin {n}/{step}", "a", "b")
-    assert weave.longest_floats() == (n - 1, 1)
     below = [int(np.flatnonzero(~row)[0]) for row in weave.draft]
     assert sorted(below) == list(range(n))
     assert all(abs(a - b) not in (1, n - 1) for a, b in pairwise([*below, below[0]]))
-
-
-def test_floats_are_counted_across_the_border() -> None:
-    assert named("twill 3/2", "a", "b").longest_floats() == (3, 2)
-    assert named("X\nX\n.", "a", "b").longest_floats() == (2, 1)
 
 
 def test_houndstooth_is_the_known_effect_of_eight_by_eight_yarns() -> None:

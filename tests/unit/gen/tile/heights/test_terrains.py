@@ -66,7 +66,8 @@ def test_low_heights_and_unused_declarations_are_data(tmp_path: Path) -> None:
     assert load_material(path).height == pytest.approx(hills())
     # Codes of 8 bits are never -9999, whatever that would be modulo 256.
     codes = np.full((32, 48), -9999 % 256, np.uint8)
-    assert load_material(terrain(tmp_path / "byte.tif", codes, (42113, 2, "-9999"))).height_bits == 8
+    found = load_material(terrain(tmp_path / "byte.tif", codes, (42113, 2, "-9999")))
+    assert found.facts["height"].bits == 8
 
 
 def test_missing_data_of_other_maps_are_mentioned(tmp_path: Path) -> None:
