@@ -68,7 +68,7 @@ class MeshShape:
     faces : (m, 3), vertices of each triangle, counterclockwise seen from outside
     uv : (n, 2), texture coordinates, v up
     colors : (n, 3), linear Rec.709 factors of the vertices on the base color
-    values : what the file says of its material, by role of a ``material.yaml`` (``base_color``,;
+    values : what the file says of its material, by role of a ``material.yaml`` (``base_color``,
         ``roughness``, …); defaults of the format included. A role that is missing was not given. ``opacity``
         may have an ``opacity_cutoff`` beside it, below which a point is a hole and above which it is opaque.
     faults : why a role cannot be read. The tile raises it unless the ``material.yaml`` gives the role.

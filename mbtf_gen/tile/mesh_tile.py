@@ -33,7 +33,7 @@ class MeshPart:
     Attributes
     ----------
     name : its name in the file
-    maps : numbers, colors and textures by role (:data:`~mbtf_gen.tile.maps.material_file.ROLES`),;
+    maps : numbers, colors and textures by role (:data:`~mbtf_gen.tile.maps.material_file.ROLES`),
         ``base_color`` among them, and ``opacity_cutoff``. Textures have the same wrap mode along both axes.
     """
 
