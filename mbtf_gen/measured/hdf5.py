@@ -37,6 +37,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError, MbtfError, reason
+from mbtf_core.extras import import_extra
 from mbtf_core.paths import refuse_special, suggest_path
 from mbtf_gen.measured.interface import (
     COMPLETE,
@@ -72,8 +73,7 @@ def opened(path: Path) -> Iterator[Any]:
     ------
     InputError : the file is missing, is not HDF5, is truncated or damaged
     """
-    import h5py
-
+    h5py = import_extra("h5py", path)
     refuse_special(path)
     if not path.is_file():
         raise InputError("no such file", where=path, hint=suggest_path(path))
@@ -94,8 +94,7 @@ def data_set(file: Any, name: str, path: Path) -> Any:
     ------
     InputError : it is missing, leads to another file, has no floats, or has parts that were never written
     """
-    import h5py
-
+    h5py = import_extra("h5py", path)
     found = file[name] if isinstance(file.get(name, getlink=True), h5py.HardLink) else None
     if not isinstance(found, h5py.Dataset) or found.is_virtual or found.external:
         names = ", ".join(sorted(file)[:10])
