@@ -47,7 +47,7 @@ def all_checks() -> list[Check]:
         Check("Python", _python),
         Check("Mitsuba", _mitsuba, hint=f"{_REINSTALL} mitsuba==3.9.1 karellen-llvm-core"),
         Check("CUDA", _cuda, required=False),
-        Check("PyTorch", _in_child(use_torch), hint=f"{_REINSTALL} torch==2.13.0"),
+        Check("PyTorch", _in_child(use_torch), hint=f"{_REINSTALL} 'torch>=2.13,<2.15'"),
         Check("Drawing", _drawing, required=False, hint=_OPENGL),
         Check("Kernel cache", _in_child(use_kernel_cache), required=False, hint=_CACHE),
     ]
