@@ -36,7 +36,7 @@ $(INSTALLED): pyproject.toml setup.py $(wildcard mbtf_fit/native/src/*)
 	    echo "error: no virtual environment could be made; on Debian: apt install python3-venv" >&2; exit 2; }; \
 	fi
 	@echo "installing the project and its dependencies into $(VENV) (some minutes the first time)"
-	@$(PIP) install --quiet --progress-bar off --editable '.[dev]' || { \
+	@$(PIP) install --quiet --progress-bar off --editable '.[dev]' torch==2.13.0 || { \
 	  echo "error: pip could not install the project (its reason stands above)" >&2; \
 	  echo "  check the network and run the same command again; what was downloaded is kept" >&2; exit 2; }
 	@touch $@

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.errors import EngineError
+from mbtf_core.extras import extra_error, has_extra, import_extra
 from mbtf_core.run.processes import run_child
 from mbtf_gen.checks import Check, Finding
 from mbtf_gen.engine.runtime import (
@@ -46,8 +47,8 @@ def all_checks() -> list[Check]:
         Check("Python", _python),
         Check("Mitsuba", _mitsuba, hint=f"{_REINSTALL} mitsuba==3.9.1 karellen-llvm-core"),
         Check("CUDA", _cuda, required=False),
-        Check("PyTorch", _in_child(use_torch), hint=f"{_REINSTALL} torch==2.13.0"),
-        Check("Drawing", _in_child(use_drawing), required=False, hint=_OPENGL),
+        Check("PyTorch", _in_child(use_torch), hint=f"{_REINSTALL} 'torch>=2.13,<2.15'"),
+        Check("Drawing", _drawing, required=False, hint=_OPENGL),
         Check("Kernel cache", _in_child(use_kernel_cache), required=False, hint=_CACHE),
     ]
 
@@ -92,6 +93,13 @@ def _cuda(_: int) -> Finding:
     return Finding("ok", "ran test kernels")
 
 
+def _drawing(number: int) -> Finding:
+    if not has_extra("pyvista"):
+        missing = extra_error("pyvista", "3D pictures")
+        return Finding("absent", f"{missing.what}; for 3D pictures: {missing.hint}")
+    return _in_child(use_drawing)(number)
+
+
 # The functions below run in child processes.
 
 
@@ -109,8 +117,7 @@ def use_torch() -> Iterator[dict[str, str]]:
 
 def use_drawing() -> Iterator[dict[str, str]]:
     """PyVista draws a sphere off screen."""
-    import pyvista
-
+    pyvista = import_extra("pyvista", "3D pictures")
     plotter = pyvista.Plotter(off_screen=True, window_size=[64, 64])
     plotter.set_background("black")
     plotter.add_mesh(pyvista.Sphere(), color="white")

@@ -18,6 +18,7 @@ from typing import Any, Protocol, TypeVar
 from urllib.parse import unquote
 
 from mbtf_core.errors import EngineError, InputError, PartialError, UsageError, reason
+from mbtf_core.extras import extra_error, import_extra
 from mbtf_core.files.atomic import create_file, remove_file, write_chunks
 from mbtf_core.paths import refuse_special, split_url
 from mbtf_core.timeouts import NoAnswer, call_within
@@ -140,14 +141,7 @@ class ObjectStore:
         self._lost = threading.Event()
         # Bytes of objects, as last listed.
         self._sizes: dict[str, int] = {}
-        try:
-            import fsspec
-        except ImportError:
-            raise EngineError(
-                "fsspec is not installed, which reads object stores",
-                where=url,
-                hint="pip install 'mbtf[stores]'",
-            ) from None
+        fsspec = import_extra("fsspec", url)
         protocol = url.partition("://")[0]
         try:
             # Some protocols connect at once.
@@ -155,7 +149,9 @@ class ObjectStore:
                 url, self._seconds(), lambda: fsspec.url_to_fs(url, use_listings_cache=False)
             )
         except ImportError as error:
-            package = "'mbtf[stores]'" if protocol in ("s3", "s3a") else _PACKAGES.get(protocol)
+            if protocol in ("s3", "s3a"):
+                raise extra_error("s3fs", url) from None
+            package = _PACKAGES.get(protocol)
             hint = f"pip install {package}" if package else "install it with pip"
             raise EngineError(f"a package is not installed ({reason(error)})", where=url, hint=hint) from None
         except ValueError as error:

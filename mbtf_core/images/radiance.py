@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mbtf_core.errors import InputError, reason
+from mbtf_core.extras import import_extra
 from mbtf_core.images.color_spaces import from_chromaticities
 from mbtf_core.images.limits import MAX_PIXELS
 from mbtf_core.images.read import Image
@@ -31,9 +32,9 @@ def read_radiance(path: Path) -> Image:
     Raises
     ------
     InputError : the file is missing, damaged, too large, or stores XYZ
+    EngineError : the package that decodes it is not installed
     """
-    import imagecodecs
-
+    imagecodecs = import_extra("imagecodecs", path)
     with opened(path) as stream:
         data = stream.read()
     try:

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from mbtf_core.errors import reason
+from mbtf_core.extras import import_extra
 from mbtf_core.run.workers import MEMORY, PRELOAD, ClusterConfig
 from mbtf_core.timeouts import call_within
 
@@ -43,8 +44,7 @@ _UNSET = (None, "00:30:00", "00:30")
 
 def site_preload() -> list[str]:
     """Modules that a worker loads: those of Dask's configuration, and ours."""
-    import dask
-
+    dask = import_extra("dask", "--cluster")
     found = dask.config.get("distributed.worker.preload", None) or []
     return [*([found] if isinstance(found, str) else found), PRELOAD]
 
@@ -59,8 +59,7 @@ def _site_options(
     ------
     ValueError : an option is a key of the file, or is given by both of its names
     """
-    import dask
-
+    dask = import_extra("dask", "--cluster")
     renamed = {**_RENAMED, **_ACCOUNTS.get(engine, {})}
     given = {key: value for key, value in options.items() if value is not None}
     for key, ours in _OURS.items():
@@ -104,7 +103,7 @@ def submitted_jobs(
     OSError, TypeError, ValueError : the batch system or its options cannot be used
     """
     handler = signal.getsignal(signal.SIGINT)
-    import dask_jobqueue
+    dask_jobqueue = import_extra("dask_jobqueue", "--cluster")
 
     # Its import lets Ctrl-C end the program as if all were done.
     if threading.current_thread() is threading.main_thread():

@@ -16,7 +16,8 @@ from importlib.metadata import version
 from typing import Any
 from uuid import uuid4
 
-from mbtf_core.errors import InputError, PartialError, UsageError, reason
+from mbtf_core.errors import InputError, PartialError, reason
+from mbtf_core.extras import extra_error, has_extra, import_extra
 from mbtf_core.run.batch import site_preload, submitted_jobs
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import GPUS_VARIABLE, THREADS_VARIABLE, Item, Result, TaskFunction, packed, run_task
@@ -140,12 +141,11 @@ class DaskRunner(Runner):
         died, at once; if another process works on its files, until locks of dead processes on other machines
         have ended.
         """
-        from distributed import as_completed
-
+        distributed = import_extra("distributed", "--cluster")
         run, waiting = uuid4().hex[:8], iter(items)
         most = _AHEAD if ahead is None else ahead
         pending: dict[str, Item] = {}
-        done = as_completed(loop=self._client.loop)
+        done = distributed.as_completed(loop=self._client.loop)
         locked: deque[tuple[float, Item]] = deque()
         since: dict[str, float] = {}
 
@@ -201,12 +201,11 @@ class DaskRunner(Runner):
 
     def _result(self, item: Item, future: Any) -> Result:
         """How the item of a future ended; an OSError where the scheduler has."""
-        from distributed import KilledWorker
-
+        distributed = import_extra("distributed", "--cluster")
         if future.status == "cancelled":
             raise OSError("the scheduler has ended")
         error = future.exception()
-        if isinstance(error, KilledWorker):
+        if isinstance(error, distributed.KilledWorker):
             text = "its worker died each time: out of memory, killed, or crashed"
             return Result(item.name, error=text)
         if error is not None:
@@ -248,12 +247,9 @@ def open_runner(
 def _open_workers(where: str, note: Callable[[str], None]) -> Iterator[DaskRunner]:
     """Workers for the tasks of a block; see :func:`open_runner`."""
     config = read_cluster(where)
-    try:
-        import dask
-        from distributed import Client
-    except ImportError:
-        hint = "pip install 'mbtf[cluster]'"
-        raise UsageError("Dask is not installed", where="--cluster", hint=hint) from None
+    dask, distributed = (import_extra(name, f"--cluster {where}") for name in ("dask", "distributed"))
+    if config.engine != "local" and config.address is None and not has_extra("dask_jobqueue"):
+        raise extra_error("dask_jobqueue", f"--cluster {where}")
     names = [name for name in logging.root.manager.loggerDict if name.startswith("distributed")]
     # Tornado prints the traceback of a job that cannot be submitted.
     for name in [*names, "tornado.application"]:
@@ -280,7 +276,8 @@ def _open_workers(where: str, note: Callable[[str], None]) -> Iterator[DaskRunne
             started = config.address or stack.enter_context(_started(config, refused, note))
             # Dask's own time limit leaves out the first answer; its error is the better one.
             client = call_within(
-                config.timeout, lambda: Client(started, timeout=0.8 * config.timeout, set_as_default=False)
+                config.timeout,
+                lambda: distributed.Client(started, timeout=0.8 * config.timeout, set_as_default=False),
             )
             cluster = DaskRunner(client, config, note, refused)
             stack.callback(cluster.close)
@@ -309,17 +306,15 @@ def _started(config: ClusterConfig, refused: list[str], note: Callable[[str], No
     environment = {THREADS_VARIABLE: str(config.threads), "OMP_NUM_THREADS": str(config.threads)}
     if config.engine != "local":
         return submitted_jobs(config, environment, refused, note)
-    import dask
-    from distributed import LocalCluster
-    from distributed.system import MEMORY_LIMIT
-
+    dask, distributed = (import_extra(name, "--cluster") for name in ("dask", "distributed"))
+    everything = import_extra("distributed.system", "--cluster").MEMORY_LIMIT
     gpus = {GPUS_VARIABLE: str(config.gpus)} if config.gpus else {}
-    return LocalCluster(
+    return distributed.LocalCluster(
         n_workers=config.workers,
         # One task at a time, which has the threads.
         threads_per_worker=1,
         processes=True,
-        memory_limit=int(config.memory or MEMORY_LIMIT / config.workers),
+        memory_limit=int(config.memory or everything / config.workers),
         dashboard_address="127.0.0.1:0",
         host="127.0.0.1",
         env={**environment, **gpus},

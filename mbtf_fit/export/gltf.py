@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.extras import import_extra
 from mbtf_fit.export import Export, ExportTarget
 from mbtf_fit.export.images import BASE_COLOR, HEIGHT, IMAGE_NAMES, NORMAL, ORM, MapOptions, write_document
 
@@ -18,8 +19,7 @@ _NAME = "material.gltf"
 
 def gltf(maps: Maps, name: str, described: dict[str, Any]) -> str:
     """A glTF 2.0 document: one tile in the plane z = 0, u along x, v along y."""
-    import pygltflib as gl
-
+    gl = import_extra("pygltflib", _NAME)
     # Texture coordinates of glTF have their origin at the upper left.
     arrays: dict[str, NDArray[Any]] = {
         "POSITION": np.array([[0, 0, 0], [1, 0, 0], [1, maps.aspect, 0], [0, maps.aspect, 0]], np.float32),
@@ -83,7 +83,7 @@ def gltf(maps: Maps, name: str, described: dict[str, Any]) -> str:
 
 def write(export: Export, options: MapOptions) -> list[str]:
     """Write the maps and the document."""
-    return write_document(export, options, _NAME, gltf, "pygltflib", "pygltflib")
+    return write_document(export, options, _NAME, gltf, "pygltflib")
 
 
 TARGET = ExportTarget("gltf", "maps and a glTF 2.0 document", [_NAME, *IMAGE_NAMES], write, MapOptions)

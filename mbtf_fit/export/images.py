@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
+import io
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import Field
 
 from mbtf_core.config.settings import Settings
-from mbtf_core.errors import EngineError
+from mbtf_core.extras import extra_error, has_extra
 from mbtf_core.files.atomic import write_chunks, write_text
 from mbtf_core.paths import real_path
 from mbtf_fit.export import Export
@@ -36,7 +36,6 @@ def write_document(
     name: str,
     text: Callable[[Maps, str, dict[str, Any]], str],
     module: str,
-    package: str,
 ) -> list[str]:
     """Write the maps of a material as images, once for all documents of an export, and a document.
 
@@ -48,8 +47,8 @@ def write_document(
         Of the document.
     text : callable
         Of maps, the material's name, and plain data that identify the neural material and the maps.
-    module, package : str
-        The library that makes the document, and what installs it.
+    module : str
+        The library that makes the document.
 
     Returns
     -------
@@ -65,8 +64,8 @@ def write_document(
     PartialError
         The folder cannot be written.
     """
-    if importlib.util.find_spec(module) is None:
-        raise EngineError(f"{package} is not installed", where=name, hint="pip install 'mbtf[maps]'")
+    if not has_extra(module):
+        raise extra_error(module, name)
     if "maps" not in export.shared:
         from mbtf_fit.material.maps import make_maps
 
@@ -95,7 +94,7 @@ def write_images(maps: Maps, folder: Path) -> list[str]:
     - ``height.png``: 16 bits, 0 the lowest and 65535 the highest vertex; the range is in the document. Models
       that know no surface have none.
     """
-    import imagecodecs
+    from PIL import Image
 
     from mbtf_core.color import linear_to_srgb
 
@@ -109,5 +108,7 @@ def write_images(maps: Maps, folder: Path) -> list[str]:
     for name, image in images.items():
         kind = np.uint16 if name == HEIGHT else np.uint8
         pixels = np.rint(np.clip(image, 0.0, 1.0) * np.iinfo(kind).max).astype(kind)
-        write_chunks(folder / name, [imagecodecs.png_encode(pixels, level=9)])
+        encoded = io.BytesIO()
+        Image.fromarray(pixels).save(encoded, format="PNG", compress_level=9)
+        write_chunks(folder / name, [encoded.getvalue()])
     return list(images)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from mbtf_core.extras import import_extra
 from mbtf_fit.export import Export, ExportTarget
 from mbtf_fit.export.images import BASE_COLOR, HEIGHT, IMAGE_NAMES, NORMAL, ORM, MapOptions, write_document
 
@@ -15,8 +16,7 @@ _NAME = "material.mtlx"
 
 def materialx(maps: Maps, name: str, described: dict[str, Any]) -> str:
     """A MaterialX document with the node ``gltf_pbr``."""
-    import MaterialX as mx
-
+    mx = import_extra("MaterialX", _NAME)
     document = mx.createDocument()
     document.setDocString(", ".join(f"{k} {v}" for k, v in described.items()))
     graph = document.addNodeGraph("maps")
@@ -75,7 +75,7 @@ def materialx(maps: Maps, name: str, described: dict[str, Any]) -> str:
 
 def write(export: Export, options: MapOptions) -> list[str]:
     """Write the maps and the document."""
-    return write_document(export, options, _NAME, materialx, "MaterialX", "MaterialX")
+    return write_document(export, options, _NAME, materialx, "MaterialX")
 
 
 TARGET = ExportTarget("materialx", "maps and a MaterialX document", [_NAME, *IMAGE_NAMES], write, MapOptions)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from mbtf_core.extras import import_extra
 from mbtf_fit.export import Export, ExportTarget
 from mbtf_fit.export.images import BASE_COLOR, HEIGHT, IMAGE_NAMES, NORMAL, ORM, MapOptions, write_document
 
@@ -15,8 +16,9 @@ _NAME = "material.usda"
 
 def usd(maps: Maps, name: str, described: dict[str, Any]) -> str:
     """A USD layer with a plane and a UsdPreviewSurface; one scene unit is a tile's width."""
-    from pxr import Sdf, Usd, UsdGeom, UsdShade
-
+    Sdf, Usd, UsdGeom, UsdShade = (
+        import_extra(f"pxr.{name}", _NAME) for name in ("Sdf", "Usd", "UsdGeom", "UsdShade")
+    )
     types = Sdf.ValueTypeNames
     stage = Usd.Stage.CreateInMemory(".usda")
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
@@ -87,7 +89,7 @@ def usd(maps: Maps, name: str, described: dict[str, Any]) -> str:
 
 def write(export: Export, options: MapOptions) -> list[str]:
     """Write the maps and the document."""
-    return write_document(export, options, _NAME, usd, "pxr", "usd-core")
+    return write_document(export, options, _NAME, usd, "pxr")
 
 
 TARGET = ExportTarget("usd", "maps and a USD layer", [_NAME, *IMAGE_NAMES], write, MapOptions)

@@ -191,7 +191,7 @@ def _load() -> tuple[Kernel | None, str]:
     paths = (Path(__file__).with_name(f"{LIBRARY}{suffix}") for suffix in EXTENSION_SUFFIXES)
     path = next((path for path in paths if path.is_file()), None)
     if path is None:
-        return None, "not built: no C compiler was found when mbtf was installed"
+        return None, "not built: there was no C compiler, or the wheel is one for any machine"
     try:
         library = open_library(path)
     except OSError as error:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.data.dataset import Dataset
-from mbtf_core.errors import UsageError
+from mbtf_core.extras import import_extra
 from mbtf_core.files.atomic import data_sha256, write_text
 from mbtf_core.files.folders import OutputFolder, OutputKind
 from mbtf_core.paths import refuse_special
@@ -152,16 +152,12 @@ class EventLog:
 
     Raises
     ------
-    UsageError
+    EngineError
         TensorBoard is not installed.
     """
 
     def __init__(self, folder: Path) -> None:
-        try:
-            import tensorboard  # noqa: F401
-        except ImportError:
-            hint = "pip install 'mbtf[tensorboard]', or use --live"
-            raise UsageError("TensorBoard is not installed", where="--tensorboard", hint=hint) from None
+        import_extra("tensorboard", "--tensorboard")
         self._folder = folder
         self._writer: Any = None
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.shard_files import Arrays
 from mbtf_core.errors import InputError
+from mbtf_core.extras import import_extra
 from mbtf_core.files.atomic import write_through
 from mbtf_gen.measured.hdf5 import CHANNELS, COLOR, LIGHT, PLACE, RADIUS, VIEW
 
@@ -58,9 +59,9 @@ def export_neumip(data: Dataset, path: Path) -> int:
         side //= 2
     images = count // side**2
 
-    def write(temporary: Path) -> None:
-        import h5py
+    h5py = import_extra("h5py", path)
 
+    def write(temporary: Path) -> None:
         with h5py.File(temporary, "w") as file:
             file.attrs["base_radius"] = 0.5 / (1 << data.lattice.finest)
             stored = {
@@ -123,9 +124,9 @@ def export_neural_btf(data: Dataset, path: Path) -> int:
     whole = data.load("train")
     values = mean_of(whole)[np.argsort(data.lattice.texel_of(whole["u"][:, 0]))].reshape(rows, columns, -1, 3)
 
-    def write(temporary: Path) -> None:
-        import h5py
+    h5py = import_extra("h5py", path)
 
+    def write(temporary: Path) -> None:
         with h5py.File(temporary, "w") as file:
             file[LIGHT], file[VIEW] = whole["omega_i"][0, :, :2], whole["omega_o"][0, :, :2]
             color: Any = file.create_dataset(COLOR, (values.shape[2], rows, columns, 3), np.float32)

@@ -38,6 +38,7 @@ from numpy.typing import NDArray
 
 from mbtf_core.data.shard_files import Arrays
 from mbtf_core.errors import InputError, MbtfError, reason
+from mbtf_core.extras import import_extra
 from mbtf_gen.measured.interface import (
     COMPLETE,
     F32,
@@ -71,8 +72,7 @@ def hdf5_file(path: Path) -> Iterator[Any]:
     ------
     InputError : the file is missing, is not HDF5, is truncated or damaged
     """
-    import h5py
-
+    h5py = import_extra("h5py", path)
     try:
         # A chunk that images share is decompressed once.
         with h5py.File(path, "r", rdcc_nbytes=_MOST_CHUNK_BYTES) as file:
@@ -90,8 +90,7 @@ def data_set(file: Any, name: str, path: Path) -> Any:
     ------
     InputError : it is missing, leads to another file, has no floats, or has parts that were never written
     """
-    import h5py
-
+    h5py = import_extra("h5py", path)
     found = file[name] if isinstance(file.get(name, getlink=True), h5py.HardLink) else None
     if not isinstance(found, h5py.Dataset) or found.is_virtual or found.external:
         names = ", ".join(sorted(file)[:10])

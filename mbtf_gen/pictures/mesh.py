@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mbtf_core.color import to_display
 from mbtf_core.errors import EngineError
+from mbtf_core.extras import import_extra
 from mbtf_core.images.resample import resample
 from mbtf_core.pictures import Camera
 from mbtf_core.run.processes import run_child
@@ -98,8 +99,7 @@ def draw(tiles: TiledMesh, camera: Camera, omega_i: NDArray[np.float64], path: P
 
 def _plotter(scene: str, view: dict[str, Any]) -> Any:
     """A plotter with the mesh, its walls, the light and the camera."""
-    import pyvista
-
+    pyvista = import_extra("pyvista", "3D pictures")
     with np.load(scene) as stored:
         points, uv, hole, texture = (stored[name] for name in ("points", "uv", "hole", "texture"))
     rows, columns = points.shape[:2]

@@ -15,6 +15,7 @@ from mbtf_core.color import auto_exposure, brightness, describe_exposure
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import InputError, PartialError
+from mbtf_core.extras import extra_error, has_extra
 from mbtf_core.files.folders import check_space, owned
 from mbtf_core.pictures import PNG_BYTES, Camera, claim_pictures, tiles_camera, write_display
 from mbtf_core.run.signals import keep_on_interruption
@@ -154,7 +155,10 @@ def draw_preview(
     if scene is not None:
         lines.append(describe_exposure(exposure))
     console.report({"folder": path, "pictures": pictures, "fault": fault}, "\n".join(lines))
-    if fault:
+    if fault and not has_extra("pyvista"):
+        missing = extra_error("pyvista", path / "mesh.png")
+        console.note(f"note: {missing.where} is not drawn: {missing.what}; {missing.hint}")
+    elif fault:
         raise PartialError(
             f"could not be drawn ({fault})",
             where=path / "mesh.png",

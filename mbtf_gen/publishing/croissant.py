@@ -11,6 +11,7 @@ import re
 from pathlib import PurePosixPath
 from typing import Any
 
+from mbtf_core.extras import import_extra
 from mbtf_gen.publishing.facts import TAGS, Facts
 
 CROISSANT_NAME = "croissant.json"
@@ -27,8 +28,7 @@ _FORMATS = {
 
 def croissant_text(facts: Facts) -> str:
     """The document, which lists the files of the facts."""
-    import mlcroissant as mlc
-
+    mlc = import_extra("mlcroissant", "croissant.json")
     config, license = facts.config, facts.config.license
     listed = re.fullmatch(r"(?!LicenseRef-)[A-Za-z0-9.+-]+", license)
     distribution: list[Any] = [
@@ -74,8 +74,7 @@ def croissant_text(facts: Facts) -> str:
 
 
 def _records(facts: Facts, split: str) -> Any:
-    import mlcroissant as mlc
-
+    mlc = import_extra("mlcroissant", "croissant.json")
     described = facts.data.manifest["arrays"]
     fields = []
     for name, shape in facts.shapes[split].items():

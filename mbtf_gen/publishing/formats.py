@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from mbtf_core.data.dataset import Shard
 from mbtf_core.data.folder import sidecar_name
 from mbtf_core.data.shard_files import Arrays
+from mbtf_core.extras import import_extra
 from mbtf_core.files.atomic import Stored, file_sha256, sync_folder, temporary_of, write_chunks, write_through
 from mbtf_gen.config.publish import Form
 
@@ -61,9 +62,7 @@ def shard_writers(
 
 def write_parquet(path: Path, arrays: Arrays, described: Described) -> Stored:
     """Write arrays (rows, …) as Parquet, atomically."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
+    pa, pq = (import_extra(name, path) for name in ("pyarrow", "pyarrow.parquet"))
     fields = []
     for name, array in arrays.items():
         metadata = {key: str(described[name][key]) for key in ("unit", "meaning")}
@@ -85,8 +84,7 @@ def write_parquet(path: Path, arrays: Arrays, described: Described) -> Stored:
 
 def _column(array: NDArray[np.float32]) -> Any:
     """A column of nested lists of fixed size, without a copy of its numbers."""
-    import pyarrow as pa
-
+    pa = import_extra("pyarrow", "--form parquet")
     column = pa.array(np.ascontiguousarray(array).reshape(-1), pa.float32())
     for size in reversed(array.shape[1:]):
         column = pa.FixedSizeListArray.from_arrays(column, size)
@@ -95,14 +93,14 @@ def _column(array: NDArray[np.float32]) -> Any:
 
 def write_tar(path: Path, arrays: Arrays) -> Stored:
     """Write arrays (rows, …) as a tar file whose samples have the name of the file, atomically."""
-    from webdataset import TarWriter
+    webdataset = import_extra("webdataset", path)
 
     total, rows = _blocks(arrays, _SAMPLE_BYTES)
 
     def write(temporary: Path) -> None:
         with (
             temporary.open("wb") as stream,
-            TarWriter(stream, user="", group="", mode=0o644, mtime=0, compress=False) as tar,
+            webdataset.TarWriter(stream, user="", group="", mode=0o644, mtime=0, compress=False) as tar,
         ):
             for number, start in enumerate(range(0, total, rows)):
                 block = {f"{n}.npy": np.ascontiguousarray(a[start : start + rows]) for n, a in arrays.items()}

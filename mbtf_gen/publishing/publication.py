@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -16,7 +15,8 @@ from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.schema import GEOMETRY_NAME
 from mbtf_core.data.shard_files import Arrays
 from mbtf_core.data.verify import verify
-from mbtf_core.errors import EngineError, InputError, UsageError
+from mbtf_core.errors import InputError, UsageError
+from mbtf_core.extras import extra_error, has_extra
 from mbtf_core.files.atomic import Stored, data_sha256, write_chunks
 from mbtf_core.files.folders import OutputFolder, OutputKind, check_space, owned
 from mbtf_gen.config.publish import PublishConfig
@@ -86,9 +86,8 @@ class Publication:
         data = Dataset.open(shards)
         manifest, measured = data.manifest, "measured" in data.manifest
         for library in ("mlcroissant", LIBRARIES[config.form]):
-            if importlib.util.find_spec(library) is None:
-                hint = "pip install 'mbtf[publish]'"
-                raise EngineError(f"{library} is not installed", where=f"--form {config.form}", hint=hint)
+            if not has_extra(library):
+                raise extra_error(library, f"--form {config.form}")
         if config.form == "npz" and manifest["array_format"] != "npz":
             raise UsageError(
                 f"{data.folder} holds shards of another format ({manifest['array_format']})",

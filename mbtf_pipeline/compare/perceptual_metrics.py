@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mbtf_core.color import linear_to_srgb
-from mbtf_core.errors import EngineError
+from mbtf_core.extras import extra_error
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -40,6 +40,8 @@ PIXELS_PER_DEGREE = 67.0
 # Standard deviation of SSIM's window in pixels, and its size; both as in the paper (11 × 11 pixels).
 WINDOW = 1.5
 _WINDOW_SIZE = 11
+# Its constants, of values from 0 to 1.
+_C1, _C2 = 0.01**2, 0.03**2
 
 # Package of ST-LPIPS, its weights, and the smallest image side for which its deepest layer is not empty.
 PACKAGE = "stlpips_pytorch"
@@ -102,22 +104,22 @@ def ssim(image: ArrayLike, reference: ArrayLike, white: float) -> float | None:
     ----------
     white : linear value displayed as white, 1/sr
     """
-    from skimage.metrics import structural_similarity
+    from scipy.ndimage import gaussian_filter
 
     test, truth = to_srgb(image, white), to_srgb(reference, white)
     if min(truth.shape[:2]) < _WINDOW_SIZE:
         return None
-    return float(
-        structural_similarity(
-            truth,
-            test,
-            data_range=1.0,
-            channel_axis=-1,
-            gaussian_weights=True,
-            sigma=WINDOW,
-            use_sample_covariance=False,
-        )
-    )
+    radius = _WINDOW_SIZE // 2
+
+    def local_mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        found = gaussian_filter(values, WINDOW, radius=radius, axes=(0, 1))
+        return np.asarray(found[radius:-radius, radius:-radius])
+
+    x, y = local_mean(truth), local_mean(test)
+    variances = local_mean(truth * truth) - x * x + local_mean(test * test) - y * y
+    covariance = local_mean(truth * test) - x * y
+    luminance = (2 * x * y + _C1) / (x * x + y * y + _C1)
+    return float(np.mean(luminance * (2 * covariance + _C2) / (variances + _C2)))
 
 
 def to_srgb(image: ArrayLike, white: float) -> NDArray[np.float64]:
@@ -142,11 +144,7 @@ def require() -> Path:
     """
     file = weights_file()
     if file is None:
-        raise EngineError(
-            "ST-LPIPS needs the weights of the package stlpips-pytorch, which is not installed",
-            where="compare.perceptual_metrics",
-            hint="pip install 'mbtf[perceptual]', or remove the option",
-        )
+        raise extra_error(PACKAGE, "compare.perceptual_metrics")
     return file
 
 

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import ast
+import re
+import sys
+import tomllib
 from collections.abc import Callable, Iterable, Iterator
 from functools import cache
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
@@ -131,6 +135,32 @@ def imported(source: str) -> Iterator[str]:
             for alias in node.names:
                 name = f"{node.module}.{alias.name}"
                 yield name if name in SOURCES else str(node.module)
+
+
+def third_party() -> dict[str, set[str]]:
+    """Modules of others that the packages import, and where."""
+    found: dict[str, set[str]] = {}
+    for module in SOURCES:
+        for name in imports_of(module):
+            top = name.split(".")[0]
+            if top not in sys.stdlib_module_names and top not in PACKAGES:
+                found.setdefault(top, set()).add(module)
+    return found
+
+
+def test_what_is_imported_directly_is_installed_by_every_installation() -> None:
+    """Modules of extras are imported by :func:`mbtf_core.extras.import_extra` alone."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    declared = {re.split(r"[^\w.-]", requirement)[0].lower() for requirement in project["dependencies"]}
+    # Parts of Mitsuba, Jinja and Pydantic.
+    allowed = {*declared, "drjit", "markupsafe", "pydantic_core"}
+    providers = packages_distributions()
+    undeclared = {
+        name: where
+        for name, where in third_party().items()
+        if not allowed & {provider.lower() for provider in providers.get(name, [name])}
+    }
+    assert undeclared == {}
 
 
 @cache

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import get_args
 
 from mbtf_core.errors import EngineError, reason
+from mbtf_core.extras import extra_error
 from mbtf_core.files.atomic import write_chunks, write_text
 from mbtf_fit.backends.shader.images import F32, buffer_of
 from mbtf_fit.backends.shader.program import program_of
@@ -74,11 +75,7 @@ def _library() -> ctypes.CDLL:
         for name in names:
             for path in sorted(folder.glob(name)):
                 return ctypes.CDLL(str(path))
-    raise EngineError(
-        "Slang's compiler is not installed",
-        where="--shader-target",
-        hint="pip install 'mbtf[shaders]' (290 MB)",
-    )
+    raise extra_error("slangpy", "--shader-target")
 
 
 class SlangCompiler:

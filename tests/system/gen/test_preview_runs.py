@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -178,6 +179,14 @@ def test_a_preview_without_drawing_is_partial_and_resumes(
     assert lines[-1].startswith("exposure ")
     assert "mesh.png: could not be drawn (the process was ended by SIGSEGV)" in err
     assert "doctor" in err
+    with monkeypatch.context() as patch:
+        patch.setattr(mesh, "draw", lambda *_: "pyvista is not installed")
+        patch.setitem(sys.modules, "pyvista", None)
+        assert run(app, line) == 0
+    assert (
+        "mesh.png is not drawn: pyvista is not installed; pip install 'mbtf[drawing]'"
+        in capsys.readouterr().err
+    )
     assert run(app, line) == 0
     out, _ = capsys.readouterr()
     assert [text.endswith("(kept)") for text in out.splitlines()[:-1]] == [False, True, True]

@@ -120,12 +120,6 @@ def test_other_versions_are_refused() -> None:
     assert "version" in found["hint"]
 
 
-def test_without_dask_one_line_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(UsageError, match=r"mbtf\[cluster\]"), open_runner("local", lambda line: None):
-        pass
-
-
 def scheduler_file(folder: Path, address: str) -> str:
     """A file that names a scheduler, which must answer within a second."""
     path = folder / "scheduler.yaml"

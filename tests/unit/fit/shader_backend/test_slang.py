@@ -228,7 +228,7 @@ def test_what_cannot_be_written_is_refused(
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert run(app, ["export", str(tmp_path / "good"), "--to", "slang", "--shader-target", "hlsl", *out]) == 3
     found = capsys.readouterr().err
-    assert "--shader-target: Slang's compiler is not installed" in found
+    assert "--shader-target: slangpy is not installed" in found
     assert "mbtf[shaders]" in found
 
 

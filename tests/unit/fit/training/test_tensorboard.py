@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import pytest
 from support.fit_data import parallax, write_data
 
-from mbtf_core.errors import UsageError
 from mbtf_fit.config import FitConfig
 from mbtf_fit.training.fit import fit
 from mbtf_fit.training.fit_folder import EventLog, read_history
@@ -33,9 +31,3 @@ def test_event_files_hold_the_history(tmp_path: Path) -> None:
     assert errors == pytest.approx(finite)
     levels = [tag for tag in events.Tags()["scalars"] if tag.startswith("unexplained variance by level/")]
     assert len(levels) > 1
-
-
-def test_without_tensorboard_one_line_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setitem(sys.modules, "tensorboard", None)
-    with pytest.raises(UsageError, match=r"mbtf\[tensorboard\]"):
-        EventLog(tmp_path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +108,7 @@ def test_the_announced_size_is_enough(shards: Path, tmp_path: Path) -> None:
 
 
 def test_without_a_library_one_line_says_so(shards: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module.importlib.util, "find_spec", lambda name: None if name == "pyarrow" else name)
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(EngineError, match="pyarrow is not installed") as raised:
         Publication.prepare(shards, PublishConfig(license="CC0-1.0"))
     assert raised.value.hint == "pip install 'mbtf[publish]'"

@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 
 from mbtf_core.color import to_display
-from mbtf_core.errors import EngineError
-from mbtf_pipeline.compare import perceptual_metrics as perceptual
 from mbtf_pipeline.compare.perceptual_metrics import flip, ssim, st_lpips, to_srgb, weights_file
 
 F64 = np.ndarray
@@ -49,12 +47,12 @@ def test_only_the_ratio_to_white_matters_and_values_above_are_clipped() -> None:
     assert ssim(picture[:10], reference[:10], 1.0) is None
 
 
-def test_missing_weights_of_st_lpips_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(perceptual, "PACKAGE", "no_such_package_of_weights")
-    perceptual._tensors.cache_clear()
-    with pytest.raises(EngineError, match="ST-LPIPS needs the weights") as raised:
-        st_lpips(*pair(), 1.0)
-    assert "mbtf[perceptual]" in str(raised.value)
+def test_ssim_is_that_of_another_implementation() -> None:
+    metrics = pytest.importorskip("skimage.metrics")
+    options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+    pictures = [to_srgb(image, 1.0) for image in pair()]
+    expected = metrics.structural_similarity(*pictures, data_range=1.0, channel_axis=-1, **options)
+    assert ssim(*pair(), 1.0) == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.fixture

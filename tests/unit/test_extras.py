@@ -1,0 +1,134 @@
+"""Packages of extras: where one is missing, one error names the extra that installs it."""
+
+from __future__ import annotations
+
+import re
+import sys
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from support.paths import ROOT
+
+from mbtf_core.data.store import open_store
+from mbtf_core.errors import EngineError
+from mbtf_core.extras import EXTRAS, import_extra
+from mbtf_core.images.radiance import read_radiance
+from mbtf_core.images.read import read_image
+from mbtf_core.run.cluster import open_runner
+from mbtf_fit.backends.shader.slang import SlangCompiler
+from mbtf_fit.export import gltf, materialx, usd
+from mbtf_fit.training.fit_folder import EventLog
+from mbtf_gen.doctor import use_drawing
+from mbtf_gen.measured.exported import export_neumip
+from mbtf_gen.measured.hdf5 import opened
+from mbtf_gen.publishing.croissant import croissant_text
+from mbtf_gen.publishing.formats import write_parquet, write_tar
+from mbtf_pipeline.compare import perceptual_metrics
+
+EXPORT: Any = SimpleNamespace(shared={})
+SQUARE = SimpleNamespace(aspect=1.0, finest=3)
+DATA: Any = SimpleNamespace(layout="shuffled", lattice=SQUARE, shards=lambda split: [])
+
+
+def export(target: Any) -> Callable[[Path], object]:
+    return lambda folder: target.write(EXPORT, None)
+
+
+def workers(where: str) -> Callable[[Path], object]:
+    """Opens workers of an engine that a file names."""
+
+    def use(folder: Path) -> None:
+        file = folder / "cluster.yaml"
+        file.write_text(f"engine: {where}\nmemory: 1GB\n")
+        with open_runner(str(file), lambda line: None):
+            pass
+
+    return use
+
+
+def image(name: str) -> Callable[[Path], object]:
+    return lambda folder: read_image(folder / name)
+
+
+# What needs a module, called with a folder that has the images of the fixture below.
+USES: list[tuple[str, Callable[[Path], object]]] = [
+    ("MaterialX", export(materialx)),
+    ("dask", workers("local")),
+    ("dask_jobqueue", workers("slurm")),
+    ("distributed", workers("local")),
+    ("fsspec", lambda folder: open_store("s3://bucket/data")),
+    ("h5py", lambda folder: export_neumip(DATA, folder / "data.h5")),
+    ("h5py", lambda folder: opened(folder / "data.h5").__enter__()),
+    ("imagecodecs", lambda folder: read_radiance(folder / "radiance.hdr")),
+    ("imagecodecs", image("deep.png")),
+    ("imagecodecs", image("lzw.tif")),
+    ("mlcroissant", lambda folder: croissant_text(EXPORT)),
+    ("pxr", export(usd)),
+    ("pyarrow", lambda folder: write_parquet(folder / "a.parquet", {}, {})),
+    ("pygltflib", export(gltf)),
+    ("pyvista", lambda folder: next(use_drawing())),
+    ("s3fs", lambda folder: open_store("s3://bucket/data")),
+    ("slangpy", lambda folder: SlangCompiler()),
+    ("stlpips_pytorch", lambda folder: perceptual_metrics.require()),
+    ("tensorboard", EventLog),
+    ("webdataset", lambda folder: write_tar(folder / "a.tar", {})),
+]
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with one image of each kind that needs a package, written by that package."""
+    imagecodecs = pytest.importorskip("imagecodecs")
+    folder = tmp_path_factory.mktemp("images")
+    pixels = np.arange(48, dtype=np.uint16).reshape(4, 4, 3)
+    (folder / "deep.png").write_bytes(imagecodecs.png_encode(pixels))
+    (folder / "radiance.hdr").write_bytes(imagecodecs.rgbe_encode(pixels.astype(np.float32)))
+    tifffile.imwrite(folder / "lzw.tif", pixels, photometric="rgb", compression="lzw")
+    return folder
+
+
+@pytest.mark.parametrize(("module", "use"), USES, ids=[f"{n}-{name}" for n, (name, _) in enumerate(USES)])
+def test_one_error_names_the_extra(
+    module: str, use: Callable[[Path], object], images: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # tifffile looks for its decoders when it is imported.
+    for name in [name for name in sys.modules if name.startswith((f"{module}.", "tifffile"))]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(EngineError, match="is not installed") as raised:
+        use(images)
+    extra, distribution = EXTRAS[module]
+    assert raised.value.hint == f"pip install 'mbtf[{extra}]'"
+    assert raised.value.what.startswith(distribution)
+    assert raised.value.where
+
+
+def test_every_module_has_a_use() -> None:
+    assert {module for module, _ in USES} == set(EXTRAS)
+
+
+def test_a_package_that_cannot_be_imported_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "webdataset.py").write_text("import no_such_dependency\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "webdataset", raising=False)
+    with pytest.raises(EngineError, match=r"cannot be imported.*no_such_dependency"):
+        import_extra("webdataset", "--form webdataset")
+
+
+def test_the_extras_of_the_table_install_their_packages() -> None:
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    found = {
+        (extra, re.split(r"[^\w-]", requirement)[0])
+        for extra, requirements in declared.items()
+        if extra != "dev"
+        for requirement in requirements
+    }
+    # The dashboard of Dask, which imports it.
+    assert found - set(EXTRAS.values()) == {("cluster", "bokeh")}
+    assert set(EXTRAS.values()) <= found
