@@ -11,7 +11,7 @@ from typing import Any
 import latex2mathml.converter
 from docutils import nodes
 
-sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parent / "extensions")]
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 project = "mbtf"
 author = "the mbtf authors"
@@ -22,8 +22,6 @@ extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
-    "configuration_reference",
-    "schema_tables",
 ]
 html_math_renderer = "mathml"
 myst_enable_extensions = ["dollarmath", "attrs_inline", "colon_fence"]

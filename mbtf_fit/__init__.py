@@ -12,13 +12,23 @@ _PUBLIC = {
     "FitConfig": "mbtf_fit.config",
     "FitResult": "mbtf_fit.training.fit",
     "Material": "mbtf_fit.material.material",
+    "QueryDataset": "mbtf_fit.data.batches",
     "evaluate": "mbtf_fit.evaluation",
     "fit": "mbtf_fit.training.fit",
     "fit_jointly": "mbtf_fit.training.fit",
     "read_history": "mbtf_fit.training.fit_folder",
 }
 
-__all__ = ["FitConfig", "FitResult", "Material", "evaluate", "fit", "fit_jointly", "read_history"]
+__all__ = [
+    "FitConfig",
+    "FitResult",
+    "Material",
+    "QueryDataset",
+    "evaluate",
+    "fit",
+    "fit_jointly",
+    "read_history",
+]
 
 
 def __getattr__(name: str) -> Any:

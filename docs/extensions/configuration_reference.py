@@ -1,16 +1,5 @@
-"""Sphinx directive ``configuration``: tables of the options of a pydantic model.
-
-In a page of Markdown::
-
-    ```{configuration} mbtf_fit.config.FitConfig
-    :only: training
-    :skip: training.blur
-    ```
-
-prints one table for the model's own keys and one for each nested section: key, type, default, range, and
-the field's description. ``only`` keeps the named top-level keys, ``skip`` lists keys whose own options are
-documented elsewhere; both are separated by blanks.
-"""
+"""Tables of the options of a pydantic model, in Markdown: one table for the model's own keys and one for each
+nested section, with key, type, default, range, and the field's description."""
 
 from __future__ import annotations
 
@@ -20,18 +9,16 @@ import re
 import types
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar, Literal, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import annotated_types
-from docutils import nodes
-from docutils.parsers.rst import directives
 from pydantic import BaseModel, TypeAdapter
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
-from sphinx.application import Sphinx
-from sphinx.util.docutils import SphinxDirective
 
 _HEADER = ("Key", "Type", "Default", "Range", "Meaning")
+# What Markdown would read as more than text.
+_SPECIAL = re.compile(r"[<$*~\[\]]|\b_|_\b")
 _LITERAL = re.compile(r"``(.+?)``|`(.+?)`")
 _SCALARS = {bool: "true or false", int: "whole number", float: "number", str: "text", Any: "any"}
 # Powers of two from here on are written as such.
@@ -218,76 +205,38 @@ def _collect(
         _collect(inner, [f"{p}{n}." for p in prefixes for n in names], (), skip, out)
 
 
-def _inline(text: str) -> list[nodes.Node]:
-    """Text with what stands in backquotes as literals."""
-    out: list[nodes.Node] = []
-    end = 0
+def cell(text: str) -> str:
+    """Text of a table's cell; what stands in backquotes is code."""
+    parts, end = [], 0
     for found in _LITERAL.finditer(text):
-        if found.start() > end:
-            out.append(nodes.Text(text[end : found.start()]))
-        word = found[1] or found[2]
-        out.append(nodes.literal(word, word))
+        parts += [_SPECIAL.sub(r"\\\g<0>", text[end : found.start()]), f"`{found[1] or found[2]}`"]
         end = found.end()
-    if end < len(text):
-        out.append(nodes.Text(text[end:]))
-    return out
+    return "".join([*parts, _SPECIAL.sub(r"\\\g<0>", text[end:])]).replace("|", "\\|")
 
 
-def _cells(cells: Sequence[list[nodes.Node]]) -> nodes.row:
-    return nodes.row("", *(nodes.entry("", nodes.paragraph("", "", *cell)) for cell in cells))
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table of cells."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join(" ".join(f"| {text}" if text else "|" for text in line) + " |" for line in lines)
 
 
-def _table(rows: Sequence[Row]) -> nodes.table:
-    group = nodes.tgroup(cols=len(_HEADER))
-    group += [nodes.colspec(colwidth=width) for width in (22, 18, 12, 12, 36)]
-    group += nodes.thead("", _cells([[nodes.Text(title)] for title in _HEADER]))
-    body = [
-        [
-            [nodes.literal(row.key, row.key)],
-            *(_inline(text) for text in (row.kind, row.default, row.bounds, row.meaning)),
+def configuration(name: str, only: Sequence[str] = (), skip: Sequence[str] = ()) -> str:
+    """The tables of a model with this dotted name.
+
+    Parameters
+    ----------
+    only : keys of the model that are shown; all by default
+    skip : dotted keys whose own options are documented elsewhere
+    """
+    module, _, attribute = name.rpartition(".")
+    parts = []
+    for section in sections(getattr(importlib.import_module(module), attribute), only, skip):
+        if section.keys:
+            parts.append(", ".join(f"**`{key}`**" for key in section.keys))
+            parts += [cell(section.text)] if section.text else []
+        rows = [
+            [f"`{row.key}`", *map(cell, (row.kind, row.default, row.bounds, row.meaning))]
+            for row in section.rows
         ]
-        for row in rows
-    ]
-    group += nodes.tbody("", *(_cells(cells) for cells in body))
-    return nodes.table("", group, classes=["colwidths-auto"])
-
-
-class ConfigurationDirective(SphinxDirective):
-    """``configuration``; see the module."""
-
-    required_arguments = 1
-    option_spec: ClassVar[dict[str, Any]] = {"only": directives.unchanged, "skip": directives.unchanged}
-
-    def run(self) -> list[nodes.Node]:
-        """The tables.
-
-        Raises
-        ------
-        docutils.parsers.rst.DirectiveError
-            If there is no such model.
-        """
-        module_name, _, name = self.arguments[0].rpartition(".")
-        try:
-            module = importlib.import_module(module_name)
-            model = getattr(module, name)
-        except (ImportError, AttributeError, ValueError) as error:
-            raise self.error(f"no pydantic model {self.arguments[0]}: {error}") from None
-        self.env.note_dependency(inspect.getfile(model))
-        only, skip = (self.options.get(option, "").split() for option in ("only", "skip"))
-        out: list[nodes.Node] = []
-        for section in sections(model, only, skip):
-            if section.keys:
-                title: list[nodes.Node] = []
-                for key in section.keys:
-                    title += [nodes.Text(", "), nodes.literal(key, key)]
-                out.append(nodes.rubric("", "", *title[1:]))
-                if section.text:
-                    out.append(nodes.paragraph("", "", *_inline(section.text)))
-            out.append(_table(section.rows))
-        return out
-
-
-def setup(app: Sphinx) -> dict[str, Any]:
-    """Called by Sphinx."""
-    app.add_directive("configuration", ConfigurationDirective)
-    return {"version": "1", "parallel_read_safe": True, "parallel_write_safe": True}
+        parts.append(table(_HEADER, rows))
+    return "\n\n".join(parts)

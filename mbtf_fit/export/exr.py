@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -50,8 +51,26 @@ def write(export: Export, options: None) -> list[str]:
         names = channel_names(name, len(planes))
         channels = {c: np.ascontiguousarray(plane) for c, plane in zip(names, planes, strict=True)}
         parts.append(OpenEXR.Part(dict(header), channels, name=name))
-    write_through(export.folder / TEXTURES_NAME, lambda path: OpenEXR.File(parts).write(str(path)))
+    path = export.folder / TEXTURES_NAME
+    write_through(path, lambda path: OpenEXR.File(parts).write(str(path)))
+    _check(export, path)
     return [TEXTURES_NAME]
+
+
+def _check(export: Export, path: Path) -> None:
+    """Evaluate what has been written."""
+    import OpenEXR
+
+    from mbtf_fit.export.checks import check_stored
+    from mbtf_fit.material.material import describe_model
+
+    model = export.material.model
+    tensors = {name: t.cpu().numpy() for name, t in model.weights().items() if t.ndim != 3}
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        for part in file.parts:
+            planes = [np.asarray(channel.pixels, np.float32) for _, channel in sorted(part.channels.items())]
+            tensors[part.name()] = np.stack(planes, -1)
+    check_stored(describe_model(model), tensors, export.material, path)
 
 
 TARGET = ExportTarget(

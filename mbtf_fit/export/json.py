@@ -23,6 +23,7 @@ def _numbers(array: Any) -> Any:
 def write(export: Export, options: None) -> list[str]:
     """Write what evaluates a material, but for its textures: its operations, the tensors that they name, and
     the conformance queries with their expected values, that of the transmittance included."""
+    from mbtf_fit.export.checks import check_stored
     from mbtf_fit.material.material import describe_model
     from mbtf_fit.material.transmittance import FORMULA
 
@@ -44,7 +45,11 @@ def write(export: Export, options: None) -> list[str]:
             "tolerance": material.description["conformance"]["tolerance"],
         },
     }
-    write_text(export.folder / LAYERS_NAME, json.dumps(document, indent=1))
+    path = export.folder / LAYERS_NAME
+    write_text(path, json.dumps(document, indent=1))
+    written = json.loads(path.read_text(encoding="utf-8"))
+    textures = {name: weights[name].cpu().numpy() for name in written["textures"]}
+    check_stored(written, written["tensors"] | textures, material, path)
     return [LAYERS_NAME]
 
 

@@ -9,11 +9,13 @@ _NAMES = ["weights.safetensors", "material.json", "transmittance.safetensors"]
 
 def write(export: Export, options: None) -> list[str]:
     """Write a material folder, unless the folder holds it already."""
+    from mbtf_fit.export.checks import check_values
+    from mbtf_fit.material.format import DESCRIPTION_NAME, QUERY
     from mbtf_fit.material.material import export as write_material
 
     material, description = export.material, export.material.description
     if not export.complete:
-        write_material(
+        written = write_material(
             material.model,
             material.config,
             export.folder,
@@ -22,6 +24,8 @@ def write(export: Export, options: None) -> list[str]:
             half=export.half,
             transmittance=material.transmittance,
         )
+        found = written.evaluate(*(material.conformance[name] for name in QUERY))
+        check_values(found, material, export.folder / DESCRIPTION_NAME)
     return _NAMES if material.transmittance is not None else _NAMES[:2]
 
 

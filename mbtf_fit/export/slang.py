@@ -20,8 +20,10 @@ class ShaderOptions(Settings):
 
 def write(export: Export, options: ShaderOptions) -> list[str]:
     """Write the module, its buffer, and the module in other languages."""
-    from mbtf_fit.backends.shader.slang import write_module
+    from mbtf_fit.backends.shader.slang import MODULE_NAME, write_module
+    from mbtf_fit.export.checks import check_shaders
 
+    check_shaders(export.material, export.folder / MODULE_NAME)
     return write_module(export.material, export.folder, list(dict.fromkeys(options.shader_target or [])))
 
 

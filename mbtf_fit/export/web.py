@@ -52,7 +52,10 @@ def make_page(material: Path, options: PageOptions) -> tuple[str, str]:
 
 
 def write(export: Export, options: PageOptions) -> list[str]:
-    """Write the page."""
+    """Write the page. It checks itself by the conformance queries when a browser opens it."""
+    from mbtf_fit.export.checks import check_shaders
+
+    check_shaders(export.material, export.folder / PAGE_NAME)
     html, precision = make_page(export.source, options)
     write_document(export.folder / PAGE_NAME, html)
     export.notes.append(precision)

@@ -131,8 +131,8 @@ class Maps:
 
 
 def knows_surface(material: Material) -> bool:
-    """Whether the model traces a surface, whose maps it has."""
-    return HEIGHTS in material.model.weights()
+    """Whether the model traces and shades a surface, whose maps then explain its values."""
+    return material.model.tracing is not None
 
 
 def opacity_of(material: Material, level: int) -> F64:

@@ -61,6 +61,11 @@ class Operation:
     output: str
 
     def __init_subclass__(cls) -> None:
+        other = _KINDS.setdefault(cls.kind(), cls)
+        if (other.__module__, other.__name__) != (cls.__module__, cls.__name__):
+            raise TypeError(
+                f"{other.__module__} has an operation '{cls.kind()}' already; choose another name"
+            )
         _KINDS[cls.kind()] = cls
 
     @classmethod

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
 from mbtf_fit import ops
+from mbtf_fit.ops.constants import DIELECTRIC, HEIGHTS, HORIZONS, LIGHT_WIDTH, MAPS
 from mbtf_fit.ops.operation import needed_for, output_names, parse, sizes_of
 from mbtf_fit.ops.value import calibrated
 from mbtf_fit.pytorch.networks import InceptionDecoder, Mlp, initialize_layers
@@ -20,6 +21,8 @@ from mbtf_fit.surface.known import KnownSurface
 
 # Standard deviation of the initial features; weight of the traced displacement before training.
 FEATURE_SCALE, FIRST_WEIGHT = 0.1, 0.9
+# Operations that read the surface.
+_SURFACE = (ops.Trace, ops.Shade)
 # Tensor of the calibration factors.
 CALIBRATION = "calibration"
 
@@ -55,6 +58,7 @@ class NeuralMaterial(nn.Module):
         self._learned: set[str] = set()
         sizes = sizes_of(operations)
         PYTORCH.check(operations)
+        _check_surface(operations)
         moving = {r for o in operations if isinstance(o, ops.Offset) for r in _behind(operations, o.r)}
         for op in reversed(operations):
             self._create(op, sizes, moves=op.output in moving)
@@ -175,7 +179,7 @@ class NeuralMaterial(nn.Module):
     def offset(self, u: Tensor, omega_o: Tensor) -> Tensor:
         """Displacement of the lookup at the finest footprint, (n, 2) in tile widths: the neural offset, or
         that of the surface point that is seen; zero for a model without."""
-        if self.tracing is not None:
+        if any(isinstance(op, ops.Trace) for op in self._own):
             height = self.known.tracer.trace(u, omega_o)[:, None]
             return height * omega_o[:, :2] / omega_o[:, 2:]
         op = next((o for o in self._own if isinstance(o, ops.Offset)), None)
@@ -311,7 +315,7 @@ class NeuralMaterial(nn.Module):
         ------
         InputError : a tensor is missing, unknown or of another shape
         """
-        if self.tracing is not None:
+        if any(isinstance(op, _SURFACE) for op in self._own):
             known = {name: tensor for name, tensor in tensors.items() if name.startswith("surface.")}
             try:
                 self.surface = KnownSurface.from_tensors(known, self.lattice)
@@ -346,6 +350,18 @@ def _size(reference: str, sizes: Mapping[str, int]) -> int:
 def _behind(operations: Sequence[ops.Operation], reference: str) -> set[str]:
     """Values that a value is computed from."""
     return {op.output for op in needed_for(operations, [parse(reference)[0]], [])}
+
+
+def _check_surface(operations: Sequence[ops.Operation]) -> None:
+    """A material has one surface, whose tensors have fixed names."""
+    surface = {HEIGHTS, MAPS, HORIZONS, LIGHT_WIDTH, DIELECTRIC}
+    for op in operations:
+        other = {*op.named("tensor"), *op.named("texture")} - surface if isinstance(op, _SURFACE) else None
+        if other:
+            raise ValueError(
+                f"{op.kind()} '{op.output}' reads '{min(other)}', which is not of the surface: "
+                + ", ".join(sorted(surface))
+            )
 
 
 def _scalars(operations: Sequence[ops.Operation]) -> list[str]:

@@ -1,8 +1,9 @@
-"""The notebook of ``examples/`` runs, from maps to a rendered ball, with the scene file beside it."""
+"""The notebooks of ``examples/`` run: from maps to a rendered ball, and a network of one's own."""
 
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,11 @@ from PIL import Image
 from support.paths import ROOT
 
 EXAMPLES = ROOT / "examples"
-# Of the cell tagged `parameters`: seconds in place of a minute.
-SMALL = 'RESOLUTION, QUERIES, SECONDS, SIZE, SPP = 16, "50/texel", 1.0, 48, 4'
+# Of the cells tagged `parameters`: seconds in place of a minute.
+SMALL = {
+    "maps_to_ball": 'RESOLUTION, QUERIES, SECONDS, SIZE, SPP = 16, "50/texel", 1.0, 48, 4',
+    "train_your_own": 'RESOLUTION, QUERIES, EPOCHS, WIDTH = 8, "100/texel", 40, 32',
+}
 
 
 def cells(notebook: Path) -> list[dict[str, Any]]:
@@ -30,15 +34,16 @@ def names(source: str) -> set[str]:
     return {name.strip() for part in left for name in part.split(",")}
 
 
-def test_the_notebook_renders_a_ball(tmp_path: Path, run_python: RunPython) -> None:
+def run_notebook(name: str, tmp_path: Path, run_python: RunPython) -> tuple[Path, str]:
+    """Its folder, and what it printed."""
     sources = []
-    for cell in cells(EXAMPLES / "maps_to_ball.ipynb"):
+    for cell in cells(EXAMPLES / f"{name}.ipynb"):
         source = "".join(cell["source"])
         if "parameters" in cell["metadata"].get("tags", []):
-            assert names(source) == names(SMALL)
-            source = SMALL
+            assert names(source) == names(SMALL[name])
+            source = SMALL[name]
         sources.append(source)
-    assert SMALL in sources
+    assert SMALL[name] in sources
     (tmp_path / "assets").symlink_to(ROOT / "assets")
     folder = tmp_path / "examples"
     folder.mkdir()
@@ -47,7 +52,24 @@ def test_the_notebook_renders_a_ball(tmp_path: Path, run_python: RunPython) -> N
     script.write_text(f"import os\nos.chdir({str(folder)!r})\n" + "\n".join(sources), encoding="utf-8")
     done = run_python(str(script), MPLBACKEND="Agg")
     assert done.returncode == 0, done.stderr
-    assert "unexplained variance" in done.stdout
+    return folder, done.stdout
+
+
+def test_the_notebook_trains_a_network(tmp_path: Path, run_python: RunPython) -> None:
+    _, printed = run_notebook("train_your_own", tmp_path, run_python)
+    numbers = r"noise-free MSE (\S+) .*with noise (\S+)\n.*values (\S+)\nunexplained variance (\S+) "
+    found = re.search(numbers, printed)
+    assert found is not None, printed
+    error, noisy, floor, unexplained = map(float, found.groups())
+    # Both errors differ by the noise alone.
+    assert floor > 0
+    assert abs(noisy - error - floor) < 0.05 * noisy
+    assert 0 < unexplained < 0.9
+
+
+def test_the_notebook_renders_a_ball(tmp_path: Path, run_python: RunPython) -> None:
+    folder, printed = run_notebook("maps_to_ball", tmp_path, run_python)
+    assert "unexplained variance" in printed
     ball = np.asarray(Image.open(folder / "ball.png").convert("RGB")).astype(float)
     assert ball.shape == (48, 48, 3)
     # Above are the gray sky and the ball before it, below the floor.
@@ -57,7 +79,7 @@ def test_the_notebook_renders_a_ball(tmp_path: Path, run_python: RunPython) -> N
     assert ball[30:].std() > 5
 
 
-@pytest.mark.parametrize("name", ["ball.xml", "maps_to_ball.ipynb"])
+@pytest.mark.parametrize("name", ["ball.xml", "maps_to_ball.ipynb", "train_your_own.ipynb"])
 def test_examples_are_named_in_the_documentation(name: str) -> None:
     pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
     assert any(f"examples/{name}" in page.read_text(encoding="utf-8") for page in pages)

@@ -11,7 +11,6 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from support.plugin_materials import net, write_material
-from support.read_material import read_material
 
 from mbtf_core.app.console import CONSOLE
 from mbtf_core.data.lattice import Lattice
@@ -19,6 +18,7 @@ from mbtf_core.errors import InputError
 from mbtf_fit import Material
 from mbtf_fit.export import Export, targets
 from mbtf_fit.material.material import export, to_half
+from mbtf_fit.material.numpy_reader import NumpyMaterial
 from mbtf_fit.material.transmittance import Transmittance
 
 F64 = NDArray[np.float64]
@@ -54,24 +54,23 @@ def make(case: str, folder: Path, contrast: float = 1.0) -> Material:
     return write_material(folder, **options)
 
 
-class Reader(read_material.Material):  # type: ignore[misc, name-defined]
+class Reader(NumpyMaterial):
     """Evaluates ``layers.json`` and ``textures.exr`` by the reader of the documentation."""
 
     def __init__(self, folder: Path) -> None:
         import OpenEXR
 
         self.document = json.loads((folder / "layers.json").read_text())
-        self.tensors: dict[str, F64] = {n: np.array(t) for n, t in self.document["tensors"].items()}
+        tensors: dict[str, F64] = {n: np.array(t) for n, t in self.document["tensors"].items()}
         with OpenEXR.File(str(folder / "textures.exr"), separate_channels=True) as file:
             for part in file.parts:
                 letter = "c" if part.name().startswith("transmittance") else "f"
                 assert sorted(part.channels) == list(part.channels)
                 assert {name[0] for name in part.channels} == {letter}
                 planes = [np.array(c.pixels, np.float64) for c in part.channels.values()]
-                self.tensors[part.name()] = np.stack(planes, -1)
-        assert set(self.document["textures"]) <= set(self.tensors)
-        self.finest, self.operations = self.document["levels"]["finest"], self.document["operations"]
-        self.scale = np.array([1.0, self.document["tile"]["aspect"]])
+                tensors[part.name()] = np.stack(planes, -1)
+        assert set(self.document["textures"]) <= set(tensors)
+        super().__init__(self.document, tensors)
 
     def value(self) -> F64:
         known = self.document["conformance"]

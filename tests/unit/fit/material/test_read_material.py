@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 from support.plugin_materials import write_material
-from support.read_material import read_material
 
+from mbtf_fit.material.numpy_reader import NumpyMaterial
 from mbtf_fit.models.registry import MODELS
 
 ENCODED = {"position": 3, "direction": 2, "direction_pi": False, "raw": True, "band_attenuation": True}
@@ -40,6 +40,6 @@ def test_the_reader_gives_the_conformance_values(case: str, glossy: bool, tmp_pa
     material = write_material(tmp_path, model=model, finest=3, **options)
     expected = material.conformance["rgb"]
     queries = [material.conformance[name] for name in ("u", "sigma", "omega_i", "omega_o")]
-    found = read_material.Material(tmp_path).evaluate(*queries)
+    found = NumpyMaterial.load(tmp_path).evaluate(*queries)
     assert expected.std() > 0
     np.testing.assert_array_less(abs(found - expected), 1e-4 * np.maximum(1.0, expected))

@@ -1,15 +1,17 @@
-"""The model of CONTRIBUTING.md is found by its name, and evaluated; a package of others may bring it, too."""
+"""The model of the page on models is evaluated; its package of two files brings it, without a change here."""
 
 from __future__ import annotations
 
 import os
 import re
+import tomllib
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from conftest import RunPython
+from support.fit_data import constant, write_data
 from support.paths import ROOT
 
 from mbtf_core.data.lattice import Lattice
@@ -19,14 +21,16 @@ from mbtf_fit.pytorch.material import NeuralMaterial
 from mbtf_fit.sections import NetworkSection
 
 
-def documented() -> str:
-    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "CONTRIBUTING.md").read_text(), re.DOTALL)
+def documented(language: str = "python") -> str:
+    """The one block of a language."""
+    page = (ROOT / "docs" / "how-to" / "add-a-model.md").read_text(encoding="utf-8")
+    (code,) = re.findall(rf"```{language}\n(.*?)```", page, re.DOTALL)
     return str(code)
 
 
 def test_the_documented_model_works() -> None:
     code, made = documented(), dict[str, Any]()
-    exec(compile(code, "CONTRIBUTING.md", "exec"), made)
+    exec(compile(code, "add-a-model.md", "exec"), made)
     (model,) = (m for m in made.values() if isinstance(m, type) and issubclass(m, Model) and m is not Model)
     assert names_in(code) == [model.name]
     lattice = Lattice(3, 1.0)
@@ -38,29 +42,59 @@ def test_the_documented_model_works() -> None:
     assert (value > 0).all()
 
 
+def install(folder: Path, point: str = "") -> str:
+    """Install the documented package, or one with another entry point; returns the path to import from."""
+    project = tomllib.loads(documented("toml"))
+    (module,) = project["tool"]["setuptools"]["py-modules"]
+    named = "\n\nclass Named(TexelLobe):\n    name, description = 'neumip', 'theirs'\n"
+    (folder / f"{module}.py").write_text(documented() + named)
+    ((group, points),) = project["project"]["entry-points"].items()
+    lines = [point] if point else [f"{name} = {value}" for name, value in points.items()]
+    info = folder / f"{module}-{project['project']['version']}.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {module}\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("\n".join([f"[{group}]", *lines, ""]))
+    return os.pathsep.join([str(folder), str(ROOT)])
+
+
+def test_another_package_brings_a_model(tmp_path: Path, run_python: RunPython) -> None:
+    """By an entry point: fitted, listed, exported."""
+    path = install(tmp_path)
+    write_data(tmp_path / "shards", constant(0.3), train=2000, test=200, finest=2)
+    out, exported = tmp_path / "out", tmp_path / "exported"
+    options = ["--model", "texel-lobe", "--steps", "20", "-o", str(out)]
+    for line in (
+        [str(tmp_path / "shards"), *options],
+        [
+            "export",
+            str(out),
+            "--to",
+            "exr",
+            "--to",
+            "json",
+            "--to",
+            "slang",
+            "-o",
+            str(tmp_path / "exported"),
+        ],
+    ):
+        done = run_python("-m", "mbtf_fit", *line, PYTHONPATH=path)
+        assert done.returncode == 0, done.stderr
+    assert '"model": "texel-lobe"' in (exported / "layers.json").read_text()
+    assert "texel-lobe" in run_python("-m", "mbtf_fit", "--help", PYTHONPATH=path).stdout
+
+
 @pytest.mark.parametrize(
     ("point", "fault"),
     [
-        ("texel-lobe = their_models:TexelLobe", ""),
         ("texel-lobe = their_models:Missing", "has no attribute 'Missing'"),
         ("other = their_models:TexelLobe", "no model of this name"),
         ("neumip = their_models:Named", "has the same name"),
     ],
 )
-def test_another_package_brings_a_model(
-    tmp_path: Path, run_python: RunPython, point: str, fault: str
-) -> None:
-    """By an entry point, without a change of the project."""
-    named = "\n\nclass Named(TexelLobe):\n    name, description = 'neumip', 'theirs'\n"
-    (tmp_path / "their_models.py").write_text(documented() + named)
-    info = tmp_path / "their_models-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: their_models\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text(f"[mbtf.models]\n{point}\n")
-    path = os.pathsep.join([str(tmp_path), str(ROOT)])
+def test_a_package_at_fault_is_named(tmp_path: Path, run_python: RunPython, point: str, fault: str) -> None:
+    path = install(tmp_path, point)
     done = run_python("-m", "mbtf_fit", "no-such-shards", "--model", point.split(" ")[0], PYTHONPATH=path)
     assert done.returncode == 3
     assert "Traceback" not in done.stderr
-    assert (fault or "no-such-shards") in done.stderr
-    if not fault:
-        assert "texel-lobe" in run_python("-m", "mbtf_fit", "--help", PYTHONPATH=path).stdout
+    assert fault in done.stderr

@@ -1,0 +1,123 @@
+"""Batches of a data set for training code of your own, as PyTorch's loaders take them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from torch import Tensor, from_numpy
+from torch.utils.data import IterableDataset, get_worker_info
+
+from mbtf_core.data.dataset import Dataset, Shard
+from mbtf_core.data.folder import DataFolder
+from mbtf_core.data.shard_files import check_values
+from mbtf_fit.data.images import philox
+from mbtf_fit.data.queries import ShardQueries, needed
+
+# Queries that are read at once from one shard, and how many such blocks are shuffled together.
+_BLOCK, _MIXED = 4096, 32
+
+
+class QueryBatch(NamedTuple):
+    """Queries with both estimates of their value, float32 tensors.
+
+    Attributes
+    ----------
+    u : Tensor
+        (n, 2) positions, uv.
+    sigma : Tensor
+        (n,) footprints in tile widths.
+    omega_i, omega_o : Tensor
+        (n, 3) unit vectors towards light and viewer.
+    value_a, value_b : Tensor
+        (n, 3) independent estimates of M in 1/sr; of measured data, which have one, the same numbers.
+    """
+
+    u: Tensor
+    sigma: Tensor
+    omega_i: Tensor
+    omega_o: Tensor
+    value_a: Tensor
+    value_b: Tensor
+
+
+class QueryDataset(IterableDataset[QueryBatch]):
+    """All queries of a split once per epoch, in batches of random order, in all layouts.
+
+    An epoch visits blocks of about 4096 queries of all shards in random order, and shuffles 32 of them at a
+    time: memory does not grow with the data set. The order depends on seed, epoch and number of workers
+    alone. A loader takes batches as they are: ``DataLoader(queries, batch_size=None, num_workers=2)``; each
+    worker reads blocks of its own.
+
+    Parameters
+    ----------
+    folder : str, Path or DataFolder
+        The data set.
+    split : str
+        ``train`` or ``test``.
+    batch_size : int
+        Queries per batch; the last batch of each worker has fewer.
+    seed : int
+        Of the order.
+
+    Attributes
+    ----------
+    data : Dataset
+        The opened data set.
+    count : int
+        Number of queries.
+
+    Raises
+    ------
+    InputError
+        There is no complete data set, or, while it is read, a shard is missing or corrupt.
+    """
+
+    def __init__(
+        self, folder: str | Path | DataFolder, split: str = "train", batch_size: int = 4096, seed: int = 0
+    ) -> None:
+        super().__init__()
+        if batch_size < 1:
+            raise ValueError(f"batch_size is {batch_size}, but must be at least 1")
+        self.data, self.batch_size, self.seed, self.epoch = Dataset.open(folder), batch_size, seed, 0
+        self._blocks: list[tuple[Shard, int, int]] = []
+        self.count = 0
+        for shard in self.data.shards(split):
+            each = int(np.prod(shard.image, dtype=int))
+            step = max(1, _BLOCK // each)
+            self._blocks += [(shard, at, min(at + step, shard.rows)) for at in range(0, shard.rows, step)]
+            self.count += each * shard.rows
+
+    def set_epoch(self, epoch: int) -> None:
+        """Select the order of an epoch; call it before each. Epochs of one number have one order."""
+        self.epoch = epoch
+
+    def __iter__(self) -> Iterator[QueryBatch]:
+        worker = get_worker_info()
+        number, workers = (0, 1) if worker is None else (worker.id, worker.num_workers)
+        order = philox(self.seed, 2 * self.epoch).permutation(len(self._blocks))[number::workers]
+        # As in the loader's batches, even streams order an epoch, odd ones what is below.
+        random = np.random.Generator(np.random.Philox(key=[self.seed, 2 * self.epoch + 1], counter=number))
+        left: list[ShardQueries] = []
+        for start in range(0, len(order), _MIXED):
+            mixed = ShardQueries.join([*left, *map(self._read, order[start : start + _MIXED])])
+            mixed = mixed.take(random.permutation(len(mixed)))
+            whole = len(mixed) // self.batch_size * self.batch_size
+            for at in range(0, whole, self.batch_size):
+                yield _batch(mixed.take(slice(at, at + self.batch_size)))
+            left = [mixed.take(slice(whole, None))] if whole < len(mixed) else []
+        for rest in left:
+            yield _batch(rest)
+
+    def _read(self, block: int) -> ShardQueries:
+        shard, start, stop = self._blocks[block]
+        mapped = shard.map(needed(shard.estimates))
+        arrays = {name: np.array(array[start:stop]) for name, array in mapped.items()}
+        check_values(arrays, shard.where)
+        return ShardQueries.of(arrays).flat()
+
+
+def _batch(queries: ShardQueries) -> QueryBatch:
+    return QueryBatch(*(from_numpy(np.array(getattr(queries, name))) for name in QueryBatch._fields))

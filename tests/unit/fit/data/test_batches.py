@@ -1,0 +1,108 @@
+"""Batches for training code of one's own: each query once an epoch, in an order that the seed decides."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from support.fit_data import constant, parallax, write_data
+from support.image_data import write_images
+from support.slice_data import write_slices
+from torch.utils.data import DataLoader
+
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.errors import InputError
+from mbtf_core.stats import noise_free_mse, pooled_variance
+from mbtf_fit import QueryDataset
+from mbtf_fit.data import batches
+from mbtf_fit.data.queries import NEEDED, needed
+
+ALBEDO, NOISE = 0.5, 0.1
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A flat Lambert plane."""
+    folder = tmp_path_factory.mktemp("batches") / "shards"
+    return write_data(folder, constant(ALBEDO / np.pi), train=9001, test=100, noise=NOISE, shards=3)
+
+
+def rows(data: QueryDataset, workers: int = 0) -> np.ndarray:
+    """All numbers of an epoch (n, 15), query by query."""
+    loader = DataLoader(data, batch_size=None, num_workers=workers)
+    return np.concatenate([torch.cat([x.view(len(x), -1) for x in batch], 1).numpy() for batch in loader])
+
+
+def stored(folder: Path, split: str = "train") -> np.ndarray:
+    data = Dataset.open(folder)
+    arrays = data.load(split, needed(data.estimates))
+    arrays.setdefault("value_b", arrays["value_a"])
+    lead = arrays["sigma"].ndim
+    columns = [arrays[name].reshape(arrays["sigma"].size, *arrays[name].shape[lead:]) for name in NEEDED]
+    return np.concatenate([c.reshape(len(c), -1) for c in columns], 1)
+
+
+def in_order(found: np.ndarray) -> np.ndarray:
+    return found[np.lexsort(found.T)]
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_an_epoch_has_each_query_once(shards: Path, workers: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(batches, "_BLOCK", 500)
+    monkeypatch.setattr(batches, "_MIXED", 3)
+    data, wanted = QueryDataset(shards, batch_size=700, seed=1), stored(shards)
+    found = rows(data, workers)
+    assert data.count == len(wanted) == 9001
+    np.testing.assert_array_equal(in_order(found), in_order(wanted))
+    np.testing.assert_array_equal(found, rows(data, workers))
+    data.set_epoch(1)
+    other = rows(data, workers)
+    np.testing.assert_array_equal(in_order(other), in_order(wanted))
+    assert (other != found).any(1).mean() > 0.99
+    # Batches mix the shards: no batch is of one of them.
+    sizes = {len(batch.sigma) for batch in data}
+    assert max(sizes) == 700
+    first = {row.tobytes() for row in wanted[:3000]}
+    shares = [np.mean([row.tobytes() in first for row in found[k : k + 1500]]) for k in range(0, 9000, 1500)]
+    assert min(shares) > 0
+    assert max(shares) < 1
+
+
+@pytest.mark.parametrize("layout", ["image", "slices"])
+def test_every_layout_is_read(layout: str, tmp_path: Path) -> None:
+    folder = tmp_path / "shards"
+    if layout == "image":
+        write_images(folder, parallax, train=20)
+    else:
+        write_slices(folder, lights=4, test=50)
+    for split in ("train", "test"):
+        found = rows(QueryDataset(folder, split))
+        np.testing.assert_array_equal(in_order(found), in_order(stored(folder, split)))
+
+
+def test_the_truth_has_no_error(shards: Path) -> None:
+    """A Lambert plane is albedo/π: without noise the error is 0, and the noise is that of the data."""
+    a, b = (
+        torch.cat([getattr(batch, name) for batch in QueryDataset(shards)]) for name in ("value_a", "value_b")
+    )
+    error = noise_free_mse(np.full(a.shape, ALBEDO / np.pi), a, b)
+    assert abs(error.value) < 3 * error.error
+    assert error.error < 0.02 * NOISE**2
+    assert noise_free_mse(np.full(a.shape, 1.1 * ALBEDO / np.pi), a, b).value > 3 * error.error
+    # Of the mean of two estimates.
+    assert pooled_variance(a, b).value == pytest.approx(NOISE**2 / 2, rel=0.03)
+
+
+def test_what_cannot_be_read_is_refused(shards: Path, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="batch_size"):
+        QueryDataset(shards, batch_size=0)
+    with pytest.raises(InputError):
+        QueryDataset(tmp_path)
+    folder = write_data(tmp_path / "shards", constant(1.0), train=100, test=10, shards=1)
+    arrays = dict(np.load(folder / "train-00000.npz"))
+    arrays["value_a"][7] = np.nan
+    np.savez(folder / "train-00000.npz", **arrays)
+    with pytest.raises(InputError, match="train-00000"):
+        next(iter(QueryDataset(folder)))
