@@ -27,15 +27,23 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from common import finish, is_available, kept, parser_of, start
+from common import ASSETS, finish, is_available, kept, parser_of, start
 from front import TEST_SPP
 from quality import generator_config
 
 from mbtf_fit import FitConfig, fit
+from mbtf_fit.config import DEFAULT_MODEL, FIBER_MODEL
 from mbtf_fit.training import validation
+from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.run import generate
 
-MATERIALS = ("turtle_shell", "twisted_wool", "cliff_rock", "metal_plate", "tree_bark", "stone_bricks")
+MATERIALS = (
+    *("turtle_shell", "twisted_wool", "cliff_rock", "basket_weave", "gold"),
+    *("metal_plate", "tree_bark", "stone_bricks"),
+)
+CLOTHS = ("basket_weave",)
+# A glossy metal, made of the heights of an asset.
+GOLD = "height: {height}\nbase_color: [1.0, 0.77, 0.34]\nmetallic: 1\nroughness: 0.25\n"
 STEPS = tuple(100 * 2**k for k in range(7))
 RESOLUTION = 64
 WITHIN, FALLS, FLAT, STANDARD_ERRORS = 1.5, 0.9, 0.8, 2.0
@@ -51,17 +59,34 @@ class Judgment:
     right: bool
 
 
+def data_config(name: str, folder: Path) -> GeneratorConfig:
+    """Configuration of the generator; writes the file of the metal."""
+    if name == "gold":
+        material = folder / f"{name}.yaml"
+        material.parent.mkdir(parents=True, exist_ok=True)
+        material.write_text(GOLD.format(height=ASSETS / "turtle_shell" / "height.exr"))
+        config = generator_config("turtle_shell", "draft", RESOLUTION)
+        geometry = config.geometry.model_copy(update={"height_scale": 0.02})
+        config = config.model_copy(update={"material": str(material), "geometry": geometry})
+    else:
+        config = generator_config(name, "draft", RESOLUTION)
+    queries = config.queries.model_copy(update={"test_spp": TEST_SPP})
+    return config.model_copy(update={"queries": queries})
+
+
 def fitted(name: str, folder: Path, steps: int, seed: int) -> dict[str, Any]:
     """Error and history of one fit; kept in the folder."""
 
     def measure() -> dict[str, Any]:
         data = folder / name / "shards"
-        config = generator_config(name, "draft", RESOLUTION)
-        queries = config.queries.model_copy(update={"test_spp": TEST_SPP})
-        generate(config.model_copy(update={"queries": queries}), data)
-        options = {"seed": seed, "training": {"steps": steps}}
+        config = data_config(name, folder)
+        generate(config, data)
+        model = FIBER_MODEL if name in CLOTHS else DEFAULT_MODEL
+        options = {"model": model, "seed": seed, "training": {"steps": steps}}
         result = fit(FitConfig.model_validate(options), data, folder / name / "fit", overwrite=True)
-        return {**result.errors["test"]["unexplained"], "history": result.history}
+        noise = result.material.description["training"].get("noise_variance")
+        error = result.errors["test"]["unexplained"]
+        return {**error, "history": result.history, "errors": result.errors, "noise": noise}
 
     return kept(folder / name / f"{steps}-{seed}.json", measure)
 

@@ -111,7 +111,7 @@ class FitResult:
 
     @property
     def marginal_cost(self) -> MarginalCost | None:
-        """Estimated training time that halves the error; None where the history does not resolve it."""
+        """Expected gain by longer training and by more data; None where the history is incomplete."""
         noise = self.material.description["training"].get("noise_variance")
         return marginal_cost_of(self.history, self.errors, noise)
 
