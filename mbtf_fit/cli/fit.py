@@ -167,8 +167,9 @@ def _training_progress(bar: Progress, folder: Path) -> Callable[[float, str], No
     """Progress of a fit whose checkpoint lies in a folder."""
 
     def update(fraction: float, note: str) -> None:
-        # Before the first report there is no checkpoint.
-        keep_on_interruption(f"the last checkpoint is kept in {folder}")
+        if fraction:
+            # Before, there is no checkpoint.
+            keep_on_interruption(f"the last checkpoint is kept in {folder}")
         bar.update(round(100 * fraction, 1), note)
 
     return update

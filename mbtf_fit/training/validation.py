@@ -11,7 +11,6 @@ import numpy as np
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.stats import Estimate, by_group, level_groups, unexplained_variance
-from mbtf_core.units import clock
 from mbtf_fit.data.loader import Partition, load_split
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.training.trainer import Trainer
@@ -125,8 +124,8 @@ class MarginalCost:
             lines = [f"expect {gain} after twice the training time"]
         if self.noise_share is not None:
             lines.append(
-                f"overfitting to noise causes {self.noise_share:.0%} of the error of new queries: expect about "
-                f"{1.0 - 0.5 * self.noise_share:.2g} of it with twice the queries, or paths per query"
+                f"overfitting to noise causes {self.noise_share:.0%} of the error of new queries: expect "
+                f"about {1.0 - 0.5 * self.noise_share:.2g} of it with twice the queries, or paths per query"
             )
         return "\n".join(lines)
 
