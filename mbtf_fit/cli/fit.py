@@ -191,6 +191,8 @@ def _announce(
     check_space(output, size, "reduce network.channels, or choose another folder with -o")
     training = config.training
     budget = format_duration(training.time) if training.steps is None else f"{training.steps} steps"
+    if training.steps is None and training.min_steps:
+        budget += f", {training.min_steps} steps at least"
     console.note(f"{what}, training for {budget} (change it with --time or --steps)")
     queries = sum(int(one.manifest["splits"]["train"].get("queries", 0)) for one in data)
     seconds = evaluation_seconds(queries) + (training.time if training.steps is None else 0.0)
@@ -216,8 +218,8 @@ def resolve_config(
     if overrides["model"] == kept.get("model"):
         presets |= kept
     if "training.time" in options.given:
-        # A time overrides the steps of a file or a preset.
-        presets["training.steps"] = None
+        # A time overrides the numbers of steps of a file or a preset.
+        presets |= {"training.steps": None, "training.min_steps": 0}
     return options.resolve(presets)
 
 

@@ -152,21 +152,22 @@ def _doubling(history: list[dict[str, Any]]) -> float | None:
     after = _relative_error(last)
     if after is None or after > _RESOLVED:
         return None
-    middle = [r for r in history if _MIDDLE[0] <= r["fraction"] <= _MIDDLE[1] and _relative_error(r)]
+    known = [(r, error) for r in history if (error := _relative_error(r)) is not None]
+    middle = [pair for pair in known if _MIDDLE[0] <= pair[0]["fraction"] <= _MIDDLE[1]]
     if not middle:
         return math.exp(law)
-    half = min(middle, key=lambda r: abs(r["fraction"] - 0.5))
+    half, before = min(middle, key=lambda pair: abs(pair[0]["fraction"] - 0.5))
     doublings = -math.log2(half["fraction"])
     slope = _LASTING * math.log(last["unexplained"] / half["unexplained"]) / doublings
     # Both records are of the same queries, so this spread is an upper bound.
-    spread = _LASTING * math.hypot(after, _relative_error(half) or 0.0) / doublings
+    spread = _LASTING * math.hypot(after, before) / doublings
     weights = _LAW_SCATTER**-2, 1.0 / (_LASTING_SCATTER**2 + spread**2)
     return math.exp((weights[0] * law + weights[1] * slope) / sum(weights))
 
 
 def _relative_error(record: dict[str, Any]) -> float | None:
     """Relative standard error of the validation of a record; None where there is none."""
-    value, error = record.get("unexplained"), record.get("unexplained_error")
+    value, error = record["unexplained"], record["unexplained_error"]
     return float(error / value) if _number(value) and _number(error) and value > 0 else None
 
 
