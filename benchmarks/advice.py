@@ -2,9 +2,8 @@
 
     python benchmarks/advice.py --out FOLDER [MATERIAL ...] [--seeds 2]
 
-Seven materials, in the preset ``draft`` at 64 texels, are fitted with 50, 100, 200, ... 3200 steps; with other
-seeds than 0, up to 800. Each fit
-ends with a sentence, which is followed, on test queries of 256 paths:
+Seven materials, in the preset ``draft`` at 64 texels, are fitted with 50, 100, 200, ... 3200 steps; with
+other seeds than 0, up to 800. What a fit says is followed, on test queries of 256 paths:
 
 - ``few`` and ``more``: "expect about 0.8 of this error after twice the time": right if twice the steps leave
   this factor, within 1.5;
@@ -45,7 +44,7 @@ MATERIALS = (
 # A glossy metal, made of the heights of an asset.
 GOLD = "height: {height}\nbase_color: [1.0, 0.77, 0.34]\nmetallic: 1\nroughness: 0.25\n"
 STEPS = tuple(50 * 2**k for k in range(7))
-# After so many steps, the number of queries is doubled. Other seeds than 0 end where their scatter matters less.
+# After so many steps, the number of queries is doubled; so many steps have seeds other than 0.
 QUERIES_AT, OTHERS_TO = 1600, 800
 QUERIES, TWICE = "400/texel", "800/texel"
 RESOLUTION = 64

@@ -63,7 +63,8 @@ def fit(
 ) -> None:
     """Fit a material to a data set: mbtf-fit shards/ -o material/
 
-    The same command again resumes an unfinished fit. --time is that of training. --dry-run forecasts time
+    The same command again resumes an unfinished fit. --time is that of training, without loading, validation
+    and evaluation. --quality trains 800 steps at least, even if they take longer. --dry-run forecasts time
     and size by some seconds of training on this machine. With --many, the output folder holds one folder per
     material.
 
