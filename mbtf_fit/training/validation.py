@@ -81,8 +81,8 @@ _EARLY_STEPS, _LAW_SCATTER = 50.0, 0.1
 # Of the reduction of the error's logarithm by the second half of training, twice the time gains half again:
 # the other half is due to the falling learning rate. Standard deviation of this rule.
 _LASTING, _LASTING_SCATTER = 0.5, 0.05
-# Below so many steps, twice the steps reduce the error by a tenth or more: in the mean over seven materials to
-# 0.84 of it after 200 steps, to 0.92 after 400.
+# Below so many steps, twice the steps reduce the error by a tenth or more: in the mean over seven materials
+# to 0.84 of it after 200 steps, to 0.92 after 400.
 _FEWEST_STEPS = 400
 # Expected remainder of the error from which longer training hardly helps.
 _FLAT = 0.95
