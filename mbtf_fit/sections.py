@@ -116,7 +116,7 @@ class TrainingSection(Settings):
     """Budget, loss and optimizer."""
 
     time: Annotated[Duration, Flag("--time", "DURATION")] = Field(
-        120.0, description="training time, without loading, validation and evaluation: 90s, 2min, 1h"
+        120.0, description="time budget: 90s, 2min, 1h"
     )
     steps: Annotated[int | None, Flag("--steps")] = Field(
         None, ge=1, description="number of training steps, in place of a time"
