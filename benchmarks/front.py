@@ -102,13 +102,15 @@ def train(
         return {
             **test["unexplained"],
             "levels": {level: errors["unexplained"]["value"] for level, errors in test["levels"].items()},
+            "steps": result.history[-1]["step"],
             "queries_per_second": round(result.history[-1]["queries_per_second"]),
         }
 
     found = kept(folder / f"{name}.json", measure)
     levels = " ".join(f"{value:.3f}" for value in found["levels"].values())
     print(
-        f"{folder.name:16s} {label:30s} {time:>6s} {found['value']:.3f} ± {found['error']:.3f}   "
+        f"{folder.name:16s} {label:30s} {time:>6s} {found['steps']:6d} steps  "
+        f"{found['value']:.3f} ± {found['error']:.3f}   "
         f"by level {levels}",
         flush=True,
     )

@@ -74,6 +74,7 @@ def figures(result: FitResult) -> dict[str, Any]:
         "held_out_directions": result.errors["held_out_directions"]["unexplained"]["value"],
         "seconds": result.seconds,
         "total_seconds": result.total_seconds,
+        "steps": training["steps"],
         "queries_per_second": round(training["steps"] * training["batch"] / result.seconds),
     }
 
@@ -96,7 +97,10 @@ def main() -> int:
             levels = "  ".join(f"{level}: {value:.3f}" for level, value in one["levels"].items())
             speed = one["queries_per_second"] / 1e6
             left = one["unexplained"]["value"]
-            print(f"{model:20s} {left:.3f}   by level  {levels}   {speed:.2f} M queries/s", flush=True)
+            print(
+                f"{model:20s} {left:.3f}   by level  {levels}   {one['steps']} steps, {speed:.2f} M/s",
+                flush=True,
+            )
     left = {model: one["unexplained"]["value"] for model, one in found.items()}
     met = all(value <= THRESHOLDS[model] for model, value in left.items() if model in THRESHOLDS)
     if {"neumip", "neumip-baseline"} <= left.keys():

@@ -108,12 +108,13 @@ class FitConfig(Settings):
 
     def fields(self) -> dict[str, Any]:
         """Options that determine the fit, as plain data: all but device and memory, and without those of
-        shared networks where they are not used."""
+        shared networks and the fewest steps where they are not used."""
         found = self.model_dump(mode="json", exclude={"device", "data"})
         if self.decoder is None:
             del found["decoder"]
-        if not self.training.shared_decoder:
-            del found["training"]["shared_decoder"]
+        for name in ("shared_decoder", "min_steps"):
+            if not found["training"][name]:
+                del found["training"][name]
         return found
 
     def hash(self, data_hash: str) -> str:
@@ -170,11 +171,13 @@ _RELIEF: _Sizes = (
 # Models that have such options.
 _MODELS: tuple[ModelName, ...] = ("relief", "neumip+", "neumip", "neumip-baseline")
 
-# Budget of each preset.
+_MIN_STEPS = "training.min_steps"
+# Budget of each preset. After 800 steps, twice the steps leave 0.93 of the error or more, except on glossy
+# materials (``benchmarks/advice.py``). Two free cores take less than 12 s for them.
 FITTER: dict[Quality, dict[str, Any]] = {
-    "draft": {"training.time": "12s", "training.steps": None},
-    "standard": {"training.time": "3min", "training.steps": None},
-    "high": {"training.time": "10min", "training.steps": None},
+    "draft": {"training.time": "12s", "training.steps": None, _MIN_STEPS: 800},
+    "standard": {"training.time": "3min", "training.steps": None, _MIN_STEPS: 800},
+    "high": {"training.time": "10min", "training.steps": None, _MIN_STEPS: 800},
     # Kuznetsov et al. 2021: 30 000 steps of 2^20 queries.
     "paper": {"training.steps": 30_000, "training.batch": 1 << 20},
 }
@@ -222,5 +225,9 @@ def fitter_options(
             for key, value in best.items()
             if (free if key.startswith("network.") else key.split(".")[1] not in training)
         }
-        out[name] = kept | FITTER[quality]
+        budget = dict(FITTER[quality])
+        if model not in _MODELS:
+            # Their steps take many times as long.
+            budget.pop(_MIN_STEPS, None)
+        out[name] = kept | budget
     return out

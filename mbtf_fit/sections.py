@@ -121,6 +121,9 @@ class TrainingSection(Settings):
     steps: Annotated[int | None, Flag("--steps")] = Field(
         None, ge=1, description="number of training steps, in place of a time"
     )
+    min_steps: int = Field(
+        0, ge=0, description="fewest steps of a time budget: a slow or busy machine takes longer for them"
+    )
     batch: Annotated[int, Flag("--batch")] = Field(1 << 15, ge=1, le=1 << 24, description="queries per step")
     patch_size: int = Field(
         32,

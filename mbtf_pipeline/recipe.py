@@ -245,6 +245,8 @@ def quality_options(
     preset = generator_options(quality, generate if isinstance(generate, Mapping) else {})
     out = COMPARE[quality] | {f"generate.{key}": value for key, value in preset.items()}
     for prefix, options in fitter_options(quality, own, training).items():
+        if any(text.startswith(f"{prefix}.training.time=") for text in assignments):
+            options.pop("training.min_steps", None)
         out |= {f"{prefix}.{key}": value for key, value in options.items()}
     return out
 

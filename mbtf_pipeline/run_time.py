@@ -273,7 +273,7 @@ class TimedRun:
 
 def _trained(recipe: Recipe, seconds: float) -> Recipe:
     """The recipe with a training time of each fit."""
-    time = {"training": {"time": seconds, "steps": None}}
+    time = {"training": {"time": seconds, "steps": None, "min_steps": 0}}
     fits = {
         name: FitConfig.model_validate(deep_merge(fit.model_dump(), time)) for name, fit in recipe.fit.items()
     }

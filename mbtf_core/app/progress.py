@@ -32,11 +32,24 @@ class Progress:
         self.done = 0.0
         self.note = ""
         self._start = time.monotonic()
+        # Time and units from which the rate counts.
+        self._base = (self._start, 0.0)
 
     @property
     def seconds(self) -> float:
         """Seconds since the job began."""
         return time.monotonic() - self._start
+
+    @property
+    def left(self) -> float | None:
+        """Seconds left, at the rate since the first units; None where that is not known yet.
+
+        Neither set-up counts, nor what an earlier run has done, nor the first step, which compiles kernels.
+        """
+        since, before = self._base
+        if not self.total or not 0 < before < self.done < self.total:
+            return None
+        return (self.total - self.done) * (time.monotonic() - since) / (self.done - before)
 
     def advance(self, step: float = 1, note: str | None = None) -> None:
         """Count `step` more as done."""
@@ -45,6 +58,8 @@ class Progress:
     def update(self, done: float, note: str | None = None, total: float | None = None) -> None:
         """Set the units done; `note` and `total` stay until the next ones."""
         self.done = done
+        if not self._base[1]:
+            self._base = (time.monotonic(), done)
         if total is not None:
             self.total = total
         if note is not None:
@@ -59,24 +74,30 @@ class Progress:
 
 
 class LineProgress(Progress):
-    """Plain lines at intervals, for logs and pipes."""
+    """Plain lines at intervals, for logs and pipes. While nothing or all is done, each new note has one."""
 
     def __init__(self, total: float | None, label: str, unit: str) -> None:
         super().__init__(total, label, unit)
         self._next = self._start + _LINE_SECONDS
-        self._shown: float | None = None
+        self._shown: tuple[float, str] | None = None
 
     def _show(self) -> None:
-        if time.monotonic() >= self._next:
+        outside = not self.done or (self.total is not None and self.done >= self.total)
+        is_stage = outside and self.note and self._state != self._shown
+        if is_stage or time.monotonic() >= self._next:
             self._next = time.monotonic() + _LINE_SECONDS
             self._print()
 
     def _close(self) -> None:
-        if self.done and self._shown != self.done:
+        if self.done and self._state != self._shown:
             self._print()
 
+    @property
+    def _state(self) -> tuple[float, str]:
+        return self.done, self.note
+
     def _print(self) -> None:
-        self._shown = self.done
+        self._shown = self._state
         parts = [f"{self.label}: {self.done:.10g}"]
         if self.unit == "%":
             parts[0] = f"{self.label}: {self.done:.0f}%"
@@ -85,8 +106,8 @@ class LineProgress(Progress):
         elif self.unit:
             parts[0] += f" {self.unit}"
         parts.append(f"{clock(self.seconds)} elapsed")
-        if self.total and 0 < self.done < self.total:
-            parts.append(f"{clock(self.seconds * (self.total - self.done) / self.done)} left")
+        if (left := self.left) is not None:
+            parts.append(f"{clock(left)} left")
         if self.note:
             parts.append(self.note)
         print(", ".join(parts), file=sys.stderr, flush=True)

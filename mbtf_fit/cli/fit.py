@@ -63,7 +63,8 @@ def fit(
 ) -> None:
     """Fit a material to a data set: mbtf-fit shards/ -o material/
 
-    The same command again resumes an unfinished fit. --time is that of training. --dry-run forecasts time
+    The same command again resumes an unfinished fit. --time is that of training, without loading, validation
+    and evaluation. --quality trains 800 steps at least, even if they take longer. --dry-run forecasts time
     and size by some seconds of training on this machine. With --many, the output folder holds one folder per
     material.
 
@@ -167,8 +168,9 @@ def _training_progress(bar: Progress, folder: Path) -> Callable[[float, str], No
     """Progress of a fit whose checkpoint lies in a folder."""
 
     def update(fraction: float, note: str) -> None:
-        # Before the first report there is no checkpoint.
-        keep_on_interruption(f"the last checkpoint is kept in {folder}")
+        if fraction:
+            # Before, there is no checkpoint.
+            keep_on_interruption(f"the last checkpoint is kept in {folder}")
         bar.update(round(100 * fraction, 1), note)
 
     return update
@@ -190,6 +192,8 @@ def _announce(
     check_space(output, size, "reduce network.channels, or choose another folder with -o")
     training = config.training
     budget = format_duration(training.time) if training.steps is None else f"{training.steps} steps"
+    if training.steps is None and training.min_steps:
+        budget += f", {training.min_steps} steps at least"
     console.note(f"{what}, training for {budget} (change it with --time or --steps)")
     queries = sum(int(one.manifest["splits"]["train"].get("queries", 0)) for one in data)
     seconds = evaluation_seconds(queries) + (training.time if training.steps is None else 0.0)
@@ -215,8 +219,8 @@ def resolve_config(
     if overrides["model"] == kept.get("model"):
         presets |= kept
     if "training.time" in options.given:
-        # A time overrides the steps of a file or a preset.
-        presets["training.steps"] = None
+        # A time overrides the numbers of steps of a file or a preset.
+        presets |= {"training.steps": None, "training.min_steps": 0}
     return options.resolve(presets)
 
 

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -111,7 +112,7 @@ class FitResult:
 
     @property
     def marginal_cost(self) -> MarginalCost | None:
-        """Estimated training time that halves the error; None where the history does not resolve it."""
+        """Expected gain by longer training and by more data; None where the history is incomplete."""
         noise = self.material.description["training"].get("noise_variance")
         return marginal_cost_of(self.history, self.errors, noise)
 
@@ -162,7 +163,8 @@ def fit(
     overwrite : bool
         Replace a fit of another configuration.
     progress : callable, optional
-        Called with the fraction of the budget that is spent, in [0, 1], and one line of text.
+        Called with the fraction of the budget that is spent, in [0, 1], and one line of text. It is 0 while
+        the data are read, and 1 during calibration, evaluation and export.
     observe : callable, optional
         Called after each validation with its record, the trainer, and the queries of the validation.
 
@@ -302,6 +304,7 @@ def _train(
     partitions: list[Partition] = []
     subsets: list[tuple[str, ShardQueries]] = []
     for member in members:
+        progress(0.0, f"reading {member.data.folder}")
         part = load_training(member.data, own.held_out, own.seed, own.data.memory)
         network = trainers[0].model if trainers else None
         trainers.append(prepare_trainer(own, member.data, part, device, network))
@@ -327,8 +330,9 @@ def _train(
                 observe(records[-1], trainer, subset)
         progress(loop.fraction, _describe(records))
 
+    progress(loop.fraction, "training")
     _spend_budget(loop, report, checkpoint)
-    _export(config, loop, members, partitions, [name for name, _ in subsets], home)
+    _export(config, loop, members, partitions, [name for name, _ in subsets], home, partial(progress, 1.0))
     return resumed
 
 
@@ -373,6 +377,7 @@ def _export(
     partitions: Sequence[Partition],
     validated: Sequence[str],
     home: Path,
+    announce: Callable[[str], None],
 ) -> None:
     """Write the materials, and the network that they share."""
     steps, seconds = loop.progress.step, round(loop.progress.seconds, 3)
@@ -384,7 +389,8 @@ def _export(
             share["shared_decoder"] = summary
         if config.decoder is not None:
             share["decoder"] = {"sha256": Decoder.find(config.decoder).sha256}
-        export_fit(loop.trainers[k], config, member, partition, validated=validated[k], share=share)
+        trainer = loop.trainers[k]
+        export_fit(trainer, config, member, partition, announce, validated=validated[k], share=share)
     if config.training.shared_decoder:
         # It tells other fits that all materials are complete.
         data = {member.folder.name: member.identity["data"] for member in members}
@@ -396,15 +402,20 @@ def export_fit(
     config: FitConfig,
     member: _Member,
     partition: Partition,
+    announce: Callable[[str], None],
     *,
     validated: str,
     share: dict[str, Any],
 ) -> None:
-    """Write the material of a finished training, with its errors; `validated`: name of the set of the
-    validations, `share`: what the summary says of the material's part in the training."""
+    """Write the material of a finished training, with its errors; `announce` receives each stage,
+    `validated`: name of the set of the validations, `share`: what the summary says of the material's part in
+    the training."""
     data = member.data
+    of = f" {member.folder.name}"
     trainer.fill_levels(float(level_of_sigma(partition.sample.sigma.max())))
+    announce(f"calibrating{of}")
     trainer.calibrate()
+    announce(f"evaluating the errors of{of}")
     errors = evaluate_splits(trainer.predict, data, partition)
     variance = errors["training"]["variance"]["value"]
     sample = partition.sample
@@ -430,6 +441,7 @@ def export_fit(
         found = evaluate_transmittance(transmittance, data, partition.selection)
         training["transmittance"] = {split: e.as_dict() for split, e in found.items()}
     described = member.identity["data"]
+    announce(f"writing{of}")
     export(
         trainer.model,
         config,

@@ -100,7 +100,9 @@ def forecast_fit(config: FitConfig, shards: str | Path | DataFolder) -> FitForec
 
     step = pilot_seconds(piece, _PILOT_SECONDS)
     steps = config.training.steps
-    total = Estimate(config.training.time, 0.0, 1) if steps is None else step.scaled(steps)
+    total = step.scaled(config.training.min_steps if steps is None else steps)
+    if steps is None and total.value < config.training.time:
+        total = Estimate(config.training.time, 0.0, 1)
     return FitForecast(
         seconds=total.value,
         seconds_se=total.error,

@@ -119,7 +119,7 @@ def generate(
     entries = unfinished(job, folder, slice_index, slice_count)
     if planned is not None and not plans and entries:
         planned(run.plan)
-    traced = render_shards(run, entries, runner or Runner(), start=start, progress=progress)
+    traced = render_shards(run, entries, runner or Runner(), progress=progress)
     summary = finish(folder, seconds=time.perf_counter() - start, **vars(traced))
     if slice_count == 1 and not summary.complete:
         raise PartialError(
@@ -250,7 +250,6 @@ def render_shards(
     entries: Sequence[ShardEntry],
     runner: Runner,
     *,
-    start: float | None = None,
     progress: ProgressCallback | None = None,
 ) -> Traced:
     """Render those of the shards that are not finished.
@@ -258,8 +257,8 @@ def render_shards(
     Parameters
     ----------
     runner : maps :func:`render_shard` over the shards
-    start : when the run began, by ``time.perf_counter``; now by default. Paths per second count from it
-    progress : called once per shard
+    progress : called once per shard. Paths per second count from the end of the first shard, once there are
+        others: it compiles the kernels
 
     Raises
     ------
@@ -267,7 +266,7 @@ def render_shards(
     PartialError : other processes render some of them, shards failed, the disk is full, the store or the
         workers cannot be reached, or there are too many non-finite samples; finished shards are kept
     """
-    start = time.perf_counter() if start is None else start
+    start, first = time.perf_counter(), 0
     job, folder = run.job, run.folder
     pending = {entry.file: entry for entry in entries}
     traced, totals, limit = Traced(), ShardStatistics(), most_paths(job)
@@ -297,7 +296,10 @@ def render_shards(
                     planned_so_far[entry.split] += planned_paths(job, [entry])
                     traced_so_far[entry.split] += paths
             if progress is not None:
-                rate = traced.paths / max(time.perf_counter() - start, 1e-9) / 1e6
+                now = time.perf_counter()
+                rate = (traced.paths - first) / max(now - start, 1e-9) / 1e6
+                if not first:
+                    start, first = now, traced.paths
                 where = "" if runner.here else f" on {runner.workers} workers"
                 noise = totals.relative_error() if totals.train else None
                 error = "" if noise is None else f", noise {noise:.2%}"

@@ -95,6 +95,7 @@ _METHODS = [
     Column("relative MSE of images", "relative_mse", partial(_picture_error, key="relative_mse")),
     *_METRICS,
     _recorded("training [s]", "training_seconds", ".0f"),
+    _recorded("training steps", "training_steps"),
     _recorded("network weights", "network_weights"),
 ]
 
@@ -205,6 +206,7 @@ def ablations(runs: Sequence[FinishedRun], published: Sequence[Published]) -> li
         _UNEXPLAINED,
         Column("MSE − MSE of the first [10⁻³/sr²]", "minus_first", difference, 1e3),
         _recorded("training [s]", "training_seconds", ".0f"),
+        _recorded("training steps", "training_steps"),
     ]
     return [Table("ablations", "Ablations", columns, rows_of(columns, each_fit(runs)))]
 

@@ -115,7 +115,7 @@ def dataset_errors(materials: Mapping[str, Material], data: Dataset) -> dict[str
 
 
 def _parameter_counts(material: Material) -> dict[str, Any]:
-    """Parameter counts of a material: per network, and of its textures."""
+    """Parameter counts of a material, per network and of its textures; time and steps of its training."""
     weights = material.description["weights"]
     networks: dict[str, int] = {}
     textures = {id(texture.texels) for texture in material.model.textures()}
@@ -128,5 +128,6 @@ def _parameter_counts(material: Material) -> dict[str, Any]:
         "networks": networks,
         "texels": weights["texels"],
         "training_seconds": material.description["training"]["seconds"],
+        "training_steps": material.description["training"]["steps"],
         "model": material.config.model,
     }

@@ -39,6 +39,7 @@ _DETAILS = [
     _detail("paths each", "spp", digits="g"),
     _detail("generating, s", "generation_seconds", digits=".1f"),
     _detail("training, s", "training_seconds", digits=".1f"),
+    _detail("steps", "training_steps", digits=".0f"),
     _detail("total, s", "total_seconds", digits=".1f"),
     _detail("1080p, ms", "evaluation_ms_1080p", digits=".0f"),
     _detail("MB", "bytes", factor=1e-6, digits=".2f"),

@@ -118,6 +118,7 @@ class Run(Configuration):
             "spp": float(self.spp),
             "generation_seconds": generation_seconds,
             "training_seconds": result.seconds,
+            "training_steps": float(result.history[-1]["step"]),
             "total_seconds": seconds,
             "evaluation_ms_1080p": 1e3 * _evaluation_seconds(result.material, test),
             "bytes": float(sum(p.stat().st_size for p in out.glob("weights*"))),

@@ -67,8 +67,10 @@ def _error_table(comparison: Mapping[str, Any]) -> dict[str, Any]:
     for fit, record in comparison["test"].items():
         cells = [data_errors(record["splits"][s])[0] if s in record["splits"] else "–" for s in splits]
         mse = data_errors(record["splits"]["test"])[1]
-        rows.append([fit, *cells, mse, f"{record['network_weights']:,}", f"{record['texels']:,}"])
-    head = ["fit", *errors, "MSE, test [10⁻³/sr²]", "network weights", "texture values"]
+        cells += [mse, f"{record['training_steps']:,}", f"{record['training_seconds']:.0f}"]
+        rows.append([fit, *cells, f"{record['network_weights']:,}", f"{record['texels']:,}"])
+    head = ["fit", *errors, "MSE, test [10⁻³/sr²]", "training steps", "training [s]"]
+    head += ["network weights", "texture values"]
     return {"head": head, "rows": rows}
 
 

@@ -238,6 +238,37 @@ def test_progress_intervals(capsys: pytest.CaptureFixture[str], monkeypatch: pyt
     ]
 
 
+def test_the_time_left_counts_neither_set_up_nor_earlier_runs(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = 0.0
+    monkeypatch.setattr("mbtf_core.app.progress.time.monotonic", lambda: now)
+    with CONSOLE.progress(100, "fitting", "%") as bar:
+        # Reading takes 30 s, the first step of a resumed fit compiles, then each percent takes a second.
+        bar.update(0, "reading the data")
+        now = 30.0
+        bar.update(0, "training")
+        now = 45.0
+        bar.update(50.0, "loss 3")
+        now = 60.0
+        bar.update(65.0, "loss 2")
+        now = 95.0
+        bar.update(100, "loss 1")
+        bar.update(100, "evaluating")
+        bar.update(100, "evaluating")
+        now = 96.0
+        bar.update(100, "writing")
+    assert capsys.readouterr().err.splitlines() == [
+        "fitting: 0%, 0:00 elapsed, reading the data",
+        "fitting: 0%, 0:30 elapsed, training",
+        "fitting: 50%, 0:45 elapsed, loss 3",
+        "fitting: 65%, 1:00 elapsed, 0:35 left, loss 2",
+        "fitting: 100%, 1:35 elapsed, loss 1",
+        "fitting: 100%, 1:35 elapsed, evaluating",
+        "fitting: 100%, 1:36 elapsed, writing",
+    ]
+
+
 def test_progress_of_percentages_unknown_totals_and_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     with CONSOLE.progress(100, "fitting", "%") as bar:
         bar.update(29.6)

@@ -57,7 +57,9 @@ def test_a_resolved_configuration_with_steps_reads_back(tmp_path: Path) -> None:
 def test_presets_keep_what_sections_set() -> None:
     single = config_of("--quality", "draft", "--set", "training.batch=50")
     assert config_of("--quality", "draft", "--set", "training={batch: 50}") == single
-    assert (single.training.time, single.network.width) == (12.0, 40)
+    assert (single.training.time, single.training.min_steps, single.network.width) == (12.0, 800, 40)
+    # An explicit time is the time.
+    assert config_of("--quality", "draft", "--time", "5s").training.min_steps == 0
 
 
 def test_shared_networks_have_a_smaller_batch(tmp_path: Path) -> None:

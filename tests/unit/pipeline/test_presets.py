@@ -60,7 +60,8 @@ def test_other_recipes_get_the_network_of_the_preset() -> None:
     fits = {"neumip": {"model": "neumip"}, "neumip-baseline": {"model": "neumip-baseline"}}
     assert {n: {**best_at("draft", n), **FITTER["draft"]} for n in fits} == fitter_options("draft", fits)
     fits["hierarchical"] = {"model": "hierarchical"}
-    assert fitter_options("draft", fits)["hierarchical"] == FITTER["draft"]
+    slow = {key: value for key, value in FITTER["draft"].items() if key != "training.min_steps"}
+    assert fitter_options("draft", fits)["hierarchical"] == slow
     text = quality_options(path, "draft")
     assert text["fit.neumip.network.width"] == 40
     assert text["fit.neumip-baseline.training.texture_weight_decay"] == 1.0
@@ -69,6 +70,14 @@ def test_other_recipes_get_the_network_of_the_preset() -> None:
     text = quality_options(path, "draft", own)
     assert not any("network" in t or t.startswith("fit.neumip.training.texture_weight_decay") for t in text)
     assert text["fit.neumip.training.blur.min_sigma"] == 0.8
+
+
+def test_presets_train_800_steps_at_least_unless_told_a_time() -> None:
+    path = ROOT / "pipelines" / "rock_cliff.yaml"
+    assert quality_options(path, "draft")["fit.neumip.training.min_steps"] == 800
+    told = quality_options(path, "draft", ["fit.neumip.training.time=5s"])
+    assert "fit.neumip.training.min_steps" not in told
+    assert told["fit.neumip-baseline.training.min_steps"] == 800
 
 
 def test_longer_training_gets_a_larger_network() -> None:

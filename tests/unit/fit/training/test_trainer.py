@@ -102,6 +102,22 @@ def test_texels_without_a_gradient_decay_with_the_rate(compiled: bool) -> None:
         torch.testing.assert_close(after.detach(), before, rtol=0, atol=0)
 
 
+def test_a_time_budget_takes_its_fewest_steps() -> None:
+    """Schedules follow whichever is behind, so that they end with the training."""
+    t = trainer(queries(), steps=None, time=1e-3, min_steps=4)
+    fractions = []
+    step = t._step
+
+    def recorded(*arguments: Any) -> torch.Tensor:
+        fractions.append(t.fraction)
+        return step(*arguments)
+
+    t._step = recorded  # type: ignore[method-assign]
+    train_fully(t)
+    assert fractions == [0.0, 0.25, 0.5, 0.75]
+    assert trainer(queries(), steps=None, time=1e3, min_steps=1).fraction == 0.0
+
+
 def test_a_time_budget_ends_training_and_annealing() -> None:
     t = train_fully(trainer(queries(), steps=None, time=0.3))
     assert t.fraction == 1.0

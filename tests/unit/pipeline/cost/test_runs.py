@@ -65,7 +65,7 @@ def used(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         clock.now += 6.0
         out.mkdir(parents=True)
         (out / "weights.safetensors").write_bytes(bytes(100))
-        return SimpleNamespace(material=Material(), seconds=5.0, total_seconds=6.0)
+        return SimpleNamespace(material=Material(), seconds=5.0, total_seconds=6.0, history=[{"step": 700}])
 
     value = np.repeat(np.arange(1000) % 2.0, 3).reshape(1000, 3).astype(np.float32)
     zero = np.zeros((1000, 3), np.float32)
@@ -85,6 +85,7 @@ def test_a_run_measures_time_and_error(used: list[Any], tmp_path: Path) -> None:
     assert found.seconds.value == 13.0
     d = found.details
     assert (d["generation_seconds"], d["training_seconds"], d["total_seconds"]) == (7, 5, 13)
+    assert d["training_steps"] == 700
     assert (d["queries"], d["spp"], d["bytes"], d["run_seconds"]) == (640, 4, 100, 13 + 5 * 0.5)
     assert d["evaluation_ms_1080p"] == pytest.approx(500 * 1920 * 1080 / 2**18)
     # Mean squares of 0.1 and 0.9 over the variance of a quarter.

@@ -24,7 +24,15 @@ def test_both_errors_of_a_group_are_significant_or_neither() -> None:
     picture: dict[str, Any] = {"view": direction, "light": direction, "tiles_across": 1}
     picture["references"] = {"query": {"flip": flip}}
     picture["fits"] = {"a": {"errors": {"query": error}, "flip": flip}}
-    test = {"a": {"splits": {"test": split}, "network_weights": 9, "texels": 9}}
+    test = {
+        "a": {
+            "splits": {"test": split},
+            "network_weights": 9,
+            "texels": 9,
+            "training_steps": 9,
+            "training_seconds": 3.0,
+        }
+    }
     record: dict[str, Any] = {
         "fits": ["a"],
         "kinds": ["query"],
