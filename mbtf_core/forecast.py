@@ -1,4 +1,5 @@
-"""Forecasts of time: a short pilot on this machine, its error, and its extrapolation to the whole work."""
+"""Forecasts of time: a short pilot on this machine, its error, and its extrapolation to the whole work; and
+the words for forecasts of the error."""
 
 from __future__ import annotations
 
@@ -8,7 +9,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from mbtf_core.stats import Estimate
+from mbtf_core.stats import Estimate, Interval
+from mbtf_core.units import clock
 
 # Fewest timed pieces of a pilot.
 FEWEST_PIECES = 3
@@ -58,3 +60,39 @@ def median_estimate(times: Sequence[float]) -> Estimate:
 def is_long(seconds: float, size: float) -> bool:
     """Whether work of so many seconds, or of so many bytes on disk, is announced before it begins."""
     return seconds >= LONG or size >= LARGE
+
+
+def expected_error(seconds: float, error: Interval) -> str:
+    """What a time is expected to give, in one line.
+
+    Parameters
+    ----------
+    seconds : float
+    error : Interval
+        Unexplained variance.
+    """
+    if error.suffices:
+        return f"{clock(seconds)}: expect an unexplained variance of {error}"
+    span = f"an unexplained variance of {error.low:.2g} to {error.high:.2g}"
+    return f"{clock(seconds)}: the evidence does not suffice: {span}"
+
+
+def expected_seconds(error: float, seconds: Interval, limit: Interval, why: str) -> str:
+    """How long an error is expected to take, in one line.
+
+    Parameters
+    ----------
+    error : float
+        Unexplained variance.
+    seconds, limit : Interval
+        Time that reaches it, and error that no time undercuts.
+    why : str
+        What limits the error, such as ``with these queries``.
+    """
+    if seconds.suffices:
+        span = f"{clock(seconds.low)} to {clock(seconds.high)}"
+        return f"error {error:g}: about {clock(seconds.value)} ({span})"
+    if seconds.low == math.inf:
+        return f"error {error:g}: not reachable {why}: they limit it at about {limit}"
+    most = f"at most {clock(seconds.high)}" if seconds.high < math.inf else "perhaps never"
+    return f"error {error:g}: the evidence does not suffice: at least {clock(seconds.low)}, {most}"

@@ -107,13 +107,15 @@ class FitConfig(Settings):
         return self
 
     def fields(self) -> dict[str, Any]:
-        """Options that determine the fit, as plain data: all but device and memory, and without those of
-        shared networks where they are not used."""
+        """Options that determine the fit, as plain data: all but device and memory, and without
+        an error to stop at and those of shared networks where they are not used."""
         found = self.model_dump(mode="json", exclude={"device", "data"})
         if self.decoder is None:
             del found["decoder"]
         if not self.training.shared_decoder:
             del found["training"]["shared_decoder"]
+        if self.training.error is None:
+            del found["training"]["error"]
         return found
 
     def hash(self, data_hash: str) -> str:

@@ -121,6 +121,13 @@ class TrainingSection(Settings):
     steps: Annotated[int | None, Flag("--steps")] = Field(
         None, ge=1, description="number of training steps, in place of a time"
     )
+    error: Annotated[float | None, Flag("--error")] = Field(
+        None,
+        gt=0,
+        le=1,
+        description="unexplained variance at which training stops early: that of the validation, with its "
+        "standard error, is no larger",
+    )
     batch: Annotated[int, Flag("--batch")] = Field(1 << 15, ge=1, le=1 << 24, description="queries per step")
     patch_size: int = Field(
         32,
