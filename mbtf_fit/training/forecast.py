@@ -64,7 +64,7 @@ class FitForecast:
 
     def describe(self) -> str:
         """Lines."""
-        error = f" ± {clock(self.seconds_se)}" if self.seconds_se else ""
+        error = f" ± {clock(self.seconds_se)}" if self.seconds_se >= 0.5 else ""
         return (
             f"forecast: {clock(self.seconds)}{error} of training, {self.steps} steps at "
             f"{self.queries_per_second / 1e6:.2f} M queries/s, after {self.loading:.0f} s of loading; "

@@ -17,6 +17,7 @@ import jinja2
 from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.units import size_text
 from mbtf_gen.planning.effects import EFFECTS
+from mbtf_gen.planning.effects_plan import bound_text
 from mbtf_gen.publishing.facts import TAGS, Facts
 from mbtf_gen.publishing.formats import SUFFIXES
 
@@ -77,13 +78,12 @@ def front_matter(facts: Facts) -> str:
 
 
 def _bound(effect: Mapping[str, Any]) -> str:
-    """Bias bound of an effect with its standard error, in percent of the mean value."""
+    """Bias of leaving an effect out, in percent of the mean value."""
     if not effect["present"]:
         return ""
     if effect["bias_bound"] is None:
         return "not measured"
-    error = f" ± {100 * effect['error']:.1g}" if effect["error"] else ""
-    return f"{100 * effect['bias_bound']:.2g}{error} %"
+    return bound_text(effect["bias_bound"], effect["error"])
 
 
 def _grouped(facts: Facts) -> dict[str, list[int]]:
