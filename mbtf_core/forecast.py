@@ -16,6 +16,8 @@ from mbtf_core.units import clock
 FEWEST_PIECES = 3
 # Work of more seconds or bytes is announced before it begins.
 LONG, LARGE = 60.0, 1e9
+# Said where the bounds of a forecast are too far apart to plan by.
+INSUFFICIENT = "the evidence does not suffice"
 
 
 def pilot_seconds(piece: Callable[[int], float], seconds: float) -> Estimate:
@@ -73,8 +75,7 @@ def expected_error(seconds: float, error: Interval) -> str:
     """
     if error.suffices:
         return f"{clock(seconds)}: expect an unexplained variance of {error}"
-    span = f"an unexplained variance of {error.low:.2g} to {error.high:.2g}"
-    return f"{clock(seconds)}: the evidence does not suffice: {span}"
+    return f"{clock(seconds)}: {INSUFFICIENT}"
 
 
 def expected_seconds(error: float, seconds: Interval, limit: Interval, why: str) -> str:
@@ -94,5 +95,5 @@ def expected_seconds(error: float, seconds: Interval, limit: Interval, why: str)
         return f"error {error:g}: about {clock(seconds.value)} ({span})"
     if seconds.low == math.inf:
         return f"error {error:g}: not reachable {why}: they limit it at about {limit}"
-    most = f"at most {clock(seconds.high)}" if seconds.high < math.inf else "perhaps never"
-    return f"error {error:g}: the evidence does not suffice: at least {clock(seconds.low)}, {most}"
+    least = f", but it takes at least {clock(seconds.low)}" if seconds.low >= 1.0 else ""
+    return f"error {error:g}: {INSUFFICIENT}{least}"

@@ -10,9 +10,9 @@ from typing import Any
 
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import read_json, write_json
-from mbtf_core.forecast import expected_error, expected_seconds
+from mbtf_core.forecast import INSUFFICIENT, expected_error, expected_seconds
 from mbtf_core.stats import Estimate, Interval, LearningCurve
-from mbtf_core.units import clock
+from mbtf_core.units import clock, format_duration
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.cost.measurement import Measurement
 
@@ -124,9 +124,7 @@ def page_answers(evidence: Evidence) -> list[dict[str, Any]]:
     rows = []
     for seconds in _TIMES:
         if (found := evidence.error_after(seconds)) is not None:
-            error = found[0]
-            text = (
-                str(error) if error.suffices else f"{error.low:.2g} to {error.high:.2g}: too wide to plan by"
-            )
-            rows.append({"time": clock(seconds), "error": text, "basis": evidence.range_text(seconds)})
+            text = str(found[0]) if found[0].suffices else INSUFFICIENT
+            basis = evidence.range_text(seconds)
+            rows.append({"time": format_duration(seconds), "error": text, "basis": basis})
     return rows

@@ -36,19 +36,19 @@ _COMMAND = _field("command", "command")
 _PARTS = [_field(f"{name}, %", name, factor=100.0) for name in ("bias", "noise", "error")]
 _SECONDS = _field("seconds per million queries", "seconds")
 _DETAILS = [
-    _detail("million queries", "queries", factor=1e-6, digits=".2f"),
-    _detail("paths each", "spp", digits="g"),
+    _detail("total, s", "total_seconds", digits=".1f"),
     _detail("generating, s", "generation_seconds", digits=".1f"),
     _detail("training, s", "training_seconds", digits=".1f"),
-    _detail("loading and calibrating, s", "overhead_seconds", digits=".1f"),
-    _detail("total, s", "total_seconds", digits=".1f"),
-    _detail("evaluating it here, s", "evaluating_seconds", digits=".1f"),
+    _detail("loading, s", "overhead_seconds", digits=".1f"),
+    _detail("evaluating, s", "evaluating_seconds", digits=".1f"),
+    _detail("million queries", "queries", factor=1e-6, digits=".2f"),
+    _detail("paths each", "spp", digits="g"),
     _detail("1080p, ms", "evaluation_ms_1080p", digits=".0f"),
     _detail("MB", "bytes", factor=1e-6, digits=".2f"),
     _detail("seeds", "seeds", digits="g"),
 ]
 _GENERATOR = [_TITLE, _SECONDS, *_PARTS, _COMMAND]
-_RUNS = [_TITLE, *_DETAILS, _field("unexplained variance", "error"), _COMMAND]
+_RUNS = [_TITLE, _field("unexplained variance", "error"), *_DETAILS, _COMMAND]
 _NAMES = [_field("", name) for name in ("study", "series", "name")]
 _CSV = [*_NAMES, _SECONDS, *reversed(_PARTS), *_DETAILS, _COMMAND]
 
@@ -120,9 +120,8 @@ def _generator_section(found: Sequence[Measurement], png: Path) -> dict[str, Any
         series = [_series(n, [m for m in found if m.series == n], style="joined") for n in names]
     if unbiased:
         limit = 100 * max(2 * max(m.bias.error, m.bias.value) for m in unbiased if m.bias)
-        caption = (
-            f"Labels at the noise: the bias is not significant, at most {limit:.2g} % of the mean value."
-        )
+        most = f"at most {limit:.2g} %" if limit < 100 else "though it may exceed 100 %"
+        caption = f"Labels at the noise: the bias is not significant, {most} of the mean value."
     return {
         "figure": _figure(series, "seconds per million queries", _NOISE_AXIS, png, caption),
         "table": _table(_GENERATOR, found).for_page(),

@@ -91,7 +91,7 @@ def test_forecasts_answer_or_say_why_not() -> None:
     vague = replace(known, error=Interval(0.08, 0.01, 0.4), asked=(0.05, Interval(720.0, 60.0, math.inf)))
     assert [line.split(": ")[1] for line in vague.describe().splitlines()] == [
         "the evidence does not suffice",
-        "the evidence does not suffice",
+        "the evidence does not suffice, but it takes at least 1:00",
     ]
     assert ErrorForecast(1.0, reason="3 steps").describe() == "no forecast of the error: 3 steps"
 

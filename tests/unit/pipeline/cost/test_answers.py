@@ -59,7 +59,7 @@ def test_a_study_answers_times_and_errors() -> None:
     never = found.time_of(0.01)
     assert never is not None
     assert "not reachable with this network, however many queries" in never[1]
-    assert [row["time"] for row in page_answers(found)] == ["1:00", "5:00", "15:00", "1:00:00"]
+    assert [row["time"] for row in page_answers(found)] == ["1min", "5min", "15min", "1h"]
     # Shorter than all runs, or too few of them: no answer.
     assert found.error_after(5.0) is None
     few = replace(found, seconds=SECONDS[:2], errors=found.errors[:2], seeds=found.seeds[:2])
