@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -40,6 +41,7 @@ class Evidence:
     ----------
     basis, system : see :func:`basis_of`, and the machine
     seconds, errors, seeds : total time, unexplained variance, and number of seeds of each
+    work : seconds of generating and training, part of `seconds`; the error is a law of these
     deviation, degrees : relative deviation of a single run over seeds, and its degrees of freedom
     test : relative standard error by the test queries
     """
@@ -49,6 +51,7 @@ class Evidence:
     seconds: tuple[float, ...]
     errors: tuple[float, ...]
     seeds: tuple[float, ...]
+    work: tuple[float, ...]
     deviation: float
     degrees: float
     test: float
@@ -67,6 +70,7 @@ class Evidence:
             tuple(m.seconds.value for m in runs),
             tuple(m.error.value for m in runs),
             tuple(m.details["seeds"] for m in runs),
+            tuple(m.details["generation_seconds"] + m.details["training_seconds"] for m in runs),
             0.0 if deviation is None else deviation.value,
             0.0 if deviation is None else deviation.degrees,
             max((m.details["test_error"] for m in runs), default=0.0),
@@ -76,9 +80,14 @@ class Evidence:
         """The law of their errors; None where they are too few."""
         deviation = Estimate(self.deviation, 0.0, 1, self.degrees) if self.degrees > 0 else None
         try:
-            return LearningCurve(self.seconds, self.errors, deviation, self.seeds, self.test)
+            return LearningCurve(self.work, self.errors, deviation, self.seeds, self.test)
         except ValueError:
             return None
+
+    @property
+    def overhead(self) -> float:
+        """Seconds of a run besides its work, which longer runs need no more of."""
+        return statistics.median(s - w for s, w in zip(self.seconds, self.work, strict=True))
 
     def store(self, folder: Path) -> None:
         """Write it into the folder of its study."""
@@ -99,14 +108,14 @@ class Evidence:
         longest = self.seconds[-1]
         if seconds <= 1.05 * longest:
             return f"measured: {len(self.seconds)} runs of {clock(self.seconds[0])} to {clock(longest)}"
-        return f"extrapolated, {seconds / longest:.1f} times the longest run"
+        return f"extrapolated, {seconds / longest:.2g} times the longest run"
 
     def error_after(self, seconds: float) -> tuple[Interval, str] | None:
         """Expected error of a run of a time, and one line; None where the runs are too few, or all longer."""
         curve = self.curve()
         if curve is None or seconds < 0.95 * self.seconds[0]:
             return None
-        error = curve.error_at(seconds)
+        error = curve.error_at(max(seconds - self.overhead, min(self.work)))
         return error, f"{expected_error(seconds, error)} ({self.range_text(seconds)})"
 
     def time_of(self, error: float) -> tuple[Interval, str] | None:
@@ -114,7 +123,8 @@ class Evidence:
         curve = self.curve()
         if curve is None:
             return None
-        time = curve.time_of(error)
+        found, least = curve.time_of(error), self.overhead
+        time = Interval(found.value + least, found.low + least, found.high + least)
         text = expected_seconds(error, time, curve.limit, _LIMITS)
         return time, f"{text} ({self.range_text(time.value)})" if time.suffices else text
 
