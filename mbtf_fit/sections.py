@@ -125,8 +125,8 @@ class TrainingSection(Settings):
         None,
         gt=0,
         le=1,
-        description="unexplained variance at which training stops early: that of the validation, with its "
-        "standard error, is no larger",
+        description="unexplained variance to reach: training stops once the validation error, with its "
+        "standard error, is no larger; forecasts state how long that takes",
     )
     batch: Annotated[int, Flag("--batch")] = Field(1 << 15, ge=1, le=1 << 24, description="queries per step")
     patch_size: int = Field(

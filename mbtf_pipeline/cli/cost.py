@@ -8,7 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from mbtf_core.app.console import CONSOLE, Console
-from mbtf_core.app.options import ClusterOption, Output, Set, command_line, whole_number
+from mbtf_core.app.options import ClusterOption, ErrorOption, Output, Set, command_line, whole_number
 from mbtf_core.errors import UsageError
 
 
@@ -19,7 +19,7 @@ def cost(
     output: Annotated[Output | None, Parameter(show_default="out/NAME-cost")] = None,
     time: Annotated[str, Parameter(metavar="DURATION")] = "10min",
     refine: Annotated[str | None, Parameter(metavar="DURATION")] = None,
-    error: Annotated[float | None, Parameter(metavar="ERROR")] = None,
+    error: ErrorOption = None,
     seed: Annotated[int | None, Parameter(converter=whole_number, show_default="the recipe's")] = None,
     cluster: ClusterOption = None,
     assignments: Set = None,
@@ -27,19 +27,18 @@ def cost(
 ) -> None:
     """Measure error against time for this material and machine: mbtf-pipeline cost RECIPE
 
-    Writes cost.html, cost.csv and PNGs, and answers which error a time gives. The same command resumes. A
-    longer time keeps all measurements and adds longer runs. With --cluster, workers measure, each for itself.
+    Writes cost.html, cost.csv and PNGs, and answers which error a time gives, from 160 s on. The same command
+    resumes. A longer time keeps all measurements and adds longer runs. With --cluster, workers measure, each
+    for itself.
 
     Parameters
     ----------
     recipe
         YAML file; its material and generator are studied.
     time
-        Time budget: 160s (the least that answers), 10min, 1h.
+        Time budget: 90s, 2min, 1h.
     refine
         Additional time: repeats runs with further seeds until their 95 % intervals are within ±10 %.
-    error
-        Also answer how long this unexplained variance takes.
     seed
         Root seed of all random numbers.
     """
@@ -111,10 +110,7 @@ def cost(
     }
     counts = f"{len(study.measurements)} configurations measured, {len(study.skipped)} skipped"
     lines = [f"{page}: {counts} for lack of time", *(f"failed: {text}" for text in study.failed)]
-    lines += [
-        f"{row['time']}: unexplained variance {row['error']} ({row['basis']})"
-        for row in page_answers(evidence)
-    ]
+    lines += [row["line"] for row in rows]
     lines += answers
     if not rows and study.least is not None:
         text = (

@@ -13,6 +13,7 @@ from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.options import (
     ClusterOption,
     DryRun,
+    ErrorOption,
     Output,
     Quality,
     QualityOption,
@@ -40,7 +41,7 @@ def run(
     output: Annotated[Output | None, Parameter(show_default="out/NAME")] = None,
     quality: QualityOption = None,
     time: Time = None,
-    error: Annotated[float | None, Parameter(metavar="ERROR")] = None,
+    error: ErrorOption = None,
     quick: Switch = False,
     dry_run: DryRun = False,
     force: Switch = False,
@@ -60,9 +61,6 @@ def run(
     ----------
     recipe
         YAML file.
-    error
-        Unexplained variance at which fits stop: once that of the validation, with its standard error, is no
-        larger, or their time is over.
     quick
         Use the small size of a recipe of several materials: minutes in place of hours.
     force

@@ -73,7 +73,7 @@ class Evidence:
             tuple(m.details["generation_seconds"] + m.details["training_seconds"] for m in runs),
             0.0 if deviation is None else deviation.value,
             0.0 if deviation is None else deviation.degrees,
-            max((m.details["test_error"] for m in runs), default=0.0),
+            statistics.median([m.details["test_error"] for m in runs] or [0.0]),
         )
 
     def curve(self) -> LearningCurve | None:
@@ -136,5 +136,5 @@ def page_answers(evidence: Evidence) -> list[dict[str, Any]]:
         if (found := evidence.error_after(seconds)) is not None:
             text = str(found[0]) if found[0].suffices else INSUFFICIENT
             basis = evidence.range_text(seconds)
-            rows.append({"time": format_duration(seconds), "error": text, "basis": basis})
+            rows.append({"time": format_duration(seconds), "error": text, "basis": basis, "line": found[1]})
     return rows

@@ -106,11 +106,15 @@ def test_training_stops_once_the_error_is_reached(
     shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fits, "_REPORT_SECONDS", 0.02)
-    asked = config(steps=100_000, error=0.8, energy_calibration=False)
+    asked = config(steps=3000, error=0.8, energy_calibration=False)
     found = fit(asked, shards, tmp_path / "early")
     *before, last = found.history
     assert last["unexplained"] + last["unexplained_error"] <= 0.8
     assert all(r["unexplained"] + r["unexplained_error"] > 0.8 for r in before)
+    assert last["step"] < 3000
+    # The error bar counts.
+    for value, enough in ((0.77, True), (0.79, False), (None, False)):
+        assert reached(asked, [{"unexplained": value, "unexplained_error": 0.02}]) is enough
     # What is exported is what was validated.
     assert found.errors["test"]["unexplained"]["value"] == pytest.approx(last["unexplained"], rel=0.1)
     assert found.as_dict()["reached"] is True
