@@ -99,7 +99,7 @@ def forecast_error(loop: TrainingLoop, queries: ShardQueries, step: Estimate, st
     if not isinstance(data, TrainingQueries):
         return ErrorForecast(seconds, reason="its queries are no shuffled ones in memory")
     if first * total > _MOST * steps:
-        reason = f"{steps} steps are too few to learn from a part of them; just fit"
+        reason = f"{steps} steps are too few for a forecast by a part of them"
         return ErrorForecast(seconds, reason=reason)
     start = snapshot(loop)
 

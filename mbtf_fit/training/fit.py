@@ -365,7 +365,7 @@ def describe_ending(config: FitConfig, history: Sequence[dict[str, Any]]) -> str
     last, training = history[-1], config.training
     error = format_estimate({"value": last["unexplained"], "error": last["unexplained_error"]})
     limit = clock(training.time) if training.steps is None else f"{training.steps} steps"
-    spent = clock(last["seconds"]) if training.steps is None else f"{last['step']} steps"
+    spent = clock(last["seconds"]) if training.steps is None else str(last["step"])
     if found:
         return f"stopped at error {training.error:g} after {spent} of {limit}: validation error {error}"
     return f"stopped after {limit}: validation error {error} has not reached {training.error:g}"

@@ -156,7 +156,7 @@ def _forecast(recipe: Recipe, folder: Path, console: Console) -> None:
     errors = forecast_errors(recipe, folder, expected, console.note)
     lines = [expected.describe()]
     for name, found in errors.items():
-        source = {"study": f" (cost study {study_folder(recipe)})", "pilots": " (pilots on the data)"}
+        source = {"study": f" (cost study {study_folder(recipe)})"}
         first, *more = found["text"].splitlines()
         lines += [f"  {name}: {first}{source.get(found['source'] or '', '')}", *(f"    {m}" for m in more)]
     if any(found["source"] is None for found in errors.values()):
