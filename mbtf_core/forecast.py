@@ -1,4 +1,5 @@
-"""Forecasts of time: a short pilot on this machine, its error, and its extrapolation to the whole work."""
+"""Forecasts of time: a short pilot on this machine, its error, and its extrapolation to the whole work; and
+the words for forecasts of the error."""
 
 from __future__ import annotations
 
@@ -8,12 +9,15 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from mbtf_core.stats import Estimate
+from mbtf_core.stats import Estimate, Interval
+from mbtf_core.units import clock
 
 # Fewest timed pieces of a pilot.
 FEWEST_PIECES = 3
 # Work of more seconds or bytes is announced before it begins.
 LONG, LARGE = 60.0, 1e9
+# Said where the bounds of a forecast are too far apart to plan by.
+INSUFFICIENT = "the evidence does not suffice"
 
 
 def pilot_seconds(piece: Callable[[int], float], seconds: float) -> Estimate:
@@ -58,3 +62,38 @@ def median_estimate(times: Sequence[float]) -> Estimate:
 def is_long(seconds: float, size: float) -> bool:
     """Whether work of so many seconds, or of so many bytes on disk, is announced before it begins."""
     return seconds >= LONG or size >= LARGE
+
+
+def expected_error(seconds: float, error: Interval) -> str:
+    """What a time is expected to give, in one line.
+
+    Parameters
+    ----------
+    seconds : float
+    error : Interval
+        Unexplained variance.
+    """
+    if error.suffices:
+        return f"{clock(seconds)}: expect an unexplained variance of {error}"
+    return f"{clock(seconds)}: {INSUFFICIENT}"
+
+
+def expected_seconds(error: float, seconds: Interval, limit: Interval, why: str) -> str:
+    """How long an error is expected to take, in one line.
+
+    Parameters
+    ----------
+    error : float
+        Unexplained variance.
+    seconds, limit : Interval
+        Time that reaches it, and error that no time undercuts.
+    why : str
+        What limits the error, such as ``with these queries``.
+    """
+    if seconds.suffices:
+        span = f"{clock(seconds.low)} to {clock(seconds.high)}"
+        return f"error {error:g}: about {clock(seconds.value)} ({span})"
+    if seconds.low == math.inf:
+        return f"error {error:g}: not reachable {why}: they limit it at about {limit}"
+    least = f", but it takes at least {clock(seconds.low)}" if seconds.low >= 1.0 else ""
+    return f"error {error:g}: {INSUFFICIENT}{least}"

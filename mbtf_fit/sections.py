@@ -124,6 +124,13 @@ class TrainingSection(Settings):
     min_steps: int = Field(
         0, ge=0, description="fewest steps of a time budget: a slow or busy machine takes longer for them"
     )
+    error: Annotated[float | None, Flag("--error")] = Field(
+        None,
+        gt=0,
+        le=1,
+        description="unexplained variance to reach: training stops once the validation error, with its "
+        "standard error, is no larger; forecasts state how long that takes",
+    )
     batch: Annotated[int, Flag("--batch")] = Field(1 << 15, ge=1, le=1 << 24, description="queries per step")
     patch_size: int = Field(
         32,

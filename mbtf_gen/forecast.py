@@ -60,8 +60,9 @@ class Forecast:
     def describe(self, target: Target | None = None) -> str:
         """One line, two under a target error."""
         total = self.start + self.seconds
+        error = f" ± {clock(self.seconds_se)}" if self.seconds_se >= 0.5 else ""
         line = (
-            f"forecast: {clock(total)} ± {clock(self.seconds_se)}, "
+            f"forecast: {clock(total)}{error}, "
             f"{self.paths / max(total, 1e-9) / 1e6:.2f} M paths/s ({self.start:.0f} s of startup included), "
             f"{size_text(self.bytes)}, noise of one training value {self.relative_error:.0%} of the mean "
             "value"

@@ -8,7 +8,6 @@ than that of the preset: a run that thus takes longer than its time says so.
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -19,7 +18,7 @@ from mbtf_core.app.options import Quality
 from mbtf_core.config.settings import deep_merge
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.files.atomic import data_sha256, read_json, write_json
-from mbtf_core.files.folders import check_space, owned
+from mbtf_core.files.folders import check_space, free_space, owned
 from mbtf_core.forecast import is_long
 from mbtf_core.units import clock, expectation
 from mbtf_fit.config import FitConfig
@@ -175,6 +174,7 @@ class TimedRun:
     progress : receives lines: the split, and by how much the run will be late
     quality : the preset to use; by default the best that fits
     began : start of the run by ``time.perf_counter``; now by default
+    dry_run : write nothing
 
     Raises
     ------
@@ -192,6 +192,7 @@ class TimedRun:
         quality: Quality | None = None,
         assignments: Sequence[str] = (),
         began: float | None = None,
+        dry_run: bool = False,
     ) -> None:
         self._progress = progress
         self._began = time.perf_counter() if began is None else began
@@ -207,6 +208,10 @@ class TimedRun:
         ]
         self._key = data_sha256({"schema": SPLIT_SCHEMA, "time": seconds, "recipes": options})
         self._path = folder / SPLIT_NAME
+        if dry_run:
+            RUN.check(folder)
+            self.split = self._stored() or self._plan(recipes)
+            return
         with owned(folder):
             RUN.check(folder)
             split = self._stored()
@@ -251,7 +256,7 @@ class TimedRun:
         """The best preset that fits; the first one with less training if none does."""
         forecaster = RunForecaster(next(iter(recipes.values())))
         forecasts = {name: forecaster.of(recipe) for name, recipe in recipes.items()}
-        left, free = self._left(), shutil.disk_usage(self._path.parent).free
+        left, free = self._left(), free_space(self._path.parent)
         fitting = [name for name, f in forecasts.items() if f.seconds <= left and f.bytes <= free]
         quality = fitting[-1] if fitting else next(iter(recipes))
         expected, fits = forecasts[quality], len(recipes[quality].fit)

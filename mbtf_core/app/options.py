@@ -71,6 +71,15 @@ Output = Annotated[Path, Parameter(name=["--output", "-o"], help="Output folder.
 DataOutput = Annotated[Path, Parameter(name=["--output", "-o"], help="Output folder or URL.")]
 Overwrite = Annotated[Switch, Parameter(help="Replace existing output.")]
 Time = Annotated[str | None, Parameter(metavar="DURATION", help="Time budget: 90s, 2min, 1h.")]
+ErrorOption = Annotated[
+    float | None,
+    Parameter(
+        name="--error",
+        metavar="FLOAT",
+        help="Unexplained variance to reach: training stops once the validation error, with its standard "
+        "error, is no larger; forecasts state how long that takes.",
+    ),
+]
 ClusterOption = Annotated[
     str | None,
     Parameter(

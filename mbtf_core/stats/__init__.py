@@ -4,6 +4,7 @@ Needs numpy and scipy alone. ``docs/explanation/statistics.md`` explains when to
 """
 
 from mbtf_core.stats.estimate import Estimate, by_group, elevation_groups, level_groups, mean_estimate
+from mbtf_core.stats.learning_curve import Interval, LearningCurve
 from mbtf_core.stats.paired import (
     mean_of_halves,
     mse_difference,
@@ -21,6 +22,8 @@ __all__ = [
     "Aggregate",
     "Comparison",
     "Estimate",
+    "Interval",
+    "LearningCurve",
     "Outcome",
     "aggregate_test",
     "by_group",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -113,7 +112,7 @@ def fit(
     from mbtf_fit.training.forecast import forecast_fit
 
     expected = forecast_fit(config, folder)
-    data = {"shards": str(folder), "model": config.model, "forecast": asdict(expected)}
+    data = {"shards": str(folder), "model": config.model, "forecast": expected.as_dict()}
     console.report(data, expected.describe())
 
 
@@ -129,7 +128,7 @@ def _fit_one(
 ) -> None:
     """Fit a data set, watched by whoever asks for it."""
     from mbtf_fit.material.format import DESCRIPTION_NAME
-    from mbtf_fit.training.fit import fit
+    from mbtf_fit.training.fit import describe_ending, fit
     from mbtf_fit.training.fit_folder import EventLog
 
     finished = not overwrite and (output / DESCRIPTION_NAME).exists()
@@ -160,8 +159,11 @@ def _fit_one(
     if finished:
         console.note(f"{output}: this fit is already finished; --overwrite trains it again")
     summary = result.as_dict()
-    cost = [result.marginal_cost.describe()] if result.marginal_cost is not None else []
-    console.report(summary, "\n".join([describe_fit(summary, verbose), *cost]))
+    ending = describe_ending(config, result.history)
+    more = [ending] if ending is not None else []
+    if result.marginal_cost is not None and not summary["reached"]:
+        more.append(result.marginal_cost.describe())
+    console.report(summary, "\n".join([describe_fit(summary, verbose), *more]))
 
 
 def _training_progress(bar: Progress, folder: Path) -> Callable[[float, str], None]:

@@ -21,6 +21,7 @@ from mbtf_core.files.folders import ELSEWHERE, owned
 from mbtf_core.paths import real_path
 from mbtf_core.run.signals import stop_on_interruption
 from mbtf_core.stats import pooled_variance
+from mbtf_core.units import clock
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import Partition, load_training, open_data
 from mbtf_fit.data.queries import ShardQueries
@@ -105,6 +106,7 @@ class FitResult:
             "seconds": self.seconds,
             "total_seconds": self.total_seconds,
             "resumed": self.resumed,
+            "reached": reached(self.material.config, self.history),
             "training": self.material.description["training"],
             "errors": self.errors,
             "marginal_cost": None if cost is None else cost.as_dict(),
@@ -321,7 +323,7 @@ def _train(
     for member in members:
         truncate_history(member.folder, loop.progress.step)
 
-    def report() -> None:
+    def report() -> bool:
         records = []
         for member, trainer, (_, subset) in zip(members, trainers, subsets, strict=True):
             records.append(history_record(trainer, subset))
@@ -329,6 +331,7 @@ def _train(
             if observe is not None:
                 observe(records[-1], trainer, subset)
         progress(loop.fraction, _describe(records))
+        return all(reached(config, [record]) for record in records)
 
     progress(loop.fraction, "training")
     _spend_budget(loop, report, checkpoint)
@@ -349,8 +352,32 @@ def _describe(records: Sequence[dict[str, Any]]) -> str:
     return f"{text}, {first['queries_per_second'] / 1e6:.2f} M queries/s"
 
 
-def _spend_budget(loop: TrainingLoop, report: Callable[[], None], checkpoint: Path) -> None:
-    """Train with reports and checkpoints at intervals; one is written before an interruption ends it."""
+def reached(config: FitConfig, history: Sequence[dict[str, Any]]) -> bool | None:
+    """Whether the last validation, with its standard error, is at or below the error of the configuration;
+    None if it has none."""
+    if config.training.error is None:
+        return None
+    value, error = (history[-1].get(key) if history else None for key in ("unexplained", "unexplained_error"))
+    return value is not None and error is not None and value + error <= config.training.error
+
+
+def describe_ending(config: FitConfig, history: Sequence[dict[str, Any]]) -> str | None:
+    """Why training ended, in one line; None if it had no error to reach."""
+    found = reached(config, history)
+    if found is None:
+        return None
+    last, training = history[-1], config.training
+    error = format_estimate({"value": last["unexplained"], "error": last["unexplained_error"]})
+    limit = clock(training.time) if training.steps is None else f"{training.steps} steps"
+    spent = clock(last["seconds"]) if training.steps is None else str(last["step"])
+    if found:
+        return f"stopped at error {training.error:g} after {spent} of {limit}: validation error {error}"
+    return f"stopped after {limit}: validation error {error} has not reached {training.error:g}"
+
+
+def _spend_budget(loop: TrainingLoop, report: Callable[[], bool], checkpoint: Path) -> None:
+    """Train with reports and checkpoints at intervals, until the budget is spent or a report says that the
+    error is reached; a checkpoint is written before an interruption ends it."""
     seconds = max(1.0, len(loop.trainers) / _VALIDATED) * _REPORT_SECONDS
     saved = time.perf_counter()
     done = loop.fraction >= 1.0
@@ -362,7 +389,7 @@ def _spend_budget(loop: TrainingLoop, report: Callable[[], None], checkpoint: Pa
                 # The store of streamed queries cannot be reached.
                 write_checkpoint(loop, checkpoint)
                 raise
-            report()
+            done = report() or done
             if time.perf_counter() - saved > _CHECKPOINT_SECONDS or done or stop.is_set():
                 write_checkpoint(loop, checkpoint)
                 saved = time.perf_counter()

@@ -185,6 +185,20 @@ def state_tensors(loop: TrainingLoop) -> dict[str, Tensor]:
     return tensors
 
 
+def snapshot(loop: TrainingLoop) -> dict[str, Tensor]:
+    """Copies of the loop's state, which :func:`restore` takes."""
+    return {name: tensor.detach().clone() for name, tensor in state_tensors(loop).items()}
+
+
+def restore(loop: TrainingLoop, tensors: dict[str, Tensor], progress: TrainingProgress) -> None:
+    """Set the loop's state to that of a snapshot or a checkpoint, and its progress."""
+    for k, trainer in enumerate(loop.trainers):
+        mine = {n.removeprefix(f"{k}."): t for n, t in tensors.items() if n.startswith(f"{k}.")}
+        _load(trainer, _own_parameters(loop, k), mine)
+    loop.trainers[0].progress = progress
+    loop.link()
+
+
 def write_checkpoint(loop: TrainingLoop, path: Path) -> None:
     """Write parameters, optimizer state and progress."""
     write_tensors(path, state_tensors(loop), asdict(loop.progress))
@@ -198,20 +212,15 @@ def read_checkpoint(loop: TrainingLoop, path: Path) -> None:
     InputError : the file is no such checkpoint
     """
     try:
-        tensors, progress = read_tensors(path)
-        for k, trainer in enumerate(loop.trainers):
-            mine = {n.removeprefix(f"{k}."): t for n, t in tensors.items() if n.startswith(f"{k}.")}
-            _load(trainer, _own_parameters(loop, k), mine)
-        loop.trainers[0].progress = TrainingProgress(
-            int(progress["step"]), float(progress["seconds"]), float(progress["loss"])
-        )
+        tensors, found = read_tensors(path)
+        progress = TrainingProgress(int(found["step"]), float(found["seconds"]), float(found["loss"]))
+        restore(loop, tensors, progress)
     except (InputError, KeyError, TypeError, ValueError, RuntimeError):
         raise InputError(
             "is not a checkpoint of this fit: corrupt, or of an older version",
             where=path,
             hint="remove it: the same command then starts from the beginning",
         ) from None
-    loop.link()
 
 
 def _load(trainer: Trainer, parameters: dict[str, Tensor], tensors: dict[str, Tensor]) -> None:

@@ -140,6 +140,7 @@ class Trainer:
         self.batch = min(config.training.batch, len(queries))
         texels, weights = self.hooks.trained()
         self.optimizer = torch.optim.Adam([{"params": texels}, {"params": weights}], betas=BETAS, fused=True)
+        self.noise = noise
         self.loss = Objective(config.training, noise)
         self.weight_decay = WeightDecay.of(config.training, noise.ratio, len(queries))
         found = kernel()

@@ -68,11 +68,11 @@ class EffectsPlan:
     def describe(self) -> str:
         """A table for people, a line or two per effect."""
         before = _NAME + 5 + _BOUND
-        lines = [f"{'effect':<{_NAME}}{'':5}{'bias bound if omitted':<{_BOUND}}reason"]
+        lines = [f"{'effect':<{_NAME}}{'':5}{'bias if omitted':<{_BOUND}}reason"]
         for e in self.effects:
             first, *rest = textwrap.wrap(e.explanation, _WIDTH - before) or [""]
             state = "on" if e.on else "off"
-            lines.append(f"{EFFECTS[e.name].description:<{_NAME}}{state:<5}{bound_text(e):<{_BOUND}}{first}")
+            lines.append(f"{EFFECTS[e.name].description:<{_NAME}}{state:<5}{bias_text(e):<{_BOUND}}{first}")
             lines += [" " * before + more for more in rest]
         bound = self.bias_bound
         share = "0 %" if bound == 0 else f"at most {_percent(bound)}"
@@ -115,21 +115,18 @@ def without(plan: EffectsPlan, name: str) -> EffectsPlan:
     return replace(plan, effects=tuple(decided.values()))
 
 
-def bound_text(effect: EffectDecision) -> str:
-    """The bias bound of leaving an effect out, with its error or as an upper bound."""
-    if effect.bias_bound is None:
-        return "-"
+def bias_text(effect: EffectDecision) -> str:
+    """The bias of leaving an effect out, as :func:`bound_text`."""
     if effect.reason == "exact" and effect.bias_bound == 0:
         return "0 (exact)"
-    if effect.reason == "bound" or not effect.on:
-        return f"< {_percent(effect.bias_bound)}"
-    if effect.bias_bound >= 1.0:
-        return "over 100 %"
-    if effect.error:
-        if effect.bias_bound < 2.0 * effect.error:
-            return f"< {_percent(effect.bias_bound + 2 * effect.error)}"
-        return f"{_percent(effect.bias_bound)[:-2]} ± {_percent(effect.error, 1)}"
-    return f"~ {_percent(effect.bias_bound)}"
+    return "-" if effect.bias_bound is None else bound_text(effect.bias_bound, effect.error)
+
+
+def bound_text(bound: float, error: float | None) -> str:
+    """An upper bound of a bias relative to the mean of M, as text: with two standard errors where it is
+    measured, and no number above 100 %, which would only mean that nothing is known."""
+    upper = bound + 2.0 * (error or 0.0)
+    return "may exceed 100 %" if upper >= 1.0 else f"< {_percent(upper)}"
 
 
 def _percent(share: float, digits: int = 2) -> str:

@@ -16,7 +16,7 @@ import jinja2
 from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.units import size_text
 from mbtf_gen.planning.effects import EFFECTS
-from mbtf_gen.planning.effects_plan import bound_text
+from mbtf_gen.planning.effects_plan import bias_text
 from mbtf_gen.planning.scene import EffectDecision
 from mbtf_gen.publishing.facts import TAGS, Facts
 from mbtf_gen.publishing.formats import SUFFIXES
@@ -112,6 +112,6 @@ def card_text(facts: Facts) -> str:
         shape=", ".join(str(n) for n in (-1, *facts.shapes[split]["value_a"])),
         configuration="" if facts.same_shapes else f'"{split}", ',
         labels={name: effect.description for name, effect in EFFECTS.items()},
-        bound=lambda effect: bound_text(EffectDecision(**effect)) if effect["present"] else "",
+        bound=lambda effect: bias_text(EffectDecision(**effect)) if effect["present"] else "",
         files=_grouped(facts),
     )

@@ -132,11 +132,9 @@ def _geometry(found: Mapping[str, Any]) -> list[str]:
         apart = f", {codes['spacing']:.4g} codes apart" if codes["spacing"] > 1 else ""
         out.append(f"values     {codes['levels']} distinct, codes {codes['low']} .. {codes['high']}{apart}")
     if found["tiling"]:
-        seams = "; ".join(
-            f"along {t['axis']} {'tiles' if t['tiles'] else 'DOES NOT TILE'} ({t['ratio']:.2f})"
-            for t in found["tiling"]
-        )
-        out.append(f"tiling     {seams} (seam / 99th percentile of steps inside)")
+        axes = ", ".join(f"along {t['axis']} {'yes' if t['tiles'] else 'NO'}" for t in found["tiling"])
+        steps = " and ".join(f"{t['ratio']:.2g}" for t in found["tiling"])
+        out.append(f"tiling     {axes}; steps across the border are {steps} of the 99th percentile inside")
         if found["make_tileable"] != "none":
             out.append(f"           before make-tileable {found['make_tileable']}, which closes the seams")
     return out

@@ -8,7 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from mbtf_core.app.console import CONSOLE, Console
-from mbtf_core.app.options import ClusterOption, Output, Set, command_line, whole_number
+from mbtf_core.app.options import ClusterOption, ErrorOption, Output, Set, command_line, whole_number
 from mbtf_core.errors import UsageError
 
 
@@ -19,6 +19,7 @@ def cost(
     output: Annotated[Output | None, Parameter(show_default="out/NAME-cost")] = None,
     time: Annotated[str, Parameter(metavar="DURATION")] = "10min",
     refine: Annotated[str | None, Parameter(metavar="DURATION")] = None,
+    error: ErrorOption = None,
     seed: Annotated[int | None, Parameter(converter=whole_number, show_default="the recipe's")] = None,
     cluster: ClusterOption = None,
     assignments: Set = None,
@@ -26,8 +27,9 @@ def cost(
 ) -> None:
     """Measure error against time for this material and machine: mbtf-pipeline cost RECIPE
 
-    Writes cost.html, cost.csv and PNGs. The same command resumes. A longer time keeps all measurements and
-    adds longer runs. With --cluster, workers measure, each for itself.
+    Writes cost.html, cost.csv and PNGs, and answers which error a time gives, from 160 s on. The same command
+    resumes. A longer time keeps all measurements and adds longer runs. With --cluster, workers measure, each
+    for itself.
 
     Parameters
     ----------
@@ -45,9 +47,11 @@ def cost(
     from mbtf_core.run.signals import keep_on_interruption
     from mbtf_core.units import asked_duration
     from mbtf_pipeline.collection.recipes import load
+    from mbtf_pipeline.cost.answers import page_answers
+    from mbtf_pipeline.cost.forecast import study_folder
     from mbtf_pipeline.cost.measurement import pareto_front
     from mbtf_pipeline.cost.page import write_page
-    from mbtf_pipeline.cost.study import run_study
+    from mbtf_pipeline.cost.study import rounded, run_study
     from mbtf_pipeline.recipe import Recipe
 
     loaded = load(recipe, assignments or [])
@@ -55,7 +59,7 @@ def cost(
         raise UsageError("has several materials", where=recipe, hint="study the recipe of one of them")
     seconds = asked_duration(time, "--time")
     more = 0.0 if refine is None else asked_duration(refine, "--refine")
-    folder = output if output is not None else loaded.folder.with_name(f"{loaded.folder.name}-cost")
+    folder = output if output is not None else study_folder(loaded)
     keep_on_interruption(f"the measurements are kept in {folder}")
     with (
         open_runner(cluster, console.note) as runner,
@@ -71,6 +75,7 @@ def cost(
                 *("mbtf-pipeline", "cost", recipe),
                 time=time,
                 refine=refine,
+                error=error,
                 output=output,
                 seed=seed,
                 cluster=cluster,
@@ -80,14 +85,24 @@ def cost(
             progress=lambda share, note: bar.update(round(100 * share, 1), note),
             runner=runner,
         )
+    evidence, answers = study.evidence, list[str]()
+    if error is not None:
+        asked = evidence.time_of(error)
+        if asked is not None:
+            study.asked = asked[1]
+            answers.append(study.asked)
     with owned(folder):
         page = write_page(study)
-    front = pareto_front(study.measurements)
+        evidence.store(folder)
+    front, rows = pareto_front(study.measurements), page_answers(evidence)
     data = {
         "page": page,
         "measurements": len(study.measurements),
         "skipped": study.skipped,
         "failed": study.failed,
+        "answers": rows,
+        "asked": study.asked or None,
+        "least_seconds": study.least,
         "front": [
             {"seconds": m.seconds.value, "unexplained": m.error.as_dict(), "command": m.command}
             for m in front
@@ -95,5 +110,12 @@ def cost(
     }
     counts = f"{len(study.measurements)} configurations measured, {len(study.skipped)} skipped"
     lines = [f"{page}: {counts} for lack of time", *(f"failed: {text}" for text in study.failed)]
+    lines += [row["line"] for row in rows]
+    lines += answers
+    if not rows and study.least is not None:
+        text = (
+            f"too few complete runs to tell what a time gives: --time {rounded(study.least)} measures enough"
+        )
+        lines.append(f"{text} on this machine")
     lines += [f"  {m.seconds.value:.0f} s: unexplained variance {m.error}   {m.command}" for m in front]
     console.report(data, "\n".join(lines))

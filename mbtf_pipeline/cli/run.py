@@ -12,6 +12,8 @@ from cyclopts import Parameter
 from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.options import (
     ClusterOption,
+    DryRun,
+    ErrorOption,
     Output,
     Quality,
     QualityOption,
@@ -28,6 +30,7 @@ from mbtf_fit.cli.live import Live, live_view
 
 if TYPE_CHECKING:
     from mbtf_pipeline.collection.run import CollectionResult
+    from mbtf_pipeline.recipe import Recipe
     from mbtf_pipeline.run import RunResult
 
 
@@ -38,7 +41,9 @@ def run(
     output: Annotated[Output | None, Parameter(show_default="out/NAME")] = None,
     quality: QualityOption = None,
     time: Time = None,
+    error: ErrorOption = None,
     quick: Switch = False,
+    dry_run: DryRun = False,
     force: Switch = False,
     live: Live = False,
     cluster: ClusterOption = None,
@@ -49,7 +54,8 @@ def run(
 
     A stage whose inputs have not changed is skipped; the same command again resumes an interrupted run.
     --time is the time of everything: it takes the best preset of --quality that fits, trains for the rest,
-    and replaces the recipe's own times.
+    and replaces the recipe's own times. --dry-run forecasts time and error: by a cost study of the material
+    (mbtf-pipeline cost), or by pilots on data that are generated already.
 
     Parameters
     ----------
@@ -66,15 +72,24 @@ def run(
     from mbtf_core.run.processes import Processes
     from mbtf_pipeline.collection.recipes import Collection, LibraryRecipe, load
 
-    given = {"quality": quality, "time": time, "quick": quick, "output": output, "set": assignments}
+    given = {
+        "quality": quality,
+        "time": time,
+        "error": error,
+        "quick": quick,
+        "output": output,
+        "set": assignments,
+    }
     command = command_line("mbtf-pipeline", "run", recipe, **given)
     loaded, own = load(recipe, assignments or []), assignments or []
-    given |= {"live": live}
+    given |= {"live": live, "dry_run": dry_run}
+    if error is not None and not 0 < error <= 1:
+        raise UsageError("must be above 0 and at most 1, the error of the mean value", where="--error")
     if isinstance(loaded, Collection):
         from mbtf_pipeline.collection.run import run_collection
 
         hint = "set times in the recipe; --quick is its small size"
-        _refuse(given, ("quality", "time", "live"), "a recipe of several materials", hint)
+        _refuse(given, ("quality", "time", "error", "dry_run", "live"), "a recipe of several materials", hint)
         folder = output or loaded.folder_of(quick)
         keep_on_interruption(f"the finished stages are kept in {folder}")
         # A crash ends one material of a library alone; the runs of a paper show their progress.
@@ -94,21 +109,27 @@ def run(
     else:
         _refuse(given, ("quick",), "a recipe of one material", "use --quality draft")
         folder = output or loaded.folder
+        from mbtf_pipeline.cost.forecast import has_error
+
         if time is None:
             from mbtf_pipeline.recipe import preset_recipe
             from mbtf_pipeline.run_time import forecast_left
 
-            loaded, generated = preset_recipe(recipe, quality, own), None
-            if (expected := forecast_left(loaded, folder)) is not None:
+            loaded, generated = has_error(preset_recipe(recipe, quality, own), error), None
+            if not dry_run and (expected := forecast_left(loaded, folder)) is not None:
                 console.note(expected.describe())
         else:
             from mbtf_core.units import asked_duration
             from mbtf_pipeline.run_time import TimedRun
 
+            seconds = asked_duration(time, "--time")
             timed = TimedRun(
-                recipe, asked_duration(time, "--time"), folder, command, console.note, quality, own, began
+                recipe, seconds, folder, command, console.note, quality, own, began, dry_run=dry_run
             )
-            loaded, generated, quality = timed.recipe, timed.generated, timed.split.quality
+            loaded, generated, quality = has_error(timed.recipe, error), timed.generated, timed.split.quality
+        if dry_run:
+            _forecast(loaded, folder, console)
+            return
         keep_on_interruption(f"the finished stages are kept in {folder}")
         from mbtf_pipeline.run import run_recipe
 
@@ -126,11 +147,30 @@ def run(
         _report(result, console, quality)
 
 
+def _forecast(recipe: Recipe, folder: Path, console: Console) -> None:
+    """Report time and errors of a run, which are forecasts."""
+    from mbtf_pipeline.cost.forecast import forecast_errors, study_folder
+    from mbtf_pipeline.run_time import RunForecaster
+
+    expected = RunForecaster(recipe).of(recipe)
+    errors = forecast_errors(recipe, folder, expected, console.note)
+    lines = [expected.describe()]
+    for name, found in errors.items():
+        source = {"study": f" (cost study {study_folder(recipe)})"}
+        first, *more = found["text"].splitlines()
+        lines += [f"  {name}: {first}{source.get(found['source'] or '', '')}", *(f"    {m}" for m in more)]
+    if any(found["source"] is None for found in errors.values()):
+        lines.append(f"a cost study answers for relief: mbtf-pipeline cost RECIPE -o {study_folder(recipe)}")
+    console.report({"seconds": expected.seconds, "bytes": expected.bytes, "fits": errors}, "\n".join(lines))
+
+
 def _refuse(given: Mapping[str, Any], flags: Sequence[str], kind: str, hint: str) -> None:
     """Refuse flags that a kind of recipe does not have."""
     for flag in flags:
         if given[flag]:
-            raise UsageError(f"is not for {kind}", where=f"--{flag}", hint=f"leave it out: {hint}")
+            raise UsageError(
+                f"is not for {kind}", where=f"--{flag.replace('_', '-')}", hint=f"leave it out: {hint}"
+            )
 
 
 def _report_collection(done: CollectionResult, folder: Path, console: Console) -> None:
@@ -148,9 +188,17 @@ def _report_collection(done: CollectionResult, folder: Path, console: Console) -
 
 
 def _report(result: RunResult, console: Console, quality: Quality | None) -> None:
+    from mbtf_fit.training.fit import describe_ending
+    from mbtf_fit.training.fit_folder import read_history
+    from mbtf_pipeline.recipe import read_resolved
+    from mbtf_pipeline.stages import FITS
     from mbtf_pipeline.tables import estimate
 
     tests = {fit: record["splits"]["test"] for fit, record in result.comparison["test"].items()}
+    folder, recipe = result.report.parent, read_resolved(result.report.parent)
+    endings = {
+        name: describe_ending(fit, read_history(folder / FITS / name)) for name, fit in recipe.fit.items()
+    }
     ran = {name: stage.seconds for name, stage in result.stages.items() if stage.reason}
     data = {
         "folder": result.report.parent,
@@ -163,12 +211,15 @@ def _report(result: RunResult, console: Console, quality: Quality | None) -> Non
             for name, stage in result.stages.items()
         },
         "test": {
-            fit: {"unexplained_variance": e["unexplained"], "mse": e["mse"]} for fit, e in tests.items()
+            fit: {"unexplained_variance": e["unexplained"], "mse": e["mse"], "ending": endings.get(fit)}
+            for fit, e in tests.items()
         },
     }
     times = ", ".join(f"{name} {clock(seconds)}" for name, seconds in ran.items())
     lines = [f"{result.report}: {times or 'everything up to date'}"]
-    lines += [f"  {fit}: unexplained variance {estimate(e['unexplained'])}" for fit, e in tests.items()]
+    for fit, e in tests.items():
+        lines.append(f"  {fit}: unexplained variance {estimate(e['unexplained'])}")
+        lines += [f"    {ending}"] if (ending := endings.get(fit)) is not None else []
     if result.viewer is not None:
         lines.append(f"{result.viewer}: open it in a browser to turn the fits under lights")
     console.report(data, "\n".join(lines))

@@ -11,8 +11,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import data_sha256, read_json, write_json
 from mbtf_core.stats import Estimate, mean_estimate
@@ -20,7 +18,7 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.tables import estimate
 
 # Raised when the method of measuring changes: older measurements are then repeated.
-SCHEMA = 8
+SCHEMA = 9
 FOLDER = "measurements"
 # Relative half-width of a 95 % interval that a study aims at, and that half-width over the standard error.
 HALF_WIDTH = 0.1
@@ -138,14 +136,6 @@ class MeasurementFolder:
         write_json(self._path(of), {"label": of.label, **numbers, "details": found.details})
 
 
-# The extrapolation uses so many points of the front, and never goes further than so many times the seconds
-# of the last one.
-_POINTS = 3
-_FURTHEST = 1000.0
-# Relative errors are taken to be known no better than this.
-_BEST_KNOWN = 1e-3
-
-
 def seed_deviation(groups: Sequence[Sequence[Measurement]]) -> Estimate | None:
     """Relative standard deviation of the error over seeds, pooled over configurations with their degrees of
     freedom; each group holds the runs of one configuration. None without any repeat."""
@@ -171,7 +161,11 @@ def combined(group: Sequence[Measurement], deviation: Estimate | None) -> Measur
         group[0],
         seconds=mean_estimate([m.seconds.value for m in group]),
         error=Estimate(error, max(spread, test) / math.sqrt(len(group)), group[0].error.n),
-        details={**details, "seeds": float(len(group))},
+        details={
+            **details,
+            "seeds": float(len(group)),
+            "test_error": test / error / math.sqrt(len(group)) if error > 0 else math.inf,
+        },
     )
 
 
@@ -188,21 +182,3 @@ def pareto_front(found: Sequence[Measurement]) -> list[Measurement]:
         if not front or m.error.value < front[-1].error.value:
             front.append(m)
     return front
-
-
-def extrapolation(front: Sequence[Measurement]) -> tuple[float, Estimate] | None:
-    """(seconds, exponent): the additional time that would halve the error of the front's last point, and the
-    power of time with which the error falls, from a power law through the last three points.
-
-    None where there are fewer, where the exponent is not significant, or where the result is too far away.
-    """
-    last = [m for m in front if m.error.value > 0 and math.isfinite(m.error.error)][-_POINTS:]
-    if len(last) < _POINTS:
-        return None
-    x, y = np.log([m.seconds.value for m in last]), np.log([m.error.value for m in last])
-    weights = [1.0 / max(m.error.relative_error, _BEST_KNOWN) for m in last]
-    (slope, _), covariance = np.polyfit(x, y, 1, w=weights, cov="unscaled")
-    power = Estimate(-float(slope), math.sqrt(covariance[0, 0]), len(last))
-    if power.value <= max(2.0 * power.error, math.log(2.0) / math.log(_FURTHEST)):
-        return None
-    return front[-1].seconds.value * (2.0 ** (1.0 / power.value) - 1.0), power

@@ -10,8 +10,9 @@ from typing import Any
 
 from mbtf_core.files.folders import write_document
 from mbtf_core.units import clock
-from mbtf_pipeline.cost.measurement import Measurement, extrapolation, pareto_front
-from mbtf_pipeline.cost.study import Study
+from mbtf_pipeline.cost.answers import page_answers
+from mbtf_pipeline.cost.measurement import Measurement, pareto_front
+from mbtf_pipeline.cost.study import Study, rounded
 from mbtf_pipeline.report.plots import Series, plot
 from mbtf_pipeline.report.report import render
 from mbtf_pipeline.tables import Column, Table, is_significant, rows_of
@@ -35,18 +36,20 @@ _COMMAND = _field("command", "command")
 _PARTS = [_field(f"{name}, %", name, factor=100.0) for name in ("bias", "noise", "error")]
 _SECONDS = _field("seconds per million queries", "seconds")
 _DETAILS = [
-    _detail("million queries", "queries", factor=1e-6, digits=".2f"),
-    _detail("paths each", "spp", digits="g"),
+    _detail("total, s", "total_seconds", digits=".1f"),
     _detail("generating, s", "generation_seconds", digits=".1f"),
     _detail("training, s", "training_seconds", digits=".1f"),
     _detail("steps", "training_steps", digits=".0f"),
-    _detail("total, s", "total_seconds", digits=".1f"),
+    _detail("loading, s", "overhead_seconds", digits=".1f"),
+    _detail("evaluating, s", "evaluating_seconds", digits=".1f"),
+    _detail("million queries", "queries", factor=1e-6, digits=".2f"),
+    _detail("paths each", "spp", digits="g"),
     _detail("1080p, ms", "evaluation_ms_1080p", digits=".0f"),
     _detail("MB", "bytes", factor=1e-6, digits=".2f"),
     _detail("seeds", "seeds", digits="g"),
 ]
 _GENERATOR = [_TITLE, _SECONDS, *_PARTS, _COMMAND]
-_RUNS = [_TITLE, *_DETAILS, _field("unexplained variance", "error"), _COMMAND]
+_RUNS = [_TITLE, _field("unexplained variance", "error"), *_DETAILS, _COMMAND]
 _NAMES = [_field("", name) for name in ("study", "series", "name")]
 _CSV = [*_NAMES, _SECONDS, *reversed(_PARTS), *_DETAILS, _COMMAND]
 
@@ -85,7 +88,7 @@ def _figure(
 
 
 def _front_section(runs: Sequence[Measurement], png: Path) -> dict[str, Any]:
-    """All runs and their Pareto front, whose points have names; and its extrapolation."""
+    """All runs and their Pareto front, whose points have names."""
     front = pareto_front(runs)
 
     def name(m: Measurement) -> str:
@@ -95,11 +98,11 @@ def _front_section(runs: Sequence[Measurement], png: Path) -> dict[str, Any]:
     caption = "Names on the front: training queries × paths per query."
     stepped = [(m.seconds.value, m.error.value) for m in front]
     series = [_series("complete runs", runs, label=name, style="points")]
-    further = extrapolation(front)
+    if len(front) < 2:
+        caption, stepped = "One run alone is no front: give the study a longer --time.", []
     return {
         "figure": _figure(series, *axes, png, caption, front=stepped),
         "table": _table(_RUNS, front).for_page(),
-        "further": None if further is None else (clock(further[0]), further[1]),
     }
 
 
@@ -118,9 +121,8 @@ def _generator_section(found: Sequence[Measurement], png: Path) -> dict[str, Any
         series = [_series(n, [m for m in found if m.series == n], style="joined") for n in names]
     if unbiased:
         limit = 100 * max(2 * max(m.bias.error, m.bias.value) for m in unbiased if m.bias)
-        caption = (
-            f"Labels at the noise: the bias is not significant, at most {limit:.2g} % of the mean value."
-        )
+        most = f"at most {limit:.2g} %" if limit < 100 else "though it may exceed 100 %"
+        caption = f"Labels at the noise: the bias is not significant, {most} of the mean value."
     return {
         "figure": _figure(series, "seconds per million queries", _NOISE_AXIS, png, caption),
         "table": _table(_GENERATOR, found).for_page(),
@@ -142,6 +144,9 @@ def write_page(study: Study) -> Path:
         study=study.description,
         time=clock(study.description["time"]),
         sections=sections,
+        answers=page_answers(study.evidence),
+        asked=study.asked,
+        least=None if study.least is None else rounded(study.least),
         skipped=study.skipped,
         failed=study.failed,
         deviation=None if study.deviation is None else f"{study.deviation.scaled(100.0)} %",

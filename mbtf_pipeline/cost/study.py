@@ -7,6 +7,7 @@ figures are of the workers' machine and threads.
 
 from __future__ import annotations
 
+import math
 import shlex
 import shutil
 import time
@@ -23,9 +24,10 @@ from mbtf_core.files.folders import ELSEWHERE, OutputKind, check_space, owned, w
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item, worker_threads
 from mbtf_core.stats import Estimate
-from mbtf_core.units import expectation
+from mbtf_core.units import expectation, format_duration
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
+from mbtf_pipeline.cost.answers import Evidence, basis_of
 from mbtf_pipeline.cost.generator import benchmark_of, generator_configurations, path_seconds
 from mbtf_pipeline.cost.measurement import (
     HALF_WIDTH,
@@ -40,7 +42,9 @@ from mbtf_pipeline.cost.measurement import (
 )
 from mbtf_pipeline.cost.runs import (
     FEWEST_SEEDS,
+    FEWEST_TOTALS,
     GENERATOR,
+    LEAST_SECONDS,
     MOST_SEEDS,
     TEST,
     Run,
@@ -75,6 +79,17 @@ class Study:
     # Configurations for which no time was left, and runs that failed, with the reason.
     skipped: list[str] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
+    # Hash of what the errors are measured on.
+    basis: str = ""
+    # Answer to the error that was asked for, and seconds of a study that can answer; None where this one can.
+    asked: str = ""
+    least: float | None = None
+
+    @property
+    def evidence(self) -> Evidence:
+        """What the complete runs say of other times and errors."""
+        system = self.description["machine"]["system"]
+        return Evidence.of(self.measurements, self.deviation, self.basis, system)
 
 
 def claim(folder: Path, on: Mapping[str, str]) -> None:
@@ -93,6 +108,21 @@ def study_config(config: GeneratorConfig, seed: int | None) -> GeneratorConfig:
     queries = config.queries.model_copy(update={"target_error": None, "layout": "shuffled"})
     seeds = {} if seed is None else {"seed": seed}
     return config.model_copy(update={"queries": queries, **seeds})
+
+
+def rounded(seconds: float) -> str:
+    """A duration, rounded up to ten seconds, or to minutes."""
+    unit = 10.0 if seconds < 300.0 else 60.0
+    return format_duration(unit * math.ceil(seconds / unit))
+
+
+def too_short(seconds: float, runs: int) -> str:
+    """Warning of a study that is too short to answer questions."""
+    room = f"{runs} complete run{'s' * (runs != 1)}"
+    return (
+        f"warning: --time {format_duration(seconds)} has room for {room}; {FEWEST_TOTALS} lengths with two "
+        f"seeds tell how the error falls: --time {rounded(LEAST_SECONDS)} at least"
+    )
 
 
 def measuring_machine() -> dict[str, str]:
@@ -175,6 +205,14 @@ class Measurements:
         """Expected seconds of measuring a run, the first one of a seed with its test set."""
         test = 0.0 if run.seed in self._seeds else TEST[0] * TEST[1] * self.path_seconds
         return run.planned_seconds(self.path_seconds) + test + self._overhead
+
+    def least_seconds(self, spp: int) -> float | None:
+        """Seconds of a study that measures all runs that tell how the error falls, by what runs have taken on
+        this machine; None where they are measured."""
+        needed = planned_runs(LEAST_SECONDS, spp, self.path_seconds)[:FEWEST_TOTALS]
+        seeds = [replace(run, seed=seed) for run in needed for seed in range(FEWEST_SEEDS)]
+        missing = [self.expected_seconds(run) for run in seeds if run.label not in self.found]
+        return max(LEAST_SECONDS, sum(missing) / (1.0 - 1.2 * GENERATOR)) if missing else None
 
     def fits(self, run: Run, seconds: float) -> bool:
         """Whether the workers can begin and finish a run in a time, besides those that they have taken."""
@@ -310,6 +348,8 @@ def run_study(
             size = disk_bytes(runs) * runner.workers
             check_space(folder, size, "give a shorter --time, or choose another folder with -o")
             announce(expectation(seconds + refine, size))
+            if seconds < LEAST_SECONDS:
+                announce(too_short(seconds, len(runs)))
             measurements.measure_runs(
                 runs,
                 lambda run: measurements.fits(run, seconds + (refine if run.seed else 0.0) - spent()),
@@ -329,4 +369,6 @@ def run_study(
         deviation,
         [c.label for c in (*configurations, *runs) if c.label not in known and c.label not in failed],
         [f"{label}: {why}" for label, why in failed.items()],
+        basis_of(config, job.material.digests),
+        least=measurements.least_seconds(config.queries.spp),
     )

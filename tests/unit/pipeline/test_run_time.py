@@ -13,6 +13,7 @@ from support.paths import ROOT
 from mbtf_core.app.console import run
 from mbtf_core.data.shard_files import row_bytes
 from mbtf_core.errors import InputError, UsageError
+from mbtf_core.files import folders
 from mbtf_pipeline import run as runs
 from mbtf_pipeline import run_time as module
 from mbtf_pipeline.cli.app import app
@@ -50,7 +51,7 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> Machine:
 
     monkeypatch.setattr(RunForecaster, "speed", property(speed))
     monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: made.now))
-    monkeypatch.setattr(module.shutil, "disk_usage", lambda path: SimpleNamespace(free=made.free))
+    monkeypatch.setattr(folders.shutil, "disk_usage", lambda path: SimpleNamespace(free=made.free))
     return made
 
 

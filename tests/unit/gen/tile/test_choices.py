@@ -56,7 +56,7 @@ class TestWrite:
         text = " ".join(capsys.readouterr().out.split())
         assert "height.scale 0.012 (suggested by the normal map; the default would be 0.05)" in text
         assert "make_tileable blend (the heights do not tile along u and v)" in text
-        assert "DOES NOT TILE" in text
+        assert "along u NO, along v NO" in text
         assert "before make-tileable blend" in text
         assert "does not tile" not in text.partition("warnings")[2]
 

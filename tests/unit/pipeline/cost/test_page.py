@@ -26,6 +26,7 @@ def measured(study: str, seconds: float, error: float, series: str = "neumip") -
         "queries": 1e6, "spp": 4.0, "generation_seconds": 3.0, "training_seconds": seconds,
         "training_steps": 700.0,
         "total_seconds": seconds + 4.0, "evaluation_ms_1080p": 250.0, "bytes": 1e6, "seeds": 2.0,
+        "test_error": 0.02, "overhead_seconds": 1.0, "evaluating_seconds": 2.0,
     }  # fmt: skip
     estimates = Estimate(seconds, 0.0, 1), Estimate(error, 0.01, 9)
     command = "mbtf-gen a && mbtf-fit b"
@@ -68,7 +69,7 @@ def test_the_page_shows_the_front_with_commands_and_what_is_biased(tmp_path: Pat
     # Two of the three runs, each with a command that one click selects.
     command = "<code>mbtf-gen a &amp;&amp; mbtf-fit b</code></td></tr>"
     # In a row of its own, so that the table fits narrow windows.
-    assert front.count(f"<tr class=command><td class=command colspan=11>{command}") == 2
+    assert front.count(f"<tr class=command><td class=command colspan=13>{command}") == 2
     assert "<th>command</th>" not in page
     assert front.count("<td>700</td>") == 2
     assert "<details>" not in front

@@ -118,7 +118,11 @@ def test_a_mean_has_the_error_of_its_seeds_and_test_sets() -> None:
     assert found.error.value == pytest.approx(0.25)
     assert found.error.error == pytest.approx(0.1 * 0.25 / math.sqrt(2))
     assert found.seconds.value == 5.0
-    assert found.details == {"total_seconds": 5.0, "seeds": 2.0}
+    assert found.details == {
+        "total_seconds": 5.0,
+        "seeds": 2.0,
+        "test_error": pytest.approx(math.hypot(0.002, 0.003) / 2 / 0.25),
+    }
     # Without repeats it is the test set's.
     assert combined(group[:1], None).error.error == pytest.approx(0.002)
     assert combined(group, Estimate(1e-4, 1e-5, 9)).error.error == pytest.approx(math.hypot(0.002, 0.003) / 2)

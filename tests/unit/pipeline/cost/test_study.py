@@ -27,7 +27,6 @@ from mbtf_pipeline.cost.measurement import (
     Conditions,
     Measurement,
     MeasurementFolder,
-    extrapolation,
     pareto_front,
 )
 from mbtf_pipeline.cost.page import to_csv
@@ -49,20 +48,6 @@ def test_the_front_holds_what_nothing_beats() -> None:
     found = [(10, 0.5), (20, 0.6), (20, 0.4), (40, 0.4), (80, 0.1), (5, math.nan), (90, 0.2)]
     front = pareto_front([*(point(*pair) for pair in found), point(1, 0.01, "paths")])
     assert [(m.seconds.value, m.error.value) for m in front] == [(10, 0.5), (20, 0.4), (80, 0.1)]
-
-
-def test_the_extrapolation_follows_the_end_of_the_front() -> None:
-    """A front that ends with the power of one half: half the error takes four times as long."""
-    front = [point(t, 0.2 * (t / 20) ** -2) for t in (5.0, 10.0)]
-    front += [point(t, 0.2 * (t / 20) ** -0.5) for t in (20.0, 40.0, 80.0)]
-    found = extrapolation(front)
-    assert found is not None
-    assert found[0] == pytest.approx(3 * 80.0)
-    assert found[1].value == pytest.approx(0.5)
-    assert found[1].error > 0
-    assert extrapolation(front[:2]) is None
-    # Nothing is promised where the error bars allow no progress.
-    assert extrapolation([point(t, e) for t, e in ((20.0, 0.2), (40.0, 0.199), (80.0, 0.198))]) is None
 
 
 def test_measurements_come_back_and_damaged_ones_are_repeated(tmp_path: Path) -> None:

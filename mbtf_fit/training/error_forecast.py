@@ -1,0 +1,147 @@
+"""Forecast of a fit's error: complete fits of a small part of its steps, and the law of their errors.
+
+Each pilot fit has the whole schedule of learning rate and blur, because the error falls most towards its end.
+Pilots see each query less often than the fit, so they do not show whether it will overfit. A last pilot does:
+it sees so few of the queries that it repeats them as often as the fit will. Its excess over the pilot with
+all queries bounds that of the fit, which has more queries to generalize from.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from mbtf_core.errors import InputError
+from mbtf_core.forecast import expected_error, expected_seconds
+from mbtf_core.stats import Estimate, Interval, LearningCurve
+from mbtf_fit.data.queries import ShardQueries, TrainingQueries
+from mbtf_fit.training.loop import TrainingLoop, restore, snapshot
+from mbtf_fit.training.trainer import TrainingProgress, WeightDecay
+from mbtf_fit.training.validation import validation_error
+
+# Pilots together take this share of the fit's steps, but each of them at least the warm-up; there is no
+# forecast if that takes more than the larger share.
+_SHARE, _MOST = 0.1, 0.5
+# Steps of the pilots relative to the first one, and of the last one, which repeats few queries.
+_LENGTHS = np.geomspace(1.0, 4.0, 6)
+
+
+@dataclass(frozen=True)
+class ErrorForecast:
+    """Expected error of a fit.
+
+    Attributes
+    ----------
+    seconds : of training, as asked
+    error : unexplained variance after them; None where nothing is known
+    asked : error that is asked for, and time that reaches it; None where none is
+    limit : error that no training time undercuts
+    excess : error that overfitting adds at most, part of the upper bound of `error`
+    repeats : how often the fit sees each query
+    reason : why nothing is known
+    """
+
+    seconds: float
+    error: Interval | None = None
+    asked: tuple[float, Interval] | None = None
+    limit: Interval | None = None
+    excess: float = 0.0
+    repeats: float = 0.0
+    reason: str = ""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        asked = None if self.asked is None else {"error": self.asked[0], "seconds": self.asked[1].as_dict()}
+        intervals = {"error": self.error, "limit": self.limit}
+        known = {name: found and found.as_dict() for name, found in intervals.items()}
+        numbers = {"seconds": self.seconds, "excess": self.excess, "repeats": self.repeats}
+        return {**numbers, **known, "asked": asked, "reason": self.reason}
+
+    def describe(self) -> str:
+        """A line for the error after the time, and one for the time of an error."""
+        if self.error is None or self.limit is None:
+            return f"no forecast of the error: {self.reason}"
+        lines = [expected_error(self.seconds, self.error)]
+        if self.excess > 0.5 * (self.error.high - self.error.value):
+            lines.append(
+                f"overfitting decides: the fit sees each query {self.repeats:.0f} times; more queries help, "
+                "longer training may not"
+            )
+        if self.asked is not None:
+            lines.append(expected_seconds(*self.asked, self.limit, "with these queries and this network"))
+        return "\n".join(lines)
+
+
+def forecast_error(loop: TrainingLoop, queries: ShardQueries, step: Estimate, steps: int) -> ErrorForecast:
+    """Forecast the error of a fit from pilots on this machine.
+
+    Parameters
+    ----------
+    loop : TrainingLoop
+        Of one material, at its first step; left in another state.
+    queries : ShardQueries
+        Validation subset.
+    step : Estimate
+        Seconds of a training step.
+    steps : int
+        Steps of the fit.
+
+    Returns
+    -------
+    ErrorForecast
+    """
+    (trainer,) = loop.trainers
+    config, data, decay = trainer.config, trainer.queries, trainer.weight_decay
+    total, seconds = float(_LENGTHS.sum() + _LENGTHS[-1]), steps * step.value
+    first = max(_SHARE * steps / total, config.training.warmup, 2.0)
+    if not isinstance(data, TrainingQueries):
+        return ErrorForecast(seconds, reason="its queries are no shuffled ones in memory")
+    if first * total > _MOST * steps:
+        reason = f"{steps} steps are too few for a forecast by a part of them"
+        return ErrorForecast(seconds, reason=reason)
+    start = snapshot(loop)
+
+    def pilot(count: int, seed: int) -> Estimate:
+        restore(loop, start, TrainingProgress())
+        trainer.model.calibrate(None)
+        training = config.training.model_copy(update={"steps": count, "error": None})
+        trainer.config = config.model_copy(update={"training": training, "seed": config.seed + seed})
+        loop.train(float("inf"))
+        trainer.calibrate()
+        return validation_error(trainer, queries)
+
+    counts = [round(first * length) for length in _LENGTHS]
+    try:
+        found = [pilot(count, number) for number, count in enumerate(counts)]
+        few = min(len(data), max(trainer.batch, len(data) * counts[-1] // steps))
+        trainer.queries = data.slice(0, few)
+        trainer.weight_decay = WeightDecay.of(config.training, trainer.noise.ratio, few)
+        repeated = pilot(counts[-1], len(counts))
+    except InputError as diverged:
+        return ErrorForecast(seconds, reason=diverged.message.splitlines()[0])
+    finally:
+        trainer.config, trainer.queries, trainer.weight_decay = config, data, decay
+    shared = float(np.median([e.relative_error for e in found]))
+    try:
+        curve = LearningCurve(counts, [e.value for e in found], shared=shared)
+    except ValueError:
+        return ErrorForecast(seconds, reason="the test queries do not resolve the errors of short fits")
+    excess = max(0.0, repeated.value - found[-1].value)
+    error = curve.error_at(steps)
+    asked = None
+    if (target := config.training.error) is not None:
+        time = curve.time_of(target)
+        # What overfitting may add must be trained away elsewhere.
+        worst = curve.time_of(target - excess).high if excess < target else float("inf")
+        scaled = replace(time, high=max(time.high, worst))
+        asked = target, Interval(*(x * step.value for x in (scaled.value, scaled.low, scaled.high)))
+    return ErrorForecast(
+        seconds,
+        replace(error, high=error.high + excess),
+        asked,
+        curve.limit,
+        excess,
+        steps * trainer.batch / len(data),
+    )

@@ -1,0 +1,133 @@
+"""Forecasts of the error of a fit, and training that ends once an error is reached."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from support.fit_data import parallax, write_data
+
+import mbtf_fit.training.error_forecast as forecasts
+import mbtf_fit.training.fit as fits
+import mbtf_fit.training.forecast as module
+from mbtf_core.stats import Estimate, Interval
+from mbtf_fit import fit
+from mbtf_fit.config import FitConfig
+from mbtf_fit.data.queries import ShardQueries
+from mbtf_fit.training.error_forecast import ErrorForecast
+from mbtf_fit.training.fit import describe_ending, reached
+from mbtf_fit.training.forecast import forecast_fit
+from mbtf_fit.training.trainer import Trainer
+
+STEPS = 4000
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_data(tmp_path_factory.mktemp("data") / "shards", parallax, train=20000, noise=0.01)
+
+
+def config(**training: object) -> FitConfig:
+    return FitConfig.model_validate({"model": "neumip", "training": {"batch": 200, "warmup": 3, **training}})
+
+
+@pytest.fixture
+def law(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
+    """(steps, queries) of pilots, which do not train: their errors are a law of the steps, more by 0.1 where
+    queries are repeated."""
+    pilots: list[tuple[int, int]] = []
+
+    def error(trainer: Trainer, queries: ShardQueries) -> Estimate:
+        assert trainer.progress.step == 0  # each starts anew
+        steps = trainer.config.training.steps
+        assert steps is not None
+        repeated = len(trainer.queries) < pilots[0][1] if pilots else False
+        pilots.append((steps, len(trainer.queries)))
+        return Estimate(0.03 + 3.0 * steps**-0.7 + 0.1 * repeated, 0.0, 1000)
+
+    monkeypatch.setattr(forecasts, "validation_error", error)
+    monkeypatch.setattr(forecasts.TrainingLoop, "train", lambda loop, seconds: True)
+    monkeypatch.setattr(module, "pilot_seconds", lambda *_: Estimate(0.01, 0.0, 5))
+    return pilots
+
+
+def test_the_law_of_the_pilots_predicts_the_fit(law: list[tuple[int, int]], shards: Path) -> None:
+    found = forecast_fit(config(steps=STEPS, error=0.06), shards).error
+    *pilots, (last, few) = law
+    # About a tenth of the steps; the last pilot repeats its queries as often as the fit does.
+    assert sum(steps for steps, _ in law) == pytest.approx(0.1 * STEPS, rel=0.1)
+    assert [queries for _, queries in pilots] == [pilots[0][1]] * 6
+    assert few / pilots[0][1] == pytest.approx(last / STEPS, rel=0.1)
+    assert found.error is not None
+    assert found.asked is not None
+    assert found.seconds == 0.01 * STEPS
+    true = 0.03 + 3.0 * STEPS**-0.7
+    assert found.error.low < true < found.error.high
+    assert found.error.value == pytest.approx(true, rel=0.2)
+    assert found.excess == pytest.approx(0.1)
+    assert found.error.high > true + 0.1
+    assert found.asked[1].low < 0.01 * 100 ** (1 / 0.7) < found.asked[1].high
+    # What overfitting may add is more than what is asked for.
+    assert found.asked[1].high == math.inf
+    assert "overfitting decides" in found.describe()
+    # Below the level at which the law ends.
+    below = forecast_fit(config(steps=STEPS, error=0.01), shards).error.describe()
+    assert below.splitlines()[-1].startswith("error 0.01: not reachable with these queries")
+
+
+def test_forecasts_answer_or_say_why_not() -> None:
+    known = ErrorForecast(300.0, Interval(0.081, 0.062, 0.113), limit=Interval(0.03, 0.025, 0.035))
+    assert known.describe() == "5:00: expect an unexplained variance of 0.081 (0.062 to 0.11)"
+    asked = replace(known, asked=(0.05, Interval(720.0, 480.0, 1200.0)))
+    assert asked.describe().splitlines()[1] == "error 0.05: about 12:00 (8:00 to 20:00)"
+    never = replace(known, asked=(0.02, Interval(math.inf, math.inf, math.inf)))
+    assert never.describe().splitlines()[1] == (
+        "error 0.02: not reachable with these queries and this network: they limit it at about "
+        "0.03 (0.025 to 0.035)"
+    )
+    assert never.as_dict()["asked"] == {"error": 0.02, "seconds": {"value": None, "low": None, "high": None}}
+    vague = replace(known, error=Interval(0.08, 0.01, 0.4), asked=(0.05, Interval(720.0, 60.0, math.inf)))
+    assert [line.split(": ")[1] for line in vague.describe().splitlines()] == [
+        "the evidence does not suffice",
+        "the evidence does not suffice, but it takes at least 1:00",
+    ]
+    assert ErrorForecast(1.0, reason="3 steps").describe() == "no forecast of the error: 3 steps"
+
+
+def test_too_few_steps_give_no_forecast(law: list[tuple[int, int]], shards: Path) -> None:
+    found = forecast_fit(config(steps=30), shards).error
+    assert found.error is None
+    assert "30 steps are too few" in found.describe()
+
+
+def test_training_stops_once_the_error_is_reached(
+    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fits, "_REPORT_SECONDS", 0.02)
+    asked = config(steps=3000, error=0.8, energy_calibration=False)
+    found = fit(asked, shards, tmp_path / "early")
+    *before, last = found.history
+    assert last["unexplained"] + last["unexplained_error"] <= 0.8
+    assert all(r["unexplained"] + r["unexplained_error"] > 0.8 for r in before)
+    assert last["step"] < 3000
+    # The error bar counts.
+    for value, enough in ((0.77, True), (0.79, False), (None, False)):
+        assert reached(asked, [{"unexplained": value, "unexplained_error": 0.02}]) is enough
+    # What is exported is what was validated.
+    assert found.errors["test"]["unexplained"]["value"] == pytest.approx(last["unexplained"], rel=0.1)
+    assert found.as_dict()["reached"] is True
+    assert str(describe_ending(asked, found.history)).startswith("stopped at error 0.8 after ")
+
+    never = config(steps=5, error=1e-6)
+    found = fit(never, shards, tmp_path / "never")
+    assert found.history[-1]["step"] == 5
+    assert found.as_dict()["reached"] is False
+    ending = describe_ending(never, found.history)
+    assert ending is not None
+    assert ending.startswith("stopped after 5 steps: validation error ")
+    assert ending.endswith("has not reached 1e-06")
+    # Without an error to reach, fits are what they were, and no other configuration.
+    assert reached(config(), found.history) is None
+    assert "error" not in config().fields()["training"]
