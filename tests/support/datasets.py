@@ -73,8 +73,8 @@ def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
 def write_sidecar(shard: Path, split: str, index: int, config_hash: str, **changes: Any) -> None:
     """The sidecar of a shard that is written without a run."""
     arrays = read_shard(shard)
-    halves = [arrays[name].reshape(-1, 3) for name in ("value_a", "value_b")]
-    mean = 0.5 * sum(a.mean(axis=0, dtype=np.float64) if len(a) else np.zeros(3) for a in halves)
+    halves = [arrays[name].reshape(-1, 3) for name in ("value_a", "value_b") if name in arrays]
+    mean = sum(a.mean(axis=0, dtype=np.float64) if len(a) else np.zeros(3) for a in halves) / len(halves)
     record = sidecar(
         ShardEntry(cast(Split, split), index, shard.name, len(arrays["sigma"])),
         Stored(shard.stat().st_size, file_sha256(shard)),

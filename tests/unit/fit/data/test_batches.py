@@ -7,12 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from support.datasets import edit, read_checksummed, rewrite, write_sidecar
 from support.fit_data import constant, parallax, write_data
 from support.image_data import write_images
 from support.slice_data import write_slices
 from torch.utils.data import DataLoader
 
 from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.shard_files import write_shard
 from mbtf_core.errors import InputError
 from mbtf_core.stats import noise_free_mse, pooled_variance
 from mbtf_fit import QueryDataset
@@ -101,8 +103,21 @@ def test_what_cannot_be_read_is_refused(shards: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError):
         QueryDataset(tmp_path)
     folder = write_data(tmp_path / "shards", constant(1.0), train=100, test=10, shards=1)
-    arrays = dict(np.load(folder / "train-00000.npz"))
-    arrays["value_a"][7] = np.nan
-    np.savez(folder / "train-00000.npz", **arrays)
-    with pytest.raises(InputError, match="train-00000"):
+    values = np.full((100, 3), np.nan, np.float32)
+    rewrite(folder / "train-00000.npz", value_a=values)
+    with pytest.raises(InputError, match=r"value_a.*not finite|NaN"):
         next(iter(QueryDataset(folder)))
+
+
+def test_one_estimate_of_measured_data_stands_for_both(tmp_path: Path) -> None:
+    folder = write_data(tmp_path / "shards", parallax, train=300, test=10, noise=NOISE, shards=2)
+    edit(folder / "manifest.json", lambda manifest: manifest.update(estimates=1))
+    for path in folder.glob("train-*.npz"):
+        arrays = dict(np.load(path))
+        write_shard(path, {name: arrays[name] for name in ("u", "sigma", "omega_i", "omega_o", "value_a")})
+        write_sidecar(
+            path, "train", int(path.stem[-5:]), read_checksummed(folder / "manifest.json")["config_hash"]
+        )
+    found = rows(QueryDataset(folder))
+    np.testing.assert_array_equal(in_order(found), in_order(stored(folder)))
+    np.testing.assert_array_equal(found[:, -6:-3], found[:, -3:])
