@@ -15,7 +15,6 @@ EXTRAS = {
     "distributed": ("cluster", "distributed"),
     "fsspec": ("stores", "fsspec"),
     "h5py": ("hdf5", "h5py"),
-    "imagecodecs": ("images", "imagecodecs"),
     "MaterialX": ("maps", "MaterialX"),
     "mlcroissant": ("publish", "mlcroissant"),
     "pxr": ("maps", "usd-core"),

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from mbtf_core.errors import InputError, reason
-from mbtf_core.extras import import_extra
 from mbtf_core.images.color_spaces import from_chromaticities
 from mbtf_core.images.limits import MAX_PIXELS
 from mbtf_core.images.read import Image
@@ -32,9 +31,9 @@ def read_radiance(path: Path) -> Image:
     Raises
     ------
     InputError : the file is missing, damaged, too large, or stores XYZ
-    EngineError : the package that decodes it is not installed
     """
-    imagecodecs = import_extra("imagecodecs", path)
+    import imagecodecs
+
     with opened(path) as stream:
         data = stream.read()
     try:

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError, reason
-from mbtf_core.extras import import_extra
 from mbtf_core.images.color_spaces import ColorSpace, srgb
 from mbtf_core.images.exr import check_floats, choose_channels, lossy_excess, read_layers, silenced
 from mbtf_core.images.limits import MAX_PIXELS, check_size
@@ -322,7 +321,8 @@ def _deep_png(path: Path, max_pixels: int) -> NDArray[np.uint16] | None:
     check_size(path, rows, columns, max_pixels, (channels or 1) * (2 if head[24] == 16 else 1))
     if head[24] != 16 or channels is None:
         return None
-    imagecodecs = import_extra("imagecodecs", path)
+    import imagecodecs
+
     try:
         with silenced():
             codes = imagecodecs.png_decode(path.read_bytes())

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError, reason
-from mbtf_core.extras import extra_error, has_extra
 from mbtf_core.images.limits import check_size
 from mbtf_core.images.tags import Tags, tiff_tags
 
@@ -40,7 +39,6 @@ def read_tiff(path: Path, max_pixels: int) -> tuple[NDArray[Any] | None, Tags]:
     Raises
     ------
     InputError : the file is damaged, cut short, too large, or of an unsupported kind
-    EngineError : its compression needs a package that is not installed
     """
     import tifffile
 
@@ -54,8 +52,6 @@ def read_tiff(path: Path, max_pixels: int) -> tuple[NDArray[Any] | None, Tags]:
     except InputError:
         raise
     except Exception as error:  # a damaged file may make the decoder raise anything
-        if "imagecodecs" in str(error) and not has_extra("imagecodecs"):
-            raise extra_error("imagecodecs", path, "is not installed, which decompresses this file") from None
         raise InputError(f"cannot be read as a TIFF image ({reason(error)})", where=path) from None
 
 

@@ -10,23 +10,19 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
-import tifffile
 from support.paths import ROOT
 
 from mbtf_core.data.store import open_store
 from mbtf_core.errors import EngineError
 from mbtf_core.extras import EXTRAS, import_extra
-from mbtf_core.images.radiance import read_radiance
-from mbtf_core.images.read import read_image
 from mbtf_core.run.cluster import open_runner
 from mbtf_fit.backends.shader.slang import SlangCompiler
 from mbtf_fit.export import gltf, materialx, usd
 from mbtf_fit.training.fit_folder import EventLog
 from mbtf_gen.doctor import use_drawing
 from mbtf_gen.measured.exported import export_neumip
-from mbtf_gen.measured.hdf5 import opened
+from mbtf_gen.measured.hdf5 import hdf5_file
 from mbtf_gen.publishing.croissant import croissant_text
 from mbtf_gen.publishing.formats import write_parquet, write_tar
 from mbtf_pipeline.compare import perceptual_metrics
@@ -52,11 +48,7 @@ def workers(where: str) -> Callable[[Path], object]:
     return use
 
 
-def image(name: str) -> Callable[[Path], object]:
-    return lambda folder: read_image(folder / name)
-
-
-# What needs a module, called with a folder that has the images of the fixture below.
+# What needs a module, called with a folder.
 USES: list[tuple[str, Callable[[Path], object]]] = [
     ("MaterialX", export(materialx)),
     ("dask", workers("local")),
@@ -64,10 +56,7 @@ USES: list[tuple[str, Callable[[Path], object]]] = [
     ("distributed", workers("local")),
     ("fsspec", lambda folder: open_store("s3://bucket/data")),
     ("h5py", lambda folder: export_neumip(DATA, folder / "data.h5")),
-    ("h5py", lambda folder: opened(folder / "data.h5").__enter__()),
-    ("imagecodecs", lambda folder: read_radiance(folder / "radiance.hdr")),
-    ("imagecodecs", image("deep.png")),
-    ("imagecodecs", image("lzw.tif")),
+    ("h5py", lambda folder: hdf5_file(folder / "data.h5").__enter__()),
     ("mlcroissant", lambda folder: croissant_text(EXPORT)),
     ("pxr", export(usd)),
     ("pyarrow", lambda folder: write_parquet(folder / "a.parquet", {}, {})),
@@ -81,28 +70,15 @@ USES: list[tuple[str, Callable[[Path], object]]] = [
 ]
 
 
-@pytest.fixture(scope="module")
-def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with one image of each kind that needs a package, written by that package."""
-    imagecodecs = pytest.importorskip("imagecodecs")
-    folder = tmp_path_factory.mktemp("images")
-    pixels = np.arange(48, dtype=np.uint16).reshape(4, 4, 3)
-    (folder / "deep.png").write_bytes(imagecodecs.png_encode(pixels))
-    (folder / "radiance.hdr").write_bytes(imagecodecs.rgbe_encode(pixels.astype(np.float32)))
-    tifffile.imwrite(folder / "lzw.tif", pixels, photometric="rgb", compression="lzw")
-    return folder
-
-
 @pytest.mark.parametrize(("module", "use"), USES, ids=[f"{n}-{name}" for n, (name, _) in enumerate(USES)])
 def test_one_error_names_the_extra(
-    module: str, use: Callable[[Path], object], images: Path, monkeypatch: pytest.MonkeyPatch
+    module: str, use: Callable[[Path], object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # tifffile looks for its decoders when it is imported.
-    for name in [name for name in sys.modules if name.startswith((f"{module}.", "tifffile"))]:
+    for name in [name for name in sys.modules if name.startswith(f"{module}.")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(EngineError, match="is not installed") as raised:
-        use(images)
+        use(tmp_path)
     extra, distribution = EXTRAS[module]
     assert raised.value.hint == f"pip install 'mbtf[{extra}]'"
     assert raised.value.what.startswith(distribution)
