@@ -173,7 +173,7 @@ _MODELS: tuple[ModelName, ...] = ("relief", "neumip+", "neumip", "neumip-baselin
 
 _MIN_STEPS = "training.min_steps"
 # Budget of each preset. After 800 steps, twice the steps leave 0.93 of the error or more, except on glossy
-# materials (``benchmarks/advice.py``). Two free cores take less than 12 s for them.
+# materials (``benchmarks/advice.py``). Two free cores take about 7 s for them.
 FITTER: dict[Quality, dict[str, Any]] = {
     "draft": {"training.time": "12s", "training.steps": None, _MIN_STEPS: 800},
     "standard": {"training.time": "3min", "training.steps": None, _MIN_STEPS: 800},
