@@ -187,10 +187,21 @@ class NumpyMaterial:
         return np.mean(hints, 0)
 
     def lobe(
-        self, base_color, specular, alpha2, slopes, omega_i, omega_o, least_alpha2, least_light, least_view
+        self,
+        base_color,
+        specular,
+        alpha2,
+        slopes,
+        omega_i,
+        omega_o,
+        weight,
+        least_alpha2,
+        least_light,
+        least_view,
     ):
         n, least = normal(slopes), [least_light, least_view]
-        lobe = ggx(specular, max(alpha2, least_alpha2), n, omega_i, omega_o, least)
+        weight = 1 if weight is None else weight
+        lobe = weight * ggx(specular, max(alpha2, least_alpha2), n, omega_i, omega_o, least)
         return max(0, n @ omega_i) / omega_i[2] * (base_color / np.pi + lobe)
 
     def rotate(self, axis, omega):

@@ -1,8 +1,14 @@
 """SVBRDF: the material that engines have, a spatially varying BRDF without a network.
 
-A texel of every level has a base color, a share of metal, a roughness and the slopes of a normal (the
-metallic workflow: Burley, *Physically Based Shading at Disney*, SIGGRAPH courses 2012). It has neither
+A texel of every level has a base color, a share of metal, a roughness, the slopes of a normal (the metallic
+workflow: Burley, *Physically Based Shading at Disney*, SIGGRAPH courses 2012) and a specular weight, which
+scales the lobe also at grazing angles (as glTF's KHR_materials_specular does for dielectrics). It has neither
 parallax nor shadows, and one lobe per texel: a baseline for all that does.
+
+Microgeometry shadows its highlights. Without the weight, the loss removes a lobe that is too bright by making
+it too narrow for the queries to sample, which leaves spikes between them. The relative loss bounds the cost
+of a spike. Roughness and slopes therefore train slower than colors: lobes start wide, and become narrow
+only where many queries agree.
 """
 
 from __future__ import annotations
@@ -17,6 +23,8 @@ from mbtf_fit.sections import NetworkSection
 
 # Reflectance of dielectrics at normal incidence.
 _DIELECTRIC = 0.04
+# Scale of the texels of roughness and slopes: their learning rate relative to that of colors.
+_SLOW = 0.3
 
 
 class Svbrdf(Model):
@@ -34,16 +42,19 @@ class Svbrdf(Model):
     def operations(cls, lattice: Lattice, network: NetworkSection) -> list[Operation]:
         metal = "texel[3:4]"
         return [
-            Lookup("texel", "u", "level", "features", channels=7),
-            # (S1) b, m, r = σ(texel); diffuse color (1 - m) b, F0 = m b + 0.04 (1 - m), α = r²
+            Lookup("texel", "u", "level", "features", channels=8),
+            # (S1) b, m, w = σ(texel), r = σ(0.3 texel), slopes 0.3 texel; diffuse color (1 - m) b,
+            # F0 = m b + 0.04 (1 - m), α = r²
             Transform("base_color", "texel[0:3]", "sigmoid"),
             Transform("dielectric", metal, scale=-1.0),
             Gate("diffuse", "dielectric", "base_color"),
             Transform("share", "dielectric", "sigmoid"),
             Matrix("reflectance", "share", rows=((_DIELECTRIC,),) * 3),
             Gate("f0", metal, "base_color", "reflectance"),
-            Transform("roughness", "texel[4:5]", "sigmoid"),
+            Transform("roughness", "texel[4:5]", "sigmoid", scale=_SLOW),
             Transform("alpha", "roughness", "square"),
             Transform("alpha2", "alpha", "square"),
-            Lobe("value", "diffuse", "f0", "alpha2", "texel[5:7]", "omega_i", "omega_o"),
+            Transform("slopes", "texel[5:7]", scale=_SLOW),
+            Transform("weight", "texel[7:8]", "sigmoid"),
+            Lobe("value", "diffuse", "f0", "alpha2", "slopes", "omega_i", "omega_o", "weight"),
         ]

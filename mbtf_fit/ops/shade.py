@@ -70,13 +70,14 @@ class Lobe(Operation):
     """A diffuse and a GGX lobe (Walter et al. 2007; Fresnel: Schlick 1994) under a light whose irradiance on
     the reference plane is 1, hence the division by ω_i,z.
 
-    ``M = max(0, n·ω_i) / ω_i,z · (b/π + GGX(F0, α²))`` with the normal ``n = (-s_x, -s_y, 1) / ‖·‖``;
+    ``M = max(0, n·ω_i) / ω_i,z · (b/π + w GGX(F0, α²))`` with the normal ``n = (-s_x, -s_y, 1) / ‖·‖``;
     cosines of light and view in the lobe are at least `least_light` and `least_view`.
 
     Attributes
     ----------
     base_color, specular, alpha2, slopes : b (3), F0 (1 or 3), squared roughness α² (1), slopes s (2)
     omega_i, omega_o : directions (3)
+    weight : w (1), which scales all of the lobe's reflectance, or None for 1
     least_alpha2 : bound of α² from below
     """
 
@@ -86,6 +87,7 @@ class Lobe(Operation):
     slopes: Value
     omega_i: Value
     omega_o: Value
+    weight: Value | None = None
     least_alpha2: float = ALPHA2[0]
     least_light: float = LEAST_LIGHT
     least_view: float = LEAST_VIEW

@@ -189,12 +189,15 @@ def _lobe(
     slopes: Tensor,
     omega_i: Tensor,
     omega_o: Tensor,
+    weight: Tensor | None,
 ) -> Tensor:
     normal = torch.nn.functional.normalize(torch.cat([-slopes, torch.ones_like(slopes[:, :1])], 1), dim=1)
     light = (normal * omega_i).sum(1, keepdim=True)
     view = (normal * omega_o).sum(1, keepdim=True).clamp_min(op.least_view)
     alpha2, f0 = alpha2.clamp_min(op.least_alpha2), specular.expand(-1, 3)
     lobe = _ggx(f0, alpha2, normal, light.clamp_min(op.least_light), view, omega_i, omega_o)
+    if weight is not None:
+        lobe = weight * lobe
     return light.clamp_min(0.0) / omega_i[:, 2:] * (base_color / math.pi + lobe)
 
 

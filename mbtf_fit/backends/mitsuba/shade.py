@@ -90,11 +90,21 @@ def _shade(op: ops.Shade, loader: Loader) -> Step:
 
 @MITSUBA.implements(ops.Lobe)
 def _lobe(op: ops.Lobe, loader: Loader) -> Step:
-    def step(base: Numbers, specular: Numbers, alpha2: Numbers, slopes: Numbers, *omega: Numbers) -> Numbers:
-        light, view = (mi.Vector3f(*w) for w in omega)
+    def step(
+        base: Numbers,
+        specular: Numbers,
+        alpha2: Numbers,
+        slopes: Numbers,
+        omega_i: Numbers,
+        omega_o: Numbers,
+        weight: Numbers | None,
+    ) -> Numbers:
+        light, view = mi.Vector3f(*omega_i), mi.Vector3f(*omega_o)
         normal = _normal(*slopes)
         roughness = dr.maximum(alpha2[0], op.least_alpha2)
         lobe = _ggx(op, mi.Color3f(*specular), roughness, normal, light, view)
+        if weight is not None:
+            lobe *= weight[0]
         irradiance = dr.maximum(dr.dot(normal, light), 0.0) / light.z
         return list(irradiance * (mi.Color3f(*base) / math.pi + lobe))
 

@@ -147,6 +147,7 @@ def _lobe(
     slopes: Value,
     omega_i: Value,
     omega_o: Value,
+    weight: Value | None,
 ) -> str:
     code.include("shading")
     with code.stage_of(alpha2, slopes):
@@ -162,6 +163,8 @@ def _lobe(
     least = vector((op.least_light, op.least_view))
     irradiance = f"max(dot({normal}, {omega_i}), 0.0) / {omega_i[2:]}"
     lobe = f"ggx({f0}, {roughness}, {normal}, {least}, {omega_i}, {omega_o})"
+    if weight is not None:
+        lobe = f"{weight} * {lobe}"
     return f"{irradiance} * ({base_color} / PI + {lobe})"
 
 
