@@ -194,13 +194,12 @@ class NumpyMaterial:
         slopes,
         omega_i,
         omega_o,
-        weight,
         least_alpha2,
         least_light,
         least_view,
+        weight=1,
     ):
         n, least = normal(slopes), [least_light, least_view]
-        weight = 1 if weight is None else weight
         lobe = weight * ggx(specular, max(alpha2, least_alpha2), n, omega_i, omega_o, least)
         return max(0, n @ omega_i) / omega_i[2] * (base_color / np.pi + lobe)
 
