@@ -21,11 +21,14 @@ from mbtf_core.stats.estimate import Estimate
 COVERAGE = 0.95
 # Shapes of the curve: exponents, and levels relative to the last error. Gradient descent on noisy data has no
 # exponent above 1; of a transient we allow 2.
-_POWERS = np.geomspace(0.02, 2.0, 70)
-_LEVELS = np.concatenate([np.linspace(0.0, 0.98, 50), [0.99, 0.995, 1.0]])
+_POWERS = np.geomspace(0.02, 2.0, 560)
+_LEVELS = np.concatenate(
+    [[0.0], np.geomspace(1e-3, 0.02, 8), np.linspace(0.04, 0.98, 48), [0.99, 0.995, 1.0]]
+)
 _PARAMETERS = 3
-# An interval whose ends have a larger ratio does not answer a question.
-_WIDEST = 5.0
+# An interval whose ends have a larger ratio does not answer a question. With a smaller bound, those that are
+# too narrow by chance would be shown more often than others.
+_WIDEST = 30.0
 
 
 @dataclass(frozen=True)

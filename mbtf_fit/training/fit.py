@@ -334,7 +334,9 @@ def _train(
         return all(reached(config, [record]) for record in records)
 
     progress(loop.fraction, "training")
-    _spend_budget(loop, report, checkpoint)
+    # A fit that was killed after it had reached its error is exported as it is.
+    if not all(reached(config, read_history(member.folder)) for member in members):
+        _spend_budget(loop, report, checkpoint)
     _export(config, loop, members, partitions, [name for name, _ in subsets], home, partial(progress, 1.0))
     return resumed
 
@@ -364,12 +366,14 @@ def reached(config: FitConfig, history: Sequence[dict[str, Any]]) -> bool | None
 def describe_ending(config: FitConfig, history: Sequence[dict[str, Any]]) -> str | None:
     """Why training ended, in one line; None if it had no error to reach."""
     found = reached(config, history)
-    if found is None:
+    if found is None or not history:
         return None
     last, training = history[-1], config.training
     error = format_estimate({"value": last["unexplained"], "error": last["unexplained_error"]})
     limit = clock(training.time) if training.steps is None else f"{training.steps} steps"
     spent = clock(last["seconds"]) if training.steps is None else str(last["step"])
+    if training.steps is None and last["seconds"] > training.time:
+        limit, spent = f"{training.min_steps} steps", str(last["step"])
     if found:
         return f"stopped at error {training.error:g} after {spent} of {limit}: validation error {error}"
     return f"stopped after {limit}: validation error {error} has not reached {training.error:g}"

@@ -145,7 +145,8 @@ def _doubling(history: list[dict[str, Any]]) -> float | None:
     """Expected factor of the error by twice the training time.
 
     The mean of two estimates of its logarithm, weighted by their inverse variances: from the number of steps,
-    and from the error in the middle of training, where the history resolves it.
+    and from the error in the middle of training. Where the history does not resolve the latter, only few
+    steps are an answer.
     """
     last = history[-1]
     steps = last["step"]
@@ -155,13 +156,17 @@ def _doubling(history: list[dict[str, Any]]) -> float | None:
         return None
     known = [(r, error) for r in history if (error := _relative_error(r)) is not None]
     middle = [pair for pair in known if _MIDDLE[0] <= pair[0]["fraction"] <= _MIDDLE[1]]
+    few = steps < _FEWEST_STEPS
     if not middle:
-        return math.exp(law)
+        return math.exp(law) if few else None
     half, before = min(middle, key=lambda pair: abs(pair[0]["fraction"] - 0.5))
     doublings = -math.log2(half["fraction"])
     slope = _LASTING * math.log(last["unexplained"] / half["unexplained"]) / doublings
     # Both records are of the same queries, so this spread is an upper bound.
     spread = _LASTING * math.hypot(after, before) / doublings
+    # The number of steps alone would say that longer training is useless.
+    if spread > _LAW_SCATTER and not few:
+        return None
     weights = _LAW_SCATTER**-2, 1.0 / (_LASTING_SCATTER**2 + spread**2)
     return math.exp((weights[0] * law + weights[1] * slope) / sum(weights))
 

@@ -57,6 +57,8 @@ def cost(
     loaded = load(recipe, assignments or [])
     if not isinstance(loaded, Recipe):
         raise UsageError("has several materials", where=recipe, hint="study the recipe of one of them")
+    if error is not None and not 0 < error <= 1:
+        raise UsageError("must be above 0 and at most 1, the error of the mean value", where="--error")
     seconds = asked_duration(time, "--time")
     more = 0.0 if refine is None else asked_duration(refine, "--refine")
     folder = output if output is not None else study_folder(loaded)
@@ -93,7 +95,6 @@ def cost(
             answers.append(study.asked)
     with owned(folder):
         page = write_page(study)
-        evidence.store(folder)
     front, rows = pareto_front(study.measurements), page_answers(evidence)
     data = {
         "page": page,

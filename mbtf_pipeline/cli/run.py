@@ -149,18 +149,15 @@ def run(
 
 def _forecast(recipe: Recipe, folder: Path, console: Console) -> None:
     """Report time and errors of a run, which are forecasts."""
-    from mbtf_pipeline.cost.forecast import forecast_errors, study_folder
+    from mbtf_pipeline.cost.forecast import forecast_errors
     from mbtf_pipeline.run_time import RunForecaster
 
     expected = RunForecaster(recipe).of(recipe)
-    errors = forecast_errors(recipe, folder, expected, console.note)
+    errors = forecast_errors(recipe, folder, console.note)
     lines = [expected.describe()]
     for name, found in errors.items():
-        source = {"study": f" (cost study {study_folder(recipe)})"}
         first, *more = found["text"].splitlines()
-        lines += [f"  {name}: {first}{source.get(found['source'] or '', '')}", *(f"    {m}" for m in more)]
-    if any(found["source"] is None for found in errors.values()):
-        lines.append(f"a cost study answers for relief: mbtf-pipeline cost RECIPE -o {study_folder(recipe)}")
+        lines += [f"  {name}: {first}", *(f"    {m}" for m in more)]
     console.report({"seconds": expected.seconds, "bytes": expected.bytes, "fits": errors}, "\n".join(lines))
 
 

@@ -5,32 +5,18 @@ from __future__ import annotations
 import statistics
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
-from mbtf_core.errors import InputError
-from mbtf_core.files.atomic import read_json, write_json
 from mbtf_core.forecast import INSUFFICIENT, expected_error, expected_seconds
 from mbtf_core.stats import Estimate, Interval, LearningCurve
 from mbtf_core.units import clock, format_duration
-from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.cost.measurement import Measurement
 
-EVIDENCE_NAME = "runs.json"
 # Times of everything that the page answers, in seconds.
 _TIMES = (60.0, 300.0, 900.0, 3600.0)
 # What limits the error of a study's runs, whose data grow with their time.
 _LIMITS = "with this network, however many queries"
-
-
-def basis_of(config: GeneratorConfig, digests: dict[str, str]) -> str:
-    """Hash of what the error of a fit is measured on: the material and the distribution of its queries,
-    without their number, paths and seed."""
-    counts = {"train": "1", "spp": 2, "test": "1", "test_spp": 2, "target_error": None}
-    queries = config.queries.model_copy(update={**counts, "allocation": "uniform", "layout": "shuffled"})
-    fixed = {"queries": queries, "output": type(config.output)(), "seed": 0}
-    return config.model_copy(update=fixed).hash(digests)
 
 
 @dataclass(frozen=True)
@@ -39,15 +25,12 @@ class Evidence:
 
     Attributes
     ----------
-    basis, system : see :func:`basis_of`, and the machine
     seconds, errors, seeds : total time, unexplained variance, and number of seeds of each
     work : seconds of generating and training, part of `seconds`; the error is a law of these
     deviation, degrees : relative deviation of a single run over seeds, and its degrees of freedom
     test : relative standard error by the test queries
     """
 
-    basis: str
-    system: str
     seconds: tuple[float, ...]
     errors: tuple[float, ...]
     seeds: tuple[float, ...]
@@ -57,16 +40,12 @@ class Evidence:
     test: float
 
     @classmethod
-    def of(
-        cls, found: Sequence[Measurement], deviation: Estimate | None, basis: str, system: str
-    ) -> Evidence:
+    def of(cls, found: Sequence[Measurement], deviation: Estimate | None) -> Evidence:
         """From the measurements of a study."""
         runs = [m for m in found if m.study == "run" and m.error.value > 0 and m.error.error < m.error.value]
         for series, _ in Counter(m.series for m in runs).most_common(1):
             runs = sorted((m for m in runs if m.series == series), key=lambda m: m.seconds.value)
         return cls(
-            basis,
-            system,
             tuple(m.seconds.value for m in runs),
             tuple(m.error.value for m in runs),
             tuple(m.details["seeds"] for m in runs),
@@ -89,23 +68,11 @@ class Evidence:
         """Seconds of a run besides its work, which longer runs need no more of."""
         return statistics.median(s - w for s, w in zip(self.seconds, self.work, strict=True))
 
-    def store(self, folder: Path) -> None:
-        """Write it into the folder of its study."""
-        write_json(folder / EVIDENCE_NAME, asdict(self))
-
-    @classmethod
-    def read(cls, folder: Path) -> Evidence | None:
-        """That of a study's folder; None where there is none, or of another version."""
-        try:
-            data = read_json(folder / EVIDENCE_NAME)
-            lists: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}
-            return cls(**lists)
-        except (InputError, KeyError, TypeError):
-            return None
-
     def range_text(self, seconds: float) -> str:
         """Whether a time lies within those that were measured."""
         longest = self.seconds[-1]
+        if seconds < 0.95 * self.seconds[0]:
+            return f"extrapolated below the shortest run, {clock(self.seconds[0])}"
         if seconds <= 1.05 * longest:
             return f"measured: {len(self.seconds)} runs of {clock(self.seconds[0])} to {clock(longest)}"
         return f"extrapolated, {seconds / longest:.2g} times the longest run"

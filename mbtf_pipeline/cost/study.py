@@ -27,7 +27,7 @@ from mbtf_core.stats import Estimate
 from mbtf_core.units import expectation, format_duration
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
-from mbtf_pipeline.cost.answers import Evidence, basis_of
+from mbtf_pipeline.cost.answers import Evidence
 from mbtf_pipeline.cost.generator import benchmark_of, generator_configurations, path_seconds
 from mbtf_pipeline.cost.measurement import (
     HALF_WIDTH,
@@ -79,8 +79,6 @@ class Study:
     # Configurations for which no time was left, and runs that failed, with the reason.
     skipped: list[str] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
-    # Hash of what the errors are measured on.
-    basis: str = ""
     # Answer to the error that was asked for, and seconds of a study that can answer; None where this one can.
     asked: str = ""
     least: float | None = None
@@ -88,8 +86,7 @@ class Study:
     @property
     def evidence(self) -> Evidence:
         """What the complete runs say of other times and errors."""
-        system = self.description["machine"]["system"]
-        return Evidence.of(self.measurements, self.deviation, self.basis, system)
+        return Evidence.of(self.measurements, self.deviation)
 
 
 def claim(folder: Path, on: Mapping[str, str]) -> None:
@@ -369,6 +366,5 @@ def run_study(
         deviation,
         [c.label for c in (*configurations, *runs) if c.label not in known and c.label not in failed],
         [f"{label}: {why}" for label, why in failed.items()],
-        basis_of(config, job.material.digests),
         least=measurements.least_seconds(config.queries.spp),
     )

@@ -7,8 +7,8 @@ to ``si.duv_dx`` and ``si.duv_dy``, which Mitsuba's own integrators leave at zer
 is neglected. The spread of a scattered ray's cone is bounded below by the density of its direction.
 
 At grazing angles a pixel's footprint is an ellipse, while those of materials are round. An elongated Gaussian
-is the mean of narrow ones along its major axis, so every hit on a material looks up one of them at random:
-the mean over samples has the elongated footprint, at the cost of one lookup each.
+is the mean of narrow ones along its major axis, so every hit on a surface's material looks up one of them at
+random: the mean over samples has the elongated footprint, at the cost of one lookup each.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def camera_cone(ray: Ray3f, samples: int) -> tuple[Float, Float]:
 
 
 def materials_of(scene: Scene) -> list[Any]:
-    """The ``mbtf`` materials of a scene's surfaces, each once."""
+    """The ``mbtf`` materials of a scene's surfaces, each once; not those inside other BSDFs or instances."""
     found = {id(bsdf): bsdf for bsdf in (s.bsdf() for s in scene.shapes()) if isinstance(bsdf, MbtfBSDF)}
     return [*found.values()]
 

@@ -122,3 +122,19 @@ def test_footprints_of_grazing_pixels_are_elongated(material: Path, texture: NDA
     contrast, difference = compared(2.0, 2.0)
     assert contrast == pytest.approx(1.0, abs=0.08)
     assert difference < 0.15
+
+
+def test_other_surfaces_are_not_filtered(material: Path) -> None:
+    """A checkerboard at 10° beside a material looks as it does with round footprints."""
+    camera = Camera(10.0, -60.0, tiles_across=1.0, rows=16, columns=16, field_of_view=2.0)
+    board = {"type": "diffuse", "reflectance": {"type": "checkerboard"}}
+    bsdf: Any = {"type": "mbtf", "material": str(material), "sampling": "cosine", "networks": "cooperative"}
+    other = mi.ScalarTransform4f().translate([0.0, 0.0, -1.0])
+    parts = {"m": plane(board), "n": {"type": "rectangle", "to_world": other, "b": bsdf}}
+    scene = mi.load_dict({"type": "scene", **parts, "e": directional(LIGHT), "sensor": sensor_of(camera)})
+    elongated, round_ = (
+        through_pixel_centers(scene, camera, mi.load_dict({"type": "mbtf_path", "max_depth": 2, **options}))
+        for options in ({}, {"max_anisotropy": 1})
+    )
+    assert len(np.unique(round_)) > 1
+    np.testing.assert_array_equal(elongated, round_)

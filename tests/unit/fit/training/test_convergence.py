@@ -42,11 +42,12 @@ def test_twice_the_time_gains_half_of_what_the_second_half_did(power: float) -> 
     assert (
         found.describe() == f"expect about {found.doubling:.2g} of this error after twice the training time"
     )
-    # Of an uncertain slope, half the weight is left, or less.
-    uncertain = cost(history(power, error=0.2), {})
+    # Of an uncertain slope, less weight is left; of one that is hardly known, none.
+    uncertain = cost(history(power, error=0.12), {})
     assert found.doubling is not None
     assert uncertain.doubling is not None
-    assert math.log(uncertain.doubling) > 0.5 * math.log(found.doubling)
+    assert math.log(uncertain.doubling) > 0.7 * math.log(found.doubling)
+    assert cost(history(power, error=0.2), {}).doubling is None
 
 
 def test_the_middle_record_counts_by_its_fraction() -> None:
@@ -75,7 +76,7 @@ def test_few_steps_ask_for_more_whatever_the_curve_shows() -> None:
         cost(history(0.0, error=0.4, steps=146), {}).describe() == "146 steps are few: train longer (--time)"
     )
     # Without a record in the middle, the number of steps decides: the error is about 1 + 50 / N.
-    for steps, expected in ((50, 0.75), (150, 0.875), (100_000, 1.0)):
+    for steps, expected in ((50, 0.75), (150, 0.875)):
         found = cost(history(0.5, steps=steps)[-1:], {})
         assert found.doubling == pytest.approx(expected, abs=1e-3)
 

@@ -13,14 +13,13 @@ from support.paths import ROOT
 
 from mbtf_core.app.console import run
 from mbtf_core.stats import Estimate
-from mbtf_gen.job import Job
 from mbtf_pipeline.cli.app import app
 from mbtf_pipeline.cost import forecast as module
-from mbtf_pipeline.cost.answers import EVIDENCE_NAME, Evidence, basis_of, page_answers
+from mbtf_pipeline.cost.answers import Evidence, page_answers
 from mbtf_pipeline.cost.forecast import forecast_errors, has_error
 from mbtf_pipeline.cost.measurement import Measurement
 from mbtf_pipeline.cost.runs import LEAST_SECONDS, planned_runs
-from mbtf_pipeline.cost.study import measuring_machine, study_config, too_short
+from mbtf_pipeline.cost.study import too_short
 from mbtf_pipeline.recipe import Recipe, load_recipe
 from mbtf_pipeline.run_time import RunForecaster
 
@@ -40,7 +39,7 @@ def times_of(seconds: float) -> dict[str, float]:
     return {"generation_seconds": 0.35 * work, "training_seconds": 0.65 * work}
 
 
-def evidence(basis: str = "", system: str = "") -> Evidence:
+def evidence() -> Evidence:
     found = [
         Measurement(
             "run", series, f"{s:g}", "command", Estimate(s, 0.0, 1),
@@ -50,7 +49,7 @@ def evidence(basis: str = "", system: str = "") -> Evidence:
         for series, factor, times in (("35 %", 1.0, SECONDS), ("60 %", 2.0, SECONDS[:2]))
         for s in times
     ]  # fmt: skip
-    return Evidence.of(found, Estimate(0.03, 0.01, 6, 6), basis, system)
+    return Evidence.of(found, Estimate(0.03, 0.01, 6, 6))
 
 
 def test_a_study_answers_times_and_errors() -> None:
@@ -77,15 +76,7 @@ def test_a_study_answers_times_and_errors() -> None:
     )
     assert few.error_after(60.0) is None
     assert few.time_of(0.1) is None
-    assert page_answers(Evidence.of([], None, "", "")) == []
-
-
-def test_evidence_is_kept_in_its_folder(tmp_path: Path) -> None:
-    evidence("b", "s").store(tmp_path)
-    assert Evidence.read(tmp_path) == evidence("b", "s")
-    (tmp_path / EVIDENCE_NAME).write_text('{"basis": "b"}')
-    assert Evidence.read(tmp_path) is None
-    assert Evidence.read(tmp_path / "nowhere") is None
+    assert page_answers(Evidence.of([], None)) == []
 
 
 def test_the_least_time_has_room_for_three_lengths() -> None:
@@ -99,50 +90,14 @@ def test_the_least_time_has_room_for_three_lengths() -> None:
 
 
 @pytest.fixture
-def recipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Recipe:
+def recipe(monkeypatch: pytest.MonkeyPatch) -> Recipe:
     monkeypatch.setattr(RunForecaster, "speed", property(lambda self: (4.0, 4e-7)))
-    monkeypatch.setattr(module, "study_folder", lambda recipe: tmp_path / "study")
-    (tmp_path / "study").mkdir()
     network = {"width": 40, "channels": 8, "relief": {"places": 1}}
     fits = {
         "relief": {"training": {"time": "60s"}, "network": network},
         "neumip": {"training": {"time": "60s"}},
     }
     return load_recipe(ROOT / "pipelines" / "quickstart.yaml", [f"fit={json.dumps(fits)}"])
-
-
-def test_a_run_asks_the_study_of_its_material(recipe: Recipe, tmp_path: Path) -> None:
-    expected = RunForecaster(recipe).of(recipe)
-
-    def sources(of: Recipe) -> list[Any]:
-        found = forecast_errors(of, tmp_path / "run", expected, lambda text: None)
-        return [found["relief"]["source"], found["neumip"]["source"]]
-
-    assert sources(recipe) == [None, None]
-    job = Job.load(study_config(recipe.generate, None))
-    basis = basis_of(job.config, job.material.digests)
-    evidence(basis, measuring_machine()["system"]).store(tmp_path / "study")
-    # The study has fits of this kind, none of `neumip`.
-    assert sources(recipe) == ["study", None]
-    text = forecast_errors(has_error(recipe, 0.05), tmp_path / "run", expected, lambda text: None)["relief"][
-        "text"
-    ]
-    after, until = text.splitlines()
-    assert "expect an unexplained variance of 0.05" in after
-    assert until.startswith("error 0.05: about ")
-    # Of other queries, another machine, or another network it says nothing.
-    other = recipe.generate.queries.model_copy(update={"resolution": 64})
-    assert (
-        sources(
-            recipe.model_copy(update={"generate": recipe.generate.model_copy(update={"queries": other})})
-        )[0]
-        is None
-    )
-    counts = recipe.generate.queries.model_copy(update={"train": "1000", "test": "70000"})
-    more = recipe.model_copy(update={"generate": recipe.generate.model_copy(update={"queries": counts})})
-    assert sources(more)[0] == "study"
-    evidence(basis, "elsewhere").store(tmp_path / "study")
-    assert sources(recipe)[0] is None
 
 
 def test_a_dry_run_writes_nothing(
@@ -152,7 +107,7 @@ def test_a_dry_run_writes_nothing(
     for time in ([], ["--time", "10min"]):
         command = ["run", str(ROOT / "pipelines" / "quickstart.yaml"), "-o", str(out), "--dry-run", *time]
         assert run(app, [*command, "--error", "0.05"]) == 0
-        assert "no forecast of the error: there are neither data nor a cost study" in capsys.readouterr().out
+        assert "no forecast of the error: the data are not generated yet" in capsys.readouterr().out
         assert not out.exists()
     assert run(app, [*command, "--error", "2"]) == 2
     assert "--error: must be above 0 and at most 1" in capsys.readouterr().err
@@ -170,7 +125,6 @@ def test_pilots_answer_where_there_are_data(
     monkeypatch.setattr("mbtf_fit.training.forecast.forecast_fit", forecast)
     monkeypatch.setattr(module, "survey", lambda *_: {"generate": ""})
     monkeypatch.setattr(module, "is_dataset", lambda folder: True)
-    expected = RunForecaster(recipe).of(recipe)
-    found = forecast_errors(has_error(recipe, 0.1), tmp_path, expected, lambda text: None)
+    found = forecast_errors(has_error(recipe, 0.1), tmp_path, lambda text: None)
     assert {f["source"] for f in found.values()} == {"pilots"}
     assert asked == [(0.1, tmp_path / "shards")] * 2
