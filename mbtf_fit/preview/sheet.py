@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from itertools import product
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +20,16 @@ from mbtf_core.directions import from_angles
 from mbtf_core.files.folders import OutputFolder, check_space
 from mbtf_core.pictures import PNG_BYTES, Camera, claim_pictures, write_png
 from mbtf_core.run.signals import keep_on_interruption
-from mbtf_fit.backends.mitsuba.evaluator import Evaluator
-from mbtf_fit.backends.mitsuba.stored_material import F32
 from mbtf_fit.material.format import read_description
 from mbtf_fit.preview.config import MaterialPreviewConfig, SheetSection
 from mbtf_fit.preview.grid import grid, width_label
 from mbtf_gen.config.pictures import Direction
 from mbtf_gen.engine.runtime import load_mitsuba
+
+if TYPE_CHECKING:
+    # They import Dr.Jit, which must find its LLVM first.
+    from mbtf_fit.backends.mitsuba.evaluator import Evaluator
+    from mbtf_fit.backends.mitsuba.stored_material import F32
 
 
 def panels(evaluator: Evaluator, section: SheetSection) -> F32:

@@ -101,11 +101,13 @@ class MarginalCost:
     noise_share : share of the error on queries without training that is overfitting to the noise of the
         training queries; None where it is not significant
     steps : number of training steps
+    noise_share_error : two standard errors of `noise_share`
     """
 
     doubling: float | None
     noise_share: float | None
     steps: int
+    noise_share_error: float = 0.0
 
     def as_dict(self) -> dict[str, float | int | None]:
         """Plain data for JSON."""
@@ -124,9 +126,13 @@ class MarginalCost:
         else:
             lines = [f"expect {gain} after twice the training time"]
         if self.noise_share is not None:
+            low, high = (
+                min(max(self.noise_share + side * self.noise_share_error, 0.0), 1.0) for side in (-1.0, 1.0)
+            )
             lines.append(
-                f"overfitting to noise causes {self.noise_share:.0%} of the error of new queries: expect "
-                f"about {1.0 - 0.5 * self.noise_share:.2g} of it with twice the queries, or paths per query"
+                f"overfitting to noise causes {low:.0%} to {high:.0%} of the error of new queries: expect "
+                f"{1.0 - 0.5 * high:.2g} to {1.0 - 0.5 * low:.2g} of it with twice the queries, or paths "
+                "per query"
             )
         return "\n".join(lines)
 
@@ -138,7 +144,8 @@ def marginal_cost_of(
     of the noise of training values in 1/sr² (None: unknown); None where the history is incomplete."""
     if not history or history[-1].get("fraction", 0.0) < 1.0:
         return None
-    return MarginalCost(_doubling(history), _noise_share(errors, noise), int(history[-1]["step"]))
+    share, error = _noise_share(errors, noise) or (None, 0.0)
+    return MarginalCost(_doubling(history), share, int(history[-1]["step"]), error)
 
 
 def _doubling(history: list[dict[str, Any]]) -> float | None:
@@ -181,8 +188,9 @@ def _number(x: Any) -> bool:
     return isinstance(x, int | float) and math.isfinite(x)
 
 
-def _noise_share(errors: dict[str, Any], noise: float | None) -> float | None:
-    """Overfitting over the error of new queries: test or held-out queries, whichever error is known best.
+def _noise_share(errors: dict[str, Any], noise: float | None) -> tuple[float, float] | None:
+    """Overfitting over the error of new queries, test or held-out queries, whichever error is known best; and
+    two standard errors.
 
     A fit that overfits the noise of its training queries gains an error on other queries that equals the
     variance of what it has overfitted, and its error on the training queries falls by as much. The difference
@@ -195,6 +203,9 @@ def _noise_share(errors: dict[str, Any], noise: float | None) -> float | None:
     if noise is None or training is None or new is None or new["value"] <= _SIGNIFICANT * new["error"]:
         return None
     overfit = min(0.5 * (new["value"] - training["value"]), noise)
+    # Of s = (new - training) / (2 new).
+    ratio = training["value"] / new["value"]
+    error = math.hypot(training["error"], ratio * new["error"]) / (2.0 * new["value"])
     if overfit <= _SIGNIFICANT * 0.5 * math.hypot(new["error"], training["error"]):
         return None
-    return min(1.0, float(overfit / new["value"]))
+    return min(1.0, float(overfit / new["value"])), _SIGNIFICANT * error

@@ -284,3 +284,11 @@ def public_classes() -> dict[str, list[str]]:
 
 def test_no_two_public_classes_share_a_name() -> None:
     assert {name: where for name, where in public_classes().items() if len(where) > 1} == {}
+
+
+def test_commands_set_llvm_before_dr_jit_is_imported(run_python: RunPython) -> None:
+    """Dr.Jit takes the system's LLVM, however old, if it is imported first."""
+    names = "mbtf_fit.preview.sheet", "mbtf_fit.comparison", "mbtf_fit.training.fit", "mbtf_pipeline.run"
+    imports = "; ".join(f"import {name}" for name in (*names, "sys"))
+    done = run_python("-c", f"{imports}; print('drjit' in sys.modules)")
+    assert done.stdout.strip() == "False", done.stderr
