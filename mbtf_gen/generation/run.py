@@ -267,6 +267,7 @@ def render_shards(
         workers cannot be reached, or there are too many non-finite samples; finished shards are kept
     """
     start, first = time.perf_counter(), 0
+    began = start
     job, folder = run.job, run.folder
     pending = {entry.file: entry for entry in entries}
     traced, totals, limit = Traced(), ShardStatistics(), most_paths(job)
@@ -297,7 +298,9 @@ def render_shards(
                     traced_so_far[entry.split] += paths
             if progress is not None:
                 now = time.perf_counter()
-                rate = (traced.paths - first) / max(now - start, 1e-9) / 1e6
+                # Without the first shard, which compiles; small shards that end together say nothing yet.
+                since, before = (start, first) if now - start >= 1.0 else (began, 0)
+                rate = (traced.paths - before) / max(now - since, 1e-9) / 1e6
                 if not first:
                     start, first = now, traced.paths
                 where = "" if runner.here else f" on {runner.workers} workers"

@@ -57,8 +57,6 @@ def forecast_errors(recipe: Recipe, folder: Path, note: Callable[[str], None]) -
             forecast = forecast_fit(fit, folder / data.sub).error
             found[name] = {"source": "pilots", "text": forecast.describe(), "forecast": forecast.as_dict()}
         else:
-            text = (
-                "no forecast of the error: the data are not generated yet; mbtf-pipeline cost measures errors"
-            )
+            text = f"no forecast of the error: {folder / data.sub} has no data of these options yet"
             found[name] = {"source": None, "text": text}
     return found

@@ -107,7 +107,7 @@ def test_a_dry_run_writes_nothing(
     for time in ([], ["--time", "10min"]):
         command = ["run", str(ROOT / "pipelines" / "quickstart.yaml"), "-o", str(out), "--dry-run", *time]
         assert run(app, [*command, "--error", "0.05"]) == 0
-        assert "no forecast of the error: the data are not generated yet" in capsys.readouterr().out
+        assert "has no data of these options yet" in capsys.readouterr().out
         assert not out.exists()
     assert run(app, [*command, "--error", "2"]) == 2
     assert "--error: must be above 0 and at most 1" in capsys.readouterr().err
