@@ -76,7 +76,7 @@ def test_the_plan_measures_multiple_scattering(done: dict[str, Done]) -> None:
     assert " on " in lines["fiber transmission"]
     # Most of the light has passed through a fiber.
     bound = lines["fiber transmission"].split()[3]
-    assert bound == "over" or float(bound) > 20.0
+    assert bound == "may" or float(lines["fiber transmission"].split("<")[1].split()[0]) > 20.0
     (opaque,) = [line for line in done["opaque"].out.splitlines() if line.startswith("fiber transmission")]
     assert " off " in opaque
     assert "forced" in opaque
