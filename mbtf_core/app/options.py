@@ -80,6 +80,19 @@ ErrorOption = Annotated[
         "error, is no larger; forecasts state how long that takes.",
     ),
 ]
+
+
+def check_error(error: float | None) -> None:
+    """Refuse an ``--error`` that is no unexplained variance below that of the mean value.
+
+    Raises
+    ------
+    UsageError : it is not in (0, 1]
+    """
+    if error is not None and not 0 < error <= 1:
+        raise UsageError("must be above 0 and at most 1, the error of the mean value", where="--error")
+
+
 ClusterOption = Annotated[
     str | None,
     Parameter(

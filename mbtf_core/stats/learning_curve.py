@@ -112,21 +112,20 @@ class LearningCurve:
         self._weight = density * self._power
         self._shared = float(stdtrit(1e9, 0.5 + 0.5 * COVERAGE)) * shared
 
-    def _interval(self, values: NDArray[np.float64], low: float, high: float) -> Interval:
+    def _median(self, values: NDArray[np.float64]) -> float:
+        """Weighted median of a number of each shape."""
         order = np.argsort(values)
         total = np.cumsum(self._weight[order])
-        middle = float(values[order][np.searchsorted(total, 0.5 * total[-1])])
-        return Interval(*(math.exp(x) for x in (min(max(middle, low), high), low, high)))
+        return float(values[order][np.searchsorted(total, 0.5 * total[-1])])
 
     def _widened(self, values: NDArray[np.float64]) -> Interval:
         """Interval of errors, from the logarithms of each shape."""
         low, high = float((values - self._margin).min()), float((values + self._margin).max())
-        order = self._interval(values, low, high)
-        middle = math.log(order.value)
+        middle = min(max(self._median(values), low), high)
         bounds = (
             middle + side * math.hypot(middle - end, self._shared) for side, end in ((-1, low), (1, high))
         )
-        return Interval(order.value, *(math.exp(x) for x in bounds))
+        return Interval(*(math.exp(x) for x in (middle, *bounds)))
 
     def error_at(self, time: float) -> Interval:
         """Error of a fit of a time."""
@@ -155,8 +154,6 @@ class LearningCurve:
             ends.append(np.where(relative > 0, np.where(self._level < 1, times, -np.inf), np.inf))
         start = math.log(self.last)
         low, high = float(ends[0].min()) + start, float(ends[2].max()) + start
-        order = np.argsort(ends[1])
-        total = np.cumsum(self._weight[order])
-        middle = float(ends[1][order][np.searchsorted(total, 0.5 * total[-1])]) + start
+        middle = self._median(ends[1]) + start
         numbers = (min(max(middle, low), high), low, high)
         return Interval(*(math.exp(x) if x < 700 else math.inf for x in numbers))

@@ -75,7 +75,7 @@ class FitForecast:
 def forecast_fit(config: FitConfig, shards: str | Path | DataFolder) -> FitForecast:
     """Forecast the fit of a configuration; nothing is written.
 
-    Takes about a tenth of the fit's time, see :mod:`~mbtf_fit.training.error_forecast`.
+    Takes a tenth to a half of the fit's steps, see :mod:`~mbtf_fit.training.error_forecast`.
 
     Parameters
     ----------

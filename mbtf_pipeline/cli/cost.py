@@ -8,7 +8,15 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from mbtf_core.app.console import CONSOLE, Console
-from mbtf_core.app.options import ClusterOption, ErrorOption, Output, Set, command_line, whole_number
+from mbtf_core.app.options import (
+    ClusterOption,
+    ErrorOption,
+    Output,
+    Set,
+    check_error,
+    command_line,
+    whole_number,
+)
 from mbtf_core.errors import UsageError
 
 
@@ -48,7 +56,6 @@ def cost(
     from mbtf_core.units import asked_duration
     from mbtf_pipeline.collection.recipes import load
     from mbtf_pipeline.cost.answers import page_answers
-    from mbtf_pipeline.cost.forecast import study_folder
     from mbtf_pipeline.cost.measurement import pareto_front
     from mbtf_pipeline.cost.page import write_page
     from mbtf_pipeline.cost.study import rounded, run_study
@@ -57,11 +64,10 @@ def cost(
     loaded = load(recipe, assignments or [])
     if not isinstance(loaded, Recipe):
         raise UsageError("has several materials", where=recipe, hint="study the recipe of one of them")
-    if error is not None and not 0 < error <= 1:
-        raise UsageError("must be above 0 and at most 1, the error of the mean value", where="--error")
+    check_error(error)
     seconds = asked_duration(time, "--time")
     more = 0.0 if refine is None else asked_duration(refine, "--refine")
-    folder = output if output is not None else study_folder(loaded)
+    folder = output if output is not None else loaded.folder.with_name(f"{loaded.folder.name}-cost")
     keep_on_interruption(f"the measurements are kept in {folder}")
     with (
         open_runner(cluster, console.note) as runner,
@@ -87,15 +93,11 @@ def cost(
             progress=lambda share, note: bar.update(round(100 * share, 1), note),
             runner=runner,
         )
-    evidence, answers = study.evidence, list[str]()
-    if error is not None:
-        asked = evidence.time_of(error)
-        if asked is not None:
-            study.asked = asked[1]
-            answers.append(study.asked)
+    if error is not None and (asked := study.evidence.time_of(error)) is not None:
+        study.asked = asked[1]
     with owned(folder):
         page = write_page(study)
-    front, rows = pareto_front(study.measurements), page_answers(evidence)
+    front, rows = pareto_front(study.measurements), page_answers(study.evidence)
     data = {
         "page": page,
         "measurements": len(study.measurements),
@@ -112,7 +114,7 @@ def cost(
     counts = f"{len(study.measurements)} configurations measured, {len(study.skipped)} skipped"
     lines = [f"{page}: {counts} for lack of time", *(f"failed: {text}" for text in study.failed)]
     lines += [row["line"] for row in rows]
-    lines += answers
+    lines += [study.asked] if study.asked else []
     if not rows and study.least is not None:
         text = (
             f"too few complete runs to tell what a time gives: --time {rounded(study.least)} measures enough"

@@ -21,6 +21,7 @@ from mbtf_core.app.options import (
     Switch,
     Time,
     Verbose,
+    check_error,
     command_line,
 )
 from mbtf_core.errors import InputError, MbtfError, PartialError, UsageError
@@ -54,8 +55,8 @@ def run(
 
     A stage whose inputs have not changed is skipped; the same command again resumes an interrupted run.
     --time is the time of everything: it takes the best preset of --quality that fits, trains for the rest,
-    and replaces the recipe's own times. --dry-run forecasts time and error: by a cost study of the material
-    (mbtf-pipeline cost), or by pilots on data that are generated already.
+    and replaces the recipe's own times. --dry-run forecasts the time, and the error by pilots on data that
+    are generated already.
 
     Parameters
     ----------
@@ -83,8 +84,7 @@ def run(
     command = command_line("mbtf-pipeline", "run", recipe, **given)
     loaded, own = load(recipe, assignments or []), assignments or []
     given |= {"live": live, "dry_run": dry_run}
-    if error is not None and not 0 < error <= 1:
-        raise UsageError("must be above 0 and at most 1, the error of the mean value", where="--error")
+    check_error(error)
     if isinstance(loaded, Collection):
         from mbtf_pipeline.collection.run import run_collection
 

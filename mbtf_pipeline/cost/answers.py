@@ -6,6 +6,7 @@ import statistics
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from mbtf_core.forecast import INSUFFICIENT, expected_error, expected_seconds
@@ -55,6 +56,7 @@ class Evidence:
             statistics.median([m.details["test_error"] for m in runs] or [0.0]),
         )
 
+    @cached_property
     def curve(self) -> LearningCurve | None:
         """The law of their errors; None where they are too few."""
         deviation = Estimate(self.deviation, 0.0, 1, self.degrees) if self.degrees > 0 else None
@@ -79,7 +81,7 @@ class Evidence:
 
     def error_after(self, seconds: float) -> tuple[Interval, str] | None:
         """Expected error of a run of a time, and one line; None where the runs are too few, or all longer."""
-        curve = self.curve()
+        curve = self.curve
         if curve is None or seconds < 0.95 * self.seconds[0]:
             return None
         error = curve.error_at(max(seconds - self.overhead, min(self.work)))
@@ -87,7 +89,7 @@ class Evidence:
 
     def time_of(self, error: float) -> tuple[Interval, str] | None:
         """Expected time of an error, and one line; None where the runs are too few."""
-        curve = self.curve()
+        curve = self.curve
         if curve is None:
             return None
         found, least = curve.time_of(error), self.overhead

@@ -12,11 +12,6 @@ from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.run import DataSet, data_sets, layout_of, survey
 
 
-def study_folder(recipe: Recipe) -> Path:
-    """Folder of a recipe's cost study, by default."""
-    return recipe.folder.with_name(f"{recipe.folder.name}-cost")
-
-
 def has_error(recipe: Recipe, error: float | None) -> Recipe:
     """The recipe with fits that stop at an error; None changes nothing."""
     if error is None:

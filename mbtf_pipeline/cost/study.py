@@ -13,6 +13,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
@@ -83,7 +84,7 @@ class Study:
     asked: str = ""
     least: float | None = None
 
-    @property
+    @cached_property
     def evidence(self) -> Evidence:
         """What the complete runs say of other times and errors."""
         return Evidence.of(self.measurements, self.deviation)
