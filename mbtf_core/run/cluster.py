@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import multiprocessing
 import threading
 import time
 from collections import deque
@@ -27,6 +28,8 @@ from mbtf_core.units import format_duration
 
 # Seconds in which a client of a silent scheduler closes.
 _LAST_SECONDS = 1.0
+# The same in which the workers of this machine end; Dask kills them after five.
+_CLOSE_SECONDS = 20.0
 # Tasks that the scheduler knows at a time, beyond those that run.
 _AHEAD = 256
 # Interval at which a result is waited for.
@@ -35,6 +38,8 @@ _POLL_SECONDS = 0.02
 _LOOK_SECONDS = 2.0
 # The same until the first one has started.
 _START_SECONDS = 0.1
+# Seconds until the first look whether an answer can still be expected.
+_ANSWER_SECONDS = 1.0
 # A task whose files another process works on is tried at this interval, until locks of dead ones have ended.
 _PAUSE_SECONDS, _LOCKED_SECONDS = 10.0, 420.0
 _RESUMES = "the same command goes on with the rest"
@@ -204,18 +209,23 @@ class DaskRunner(Runner):
         distributed = import_extra("distributed", "--cluster")
         if future.status == "cancelled":
             raise OSError("the scheduler has ended")
-        error = future.exception()
+        error = self._answer(future.exception)
         if isinstance(error, distributed.KilledWorker):
             text = "its worker died each time: out of memory, killed, or crashed"
             return Result(item.name, error=text)
         if error is not None:
             return Result(item.name, error=f"{type(error).__name__}: {reason(error)}")
+        return Result(item.name, **self._answer(future.result))
+
+    def _answer(self, ask: Callable[..., Any]) -> Any:
+        """What a call of a future returns; it is computed again where its worker has died."""
+        seconds = _ANSWER_SECONDS
         while True:
             try:
-                return Result(item.name, **future.result(timeout=self._config.timeout))
+                return ask(timeout=seconds)
             except TimeoutError:
-                # It is computed again where its worker has died.
                 self._check()
+                seconds = min(2 * seconds, self._config.timeout)
 
 
 @contextlib.contextmanager
@@ -306,10 +316,16 @@ def _started(config: ClusterConfig, refused: list[str], note: Callable[[str], No
     environment = {THREADS_VARIABLE: str(config.threads), "OMP_NUM_THREADS": str(config.threads)}
     if config.engine != "local":
         return submitted_jobs(config, environment, refused, note)
+    return _local_workers(config, environment)
+
+
+@contextlib.contextmanager
+def _local_workers(config: ClusterConfig, environment: dict[str, str]) -> Iterator[Any]:
+    """A Dask cluster on this machine."""
     dask, distributed = (import_extra(name, "--cluster") for name in ("dask", "distributed"))
     everything = import_extra("distributed.system", "--cluster").MEMORY_LIMIT
     gpus = {GPUS_VARIABLE: str(config.gpus)} if config.gpus else {}
-    return distributed.LocalCluster(
+    cluster = distributed.LocalCluster(
         n_workers=config.workers,
         # One task at a time, which has the threads.
         threads_per_worker=1,
@@ -326,3 +342,14 @@ def _started(config: ClusterConfig, refused: list[str], note: Callable[[str], No
         silence_logs=logging.CRITICAL,
         **config.options,
     )
+    try:
+        yield cluster
+    finally:
+        try:
+            cluster.close(timeout=_CLOSE_SECONDS)
+        except TimeoutError:
+            # Dask before 2026.8 waits for ever for a worker that was killed while it was started again.
+            cluster.shutdown_on_close = False
+            for child in multiprocessing.active_children():
+                if child.name.startswith("Dask Worker"):
+                    child.kill()

@@ -16,6 +16,7 @@ import socket
 import threading
 from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -86,17 +87,23 @@ def failure(error: MbtfError) -> dict[str, Any]:
     return {"error": text, "hint": error.hint, "fatal": fatal, "locked": locked}
 
 
+@cache
+def _version() -> str:
+    """Of this package; reading it takes longer than to submit a task."""
+    return version("mbtf")
+
+
 def packed(function: TaskFunction, item: Item) -> tuple[bytes, str, str]:
     """Arguments of :func:`run_task` for an item: the call, the version of this package, the working
     folder."""
-    return pickle.dumps((function, dict(item.arguments))), version("mbtf"), os.getcwd()
+    return pickle.dumps((function, dict(item.arguments))), _version(), os.getcwd()
 
 
 def run_task(call: bytes, expected: str, folder: str) -> dict[str, Any]:
     """Run a task on a worker, with the arguments that :func:`packed` made, in the working folder where this
     machine has it; returns the fields of :class:`Result` except for the name."""
     worker = {"worker": f"{socket.gethostname()}:{os.getpid()}"}
-    installed = version("mbtf")
+    installed = _version()
     if installed != expected:
         error = f"the worker has version {installed} of mbtf, the command {expected}"
         return {"error": error, "hint": "install the same version on every machine", "fatal": True, **worker}

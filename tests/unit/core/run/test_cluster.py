@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
+import multiprocessing
 import os
 import re
 import signal
@@ -105,6 +107,22 @@ def test_workers_that_die_each_time_are_reported(cluster: Runner) -> None:
     assert "died each time" in done.error
     (after,) = cluster.map(run_tasks.double, [Item("after", {"x": 1})])
     assert after.value == 2
+
+
+@pytest.mark.timeout(120)
+def test_workers_that_dask_cannot_close_are_killed(monkeypatch: pytest.MonkeyPatch) -> None:
+    distributed = pytest.importorskip("distributed")
+
+    async def close(nanny: Any, *arguments: Any, **options: Any) -> None:
+        await asyncio.Event().wait()
+
+    monkeypatch.setattr(distributed.Nanny, "close", close)
+    monkeypatch.setattr(module, "_CLOSE_SECONDS", 0.5)
+    before = set(multiprocessing.active_children())
+    with open_runner("local:1", lambda line: None):
+        (worker,) = set(multiprocessing.active_children()) - before
+    worker.join()
+    assert worker.exitcode == -signal.SIGKILL
 
 
 def test_tasks_for_gpus_run_where_none_is_stated(cluster: Runner) -> None:
