@@ -28,10 +28,38 @@ uint hash(uint x) {
   return x;
 }
 
+// Of more elongated footprints the minor radius is enlarged.
+const float MAX_ANISOTROPY = 16.0;
+
+// Quantile of the normal distribution (Winitzki's approximation of the inverse error function).
+float normal_quantile(float p) {
+  float x = 2.0 * p - 1.0, l = log(max(1.0 - x * x, 1e-7)), q = 4.33 + 0.5 * l;
+  return sign(x) * sqrt(2.0 * (sqrt(q * q - l / 0.147) - q));
+}
+
+// Place (in tile widths, relative to the pixel's) and sigma of one of the round footprints whose mean is the
+// pixel's elongated one. The first frame has the round footprint of the same area.
+vec3 round_footprint(vec2 dx, vec2 dy) {
+  float area = abs(dx.x * dy.y - dx.y * dy.x);
+  if (frame == 0) return vec3(0.0, 0.0, 0.5 * sqrt(area));
+  // Squared radii of the ellipse, and the direction of the major one.
+  float xy = dx.x * dx.y + dy.x * dy.y, difference = 0.5 * (dx.x * dx.x + dy.x * dy.x - dx.y * dx.y - dy.y * dy.y);
+  float major = 0.5 * (dot(dx, dx) + dot(dy, dy)) + length(vec2(difference, xy));
+  float minor = max(area * area / max(major, 1e-20), major / (MAX_ANISOTROPY * MAX_ANISOTROPY));
+  float angle = 0.5 * atan(xy, difference);
+  uint pixel = uint(gl_FragCoord.x) * 2749u + uint(gl_FragCoord.y) * 6997u;
+  // Frames are steps of the golden ratio, which fill the interval evenly.
+  float number = fract(float(hash(pixel) >> 8) / 16777216.0 + 0.6180340 * float(frame));
+  float along = 0.5 * sqrt(max(major - minor, 0.0)) * normal_quantile(number);
+  return vec3(along * cos(angle), along * sin(angle), 0.5 * sqrt(minor));
+}
+
 void main() {
-  // The pixel's filter has a standard deviation of half a pixel; the footprint is isotropic.
-  vec2 dx = dFdx(uv_there) * vec2(1.0, ASPECT), dy = dFdy(uv_there) * vec2(1.0, ASPECT);
-  float sigma = 0.5 * sqrt(abs(dx.x * dy.y - dx.y * dy.x));
+  // The pixel's filter has a standard deviation of half a pixel.
+  vec2 shape = vec2(1.0, ASPECT);
+  vec3 footprint = round_footprint(dFdx(uv_there) * shape, dFdy(uv_there) * shape);
+  vec2 uv = uv_there + footprint.xy / shape;
+  float sigma = footprint.z;
   vec3 n = normalize(normal_there), towards = normalize(camera - world);
   vec3 t = normalize(tangent_there.xyz - n * dot(n, tangent_there.xyz));
   float hand = tangent_there.w;
@@ -42,9 +70,9 @@ void main() {
   vec3 b = hand * cross(n, t);
   vec3 view = vec3(dot(towards, t), dot(towards, b), dot(towards, n));
   vec3 omega_o = raised(view);
-  if (shown == 1) { color = vec4(uv_there - floor(uv_there), sigma, 1.0); return; }
+  if (shown == 1) { color = vec4(uv - floor(uv), sigma, 1.0); return; }
   if (shown == 2) { color = vec4(omega_o, 1.0); return; }
-  Seen seen = stage1(uv_there, sigma, omega_o);
+  Seen seen = stage1(uv, sigma, omega_o);
   vec3 sum = vec3(0.0);
   int count = light_count + (has_environment ? 1 : 0);
   for (int k = 0; k < count; k++) {
@@ -67,5 +95,5 @@ void main() {
 #ifdef TRACED
   if (shown == 3) { color = vec4(visited); return; }
 #endif
-  color = vec4(sum, 1.0 - transmittance(uv_there, sigma, omega_o));
+  color = vec4(sum, 1.0 - transmittance(uv, sigma, omega_o));
 }

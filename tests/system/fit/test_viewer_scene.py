@@ -112,6 +112,36 @@ def test_pictures_are_those_of_the_same_camera(
     assert (found[..., 3] == 1).all()
 
 
+@pytest.mark.parametrize("azimuth", [-90, 20])
+def test_round_footprints_of_the_frames_add_up_to_the_ellipse_of_a_pixel(page: Page, azimuth: float) -> None:
+    """A pixel sees an ellipse of the plane, which is 1/sin of the elevation as long as wide, towards the
+    camera. Its covariance is that of the places plus that of the footprints around them."""
+    page.set({"camera": view(12, azimuth, 1, 0.5, 0.25), "lights": [LIGHT], "material": 0})
+    code = """
+        const { viewer } = window.mbtf, { renderer } = viewer, size = arguments[0], found = [];
+        const target = renderer.mean("test", size, size, 1).latest;
+        for (let frame = 0; frame < 65; frame++) {
+            renderer._scene(viewer.material, target, viewer.scene, { shown: 1, frame }, [0, 0, size, size]);
+            found.push([...target.read(0, 0, size, size)]);
+        }
+        return found;
+    """
+    size, aspect = 64, 0.5
+    middle = slice(24, 40), slice(24, 40)
+    found = np.array(page.js(code, size)).reshape(-1, size, size, 4)[:, ::-1]
+    q = Camera(12, azimuth, 1, (0.5, 0.25), rows=size, columns=size).queries(np.array([0, 0, 1.0]), aspect)
+    assert np.median(found[0, ..., 2] / q.sigma) == pytest.approx(1, abs=0.03)
+    step = ((found[1:, ..., :2] - found[0, ..., :2] + 0.5) % 1 - 0.5) * (1, aspect)
+    along = q.omega_o[..., :2] / np.linalg.norm(q.omega_o[..., :2], axis=-1)[..., None]
+    across = np.stack([-along[..., 1], along[..., 0]], -1)
+    expected = q.omega_o[..., 2] ** -1.0 * q.sigma**2, q.omega_o[..., 2] * q.sigma**2, np.zeros((size, size))
+    for (a, b), variance in zip(((along, along), (across, across), (along, across)), expected, strict=True):
+        places = ((step * a).sum(-1) * (step * b).sum(-1)).mean(0)
+        covariance = places + (found[1, ..., 2] ** 2 if a is b else 0.0)
+        # Around the center, where rays are parallel to the camera's axis.
+        assert np.median((covariance - variance)[middle] / expected[1][middle]) == pytest.approx(0, abs=0.15)
+
+
 def test_each_side_has_the_tile_of_its_material(page: Page, tmp_path: Path) -> None:
     materials = [make("calibrated", tmp_path / "half"), square(tmp_path / "square")]
     light = from_angles(40.0, 20.0)
