@@ -119,7 +119,7 @@ class RunForecaster:
         return RunForecast(
             start=_START + (start if paths else 0.0),
             generating=paths * path,
-            training=sum(fit.training.time for fit in fits.values() if fit.training.steps is None),
+            training=sum(fit.training.time.seconds for fit in fits.values() if fit.training.steps is None),
             evaluating=len(fits) * evaluation_seconds(queries),
             comparing=comparing,
             bytes=size,
@@ -278,7 +278,7 @@ class TimedRun:
 
 def _trained(recipe: Recipe, seconds: float) -> Recipe:
     """The recipe with a training time of each fit."""
-    time = {"training": {"time": seconds, "steps": None, "min_steps": 0}}
+    time = {"training": {"time": seconds, "steps": None}}
     fits = {
         name: FitConfig.model_validate(deep_merge(fit.model_dump(), time)) for name, fit in recipe.fit.items()
     }

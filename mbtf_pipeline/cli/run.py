@@ -185,7 +185,7 @@ def _report_collection(done: CollectionResult, folder: Path, console: Console) -
 
 
 def _report(result: RunResult, console: Console, quality: Quality | None) -> None:
-    from mbtf_fit.training.fit import describe_ending
+    from mbtf_fit.training.endings import describe_ending
     from mbtf_fit.training.fit_folder import read_history
     from mbtf_pipeline.recipe import read_resolved
     from mbtf_pipeline.stages import FITS

@@ -16,8 +16,8 @@ from mbtf_core.stats import Estimate, Interval
 from mbtf_fit import fit
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries
+from mbtf_fit.training.endings import describe_ending, reached
 from mbtf_fit.training.error_forecast import ErrorForecast
-from mbtf_fit.training.fit import describe_ending, reached
 from mbtf_fit.training.forecast import forecast_fit
 from mbtf_fit.training.trainer import Trainer
 

@@ -14,6 +14,7 @@ from support.fit_data import F32, parallax, write_data
 from support.known_surfaces import geometry, rough_heights
 
 import mbtf_fit.training.fit
+import mbtf_fit.training.fit_export
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
 from mbtf_fit import FitConfig, FitResult, Material, fit
@@ -208,7 +209,7 @@ def test_a_killed_joint_fit_ends_with_the_same_bits(
     config = joint_config(model, steps=9)
     whole = fit_two(config, data, tmp_path / "whole")
     random = np.random.default_rng(0)
-    out, step, export = tmp_path / "killed", Trainer._step, mbtf_fit.training.fit.export_fit
+    out, step, export = tmp_path / "killed", Trainer._step, mbtf_fit.training.fit_export.export_fit
     kills, exports = 0, 0
     save = mbtf_fit.training.fit.write_checkpoint
     while not (out / "decoder" / "decoder.json").exists():
@@ -235,7 +236,7 @@ def test_a_killed_joint_fit_ends_with_the_same_bits(
                 save(loop, path)
 
         monkeypatch.setattr(Trainer, "_step", dying)
-        monkeypatch.setattr(mbtf_fit.training.fit, "export_fit", dying_export)
+        monkeypatch.setattr(mbtf_fit.training.fit_export, "export_fit", dying_export)
         monkeypatch.setattr(mbtf_fit.training.fit, "write_checkpoint", forgetful)
         try:
             found = fit_two(config, data, out)

@@ -104,7 +104,7 @@ def test_texels_without_a_gradient_decay_with_the_rate(compiled: bool) -> None:
 
 def test_a_time_budget_takes_its_fewest_steps() -> None:
     """Schedules follow whichever is behind, so that they end with the training."""
-    t = trainer(queries(), steps=None, time=1e-3, min_steps=4)
+    t = trainer(queries(), steps=None, time="0.001s, at least 4 steps")
     fractions = []
     step = t._step
 
@@ -115,7 +115,7 @@ def test_a_time_budget_takes_its_fewest_steps() -> None:
     t._step = recorded  # type: ignore[method-assign]
     train_fully(t)
     assert fractions == [0.0, 0.25, 0.5, 0.75]
-    assert trainer(queries(), steps=None, time=1e3, min_steps=1).fraction == 0.0
+    assert trainer(queries(), steps=None, time="1h, at least 1 steps").fraction == 0.0
 
 
 def test_a_time_budget_ends_training_and_annealing() -> None:
