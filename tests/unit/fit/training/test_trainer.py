@@ -17,7 +17,14 @@ from mbtf_fit.data.loader import load_training, open_data
 from mbtf_fit.data.queries import ShardQueries, TrainingQueries
 from mbtf_fit.objective.parallel import Workers
 from mbtf_fit.sections import TrainingSection
-from mbtf_fit.training.trainer import Trainer, WeightDecay, learning_rate_factor, prepare_trainer
+from mbtf_fit.training.loop import TrainingLoop, restore, snapshot, state_tensors
+from mbtf_fit.training.trainer import (
+    Trainer,
+    TrainingProgress,
+    WeightDecay,
+    learning_rate_factor,
+    prepare_trainer,
+)
 
 LATTICE = Lattice(3)
 
@@ -126,6 +133,18 @@ def test_a_time_budget_ends_training_and_annealing() -> None:
     tables = t._tables()
     assert tables[0] is pyramid.texels
     torch.testing.assert_close(tables[1], offset.blurred(2.0))
+
+
+def test_a_snapshot_keeps_a_state_however_often_training_goes_on() -> None:
+    loop = TrainingLoop([trainer(queries())])
+    loop.train(0.0)
+    expected = {name: tensor.tolist() for name, tensor in state_tensors(loop).items()}
+    start = snapshot(loop)
+    for _ in range(2):
+        loop.train(0.0)
+        assert {name: tensor.tolist() for name, tensor in state_tensors(loop).items()} != expected
+        restore(loop, start, TrainingProgress(1))
+        assert {name: tensor.tolist() for name, tensor in state_tensors(loop).items()} == expected
 
 
 def test_each_texture_keeps_its_least_blur() -> None:
