@@ -159,9 +159,11 @@ def test_each_texture_keeps_its_least_blur() -> None:
     torch.testing.assert_close(pyramid.export()["3"].reshape(64, -1), pyramid.blurred(0.7)[-64:].detach())
 
 
+@pytest.mark.parametrize("compiled", [True, False])
 @pytest.mark.parametrize("poison", ["pyramid.texels", "offset_texture.texels", "offset_network.3.bias"])
-def test_divergence_is_one_error_with_a_hint(poison: str) -> None:
+def test_divergence_is_one_error_with_a_hint(poison: str, compiled: bool) -> None:
     t = trainer(queries())
+    t._stepper = t._stepper if compiled else None
     with torch.no_grad():
         t.model.get_parameter(poison).fill_(torch.nan)
     with pytest.raises(InputError, match=r"diverged at step 1: its batch .*\n.*--learning-rate 0\.01 "):
