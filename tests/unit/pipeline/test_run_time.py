@@ -182,6 +182,14 @@ def test_all_stages_count(fake: Machine) -> None:
     by_steps = forecaster.of(load_recipe(FILE, ["fit.neumip.training.steps=100"]))
     assert by_steps.training == 80.0
     assert by_steps.describe().endswith(", and the steps of neumip")
+    # Steps that pilots have timed, and others.
+    recipe = preset_recipe(FILE, "draft")
+    found = forecaster.of(recipe, training={"relief": 50.0})
+    assert found.training == 50.0 + 12.0 * (len(recipe.fit) - 1)
+    assert found.describe().endswith(", or longer for 800 steps of training")
+    timed = forecaster.of(recipe, training=dict.fromkeys(recipe.fit, 50.0))
+    assert (timed.training, timed.min_steps) == (50.0 * len(recipe.fit), 0)
+    recipe = load_recipe(FILE)
     # What is finished costs nothing.
     left = forecaster.of(recipe, ["fit neumip", "compare", "report"])
     assert (left.generating, left.training) == (0.0, 60.0)

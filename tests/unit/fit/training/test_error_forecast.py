@@ -126,6 +126,17 @@ def test_too_few_steps_give_no_forecast(law: list[tuple[int, int]], shards: Path
     assert "30 steps are too few" in found.describe()
 
 
+def test_an_ending_names_the_limit_that_came_last() -> None:
+    for budget, seconds, step, limit in (
+        ("5s", 5.01, 900, "0:05"),
+        ("5s, at least 800 steps", 5.01, 900, "0:05"),
+        ("5s, at least 800 steps", 9.0, 800, "800 steps"),
+    ):
+        last = {"unexplained": 0.3, "unexplained_error": 0.01, "seconds": seconds, "step": step}
+        ending = str(describe_ending(config(time=budget, error=0.1), [last]))
+        assert ending.startswith(f"stopped after {limit}: ")
+
+
 def test_training_stops_once_the_error_is_reached(
     shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
