@@ -219,9 +219,6 @@ def resolve_config(
         presets |= fitter_options(quality, {"": overrides})[""]
     if overrides["model"] == kept.get("model"):
         presets |= kept
-    if "training.time" in options.given:
-        # A time overrides the number of steps of a file or a preset.
-        presets["training.steps"] = None
     return options.resolve(presets)
 
 

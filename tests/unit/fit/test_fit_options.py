@@ -29,8 +29,11 @@ def test_flags_override_assignments_presets_and_files(tmp_path: Path) -> None:
     found = config_of(*words, "--set", "training.steps=8", "--steps", "2")
     assert found.model == "neumip-baseline"
     assert (found.training.steps, found.training.batch, found.training.warmup) == (2, 400, 7)
-    found = config_of(*words, "--time", "1min")
-    assert (found.training.steps, found.training.time) == (None, TimeBudget(60.0))
+    for time in (("--time", "1min"), ("--set", "training.time=1min"), ("--set", "training={time: 1min}")):
+        found = config_of(*words, *time)
+        assert (found.training.steps, found.training.time) == (None, TimeBudget(60.0))
+    found = config_of("--quality", "draft", "--set", "training={steps: 3}")
+    assert found.training.steps == 3
     found = config_of("--quality", "paper", "--batch", "500")
     assert (found.training.steps, found.training.batch, found.network.width) == (30_000, 500, 64)
 
