@@ -154,10 +154,7 @@ class TrainingSection(Settings):
 
     time: Annotated[
         TimeBudget, BeforeValidator(TimeBudget.parse), PlainSerializer(str), Flag("--time", "DURATION")
-    ] = Field(
-        TimeBudget(120.0),
-        description="time budget: 90s, 2min, 1h, or with the fewest steps: 12s, at least 800 steps",
-    )
+    ] = Field(TimeBudget(120.0), description="time budget: 90s, 2min, 1h")
     steps: Annotated[int | None, Flag("--steps")] = Field(
         None, ge=1, description="number of training steps, in place of a time"
     )

@@ -63,9 +63,9 @@ def fit(
     """Fit a material to a data set: mbtf-fit shards/ -o material/
 
     The same command again resumes an unfinished fit. --time is that of training, without loading, validation
-    and evaluation. --quality trains 800 steps at least, even if they take longer. --dry-run forecasts time
-    and size by some seconds of training on this machine. With --many, the output folder holds one folder per
-    material.
+    and evaluation. --quality trains 800 steps at least, even if they take longer, as does --time "12s, at
+    least 800 steps". --dry-run forecasts time and size by some seconds of training on this machine. With
+    --many, the output folder holds one folder per material.
 
     Parameters
     ----------
