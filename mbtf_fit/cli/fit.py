@@ -255,10 +255,10 @@ def _fit_many(
     console: Console,
 ) -> None:
     """Fit several data sets, each on its own or all with one network."""
-    from mbtf_fit.training.fit_many import find_data, name_materials
+    from mbtf_fit.training.fit_many import find_data, material_folders
 
     shards = find_data(many)
-    folders = name_materials(shards, output)
+    folders = material_folders(shards, output)
     config = resolve_config(options, quality, *shards)
     if not config.training.shared_decoder:
         configs = [resolve_config(options, quality, folder) for folder in shards]
