@@ -32,7 +32,7 @@ from mbtf_core.config.settings import resolve
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import data_sha256, read_json, write_json
 from mbtf_core.units import clock
-from mbtf_fit.config import FITTER, FitConfig, best_at
+from mbtf_fit.config import FitConfig, fitter_options
 from mbtf_gen.config.generator import GENERATOR, RESOLUTION, GeneratorConfig
 from mbtf_pipeline.recipe import COMPARE
 from mbtf_pipeline.stages import machine
@@ -93,7 +93,7 @@ class MeasuredRun:
 
 def options_hash(quality: Quality) -> str:
     """Hash of all options of a preset and of the fitter's other training options."""
-    options = best_at(quality) | FITTER[quality]
+    options = fitter_options(quality, {"": {}})[""]
     training = resolve(FitConfig, presets=options).training.model_dump(mode="json")
     return data_sha256([GENERATOR[quality], options, training, COMPARE[quality]])[:12]
 

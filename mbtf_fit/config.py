@@ -108,11 +108,11 @@ class FitConfig(Settings):
 
     def fields(self) -> dict[str, Any]:
         """Options that determine the fit, as plain data: all but device and memory, and without those of
-        shared networks, the fewest steps and an error to stop at where they are not used."""
+        shared networks and an error to stop at where they are not used."""
         found = self.model_dump(mode="json", exclude={"device", "data"})
         if self.decoder is None:
             del found["decoder"]
-        for name in ("shared_decoder", "min_steps", "error"):
+        for name in ("shared_decoder", "error"):
             if not found["training"][name]:
                 del found["training"][name]
         return found
@@ -171,13 +171,14 @@ _RELIEF: _Sizes = (
 # Models that have such options.
 _MODELS: tuple[ModelName, ...] = ("relief", "neumip+", "neumip", "neumip-baseline")
 
-_MIN_STEPS = "training.min_steps"
-# Budget of each preset. After 800 steps, twice the steps leave 0.93 of the error or more, except on glossy
-# materials (``benchmarks/advice.py``). Two free cores take about 7 s for them.
+# Fewest steps of these models. Twice as many leave 0.93 of the error or more, except on glossy materials
+# (``benchmarks/advice.py``). Two free cores take about 7 s for them; steps of other models take longer.
+_MIN_STEPS = 800
+# Budget of each preset.
 FITTER: dict[Quality, dict[str, Any]] = {
-    "draft": {"training.time": "12s", "training.steps": None, _MIN_STEPS: 800},
-    "standard": {"training.time": "3min", "training.steps": None, _MIN_STEPS: 800},
-    "high": {"training.time": "10min", "training.steps": None, _MIN_STEPS: 800},
+    "draft": {"training.time": "12s", "training.steps": None},
+    "standard": {"training.time": "3min", "training.steps": None},
+    "high": {"training.time": "10min", "training.steps": None},
     # Kuznetsov et al. 2021: 30 000 steps of 2^20 queries.
     "paper": {"training.steps": 30_000, "training.batch": 1 << 20},
 }
@@ -226,8 +227,7 @@ def fitter_options(
             if (free if key.startswith("network.") else key.split(".")[1] not in training)
         }
         budget = dict(FITTER[quality])
-        if model not in _MODELS:
-            # Their steps take many times as long.
-            budget.pop(_MIN_STEPS, None)
+        if "training.time" in budget and model in _MODELS:
+            budget["training.time"] += f", at least {_MIN_STEPS} steps"
         out[name] = kept | budget
     return out

@@ -3,13 +3,15 @@ queries."""
 
 from __future__ import annotations
 
+import re
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, model_validator
 
 from mbtf_core.app.options import Flag
 from mbtf_core.config.settings import Settings
-from mbtf_core.units import Duration, Size
+from mbtf_core.units import Size, format_duration, parse_duration
 
 OutputTransform = Literal["expm1", "exp", "identity", "softplus", "fourth-root"]
 LossKind = Literal["relative", "squared", "linear", "log", "fourth-root", "gradient"]
@@ -112,17 +114,49 @@ class LossTerm(Settings):
     start: float = Field(0.0, ge=0, lt=1, description="fraction of the training after which the term counts")
 
 
+@dataclass(frozen=True)
+class TimeBudget:
+    """Training time.
+
+    Attributes
+    ----------
+    seconds : of training
+    min_steps : fewest steps: a slow or busy machine takes longer for them
+    """
+
+    seconds: float
+    min_steps: int = 0
+
+    @classmethod
+    def parse(cls, text: TimeBudget | str | float) -> TimeBudget:
+        """The budget of ``90s`` or ``12s, at least 800 steps``.
+
+        Raises
+        ------
+        ValueError : neither of these
+        """
+        if isinstance(text, TimeBudget):
+            return text
+        match = re.fullmatch(r"(.*), at least (\d+) steps", str(text))
+        return cls(parse_duration(text)) if match is None else cls(parse_duration(match[1]), int(match[2]))
+
+    def __str__(self) -> str:
+        least = f", at least {self.min_steps} steps" if self.min_steps else ""
+        return f"{format_duration(self.seconds)}{least}"
+
+    def spent(self, seconds: float, steps: int) -> float:
+        """Fraction of the budget, in [0, 1], after so many seconds and steps."""
+        return min(1.0, seconds / self.seconds, *([steps / self.min_steps] if self.min_steps else []))
+
+
 class TrainingSection(Settings):
     """Budget, loss and optimizer."""
 
-    time: Annotated[Duration, Flag("--time", "DURATION")] = Field(
-        120.0, description="time budget: 90s, 2min, 1h"
-    )
+    time: Annotated[
+        TimeBudget, BeforeValidator(TimeBudget.parse), PlainSerializer(str), Flag("--time", "DURATION")
+    ] = Field(TimeBudget(120.0), description="time budget: 90s, 2min, 1h")
     steps: Annotated[int | None, Flag("--steps")] = Field(
         None, ge=1, description="number of training steps, in place of a time"
-    )
-    min_steps: int = Field(
-        0, ge=0, description="fewest steps of a time budget: a slow or busy machine takes longer for them"
     )
     error: Annotated[float | None, Flag("--error")] = Field(
         None,

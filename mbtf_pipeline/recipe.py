@@ -245,8 +245,6 @@ def quality_options(
     preset = generator_options(quality, generate if isinstance(generate, Mapping) else {})
     out = COMPARE[quality] | {f"generate.{key}": value for key, value in preset.items()}
     for prefix, options in fitter_options(quality, own, training).items():
-        if any(text.startswith(f"{prefix}.training.time=") for text in assignments):
-            options.pop("training.min_steps", None)
         out |= {f"{prefix}.{key}": value for key, value in options.items()}
     return out
 
@@ -282,7 +280,7 @@ def write_recipe(recipe: Recipe, folder: Path, *, overwrite: bool = False) -> No
     ------
     InputError : there is one that has been edited, unless it is to be overwritten
     """
-    from mbtf_core.files.folders import write_document
+    from mbtf_core.files.editable import write_document
 
     data = recipe.model_dump(mode="json")
     data["generate"]["material"] = os.path.relpath(recipe.generate.material, folder)

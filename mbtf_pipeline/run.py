@@ -182,7 +182,7 @@ class _RecipeRun:
                 raise PartialError(done.error, where=fit_stage(name), hint="the same command resumes the run")
             return 0.0
         steps = config.training.steps
-        budget, unit = (config.training.time, "s") if steps is None else (steps, "steps")
+        budget, unit = (config.training.time.seconds, "s") if steps is None else (steps, "steps")
         with self.console.progress(budget, fit_stage(name), unit) as bar:
             done = fit(
                 config,

@@ -13,6 +13,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 
 from mbtf_core.app.options import Quality
 from mbtf_core.config.settings import deep_merge
@@ -53,6 +54,7 @@ class RunForecast:
     generating, training, evaluating, comparing : seconds of these; evaluating includes loading
     bytes : on disk
     by_steps : names of the fits that count steps, whose training is not included
+    min_steps : fewest steps of a fit, for which training may take longer than its time; 0 where that is known
     """
 
     start: float
@@ -62,6 +64,7 @@ class RunForecast:
     comparing: float
     bytes: int
     by_steps: tuple[str, ...]
+    min_steps: int
 
     @property
     def seconds(self) -> float:
@@ -74,7 +77,8 @@ class RunForecast:
             f"{expectation(self.seconds, self.bytes)} (generate {clock(self.generating)}, "
             f"fit {clock(self.training + self.evaluating)}, compare {clock(self.comparing)})"
         )
-        return f"{text}, and the steps of {', '.join(self.by_steps)}" if self.by_steps else text
+        longer = f", or longer for {self.min_steps} steps of training" if self.min_steps else ""
+        return text + longer + (f", and the steps of {', '.join(self.by_steps)}" if self.by_steps else "")
 
 
 class RunForecaster:
@@ -94,9 +98,14 @@ class RunForecaster:
         return found.start, found.query_seconds / self.recipe.generate.queries.spp
 
     def of(
-        self, recipe: Recipe, stages: Collection[str] | None = None, speed: tuple[float, float] | None = None
+        self,
+        recipe: Recipe,
+        stages: Collection[str] | None = None,
+        speed: tuple[float, float] | None = None,
+        training: Mapping[str, float] = MappingProxyType({}),
     ) -> RunForecast:
-        """Forecast of some stages of a recipe of this material, by default of all, at the pilot's speed."""
+        """Forecast of some stages of a recipe of this material, by default of all, at the pilot's speed;
+        `training`: seconds of the fits whose steps have been timed."""
         from mbtf_fit.training.forecast import evaluation_seconds, fit_bytes
         from mbtf_gen.job import data_bytes
 
@@ -116,14 +125,17 @@ class RunForecaster:
             traced = pixels * len(compare.kinds)
             comparing = _COMPARE + traced * compare.spp * path
             size += traced * _REFERENCE_BYTES + pixels * len(recipe.fit) * _FIT_BYTES
+        untimed = {name: fit.training for name, fit in fits.items() if name not in training}
+        by_time = [budget.time for budget in untimed.values() if budget.steps is None]
         return RunForecast(
             start=_START + (start if paths else 0.0),
             generating=paths * path,
-            training=sum(fit.training.time for fit in fits.values() if fit.training.steps is None),
+            training=sum(training.values()) + sum(budget.seconds for budget in by_time),
             evaluating=len(fits) * evaluation_seconds(queries),
             comparing=comparing,
             bytes=size,
-            by_steps=tuple(name for name, fit in fits.items() if fit.training.steps is not None),
+            by_steps=tuple(name for name, budget in untimed.items() if budget.steps is not None),
+            min_steps=max((budget.min_steps for budget in by_time), default=0),
         )
 
 
@@ -278,7 +290,7 @@ class TimedRun:
 
 def _trained(recipe: Recipe, seconds: float) -> Recipe:
     """The recipe with a training time of each fit."""
-    time = {"training": {"time": seconds, "steps": None, "min_steps": 0}}
+    time = {"training": {"time": seconds, "steps": None}}
     fits = {
         name: FitConfig.model_validate(deep_merge(fit.model_dump(), time)) for name, fit in recipe.fit.items()
     }

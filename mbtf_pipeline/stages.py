@@ -21,7 +21,8 @@ from typing import Any, NamedTuple
 
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import data_sha256, file_sha256, read_json, write_json
-from mbtf_core.files.folders import OutputKind, changed
+from mbtf_core.files.editable import changed
+from mbtf_core.files.folders import OutputKind
 from mbtf_pipeline.recipe import Recipe, write_recipe
 
 STAMP_FORMAT = "mbtf-stage"

@@ -152,7 +152,7 @@ def _row(prefix: str, name: str, info: FieldInfo) -> Row:
     # A number that is written with its unit, such as 2min or 4GB.
     if (
         not info.is_required()
-        and kind in ("number", "whole number")
+        and kind in ("number", "whole number", "TimeBudget")
         and isinstance(_plain_default(info), str)
     ):
         kind = "number with unit"

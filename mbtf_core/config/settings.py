@@ -46,7 +46,8 @@ class Settings(BaseModel):
 
     Attributes
     ----------
-    exclusive : class attribute, pairs of dotted keys that a file or a command line must not both give
+    exclusive : class attribute, pairs of dotted keys that a file or a command line must not both give; one of
+        a command line replaces the other of file and presets
     """
 
     exclusive: ClassVar[tuple[tuple[str, str], ...]] = ()
@@ -206,15 +207,19 @@ def _over_presets(presets: Any, key: str, value: Any) -> tuple[str, Any]:
     return key, deep_merge(presets, value) if both else value
 
 
-def _contradiction(model: type[Settings], data: Mapping[str, Any]) -> tuple[str, str] | None:
-    """The first two keys of nested data that the model declares exclusive, at any depth."""
+def _excluded(model: type[Settings], data: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Keys of nested data, and what the model declares exclusive to each, at any depth."""
     given = [key for key, value in leaves(data) if value is not None]
-    for key in given:
-        for first, second in model.exclusive:
-            other = key.removesuffix(first) + second
-            if f".{key}".endswith(f".{first}") and other in given:
-                return key, other
-    return None
+    for mine, other in (*model.exclusive, *(pair[::-1] for pair in model.exclusive)):
+        for key in given:
+            if f".{key}".endswith(f".{mine}"):
+                yield key, key.removesuffix(mine) + other
+
+
+def _contradiction(model: type[Settings], data: Mapping[str, Any]) -> tuple[str, str] | None:
+    """The first two keys of nested data that the model declares exclusive."""
+    found = dict(_excluded(model, data))
+    return next(((key, other) for key, other in found.items() if other in found), None)
 
 
 def explicit_options(file: Path | None, assignments: Sequence[str]) -> dict[str, Any]:
@@ -257,12 +262,14 @@ def resolve(
     UsageError : an assignment or a flag is at fault
     """
     data: Any = read_yaml(file) if file is not None else {}
-    defaults = dict(presets or {})
-    own = [_over_presets(nested(defaults), *parse_assignment(text)) for text in assignments]
     switches = [(key, value) for key, value in (flags or {}).items() if value is not None]
-    given = [*defaults.items(), *own, *switches]
     names = {key: flag for key, flag in (spelled or {}).items() if (flags or {}).get(key) is not None}
-    both = _contradiction(model, nested(dict(own) | {key: value for key, value in switches if key in names}))
+    said = nested(dict(map(parse_assignment, assignments)) | dict(switches))
+    replaced = {other for _, other in _excluded(model, said)}
+    defaults = {key: value for key, value in (presets or {}).items() if key not in replaced}
+    own = [_over_presets(nested(defaults), *parse_assignment(text)) for text in assignments]
+    given = [*defaults.items(), *own, *switches]
+    both = _contradiction(model, said)
     if both:
         raise UsageError(
             " and ".join(names.get(key, f"'{key}'") for key in both) + " are mutually exclusive",
@@ -282,6 +289,8 @@ def resolve(
         resolved = build(model, data, source=str(file))
         if not given:
             return resolved
+    for key in replaced:
+        _remove(data, key.split("."))
     for key, value in given:
         merge(data, key.split("."), value)
     return build(model, data, source=_COMMAND_LINE, error=UsageError, spelled=names)
@@ -294,6 +303,14 @@ def merge(base: Any, path: Sequence[str], value: Any) -> None:
             base[part] = {}
         base = base[part]
     base[path[-1]] = value
+
+
+def _remove(base: Any, path: Sequence[str]) -> None:
+    """Remove ``base[path[0]][path[1]]…`` of nested mappings, where it is."""
+    for part in path[:-1]:
+        base = base.get(part) if isinstance(base, Mapping) else None
+    if isinstance(base, Mapping):
+        base.pop(path[-1], None)  # type: ignore[attr-defined]
 
 
 def nested(options: Mapping[str, Any]) -> dict[str, Any]:

@@ -101,6 +101,10 @@ class DataFolder:
         found.refresh()
         return found
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Another process opens it anew."""
+        return DataFolder.open, (str(self),)
+
     def __str__(self) -> str:
         return self.store.url
 

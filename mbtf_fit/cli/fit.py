@@ -26,7 +26,7 @@ from mbtf_core.app.options import (
 from mbtf_core.app.progress import Progress
 from mbtf_core.errors import InputError, PartialError, UsageError
 from mbtf_core.run.signals import keep_on_interruption
-from mbtf_core.units import expectation, format_duration
+from mbtf_core.units import expectation
 from mbtf_fit.cli.live import Live, live_view
 from mbtf_fit.config import DEFAULT_MODEL, FIBER_MODEL, FitConfig, ModelName, decoder_models
 from mbtf_fit.formatting import describe_fit, fits_table
@@ -63,9 +63,9 @@ def fit(
     """Fit a material to a data set: mbtf-fit shards/ -o material/
 
     The same command again resumes an unfinished fit. --time is that of training, without loading, validation
-    and evaluation. --quality trains 800 steps at least, even if they take longer. --dry-run forecasts time
-    and size by some seconds of training on this machine. With --many, the output folder holds one folder per
-    material.
+    and evaluation. --quality trains 800 steps at least, even if they take longer, as does --time "12s, at
+    least 800 steps". --dry-run forecasts time and size by some seconds of training on this machine. With
+    --many, the output folder holds one folder per material.
 
     Parameters
     ----------
@@ -128,7 +128,8 @@ def _fit_one(
 ) -> None:
     """Fit a data set, watched by whoever asks for it."""
     from mbtf_fit.material.format import DESCRIPTION_NAME
-    from mbtf_fit.training.fit import describe_ending, fit
+    from mbtf_fit.training.endings import describe_ending
+    from mbtf_fit.training.fit import fit
     from mbtf_fit.training.fit_folder import EventLog
 
     finished = not overwrite and (output / DESCRIPTION_NAME).exists()
@@ -193,12 +194,10 @@ def _announce(
     size = sum(fit_bytes(config, one.lattice) for one in data)
     check_space(output, size, "reduce network.channels, or choose another folder with -o")
     training = config.training
-    budget = format_duration(training.time) if training.steps is None else f"{training.steps} steps"
-    if training.steps is None and training.min_steps:
-        budget += f", {training.min_steps} steps at least"
+    budget = training.time if training.steps is None else f"{training.steps} steps"
     console.note(f"{what}, training for {budget} (change it with --time or --steps)")
     queries = sum(int(one.manifest["splits"]["train"].get("queries", 0)) for one in data)
-    seconds = evaluation_seconds(queries) + (training.time if training.steps is None else 0.0)
+    seconds = evaluation_seconds(queries) + (training.time.seconds if training.steps is None else 0.0)
     if is_long(seconds, size):
         console.note(expectation(seconds, size))
     if missing := missing_reason():
@@ -220,9 +219,6 @@ def resolve_config(
         presets |= fitter_options(quality, {"": overrides})[""]
     if overrides["model"] == kept.get("model"):
         presets |= kept
-    if "training.time" in options.given:
-        # A time overrides the numbers of steps of a file or a preset.
-        presets |= {"training.steps": None, "training.min_steps": 0}
     return options.resolve(presets)
 
 
@@ -259,10 +255,10 @@ def _fit_many(
     console: Console,
 ) -> None:
     """Fit several data sets, each on its own or all with one network."""
-    from mbtf_fit.training.fit_many import find_data, name_materials
+    from mbtf_fit.training.fit_many import find_data, material_folders
 
     shards = find_data(many)
-    folders = name_materials(shards, output)
+    folders = material_folders(shards, output)
     config = resolve_config(options, quality, *shards)
     if not config.training.shared_decoder:
         configs = [resolve_config(options, quality, folder) for folder in shards]

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from torch import Tensor, from_numpy
+from torch import Tensor, from_numpy, int64, zeros
 from torch.utils.data import IterableDataset, get_worker_info
 
 from mbtf_core.data.dataset import Dataset, Shard
@@ -81,7 +81,9 @@ class QueryDataset(IterableDataset[QueryBatch]):
         super().__init__()
         if batch_size < 1:
             raise ValueError(f"batch_size is {batch_size}, but must be at least 1")
-        self.data, self.batch_size, self.seed, self.epoch = Dataset.open(folder), batch_size, seed, 0
+        self.data, self.batch_size, self.seed = Dataset.open(folder), batch_size, seed
+        # Shared with workers, also with those that live for several epochs.
+        self._epoch = zeros((), dtype=int64).share_memory_()
         self._blocks: list[tuple[Shard, int, int]] = []
         self.count = 0
         for shard in self.data.shards(split):
@@ -92,14 +94,15 @@ class QueryDataset(IterableDataset[QueryBatch]):
 
     def set_epoch(self, epoch: int) -> None:
         """Select the order of an epoch; call it before each. Epochs of one number have one order."""
-        self.epoch = epoch
+        self._epoch.fill_(epoch)
 
     def __iter__(self) -> Iterator[QueryBatch]:
         worker = get_worker_info()
         number, workers = (0, 1) if worker is None else (worker.id, worker.num_workers)
-        order = philox(self.seed, 2 * self.epoch).permutation(len(self._blocks))[number::workers]
+        epoch = int(self._epoch)
+        order = philox(self.seed, 2 * epoch).permutation(len(self._blocks))[number::workers]
         # As in the loader's batches, even streams order an epoch, odd ones what is below.
-        random = np.random.Generator(np.random.Philox(key=[self.seed, 2 * self.epoch + 1], counter=number))
+        random = np.random.Generator(np.random.Philox(key=[self.seed, 2 * epoch + 1], counter=number))
         left: list[ShardQueries] = []
         for start in range(0, len(order), _MIXED):
             mixed = ShardQueries.join([*left, *map(self._read, order[start : start + _MIXED])])

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mbtf_core.extras import import_extra
 from mbtf_fit.export import Export, ExportTarget
-from mbtf_fit.export.images import BASE_COLOR, HEIGHT, IMAGE_NAMES, NORMAL, ORM, MapOptions, write_document
+from mbtf_fit.export.images import BASE_COLOR, HEIGHT, IMAGE_NAMES, NORMAL, ORM, MapOptions, write_maps
 
 if TYPE_CHECKING:
     from mbtf_fit.material.maps import Maps
@@ -83,7 +83,7 @@ def gltf(maps: Maps, name: str, described: dict[str, Any]) -> str:
 
 def write(export: Export, options: MapOptions) -> list[str]:
     """Write the maps and the document."""
-    return write_document(export, options, _NAME, gltf, "pygltflib")
+    return write_maps(export, options, _NAME, gltf, "pygltflib")
 
 
 TARGET = ExportTarget("gltf", "maps and a glTF 2.0 document", [_NAME, *IMAGE_NAMES], write, MapOptions)

@@ -30,7 +30,7 @@ class MapOptions(Settings):
     level: int | None = Field(None, description="level of the maps; default: the finest")
 
 
-def write_document(
+def write_maps(
     export: Export,
     options: MapOptions,
     name: str,

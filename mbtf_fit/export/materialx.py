@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from mbtf_core.extras import import_extra
 from mbtf_fit.export import Export, ExportTarget
-from mbtf_fit.export.images import BASE_COLOR, HEIGHT, IMAGE_NAMES, NORMAL, ORM, MapOptions, write_document
+from mbtf_fit.export.images import BASE_COLOR, HEIGHT, IMAGE_NAMES, NORMAL, ORM, MapOptions, write_maps
 
 if TYPE_CHECKING:
     from mbtf_fit.material.maps import Maps
@@ -75,7 +75,7 @@ def materialx(maps: Maps, name: str, described: dict[str, Any]) -> str:
 
 def write(export: Export, options: MapOptions) -> list[str]:
     """Write the maps and the document."""
-    return write_document(export, options, _NAME, materialx, "MaterialX")
+    return write_maps(export, options, _NAME, materialx, "MaterialX")
 
 
 TARGET = ExportTarget("materialx", "maps and a MaterialX document", [_NAME, *IMAGE_NAMES], write, MapOptions)

@@ -7,7 +7,7 @@ from pathlib import Path
 from pydantic import Field
 
 from mbtf_core.config.settings import Settings
-from mbtf_core.files.folders import write_document
+from mbtf_core.files.editable import write_document
 from mbtf_fit.export import Export, ExportTarget
 
 PAGE_NAME = "viewer.html"

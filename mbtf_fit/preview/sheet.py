@@ -124,7 +124,6 @@ def _draw_missing(
     """Draw pictures that are not kept; returns their exposure."""
     load_mitsuba()
     from mbtf_fit.backends.mitsuba import load_scene
-    from mbtf_fit.preview.sheet import contact_sheet, exposure_of, panels
     from mbtf_fit.preview.turntable import frames, write_gif
 
     bsdf = load_scene({"type": "mbtf", "material": config.material})

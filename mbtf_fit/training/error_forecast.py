@@ -12,20 +12,30 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
 from mbtf_core.forecast import expected_error, expected_seconds
-from mbtf_core.stats import Estimate, Interval, LearningCurve
+from mbtf_core.stats import (
+    Estimate,
+    Interval,
+    LearningCurve,
+    mse_difference,
+    signal_variance,
+    unexplained_variance,
+)
 from mbtf_fit.data.queries import ShardQueries, TrainingQueries
 from mbtf_fit.training.loop import TrainingLoop, restore, snapshot
 from mbtf_fit.training.trainer import TrainingProgress, WeightDecay
-from mbtf_fit.training.validation import validation_error
 
 # Pilots together take this share of the fit's steps, but each of them at least the warm-up; there is no
 # forecast if that takes more than the larger share.
 _SHARE, _MOST = 0.1, 0.5
 # Steps of the pilots relative to the first one, and of the last one, which repeats few queries.
 _LENGTHS = np.geomspace(1.0, 4.0, 6)
+# Standard errors that make overfitting significant.
+_SIGNIFICANT = 2.0
+_NONE = Estimate(0.0, 0.0, 0)
 
 
 @dataclass(frozen=True)
@@ -38,7 +48,7 @@ class ErrorForecast:
     error : unexplained variance after them; None where nothing is known
     asked : error that is asked for, and time that reaches it; None where none is
     limit : error that no training time undercuts
-    excess : error that overfitting adds at most, part of the upper bound of `error`
+    excess : error that overfitting adds at most, part of the upper bound of `error`, and its standard error
     repeats : how often the fit sees each query
     reason : why nothing is known
     """
@@ -47,7 +57,7 @@ class ErrorForecast:
     error: Interval | None = None
     asked: tuple[float, Interval] | None = None
     limit: Interval | None = None
-    excess: float = 0.0
+    excess: Estimate = _NONE
     repeats: float = 0.0
     reason: str = ""
 
@@ -56,7 +66,7 @@ class ErrorForecast:
         asked = None if self.asked is None else {"error": self.asked[0], "seconds": self.asked[1].as_dict()}
         intervals = {"error": self.error, "limit": self.limit}
         known = {name: found and found.as_dict() for name, found in intervals.items()}
-        numbers = {"seconds": self.seconds, "excess": self.excess, "repeats": self.repeats}
+        numbers = {"seconds": self.seconds, "excess": self.excess.as_dict(), "repeats": self.repeats}
         return {**numbers, **known, "asked": asked, "reason": self.reason}
 
     def describe(self) -> str:
@@ -64,7 +74,8 @@ class ErrorForecast:
         if self.error is None or self.limit is None:
             return f"no forecast of the error: {self.reason}"
         lines = [expected_error(self.seconds, self.error)]
-        if self.excess > 0.5 * (self.error.high - self.error.value):
+        excess = self.excess
+        if excess.value > max(0.5 * (self.error.high - self.error.value), _SIGNIFICANT * excess.error):
             lines.append(
                 f"overfitting decides: the fit sees each query {self.repeats:.0f} times; more queries help, "
                 "longer training may not"
@@ -103,18 +114,18 @@ def forecast_error(loop: TrainingLoop, queries: ShardQueries, step: Estimate, st
         return ErrorForecast(seconds, reason=reason)
     start = snapshot(loop)
 
-    def pilot(count: int, seed: int) -> Estimate:
+    def pilot(count: int, seed: int) -> NDArray[np.float32]:
         restore(loop, start, TrainingProgress())
         trainer.model.calibrate(None)
         training = config.training.model_copy(update={"steps": count, "error": None})
         trainer.config = config.model_copy(update={"training": training, "seed": config.seed + seed})
         loop.train(float("inf"))
         trainer.calibrate()
-        return validation_error(trainer, queries)
+        return trainer.predict(queries)
 
     counts = [round(first * length) for length in _LENGTHS]
     try:
-        found = [pilot(count, number) for number, count in enumerate(counts)]
+        predictions = [pilot(count, number) for number, count in enumerate(counts)]
         few = min(len(data), max(trainer.batch, len(data) * counts[-1] // steps))
         trainer.queries = data.slice(0, few)
         trainer.weight_decay = WeightDecay.of(config.training, trainer.noise.ratio, few)
@@ -123,23 +134,26 @@ def forecast_error(loop: TrainingLoop, queries: ShardQueries, step: Estimate, st
         return ErrorForecast(seconds, reason=diverged.message.splitlines()[0])
     finally:
         trainer.config, trainer.queries, trainer.weight_decay = config, data, decay
+    halves = queries.value_a, queries.value_b
+    found = [unexplained_variance(prediction, *halves) for prediction in predictions]
     shared = float(np.median([e.relative_error for e in found]))
     try:
         curve = LearningCurve(counts, [e.value for e in found], shared=shared)
     except ValueError:
         return ErrorForecast(seconds, reason="the test queries do not resolve the errors of short fits")
-    excess = max(0.0, repeated.value - found[-1].value)
+    added = mse_difference(repeated, predictions[-1], *halves).scaled(1.0 / signal_variance(*halves).value)
+    excess = replace(added, value=max(0.0, added.value))
     error = curve.error_at(steps)
     asked = None
     if (target := config.training.error) is not None:
         time = curve.time_of(target)
         # What overfitting may add must be trained away elsewhere.
-        worst = curve.time_of(target - excess).high if excess < target else float("inf")
+        worst = curve.time_of(target - excess.value).high if excess.value < target else float("inf")
         scaled = replace(time, high=max(time.high, worst))
         asked = target, Interval(*(x * step.value for x in (scaled.value, scaled.low, scaled.high)))
     return ErrorForecast(
         seconds,
-        replace(error, high=error.high + excess),
+        replace(error, high=error.high + excess.value),
         asked,
         curve.limit,
         excess,

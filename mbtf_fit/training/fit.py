@@ -6,32 +6,27 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.folder import DataFolder
-from mbtf_core.data.lattice import level_of_sigma
 from mbtf_core.errors import InputError, PartialError
 from mbtf_core.files.folders import ELSEWHERE, owned
 from mbtf_core.paths import real_path
 from mbtf_core.run.signals import stop_on_interruption
-from mbtf_core.stats import pooled_variance
-from mbtf_core.units import clock
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import Partition, load_training, open_data
 from mbtf_fit.data.queries import ShardQueries
-from mbtf_fit.evaluation import evaluate_splits
-from mbtf_fit.formatting import format_estimate
-from mbtf_fit.material.decoder import DECODER_NAME, Decoder, write_decoder
+from mbtf_fit.material.decoder import DECODER_NAME, Decoder
 from mbtf_fit.material.format import DESCRIPTION_NAME
-from mbtf_fit.material.material import Material, export
-from mbtf_fit.material.transmittance import evaluate_transmittance, fit_transmittance
+from mbtf_fit.material.material import Material
 from mbtf_fit.models.registry import MODELS
+from mbtf_fit.training.endings import describe_validations, reached
+from mbtf_fit.training.fit_export import Member, export_fits
 from mbtf_fit.training.fit_folder import (
     append_history,
     claim,
@@ -117,15 +112,6 @@ class FitResult:
         """Expected gain by longer training and by more data; None where the history is incomplete."""
         noise = self.material.description["training"].get("noise_variance")
         return marginal_cost_of(self.history, self.errors, noise)
-
-
-@dataclass(frozen=True)
-class _Member:
-    """A material: its folder, its data, the content of its ``fit.json``."""
-
-    folder: Path
-    data: Dataset
-    identity: dict[str, Any]
 
 
 def _check_folder(config: FitConfig, out: Path) -> None:
@@ -269,7 +255,7 @@ def _fit(
     data = [open_data(folder, layout, config.model, config.data.cache) for folder in shards]
     group = data if shared else ()
     members = [
-        _Member(out, one, identity_of(config, one, group)) for out, one in zip(folders, data, strict=True)
+        Member(out, one, identity_of(config, one, group)) for out, one in zip(folders, data, strict=True)
     ]
     identities = {member.folder.name: member.identity for member in members}
     with ExitStack() as stack:
@@ -291,7 +277,7 @@ def _fit(
 
 def _train(
     config: FitConfig,
-    members: Sequence[_Member],
+    members: Sequence[Member],
     home: Path,
     device: torch.device,
     progress: ProgressCallback,
@@ -330,53 +316,17 @@ def _train(
             append_history(member.folder, records[-1])
             if observe is not None:
                 observe(records[-1], trainer, subset)
-        progress(loop.fraction, _describe(records))
+        progress(loop.fraction, describe_validations(records))
         return all(reached(config, [record]) for record in records)
 
     progress(loop.fraction, "training")
     # A fit that was killed after it had reached its error is exported as it is.
     if not all(reached(config, read_history(member.folder)) for member in members):
         _spend_budget(loop, report, checkpoint)
-    _export(config, loop, members, partitions, [name for name, _ in subsets], home, partial(progress, 1.0))
+    export_fits(
+        config, loop, members, partitions, [name for name, _ in subsets], home, partial(progress, 1.0)
+    )
     return resumed
-
-
-def _describe(records: Sequence[dict[str, Any]]) -> str:
-    """One line for the progress bar."""
-    first = records[0]
-    text = f"loss {first['loss']:.3f}"
-    known = [r["unexplained"] for r in records if r["unexplained"] is not None]
-    if len(records) > 1 and known:
-        text += f", validation error {min(known):.3f} to {max(known):.3f}"
-    elif known:
-        estimate = {"value": first["unexplained"], "error": first["unexplained_error"]}
-        text += f", validation error {format_estimate(estimate)}"
-    return f"{text}, {first['queries_per_second'] / 1e6:.2f} M queries/s"
-
-
-def reached(config: FitConfig, history: Sequence[dict[str, Any]]) -> bool | None:
-    """Whether the last validation, with its standard error, is at or below the error of the configuration;
-    None if it has none."""
-    if config.training.error is None:
-        return None
-    value, error = (history[-1].get(key) if history else None for key in ("unexplained", "unexplained_error"))
-    return value is not None and error is not None and value + error <= config.training.error
-
-
-def describe_ending(config: FitConfig, history: Sequence[dict[str, Any]]) -> str | None:
-    """Why training ended, in one line; None if it had no error to reach."""
-    found = reached(config, history)
-    if found is None or not history:
-        return None
-    last, training = history[-1], config.training
-    error = format_estimate({"value": last["unexplained"], "error": last["unexplained_error"]})
-    limit = clock(training.time) if training.steps is None else f"{training.steps} steps"
-    spent = clock(last["seconds"]) if training.steps is None else str(last["step"])
-    if training.steps is None and last["seconds"] > training.time:
-        limit, spent = f"{training.min_steps} steps", str(last["step"])
-    if found:
-        return f"stopped at error {training.error:g} after {spent} of {limit}: validation error {error}"
-    return f"stopped after {limit}: validation error {error} has not reached {training.error:g}"
 
 
 def _spend_budget(loop: TrainingLoop, report: Callable[[], bool], checkpoint: Path) -> None:
@@ -399,88 +349,6 @@ def _spend_budget(loop: TrainingLoop, report: Callable[[], bool], checkpoint: Pa
                 saved = time.perf_counter()
         if stop.is_set():
             raise KeyboardInterrupt
-
-
-def _export(
-    config: FitConfig,
-    loop: TrainingLoop,
-    members: Sequence[_Member],
-    partitions: Sequence[Partition],
-    validated: Sequence[str],
-    home: Path,
-    announce: Callable[[str], None],
-) -> None:
-    """Write the materials, and the network that they share."""
-    steps, seconds = loop.progress.step, round(loop.progress.seconds, 3)
-    summary: dict[str, Any] = {"materials": list(loop.names), "steps": steps, "seconds": seconds}
-    for k, (member, partition) in enumerate(zip(members, partitions, strict=True)):
-        mine = loop.batches_of(k, steps)
-        share: dict[str, Any] = {"steps": mine, "seconds": round(seconds * mine / steps, 3)}
-        if config.training.shared_decoder:
-            share["shared_decoder"] = summary
-        if config.decoder is not None:
-            share["decoder"] = {"sha256": Decoder.find(config.decoder).sha256}
-        trainer = loop.trainers[k]
-        export_fit(trainer, config, member, partition, announce, validated=validated[k], share=share)
-    if config.training.shared_decoder:
-        # It tells other fits that all materials are complete.
-        data = {member.folder.name: member.identity["data"] for member in members}
-        write_decoder(home, loop.trainers[0].model, config, materials=data, training=summary)
-
-
-def export_fit(
-    trainer: Trainer,
-    config: FitConfig,
-    member: _Member,
-    partition: Partition,
-    announce: Callable[[str], None],
-    *,
-    validated: str,
-    share: dict[str, Any],
-) -> None:
-    """Write the material of a finished training, with its errors; `announce` receives each stage,
-    `validated`: name of the set of the validations, `share`: what the summary says of the material's part in
-    the training."""
-    data = member.data
-    of = f" {member.folder.name}"
-    trainer.fill_levels(float(level_of_sigma(partition.sample.sigma.max())))
-    announce(f"calibrating{of}")
-    trainer.calibrate()
-    announce(f"evaluating the errors of{of}")
-    errors = evaluate_splits(trainer.predict, data, partition)
-    variance = errors["training"]["variance"]["value"]
-    sample = partition.sample
-    noise = pooled_variance(sample.value_a, sample.value_b).value if data.estimates == 2 else None
-    training = {
-        "batch": trainer.batch,
-        "queries": len(partition.training),
-        "loss": trainer.progress.loss,
-        "validation_set": validated,
-        "weight_decay": asdict(trainer.weight_decay),
-        "coverage": {str(level): fraction for level, fraction in trainer.coverage().items()},
-        "device": str(trainer.device),
-        "threads": torch.get_num_threads(),
-        "backend": trainer.backend,
-        "torch": torch.__version__,
-        "errors": errors,
-        # Variance of the noise of values, in 1/sr² and over that of the values; null where it is unknown.
-        "noise_variance": noise,
-        "noise_ratio": noise / variance if noise is not None and variance and variance > 0 else None,
-    }
-    transmittance = fit_transmittance(data, partition.selection)
-    if transmittance is not None:
-        found = evaluate_transmittance(transmittance, data, partition.selection)
-        training["transmittance"] = {split: e.as_dict() for split, e in found.items()}
-    described = member.identity["data"]
-    announce(f"writing{of}")
-    export(
-        trainer.model,
-        config,
-        member.folder,
-        data=described,
-        training=training | share,
-        transmittance=transmittance,
-    )
 
 
 def result_of(out: Path, total: float, *, resumed: bool) -> FitResult:

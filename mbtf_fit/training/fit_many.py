@@ -35,7 +35,7 @@ def find_data(arguments: Sequence[Path]) -> list[Path]:
     return found
 
 
-def name_materials(shards: Sequence[Path], out: Path) -> list[Path]:
+def material_folders(shards: Sequence[Path], out: Path) -> list[Path]:
     """A folder in `out` for each data set, with its name; equal names are prefixed by the parent's name."""
     names = [real_path(path).name for path in shards]
     often = Counter(names)

@@ -17,6 +17,7 @@ from mbtf_core.units import clock
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import load_training, open_data
 from mbtf_fit.models.registry import MODELS, material_of
+from mbtf_fit.sections import TimeBudget
 from mbtf_fit.surface.known import surface_bytes
 from mbtf_fit.training.error_forecast import ErrorForecast, forecast_error
 from mbtf_fit.training.loop import TrainingLoop, choose_device, keep_freed_memory, restore, snapshot
@@ -97,7 +98,7 @@ def forecast_fit(config: FitConfig, shards: str | Path | DataFolder) -> FitForec
     keep_freed_memory()
     partition = load_training(data, config.held_out, config.seed, config.data.memory)
     loading = time.perf_counter() - began
-    pilot = {"training": config.training.model_copy(update={"time": _ENDLESS, "steps": None})}
+    pilot = {"training": config.training.model_copy(update={"time": TimeBudget(_ENDLESS), "steps": None})}
     device = choose_device(config.device)
     trainer = prepare_trainer(config.model_copy(update=pilot), data, partition, device)
     loop = TrainingLoop([trainer])
@@ -111,10 +112,10 @@ def forecast_fit(config: FitConfig, shards: str | Path | DataFolder) -> FitForec
         return loop.progress.step - before
 
     step = pilot_seconds(piece, _PILOT_SECONDS)
-    asked = config.training.steps
-    total = step.scaled(config.training.min_steps if asked is None else asked)
-    if asked is None and total.value < config.training.time:
-        total = Estimate(config.training.time, 0.0, 1)
+    asked, budget = config.training.steps, config.training.time
+    total = step.scaled(budget.min_steps if asked is None else asked)
+    if asked is None and total.value < budget.seconds:
+        total = Estimate(budget.seconds, 0.0, 1)
     steps = round(total.value / step.value) if asked is None else asked
     restore(loop, start, TrainingProgress())
     trainer.config = config

@@ -229,7 +229,7 @@ def _load(trainer: Trainer, parameters: dict[str, Tensor], tensors: dict[str, Te
         for name, p in parameters.items():
             p.copy_(tensors[f"model.{name}"])
             trainer.optimizer.state[p] = {
-                key: tensors[f"adam.{key}.{name}"].to(p.device)
+                key: tensors[f"adam.{key}.{name}"].to(p.device, copy=True)
                 for key in _MOMENTS
                 if f"adam.{key}.{name}" in tensors
             }

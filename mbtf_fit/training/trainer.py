@@ -164,8 +164,7 @@ class Trainer:
         training = self.config.training
         if training.steps is not None:
             return min(1.0, self.progress.step / training.steps)
-        spent = min(1.0, self.progress.seconds / training.time)
-        return min(spent, self.progress.step / training.min_steps) if training.min_steps else spent
+        return training.time.spent(self.progress.seconds, self.progress.step)
 
     def steps(self, workers: Workers, first: int) -> Iterator[Tensor]:
         """Endless steps from the batch of a number on; each yields its mean loss."""

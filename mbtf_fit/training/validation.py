@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mbtf_core.data.dataset import Dataset
-from mbtf_core.stats import Estimate, by_group, level_groups, unexplained_variance
+from mbtf_core.stats import by_group, level_groups, unexplained_variance
 from mbtf_fit.data.loader import Partition, load_split
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.training.trainer import Trainer
@@ -39,11 +39,6 @@ def validation_subset(positions: int, queries: ShardQueries, most: int = _SUBSET
     return queries.take(np.arange(0, len(queries), max(1, math.ceil(len(queries) / most))))
 
 
-def validation_error(trainer: Trainer, queries: ShardQueries) -> Estimate:
-    """Unexplained variance of queries by the current model."""
-    return unexplained_variance(trainer.predict(queries), queries.value_a, queries.value_b)
-
-
 def finite(number: float | None) -> float | None:
     """A number, or None where it is not finite; JSON and plots have no others."""
     return number if number is not None and math.isfinite(number) else None
@@ -59,7 +54,9 @@ def errors_by_level(trainer: Trainer, queries: ShardQueries) -> dict[str, float 
 def history_record(trainer: Trainer, subset: ShardQueries) -> dict[str, Any]:
     """Progress and validation error of the current model."""
     state = trainer.progress
-    found = validation_error(trainer, subset).as_dict() if len(subset) else {}
+    found: dict[str, Any] = {}
+    if len(subset):
+        found = unexplained_variance(trainer.predict(subset), subset.value_a, subset.value_b).as_dict()
     return {
         "step": state.step,
         "seconds": round(state.seconds, 3),

@@ -152,8 +152,9 @@ def _forecast(recipe: Recipe, folder: Path, console: Console) -> None:
     from mbtf_pipeline.cost.forecast import forecast_errors
     from mbtf_pipeline.run_time import RunForecaster
 
-    expected = RunForecaster(recipe).of(recipe)
     errors = forecast_errors(recipe, folder, console.note)
+    training = {name: found["forecast"]["seconds"] for name, found in errors.items() if found["source"]}
+    expected = RunForecaster(recipe).of(recipe, training=training)
     lines = [expected.describe()]
     for name, found in errors.items():
         first, *more = found["text"].splitlines()
@@ -185,7 +186,7 @@ def _report_collection(done: CollectionResult, folder: Path, console: Console) -
 
 
 def _report(result: RunResult, console: Console, quality: Quality | None) -> None:
-    from mbtf_fit.training.fit import describe_ending
+    from mbtf_fit.training.endings import describe_ending
     from mbtf_fit.training.fit_folder import read_history
     from mbtf_pipeline.recipe import read_resolved
     from mbtf_pipeline.stages import FITS

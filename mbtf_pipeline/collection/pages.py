@@ -9,7 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.files.folders import write_document
+from mbtf_core.files.editable import write_document
 from mbtf_core.units import clock
 from mbtf_pipeline.collection.check_tables import independence, offsets, timing, weights
 from mbtf_pipeline.collection.error_tables import ablations, levels, methods, zooms

@@ -204,7 +204,7 @@ class Collection(Settings):
         each, fits = data.pop("each_fit"), data["fit"] or {_model_for(path): None}
         data["fit"] = {fit: deep_merge(each, {"model": fit, **(own or {})}) for fit, own in fits.items()}
         if self.training is not None:
-            time = {"time": round(self.training / len(fits), 3), "steps": None, "min_steps": 0}
+            time = {"time": round(self.training / len(fits), 3), "steps": None}
             data["fit"] = {
                 fit: deep_merge(options, {"training": time}) for fit, options in data["fit"].items()
             }

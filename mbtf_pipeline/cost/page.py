@@ -8,7 +8,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.files.folders import write_document
+from mbtf_core.files.editable import write_document
 from mbtf_core.units import clock
 from mbtf_pipeline.cost.answers import page_answers
 from mbtf_pipeline.cost.measurement import Measurement, pareto_front

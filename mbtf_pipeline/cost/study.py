@@ -21,7 +21,8 @@ from typing import Any
 from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.errors import InputError, PartialError
 from mbtf_core.files.atomic import read_json
-from mbtf_core.files.folders import ELSEWHERE, OutputKind, check_space, owned, write_document
+from mbtf_core.files.editable import write_document
+from mbtf_core.files.folders import ELSEWHERE, OutputKind, check_space, owned
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item, worker_threads
 from mbtf_core.stats import Estimate

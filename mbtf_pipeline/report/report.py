@@ -13,7 +13,7 @@ from mbtf_core.config.settings import check_schema
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import read_json
-from mbtf_core.files.folders import read_document, write_document
+from mbtf_core.files.editable import read_document, write_document
 from mbtf_core.pictures import Camera
 from mbtf_pipeline.compare.compare import COMPARISON_NAME, COMPARISON_SCHEMA
 from mbtf_pipeline.compare.image_files import read_picture

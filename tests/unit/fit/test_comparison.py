@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 from support.command_lines import call, fails
 from support.commands import Done
-from support.datasets import edit, write_dataset
+from support.datasets import edit, read_checksummed, write_dataset
 from support.plugin_materials import write_material
 
 from mbtf_core.color import to_display
@@ -28,7 +28,8 @@ OPTIONS = ["--view", "50,20", "--light", "60,80", "--tiles-across", "1,3", "--sp
 def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("comparison")
     write_dataset(folder / "shards", queries={"train": "40", "test": "8"})
-    write_material(folder / "fit", finest=3, aspect=0.5, constant=VALUE)
+    inputs = read_checksummed(folder / "shards/manifest.json")["inputs"]
+    write_material(folder / "fit", finest=3, aspect=0.5, constant=VALUE, inputs=inputs)
     return folder
 
 
@@ -47,6 +48,7 @@ def test_errors_and_panels_are_those_of_reference_and_fit(work: Path) -> None:
     done = compare(work)
     report = done.result()
     assert "texels of the resolution 8" in done.err
+    assert "another material" not in done.err
     exposure = report["exposure"]
     image = np.asarray(Image.open(work / "out/comparison.png")).astype(int)
     # By column and row.
@@ -67,6 +69,14 @@ def test_errors_and_panels_are_those_of_reference_and_fit(work: Path) -> None:
         # Orange where the fit is too bright, blue where it is too dark.
         assert ((signed[..., 0] > signed[..., 2]) == (brighter > 0))[clear].all()
         assert clear.mean() > 0.3
+
+
+def test_data_of_another_material_are_announced(work: Path, tmp_path: Path) -> None:
+    write_material(tmp_path / "fit", finest=3, aspect=0.5, inputs={"height": "0" * 64})
+    paths = [str(tmp_path / "fit"), str(work / "shards")]
+    picture = ["--view", "90,0", "--tiles-across", "1", "--spp", "2", "--size", "8"]
+    for words in (["compare", *paths, "-o", str(tmp_path / "out"), *picture], ["evaluate", *paths]):
+        assert "another material" in call(["mbtf-fit", *words]).err
 
 
 def test_finished_references_are_kept(work: Path, monkeypatch: pytest.MonkeyPatch) -> None:

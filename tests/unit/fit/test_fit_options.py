@@ -13,6 +13,7 @@ from mbtf_core.units import format_duration, parse_duration
 from mbtf_fit.cli.app import app
 from mbtf_fit.cli.fit import FitOptions, resolve_config
 from mbtf_fit.config import FitConfig
+from mbtf_fit.sections import TimeBudget
 
 
 def config_of(*words: str) -> FitConfig:
@@ -28,8 +29,11 @@ def test_flags_override_assignments_presets_and_files(tmp_path: Path) -> None:
     found = config_of(*words, "--set", "training.steps=8", "--steps", "2")
     assert found.model == "neumip-baseline"
     assert (found.training.steps, found.training.batch, found.training.warmup) == (2, 400, 7)
-    found = config_of(*words, "--time", "1min")
-    assert (found.training.steps, found.training.time) == (None, 60.0)
+    for time in (("--time", "1min"), ("--set", "training.time=1min"), ("--set", "training={time: 1min}")):
+        found = config_of(*words, *time)
+        assert (found.training.steps, found.training.time) == (None, TimeBudget(60.0))
+    found = config_of("--quality", "draft", "--set", "training={steps: 3}")
+    assert found.training.steps == 3
     found = config_of("--quality", "paper", "--batch", "500")
     assert (found.training.steps, found.training.batch, found.network.width) == (30_000, 500, 64)
 
@@ -57,9 +61,10 @@ def test_a_resolved_configuration_with_steps_reads_back(tmp_path: Path) -> None:
 def test_presets_keep_what_sections_set() -> None:
     single = config_of("--quality", "draft", "--set", "training.batch=50")
     assert config_of("--quality", "draft", "--set", "training={batch: 50}") == single
-    assert (single.training.time, single.training.min_steps, single.network.width) == (12.0, 800, 40)
+    assert (single.training.time, single.network.width) == (TimeBudget(12.0, 800), 40)
     # An explicit time is the time.
-    assert config_of("--quality", "draft", "--time", "5s").training.min_steps == 0
+    for words in (("--time", "5s"), ("--set", "training={time: 5s}")):
+        assert config_of("--quality", "draft", *words).training.time == TimeBudget(5.0)
 
 
 def test_shared_networks_have_a_smaller_batch(tmp_path: Path) -> None:
@@ -88,6 +93,13 @@ def test_durations_are_read(text: str | float, seconds: float) -> None:
 @pytest.mark.parametrize("seconds", [0.25, 45.0, 90.0, 120.0, 3600.0, 5400.0, 7261.0])
 def test_durations_survive_writing(seconds: float) -> None:
     assert parse_duration(format_duration(seconds)) == seconds
+
+
+@pytest.mark.parametrize("budget", [TimeBudget(90.0), TimeBudget(0.5, 3)])
+def test_time_budgets_survive_writing(budget: TimeBudget) -> None:
+    assert TimeBudget.parse(str(budget)) == budget
+    with pytest.raises(ValueError, match="must be a duration"):
+        TimeBudget.parse(f"{budget} or so")
 
 
 def test_hash_covers_data_and_options_but_not_the_device() -> None:

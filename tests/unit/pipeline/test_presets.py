@@ -13,6 +13,7 @@ from support.paths import ROOT
 from mbtf_core.app.options import Quality
 from mbtf_core.config.settings import resolve
 from mbtf_fit.config import FITTER, FitConfig, best_at, best_options, fitter_options
+from mbtf_fit.sections import TimeBudget
 from mbtf_gen.config.generator import GENERATOR, GeneratorConfig, count_queries
 from mbtf_pipeline.recipe import COMPARE, load_recipe, preset_recipe, quality_options
 
@@ -40,7 +41,7 @@ def test_recipes_take_a_preset(quality: Quality) -> None:
         expected = resolve(FitConfig, presets=FITTER[quality])
         assert fit.training.steps == expected.training.steps
         if expected.training.steps is None:
-            assert fit.training.time == expected.training.time
+            assert fit.training.time.seconds == expected.training.time.seconds
     assert recipe.compare.size == COMPARE[quality]["compare.size"]
 
 
@@ -58,10 +59,10 @@ def test_recipes_that_compare_networks_keep_them(quality: Quality, name: str) ->
 def test_other_recipes_get_the_network_of_the_preset() -> None:
     path = ROOT / "pipelines" / "rock_cliff.yaml"
     fits = {"neumip": {"model": "neumip"}, "neumip-baseline": {"model": "neumip-baseline"}}
-    assert {n: {**best_at("draft", n), **FITTER["draft"]} for n in fits} == fitter_options("draft", fits)
+    budget = FITTER["draft"] | {"training.time": "12s, at least 800 steps"}
+    assert {n: {**best_at("draft", n), **budget} for n in fits} == fitter_options("draft", fits)
     fits["hierarchical"] = {"model": "hierarchical"}
-    slow = {key: value for key, value in FITTER["draft"].items() if key != "training.min_steps"}
-    assert fitter_options("draft", fits)["hierarchical"] == slow
+    assert fitter_options("draft", fits)["hierarchical"] == FITTER["draft"]
     text = quality_options(path, "draft")
     assert text["fit.neumip.network.width"] == 40
     assert text["fit.neumip-baseline.training.texture_weight_decay"] == 1.0
@@ -70,14 +71,6 @@ def test_other_recipes_get_the_network_of_the_preset() -> None:
     text = quality_options(path, "draft", own)
     assert not any("network" in t or t.startswith("fit.neumip.training.texture_weight_decay") for t in text)
     assert text["fit.neumip.training.blur.min_sigma"] == 0.8
-
-
-def test_presets_train_800_steps_at_least_unless_told_a_time() -> None:
-    path = ROOT / "pipelines" / "rock_cliff.yaml"
-    assert quality_options(path, "draft")["fit.neumip.training.min_steps"] == 800
-    told = quality_options(path, "draft", ["fit.neumip.training.time=5s"])
-    assert "fit.neumip.training.min_steps" not in told
-    assert told["fit.neumip-baseline.training.min_steps"] == 800
 
 
 def test_longer_training_gets_a_larger_network() -> None:
@@ -104,7 +97,7 @@ def test_a_section_overrides_the_preset_value_by_value(section: str, single: str
     path.write_text("name: r\ngenerate: {material: height.npy}\nfit: {neumip: {}}\n")
     found, expected = (preset_recipe(path, "draft", [text]) for text in (section, single))
     assert found == expected
-    assert found.fit["neumip"].training.time == 12
+    assert found.fit["neumip"].training.time == TimeBudget(12.0, 800)
 
 
 def test_a_preset_sets_the_resolution_unless_told(tmp_path: Path) -> None:

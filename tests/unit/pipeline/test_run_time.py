@@ -14,6 +14,7 @@ from mbtf_core.app.console import run
 from mbtf_core.data.shard_files import row_bytes
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.files import folders
+from mbtf_fit.sections import TimeBudget
 from mbtf_pipeline import run as runs
 from mbtf_pipeline import run_time as module
 from mbtf_pipeline.cli.app import app
@@ -86,7 +87,7 @@ def test_the_best_preset_that_fits_trains_for_the_rest(fake: Machine, one: Path,
     # The data of the preset, and no less training: never worse.
     preset = preset_recipe(one, found.split.quality)
     assert found.recipe.generate == preset.generate
-    assert found.recipe.fit["neumip"].training.time >= preset.fit["neumip"].training.time
+    assert found.recipe.fit["neumip"].training.time.seconds >= preset.fit["neumip"].training.time.seconds
     assert found.recipe.fit["neumip"].network.width >= preset.fit["neumip"].network.width
     # Everything is counted: starting, generating, loading, training, evaluation, comparison.
     assert seconds_of(found) == pytest.approx(0.96 * seconds, rel=0.02)
@@ -107,21 +108,21 @@ def test_less_than_a_draft_is_a_draft_of_less_training(fake: Machine, one: Path)
 def test_training_is_shortened_when_generating_overran(fake: Machine, one: Path) -> None:
     found = timed(one, 120.0)
     planned = found.recipe
-    before = planned.fit["neumip"].training.time
+    before = planned.fit["neumip"].training.time.seconds
     fake.now = START + RunForecaster(planned).of(planned).generating + 15.0
-    after = found.generated(planned).fit["neumip"].training.time
+    after = found.generated(planned).fit["neumip"].training.time.seconds
     assert before - 15.0 <= after <= before - 15.0 + 3.0
     assert after == pytest.approx(0.96 * 120.0 - fake.now - found.split.after, abs=0.1)
     # The same command resumes with the same time, however late.
     fake.now = 1e4
     again = timed(one, 120.0)
-    assert again.generated(again.recipe).fit["neumip"].training.time == after
+    assert again.generated(again.recipe).fit["neumip"].training.time.seconds == after
     fake.now = 0.0
     notes: list[str] = []
     late = timed(one, 120.0, folder=one.parent / "late", progress=notes.append)
     fake.now = 500.0
     # No less than the preset's: never worse.
-    assert late.generated(late.recipe).fit["neumip"].training.time == 12.0
+    assert late.generated(late.recipe).fit["neumip"].training.time.seconds == 12.0
     assert "the run will be about" in notes[-1]
 
 
@@ -141,7 +142,7 @@ def test_a_given_preset_is_kept_and_fits_share_the_training(fake: Machine, one: 
     assert found.split.quality == "draft"
     assert len(found.recipe.fit) == 3
     assert all(fit.training.steps is None for fit in found.recipe.fit.values())
-    assert {fit.training.time for fit in found.recipe.fit.values()} == {found.split.training}
+    assert {fit.training.time for fit in found.recipe.fit.values()} == {TimeBudget(found.split.training)}
     assert found.recipe.generate.light == preset_recipe(FILE, None).generate.light
     assert [note.split(",")[0] for note in notes] == ["time: preset draft"]
 
@@ -181,6 +182,14 @@ def test_all_stages_count(fake: Machine) -> None:
     by_steps = forecaster.of(load_recipe(FILE, ["fit.neumip.training.steps=100"]))
     assert by_steps.training == 80.0
     assert by_steps.describe().endswith(", and the steps of neumip")
+    # Steps that pilots have timed, and others.
+    recipe = preset_recipe(FILE, "draft")
+    found = forecaster.of(recipe, training={"relief": 50.0})
+    assert found.training == 50.0 + 12.0 * (len(recipe.fit) - 1)
+    assert found.describe().endswith(", or longer for 800 steps of training")
+    timed = forecaster.of(recipe, training=dict.fromkeys(recipe.fit, 50.0))
+    assert (timed.training, timed.min_steps) == (50.0 * len(recipe.fit), 0)
+    recipe = load_recipe(FILE)
     # What is finished costs nothing.
     left = forecaster.of(recipe, ["fit neumip", "compare", "report"])
     assert (left.generating, left.training) == (0.0, 60.0)

@@ -16,8 +16,9 @@ from typing import Any
 import pytest
 
 from mbtf_core.errors import InputError, PartialError
-from mbtf_core.files import folders
+from mbtf_core.files import editable, folders
 from mbtf_core.files.atomic import temporary_of
+from mbtf_core.files.editable import write_document
 from mbtf_core.files.folders import (
     OutputFolder,
     OutputKind,
@@ -26,7 +27,6 @@ from mbtf_core.files.folders import (
     make_folder,
     owned,
     remove_unfinished,
-    write_document,
 )
 from mbtf_core.units import expectation
 
@@ -188,7 +188,7 @@ def test_documents_are_replaced_unless_they_were_edited(tmp_path: Path) -> None:
 def test_a_document_is_written_again_after_a_kill_between_its_digest_and_itself(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path, write = tmp_path / "table.csv", folders.write_chunks
+    path, write = tmp_path / "table.csv", editable.write_chunks
 
     def killed(to: Path, chunks: Iterable[bytes]) -> object:
         if to == path:
@@ -197,7 +197,7 @@ def test_a_document_is_written_again_after_a_kill_between_its_digest_and_itself(
 
     for text, again in (("a,1\n", "a,2\n"), ("a,3\n", "a,4\n")):
         with monkeypatch.context() as patch:
-            patch.setattr(folders, "write_chunks", killed)
+            patch.setattr(editable, "write_chunks", killed)
             with pytest.raises(KeyboardInterrupt):
                 write_document(path, text)
             with pytest.raises(KeyboardInterrupt):

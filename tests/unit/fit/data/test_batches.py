@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 
 import numpy as np
@@ -70,6 +71,20 @@ def test_an_epoch_has_each_query_once(shards: Path, workers: int, monkeypatch: p
     shares = [np.mean([row.tobytes() in first for row in found[k : k + 1500]]) for k in range(0, 9000, 1500)]
     assert min(shares) > 0
     assert max(shares) < 1
+
+
+def test_workers_that_stay_follow_the_epoch(shards: Path) -> None:
+    data = QueryDataset(shards, "test", seed=1)
+    loader = DataLoader(data, batch_size=None, num_workers=1, persistent_workers=True)
+    found = []
+    for epoch in (0, 1, 0):
+        data.set_epoch(epoch)
+        found.append(torch.cat([batch.sigma for batch in loader]).tolist())
+    assert found[0] == found[2] != found[1]
+    # What a worker gets where processes are not forked.
+    received = ForkingPickler.loads(ForkingPickler.dumps(data))
+    data.set_epoch(1)
+    assert torch.cat([batch.sigma for batch in received]).tolist() == found[1]
 
 
 @pytest.mark.parametrize("layout", ["image", "slices"])

@@ -6,19 +6,21 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 from support.fit_data import parallax, write_data
 
-import mbtf_fit.training.error_forecast as forecasts
 import mbtf_fit.training.fit as fits
 import mbtf_fit.training.forecast as module
-from mbtf_core.stats import Estimate, Interval
+from mbtf_core.stats import Estimate, Interval, signal_variance
 from mbtf_fit import fit
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries
+from mbtf_fit.training.endings import describe_ending, reached
 from mbtf_fit.training.error_forecast import ErrorForecast
-from mbtf_fit.training.fit import describe_ending, reached
 from mbtf_fit.training.forecast import forecast_fit
+from mbtf_fit.training.loop import TrainingLoop
 from mbtf_fit.training.trainer import Trainer
 
 STEPS = 4000
@@ -36,19 +38,29 @@ def config(**training: object) -> FitConfig:
 @pytest.fixture
 def law(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
     """(steps, queries) of pilots, which do not train: their errors are a law of the steps, more by 0.1 where
-    queries are repeated."""
+    queries are repeated. One of fifty test queries has all of the error. Each pilot starts anew, and is
+    calibrated."""
     pilots: list[tuple[int, int]] = []
 
-    def error(trainer: Trainer, queries: ShardQueries) -> Estimate:
-        assert trainer.progress.step == 0  # each starts anew
+    def predict(trainer: Trainer, queries: ShardQueries) -> NDArray[np.float64]:
+        assert trainer.progress.step == 0
+        assert trainer.model.calibration is not None
         steps = trainer.config.training.steps
         assert steps is not None
         repeated = len(trainer.queries) < pilots[0][1] if pilots else False
         pilots.append((steps, len(trainer.queries)))
-        return Estimate(0.03 + 3.0 * steps**-0.7 + 0.1 * repeated, 0.0, 1000)
+        a, b = queries.value_a.astype(float), queries.value_b
+        error = (0.03 + 3.0 * steps**-0.7 + 0.1 * repeated) * signal_variance(a, b).value
+        squares = np.where(np.arange(len(a)) % 50 == 0, 50 * error, 0.0)[:, None]
+        # (p - a)(p - b) are these squares.
+        return 0.5 * (a + b) + np.sqrt(squares + 0.25 * (a - b) ** 2)
 
-    monkeypatch.setattr(forecasts, "validation_error", error)
-    monkeypatch.setattr(forecasts.TrainingLoop, "train", lambda loop, seconds: True)
+    def train(loop: TrainingLoop, seconds: float) -> bool:
+        assert loop.trainers[0].model.calibration is None
+        return True
+
+    monkeypatch.setattr(Trainer, "predict", predict)
+    monkeypatch.setattr(TrainingLoop, "train", train)
     monkeypatch.setattr(module, "pilot_seconds", lambda *_: Estimate(0.01, 0.0, 5))
     return pilots
 
@@ -66,7 +78,10 @@ def test_the_law_of_the_pilots_predicts_the_fit(law: list[tuple[int, int]], shar
     true = 0.03 + 3.0 * STEPS**-0.7
     assert found.error.low < true < found.error.high
     assert found.error.value == pytest.approx(true, rel=0.2)
-    assert found.excess == pytest.approx(0.1)
+    assert found.excess.value == pytest.approx(0.1)
+    # Of forty test queries, whose error limits all that is known.
+    assert found.excess.error == pytest.approx(0.1 / math.sqrt(40), rel=0.05)
+    assert found.error.value / found.error.low > math.exp(1.9 / math.sqrt(40))
     assert found.error.high > true + 0.1
     assert found.asked[1].low < 0.01 * 100 ** (1 / 0.7) < found.asked[1].high
     # What overfitting may add is more than what is asked for.
@@ -75,6 +90,15 @@ def test_the_law_of_the_pilots_predicts_the_fit(law: list[tuple[int, int]], shar
     # Below the level at which the law ends.
     below = forecast_fit(config(steps=STEPS, error=0.01), shards).error.describe()
     assert below.splitlines()[-1].startswith("error 0.01: not reachable with these queries")
+
+
+@pytest.mark.parametrize(("time", "seconds"), [("2s", 8.0), ("20s", 20.0)])
+def test_a_time_takes_its_fewest_steps(
+    law: list[tuple[int, int]], shards: Path, time: str, seconds: float
+) -> None:
+    """Steps of 0.01 s."""
+    found = forecast_fit(config(time=f"{time}, at least 800 steps"), shards)
+    assert (found.seconds, found.steps) == (seconds, 100 * seconds)
 
 
 def test_forecasts_answer_or_say_why_not() -> None:
@@ -100,6 +124,17 @@ def test_too_few_steps_give_no_forecast(law: list[tuple[int, int]], shards: Path
     found = forecast_fit(config(steps=30), shards).error
     assert found.error is None
     assert "30 steps are too few" in found.describe()
+
+
+def test_an_ending_names_the_limit_that_came_last() -> None:
+    for budget, seconds, step, limit in (
+        ("5s", 5.01, 900, "0:05"),
+        ("5s, at least 800 steps", 5.01, 900, "0:05"),
+        ("5s, at least 800 steps", 9.0, 800, "800 steps"),
+    ):
+        last = {"unexplained": 0.3, "unexplained_error": 0.01, "seconds": seconds, "step": step}
+        ending = str(describe_ending(config(time=budget, error=0.1), [last]))
+        assert ending.startswith(f"stopped after {limit}: ")
 
 
 def test_training_stops_once_the_error_is_reached(

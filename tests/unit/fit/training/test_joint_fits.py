@@ -14,15 +14,18 @@ from support.fit_data import F32, parallax, write_data
 from support.known_surfaces import geometry, rough_heights
 
 import mbtf_fit.training.fit
+import mbtf_fit.training.fit_export
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
 from mbtf_fit import FitConfig, FitResult, Material, fit
+from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.evaluation import evaluate
 from mbtf_fit.material.decoder import Decoder, network_tensors
 from mbtf_fit.training.fit import fit_jointly
 from mbtf_fit.training.fit_folder import read_history
 from mbtf_fit.training.loop import TrainingLoop
 from mbtf_fit.training.trainer import Trainer
+from mbtf_fit.training.validation import history_record
 
 NAMES = ("waves", "stripes", "third")
 BATCH = {"batch": 512, "warmup": 10}
@@ -208,7 +211,7 @@ def test_a_killed_joint_fit_ends_with_the_same_bits(
     config = joint_config(model, steps=9)
     whole = fit_two(config, data, tmp_path / "whole")
     random = np.random.default_rng(0)
-    out, step, export = tmp_path / "killed", Trainer._step, mbtf_fit.training.fit.export_fit
+    out, step, export = tmp_path / "killed", Trainer._step, mbtf_fit.training.fit_export.export_fit
     kills, exports = 0, 0
     save = mbtf_fit.training.fit.write_checkpoint
     while not (out / "decoder" / "decoder.json").exists():
@@ -235,7 +238,7 @@ def test_a_killed_joint_fit_ends_with_the_same_bits(
                 save(loop, path)
 
         monkeypatch.setattr(Trainer, "_step", dying)
-        monkeypatch.setattr(mbtf_fit.training.fit, "export_fit", dying_export)
+        monkeypatch.setattr(mbtf_fit.training.fit_export, "export_fit", dying_export)
         monkeypatch.setattr(mbtf_fit.training.fit, "write_checkpoint", forgetful)
         try:
             found = fit_two(config, data, out)
@@ -254,6 +257,42 @@ def test_a_killed_joint_fit_ends_with_the_same_bits(
     # A finished one is kept.
     monkeypatch.undo()
     assert all(again.resumed for again in fit_two(config, data, out))
+
+
+def test_training_stops_once_all_materials_have_reached_the_error(
+    data: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first one has after step 2, the other after step 5; killed in step 4, and once more when all is
+    done."""
+    step, killed = Trainer._step, {4}
+
+    def dying(self: Trainer, *arguments: Any) -> torch.Tensor:
+        if self.progress.step + 1 in killed:
+            raise Killed
+        return step(self, *arguments)
+
+    def record(trainer: Trainer, subset: ShardQueries) -> dict[str, Any]:
+        least = 2 if trainer.model.lattice.finest == 3 else 5
+        error = 0.1 if trainer.progress.step >= least else 0.9
+        return history_record(trainer, subset) | {"unexplained": error, "unexplained_error": 0.01}
+
+    def dying_export(*arguments: Any, **more: Any) -> None:
+        raise Killed
+
+    monkeypatch.setattr(Trainer, "_step", dying)
+    for name, new in (("history_record", record), ("_REPORT_SECONDS", 0.0), ("_CHECKPOINT_SECONDS", 0.0)):
+        monkeypatch.setattr(mbtf_fit.training.fit, name, new)
+    training = {"steps": 9, "shared_decoder": True, "error": 0.5, **BATCH}
+    config = FitConfig.model_validate({"model": "neumip", "training": training})
+    with monkeypatch.context() as patch:
+        patch.setattr(mbtf_fit.training.fit_export, "export_fit", dying_export)
+        for steps in (3, 5):
+            with pytest.raises(Killed):
+                fit_two(config, data, tmp_path)
+            killed.clear()
+            assert len(read_history(tmp_path / NAMES[0])) == steps
+    for found in fit_two(config, data, tmp_path):
+        assert [r["step"] for r in found.history] == [1, 2, 3, 4, 5]
 
 
 def test_a_lost_material_is_fitted_again(data: dict[str, Path], tmp_path: Path) -> None:

@@ -17,7 +17,14 @@ from mbtf_fit.data.loader import load_training, open_data
 from mbtf_fit.data.queries import ShardQueries, TrainingQueries
 from mbtf_fit.objective.parallel import Workers
 from mbtf_fit.sections import TrainingSection
-from mbtf_fit.training.trainer import Trainer, WeightDecay, learning_rate_factor, prepare_trainer
+from mbtf_fit.training.loop import TrainingLoop, restore, snapshot, state_tensors
+from mbtf_fit.training.trainer import (
+    Trainer,
+    TrainingProgress,
+    WeightDecay,
+    learning_rate_factor,
+    prepare_trainer,
+)
 
 LATTICE = Lattice(3)
 
@@ -104,7 +111,7 @@ def test_texels_without_a_gradient_decay_with_the_rate(compiled: bool) -> None:
 
 def test_a_time_budget_takes_its_fewest_steps() -> None:
     """Schedules follow whichever is behind, so that they end with the training."""
-    t = trainer(queries(), steps=None, time=1e-3, min_steps=4)
+    t = trainer(queries(), steps=None, time="0.001s, at least 4 steps")
     fractions = []
     step = t._step
 
@@ -115,7 +122,7 @@ def test_a_time_budget_takes_its_fewest_steps() -> None:
     t._step = recorded  # type: ignore[method-assign]
     train_fully(t)
     assert fractions == [0.0, 0.25, 0.5, 0.75]
-    assert trainer(queries(), steps=None, time=1e3, min_steps=1).fraction == 0.0
+    assert trainer(queries(), steps=None, time="1h, at least 1 steps").fraction == 0.0
 
 
 def test_a_time_budget_ends_training_and_annealing() -> None:
@@ -126,6 +133,18 @@ def test_a_time_budget_ends_training_and_annealing() -> None:
     tables = t._tables()
     assert tables[0] is pyramid.texels
     torch.testing.assert_close(tables[1], offset.blurred(2.0))
+
+
+def test_a_snapshot_keeps_a_state_however_often_training_goes_on() -> None:
+    loop = TrainingLoop([trainer(queries())])
+    loop.train(0.0)
+    expected = {name: tensor.tolist() for name, tensor in state_tensors(loop).items()}
+    start = snapshot(loop)
+    for _ in range(2):
+        loop.train(0.0)
+        assert {name: tensor.tolist() for name, tensor in state_tensors(loop).items()} != expected
+        restore(loop, start, TrainingProgress(1))
+        assert {name: tensor.tolist() for name, tensor in state_tensors(loop).items()} == expected
 
 
 def test_each_texture_keeps_its_least_blur() -> None:
@@ -140,9 +159,11 @@ def test_each_texture_keeps_its_least_blur() -> None:
     torch.testing.assert_close(pyramid.export()["3"].reshape(64, -1), pyramid.blurred(0.7)[-64:].detach())
 
 
+@pytest.mark.parametrize("compiled", [True, False])
 @pytest.mark.parametrize("poison", ["pyramid.texels", "offset_texture.texels", "offset_network.3.bias"])
-def test_divergence_is_one_error_with_a_hint(poison: str) -> None:
+def test_divergence_is_one_error_with_a_hint(poison: str, compiled: bool) -> None:
     t = trainer(queries())
+    t._stepper = t._stepper if compiled else None
     with torch.no_grad():
         t.model.get_parameter(poison).fill_(torch.nan)
     with pytest.raises(InputError, match=r"diverged at step 1: its batch .*\n.*--learning-rate 0\.01 "):

@@ -113,6 +113,21 @@ def test_a_dry_run_writes_nothing(
     assert "--error: must be above 0 and at most 1" in capsys.readouterr().err
 
 
+def test_a_dry_run_takes_the_training_times_of_pilots(
+    recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def seconds(found: dict[str, Any]) -> float:
+        monkeypatch.setattr(module, "forecast_errors", lambda *_: found)
+        file, out = ROOT / "pipelines" / "quickstart.yaml", tmp_path / "run"
+        assert run(app, ["run", str(file), "-o", str(out), "--dry-run", "--json"]) == 0
+        return float(json.loads(capsys.readouterr().out)["seconds"])
+
+    pilots = {"relief": {"source": "pilots", "text": "text", "forecast": {"seconds": 500.0}}}
+    without = {"relief": {"source": None, "text": "text"}}
+    # The recipe says 60 s.
+    assert seconds(pilots) - seconds(without) == pytest.approx(440.0)
+
+
 def test_pilots_answer_where_there_are_data(
     recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

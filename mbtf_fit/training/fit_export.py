@@ -1,0 +1,113 @@
+"""Materials of finished training: calibrated, with their errors, written to their folders."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.lattice import level_of_sigma
+from mbtf_core.stats import pooled_variance
+from mbtf_fit.config import FitConfig
+from mbtf_fit.data.loader import Partition
+from mbtf_fit.evaluation import evaluate_splits
+from mbtf_fit.material.decoder import Decoder, write_decoder
+from mbtf_fit.material.material import export
+from mbtf_fit.material.transmittance import evaluate_transmittance, fit_transmittance
+from mbtf_fit.training.loop import TrainingLoop
+from mbtf_fit.training.trainer import Trainer
+
+
+@dataclass(frozen=True)
+class Member:
+    """A material: its folder, its data, the content of its ``fit.json``."""
+
+    folder: Path
+    data: Dataset
+    identity: dict[str, Any]
+
+
+def export_fits(
+    config: FitConfig,
+    loop: TrainingLoop,
+    members: Sequence[Member],
+    partitions: Sequence[Partition],
+    validated: Sequence[str],
+    home: Path,
+    announce: Callable[[str], None],
+) -> None:
+    """Write the materials, and the network that they share."""
+    steps, seconds = loop.progress.step, round(loop.progress.seconds, 3)
+    summary: dict[str, Any] = {"materials": list(loop.names), "steps": steps, "seconds": seconds}
+    for k, (member, partition) in enumerate(zip(members, partitions, strict=True)):
+        mine = loop.batches_of(k, steps)
+        share: dict[str, Any] = {"steps": mine, "seconds": round(seconds * mine / steps, 3)}
+        if config.training.shared_decoder:
+            share["shared_decoder"] = summary
+        if config.decoder is not None:
+            share["decoder"] = {"sha256": Decoder.find(config.decoder).sha256}
+        trainer = loop.trainers[k]
+        export_fit(trainer, config, member, partition, announce, validated=validated[k], share=share)
+    if config.training.shared_decoder:
+        # It tells other fits that all materials are complete.
+        data = {member.folder.name: member.identity["data"] for member in members}
+        write_decoder(home, loop.trainers[0].model, config, materials=data, training=summary)
+
+
+def export_fit(
+    trainer: Trainer,
+    config: FitConfig,
+    member: Member,
+    partition: Partition,
+    announce: Callable[[str], None],
+    *,
+    validated: str,
+    share: dict[str, Any],
+) -> None:
+    """Write the material of a finished training, with its errors; `announce` receives each stage,
+    `validated`: name of the set of the validations, `share`: what the summary says of the material's part in
+    the training."""
+    data = member.data
+    of = f" {member.folder.name}"
+    trainer.fill_levels(float(level_of_sigma(partition.sample.sigma.max())))
+    announce(f"calibrating{of}")
+    trainer.calibrate()
+    announce(f"evaluating the errors of{of}")
+    errors = evaluate_splits(trainer.predict, data, partition)
+    variance = errors["training"]["variance"]["value"]
+    sample = partition.sample
+    noise = pooled_variance(sample.value_a, sample.value_b).value if data.estimates == 2 else None
+    training = {
+        "batch": trainer.batch,
+        "queries": len(partition.training),
+        "loss": trainer.progress.loss,
+        "validation_set": validated,
+        "weight_decay": asdict(trainer.weight_decay),
+        "coverage": {str(level): fraction for level, fraction in trainer.coverage().items()},
+        "device": str(trainer.device),
+        "threads": torch.get_num_threads(),
+        "backend": trainer.backend,
+        "torch": torch.__version__,
+        "errors": errors,
+        # Variance of the noise of values, in 1/sr² and over that of the values; null where it is unknown.
+        "noise_variance": noise,
+        "noise_ratio": noise / variance if noise is not None and variance and variance > 0 else None,
+    }
+    transmittance = fit_transmittance(data, partition.selection)
+    if transmittance is not None:
+        found = evaluate_transmittance(transmittance, data, partition.selection)
+        training["transmittance"] = {split: e.as_dict() for split, e in found.items()}
+    described = member.identity["data"]
+    announce(f"writing{of}")
+    export(
+        trainer.model,
+        config,
+        member.folder,
+        data=described,
+        training=training | share,
+        transmittance=transmittance,
+    )
