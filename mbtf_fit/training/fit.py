@@ -445,7 +445,7 @@ def export_fit(
     of = f" {member.folder.name}"
     trainer.fill_levels(float(level_of_sigma(partition.sample.sigma.max())))
     announce(f"calibrating{of}")
-    trainer.calibrate()
+    trainer.calibrate(_now_and_then(lambda fraction: announce(f"calibrating{of}: {fraction:.0%}")))
     announce(f"evaluating the errors of{of}")
     errors = evaluate_splits(trainer.predict, data, partition)
     variance = errors["training"]["variance"]["value"]
@@ -481,6 +481,19 @@ def export_fit(
         training=training | share,
         transmittance=transmittance,
     )
+
+
+def _now_and_then(tell: Callable[[float], None]) -> Callable[[float], None]:
+    """The same, but at most once in some seconds."""
+    last = time.monotonic()
+
+    def sparse(fraction: float) -> None:
+        nonlocal last
+        if time.monotonic() - last > _REPORT_SECONDS:
+            last = time.monotonic()
+            tell(fraction)
+
+    return sparse
 
 
 def result_of(out: Path, total: float, *, resumed: bool) -> FitResult:

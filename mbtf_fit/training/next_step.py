@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.schema import CONFIG_NAME
 from mbtf_core.units import format_duration
 from mbtf_fit.config import FitConfig
 from mbtf_fit.formatting import headline
@@ -34,7 +35,8 @@ class NextStep:
     reason: str
 
     def command(self, config: FitConfig, seconds: float, data: Dataset, material: Path) -> str | None:
-        """The whole command, which writes to new folders; None where there is nothing to do.
+        """The whole command, which writes to new folders; None where there is nothing to do, or where the
+        data are of an unknown source.
 
         Parameters
         ----------
@@ -53,19 +55,19 @@ class NextStep:
             if training.steps is not None:
                 more = ["--steps", str(2 * training.steps)]
             return shlex.join(["mbtf-fit", str(data.folder), *fitted, *more, *out])
-        manifest, shards = data.manifest, _numbered(str(data.folder))
-        if "measured" in manifest:
-            made = ["mbtf-gen", "import", manifest["measured"]["file"]]
-        else:
-            made = ["mbtf-gen", manifest["config"]["material"]]
-        made += ["--config", str(data.folder.at("config.yaml"))]
-        queries = (manifest.get("config") or {}).get("queries") or {}
+        made, shards = data.manifest.get("config") or {}, _numbered(str(data.folder))
+        source = data.manifest["measured"]["file"] if "measured" in data.manifest else made.get("material")
+        if source is None or "queries" not in made:
+            # Of another program.
+            return None
+        words = ["mbtf-gen", *(["import"] if "measured" in data.manifest else []), source]
+        words += ["--config", str(data.folder.at(CONFIG_NAME))]
         if self.kind == "queries":
-            made += ["--queries", _times(queries.get("train", "100/texel"), 2)]
+            words += ["--queries", _times(made["queries"]["train"], 2)]
         else:
-            made += ["--test-queries", _times(queries.get("test", "8192"), 4)]
-        made += ["-o", shards]
-        return f"{shlex.join(made)} && {shlex.join(['mbtf-fit', shards, *fitted, *out])}"
+            words += ["--test-queries", _times(made["queries"]["test"], 4)]
+        words += ["-o", shards]
+        return f"{shlex.join(words)} && {shlex.join(['mbtf-fit', shards, *fitted, *out])}"
 
 
 def next_step(cost: MarginalCost, errors: Mapping[str, Any]) -> NextStep:
