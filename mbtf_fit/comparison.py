@@ -124,7 +124,9 @@ def compare(config: ComparisonConfig, output: Path, console: Console, *, overwri
         seen.append(f"unexplained variance {format_estimate(found['unexplained'])}")
         of = f"reference: contrast {found['contrast']:.1%}, noise {facts['relative_noise']:.1%}"
         lines.append(f"{width_label(across)}: {', '.join(seen)}; {of}")
-    lines.append("% of the mean value; unexplained variance is (RMS error / contrast)², large where contrast is low")
+    lines.append(
+        "% of the mean value; unexplained variance is (RMS error / contrast)², large where contrast is low"
+    )
     lines.append(describe_exposure(exposure))
     report = {"file": output / PICTURE_NAME, "exposure": exposure, "foreign_inputs": foreign}
     console.report({**report, "pictures": pictures}, "\n".join(lines))
