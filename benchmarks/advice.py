@@ -1,15 +1,15 @@
-"""What mbtf-fit says of longer training and of more queries, followed.
+"""What mbtf-fit expects of longer training and of more queries, followed.
 
     python benchmarks/advice.py --out FOLDER [MATERIAL ...] [--seeds 2]
 
 Seven materials, in the preset ``draft`` at 64 texels, are fitted with 50, 100, 200, ... 3200 steps; with
-other seeds than 0, up to 800. What a fit says is followed, on test queries of 256 paths:
+other seeds than 0, up to 800. What a fit expects is followed, on test queries of 256 paths:
 
-- ``few`` and ``more``: "expect about 0.8 of this error after twice the time": right if twice the steps leave
-  this factor, within 1.5;
-- ``flat``: "longer training alone would hardly reduce the error": right if twice the steps leave 0.8 or more;
+- ``few`` and ``more``, about 0.8 of this error after twice the time: right if twice the steps leave this
+  factor, within 1.5;
+- ``flat``, hardly any reduction: right if twice the steps leave 0.8 or more;
 - ``few`` and ``none`` without a factor, where the error is too uncertain: the former is right if it falls;
-- ``data``: "expect about 0.7 of it with twice the queries": as ``more``, at equal steps, after 1600 steps.
+- ``data``, about 0.7 of it with twice the queries: as ``more``, at equal steps, after 1600 steps.
 
 Two standard errors of both errors are allowed. Below, the factors of twice the steps are compared with
 those that would be said, by number of steps; this is what the constants of
@@ -34,6 +34,7 @@ from front import TEST_SPP
 from quality import generator_config
 
 from mbtf_fit import FitConfig, fit
+from mbtf_fit.training import validation
 from mbtf_fit.training.validation import MarginalCost, marginal_cost_of
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.run import generate
@@ -113,12 +114,11 @@ def followed(before: dict[str, Any], after: dict[str, Any], kind: Sentence, said
 
 def sentence(cost: MarginalCost) -> Sentence:
     """What a fit says of longer training."""
-    text = cost.describe()
-    if "are few" in text:
+    if cost.few:
         return "few"
     if cost.doubling is None:
         return "none"
-    return "flat" if "hardly" in text else "more"
+    return "flat" if cost.doubling >= validation.FLAT else "more"
 
 
 def shown(name: str, seed: int, steps: int, before: dict[str, Any], found: Followed) -> None:

@@ -14,6 +14,8 @@ U8 = NDArray[np.uint8]
 Palette = Literal["local", "flip", "signed"]
 # Color maps of magnitudes from 0 to 1. Both are perceptually uniform, with monotonic lightness.
 _MAGNITUDES = {"local": "viridis", "flip": "magma"}
+# A group of maps that exceeds the median one by this factor does not widen the common scale.
+_OUTLIER = 4.0
 # sRGB colors of a signed difference from -1 (blue) over 0 (nearly black) to 1 (orange). Lightness encodes the
 # magnitude. Blue and orange are distinguishable under every common color-vision deficiency.
 _STOPS = (-1.0, -0.5, 0.0, 0.5, 1.0)
@@ -51,4 +53,17 @@ def round_scale(x: float) -> float:
 
 def common_scale(maps: Sequence[ArrayLike]) -> float:
     """Rounded end of the scale of several maps: the 99th percentile of all magnitudes."""
-    return round_scale(float(np.percentile(np.concatenate([np.abs(np.ravel(m)) for m in maps]), 99)))
+    return round_scale(_extent(maps))
+
+
+def robust_scale(groups: Sequence[Sequence[ArrayLike]]) -> float:
+    """Rounded end of the common scale of several groups of maps, such as those of each fit: the 99th
+    percentile of the magnitudes of a group, and the largest over the groups that do not exceed four times the
+    median one."""
+    extents = sorted(map(_extent, groups))
+    median = extents[(len(extents) - 1) // 2]
+    return round_scale(max(x for x in extents if x <= _OUTLIER * median or x == median))
+
+
+def _extent(maps: Sequence[ArrayLike]) -> float:
+    return float(np.percentile(np.concatenate([np.abs(np.ravel(m)) for m in maps]), 99))

@@ -5,6 +5,7 @@ A pixel is M for one query, as in ``mbtf-gen reference --kind query``, for both.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from mbtf_core.files.folders import OutputFolder, owned
 from mbtf_core.palettes import common_scale, indices, palette
 from mbtf_core.pictures import claim_pictures, write_png
 from mbtf_core.run.signals import keep_on_interruption
-from mbtf_core.stats import noise_free_mse, unexplained_variance
+from mbtf_core.stats import noise_free_mse, signal_variance, unexplained_variance
 from mbtf_fit.evaluation import foreign_inputs
 from mbtf_fit.formatting import format_estimate, visibility
 from mbtf_fit.material.material import Material
@@ -119,13 +120,22 @@ def compare(config: ComparisonConfig, output: Path, console: Console, *, overwri
     pictures, lines = [], [f"{output / PICTURE_NAME}: reference, fit, and fit - reference"]
     for across, facts, found in zip(view.tiles_across, known, errors, strict=True):
         pictures.append({"tiles_across": across, "relative_noise": facts["relative_noise"], **found})
-        unexplained = f"unexplained variance {format_estimate(found['unexplained'])}"
-        seen = [unexplained, *filter(None, visibility(found))]
-        noise = f"noise of the reference {facts['relative_noise']:.2%} of the mean value"
-        lines.append(f"{width_label(across)}: {', '.join(seen)}; {noise}")
+        seen = [_rms_text(found), *filter(None, visibility(found))]
+        seen.append(f"unexplained variance {format_estimate(found['unexplained'])}")
+        of = f"reference: contrast {found['contrast']:.1%}, noise {facts['relative_noise']:.1%}"
+        lines.append(f"{width_label(across)}: {', '.join(seen)}; {of}")
+    lines.append(
+        "% of the mean value; unexplained variance is (RMS error / contrast)², large where contrast is low"
+    )
     lines.append(describe_exposure(exposure))
     report = {"file": output / PICTURE_NAME, "exposure": exposure, "foreign_inputs": foreign}
     console.report({**report, "pictures": pictures}, "\n".join(lines))
+
+
+def _rms_text(found: dict[str, Any]) -> str:
+    mse, error, mean = found["mse"]["value"], found["mse"]["error"], found["mean"]
+    significant = mse is not None and error is not None and mse > 2.0 * error
+    return f"RMS error {math.sqrt(mse) / mean:.1%}" if significant and mean > 0 else "RMS error within noise"
 
 
 def _draw(
@@ -144,7 +154,10 @@ def _draw(
         halves = [stored[key].reshape(-1, 3) for key in ("value_a", "value_b")]
         reference = 0.5 * (halves[0] + halves[1])
         mse, unexplained = noise_free_mse(fit, *halves), unexplained_variance(fit, *halves)
-        errors.append({"mse": mse.as_dict(), "unexplained": unexplained.as_dict(), "exposure": exposure})
+        mean, variance = float(reference.mean()), signal_variance(*halves).value
+        contrast = math.sqrt(max(0.0, variance)) / mean if mean > 0 else 0.0
+        numbers = {"exposure": exposure, "mean": mean, "contrast": contrast}
+        errors.append({"mse": mse.as_dict(), "unexplained": unexplained.as_dict(), **numbers})
         columns[0].append(to_display(reference.reshape(shape), exposure))
         columns[1].append(to_display(fit.reshape(shape), exposure))
         differences.append((fit - reference).mean(axis=-1).reshape(shape[:2]) / white_of(exposure))

@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from mbtf_core.app.options import Flag, Quality
 from mbtf_core.config.settings import LocalName, Settings, deep_merge, leaves
@@ -16,13 +16,29 @@ from mbtf_core.units import parse_duration
 from mbtf_fit.models import NAMES
 from mbtf_fit.sections import DataSection, HeldOutSection, NetworkSection, TrainingSection
 
+
+def _installed(name: object) -> object:
+    """The name of a model.
+
+    Raises
+    ------
+    ValueError : there is none of this name
+    """
+    if isinstance(name, str) and name not in NAMES:
+        raise ValueError(
+            f"must be an installed model: {', '.join(NAMES)}, or one that another package registers by an "
+            f"entry point of mbtf.models; '{name}' is none"
+        )
+    return name
+
+
 if TYPE_CHECKING:
     from mbtf_core.data.lattice import Lattice
     from mbtf_fit.pytorch.material import NeuralMaterial
 
     ModelName = str
 else:
-    ModelName = Literal[NAMES]
+    ModelName = Annotated[Literal[NAMES], BeforeValidator(_installed)]
 
 # The best of them where the data set has a geometry.
 DEFAULT_MODEL = "relief"
@@ -45,7 +61,9 @@ class FitConfig(Settings):
     exclusive = (("training.time", "training.steps"),)
 
     version: Literal[2] = 2
-    model: Annotated[ModelName, Flag("--model")] = Field(DEFAULT_MODEL, description="model to fit")
+    model: Annotated[ModelName, Flag("--model")] = Field(
+        DEFAULT_MODEL, description="model to fit; mbtf-fit models describes them"
+    )
     init_from: Annotated[LocalName | None, Flag("--init-from", "FOLDER")] = Field(
         None, description="folder of a material that initializes textures and offset"
     )

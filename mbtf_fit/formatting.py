@@ -10,10 +10,9 @@ from mbtf_core.units import clock
 
 SPLIT_NAMES = {
     "test": "test queries",
-    "held_out_queries": "held-out queries",
-    "held_out_directions": "held-out directions",
+    "held_out_queries": "test queries of the train split",
+    "held_out_directions": "test directions",
     "training": "training queries",
-    "held_out": "held out",
 }
 # Smallest PSNR in dB of each word for a fit beside its reference. There, the mean HDR-FLIP of pictures is
 # that of grays that differ by 1, 2.3 and 5 in L*; materials vary by 3 dB.
@@ -23,15 +22,13 @@ VISIBILITY = (
     (26.0, "visible"),
     (-math.inf, "clearly visible"),
 )
-# The word where queries are too few or too noisy for another.
-UNRESOLVED = "unresolved"
 # Standard errors of a significant difference from zero.
 _SIGNIFICANT = 2.0
 
 
 def visibility(split: Mapping[str, Any]) -> tuple[str, str | None]:
     """PSNR as text, and a word of :data:`VISIBILITY`, of the errors of a split; where the error is below its
-    own uncertainty, lower bounds. None without an error."""
+    own uncertainty, bounds. None without an error, or where the bounds exclude nothing."""
     from mbtf_core.color import white_of
 
     mse, error = split["mse"]["value"], split["mse"]["error"]
@@ -43,12 +40,15 @@ def visibility(split: Mapping[str, Any]) -> tuple[str, str | None]:
         return "PSNR infinite", VISIBILITY[0][1]
     psnr = 10.0 * math.log10(white_of(split["exposure"]) ** 2 / squared)
     word = next(word for least, word in VISIBILITY if psnr >= least)
-    clear = resolved or word == VISIBILITY[0][1]
-    return f"PSNR {'' if resolved else 'above '}{psnr:.1f} dB", word if clear else UNRESOLVED
+    if resolved or word == VISIBILITY[0][1]:
+        return f"PSNR {'' if resolved else 'above '}{psnr:.1f} dB", word
+    if word == VISIBILITY[-1][1]:
+        return "PSNR unknown", None
+    return f"PSNR above {psnr:.1f} dB", f"{word} at most"
 
 
 def headline(errors: Mapping[str, Any]) -> str:
-    """The split whose errors are reported first: test, else held-out queries, else any."""
+    """The split whose errors are reported first: test, else test queries of the train split, else any."""
     return next((name for name in ("test", "held_out_queries") if name in errors), next(iter(errors)))
 
 
@@ -59,8 +59,9 @@ def report_errors(
     *,
     foreign: bool = False,
 ) -> list[str]:
-    """Three lines, and advice: unexplained variance (where defined) and PSNR of the first split, and those of
-    other splits; if `verbose` a table, too. `foreign`: the errors are of the data of another material."""
+    """Three lines, and remarks: unexplained variance (where defined) and PSNR of the first split, and the
+    former of other directions; if `verbose` a table of all splits, too. `foreign`: the errors are of the data
+    of another material."""
     from mbtf_core.color import describe_exposure
 
     if not errors:
@@ -74,13 +75,11 @@ def report_errors(
     text, word = visibility(split)
     if word is not None:
         shown = describe_exposure(split["exposure"])
-        seen = f"{word} beside the reference"
-        seen = "these queries do not resolve the error" if word == UNRESOLVED else seen
-        lines.append(f"{text} {'' if lines else of + ' '}at {shown}: {seen}")
+        lines.append(f"{text} {'' if lines else of + ' '}at {shown}: {word} beside the reference")
     others = [
         f"{SPLIT_NAMES.get(name, name)} {format_estimate(found['unexplained'])}"
         for name, found in errors.items()
-        if name != first
+        if name == "held_out_directions" != first
     ]
     if transmittance:
         through = next(iter(transmittance.values()))
@@ -100,15 +99,7 @@ def _remarks(errors: Mapping[str, Any], foreign: bool) -> list[str]:
         found.append("these errors include the noise of the data, which have one value per query")
     if value is None or value < 1 or foreign:
         return found
-    own = errors["training"]["unexplained"]["value"] if "training" in errors else None
-    if own is not None and own >= 1:
-        advice = "as the training queries are so too, the fit has not converged"
-    elif measured:
-        advice = "import more queries (mbtf-gen import --queries)"
-    else:
-        advice = "generate more queries (mbtf-gen --queries), more paths per query (--spp), or a wider light "
-        advice += "(--light-width)"
-    return [*found, f"above 1: worse than the mean value; {advice}"]
+    return [*found, "above 1: worse than the mean value"]
 
 
 def _table_of(errors: Mapping[str, Any]) -> list[str]:

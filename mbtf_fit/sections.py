@@ -252,12 +252,12 @@ def _on_disk(point: tuple[float, float]) -> tuple[float, float]:
 
 
 class HeldOutSection(Settings):
-    """Queries of the train split that are held out for validation."""
+    """Queries of the train split that are kept out of training, for tests."""
 
     queries: float = Field(0.01, ge=0, lt=0.5, description="fraction of the queries, selected at random")
     direction: Annotated[tuple[float, float], AfterValidator(_on_disk)] = Field(
-        (0.45, 0.3), description="center (x, y) of the held-out region on the projected disk"
+        (0.45, 0.3), description="center (x, y) of a region on the projected disk"
     )
     radius: float = Field(
-        0.1, ge=0, lt=1, description="radius of that region; queries with light or view in it are held out"
+        0.1, ge=0, lt=1, description="radius of that region; those with light or view in it are kept out"
     )

@@ -48,16 +48,17 @@ def signed(text: str) -> str:
 
 
 def data_errors(record: Mapping[str, Any]) -> tuple[str, str]:
-    """(unexplained variance in percent, MSE in 10⁻³/sr²) of the same queries.
+    """(unexplained variance, MSE in 10⁻³/sr²) of the same queries.
 
-    The former is the latter divided by a variance, so both are marked as significant or neither is.
+    The former is the latter divided by a variance, so both are marked as significant or neither is. An
+    unexplained variance that may be below 0 and above 1 has no number.
     """
     unexplained, mse = estimate(record["unexplained"]), estimate(record["mse"])
     significant = is_significant(unexplained) and is_significant(mse)
-    return (
-        estimate_text(unexplained, 100.0, " %", significant=significant),
-        estimate_text(mse, 1e3, significant=significant),
-    )
+    text = estimate_text(unexplained, significant=significant)
+    if not significant and unexplained.value + SIGNIFICANT * unexplained.error > 1.0:
+        text = NOT_SIGNIFICANT
+    return text, estimate_text(mse, 1e3, significant=significant)
 
 
 def decibel(psnr: Estimate, mse: Estimate) -> str:

@@ -9,7 +9,7 @@ from mbtf_core.app.console import new_app
 from mbtf_fit.cli.fit import fit
 
 _COMMANDS = {
-    **{name: name for name in ("evaluate", "compare", "preview", "view", "info")},
+    **{name: name for name in ("models", "evaluate", "compare", "preview", "view", "info")},
     "export": "export_material",
 }
 

@@ -16,8 +16,8 @@ def evaluate(
 
     Measured data have one value per query: errors on them include their noise, and say so.
 
-    Errors are those of the test split, of held-out queries and directions, and of training queries; with
-    --verbose also by level of detail and by elevation.
+    No fit is trained on test queries and directions. --verbose adds the training queries, and errors by level
+    of detail and by elevation.
 
     Parameters
     ----------

@@ -63,9 +63,10 @@ def fit(
     """Fit a material to a data set: mbtf-fit shards/ -o material/
 
     The same command again resumes an unfinished fit. --time is that of training, without loading, validation
-    and evaluation. --quality trains 800 steps at least, even if they take longer, as does --time "12s, at
-    least 800 steps". --dry-run forecasts time and size by some seconds of training on this machine. With
-    --many, the output folder holds one folder per material.
+    and evaluation. Errors are those of test queries, which no fit is trained on. --quality trains 800 steps
+    at least, even if they take longer, as does --time "12s, at least 800 steps". --dry-run forecasts time and
+    size by some seconds of training on this machine. With --many, the output folder holds one folder per
+    material.
 
     Parameters
     ----------
@@ -127,10 +128,12 @@ def _fit_one(
     console: Console,
 ) -> None:
     """Fit a data set, watched by whoever asks for it."""
+    from mbtf_core.data.dataset import Dataset
     from mbtf_fit.material.format import DESCRIPTION_NAME
     from mbtf_fit.training.endings import describe_ending
     from mbtf_fit.training.fit import fit
     from mbtf_fit.training.fit_folder import EventLog
+    from mbtf_fit.training.next_step import next_step
 
     finished = not overwrite and (output / DESCRIPTION_NAME).exists()
     if not finished:
@@ -159,11 +162,14 @@ def _fit_one(
             shown.finished(output.name, output)
     if finished:
         console.note(f"{output}: this fit is already finished; --overwrite trains it again")
-    summary = result.as_dict()
+    summary = {**result.as_dict(), "next_command": None}
     ending = describe_ending(config, result.history)
     more = [ending] if ending is not None else []
     if result.marginal_cost is not None and not summary["reached"]:
-        more.append(result.marginal_cost.describe())
+        step = next_step(result.marginal_cost, result.errors)
+        command = step.command(config, result.seconds, Dataset.open(shards), output)
+        summary["next_command"] = command
+        more.append(step.reason if command is None else f"{step.reason}:\n  {command}")
     console.report(summary, "\n".join([describe_fit(summary, verbose), *more]))
 
 

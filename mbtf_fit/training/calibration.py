@@ -37,6 +37,8 @@ from mbtf_fit.sections import HeldOutSection
 # Most training queries that are used, and queries per block.
 MAX_QUERIES = 1 << 21
 _CHUNK = 1 << 18
+# Evaluations that are always granted.
+_LEAST_EVALUATIONS = 1 << 19
 # Footprint of level 0.
 _COARSEST = np.float32(0.5)
 # Points per level, at most; fewer where queries are few.
@@ -120,6 +122,8 @@ def fit_calibration(
     queries: TrainingQueries | StreamedQueries,
     held_out: HeldOutSection,
     bound: Callable[[Tensor], Tensor | None],
+    evaluations: int | None = None,
+    progress: Callable[[float], None] = lambda fraction: None,
 ) -> F32:
     """Tables (2, levels, knots, 3) of G_i and G_o.
 
@@ -129,8 +133,20 @@ def fit_calibration(
     queries : training queries
     held_out : region without training queries
     bound : Huber bound of the errors of predictions (n, 3); None without one
+    evaluations : about the most that it may take; no limit by default
+    progress : called with the fraction that is done, after each block
     """
-    used = min(len(queries), MAX_QUERIES)
+    levels = lattice.finest + 1
+    used = most_queries(len(queries), levels, evaluations)
+    # Two evaluations of each query, one of each point and level.
+    total = 2 * used + levels * _points_of(used)
+    done = 0
+
+    def count(n: int) -> None:
+        nonlocal done
+        done += n
+        progress(min(1.0, done / total))
+
     sums, squares = np.zeros((2, _BINS, 3)), np.zeros((2, _BINS, 3))
     largest = 0.0
     for start in range(0, used, _CHUNK):
@@ -147,37 +163,57 @@ def fit_calibration(
             sums[k] += _binned(_bin(omega), residual)
             squares[k] += _binned(_bin(omega), residual.astype(np.float64) ** 2)
             largest = max(largest, float(np.hypot(omega[:, 0], omega[:, 1]).max()))
-    means, spread, count = _means(evaluate, lattice, held_out, min(largest, 1.0), 2 * used)
-    tables = np.ones((2, lattice.finest + 1, KNOTS, 3))
-    for s in range(lattice.finest + 1):
+        count(2 * len(u))
+    means, spread, kept = _means(evaluate, lattice, held_out, min(largest, 1.0), _points_of(used), count)
+    tables = np.ones((2, levels, KNOTS, 3))
+    for s in range(levels):
         for c, k in product(range(3), (0, 1) * ROUNDS):
             # Sums over the other elevation, with its current factors.
             other = _HATS @ tables[1 - k, s, :, c]
             mine = means[s, ..., c] @ other if k == 0 else other @ means[s, ..., c]
             total = sums[k, :, c] / used + means[0, ..., c].sum(1 - k)
-            variance = squares[k, :, c] / used**2 + spread[s, ..., c].sum(1 - k) / count
+            variance = squares[k, :, c] / used**2 + spread[s, ..., c].sum(1 - k) / kept
             target = _HATS.T @ total
             covariance = _HATS.T @ (variance[:, None] * _HATS) + np.diag((POINT_ERROR * target) ** 2)
             tables[k, s, :, c] = solve(_HATS.T @ (mine[:, None] * _HATS), target, covariance)
     return tables.astype(np.float32)
 
 
+def most_queries(queries: int, levels: int, evaluations: int | None = None) -> int:
+    """How many of the training queries are used, within so many evaluations of them and of the points."""
+    if evaluations is not None:
+        granted = max(evaluations, _LEAST_EVALUATIONS)
+        # Points are twice as many as queries, up to a limit.
+        queries = min(queries, max(granted // (2 + 2 * levels), (granted - levels * POINTS) // 2))
+    return min(queries, MAX_QUERIES)
+
+
+def _points_of(queries: int) -> int:
+    return min(POINTS, max(_LEAST_POINTS, 2 * queries))
+
+
 def _means(
-    evaluate: Evaluate, lattice: Lattice, held_out: HeldOutSection, largest: float, count: int
+    evaluate: Evaluate,
+    lattice: Lattice,
+    held_out: HeldOutSection,
+    largest: float,
+    total: int,
+    count: Callable[[int], None],
 ) -> tuple[F64, F64, int]:
     """Means over points of a fit's values at each level, and of their squared differences from level 0, by
     bins of light and view: (levels, bins, bins, 3) each; and the number of points."""
     out = np.zeros((2, lattice.finest + 1, _BINS * _BINS, 3))
     used = 0
-    total = min(POINTS, max(_LEAST_POINTS, count))
     for start in range(0, total, _CHUNK):
-        u, light, view = points(start, min(start + _CHUNK, total), largest)
+        stop = min(start + _CHUNK, total)
+        u, light, view = points(start, stop, largest)
         kept = ~(in_region(held_out, light) | in_region(held_out, view))
         u, light, view = u[kept], light[kept], view[kept]
         used += len(u)
         index, first = _bin(light) * _BINS + _bin(view), np.zeros((0, 3), np.float32)
         for s in range(lattice.finest + 1):
             value = evaluate(u, np.full(len(u), sigma_of_level(s), np.float32), light, view)
+            count(stop - start)
             first = value if s == 0 else first
             out[0, s] += _binned(index, value, _BINS * _BINS)
             out[1, s] += _binned(index, (value - first).astype(np.float64) ** 2, _BINS * _BINS)

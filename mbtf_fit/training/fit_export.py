@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -20,6 +21,9 @@ from mbtf_fit.material.material import export
 from mbtf_fit.material.transmittance import evaluate_transmittance, fit_transmittance
 from mbtf_fit.training.loop import TrainingLoop
 from mbtf_fit.training.trainer import Trainer
+
+# Interval at which a stage says how far it is.
+_REPORT_SECONDS = 5.0
 
 
 @dataclass(frozen=True)
@@ -75,7 +79,7 @@ def export_fit(
     of = f" {member.folder.name}"
     trainer.fill_levels(float(level_of_sigma(partition.sample.sigma.max())))
     announce(f"calibrating{of}")
-    trainer.calibrate()
+    trainer.calibrate(_now_and_then(lambda fraction: announce(f"calibrating{of}: {fraction:.0%}")))
     announce(f"evaluating the errors of{of}")
     errors = evaluate_splits(trainer.predict, data, partition)
     variance = errors["training"]["variance"]["value"]
@@ -111,3 +115,16 @@ def export_fit(
         training=training | share,
         transmittance=transmittance,
     )
+
+
+def _now_and_then(tell: Callable[[float], None]) -> Callable[[float], None]:
+    """The same, but at most once in some seconds."""
+    last = time.monotonic()
+
+    def sparse(fraction: float) -> None:
+        nonlocal last
+        if time.monotonic() - last > _REPORT_SECONDS:
+            last = time.monotonic()
+            tell(fraction)
+
+    return sparse

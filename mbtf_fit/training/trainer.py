@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -247,9 +247,10 @@ class Trainer:
             for texture, table in zip(self.model.textures(), self._tables(), strict=True):
                 texture.read(table)
 
-    def calibrate(self) -> None:
+    def calibrate(self, progress: Callable[[float], None] = lambda fraction: None) -> None:
         """Fit the calibration factors (:mod:`~mbtf_fit.training.calibration`), if the configuration asks for
-        them and the model has some."""
+        them and the model has some; with at most half as many evaluations as training took, whose steps take
+        about three each. `progress` is called with the fraction that is done."""
         model = self.model
         if not (self.config.training.energy_calibration and self.hooks.calibrates):
             return
@@ -257,7 +258,13 @@ class Trainer:
         self._read_blurred()
         model.calibrate(None)
         found = fit_calibration(
-            partial(predict, model), model.lattice, self.queries, self.config.held_out, self.loss.bound
+            partial(predict, model),
+            model.lattice,
+            self.queries,
+            self.config.held_out,
+            self.loss.bound,
+            self.progress.step * self.batch // 2,
+            progress,
         )
         model.calibrate(torch.from_numpy(found).to(self.device))
 

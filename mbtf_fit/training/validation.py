@@ -15,7 +15,7 @@ from mbtf_fit.data.loader import Partition, load_split
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.training.trainer import Trainer
 
-# Queries of the validation subset, and the fewest test queries that are preferred over held-out queries.
+# Queries of the validation subset, and the fewest queries of the test split that are preferred over others.
 _SUBSET, _FEWEST = 1 << 14, 1 << 12
 
 
@@ -23,7 +23,8 @@ def validation_set(data: Dataset, partition: Partition) -> tuple[str, ShardQueri
     """(name among the errors, queries) of the set on which the error is tracked.
 
     The test split, because it has more paths per query: four paths often do not resolve the error of glossy
-    materials. The held-out queries where there is no test split, or a small one. No option is selected by it.
+    materials. Those of the train split where there is no test split, or a small one. No option is selected
+    by it.
     """
     held_out = partition.held_out_queries
     test = load_split(data, "test") if "test" in data.splits and data.shards("test") else None
@@ -82,7 +83,7 @@ _LASTING, _LASTING_SCATTER = 0.5, 0.05
 # to 0.84 of it after 200 steps, to 0.92 after 400.
 _FEWEST_STEPS = 400
 # Expected remainder of the error from which longer training hardly helps.
-_FLAT = 0.95
+FLAT = 0.95
 # Relative standard error of the validation above which it does not tell convergence.
 _RESOLVED = 0.25
 
@@ -110,28 +111,10 @@ class MarginalCost:
         """Plain data for JSON."""
         return asdict(self)
 
-    def describe(self) -> str:
-        """One line, or two; factors are relative to the present error."""
-        gain = "" if self.doubling is None else f"about {self.doubling:.2g} of this error"
-        if self.steps < _FEWEST_STEPS:
-            line = f"{self.steps} steps are few: train longer (--time)"
-            lines = [f"{line}; expect {gain} after twice the time" if gain else line]
-        elif self.doubling is None:
-            lines = ["the error is too uncertain to say what longer training would gain: try twice the time"]
-        elif self.doubling >= _FLAT:
-            lines = ["longer training alone would hardly reduce the error"]
-        else:
-            lines = [f"expect {gain} after twice the training time"]
-        if self.noise_share is not None:
-            low, high = (
-                min(max(self.noise_share + side * self.noise_share_error, 0.0), 1.0) for side in (-1.0, 1.0)
-            )
-            lines.append(
-                f"overfitting to noise causes {low:.0%} to {high:.0%} of the error of new queries: expect "
-                f"{1.0 - 0.5 * high:.2g} to {1.0 - 0.5 * low:.2g} of it with twice the queries, or paths "
-                "per query"
-            )
-        return "\n".join(lines)
+    @property
+    def few(self) -> bool:
+        """Whether so few steps ask for more, whatever the curve shows."""
+        return self.steps < _FEWEST_STEPS
 
 
 def marginal_cost_of(
@@ -186,7 +169,7 @@ def _number(x: Any) -> bool:
 
 
 def _noise_share(errors: dict[str, Any], noise: float | None) -> tuple[float, float] | None:
-    """Overfitting over the error of new queries, test or held-out queries, whichever error is known best; and
+    """Overfitting over the error of new queries, of either split, whichever error is known best; and
     two standard errors.
 
     A fit that overfits the noise of its training queries gains an error on other queries that equals the

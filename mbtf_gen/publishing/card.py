@@ -112,6 +112,6 @@ def card_text(facts: Facts) -> str:
         shape=", ".join(str(n) for n in (-1, *facts.shapes[split]["value_a"])),
         configuration="" if facts.same_shapes else f'"{split}", ',
         labels={name: effect.description for name, effect in EFFECTS.items()},
-        bound=lambda effect: bias_text(EffectDecision(**effect)) if effect["present"] else "",
+        bound=lambda effect: bias_text(EffectDecision(**effect)),
         files=_grouped(facts),
     )

@@ -171,7 +171,9 @@ def _normals(found: Mapping[str, Any]) -> list[str]:
         out.append(f"           DOES NOT FIT; fits with {how}: correlation {n['best']:.2f}")
     elif n["suggested_height_scale"] is not None:
         out.append(
-            f"           the normal map suggests the height scale {n['suggested_height_scale']:.3g}; "
-            f"in use {found['geometry']['height_scale']:.3g}"
+            f"           slopes agree best at --height-scale {n['suggested_height_scale']:.3g}; "
+            f"{found['geometry']['height_scale']:.3g} is in use"
         )
+    else:
+        out.append("           at no height scale do the slopes agree: the normal map shows other details")
     return out

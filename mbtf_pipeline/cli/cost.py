@@ -111,14 +111,17 @@ def cost(
             for m in front
         ],
     }
-    counts = f"{len(study.measurements)} configurations measured, {len(study.skipped)} skipped"
-    lines = [f"{page}: {counts} for lack of time", *(f"failed: {text}" for text in study.failed)]
+    runs = [m for m in study.measurements if m.study == "run"]
+    generator = len(study.measurements) - len(runs)
+    counts = f"{generator} configurations of the generator and {len(runs)} of complete runs measured"
+    lines = [f"{page}: {counts}; no time for {len(study.skipped)} others"]
+    lines += [f"failed: {text}" for text in study.failed]
     lines += [row["line"] for row in rows]
     lines += [study.asked] if study.asked else []
     if not rows and study.least is not None:
-        text = (
-            f"too few complete runs to tell what a time gives: --time {rounded(study.least)} measures enough"
+        lines.append(
+            "too few complete runs to tell what a time gives: the same command with --time "
+            f"{rounded(study.least)} keeps these and measures enough on this machine"
         )
-        lines.append(f"{text} on this machine")
     lines += [f"  {m.seconds.value:.0f} s: unexplained variance {m.error}   {m.command}" for m in front]
     console.report(data, "\n".join(lines))

@@ -82,9 +82,7 @@ def _psnr(run: FinishedRun, fit: str, pictures: Pictures | None = None, *, kind:
     return Shown(decibel(found, mse), found.value, found.error, "se")
 
 
-_UNEXPLAINED = Column(
-    "unexplained variance [%]", "unexplained", lambda run, fit: run.error(fit, "unexplained"), 100.0
-)
+_UNEXPLAINED = Column("unexplained variance", "unexplained", lambda run, fit: run.error(fit, "unexplained"))
 _METHODS = [
     MATERIAL,
     METHOD,

@@ -84,6 +84,8 @@ def _figure(
     shown = [one for one in series if one.x]
     if not shown:
         return {"svg": "", "caption": f"No {y} could be measured."}
+    if max(len(one.x) for one in shown) < 2:
+        return {"svg": "", "caption": caption or "One measurement; a longer --time takes more."}
     return {"svg": plot(shown, x, y, f"cost {png.stem}", png=png, **options), "caption": caption}
 
 

@@ -26,7 +26,7 @@ from mbtf_core.files.folders import ELSEWHERE, OutputKind, check_space, owned
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item, worker_threads
 from mbtf_core.stats import Estimate
-from mbtf_core.units import expectation, format_duration
+from mbtf_core.units import clock, expectation, format_duration
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
 from mbtf_pipeline.cost.answers import Evidence
@@ -115,12 +115,11 @@ def rounded(seconds: float) -> str:
     return format_duration(unit * math.ceil(seconds / unit))
 
 
-def too_short(seconds: float, runs: int) -> str:
+def too_short(seconds: float, least: float) -> str:
     """Warning of a study that is too short to answer questions."""
-    room = f"{runs} complete run{'s' * (runs != 1)}"
     return (
-        f"warning: --time {format_duration(seconds)} has room for {room}; {FEWEST_TOTALS} lengths with two "
-        f"seeds tell how the error falls: --time {rounded(LEAST_SECONDS)} at least"
+        f"warning: --time {format_duration(seconds)} is too short to tell how the error falls: complete runs "
+        f"of {FEWEST_TOTALS} lengths with two seeds take about {rounded(least)} on this machine"
     )
 
 
@@ -139,7 +138,7 @@ class Measurements:
     Attributes
     ----------
     conditions, store, runner : what measures, and where the results are kept
-    note : called with the label of a configuration when it is taken
+    note : called when a configuration is taken, with its label and the time that it is expected to take
     failed : why runs failed
     path_seconds : seconds of generating a query over its number of paths
     """
@@ -181,7 +180,10 @@ class Measurements:
         def items() -> Iterator[Item]:
             for configuration in wanted:
                 self._pending[configuration.label] = configuration
-                self.note(configuration.label)
+                left = ""
+                if isinstance(configuration, Run):
+                    left = f", about {clock(self.expected_seconds(configuration))}"
+                self.note(configuration.label + left)
                 arguments = {"configuration": configuration, "conditions": self.conditions}
                 yield Item(configuration.label, arguments)
 
@@ -194,6 +196,7 @@ class Measurements:
                 self.failed[done.name] = done.error
                 continue
             self.found[done.name] = done.value
+            self.note(f"{done.name}: done")
             self.store.put(configuration, done.value)
             if isinstance(configuration, Run):
                 self._seeds.add(configuration.seed)
@@ -210,7 +213,7 @@ class Measurements:
         this machine; None where they are measured."""
         needed = planned_runs(LEAST_SECONDS, spp, self.path_seconds)[:FEWEST_TOTALS]
         seeds = [replace(run, seed=seed) for run in needed for seed in range(FEWEST_SEEDS)]
-        missing = [self.expected_seconds(run) for run in seeds if run.label not in self.found]
+        missing = [self.expected_seconds(run) for run in seeds if not self.recall(run)]
         return max(LEAST_SECONDS, sum(missing) / (1.0 - 1.2 * GENERATOR)) if missing else None
 
     def fits(self, run: Run, seconds: float) -> bool:
@@ -347,8 +350,9 @@ def run_study(
             size = disk_bytes(runs) * runner.workers
             check_space(folder, size, "give a shorter --time, or choose another folder with -o")
             announce(expectation(seconds + refine, size))
-            if seconds < LEAST_SECONDS:
-                announce(too_short(seconds, len(runs)))
+            least = measurements.least_seconds(config.queries.spp)
+            if least is not None and seconds < least:
+                announce(too_short(seconds, least))
             measurements.measure_runs(
                 runs,
                 lambda run: measurements.fits(run, seconds + (refine if run.seed else 0.0) - spent()),
@@ -358,6 +362,7 @@ def run_study(
             shutil.rmtree(conditions.folder, ignore_errors=True)
             for kept in (benchmark_of, test_set):
                 kept.cache_clear()
+    progress(1.0, "finished")
     groups = [measurements.group(run) for run in runs]
     deviation = seed_deviation(groups)
     known, failed = measurements.found, measurements.failed

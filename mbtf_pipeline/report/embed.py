@@ -24,15 +24,22 @@ REDUCTIONS = (1, 2, 4, 8, 16)
 _JPEG_QUALITY = 86
 
 
-def color_bar(key: Palette, title: str, high: float, unit: str, factor: float = 1.0) -> dict[str, Any]:
-    """A labeled color bar with five evenly spaced numbers up to `high`, which `factor` converts to `unit`."""
+def color_bar(
+    key: Palette, title: str, high: float, unit: str, factor: float = 1.0, *, clipped: bool = False
+) -> dict[str, Any]:
+    """A labeled color bar with five evenly spaced numbers up to `high`, which `factor` converts to `unit`;
+    where values are `clipped`, its ends say so."""
     low = -high if key == "signed" else 0.0
     colors = palette(key)[np.linspace(0, 255, 17).round().astype(int)].tolist()
+    ticks = [f"{factor * x:.3g}".replace("-", "−") for x in np.linspace(low, high, 5)]
+    if clipped:
+        ticks[-1] = f"≥ {ticks[-1]}"
+        ticks[0] = f"≤ {ticks[0]}" if low else ticks[0]
     return {
         "key": key,
         "title": title,
         "gradient": f"linear-gradient(90deg, {', '.join('rgb({} {} {})'.format(*c) for c in colors)})",
-        "ticks": [f"{factor * x:.3g}".replace("-", "−") for x in np.linspace(low, high, 5)],
+        "ticks": ticks,
         "unit": unit,
     }
 

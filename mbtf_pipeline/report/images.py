@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.color import white_of
-from mbtf_core.palettes import Palette, common_scale
+from mbtf_core.palettes import Palette, common_scale, robust_scale
 from mbtf_pipeline.compare.image_files import read_halves, read_map, read_picture
 from mbtf_pipeline.compare.offsets import read_offset, towards_view
 from mbtf_pipeline.compare.perceptual_metrics import available_metrics
@@ -41,6 +41,8 @@ from mbtf_pipeline.tables import (
 _KIND = {"query": "Reference", "pixel": "Reference, filtered pixel"}
 # Standard deviation in pixels of the averaging window of local errors.
 WINDOW = 2.0
+# Share of a map's pixels beyond the scale from which it is marked.
+_CLIPPED = 0.05
 # Error maps: title, unit, and factor to that unit.
 _MAPS: dict[Palette, tuple[str, str, float]] = {
     "local": ("Local RMS error", "% of white", 100.0),
@@ -83,7 +85,10 @@ def picture_section(
     white = white_of(exposure)
     groups: list[dict[str, Any]] = []
     scenes = []
-    maps: dict[Palette, dict[str, Pixels]] = {name: {} for name in _MAPS}
+    # By map and fit, then by file.
+    maps: dict[Palette, dict[str, dict[str, Pixels]]] = {
+        name: {fit: {} for fit in comparison["fits"]} for name in _MAPS
+    }
     for number, picture in enumerate(comparison["pictures"]):
         references = [picture["references"][kind]["file"] for kind in comparison["kinds"]]
         fits = [picture["fits"][fit]["file"] for fit in comparison["fits"]]
@@ -91,10 +96,10 @@ def picture_section(
         gallery |= {file: partial(linear_uri, value, exposure) for file, value in pictures.items()}
         a, b = read_halves(folder / references[0])
         mean = 0.5 * (a.astype(np.float64) + b)
-        for file in fits:
-            maps["local"][file] = local_error(pictures[file], a, b) / white
-            maps["flip"][file] = read_map(folder / file)
-            maps["signed"][file] = (pictures[file] - mean).mean(axis=-1) / white
+        for fit, file in zip(comparison["fits"], fits, strict=True):
+            maps["local"][fit][file] = local_error(pictures[file], a, b) / white
+            maps["flip"][fit][file] = read_map(folder / file)
+            maps["signed"][fit][file] = (pictures[file] - mean).mean(axis=-1) / white
         key = (picture["view"], picture["light"])
         if not groups or groups[-1]["key"] != key:
             # Places in the unit disk: cosine of the elevation, and azimuth.
@@ -105,16 +110,41 @@ def picture_section(
             groups.append(group)
         groups[-1]["blocks"].append(_block(comparison, picture, number))
         scenes.append({"group": len(groups) - 1, **_scene(comparison, picture)})
-    bars = {}
-    for name, found in maps.items():
-        scale = common_scale(list(found.values()))
-        scale = min(scale, 1.0) if name == "flip" else scale
-        title, unit, factor = _MAPS[name]
-        bars[name] = color_bar(name, title, scale, unit, factor)
-        gallery |= {
-            f"{file}-{name}": partial(map_uri, values / scale, name) for file, values in found.items()
-        }
+    bars, images, beyond = scaled_maps(maps)
+    gallery |= images
+    for cell in (c for g in groups for block in g["blocks"] for row in block["rows"] for c in row if c):
+        if (share := beyond.get(cell["image"])) is not None:
+            cell["lines"].append(f"{share:.0%} of the pixels exceed the scale")
     return {"groups": groups, "scenes": scenes, "color_bars": bars}
+
+
+def scaled_maps(
+    maps: Mapping[Palette, Mapping[str, Mapping[str, Pixels]]],
+) -> tuple[dict[str, Any], Gallery, dict[str, float]]:
+    """Error maps on common scales, which a diverged fit does not widen.
+
+    Parameters
+    ----------
+    maps : by kind, fit and file
+
+    Returns
+    -------
+    (color bar of each kind; images by name; share of pixels beyond the scale of those with more than a few)
+    """
+    bars: dict[str, Any] = {}
+    images: Gallery = {}
+    beyond: dict[str, float] = {}
+    for kind, by_fit in maps.items():
+        scale = robust_scale([list(found.values()) for found in by_fit.values()])
+        scale = min(scale, 1.0) if kind == "flip" else scale
+        found = {f"{file}-{kind}": values for files in by_fit.values() for file, values in files.items()}
+        shares = {image: float(np.mean(np.abs(values) > scale)) for image, values in found.items()}
+        clipped = {image: share for image, share in shares.items() if share > _CLIPPED}
+        title, unit, factor = _MAPS[kind]
+        bars[kind] = color_bar(kind, title, scale, unit, factor, clipped=bool(clipped))
+        images |= {image: partial(map_uri, values / scale, kind) for image, values in found.items()}
+        beyond |= clipped
+    return bars, images, beyond
 
 
 def _title(comparison: Mapping[str, Any], picture: Mapping[str, Any]) -> str:

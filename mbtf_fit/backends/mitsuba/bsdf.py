@@ -95,7 +95,8 @@ class MbtfBSDF(mi.BSDF):
     Plugin parameters
     -----------------
     material : the material's folder
-    uv_scale : tile widths per unit of the shape's texture coordinates (default 1)
+    uv_scale : tile widths per unit of the shape's texture coordinates (default 1), or those of u and of v as
+        text, such as ``8,4``
     sigma : footprint in tile widths where the integrator provides none; default: that of the finest level
     networks : ``unrolled``, ``cooperative`` or ``half``; the default depends on variant and size
     sampling : ``lobes`` (default) or ``cosine``
@@ -123,7 +124,7 @@ class MbtfBSDF(mi.BSDF):
         if self._choice(props, "sampling", ("lobes", "cosine")) != "cosine":
             # Cooperative kernels do not depend on the material: they are compiled once.
             self.lobes = LobeTextures(fit_lobes(Evaluator(stored, "cooperative")))
-        self.uv_scale = self._positive(props, "uv_scale", 1.0)
+        self.uv_scale = self._pair(props, "uv_scale")
         self.sigma_given = "sigma" in props
         self.sigma = self._positive(props, "sigma", stored.lattice.sigma_range[0])
         self.folder = folder
@@ -147,6 +148,19 @@ class MbtfBSDF(mi.BSDF):
             raise UsageError(f"{name} must be a positive number, not {value}", where=self._name(props))
         return dr.opaque(mi.Float, float(value))
 
+    def _pair(self, props: Properties, name: str) -> Any:
+        """A positive number for u and v (default 1), or one for each, separated by a comma."""
+        value = props.get(name, 1.0)
+        parts = value.split(",") if isinstance(value, str) else [value]
+        try:
+            numbers = [float(part) for part in parts]
+        except (TypeError, ValueError):
+            numbers = []
+        if len(numbers) not in (1, 2) or not all(0 < number < np.inf for number in numbers):
+            what = f"{name} must be a positive number, or two such as 8,4, not {value}"
+            raise UsageError(what, where=self._name(props))
+        return mi.Point2f(*(dr.opaque(mi.Float, number) for number in (numbers[0], numbers[-1])))
+
     def _choice(self, props: Properties, name: str, choices: tuple[str, ...]) -> Any:
         value = props.get(name, None)
         if value is not None and value not in choices:
@@ -168,12 +182,12 @@ class MbtfBSDF(mi.BSDF):
     def footprint(self, si: SurfaceInteraction3f) -> Float:
         """σ at hits in tile widths, from the area of a pixel on the surface."""
         dx, dy = si.duv_dx, si.duv_dy
-        area = dr.abs(dx.x * dy.y - dx.y * dy.x) * dr.square(self.uv_scale)
+        area = dr.abs(dx.x * dy.y - dx.y * dy.x) * self.uv_scale.x * self.uv_scale.y
         return dr.select(area > 0, pixel_sigma(area), self.sigma)
 
     def uv(self, si: SurfaceInteraction3f) -> Point2f:
         """Positions in the tile at hits, uv."""
-        return mi.Point2f(self.uv_scale * si.uv.x, 1.0 - self.uv_scale * si.uv.y / self.lattice.aspect)
+        return mi.Point2f(self.uv_scale.x * si.uv.x, 1.0 - self.uv_scale.y * si.uv.y / self.lattice.aspect)
 
     def _view(self, si: SurfaceInteraction3f) -> View:
         self._warn_once()

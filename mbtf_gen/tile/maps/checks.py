@@ -131,8 +131,8 @@ def suggestion_warning(path: Path, fit: NormalFit | None, factor: float) -> str 
     if 1 / _FAR_OFF <= ratio <= _FAR_OFF:
         return None
     return (
-        f"{path}: its slopes suggest --height-scale {fit.scale:.3g}; {factor:.3g} is in use, "
-        f"{ratio:{'.0f' if abs(ratio) >= 10 else '.2g'}} times as much"
+        f"{path}: the heights are {ratio:{'.0f' if abs(ratio) >= 10 else '.2g'}} times as steep as its "
+        f"slopes; both agree at --height-scale {fit.scale:.3g} ({factor:.3g} is in use)"
     )
 
 

@@ -27,7 +27,11 @@ def material(shards: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = call(["mbtf-fit", str(shards), "-o", str(folder), *QUICK])
     assert done.code == 0, done.err
     assert "training for 5 steps (change it with --time or --steps)" in done.err
-    assert len(done.out.splitlines()) <= 6  # the advice of five steps included
+    # One suggestion, and its command.
+    *summary, reason, command = done.out.splitlines()
+    assert len(summary) <= 5
+    assert reason.endswith(":")
+    assert command.startswith("  mbtf-")
     assert re.search(r"^unexplained variance [\d.]+ ± [\d.]+ of \d+ test queries", done.out, re.M)
     return folder
 

@@ -62,7 +62,7 @@ def test_the_example_scene_in_xml_loads(tmp_path: Path, run_python: RunPython) -
     code = (
         "import mbtf_fit.backends.mitsuba\nmbtf_fit.backends.mitsuba.register('llvm_ad_rgb')\n"
         "scene = mbtf_fit.backends.mitsuba.load_scene('scene.xml', spp=9)\n"
-        "print(type(scene.integrator()).__name__, scene.shapes()[0].bsdf().uv_scale, "
+        "print(type(scene.integrator()).__name__, scene.shapes()[0].bsdf().uv_scale.x, "
         "scene.sensors()[0].sampler().sample_count())"
     )
     done = run_python("-c", MOVE + code, str(tmp_path), DRJIT_LIBLLVM_PATH=None)

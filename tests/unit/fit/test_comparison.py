@@ -60,6 +60,11 @@ def test_errors_and_panels_are_those_of_reference_and_fit(work: Path) -> None:
         assert found["mse"]["value"] == pytest.approx(mse, rel=1e-4)
         spread = ((VALUE - a.astype(np.float64)) * (VALUE - b)).mean(-1)
         assert found["mse"]["error"] == pytest.approx(spread.std(ddof=1) / SIZE, rel=1e-4)
+        # Both relative to the mean value, their squared ratio is the unexplained variance.
+        covariance = np.mean([np.cov(a[..., c].ravel(), b[..., c].ravel())[0, 1] for c in range(3)])
+        assert found["contrast"] == pytest.approx(np.sqrt(covariance) / np.mean(0.5 * (a + b)), rel=1e-3)
+        ratio = found["mse"]["value"] / (found["mean"] * found["contrast"]) ** 2
+        assert found["unexplained"]["value"] == pytest.approx(ratio, rel=1e-3)
         shown, fit, signed = (panels[row, :SIZE, column, :SIZE] for column in range(3))
         # Labels cover the lower part of the first column.
         assert np.abs(shown - to_display(0.5 * (a + b), exposure))[: SIZE // 2].max() <= 1

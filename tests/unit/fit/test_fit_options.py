@@ -7,12 +7,14 @@ from pathlib import Path
 import pytest
 
 from mbtf_core.app.console import run
+from mbtf_core.config.settings import build
 from mbtf_core.config.yaml_file import dump_yaml
-from mbtf_core.errors import UsageError
+from mbtf_core.errors import InputError, UsageError
 from mbtf_core.units import format_duration, parse_duration
 from mbtf_fit.cli.app import app
 from mbtf_fit.cli.fit import FitOptions, resolve_config
 from mbtf_fit.config import FitConfig
+from mbtf_fit.models import NAMES
 from mbtf_fit.sections import TimeBudget
 
 
@@ -134,3 +136,19 @@ def test_one_fit_and_several_have_options_of_their_own(
 ) -> None:
     assert run(app, line.split()) == 2
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("source", ["fit.yaml", "material.json"])
+def test_a_model_that_is_not_installed_is_named(tmp_path: Path, source: str) -> None:
+    """With the models that are, and how a package adds others."""
+    with pytest.raises(InputError) as caught:
+        build(FitConfig, {"model": "texel-lobe"}, source=str(tmp_path / source))
+    for part in (source, "'texel-lobe'", ", ".join(NAMES), "entry point of mbtf.models"):
+        assert part in caught.value.message
+
+
+def test_every_model_has_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(app, ["models"]) == 0
+    rows = capsys.readouterr().out.splitlines()[1:]
+    assert [row.split()[0] for row in rows] == sorted(NAMES)
+    assert all(len(row.split()) > 3 for row in rows)

@@ -29,7 +29,14 @@ def test_both_errors_of_the_same_queries_are_marked_or_neither() -> None:
     for unexplained, mse in ((close, clear), (clear, close), (close, close)):
         texts = data_errors({"unexplained": unexplained, "mse": mse})
         assert all(text.startswith("not significant (") for text in texts)
-    assert data_errors({"unexplained": clear, "mse": clear}) == ("0.010 ± 0.005 %", "0.10 ± 0.05")
+    assert data_errors({"unexplained": clear, "mse": clear}) == ("(1.0 ± 0.5)e−04", "0.10 ± 0.05")
+
+
+def test_an_unexplained_variance_that_says_nothing_has_no_number() -> None:
+    noisy, mse = {"value": 4070.0, "error": 5000.0, "n": 9}, {"value": 1e-4, "error": 1e-6, "n": 9}
+    assert data_errors({"unexplained": noisy, "mse": mse})[0] == "not significant"
+    # That of a diverged fit is one.
+    assert data_errors({"unexplained": {**noisy, "error": 50.0}, "mse": mse})[0] == "4070 ± 50"
 
 
 def test_psnr_of_an_insignificant_error_is_marked() -> None:

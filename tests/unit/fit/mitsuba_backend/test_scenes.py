@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from pathlib import Path
 from typing import Any
 
@@ -76,8 +77,10 @@ ROTATION = np.array([[np.cos(0.5), -np.sin(0.5)], [np.sin(0.5), np.cos(0.5)]])
 
 @BOTH_MODELS
 @pytest.mark.parametrize("mirrored", [False, True])
-@pytest.mark.parametrize("scale", [1.0, 2.5])
-def test_the_tile_follows_its_uv(material: tuple[Path, Material], mirrored: bool, scale: float) -> None:
+@pytest.mark.parametrize("scale", [(1.0, 1.0), (2.5, 1.5)])
+def test_the_tile_follows_its_uv(
+    material: tuple[Path, Material], mirrored: bool, scale: tuple[float, float]
+) -> None:
     """Turned, mirrored and scaled coordinates: the plane equals the material at turned, mirrored queries."""
     folder, fitted = material
     turn = ROTATION @ np.diag([1.0, -1.0 if mirrored else 1.0])
@@ -85,13 +88,13 @@ def test_the_tile_follows_its_uv(material: tuple[Path, Material], mirrored: bool
     queries = CAMERA.queries(LIGHT)
     # Mitsuba's v is 1 - y here, and is scaled about 0.
     x, y = np.moveaxis(seen_places(CAMERA) @ turn.T, -1, 0)
-    u = np.stack([scale * x, 1.0 - scale * (1.0 - y) / fitted.lattice.aspect], -1)
+    u = np.stack([scale[0] * x, 1.0 - scale[1] * (1.0 - y) / fitted.lattice.aspect], -1)
     turned = [
         np.concatenate([w[..., :2] @ turn.T, w[..., 2:]], -1) for w in (queries.omega_i, queries.omega_o)
     ]
-    arrays = (u, scale * queries.sigma, *turned)
+    arrays = (u, math.sqrt(scale[0] * scale[1]) * queries.sigma, *turned)
     wanted = fitted.evaluate(*(a.reshape(-1, *a.shape[2:]) for a in arrays))
-    found = shown(plane(bsdf(folder, uv_scale=scale), to_uv)).reshape(-1, 3)
+    found = shown(plane(bsdf(folder, uv_scale=f"{scale[0]}, {scale[1]}"), to_uv)).reshape(-1, 3)
     assert deviation(found, wanted) < 2e-2
 
 
@@ -226,7 +229,8 @@ def scene_of(folder: Path | str, **options: Any) -> dict[str, Any]:
     ("options", "fault", "kind"),
     [
         ({"material": "nowhere"}, "nowhere: no such folder", InputError),
-        ({"uv_scale": -1.0}, "uv_scale must be a positive number, not -1", UsageError),
+        ({"uv_scale": -1.0}, "uv_scale must be a positive number, or two such as 8,4, not -1", UsageError),
+        ({"uv_scale": "8,4,1"}, "or two such as 8,4, not 8,4,1", UsageError),
         ({"sigma": 0.0}, "sigma must be a positive number, not 0", UsageError),
         ({"networks": "exact"}, "networks must be one of unrolled, cooperative, half, not exact", UsageError),
         ({"sampling": "uniform"}, "sampling must be one of lobes, cosine, not uniform", UsageError),

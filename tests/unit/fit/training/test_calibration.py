@@ -16,7 +16,7 @@ from mbtf_fit.material.inference import predict
 from mbtf_fit.ops.constants import KNOTS
 from mbtf_fit.pytorch.operations import interpolate_factors
 from mbtf_fit.sections import HeldOutSection
-from mbtf_fit.training.calibration import fit_calibration
+from mbtf_fit.training.calibration import MAX_QUERIES, POINTS, fit_calibration, most_queries
 
 F32 = np.ndarray
 LATTICE = Lattice(3)
@@ -127,3 +127,24 @@ def test_fits_are_calibrated_by_default(tmp_path: Path) -> None:
         assert result.material.deviation() < 1e-5
     assert off[False] > 0.08
     assert off[True] < 0.03
+
+
+def test_its_work_is_limited_and_reported() -> None:
+    """Slow models of short fits would calibrate for longer than they were trained."""
+    done: list[int] = []
+
+    def counted(u: F32, *arrays: F32) -> F32:
+        done.append(len(u))
+        return np.zeros((len(u), 3), np.float32)
+
+    shares: list[float] = []
+    fit_calibration(counted, LATTICE, data(150_000, 0.5), HELD_OUT, nothing, 1, shares.append)
+    limit = 1 << 19  # always granted
+    assert 0.7 * limit < sum(done) <= limit
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+    # Beyond the limit of the points, all that is granted goes to queries.
+    assert [most_queries(10**9, 8, n) for n in (6 * 10**6, 10**8)] == [
+        (6 * 10**6 - 8 * POINTS) // 2,
+        MAX_QUERIES,
+    ]

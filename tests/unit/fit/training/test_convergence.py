@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from mbtf_fit.training.validation import MarginalCost, marginal_cost_of
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.folder import DataFolder
+from mbtf_fit.config import FitConfig
+from mbtf_fit.training.next_step import NextStep, next_step
+from mbtf_fit.training.validation import FLAT, MarginalCost, marginal_cost_of
 
 
 def history(power: float, error: float = 1e-4, steps: int = 4000) -> list[dict[str, Any]]:
@@ -28,6 +33,12 @@ def errors(held_out: float, training: float, error: float = 0.002) -> dict[str, 
     }
 
 
+def fitted(value: float, error: float, training: float = 0.1) -> dict[str, Any]:
+    """Errors of a fit, of the test split and of training queries."""
+    both = {"test": (value, error), "training": (training, 0.001)}
+    return {name: {"unexplained": {"value": v, "error": e}} for name, (v, e) in both.items()}
+
+
 def cost(records: list[dict[str, Any]], *arguments: Any, **options: Any) -> MarginalCost:
     found = marginal_cost_of(records, *arguments, **options)
     assert found is not None
@@ -39,9 +50,6 @@ def test_twice_the_time_gains_half_of_what_the_second_half_did(power: float) -> 
     """A slope that is known well outweighs what the number of steps suggests."""
     found = cost(history(power), {})
     assert found.doubling == pytest.approx(2 ** (-power / 2), rel=0.2 * power)
-    assert (
-        found.describe() == f"expect about {found.doubling:.2g} of this error after twice the training time"
-    )
     # Of an uncertain slope, less weight is left; of one that is hardly known, none.
     uncertain = cost(history(power, error=0.12), {})
     assert found.doubling is not None
@@ -58,23 +66,23 @@ def test_the_middle_record_counts_by_its_fraction() -> None:
 
 
 def test_only_a_flat_curve_says_that_longer_training_is_useless() -> None:
-    useless = "longer training alone would hardly reduce the error"
-    assert cost(history(0.02), {}).describe() == useless
-    assert cost(history(-0.2), {}).describe() == useless
-    assert useless not in cost(history(0.25), {}).describe()
+    for power, useless in ((0.02, True), (-0.2, True), (0.25, False)):
+        found = cost(history(power), {})
+        assert found.doubling is not None
+        assert (found.doubling >= FLAT) == useless
+        assert (next_step(found, fitted(0.2, 0.002)).kind == "none") == useless
     # An error as uncertain as that of a glossy metal tells neither.
     for records in (history(0.02, error=0.4), history(0.25, error=0.4)):
         assert cost(records, {}).doubling is None
-        assert "too uncertain to say what longer training would gain" in cost(records, {}).describe()
 
 
 def test_few_steps_ask_for_more_whatever_the_curve_shows() -> None:
     for power in (0.0, 0.5):
-        found = cost(history(power, steps=146), {})
-        assert found.describe().startswith("146 steps are few: train longer (--time); expect about 0.")
-    assert (
-        cost(history(0.0, error=0.4, steps=146), {}).describe() == "146 steps are few: train longer (--time)"
-    )
+        found = next_step(cost(history(power, steps=146), {}), fitted(0.2, 0.002))
+        assert found.kind == "time"
+        assert found.reason.startswith("expect about 0.")
+    found = next_step(cost(history(0.0, error=0.4, steps=146), {}), fitted(0.2, 0.002))
+    assert found.reason == "146 steps are few; try twice the training"
     # Without a record in the middle, the number of steps decides: the error is about 1 + 50 / N.
     for steps, expected in ((50, 0.75), (150, 0.875)):
         found = cost(history(0.5, steps=steps)[-1:], {})
@@ -86,8 +94,8 @@ def test_half_of_the_distance_to_the_training_error_is_overfitting() -> None:
     # its own by -s²k/n.
     found = cost(history(0.5), errors(0.2 + 0.05, 0.2 - 0.05), 0.3)
     assert found.noise_share == pytest.approx(0.05 / 0.25)
-    # Twice the queries halve this part. Two standard errors of 0.002, over 2 x 0.25: ± 0.01.
-    assert "causes 19% to 21% of the error of new queries: expect 0.9 to 0.9 of it" in found.describe()
+    # Two standard errors of 0.002, over 2 x 0.25.
+    assert found.noise_share_error == pytest.approx(0.01, rel=0.1)
     for same in (errors(0.25, 0.248), errors(0.25, 0.3), {}, errors(math.nan, 0.1)):
         assert cost(history(0.5), same, 0.3).noise_share is None
 
@@ -111,3 +119,49 @@ def test_incomplete_histories_say_nothing() -> None:
         "steps": 4000,
         "noise_share_error": 0.0,
     }
+
+
+@pytest.mark.parametrize(
+    ("doubling", "share", "errors", "kind"),
+    [
+        # What leaves the smaller error, which is known well enough.
+        (0.9, 0.1, fitted(0.2, 0.04), "time"),
+        (0.9, 0.3, fitted(0.2, 0.04), "queries"),
+        (None, 0.3, fitted(0.2, 0.04), "queries"),
+        (None, None, fitted(0.2, 0.04), "time"),
+        (0.99, 0.05, fitted(0.2, 0.04), "none"),
+        # Neither is known of an uncertain or an undefined error.
+        (0.8, 0.9, fitted(0.2, 0.06), "test"),
+        (0.8, 0.9, {"test": {"unexplained": {"value": None, "error": None}}}, "test"),
+        # Worse than the mean value: training queries that were learned, or not yet.
+        (0.8, None, fitted(1.4, 0.1), "queries"),
+        (0.8, None, fitted(1.4, 0.1, training=1.2), "time"),
+    ],
+)
+def test_the_next_step_is_what_pays_most(
+    doubling: float | None, share: float | None, errors: dict[str, Any], kind: str
+) -> None:
+    assert next_step(MarginalCost(doubling, share, 4000), errors).kind == kind
+
+
+def test_the_next_command_is_complete(tmp_path: Path) -> None:
+    """Twice of what was given, four times the test queries, in new folders."""
+    queries = {"train": "50/texel", "test": "8192"}
+    manifest = {"config": {"material": "wool maps", "queries": queries}}
+    data = Dataset(DataFolder.open(tmp_path / "shards"), manifest)
+    config = FitConfig.model_validate({"training": {"time": "30s"}})
+
+    def command(kind: Any, config: FitConfig = config, seconds: float = 30.1) -> str | None:
+        found = NextStep(kind, "").command(config, seconds, data, Path("material"))
+        return None if found is None else found.replace(f"{tmp_path}/", "")
+
+    fitted = "--config material/config.yaml"
+    assert command("time") == f"mbtf-fit shards {fitted} --time 1min -o material2"
+    # The fewest steps took longer than the time.
+    assert command("time", seconds=41.0) == f"mbtf-fit shards {fitted} --time 90s -o material2"
+    steps = FitConfig.model_validate({"training": {"steps": 300}})
+    assert command("time", steps) == f"mbtf-fit shards {fitted} --steps 600 -o material2"
+    made, fit = "mbtf-gen 'wool maps' --config shards/config.yaml", f"mbtf-fit shards2 {fitted} -o material2"
+    assert command("queries") == f"{made} --queries 100/texel -o shards2 && {fit}"
+    assert command("test") == f"{made} --test-queries 32768 -o shards2 && {fit}"
+    assert command("none") is None

@@ -158,7 +158,7 @@ class TestWarning:
         with caplog.at_level(logging.INFO):
             Job.prepare(config)
         (warning,) = (r.getMessage() for r in caplog.records if r.levelno == logging.WARNING)
-        assert f"its slopes suggest --height-scale 0.012; {factor:g} is in use" in warning
+        assert f"both agree at --height-scale 0.012 ({factor:g} is in use)" in warning
         header = next(r.getMessage() for r in caplog.records if r.getMessage().startswith("mesh: "))
         assert f"height scale {factor:g} ({source})" in header
 

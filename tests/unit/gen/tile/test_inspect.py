@@ -120,7 +120,7 @@ class TestText:
             "displaces the mesh",
             "slopes     median",
             "OpenGL",
-            "suggests the height scale 0.1",
+            "slopes agree best at --height-scale 0.1",
             "holes 25.0%",
         ):
             assert part in text
@@ -130,20 +130,20 @@ class TestText:
 
         def warned(height: float | None = None) -> bool:
             warnings = load_material(folder).inspect(GeometrySection(height_scale=height))["warnings"]
-            return any("; 0.05 is in use, 5 times as much" in warning for warning in warnings)
+            return any("are 5 times as steep as its slopes; both agree at" in warning for warning in warnings)
 
         assert warned()
         assert warned(0.05)
         assert not warned(0.012)
         save_heights(folder / "height.png", fractal(48, 96) / 50)
-        (warning,) = (w for w in load_material(folder).warnings_in_use() if "suggest" in w)
-        assert "in use, 0.1 times as much" in warning
+        (warning,) = (w for w in load_material(folder).warnings_in_use() if "as steep as" in w)
+        assert "are 0.1 times as steep" in warning
         save_heights(folder / "height.png", fractal(48, 96))
         (folder / "material.yaml").write_text("height: {file: height.png, scale: 0.05}\nnormal: normal.png\n")
         assert warned()
         (folder / "material.yaml").unlink()
         save_normals(folder / "normal.png", normals_of(fractal(48, 96), 0.04))
-        assert not any("slopes suggest" in w for w in load_material(folder).warnings_in_use())
+        assert not any("as steep as its slopes" in w for w in load_material(folder).warnings_in_use())
 
 
 class TestCommand:

@@ -50,6 +50,13 @@ def test_an_undefined_error_is_shown_as_such(tmp_path: Path) -> None:
     assert "are too narrow" in page
 
 
+def test_one_measurement_is_no_plot(tmp_path: Path) -> None:
+    page = write_page(Study(tmp_path, DESCRIPTION, [measured("run", 10.0, 0.3)])).read_text()
+    assert list(tmp_path.glob("*.png")) == []
+    assert "One run alone is no front" in page
+    assert "<td>700</td>" in page
+
+
 def test_the_page_shows_the_front_with_commands_and_what_is_biased(tmp_path: Path) -> None:
     def limited(name: str, bias: Estimate) -> Measurement:
         noise = Estimate(0.5, 0.01, 9)

@@ -178,12 +178,22 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> FakeRuns:
 def test_a_study_keeps_its_time_and_resumes(fake: FakeRuns, tmp_path: Path) -> None:
     recipe, folder = load_recipe(RECIPE, []), tmp_path / "study"
 
-    def measured(**options: float) -> tuple[module.Study, list[Run]]:
+    def measured(**options: Any) -> tuple[module.Study, list[Run]]:
         fake.measured.clear()
         return module.run_study(recipe, folder, **options), [*fake.measured]  # type: ignore[arg-type]
 
     # Two runs of 60 s and one of 40 s.
-    first, runs = measured(seconds=190.0)
+    said, shown = list[str](), list[tuple[float, str]]()
+    first, runs = measured(
+        seconds=190.0,
+        announce=said.append,
+        progress=lambda share, note: shown.append((share, note)),
+    )
+    # The shortest study that answers, by the runs that it takes; the time of the next run.
+    assert "two seeds take about 277min" in said[-1]
+    assert "run, neumip, short, about 1:02" in [note for _, note in shown]
+    assert shown[-1][0] == 1.0
+    assert [share for share, _ in shown] == sorted(share for share, _ in shown)
     assert [m.details.get("seeds") for m in first.measurements] == [None, 2, 1]
     assert sum(r.planned_seconds(0.0) for r in runs) <= 190.0
     assert first.skipped == ["run, neumip, long"]

@@ -10,9 +10,9 @@ import pytest
 from PIL import Image
 
 from mbtf_core.color import to_display
-from mbtf_core.palettes import Palette, common_scale, indices, palette
+from mbtf_core.palettes import Palette, common_scale, indices, palette, robust_scale
 from mbtf_pipeline.report.embed import REDUCTIONS, color_bar, linear_uri, map_uri, shrink
-from mbtf_pipeline.report.images import local_error
+from mbtf_pipeline.report.images import local_error, scaled_maps
 
 
 def decoded(uri: str) -> np.ndarray:
@@ -85,3 +85,16 @@ def test_scales_and_color_bars_are_round() -> None:
     assert bar["ticks"] == ["0", "5", "10", "15", "20"]
     assert color_bar("signed", "", 0.5, "")["ticks"] == ["−0.5", "−0.25", "0", "0.25", "0.5"]
     assert bar["gradient"].startswith("linear-gradient(90deg, rgb({} {} {}),".format(*palette("local")[0]))
+
+
+def test_a_diverged_fit_is_clipped_and_marked() -> None:
+    """It does not widen the scale of the others; fits that differ by less keep one scale."""
+    ramp = np.linspace(0, 0.1, 400).reshape(20, 20)
+    assert robust_scale([[ramp], [2 * ramp]]) == robust_scale([[2 * ramp]])
+    fits = {"good": {"g": ramp}, "fair": {"f": 2 * ramp}, "diverged": {"d": 1e4 * ramp}}
+    bars, images, beyond = scaled_maps({"local": fits, "signed": {"good": {"g": ramp}}})
+    assert bars["local"]["ticks"] == ["0", "5", "10", "15", "≥ 20"]
+    assert not any("≥" in tick for tick in bars["signed"]["ticks"])
+    assert list(beyond) == ["d-local"]
+    assert beyond["d-local"] == pytest.approx(1, abs=0.01)
+    assert (decoded(images["f-local"](1))[-1, -1] == palette("local")[-1]).all()

@@ -43,10 +43,10 @@ def test_both_errors_of_a_group_are_significant_or_neither() -> None:
     record |= {"pictures": [picture], "test": test}
     context = error_context(record)
     levels, cosines = (table["rows"] for table in context["group_tables"])
-    assert levels[0] == ["0", "50", "not significant (11 ± 6 %)", "not significant (0.20 ± 0.09)"]
-    assert levels[1] == ["1", "50", "20.0 ± 1.0 %", "0.400 ± 0.010"]
+    assert levels[0] == ["0", "50", "not significant (0.11 ± 0.06)", "not significant (0.20 ± 0.09)"]
+    assert levels[1] == ["1", "50", "0.200 ± 0.010", "0.400 ± 0.010"]
     assert cosines[0][0] == "0.2–0.4"
-    assert context["facts"][0]["value"] == "20.0 ± 1.0 %"
+    assert context["facts"][0]["value"] == "0.200 ± 0.010"
 
 
 def test_the_warm_up_and_an_outlier_do_not_count(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,116 @@
+"""What reduces the error of a finished fit most, as one command."""
+
+from __future__ import annotations
+
+import math
+import re
+import shlex
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.schema import CONFIG_NAME
+from mbtf_core.units import format_duration
+from mbtf_fit.config import FitConfig
+from mbtf_fit.formatting import headline
+from mbtf_fit.training.validation import FLAT, MarginalCost
+
+# Relative standard error of the test error from which more test queries come first.
+_UNCERTAIN = 0.25
+
+
+@dataclass(frozen=True)
+class NextStep:
+    """The most useful change after a fit.
+
+    Attributes
+    ----------
+    kind : what to take more of: test queries, training time, training queries; or nothing
+    reason : one sentence
+    """
+
+    kind: Literal["test", "time", "queries", "none"]
+    reason: str
+
+    def command(self, config: FitConfig, seconds: float, data: Dataset, material: Path) -> str | None:
+        """The whole command, which writes to new folders; None where there is nothing to do, or where the
+        data are of an unknown source.
+
+        Parameters
+        ----------
+        config : of the fit
+        seconds : that it was trained for
+        data : its data set
+        material : its folder
+        """
+        fitted = ["--config", str(material / "config.yaml")]
+        out = ["-o", _numbered(str(material))]
+        if self.kind == "none":
+            return None
+        if self.kind == "time":
+            training = config.training
+            more = ["--time", _twice(training.time.seconds, seconds)]
+            if training.steps is not None:
+                more = ["--steps", str(2 * training.steps)]
+            return shlex.join(["mbtf-fit", str(data.folder), *fitted, *more, *out])
+        made, shards = data.manifest.get("config") or {}, _numbered(str(data.folder))
+        source = data.manifest["measured"]["file"] if "measured" in data.manifest else made.get("material")
+        if source is None or "queries" not in made:
+            # Of another program.
+            return None
+        words = ["mbtf-gen", *(["import"] if "measured" in data.manifest else []), source]
+        words += ["--config", str(data.folder.at(CONFIG_NAME))]
+        if self.kind == "queries":
+            words += ["--queries", _times(made["queries"]["train"], 2)]
+        else:
+            words += ["--test-queries", _times(made["queries"]["test"], 4)]
+        words += ["-o", shards]
+        return f"{shlex.join(words)} && {shlex.join(['mbtf-fit', shards, *fitted, *out])}"
+
+
+def next_step(cost: MarginalCost, errors: Mapping[str, Any]) -> NextStep:
+    """What the evidence says pays most.
+
+    Parameters
+    ----------
+    cost : of the fit
+    errors : by split
+    """
+    test = errors[headline(errors)]["unexplained"]
+    value, error = test["value"], test["error"]
+    if value is None or error is None or error > _UNCERTAIN * abs(value):
+        return NextStep("test", "the error is uncertain; four times the test queries halve its ±")
+    own = errors["training"]["unexplained"]["value"] if "training" in errors else None
+    if value >= 1.0 and own is not None and own < 1.0:
+        return NextStep("queries", "the training queries are too few or too noisy")
+    data = 1.0 if cost.noise_share is None else 1.0 - 0.5 * cost.noise_share
+    time = cost.doubling
+    if data < min(FLAT, 1.0 if time is None else time):
+        reason = f"the fit overfits noise; expect about {data:.2g} of this error with twice the queries"
+        return NextStep("queries", reason)
+    if time is None:
+        reason = f"{cost.steps} steps are few" if cost.few else "it is unknown what longer training gains"
+        return NextStep("time", f"{reason}; try twice the training")
+    if time < FLAT or cost.few:
+        return NextStep("time", f"expect about {time:.2g} of this error after twice the training")
+    return NextStep("none", "neither twice the training nor twice the queries would reduce the error by 5 %")
+
+
+def _numbered(folder: str) -> str:
+    """Name of the next folder: ``material2`` after ``material``."""
+    stem, digits = re.fullmatch(r"(.*?)(\d*)/*", folder, re.DOTALL).groups()  # type: ignore[union-attr]
+    return f"{stem}{int(digits or 1) + 1}"
+
+
+def _twice(planned: float, spent: float) -> str:
+    """Twice a time, which was exceeded where the least number of steps took longer."""
+    seconds = planned if spent <= 1.1 * planned else spent
+    return format_duration(2.0 * seconds if seconds == planned else 10.0 * math.ceil(0.2 * seconds))
+
+
+def _times(count: str, factor: int) -> str:
+    """A number of queries, or of queries per texel, times a factor."""
+    number, slash, unit = count.partition("/")
+    return f"{factor * float(number):.15g}{slash}{unit}"
