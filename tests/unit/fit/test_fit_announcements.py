@@ -64,5 +64,8 @@ def test_a_fit_announces_each_stage(shards: Path, tmp_path: Path, monkeypatch: p
     fits.fit(config, shards, tmp_path / "material", progress=lambda *state: said.append(state))
     assert said[:2] == [(0.0, f"reading {shards}"), (0.0, "training")]
     assert [fraction for fraction, _ in said[2:5]] == pytest.approx([1 / 3, 2 / 3, 1.0])
-    assert [fraction for fraction, _ in said[5:]] == [1.0] * 3
-    assert [note.split()[0] for _, note in said[5:]] == ["calibrating", "evaluating", "writing"]
+    assert {fraction for fraction, _ in said[5:]} == {1.0}
+    notes = [note for _, note in said[5:]]
+    assert list(dict.fromkeys(note.split()[0] for note in notes)) == ["calibrating", "evaluating", "writing"]
+    # Models without the compiled kernel calibrate for long.
+    assert "calibrating material: 100%" in notes

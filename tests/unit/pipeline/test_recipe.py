@@ -98,7 +98,7 @@ def test_names_and_models_default_to_each_other(tmp_path: Path, fit: str, models
     [
         (SINGLE + "compare:\n  views:\n  - {elevation: 45, azimut: 3}\n", 8, "did you mean 'azimuth'"),
         (NAMED.replace("time: 5s", "tmie: 5s"), 10, "did you mean 'time'"),
-        (HEAD + "fit:\n  other:\n", 6, "'rainer2020'"),
+        (HEAD + "fit:\n  other:\n", 6, "rainer2020"),
         (HEAD + "fit: {}\n", 5, "contains no fit"),
         (SINGLE + "compare: {tiles_across: [2, 2.0]}\n", 6, "same entry twice"),
     ],
