@@ -65,6 +65,11 @@ class Shade(Operation):
         return 6
 
 
+def grazing_reflectance(f0: float) -> float:
+    """Reflectance of a dielectric at grazing angles, from that along the normal: less than 1 below 2 %."""
+    return min(1.0, 50.0 * f0)
+
+
 @dataclass(frozen=True)
 class Lobe(Operation):
     """A diffuse and a GGX lobe (Walter et al. 2007; Fresnel: Schlick 1994) under a light whose irradiance on
