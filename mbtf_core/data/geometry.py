@@ -32,8 +32,9 @@ HEIGHTS, MAPS = "heights", "maps"
 _ASPECT = "mbtf.aspect"
 # Attributes of Geometry whose channels have other names.
 _ATTRIBUTES = {"height": "heights", "slope": "slopes", "slope_moment": "slope_moments"}
-# All or none of them are stored.
+# Of each group all or none are stored.
 GLOSSY = ("roughness", "metallic", "specular")
+CLEARCOAT = ("clearcoat", "clearcoat_roughness")
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,8 @@ class Geometry:
         In [0, 1]; all three are None for a Lambert surface, or where the material has its own BSDF.
     opacity : (h, w) float32 array or None
         In [0, 1]; None for an opaque surface.
+    clearcoat, clearcoat_roughness : (h, w) float32 array or None
+        In [0, 1], weight and roughness of the coat; both are None for a surface without.
     """
 
     heights: F32
@@ -66,6 +69,8 @@ class Geometry:
     metallic: F32 | None = None
     specular: F32 | None = None
     opacity: F32 | None = None
+    clearcoat: F32 | None = None
+    clearcoat_roughness: F32 | None = None
 
     @classmethod
     def of_heights(cls, heights: F32, aspect: float) -> Geometry:
@@ -207,5 +212,6 @@ def _check(geometry: Geometry, path: Path) -> None:
         raise InputError("the maximum of 'height' is not 0", where=path)
     if geometry.slope_moments[..., (0, 2)].min() < 0:
         raise InputError("'slope_moment' holds negative means of squares", where=path)
-    if len({getattr(geometry, name) is None for name in GLOSSY}) > 1:
-        raise InputError(f"has some, but not all, of {', '.join(GLOSSY)}", where=path)
+    for group in (GLOSSY, CLEARCOAT):
+        if len({getattr(geometry, name) is None for name in group}) > 1:
+            raise InputError(f"has some, but not all, of {', '.join(group)}", where=path)

@@ -129,6 +129,8 @@ ARRAYS: tuple[ArraySpec, ...] = (
 )
 ARRAY: dict[str, ArraySpec] = {a.name: a for a in ARRAYS}
 
+# F0 of clear coats.
+CLEARCOAT_F0 = 0.04
 # Images of `GEOMETRY_NAME`. Means are over a texel; the optional ones are left out where they do not apply.
 GEOMETRY: tuple[ArraySpec, ...] = (
     _array("height", "", "tile widths", "height z <= 0 of the mesh at its vertices, maximum 0"),
@@ -139,6 +141,8 @@ GEOMETRY: tuple[ArraySpec, ...] = (
     _array("metallic", "", "1", "mean metallic", optional=True),
     _array("specular", "", "1", "mean specular", optional=True),
     _array("opacity", "", "1", "mean opacity", optional=True),
+    _array("clearcoat", "", "1", "mean weight of the clear coat, whose F0 is 4 %", optional=True),
+    _array("clearcoat_roughness", "", "1", "mean roughness of the clear coat", optional=True),
 )
 
 CONVENTIONS: dict[str, str] = {

@@ -148,7 +148,7 @@ def surface_maps(material: Material, level: int) -> Maps:
     weights = material.model.weights()
     maps = weights[f"{MAPS}.{level}"].cpu().double().numpy()
     slopes, base = maps[..., :2], maps[..., 5:8]
-    glossy = maps.shape[2] == GLOSSY_CHANNELS
+    glossy = maps.shape[2] >= GLOSSY_CHANNELS
     alpha2, metallic = (
         (maps[..., 8], maps[..., 9]) if glossy else (np.ones_like(base[..., 0]), np.zeros_like(base[..., 0]))
     )

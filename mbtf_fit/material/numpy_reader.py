@@ -73,20 +73,34 @@ def normal(slopes):
     return unit(join(-slopes, np.ones(1)))
 
 
-def fresnel(f0, h, omega_o):
-    return f0 + (1 - f0) * np.clip(1 - omega_o @ h, 0, 1) ** 5
+def fresnel(f0, cosine, f90=1):
+    return f0 + (f90 - f0) * np.clip(1 - cosine, 0, 1) ** 5
 
 
 def ggx(f0, alpha2, n, omega_i, omega_o, least):
     h, cosines = unit(omega_i + omega_o), np.maximum([n @ omega_i, n @ omega_o], least)
     facets = alpha2 / (np.pi * (max(0, n @ h) ** 2 * (alpha2 - 1) + 1) ** 2)
     masking = 2 * cosines.prod() * np.sqrt(1 + alpha2 * (1 / cosines**2 - 1)).sum()
-    return fresnel(f0, h, omega_o) * facets / masking
+    return fresnel(f0, omega_o @ h) * facets / masking
+
+
+def projections(omega, center, matrix):
+    p = omega[2] - center @ omega[:2]
+    return np.array([p, np.sqrt(p**2 + omega[:2] @ matrix @ omega[:2])])
 
 
 def shown(omega, center, matrix):
-    p = omega[2] - center @ omega[:2]
-    return (p + np.sqrt(p**2 + omega[:2] @ matrix @ omega[:2])) / 2
+    return projections(omega, center, matrix).sum() / 2
+
+
+def reflected(alpha2, c, spread, h, omega_o, light_width, least_view):
+    middle = (1 - alpha2) / (1 + alpha2 * c @ c) * c
+    facets = alpha2 * (1 + c @ c) / (1 + alpha2 * c @ c) * (np.eye(2) + np.outer(middle, c)) + spread
+    widened, g = facets + np.eye(2) * light_width**2 / 2, h[:2] + h[2] * middle
+    density = (
+        1 / (h[2] ** 2 + g @ np.linalg.solve(widened, g)) ** 2 / (np.pi * np.sqrt(np.linalg.det(widened)))
+    )
+    return density / (4 * max(shown(omega_o, middle, facets), least_view))
 
 
 def doubled_scatter(center, moments):
@@ -171,18 +185,19 @@ class NumpyMaterial:
             light, c, n, base = (0.5 + 0.5 * erf(over)) / omega_i[2], known[:2], normal(known[:2]), known[5:8]
             spread = doubled_scatter(c, known[2:5])
             irradiance = light * n[2] * shown(omega_i, c, spread)
-            core = irradiance * base / np.pi
-            if len(known) == 10:
-                a2, metal = np.clip(known[8], *alpha2), known[9]
-                middle = (1 - a2) / (1 + a2 * c @ c) * c
-                facets = a2 * (1 + c @ c) / (1 + a2 * c @ c) * (np.eye(2) + np.outer(middle, c)) + spread
-                h, widened = unit(omega_i + omega_o), facets + np.eye(2) * light_width**2 / 2
-                g = h[:2] + h[2] * middle
-                density = 1 / (h[2] ** 2 + g @ np.linalg.solve(widened, g)) ** 2
-                density = density / (np.pi * np.sqrt(np.linalg.det(widened)))
-                lobe = density / (4 * max(shown(omega_o, middle, facets), least_view))
-                f = fresnel(dielectric + metal * (base - dielectric), h, omega_o)
-                core = (1 - metal) * core + light * f * lobe
+            core, h = irradiance * base / np.pi, unit(omega_i + omega_o)
+            shared = c, spread, h, omega_o, light_width, least_view
+            if len(known) >= 10:
+                metal, grazing = known[9], min(1, 50 * dielectric)
+                f = fresnel(
+                    dielectric + metal * (base - dielectric), omega_o @ h, grazing + metal * (1 - grazing)
+                )
+                core = (1 - metal) * core + light * f * reflected(np.clip(known[8], *alpha2), *shared)
+            if len(known) == 12:
+                for omega in (omega_i, omega_o):
+                    core = core * (1 - known[10] * fresnel(0.04, n[2] * projections(omega, c, spread)[1]))
+                f = known[10] * fresnel(0.04, omega_o @ h)
+                core = core + light * f * reflected(np.clip(known[11], *alpha2), *shared)
             hints.append(np.array([irradiance, *n[:2], *core]))
         return np.mean(hints, 0)
 

@@ -20,8 +20,8 @@ HINTS = 7
 # Factor of the irradiance under the logarithm.
 IRRADIANCE_SCALE = 4.0
 # Channels of the maps: center of the slopes (x, y), moments about 0 (xx, xy, yy), base color (RGB); of glossy
-# surfaces besides α² and metallic.
-DIFFUSE_CHANNELS, GLOSSY_CHANNELS = 8, 10
+# surfaces besides α² and metallic; of coated ones besides weight and α² of the clear coat.
+DIFFUSE_CHANNELS, GLOSSY_CHANNELS, COATED_CHANNELS = MAP_CHANNELS = 8, 10, 12
 # Azimuths of the horizons; share of the light kernel's width (RMS per axis) that blurs them.
 AZIMUTHS, LIGHT_BLUR = 16, 0.8
 # Smallest cosines of light and view to a normal, bounds of a lobe's own α², least variance of horizons.

@@ -15,7 +15,8 @@ class Shade(Operation):
 
     Maps and horizons are read at the level ``l + finer``. Maps hold, of the slopes below the footprint, the
     center c (2) and the moments q (xx, xy, yy) of ``c cᵀ + C`` with the scatter C
-    (:mod:`mbtf_fit.surface.slopes`), then base color b (3); of glossy surfaces besides α² and metallic m.
+    (:mod:`mbtf_fit.surface.slopes`), then base color b (3); of glossy surfaces besides α² and metallic m; of
+    coated ones also weight w and α² of a clear coat.
     C is read with variances of at least 0 and a correlation within ±1. The normal is
     ``n = (-c_x, -c_y, 1) / ‖·‖``. Horizons hold, for equidistant azimuths from +u towards +v, the mean h of
     the horizon's elevation in the first half of the channels, the mean of its square in the second half,
@@ -33,11 +34,19 @@ class Shade(Operation):
 
         (R5) V F D(h) / (4 ω_i,z max(P(ω_o; c', A'), least_view)),
 
-    with ``F0 = (1-m) dielectric + m b`` (Fresnel: Schlick 1994), the half vector h, and ``D(h) = 1 / (π √det
-    B (h_z² + gᵀ B⁻¹ g)²)``, ``g = h_xy + h_z c'`` (GGX: Walter et al. 2007). GGX facets of α² about n are, in
-    slopes of the plane, such facets about κ c with ``ρ (I + κ c cᵀ)``, where ``κ = (1-α²) / (1 + α² ‖c‖²)``
-    and ``ρ = α² (1 + ‖c‖²) / (1 + α² ‖c‖²)``. Below a footprint ``c' = κ c``, ``A' = ρ (I + κ c cᵀ) + 2C``,
+    with ``F = F0 + (F90 - F0) (1 - h·ω_o)⁵`` (Schlick 1994), ``F0 = (1-m) dielectric + m b``, ``F90 = (1-m)
+    min(1, 50 dielectric) + m``, the half vector h, and ``D(h) = 1 / (π √det B (h_z² + gᵀ B⁻¹ g)²)``, ``g =
+    h_xy + h_z c'`` (GGX: Walter et al. 2007). GGX facets of α² about n are, in slopes of the plane, such
+    facets about κ c with ``ρ (I + κ c cᵀ)``, where ``κ = (1-α²) / (1 + α² ‖c‖²)`` and ``ρ = α² (1 + ‖c‖²) /
+    (1 + α² ‖c‖²)``. Below a footprint ``c' = κ c``, ``A' = ρ (I + κ c cᵀ) + 2C``,
     and the light widens them to ``B = A' + light_width²/2 I``. α² is clamped to `alpha2`.
+
+    A clear coat with ``F_c(x) = w (0.04 + 0.96 (1 - min(1, x))⁵)`` adds such a lobe of its own α² and of the
+    reflectance ``F_c(h·ω_o)``. Of the core below it the share
+
+        (R6) (1 - F_c(n_z R(ω_i))) (1 - F_c(n_z R(ω_o))),    R(ω) = √(p² + ω_xyᵀ 2C ω_xy),
+
+    is left, where ``n_z R`` is about the mean cosine of the facets that a direction sees.
 
     Attributes
     ----------
@@ -63,6 +72,11 @@ class Shade(Operation):
 
     def size(self, sizes: Sequence[int]) -> int:
         return 6
+
+
+def grazing_reflectance(f0: float) -> float:
+    """Reflectance of a dielectric at grazing angles, from that along the normal: less than 1 below 2 %."""
+    return min(1.0, 50.0 * f0)
 
 
 @dataclass(frozen=True)

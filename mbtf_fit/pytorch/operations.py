@@ -17,7 +17,8 @@ from mbtf_core.data.lattice import Lattice
 from mbtf_fit import ops
 from mbtf_fit.ops.constants import FIRST_DEPTH, HEIGHT_SCALE, LEAST_FACING
 from mbtf_fit.pytorch.textures import FeatureTextures
-from mbtf_fit.surface.known import KnownSurface, fresnel
+from mbtf_fit.surface.facets import fresnel
+from mbtf_fit.surface.known import KnownSurface
 from mbtf_fit.surface.lookup import coarse_level, lookup
 
 # Of each function its code, and the x whose value is 1; 0 for expm1.

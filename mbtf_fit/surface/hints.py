@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import torch
 from torch import Tensor
 
+from mbtf_core.data.schema import CLEARCOAT_F0
 from mbtf_fit.native.library import (
     MAX_LEVELS,
     MAX_PLACES,
@@ -18,7 +19,7 @@ from mbtf_fit.native.library import (
 )
 from mbtf_fit.ops.constants import HINTS
 from mbtf_fit.ops.lookup import Trace
-from mbtf_fit.ops.shade import Shade
+from mbtf_fit.ops.shade import Shade, grazing_reflectance
 from mbtf_fit.surface.known import KnownSurface
 from mbtf_fit.surface.lookup import Packing
 
@@ -77,7 +78,8 @@ def compute_hints(
     description.places, description.finer = places, shade.finer
     description.offsets[: 2 * places] = [x for offset in trace.places for x in offset]
     description.light_width, description.light_blur = surface.light_width, shade.light_blur
-    description.dielectric, description.least_view = surface.dielectric, shade.least_view
+    description.dielectric, description.edge = surface.dielectric, grazing_reflectance(surface.dielectric)
+    description.coat, description.least_view = CLEARCOAT_F0, shade.least_view
     description.alpha2[:] = shade.alpha2
 
     def task(start: int) -> None:

@@ -34,16 +34,26 @@ from mbtf_core.data.lattice import Lattice, sigma_of_level
 from mbtf_core.images.resample import resample
 from mbtf_fit.ops.constants import (
     AZIMUTHS,
+    COATED_CHANNELS,
     DIELECTRIC,
-    DIFFUSE_CHANNELS,
     GLOSSY_CHANNELS,
     HEIGHTS,
     HORIZONS,
     LIGHT_WIDTH,
+    MAP_CHANNELS,
     MAPS,
 )
 from mbtf_fit.ops.lookup import Trace
-from mbtf_fit.ops.shade import Shade
+from mbtf_fit.ops.shade import Shade, grazing_reflectance
+from mbtf_fit.surface.facets import (
+    coat_reflectance,
+    doubled_scatter,
+    own_facets,
+    projections,
+    schlick,
+    shown,
+    slope_density,
+)
 from mbtf_fit.surface.heightfield import DeviceCopies, HeightfieldTracer
 from mbtf_fit.surface.lookup import Packing, lookup
 from mbtf_fit.surface.slopes import slope_distributions
@@ -145,7 +155,7 @@ class KnownSurface:
         if heights.numel() == 0 or not bool((heights <= 0).all() and heights.isfinite().all()):
             raise ValueError(f"'{HEIGHTS}'")
         channels = tensors[f"{MAPS}.0"].shape[-1:]
-        if channels not in ((DIFFUSE_CHANNELS,), (GLOSSY_CHANNELS,)):
+        if tuple(channels) not in {(n,) for n in MAP_CHANNELS}:
             raise ValueError(f"'{MAPS}.0'")
         return cls(
             lattice,
@@ -162,7 +172,12 @@ class KnownSurface:
     @property
     def glossy(self) -> bool:
         """Whether the maps describe a glossy lobe."""
-        return self.maps[0].shape[2] == GLOSSY_CHANNELS
+        return self.maps[0].shape[2] >= GLOSSY_CHANNELS
+
+    @property
+    def coated(self) -> bool:
+        """Whether the maps describe a clear coat."""
+        return self.maps[0].shape[2] == COATED_CHANNELS
 
     @cached_property
     def tracer(self) -> HeightfieldTracer:
@@ -212,26 +227,37 @@ class KnownSurface:
         """Irradiance, normal and core (n, 6) at surface points."""
         maps = lookup(self._map_copies.on(hit.device), self.map_table[1], hit, level)
         center, base = maps[:, :2], maps[:, 5:8]
-        spread = _spread(center, maps[:, 2:5])
+        spread = doubled_scatter(center, maps[:, 2:5])
         normal = torch.nn.functional.normalize(torch.cat([-center, torch.ones_like(center[:, :1])], 1), dim=1)
         light = self.visibility(op, hit, level, omega_i) / omega_i[:, 2:]
-        irradiance = light * normal[:, 2:] * _shown(omega_i, center, spread)
+        irradiance = light * normal[:, 2:] * shown(omega_i, center, spread)
         core = irradiance * base / math.pi
-        if self.glossy:
-            alpha2, metallic = maps[:, 8:9].clamp(*op.alpha2), maps[:, 9:10]
-            # (R5)
-            length2 = center.square().sum(1, keepdim=True)
-            scale = 1.0 + alpha2 * length2
-            middle, rho = (1.0 - alpha2) / scale * center, alpha2 * (1.0 + length2) / scale
-            (x, y), (p, q) = center.split(1, 1), middle.split(1, 1)
-            facets = rho * torch.cat([1.0 + p * x, p * y, 1.0 + q * y], 1) + spread
-            facing = _shown(omega_o, middle, facets).clamp_min(op.least_view)
+        if not self.glossy:
+            return torch.cat([irradiance, normal[:, :2], core], 1)
+        half = torch.nn.functional.normalize(omega_i + omega_o, dim=1)
+        rest = schlick((omega_o * half).sum(1, keepdim=True))
+
+        def lobe(alpha2: Tensor, reflectance: Tensor) -> Tensor:
+            """(R5) Light (n, 1 or 3) that facets of α² (n, 1) and of a reflectance (n, 1 or 3) reflect."""
+            middle, own = own_facets(alpha2.clamp(*op.alpha2), center)
+            facets = own + spread
+            facing = shown(omega_o, middle, facets).clamp_min(op.least_view)
             widening = facets.new_tensor([1.0, 0.0, 1.0]) * (0.5 * self.light_width**2)
-            half = torch.nn.functional.normalize(omega_i + omega_o, dim=1)
-            density = _slope_density(half, middle, facets + widening)
-            f0 = torch.lerp(base.new_tensor(self.dielectric), base, metallic)
-            lobe = fresnel(f0, half, omega_o) * density / (4.0 * facing)
-            core = (1.0 - metallic) * core + light * lobe
+            density = slope_density(half, middle, facets + widening)
+            return light * (reflectance * density / (4.0 * facing))
+
+        metallic = maps[:, 9:10]
+        f0 = torch.lerp(base.new_tensor(self.dielectric), base, metallic)
+        grazing = grazing_reflectance(self.dielectric)
+        f90 = grazing + metallic * (1.0 - grazing)
+        core = (1.0 - metallic) * core + lobe(maps[:, 8:9], f0 + (f90 - f0) * rest)
+        if self.coated:
+            weight = maps[:, 10:11]
+            # (R6)
+            for omega in (omega_i, omega_o):
+                cosine = normal[:, 2:] * projections(omega, center, spread)[1]
+                core = core * (1.0 - coat_reflectance(weight, schlick(cosine)))
+            core = core + lobe(maps[:, 11:12], coat_reflectance(weight, rest))
         return torch.cat([irradiance, normal[:, :2], core], 1)
 
     def visibility(self, op: Shade, hit: Tensor, level: Tensor, omega_i: Tensor) -> Tensor:
@@ -263,46 +289,8 @@ def _azimuth(omega: Tensor) -> Tensor:
 def surface_bytes(lattice: Lattice) -> int:
     """Bytes of the surface in a material, besides its heights."""
     finer = Lattice(lattice.finest + 1, lattice.aspect)
-    maps = GLOSSY_CHANNELS * sum(finer.texels(s) for s in range(finer.finest + 1))
+    maps = COATED_CHANNELS * sum(finer.texels(s) for s in range(finer.finest + 1))
     return 4 * (maps + 2 * AZIMUTHS * sum(lattice.texels(s) for s in range(lattice.finest + 1)))
-
-
-def fresnel(f0: Tensor, half: Tensor, omega: Tensor) -> Tensor:
-    """Reflectance (n, 3) of facets with normals `half`, of F0 (n, 3), towards directions (Schlick 1994)."""
-    return f0 + (1.0 - f0) * (1.0 - (omega * half).sum(1, keepdim=True).clamp(0.0, 1.0)) ** 5
-
-
-def _slope_density(half: Tensor, center: Tensor, matrix: Tensor) -> Tensor:
-    """Density D(h) (n, 1) of facets per area of the reference plane (Walter et al. 2007).
-
-    Parameters
-    ----------
-    half : (n, 3) unit vectors
-    center : (n, 2) center of the slopes
-    matrix : (n, 3) A (xx, xy, yy)
-    """
-    xx, xy, yy = matrix.split(1, 1)
-    x, y = (half[:, :2] + half[:, 2:] * center).split(1, 1)
-    determinant = xx * yy - xy * xy
-    inside = half[:, 2:].square() + (yy * x * x - 2.0 * xy * x * y + xx * y * y) / determinant
-    return 1.0 / (math.pi * determinant.sqrt() * inside.square())
-
-
-def _shown(omega: Tensor, center: Tensor, matrix: Tensor) -> Tensor:
-    """(R4) Area (n, 1) that facets show to directions, per area of the reference plane; A (n, 3)."""
-    x, y, z = omega.split(1, 1)
-    p = z - (center * omega[:, :2]).sum(1, keepdim=True)
-    square = torch.cat([x * x, 2.0 * x * y, y * y], 1)
-    return 0.5 * (p + (p * p + (matrix * square).sum(1, keepdim=True)).clamp_min(1e-20).sqrt())
-
-
-def _spread(center: Tensor, moments: Tensor) -> Tensor:
-    """2C (n, 3) of centers and moments."""
-    x, y = center.split(1, 1)
-    xx, xy, yy = (moments - torch.cat([x * x, x * y, y * y], 1)).split(1, 1)
-    xx, yy = xx.clamp_min(0.0), yy.clamp_min(0.0)
-    most = (xx * yy).sqrt()
-    return 2.0 * torch.cat([xx, xy.clamp(-most, most), yy], 1)
 
 
 def _map_levels(geometry: Geometry, lattice: Lattice) -> list[Tensor]:
@@ -311,9 +299,15 @@ def _map_levels(geometry: Geometry, lattice: Lattice) -> list[Tensor]:
     if base is None:
         base = np.full((*geometry.slopes.shape[:2], 3), UNKNOWN_COLOR, np.float32)
     rest = [base]
+    coat, coat_roughness = geometry.clearcoat, geometry.clearcoat_roughness
+    # α = roughness².
     if geometry.roughness is not None and geometry.metallic is not None:
-        # α = roughness².
         rest += [geometry.roughness[..., None] ** 4, geometry.metallic[..., None]]
+    elif coat is not None:
+        # A Lambert surface below the coat: a dielectric of F0 = 0, which has no lobe.
+        rest += [np.ones_like(base[..., :1]), np.zeros_like(base[..., :1])]
+    if coat is not None and coat_roughness is not None:
+        rest += [coat[..., None], coat_roughness[..., None] ** 4]
     filtered = prefiltered_levels(torch.from_numpy(np.concatenate(rest, -1)), lattice)
     return [
         torch.cat(

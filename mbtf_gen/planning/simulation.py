@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mbtf_core.data.geometry import FINEST_LEVEL, GLOSSY, Geometry
+from mbtf_core.data.geometry import CLEARCOAT, FINEST_LEVEL, GLOSSY, Geometry
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.data.schema import Queries
 from mbtf_core.images.resample import resample
@@ -119,6 +119,8 @@ def geometry_of(job: Job, plan: EffectsPlan) -> Geometry | None:
         weights = {name: material.maps[name] if plan.on(name) else 0.0 for name in GLOSSY[1:]}
         shares = {"roughness": material.maps["roughness"], **weights}
         maps |= {name: _means(share, shape) for name, share in shares.items()}
+    if plan.on("clearcoat"):
+        maps |= {name: _means(material.maps[name], shape) for name in CLEARCOAT}
     if "opacity" in material.maps and plan.on("opacity"):
         maps["opacity"] = _means(material.maps["opacity"], shape)
     return replace(geometry, **maps)

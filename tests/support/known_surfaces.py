@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.data.geometry import Geometry
+from mbtf_core.data.geometry import CLEARCOAT, Geometry
 from mbtf_core.data.lattice import Lattice
 from mbtf_fit.surface.known import KnownSurface
 
@@ -32,9 +34,12 @@ def geometry(
     color: tuple[float, float, float] = (0.5, 0.4, 0.3),
     roughness: float | None = None,
     metallic: float = 0.0,
+    specular: float = 0.5,
+    clearcoat: tuple[float, float] | None = None,
     seed: int | None = None,
 ) -> Geometry:
-    """Geometry of heights with constant maps; random maps with a `seed`."""
+    """Geometry of heights with constant maps; random maps with a `seed`. A clear coat has weight and
+    roughness."""
     shape = Lattice(lattice.finest + 1, lattice.aspect).shape()
     random = np.random.default_rng(seed)
 
@@ -44,13 +49,20 @@ def geometry(
 
     slopes = varied(np.asarray(slope) if seed is None else np.ones(2))
     moments = np.stack([slopes[..., 0] ** 2, slopes[..., 0] * slopes[..., 1], slopes[..., 1] ** 2], -1)
-    glossy = {"roughness": roughness, "metallic": metallic, "specular": 0.5}
+    glossy = {"roughness": roughness, "metallic": metallic, "specular": specular}
     maps = {} if roughness is None else {n: varied(np.asarray(v)) for n, v in glossy.items()}
+    if clearcoat is not None:
+        maps |= {n: varied(np.asarray(v)) for n, v in zip(CLEARCOAT, clearcoat, strict=True)}
     return Geometry(heights, lattice.aspect, slopes, moments, base_color=varied(np.asarray(color)), **maps)
 
 
-def rough_surface(lattice: Lattice, *, glossy: bool = True, size: int = 16, seed: int = 0) -> KnownSurface:
+def rough_surface(
+    lattice: Lattice, *, glossy: bool = True, coated: bool = False, size: int = 16, seed: int = 0
+) -> KnownSurface:
     """A rough surface with random maps."""
     heights = rough_heights(max(1, round(size * lattice.aspect)), size, seed=seed)
-    given = geometry(lattice, heights, roughness=0.4 if glossy else None, metallic=0.7, seed=seed)
+    layers: dict[str, Any] = {"clearcoat": (1.0, 0.5)} if coated else {}
+    if glossy:
+        layers |= {"roughness": 0.4, "metallic": 0.7}
+    given = geometry(lattice, heights, **layers, seed=seed)
     return KnownSurface.of(given, lattice, 5.0)

@@ -37,6 +37,7 @@ def write_material(
     seed: int = 0,
     transmittance: Transmittance | None = None,
     glossy: bool = True,
+    coated: bool = False,
     **data: Any,
 ) -> Material:
     """Write a material of random weights that all matter, and return it as read back.
@@ -49,7 +50,7 @@ def write_material(
     contrast : standard deviation of the features
     brightness : mean of all biases
     transmittance : None for an opaque material
-    glossy : whether the known surface of `relief` has a glossy lobe
+    glossy, coated : whether the known surface of `relief` has a glossy lobe, and a clear coat
     data : what material.json states of the data set
     """
     config = FitConfig.model_validate({"model": model, "network": network or {}})
@@ -58,7 +59,8 @@ def write_material(
     built = build_model(model, lattice, **(network or {}))
     built.initialize(torch.Generator().manual_seed(seed), 0.2)
     if built.tracing is not None:
-        built.know(rough_surface(lattice, glossy=glossy) if constant is None else flat(lattice, constant))
+        rough = rough_surface(lattice, glossy=glossy, coated=coated)
+        built.know(rough if constant is None else flat(lattice, constant))
     tensors = built.weights()
     for name, tensor in tensors.items():
         if "texture" in name or "pyramid" in name:

@@ -34,6 +34,7 @@ CASES: dict[str, dict[str, Any]] = {
     },
     "relief": {"model": "relief"},
     "relief, diffuse, four places": {"model": "relief", "glossy": False, **net(relief={"places": 4})},
+    "relief under a coat": {"model": "relief", "coated": True, **net(relief={"places": 2})},
     "relief without hints": {"model": "relief", **net(relief={"hints": False}, oversampling=1)},
     "relief without gate": {
         "model": "relief",

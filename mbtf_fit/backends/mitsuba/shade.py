@@ -10,13 +10,21 @@ import mitsuba as mi
 import numpy as np
 
 from mbtf_core.data.lattice import Lattice
+from mbtf_core.data.schema import CLEARCOAT_F0
 from mbtf_core.errors import InputError
 from mbtf_fit import ops
 from mbtf_fit.backends.mitsuba.backend import MITSUBA, Loader, Numbers, Step, opaque
 from mbtf_fit.backends.mitsuba.stored_material import F32
 from mbtf_fit.backends.mitsuba.textures import GROUP, Textures
 from mbtf_fit.material.format import WEIGHTS_NAME
-from mbtf_fit.ops.constants import AZIMUTHS, DIFFUSE_CHANNELS, GLOSSY_CHANNELS
+from mbtf_fit.ops.constants import (
+    AZIMUTHS,
+    COATED_CHANNELS,
+    DIFFUSE_CHANNELS,
+    GLOSSY_CHANNELS,
+    MAP_CHANNELS,
+)
+from mbtf_fit.ops.shade import grazing_reflectance
 from mbtf_gen.engine.types import Color3f, Float, Normal3f, Point2f, Vector3f
 
 
@@ -26,9 +34,9 @@ def _shade(op: ops.Shade, loader: Loader) -> Step:
     grids = [finer.shape(s) for s in range(finer.finest + 1)]
     first = loader.stored.tensors.get(f"{op.maps}.0", np.empty((1, 1, GLOSSY_CHANNELS)))
     channels = first.shape[-1]
-    if channels not in (DIFFUSE_CHANNELS, GLOSSY_CHANNELS):
+    if channels not in MAP_CHANNELS:
         raise InputError(
-            f"its tensors '{op.maps}' have neither {DIFFUSE_CHANNELS} nor {GLOSSY_CHANNELS} channels",
+            f"its tensors '{op.maps}' have {channels} channels in place of one of {MAP_CHANNELS}",
             where=loader.stored.folder / WEIGHTS_NAME,
         )
     maps = loader.texture(op.maps, grids, channels)
@@ -36,7 +44,8 @@ def _shade(op: ops.Shade, loader: Loader) -> Step:
         [_adjacent_azimuths(level) for level in loader.levels(op.horizons, grids[:-1], 2 * AZIMUTHS)],
         by_group=True,
     )
-    width, dielectric = loader.scalar(op.light_width), opaque(loader.scalar(op.dielectric))
+    width, f0 = loader.scalar(op.light_width), loader.scalar(op.dielectric)
+    dielectric, grazing = opaque(f0), opaque(grazing_reflectance(f0))
     blur, widening = opaque((op.light_blur * width) ** 2), opaque(0.5 * width**2)
 
     def visibility(hit: Point2f, level: Float, omega_i: Vector3f) -> Float:
@@ -61,19 +70,32 @@ def _shade(op: ops.Shade, loader: Loader) -> Step:
         light = visibility(hit, level, omega_i) / omega_i.z
         irradiance = light * upright * _shown(omega_i, center, spread)
         core = irradiance * base / math.pi
-        if channels == GLOSSY_CHANNELS:
-            alpha2, metallic = dr.clip(found[8], *op.alpha2), found[9]
+        if channels == DIFFUSE_CHANNELS:
+            return [irradiance, -upright * x, -upright * y, *core]
+        half = dr.normalize(omega_i + omega_o)
+        rest = _schlick(dr.dot(omega_o, half))
+
+        def lobe(alpha2: Float) -> Float:
+            """(R5) Light that facets of reflectance 1 reflect."""
+            alpha2 = dr.clip(alpha2, *op.alpha2)
             below = dr.rcp(dr.fma(alpha2, length2, 1.0))
             kappa, rho = (1.0 - alpha2) * below, alpha2 * (1.0 + length2) * below
             middle = kappa * center
             own = (dr.fma(middle.x, x, 1.0), middle.x * y, dr.fma(middle.y, y, 1.0))
             facets = [dr.fma(rho, a, b) for a, b in zip(own, spread, strict=True)]
             facing = dr.maximum(_shown(omega_o, middle, facets), op.least_view)
-            half = dr.normalize(omega_i + omega_o)
             widened = (facets[0] + widening, facets[1], facets[2] + widening)
-            lobe = light * _density(half, middle, widened) / (4.0 * facing)
-            f0 = dr.lerp(mi.Color3f(dielectric), base, metallic)
-            core = (1.0 - metallic) * core + _fresnel(f0, half, omega_o) * lobe
+            return light * _density(half, middle, widened) / (4.0 * facing)
+
+        metallic = found[9]
+        f0, f90 = dr.lerp(mi.Color3f(dielectric), base, metallic), dr.fma(metallic, 1.0 - grazing, grazing)
+        core = (1.0 - metallic) * core + (f0 + (f90 - f0) * rest) * lobe(found[8])
+        if channels == COATED_CHANNELS:
+            weight, alpha2 = found[10:12]
+            for omega in (omega_i, omega_o):
+                cosine = upright * _projections(omega, center, spread)[1]
+                core *= 1.0 - weight * _coat_reflectance(_schlick(cosine))
+            core += weight * _coat_reflectance(rest) * lobe(alpha2)
         return [irradiance, -upright * x, -upright * y, *core]
 
     def step(hits: Numbers, level: Numbers, omega_i: Numbers, omega_o: Numbers) -> Numbers:
@@ -124,12 +146,18 @@ def _spread(x: Float, y: Float, xx: Float, xy: Float, yy: Float) -> tuple[Float,
     return 2.0 * xx, 2.0 * dr.clip(xy, -most, most), 2.0 * yy
 
 
-def _shown(omega: Vector3f, center: Point2f, matrix: Sequence[Float]) -> Float:
-    """(R4) Area that facets show to a direction, per area of the reference plane."""
+def _projections(omega: Vector3f, center: Point2f, matrix: Sequence[Float]) -> tuple[Float, Float]:
+    """(R4) Twice both terms of :func:`_shown`."""
     xx, xy, yy = matrix
     p = omega.z - center.x * omega.x - center.y * omega.y
     square = xx * dr.square(omega.x) + 2.0 * xy * omega.x * omega.y + yy * dr.square(omega.y)
-    return 0.5 * (p + dr.safe_sqrt(dr.fma(p, p, square)))
+    return p, dr.safe_sqrt(dr.fma(p, p, square))
+
+
+def _shown(omega: Vector3f, center: Point2f, matrix: Sequence[Float]) -> Float:
+    """(R4) Area that facets show to a direction, per area of the reference plane."""
+    p, root = _projections(omega, center, matrix)
+    return 0.5 * (p + root)
 
 
 def _density(half: Vector3f, center: Point2f, matrix: Sequence[Float]) -> Float:
@@ -141,9 +169,14 @@ def _density(half: Vector3f, center: Point2f, matrix: Sequence[Float]) -> Float:
     return 1.0 / (math.pi * dr.sqrt(determinant) * dr.square(dr.fma(half.z, half.z, square)))
 
 
-def _fresnel(f0: Color3f, half: Vector3f, omega: Vector3f) -> Color3f:
-    """Schlick 1994."""
-    return f0 + (1.0 - f0) * (1.0 - dr.clip(dr.dot(omega, half), 0.0, 1.0)) ** 5
+def _schlick(cosine: Float) -> Float:
+    """Weight of the grazing reflectance (Schlick 1994)."""
+    return (1.0 - dr.clip(cosine, 0.0, 1.0)) ** 5
+
+
+def _coat_reflectance(grazing: Float) -> Float:
+    """Reflectance of a clear coat, by the weight of its grazing reflectance."""
+    return dr.fma(1.0 - CLEARCOAT_F0, grazing, CLEARCOAT_F0)
 
 
 def _adjacent_azimuths(horizons: F32) -> F32:
@@ -169,4 +202,5 @@ def _ggx(
     cosine = dr.maximum(dr.dot(normal, half), 0.0)
     facets = alpha2 / (math.pi * dr.square(dr.fma(dr.square(cosine), alpha2 - 1.0, 1.0)))
     masking = sum(dr.sqrt(dr.fma(alpha2, dr.rcp(dr.square(c)) - 1.0, 1.0)) for c in (light, view))
-    return _fresnel(f0, half, omega_o) * facets / (2.0 * masking * light * view)
+    reflectance = f0 + (1.0 - f0) * _schlick(dr.dot(omega_o, half))
+    return reflectance * facets / (2.0 * masking * light * view)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from mbtf_core.data.schema import CLEARCOAT_F0
 from mbtf_fit import ops
 from mbtf_fit.backends.shader.backend import SHADER, Code, Value, in_fours
 from mbtf_fit.backends.shader.images import layer_vectors
 from mbtf_fit.backends.shader.syntax import number, vector
-from mbtf_fit.ops.constants import GLOSSY_CHANNELS, LEAK
+from mbtf_fit.ops.constants import COATED_CHANNELS, GLOSSY_CHANNELS, LEAK
+from mbtf_fit.ops.shade import grazing_reflectance
 
 PER_WIDTH = "float2(1.0, ASPECT)"
 ACTIVATIONS = {"relu": "max({0}, 0.0)", "leaky-relu": f"max({{0}}, {LEAK} * {{0}})", "sine": "sin({0})"}
@@ -97,12 +99,14 @@ def _shade(op: ops.Shade, code: Code, hits: Value, level: Value, omega_i: Value,
     code.include("shading")
     maps = code.image(op.maps, "maps")
     horizons = code.image(op.horizons, "horizons")
-    glossy = maps.levels[0].shape[2] == GLOSSY_CHANNELS
-    count, width = len(hits) // 2, code.scalar(op.light_width)
+    channels = maps.levels[0].shape[2]
+    glossy, coated = channels >= GLOSSY_CHANNELS, channels == COATED_CHANNELS
+    count, width, coat_f0 = len(hits) // 2, code.scalar(op.light_width), number(CLEARCOAT_F0)
     with code.stage_of(hits, level, omega_o):
         places = code.variable("Place", "places", count, kept=True)
         at, finer = code.variable("float2", "at", count, kept=False), f"{level} + {number(op.finer)}"
         p, q = (code.pair(image, finer, f"{at}[k]") for image in (maps, horizons))
+        coats = code.variable("Coat", "coats", count, kept=True) if coated else ""
         given = f"{omega_o}, {number(0.5 * width**2)}, {number(op.least_view)}, {vector(op.alpha2)}"
         code.write(
             *(f"{at}[{k}] = {hits[2 * k : 2 * k + 2]};" for k in range(count)),
@@ -110,15 +114,19 @@ def _shade(op: ops.Shade, code: Code, hits: Value, level: Value, omega_i: Value,
             f"  Pair p = {p}, q = {q};",
             f"  {places}[k] = "
             + (f"glossy_place_at({maps}, p, q, {given});" if glossy else f"place_at({maps}, p, q);"),
+            *([f"  {coats}[k] = coat_at({maps}, p, {places}[k], {coat_f0}, {given});"] if coated else []),
             "}",
         )
         if glossy and not code.lit:
-            facets = f"{places}[0].facets"
+            facets = f"{places}[0].facets.matrix"
             code.lobe = f"float4(normal_of({places}[0]), min(0.5 * ({facets}.x + {facets}.z), 1.0))"
     core = "irradiance * at.base / PI"
     if glossy:
-        lobe = f"reflected(at, {number(code.scalar(op.dielectric))}, {omega_i}, {omega_o})"
+        f0 = code.scalar(op.dielectric)
+        lobe = f"reflected(at, {vector((f0, grazing_reflectance(f0)))}, {omega_i}, {omega_o})"
         core = f"(1.0 - at.metallic) * {core} + light * {lobe}"
+    if coated:
+        core = f"coated({core}, {coats}[k], at, {coat_f0}, light, {omega_i}, {omega_o})"
     hints, sum_ = code.variable("float3", op.output), code.variable("float3", op.output)
     blur = f"{number((op.light_blur * width) ** 2)}, {number(op.least_variance)}"
     code.write(

@@ -6,8 +6,9 @@
 #define EXPORT __attribute__((visibility("default")))
 #define PI 3.14159265f
 /* Channels of the maps: center of the slopes (x, y), moments (xx, xy, yy), base color; squared alpha, metallic of
- * glossy ones. */
+ * glossy ones; weight, squared alpha of the clear coat of coated ones. */
 #define GLOSSY 10
+#define COATED 12
 /* Rays that are traced before the first of them is shaded. */
 #define AHEAD 8
 
@@ -86,11 +87,22 @@ typedef struct {
     float xx, xy, yy;
 } matrix;
 
-/* Area that facets about a center show to a direction, per area of the reference plane. */
-static float shown(const float *w, float cx, float cy, matrix a) {
+/* Area that facets about a center show to a direction, per area of the reference plane, as half the sum of both. */
+typedef struct {
+    float plane, root;
+} projection;
+
+static projection project(const float *w, float cx, float cy, matrix a) {
     const float p = w[2] - cx * w[0] - cy * w[1];
     const float square = p * p + a.xx * w[0] * w[0] + 2.0f * a.xy * w[0] * w[1] + a.yy * w[1] * w[1];
-    return 0.5f * (p + sqrtf(square > 0.0f ? square : 0.0f));
+    return (projection){p, sqrtf(square > 0.0f ? square : 0.0f)};
+}
+
+static float shown(projection p) { return 0.5f * (p.plane + p.root); }
+
+static float schlick(float cosine) {
+    const float rest = 1.0f - clamped(cosine, 0.0f, 1.0f);
+    return rest * rest * rest * rest * rest;
 }
 
 /* Twice the scatter of the slopes. */
@@ -102,42 +114,57 @@ static matrix spread(const float *m) {
     return (matrix){2.0f * a.xx, 2.0f * clamped(a.xy, -most, most), 2.0f * a.yy};
 }
 
+/* Light that facets of a squared alpha reflect of half vector w about slopes, where their reflectance is 1. */
+static float reflected(const mbtf_surface *s, float light, float alpha2, const float *m, matrix a, const float *w,
+                       const float *o) {
+    const float length2 = m[0] * m[0] + m[1] * m[1];
+    alpha2 = clamped(alpha2, s->alpha2[0], s->alpha2[1]);
+    const float below = 1.0f / (1.0f + alpha2 * length2);
+    const float kappa = (1.0f - alpha2) * below, rho = alpha2 * (1.0f + length2) * below;
+    const float cx = kappa * m[0], cy = kappa * m[1];
+    a.xx += rho * (1.0f + cx * m[0]);
+    a.xy += rho * cx * m[1];
+    a.yy += rho * (1.0f + cy * m[1]);
+    const float facing = shown(project(o, cx, cy, a));
+    a.xx += 0.5f * s->light_width * s->light_width;
+    a.yy += 0.5f * s->light_width * s->light_width;
+    const float gx = w[0] + w[2] * cx, gy = w[1] + w[2] * cy, determinant = a.xx * a.yy - a.xy * a.xy;
+    const float inside = w[2] * w[2] + (a.yy * gx * gx - 2.0f * a.xy * gx * gy + a.xx * gy * gy) / determinant;
+    const float density = 1.0f / (PI * sqrtf(determinant) * inside * inside);
+    return light * density / (4.0f * (facing > s->least_view ? facing : s->least_view));
+}
+
 /* Adds irradiance, normal (x, y) and core at a surface point. */
 static void shade(const mbtf_surface *s, const hit *h, const float *i, const float *o, float *sum) {
-    float m[GLOSSY] = {0};
+    float m[COATED] = {0};
     const int channels = s->maps.channels;
     for (int k = 0; k < 8; k++) {
         const float *row = s->maps.table + h->maps.rows[k] * channels;
         for (int c = 0; c < channels; c++) m[c] += h->maps.weights[k] * row[c];
     }
-    const float length2 = m[0] * m[0] + m[1] * m[1], nz = 1.0f / sqrtf(length2 + 1.0f);
-    matrix a = spread(m);
+    const float nz = 1.0f / sqrtf(m[0] * m[0] + m[1] * m[1] + 1.0f);
+    const matrix a = spread(m);
     const float light = visibility(s, &h->horizons, i) / i[2];
-    const float irradiance = light * nz * shown(i, m[0], m[1], a);
+    const projection lit = project(i, m[0], m[1], a);
+    const float irradiance = light * nz * shown(lit);
     float core[3];
     for (int c = 0; c < 3; c++) core[c] = irradiance * m[5 + c] / PI;
-    if (channels == GLOSSY) {
-        const float alpha2 = clamped(m[8], s->alpha2[0], s->alpha2[1]), below = 1.0f / (1.0f + alpha2 * length2);
-        const float kappa = (1.0f - alpha2) * below, rho = alpha2 * (1.0f + length2) * below;
-        const float cx = kappa * m[0], cy = kappa * m[1];
-        a.xx += rho * (1.0f + cx * m[0]);
-        a.xy += rho * cx * m[1];
-        a.yy += rho * (1.0f + cy * m[1]);
-        const float facing = shown(o, cx, cy, a);
-        a.xx += 0.5f * s->light_width * s->light_width;
-        a.yy += 0.5f * s->light_width * s->light_width;
-        float hx = i[0] + o[0], hy = i[1] + o[1], hz = i[2] + o[2];
-        const float length = sqrtf(hx * hx + hy * hy + hz * hz);
-        hx /= length, hy /= length, hz /= length;
-        const float gx = hx + hz * cx, gy = hy + hz * cy, determinant = a.xx * a.yy - a.xy * a.xy;
-        const float inside = hz * hz + (a.yy * gx * gx - 2.0f * a.xy * gx * gy + a.xx * gy * gy) / determinant;
-        const float density = 1.0f / (PI * sqrtf(determinant) * inside * inside);
-        const float rest = 1.0f - clamped(o[0] * hx + o[1] * hy + o[2] * hz, 0.0f, 1.0f);
-        const float schlick = rest * rest * rest * rest * rest;
-        const float lobe = light * density / (4.0f * (facing > s->least_view ? facing : s->least_view));
+    if (channels >= GLOSSY) {
+        float w[3] = {i[0] + o[0], i[1] + o[1], i[2] + o[2]};
+        const float length = sqrtf(w[0] * w[0] + w[1] * w[1] + w[2] * w[2]);
+        for (int c = 0; c < 3; c++) w[c] /= length;
+        const float rest = schlick(o[0] * w[0] + o[1] * w[1] + o[2] * w[2]);
+        const float lobe = reflected(s, light, m[8], m, a, w, o), edge = s->edge + m[9] * (1.0f - s->edge);
         for (int c = 0; c < 3; c++) {
             const float f0 = s->dielectric + m[9] * (m[5 + c] - s->dielectric);
-            core[c] = (1.0f - m[9]) * core[c] + (f0 + (1.0f - f0) * schlick) * lobe;
+            core[c] = (1.0f - m[9]) * core[c] + (f0 + (edge - f0) * rest) * lobe;
+        }
+        if (channels == COATED) {
+            const float f0 = s->coat, seen = project(o, m[0], m[1], a).root;
+            const float coat = m[10] * (f0 + (1.0f - f0) * rest) * reflected(s, light, m[11], m, a, w, o);
+            const float below = (1.0f - m[10] * (f0 + (1.0f - f0) * schlick(nz * lit.root))) *
+                                (1.0f - m[10] * (f0 + (1.0f - f0) * schlick(nz * seen)));
+            for (int c = 0; c < 3; c++) core[c] = below * core[c] + coat;
         }
     }
     sum[0] += irradiance;

@@ -28,6 +28,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mbtf_core.data.schema import CLEARCOAT_F0
 from mbtf_gen.engine.types import (
     Color3f,
     Float,
@@ -53,7 +54,6 @@ from mbtf_gen.render.bsdf.microfacet import (
 )
 from mbtf_gen.render.bsdf.sheen import SheenTables, sheen_value
 
-CLEARCOAT_REFLECTANCE = 0.04
 # Smallest cosine between shading normal and viewer; shading normals below it are bent towards the viewer.
 SMALLEST_COSINE = 0.01
 # Smallest and largest probability of sampling the lobe, without a clear coat.
@@ -224,7 +224,7 @@ class SurfacePoint:
         roughness = dr.clip(maps["clearcoat_roughness"].eval_1(si), 0.0, 1.0)
         pair = self.tables.at(self.wi.z, roughness)
         self.clearcoat_weight = maps["clearcoat"].eval_1(si)
-        normal, grazing = mi.Color3f(CLEARCOAT_REFLECTANCE), mi.Color3f(1.0)
+        normal, grazing = mi.Color3f(CLEARCOAT_F0), mi.Color3f(1.0)
         self.clearcoat = GgxLobe(roughness, normal, grazing, self.tables, pair)
 
     def _sheen(self, maps: dict[str, Texture], si: SurfaceInteraction3f) -> None:

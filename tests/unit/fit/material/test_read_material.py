@@ -28,15 +28,16 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
 }
 
 
-@pytest.mark.parametrize("glossy", [True, False])
+@pytest.mark.parametrize("surface", ["glossy", "diffuse", "coated"])
 @pytest.mark.parametrize("case", CASES)
-def test_the_reader_gives_the_conformance_values(case: str, glossy: bool, tmp_path: Path) -> None:
+def test_the_reader_gives_the_conformance_values(case: str, surface: str, tmp_path: Path) -> None:
     model, network = CASES[case]
-    if not glossy and model not in ("relief", "neumip+"):
+    if surface != "glossy" and model not in ("relief", "neumip+"):
         pytest.skip("knows no surface")
     calibration = 0.7 + 0.6 * torch.rand(2, 4, 5, 3, generator=torch.Generator().manual_seed(0))
     weights = {"calibration": calibration} if MODELS[model].calibrates else None
-    options = {"aspect": 0.5, "network": network, "glossy": glossy, "weights": weights}
+    options = {"aspect": 0.5, "network": network, "weights": weights}
+    options |= {"glossy": surface != "diffuse", "coated": surface == "coated"}
     material = write_material(tmp_path, model=model, finest=3, **options)
     expected = material.conformance["rgb"]
     queries = [material.conformance[name] for name in ("u", "sigma", "omega_i", "omega_o")]

@@ -65,6 +65,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "relief": relief(),
     "four places": {"aspect": 0.5, **relief(places=4)},
     "Lambert": {"aspect": 2.3, "glossy": False, **relief()},
+    "clear coat": {"aspect": 0.5, "coated": True, **relief()},
+    "Lambert below a clear coat": {"glossy": False, "coated": True, **relief(places=2)},
     "calibrated relief": {**relief(), **calibration(4)},
     "relief, one texel": {"finest": 0, **relief()},
     "no hints": relief(hints=False),

@@ -13,7 +13,14 @@ import pytest
 from numpy.typing import NDArray
 from support.datasets import write_dataset
 
-from mbtf_core.data.geometry import Geometry, encode_geometry, geometry_record, read_geometry
+from mbtf_core.data.geometry import (
+    CLEARCOAT,
+    GLOSSY,
+    Geometry,
+    encode_geometry,
+    geometry_record,
+    read_geometry,
+)
 from mbtf_core.errors import InputError
 from mbtf_core.images.exr import encode_parts
 from mbtf_gen.config.generator import GeneratorConfig
@@ -138,8 +145,14 @@ def test_reflectance_is_that_of_the_maps(tmp_path: Path) -> None:
     assert found.metallic is not None
     assert found.specular is not None
     assert (set(found.metallic.ravel()), set(found.specular.ravel())) == ({0.25}, {0.5})
+    assert (found.clearcoat, found.clearcoat_roughness) == (None, None)
+    coat = {"clearcoat": roughness, "clearcoat_roughness": 0.2}
+    coated = made(job_of(tmp_path, heights, base_color=color, **coat))
+    assert coated.roughness is None
+    np.testing.assert_allclose(coated.clearcoat, means, rtol=1e-6)
+    np.testing.assert_allclose(coated.clearcoat_roughness, 0.2, rtol=1e-6)
     own = made(job_of(tmp_path, heights, bsdf={"type": "diffuse"}, opacity=opacity, **gloss))
-    optional = ("base_color", "roughness", "metallic", "specular", "opacity")
+    optional = ("base_color", "roughness", "metallic", "specular", "opacity", *CLEARCOAT)
     assert {name for name in optional if getattr(own, name) is not None} == set()
 
 
@@ -151,6 +164,8 @@ def test_what_the_plan_leaves_out_is_left_out(tmp_path: Path) -> None:
         "roughness": 0.5,
         "metallic": 0.5,
         "specular": 0.5,
+        "clearcoat": 0.5,
+        "clearcoat_roughness": 0.1,
     }
 
     def of(effects: str) -> Geometry:
@@ -164,6 +179,7 @@ def test_what_the_plan_leaves_out_is_left_out(tmp_path: Path) -> None:
     assert bare.metallic is not None
     assert not bare.metallic.any()
     assert of("auto,-metallic,-specular").roughness is None
+    assert of("auto,-clearcoat").clearcoat is None
     # Without displacement the shading normal still follows the heights.
     plane = of("auto,-normal,-parallax")
     np.testing.assert_allclose(plane.slopes, bare.slopes, atol=1e-6)
@@ -180,7 +196,7 @@ def test_maps_end_at_a_finest_level(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def full(tmp_path: Path) -> Geometry:
     """Geometry of random maps, all of them."""
     rng = np.random.default_rng(3)
-    maps = {name: rng.random(SQUARE) for name in ("roughness", "metallic", "specular", "opacity")}
+    maps = {name: rng.random(SQUARE) for name in (*GLOSSY, "opacity", *CLEARCOAT)}
     slopes = rng.normal(size=(2, *SQUARE))
     maps |= {"normal": normals(*slopes), "base_color": rng.random((*SQUARE, 3))}
     return made(job_of(tmp_path, 0.1 * rng.random((24, 48)), finest=2, **maps))
@@ -206,7 +222,7 @@ def test_another_reader_finds_the_channels_the_right_way_up(full: Geometry, tmp_
     ):
         assert parts["maps"][channel].dtype == np.float32
         np.testing.assert_array_equal(parts["maps"][channel], pixels)
-    assert len(parts["maps"]) == 12
+    assert len(parts["maps"]) == 14
     # Nothing that differs between two runs, such as a date.
     known = "channels chunkCount compression dataWindow displayWindow lineOrder mbtf.aspect name "
     known += "pixelAspectRatio screenWindowCenter screenWindowWidth type"
@@ -217,7 +233,7 @@ def test_what_is_written_is_read(full: Geometry, tmp_path: Path) -> None:
     path = tmp_path / "geometry.exr"
     path.write_bytes(encode_geometry(full))
     assert hashlib.sha256(path.read_bytes()).hexdigest() == geometry_record(full)["sha256"]
-    bare = replace(full, roughness=None, metallic=None, specular=None, opacity=None, aspect=0.5 + 2**-40)
+    bare = replace(full, **dict.fromkeys((*GLOSSY, "opacity", *CLEARCOAT)), aspect=0.5 + 2**-40)
     for expected in (full, bare):
         path.write_bytes(encode_geometry(expected))
         for name, value in vars(read_geometry(path)).items():
@@ -241,6 +257,7 @@ INVALID: dict[str, tuple[Callable[[Geometry], Geometry], str]] = {
     "color": (_set("base_color", 1.5), r"'base_color' holds numbers outside \[0, 1\]"),
     "moments": (_set("slope_moments", -1.0), "negative means of squares"),
     "gloss": (lambda g: replace(g, metallic=None), "some, but not all, of roughness"),
+    "coat": (lambda g: replace(g, clearcoat=None), "some, but not all, of clearcoat"),
     "aspect": (lambda g: replace(g, aspect=2.0), "8 x 4 texels, which no level has"),
 }
 
