@@ -5,6 +5,8 @@ const SHADERS = CONTENT.shaders;
 // Seconds of drawing after which the page answers; frames after which nothing moves any more.
 const SLOW = 0.06,
   STILL = 4;
+// Seconds in which the light of the first view moves in a circle, once.
+const ROUND = 20;
 
 class Viewer {
   constructor(content) {
@@ -30,7 +32,10 @@ class Viewer {
     state.material = clamp(Math.round(state.material), 0, this.materials.length - 1);
     // While a fit is trained, what is compared may come later.
     if (!this.content.live && !this.picture && !this.shown[1]) state.against = "none";
-    Object.assign(this, { chosen: 0, automatic: false });
+    Object.assign(this, { chosen: 0, automatic: false, round: undefined });
+    // A link shows what its author chose. Drawing would slow down a fit that is running.
+    if (fragment.length < 2 && !this.content.live && !matchMedia("(prefers-reduced-motion: reduce)").matches)
+      this.round = performance.now();
     this.shapeChanged();
     this.environmentChanged();
     this.againstChanged();
@@ -102,6 +107,22 @@ class Viewer {
     this.saveLater();
   }
 
+  // Move the light of the first view on its circle; it ends where it began.
+  moveLight() {
+    if (this.round === undefined) return;
+    const turns = Math.min((performance.now() - this.round) / (1000 * ROUND), 1),
+      [elevation, azimuth] = toAngles(FIRST.lights[0].direction);
+    this.state.lights[0].direction = fromAngles(elevation, azimuth + 360 * turns);
+    if (turns === 1) this.stopLight();
+    this.changed();
+    this.refresh?.();
+  }
+
+  // The user moves light and picture from now on.
+  stopLight() {
+    this.round = undefined;
+  }
+
   saveLater() {
     clearTimeout(this.saving);
     this.saving = setTimeout(() => history.replaceState(null, "", linkOf(this.state, this.camera)), 300);
@@ -141,6 +162,7 @@ class Viewer {
   againstChanged() {
     const { gl } = this.renderer,
       picture = this.picture;
+    if (picture) this.stopLight();
     if (this.pictureTexture) gl.deleteTexture(this.pictureTexture.handle);
     this.pictureTexture = undefined;
     if (picture) {
@@ -200,6 +222,7 @@ class Viewer {
   // Draw: coarse pictures while something moves, then frames of full size in parts, so that the page answers.
   // Returns whether anything changed.
   draw() {
+    this.moveLight();
     const { renderer, shown, scene } = this,
       { width, height } = renderer.canvas,
       moving = this.still++ < STILL;
