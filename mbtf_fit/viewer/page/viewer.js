@@ -5,8 +5,9 @@ const SHADERS = CONTENT.shaders;
 // Seconds of drawing after which the page answers; frames after which nothing moves any more.
 const SLOW = 0.06,
   STILL = 4;
-// Seconds in which the light of the first view moves in a circle, once.
-const ROUND = 20;
+// Seconds in which the light of the first view moves in a circle, once, and the circle's radius on the dome.
+const ROUND = 20,
+  RADIUS = 0.3;
 
 class Viewer {
   constructor(content) {
@@ -111,8 +112,11 @@ class Viewer {
   moveLight() {
     if (this.round === undefined) return;
     const turns = Math.min((performance.now() - this.round) / (1000 * ROUND), 1),
-      [elevation, azimuth] = toAngles(FIRST.lights[0].direction);
-    this.state.lights[0].direction = fromAngles(elevation, azimuth + 360 * turns);
+      [x0, y0] = FIRST.lights[0].direction,
+      angle = 2 * Math.PI * turns;
+    // Far from the mirror direction, whose highlight the exposure of the first picture would show white.
+    const [x, y] = [x0 + RADIUS * (Math.cos(angle) - 1), y0 + RADIUS * Math.sin(angle)];
+    this.state.lights[0].direction = [x, y, Math.sqrt(1 - x * x - y * y)];
     if (turns === 1) this.stopLight();
     this.changed();
     this.refresh?.();
