@@ -6,9 +6,12 @@ scales the lobe also at grazing angles (as glTF's KHR_materials_specular does fo
 parallax nor shadows, and one lobe per texel: a baseline for all that does.
 
 Microgeometry shadows its highlights. Without the weight, the loss removes a lobe that is too bright by making
-it too narrow for the queries to sample, which leaves spikes between them. The relative loss bounds the cost
-of a spike. Roughness and slopes therefore train slower than colors: lobes start wide, and become narrow
-only where many queries agree.
+it too narrow for the queries to sample, which leaves spikes between them. Roughness and slopes therefore
+train slower than colors: lobes start wide, and become narrow only where many queries agree.
+
+Towards grazing angles every lobe is bright, while parallax and shadows move and remove highlights. The
+relative loss of a highlight at the wrong place is bounded, and energy calibration scales it up: such fits can
+be worse than a constant. The squared loss is added, and there is no calibration, which engines lack too.
 """
 
 from __future__ import annotations
@@ -34,8 +37,12 @@ class Svbrdf(Model):
     description = "a diffuse and a GGX lobe per texel, without a network"
     defaults: ClassVar[Mapping[str, Any]] = {
         "network": {"offset": "none"},
-        "training": {"texture_learning_rate": 0.1},
+        "training": {
+            "texture_learning_rate": 0.1,
+            "losses": [{"kind": "relative"}, {"kind": "squared"}],
+        },
     }
+    calibrates = False
     takes = ("init_from",)
 
     @classmethod

@@ -200,6 +200,7 @@ function bindPanel(viewer) {
   });
 
   byId("add_light").addEventListener("click", () => {
+    viewer.stopLight();
     state.lights.push({
       direction: fromAngles(40, 45 + 90 * state.lights.length),
       color: [1, 1, 1],
@@ -210,6 +211,7 @@ function bindPanel(viewer) {
     refresh();
   });
   byId("remove_light").addEventListener("click", () => {
+    viewer.stopLight();
     state.lights.splice(viewer.chosen, 1);
     viewer.chosen = Math.max(0, viewer.chosen - 1);
     viewer.changed();

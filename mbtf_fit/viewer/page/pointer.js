@@ -15,6 +15,7 @@ function bindDome(viewer) {
   const dome = byId("dome"),
     { state } = viewer;
   drag(dome, (event) => {
+    viewer.stopLight();
     const at = domeDirection(dome, event);
     const near = state.lights.map(({ direction }) => Math.hypot(direction[0] - at[0], direction[1] - at[1]));
     viewer.chosen = Math.max(0, near.indexOf(Math.min(...near)));
@@ -49,6 +50,7 @@ function bindCanvas(viewer) {
   const one = (dx, dy, box) => {
     const light = state.lights[viewer.chosen];
     if (first.shiftKey && light) {
+      viewer.stopLight();
       const [elevation, azimuth] = toAngles(light.direction);
       light.direction = fromAngles(
         clamp(elevation - (90 * dy) / box.height, 1, 89.9),

@@ -5,6 +5,9 @@ const SHADERS = CONTENT.shaders;
 // Seconds of drawing after which the page answers; frames after which nothing moves any more.
 const SLOW = 0.06,
   STILL = 4;
+// Seconds in which the light of the first view moves in a circle, once, and the circle's radius on the dome.
+const ROUND = 20,
+  RADIUS = 0.3;
 
 class Viewer {
   constructor(content) {
@@ -30,7 +33,10 @@ class Viewer {
     state.material = clamp(Math.round(state.material), 0, this.materials.length - 1);
     // While a fit is trained, what is compared may come later.
     if (!this.content.live && !this.picture && !this.shown[1]) state.against = "none";
-    Object.assign(this, { chosen: 0, automatic: false });
+    Object.assign(this, { chosen: 0, automatic: false, round: undefined });
+    // A link shows what its author chose. Drawing would slow down a fit that is running.
+    if (fragment.length < 2 && !this.content.live && !matchMedia("(prefers-reduced-motion: reduce)").matches)
+      this.round = performance.now();
     this.shapeChanged();
     this.environmentChanged();
     this.againstChanged();
@@ -102,6 +108,25 @@ class Viewer {
     this.saveLater();
   }
 
+  // Move the light of the first view on its circle; it ends where it began.
+  moveLight() {
+    if (this.round === undefined) return;
+    const turns = Math.min((performance.now() - this.round) / (1000 * ROUND), 1),
+      [x0, y0] = FIRST.lights[0].direction,
+      angle = 2 * Math.PI * turns;
+    // Far from the mirror direction, whose highlight the exposure of the first picture would show white.
+    const [x, y] = [x0 + RADIUS * (Math.cos(angle) - 1), y0 + RADIUS * Math.sin(angle)];
+    this.state.lights[0].direction = [x, y, Math.sqrt(1 - x * x - y * y)];
+    if (turns === 1) this.stopLight();
+    this.changed();
+    this.refresh?.();
+  }
+
+  // The user moves light and picture from now on.
+  stopLight() {
+    this.round = undefined;
+  }
+
   saveLater() {
     clearTimeout(this.saving);
     this.saving = setTimeout(() => history.replaceState(null, "", linkOf(this.state, this.camera)), 300);
@@ -141,6 +166,7 @@ class Viewer {
   againstChanged() {
     const { gl } = this.renderer,
       picture = this.picture;
+    if (picture) this.stopLight();
     if (this.pictureTexture) gl.deleteTexture(this.pictureTexture.handle);
     this.pictureTexture = undefined;
     if (picture) {
@@ -200,6 +226,7 @@ class Viewer {
   // Draw: coarse pictures while something moves, then frames of full size in parts, so that the page answers.
   // Returns whether anything changed.
   draw() {
+    this.moveLight();
     const { renderer, shown, scene } = this,
       { width, height } = renderer.canvas,
       moving = this.still++ < STILL;

@@ -196,6 +196,36 @@ def test_inputs_set_what_they_say(page: Page) -> None:
     assert page.driver.find_element("id", "dark").is_displayed()
 
 
+def test_the_light_of_the_first_view_moves_once_around(page: Page) -> None:
+    """From its first direction back to it, until the user moves a light; not in views of links, nor for
+    users who prefer reduced motion."""
+    moved = (
+        STATE + "viewer.round &&= viewer.round - 1000 * arguments[0]; viewer.moveLight();"
+        "return [state.lights[0].direction, viewer.round === undefined]"
+    )
+    page.js(STATE + "viewer.restore('')")
+    x, y, _ = from_angles(45.0, -30.0)
+    for seconds, at, ended in (
+        (5, (x - 0.3, y + 0.3), False),
+        (5, (x - 0.6, y), False),
+        (15, (x, y), True),
+    ):
+        direction, stopped = page.js(moved, seconds)
+        assert direction[:2] == pytest.approx(at, abs=0.1)
+        assert np.linalg.norm(direction) == pytest.approx(1)
+        assert stopped == ended
+    for touched in (lambda: drag(page, "dome", (0.2, 0.1), (5, 5)), lambda: page.set(FLAT)):
+        page.js(STATE + "viewer.restore('')")
+        touched()
+        before = page.js(STATE + "return state.lights[0].direction")
+        assert page.js(moved, 5) == [before, True]
+    media = {"features": [{"name": "prefers-reduced-motion", "value": "reduce"}]}
+    page.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", media)
+    page.js(STATE + "viewer.restore('')")
+    assert page.js(moved, 5) == [pytest.approx(from_angles(45.0, -30.0).tolist()), True]
+    page.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+
+
 def test_the_dome_is_seen_from_above(page: Page) -> None:
     """A light at +v is at the top, one that is dragged to the right is at +u."""
     page.set({**FLAT, "lights": [{**ABOVE, "direction": [0, 0.8, 0.6], "color": [1, 0, 0]}]})
