@@ -23,7 +23,7 @@ from mbtf_fit.training.loop import TrainingLoop
 from mbtf_fit.training.trainer import Trainer
 
 # Interval at which a stage says how far it is.
-_REPORT_SECONDS = 5.0
+_REPORT_SECONDS = 2.0
 
 
 @dataclass(frozen=True)

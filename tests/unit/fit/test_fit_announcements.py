@@ -15,6 +15,7 @@ from mbtf_core.files import folders
 from mbtf_fit.cli.app import app
 from mbtf_fit.config import FitConfig
 from mbtf_fit.training import fit as fits
+from mbtf_fit.training import fit_export
 from mbtf_fit.training.forecast import fit_bytes
 
 
@@ -57,7 +58,8 @@ def test_the_size_is_that_of_two_checkpoints(shards: Path, tmp_path: Path) -> No
 
 def test_a_fit_announces_each_stage(shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Reading counts as no progress; after the last step, nothing takes its time in silence."""
-    monkeypatch.setattr(fits, "_REPORT_SECONDS", 0.0)
+    for module in (fits, fit_export):
+        monkeypatch.setattr(module, "_REPORT_SECONDS", 0.0)
     training = {"steps": 3, "batch": 500}
     config = FitConfig.model_validate({"model": "neumip", "network": {"width": 8}, "training": training})
     said: list[tuple[float, str]] = []
