@@ -36,7 +36,8 @@ def _shade(op: ops.Shade, loader: Loader) -> Step:
     channels = first.shape[-1]
     if channels not in MAP_CHANNELS:
         raise InputError(
-            f"its tensors '{op.maps}' have {channels} channels in place of one of {MAP_CHANNELS}",
+            f"its tensors '{op.maps}' have {channels} channels in place of "
+            f"{DIFFUSE_CHANNELS}, {GLOSSY_CHANNELS} or {COATED_CHANNELS}",
             where=loader.stored.folder / WEIGHTS_NAME,
         )
     maps = loader.texture(op.maps, grids, channels)

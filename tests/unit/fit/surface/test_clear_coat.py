@@ -97,3 +97,10 @@ def test_light_that_the_coat_transmits(metal: bool, scatter: F64, tolerance: flo
     found = (coated - lobe) / bare
     assert wanted.min() < 0.85
     assert np.quantile(abs(found / wanted - 1), 0.75) < tolerance
+
+
+def test_a_coat_without_weight_changes_nothing() -> None:
+    """Of a Lambert surface, also at grazing angles."""
+    light, view = pairs(0.02)
+    bare, coated = (known(light, view, **o) for o in ({}, {"clearcoat": (0.0, 0.3)}))
+    np.testing.assert_allclose(coated, bare, rtol=1e-6)
