@@ -41,7 +41,7 @@ def validation_subset(positions: int, queries: ShardQueries, most: int = _SUBSET
 
 def validation_error(trainer: Trainer, queries: ShardQueries) -> Estimate:
     """Unexplained variance of queries by the current model."""
-    return unexplained_variance(trainer.predict(queries), queries.value_a, queries.value_b)
+    return unexplained_variance(trainer.predict(queries), queries.value_a, queries.value_b, queries.weight)
 
 
 def finite(number: float | None) -> float | None:
@@ -52,7 +52,7 @@ def finite(number: float | None) -> float | None:
 def errors_by_level(trainer: Trainer, queries: ShardQueries) -> dict[str, float | None]:
     """Unexplained variance by nearest level; None where it is undefined."""
     level = level_groups(queries.sigma, trainer.model.lattice.finest)
-    values = trainer.predict(queries), queries.value_a, queries.value_b
+    values = trainer.predict(queries), queries.value_a, queries.value_b, queries.weight
     return {str(s): finite(e.value) for s, e in by_group(unexplained_variance, level, *values).items()}
 
 
