@@ -29,7 +29,7 @@ from mbtf_core.stats import Estimate, unexplained_variance
 from mbtf_fit import FitConfig, Material, fit
 from mbtf_fit.data.loader import load_split
 from mbtf_gen.generation.run import generate
-from mbtf_gen.planning.highlights import PILOT_SHARE
+from mbtf_gen.planning.highlights import PILOT_MOST, PILOT_SHARE, PILOT_SPP
 
 CLOTH = ("twill_silk", "basket_weave")
 RESOLUTION, TRAIN = 64, "400/texel"
@@ -41,7 +41,8 @@ THRESHOLDS = {"relative_error": 0.05, "standard_errors": STANDARD_ERRORS}
 def test_set(name: str, folder: Path, share: float, paths: float) -> dict[str, Any]:
     """Error of a material's fit on one test set of so many paths, its pilot included."""
     config = generator_config(name, "draft", RESOLUTION)
-    count = round(paths / (1.0 + (PILOT_SHARE if share else 0.0)) / TEST_SPP)
+    pilot = min(PILOT_SHARE / (1.0 + PILOT_SHARE) * paths, PILOT_MOST * PILOT_SPP) if share else 0.0
+    count = round((paths - pilot) / TEST_SPP)
     options = {"train": "2", "test": str(count), "test_spp": TEST_SPP, "test_highlights": share}
     out = folder / f"test-{share:g}-{paths:g}"
     began = time.process_time()
