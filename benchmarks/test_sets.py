@@ -1,6 +1,6 @@
 """Standard error of the error of a fit, with and without test queries drawn by highlights, at equal paths.
 
-    python benchmarks/test_sets.py --out FOLDER [MATERIAL ...] [--paths 4e6] [--share 75%] [--steps 1200]
+    python benchmarks/test_sets.py --out FOLDER [MATERIAL ...] [--paths 4e6] [--spp 16]
 
 For each material, one fit is evaluated on two test sets: one with the distribution of the training queries,
 and one with ``queries.test_highlights``, whose pilot counts as paths, too. The fit is ``relief``, or
@@ -33,18 +33,17 @@ from mbtf_gen.planning.highlights import PILOT_MOST, PILOT_SHARE, PILOT_SPP
 
 CLOTH = ("twill_silk", "basket_weave")
 RESOLUTION, TRAIN = 64, "400/texel"
-TEST_SPP = 16
 STANDARD_ERRORS, RESOLVED = 4.0, 0.25
 THRESHOLDS = {"relative_error": 0.05, "standard_errors": STANDARD_ERRORS}
 
 
-def test_set(name: str, folder: Path, share: float, paths: float) -> dict[str, Any]:
-    """Error of a material's fit on one test set of so many paths, its pilot included."""
+def test_set(name: str, folder: Path, share: float, paths: float, spp: int) -> dict[str, Any]:
+    """Error of a material's fit on one test set of so many paths, its pilot included, `spp` per query."""
     config = generator_config(name, "draft", RESOLUTION)
     pilot = min(PILOT_SHARE / (1.0 + PILOT_SHARE) * paths, PILOT_MOST * PILOT_SPP) if share else 0.0
-    count = round((paths - pilot) / TEST_SPP)
-    options = {"train": "2", "test": str(count), "test_spp": TEST_SPP, "test_highlights": share}
-    out = folder / f"test-{share:g}-{paths:g}"
+    count = round((paths - pilot) / spp)
+    options = {"train": "2", "test": str(count), "test_spp": spp, "test_highlights": share}
+    out = folder / f"test-{share:g}-{paths:g}-{spp}"
     began = time.process_time()
     generate(config.model_copy(update={"queries": config.queries.model_copy(update=options)}), out)
     seconds = time.process_time() - began
@@ -74,11 +73,13 @@ def estimate_of(figures: dict[str, Any]) -> Estimate:
     return Estimate(value, error, figures["n"])
 
 
-def compared(name: str, folder: Path, steps: int, share: float, paths: float) -> dict[str, Any]:
+def compared(name: str, folder: Path, steps: int, share: float, paths: float, spp: int) -> dict[str, Any]:
     """Both errors of a material."""
     trained(name, folder, steps)
     found = {
-        label: kept(folder / f"{label}-{s:g}-{paths:g}.json", partial(test_set, name, folder, s, paths))
+        label: kept(
+            folder / f"{label}-{s:g}-{paths:g}-{spp}.json", partial(test_set, name, folder, s, paths, spp)
+        )
         for label, s in (("plain", 0.0), ("highlights", share))
     }
     plain, drawn = map(estimate_of, found.values())
@@ -98,12 +99,13 @@ def main() -> int:
     parser.add_argument("materials", nargs="*")
     parser.add_argument("--out", type=Path, required=True, help="folder of fits and figures")
     parser.add_argument("--paths", type=float, default=4e6, help="paths of each test set")
+    parser.add_argument("--spp", type=int, default=16, help="paths per test query")
     parser.add_argument("--share", type=float, default=0.75, help="share drawn by highlights")
     parser.add_argument("--steps", type=int, default=1200, help="training steps")
     arguments = parser.parse_args()
     names = arguments.materials or [*RELIEFS, *HEIGHT_SCALES, *CLOTH]
     found = [
-        compared(name, arguments.out / name, arguments.steps, arguments.share, arguments.paths)
+        compared(name, arguments.out / name, arguments.steps, arguments.share, arguments.paths, arguments.spp)
         for name in names
         if is_available(name)
     ]
