@@ -13,6 +13,7 @@ would have the least variance; the fourth power needs a larger pilot than the th
 Queries are selected among :data:`CANDIDATES` times as many candidates, half of which have their light near
 the mirror direction of the view on the reference plane. The probability of a selection is proportional to s
 times the ratio of p to the candidates' density; none is selected twice (systematic sampling, Madow 1949).
+Where that would exceed 1, all candidates are selected, with weights that their own density gives.
 Footprints and directions decide, so positions are drawn afterwards, as without selection.
 """
 
