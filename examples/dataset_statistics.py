@@ -19,9 +19,11 @@ from mbtf_gen import Dataset
 
 train, test = (Dataset.open("shards").load(split) for split in ("train", "test"))
 a, b = test["value_a"], test["value_b"]
+# Weights of test queries that are drawn by highlights (--test-highlights).
+weight = test.get("weight")
 levels = level_groups(test["sigma"])
 
-print("noise of one query:", pooled_relative_error(a, b))
+print("noise of one query:", pooled_relative_error(a, b, weight))
 
 # Two predictions: a constant, and a linear function of the view's cosine.
 constant = np.broadcast_to(train["value_a"].mean(axis=0), a.shape)
@@ -30,12 +32,12 @@ weights, *_ = np.linalg.lstsq(basis, (train["value_a"] + train["value_b"]) / 2, 
 shaded = np.stack([np.ones(len(a)), test["omega_o"][:, 2]], axis=1) @ weights
 
 for name, prediction in (("constant", constant), ("shaded", shaded)):
-    print(name, "error:", noise_free_mse(prediction, a, b))
-    for level, share in by_group(unexplained_variance, levels, prediction, a, b).items():
+    print(name, "error:", noise_free_mse(prediction, a, b, weight))
+    for level, share in by_group(unexplained_variance, levels, prediction, a, b, weight).items():
         print(f"  unexplained at level {level}: {share}")
 
 # Is the second one better? The paired difference cancels the noise of the reference.
-better = t_test(mse_difference(shaded, constant, a, b), alternative="less")
+better = t_test(mse_difference(shaded, constant, a, b, weight), alternative="less")
 print("shaded is better:", better)
 
 # Does the prediction agree with the data? It is free of noise, so both its halves are equal.

@@ -36,9 +36,13 @@ def _floating(numbers: ArrayLike) -> NDArray[np.floating[Any]]:
     return c if c.dtype.kind == "f" else c.astype(np.float64)
 
 
-def brightness(picture: ArrayLike) -> float:
-    """The 95th percentile of the mean channel of linear values (..., 3)."""
-    return float(np.percentile(np.asarray(picture, np.float64).mean(axis=-1), _PERCENTILE))
+def brightness(picture: ArrayLike, weights: ArrayLike | None = None) -> float:
+    """The 95th percentile of the mean channel of linear values (..., 3), with weights (...)."""
+    gray = np.asarray(picture, np.float64).mean(axis=-1)
+    if weights is None:
+        return float(np.percentile(gray, _PERCENTILE))
+    w = np.asarray(weights, np.float64)
+    return float(np.percentile(gray, _PERCENTILE, weights=w, method="inverted_cdf"))
 
 
 def auto_exposure(bright: Iterable[float]) -> float:

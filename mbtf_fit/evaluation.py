@@ -37,7 +37,8 @@ Predict = Callable[[ShardQueries], NDArray[np.float32]]
 
 def exposure_of(queries: ShardQueries) -> float:
     """Automatic exposure in EV of the values of queries."""
-    return auto_exposure([brightness(mean_value(queries.value_a, queries.value_b))])
+    values = mean_value(queries.value_a, queries.value_b)
+    return auto_exposure([brightness(values, queries.weight)])
 
 
 def split_errors(
@@ -67,7 +68,7 @@ def split_errors(
     if len(queries) == 0:
         return None
     exposure = exposure_of(queries) if exposure is None else exposure
-    arrays = predict(queries), queries.value_a, queries.value_b
+    arrays = predict(queries), queries.value_a, queries.value_b, queries.weight
     mse = noise_free_mse(*arrays)
     found = {
         **_errors(len(queries), mse, signal_variance(*arrays[1:]), unexplained_variance(*arrays)),
@@ -98,7 +99,7 @@ def _errors(n: int, mse: Estimate, variance: Estimate, unexplained: Estimate) ->
     }
 
 
-def _grouped(labels: NDArray[np.int64], *arrays: NDArray[np.float32]) -> dict[int, dict[str, Any]]:
+def _grouped(labels: NDArray[np.int64], *arrays: NDArray[np.float32] | None) -> dict[int, dict[str, Any]]:
     mse = by_group(noise_free_mse, labels, *arrays)
     unexplained = by_group(unexplained_variance, labels, *arrays)
     variance = by_group(signal_variance, labels, *arrays[1:])

@@ -205,6 +205,11 @@ class Dataset:
         return int(self.manifest.get("estimates", 2))
 
     @property
+    def weighted(self) -> bool:
+        """Whether test queries have weights, the array ``weight``."""
+        return "weight" in self.manifest.get("arrays", {})
+
+    @property
     def lattice(self) -> Lattice:
         """Texel grids of the tile."""
         return Lattice(int(self.manifest["levels"]["finest"]), float(self.manifest["tile"]["aspect"]))

@@ -135,7 +135,8 @@ def plan_digest(manifest: Mapping[str, Any]) -> str:
     plan = manifest.get("effects") or {}
     decided = {key: plan.get(key) for key in ("max_depth", "roulette_depth", "closed_form")}
     on = sorted(effect["name"] for effect in plan.get("effects", []) if effect["on"])
-    return data_sha256({**decided, "effects": on, "allocation": manifest.get("allocation")})
+    pilots = {key: manifest.get(key) for key in ("allocation", "highlights")}
+    return data_sha256({**decided, "effects": on, **pilots})
 
 
 def read_manifest(folder: str | Path | DataFolder) -> dict[str, Any]:

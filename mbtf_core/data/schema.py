@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 F32 = NDArray[np.float32]
 
 FORMAT_NAME = "mbtf-shards"
-SCHEMA_VERSION = 5
+SCHEMA_VERSION = 6
 MANIFEST_NAME = "manifest.json"
 CONFIG_NAME = "config.yaml"
 GEOMETRY_NAME = "geometry.exr"
@@ -126,6 +126,9 @@ ARRAYS: tuple[ArraySpec, ...] = (
     _array("value_b", "R G B", "1/sr", "second estimate, independent of the first", optional=True),
     _array("spp", "", "paths", "paths traced for this query, both halves together", optional=True),
     _array("transmittance", "", "1", "fraction of the footprint that rays pass through", optional=True),
+    _array(
+        "weight", "", "1", "of test queries drawn by highlights: weight in means over queries", optional=True
+    ),
 )
 ARRAY: dict[str, ArraySpec] = {a.name: a for a in ARRAYS}
 

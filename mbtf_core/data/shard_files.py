@@ -42,7 +42,8 @@ _CHECKED = 1 << 16
 
 def row_bytes(holes: bool) -> int:
     """Bytes of one query in a shard."""
-    return sum(4 * max(1, math.prod(a.trailing)) for a in ARRAYS if holes or a.name != "transmittance")
+    absent = {"weight"} if holes else {"weight", "transmittance"}
+    return sum(4 * max(1, math.prod(a.trailing)) for a in ARRAYS if a.name not in absent)
 
 
 def check_arrays(
@@ -85,9 +86,10 @@ _VALID: dict[str, tuple[Callable[[NDArray[np.float32]], NDArray[np.bool_]], str]
     "value_b": (np.isfinite, "NaN or infinite numbers"),
     "spp": (lambda a: (a > 0) & (a < np.inf), "numbers that are not positive"),
     "transmittance": (np.isfinite, "NaN or infinite numbers"),
+    "weight": (lambda a: (a > 0) & (a < np.inf), "numbers that are not positive"),
 }
 # One per image of the image layout.
-_SHARED = ("sigma", "omega_i", "omega_o")
+_SHARED = ("sigma", "omega_i", "omega_o", "weight")
 
 
 def check_values(arrays: Mapping[str, NDArray[np.float32]], where: object) -> None:

@@ -76,16 +76,19 @@ def _exponent(x: float) -> int:
     return math.floor(math.log10(x))
 
 
-def mean_estimate(samples: ArrayLike) -> Estimate:
+def mean_estimate(samples: ArrayLike, weights: ArrayLike | None = None) -> Estimate:
     """Mean of independent samples, with its standard error.
 
     The sample mean is unbiased, and ``s²/n`` with the ``n-1`` divisor an unbiased estimate of its variance.
     Trailing axes (channels of a query, texels of an image) are averaged first, so their correlation does not
-    bias the error.
+    bias the error. Weighted means are self-normalized, ``Σ w x / Σ w``: consistent, with the delta method's
+    error.
 
     Parameters
     ----------
     samples : (n, ...) array_like
+    weights : (n,) array_like, optional
+        Ratio of the density that the mean is over to the density that the samples come from, up to a factor.
 
     Returns
     -------
@@ -94,8 +97,27 @@ def mean_estimate(samples: ArrayLike) -> Estimate:
     """
     units = per_unit(checked(samples, "samples"))
     n = len(units)
-    error = float(units.std(ddof=1)) / math.sqrt(n) if n > 1 else math.inf
-    return Estimate(float(units.mean()), error, n)
+    if weights is None:
+        error = float(units.std(ddof=1)) / math.sqrt(n) if n > 1 else math.inf
+        return Estimate(float(units.mean()), error, n)
+    w = unit_weights(weights, n)
+    mean = float((w * units).mean())
+    error = float(np.linalg.norm(w * (units - mean))) / math.sqrt(n * (n - 1)) if n > 1 else math.inf
+    return Estimate(mean, error, n)
+
+
+def unit_weights(weights: ArrayLike, n: int) -> NDArray[np.float64]:
+    """Weights (n,) as float64 with mean 1.
+
+    Raises
+    ------
+    InputError : NaN or infinity
+    ValueError : another length, or not positive
+    """
+    w = checked(weights, "weights")
+    if w.shape != (n,) or not (w > 0).all():
+        raise ValueError(f"weights must be {n} positive numbers")
+    return w / w.mean()
 
 
 def checked(array: ArrayLike, name: str) -> NDArray[np.float64]:
@@ -123,7 +145,9 @@ def per_unit(array: NDArray[np.float64]) -> NDArray[np.float64]:
     return array.reshape(len(array), -1).mean(axis=1)
 
 
-def by_group(function: Callable[..., Estimate], groups: ArrayLike, *arrays: ArrayLike) -> dict[int, Estimate]:
+def by_group(
+    function: Callable[..., Estimate], groups: ArrayLike, *arrays: ArrayLike | None
+) -> dict[int, Estimate]:
     """Evaluate a statistic per group: ``by_group(noise_free_mse, level_groups(sigma), p, a, b)``.
 
     Parameters
@@ -131,8 +155,8 @@ def by_group(function: Callable[..., Estimate], groups: ArrayLike, *arrays: Arra
     function : a function of this package that takes arrays and returns an Estimate
     groups : (n,) int array_like
         Labels; rows with negative labels are ignored.
-    *arrays : (n, ...) array_like
-        Arguments of the function.
+    *arrays : (n, ...) array_like, or None
+        Arguments of the function, the first of them an array.
 
     Returns
     -------
@@ -140,9 +164,9 @@ def by_group(function: Callable[..., Estimate], groups: ArrayLike, *arrays: Arra
         Estimate of each group from its own rows, by ascending label.
     """
     labels = group_labels(groups, len(np.asarray(arrays[0])))
-    rows = [np.asarray(array) for array in arrays]
+    rows = [None if array is None else np.asarray(array) for array in arrays]
     return {
-        int(label): function(*(array[labels == label] for array in rows))
+        int(label): function(*(None if array is None else array[labels == label] for array in rows))
         for label in np.unique(labels[labels >= 0])
     }
 

@@ -7,6 +7,9 @@ have the expectation they would have without noise; squares of one half do not.
 The halves are arrays ``(n,)``, ``(n, channels)`` or ``(items, rows, columns, channels)``. The first axis
 counts the independent units. Everything else is averaged within a unit before an error bar is taken: channels
 of one query are correlated, and texels of one image share its directions.
+
+Units that were not drawn from the distribution that a mean is over have weights (n,), the ratio of both
+densities up to a factor, such as the array ``weight`` of test queries. Weighted means are self-normalized.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mbtf_core.stats.estimate import Estimate, checked, mean_estimate, per_unit
+from mbtf_core.stats.estimate import Estimate, checked, mean_estimate, per_unit, unit_weights
 
 
 def _pair(a: ArrayLike, b: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -85,7 +88,7 @@ def pooled_error(a: ArrayLike, b: ArrayLike) -> Estimate:
     return _root(pooled_variance(a, b))
 
 
-def pooled_relative_error(a: ArrayLike, b: ArrayLike) -> Estimate:
+def pooled_relative_error(a: ArrayLike, b: ArrayLike, weights: ArrayLike | None = None) -> Estimate:
     """Noise of the values relative to the values, pooled; a pure number.
 
     The RMS noise over the RMS value, ``√(mean (a-b)²/4 / mean ab)``, which is consistent.
@@ -93,12 +96,16 @@ def pooled_relative_error(a: ArrayLike, b: ArrayLike) -> Estimate:
     Parameters
     ----------
     a, b : (n, ...) array_like
+    weights : (n,) array_like, optional
     """
     first, second = _pair(a, b)
-    return _root(_ratio(per_unit((first - second) ** 2 / 4.0), per_unit(first * second)))
+    w = _weights(weights, len(first))
+    return _root(_ratio(w * per_unit((first - second) ** 2 / 4.0), w * per_unit(first * second)))
 
 
-def noise_free_mse(prediction: ArrayLike, a: ArrayLike, b: ArrayLike) -> Estimate:
+def noise_free_mse(
+    prediction: ArrayLike, a: ArrayLike, b: ArrayLike, weights: ArrayLike | None = None
+) -> Estimate:
     """Mean squared error of a prediction against the truth, without the noise of the reference.
 
     The mean of ``(p-a)(p-b)`` over queries and channels. Unbiased if p is independent of these halves:
@@ -108,12 +115,15 @@ def noise_free_mse(prediction: ArrayLike, a: ArrayLike, b: ArrayLike) -> Estimat
     Parameters
     ----------
     prediction, a, b : (n, ...) array_like; the estimate has their squared unit
+    weights : (n,) array_like, optional
     """
     p, first, second = _with_prediction(prediction, a, b)
-    return mean_estimate((p - first) * (p - second))
+    return mean_estimate((p - first) * (p - second), weights)
 
 
-def mse_difference(prediction: ArrayLike, other: ArrayLike, a: ArrayLike, b: ArrayLike) -> Estimate:
+def mse_difference(
+    prediction: ArrayLike, other: ArrayLike, a: ArrayLike, b: ArrayLike, weights: ArrayLike | None = None
+) -> Estimate:
     """Noise-free mean squared error of `prediction` minus that of `other`, compared query by query.
 
     Negative where `prediction` is better. Shared reference noise cancels, so the error bar is much smaller
@@ -122,13 +132,14 @@ def mse_difference(prediction: ArrayLike, other: ArrayLike, a: ArrayLike, b: Arr
     Parameters
     ----------
     prediction, other, a, b : (n, ...) array_like; the estimate has their squared unit
+    weights : (n,) array_like, optional
     """
     p, first, second = _with_prediction(prediction, a, b)
     q, _, _ = _with_prediction(other, a, b)
-    return mean_estimate((p - first) * (p - second) - (q - first) * (q - second))
+    return mean_estimate((p - first) * (p - second) - (q - first) * (q - second), weights)
 
 
-def signal_variance(a: ArrayLike, b: ArrayLike) -> Estimate:
+def signal_variance(a: ArrayLike, b: ArrayLike, weights: ArrayLike | None = None) -> Estimate:
     """Variance of the true values over queries, free of noise: per channel about its mean, then averaged.
 
     For ``(n, channels)`` the sample covariance of a and b, ``Σ (a-ā)(b-b̄)/(n-1)``: given the queries, every
@@ -139,15 +150,19 @@ def signal_variance(a: ArrayLike, b: ArrayLike) -> Estimate:
     Parameters
     ----------
     a, b : (n, ...) array_like; the estimate has their squared unit
+    weights : (n,) array_like, optional
     """
-    products, correction = _centered_products(*_pair(a, b))
-    spread = mean_estimate(products)
+    first, second = _pair(a, b)
+    products, correction = _centered_products(first, second, _weights(weights, len(first)))
+    spread = mean_estimate(products, weights)
     if spread.n < 2:
         return Estimate(math.nan, math.inf, spread.n)
     return Estimate(spread.value + correction, spread.error, spread.n)
 
 
-def unexplained_variance(prediction: ArrayLike, a: ArrayLike, b: ArrayLike) -> Estimate:
+def unexplained_variance(
+    prediction: ArrayLike, a: ArrayLike, b: ArrayLike, weights: ArrayLike | None = None
+) -> Estimate:
     """Fraction of unexplained variance, 1 - R²: noise-free MSE over signal variance.
 
     0 is perfect, 1 no better than the mean value, more is possible. Numerator and denominator are unbiased;
@@ -160,6 +175,7 @@ def unexplained_variance(prediction: ArrayLike, a: ArrayLike, b: ArrayLike) -> E
     ----------
     prediction, a, b : (n, ...) array_like
         The prediction, and independent halves of the reference.
+    weights : (n,) array_like, optional
 
     Raises
     ------
@@ -167,8 +183,9 @@ def unexplained_variance(prediction: ArrayLike, a: ArrayLike, b: ArrayLike) -> E
     ValueError : shapes differ
     """
     p, first, second = _with_prediction(prediction, a, b)
-    products, correction = _centered_products(first, second)
-    return _ratio(per_unit((p - first) * (p - second)), products + correction)
+    w = _weights(weights, len(p))
+    products, correction = _centered_products(first, second, w)
+    return _ratio(w * per_unit((p - first) * (p - second)), w * (products + correction))
 
 
 def psnr(mse: Estimate, peak: float) -> Estimate:
@@ -190,15 +207,24 @@ def psnr(mse: Estimate, peak: float) -> Estimate:
     return Estimate(value, 10.0 / math.log(10.0) * mse.relative_error, mse.n)
 
 
-def _centered_products(a: NDArray[np.float64], b: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Per unit ``(a-ā)(b-b̄)`` (n,), and what must be added to its mean to make it unbiased."""
+def _weights(weights: ArrayLike | None, n: int) -> NDArray[np.float64]:
+    """Weights (n,) with mean 1; all 1 where there are none."""
+    return np.ones(n) if weights is None else unit_weights(weights, n)
+
+
+def _centered_products(
+    a: NDArray[np.float64], b: NDArray[np.float64], w: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], float]:
+    """Per unit ``(a-ā)(b-b̄)`` (n,), and what must be added to its mean to make it unbiased, for weights (n,)
+    with mean 1."""
     n = len(a)
     channels = a.shape[-1] if a.ndim > 1 else 1
     x, y = a.reshape(n, -1, channels), b.reshape(n, -1, channels)
     # Constant data must come out as exactly zero, without the rounding of their mean.
     x, y = x - x[0, 0], y - y[0, 0]
-    x, y = (v - v.mean(axis=1).mean(axis=0) for v in (x, y))
-    between = float((x.mean(axis=1) * y.mean(axis=1)).sum(axis=0).mean())
+    each = w[:, None]
+    x, y = (v - (each * v.mean(axis=1)).mean(axis=0) for v in (x, y))
+    between = float((each**2 * x.mean(axis=1) * y.mean(axis=1)).sum(axis=0).mean())
     return per_unit(x * y), between / (n * (n - 1)) if n > 1 else 0.0
 
 

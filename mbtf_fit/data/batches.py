@@ -33,6 +33,8 @@ class QueryBatch(NamedTuple):
         (n, 3) unit vectors towards light and viewer.
     value_a, value_b : Tensor
         (n, 3) independent estimates of M in 1/sr; of measured data, which have one, the same numbers.
+    weight : Tensor
+        (n,) weights in means over queries; 1 where the data have none.
     """
 
     u: Tensor
@@ -41,6 +43,7 @@ class QueryBatch(NamedTuple):
     omega_o: Tensor
     value_a: Tensor
     value_b: Tensor
+    weight: Tensor
 
 
 class QueryDataset(IterableDataset[QueryBatch]):
@@ -84,6 +87,9 @@ class QueryDataset(IterableDataset[QueryBatch]):
         self.data, self.batch_size, self.seed = Dataset.open(folder), batch_size, seed
         # Shared with workers, also with those that live for several epochs.
         self._epoch = zeros((), dtype=int64).share_memory_()
+        self._names = needed(self.data.estimates)
+        if split == "test" and self.data.weighted:
+            self._names += ("weight",)
         self._blocks: list[tuple[Shard, int, int]] = []
         self.count = 0
         for shard in self.data.shards(split):
@@ -116,11 +122,13 @@ class QueryDataset(IterableDataset[QueryBatch]):
 
     def _read(self, block: int) -> ShardQueries:
         shard, start, stop = self._blocks[block]
-        mapped = shard.map(needed(shard.estimates))
+        mapped = shard.map(self._names)
         arrays = {name: np.array(array[start:stop]) for name, array in mapped.items()}
         check_values(arrays, shard.where)
         return ShardQueries.of(arrays).flat()
 
 
 def _batch(queries: ShardQueries) -> QueryBatch:
-    return QueryBatch(*(from_numpy(np.array(getattr(queries, name))) for name in QueryBatch._fields))
+    weight = np.ones_like(queries.sigma) if queries.weight is None else queries.weight
+    arrays = vars(queries) | {"weight": weight}
+    return QueryBatch(*(from_numpy(np.array(arrays[name])) for name in QueryBatch._fields))

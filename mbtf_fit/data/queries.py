@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -32,6 +32,7 @@ class ShardQueries:
     Attributes
     ----------
     u : (n, 2) uv; sigma : (n,) tile widths; omega_i, omega_o : (n, 3); value_a, value_b : (n, 3) in 1/sr
+    weight : (n,) weights in means over queries; None where all are 1
     """
 
     u: NDArray[np.float32]
@@ -40,6 +41,7 @@ class ShardQueries:
     omega_o: NDArray[np.float32]
     value_a: NDArray[np.float32]
     value_b: NDArray[np.float32]
+    weight: NDArray[np.float32] | None = None
 
     def __len__(self) -> int:
         return len(self.sigma)
@@ -52,18 +54,20 @@ class ShardQueries:
     @classmethod
     def join(cls, parts: Iterable[ShardQueries]) -> ShardQueries:
         """Concatenation of all parts."""
-        found = list(parts)
-        return cls(**{f.name: np.concatenate([getattr(p, f.name) for p in found]) for f in fields(cls)})
+        found = [part._arrays() for part in parts]
+        return cls(**{name: np.concatenate([arrays[name] for arrays in found]) for name in found[0]})
 
     def flat(self) -> ShardQueries:
         """The same queries with one leading axis."""
         lead = self.sigma.ndim
-        arrays = {f.name: getattr(self, f.name) for f in fields(self)}
-        return ShardQueries(**{name: a.reshape(-1, *a.shape[lead:]) for name, a in arrays.items()})
+        return ShardQueries(**{name: a.reshape(-1, *a.shape[lead:]) for name, a in self._arrays().items()})
 
     def take(self, rows: Any) -> ShardQueries:
         """Some of the queries: a slice, an index array or a mask."""
-        return ShardQueries(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+        return ShardQueries(**{name: a[rows] for name, a in self._arrays().items()})
+
+    def _arrays(self) -> dict[str, NDArray[np.float32]]:
+        return {name: array for name, array in vars(self).items() if array is not None}
 
 
 def batch_starts(total: int, size: int, seed: int, step: int) -> Iterator[int]:

@@ -141,16 +141,19 @@ def has_transmittance(data: Dataset) -> bool:
     return "transmittance" in data.manifest.get("arrays", {})
 
 
-def _blocks(shard: Shard, chosen: NDArray[np.bool_] | None = None) -> Iterator[Arrays]:
+def _blocks(
+    shard: Shard, chosen: NDArray[np.bool_] | None = None, weighted: bool = False
+) -> Iterator[Arrays]:
     """Blocks of arrays (n, ...) of the chosen rows of a shard, or of all."""
-    arrays = shard.map(_TRAILING)
+    trailing = _TRAILING | ({"weight": ()} if weighted else {})
+    arrays = shard.map(trailing)
     check_values(arrays, shard.where)
     count = len(arrays["sigma"])
     rows = np.arange(count) if chosen is None else np.flatnonzero(chosen)
     step = max(1, _BLOCK * max(count, 1) // max(arrays["sigma"].size, 1))
     for start in range(0, len(rows), step):
         part = rows[start : start + step]
-        yield {name: arrays[name][part].reshape(-1, *shape) for name, shape in _TRAILING.items()}
+        yield {name: arrays[name][part].reshape(-1, *shape) for name, shape in trailing.items()}
 
 
 class _Sums:
@@ -265,7 +268,8 @@ def evaluate_transmittance(
     queries is left out."""
     sets: dict[str, Iterator[Arrays]] = {}
     if "test" in data.splits:
-        sets["test"] = (block for shard in data.shards("test") for block in _blocks(shard))
+        test = data.shards("test")
+        sets["test"] = (b for shard in test for b in _blocks(shard, weighted=data.weighted))
     sets["held_out"] = (block for shard, chosen in selection.masks() for block in _blocks(shard, ~chosen))
     sets["training"] = (block for shard, chosen in selection.masks() for block in _blocks(shard, chosen))
     found = {name: _error(model, blocks) for name, blocks in sets.items()}
@@ -273,7 +277,7 @@ def evaluate_transmittance(
 
 
 def _error(model: Transmittance, blocks: Iterator[Arrays]) -> TransmittanceError | None:
-    squares, noises, values = [], [], []
+    squares, noises, values, weights = [], [], [], []
     left = _EVALUATED
     for block in blocks:
         part = {name: array[:left] for name, array in block.items()}
@@ -281,10 +285,14 @@ def _error(model: Transmittance, blocks: Iterator[Arrays]) -> TransmittanceError
         squares.append((model.evaluate(part["u"], part["sigma"], part["omega_o"]) - t) ** 2)
         noises.append(t * (1.0 - t) / np.maximum(part["spp"].astype(np.float64) - 1.0, 1.0))
         values.append(t)
+        weights.append(part["weight"].astype(np.float64) if "weight" in part else np.ones(len(t)))
         left -= len(t)
         if left <= 0:
             break
     if not values:
         return None
-    square, noise, value = (np.concatenate(parts) for parts in (squares, noises, values))
-    return TransmittanceError(len(value), mean_estimate(square), mean_estimate(noise), float(value.var()))
+    parts: tuple[list[F64], ...] = squares, noises, values, weights
+    square, noise, value, weight = (np.concatenate(arrays) for arrays in parts)
+    mse, noise_bound = (mean_estimate(x, weight) for x in (square, noise))
+    variance = float(np.cov(value, ddof=0, aweights=weight))
+    return TransmittanceError(len(value), mse, noise_bound, variance)

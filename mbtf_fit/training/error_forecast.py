@@ -134,7 +134,7 @@ def forecast_error(loop: TrainingLoop, queries: ShardQueries, step: Estimate, st
         return ErrorForecast(seconds, reason=diverged.message.splitlines()[0])
     finally:
         trainer.config, trainer.queries, trainer.weight_decay = config, data, decay
-    halves = queries.value_a, queries.value_b
+    halves = queries.value_a, queries.value_b, queries.weight
     found = [unexplained_variance(prediction, *halves) for prediction in predictions]
     shared = float(np.median([e.relative_error for e in found]))
     try:

@@ -180,6 +180,13 @@ class QueriesSection(Settings):
     test_spp: Annotated[Paths, Flag("--test-spp")] = Field(
         256, description="mean number of paths per test query, both estimates together (even)"
     )
+    test_highlights: Annotated[float, BeforeValidator(_share), Flag("--test-highlights", "75%")] = Field(
+        0.0,
+        ge=0,
+        le=0.95,
+        description="share of the test queries drawn where highlights are, with weights that keep errors "
+        "unbiased; glossy materials need fewer test queries",
+    )
     allocation: Literal["noise", "uniform"] = Field(
         "noise", description="paths per query: more where a pilot expects more noise, or the same for all"
     )

@@ -136,6 +136,7 @@ class Import(ABC):
             geometry=None,
             effects=None,
             allocation=None,
+            highlights=None,
         )
 
 

@@ -38,6 +38,7 @@ from mbtf_gen.generation.shard_record import ShardStatistics
 from mbtf_gen.job import Job, split_queries, split_spp
 from mbtf_gen.planning.effects import EFFECTS
 from mbtf_gen.planning.effects_plan import EffectsPlan
+from mbtf_gen.planning.highlights import Highlights
 from mbtf_gen.planning.run_plan import RunPlan
 from mbtf_gen.planning.sample_allocation import Allocation
 
@@ -122,7 +123,8 @@ def new_manifest(
 def build_manifest(job: Job, plan: RunPlan, geometry: Mapping[str, Any] | None) -> dict[str, Any]:
     """Manifest of a job's data set without shards; `geometry` is its key of that name."""
     tile, queries = job.material, job.query_plan
-    stored = [a.name for a in ARRAYS if a.name != "transmittance" or plan.effects.on("opacity")]
+    optional = {"transmittance": plan.effects.on("opacity"), "weight": plan.highlights is not None}
+    stored = [a.name for a in ARRAYS if optional.get(a.name, True)]
     found = new_manifest(
         job,
         arrays=dict.fromkeys(stored, ""),
@@ -148,6 +150,7 @@ class _Plan(BaseModel, allow_inf_nan=False):
     complete: bool
     effects: EffectsPlan
     allocation: Allocation | None
+    highlights: Highlights | None
 
     @field_validator("effects")
     @classmethod
@@ -160,7 +163,7 @@ class _Plan(BaseModel, allow_inf_nan=False):
 def stored_plan(manifest: Mapping[str, Any], path: object) -> RunPlan:
     """The run plan in a manifest, of the file `path`; an InputError where that is corrupt."""
     found = check_document(_Plan, manifest, path, "check the data set with: mbtf-gen verify")
-    return RunPlan(found.effects, found.allocation)
+    return RunPlan(found.effects, found.allocation, found.highlights)
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mbtf_core.data.documents import finished_record, plan_digest, upload_waiting
 from mbtf_core.data.folder import DataFolder
@@ -161,8 +162,20 @@ class ShardRun:
         self.folder.refresh()
         return finished_record(self.folder, entry, self.job.config_hash)
 
+    def draw(self, entry: ShardEntry) -> tuple[Queries, NDArray[np.float32] | None]:
+        """Queries of a shard, and their weights where they have any."""
+        plan, highlights = self.job.query_plan, self.plan.highlights
+        if entry.split == "train" or highlights is None:
+            return plan.draw(entry.split, entry.index, entry.rows), None
+        return highlights.draw(plan, self.job.config.queries.test_highlights, entry.index, entry.rows)
+
     def store(
-        self, entry: ShardEntry, queries: Queries, estimates: Estimates, seconds: float
+        self,
+        entry: ShardEntry,
+        queries: Queries,
+        estimates: Estimates,
+        seconds: float,
+        weight: NDArray[np.float32] | None = None,
     ) -> dict[str, Any]:
         """Write a shard and its sidecar, which is returned."""
         lead, through = queries.lead, estimates.transmittance
@@ -174,6 +187,7 @@ class ShardRun:
             "value_b": estimates.value_b.reshape(*lead, 3),
             "spp": np.broadcast_to(np.asarray(spp, np.float32), lead).copy(),
             **({} if through is None else {"transmittance": through.reshape(lead)}),
+            **({} if weight is None else {"weight": weight}),
         }
         digests, seed = (self.job.config_hash, self.digest), self.job.config.seed
         return store_shard(
@@ -214,7 +228,7 @@ def render_shard(run: ShardRun, entry: ShardEntry) -> Generator[None, None, dict
         # Another process may have finished it since.
         if (record := run.finished(entry)) is not None:
             return {"record": record, "rendered": False, "writing": 0.0}
-        queries = run.job.query_plan.draw(entry.split, entry.index, entry.rows)
+        queries, weight = run.draw(entry)
         yield
         began, config = time.perf_counter(), run.job.config
         # The values depend on seed, split and index, not on the process.
@@ -224,12 +238,13 @@ def render_shard(run: ShardRun, entry: ShardEntry) -> Generator[None, None, dict
             split_spp(config, entry.split),
             split_target(config, entry.split),
             Stream(config.seed, entry.split, entry.index),
-            run.plan.allocation,
+            # The allocation has the requested mean over the distribution of queries without weights.
+            run.plan.allocation if weight is None else None,
         )
         seconds = time.perf_counter() - began
         yield
         began = time.thread_time()
-        record = run.store(entry, queries, estimates, seconds)
+        record = run.store(entry, queries, estimates, seconds, weight)
         return {"record": record, "rendered": True, "writing": time.thread_time() - began}
     finally:
         lock.release()

@@ -1,4 +1,4 @@
-"""The plan of a run: which effects it simulates, and how many paths each query gets.
+"""The plan of a run: which effects it simulates, how many paths each query gets, where test queries lie.
 
 Every effect proposes, the user's request counts, and a tolerance is divided. Pilots, small runs of the
 generator, measure the bias of leaving effects out where theory gives no bound.
@@ -16,6 +16,7 @@ from mbtf_gen.job import Job, planned_paths
 from mbtf_gen.planning.bounds import CAUTION, FEW, POINTS, Change, DisplacementBounds, displacement_bounds
 from mbtf_gen.planning.effects import EFFECTS
 from mbtf_gen.planning.effects_plan import EffectsPlan, consistent, without
+from mbtf_gen.planning.highlights import Highlights, measure_highlights
 from mbtf_gen.planning.sample_allocation import Allocation, measure_allocation
 from mbtf_gen.planning.scene import EffectDecision, EffectsRequest, PlanScene
 from mbtf_gen.planning.simulation import build_estimator, pilot_queries
@@ -39,15 +40,18 @@ class RunPlan:
     ----------
     effects : effects that are simulated
     allocation : numbers of paths by query; None where all queries get the same
+    highlights : where test queries are concentrated; None where they have the distribution of the others
     """
 
     effects: EffectsPlan
     allocation: Allocation | None = None
+    highlights: Highlights | None = None
 
     def to_manifest(self) -> dict[str, Any]:
-        """The manifest's keys ``effects`` and ``allocation``."""
-        allocation = None if self.allocation is None else asdict(self.allocation)
-        return {"effects": self.effects.to_manifest(), "allocation": allocation}
+        """The manifest's keys ``effects``, ``allocation`` and ``highlights``."""
+        measured = {"allocation": self.allocation, "highlights": self.highlights}
+        stated = {name: None if one is None else asdict(one) for name, one in measured.items()}
+        return {"effects": self.effects.to_manifest(), **stated}
 
 
 def _is_large(job: Job) -> bool:
@@ -60,13 +64,18 @@ def plan_run(job: Job) -> RunPlan:
 
 
 def allocate(job: Job, effects: EffectsPlan) -> RunPlan:
-    """The plan of a run that simulates given effects; a pilot allocates the paths under a target error and in
-    large runs."""
+    """The plan of a run that simulates given effects; pilots allocate the paths under a target error and in
+    large runs, and find the highlights where test queries are to have them."""
     queries = job.config.queries
-    needed = queries.target_error is not None or (_is_large(job) and queries.allocation == "noise")
-    if effects.closed_form or not needed:
+    if effects.closed_form:
         return RunPlan(effects)
-    return RunPlan(effects, measure_allocation(job, effects))
+    needed = queries.target_error is not None or (_is_large(job) and queries.allocation == "noise")
+    tiles: dict[frozenset[str], Any] = {}
+    return RunPlan(
+        effects,
+        measure_allocation(job, effects, tiles) if needed else None,
+        measure_highlights(job, effects, tiles) if queries.test_highlights else None,
+    )
 
 
 def plan_effects(job: Job, *, pilots: bool = True) -> EffectsPlan:

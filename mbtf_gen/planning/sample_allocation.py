@@ -20,6 +20,7 @@ from __future__ import annotations
 import logging
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,7 +68,7 @@ def _features(queries: Queries) -> list[F64]:
     ]
 
 
-def _terms(queries: Queries, *, levels: bool = True) -> list[F64]:
+def direction_terms(queries: Queries, *, levels: bool = True) -> list[F64]:
     """Terms of the polynomial: 1, the features (with or without the level), and their pairwise products."""
     base = _features(queries)[0 if levels else 1 :]
     products = [base[i] * base[j] for i in range(len(base)) for j in range(i, len(base))]
@@ -135,11 +136,11 @@ class Allocation:
 
     def deviation(self, queries: Queries) -> F64:
         """Predicted standard deviation s (n,) of one path, 1/sr."""
-        return np.maximum(_evaluate(self.weights, _terms(queries)), FLOOR * self.typical)
+        return np.maximum(evaluate_terms(self.weights, direction_terms(queries)), FLOOR * self.typical)
 
     def tile_mean(self, queries: Queries) -> F64:
         """Predicted tile mean (n,) at the queries' directions, 1/sr."""
-        return _evaluate(self.mean_weights, _terms(queries, levels=False))
+        return evaluate_terms(self.mean_weights, direction_terms(queries, levels=False))
 
     def counts(self, queries: Queries, spp: int) -> NDArray[np.int64]:
         """Numbers of paths (n,), powers of two, with a mean of `spp` over the run."""
@@ -148,7 +149,8 @@ class Allocation:
         return _round_counts(self.deviation(queries) * (self.scale * spp / self.typical), spp)
 
 
-def _evaluate(weights: tuple[float, ...], terms: list[F64]) -> F64:
+def evaluate_terms(weights: tuple[float, ...], terms: list[F64]) -> F64:
+    """``exp(Σ w·term)`` (n,)."""
     # Term by term: the rounding of a matrix product may depend on the number of rows.
     total = np.zeros(len(terms[0]))
     for weight, term in zip(weights, terms, strict=True):
@@ -178,7 +180,7 @@ def fit_deviation(terms: list[F64], size: F64) -> F64 | None:
     """
     weights = fit_log_linear(terms, size)
     if weights is not None and size.any():
-        fitted = _evaluate(tuple(weights), terms)
+        fitted = evaluate_terms(tuple(weights), terms)
         weights[0] += 0.5 * math.log(float(np.sum(size**2) / np.sum(fitted**2)))
     return weights
 
@@ -194,7 +196,7 @@ def fit_allocation(queries: Queries, estimates: Estimates, paths: int, spp: int)
     difference = estimates.value_a.astype(np.float64) - estimates.value_b
     noise = np.sqrt(np.mean(difference**2, axis=-1))
     value = mean_values(estimates)
-    terms, flat_terms = _terms(queries), _terms(queries, levels=False)
+    terms, flat_terms = direction_terms(queries), direction_terms(queries, levels=False)
     mean_weights = fit_log_linear(flat_terms, value)
     if mean_weights is None:
         log.warning("the fit of the tile mean over directions did not converge; a constant is used")
@@ -205,7 +207,7 @@ def fit_allocation(queries: Queries, estimates: Estimates, paths: int, spp: int)
     if weights is None:
         log.warning("the fit of the noise over queries did not converge; a constant is used")
         weights = _constant(terms, math.sqrt(float(np.mean(sizes**2))))
-    typical = 0.0 if uniform else float(_evaluate(tuple(weights), terms).mean())
+    typical = 0.0 if uniform else float(evaluate_terms(tuple(weights), terms).mean())
     flat = Allocation(tuple(weights.tolist()), typical, 1.0, 1.0, tuple(mean_weights.tolist()))
     if uniform:
         return flat
@@ -221,10 +223,13 @@ def fit_allocation(queries: Queries, estimates: Estimates, paths: int, spp: int)
     return replace(fitted, gain=float(np.mean(noise**2) / np.mean(noise**2 * ratio)))
 
 
-def measure_allocation(job: Job, plan: EffectsPlan) -> Allocation:
-    """Allocation of a job under an effects plan, by a pilot with its own random numbers."""
+def measure_allocation(
+    job: Job, plan: EffectsPlan, tiles: dict[frozenset[str], Any] | None = None
+) -> Allocation:
+    """Allocation of a job under an effects plan, by a pilot with its own random numbers; `tiles` as of
+    :func:`~mbtf_gen.planning.simulation.build_estimator`."""
     queries = pilot_queries(job, PILOT_QUERIES)
     # The effects plan's pilot uses shard 0 of this split.
     stream = Stream(job.config.seed, "pilot", 1)
-    estimates = build_estimator(job, plan).estimate(queries, PILOT_SPP, stream)
+    estimates = build_estimator(job, plan, tiles).estimate(queries, PILOT_SPP, stream)
     return fit_allocation(queries, estimates, PILOT_SPP, job.config.queries.spp)

@@ -12,6 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.shard_files import Arrays
 from mbtf_core.files.atomic import Stored
@@ -96,12 +99,20 @@ class Facts:
     def mean(self, split: str) -> list[Estimate]:
         """Mean value of each color channel of a split, in 1/sr."""
         value = mean_of(self.samples[split])
-        return [mean_estimate(value[..., channel]) for channel in range(3)]
+        weight = _weight(self.samples[split])
+        return [mean_estimate(value[..., channel], weight) for channel in range(3)]
 
     def noise(self, split: str) -> Estimate | None:
         """RMS noise of the value of one query over the RMS value; None of measured data: it is unknown."""
         arrays = self.samples[split]
-        return pooled_relative_error(arrays["value_a"], arrays["value_b"]) if "value_b" in arrays else None
+        if "value_b" not in arrays:
+            return None
+        return pooled_relative_error(arrays["value_a"], arrays["value_b"], _weight(arrays))
+
+
+def _weight(arrays: Arrays) -> NDArray[np.float32] | None:
+    """Weights (n,) of rows; None where they have none."""
+    return arrays["weight"].reshape(len(arrays["weight"]), -1)[:, 0] if "weight" in arrays else None
 
 
 def name_of(manifest: Mapping[str, Any]) -> str:

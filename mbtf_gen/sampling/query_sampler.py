@@ -9,7 +9,7 @@ uniform on the projected disk, ``r ≤ √(1 - cos²_min)``. All arithmetic is e
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,8 @@ from mbtf_gen.sampling.exact_math import exp2, sincos_turns
 from mbtf_gen.sampling.rng import Purpose, numpy_generator
 
 F32 = NDArray[np.float32]
+# sigma (n,), omega_i (n, 3) and omega_o (n, 3) of queries or images.
+Footprints = tuple[F32, F32, F32]
 # (angle to the normal in degrees, directions on that circle) of the BTF database Bonn 2003: Sattler, Sarlette
 # and Klein, "Efficient and realistic visualization of cloth", EGSR 2003. The first of each circle has the
 # azimuth 0.
@@ -109,18 +111,31 @@ class QueryPlan:
         ``(rows,)``, or ``(rows, height, width)`` of images. Slices are ``(rows, n²)``, one at the center of
         each texel of the finest level; those of other splits hold one query, as of the shuffled layout.
         """
-        if self.layout == "slices":
-            if split == "train":
-                return self._slices(self._texels(split, shard * self.shard_rows, rows))
-            flat = replace(self, layout="shuffled").draw(split, shard, rows)
-            return Queries(flat.u[:, None], flat.sigma[:, None], flat.omega_i[:, None], flat.omega_o[:, None])
-        generator = numpy_generator(self.root, split, shard, Purpose.QUERIES)
+        if self.layout == "slices" and split == "train":
+            return self._slices(self._texels(split, shard * self.shard_rows, rows))
+        generator = self.generator(split, shard)
+        return self.place(generator, split, shard, self.footprints(generator, rows))
+
+    def generator(self, split: str, shard: int) -> np.random.Generator:
+        """Random numbers of a shard's queries."""
+        return numpy_generator(self.root, split, shard, Purpose.QUERIES)
+
+    def footprints(self, generator: np.random.Generator, rows: int) -> Footprints:
+        """Sample footprints and directions."""
         sigma = self._sigma(generator, rows)
         omega_i = self._directions(generator, rows)
-        omega_o = self._directions(generator, rows)
-        if self.layout == "shuffled":
+        return sigma, omega_i, self._directions(generator, rows)
+
+    def place(
+        self, generator: np.random.Generator, split: str, shard: int, footprints: Footprints
+    ) -> Queries:
+        """Sample positions for footprints and directions, see :meth:`draw`."""
+        sigma, omega_i, omega_o = footprints
+        rows = len(sigma)
+        if self.layout != "image":
             texel = self._texels(split, shard * self.shard_rows, rows)
-            return Queries(self._positions(generator, texel), sigma, omega_i, omega_o)
+            found = Queries(self._positions(generator, texel), sigma, omega_i, omega_o)
+            return found if self.layout == "shuffled" else found.take((slice(None), None))
         if self.patch_size is None:
             shape = (rows, *self.lattice.shape())
             texel = np.broadcast_to(np.arange(self.lattice.texels()).reshape(shape[1:]), shape)

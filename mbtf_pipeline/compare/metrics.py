@@ -89,7 +89,7 @@ def dataset_errors(materials: Mapping[str, Material], data: Dataset) -> dict[str
     from mbtf_fit.evaluation import split_errors
 
     test = load_split(data, "test")
-    halves = test.value_a, test.value_b
+    halves = test.value_a, test.value_b, test.weight
     labels = level_groups(test.sigma, data.lattice.finest)
     first: Any = None
     out: dict[str, Any] = {}

@@ -114,7 +114,8 @@ class Run(Configuration):
         out = _own_folder(conditions) / f"fit-{data_sha256(self.key)[:12]}"
         shutil.rmtree(out, ignore_errors=True)
         result = fit(FitConfig.model_validate(options), shards, out)
-        error = unexplained_variance(result.material.predict(test), test.value_a, test.value_b)
+        halves = test.value_a, test.value_b
+        error = unexplained_variance(result.material.predict(test), *halves, test.weight)
         seconds = generation_seconds + result.total_seconds
         details = {
             "queries": float(self.queries),

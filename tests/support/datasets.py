@@ -22,6 +22,7 @@ from mbtf_gen.generation.folder import open_folder
 from mbtf_gen.generation.manifest import finish
 from mbtf_gen.generation.run import ShardRun
 from mbtf_gen.job import Job, split_spp
+from mbtf_gen.planning.highlights import Highlights
 from mbtf_gen.planning.run_plan import RunPlan, reference_plan
 from mbtf_gen.render.estimates import Estimates
 
@@ -37,11 +38,14 @@ def formula(queries: Queries) -> NDArray[np.float64]:
     return (base * shade)[..., None] * np.array([1.0, 0.8, 0.5])
 
 
-def write_dataset(folder: Path, *, rows: int = 4, columns: int = 8, **options: Any) -> Dataset:
+def write_dataset(
+    folder: Path, *, rows: int = 4, columns: int = 8, highlights: Highlights | None = None, **options: Any
+) -> Dataset:
     """Write a data set of a random height map of `rows` × `columns` texels.
 
     Parameters
     ----------
+    highlights : by which test queries are drawn
     options : sections of the configuration, as :class:`~mbtf_gen.config.generator.GeneratorConfig` takes them
     """
     heights = folder.parent / f"{folder.name}.npy"
@@ -49,16 +53,17 @@ def write_dataset(folder: Path, *, rows: int = 4, columns: int = 8, **options: A
     np.save(heights, 0.1 * np.random.default_rng(0).random((rows, columns)))
     config = GeneratorConfig.model_validate({"material": str(heights), **options})
     job = Job.prepare(config)
-    plan = RunPlan(reference_plan(job))
+    plan = RunPlan(reference_plan(job), highlights=highlights)
     files = DataFolder.open(folder)
     open_folder(job, files, lambda job: plan)
+    run = ShardRun(job, files, plan)
     for number, entry in enumerate(job.shards):
-        queries = job.query_plan.draw(entry.split, entry.index, entry.rows)
+        queries, weight = run.draw(entry)
         truth, rng = formula(queries), np.random.default_rng(number)
         a, b = ((truth * (1 + NOISE * rng.normal(size=truth.shape))).astype(np.float32) for _ in range(2))
         paths = queries.sigma.size * split_spp(config, entry.split)
         made = Estimates(a.reshape(-1, 3), b.reshape(-1, 3), None, paths, 0, 0, 0)
-        ShardRun(job, files, plan).store(entry, queries, made, 0.1)
+        run.store(entry, queries, made, 0.1, weight)
     finish(folder)
     return Dataset.open(folder)
 

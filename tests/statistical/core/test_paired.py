@@ -77,6 +77,31 @@ def test_noise_free_mse() -> None:
     assert_honest(experiment, float(np.mean((0.1 - 0.1 * mean) ** 2)) + 0.01 * SIGNAL)
 
 
+def test_weighted_queries_are_those_of_the_distribution() -> None:
+    """Queries drawn three times as wide, with the ratio of densities as their weights: the truth is that of
+    the narrow distribution, and error bars are honest."""
+
+    def experiment(estimate: Callable[[Floats, Floats, Floats, Floats], Estimate]) -> Experiment:
+        def weighted(rng: np.random.Generator) -> Estimate:
+            x = 3.0 * rng.normal(size=(QUERIES, 1))
+            truth = np.array([1.0, 2.0, 3.0]) + x * np.array([0.5, 1.0, 1.5])
+            noise = rng.exponential(size=(2, *truth.shape)) - 1.0
+            a, b = truth + NOISE_A * noise[0], truth + NOISE_B * noise[1]
+            # Up to a factor.
+            return estimate(0.9 * truth + 0.1, a, b, 7.0 * np.exp(x**2 / 18.0 - x**2 / 2.0)[:, 0])
+
+        return weighted
+
+    mse = float(np.mean((0.1 - 0.1 * np.array([1.0, 2.0, 3.0])) ** 2)) + 0.01 * SIGNAL
+    assert_honest(experiment(noise_free_mse), mse)
+    assert_honest(experiment(lambda p, a, b, w: signal_variance(a, b, w)), SIGNAL)
+    assert_honest(experiment(lambda p, a, b, w: mse_difference(p, 0 * p, a, b, w)), mse - SIGNAL - 14 / 3)
+    # A ratio of two means has a bias of order 1/n, here with few effective queries.
+    values, deviations = normalized_deviations(experiment(unexplained_variance), mse / SIGNAL)
+    assert values.mean() == pytest.approx(mse / SIGNAL, rel=3e-2)
+    assert deviations.std(ddof=1) == pytest.approx(1, abs=0.2)
+
+
 def test_channels_of_a_query_are_no_extra_samples() -> None:
     """Counting correlated channels as independent queries makes error bars too small, which
     the test detects."""

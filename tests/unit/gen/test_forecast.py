@@ -77,7 +77,7 @@ def faked(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = Clock()
     monkeypatch.setattr(module, "time", clock)
     monkeypatch.setattr(core, "time", clock)
-    monkeypatch.setattr(sample_allocation, "build_estimator", lambda job, plan: Fake(clock))
+    monkeypatch.setattr(sample_allocation, "build_estimator", lambda job, plan, tiles: Fake(clock))
     monkeypatch.setattr(module, "build_estimator", lambda job, plan: Fake(clock))
 
 

@@ -87,7 +87,7 @@ def test_folders_that_hold_no_data_set(tmp_path: Path) -> None:
         ("{", "not readable as JSON"),
         ("[1]", "must hold a JSON object"),
         ('{"format": "other"}', "is not a manifest"),
-        ('{"format": "mbtf-shards", "schema": 99}', "schema version 99, this program reads version 5"),
+        ('{"format": "mbtf-shards", "schema": 99}', "schema version 99, this program reads version 6"),
         ('{"format": "mbtf-shards"}', "schema version None"),
     ):
         path.write_text(text)

@@ -127,3 +127,11 @@ def test_the_kit_imports_without_scipy() -> None:
 
     code = "import mbtf_core.stats, sys; sys.exit('scipy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_weights_are_refused_unless_positive_and_one_per_query() -> None:
+    values = np.ones((3, 2))
+    for weights in ([1.0, 2.0], [1.0, 2.0, 0.0], [[1.0], [1.0], [1.0]]):
+        with pytest.raises(ValueError, match="weights must be 3 positive numbers"):
+            mean_estimate(values, weights)
+    assert mean_estimate([1.0, 4.0], [2.0, 1.0]).value == pytest.approx(2.0)

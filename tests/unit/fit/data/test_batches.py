@@ -33,17 +33,21 @@ def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def rows(data: QueryDataset, workers: int = 0) -> np.ndarray:
-    """All numbers of an epoch (n, 15), query by query."""
+    """All numbers of an epoch (n, 16), query by query."""
     loader = DataLoader(data, batch_size=None, num_workers=workers)
     return np.concatenate([torch.cat([x.view(len(x), -1) for x in batch], 1).numpy() for batch in loader])
 
 
 def stored(folder: Path, split: str = "train") -> np.ndarray:
     data = Dataset.open(folder)
-    arrays = data.load(split, needed(data.estimates))
+    weight = ("weight",) if split == "test" and data.weighted else ()
+    arrays = data.load(split, (*needed(data.estimates), *weight))
     arrays.setdefault("value_b", arrays["value_a"])
+    arrays.setdefault("weight", np.ones_like(arrays["sigma"]))
     lead = arrays["sigma"].ndim
-    columns = [arrays[name].reshape(arrays["sigma"].size, *arrays[name].shape[lead:]) for name in NEEDED]
+    columns = [
+        arrays[name].reshape(arrays["sigma"].size, *arrays[name].shape[lead:]) for name in (*NEEDED, "weight")
+    ]
     return np.concatenate([c.reshape(len(c), -1) for c in columns], 1)
 
 
@@ -135,4 +139,4 @@ def test_one_estimate_of_measured_data_stands_for_both(tmp_path: Path) -> None:
         )
     found = rows(QueryDataset(folder))
     np.testing.assert_array_equal(in_order(found), in_order(stored(folder)))
-    np.testing.assert_array_equal(found[:, -6:-3], found[:, -3:])
+    np.testing.assert_array_equal(found[:, 9:12], found[:, 12:15])

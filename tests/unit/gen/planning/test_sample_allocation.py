@@ -12,8 +12,8 @@ from mbtf_gen.planning.adaptive import DOUBT, MOST_CORRECTION, PRIOR_PATHS, corr
 from mbtf_gen.planning.sample_allocation import (
     FLOOR,
     Allocation,
-    _evaluate,
-    _terms,
+    direction_terms,
+    evaluate_terms,
     fit_allocation,
     fit_log_linear,
 )
@@ -75,15 +75,15 @@ def test_a_sharp_lobe_is_fitted_to_the_end() -> None:
     q = some_queries(8000)
     found = glossy_pilot(q, 1)
     noise = np.sqrt(np.mean((found.value_a.astype(np.float64) - found.value_b) ** 2, axis=-1))
-    weights = fit_log_linear(_terms(q), noise)
+    weights = fit_log_linear(direction_terms(q), noise)
     assert weights is not None
-    fit = np.exp(np.stack(_terms(q), axis=1) @ weights)
+    fit = np.exp(np.stack(direction_terms(q), axis=1) @ weights)
     # The constant has no ridge, so this holds at the optimum and nowhere else along it.
     assert fit.mean() == pytest.approx(noise.mean(), rel=1e-3)
     allocation = fit_allocation(q, found, SPP, SPP)
     assert allocation.counts(q, SPP).mean() == pytest.approx(SPP, rel=0.02)
     # s is the root mean square, which a pilot of few bright paths has well above the mean size.
-    s = _evaluate(allocation.weights, _terms(q))
+    s = evaluate_terms(allocation.weights, direction_terms(q))
     assert s.mean() == pytest.approx(allocation.typical)
     assert np.mean(s**2) == pytest.approx(0.25 * SPP * np.mean(noise**2), rel=1e-3)
 

@@ -15,13 +15,15 @@ from mbtf_core.data.schema import Queries
 from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan
 
 # Draws of every kind, and the elementary functions in double precision, where the last bit shows; numbers of
-# paths by a run's allocation and for a target error. Prints NumPy's features in use and digests of all bits.
+# paths by a run's allocation and for a target error; draws by highlights. Prints NumPy's features in use and
+# digests of all bits.
 CODE = """
 import hashlib, json
 import numpy as np
 from mbtf_gen.sampling.exact_math import exp2, sincos_turns
 from mbtf_core.data.lattice import Lattice
 from mbtf_gen.planning.adaptive import needed_paths, round_up
+from mbtf_gen.planning.highlights import Highlights
 from mbtf_gen.planning.sample_allocation import Allocation
 from mbtf_gen.render.estimates import Estimates
 from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan
@@ -46,6 +48,10 @@ pilot = Estimates(a, b, None, 0, 0, 0, 0, path_variance=v[:, 0])
 expected = allocation.deviation(q), allocation.tile_mean(q)
 needed, scale = needed_paths(pilot, 16, *expected, 0.05)
 for array in (*expected, needed, scale, allocation.counts(q, 16), round_up(needed, 1000)):
+    c.update(array.tobytes())
+plan = QueryPlan(Lattice(6), LevelMixture(0.6, 0.4), 0.1, "shuffled", 0, n)
+q, weight = Highlights(weights[0]).draw(plan, 0.75, 2, 2000)
+for array in (q.u, q.sigma, q.omega_i, q.omega_o, weight):
     c.update(array.tobytes())
 found = np.show_config(mode="dicts")["SIMD Extensions"].get("found", [])
 print(json.dumps({"found": found, "digests": [h.hexdigest(), c.hexdigest()]}))
