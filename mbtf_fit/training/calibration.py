@@ -139,13 +139,13 @@ def fit_calibration(
     levels = lattice.finest + 1
     used = most_queries(len(queries), levels, evaluations)
     # Two evaluations of each query, one of each point and level.
-    total = 2 * used + levels * _points_of(used)
+    work = 2 * used + levels * _points_of(used)
     done = 0
 
     def count(n: int) -> None:
         nonlocal done
         done += n
-        progress(min(1.0, done / total))
+        progress(min(1.0, done / work))
 
     sums, squares = np.zeros((2, _BINS, 3)), np.zeros((2, _BINS, 3))
     largest = 0.0

@@ -120,7 +120,7 @@ def forecast_error(loop: TrainingLoop, queries: ShardQueries, step: Estimate, st
         training = config.training.model_copy(update={"steps": count, "error": None})
         trainer.config = config.model_copy(update={"training": training, "seed": config.seed + seed})
         loop.train(float("inf"))
-        trainer.calibrate()
+        trainer.calibrate(count)
         return trainer.predict(queries)
 
     counts = [round(first * length) for length in _LENGTHS]

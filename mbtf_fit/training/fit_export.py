@@ -79,7 +79,8 @@ def export_fit(
     of = f" {member.folder.name}"
     trainer.fill_levels(float(level_of_sigma(partition.sample.sigma.max())))
     announce(f"calibrating{of}")
-    trainer.calibrate(_now_and_then(lambda fraction: announce(f"calibrating{of}: {fraction:.0%}")))
+    tell = _now_and_then(lambda fraction: announce(f"calibrating{of}: {fraction:.0%}"))
+    trainer.calibrate(share["steps"], tell)
     announce(f"evaluating the errors of{of}")
     errors = evaluate_splits(trainer.predict, data, partition)
     variance = errors["training"]["variance"]["value"]

@@ -56,12 +56,10 @@ class NextStep:
                 more = ["--steps", str(2 * training.steps)]
             return shlex.join(["mbtf-fit", str(data.folder), *fitted, *more, *out])
         made, shards = data.manifest.get("config") or {}, _numbered(str(data.folder))
-        source = data.manifest["measured"]["file"] if "measured" in data.manifest else made.get("material")
-        if source is None or "queries" not in made:
-            # Of another program.
+        if not {"material", "queries"} <= made.keys():
+            # Measured, which have no path of their file, or of another program.
             return None
-        words = ["mbtf-gen", *(["import"] if "measured" in data.manifest else []), source]
-        words += ["--config", str(data.folder.at(CONFIG_NAME))]
+        words = ["mbtf-gen", made["material"], "--config", str(data.folder.at(CONFIG_NAME))]
         if self.kind == "queries":
             words += ["--queries", _times(made["queries"]["train"], 2)]
         else:

@@ -247,10 +247,10 @@ class Trainer:
             for texture, table in zip(self.model.textures(), self._tables(), strict=True):
                 texture.read(table)
 
-    def calibrate(self, progress: Callable[[float], None] = lambda fraction: None) -> None:
+    def calibrate(self, steps: int, progress: Callable[[float], None] = lambda fraction: None) -> None:
         """Fit the calibration factors (:mod:`~mbtf_fit.training.calibration`), if the configuration asks for
-        them and the model has some; with at most half as many evaluations as training took, whose steps take
-        about three each. `progress` is called with the fraction that is done."""
+        them and the model has some; with at most half as many evaluations as training took, whose `steps` for
+        this material take about three each. `progress` is called with the fraction that is done."""
         model = self.model
         if not (self.config.training.energy_calibration and self.hooks.calibrates):
             return
@@ -263,7 +263,7 @@ class Trainer:
             self.queries,
             self.config.held_out,
             self.loss.bound,
-            self.progress.step * self.batch // 2,
+            steps * self.batch // 2,
             progress,
         )
         model.calibrate(torch.from_numpy(found).to(self.device))

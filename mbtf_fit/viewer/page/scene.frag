@@ -34,7 +34,8 @@ const float MAX_ANISOTROPY = 16.0;
 // Quantile of the normal distribution (Winitzki's approximation of the inverse error function).
 float normal_quantile(float p) {
   float x = 2.0 * p - 1.0, l = log(max(1.0 - x * x, 1e-7)), q = 4.33 + 0.5 * l;
-  return sign(x) * sqrt(2.0 * (sqrt(q * q - l / 0.147) - q));
+  // Roots of GPUs are not exact: near the median the difference may be negative.
+  return sign(x) * sqrt(2.0 * max(sqrt(q * q - l / 0.147) - q, 0.0));
 }
 
 // Place (in tile widths, relative to the pixel's) and sigma of one of the round footprints whose mean is the
@@ -46,7 +47,8 @@ vec3 round_footprint(vec2 dx, vec2 dy) {
   float xy = dx.x * dx.y + dy.x * dy.y, difference = 0.5 * (dx.x * dx.x + dy.x * dy.x - dx.y * dx.y - dy.y * dy.y);
   float major = 0.5 * (dot(dx, dx) + dot(dy, dy)) + length(vec2(difference, xy));
   float minor = max(area * area / max(major, 1e-20), major / (MAX_ANISOTROPY * MAX_ANISOTROPY));
-  float angle = 0.5 * atan(xy, difference);
+  // Undefined at (0, 0), where the ellipse is a circle.
+  float angle = 0.5 * atan(xy, difference == 0.0 ? 1e-30 : difference);
   uint pixel = uint(gl_FragCoord.x) * 2749u + uint(gl_FragCoord.y) * 6997u;
   // Frames are steps of the golden ratio, which fill the interval evenly.
   float number = fract(float(hash(pixel) >> 8) / 16777216.0 + 0.6180340 * float(frame));

@@ -81,21 +81,21 @@ def test_the_coats_lobe(roughness: float, weight: float) -> None:
 
 
 @pytest.mark.parametrize("metal", [False, True])
-@pytest.mark.parametrize(("scatter", "tolerance"), [(SCATTER, 0.08), (1e-4 * np.eye(2), 0.02)])
+@pytest.mark.parametrize(("scatter", "tolerance"), [(SCATTER, 0.026), (1e-4 * np.eye(2), 0.005)])
 def test_light_that_the_coat_transmits(metal: bool, scatter: F64, tolerance: float) -> None:
     """Share of the light of the layers below that is left. Facets beyond the horizon are not that exact."""
     light, view = pairs(0.25)
     below = SurfaceParts(specular=metal, metallic=metal)
     gloss = {"roughness": 0.4, "metallic": 1.0} if metal else {}
     layers = below, replace(below, clearcoat=True), COAT
-    maps = {"base_color": 0.5, "clearcoat_roughness": 0.2, **gloss}
+    maps = {"base_color": 0.5, "clearcoat": 0.6, "clearcoat_roughness": 0.2, **gloss}
     bare, coated, lobe = (averages(parts, light, view, scatter, **maps) for parts in layers)
     wanted = (coated - lobe) / bare
-    gray, coat = {"color": (0.5,) * 3, **gloss}, {"clearcoat": (1.0, 0.2)}
+    gray, coat = {"color": (0.5,) * 3, **gloss}, {"clearcoat": (0.6, 0.2)}
     options: list[dict[str, Any]] = [gray, gray | coat, {"color": (0.0,) * 3, **coat}]
     bare, coated, lobe = (known(light, view, scatter, **o) for o in options)
     found = (coated - lobe) / bare
-    assert wanted.min() < 0.85
+    assert wanted.min() < 0.9
     assert np.quantile(abs(found / wanted - 1), 0.75) < tolerance
 
 

@@ -127,6 +127,7 @@ def test_incomplete_histories_say_nothing() -> None:
         # What leaves the smaller error, which is known well enough.
         (0.9, 0.1, fitted(0.2, 0.04), "time"),
         (0.9, 0.3, fitted(0.2, 0.04), "queries"),
+        (0.9, 0.15, fitted(0.2, 0.04), "time"),
         (None, 0.3, fitted(0.2, 0.04), "queries"),
         (None, None, fitted(0.2, 0.04), "time"),
         (0.99, 0.05, fitted(0.2, 0.04), "none"),
@@ -147,7 +148,7 @@ def test_the_next_step_is_what_pays_most(
 def test_the_next_command_is_complete(tmp_path: Path) -> None:
     """Twice of what was given, four times the test queries, in new folders."""
     queries = {"train": "50/texel", "test": "8192"}
-    manifest = {"config": {"material": "wool maps", "queries": queries}}
+    manifest: dict[str, Any] = {"config": {"material": "wool maps", "queries": queries}}
     data = Dataset(DataFolder.open(tmp_path / "shards"), manifest)
     config = FitConfig.model_validate({"training": {"time": "30s"}})
 
@@ -165,3 +166,6 @@ def test_the_next_command_is_complete(tmp_path: Path) -> None:
     assert command("queries") == f"{made} --queries 100/texel -o shards2 && {fit}"
     assert command("test") == f"{made} --test-queries 32768 -o shards2 && {fit}"
     assert command("none") is None
+    for made in ({"queries": queries}, {"material": "wool maps"}, None):
+        manifest["config"] = made
+        assert command("queries") is None

@@ -112,6 +112,9 @@ def test_forecasts_answer_or_say_why_not() -> None:
         "0.03 (0.025 to 0.035)"
     )
     assert never.as_dict()["asked"] == {"error": 0.02, "seconds": {"value": None, "low": None, "high": None}}
+    for error, lines in ((0.01, 2), (0.02, 1)):
+        overfit = replace(known, excess=Estimate(0.03, error, 40)).describe()
+        assert (len(overfit.splitlines()), "overfitting decides" in overfit) == (lines, lines == 2)
     vague = replace(known, error=Interval(0.08, 0.01, 0.4), asked=(0.05, Interval(720.0, 60.0, math.inf)))
     assert [line.split(": ")[1] for line in vague.describe().splitlines()] == [
         "the evidence does not suffice",

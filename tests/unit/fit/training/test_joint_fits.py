@@ -15,6 +15,7 @@ from support.known_surfaces import geometry, rough_heights
 
 import mbtf_fit.training.fit
 import mbtf_fit.training.fit_export
+import mbtf_fit.training.trainer
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
 from mbtf_fit import FitConfig, FitResult, Material, fit
@@ -293,6 +294,20 @@ def test_training_stops_once_all_materials_have_reached_the_error(
             assert len(read_history(tmp_path / NAMES[0])) == steps
     for found in fit_two(config, data, tmp_path):
         assert [r["step"] for r in found.history] == [1, 2, 3, 4, 5]
+
+
+def test_a_calibration_takes_a_share_of_the_steps_of_its_material(
+    data: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    granted, calibration = [], mbtf_fit.training.trainer.fit_calibration
+
+    def recorded(*arguments: Any) -> F32:
+        granted.append(arguments[5])
+        return calibration(*arguments)
+
+    monkeypatch.setattr(mbtf_fit.training.trainer, "fit_calibration", recorded)
+    fit_two(joint_config(steps=9), data, tmp_path)
+    assert granted == [5 * 512 // 2, 4 * 512 // 2]
 
 
 def test_a_lost_material_is_fitted_again(data: dict[str, Path], tmp_path: Path) -> None:
