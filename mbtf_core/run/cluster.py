@@ -209,13 +209,16 @@ class DaskRunner(Runner):
         distributed = import_extra("distributed", "--cluster")
         if future.status == "cancelled":
             raise OSError("the scheduler has ended")
-        error = self._answer(future.exception)
+        try:
+            error = self._answer(future.exception)
+            if error is None:
+                return Result(item.name, **self._answer(future.result))
+        except distributed.KilledWorker as died:
+            # A lost result was computed again.
+            error = died
         if isinstance(error, distributed.KilledWorker):
-            text = "its worker died each time: out of memory, killed, or crashed"
-            return Result(item.name, error=text)
-        if error is not None:
-            return Result(item.name, error=f"{type(error).__name__}: {reason(error)}")
-        return Result(item.name, **self._answer(future.result))
+            return Result(item.name, error="its worker died each time: out of memory, killed, or crashed")
+        return Result(item.name, error=f"{type(error).__name__}: {reason(error)}")
 
     def _answer(self, ask: Callable[..., Any]) -> Any:
         """What a call of a future returns; it is computed again where its worker has died."""
