@@ -64,8 +64,13 @@ class NextStep:
             words += ["--queries", _times(made["queries"]["train"], 2)]
         else:
             words += ["--test-queries", _times(made["queries"]["test"], 4)]
+            words += [] if made["queries"].get("test_highlights") else ["--test-highlights", "75%"]
         words += ["-o", shards]
-        return f"{shlex.join(words)} && {shlex.join(['mbtf-fit', shards, *fitted, *out])}"
+        then = ["mbtf-fit", shards, *fitted, *out]
+        if self.kind == "test":
+            # Training queries are the same.
+            then = ["mbtf-fit", "evaluate", str(material), shards]
+        return f"{shlex.join(words)} && {shlex.join(then)}"
 
 
 def next_step(cost: MarginalCost, errors: Mapping[str, Any]) -> NextStep:
@@ -79,7 +84,8 @@ def next_step(cost: MarginalCost, errors: Mapping[str, Any]) -> NextStep:
     test = errors[headline(errors)]["unexplained"]
     value, error = test["value"], test["error"]
     if value is None or error is None or error > _UNCERTAIN * abs(value):
-        return NextStep("test", "the error is uncertain; four times the test queries halve its ±")
+        reason = "few test queries decide the error; four times as many, by highlights, halve its ±"
+        return NextStep("test", reason)
     own = errors["training"]["unexplained"]["value"] if "training" in errors else None
     if value >= 1.0 and own is not None and own < 1.0:
         return NextStep("queries", "the training queries are too few or too noisy")

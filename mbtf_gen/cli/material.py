@@ -117,17 +117,20 @@ def plan(
         Measure the bias of omitting each simulated effect by a pilot run, and forecast the run.
     """
     from mbtf_gen.job import split_target
-    from mbtf_gen.planning.run_plan import plan_effects
+    from mbtf_gen.planning.run_plan import plan_effects, skips_pilots
 
     job = prepare_job(options, material, quality)
     found = plan_effects(job)
+    note = ""
+    if skips_pilots(job) and any(decision.reason == "pilot" for decision in found.effects):
+        note = "\nthe run is too small for pilots: it simulates what only a pilot leaves out"
     if not measure:
-        console.report({**found.to_manifest(), "forecast": None}, found.describe())
+        console.report({**found.to_manifest(), "forecast": None}, found.describe() + note)
         return
     from mbtf_gen.forecast import forecast
     from mbtf_gen.planning.run_plan import allocate, measured
 
     expected = forecast(job, allocate(job, found))
     found = measured(job, found)
-    text = f"{found.describe()}\n{expected.describe(split_target(job.config, 'train'))}"
+    text = f"{found.describe()}{note}\n{expected.describe(split_target(job.config, 'train'))}"
     console.report({**found.to_manifest(), "forecast": asdict(expected)}, text)

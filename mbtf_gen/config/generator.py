@@ -188,7 +188,9 @@ class QueriesSection(Settings):
         "unbiased; glossy materials need fewer test queries",
     )
     allocation: Literal["noise", "uniform"] = Field(
-        "noise", description="paths per query: more where a pilot expects more noise, or the same for all"
+        "noise",
+        description="paths per query: more where a pilot expects more noise, which takes 2.6 million "
+        "training paths, or the same for all",
     )
     target_error: Annotated[float | None, BeforeValidator(_share), Flag("--target-error", "2%")] = Field(
         None,

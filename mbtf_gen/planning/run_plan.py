@@ -17,14 +17,17 @@ from mbtf_gen.planning.bounds import CAUTION, FEW, POINTS, Change, DisplacementB
 from mbtf_gen.planning.effects import EFFECTS
 from mbtf_gen.planning.effects_plan import EffectsPlan, consistent, without
 from mbtf_gen.planning.highlights import Highlights, measure_highlights
+from mbtf_gen.planning.sample_allocation import PILOT_QUERIES as ALLOCATION_QUERIES
+from mbtf_gen.planning.sample_allocation import PILOT_SPP as ALLOCATION_SPP
 from mbtf_gen.planning.sample_allocation import Allocation, measure_allocation
 from mbtf_gen.planning.scene import EffectDecision, EffectsRequest, PlanScene
 from mbtf_gen.planning.simulation import build_estimator, pilot_queries
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.sampling.light_kernel import LightKernel
 
-# Runs of fewer paths end before a pilot has paid for itself.
-SMALL_RUN = 10_000_000
+# Paths of training queries below which runs end before the pilots of effects have paid, and before that of
+# the allocation. Test queries do not count: they change no training data.
+SMALL_RUN, SMALLEST_ALLOCATED = 10_000_000, 10 * ALLOCATION_QUERIES * ALLOCATION_SPP
 # Queries of the pilot and paths of each.
 PILOT_QUERIES, PILOT_SPP = 8192, 4
 # Interactions before roulette. With early roulette few paths would reach late interactions, with large
@@ -54,22 +57,28 @@ class RunPlan:
         return {"effects": self.effects.to_manifest(), **stated}
 
 
-def _is_large(job: Job) -> bool:
-    return planned_paths(job, job.shards) >= SMALL_RUN
+def _training_paths(job: Job) -> int:
+    return planned_paths(job, (entry for entry in job.shards if entry.split == "train"))
+
+
+def skips_pilots(job: Job) -> bool:
+    """Whether a run is too small for pilots of effects."""
+    return _training_paths(job) < SMALL_RUN
 
 
 def plan_run(job: Job) -> RunPlan:
     """Plan a run, by pilots where they pay."""
-    return allocate(job, plan_effects(job, pilots=_is_large(job)))
+    return allocate(job, plan_effects(job, pilots=not skips_pilots(job)))
 
 
 def allocate(job: Job, effects: EffectsPlan) -> RunPlan:
-    """The plan of a run that simulates given effects; pilots allocate the paths under a target error and in
-    large runs, and find the highlights where test queries are to have them."""
+    """The plan of a run that simulates given effects; pilots allocate the paths under a target error and
+    where that pays, and find the highlights where test queries are to have them."""
     queries = job.config.queries
     if effects.closed_form:
         return RunPlan(effects)
-    needed = queries.target_error is not None or (_is_large(job) and queries.allocation == "noise")
+    pays = queries.allocation == "noise" and _training_paths(job) >= SMALLEST_ALLOCATED
+    needed = queries.target_error is not None or pays
     tiles: dict[frozenset[str], Any] = {}
     return RunPlan(
         effects,

@@ -172,7 +172,8 @@ def of_kind(config: GeneratorConfig, kind: str) -> GeneratorConfig:
 @pytest.fixture
 def small_pilots(monkeypatch: pytest.MonkeyPatch) -> None:
     """Runs of any size use a pilot, and pilots are short."""
-    monkeypatch.setattr("mbtf_gen.planning.run_plan.SMALL_RUN", 0)
+    for name in ("SMALL_RUN", "SMALLEST_ALLOCATED"):
+        monkeypatch.setattr(f"mbtf_gen.planning.run_plan.{name}", 0)
     monkeypatch.setattr("mbtf_gen.planning.sample_allocation.PILOT_QUERIES", 1024)
     monkeypatch.setattr("mbtf_gen.planning.run_plan.plan_effects", lambda job, pilots: plan_effects(job))
 

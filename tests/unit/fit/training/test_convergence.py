@@ -164,7 +164,8 @@ def test_the_next_command_is_complete(tmp_path: Path) -> None:
     assert command("time", steps) == f"mbtf-fit shards {fitted} --steps 600 -o material2"
     made, fit = "mbtf-gen 'wool maps' --config shards/config.yaml", f"mbtf-fit shards2 {fitted} -o material2"
     assert command("queries") == f"{made} --queries 100/texel -o shards2 && {fit}"
-    assert command("test") == f"{made} --test-queries 32768 -o shards2 && {fit}"
+    more = "--test-queries 32768 --test-highlights 75%"
+    assert command("test") == f"{made} {more} -o shards2 && mbtf-fit evaluate material shards2"
     assert command("none") is None
     for made in ({"queries": queries}, {"material": "wool maps"}, None):
         manifest["config"] = made
