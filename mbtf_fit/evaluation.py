@@ -32,7 +32,8 @@ from mbtf_fit.material.transmittance import evaluate_transmittance, has_transmit
 if TYPE_CHECKING:
     from mbtf_fit.material.material import Material
 
-Predict = Callable[[ShardQueries], NDArray[np.float32]]
+F32 = NDArray[np.float32]
+Predict = Callable[[ShardQueries], F32]
 
 
 def exposure_of(queries: ShardQueries) -> float:
@@ -61,9 +62,10 @@ def split_errors(
     dict
         Plain data for JSON. ``mse`` E[(p-a)(p-b)] and ``variance`` of the values, in 1/sr², and their ratio
         ``unexplained`` (1 - R²: 0 is exact, 1 as good as the mean value), each an estimate with ``value``,
-        ``error`` and ``n``; also by nearest level (``levels``) and by band of the smaller cosine of light and
-        view (``elevations``). ``psnr``: its peak is the value that the exposure shows as white;
-        ``visibility``: in words; ``includes_noise``: whether the data have one value per query.
+        ``error`` and ``n``; ``ten_largest``: share of the ten largest squared errors in their sum; also by
+        nearest level (``levels``) and by band of the smaller cosine of light and view (``elevations``).
+        ``psnr``: its peak is the value that the exposure shows as white; ``visibility``: in words;
+        ``includes_noise``: whether the data have one value per query.
     """
     if len(queries) == 0:
         return None
@@ -73,6 +75,7 @@ def split_errors(
     found = {
         **_errors(len(queries), mse, signal_variance(*arrays[1:]), unexplained_variance(*arrays)),
         "exposure": exposure,
+        "ten_largest": _ten_largest(*arrays),
     }
     bands = _grouped(elevation_groups(queries.omega_i, queries.omega_o), *arrays)
     return {
@@ -88,6 +91,14 @@ def split_errors(
             f"{ELEVATION_BANDS[k]:g}-{ELEVATION_BANDS[k + 1]:g}": errors for k, errors in bands.items()
         },
     }
+
+
+def _ten_largest(prediction: F32, a: F32, b: F32, weight: F32 | None) -> float | None:
+    product = (prediction - a) * (prediction - b)
+    squared = product.reshape(len(product), -1).mean(axis=1, dtype=np.float64)
+    squared = squared if weight is None else squared * weight
+    total = float(squared.sum())
+    return float(np.sort(squared)[-10:].sum()) / total if total > 0 else None
 
 
 def _errors(n: int, mse: Estimate, variance: Estimate, unexplained: Estimate) -> dict[str, Any]:

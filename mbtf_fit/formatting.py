@@ -22,6 +22,8 @@ VISIBILITY = (
     (26.0, "visible"),
     (-math.inf, "clearly visible"),
 )
+# Share of an error that ten of so many queries at least make up.
+_DECISIVE, _MANY = 0.5, 1000
 # Standard errors of a significant difference from zero.
 _SIGNIFICANT = 2.0
 
@@ -88,6 +90,11 @@ def report_errors(
     return [*lines, *_remarks(errors, foreign), *(_table_of(errors) if verbose else [])]
 
 
+def uncertain_bars(split: Mapping[str, Any]) -> bool:
+    """Whether so few of many queries decide an error that others like them may be missing."""
+    return split["n"] >= _MANY and (split.get("ten_largest") or 0.0) > _DECISIVE
+
+
 def _remarks(errors: Mapping[str, Any], foreign: bool) -> list[str]:
     """Notes on an undefined or large error."""
     found, split = [], errors[headline(errors)]
@@ -95,6 +102,9 @@ def _remarks(errors: Mapping[str, Any], foreign: bool) -> list[str]:
     if value is None:
         why = "these values do not vary" if measured else "the noise exceeds the variance of these values"
         found.append(f"undefined unexplained variance: {why}")
+    if uncertain_bars(split):
+        share = min(1.0, split["ten_largest"])
+        found.append(f"ten queries make {share:.0%} of this error: its ± may be too small")
     if measured:
         found.append("these errors include the noise of the data, which have one value per query")
     if value is None or value < 1 or foreign:

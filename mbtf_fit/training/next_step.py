@@ -14,7 +14,7 @@ from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.schema import CONFIG_NAME
 from mbtf_core.units import format_duration
 from mbtf_fit.config import FitConfig
-from mbtf_fit.formatting import headline
+from mbtf_fit.formatting import headline, uncertain_bars
 from mbtf_fit.training.validation import FLAT, MarginalCost
 
 # Relative standard error of the test error from which more test queries come first.
@@ -81,9 +81,9 @@ def next_step(cost: MarginalCost, errors: Mapping[str, Any]) -> NextStep:
     cost : of the fit
     errors : by split
     """
-    test = errors[headline(errors)]["unexplained"]
-    value, error = test["value"], test["error"]
-    if value is None or error is None or error > _UNCERTAIN * abs(value):
+    split = errors[headline(errors)]
+    value, error = split["unexplained"]["value"], split["unexplained"]["error"]
+    if value is None or error is None or error > _UNCERTAIN * abs(value) or uncertain_bars(split):
         reason = "few test queries decide the error; four times as many, by highlights, halve its ±"
         return NextStep("test", reason)
     own = errors["training"]["unexplained"]["value"] if "training" in errors else None

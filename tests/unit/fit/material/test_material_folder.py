@@ -19,8 +19,10 @@ from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import EngineError, InputError
 from mbtf_fit import FitConfig, FitResult, Material, evaluate, fit, read_history
-from mbtf_fit.data.loader import load_training
+from mbtf_fit.data.loader import load_split, load_training
+from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.evaluation import split_errors
+from mbtf_fit.formatting import report_errors
 from mbtf_fit.material.material import conformance_queries, export
 from mbtf_fit.models.registry import MODELS
 from mbtf_fit.training.trainer import prepare_trainer
@@ -176,9 +178,6 @@ def test_damaged_materials_are_refused(fitted: FitResult, tmp_path: Path) -> Non
 
 
 def test_errors_of_a_perfect_prediction_are_zero(data: Path) -> None:
-    from mbtf_core.data.dataset import Dataset
-    from mbtf_fit.data.loader import load_split
-
     opened = Dataset.open(data)
     queries = load_split(opened, "test")
     truth = parallax(queries.u, queries.sigma, queries.omega_i, queries.omega_o).astype(np.float32)
@@ -191,6 +190,24 @@ def test_errors_of_a_perfect_prediction_are_zero(data: Path) -> None:
     for groups in (flat["levels"], flat["elevations"]):
         assert sum(errors["n"] for errors in groups.values()) == len(queries)
     assert set(flat["elevations"]) == {"0-0.2", "0.2-0.4", "0.4-0.7", "0.7-1"}
+
+
+def test_few_queries_that_decide_an_error_are_said(data: Path) -> None:
+    """Ten errors of 1 among many of 0.1; each also counts as often as its weight says."""
+    opened = Dataset.open(data)
+    stored = load_split(opened, "test")
+    truth, n = stored.value_a, len(stored)
+    wrong = np.full_like(truth, 0.1)
+    wrong[5:105:10] = 1.0
+    for heavy in (None, 3.0):
+        weight = None if heavy is None else np.where(wrong[:, 0] == 1, heavy, 1).astype(np.float32)
+        queries = ShardQueries(**(vars(stored) | {"value_b": truth, "weight": weight}))
+        found = split_errors(lambda q: truth + wrong, queries, opened)
+        assert found is not None
+        ten = 10 * (heavy or 1.0)
+        assert found["ten_largest"] == pytest.approx(ten / (ten + 0.01 * (n - 10)), rel=1e-3)
+    assert "ten queries make" in "".join(report_errors({"test": found | {"n": 5000}}, None))
+    assert "ten queries make" not in "".join(report_errors({"test": found | {"n": 500}}, None))
 
 
 def test_evaluation_repeats_the_errors_of_the_fit(fitted: FitResult, data: Path) -> None:

@@ -36,7 +36,7 @@ def errors(held_out: float, training: float, error: float = 0.002) -> dict[str, 
 def fitted(value: float, error: float, training: float = 0.1) -> dict[str, Any]:
     """Errors of a fit, of the test split and of training queries."""
     both = {"test": (value, error), "training": (training, 0.001)}
-    return {name: {"unexplained": {"value": v, "error": e}} for name, (v, e) in both.items()}
+    return {name: {"n": 8192, "unexplained": {"value": v, "error": e}} for name, (v, e) in both.items()}
 
 
 def cost(records: list[dict[str, Any]], *arguments: Any, **options: Any) -> MarginalCost:
@@ -133,7 +133,8 @@ def test_incomplete_histories_say_nothing() -> None:
         (0.99, 0.05, fitted(0.2, 0.04), "none"),
         # Neither is known of an uncertain or an undefined error.
         (0.8, 0.9, fitted(0.2, 0.06), "test"),
-        (0.8, 0.9, {"test": {"unexplained": {"value": None, "error": None}}}, "test"),
+        (0.8, 0.9, {"test": {"n": 8, "unexplained": {"value": None, "error": None}}}, "test"),
+        (0.8, 0.9, {"test": fitted(0.2, 0.04)["test"] | {"ten_largest": 0.69}}, "test"),
         # Worse than the mean value: training queries that were learned, or not yet.
         (0.8, None, fitted(1.4, 0.1), "queries"),
         (0.8, None, fitted(1.4, 0.1, training=1.2), "time"),
