@@ -10,7 +10,7 @@ import os
 import re
 import types
 import typing
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar, Union
 
@@ -31,13 +31,15 @@ from mbtf_core.paths import named_file, suggest_name
 _COMMAND_LINE = "command line"
 
 
-def parts_of(annotation: Any) -> list[Any]:
-    """The types within an annotation's Optional, unions, lists and dicts, without metadata."""
+def parts_of(annotation: Any, *, containers: bool = True) -> list[Any]:
+    """The types within an annotation's Optional, unions and `containers` (lists and dicts), without
+    metadata."""
     origin = typing.get_origin(annotation)
     if origin is Annotated:
-        return parts_of(typing.get_args(annotation)[0])
-    if origin in (Union, types.UnionType, list, tuple, dict):
-        return [part for inner in typing.get_args(annotation) for part in parts_of(inner)]
+        return parts_of(typing.get_args(annotation)[0], containers=containers)
+    if origin in (Union, types.UnionType) or (containers and origin in (list, tuple, dict)):
+        inner = typing.get_args(annotation)
+        return [part for each in inner for part in parts_of(each, containers=containers)]
     return [annotation]
 
 
@@ -98,15 +100,36 @@ def _separated(name: str) -> str:
 LocalName = Annotated[FileName, AfterValidator(_separated)]
 
 
-def _known_keys(model: type[BaseModel], location: Sequence[str | int]) -> list[str]:
-    """Valid keys of the section that `location` lies in (the last part is the offending key)."""
+def _models_in(parts: Iterable[Any]) -> list[type[BaseModel]]:
+    return [k for k in parts if isinstance(k, type) and issubclass(k, BaseModel)]
+
+
+def _models_at(model: type[BaseModel], location: Sequence[str | int]) -> list[type[BaseModel]]:
+    """Models of the section at `location`; names of a dict and numbers of a list are skipped."""
     models = [model]
-    for name in location[:-1]:
-        kinds = [
-            k for m in models if name in m.model_fields for k in parts_of(m.model_fields[name].annotation)
-        ]
-        models = [k for k in kinds if isinstance(k, type) and issubclass(k, BaseModel)] or models
-    return sorted({key for m in models for key in m.model_fields})
+    for name in location:
+        fields = [m.model_fields[str(name)] for m in models if name in m.model_fields]
+        models = _models_in(part for f in fields for part in parts_of(f.annotation)) or models
+    return models
+
+
+def _keys_below(model: type[BaseModel]) -> Iterator[str]:
+    """Dotted keys of a model and its sections."""
+    for name, field in model.model_fields.items():
+        yield name
+        for section in _models_in(parts_of(field.annotation, containers=False)):
+            yield from (f"{name}.{key}" for key in _keys_below(section))
+
+
+def _suggest_key(model: type[BaseModel], location: Sequence[str | int]) -> str:
+    """Hint at a key of the same name in the nearest section, or at the key of this section that is meant."""
+    *sections, name = map(str, location)
+    for depth in range(len(sections), -1, -1):
+        for key in (k for m in _models_at(model, sections[:depth]) for k in _keys_below(m)):
+            if key.rpartition(".")[2] == name:
+                return f"did you mean '{'.'.join([*sections[:depth], key])}'?"
+    known = sorted({key for m in _models_at(model, sections) for key in m.model_fields})
+    return suggest_name(name, known, 0.5) or f"valid keys: {', '.join(known)}"
 
 
 def _explain(
@@ -122,9 +145,7 @@ def _explain(
     flag = next((f for key, f in spelled.items() if f"{dotted}.".startswith(f"{key}.")), None)
     where = flag or (f"{source}:{line}" if line is not None else source)
     if fault["type"] == "extra_forbidden":
-        known = _known_keys(model, location)
-        hint = suggest_name(str(location[-1]), known, 0.5) or f"valid keys: {', '.join(known)}"
-        return where, f"unknown key '{dotted}'", hint
+        return where, f"unknown key '{dotted}'", _suggest_key(model, location)
     if fault["type"] == "missing":
         return where, f"key '{dotted}' is missing", "add it"
     what = fault["msg"].removeprefix("Value error, ").replace("Input should", "must")

@@ -16,7 +16,7 @@ from mbtf_core.config.settings import build
 from mbtf_core.data.lattice import Lattice, sigma_of_level
 from mbtf_core.data.schema import CONVENTIONS
 from mbtf_core.directions import check_unit, from_projected_disk
-from mbtf_core.errors import InputError
+from mbtf_core.errors import InputError, reason
 from mbtf_core.files.atomic import write_json
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries
@@ -111,14 +111,16 @@ class Material:
         description, weights = read_description(Path(folder))
         config = build(FitConfig, description["config"], source=str(weights.with_name(DESCRIPTION_NAME)))
         lattice = lattice_of(description)
-        # A small file cannot ask for the memory of a large model.
-        number = 2 if description["weights"].get("dtype") == "float16" else 4
-        if number * lattice.texels() * config.network.channels > weights.stat().st_size:
-            raise InputError("is too small for the levels that material.json describes", where=weights)
         try:
-            model = NeuralMaterial(lattice, read_operations(description["operations"]), config.model)
-        except ValueError as error:
-            raise InputError(str(error), where=weights.with_name(DESCRIPTION_NAME), hint=AGAIN) from None
+            # Without memory at first: a small file cannot ask for that of a large model.
+            with torch.device("meta"):
+                model = NeuralMaterial(lattice, read_operations(description["operations"]), config.model)
+        except (ValueError, TypeError, RuntimeError) as error:
+            raise InputError(reason(error), where=weights.with_name(DESCRIPTION_NAME), hint=AGAIN) from None
+        if 2 * sum(p.numel() for p in model.parameters()) > weights.stat().st_size:
+            what = f"is too small for the operations and levels that {DESCRIPTION_NAME} describes"
+            raise InputError(what, where=weights, hint=AGAIN)
+        model.to_empty(device="cpu")
         tensors = read_weights(weights)
         conformance = check_conformance(tensors, description, weights)
         model.load_weights({n: t for n, t in tensors.items() if not n.startswith("conformance.")})

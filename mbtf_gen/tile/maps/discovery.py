@@ -11,6 +11,7 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
+from mbtf_core.data.dataset import is_dataset
 from mbtf_core.errors import InputError
 from mbtf_core.images.read import SUFFIXES, is_image, read_image
 from mbtf_core.meshes.read import MESH_FILES
@@ -240,7 +241,9 @@ def _images(folder: Path) -> list[Path]:
 
 
 def _elsewhere(folder: Path) -> str:
-    """Hint at what else is there: a mesh, a subfolder with a height map, or an archive."""
+    """Hint at what else is there: a data set, a mesh, a subfolder with a height map, or an archive."""
+    if is_dataset(folder):
+        return f"it is a data set; fit it with: mbtf-fit {folder}"
     content = _content(folder)
     if mesh := next((p for p in content if p.suffix.lower() in MESH_FILES), None):
         return f"did you mean '{mesh}'?"

@@ -37,7 +37,7 @@ class Needy(Settings):
     spp: int = 1
 
 
-_ONE, _LIGHT = "give one of them", "valid keys: kind, width_deg"
+_ONE, _ALL = "give one of them", "valid keys: height, levels, light, stages"
 
 
 @pytest.fixture
@@ -87,7 +87,10 @@ def test_assignments_are_read_as_yaml_and_later_ones_win() -> None:
             "unknown key 'light.widht_deg'",
             "did you mean 'width_deg'?",
         ),
-        ("height: 1\nxyzzy: 1\n", 2, "unknown key 'xyzzy'", "valid keys: height, levels, light, stages"),
+        ("width_deg: 2\n", 1, "unknown key 'width_deg'", "did you mean 'light.width_deg'?"),
+        ("light:\n  levels: 2\n", 2, "unknown key 'light.levels'", "did you mean 'levels'?"),
+        ("spp: 2\n", 1, "unknown key 'spp'", _ALL),
+        ("height: 1\nxyzzy: 1\n", 2, "unknown key 'xyzzy'", _ALL),
         ("stages:\n- name: a\n- name: b\n  ssp: 2\n", 4, "unknown key 'stages.1.ssp'", "did you mean 'spp'?"),
         ("\n\nheight: tall\n", 3, "'height': must be a valid number", ""),
         ("light:\n  width_deg: 31\n", 2, "'light.width_deg': must be less than or equal to 30", ""),

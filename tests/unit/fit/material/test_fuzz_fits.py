@@ -126,19 +126,19 @@ def test_odd_tensors(case: str, whole: Path, folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("key", "value"), [("levels.finest", 14), ("tile.aspect", 1e6), ("config.network.channels", 64)]
+    ("lookup", "levels", "aspect"),
+    [({}, 13, 1.0), ({}, 2, 1e6), ({"channels": 1000}, 8, 1.0), ({"channels": 2**62}, 13, 1e6)],
 )
-def test_descriptions_larger_than_the_weights(key: str, value: Any, whole: Path, folder: Path) -> None:
+def test_descriptions_larger_than_the_weights(
+    lookup: dict[str, int], levels: int, aspect: float, whole: Path, folder: Path
+) -> None:
     description = json.loads((whole / DESCRIPTION).read_text())
-    *sections, last = key.split(".")
-    place = description
-    for section in sections:
-        place = place[section]
-    place[last] = value
-    if last == "channels":
-        description["levels"]["finest"] = 8
+    for operation in description["operations"]:
+        if operation["operation"] == "lookup":
+            operation.update(lookup)
+    description["levels"]["finest"], description["tile"]["aspect"] = levels, aspect
     write(folder, whole, json.dumps(description), None)
-    with pytest.raises(InputError, match="too small for the levels"):
+    with pytest.raises(InputError, match=r"is too small for the operations and levels|overflow"):
         Material.load(folder)
 
 

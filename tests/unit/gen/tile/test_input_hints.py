@@ -8,6 +8,7 @@ import numpy as np
 import OpenEXR
 import pytest
 from PIL import Image
+from support.fit_data import constant, write_data
 
 from mbtf_core.errors import InputError
 from mbtf_gen.tile.loading import load_material
@@ -38,6 +39,15 @@ def test_a_folder_of_a_mesh_names_it(tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
         load_material(tmp_path)
     assert "scene.obj" in caught.value.hint
+
+
+def test_a_data_set_is_no_material(tmp_path: Path) -> None:
+    folder = write_data(tmp_path / "shards", constant(0.5), train=10, test=10)
+    with pytest.raises(InputError, match=f"it is a data set; fit it with: mbtf-fit {folder}"):
+        load_material(folder)
+    (tmp_path / "geometry.exr").write_bytes((folder / "geometry.exr").read_bytes())
+    with pytest.raises(InputError, match="its name must contain one of"):
+        load_material(tmp_path)
 
 
 @pytest.mark.parametrize(("name", "warned"), [("x_albedo_acescg.exr", True), ("x_albedo.exr", False)])
