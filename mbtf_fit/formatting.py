@@ -73,7 +73,10 @@ def report_errors(
     lines = []
     if split["unexplained"]["value"] is not None:
         value = format_estimate(split["unexplained"])
-        lines.append(f"unexplained variance {value} {of} (0: exact, 1: as good as the mean value)")
+        scale = "0: exact, 1: as good as the mean value"
+        if few_decide(split):
+            scale = f"unreliable: ten of them make {min(1.0, split['ten_largest']):.0%} of it"
+        lines.append(f"unexplained variance {value} {of} ({scale})")
     text, word = visibility(split)
     if word is not None:
         shown = describe_exposure(split["exposure"])
@@ -90,7 +93,7 @@ def report_errors(
     return [*lines, *_remarks(errors, foreign), *(_table_of(errors) if verbose else [])]
 
 
-def uncertain_bars(split: Mapping[str, Any]) -> bool:
+def few_decide(split: Mapping[str, Any]) -> bool:
     """Whether so few of many queries decide an error that others like them may be missing."""
     return split["n"] >= _MANY and (split.get("ten_largest") or 0.0) > _DECISIVE
 
@@ -102,9 +105,6 @@ def _remarks(errors: Mapping[str, Any], foreign: bool) -> list[str]:
     if value is None:
         why = "these values do not vary" if measured else "the noise exceeds the variance of these values"
         found.append(f"undefined unexplained variance: {why}")
-    if uncertain_bars(split):
-        share = min(1.0, split["ten_largest"])
-        found.append(f"ten queries make {share:.0%} of this error: its ± may be too small")
     if measured:
         found.append("these errors include the noise of the data, which have one value per query")
     if value is None or value < 1 or foreign:

@@ -14,7 +14,7 @@ from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.schema import CONFIG_NAME
 from mbtf_core.units import format_duration
 from mbtf_fit.config import FitConfig
-from mbtf_fit.formatting import headline, uncertain_bars
+from mbtf_fit.formatting import few_decide, headline
 from mbtf_fit.training.validation import FLAT, MarginalCost
 
 # Relative standard error of the test error from which more test queries come first.
@@ -82,11 +82,13 @@ def next_step(cost: MarginalCost, errors: Mapping[str, Any]) -> NextStep:
     errors : by split
     """
     split = errors[headline(errors)]
-    value, error = split["unexplained"]["value"], split["unexplained"]["error"]
-    if value is None or error is None or error > _UNCERTAIN * abs(value) or uncertain_bars(split):
-        reason = "few test queries decide the error; four times as many, by highlights, halve its ±"
-        return NextStep("test", reason)
     own = errors["training"]["unexplained"]["value"] if "training" in errors else None
+    value, error = split["unexplained"]["value"], split["unexplained"]["error"]
+    if value is None or error is None or error > _UNCERTAIN * abs(value) or few_decide(split):
+        reason = "few test queries decide the error; four times as many, by highlights, tell more"
+        if value is not None and own is not None and own < 0.5 * value:
+            reason += f"; that of training queries is {own:.2g}: the fit overfits noise"
+        return NextStep("test", reason)
     if value >= 1.0 and own is not None and own < 1.0:
         return NextStep("queries", "the training queries are too few or too noisy")
     data = 1.0 if cost.noise_share is None else 1.0 - 0.5 * cost.noise_share

@@ -90,8 +90,9 @@ def _grouped(facts: Facts) -> dict[str, list[int]]:
 
 
 def _row_shape(facts: Facts, name: str) -> str:
-    """Shape of a row of an array, of each split where they differ."""
-    shapes = {split: " × ".join(map(str, arrays[name])) or "1" for split, arrays in facts.shapes.items()}
+    """Shape of a row of an array, of each split where they differ; not all splits have all arrays."""
+    having = {split: arrays[name] for split, arrays in facts.shapes.items() if name in arrays}
+    shapes = {split: " × ".join(map(str, shape)) or "1" for split, shape in having.items()}
     texts = set(shapes.values())
     return texts.pop() if len(texts) == 1 else "; ".join(f"{split}: {text}" for split, text in shapes.items())
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import yaml
 from markdown_it import MarkdownIt
-from support.datasets import edit
+from support.datasets import edit, write_dataset
 from support.measured_files import btf
 from support.published import LAYOUTS, publish, python_blocks, small, stored
 
@@ -23,6 +23,7 @@ from mbtf_core.data.dataset import Dataset
 from mbtf_gen.config.measured import ImportConfig
 from mbtf_gen.config.publish import PublishConfig
 from mbtf_gen.generation.imported import Import, import_measured
+from mbtf_gen.planning.highlights import Highlights
 from mbtf_gen.publishing.card import card_text, code, escaped, fenced
 from mbtf_gen.publishing.facts import Facts
 
@@ -87,6 +88,21 @@ def test_datasets_of_hugging_face_loads_the_folder(layout: str, form: str, tmp_p
     count = min(len(found), len(expected))
     np.testing.assert_array_equal(np.asarray(found, np.float32)[:count], expected[:count])
     assert count >= 4
+
+
+@pytest.mark.parametrize("form", ["npz", "parquet", "webdataset"])
+def test_weights_of_test_queries_are_published(form: str, tmp_path: Path) -> None:
+    """Training queries have none: the splits are tables of their own."""
+    flat = Highlights((0.0, 0.0, -1.0, *[0.0] * 52))
+    write_dataset(tmp_path / "data", queries=LAYOUTS["shuffled"] | {"test_highlights": 0.5}, highlights=flat)
+    card = publish(tmp_path / "data", tmp_path / "card", form=form)
+    assert "weight in means over queries" in (card / "README.md").read_text()
+    if form != "npz":
+        assert [c["config_name"] for c in front_matter(card)["configs"]] == ["train", "test"]
+    if form == "parquet":
+        described = (card / "croissant.json").read_text()
+        assert "test/weight" in described
+        assert "train/weight" not in described
 
 
 def test_front_matter_is_that_of_data_hubs(tmp_path: Path) -> None:
