@@ -82,11 +82,16 @@ def next_step(cost: MarginalCost, errors: Mapping[str, Any]) -> NextStep:
     errors : by split
     """
     split = errors[headline(errors)]
-    own = errors["training"]["unexplained"]["value"] if "training" in errors else None
+    training: Mapping[str, Any] = errors["training"]["unexplained"] if "training" in errors else {}
+    own = training.get("value")
     value, error = split["unexplained"]["value"], split["unexplained"]["error"]
     if value is None or error is None or error > _UNCERTAIN * abs(value) or few_decide(split):
         reason = "few test queries decide the error; four times as many, by highlights, tell more"
-        if value is not None and own is not None and own < 0.5 * value:
+        if (
+            value is not None
+            and own is not None
+            and value - own > 2.0 * math.hypot(error or 0, training["error"] or 0)
+        ):
             reason += f"; that of training queries is {own:.2g}: the fit overfits noise"
         return NextStep("test", reason)
     if value >= 1.0 and own is not None and own < 1.0:

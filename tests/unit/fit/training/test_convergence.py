@@ -146,6 +146,12 @@ def test_the_next_step_is_what_pays_most(
     assert next_step(MarginalCost(doubling, share, 4000), errors).kind == kind
 
 
+@pytest.mark.parametrize(("training", "overfits"), [(-0.24, True), (0.2, False)])
+def test_overfitting_is_named_beside_an_uncertain_error(training: float, overfits: bool) -> None:
+    found = next_step(MarginalCost(0.8, 0.9, 4000), fitted(0.28, 0.08, training))
+    assert (found.kind, "overfits" in found.reason) == ("test", overfits)
+
+
 def test_the_next_command_is_complete(tmp_path: Path) -> None:
     """Twice of what was given, four times the test queries, in new folders."""
     queries = {"train": "50/texel", "test": "8192"}
