@@ -28,6 +28,8 @@ _PIECE_PATHS = 1 << 19
 LONG_RUN = 30_000_000
 # Likewise through fibers, which scatter light many times.
 LONG_FIBER_RUN = 1_000_000
+# Time from which a shorter command is named.
+_LONG_SECONDS = 120.0
 
 
 @dataclass(frozen=True)
@@ -129,7 +131,12 @@ def forecast(job: Job, plan: RunPlan | None = None, seconds: float = 2.0) -> For
 
 
 def announce(
-    console: Console, paths: float, seconds: Callable[[], float], size: float, fibers: bool = False
+    console: Console,
+    paths: float,
+    seconds: Callable[[], float],
+    size: float,
+    fibers: bool = False,
+    faster: str = "",
 ) -> None:
     """State the expected time and size of a command, unless no machine needs a minute for it.
 
@@ -139,9 +146,12 @@ def announce(
     seconds : measures its duration; called for many paths only
     size : bytes that it writes
     fibers : whether the paths lead through fibers
+    faster : options of a shorter command, which is named where it takes long
     """
     if paths >= (LONG_FIBER_RUN if fibers else LONG_RUN):
-        console.note(expectation(seconds(), size))
+        expected = seconds()
+        hint = f"; faster: {faster}" if faster and expected > _LONG_SECONDS else ""
+        console.note(f"{expectation(expected, size)}{hint}")
 
 
 def announce_shards(

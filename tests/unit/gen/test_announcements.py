@@ -98,6 +98,14 @@ def test_only_many_paths_are_announced(
     assert capsys.readouterr().err == line
 
 
+@pytest.mark.parametrize(("seconds", "named"), [(119.0, False), (121.0, True)])
+def test_long_commands_name_a_shorter_one(
+    seconds: float, named: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    forecast.announce(CONSOLE, 3e7, lambda: seconds, 1e6, faster="--size 8")
+    assert ("faster: --size 8" in capsys.readouterr().err) == named
+
+
 @pytest.mark.parametrize(("rate", "most"), [(3e4, 1e5), (5e5, 8e5), (5e6, 2e6)])
 def test_the_pilot_of_a_picture_is_short_and_exact(
     monkeypatch: pytest.MonkeyPatch, rate: float, most: float
