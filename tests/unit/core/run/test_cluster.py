@@ -6,7 +6,6 @@ import asyncio
 import json
 import multiprocessing
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -22,13 +21,13 @@ import pytest
 from support import run_tasks
 from support.object_stores import silent_server
 
-from mbtf_core.errors import InputError, PartialError, UsageError
+from mbtf_core.errors import InputError, PartialError
 from mbtf_core.run import cluster as module
 from mbtf_core.run import task
 from mbtf_core.run.cluster import open_runner
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item, packed, run_task
-from mbtf_core.run.workers import ClusterConfig, local_config, read_cluster
+from mbtf_core.run.workers import ClusterConfig
 
 
 @pytest.fixture(scope="module")
@@ -394,61 +393,3 @@ def test_workers_of_this_machine_divide_its_gpus(monkeypatch: pytest.MonkeyPatch
         assert os.environ["CUDA_VISIBLE_DEVICES"] == expected
     # The signal of Ctrl-C is the command's.
     assert handlers == {signal.SIGINT: signal.SIG_IGN}
-
-
-def test_local_workers_share_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("os.sched_getaffinity", lambda pid: set(range(16)), raising=False)
-    assert (local_config().workers, local_config().threads) == (4, 4)
-    config = read_cluster("local:8")
-    assert (config.engine, config.workers, config.threads) == ("local", 8, 2)
-    many = read_cluster("local:64")
-    assert many.threads == 1
-
-
-def test_files_and_addresses(tmp_path: Path) -> None:
-    file = tmp_path / "slurm.yaml"
-    file.write_text(
-        "engine: slurm\nworkers: 16\nthreads: 8\nmemory: 16GB\nwalltime: 2h\noptions: {queue: short}\n"
-    )
-    config = read_cluster(str(file))
-    assert (config.engine, config.workers, config.memory, config.walltime) == ("slurm", 16, 16e9, 7200.0)
-    assert config.options == {"queue": "short"}
-    config = read_cluster("tcp://scheduler:8786")
-    assert (config.address, config.timeout) == ("tcp://scheduler:8786", 30.0)
-    file.write_text("address: tcp://scheduler:8786\ntimeout: 2min\n")
-    config = read_cluster(str(file))
-    assert (config.address, config.timeout) == ("tcp://scheduler:8786", 120.0)
-
-
-@pytest.mark.parametrize(
-    ("text", "word"),
-    [
-        ("address: tcp://a:1\nworkers: 3", "workers cannot go with address"),
-        ("address: scheduler:8786", "tcp://scheduler:8786"),
-        ("memory: 16", "memory"),
-        ("timeout: 0s", "timeout"),
-        ("engine: [slurm", "site.yaml"),
-        ("\x00\x01\xff", "site.yaml"),
-        ("slurm", "site.yaml"),
-    ],
-)
-def test_files_that_are_at_fault(tmp_path: Path, text: str, word: str) -> None:
-    file = tmp_path / "site.yaml"
-    file.write_text(text, "latin-1")
-    with pytest.raises(InputError, match=re.escape(word)):
-        read_cluster(str(file))
-
-
-@pytest.mark.parametrize("target", ["/dev/zero", "/dev/null", "folder", "fifo"])
-def test_files_that_are_none(tmp_path: Path, target: str) -> None:
-    (tmp_path / "folder").mkdir()
-    os.mkfifo(tmp_path / "fifo")
-    (tmp_path / "site.yaml").symlink_to(target)
-    with pytest.raises(InputError, match=r"site\.yaml"):
-        read_cluster(str(tmp_path / "site.yaml"))
-
-
-@pytest.mark.parametrize("where", ["lokal", "local:0", "local:", "local:-1", "http://x", ""])
-def test_other_words_are_refused(where: str) -> None:
-    with pytest.raises(UsageError, match="is no cluster"):
-        read_cluster(where)
