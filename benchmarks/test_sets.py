@@ -49,7 +49,7 @@ def test_set(name: str, folder: Path, share: float, paths: float, spp: int) -> d
     seconds = time.process_time() - began
     test = load_split(Dataset.open(out), "test")
     predicted = Material.load(folder / "fit").predict(test)
-    found = unexplained_variance(predicted, test.value_a, test.value_b, test.weight)
+    found = unexplained_variance(predicted, *test.halves)
     return {**found.as_dict(), "processor_seconds": round(seconds, 1)}
 
 

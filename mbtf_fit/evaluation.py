@@ -70,7 +70,7 @@ def split_errors(
     if len(queries) == 0:
         return None
     exposure = exposure_of(queries) if exposure is None else exposure
-    arrays = predict(queries), queries.value_a, queries.value_b, queries.weight
+    arrays = predict(queries), *queries.halves
     mse = noise_free_mse(*arrays)
     found = {
         **_errors(len(queries), mse, signal_variance(*arrays[1:]), unexplained_variance(*arrays)),

@@ -41,6 +41,7 @@ class Shard:
     image : rows and columns of an image in the image layout, the number of directions in the slices layout;
         empty in the shuffled layout
     estimates : independent estimates of every value: 2, or 1 of measured data
+    weighted : whether its queries have weights, the array ``weight``
     """
 
     folder: DataFolder
@@ -48,6 +49,7 @@ class Shard:
     sidecar: dict[str, Any]
     image: tuple[int, ...] = ()
     estimates: int = 2
+    weighted: bool = False
 
     @property
     def rows(self) -> int:
@@ -258,7 +260,8 @@ class Dataset:
                     ) from None
                 hint = f"check the data set with: mbtf-gen verify {self.folder}"
                 raise InputError(error.what, where=self.folder.at(entry.file), hint=hint) from None
-            out.append(Shard(self.folder, entry.file, record, image, self.estimates))
+            weighted = self.weighted and entry.split == "test"
+            out.append(Shard(self.folder, entry.file, record, image, self.estimates, weighted))
         return out
 
     def geometry(self) -> Geometry | None:

@@ -87,9 +87,6 @@ class QueryDataset(IterableDataset[QueryBatch]):
         self.data, self.batch_size, self.seed = Dataset.open(folder), batch_size, seed
         # Shared with workers, also with those that live for several epochs.
         self._epoch = zeros((), dtype=int64).share_memory_()
-        self._names = needed(self.data.estimates)
-        if split == "test" and self.data.weighted:
-            self._names += ("weight",)
         self._blocks: list[tuple[Shard, int, int]] = []
         self.count = 0
         for shard in self.data.shards(split):
@@ -122,7 +119,7 @@ class QueryDataset(IterableDataset[QueryBatch]):
 
     def _read(self, block: int) -> ShardQueries:
         shard, start, stop = self._blocks[block]
-        mapped = shard.map(self._names)
+        mapped = shard.map(needed(shard.estimates, shard.weighted))
         arrays = {name: np.array(array[start:stop]) for name, array in mapped.items()}
         check_values(arrays, shard.where)
         return ShardQueries.of(arrays).flat()

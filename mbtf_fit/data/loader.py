@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -69,9 +68,9 @@ def open_data(
     return data
 
 
-def read_checked(shard: Shard, more: Sequence[str] = ()) -> ShardQueries:
-    """One shard, every number checked; `more`: further arrays to read."""
-    return ShardQueries.of(shard.read((*needed(shard.estimates), *more)))
+def read_checked(shard: Shard) -> ShardQueries:
+    """One shard, every number checked."""
+    return ShardQueries.of(shard.read(needed(shard.estimates, shard.weighted)))
 
 
 def in_region(held_out: HeldOutSection, omega: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -285,11 +284,10 @@ def load_split(data: Dataset, split: Split, limit: int | None = None) -> ShardQu
     InputError : no such split, no queries in it, NaN or infinity, corrupt shards
     """
     parts: list[ShardQueries] = []
-    weight = ("weight",) if data.weighted and split == "test" else ()
     for shard in ahead(data.shards(split)):
         left = None if limit is None else limit - sum(map(len, parts))
         if left is None or left > 0:
-            parts.append(read_checked(shard, weight).flat().take(slice(left)))
+            parts.append(read_checked(shard).flat().take(slice(left)))
     if not parts or not sum(map(len, parts)):
         raise InputError(f"its {split} split has no queries", where=data.folder)
     return ShardQueries.join(parts)

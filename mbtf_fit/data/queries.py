@@ -17,9 +17,10 @@ NEEDED = ("u", "sigma", "omega_i", "omega_o", "value_a", "value_b")
 QUERY_BYTES, HINT_BYTES = 48, 28
 
 
-def needed(estimates: int) -> tuple[str, ...]:
-    """Arrays of shards with so many estimates of every value."""
-    return NEEDED if estimates == 2 else tuple(name for name in NEEDED if name != "value_b")
+def needed(estimates: int, weighted: bool = False) -> tuple[str, ...]:
+    """Arrays of shards with so many estimates of every value, and with weights or none."""
+    names = NEEDED if estimates == 2 else tuple(name for name in NEEDED if name != "value_b")
+    return (*names, "weight") if weighted else names
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,11 @@ class ShardQueries:
 
     def __len__(self) -> int:
         return len(self.sigma)
+
+    @property
+    def halves(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32] | None]:
+        """Both estimates and the weights, as statistics of :mod:`mbtf_core.stats` take them."""
+        return self.value_a, self.value_b, self.weight
 
     @classmethod
     def of(cls, arrays: Mapping[str, NDArray[np.float32]]) -> ShardQueries:

@@ -141,11 +141,9 @@ def has_transmittance(data: Dataset) -> bool:
     return "transmittance" in data.manifest.get("arrays", {})
 
 
-def _blocks(
-    shard: Shard, chosen: NDArray[np.bool_] | None = None, weighted: bool = False
-) -> Iterator[Arrays]:
+def _blocks(shard: Shard, chosen: NDArray[np.bool_] | None = None) -> Iterator[Arrays]:
     """Blocks of arrays (n, ...) of the chosen rows of a shard, or of all."""
-    trailing = _TRAILING | ({"weight": ()} if weighted else {})
+    trailing = _TRAILING | ({"weight": ()} if shard.weighted else {})
     arrays = shard.map(trailing)
     check_values(arrays, shard.where)
     count = len(arrays["sigma"])
@@ -268,8 +266,7 @@ def evaluate_transmittance(
     queries is left out."""
     sets: dict[str, Iterator[Arrays]] = {}
     if "test" in data.splits:
-        test = data.shards("test")
-        sets["test"] = (b for shard in test for b in _blocks(shard, weighted=data.weighted))
+        sets["test"] = (block for shard in data.shards("test") for block in _blocks(shard))
     sets["held_out"] = (block for shard, chosen in selection.masks() for block in _blocks(shard, ~chosen))
     sets["training"] = (block for shard, chosen in selection.masks() for block in _blocks(shard, chosen))
     found = {name: _error(model, blocks) for name, blocks in sets.items()}

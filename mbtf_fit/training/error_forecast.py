@@ -134,14 +134,14 @@ def forecast_error(loop: TrainingLoop, queries: ShardQueries, step: Estimate, st
         return ErrorForecast(seconds, reason=diverged.message.splitlines()[0])
     finally:
         trainer.config, trainer.queries, trainer.weight_decay = config, data, decay
-    halves = queries.value_a, queries.value_b, queries.weight
-    found = [unexplained_variance(prediction, *halves) for prediction in predictions]
+    found = [unexplained_variance(prediction, *queries.halves) for prediction in predictions]
     shared = float(np.median([e.relative_error for e in found]))
     try:
         curve = LearningCurve(counts, [e.value for e in found], shared=shared)
     except ValueError:
         return ErrorForecast(seconds, reason="the test queries do not resolve the errors of short fits")
-    added = mse_difference(repeated, predictions[-1], *halves).scaled(1.0 / signal_variance(*halves).value)
+    added = mse_difference(repeated, predictions[-1], *queries.halves)
+    added = added.scaled(1.0 / signal_variance(*queries.halves).value)
     excess = replace(added, value=max(0.0, added.value))
     error = curve.error_at(steps)
     asked = None

@@ -78,7 +78,7 @@ def export_fit(
     data = member.data
     of = f" {member.folder.name}"
     trainer.fill_levels(float(level_of_sigma(partition.sample.sigma.max())))
-    if config.training.energy_calibration and trainer.hooks.calibrates:
+    if trainer.calibrates:
         announce(f"calibrating{of}")
     tell = _now_and_then(lambda fraction: announce(f"calibrating{of}: {fraction:.0%}"))
     trainer.calibrate(share["steps"], tell)

@@ -247,12 +247,17 @@ class Trainer:
             for texture, table in zip(self.model.textures(), self._tables(), strict=True):
                 texture.read(table)
 
+    @property
+    def calibrates(self) -> bool:
+        """Whether the model gets calibration factors: it has some, and the configuration asks for them."""
+        return self.config.training.energy_calibration and self.hooks.calibrates
+
     def calibrate(self, steps: int, progress: Callable[[float], None] = lambda fraction: None) -> None:
-        """Fit the calibration factors (:mod:`~mbtf_fit.training.calibration`), if the configuration asks for
-        them and the model has some; with at most half as many evaluations as training took, whose `steps` for
-        this material take about three each. `progress` is called with the fraction that is done."""
+        """Fit the calibration factors (:mod:`~mbtf_fit.training.calibration`), if it :attr:`calibrates`; with
+        at most half as many evaluations as training took, whose `steps` for this material take about three
+        each. `progress` is called with the fraction that is done."""
         model = self.model
-        if not (self.config.training.energy_calibration and self.hooks.calibrates):
+        if not self.calibrates:
             return
         assert isinstance(self.queries, TrainingQueries | StreamedQueries)
         self._read_blurred()

@@ -48,7 +48,7 @@ def finite(number: float | None) -> float | None:
 def errors_by_level(trainer: Trainer, queries: ShardQueries) -> dict[str, float | None]:
     """Unexplained variance by nearest level; None where it is undefined."""
     level = level_groups(queries.sigma, trainer.model.lattice.finest)
-    values = trainer.predict(queries), queries.value_a, queries.value_b, queries.weight
+    values = trainer.predict(queries), *queries.halves
     return {str(s): finite(e.value) for s, e in by_group(unexplained_variance, level, *values).items()}
 
 
@@ -57,8 +57,7 @@ def history_record(trainer: Trainer, subset: ShardQueries) -> dict[str, Any]:
     state = trainer.progress
     found: dict[str, Any] = {}
     if len(subset):
-        values = subset.value_a, subset.value_b, subset.weight
-        found = unexplained_variance(trainer.predict(subset), *values).as_dict()
+        found = unexplained_variance(trainer.predict(subset), *subset.halves).as_dict()
     return {
         "step": state.step,
         "seconds": round(state.seconds, 3),

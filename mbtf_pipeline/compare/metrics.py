@@ -89,7 +89,6 @@ def dataset_errors(materials: Mapping[str, Material], data: Dataset) -> dict[str
     from mbtf_fit.evaluation import split_errors
 
     test = load_split(data, "test")
-    halves = test.value_a, test.value_b, test.weight
     labels = level_groups(test.sigma, data.lattice.finest)
     first: Any = None
     out: dict[str, Any] = {}
@@ -105,9 +104,9 @@ def dataset_errors(materials: Mapping[str, Material], data: Dataset) -> dict[str
         if first is None:
             first = value
         else:
-            levels = by_group(mse_difference, labels, value, first, *halves)
+            levels = by_group(mse_difference, labels, value, first, *test.halves)
             record["mse_minus_first"] = {
-                **mse_difference(value, first, *halves).as_dict(),
+                **mse_difference(value, first, *test.halves).as_dict(),
                 "levels": {str(level): e.as_dict() for level, e in levels.items()},
             }
         out[name] = record
