@@ -7,6 +7,7 @@ import json
 import os
 import platform
 import re
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping
@@ -58,6 +59,28 @@ def timed(act: Callable[[], Any]) -> float:
     start = time.perf_counter()
     act()
     return time.perf_counter() - start
+
+
+def watched(command: list[str], out: Path) -> tuple[float, float, float]:
+    """(peak memory in GiB, seconds to the first shard, seconds in all) of a run that writes shards to `out`.
+
+    Raises
+    ------
+    SystemExit : the run failed
+    """
+    start, first = time.perf_counter(), float("nan")
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as child:
+        while True:
+            done, status, usage = os.wait4(child.pid, os.WNOHANG)
+            if first != first and (out / "train-00000.json").exists():
+                first = time.perf_counter() - start
+            if done:
+                break
+            time.sleep(0.01)
+        child.returncode = os.waitstatus_to_exitcode(status)
+    if child.returncode:
+        raise SystemExit(f"failed: {' '.join(command)}")
+    return usage.ru_maxrss / 2**20, first, time.perf_counter() - start
 
 
 def alternate(ways: Mapping[str, Callable[[int], Any]], rounds: int) -> dict[str, list[float]]:

@@ -34,7 +34,7 @@ from typing import Any
 import numpy as np
 import torch
 from common import finish, parser_of, start, timed
-from rock_cliff_128 import MODELS as TRAINED
+from front import NEUMIP
 from torch import Tensor, nn
 
 from mbtf_core.data.lattice import Lattice, sigma_of_level
@@ -60,7 +60,7 @@ POSITIONS = 1 << 15
 WIDE = "neumip-wide"
 CASES: dict[str, tuple[str, dict[str, Any]]] = {
     **{name: (name, {}) for name in COMPARED},
-    WIDE: ("neumip", TRAINED[WIDE]["network"]),
+    WIDE: ("neumip", NEUMIP["network"]),
 }
 OVER_NEUMIP = {WIDE: 2.0}
 # Moments of training at which a step is timed, as shares of the budget.

@@ -26,9 +26,8 @@ from __future__ import annotations
 import argparse
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -45,7 +44,8 @@ from mbtf_gen.tile.heightfield_tile import HeightFieldTile, Tile
 from mbtf_gen.tile.loading import load_material
 
 if TYPE_CHECKING:
-    from mbtf_gen.tile.heights import HeightGrid
+    from mbtf_gen.render.path_tracer import Transport
+    from mbtf_gen.render.scene import TileScene
 
 MESH = 512
 DEPTH = 6
@@ -82,25 +82,19 @@ def rocky() -> HeightFieldTile:
     )
 
 
-def query_plan(grid: HeightGrid, count: int) -> QueryPlan:
+def query_plan(lattice: Lattice, count: int) -> QueryPlan:
     """Levels log-uniform; the generator's default favors fine ones, which are faster."""
-    lattice = Lattice.for_map(*grid.z.shape)
     return QueryPlan(lattice, LevelMixture(1.0, 0.0), 0.1, "shuffled", 0, count)
 
 
-def generator_run(
-    material: Tile, grid: HeightGrid, count: int, spp: int, tracer: Tracer = "heightfield"
-) -> Run:
+def generator_run(scene: TileScene, lattice: Lattice, transport: Transport, count: int, spp: int) -> Run:
     """A function of the run's number that traces `count` queries."""
     from mbtf_gen.render.estimates import Stream
     from mbtf_gen.render.estimator import Estimator
-    from mbtf_gen.render.path_tracer import Transport
-    from mbtf_gen.render.scene import build_scene
     from mbtf_gen.sampling.light_kernel import LightKernel
 
-    light, transport = LightKernel(LIGHT_WIDTH), Transport(DEPTH, ROULETTE)
-    estimator = Estimator(build_scene(replace(grid, tracer=tracer), material.surface()), light, transport)
-    plan = query_plan(grid, count)
+    estimator = Estimator(scene, LightKernel(LIGHT_WIDTH), transport)
+    plan = query_plan(lattice, count)
 
     def run(number: int) -> tuple[float, float]:
         queries = plan.draw("train", number, count)
@@ -115,48 +109,40 @@ def generator_run(
     return run
 
 
-def mitsuba_run(material: Tile, grid: HeightGrid, count: int, spp: int) -> Run:
-    """The same for ``mi.render`` and a picture of `count` pixels."""
+def mitsuba_run(material: Tile, count: int, spp: int, depth: int, roulette: int) -> Run:
+    """The same for ``mi.render`` and a picture of `count` pixels; `depth` -1 has no limit."""
     import drjit as dr
     import mitsuba as mi
 
     from mbtf_gen.render.scene import unit_of
 
-    unit = unit_of(grid.aspect)
-    columns = max(1, round((count / grid.aspect) ** 0.5))
+    unit = unit_of(material.aspect)
+    columns = max(1, round((count / material.aspect) ** 0.5))
     rows = max(1, count // columns)
-    half = 0.5 * unit
-    folder = TemporaryDirectory()
-    shapes = material.mitsuba_shapes(unit, Path(folder.name), material.surface())  # type: ignore[arg-type]
     # The camera looks down, its picture exactly as wide as the tile; pixels are square.
     above = mi.ScalarTransform4f().look_at(origin=[0, 0, 10 * unit], target=[0, 0, 0], up=[0, 1, 0])
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {
-                "type": "path",
+    size = {"width": columns, "height": rows}
+    with TemporaryDirectory() as folder:
+        scene = mi.load_dict(
+            {
+                "type": "scene",
                 # Stock depth counts the emitter's vertex too.
-                "max_depth": DEPTH + 1,
-                "rr_depth": ROULETTE,
-                "hide_emitters": True,
-            },
-            "sensor": {
-                "type": "orthographic",
-                "to_world": above @ mi.ScalarTransform4f().scale([half, half, 1]),
-                "sampler": {"type": "independent", "sample_count": spp},
-                "film": {
-                    "type": "hdrfilm",
-                    "width": columns,
-                    "height": rows,
-                    "rfilter": {"type": "box"},
-                    "component_format": "float32",
+                "integrator": {
+                    "type": "path",
+                    "max_depth": depth + 1 if depth > 0 else -1,
+                    "rr_depth": roulette,
+                    "hide_emitters": True,
                 },
-            },
-            "light": {"type": "directional", "direction": [-0.5, -0.5, -0.707]},
-            **shapes,
-        }
-    )
-    folder.cleanup()
+                "sensor": {
+                    "type": "orthographic",
+                    "to_world": above @ mi.ScalarTransform4f().scale([0.5 * unit, 0.5 * unit, 1]),
+                    "sampler": {"type": "independent", "sample_count": spp},
+                    "film": {"type": "hdrfilm", "rfilter": {"type": "box"}, **size},
+                },
+                "light": {"type": "directional", "direction": [-0.5, -0.5, -0.707]},
+                **material.mitsuba_shapes(unit, Path(folder), material.surface()),  # type: ignore[arg-type]
+            }
+        )
 
     last: NDArray[np.float64] | None = None
 
@@ -191,50 +177,52 @@ def spread(seconds: list[float], paths: int) -> dict[str, float]:
     }
 
 
-def measure_speed(material: Tile, arguments: argparse.Namespace) -> int:
-    """Paths per second in the three ways."""
-    import drjit as dr
-
-    material = material.at(arguments.height_scale, MESH)
-    grid = material.grid
-    assert grid is not None
-    makers: dict[str, Any] = {
-        "generator": generator_run,
-        "mesh": partial(generator_run, tracer="mesh"),
-        "mitsuba": mitsuba_run,
-    }
-    runs = {name: make(material, grid, arguments.queries, arguments.spp) for name, make in makers.items()}
-    seconds: dict[str, list[float]] = {name: [] for name in runs}
-    variances: dict[str, list[float]] = {name: [] for name in runs}
-    for number in range(arguments.runs + 1):
-        for name, run in runs.items():
+def take_turns(ways: Mapping[str, Run], paths: int, rounds: int) -> dict[str, dict[str, float]]:
+    """Million paths per second of each way, printed; the first round, which compiles, is not counted."""
+    seconds: dict[str, list[float]] = {name: [] for name in ways}
+    variances: dict[str, list[float]] = {name: [] for name in ways}
+    for number in range(rounds + 1):
+        for name, run in ways.items():
             took, variance = run(number)
             if number:
                 seconds[name].append(took)
                 variances[name].append(variance)
-    paths = arguments.queries * arguments.spp
-    figures = {name: spread(took, paths) for name, took in seconds.items()}
-    products = {
-        name: float(f"{statistics.median(seconds[name]) * statistics.mean(variances[name]):.3g}")
-        for name in runs
-    }
-    for name, rates in figures.items():
+    figures = {}
+    for name in ways:
+        figures[name] = rates = spread(seconds[name], paths)
+        product = statistics.median(seconds[name]) * statistics.mean(variances[name])
         print(
-            f"{name:9s} {rates['median']:.2f} M paths/s ({rates['min']:.2f} to {rates['max']:.2f}), "
-            f"relative variance x time {products[name]:.3g} s"
+            f"{name:9s} {rates['median']:.3g} M paths/s ({rates['min']:.3g} to {rates['max']:.3g}), "
+            f"relative variance x time {product:.3g} s"
         )
-    ratio = round(figures["generator"]["median"] / figures["mitsuba"]["median"], 3)
-    cores = dr.thread_count()
-    print(f"generator over mitsuba {ratio:.2f}; {cores} threads, {paths} paths per run")
-    report = {
-        "million_paths_per_second": figures,
-        "generator over mitsuba": ratio,
-        "generator over mesh": round(figures["generator"]["median"] / figures["mesh"]["median"], 3),
-        "relative_variance_times_seconds": products,
-        "threads": cores,
-        "paths_per_run": paths,
-        "material": str(arguments.material or "random heights"),
+    return figures
+
+
+def measure_speed(material: Tile, arguments: argparse.Namespace) -> int:
+    """Paths per second in the three ways."""
+    import drjit as dr
+
+    from mbtf_gen.render.path_tracer import Transport
+    from mbtf_gen.render.scene import build_scene
+
+    material = material.at(arguments.height_scale, MESH)
+    grid, count, spp = material.grid, arguments.queries, arguments.spp
+    assert grid is not None
+
+    def generator(tracer: Tracer) -> Run:
+        scene = build_scene(replace(grid, tracer=tracer), material.surface())
+        return generator_run(scene, Lattice.for_map(*grid.z.shape), Transport(DEPTH, ROULETTE), count, spp)
+
+    ways = {
+        "generator": generator("heightfield"),
+        "mesh": generator("mesh"),
+        "mitsuba": mitsuba_run(material, count, spp, DEPTH, ROULETTE),
     }
+    figures = take_turns(ways, count * spp, arguments.runs)
+    median = {name: rates["median"] for name, rates in figures.items()}
+    ratio, cores = round(median["generator"] / median["mitsuba"], 3), dr.thread_count()
+    print(f"generator over mitsuba {ratio:.2f}; {cores} threads, {count * spp} paths per run")
+    report = {"million_paths_per_second": figures, "generator over mitsuba": ratio, "threads": cores}
     met = ratio >= THRESHOLDS["generator over mitsuba"]
     return finish(report, THRESHOLDS, met if cores == CORES else None)
 
@@ -258,7 +246,7 @@ def measure_steps(material: Tile, arguments: argparse.Namespace) -> int:
         "light found by BSDF sampling": Transport(1, interreflection=False),
         "up to six interactions": Transport(DEPTH),
     }
-    plan = query_plan(grid, arguments.queries)
+    plan = query_plan(Lattice.for_map(*grid.z.shape), arguments.queries)
 
     def traced(transport: Transport) -> Callable[[int], Any]:
         estimator = Estimator(tile, light, transport)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from common import conformance_deviation, timed
 
 from mbtf_core.data.schema import Layout
 from mbtf_core.errors import InputError
@@ -185,18 +185,9 @@ def picture(sizes: Sizes) -> Queries:
     return camera.queries(from_angles(40, 30)).flat()
 
 
-def deviation(found: NDArray[np.float32], wanted: NDArray[np.float32]) -> float:
-    """Largest error of conformance values (n, 3), relative to the larger of value and mean."""
-    return float((np.abs(found - wanted) / np.maximum(wanted, max(float(wanted.mean()), 1e-9))).max())
-
-
-def timed(work: Callable[[], object]) -> dict[str, float]:
+def seconds_of(work: Callable[[], object]) -> dict[str, float]:
     """Seconds of a first run, which compiles, and the least milliseconds of three more."""
-    seconds = []
-    for _ in range(4):
-        start = time.perf_counter()
-        work()
-        seconds.append(time.perf_counter() - start)
+    seconds = [timed(work) for _ in range(4)]
     return {"first_seconds": seconds[0], "milliseconds": 1e3 * min(seconds[1:])}
 
 
@@ -206,13 +197,12 @@ def infer(device: str, sizes: str, folder: str) -> Answers:
 
     material = Material.load(folder, device)
     names = ("u", "sigma", "omega_i", "omega_o")
-    found = material.evaluate(*(material.conformance[name] for name in names))
-    yield {"deviation": deviation(found, material.conformance["rgb"])}
+    yield {"deviation": conformance_deviation(material, material)}
     # Fewer for a model that reads many positions.
     every = slice(None, None, material.model.positions)
     queries = picture(Sizes.read(sizes))
     arrays = [getattr(queries, name)[every] for name in names]
-    yield {"queries": len(arrays[0])} | timed(lambda: material.evaluate(*arrays))
+    yield {"queries": len(arrays[0])} | seconds_of(lambda: material.evaluate(*arrays))
 
 
 def evaluate_plugin(device: str, arithmetic: Any, sizes: str, folder: str) -> Answers:
@@ -228,9 +218,7 @@ def evaluate_plugin(device: str, arithmetic: Any, sizes: str, folder: str) -> An
 
     stored = read_material(folder)
     evaluator = Evaluator(stored, arithmetic)
-    names = ("u", "sigma", "omega_i", "omega_o")
-    found = evaluator.evaluate(*(stored.conformance[name] for name in names))
-    yield {"deviation": deviation(found, stored.conformance["rgb"])}
+    yield {"deviation": conformance_deviation(evaluator, stored)}
     queries = picture(Sizes.read(sizes))
     u, sigma = mi.Point2f(queries.u.T), mi.Float(queries.sigma)
     light, view = mi.Vector3f(queries.omega_i.T), mi.Vector3f(queries.omega_o.T)
@@ -240,7 +228,7 @@ def evaluate_plugin(device: str, arithmetic: Any, sizes: str, folder: str) -> An
         dr.eval(evaluator.value(evaluator.stage1(u, evaluator.level(sigma), view), light))
         dr.sync_thread()
 
-    yield {"queries": len(queries.sigma)} | timed(work)
+    yield {"queries": len(queries.sigma)} | seconds_of(work)
 
 
 def render(device: str, sizes: str, folder: str, out: str) -> Answers:

@@ -19,18 +19,16 @@ The last line is one JSON object.
 from __future__ import annotations
 
 import argparse
-import os
 import resource
 import struct
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 import h5py
 import numpy as np
-from common import finish, parser_of, start, timed
+from common import finish, parser_of, start, timed, watched
 
 from mbtf_gen.measured.hdf5 import CHANNELS, COLOR, LIGHT, PLACE, RADIUS, VIEW
 from mbtf_gen.sampling.query_sampler import direction_pairs, slice_directions
@@ -65,24 +63,11 @@ def make_material(folder: Path, resolution: int) -> None:
 
 def generated(material: Path, resolution: int, queries: int, out: Path) -> tuple[float, float, float]:
     """(peak memory in GiB, seconds to the first shard, seconds in all) of one run."""
-    start = time.perf_counter()
     command = [sys.executable, "-m", "mbtf_gen", str(material), "--queries", str(queries), "-o", str(out)]
     # Light is always scattered, so that no plan leaves the second kernel out.
     command += ["--height-scale", "0.1", "--mesh", str(resolution), "--effects", "all", "--spp", "16"]
     command += ["--set", "queries.test=1024", "--set", f"output.shard_queries={SHARD_QUERIES}"]
-    quiet = os.open(os.devnull, os.O_WRONLY)
-    child = os.posix_spawn(command[0], command, os.environ, file_actions=[(os.POSIX_SPAWN_DUP2, quiet, 1)])
-    os.close(quiet)
-    first, status, used = float("nan"), 0, None
-    while used is None:
-        done, status, usage = os.wait4(child, os.WNOHANG)
-        used = usage if done else None
-        if np.isnan(first) and (out / "train-00000.json").exists():
-            first = time.perf_counter() - start
-        time.sleep(0.01)
-    if status:
-        raise SystemExit(f"the generator failed: {' '.join(command)}")
-    return used.ru_maxrss / 2**20, first, time.perf_counter() - start
+    return watched(command, out)
 
 
 def write_images(path: Path, values: int) -> None:

@@ -1,16 +1,12 @@
 """Time, error and size of the quality presets: complete runs, from height map to report.
 
-    python benchmarks/quality.py --out FOLDER [--only MATERIAL:QUALITY ...] [--store] [--check]
-    python benchmarks/quality.py --table
+    python benchmarks/quality.py --out FOLDER [--only MATERIAL:QUALITY ...]
 
 Runs ``mbtf-pipeline run --quality`` in a process of its own: ``draft`` on six texture sets, ``standard`` on
 three of them, ``high`` on one. ``paper`` needs a GPU and is not run. ``--only`` (repeatable) selects single
 runs, also of assets, such as ``turtle_shell:draft``. FOLDER keeps every finished run, so the same command
-resumes; a run is repeated only if its preset has changed since.
-
-``--store`` writes the runs of FOLDER to ``quality_measured.json`` beside this script. ``--table`` prints that
-file as the Markdown table of the documentation. ``--check`` compares FOLDER with that file: seconds may
-differ by 30 %, errors by a factor of 1.5. The last line is one JSON object.
+resumes; a run is repeated only if its preset has changed since. Each is printed as a row of the
+documentation's table. The last line is one JSON object.
 """
 
 from __future__ import annotations
@@ -23,7 +19,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 from common import HEIGHT_SCALES, finish, is_available, parser_of, source, start
 
@@ -35,10 +31,7 @@ from mbtf_core.units import clock
 from mbtf_fit.config import FitConfig, fitter_options
 from mbtf_gen.config.generator import GENERATOR, RESOLUTION, GeneratorConfig
 from mbtf_pipeline.recipe import COMPARE
-from mbtf_pipeline.stages import machine
 
-STORED = Path(__file__).with_name("quality_measured.json")
-FORMAT, SCHEMA = "mbtf-quality", 2
 # Texture sets of the longer runs.
 LONGER: dict[Quality, tuple[str, ...]] = {
     "standard": ("metal_plate", "rock_cliff", "tree_bark"),
@@ -46,8 +39,6 @@ LONGER: dict[Quality, tuple[str, ...]] = {
 }
 # Seconds of a whole run.
 THRESHOLDS = {"draft": 60.0, "standard": 600.0}
-# Largest factors between a stored figure and a new one.
-CHECK = {"seconds": 1.3, "error": 1.5}
 QUALITIES: tuple[Quality, ...] = get_args(Quality)
 RECIPE = """\
 name: quality
@@ -84,11 +75,16 @@ class MeasuredRun:
     options_hash: str
 
     def __str__(self) -> str:
-        return (
-            f"{self.material:16s} {self.quality:9s} {self.seconds:7.1f} s (generate {self.generate:.1f}, "
-            f"fit {self.fit:.1f})  unexplained {self.unexplained:.3f} ± {self.unexplained_error:.3f}  "
-            f"data {self.data_bytes / 1e6:.0f} MB  material {self.material_bytes / 1e6:.2f} MB"
+        scale = "" if self.height_scale is None else f", height scale {self.height_scale:g}"
+        cells = (
+            f"`{self.quality}`",
+            f"{self.material}{scale}",
+            *(clock(seconds) for seconds in (self.seconds, self.generate, self.fit)),
+            f"{self.unexplained:.3f} ± {self.unexplained_error:.3f}",
+            f"{self.data_bytes / 1e6:.0f} MB",
+            f"{self.material_bytes / 1e6:.2f} MB",
         )
+        return f"| {' | '.join(cells)} |"
 
 
 def options_hash(quality: Quality) -> str:
@@ -187,105 +183,27 @@ def finished(path: Path) -> MeasuredRun | None:
         return None
 
 
-def finished_runs(folder: Path, resolution: int | None) -> list[MeasuredRun]:
-    """All stored runs of a resolution, by default those of the presets, in the order of the table."""
-    found = []
-    for path in folder.glob("*-*.json"):
-        one = finished(path)
-        if one is not None and not path.stem.endswith(f"-{resolution_of(one.quality, resolution)}"):
-            continue
-        if one is None:
-            print(f"{path}: ignored, damaged or measured with other options", file=sys.stderr)
-        else:
-            found.append(one)
-    return sorted(found, key=lambda r: (QUALITIES.index(r.quality), r.material))
-
-
-def store(runs: Sequence[MeasuredRun], resolution: int | None) -> None:
-    """Write the figures beside this script."""
-    data = {
-        "format": FORMAT,
-        "schema": SCHEMA,
-        "command": "python benchmarks/quality.py --out out/quality --store",
-        "date": time.strftime("%Y-%m-%d"),
-        "machine": machine()["system"],
-        "resolution": resolution,
-        "runs": [asdict(r) for r in runs],
-    }
-    STORED.write_text(json.dumps(data, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-
-
-def stored_runs() -> list[MeasuredRun]:
-    """The figures beside this script."""
-    return [MeasuredRun(**row) for row in read_json(STORED)["runs"]]
-
-
-def markdown_table(runs: Sequence[MeasuredRun]) -> str:
-    """The table of the documentation."""
-    head = ("quality", "material", "total", "generate", "fit", "unexplained variance", "data", "weights")
-    rows = [head, ("---",) * len(head)]
-    for r in runs:
-        rows.append(
-            (
-                f"`{r.quality}`",
-                r.material if r.height_scale is None else f"{r.material}, height scale {r.height_scale:g}",
-                clock(r.seconds),
-                clock(r.generate),
-                clock(r.fit),
-                f"{r.unexplained:.3f} ± {r.unexplained_error:.3f}",
-                f"{r.data_bytes / 1e6:.0f} MB",
-                f"{r.material_bytes / 1e6:.2f} MB",
-            )
-        )
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
-
-
-def compare(runs: Sequence[MeasuredRun]) -> list[dict[str, Any]]:
-    """Factors between the stored figures and these."""
-    stored = {(r.material, r.quality): r for r in stored_runs()}
-    out = []
-    for r in runs:
-        other = stored.get((r.material, r.quality))
-        if other is not None:
-            pairs = {"seconds": (r.seconds, other.seconds), "error": (r.unexplained, other.unexplained)}
-            factors = {name: max(a / b, b / a) for name, (a, b) in pairs.items()}
-            out.append({"material": r.material, "quality": r.quality, "factors": factors})
-    return out
-
-
 def main() -> int:
     parser = parser_of(__doc__)
-    parser.add_argument("--out", type=Path, help="folder of the finished runs")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the finished runs")
     parser.add_argument("--only", action="append", help="MATERIAL:QUALITY (repeatable)")
     parser.add_argument("--resolution", type=int, help="texels across; default: the preset's")
-    parser.add_argument("--store", action="store_true", help="write quality_measured.json")
-    parser.add_argument("--table", action="store_true", help="print quality_measured.json as Markdown")
-    parser.add_argument("--check", action="store_true", help="compare with quality_measured.json")
     arguments = parser.parse_args()
-    if arguments.table:
-        print(markdown_table(stored_runs()))
-        return finish({"runs": len(stored_runs())}, {}, None)
-    if arguments.out is None:
-        parser.error("--out is required")
     arguments.out.mkdir(parents=True, exist_ok=True)
+    runs = []
     for name, quality in requested(arguments.only):
         resolution = resolution_of(quality, arguments.resolution)
         path = arguments.out / f"{name}-{quality}-{resolution}.json"
-        if finished(path) is None and is_available(name):
+        found = finished(path)
+        if found is None and is_available(name):
             found = run(name, quality, resolution, arguments.out / ".work")
             write_json(path, asdict(found))
+        if found is not None:
+            runs.append(found)
             print(found, flush=True)
-    runs = finished_runs(arguments.out, arguments.resolution)
     timed = [r for r in runs if r.quality in THRESHOLDS and arguments.resolution is None]
     met = all(r.seconds <= THRESHOLDS[r.quality] for r in timed)
-    figures: dict[str, Any] = {"runs": [asdict(r) for r in runs]}
-    if arguments.check:
-        figures["compared"] = rows = compare(runs)
-        met &= bool(rows)
-        met &= all(f <= CHECK[name] for row in rows for name, f in row["factors"].items())
-    if arguments.store:
-        store(runs, arguments.resolution)
-    return finish(figures, THRESHOLDS | (CHECK if arguments.check else {}), met)
+    return finish({"runs": [asdict(r) for r in runs]}, THRESHOLDS, met)
 
 
 if __name__ == "__main__":

@@ -1,1 +1,0 @@
-"""Makers of small inputs with mutations whose right reading they know."""
