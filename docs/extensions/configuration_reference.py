@@ -1,5 +1,5 @@
 """Tables of the options of a pydantic model, in Markdown: one table for the model's own keys and one for each
-nested section, with key, type, default, range, and the field's description."""
+nested section, with key, values, default, and the field's description."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from pydantic import BaseModel, TypeAdapter
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-_HEADER = ("Key", "Type", "Default", "Range", "Meaning")
+_HEADER = ("key", "values", "default", "meaning")
 # What Markdown would read as more than text.
 _SPECIAL = re.compile(r"[<$*~\[\]]|\b_|_\b")
 _LITERAL = re.compile(r"``(.+?)``|`(.+?)`")
-_SCALARS = {bool: "true or false", int: "whole number", float: "number", str: "text", Any: "any"}
+_SCALARS = {bool: "true/false", int: "integer", float: "number", str: "text", Any: "any"}
 # Powers of two from here on are written as such.
 _LARGE = 1 << 15
-_BOUNDS = (("ge", "≥"), ("gt", ">"), ("le", "≤"), ("lt", "<"))
+_BOUNDS = ("ge", "gt", "le", "lt")
 
 
 @dataclass
@@ -31,9 +31,8 @@ class Row:
     """One option, as the table shows it."""
 
     key: str
-    kind: str
+    values: str
     default: str
-    bounds: str
     meaning: str
 
 
@@ -77,7 +76,7 @@ def _kind(annotation: Any) -> str:
     annotation, _ = _arguments(annotation)
     origin, inner = get_origin(annotation), get_args(annotation)
     if origin is Literal:
-        return " or ".join(f"`{_value(v)}`" for v in inner)
+        return ", ".join(f"`{_value(v)}`" for v in inner)
     if origin in (Union, types.UnionType):
         return " or ".join(_kind(a) for a in inner if a is not type(None))
     if origin in (list, Sequence) or (origin is tuple and inner[-1] is Ellipsis):
@@ -123,28 +122,36 @@ def _default(info: FieldInfo) -> str:
     return "required" if info.is_required() else f"`{_value(_plain_default(info))}`"
 
 
-def _found_bounds(info: FieldInfo) -> list[str]:
-    """The limits of a number, or of the length of a list."""
+def _found_bounds(info: FieldInfo) -> dict[str, Any]:
+    """Limits of a number, as pydantic names them, and the largest ``length`` of a list or text."""
     said, inside = list(info.metadata), info.annotation
     inside, more = _arguments(inside)
     said += more
     if get_origin(inside) in (list, tuple) and len({*get_args(inside)} - {Ellipsis}) == 1:
         said += [FieldInfo.from_annotation(get_args(inside)[0])]
-    out: list[str] = []
+    out: dict[str, Any] = {}
     for limit in said:
         if isinstance(limit, FieldInfo):
-            out += _found_bounds(limit)
-        elif isinstance(limit, annotated_types.MinLen | annotated_types.MaxLen):
-            least = isinstance(limit, annotated_types.MinLen)
-            length = limit.min_length if isinstance(limit, annotated_types.MinLen) else limit.max_length
-            if not (least and length <= 1):
-                out.append(f"length {'≥' if least else '≤'} {length}")
+            out |= _found_bounds(limit)
+        elif isinstance(limit, annotated_types.MaxLen):
+            out["length"] = limit.max_length
         else:
-            for name, sign in _BOUNDS:
-                number = getattr(limit, name, None)
-                if number is not None:
-                    out.append(f"{sign} {_value(number)}")
+            out |= {name: n for name in _BOUNDS if (n := getattr(limit, name, None)) is not None}
     return out
+
+
+def _range(info: FieldInfo) -> str:
+    """Limits as an interval, a comparison, or the largest length."""
+    found = _found_bounds(info)
+    out = [f"length ≤ {found.pop('length')}"] if "length" in found else []
+    limits = {name: _value(number) for name, number in found.items()}
+    if len(limits) == 2:
+        low, high = (limits.get(name, limits.get(other)) for name, other in (("ge", "gt"), ("le", "lt")))
+        out.insert(0, f"{'[' if 'ge' in limits else '('}{low}, {high}{']' if 'le' in limits else ')'}")
+    else:
+        signs = dict(zip(_BOUNDS, "≥>≤<", strict=True))
+        out = [f"{signs[name]} {number}" for name, number in limits.items()] + out
+    return ", ".join(out)
 
 
 def _row(prefix: str, name: str, info: FieldInfo) -> Row:
@@ -152,13 +159,12 @@ def _row(prefix: str, name: str, info: FieldInfo) -> Row:
     # A number that is written with its unit, such as 2min or 4GB.
     if (
         not info.is_required()
-        and kind in ("number", "whole number", "TimeBudget")
+        and kind in ("number", "integer", "TimeBudget")
         and isinstance(_plain_default(info), str)
     ):
         kind = "number with unit"
-    return Row(
-        f"{prefix}{name}", kind, _default(info), ", ".join(_found_bounds(info)), info.description or ""
-    )
+    values = f"{kind} {_range(info)}".rstrip()
+    return Row(f"{prefix}{name}", values, _default(info), info.description or "")
 
 
 def _is_section(info: FieldInfo) -> bool:
@@ -216,8 +222,8 @@ def cell(text: str) -> str:
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A table of cells."""
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join(" ".join(f"| {text}" if text else "|" for text in line) + " |" for line in lines)
+    lines = [" ".join(f"| {text}" if text else "|" for text in line) + " |" for line in (header, *rows)]
+    return "\n".join([lines[0], "|---" * len(header) + "|", *lines[1:]])
 
 
 def configuration(name: str, only: Sequence[str] = (), skip: Sequence[str] = ()) -> str:
@@ -234,9 +240,6 @@ def configuration(name: str, only: Sequence[str] = (), skip: Sequence[str] = ())
         if section.keys:
             parts.append(", ".join(f"**`{key}`**" for key in section.keys))
             parts += [cell(section.text)] if section.text else []
-        rows = [
-            [f"`{row.key}`", *map(cell, (row.kind, row.default, row.bounds, row.meaning))]
-            for row in section.rows
-        ]
+        rows = [[f"`{row.key}`", *map(cell, (row.values, row.default, row.meaning))] for row in section.rows]
         parts.append(table(_HEADER, rows))
     return "\n\n".join(parts)
