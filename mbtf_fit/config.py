@@ -69,8 +69,8 @@ class FitConfig(Settings):
     )
     decoder: Annotated[LocalName | None, Flag("--decoder", "FOLDER")] = Field(
         None,
-        description="folder of a shared network, or of a material, whose network is kept: the fit trains "
-        "textures alone",
+        description="folder of a shared network or of a material, whose network is kept: only textures are "
+        "trained",
     )
     network: NetworkSection = NetworkSection()
     training: TrainingSection = TrainingSection()

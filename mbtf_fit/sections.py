@@ -162,16 +162,16 @@ class TrainingSection(Settings):
         None,
         gt=0,
         le=1,
-        description="unexplained variance to reach: training stops once the validation error, with its "
-        "standard error, is no larger; forecasts state how long that takes",
+        description="unexplained variance at which training stops: validation error plus its standard "
+        "error; forecasts state the time",
     )
     batch: Annotated[int, Flag("--batch")] = Field(1 << 15, ge=1, le=1 << 24, description="queries per step")
     patch_size: int = Field(
         32,
         ge=1,
         le=256,
-        description="image layout: largest width and height of the patches in a batch, in texels; smaller "
-        "patches put more lights and views into a batch, and read a larger margin per texel",
+        description="image layout: largest side of the patches in a batch, in texels; smaller patches show "
+        "more lights and views, at a larger margin per texel",
     )
     losses: tuple[LossTerm, ...] = Field(
         (LossTerm(kind="relative", weight=1.0),),
@@ -184,8 +184,8 @@ class TrainingSection(Settings):
     huber_delta: float | None = Field(
         10.0,
         gt=0,
-        description="Huber threshold: errors beyond this multiple of value and noise count linearly; "
-        "null: no threshold",
+        description="Huber threshold: errors beyond this multiple of value and noise count linearly; null: "
+        "none",
     )
     learning_rate: Annotated[float, Flag("--learning-rate")] = Field(
         3e-2, gt=0, lt=1, description="peak learning rate of the networks (Adam)"
@@ -198,29 +198,28 @@ class TrainingSection(Settings):
         0.0,
         ge=0,
         le=10,
-        description="weight decay (L2) of the texels per step, times the learning rate; multiplied by 2r "
-        "where the noise-to-signal ratio r of the data exceeds 1/2",
+        description="weight decay (L2) of the texels per step, times the learning rate, and 2r where the "
+        "noise-to-signal ratio r exceeds 1/2",
     )
     noise_regularization: float = Field(
         2e5,
         ge=0,
         le=1e9,
-        description="weight decay (L2) of the network weights per step, times the learning rate and "
-        "r min(1, 2r) over the number of queries; r: noise-to-signal ratio of the data; at most 1",
+        description="weight decay (L2) of the networks per step, times the learning rate and r min(1, 2r) "
+        "over the number of queries (r: noise-to-signal ratio), at most 1",
     )
     warmup: int = Field(100, ge=0, description="steps in which the learning rates rise to their peaks")
     materials: tuple[str, ...] = Field(
         (),
-        description="rainer2020: folders of slices of other materials that the network learns, too; relative "
-        "to the working directory",
+        description="rainer2020: folders of other materials' slices that the network also learns",
     )
     own_material: bool = Field(
         True, description="rainer2020: whether the network also learns the material that it encodes"
     )
     shared_decoder: bool = Field(
         False,
-        description="relief and neumip: all data sets of one command share the network, each has textures of "
-        "its own; the budget is that of all together",
+        description="relief and neumip: all data sets of one command share the network and the budget, "
+        "each has its own textures",
     )
     energy_calibration: bool = Field(
         True, description="after training, scale the mean reflectance at each elevation to that of the data"

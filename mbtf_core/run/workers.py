@@ -34,8 +34,8 @@ class ClusterConfig(Settings):
     memory: Size | None = Field(
         None,
         ge=_LEAST_MEMORY,
-        description="memory of a worker; one that exceeds it is restarted; default: an equal share of this "
-        "machine's, or 2 GB per thread of a batch system",
+        description="memory beyond which a worker is restarted; default: an equal share of this machine's, "
+        "2 GB per thread of a batch system",
     )
     gpus: int = Field(0, ge=0, description="GPUs of a worker")
     walltime: Duration = Field(3600.0, gt=0, description="time after which a batch system ends a worker")

@@ -143,8 +143,7 @@ class GeometrySection(Settings):
         MAX_PIXELS,
         ge=1,
         le=1 << 31,
-        description="largest map that is read, in pixels; loading takes about 30 bytes of memory for each, "
-        "60 for 8-bit heights",
+        description="largest map in pixels; each takes about 30 bytes of memory, 60 for 8-bit heights",
     )
     mesh: Annotated[int | None, Flag("--mesh")] = Field(
         None, ge=1, le=8192, description="mesh cells across the tile; default: the map's width, at most 512"
@@ -184,13 +183,12 @@ class QueriesSection(Settings):
         0.0,
         ge=0,
         le=0.95,
-        description="share of the test queries drawn where highlights are, with weights that keep errors "
-        "unbiased; glossy materials need fewer test queries",
+        description="share of test queries drawn where highlights are, with weights that keep errors "
+        "unbiased; glossy materials need fewer",
     )
     allocation: Literal["noise", "uniform"] = Field(
         "noise",
-        description="paths per query: more where a pilot expects more noise, which takes 2.6 million "
-        "training paths, or the same for all",
+        description="paths per query: more where a pilot (2.6 million paths) expects noise, or equal",
     )
     target_error: Annotated[float | None, BeforeValidator(_share), Flag("--target-error", "2%")] = Field(
         None,
@@ -209,20 +207,20 @@ class QueriesSection(Settings):
     min_cos: MinCos = 0.1
     layout: Annotated[Layout, Flag("--layout")] = Field(
         "shuffled",
-        description="shuffled queries; images that share one light, view and footprint each; or slices: "
-        "every texel of the finest level at the same lights and views",
+        description="shuffled queries, images of one light, view and footprint each, or slices: all finest "
+        "texels at the same lights and views",
     )
     slice_directions: SliceDirections = Field(
         "spiral",
-        description="slices layout: a spiral of n lights and n views for n² queries per texel, or the 81 of "
-        "the BTF database Bonn 2003 (6561/texel)",
+        description="slices layout: spirals of n lights and n views for n² queries per texel, or the 81 "
+        "directions of Bonn 2003 (6561/texel)",
     )
     patch_size: Annotated[int | None, Flag("--patch-size")] = Field(
         None,
         ge=1,
         le=256,
-        description="image layout: texels along each side of an image, of the level nearest to its "
-        "footprint; default: one query in every texel of the finest level",
+        description="image layout: texels along each side of an image, at the level of its footprint; "
+        "default: all texels of the finest level",
     )
 
     @property
