@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError
 from mbtf_core.meshes.companions import Companions
-from mbtf_core.meshes.content import F64, MeshContent, MeshShape, Texture
-from mbtf_core.meshes.parts import groups_of, with_colors
+from mbtf_core.meshes.content import F64, MeshContent, MeshShape, Texture, groups_of, with_colors
 from mbtf_core.meshes.ply_elements import Element, Elements, read_elements
 from mbtf_core.meshes.polygons import UNCUT, triangulate
 

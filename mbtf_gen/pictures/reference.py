@@ -60,8 +60,7 @@ def _camera_rays(camera: Camera, estimator: Estimator) -> Any:
     import drjit as dr
     import mitsuba as mi
 
-    from mbtf_gen.render.scene import CLEARANCE
-    from mbtf_gen.render.sensor import ray_through
+    from mbtf_gen.render.scene import CLEARANCE, ray_through
 
     tile = estimator.tile
 

@@ -113,7 +113,7 @@ class SmoothedDirectional(mi.Emitter):
 
     Plugin parameters: ``width`` (RMS angle per axis in degrees, 0 for a delta light), ``direction`` (towards
     the light). In place of it, :meth:`set_directions` sets the lights of a batch of queries; a ray's query is
-    the number that :class:`~mbtf_gen.render.sensor.QuerySensor` stores in its time.
+    the number that :class:`~mbtf_gen.render.scene.QuerySensor` stores in its time.
     """
 
     def __init__(self, props: Properties) -> None:

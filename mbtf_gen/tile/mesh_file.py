@@ -15,8 +15,7 @@ from mbtf_core.data.schema import Tiling
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import data_sha256, file_sha256
 from mbtf_core.meshes.content import MOST_TRIANGLES, MeshShape, Value, joined, numbers_of, of_faces
-from mbtf_core.meshes.read import read_mesh_content
-from mbtf_core.meshes.up_axis import seems_up
+from mbtf_core.meshes.read import read_mesh_content, seems_up
 from mbtf_core.paths import named_file
 from mbtf_gen.config.generator import Positive, Resolution, Rgb, Share, no_tiling
 from mbtf_gen.tile.maps.material_file import LOBES, ROLES

@@ -40,8 +40,7 @@ def traced_offset(estimator: Estimator, u: F32, omega_o: NDArray[np.float64]) ->
     import drjit as dr
     import mitsuba as mi
 
-    from mbtf_gen.render.scene import CLEARANCE
-    from mbtf_gen.render.sensor import ray_through
+    from mbtf_gen.render.scene import CLEARANCE, ray_through
 
     tile = estimator.tile
     towards = mi.Vector3f([float(c) for c in omega_o])

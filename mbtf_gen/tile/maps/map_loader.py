@@ -18,7 +18,7 @@ from mbtf_core.paths import named_file
 from mbtf_gen.tile.maps.checks import refuse_color
 from mbtf_gen.tile.maps.file_names import role_of, tokens
 from mbtf_gen.tile.maps.material_file import ColorEntry, HeightEntry, NormalEntry, ShareEntry
-from mbtf_gen.tile.maps.normal_encoding import height_of, stored_xy
+from mbtf_gen.tile.maps.normal_map import height_of, stored_xy
 
 Color = NDArray[np.floating[Any]]
 Share = NDArray[np.float64] | float | None

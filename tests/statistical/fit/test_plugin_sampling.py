@@ -17,8 +17,7 @@ from support.scenes import mi
 
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.stats import Estimate, t_test
-from mbtf_fit.backends.mitsuba.lobe_fit import fit_lobes
-from mbtf_fit.backends.mitsuba.lobes import LobeTextures, Mixture, SlopeLobe
+from mbtf_fit.backends.mitsuba.lobes import LobeTextures, Mixture, SlopeLobe, fit_lobes
 
 COUNT = 32
 

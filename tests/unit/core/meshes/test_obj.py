@@ -16,7 +16,7 @@ from mbtf_core.errors import InputError
 from mbtf_core.meshes.content import MeshContent, MeshShape, Texture
 from mbtf_core.meshes.obj import read_obj
 from mbtf_core.meshes.polygons import triangulate
-from mbtf_core.meshes.up_axis import seems_up
+from mbtf_core.meshes.read import seems_up
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nvn 0 0 1\n"
 FACES = "f 1/1 2/2 3/3\nf 1/1 3/3 4/4\n"

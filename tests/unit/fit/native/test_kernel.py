@@ -13,10 +13,9 @@ from support.fit_data import make_trainer, parallax, random_queries, train_fully
 from torch import Tensor
 
 from mbtf_core.data.lattice import Lattice
-from mbtf_fit.backends.cpu.blur import Blur
 from mbtf_fit.backends.cpu.gradients import NativeGradients, query_pointers
 from mbtf_fit.backends.cpu.model import NativeModel, supports
-from mbtf_fit.backends.cpu.stepper import adam
+from mbtf_fit.backends.cpu.stepper import Blur, adam
 from mbtf_fit.config import FitConfig, build_model
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.material.inference import evaluate_in_chunks, predict

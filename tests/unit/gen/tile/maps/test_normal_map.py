@@ -13,8 +13,7 @@ from support.paths import ROOT
 from mbtf_core.images.read import gray, read_image
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 from mbtf_gen.tile.loading import load_material
-from mbtf_gen.tile.maps.normal_encoding import stored_xy
-from mbtf_gen.tile.maps.normal_map import SYMMETRIES, NormalFit, fit_normals
+from mbtf_gen.tile.maps.normal_map import SYMMETRIES, NormalFit, fit_normals, stored_xy
 
 # What undoes each symmetry.
 UNDO = {
