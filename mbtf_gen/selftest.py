@@ -150,9 +150,9 @@ class Groove:
         return total
 
 
-def terraces(cells: int = 64) -> HeightGrid:
+def terraces() -> HeightGrid:
     """A periodic height field with terraces, steep flanks and no symmetry."""
-    t = 2.0 * np.pi * np.arange(cells) / cells
+    t = 2.0 * np.pi * np.arange(64) / 64
     x, y = np.meshgrid(t, t)
     h = np.sin(x + 1.3 * np.sin(y)) + 0.6 * np.cos(2 * y - x + 0.4) + 0.3 * np.sin(3 * x + 2 * y)
     h = (h - h.min()) / np.ptp(h)

@@ -276,18 +276,14 @@ def _pairs(
     return slices.flat().take(random.permutation(flat)[:most])
 
 
-def load_split(data: Dataset, split: Split, limit: int | None = None) -> ShardQueries:
-    """Queries of a split, or its first `limit`.
+def load_split(data: Dataset, split: Split) -> ShardQueries:
+    """Queries of a split.
 
     Raises
     ------
     InputError : no such split, no queries in it, NaN or infinity, corrupt shards
     """
-    parts: list[ShardQueries] = []
-    for shard in ahead(data.shards(split)):
-        left = None if limit is None else limit - sum(map(len, parts))
-        if left is None or left > 0:
-            parts.append(read_checked(shard).flat().take(slice(left)))
-    if not parts or not sum(map(len, parts)):
+    parts = [read_checked(shard).flat() for shard in ahead(data.shards(split))]
+    if not sum(map(len, parts)):
         raise InputError(f"its {split} split has no queries", where=data.folder)
     return ShardQueries.join(parts)

@@ -129,10 +129,10 @@ def bound_text(bound: float, error: float | None) -> str:
     return "may exceed 100 %" if upper >= 1.0 else f"< {_percent(upper)}"
 
 
-def _percent(share: float, digits: int = 2) -> str:
-    """A share in percent, rounded to some digits but written out."""
+def _percent(share: float) -> str:
+    """A share in percent, rounded to two digits but written out."""
     percent = 100.0 * share
     if percent <= 0.0:
         return "0 %"
-    places = digits - 1 - math.floor(math.log10(percent))
+    places = 1 - math.floor(math.log10(percent))
     return f"{round(percent, places):.{max(0, places)}f} %"
