@@ -76,8 +76,8 @@ ErrorOption = Annotated[
     Parameter(
         name="--error",
         metavar="FLOAT",
-        help="Unexplained variance to reach: training stops once the validation error, with its standard "
-        "error, is no larger; forecasts state how long that takes.",
+        help="Unexplained variance at which training stops: validation error plus its standard error; "
+        "forecasts state the time.",
     ),
 ]
 
