@@ -5,9 +5,10 @@
 
 A displaced material is a folder with ``height.exr`` (float, heights in tile widths), and mostly
 ``base_color.png`` (sRGB) and ``roughness.png`` (linear), all 256 × 256 and periodic; a ``material.yaml``
-has constants, such as another refractive index than 1.5. The scales are a mesh. Random numbers come from an
-integer hash and every result is rounded to a coarse grid (heights to 2^-14 tile widths, colors to 8 bits), so
-that neither the version of a library nor the last bit of a sine shows in the files. Row 0 of every image is the side v → 1.
+has constants, such as another refractive index than 1.5. The scales are a mesh. Random numbers come from
+an integer hash and every result is rounded to a coarse grid (heights to 2^-14 tile widths, colors to 8 bits),
+so that neither the version of a library nor the last bit of a sine shows in the files. Row 0 of every image
+is the side v → 1.
 """
 
 from __future__ import annotations
