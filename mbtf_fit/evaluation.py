@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.folder import DataFolder
 from mbtf_core.directions import ELEVATION_BANDS
 from mbtf_core.errors import InputError
+from mbtf_core.paths import opened
 from mbtf_core.stats import (
     Estimate,
     by_group,
@@ -186,3 +188,52 @@ def evaluate(material: Material, shards: str | Path | DataFolder) -> dict[str, d
         through = evaluate_transmittance(material.transmittance, data, partition.selection)
         found["transmittance"] = {split: errors.as_dict() for split, errors in through.items()}
     return found
+
+
+def score_predictions(file: str | Path, shards: str | Path | DataFolder) -> dict[str, dict[str, Any]]:
+    """Errors of predictions that any code made for the test queries of a data set.
+
+    Parameters
+    ----------
+    file : str or Path
+        npz file with the array ``value``: predicted values in 1/sr of all test queries, the shards' arrays
+        one after the other, (n, 3) or with the axes of images.
+    shards : str or Path
+        Folder made by ``mbtf-gen``.
+
+    Returns
+    -------
+    dict
+        As of :func:`evaluate`, with the errors of ``test`` alone.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or its values are not as many as the test queries, or not finite; the data
+        set has no test queries.
+    """
+    data = Dataset.open(shards)
+    queries = load_split(data, "test")
+    value = _read_values(Path(file))
+    if value.ndim < 2 or value.shape[-1] != 3 or value.size != 3 * len(queries):
+        raise InputError(
+            f"'value' has the shape {value.shape}; the data set has {len(queries)} test queries of 3 numbers",
+            where=file,
+            hint="predict the queries of all test shards, in their order",
+        )
+    bad = np.flatnonzero(~np.isfinite(value.reshape(-1, 3)).all(axis=1))
+    if len(bad):
+        raise InputError(
+            f"'value' is NaN or infinite at {len(bad)} queries, first at query {bad[0]}", where=file
+        )
+    errors = split_errors(lambda _: value.reshape(-1, 3), queries, data)
+    assert errors is not None
+    return {"errors": {"test": errors}}
+
+
+def _read_values(file: Path) -> F32:
+    try:
+        with opened(file) as stream, np.load(stream) as arrays:
+            return np.asarray(arrays["value"], np.float32)
+    except (EOFError, ValueError, TypeError, AttributeError, KeyError, BadZipFile) as error:
+        raise InputError("is no npz file with the array 'value'", where=file) from error

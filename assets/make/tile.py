@@ -23,12 +23,14 @@ class Material:
     base_color : (H, W, 3) in sRGB, [0, 1]
     roughness : (H, W) in [0, 1]
     index : refractive index of the substance; None leaves it at the 1.5 of the customary constant
+    constants : lines of ``material.yaml`` below those of the maps
     """
 
     height: Field
-    base_color: Field
-    roughness: Field
+    base_color: Field | None = None
+    roughness: Field | None = None
     index: float | None = None
+    constants: tuple[str, ...] = ()
 
 
 def specular(index: float) -> float:
@@ -47,14 +49,16 @@ def write(material: Material, folder: Path) -> None:
     height = np.round((material.height - material.height.max()) / QUANTUM) * QUANTUM + 0.0
     header = {"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage}
     OpenEXR.File(header, {"Y": height.astype(np.float32)}).write(str(folder / "height.exr"))
-    for name, image in (("base_color", material.base_color), ("roughness", material.roughness)):
+    maps = {"base_color": material.base_color, "roughness": material.roughness}
+    for name, image in maps.items():
+        if image is None:
+            continue
         codes = np.round(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
         Image.fromarray(codes).save(folder / f"{name}.png", optimize=True)
+    constants = list(material.constants)
     if material.index is not None:
-        lines = [
-            "height: height.exr",
-            "base_color: base_color.png",
-            "roughness: roughness.png",
-            f"specular: {specular(material.index):.2f} # refractive index {material.index:g}",
-        ]
-        (folder / "material.yaml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        constants += [f"specular: {specular(material.index):.2f} # refractive index {material.index:g}"]
+    if constants:
+        lines = [f"{name}: {name}.png" for name, image in maps.items() if image is not None]
+        text = "\n".join(["height: height.exr", *lines, *constants, ""])
+        (folder / "material.yaml").write_text(text, encoding="utf-8")

@@ -12,7 +12,7 @@ from mbtf_fit.formatting import report_errors
 def evaluate(
     material: Path, shards: Path, /, *, verbose: Verbose = False, console: Console = CONSOLE
 ) -> None:
-    """Measure the errors of a material on a data set, without the noise of the data.
+    """Measure the errors of a material, or of other code's predictions, without the noise of the data.
 
     Measured data have one value per query: errors on them include their noise, and say so.
 
@@ -22,16 +22,23 @@ def evaluate(
     Parameters
     ----------
     material
-        Folder made by mbtf-fit.
+        Folder made by mbtf-fit; or an npz file with the array 'value' (n, 3): predictions, by any code, for
+        the test queries in the order of the shards.
     shards
         Folder made by mbtf-gen, or its URL.
     """
     from mbtf_core.data.dataset import Dataset
     from mbtf_core.data.folder import DataFolder
-    from mbtf_fit.evaluation import evaluate, foreign_inputs
+    from mbtf_fit.evaluation import evaluate, foreign_inputs, score_predictions
     from mbtf_fit.material.material import Material
 
-    loaded, folder = Material.load(material), DataFolder.open(shards)
+    folder = DataFolder.open(shards)
+    if material.suffix == ".npz":
+        found = score_predictions(material, folder)
+        lines = [f"{material}: predictions on {folder}", *report_errors(found["errors"], None, verbose)]
+        console.report({"predictions": material, "shards": shards, **found}, "\n".join(lines))
+        return
+    loaded = Material.load(material)
     foreign = foreign_inputs(loaded, Dataset.open(folder))
     if foreign:
         console.note(

@@ -14,6 +14,7 @@ from mbtf_core.units import clock
 from mbtf_pipeline.collection.check_tables import independence, offsets, timing, weights
 from mbtf_pipeline.collection.error_tables import ablations, levels, methods, zooms
 from mbtf_pipeline.collection.finished_run import FinishedRun, each_fit
+from mbtf_pipeline.collection.ranking import ranking
 from mbtf_pipeline.collection.recipes import Published
 from mbtf_pipeline.compare import unmodified_mitsuba
 from mbtf_pipeline.compare.metrics import DEFINITIONS
@@ -30,7 +31,10 @@ RUNS, TABLES = "runs", "tables"
 _SIZE = 160
 # States of a material in the order of the page, and their text.
 _STATES = {"done": "done", "failed": "failed", "pending": "not run yet"}
-_TABLES = {f.__name__: f for f in (methods, levels, weights, ablations, timing, offsets, zooms, independence)}
+_TABLES = {
+    f.__name__: f
+    for f in (methods, levels, weights, ablations, timing, offsets, zooms, independence, ranking)
+}
 
 
 def write_page(folder: Path, record: Mapping[str, Any]) -> tuple[Path, list[Path]]:

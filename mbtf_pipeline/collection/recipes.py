@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self, TypeVar
@@ -19,7 +20,11 @@ from mbtf_pipeline.collection.materials import find_materials, name_materials
 from mbtf_pipeline.compare.perceptual_metrics import weights_file
 from mbtf_pipeline.recipe import Name, Recipe, load_recipe
 
-TableName = Literal["methods", "levels", "weights", "ablations", "timing", "offsets", "zooms", "independence"]
+TableName = Literal[
+    "methods", "levels", "weights", "ablations", "timing", "offsets", "zooms", "independence", "ranking"
+]
+# The name of a fit that is repeated: what is trained, and the seed.
+_SEEDED = re.compile(r"(.+)-seed([0-9]+)")
 
 
 class Layer(Settings):
@@ -29,6 +34,8 @@ class Layer(Settings):
     each_fit: dict[str, Any] = Field({}, description="of every fit; its own options override them")
     fit: dict[Name, dict[str, Any] | None] = Field({}, description="name → options of a fit")
     compare: dict[str, Any] = Field({}, description="of the comparison")
+    without: list[Name] = Field([], description="fits that are left out, for example of a material")
+    seeds: list[int] | None = Field(None, description="repeats each fit with each seed; default: its own")
 
 
 def _layer(data: Any) -> Any:
@@ -78,6 +85,12 @@ def first_known(
     """A number from the first source that has it, and the source; (None, None) if none has."""
     found = ((get(one), one.source) for one in published)
     return next((one for one in found if one[0] is not None), (None, None))
+
+
+def seedless(fit: str) -> str:
+    """The name of a fit without its seed."""
+    found = _SEEDED.fullmatch(fit)
+    return found[1] if found else fit
 
 
 class Planned(NamedTuple):
@@ -199,12 +212,25 @@ class Collection(Settings):
     def _compose(self, layers: Sequence[Layer], quick: bool, name: str, path: Path, file: Path) -> Recipe:
         """The recipe of one run: the options of all runs, overridden by the layers."""
         data: dict[str, Any] = {}
+        seeds: list[int] = []
         for layer in (self.base, *([self.quick] if quick else []), *layers):
-            data = deep_merge(data, layer.model_dump(mode="json"))
+            data = deep_merge(data, layer.model_dump(mode="json", exclude={"seeds", "without"}))
+            seeds = seeds if layer.seeds is None else layer.seeds
         each, fits = data.pop("each_fit"), data["fit"] or {_model_for(path): None}
-        data["fit"] = {fit: deep_merge(each, {"model": fit, **(own or {})}) for fit, own in fits.items()}
+        left_out = {fit for layer in (self.base, *layers) for fit in layer.without}
+        data["fit"] = {
+            fit: deep_merge(each, {"model": fit, **(own or {})})
+            for fit, own in fits.items()
+            if fit not in left_out
+        }
+        if seeds:
+            data["fit"] = {
+                f"{fit}-seed{seed}": {**options, "seed": seed}
+                for seed in seeds
+                for fit, options in data["fit"].items()
+            }
         if self.training is not None:
-            time = {"time": round(self.training / len(fits), 3), "steps": None}
+            time = {"time": round(self.training / len(data["fit"]), 3), "steps": None}
             data["fit"] = {
                 fit: deep_merge(options, {"training": time}) for fit, options in data["fit"].items()
             }

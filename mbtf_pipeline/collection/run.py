@@ -18,7 +18,7 @@ from mbtf_core.files.folders import OutputKind, owned
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item
 from mbtf_pipeline.collection.pages import RUNS, write_page
-from mbtf_pipeline.collection.recipes import Collection, PaperRecipe, Planned
+from mbtf_pipeline.collection.recipes import Collection, PaperRecipe, Planned, seedless
 from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.run import generate_data, run_recipe, slices_folder
 from mbtf_pipeline.stages import COMPARE, machine
@@ -150,9 +150,9 @@ def _learning(one: Planned, planned: Sequence[Planned], recipe: Collection, fold
     """The recipe of a run, some fits of which also learn from the slices of all other materials."""
     others = [p for p in planned if p.material != one.material and p.variant == one.variant]
     fits = dict(one.recipe.fit)
-    for name in fits.keys() & set(recipe.learn_from_others):
+    for name in fits:
         training = fits[name].training
-        if training.materials:
+        if seedless(name) not in recipe.learn_from_others or training.materials:
             continue
         if not (others or training.own_material):
             raise InputError(

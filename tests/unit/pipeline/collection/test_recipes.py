@@ -15,7 +15,7 @@ from mbtf_pipeline.collection.run import run_collection
 from mbtf_pipeline.recipe import Recipe
 
 BASE = "base: {generate: {queries: {train: 10/texel}}}\n"
-SHIPPED = sorted((ROOT / "pipelines").glob("paper_*.yaml"))
+SHIPPED = sorted([*(ROOT / "pipelines").glob("paper_*.yaml"), ROOT / "pipelines" / "benchmark.yaml"])
 TEXT = """\
 name: small
 tables: [methods]
@@ -221,6 +221,22 @@ def test_a_fit_of_other_materials_needs_some(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
+def test_fits_are_repeated_with_seeds_or_left_out(tmp_path: Path) -> None:
+    material(tmp_path / "maps")
+    text = TEXT.replace("  fit:\n", "  seeds: [3, 5]\n  fit:\n").replace("quick:\n", "quick:\n  seeds: [7]\n")
+    text = text.replace("  here: maps/height.npy", "  here: {generate: {material: maps}, without: [wide]}")
+    (tmp_path / "small.yaml").write_text(text)
+    full, quick = (planned(tmp_path / "small.yaml", size)[0] for size in (False, True))
+    wanted = [f"{name}-seed{seed}" for seed in (3, 5) for name in ("neumip-baseline", "wide")]
+    assert list(full["steep"].fit) == wanted
+    assert [fit.seed for fit in full["steep"].fit.values()] == [3, 3, 5, 5]
+    assert {fit.model for name, fit in full["steep"].fit.items() if "wide" in name} == {"neumip"}
+    assert full["steep"].fit["wide-seed5"].training.batch == 32
+    assert list(full["here"].fit) == ["neumip-baseline-seed3", "neumip-baseline-seed5"]
+    assert list(quick["here"].fit) == ["neumip-baseline-seed7"]
+    assert [recipes.seedless(name) for name in wanted[:2]] == ["neumip-baseline", "wide"]
+
+
 @pytest.mark.parametrize("path", SHIPPED, ids=[p.stem for p in SHIPPED])
 def test_shipped_recipes_are_valid_and_quick_is_smaller(path: Path) -> None:
     full, missing = planned(path)
@@ -233,7 +249,7 @@ def test_shipped_recipes_are_valid_and_quick_is_smaller(path: Path) -> None:
         assert small.compare.spp <= large.compare.spp
         assert int(small.generate.queries.test) <= int(large.generate.queries.test)
         assert (small.generate.queries.resolution or 99) < (large.generate.queries.resolution or 0)
-        assert small.fit.keys() == large.fit.keys()
+        assert set(map(recipes.seedless, small.fit)) == set(map(recipes.seedless, large.fit))
 
 
 def test_the_shipped_library_has_its_assets() -> None:

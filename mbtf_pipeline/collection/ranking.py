@@ -1,0 +1,179 @@
+"""Tables of a benchmark: methods ranked over materials and seeds, and predictions of foreign code among them.
+
+A method's error on a material is the mean over its seeds. Its standard error has two parts: the spread over
+the seeds, and the noise of the test queries, which all seeds share.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean, stdev
+from typing import Any
+
+from mbtf_core.errors import MbtfError
+from mbtf_core.stats import Estimate
+from mbtf_pipeline.collection.finished_run import MATERIAL, METHOD, FinishedRun, ratio_of
+from mbtf_pipeline.collection.recipes import Published, seedless
+from mbtf_pipeline.stages import SHARDS
+from mbtf_pipeline.tables import Cell, Column, Table, estimate, rows_of
+
+# Beside the runs: SUBMISSIONS/METHOD/MATERIAL.npz with predictions of foreign code.
+SUBMISSIONS = "submissions"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A method on a material.
+
+    Attributes
+    ----------
+    run : the run of the material
+    method : name of the fit without its seed, or of the submission
+    errors : errors of the test queries, one record per seed
+    records : records of the fits; none of a submission
+    problem : why a submission has no errors
+    """
+
+    run: FinishedRun
+    method: str
+    errors: Sequence[Any]
+    records: Sequence[Any] = ()
+    problem: str = ""
+
+    def error(self, *keys: str) -> Estimate | None:
+        """``unexplained`` variance of the test queries, or of a group of them: mean over the seeds."""
+        found = [estimate(_inside(errors, *keys)["unexplained"]) for errors in self.errors]
+        if not found or not all(math.isfinite(e.value) for e in found):
+            return None
+        seeds = stdev(e.value for e in found) / math.sqrt(len(found)) if len(found) > 1 else 0.0
+        noise = fmean(e.error for e in found)
+        return Estimate(fmean(e.value for e in found), math.hypot(seeds, noise), found[0].n)
+
+    def mean(self, key: str) -> float | None:
+        """Mean over the seeds of a number of the fits' records."""
+        return fmean(record[key] for record in self.records) if self.records else None
+
+    def kib(self) -> float | None:
+        """Size of weights and textures in float32."""
+        sizes = self.mean("network_weights"), self.mean("texels")
+        return None if sizes[0] is None or sizes[1] is None else (sizes[0] + sizes[1]) / 256
+
+    def flip(self) -> float | None:
+        """Mean LDR-FLIP of the pictures, over the seeds."""
+        fits = [fit for fit in self.run.fits if seedless(fit) == self.method] if self.records else []
+        values = [p["fits"][fit]["flip"]["ldr"] for p in self.run.pictures for fit in fits]
+        return fmean(values) if values else None
+
+    def milliseconds(self) -> float | None:
+        """Time of one evaluation of 1080p on the CPU, where it was measured."""
+        timing = self.run.comparison.get("timing", {})
+        found = [
+            record["evaluate_ms"]
+            for fit, records in timing.items()
+            if seedless(fit) == self.method
+            for record in records
+            if record["device"] == "cpu"
+        ]
+        return fmean(found) if found else None
+
+
+def _inside(errors: Any, *keys: str) -> Any:
+    for key in keys:
+        errors = errors[key]
+    return errors
+
+
+def entries(runs: Sequence[FinishedRun]) -> Iterator[Entry]:
+    """All methods on all materials, submissions last."""
+    for run in runs:
+        for method in dict.fromkeys(map(seedless, run.fits)):
+            records = [run.fit(fit) for fit in run.fits if seedless(fit) == method]
+            yield Entry(run, method, [record["splits"]["test"] for record in records], records)
+        for file in sorted((run.folder.parent.parent / SUBMISSIONS).glob(f"*/{run.material}.npz")):
+            yield _submission(run, file)
+
+
+def _submission(run: FinishedRun, file: Path) -> Entry:
+    from mbtf_fit.evaluation import score_predictions
+
+    try:
+        errors = score_predictions(file, run.folder / SHARDS)["errors"]["test"]
+    except MbtfError as error:
+        return Entry(run, file.parent.name, [], problem=error.message)
+    return Entry(run, file.parent.name, [errors])
+
+
+def _lowest(entry: Entry) -> Estimate | None:
+    """Error of the queries whose light or view is in the lowest band of elevations."""
+    bands = entry.errors[0]["elevations"] if entry.errors else {}
+    return (
+        entry.error("elevations", min(bands, key=lambda band: float(band.split("-")[0]))) if bands else None
+    )
+
+
+def _error_cell(entry: Entry) -> Cell:
+    return entry.problem or entry.error()
+
+
+_COLUMNS = (
+    Column(MATERIAL.title, MATERIAL.key, lambda entry, _: entry.run.title),
+    Column(METHOD.title, METHOD.key, lambda entry, _: entry.method),
+    Column("seeds", "seeds", lambda entry, _: len(entry.records) or None),
+    Column("unexplained variance", "unexplained", lambda entry, _: _error_cell(entry)),
+    Column("relative to the first", "ratio", lambda entry, first: _ratio(entry, first)),
+    Column("grazing", "grazing", lambda entry, _: _lowest(entry)),
+    Column("LDR-FLIP", "flip_ldr", lambda entry, _: entry.flip()),
+    Column("float32 [KiB]", "kib", lambda entry, _: entry.kib(), digits=",.0f"),
+    Column("training [s]", "training_seconds", lambda entry, _: entry.mean("training_seconds"), digits=".0f"),
+    Column("1080p [ms]", "evaluate_ms", lambda entry, _: entry.milliseconds(), digits=",.0f"),
+)
+
+
+def _ratio(entry: Entry, first: Entry) -> Estimate | None:
+    """Error relative to that of the material's first method."""
+    if entry.method == first.method:
+        return Estimate(1.0, 0.0, first.errors[0]["n"])
+    upper, lower = entry.error(), first.error()
+    return None if upper is None or lower is None else ratio_of(upper, lower)
+
+
+def ranking(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[Table]:
+    """Methods by the geometric mean of their errors, and every method on every material."""
+    found = list(entries(runs))
+    firsts = {entry.run.material: entry for entry in reversed(found)}
+    pairs = [(entry, firsts[entry.run.material]) for entry in found]
+    rows: list[list[Cell]] = []
+    for method in dict.fromkeys(entry.method for entry in found):
+        own = [(entry, first) for entry, first in pairs if entry.method == method]
+        errors = [entry.error() for entry, _ in own]
+        worst = max((e.value for e in errors if e is not None), default=None)
+        seconds = [s for entry, _ in own if (s := entry.mean("training_seconds")) is not None]
+        ratio = _geometric([_ratio(entry, first) for entry, first in own])
+        rows.append([method, len(own), ratio, _geometric(errors), worst, fmean(seconds) if seconds else None])
+    columns = [
+        METHOD,
+        Column("materials", "materials"),
+        Column("error relative to the first method", "ratio"),
+        Column("unexplained variance", "unexplained"),
+        Column("largest", "largest"),
+        Column("training [s]", "training_seconds", digits=".0f"),
+    ]
+    # The best first; those without a number last.
+    rows.sort(key=lambda row: row[2].value if isinstance(row[2], Estimate) else math.inf)
+    return [
+        Table("ranking", "Ranking", columns, rows),
+        Table("by_material", "Errors by material", _COLUMNS, rows_of(_COLUMNS, pairs)),
+    ]
+
+
+def _geometric(found: Sequence[Estimate | None]) -> Estimate | None:
+    """Geometric mean of independent estimates; None unless all are positive numbers."""
+    known = [e for e in found if e is not None and math.isfinite(e.value) and e.value > 0]
+    if len(known) < len(found) or not known:
+        return None
+    mean = math.exp(fmean(math.log(e.value) for e in known))
+    error = mean * math.sqrt(sum((e.error / e.value) ** 2 for e in known)) / len(known)
+    return Estimate(mean, error, len(known))

@@ -1,0 +1,68 @@
+"""Errors of predictions that foreign code made for the test queries."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.fit_data import parallax, write_data
+
+from mbtf_core.app.console import run
+from mbtf_core.errors import InputError
+from mbtf_fit.cli.app import app
+from mbtf_fit.evaluation import score_predictions
+
+NOISE, OFFSET = 0.02, 0.01
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_data(tmp_path_factory.mktemp("foreign"), parallax, train=100, test=1500, noise=NOISE)
+
+
+def exact(shards: Path) -> np.ndarray:
+    with np.load(shards / "test-00000.npz") as arrays:
+        return parallax(*(arrays[name] for name in ("u", "sigma", "omega_i", "omega_o")))
+
+
+def test_the_error_is_that_of_the_prediction_alone(shards: Path, tmp_path: Path) -> None:
+    """A known offset; the noise of the data is twice as large and must not count."""
+    value = exact(shards)
+    np.savez(tmp_path / "mine.npz", value=value + OFFSET)
+    errors = score_predictions(tmp_path / "mine.npz", shards)["errors"]["test"]
+    assert errors["n"] == 1500
+    assert abs(errors["mse"]["value"] - OFFSET**2) < 4 * errors["mse"]["error"] < OFFSET**2
+    assert math.isclose(errors["unexplained"]["value"], OFFSET**2 / value.var(0).mean(), rel_tol=0.3)
+
+
+def test_the_command_takes_predictions_for_a_material(
+    shards: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    np.savez(tmp_path / "mine.npz", value=exact(shards) + OFFSET)
+    assert run(app, ["evaluate", str(tmp_path / "mine.npz"), str(shards)]) == 0
+    assert "1500 test queries" in capsys.readouterr().out
+
+
+def test_what_cannot_be_scored_is_refused(shards: Path, tmp_path: Path) -> None:
+    file = tmp_path / "mine.npz"
+    with pytest.raises(InputError, match="no such file"):
+        score_predictions(file, shards)
+    for text in (b"", b"text", b"PK\x03\x04"):
+        file.write_bytes(text)
+        with pytest.raises(InputError, match="no npz file"):
+            score_predictions(file, shards)
+    for arrays in ({"values": np.zeros((1500, 3))}, {"value": np.array(["a"])}):
+        np.savez(file, **arrays)
+        with pytest.raises(InputError, match="no npz file"):
+            score_predictions(file, shards)
+    for shape in ((), (4500,), (1499, 3), (3, 1500)):
+        np.savez(file, value=np.zeros(shape))
+        with pytest.raises(InputError, match=r"shape .* 1500 test queries"):
+            score_predictions(file, shards)
+    value = exact(shards)
+    value[[7, 9], 1] = math.nan, math.inf
+    np.savez(file, value=value)
+    with pytest.raises(InputError, match="at 2 queries, first at query 7"):
+        score_predictions(file, shards)
