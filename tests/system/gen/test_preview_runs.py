@@ -62,13 +62,8 @@ def batch(work: Path) -> dict[str, Done]:
     lines = {
         "tilted": f"preview maps -o tilted --tiles 1 {FAST} --json",
         "side": f"preview maps -o side --tiles 1 --view 50,30 --light 70,0 {FAST} --json",
-        "flat": f"preview flat.npy -o flat {FAST}",
-        "again": f"preview maps -o tilted --tiles 1 {FAST} --json",
-        "changed": f"preview maps -o tilted --tiles 2 {FAST}",
         "darker": f"preview flat.npy -o darker {FAST} --json",
         "darker again": f"preview flat.npy -o darker --exposure -0.5 {FAST} --json",
-        "replaced": f"preview flat.npy -o flat --tiles 1 --overwrite {FAST} --json",
-        "data": "preview data -o data-pictures --size 64 --spp 2 --json",
         "lonely": "preview lonely -o lonely-pictures --json",
         "settled": "preview data -o nowhere --min-cos 0.2",
     }
@@ -118,17 +113,6 @@ def test_colors_lie_in_the_quadrants_of_the_map(batch: dict[str, Done], work: Pa
 
 
 @pytest.mark.usefixtures("drawing")
-def test_the_same_command_keeps_and_another_is_refused(batch: dict[str, Done], work: Path) -> None:
-    assert [p["kept"] for p in batch["tilted"].result()["pictures"]] == [False] * 3
-    assert [p["kept"] for p in batch["again"].result()["pictures"]] == [True] * 3
-    assert batch["changed"].code == 3
-    assert "preview.tiles: 1 -> 2" in batch["changed"].err
-    assert "tiles: 1" in (work / "tilted/config.yaml").read_text()
-    assert [p["kept"] for p in batch["replaced"].result()["pictures"]] == [False] * 3
-    assert "tiles: 1" in (work / "flat/config.yaml").read_text()
-
-
-@pytest.mark.usefixtures("drawing")
 def test_another_exposure_shows_the_same_values(batch: dict[str, Done], work: Path) -> None:
     """A flat gray tile of albedo 1/2: the automatic exposure shows it as 0.8 of white, 2^EV / (2 π)."""
     mesh, beauty, _ = batch["darker"].result()["pictures"]
@@ -139,13 +123,6 @@ def test_another_exposure_shows_the_same_values(batch: dict[str, Done], work: Pa
     shown = srgb_to_linear(pixels(work / "darker/beauty.png")).mean()
     assert shown == pytest.approx(2**-0.5 / (2 * np.pi), rel=0.03)
     assert "exposure: -0.5" in (work / "darker/config.yaml").read_text()
-
-
-@pytest.mark.usefixtures("drawing")
-def test_plots_of_a_data_set_are_of_its_stored_queries(batch: dict[str, Done], work: Path) -> None:
-    pictures = {Path(p["file"]).stem: p for p in batch["data"].result()["pictures"]}
-    assert list(pictures) == ["mesh", "beauty", "queries"]
-    assert "5000 of 5000 training queries stored in data" in pictures["queries"]["shows"]
 
 
 def test_a_data_set_is_shown_as_it_is(batch: dict[str, Done], work: Path) -> None:

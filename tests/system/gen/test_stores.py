@@ -173,14 +173,7 @@ def test_a_store_that_is_gone(tmp_path: Path, proxy: Proxy, monkeypatch: pytest.
     assert not list((tmp_path / "cache/mbtf/stores/waiting").glob("*/*"))
 
 
-@pytest.mark.parametrize(
-    "at",
-    [
-        "geometry.exr",
-        "train-00001.json",
-        *(pytest.param(name, marks=pytest.mark.slow) for name in ("manifest.json", "train-00001.npz")),
-    ],
-)
+@pytest.mark.parametrize("at", ["geometry.exr", "train-00001.json"])
 def test_a_writer_that_is_killed(tmp_path: Path, proxy: Proxy, at: str) -> None:
     """Also between a shard and its sidecar; then another machine goes on, or the same one."""
     expected = generated(tmp_path)
@@ -191,24 +184,6 @@ def test_a_writer_that_is_killed(tmp_path: Path, proxy: Proxy, at: str) -> None:
     assert call(*line_at(tmp_path)).code == 0
     assert stored(tmp_path / "copy") == expected
     assert verify(URL) == []
-
-
-def test_two_slices_at_the_same_time(tmp_path: Path, proxy: Proxy) -> None:
-    expected = generated(tmp_path, train=400)
-    paths = os.pathsep.join(filter(None, sys.path))
-    runs = [
-        subprocess.Popen(
-            [sys.executable, "-c", _CODE, "mbtf-gen", "", *line_at(tmp_path, "--slice", f"{i}/2", train=400)],
-            stderr=subprocess.PIPE,
-            env={**os.environ, "PYTHONPATH": paths},
-        )
-        for i in (1, 2)
-    ]
-    for one in runs:
-        err = one.communicate(timeout=300)[1]
-        assert one.returncode == 0, err
-    assert call("merge", URL).code == 0
-    assert stored(tmp_path / "copy") == expected
 
 
 def test_workers_upload_their_shards(tmp_path: Path, proxy: Proxy, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -186,12 +186,6 @@ def test_what_the_plan_leaves_out_is_left_out(tmp_path: Path) -> None:
     np.testing.assert_array_equal(plane.heights, bare.heights)
 
 
-def test_maps_end_at_a_finest_level(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mbtf_gen.planning.simulation.FINEST_LEVEL", 4)
-    shapes = [made(job_of(tmp_path, np.zeros((32, 64)), finest=k)).slopes.shape[:2] for k in (2, 3, 4, 5)]
-    assert shapes == [(4, 8), (8, 16), (8, 16), (8, 16)]
-
-
 @pytest.fixture
 def full(tmp_path: Path) -> Geometry:
     """Geometry of random maps, all of them."""

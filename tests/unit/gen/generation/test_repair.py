@@ -138,17 +138,6 @@ def test_files_that_disagree_are_named_and_not_touched(
         assert contents(out) == contents(out.parent / "whole")
 
 
-def test_the_configuration_of_another_run_is_replaced(out: Path, other: Path) -> None:
-    shutil.copy(other / "config.yaml", out)
-    assert repair(out).documents == ["config.yaml"]
-    assert contents(out) == contents(out.parent / "whole")
-    # Without a manifest it is that of another data set.
-    shutil.copy(other / "config.yaml", out)
-    (out / "manifest.json").unlink()
-    with pytest.raises(InputError, match="belong to another configuration"):
-        repair(out)
-
-
 def test_a_lost_manifest_is_answered_everywhere(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (out / "manifest.json").unlink()
     before = contents_of_shards(out)
@@ -216,31 +205,6 @@ def test_a_manifest_is_not_restored_without_its_plan(out: Path, monkeypatch: pyt
     with pytest.raises(InputError, match="no intact sidecar"):
         repair(out)
     assert moments(out) == before
-
-
-def test_an_interrupted_repair_is_incomplete(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    flip(out / "train-00000.npz", 700)
-
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(ClosedForm, "estimate", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            repair(out)
-    assert json.loads((out / "manifest.json").read_text())["complete"] is False
-    assert repair(out).complete
-    assert contents(out) == contents(out.parent / "whole")
-
-
-def test_what_was_generated_again_is_reported(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    flip(out / "train-00000.npz", 700)
-    (out / "config.yaml").unlink()
-    capsys.readouterr()
-    assert generate(["repair", str(out)]) == 0
-    text = capsys.readouterr().out
-    assert f"{out}: 1 shards rendered again (train-00000.npz)" in text
-    assert f"{out}: config.yaml written again" in text
 
 
 def test_folders_without_a_data_set_are_refused(tmp_path: Path) -> None:

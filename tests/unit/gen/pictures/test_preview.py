@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,13 +10,11 @@ import numpy as np
 import pytest
 from support.datasets import write_dataset
 
-from mbtf_core.app.console import run
 from mbtf_core.data.lattice import texel_centers
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import InputError
 from mbtf_core.pictures import Camera, tiles_camera
 from mbtf_core.run.processes import run_child
-from mbtf_gen.cli.app import app
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
 from mbtf_gen.pictures import mesh
@@ -181,15 +178,3 @@ def test_a_crash_while_drawing_is_one_line(tmp_path: Path, monkeypatch: pytest.M
     fault = draw(block, camera, LIGHT, tmp_path / "mesh.png")
     assert fault == "the process was ended by SIGSEGV"
     assert list(tmp_path.iterdir()) == []
-
-
-def test_pictures_that_do_not_fit_are_refused_before_their_pixels_are_computed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    np.save(tmp_path / "flat.npy", np.zeros((8, 8)))
-    monkeypatch.setattr(Camera, "queries", lambda *_: pytest.fail("pixels are computed"))
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(1, 1, 10_000))
-    line = ["reference", str(tmp_path / "flat.npy"), "--size", "4096", "-o", str(tmp_path / "out")]
-    assert run(app, line) == 3
-    assert "10 kB are free" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
