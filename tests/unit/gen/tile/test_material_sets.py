@@ -65,19 +65,6 @@ def test_every_oddity_is_named_and_nothing_else(name: str) -> None:
     assert (normal["correlation_u"], normal["correlation_v"]) == pytest.approx(correlations, abs=0.015)
 
 
-@pytest.mark.parametrize("name", ["knit_fabric", "metal_plate"])
-def test_cut_maps_do_not_tile(name: str, tmp_path: Path) -> None:
-    """Three quarters of 900 texels: no multiple of any cell."""
-    from mbtf_core.images.read import gray, read_image
-
-    (path,) = folder_of(name).glob("height.*")
-    height = gray(read_image(path))[0]
-    np.save(tmp_path / "h.npy", height[: 3 * height.shape[0] // 4 - 21, : 3 * height.shape[1] // 4 - 21])
-    (warning,) = (w for w in load_material(tmp_path / "h.npy").warnings if "does not tile" in w)
-    assert "along u and v" in warning
-    assert not any("does not tile" in w for w in load_material(tmp_path / "h.npy", "blend").warnings)
-
-
 def test_the_published_rotation_of_metal_plate_is_found(tmp_path: Path) -> None:
     """The set was published with its heights turned by 90 degrees against all other maps."""
     from PIL import Image as Pillow

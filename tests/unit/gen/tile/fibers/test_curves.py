@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline
 
-from mbtf_gen.tile.fibers.curves import Bundle, Curve, closed_frames, interpolating, level_frames
+from mbtf_gen.tile.fibers.curves import Bundle, Curve, closed_frames, level_frames
 
 SHIFT = np.array([1.0, 0.0, 0.0])
 
@@ -36,11 +36,6 @@ def test_positions_and_derivatives_are_those_of_the_b_spline() -> None:
     at, slope = Curve(control).at(t)
     assert np.abs(at - spline(t)).max() < 1e-12
     assert np.abs(slope - spline.derivative()(t)).max() < 1e-11
-
-
-def test_straight_lines_are_kept() -> None:
-    points = np.arange(5)[:, None] / 5 * SHIFT
-    assert np.abs(interpolating(points, SHIFT) - points).max() < 1e-15
 
 
 @pytest.mark.parametrize("kind", ["closed", "two periods", "diagonal", "open"])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mbtf_gen.tile.heights import HeightGrid, carried_share, height_slopes, normal_slopes, residual_slopes
+from mbtf_gen.tile.heights import HeightGrid, height_slopes, normal_slopes, residual_slopes
 
 F64 = NDArray[np.float64]
 
@@ -78,8 +78,3 @@ def test_absolute_puts_the_map_in_place_of_the_mesh() -> None:
     grid = HeightGrid.from_map(z, 1.0)
     residual, _ = residual_slopes(normals(other), grid, "absolute")
     np.testing.assert_allclose(height_slopes(grid) + residual, other, atol=1e-5)
-
-
-def test_a_map_against_the_heights_is_not_subtracted() -> None:
-    _, slopes = waves(64, 64)
-    assert carried_share(-slopes, slopes) == 0.0
