@@ -97,18 +97,6 @@ def test_faulty_files_are_restored_and_nothing_else(name: str, out: Path) -> Non
     assert moments(out) == before
 
 
-def test_foreign_files_are_named_and_left_alone(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    shutil.copy(out / "train-00000.npz", out / "train-00007.npz")
-    (out / "notes.txt").write_text("harmless")
-    flip(out / "train-00000.npz", 700)
-    assert repair(out).shards == ["train-00000.npz"]
-    capsys.readouterr()
-    assert generate(["verify", str(out)]) == 0
-    text = capsys.readouterr().out
-    assert f"{out}: 4 shards and geometry.exr, all intact\n" in text
-    assert f"{out}: not part of the data set, left alone: notes.txt, train-00007.npz\n" in text
-
-
 @pytest.fixture
 def other(out: Path) -> Path:
     """The same of another seed."""

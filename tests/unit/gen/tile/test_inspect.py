@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -129,22 +128,6 @@ class TestText:
 
 
 class TestCommand:
-    def test_a_displacement_that_generation_refuses(
-        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        np.save(tmp_path / "tall.npy", np.linspace(0.0, 200.0, 32).reshape(4, 8))
-        refused = "tall.npy: generation refuses it: the displacement range is 200 tile widths; at most 100"
-
-        def warned(*options: str) -> bool:
-            command = ["inspect", str(tmp_path / "tall.npy"), "--json", *options]
-            assert run(app, command) == 0
-            warnings = json.loads(capsys.readouterr().out)["warnings"]
-            return any(refused in warning for warning in warnings)
-
-        assert warned("--height-scale", "1")
-        assert not warned("--height-scale", "0.4")
-        assert not warned("--height-scale", "1", "--set", "geometry.max_displacement=300")
-
     @pytest.mark.parametrize(
         ("options", "fault", "hint"),
         [

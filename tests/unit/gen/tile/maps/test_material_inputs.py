@@ -60,12 +60,6 @@ class TestLayers:
         exr(folder / "all.exr", {**color, "displacement.Y": one["d"], "extra.Y": one["e"]})
         return {**one, **color}
 
-    def test_names_of_layers_decide(self, tmp_path: Path) -> None:
-        stored = self.layered(tmp_path)
-        material = load_material(tmp_path / "all.exr")
-        assert np.array_equal(material.height, stored["d"])
-        assert any("displacement.Y of all.exr" in note for note in material.notes)
-
     def test_the_option_decides(self, tmp_path: Path) -> None:
         stored = self.layered(tmp_path)
         path = write(tmp_path, "height: {file: all.exr, channel: extra.Y}\nbase_color: all.exr\n")
@@ -83,19 +77,6 @@ class TestLayers:
 
 
 class TestScalars:
-    def test_packed_channels(self, heights: Path) -> None:
-        codes = rng().integers(0, 256, (8, 16, 3))
-        png(heights / "rock_arm.png", codes, 2, 8)
-        material = load_material(
-            write(
-                heights,
-                "height: height.npy\nroughness: {file: rock_arm.png, channel: G}\n"
-                "metallic: {file: rock_arm.png, channel: B}\n",
-            )
-        )
-        assert np.array_equal(np.rint(255 * np.asarray(material.maps["roughness"])), codes[..., 1])
-        assert np.array_equal(np.rint(255 * np.asarray(material.maps["metallic"])), codes[..., 2])
-
     def test_gloss_is_inverted_roughness(self, heights: Path) -> None:
         codes = rng().integers(0, 65536, (8, 16, 1))
         png(heights / "gloss.png", codes, 0, 16)
