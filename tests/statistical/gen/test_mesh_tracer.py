@@ -1,4 +1,4 @@
-"""Triangles traced by Mitsuba give the values of the height field; so do shifted periods."""
+"""Triangles traced by Mitsuba give the values of the height field."""
 
 from __future__ import annotations
 

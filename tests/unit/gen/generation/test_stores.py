@@ -312,3 +312,18 @@ def test_only_data_sets_are_written_to_stores(
     line = command(tmp_path, tmp_path / "unused")
     assert run(app, [program, line[0], "-o", url]) == 2
     assert "only data sets are written to object stores" in capsys.readouterr().err
+
+
+def test_a_corrupt_shard_is_not_read(tmp_path: Path, url: str) -> None:
+    assert generate(command_at(tmp_path, url)) == 0
+    store = ObjectStore(url)
+    flipped = bytearray(store.read("train-00001.npz"))
+    flipped[-100] ^= 1
+    store.write("train-00001.npz", bytes(flipped))
+    with pytest.raises(InputError, match=f"{url}/train-00001.npz: has changed since it was written"):
+        Dataset.open(url).load("train")
+
+
+def test_a_url_names_a_bucket() -> None:
+    with pytest.raises(InputError, match="names no bucket"):
+        Dataset.open("s3://")

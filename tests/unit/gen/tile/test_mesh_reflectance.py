@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.gltf_files import SQUARE, GltfBuilder, png
+from support.gltf_files import SQUARE, SQUARE_UV, GltfBuilder, png
 from support.scenes import mi
 
 from mbtf_core.errors import InputError
@@ -240,3 +240,13 @@ def test_each_companion_is_part_of_the_material(tmp_path: Path, changed: str) ->
     assert [role for role in before.digests if before.digests[role] != after.digests[role]] == [
         {"wood.png": "mesh.wood.png", "a.bin": "mesh.a.bin", "a.gltf": "mesh"}[changed]
     ]
+
+
+def test_texture_coordinates_that_are_not_numbers_are_refused(tmp_path: Path) -> None:
+    uv = SQUARE_UV.copy()
+    uv[0, 0] = np.nan
+    builder = GltfBuilder()
+    texture = {"index": builder.texture(np.zeros((2, 2, 3), np.uint8))}
+    builder.plate(builder.material({"baseColorTexture": texture}), TEXCOORD_0=uv)
+    with pytest.raises(InputError, match="texture coordinates"):
+        tile_of(builder, tmp_path)

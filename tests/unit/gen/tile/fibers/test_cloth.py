@@ -237,3 +237,9 @@ def test_fibers_are_the_same_on_every_machine() -> None:
     assert isinstance(found, FiberTile)
     points = np.concatenate([curve.control for curve in found.curves])
     assert points.sum() == pytest.approx(GOLDEN, abs=1e-6)
+
+
+def test_curves_that_reach_too_far_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.curves").write_text("".join(f"{x} 0.5 0 .02\n" for x in range(9)))
+    with pytest.raises(InputError, match="period"):
+        load_material(write(tmp_path, "curves: a.curves\nperiod: [1, 1]\n"))
