@@ -7,6 +7,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -68,6 +69,22 @@ def test_shards_hold_what_was_drawn_and_estimated(
         expected = {**vars(drawn), "value_a": value, "value_b": value}
         for name, array in expected.items():
             np.testing.assert_array_equal(stored[name], array, err_msg=name)
+
+
+def test_half_the_difference_of_the_halves_is_the_error(
+    config: GeneratorConfig, engine: Formula, monkeypatch: pytest.MonkeyPatch, out: Path
+) -> None:
+    estimate = engine.estimate
+
+    def noisy(queries: Any, spp: int, stream: Any) -> Any:
+        found = estimate(queries, spp, stream)
+        return replace(found, value_a=1.1 * found.value_a, value_b=0.9 * found.value_b)
+
+    monkeypatch.setattr(engine, "estimate", noisy)
+    summary = generate(config, out)
+    data = Dataset.open(out).load("train")
+    a, b = (data[name].astype(np.float64) for name in ("value_a", "value_b"))
+    assert summary.relative_error == pytest.approx(np.sqrt(np.mean((a - b) ** 2 / 4)) / np.mean((a + b) / 2))
 
 
 def test_progress_counts_traced_paths(config: GeneratorConfig, engine: Formula, out: Path) -> None:
