@@ -59,6 +59,12 @@ class TestWrite:
         assert "before make-tileable blend" in text
         assert "does not tile" not in text.partition("warnings")[2]
 
+    def test_what_was_given(self, maps: Path) -> None:
+        flags = ["--height-scale", "0.3", "--make-tileable", "mirror", "--resolution", "16"]
+        content = written(maps, *flags)
+        assert (content["height"]["scale"], content["make_tileable"]) == (0.3, "mirror")
+        assert content["resolution"] == 16
+
     def test_what_the_material_file_says(self, maps: Path) -> None:
         text = "height: {file: height.png, scale: 0.2}\nmake_tileable: none\nresolution: 8\nroughness: 0.4\n"
         (maps / "material.yaml").write_text(text)

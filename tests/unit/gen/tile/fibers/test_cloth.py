@@ -13,7 +13,7 @@ from mbtf_core.errors import InputError, UsageError
 from mbtf_gen.config.generator import GeneratorConfig, GeometrySection
 from mbtf_gen.job import Job
 from mbtf_gen.tile.cloth import loose_ends
-from mbtf_gen.tile.fiber_tile import FiberTile, absorption
+from mbtf_gen.tile.fiber_tile import FiberScattering, FiberTile, absorption
 from mbtf_gen.tile.fibers.curves import Bundle, Curve
 from mbtf_gen.tile.loading import load_material
 
@@ -243,3 +243,8 @@ def test_curves_that_reach_too_far_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a.curves").write_text("".join(f"{x} 0.5 0 .02\n" for x in range(9)))
     with pytest.raises(InputError, match="period"):
         load_material(write(tmp_path, "curves: a.curves\nperiod: [1, 1]\n"))
+
+
+def test_narrow_lobes_are_found_along_and_around_the_fiber() -> None:
+    assert FiberScattering(0.72, 0.6).narrowest == pytest.approx(np.radians(27.0), rel=0.02)
+    assert FiberScattering(0.72, 0.02).narrowest < np.radians(1.0)
