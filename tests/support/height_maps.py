@@ -36,7 +36,12 @@ def normals_of(height: Floats, factor: float) -> Floats:
     columns = height.shape[1]
     du = factor * 0.5 * columns * (np.roll(height, -1, 1) - np.roll(height, 1, 1))
     dv = factor * 0.5 * columns * (np.roll(height, 1, 0) - np.roll(height, -1, 0))
-    n = np.stack([-du, -dv, np.ones_like(du)], axis=-1)
+    return slope_normals(np.stack([du, dv], axis=-1))
+
+
+def slope_normals(slopes: Floats) -> Floats:
+    """Normals (H, W, 3) of slopes (H, W, 2) along u and v."""
+    n = np.concatenate([-slopes, np.ones_like(slopes[..., :1])], axis=-1)
     return n / np.linalg.norm(n, axis=-1, keepdims=True)
 
 

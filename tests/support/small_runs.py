@@ -27,9 +27,7 @@ def noisy_plane(self: ClosedForm, queries: Queries, spp: int, stream: Stream) ->
     return Estimates(a, b, None, len(a) * spp, 0, 0, 0)
 
 
-def command(
-    folder: Path, output: Path, *, train: int = 100, shard: int = 40, suffix: str = "npz"
-) -> list[str]:
+def command(folder: Path, output: Path, *, train: int = 100) -> list[str]:
     """Command line of a small run; makes its material, `folder`/plane.npy, where it is missing."""
     material = folder / "plane.npy"
     if not material.exists():

@@ -8,13 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
-from support.scenes import DIRECT, direction, estimate, flat, mi, queries
+from support.scenes import direction, estimate, flat, mi, queries
 from support.surfaces import point, towards, vectors
 
 from mbtf_core.errors import PartialError
 from mbtf_gen.render.bsdf.surface import SurfaceParts
 from mbtf_gen.sampling.light_kernel import LightKernel
-from mbtf_gen.tile.heights import HeightGrid
 
 Array = NDArray[np.float64]
 GOLD = np.array([0.9, 0.6, 0.3])
@@ -216,44 +215,6 @@ def test_slopes_tilt_the_normal_of_a_plane(slope: tuple[float, float], light: tu
     n = np.array([-slope[0], -slope[1], 1.0]) / np.sqrt(1 + slope[0] ** 2 + slope[1] ** 2)
     got = values(surface(0.6, slopes=slopes(*slope)), LightKernel(0.0), omega_i, direction(90, 0))
     np.testing.assert_allclose(got, 0.6 / np.pi * max(0.0, n @ omega_i) / omega_i[2], rtol=1e-4, atol=1e-7)
-
-
-def test_rows_of_slopes_go_down_from_v_1() -> None:
-    along_x = np.array([[0.5, 0.5], [0.0, 0.0]])
-    q = queries([[0.5, 0.75], [0.5, 0.25]], 1e-3, direction(60, 180), direction(90, 0), 2)
-    e = estimate(flat(), surface(0.6, slopes=slopes(along_x, 0 * along_x)), LightKernel(0.0), q, 16)
-    tilted = (0.5 * np.cos(np.radians(60)) + np.sin(np.radians(60))) / np.sqrt(1.25) / np.sin(np.radians(60))
-    np.testing.assert_allclose(e.value_a[:, 0], 0.6 / np.pi * np.array([tilted, 1.0]), rtol=1e-4)
-
-
-@pytest.mark.parametrize("axis", [0, 1])
-def test_slopes_add_to_those_of_the_mesh(axis: int) -> None:
-    """Slopes opposite to those of a roof give the value of a plane; equal slopes give that of a roof twice as
-    steep."""
-    slope, cells = 0.3, 8
-    # A ridge and a valley on vertices, which lie on texel centers: creases where the map's texels end.
-    x = np.abs(np.arange(cells) - cells // 2) / cells * slope
-    z = np.tile(x, (cells, 1)) if axis == 0 else np.tile(x[:, None], (1, cells))
-    grid = HeightGrid(z - z.max(), 1.0)
-    fine = (np.arange(2 * cells) - 1) // 2 % cells
-    rise = np.where(fine < cells // 2, -slope, slope)
-    rise = np.tile(rise, (2 * cells, 1)) if axis == 0 else -np.tile(rise[:, None], (1, 2 * cells))
-    rng = np.random.default_rng(4)
-    omega_i = direction(75, 25)
-    q = queries(rng.random((400, 2)), 1e-4, omega_i, direction(90, 0), 400)
-    seen = {}
-    for factor in (-1.0, 0.0, 1.0):
-        own, other = (factor * rise, 0 * rise) if axis == 0 else (0 * rise, factor * rise)
-        e = estimate(grid, surface(0.6, slopes=slopes(own, other)), LightKernel(0.0), q, 2, transport=DIRECT)
-        seen[factor] = np.unique(np.round(e.value_a[:, 0].astype(np.float64), 5))
-    np.testing.assert_allclose(seen[-1.0], 0.6 / np.pi, rtol=1e-4)
-    for factor in (0.0, 1.0):
-        total = (1 + factor) * slope
-        cosines = [(omega_i[2] - s * omega_i[axis]) / np.sqrt(1 + s * s) for s in (-total, total)]
-        expected = np.sort(0.6 / np.pi * np.array(cosines) / omega_i[2])
-        assert seen[factor][0] == pytest.approx(expected[0], rel=1e-3)
-        assert seen[factor][-1] == pytest.approx(expected[1], rel=1e-3)
-        assert len(seen[factor]) <= 4
 
 
 def test_what_lies_behind_the_face_or_the_shading_plane_is_black() -> None:

@@ -99,30 +99,22 @@ def test_the_pilot_draws_random_numbers_of_its_own(skewed: tuple[Queries, Alloca
     assert abs(pilot.first_pass - stored.first_pass) > MAX_RESAMPLES
 
 
+@pytest.mark.parametrize(("most", "low", "high"), [(8192, 0.2, 0.24), (8, 1.0, 9.0)])
 def test_a_skewed_scene_comes_near_its_target_and_what_is_reported_is_so(
-    skewed: tuple[Queries, Allocation],
+    most: int, low: float, high: float, skewed: tuple[Queries, Allocation]
 ) -> None:
+    """Also what a cap leaves: rare bright paths increase the value itself, so relative errors would rarely
+    exceed one."""
     q, allocation = skewed
-    e = estimate_shard(FewBrightPaths(), q, 4, Target(0.2, 8192), Stream(1, "train", 0), allocation)
+    e = estimate_shard(FewBrightPaths(), q, 4, Target(0.2, most), Stream(1, "train", 0), allocation)
     value = 0.5 * (e.value_a[:, 0].astype(np.float64) + e.value_b[:, 0])
     error = float(np.sqrt(np.mean((value - TRUTH) ** 2))) / TRUTH
-    assert 0.2 < error < 1.2 * 0.2
+    assert low < error < high
     assert e.target is not None
     assert np.sqrt(e.target.square) == pytest.approx(error, rel=0.2)
     # What the pilot expects of a path is its root mean square deviation.
     s = allocation.deviation(q)
     assert np.sqrt(np.mean(s**2)) == pytest.approx(np.sqrt(RARE * (1 - RARE)) * (BRIGHT - DIM), rel=0.05)
-
-
-def test_errors_that_the_cap_leaves_are_reported(skewed: tuple[Queries, Allocation]) -> None:
-    """Rare bright paths increase the value itself, so relative errors would rarely exceed one."""
-    q, allocation = skewed
-    e = estimate_shard(FewBrightPaths(), q, 4, Target(0.2, 8), Stream(1, "train", 0), allocation)
-    value = 0.5 * (e.value_a[:, 0].astype(np.float64) + e.value_b[:, 0])
-    error = float(np.sqrt(np.mean((value - TRUTH) ** 2))) / TRUTH
-    assert error > 1.0
-    assert e.target is not None
-    assert np.sqrt(e.target.square) == pytest.approx(error, rel=0.15)
 
 
 @pytest.fixture(scope="module")

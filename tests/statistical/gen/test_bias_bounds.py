@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from support.height_maps import slope_normals
 
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
@@ -16,7 +17,7 @@ from mbtf_gen.planning.bounds import Change, displacement_bounds
 from mbtf_gen.planning.effects import bounce_bound
 from mbtf_gen.planning.effects_plan import EffectsPlan, without
 from mbtf_gen.planning.run_plan import plan_effects
-from mbtf_gen.planning.scene import EffectDecision, EffectsRequest, PlanScene
+from mbtf_gen.planning.scene import EffectsRequest, PlanScene
 from mbtf_gen.planning.simulation import build_estimator, pilot_queries
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.sampling.light_kernel import LightKernel
@@ -58,8 +59,7 @@ def tilted(rows: int, columns: int) -> NDArray[np.float32]:
     v = 2 * np.pi * (1 - (np.arange(rows) + 0.5) / rows)[:, None]
     u = 2 * np.pi * ((np.arange(columns) + 0.5) / columns)[None, :]
     slopes = np.stack(np.broadcast_arrays(0.05 * np.cos(5 * u) + 0 * v, 0.08 * np.cos(4 * v + u)), axis=-1)
-    n = np.concatenate([-slopes, np.ones_like(slopes[..., :1])], axis=-1)
-    return (n / np.linalg.norm(n, axis=-1, keepdims=True)).astype(np.float32)
+    return slope_normals(slopes).astype(np.float32)
 
 
 @pytest.mark.parametrize("mapped", [False, True], ids=["plain", "normal map"])
@@ -109,11 +109,6 @@ def test_bias_bounds_equal_the_rendered_change(shape: tuple[int, int]) -> None:
         assert bound == pytest.approx(measured, rel=0.3), name
     measured = Change.of(estimates(job, plan), estimates(job, without(plan, "normal"))).rms
     assert bounds.normal == pytest.approx(measured, rel=0.3)
-
-
-def test_the_bias_bound_sums_the_cap_and_what_is_off() -> None:
-    effects = (EffectDecision("parallax", True, "", 0.5), EffectDecision("shadowing", False, "", 0.001))
-    assert EffectsPlan(effects, max_depth=2, cap_bias_bound=0.002).bias_bound == pytest.approx(0.003)
 
 
 def test_the_change_is_relative_to_the_mean_and_free_of_noise() -> None:

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from support.height_maps import slope_normals
 from support.scenes import rocks
 
 from mbtf_core.stats import Estimate, mean_of_halves
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
 from mbtf_gen.planning.bounds import Change
-from mbtf_gen.planning.effects import EFFECTS
 from mbtf_gen.planning.effects_plan import EffectsPlan, without
 from mbtf_gen.planning.run_plan import plan_effects
 from mbtf_gen.planning.simulation import build_estimator, pilot_queries
@@ -23,8 +23,6 @@ from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 
 QUERIES, SPP = 16384, 8
-
-DISPLACEMENT_EFFECTS = [name for name, effect in EFFECTS.items() if effect.displaced]
 
 
 def pattern() -> NDArray[np.float32]:
@@ -36,8 +34,7 @@ def bumps(strength: float) -> NDArray[np.float32]:
     """Normals of ripples along u."""
     x = (np.arange(64) + 0.5) / 64
     slope = np.broadcast_to(strength * np.cos(2 * np.pi * 4 * x), (64, 64))
-    n = np.stack([-slope, np.zeros_like(slope), np.ones_like(slope)], axis=-1)
-    return (n / np.linalg.norm(n, axis=-1, keepdims=True)).astype(np.float32)
+    return slope_normals(np.stack([slope, 0 * slope], axis=-1)).astype(np.float32)
 
 
 ROCKS = rocks(64, 1.0).z
@@ -148,26 +145,6 @@ def test_an_effect_is_on_where_it_matters_and_off_where_not(name: str, needed: s
     change, upper = found.rms, found.upper
     assert change > 2 * plan.tolerance
     assert upper - change < 0.5 * change
-
-
-def test_a_faint_relief_becomes_its_slopes() -> None:
-    """Without displacement the slopes still shade the plane."""
-    plan = planned("faint relief")[1]
-    assert not any(plan.on(name) for name in DISPLACEMENT_EFFECTS)
-    assert 0 < plan["parallax"].bias_bound <= plan.tolerance
-    bare = replace(SCENES["faint relief"][0], height_scale=0.0)
-    plane = job_of(bare, min_cos=0.3)
-    strong = job_of(replace(bare, height_scale=0.02), "-parallax", min_cos=0.3)
-    shaded = estimates(strong, plan_effects(strong))
-    assert Change.of(shaded, estimates(plane, plan_effects(plane))).rms > 0.02
-
-
-def test_the_bias_of_a_cap_is_within_its_bound() -> None:
-    job, plan = planned("dark relief")
-    assert plan.on("interreflection")
-    assert 2 <= plan.max_depth <= 4
-    unlimited = estimates(job, replace(plan, max_depth=0))
-    assert Change.of(unlimited, estimates(job, plan)).rms < plan.tolerance
 
 
 def test_light_is_sampled_both_ways_only_where_it_helps() -> None:

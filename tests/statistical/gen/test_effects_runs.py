@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from pydantic import TypeAdapter
 
 from mbtf_core.data.schema import Queries
 from mbtf_core.files.atomic import write_checksummed
@@ -84,13 +83,6 @@ def test_the_closed_form_is_the_color_over_pi() -> None:
     # The same as traced.
     traced = build_estimator(job, replace(plan, closed_form=False)).estimate(q, 4, STREAM)
     np.testing.assert_allclose(traced.value_a, found.value_a, rtol=1e-5)
-
-
-def test_a_manifest_keeps_every_number_of_a_plan() -> None:
-    plan = plan_effects(job_of(lambert(noise(4, 4), 0.01), "none"))
-    limits = {"max_depth": 3, "cap_bias_bound": 0.25, "roulette_depth": 7}
-    changed = replace(plan, **limits, mode="x", tolerance=0.5, closed_form=True)
-    assert TypeAdapter(EffectsPlan).validate_json(json.dumps(changed.to_manifest())) == changed
 
 
 class Recorder:

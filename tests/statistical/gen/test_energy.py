@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import drjit as dr
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -14,7 +13,6 @@ from support.scenes import (
     direction,
     estimate,
     lambert,
-    mi,
     real_heights,
     rocks,
     tile_mean_queries,
@@ -85,36 +83,6 @@ def test_tile_mean_is_reciprocal(
     forward, backward = tile_mean(grid, bsdf, one, other, 1), tile_mean(grid, bsdf, other, one, 2)
     assert max(forward.relative_error, backward.relative_error) < 0.01
     assert t_test(forward, backward).p_value > 1e-3
-
-
-class NoCosine(mi.BSDF):  # type: ignore[misc]
-    """A Lambert reflector without the cosine of the light, a fault that reciprocity must detect."""
-
-    def __init__(self, props: Any) -> None:
-        mi.BSDF.__init__(self, props)
-        self.inner = mi.load_dict(lambert(0.9))
-        self.m_flags = self.inner.flags()
-        self.m_components = [self.inner.flags()]
-
-    def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-        return self.inner.eval(ctx, si, wo, active) / dr.maximum(wo.z, 1e-3)
-
-    def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-        return self.inner.pdf(ctx, si, wo, active)
-
-    def sample(self, ctx: Any, si: Any, s1: Any, s2: Any, active: Any = True) -> Any:
-        return self.inner.sample(ctx, si, s1, s2, active)
-
-
-def test_reciprocity_fails_without_a_cosine() -> None:
-    one, other = direction(*PAIRS[1][0]), direction(*PAIRS[1][1])
-    forward, backward = (tile_mean(rocks(), lambert(0.9), *w) for w in ((one, other, 1), (other, one, 2)))
-    # Values divided by the light's cosine, as some published data are: no longer reciprocal.
-    assert t_test(forward.scaled(1 / one[2]), backward.scaled(1 / other[2])).p_value < 1e-6
-    # The cosine dropped inside the BSDF.
-    faulty = NoCosine(mi.Properties())
-    forward, backward = tile_mean(rocks(), faulty, one, other, 1), tile_mean(rocks(), faulty, other, one, 2)
-    assert t_test(forward, backward).p_value < 1e-6
 
 
 @pytest.mark.parametrize("light", [(80, 0), (20, 130)])

@@ -35,14 +35,12 @@ def same_query(n: int) -> Any:
     return queries([0.3, 0.7], 0.1, direction(40, 60), direction(55, 200), n)
 
 
-def test_equal_queries_get_paths_of_their_own() -> None:
-    n = 20_000
-    e = estimator().estimate(same_query(n), 2, Stream(0, "train", 0))
-    a, b = e.value_a[:, 0].astype(np.float64), e.value_b[:, 0].astype(np.float64)
-    bound = 4 / np.sqrt(n)
-    assert abs(np.corrcoef(a, b)[0, 1]) < bound
-    for x in (a, b):
-        assert abs(np.corrcoef(x[1:], x[:-1])[0, 1]) < bound
+def test_one_path_in_each_half_has_the_variance_of_two_numbers() -> None:
+    e = estimator().estimate(same_query(500), 2, Stream(0, "train", 0), path_variance=True)
+    assert e.path_variance is not None
+    expected = 0.5 * np.mean((e.value_a.astype(np.float64) - e.value_b) ** 2, axis=1)
+    assert expected.max() > 1e-3
+    np.testing.assert_allclose(e.path_variance, expected, rtol=1e-3, atol=1e-6)
 
 
 def test_directions_that_are_no_unit_vectors_are_refused() -> None:

@@ -110,15 +110,6 @@ def test_few_queries_reach_the_error(plane: Highlights) -> None:
     assert len(np.unique(q.omega_i, axis=0)) == len(w)
 
 
-def test_error_bars_are_those_of_repeated_test_sets(plane: Highlights) -> None:
-    errors = []
-    for shard in range(60):
-        q, w = plane.draw(PLAN, SHARE, shard, 512)
-        errors.append(mean_estimate((value_of(q) - value_of(q, 0.25)) ** 2, w))
-    spread = np.std([e.value for e in errors], ddof=1)
-    assert spread == pytest.approx(np.sqrt(np.mean([e.error**2 for e in errors])), rel=0.4)
-
-
 def test_probabilities_of_selection() -> None:
     size = np.random.default_rng(0).exponential(size=1000) ** 4
     chance = inclusion(size, 200)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import trimesh
 from numpy.typing import NDArray
-from PIL import Image
 from support.scenes import (
     Estimator,
     LightKernel,
@@ -153,54 +152,3 @@ def test_white_bodies_above_a_grid_return_all_light() -> None:
     total = 0.5 * (e.value_a + e.value_b)[:, 0] + e.transmittance
     assert total.mean() == pytest.approx(1.0, abs=4.0 * total.std() / np.sqrt(len(total)) + 1e-4)
     assert 0.1 < e.transmittance.mean() < 0.9
-
-
-def test_textures_are_the_right_way_round(tmp_path: Path) -> None:
-    """Quadrants of a glTF texture on a plate whose v runs along y."""
-    pixels = np.zeros((16, 16, 3), np.uint8)
-    pixels[:8, :8], pixels[:8, 8:], pixels[8:, :8], pixels[8:, 8:] = (
-        (255, 0, 0),
-        (0, 255, 0),
-        (0, 0, 255),
-        (255,) * 3,
-    )
-    material = trimesh.visual.material.PBRMaterial(
-        baseColorTexture=Image.fromarray(pixels), roughnessFactor=1.0, metallicFactor=0.0
-    )
-    corners = plate((0, 0), (2, 2))
-    # glTF has y up: our y is its -z.
-    mesh = trimesh.Trimesh(
-        corners[:, [0, 2, 1]] * (1, 1, -1),
-        [[0, 1, 2], [0, 2, 3]],
-        process=False,
-        visual=trimesh.visual.TextureVisuals(uv=corners[:, :2] / 2, material=material),
-    )
-    mesh.export(tmp_path / "plate.glb")
-    shape = load_material(tmp_path / "plate.glb")
-    assert isinstance(shape, MeshTile)
-    assert (shape.aspect, shape.thickness) == (1.0, 0.0)
-    u = np.array([[0.25, 0.75], [0.75, 0.75], [0.25, 0.25], [0.75, 0.25]])
-    e = traced(shape, LightKernel(0.0), queries(u, 0.02, direction(60, 0), UP, 4))
-    value = 0.5 * (e.value_a + e.value_b)
-    # The first row of the image is the side v → 1.
-    for row, color in zip(value, np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]]), strict=True):
-        assert (row[color == 1] > 0.2).all()
-        assert (row[color == 0] < 0.1).all()
-
-
-def test_an_obj_file_has_its_image_as_often_as_its_material_says(tmp_path: Path) -> None:
-    # White where u < 1/2 and v > 1/2, which is the top left of the image.
-    pixels = np.zeros((16, 16, 3), np.uint8)
-    pixels[:8, :8] = 255
-    Image.fromarray(pixels).save(tmp_path / "corner.png")
-    (tmp_path / "a.mtl").write_text("newmtl m\nKd 0.5 0.5 0.5\nmap_Kd -s 2 1 1 -o 0 0.5 0 corner.png\n")
-    square = "v 0 0 0\nv 3 0 0\nv 3 3 0\nv 0 3 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
-    (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{square}usemtl m\nf 1/1 2/2 3/3 4/4\n")
-    tile = load_material(tmp_path / "a.obj")
-    assert isinstance(tile, MeshTile)
-    u, v = np.meshgrid((0.125, 0.375, 0.625, 0.875), (0.25, 0.75))
-    q = queries(np.stack([u.ravel(), v.ravel()], axis=-1), 0.005, direction(60, 10), direction(50, 80), 8)
-    e = traced(tile, LightKernel(1.0), q)
-    # Twice along u; moved by half of the image along v.
-    expected = 0.5 / np.pi * np.array([[1, 0, 1, 0], [0, 0, 0, 0]]).ravel()
-    np.testing.assert_allclose(e.value_a[:, 1], expected, atol=0.01)

@@ -1,9 +1,8 @@
-"""Triangles traced by Mitsuba give the values of the height field; so do shifted periods."""
+"""Triangles traced by Mitsuba give the values of the height field."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -12,27 +11,17 @@ from support.mitsuba_blocks import SPP, random_queries
 from support.scenes import (
     LightKernel,
     build_scene,
-    direction,
     estimate,
     lambert,
     mi,
     real_heights,
-    rocks,
-    tile_mean_queries,
 )
 
 from mbtf_core.errors import InputError
 from mbtf_core.stats import aggregate_test, elevation_groups
-from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.job import Job
-from mbtf_gen.planning.run_plan import reference_plan
-from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.tile.heights import HeightGrid, Tracer
-from mbtf_gen.tile.tracers.heightfield_tracer import HeightfieldGeometry
-from mbtf_gen.tile.tracers.mesh_tracer import MeshGeometry
 from mbtf_gen.tile.tracers.protocol import Vertex
 
-WHITE = lambert(1.0)
 SURFACES: dict[str, dict[str, Any]] = {
     "diffuse": lambert(0.7),
     "glossy": {"type": "roughconductor", "alpha": 0.2},
@@ -62,39 +51,6 @@ def test_both_tracers_give_the_same_values(name: str) -> None:
         assert abs(gap.mean()) < 4 * gap.std() / len(gap) ** 0.5
 
 
-def test_a_white_mesh_returns_all_light() -> None:
-    q = tile_mean_queries([0, 0, 1], direction(30, 20), 2000)
-    e = estimate(rocks(), WHITE, None, q, 16, tracer="mesh")
-    assert e.lost == e.capped == 0
-    mean = 0.5 * (e.value_a + e.value_b).mean(axis=1)
-    error = float(mean.std()) / len(mean) ** 0.5
-    assert float(mean.mean()) == pytest.approx(1.0, abs=4 * error + 1e-6)
-
-
-def test_shifts_by_periods_change_nothing() -> None:
-    """Hits of rays whose origins lie in other periods."""
-    grid = HeightGrid(rocks().z, 0.5)
-    tile = build_scene(replace(grid, tracer="mesh"), lambert(0.5))
-    rng = np.random.default_rng(0)
-    n = 20_000
-    o = np.column_stack([(rng.random((n, 2)) - 0.5) * (tile.unit, 0.5 * tile.unit), np.full(n, 0.1)])
-    d = rng.normal(size=(n, 3)) * (1.0, 1.0, 0.3)
-    d[:, 2] = -np.abs(d[:, 2]) - 0.05
-    d /= np.linalg.norm(d, axis=1)[:, None]
-
-    def hits(shift: tuple[int, int]) -> Any:
-        moved = o + np.array([shift[0] * tile.unit, 0.5 * shift[1] * tile.unit, 0.0])
-        origin, toward = (np.ascontiguousarray(a.T, np.float32) for a in (moved, d))
-        ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(toward))
-        return np.array(tile.geometry.closest_hit(ray, mi.Bool(True), 100)[0].p)
-
-    here = hits((0, 0))
-    for shift in ((1, 0), (-2, 1), (0, -3)):
-        gap = np.abs(hits(shift) - here).max(axis=0) / tile.unit
-        # Origins far away are rounded more coarsely; over rims rounding decides.
-        assert np.mean(gap > 1e-5) < 1e-3
-
-
 def test_rays_that_leave_points_on_the_border_do_not_meet_their_own_triangle() -> None:
     """The border runs through the outermost vertices, where texel centers lie."""
     z = np.full((16, 16), -0.02)
@@ -117,16 +73,6 @@ def test_rays_that_leave_points_on_the_border_do_not_meet_their_own_triangle() -
             blocked.append(np.array(tile.geometry.occluded(ray, mi.Bool(True), 100)[0]).mean())
         found.append(blocked)
     assert np.abs(np.array(found[1]) - found[0]).max() < 2e-3
-
-
-@pytest.mark.parametrize("tracer", ["heightfield", "mesh"])
-def test_a_job_is_traced_as_its_options_say(tmp_path: Path, tracer: Tracer) -> None:
-    np.save(tmp_path / "height.npy", 0.1 * np.random.default_rng(0).random((8, 8)))
-    described = {"material": str(tmp_path / "height.npy"), "geometry": {"tracer": tracer}}
-    job = Job.load(GeneratorConfig.model_validate(described))
-    estimator = build_estimator(job, reference_plan(job))
-    kind = MeshGeometry if tracer == "mesh" else HeightfieldGeometry
-    assert isinstance(estimator.tile.geometry, kind)
 
 
 def test_a_mesh_too_large_for_memory_is_refused() -> None:

@@ -61,17 +61,6 @@ def test_smoothed_emitter_in_mitsubas_integrator_agrees(tmp_path: Path) -> None:
     assert result.p_value > 1e-3, str(result)
 
 
-def test_the_comparison_finds_a_shifted_map(tmp_path: Path) -> None:
-    """The comparison detects a shift by half a texel."""
-    grid = GRIDS["square"]
-    omega_i = direction(40, 70)
-    q = random_queries(4096, 1e-6, omega_i)
-    moved = HeightGrid(np.roll(grid.z, 1, axis=1), grid.aspect)
-    a, b = mitsuba_halves(block(moved, colors(), tmp_path), directional(omega_i), q, 1.0, 2)
-    ours = estimate(grid, colors(), LightKernel(0.0), q, SPP, transport=Transport(max_depth=1))
-    assert aggregate_test(ours.value_a, ours.value_b, a, b).p_value < 1e-6
-
-
 def test_mitsubas_render_of_a_plane_is_albedo_over_pi() -> None:
     bsdf = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}
     q = random_queries(640, 0.1)

@@ -16,15 +16,11 @@ from support.scenes import (
     direction,
     estimate,
     flat,
-    lambert,
-    mi,
     queries,
 )
 
-from mbtf_core.data.lattice import Lattice, texel_centers
+from mbtf_core.data.lattice import texel_centers
 from mbtf_core.pictures import Camera
-from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan
-from mbtf_gen.tile.heights import tile_mesh
 
 ROWS, COLUMNS = 4, 8
 ASPECT = ROWS / COLUMNS
@@ -57,28 +53,6 @@ def test_color_between_texels_wraps_around() -> None:
     np.testing.assert_allclose(e.value_a[0] * np.pi, corner, atol=2e-4)
 
 
-def test_vertices_sit_on_texel_centers() -> None:
-    heights = np.random.default_rng(4).random((ROWS, COLUMNS))
-    grid = HeightGrid.from_map(heights, 0.3)
-    assert grid.z.max() == 0
-    assert grid.displacement_range == pytest.approx(0.3 * np.ptp(heights))
-    tile = build_scene(grid, lambert(0.5))
-    u = texel_centers(ROWS, COLUMNS).reshape(-1, 2)
-    origin = np.column_stack(
-        [(u[:, 0] - 0.5) * tile.unit, (u[:, 1] - 0.5) * ASPECT * tile.unit, np.full(len(u), 1.0)]
-    )
-    ray = mi.Ray3f(mi.Point3f(origin.T.astype(np.float32).copy()), mi.Vector3f(0, 0, -1))
-    si, *_ = tile.geometry.closest_hit(ray, mi.Bool(True), 16)
-    np.testing.assert_allclose(np.array(si.p.z) / tile.unit, grid.z.ravel(), atol=1e-5)
-    # Mitsuba's texture coordinates of the hits: (u, 1-v).
-    np.testing.assert_allclose(np.array(si.uv).T % 1.0, u * [1, -1] + [0, 1], atol=1e-5)
-    # The exported mesh agrees.
-    mesh = tile_mesh(grid)
-    found = {(round(float(x), 6), round(float(y), 6)): z for x, y, z in mesh.vertices}
-    for (s, t), z in zip(u, grid.z.ravel(), strict=True):
-        assert found[(round(s, 6), round(t * ASPECT, 6))] == pytest.approx(z)
-
-
 @pytest.mark.parametrize(("azimuth", "axis", "sign"), [(0, 0, -1), (180, 0, 1), (90, 1, -1), (270, 1, 1)])
 def test_sunk_texture_is_seen_displaced(azimuth: float, axis: int, sign: int) -> None:
     """A plane sunk by d under one high texel: the texture is looked up at u - d·ω_xy/ω_z."""
@@ -101,16 +75,6 @@ def test_sunk_texture_is_seen_displaced(azimuth: float, axis: int, sign: int) ->
     assert np.sign(seen - u[axis]) == sign
 
 
-def test_image_layout_walks_texels_in_row_order() -> None:
-    plan = QueryPlan(Lattice(3, 0.5), LevelMixture(1, 0), 0.1, "image", 5, 4)
-    q = plan.draw("train", 0, 3)
-    assert q.lead == (3, 4, 8)
-    centers = texel_centers(4, 8)
-    assert np.all(np.abs(q.u - centers) <= np.array([0.5 / 8, 0.5 / 4]) + 1e-6)
-    assert np.ptp(q.omega_i[1].reshape(-1, 3), axis=0).max() == 0
-    assert np.ptp(q.sigma[2]) == 0
-
-
 def test_picture_shows_the_map_the_right_way_up() -> None:
     """Seen from above, a picture of one tile is the map: row 0 on top, column 0 on the left."""
     camera = Camera(
@@ -121,16 +85,6 @@ def test_picture_shows_the_map_the_right_way_up() -> None:
     assert np.abs(q.u - expected).max() < 1e-3
     # A pixel's footprint: half the pitch of pixels.
     np.testing.assert_allclose(q.sigma, 0.5 / (COLUMNS * 8), rtol=1e-2)
-
-
-def test_tilted_picture_is_not_mirrored() -> None:
-    camera = Camera(50.0, -90.0, 0.5, rows=33, columns=33)
-    q = camera.queries(np.array(UP))
-    # The camera stands towards -v: right is +u, the far side (+v) is on top, the view points back to it.
-    assert q.u[16, 32, 0] > q.u[16, 0, 0]
-    assert q.u[0, 16, 1] > q.u[32, 16, 1]
-    assert np.all(q.omega_o[..., 1] < 0)
-    np.testing.assert_allclose(np.linalg.norm(q.omega_o, axis=-1), 1.0, atol=1e-6)
 
 
 def test_pixel_kind_and_query_kind_agree_from_above() -> None:

@@ -75,12 +75,6 @@ def test_levels_follow_the_mixture(weights: tuple[float, float]) -> None:
     assert kolmogorov(distance * np.sqrt(n)) > 1e-3
 
 
-def test_log_uniform_footprints_have_equal_shares_per_octave() -> None:
-    q = draw(mixture=LevelMixture(1.0, 0.0))
-    octave = np.clip(np.floor(level_of_sigma(q.sigma)), 0, LATTICE.finest - 1).astype(int)
-    np.testing.assert_allclose(np.bincount(octave) / ROWS, 1 / LATTICE.finest, atol=2 / ROWS)
-
-
 def test_positions_are_uniform_within_their_texels(sampled: Queries) -> None:
     rows, columns = LATTICE.shape()
     inside = (sampled.u.astype(np.float64) * (columns, rows)) % 1.0

@@ -6,7 +6,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.chi_square import Rectangle, chi_square_test, uniformity
+from support.chi_square import Rectangle, chi_square_test
 from support.scenes import mi, queries
 
 from mbtf_core.stats import mean_estimate, t_test
@@ -59,10 +59,3 @@ def test_on_the_torus_they_follow_the_wrapped_gaussian(sigma: float, aspect: flo
 
     result = chi_square_test(p - np.floor(p), density, Rectangle(), (24, 24))
     assert result.p_value > 1e-3, str(result)
-
-
-@pytest.mark.parametrize("aspect", [1.0, 0.5])
-@pytest.mark.parametrize("sigma", [2.0, 50.0])
-def test_footprints_far_wider_than_the_tile_are_uniform_on_it(sigma: float, aspect: float) -> None:
-    p = points(sigma, aspect)
-    assert uniformity(*(p - np.floor(p)).T, (24, 24)) > 1e-3

@@ -93,8 +93,9 @@ def test_surfaces_under_sheen_return_at_most_what_they_receive() -> None:
     assert energy[black].min() > 0.95
 
 
-@pytest.mark.parametrize("roughness", [0.1, 0.3, 0.45, 1.0])
-@pytest.mark.parametrize("cosine", [1.0, 0.5, 0.1, 1e-2])
+@pytest.mark.parametrize(
+    ("roughness", "cosine"), [(0.1, 0.1), (0.1, 0.5), (0.3, 1e-2), (0.45, 1.0), (1.0, 0.1), (1.0, 0.5)]
+)
 def test_sheen_takes_from_the_base_what_it_reflects(roughness: float, cosine: float) -> None:
     """Against a quadrature of the published model: D of Estevez and Kulla 2017 with Smith masking. The base
     receives the smaller remainder of the two directions, of view and light."""
@@ -138,37 +139,6 @@ def textbook_sheen(cosine: float, mu: Array, phi: Array, roughness: float) -> Ar
     h /= np.linalg.norm(h, axis=-1, keepdims=True)
     d = (2 + n) / (2 * np.pi) * (1 - h[..., 2] ** 2).clip(0) ** (n / 2)
     return np.asarray(d / (1 + capital_lambda(cosine) + capital_lambda(mu)) / (4 * cosine * mu))
-
-
-def mitsuba_albedo(bsdf: dict[str, Any], cosine: float, points: int = 1 << 14) -> float:
-    """∫ f μo dωo of a BSDF of Mitsuba's, by its own sampling."""
-    xi = sobol(points, 3, seed=5)
-    si = dr.zeros(mi.SurfaceInteraction3f, points)
-    si.n = mi.Normal3f(0, 0, 1)
-    si.sh_frame = mi.Frame3f(si.n)
-    si.wi = mi.Vector3f(*map(float, towards(cosine)))
-    weight = mi.load_dict(bsdf).sample(mi.BSDFContext(), si, mi.Float(xi[:, 0]), mi.Point2f(xi[:, 1:].T))[1]
-    return float(np.mean(np.array(weight.x, np.float64)))
-
-
-def white(kind: str, **values: Any) -> dict[str, Any]:
-    return {"type": kind, "base_color": {"type": "rgb", "value": 1.0}, **values}
-
-
-@pytest.mark.parametrize("metallic", [0.0, 1.0])
-def test_principled_makes_energy_where_the_surface_does_not(metallic: float) -> None:
-    """Mitsuba's ``principled`` returns up to 1.5 times the light it receives."""
-    grid = list(itertools.product((0.02, 0.1, 0.3, 0.5, 1.0), (1.0, 0.5, 0.2, 0.05)))
-    mitsuba, own = (
-        np.array([mitsuba_albedo(white(k, roughness=r, metallic=metallic, specular=0.5), c) for r, c in grid])
-        for k in ("principled", "mbtf_surface")
-    )
-    assert np.abs(own - 1).max() < TOLERANCE
-    if metallic == 0:
-        assert mitsuba.max() > 1.05
-    else:
-        # Its metal loses instead, for it scatters once.
-        assert mitsuba.min() < 0.9
 
 
 def random_directions(n: int, seed: int, least: float = 1e-2) -> Array:
@@ -306,5 +276,3 @@ def test_metal_gives_back_what_one_scattering_loses() -> None:
     expected = [reflected(cosine, b) for b in base] + several * (1 - reflected(cosine, 1.0))
     rows = np.array([[roughness, 1.0, 0.0, 0.0, 0.0, b, cosine] for b in base])
     np.testing.assert_allclose(albedos(rows, METAL, 1 << 15)[0], expected, atol=TOLERANCE)
-    mitsuba = {"type": "roughconductor", "alpha": roughness**2, "distribution": "ggx", "material": "none"}
-    assert mitsuba_albedo(mitsuba, cosine) < 0.7

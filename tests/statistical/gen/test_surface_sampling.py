@@ -71,10 +71,8 @@ class Hemisphere:
         return sine * self.width * dr.cosh(p.y) * self.turn * self.turns * dr.cosh(p.x * self.turns)
 
 
-def chi_square(
-    parts: SurfaceParts, wi: NDArray[np.float64], maps: dict[str, Any], fault: dict[str, Any] | None = None
-) -> ChiSquareTest:
-    """The test, run, of sampling a surface towards `wi`; `fault` changes maps for the samples alone."""
+def chi_square(parts: SurfaceParts, wi: NDArray[np.float64], maps: dict[str, Any]) -> ChiSquareTest:
+    """The test, run, of sampling a surface towards `wi`."""
     widths = [maps.get("roughness", 0.3) ** 2] if parts.specular or parts.metallic else [1.0]
     if parts.clearcoat:
         widths.append(maps.get("clearcoat_roughness", 0.3) ** 2)
@@ -84,7 +82,7 @@ def chi_square(
     domain = Hemisphere(2 * (wi @ normal) * normal - wi, min(1.0, 2.0 * min(widths)))
 
     def draw(xi: Any) -> tuple[Any, Any]:
-        surface = point(parts, np.tile(wi, (dr.width(xi), 1)), **{**maps, **(fault or {})})
+        surface = point(parts, np.tile(wi, (dr.width(xi), 1)), **maps)
         omega, weight, _ = surface.sample(xi.x, mi.Point2f(xi.y, xi.z))
         kept = dr.max(weight) > 0
         return dr.select(kept, omega, mi.Vector3f(0, 0, 1)), dr.select(kept, mi.Float(1.0), 0.0)
@@ -122,22 +120,6 @@ def test_samples_have_the_stated_density(case: tuple[str, SurfaceParts, dict[str
     test = chi_square(case[1], VIEWS[view], case[2])
     assert not test.fail, test.messages
     assert p_value(test) > 1 - (1 - 0.01) ** (1 / (len(CASES) * len(VIEWS))), test.messages
-
-
-FAULTS = {
-    "diffuse tilted": tilt(0.6, -0.3),
-    "specular 0.2": {"roughness": 0.22},
-    "metal 1.0": {"metallic": 0.9},
-    "clearcoat": {"clearcoat_roughness": 0.24},
-    "sheen 1.0": {"sheen": 0.8},
-}
-
-
-@pytest.mark.parametrize("name", FAULTS)
-def test_the_chi_square_test_finds_a_fault(name: str) -> None:
-    """Samples of a slightly different surface fail the test."""
-    _, parts, maps = next(c for c in CASES if c[0] == name)
-    assert p_value(chi_square(parts, VIEWS["oblique"], maps, FAULTS[name])) < 1e-4
 
 
 def p_value(test: ChiSquareTest) -> float:

@@ -91,20 +91,3 @@ def test_finite_footprint(light: tuple[float, float], view: tuple[float, float],
         return
     result = aggregate_test(a, b, exact, exact, thirds, minimum=500)
     assert result.p_value > 1e-3, str(result)
-
-
-def test_a_mirrored_offset_is_caught() -> None:
-    """The test of finite footprints detects a mirrored offset."""
-    omega_i, omega_o = direction(35, 0), direction(50, 200)
-    n = 3000
-    u = np.random.default_rng(3).random((n, 2))
-    e = estimate(
-        GROOVE.grid,
-        lambert(ALBEDO),
-        LightKernel(0.0),
-        queries(u, 0.08, omega_i, omega_o, n),
-        64,
-        transport=DIRECT,
-    )
-    mirrored = footprint_mean(1 - u[:, 0] - 0.5, 0.08, omega_i, omega_o)[:, None]
-    assert aggregate_test(e.value_a[:, :1], e.value_b[:, :1], mirrored, mirrored, minimum=500).p_value < 1e-6

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +23,6 @@ resolution: 16
 SMALL = "--queries 12/texel --test-queries 256 --test-spp 64 --set output.shard_queries=1000"
 LINES = {
     "generate": f"cloth.yaml {SMALL} -o data --json",
-    "again": f"cloth.yaml {SMALL} -o data --json",
     "verify": "verify data",
     "plan": "plan cloth.yaml --queries 12/texel",
     "opaque": "plan cloth.yaml --queries 12/texel --effects=-transmission",
@@ -51,7 +49,6 @@ def test_a_data_set_holds_light_that_fibers_reflect_and_pass(work: Path, done: d
     summary = done["generate"].result()
     assert summary["complete"]
     assert (summary["lost"], summary["nonfinite"]) == (0, 0)
-    assert done["again"].result()["paths"] == 0
     assert done["verify"].code == 0, done["verify"].err
     dataset = Dataset.open(work / "data")
     tile = dataset.manifest["tile"]
@@ -94,17 +91,6 @@ def test_pictures_and_description(work: Path, done: dict[str, Done]) -> None:
     with Image.open(work / "preview/beauty.png") as picture:
         assert np.asarray(picture).std() > 5
     assert len(list((work / "reference").glob("*.exr"))) == 2
-
-
-def test_damaged_data_are_repaired(work: Path, done: dict[str, Done]) -> None:
-    shutil.copytree(work / "data", work / "damaged")
-    for name in ("manifest.json", "train-00001.npz"):
-        (work / "damaged" / name).write_bytes(b"damaged")
-    found = run_named({"repair": "repair damaged --material cloth.yaml", "verify": "verify damaged"}, work)
-    assert found["repair"].code == 0, found["repair"].err
-    assert found["verify"].code == 0, found["verify"].err
-    a, b = (Dataset.open(work / name).load("train") for name in ("data", "damaged"))
-    assert all(np.array_equal(a[key], b[key]) for key in a)
 
 
 def test_a_fit_learns_heights_by_default_and_draws_cloth(work: Path, done: dict[str, Done]) -> None:

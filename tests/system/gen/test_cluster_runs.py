@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 from support.commands import Done, run_named
-from support.slurm import slurm_node
 from support.small_runs import contents, write_maps
 
 from mbtf_core.data.verify import verify
@@ -86,35 +85,6 @@ def test_reference_pictures_are_those_of_one_process(runs: tuple[Path, dict[str,
 
 def test_a_finished_data_set_needs_no_cluster(runs: tuple[Path, dict[str, Done]]) -> None:
     assert runs[1]["again"].result()["paths"] == 0
-
-
-SLURM_WORKERS = "engine: slurm\nworkers: 2\nthreads: 1\nmemory: 2GB\nwalltime: 10min\n"
-
-
-# Workers that die: the next test; what is submitted: `test_cluster`; a real SLURM: `test_slurm_array`.
-@pytest.mark.slow
-def test_jobs_of_slurm_that_are_canceled_are_replaced(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    pytest.importorskip("dask_jobqueue", reason="no dask-jobqueue; to enable: pip install 'mbtf[cluster]'")
-    write_maps(tmp_path)
-    (tmp_path / "slurm.yaml").write_text(SLURM_WORKERS)
-    line = "maps --queries 65536 --test-queries 1024 --spp 64 --test-spp 8 --set output.shard_queries=1024"
-    line += " --json -o"
-    command = [sys.executable, "-m", "mbtf_gen", *line.split()]
-    with slurm_node(monkeypatch):
-        clustered = subprocess.Popen([*command, "out", "--cluster", "slurm.yaml"], cwd=tmp_path)
-        while clustered.poll() is None and len(list(tmp_path.glob("out/train*.json"))) < 3:
-            time.sleep(0.1)
-        running = subprocess.run(["squeue", "-h", "-o", "%i"], capture_output=True, text=True, check=True)
-        jobs = running.stdout.split()
-        assert len(jobs) == 2
-        # Both: only a new job can go on.
-        subprocess.run(["scancel", *jobs], check=True)
-        assert clustered.wait(300) == 0
-    plain = subprocess.run([*command, "whole"], cwd=tmp_path, check=False, capture_output=True)
-    assert plain.returncode == 0
-    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
 
 
 def is_worker(process: Any) -> bool:

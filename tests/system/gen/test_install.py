@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from conftest import RunPython
-from support.paths import ROOT
+from support.paths import ASSETS
 
 from mbtf_gen import doctor
 
@@ -40,24 +40,14 @@ def test_the_three_programs_are_installed() -> None:
     }
 
 
-@pytest.mark.parametrize("content", [b"no library\n", b"\x7fELF" + bytes(4096), None])
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ["mbtf_gen", "{asset}", "--queries", "10", "--test-queries", "10", "-o", "{out}"],
-        ["mbtf_gen", "reference", "{asset}", "--size", "8", "-o", "{out}"],
-    ],
-    ids=["generate", "reference"],
-)
+@pytest.mark.parametrize("command", [[], ["reference"]], ids=["generate", "reference"])
 def test_a_broken_llvm_ends_every_rendering_command_in_one_clear_error(
-    arguments: list[str], content: bytes | None, tmp_path: Path, run_python: RunPython
+    command: list[str], tmp_path: Path, run_python: RunPython
 ) -> None:
     library = tmp_path / "libLLVM.so"
-    if content is not None:
-        library.write_bytes(content)
-    asset = ROOT / "assets" / "turtle_shell"
-    filled = [a.format(asset=asset, out=tmp_path / "out") for a in arguments]
-    done = run_python("-m", *filled, "--quiet", DRJIT_LIBLLVM_PATH=str(library))
+    library.write_bytes(b"\x7fELF" + bytes(4096))
+    line = [*command, str(ASSETS / "turtle_shell"), "-o", str(tmp_path / "out"), "--quiet"]
+    done = run_python("-m", "mbtf_gen", *line, DRJIT_LIBLLVM_PATH=str(library))
     assert done.returncode == 3
     lines = done.stderr.splitlines()
     assert len(lines) == 2

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.commands import Done, run_named
-from support.measured_files import btf, factorized, photographs, write_folder, zipped
+from support.measured_files import btf, photographs, write_folder, zipped
 
 from mbtf_core.data.dataset import Dataset
 
@@ -24,7 +24,6 @@ LINES = {
     "missing": "import missing.btf -o none",
     "generate": f"wool {SMALL} --queries 20/texel -o shuffled",
     "slices": f"wool {SMALL} --queries 81/texel --layout slices -o slices",
-    "plane": "plane --resolution 8 --queries 81/texel --layout slices --test-queries 8 -o flat",
     "to neumip": "export shuffled shuffled.hdf5",
     "from neumip": "import shuffled.hdf5 --test-queries 32 -o neumip",
     "to neuralbtf": "export slices slices.hdf5 --program neuralbtf",
@@ -45,9 +44,6 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
     heights = np.random.default_rng(0).random((8, 8)).astype(np.float32)
     np.save(folder / "wool/height.npy", heights)
     (folder / "wool/material.yaml").write_text("height: height.npy\nbase_color: [0.8, 0.5, 0.2]\n")
-    (folder / "plane").mkdir()
-    np.save(folder / "plane/height.npy", np.zeros((8, 8), np.float32))
-    (folder / "plane/material.yaml").write_text("height: height.npy\nbase_color: [0.8, 0.5, 0.2]\n")
     return folder
 
 
@@ -92,41 +88,3 @@ def test_an_export_is_imported_exactly(work: Path, done: dict[str, Done], source
     assert len(missing) < 0.01 * len(after)
     assert all(before[key] == value for key, value in after.items() if key in before)
     assert data.lattice.finest == 3
-
-
-def as_btf(data: Dataset, cosine: bool) -> bytes:
-    """A DFMF file of all slices of a data set, which has the values times the cosine of the light."""
-    rows, columns = data.lattice.shape()
-    whole = data.load("train")
-    texel = np.floor(whole["u"][:, 0].astype(np.float64) * (columns, rows)).astype(np.int64)
-    order = np.argsort((rows - 1 - texel[:, 1]) * columns + texel[:, 0])
-    value = (whole["value_a"].astype(np.float64) + whole["value_b"])[order] / 2
-    # Of each texel all views under the first light, then under the next.
-    omega = whole["omega_o"][0, : round(len(whole["omega_o"][0]) ** 0.5)].astype(np.float64)
-    n = len(omega)
-    grid = value.reshape(rows, columns, n, n, 3).transpose(3, 2, 0, 1, 4)
-    if cosine:
-        grid = grid * omega[None, :, 2, None, None, None]
-    angles = np.rad2deg(np.stack([np.arccos(omega[:, 2]), np.arctan2(omega[:, 1], omega[:, 0])], axis=-1))
-    return factorized(grid, angles, angles, model=1, cosine=int(cosine))
-
-
-def test_renderings_come_back_from_the_factors_of_a_btf(work: Path, done: dict[str, Done]) -> None:
-    assert done["plane"].code == 0, done["plane"].err
-    for name, cosine in (("slices", True), ("flat", False)):
-        (work / f"{name}.btf").write_bytes(as_btf(Dataset.open(work / name), cosine))
-    lines = {n: f"import {n}.btf --queries 60/texel --min-cos 0.05 -o {n}_btf" for n in ("slices", "flat")}
-    again = run_named(lines, work)
-    for name in lines:
-        assert again[name].code == 0, again[name].err
-        before = rows(Dataset.open(work / name).load("train"), 3)
-        data = Dataset.open(work / f"{name}_btf")
-        for split in data.splits:
-            after = rows(data.load(split), 3)
-            assert len(after) > 100
-            found = np.array([(value, before[key]) for key, value in after.items() if key in before])
-            assert len(found) > 0.9 * len(after)
-            np.testing.assert_allclose(found[:, 0], found[:, 1], rtol=2e-4, atol=2e-5)
-    # A Lambert plane has the value of its albedo over pi under every light.
-    flat = Dataset.open(work / "flat_btf").load("train")
-    np.testing.assert_allclose(flat["value_a"] * np.pi, [[0.8, 0.5, 0.2]] * len(flat["sigma"]), rtol=1e-4)

@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pytest
 import trimesh
 from PIL import Image
-from support.commands import Done, run_named
+from support.commands import run_named
 
 from mbtf_core.data.dataset import Dataset
 
@@ -21,57 +20,35 @@ LINES = {
 
 
 def write_pebbles(path: Path) -> None:
-    """Glossy red pebbles on a gray floor, in centimeters; one reaches over the border."""
-    rng = np.random.default_rng(0)
-    scene = trimesh.Scene()
+    """Red pebbles on a gray floor, in centimeters; one reaches over the border."""
     pebbles = []
-    for x, y in ((0.0, 1.2), (1.5, 0.6), (2.4, 1.9)):
+    for place in ((0.0, 1.2, 0.3), (1.5, 0.6, 0.35), (2.4, 1.9, 0.38)):
         ball = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
         ball.apply_scale([1.0, 0.8, 0.5])
-        ball.apply_translation([x, y, 0.3 + 0.1 * rng.random()])
-        pebbles.append(ball)
+        pebbles.append(ball.apply_translation(place))
     floor = trimesh.Trimesh([[0, 0, 0], [3, 0, 0], [3, 2.4, 0], [0, 2.4, 0]], [[0, 1, 2], [0, 2, 3]])
-    for name, mesh, color, roughness in (
-        ("pebbles", trimesh.util.concatenate(pebbles), [200, 40, 30, 255], 0.3),
-        ("floor", floor, [128, 128, 128, 255], 1.0),
-    ):
+    scene = trimesh.Scene()
+    for mesh, color in ((trimesh.util.concatenate(pebbles), [200, 40, 30, 255]), (floor, [128] * 3 + [255])):
         # glTF has y up.
         mesh.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0]))
-        mesh.visual = trimesh.visual.TextureVisuals(
-            material=trimesh.visual.material.PBRMaterial(
-                baseColorFactor=color, roughnessFactor=roughness, metallicFactor=0.0
-            )
-        )
-        scene.add_geometry(mesh, geom_name=name)
+        material = trimesh.visual.material.PBRMaterial(baseColorFactor=color, metallicFactor=0.0)
+        mesh.visual = trimesh.visual.TextureVisuals(material=material)
+        scene.add_geometry(mesh)
     scene.export(path)
 
 
-@pytest.fixture(scope="module")
-def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("mesh")
-    write_pebbles(folder / "pebbles.glb")
-    return folder
-
-
-@pytest.fixture(scope="module")
-def done(work: Path) -> dict[str, Done]:
-    return run_named(LINES, work)
-
-
-def test_a_mesh_gives_a_complete_data_set(work: Path, done: dict[str, Done]) -> None:
+def test_a_mesh_gives_data_and_pictures(tmp_path: Path) -> None:
+    write_pebbles(tmp_path / "pebbles.glb")
+    done = run_named(LINES, tmp_path)
     assert done["generate"].result()["complete"]
-    assert done["verify"].code == 0, done["verify"].err
-    dataset = Dataset.open(work / "data")
+    for name in ("verify", "reference", "preview"):
+        assert done[name].code == 0, done[name].err
+    dataset = Dataset.open(tmp_path / "data")
     # A pebble over the border makes the mesh wider than its floor.
     assert dataset.manifest["tile"]["triangles"] == 3 * 320 + 2
     assert dataset.geometry() is None
     test = dataset.load("test")
     value = 0.5 * (test["value_a"] + test["value_b"])
     assert (value.mean(axis=0)[0] > 1.2 * value.mean(axis=0)[1:]).all()
-
-
-def test_pictures_are_drawn(work: Path, done: dict[str, Done]) -> None:
-    for name in ("reference", "preview"):
-        assert done[name].code == 0, done[name].err
-    with Image.open(work / "preview/beauty.png") as picture:
+    with Image.open(tmp_path / "preview/beauty.png") as picture:
         assert np.asarray(picture).std() > 5

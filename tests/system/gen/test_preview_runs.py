@@ -61,14 +61,8 @@ def drawing(work: Path) -> None:
 def batch(work: Path) -> dict[str, Done]:
     lines = {
         "tilted": f"preview maps -o tilted --tiles 1 {FAST} --json",
-        "side": f"preview maps -o side --tiles 1 --view 50,30 --light 70,0 {FAST} --json",
-        "flat": f"preview flat.npy -o flat {FAST}",
-        "again": f"preview maps -o tilted --tiles 1 {FAST} --json",
-        "changed": f"preview maps -o tilted --tiles 2 {FAST}",
         "darker": f"preview flat.npy -o darker {FAST} --json",
         "darker again": f"preview flat.npy -o darker --exposure -0.5 {FAST} --json",
-        "replaced": f"preview flat.npy -o flat --tiles 1 --overwrite {FAST} --json",
-        "data": "preview data -o data-pictures --size 64 --spp 2 --json",
         "lonely": "preview lonely -o lonely-pictures --json",
         "settled": "preview data -o nowhere --min-cos 0.2",
     }
@@ -88,25 +82,6 @@ def quadrant(picture: NDArray[np.float64]) -> NDArray[np.intp]:
 
 
 @pytest.mark.usefixtures("drawing")
-@pytest.mark.parametrize("name", ["tilted", "side"])
-def test_mesh_and_path_traced_picture_show_the_same_thing(
-    name: str, batch: dict[str, Done], work: Path
-) -> None:
-    batch[name].result()
-    mesh, beauty = (pixels(work / name / f"{n}.png") for n in ("mesh", "beauty"))
-    assert mesh.shape == beauty.shape == (72, 96, 3)
-    block = np.abs(mesh - mesh[0, 0]).max(axis=-1) > 0.1
-    assert 0.15 < block.mean() < 0.9
-    a, b = quadrant(mesh), quadrant(beauty)
-    clear = block & (a >= 0) & (b >= 0)
-    assert clear.sum() > 0.5 * block.sum()
-    assert (a == b)[clear].mean() > 0.9
-    # Not so if one of them were mirrored or turned.
-    for turned in (b[:, ::-1], b[::-1], b[::-1, ::-1]):
-        assert (a == turned)[clear].mean() < 0.6
-
-
-@pytest.mark.usefixtures("drawing")
 def test_colors_lie_in_the_quadrants_of_the_map(batch: dict[str, Done], work: Path) -> None:
     """The camera stands towards -v: the map's first row is far, its first column left."""
     for file in ("mesh.png", "beauty.png"):
@@ -115,17 +90,6 @@ def test_colors_lie_in_the_quadrants_of_the_map(batch: dict[str, Done], work: Pa
         for number, (down, right) in enumerate([(-5, -12), (-5, 12), (6, -12), (6, 12)]):
             part = picture[36 + down - 2 : 36 + down + 3, 48 + right - 4 : 48 + right + 5]
             assert (part == number).mean() > 0.8, (file, number)
-
-
-@pytest.mark.usefixtures("drawing")
-def test_the_same_command_keeps_and_another_is_refused(batch: dict[str, Done], work: Path) -> None:
-    assert [p["kept"] for p in batch["tilted"].result()["pictures"]] == [False] * 3
-    assert [p["kept"] for p in batch["again"].result()["pictures"]] == [True] * 3
-    assert batch["changed"].code == 3
-    assert "preview.tiles: 1 -> 2" in batch["changed"].err
-    assert "tiles: 1" in (work / "tilted/config.yaml").read_text()
-    assert [p["kept"] for p in batch["replaced"].result()["pictures"]] == [False] * 3
-    assert "tiles: 1" in (work / "flat/config.yaml").read_text()
 
 
 @pytest.mark.usefixtures("drawing")
@@ -139,13 +103,6 @@ def test_another_exposure_shows_the_same_values(batch: dict[str, Done], work: Pa
     shown = srgb_to_linear(pixels(work / "darker/beauty.png")).mean()
     assert shown == pytest.approx(2**-0.5 / (2 * np.pi), rel=0.03)
     assert "exposure: -0.5" in (work / "darker/config.yaml").read_text()
-
-
-@pytest.mark.usefixtures("drawing")
-def test_plots_of_a_data_set_are_of_its_stored_queries(batch: dict[str, Done], work: Path) -> None:
-    pictures = {Path(p["file"]).stem: p for p in batch["data"].result()["pictures"]}
-    assert list(pictures) == ["mesh", "beauty", "queries"]
-    assert "5000 of 5000 training queries stored in data" in pictures["queries"]["shows"]
 
 
 def test_a_data_set_is_shown_as_it_is(batch: dict[str, Done], work: Path) -> None:

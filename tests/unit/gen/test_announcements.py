@@ -98,14 +98,6 @@ def test_only_many_paths_are_announced(
     assert capsys.readouterr().err == line
 
 
-@pytest.mark.parametrize(("seconds", "named"), [(119.0, False), (121.0, True)])
-def test_long_commands_name_a_shorter_one(
-    seconds: float, named: bool, capsys: pytest.CaptureFixture[str]
-) -> None:
-    forecast.announce(CONSOLE, 3e7, lambda: seconds, 1e6, faster="--size 8")
-    assert ("faster: --size 8" in capsys.readouterr().err) == named
-
-
 @pytest.mark.parametrize(("rate", "most"), [(3e4, 1e5), (5e5, 8e5), (5e6, 2e6)])
 def test_the_pilot_of_a_picture_is_short_and_exact(
     monkeypatch: pytest.MonkeyPatch, rate: float, most: float
@@ -123,28 +115,6 @@ def test_the_pilot_of_a_picture_is_short_and_exact(
     found = reference.picture_seconds(None, Camera(rows=500), None, 10_000_000)  # type: ignore[arg-type]
     assert found == pytest.approx(1e7 / rate)
     assert traced[0] < most
-
-
-def test_pictures_of_fibers_state_their_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "cloth.yaml").write_text("weave: plain\n")
-    monkeypatch.setattr(reference, "picture_estimator", lambda job: None)
-    monkeypatch.setattr(reference, "picture_seconds", lambda *_: 75.0)
-    monkeypatch.setattr(reference, "render_picture", stop)
-    line = ["reference", str(tmp_path / "cloth.yaml"), "--tiles-across", "1", "--kind", "query"]
-    assert run(app, [*line, "--spp", "16", "-o", str(tmp_path / "out")]) == 130
-    assert "expected: about 1:15" in capsys.readouterr().err
-
-
-def test_a_short_run_needs_no_forecast(
-    heights: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(forecast, "forecast", lambda *_, **__: pytest.fail("a pilot"))
-    monkeypatch.setattr(generation, "build_estimator", stop)
-    words = [str(heights), "--height-scale", "0", "--queries", "1000", "--test-queries", "10"]
-    assert run(app, [*words, "-o", str(heights.parent / "out")]) == 130
-    assert "expected" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -166,14 +136,3 @@ def test_a_preset_sets_the_resolution_up_to_that_of_the_map(
     arguments = dict(bound.arguments)
     job = prepare_job(arguments.get("options", GenerateOptions()), str(heights), arguments["quality"])
     assert job.lattice.shape() == (resolution, resolution)
-
-
-def test_the_resolution_of_a_material_overrides_that_of_a_preset(heights: Path) -> None:
-    from mbtf_core.config.settings import build
-    from mbtf_gen.config.generator import GeneratorConfig
-    from mbtf_gen.job import Job, limit_resolution
-
-    file = heights.with_name("material.yaml")
-    file.write_text(f"height: {heights.name}\nresolution: 32\n")
-    config = build(GeneratorConfig, {"material": str(file), "queries": {"resolution": 128}}, source="")
-    assert limit_resolution(Job.load(config)).lattice.shape() == (32, 32)

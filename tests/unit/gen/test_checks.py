@@ -102,16 +102,6 @@ def test_checks_of_the_physics_can_fail(name: str, monkeypatch: pytest.MonkeyPat
     assert finding.found.startswith("off by")
 
 
-def test_a_broken_llvm_is_a_finding_not_a_crash(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    fake = tmp_path / "libLLVM.so"
-    fake.write_text("no library\n")
-    monkeypatch.setenv(runtime.VARIABLE, str(fake))
-    check = run_one(doctor.all_checks(), "Mitsuba")
-    assert (check.failed, check.required) == (True, True)
-    assert str(fake) in check.finding.found
-    assert "unset" in check.finding.hint
-
-
 def test_an_abort_of_the_drawing_library_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
     fault = "the process was ended by SIGSEGV"
     monkeypatch.setattr(doctor, "run_child", lambda *a, **k: ChildResult({}, fault, 0.1))

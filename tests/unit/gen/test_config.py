@@ -13,7 +13,6 @@ from mbtf_core.config.settings import resolve
 from mbtf_core.errors import UsageError
 from mbtf_gen.config.generator import GeneratorConfig, count_queries, parse_count
 from mbtf_gen.config.publish import PublishConfig
-from mbtf_gen.sampling.light_kernel import MIN_WIDTH_DEG, LightKernel
 from mbtf_gen.tile.loading import load_material
 
 
@@ -50,21 +49,6 @@ def test_values_out_of_range_are_refused_with_key_and_reason(key: str, value: An
         resolve(GeneratorConfig, flags={"material": "m", key: value})
     assert key in caught.value.what
     assert says in caught.value.what
-
-
-@pytest.mark.parametrize("width", [0.0, MIN_WIDTH_DEG, 1.0, 45.0])
-def test_every_light_width_that_is_accepted_can_be_used(width: float) -> None:
-    config = GeneratorConfig.model_validate({"material": "m", "light": {"width": width}})
-    assert LightKernel(config.light.width).width_deg == width
-
-
-def test_a_bad_flag_over_a_good_file_is_a_usage_error_without_a_line(tmp_path: Path) -> None:
-    path = tmp_path / "config.yaml"
-    path.write_text("material: m\nqueries:\n  spp: 8\n")
-    with pytest.raises(UsageError) as caught:
-        resolve(GeneratorConfig, file=path, flags={"queries.spp": 7})
-    assert caught.value.where == "command line"
-    assert "even" in caught.value.what
 
 
 @pytest.mark.parametrize(
@@ -128,15 +112,6 @@ def test_hash_covers_every_option_but_the_materials_name(tmp_path: Path) -> None
     }
     assert listed == known - {("geometry", "max_displacement"), ("geometry", "max_pixels")}
     assert set(fields) - {s for s, _ in known} == {"version", "material", "seed"}
-
-
-def test_a_material_constant_changes_the_hash(tmp_path: Path) -> None:
-    folder = write_maps(tmp_path / "a")
-    hashes = set()
-    for text in ("roughness: 0.5", "roughness: 0.6", "roughness: 0.5\nspecular: 0.1", "metallic: 0.5"):
-        (folder / "material.yaml").write_text(f"height: height.npy\nbase_color: base_color.npy\n{text}\n")
-        hashes.add(config_hash(folder))
-    assert len(hashes) == 4
 
 
 @pytest.mark.parametrize(("text", "share"), [("2%", 0.02), (" 2.5 % ", 0.025), (0.02, 0.02), ("0.02", 0.02)])

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.datasets import write_dataset
+from support.height_maps import slope_normals
 
 from mbtf_core.data.geometry import (
     CLEARCOAT,
@@ -60,8 +61,7 @@ def centers(rows: int, columns: int) -> tuple[F64, F64]:
 
 def normals(sx: F64, sy: F64) -> NDArray[np.float32]:
     """Unit normals (h, w, 3) of a surface with these slopes: it rises against them."""
-    n = np.stack(np.broadcast_arrays(-sx, -sy, 1.0), axis=-1)
-    return (n / np.linalg.norm(n, axis=-1, keepdims=True)).astype(np.float32)
+    return slope_normals(np.stack(np.broadcast_arrays(sx, sy), axis=-1)).astype(np.float32)
 
 
 @pytest.mark.parametrize("shape", [(256, 256), (128, 256), (360, 240)])
@@ -90,16 +90,6 @@ def test_slopes_of_a_wave_are_its_differences(shape: tuple[int, int], tmp_path: 
     np.testing.assert_allclose(found.slopes[..., 1], slope_y, atol=2e-3 * np.abs(slope_y).max())
     # The two waves are independent, so that the mean of the product is the product of the means.
     np.testing.assert_allclose(found.slope_moments[..., 1], slope_x * slope_y, atol=2e-4)
-
-
-def test_a_tilted_plane_leans_against_its_slopes(tmp_path: Path) -> None:
-    """It rises to the right and to the top of the image."""
-    maps = {"normal": normals(np.full(SQUARE, 0.3), np.full(SQUARE, 0.2))}
-    found = made(job_of(tmp_path, np.zeros(SQUARE), **maps))
-    np.testing.assert_allclose(found.slopes, np.broadcast_to([0.3, 0.2], (16, 16, 2)), rtol=1e-5)
-    np.testing.assert_allclose(
-        found.slope_moments, np.broadcast_to([0.09, 0.06, 0.04], (16, 16, 3)), rtol=1e-5
-    )
 
 
 def test_moments_keep_detail_below_a_texel(tmp_path: Path) -> None:
@@ -184,12 +174,6 @@ def test_what_the_plan_leaves_out_is_left_out(tmp_path: Path) -> None:
     plane = of("auto,-normal,-parallax")
     np.testing.assert_allclose(plane.slopes, bare.slopes, atol=1e-6)
     np.testing.assert_array_equal(plane.heights, bare.heights)
-
-
-def test_maps_end_at_a_finest_level(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mbtf_gen.planning.simulation.FINEST_LEVEL", 4)
-    shapes = [made(job_of(tmp_path, np.zeros((32, 64)), finest=k)).slopes.shape[:2] for k in (2, 3, 4, 5)]
-    assert shapes == [(4, 8), (8, 16), (8, 16), (8, 16)]
 
 
 @pytest.fixture

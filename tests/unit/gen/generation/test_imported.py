@@ -259,13 +259,3 @@ def test_rounded_footprints_add_no_level(opened: Open) -> None:
         source = Listed()
         source.arrays["sigma"][:] = sigma
         assert opened(source).lattice.finest == finest
-
-
-def test_rounded_footprints_of_the_whole_tile_are_fitted(opened: Open, tmp_path: Path) -> None:
-    """Half precision rounds 0.5 up; the fit must not look for a level before the first."""
-    source = Listed()
-    source.arrays["sigma"][:] = 0.5003
-    import_measured(opened(source, queries={"test": "100"}), tmp_path / "shards")
-    assert Dataset.open(tmp_path / "shards").load("train")["sigma"].max() == 0.5
-    config = FitConfig.model_validate({"model": "neumip-baseline", "training": {"steps": 3, "batch": 500}})
-    assert fit(config, tmp_path / "shards", tmp_path / "fit").errors["test"]["n"] == 100

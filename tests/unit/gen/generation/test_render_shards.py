@@ -6,7 +6,6 @@ import json
 import pickle
 import time
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -97,30 +96,6 @@ class FullDisk(Runner):
                 yield Result(item.name, self.value)
             else:
                 yield Result(item.name, error="no space left", hint="make room", worker="node:1")
-
-
-def test_the_rate_counts_from_the_end_of_the_first_shard(
-    run: ShardRun, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The first shard compiles for 100 s; the others take a second each."""
-    clock: Any = SimpleNamespace(now=0.0, perf_counter=lambda: clock.now, thread_time=lambda: 0.0)
-    monkeypatch.setattr("mbtf_gen.generation.run.time", clock)
-    value = {
-        "record": exhausted(render_shard(run, run.job.shards[0]))["record"],
-        "rendered": True,
-        "writing": 0.0,
-    }
-    value["record"]["paths"] = 10**6
-
-    class Slow(Runner):
-        def map(self, function: Any, items: Any, **options: Any) -> Any:
-            for item in items:
-                clock.now += 1.0 if clock.now else 100.0
-                yield Result(item.name, value)
-
-    notes: list[str] = []
-    render_shards(run, run.job.shards[:3], Slow(), progress=lambda done, note, total: notes.append(note))
-    assert [note.split(",")[0] for note in notes] == ["0.01 M paths/s", "1.00 M paths/s", "1.00 M paths/s"]
 
 
 def test_a_full_disk_ends_the_run(run: ShardRun) -> None:

@@ -97,18 +97,6 @@ def test_faulty_files_are_restored_and_nothing_else(name: str, out: Path) -> Non
     assert moments(out) == before
 
 
-def test_foreign_files_are_named_and_left_alone(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    shutil.copy(out / "train-00000.npz", out / "train-00007.npz")
-    (out / "notes.txt").write_text("harmless")
-    flip(out / "train-00000.npz", 700)
-    assert repair(out).shards == ["train-00000.npz"]
-    capsys.readouterr()
-    assert generate(["verify", str(out)]) == 0
-    text = capsys.readouterr().out
-    assert f"{out}: 4 shards and geometry.exr, all intact\n" in text
-    assert f"{out}: not part of the data set, left alone: notes.txt, train-00007.npz\n" in text
-
-
 @pytest.fixture
 def other(out: Path) -> Path:
     """The same of another seed."""
@@ -136,17 +124,6 @@ def test_files_that_disagree_are_named_and_not_touched(
             (out / name).unlink()
         assert repair(out).complete
         assert contents(out) == contents(out.parent / "whole")
-
-
-def test_the_configuration_of_another_run_is_replaced(out: Path, other: Path) -> None:
-    shutil.copy(other / "config.yaml", out)
-    assert repair(out).documents == ["config.yaml"]
-    assert contents(out) == contents(out.parent / "whole")
-    # Without a manifest it is that of another data set.
-    shutil.copy(other / "config.yaml", out)
-    (out / "manifest.json").unlink()
-    with pytest.raises(InputError, match="belong to another configuration"):
-        repair(out)
 
 
 def test_a_lost_manifest_is_answered_everywhere(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -216,31 +193,6 @@ def test_a_manifest_is_not_restored_without_its_plan(out: Path, monkeypatch: pyt
     with pytest.raises(InputError, match="no intact sidecar"):
         repair(out)
     assert moments(out) == before
-
-
-def test_an_interrupted_repair_is_incomplete(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    flip(out / "train-00000.npz", 700)
-
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(ClosedForm, "estimate", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            repair(out)
-    assert json.loads((out / "manifest.json").read_text())["complete"] is False
-    assert repair(out).complete
-    assert contents(out) == contents(out.parent / "whole")
-
-
-def test_what_was_generated_again_is_reported(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    flip(out / "train-00000.npz", 700)
-    (out / "config.yaml").unlink()
-    capsys.readouterr()
-    assert generate(["repair", str(out)]) == 0
-    text = capsys.readouterr().out
-    assert f"{out}: 1 shards rendered again (train-00000.npz)" in text
-    assert f"{out}: config.yaml written again" in text
 
 
 def test_folders_without_a_data_set_are_refused(tmp_path: Path) -> None:

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import tempfile
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from support import measured_files as files
 from support.datasets import write_dataset
-from support.fuzzing import damaged, examples, loads_or_refuses
 from support.measured_files import write_hdf5
 
 from mbtf_core.errors import InputError
@@ -290,37 +286,3 @@ def test_files_of_no_known_kind(tmp_path: Path) -> None:
         open_measured(write_hdf5(tmp_path / "a", {"other": np.zeros(3)}))
     with pytest.raises(InputError, match="no such file"):
         open_measured(tmp_path / "none")
-
-
-def samples() -> dict[str, bytes]:
-    with tempfile.TemporaryDirectory() as folder:
-        plain, chunks = Path(folder, "plain.hdf5"), Path(folder, "chunks.hdf5")
-        write_hdf5(plain, stored(), base_radius=0.1)
-        with h5py.File(chunks, "w") as file:
-            for name, array in stored().items():
-                file.create_dataset(name, data=array, chunks=(1, *array.shape[1:]))
-        write_hdf5(Path(folder, "images.hdf5"), images())
-        return {path.name: path.read_bytes() for path in Path(folder).iterdir()}
-
-
-SAMPLES = samples()
-
-
-@given(data=st.data())
-@examples(400)
-def test_a_damaged_file(data: st.DataObject, tmp_path_factory: pytest.TempPathFactory) -> None:
-    name, content = data.draw(damaged(SAMPLES))
-    path = tmp_path_factory.getbasetemp() / "damaged.hdf5"
-    path.write_bytes(content)
-    if name == "images.hdf5":
-        btf = loads_or_refuses(lambda: NeuralBtf(path))
-        if btf is not None and len(btf.light):
-            texels = np.arange(min(btf.rows * btf.columns, 50))
-            values = loads_or_refuses(lambda: btf.values(np.zeros_like(texels), texels))
-            assert values is None or np.isfinite(values).all()
-        return
-    found = loads_or_refuses(lambda: NeumipQueries(path))
-    queries = None if found is None else loads_or_refuses(lambda: found.read(0, 30))
-    if queries is not None:
-        assert all(np.isfinite(queries[name]).all() for name in FIELDS)
-        assert ((queries["u"] >= 0) & (queries["u"] < 1)).all()

@@ -8,11 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 from support import measured_files as files
-from support.fuzzing import damaged, examples, loads_or_refuses
 
 from mbtf_core.errors import InputError
 from mbtf_gen.measured.ubo2003 import Ubo2003, angles_of
@@ -232,17 +229,3 @@ def test_names_that_climb_out_of_an_archive_are_harmless(tmp_path: Path) -> None
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("photographs")
-
-
-@given(data=st.data())
-@examples(200)
-def test_a_damaged_archive(data: st.DataObject, folder: Path) -> None:
-    two = good() | {"tl010 pl000 tv000 pv000.jpg": files.encoded(UP, UP)}
-    samples = {"a": files.zipped(two), "b": files.zipped(two, zipfile.ZIP_DEFLATED)}
-    _, content = data.draw(damaged(samples))
-    path = folder / "a.zip"
-    path.write_bytes(content)
-    btf = loads_or_refuses(lambda: Ubo2003(path))
-    if btf is not None:
-        pairs = np.arange(len(btf.light))
-        loads_or_refuses(lambda: btf.values(pairs, np.zeros_like(pairs)))

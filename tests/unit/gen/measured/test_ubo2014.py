@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import struct
-import tracemalloc
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from support import measured_files as files
-from support.fuzzing import damaged, examples, loads_or_refuses
 
 from mbtf_core.errors import InputError
 from mbtf_gen.measured.ubo2014 import Ubo2014
@@ -130,34 +126,6 @@ def test_nan_factors_are_refused_where_they_are_used(tmp_path: Path) -> None:
         btf.values(np.array([0, 1]), np.array([TEXELS - 1, 0]))
 
 
-def test_many_components_take_little_memory(tmp_path: Path) -> None:
-    """A value of 65 536 components takes half a megabyte while it is computed."""
-    values = np.ones((1, 1, 4, 4, 3))
-    content = files.factorized(values, [(10, 20)], [(30, 40)], version=1, width=2)
-    head = content[: content.index(struct.pack("<BIII", 2, 1, 1, 16))]
-    head = head[:-56] + struct.pack("<I", 65_536) + head[-52:]
-    channel = struct.pack("<BIII", 2, 65_536, 1, 16) + np.full(18 * 65_536, 1 / 256, "<f2").tobytes()
-    btf = opened(tmp_path, head + 3 * channel)
-    tracemalloc.start()
-    found = btf.values(np.zeros(4000, int), np.zeros(4000, int))
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    np.testing.assert_allclose(found, 1.0)
-    assert peak < 400e6
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("btf")
-
-
-@given(data=st.data())
-@examples(300)
-def test_a_damaged_file(data: st.DataObject, folder: Path) -> None:
-    samples = {"v1": files.btf(version=1), "yuv": files.btf(11, 2)}
-    _, content = data.draw(damaged(samples))
-    btf = loads_or_refuses(lambda: opened(folder, content))
-    if btf is not None and len(btf.light):
-        texels = np.arange(min(btf.rows * btf.columns, 50))
-        values = loads_or_refuses(lambda: btf.values(np.zeros_like(texels), texels))
-        assert values is None or np.isfinite(values).all()

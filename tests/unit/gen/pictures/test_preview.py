@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,13 +10,11 @@ import numpy as np
 import pytest
 from support.datasets import write_dataset
 
-from mbtf_core.app.console import run
 from mbtf_core.data.lattice import texel_centers
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import InputError
-from mbtf_core.pictures import Camera, tiles_camera
+from mbtf_core.pictures import Camera
 from mbtf_core.run.processes import run_child
-from mbtf_gen.cli.app import app
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
 from mbtf_gen.pictures import mesh
@@ -33,28 +30,6 @@ def material(rows: int = 4, columns: int = 8, **options: Any) -> HeightFieldTile
     rng = np.random.default_rng(1)
     color = rng.uniform(0.1, 0.9, (rows, columns, 3)).astype(np.float32)
     return HeightFieldTile(0.1 * rng.random((rows, columns)), maps={"base_color": color, **options})
-
-
-@pytest.mark.parametrize("aspect", [0.5, 1.0, 3.0])
-@pytest.mark.parametrize(("elevation", "azimuth"), [(90, -90), (40, -90), (25, 30)])
-@pytest.mark.parametrize("depth_range", [0.0, 0.3, 5.0])
-def test_the_camera_frames_the_block(
-    aspect: float, elevation: float, azimuth: float, depth_range: float
-) -> None:
-    camera = tiles_camera(
-        elevation, azimuth, tiles=2, aspect=aspect, displacement_range=depth_range, columns=120
-    )
-    assert (camera.rows, camera.columns) == (90, 120)
-    assert camera.target == (1.0, aspect)
-    forward, right, up = camera.frame()
-    reach = []
-    for corner in np.ndindex(2, 2, 2):
-        offset = np.array(corner) * (2.0, 2.0 * aspect, -depth_range) - camera.position
-        depth = offset @ forward
-        assert depth > 0
-        half = camera.pixel_pitch / 2 * depth
-        reach += [abs(offset @ right) / (half * 120), abs(offset @ up) / (half * 90)]
-    assert max(reach) == pytest.approx(0.94, abs=1e-3)
 
 
 @pytest.mark.parametrize("tiles", [1, 2, 3])
@@ -103,21 +78,6 @@ def sample_of(count: int, seed: int = 0, **options: Any) -> QuerySample:
     config = GeneratorConfig.model_validate({"material": "m", "queries": {"train": str(count), **options}})
     job = Job.of(config, material())
     return sampled_queries(job)
-
-
-@pytest.mark.parametrize("weights", [(0.6, 0.4), (1.0, 0.0), (0.0, 1.0)])
-@pytest.mark.parametrize("finest", [1, 2, 5])
-def test_the_stated_density_is_that_of_the_levels(weights: tuple[float, float], finest: int) -> None:
-    mixture = LevelMixture(*weights)
-    at = np.linspace(-1, finest + 1, 20_001)
-    density = mixture.density(at, finest)
-    assert np.trapezoid(density, at) == pytest.approx(1.0, abs=2e-3)
-    assert density[(at < 0) | (at > finest)].max() == 0
-    # Quantiles of the generator against the integral of the density.
-    level = mixture.level((np.arange(4000) + 0.5) / 4000, finest)
-    for limit in np.linspace(0.1, finest, 7):
-        below = float(np.trapezoid(np.where(at <= limit, density, 0), at))
-        assert (level <= limit).mean() == pytest.approx(below, abs=2e-3)
 
 
 def test_the_histogram_of_levels_follows_the_mixture() -> None:
@@ -181,15 +141,3 @@ def test_a_crash_while_drawing_is_one_line(tmp_path: Path, monkeypatch: pytest.M
     fault = draw(block, camera, LIGHT, tmp_path / "mesh.png")
     assert fault == "the process was ended by SIGSEGV"
     assert list(tmp_path.iterdir()) == []
-
-
-def test_pictures_that_do_not_fit_are_refused_before_their_pixels_are_computed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    np.save(tmp_path / "flat.npy", np.zeros((8, 8)))
-    monkeypatch.setattr(Camera, "queries", lambda *_: pytest.fail("pixels are computed"))
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(1, 1, 10_000))
-    line = ["reference", str(tmp_path / "flat.npy"), "--size", "4096", "-o", str(tmp_path / "out")]
-    assert run(app, line) == 3
-    assert "10 kB are free" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()

@@ -12,7 +12,7 @@ from mbtf_core.errors import UsageError
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
 from mbtf_gen.planning.effects import EFFECTS
-from mbtf_gen.planning.effects_plan import EffectsPlan, bound_text
+from mbtf_gen.planning.effects_plan import EffectsPlan
 from mbtf_gen.planning.run_plan import measured, plan_effects, reference_plan
 from mbtf_gen.planning.scene import EffectsRequest
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
@@ -198,18 +198,3 @@ def test_a_plan_never_measures_a_rare_change_as_exactly_zero() -> None:
     shadowing = measured(job, plan_effects(job))["shadowing"]
     assert shadowing.bias_bound is not None
     assert shadowing.bias_bound + 2 * shadowing.error > TRUE_CHANGE
-
-
-@pytest.mark.parametrize(
-    ("bound", "error", "text"),
-    [
-        (0.13, 0.004, "< 14 %"),
-        (0.0041, 0.0004, "< 0.49 %"),
-        (0.2, None, "< 20 %"),
-        (0.98, 0.3, "may exceed 100 %"),
-        (1.1, 0.2, "may exceed 100 %"),
-    ],
-)
-def test_bounds_are_upper_ends(bound: float, error: float | None, text: str) -> None:
-    """No number beyond 100 %, and none that is a bound with an error bar."""
-    assert bound_text(bound, error) == text

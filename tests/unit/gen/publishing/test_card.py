@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import html
 import json
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +17,14 @@ from support.measured_files import btf
 from support.published import LAYOUTS, publish, python_blocks, small, stored
 
 from mbtf_core.data.dataset import Dataset
+from mbtf_core.errors import UsageError
 from mbtf_gen.config.measured import ImportConfig
 from mbtf_gen.config.publish import PublishConfig
 from mbtf_gen.generation.imported import Import, import_measured
 from mbtf_gen.planning.highlights import Highlights
 from mbtf_gen.publishing.card import card_text, code, escaped, fenced
 from mbtf_gen.publishing.facts import Facts
+from mbtf_gen.publishing.publication import Publication
 
 HOSTILE = '<script>alert("1")</script> ![x](https://example.org/p.png) | `*_'
 
@@ -62,32 +61,6 @@ def test_its_code_loads_the_data(
     assert found.dtype == np.float32
     assert found.shape == expected.shape
     assert found.tobytes() == expected.tobytes()
-
-
-@pytest.mark.parametrize("form", ["parquet", "webdataset"])
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_datasets_of_hugging_face_loads_the_folder(layout: str, form: str, tmp_path: Path) -> None:
-    pytest.importorskip("datasets")
-    small(tmp_path / "data", layout)
-    card = publish(tmp_path / "data", tmp_path / "card", form=form)
-    block = python_blocks((card / "README.md").read_text())[-1]
-    if form == "webdataset":
-        name = '"test", ' if layout == "slices" else ""
-        block = (
-            "import os\nfrom datasets import load_dataset\n"
-            f'data = load_dataset(os.getcwd(), {name}split="test").with_format("numpy")\n'
-            'value_a = data[:1]["value_a.npy"][0]'
-        )
-    code = f"{block}\nimport numpy\nnumpy.save({str(tmp_path / 'found.npy')!r}, value_a)"
-    homes = {"HF_HOME": str(tmp_path / "home"), "HF_HUB_OFFLINE": "1"}
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=card, env=os.environ | homes, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    found, expected = np.load(tmp_path / "found.npy"), stored(tmp_path / "data", "test")["value_a"]
-    count = min(len(found), len(expected))
-    np.testing.assert_array_equal(np.asarray(found, np.float32)[:count], expected[:count])
-    assert count >= 4
 
 
 @pytest.mark.parametrize("form", ["npz", "parquet", "webdataset"])
@@ -182,6 +155,8 @@ def test_measured_data_say_what_they_lack(tmp_path: Path) -> None:
     assert not (card / "recipe").exists()
     assert "| train | 160 |" in text
     assert " | unknown |" in text
+    with pytest.raises(UsageError, match="holds measured data, without maps"):
+        Publication.prepare(tmp_path / "data", PublishConfig(license="MIT", form="npz"), with_maps=True)
 
 
 def test_what_is_left_out_has_its_bound(tmp_path: Path) -> None:

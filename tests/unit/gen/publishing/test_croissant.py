@@ -74,13 +74,3 @@ def test_what_the_publishers_say_is_kept_and_harmless(tmp_path: Path) -> None:
     text = (card / "croissant.json").read_text()
     assert "<" not in text
     assert json.loads(text)["alternateName"] == SAYS["name"]
-
-
-@pytest.mark.parametrize("form", ["webdataset", "npz"])
-def test_other_forms_list_files_alone(form: str, tmp_path: Path) -> None:
-    small(tmp_path / "data")
-    metadata = opened(publish(tmp_path / "data", tmp_path / "card", form=form)).metadata
-    assert metadata.record_sets == []
-    # What the publishers do not say is not invented.
-    assert not {"creator", "url", "citeAs", "datePublished", "version", "publisher"} & set(metadata.to_json())
-    assert sum(file.content_url.startswith("data/train-0") for file in metadata.file_objects) >= 2

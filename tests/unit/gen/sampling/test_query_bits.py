@@ -196,11 +196,6 @@ def test_every_number_is_within_its_range(layout: str) -> None:
             assert (omega[:, 2] >= np.float32(0.2)).all()
 
 
-def test_level_zero_alone_has_one_footprint() -> None:
-    q = plan(Lattice(0, 1.0), 100).draw("train", 0, 100)
-    assert set(q.sigma.tolist()) == {0.5}
-
-
 def test_mixture_weights_are_normalized_and_not_all_zero() -> None:
     assert (LevelMixture(3.0, 1.0).log_uniform, LevelMixture(3.0, 1.0).finest) == (0.75, 0.25)
     with pytest.raises(ValueError, match="zero"):

@@ -39,14 +39,6 @@ def test_the_measured_directions_are_those_of_bonn() -> None:
     np.testing.assert_allclose(azimuth[angle == 60.0], 18.0 * np.arange(20), atol=1e-4)
 
 
-def test_pairs_combine_every_light_with_every_view() -> None:
-    omega = slice_directions("spiral", 5, 0.2)
-    light, view = direction_pairs(omega)
-    assert len(np.unique(np.concatenate([light, view], axis=1), axis=0)) == 25
-    assert (light[:5] == omega[0]).all()
-    assert (view[:5] == omega).all()
-
-
 @pytest.mark.parametrize("aspect", [1.0, 0.5])
 def test_every_texel_has_one_slice_at_its_center(aspect: float) -> None:
     lattice = Lattice(3, aspect)

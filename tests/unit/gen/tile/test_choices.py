@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 from pathlib import Path
 from typing import Any
 
@@ -132,36 +131,6 @@ class TestWrite:
         # The seams stay: the textures could not follow.
         assert content["make_tileable"] == "none"
 
-    def test_an_existing_file_is_kept(self, maps: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        (maps / "material.yaml").write_text("height: height.png\n")
-        for flag in ("--write", "--export"):
-            path = maps / ("material.yaml" if flag == "--write" else "z.exr")
-            path.touch()
-            before = path.read_bytes()
-            assert run(app, ["inspect", str(maps), flag, str(path)]) == 3
-            assert "exists already: --overwrite replaces it" in capsys.readouterr().err.replace("\n  ", ": ")
-            assert path.read_bytes() == before
-
-
-class TestWarning:
-    """The height scale in use is in the header of every run, and the warning where it is far off."""
-
-    @pytest.mark.parametrize(
-        ("given", "factor", "source"), [(None, 0.05, "default"), (0.3, 0.3, "given"), (-0.1, -0.1, "given")]
-    )
-    def test_far_off(
-        self, maps: Path, given: float | None, factor: float, source: str, caplog: pytest.LogCaptureFixture
-    ) -> None:
-        config = GeneratorConfig.model_validate(
-            {"material": str(maps), "geometry": {"height_scale": given, "make_tileable": "mirror"}}
-        )
-        with caplog.at_level(logging.INFO):
-            Job.prepare(config)
-        (warning,) = (r.getMessage() for r in caplog.records if r.levelno == logging.WARNING)
-        assert f"both agree at --height-scale 0.012 ({factor:g} is in use)" in warning
-        header = next(r.getMessage() for r in caplog.records if r.getMessage().startswith("mesh: "))
-        assert f"height scale {factor:g} ({source})" in header
-
 
 class TestExport:
     @pytest.mark.parametrize("flags", [(), ("--mesh", "40"), ("--height-scale", "-0.2")])
@@ -176,8 +145,3 @@ class TestExport:
         assert np.array_equal(found.z, expected.z.astype(np.float32))
         assert found.z.max() == 0.0
         assert found.aspect == expected.aspect
-
-    def test_with_choices(self, maps: Path) -> None:
-        written(maps, "--export", str(maps.parent / "z.exr"))
-        expected = job_of(maps).material.grid.z.astype(np.float32)
-        assert np.array_equal(load_material(maps.parent / "z.exr").grid.z, expected)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -28,12 +27,6 @@ class TestSlopes:
         expected = np.hypot(normals[:, 0], normals[:, 1]) / normals[:, 2]
         assert np.sort(triangle_slopes(grid)) == pytest.approx(np.sort(expected))
         assert rms_slope(grid) == pytest.approx(np.sqrt(np.mean(expected**2)))
-
-    def test_a_roof(self) -> None:
-        """Both flanks of a ridge along v rise by as much as they are wide."""
-        roof = np.tile(np.abs(np.arange(16) - 8.0) / 16, (4, 1))
-        median, high, steepest = slope_angles(HeightGrid.from_map(roof, 1.0, 0.25))
-        assert (median, high, steepest) == pytest.approx((45.0, 45.0, 45.0))
 
     def test_percentiles(self) -> None:
         """A gentle flank over seven eighths of the tile, a steep one over the last."""
@@ -113,18 +106,6 @@ class TestNumbers:
 
 
 class TestText:
-    def test_heading_and_figures(self, folder: Path) -> None:
-        text = inspection_text(load_material(folder).inspect(GeometrySection()), "rock")
-        assert text.startswith("rock: tile 1 x 0.5, surface glossy, make-tileable none, resolution 64\n")
-        for part in (
-            "displaces the mesh",
-            "slopes     median",
-            "OpenGL",
-            "slopes agree best at --height-scale 0.1",
-            "holes 25.0%",
-        ):
-            assert part in text
-
     def test_a_height_scale_far_from_the_suggested_one(self, folder: Path) -> None:
         save_normals(folder / "normal.png", normals_of(fractal(48, 96), 0.01))
 
@@ -147,22 +128,6 @@ class TestText:
 
 
 class TestCommand:
-    def test_a_displacement_that_generation_refuses(
-        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        np.save(tmp_path / "tall.npy", np.linspace(0.0, 200.0, 32).reshape(4, 8))
-        refused = "tall.npy: generation refuses it: the displacement range is 200 tile widths; at most 100"
-
-        def warned(*options: str) -> bool:
-            command = ["inspect", str(tmp_path / "tall.npy"), "--json", *options]
-            assert run(app, command) == 0
-            warnings = json.loads(capsys.readouterr().out)["warnings"]
-            return any(refused in warning for warning in warnings)
-
-        assert warned("--height-scale", "1")
-        assert not warned("--height-scale", "0.4")
-        assert not warned("--height-scale", "1", "--set", "geometry.max_displacement=300")
-
     @pytest.mark.parametrize(
         ("options", "fault", "hint"),
         [

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError
 from mbtf_gen.tile.loading import load_material
-from mbtf_gen.tile.maps.file_names import normal_convention, role_of
 
 
 def rng() -> np.random.Generator:
@@ -54,32 +53,6 @@ def folder(tmp_path: Path) -> Path:
     return out
 
 
-# Role → names of files that have it.
-ROLES: dict[str | None, str] = {
-    "height": "height.png Bricks102_1K-JPG_Displacement.jpg metal_plate_disp_1k.png BUMP.tif",
-    "base_color": "Fabric_Knitted_006_basecolor.jpg base_color.png woodBaseColor.png albedo.jpg "
-    "Bricks102_1K-JPG_Color.jpg bark_col_2k.jpg arm_chair_diff.png",
-    "roughness": "metal_plate_rough_1k.png",
-    "metallic": "metal_plate_metal_1k.png Metalness.png",
-    "normal": "metal_plate_nor_gl_1k.png NormalDX.png rock_normaldx.png",
-    "opacity": "color_mask.png Fabric_Knitted_006_opacity.jpg",
-    None: "rock_ao.png ambientOcclusion.png rock_arm_1k.png Rock023.png colorful.png",
-}
-
-
-class TestNames:
-    @pytest.mark.parametrize("role", ROLES)
-    def test_roles(self, role: str | None) -> None:
-        assert {name: role_of(name) for name in ROLES[role].split()} == dict.fromkeys(
-            ROLES[role].split(), role
-        )
-
-    def test_normal_conventions(self) -> None:
-        assert normal_convention("metal_plate_nor_gl_1k.png") == "gl"
-        assert normal_convention("Rock_NormalDX.png") == "dx"
-        assert normal_convention("normal.png") is None
-
-
 class TestBareFile:
     def test_float_heights_are_tile_widths(self, tmp_path: Path) -> None:
         heights = rng().random((6, 9))
@@ -97,20 +70,6 @@ class TestBareFile:
         material = load_material(png(tmp_path / "h.png", numbers))
         assert np.array_equal(material.height, numbers / 65535)
         assert (material.height_scale, material.facts["height"].bits) == (0.05, 16)
-
-    def test_eight_bits_are_smoothed_within_half_a_code_with_a_warning(self, tmp_path: Path) -> None:
-        ramp = np.rint(np.tile(100 + 5 * np.sin(np.arange(64) / 64 * 2 * np.pi), (64, 1))).astype(np.uint8)
-        material = load_material(png(tmp_path / "h.png", ramp))
-        assert np.abs(material.height - ramp / 255).max() <= 0.5 / 255 * (1 + 1e-9)
-        assert not np.array_equal(material.height, ramp / 255)
-        assert "8-bit heights with 11 distinct values" in material.warnings[0]
-
-    @pytest.mark.parametrize("shape", [(1, 1), (1, 7), (5, 1), (3, 10)])
-    def test_any_shape_and_constant_heights(self, tmp_path: Path, shape: tuple[int, int]) -> None:
-        material = load_material(npy(tmp_path / "h.npy", np.full(shape, 0.25)))
-        assert material.grid.z.shape == shape
-        assert material.grid.displacement_range == 0.0
-        assert material.aspect == shape[0] / shape[1]
 
     def test_a_large_displacement_at_the_default_scale_warns(self, tmp_path: Path) -> None:
         material = load_material(npy(tmp_path / "h.npy", np.array([[0.0, 0.6]])))
@@ -143,32 +102,6 @@ class TestGrid:
 
 
 class TestFolder:
-    def test_colors_become_linear(self, folder: Path) -> None:
-        from PIL import Image as Pillow
-
-        stored = np.asarray(Pillow.open(folder / "Rock_BaseColor.png")) / 255.0
-        assert load_material(folder).maps["base_color"] == pytest.approx(srgb_to_linear(stored), abs=1e-6)
-        (folder / "Rock_BaseColor.png").unlink()
-        linear = npy(folder / "color.npy", rng().random((4, 8, 3)))
-        assert load_material(folder).maps["base_color"] == pytest.approx(np.load(linear), abs=1e-7)
-        linear.unlink()
-        png(folder / "albedo.png", np.full((8, 16), 255, np.uint8))
-        assert np.array_equal(load_material(folder).maps["base_color"], np.ones((8, 16, 3)))
-
-    def test_normals_point_up_and_dx_is_turned(self, folder: Path) -> None:
-        tilted = np.full((8, 16, 3), (128, 200, 230), np.uint8)
-        png(folder / "rockNormalGL.png", tilted)
-        gl = load_material(folder).maps["normal"]
-        assert gl is not None
-        assert np.linalg.norm(gl, axis=-1) == pytest.approx(1.0, abs=1e-6)
-        assert gl[0, 0, 1] > 0.5
-        (folder / "rockNormalGL.png").rename(folder / "rockNormalDX.png")
-        dx = load_material(folder).maps["normal"]
-        assert dx is not None
-        assert dx * [1, -1, 1] == pytest.approx(gl)
-        png(folder / "rockNormalGL.png", codes(8, 16, 3))
-        assert load_material(folder).files["normal"].name == "rockNormalGL.png"
-
     def test_single_pixels_are_constants_of_any_aspect(self, folder: Path) -> None:
         png(folder / "rock-rough.png", np.full((1, 1), 51, np.uint8))
         png(folder / "Rock_BaseColor.png", np.full((1, 1, 3), 255, np.uint8))
@@ -229,11 +162,6 @@ class TestYaml:
                 0.25,
                 0.75,
             )
-
-    def test_gray_shorthand(self, folder: Path) -> None:
-        material = load_material(self.write(folder, "height: rock_height.npy\nbase_color: 0.8\n"))
-        assert np.array_equal(material.maps["base_color"], np.full(3, 0.8))
-        assert material.is_lambert
 
     def test_bsdf_is_passed_on(self, folder: Path) -> None:
         path = self.write(
@@ -319,8 +247,3 @@ class TestDigests:
         path = folder / "material.yaml"
         path.write_text("height: rock_height.npy\n")
         assert load_material(path).digests == load_material(folder / "rock_height.npy").digests
-
-    def test_the_convention_of_normals_counts(self, folder: Path) -> None:
-        before = load_material(folder).digests["settings"]
-        (folder / "rockNormalGL.png").rename(folder / "rockNormalDX.png")
-        assert load_material(folder).digests["settings"] != before

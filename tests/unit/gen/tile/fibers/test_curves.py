@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline
 
-from mbtf_gen.tile.fibers.curves import Bundle, Curve, closed_frames, interpolating, level_frames
+from mbtf_gen.tile.fibers.curves import Bundle, Curve, closed_frames, level_frames
 
 SHIFT = np.array([1.0, 0.0, 0.0])
 
@@ -36,11 +36,6 @@ def test_positions_and_derivatives_are_those_of_the_b_spline() -> None:
     at, slope = Curve(control).at(t)
     assert np.abs(at - spline(t)).max() < 1e-12
     assert np.abs(slope - spline.derivative()(t)).max() < 1e-11
-
-
-def test_straight_lines_are_kept() -> None:
-    points = np.arange(5)[:, None] / 5 * SHIFT
-    assert np.abs(interpolating(points, SHIFT) - points).max() < 1e-15
 
 
 @pytest.mark.parametrize("kind", ["closed", "two periods", "diagonal", "open"])
@@ -117,3 +112,10 @@ def test_segments_are_halved_until_they_are_short_for_their_radius() -> None:
         thin = thin.halved()
     length = np.linalg.norm(thin.at(np.arange(len(thin.windows())) + 0.5)[1][:, :3], axis=1)
     assert 25e-4 < length.max() < 100e-4
+
+
+def test_a_tube_that_reaches_over_the_border_has_a_copy_on_its_other_side() -> None:
+    points = np.column_stack([np.arange(6) / 6, np.full(6, 0.01), np.zeros(6)])
+    for radius, expected in ((0.005, {0.01}), (0.02, {0.01, 1.01})):
+        runs, _ = Bundle([Curve.through(points, radius, SHIFT)]).copies((1.0, 1.0))
+        assert {round(float(y), 6) for run in runs for y in run[:, 1]} == expected

@@ -64,14 +64,6 @@ def test_houndstooth_is_the_known_effect_of_eight_by_eight_yarns() -> None:
     assert ["".join("#" if name == "dark" else "." for name in row) for row in seen] == HOUNDSTOOTH
 
 
-def test_gingham_has_three_tones_in_the_ratio_1_2_1() -> None:
-    weave = named("gingham 4", "red4 white4", "red4 white4")
-    assert colors_of("gingham 4") == (4, 4)
-    assert colors_of("gingham") == (8, 8)
-    red = (weave.seen() == "red").reshape(2, 4, 2, 4).mean(axis=(1, 3))
-    assert red.tolist() == [[1.0, 0.5], [0.5, 0.0]]
-
-
 def test_the_period_is_the_least_common_multiple() -> None:
     weave = named("twill 2/1", "a2 b2", "c5", repeat=2)
     assert weave.draft.shape == (30, 24)
@@ -93,13 +85,6 @@ def test_other_sequences_are_refused_in_one_line(text: str) -> None:
     with pytest.raises(InputError) as error:
         parse_sequence(text, "warp")
     assert "\n" not in error.value.what
-
-
-def test_the_drawing_has_a_letter_for_each_yarn() -> None:
-    lines = named("plain", "red white", "red").describe()
-    assert [line.split() for line in lines[-2:]] == [["X.", "rr"], [".X", "rw"]]
-    assert named("plain", "red rust", "red").letters() == {"red": "a", "rust": "b"}
-    assert len(named("plain", "a400", "a2").describe()[-1].split()[0]) == 48
 
 
 @pytest.mark.parametrize(

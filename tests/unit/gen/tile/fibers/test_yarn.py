@@ -12,8 +12,6 @@ from scipy.stats import kstest
 from mbtf_gen.tile.fibers.curves import Curve
 from mbtf_gen.tile.fibers.yarn import YARNS, CrossSection, YarnModel, _disk, fibers_of, roughness_of
 
-# One tile width is four centimeters of a straight yarn.
-SECTION = CrossSection(0.25, 0.25, True)
 # Sign of the angle from y to z along x of a fiber with a negative pitch.
 TURNS = -1
 

@@ -6,24 +6,13 @@ import numpy as np
 import pytest
 
 from mbtf_core.data.lattice import texel_centers
-from mbtf_gen.tile.heights import HeightGrid, grid_faces, grid_vertices, tile_mesh
+from mbtf_gen.tile.heights import HeightGrid, grid_faces, grid_vertices
 
 SHAPES = [(4, 6), (1, 1), (1, 5), (5, 1), (3, 3)]
 
 
 def grid(rows: int, columns: int, seed: int = 0) -> HeightGrid:
     return HeightGrid.from_map(np.random.default_rng(seed).random((rows, columns)), 0.3)
-
-
-def test_heights_lie_below_the_reference_plane() -> None:
-    stored = np.array([[0.2, 0.5], [0.3, -0.1]])
-    np.testing.assert_allclose(HeightGrid.from_map(stored, 2.0).z, 2 * (stored - 0.5))
-    # A negative factor turns the height field upside down; its highest point still touches the plane.
-    np.testing.assert_allclose(HeightGrid.from_map(stored, -2.0).z, -2 * (stored + 0.1))
-    assert HeightGrid.from_map(stored, 0.0).displacement_range == 0.0
-    assert HeightGrid.from_map(stored, -2.0).displacement_range == pytest.approx(1.2)
-    assert HeightGrid.from_map(stored[:1], 1.0).aspect == 0.5
-    assert HeightGrid.from_map(stored, 1.0, 0.7).aspect == 0.7
 
 
 @pytest.mark.parametrize(("rows", "columns"), SHAPES)
@@ -68,12 +57,3 @@ def test_triangles_face_up_and_share_their_edges() -> None:
     _, counts = np.unique(edges, axis=0, return_counts=True)
     assert set(counts.tolist()) == {1, 2}
     assert np.sum(counts == 1) == 2 * (4 + 6)
-
-
-def test_the_exported_mesh_carries_uv() -> None:
-    g = grid(4, 6)
-    mesh = tile_mesh(g)
-    assert mesh.area_faces.sum() > g.aspect
-    assert mesh.bounds[:, 2].tolist() == [-g.displacement_range, 0.0]
-    np.testing.assert_allclose(mesh.visual.uv * (1.0, g.aspect), mesh.vertices[:, :2], atol=1e-12)
-    assert len(mesh.vertices) == 5 * 7

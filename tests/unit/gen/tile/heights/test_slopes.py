@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from support.height_maps import slope_normals
 
-from mbtf_gen.tile.heights import HeightGrid, carried_share, height_slopes, normal_slopes, residual_slopes
+from mbtf_gen.tile.heights import HeightGrid, height_slopes, residual_slopes
 
 F64 = NDArray[np.float64]
 
@@ -25,20 +26,7 @@ def waves(rows: int, columns: int, amplitude: float = 0.01, along: int = 3, up: 
 
 
 def normals(slopes: F64) -> NDArray[np.float32]:
-    n = np.concatenate([-slopes, np.ones_like(slopes[..., :1])], axis=-1)
-    return (n / np.linalg.norm(n, axis=-1, keepdims=True)).astype(np.float32)
-
-
-@pytest.mark.parametrize("shape", [(128, 128), (64, 128), (96, 64)])
-def test_slopes_of_heights_are_the_derivative(shape: tuple[int, int]) -> None:
-    z, slopes = waves(*shape)
-    found = height_slopes(HeightGrid.from_map(z, 1.0))
-    np.testing.assert_allclose(found, slopes, atol=0.02 * np.abs(slopes).max())
-
-
-def test_slopes_of_normals_are_those_they_were_made_of() -> None:
-    _, slopes = waves(32, 32, 0.05)
-    np.testing.assert_allclose(normal_slopes(normals(slopes)), slopes, atol=1e-5)
+    return slope_normals(slopes).astype(np.float32)
 
 
 @pytest.mark.parametrize("factor", [0.3, 1.0])
@@ -65,21 +53,9 @@ def test_detail_that_the_mesh_lacks_is_added_in_full() -> None:
     np.testing.assert_allclose(residual, detail, atol=0.01)
 
 
-def test_a_plane_takes_the_whole_map() -> None:
-    _, slopes = waves(64, 64)
-    residual, share = residual_slopes(normals(slopes), HeightGrid(np.zeros((64, 64)), 1.0))
-    np.testing.assert_allclose(residual, slopes, atol=1e-5)
-    assert share == 0.0
-
-
 def test_absolute_puts_the_map_in_place_of_the_mesh() -> None:
     z, _ = waves(64, 64)
     _, other = waves(64, 64, 0.003, along=5, up=4)
     grid = HeightGrid.from_map(z, 1.0)
     residual, _ = residual_slopes(normals(other), grid, "absolute")
     np.testing.assert_allclose(height_slopes(grid) + residual, other, atol=1e-5)
-
-
-def test_a_map_against_the_heights_is_not_subtracted() -> None:
-    _, slopes = waves(64, 64)
-    assert carried_share(-slopes, slopes) == 0.0

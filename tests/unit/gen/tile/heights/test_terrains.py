@@ -147,13 +147,6 @@ def test_fractions_that_are_cliffs_need_a_scale(tmp_path: Path) -> None:
     assert "--height-scale 0.05" in caught.value.hint
 
 
-def test_fractions_of_a_tile_go_on(tmp_path: Path) -> None:
-    np.save(tmp_path / "h.npy", (hills() - 580) / 40)
-    grid = load_material(tmp_path / "h.npy").configured(DEFAULT).grid
-    assert grid is not None
-    assert grid.displacement_range == pytest.approx(1, rel=1e-3)
-
-
 def test_a_scale_beyond_the_largest_is_not_suggested(tmp_path: Path) -> None:
     path = terrain(tmp_path / "dem.tif", hills().astype("u2"), (SCALE, 12, (1.0, 1.0, 0.0)))
     with pytest.raises(InputError, match="need a height scale") as caught:

@@ -43,13 +43,6 @@ class TestHeights:
         with pytest.raises(InputError, match="colored like a normal map"):
             load_material(png(tmp_path / "height.png", codes, 2, 8))
 
-    def test_gray_in_four_channels(self, tmp_path: Path) -> None:
-        gray = rng().integers(0, 65536, (8, 16, 1))
-        codes = np.concatenate([gray, gray, gray, np.full_like(gray, 65535)], axis=2)
-        material = load_material(png(tmp_path / "height.png", codes, 6, 16))
-        assert np.array_equal(material.height, gray[..., 0] / 65535)
-        assert material.warnings == ()
-
     def test_srgb_when_asked_for(self, tmp_path: Path) -> None:
         codes = rng().integers(0, 65536, (8, 16, 1))
         png(tmp_path / "h.png", codes, 0, 16)
@@ -66,12 +59,6 @@ class TestLayers:
         color = {c: rng().random((6, 9)).astype(np.float32) for c in "RGB"}
         exr(folder / "all.exr", {**color, "displacement.Y": one["d"], "extra.Y": one["e"]})
         return {**one, **color}
-
-    def test_names_of_layers_decide(self, tmp_path: Path) -> None:
-        stored = self.layered(tmp_path)
-        material = load_material(tmp_path / "all.exr")
-        assert np.array_equal(material.height, stored["d"])
-        assert any("displacement.Y of all.exr" in note for note in material.notes)
 
     def test_the_option_decides(self, tmp_path: Path) -> None:
         stored = self.layered(tmp_path)
@@ -90,19 +77,6 @@ class TestLayers:
 
 
 class TestScalars:
-    def test_packed_channels(self, heights: Path) -> None:
-        codes = rng().integers(0, 256, (8, 16, 3))
-        png(heights / "rock_arm.png", codes, 2, 8)
-        material = load_material(
-            write(
-                heights,
-                "height: height.npy\nroughness: {file: rock_arm.png, channel: G}\n"
-                "metallic: {file: rock_arm.png, channel: B}\n",
-            )
-        )
-        assert np.array_equal(np.rint(255 * np.asarray(material.maps["roughness"])), codes[..., 1])
-        assert np.array_equal(np.rint(255 * np.asarray(material.maps["metallic"])), codes[..., 2])
-
     def test_gloss_is_inverted_roughness(self, heights: Path) -> None:
         codes = rng().integers(0, 65536, (8, 16, 1))
         png(heights / "gloss.png", codes, 0, 16)
@@ -239,15 +213,6 @@ class TestNamesOfFiles:
         files = load_material(path).files
         assert {role: file.relative_to(heights).as_posix() for role, file in files.items()} == expected
 
-    @pytest.mark.skipif(os.sep != "/", reason="backslashes are separators")
-    def test_a_name_with_a_backslash(self, heights: Path) -> None:
-        (heights / "maps").mkdir()
-        codes = rng().integers(0, 256, (8, 16, 1))
-        png(heights / "maps" / "rough.png", codes, 0, 8)
-        png(heights / "maps\\rough.png", 255 - codes, 0, 8)
-        material = load_material(write(heights, "height: height.npy\nroughness: maps\\rough.png\n"))
-        assert np.array_equal(np.rint(255 * np.asarray(material.maps["roughness"])), 255 - codes[..., 0])
-
     @pytest.mark.skipif(os.sep != "/", reason="paths of Windows are valid")
     @pytest.mark.parametrize(
         ("name", "hint"),
@@ -277,14 +242,3 @@ def test_orientation_is_ignored_with_a_warning(heights: Path) -> None:
     material = load_material(heights)
     assert np.shape(material.maps["roughness"]) == np.shape(material.maps["metallic"]) == (8, 16)
     assert len([w for w in material.warnings if "EXIF orientation (6) is ignored" in w]) == 2
-
-
-def test_sizes_that_are_neither_square_nor_powers_of_two(tmp_path: Path) -> None:
-    np.save(tmp_path / "height.npy", 0.01 * rng().random((30, 45)))
-    np.save(tmp_path / "albedo.npy", rng().random((20, 30, 3)))
-    np.save(tmp_path / "rough.npy", rng().random((7, 10)).repeat(2, 0).repeat(3, 1)[:14, :21])
-    material = load_material(tmp_path)
-    assert material.aspect == pytest.approx(2 / 3)
-    assert material.grid.z.shape == (30, 45)
-    assert material.at(mesh=20).grid.z.shape == (13, 20)
-    assert np.shape(material.maps["roughness"]) == (14, 21)

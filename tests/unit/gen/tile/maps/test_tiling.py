@@ -8,10 +8,7 @@ import numpy as np
 import pytest
 from support.height_maps import Floats, fractal, normals_of, save_heights, save_normals
 
-from mbtf_core.app.console import run
-from mbtf_core.data.schema import Tiling
 from mbtf_core.errors import InputError
-from mbtf_gen.cli.app import app
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 from mbtf_gen.tile.loading import load_material
 from mbtf_gen.tile.maps.normal_map import fit_normals
@@ -59,10 +56,6 @@ class TestSeams:
 
 
 class TestMirror:
-    def test_by_hand(self) -> None:
-        image = np.array([[1.0, 2.0], [3.0, 4.0]])
-        assert np.array_equal(mirror(image), [[1, 2, 2, 1], [3, 4, 4, 3], [3, 4, 4, 3], [1, 2, 2, 1]])
-
     def test_normals_follow_the_mirrored_heights(self) -> None:
         height = cut(fractal(96, 128))
         expected = normals_of(mirror(height), 0.025)
@@ -132,10 +125,6 @@ class TestMaterial:
             assert np.abs(after - before)[rows // 2, columns // 2].max() < 1e-6
             assert np.abs(after - before)[0].max() > 0.01
 
-    @pytest.mark.parametrize("tile", ["mirror", "blend"])
-    def test_tiling_changes_the_digest(self, folder: Path, tile: Tiling) -> None:
-        assert load_material(folder, tile).digests["settings"] != load_material(folder).digests["settings"]
-
     def test_what_cannot_be_mirrored_is_refused(self, folder: Path) -> None:
         (folder / "material.yaml").write_text(
             "height: height.png\nbsdf: {type: diffuse, reflectance: {type: bitmap, filename: rough.png}}\n"
@@ -150,19 +139,3 @@ class TestMaterial:
         assert load_material(folder, "blend", 4 * 72 * 96 - 1).height.shape == (72, 96)
         with pytest.raises(InputError, match="96 x 72 pixels; at most 6,911"):
             load_material(folder, max_pixels=72 * 96 - 1)
-
-
-def test_jobs_use_it(tmp_path: Path) -> None:
-    from mbtf_gen.config.generator import GeneratorConfig
-    from mbtf_gen.job import Job
-
-    path = save_heights(tmp_path / "h.png", cut(fractal(64, 64)))
-    config = {"material": str(path), "geometry": {"make_tileable": "mirror"}}
-    assert GeneratorConfig.model_validate({"material": "m"}).geometry.make_tileable is None
-    job = Job.prepare(GeneratorConfig.model_validate(config))
-    assert job.material.height.shape == (96, 96)
-    config["geometry"] = {"max_pixels": 48 * 48 - 1}
-    with pytest.raises(InputError, match="at most 2,303 are read"):
-        Job.prepare(GeneratorConfig.model_validate(config))
-    assert run(app, ["inspect", str(path), "--set", "geometry.max_pixels=2303"]) == 3
-    assert job.material.tiling == "mirror"
