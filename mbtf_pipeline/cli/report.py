@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
@@ -17,7 +17,8 @@ def report(
     /,
     *,
     exposure: Annotated[
-        float | None, Parameter(metavar="EV", show_default=False, validator=Number(gte=-40, lte=40))
+        Annotated[float, Parameter(validator=Number(gte=-40, lte=40))] | Literal["auto"] | None,
+        Parameter(metavar="EV|auto", show_default=False),
     ] = None,
     console: Console = CONSOLE,
 ) -> None:
@@ -28,7 +29,7 @@ def report(
     folder
         Folder of the run.
     exposure
-        Exposure of the pictures: a value v in 1/sr is shown as 2^EV v.
+        Exposure of the pictures: a value v in 1/sr is shown as 2^EV v; auto: from the pictures.
     """
     from mbtf_core.color import describe_exposure
     from mbtf_pipeline.collection.run import is_collection, write_again
