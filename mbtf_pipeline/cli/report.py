@@ -6,10 +6,15 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import Parameter
-from cyclopts.validators import Number
 
 from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.errors import UsageError
+
+
+def _check_exposure(kind: object, exposure: object) -> None:
+    """Refuse what recipes refuse."""
+    if isinstance(exposure, float) and not -40 <= exposure <= 40:
+        raise ValueError("must be at least -40 and at most 40")
 
 
 def report(
@@ -17,8 +22,8 @@ def report(
     /,
     *,
     exposure: Annotated[
-        Annotated[float, Parameter(validator=Number(gte=-40, lte=40))] | Literal["auto"] | None,
-        Parameter(metavar="EV|auto", show_default=False),
+        float | Literal["auto"] | None,
+        Parameter(metavar="EV|auto", show_default=False, validator=_check_exposure),
     ] = None,
     console: Console = CONSOLE,
 ) -> None:
