@@ -1,18 +1,21 @@
 """The transfer curve of sRGB (IEC 61966-2-1), and the display of linear values: one rule for all pictures.
 
 An exposure is a number of stops (EV): a value v in 1/sr is displayed as sRGB of ``min(1, 2^EV v)``. Pictures
-with the same exposure can be compared by eye, whichever command made them.
+with the same exposure can be compared by eye, whichever command made them. The default keeps albedos: under
+unit irradiance a Lambertian surface of albedo 0.5 is displayed as 0.5 of white.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+# Shows 1/π in 1/sr as white, to hundredths of a stop.
+ALBEDO_EXPOSURE = 1.65
 # Percentile of a picture's mean channel, and the fraction of white as which the automatic exposure shows it.
 _PERCENTILE, _SHOWN = 95.0, 0.8
 
@@ -62,6 +65,11 @@ def auto_exposure(bright: Iterable[float]) -> float:
     return round(math.log2(_SHOWN / level), 2) if level > 0 else 0.0
 
 
+def chosen_exposure(asked: float | Literal["auto"], bright: Iterable[float]) -> float:
+    """The exposure in EV that a configuration asks for, where ``auto`` is that of :func:`auto_exposure`."""
+    return auto_exposure(bright) if asked == "auto" else asked
+
+
 def white_of(exposure: float) -> float:
     """The smallest value in 1/sr that an exposure in EV shows as white."""
     return 2.0**-exposure
@@ -74,5 +82,6 @@ def to_display(value: ArrayLike, exposure: float) -> NDArray[np.uint8]:
 
 
 def describe_exposure(exposure: float) -> str:
-    """``exposure +2.31 EV (0.202 1/sr is white)``."""
-    return f"exposure {exposure:+.2f} EV ({white_of(exposure):.3g} 1/sr is white)"
+    """``exposure +1.65 EV (0.319 1/sr, albedo 1, is white)``."""
+    white = white_of(exposure)
+    return f"exposure {exposure:+.2f} EV ({white:.3g} 1/sr, albedo {math.pi * white:.2g}, is white)"

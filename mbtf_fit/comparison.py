@@ -9,10 +9,13 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
 from pydantic import ValidationError
 
 from mbtf_core.app.console import Console
-from mbtf_core.color import auto_exposure, describe_exposure, to_display, white_of
+from mbtf_core.color import auto_exposure, chosen_exposure, describe_exposure, to_display, white_of
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.shard_files import read_exr
@@ -38,6 +41,8 @@ from mbtf_gen.pictures.reference import (
 )
 
 PICTURE_NAME = "comparison.png"
+# Smaller pictures are enlarged to about so many pixels across.
+_SHOWN = 384
 _QUERY = ("u", "sigma", "omega_i", "omega_o")
 
 
@@ -87,7 +92,8 @@ def compare(config: ComparisonConfig, output: Path, console: Console, *, overwri
     PartialError : a picture failed; the same command renders the missing ones
     """
     material, data = Material.load(config.material), Dataset.open(DataFolder.open(config.shards))
-    job, view = _job_of(data), config.picture
+    job = _job_of(data)
+    view = config.picture.resolved(data.lattice.shape()[1], job.material.scatters)
     if material.lattice.aspect != data.lattice.aspect:
         what = f"its tile has the aspect {data.lattice.aspect:g}, the material's {material.lattice.aspect:g}"
         raise InputError(what, where=data.folder)
@@ -113,11 +119,12 @@ def compare(config: ComparisonConfig, output: Path, console: Console, *, overwri
         folder.finished(PICTURE_NAME)  # refuses to replace one that has changed
         render_missing(folder, job, view, ["query"], console, bar.advance)
         known = [folder.finished(name) or {} for name in names.values()]
-        exposure = config.exposure
-        if exposure is None:
-            exposure = auto_exposure([facts["brightness"] for facts in known])
-        errors = _draw(folder, material, [*names.values()], view.tiles_across, exposure)
-    pictures, lines = [], [f"{output / PICTURE_NAME}: reference, fit, and fit - reference"]
+        bright = [facts["brightness"] for facts in known]
+        exposure, peak = chosen_exposure(config.exposure, bright), auto_exposure(bright)
+        errors = _draw(folder, material, [*names.values()], view.tiles_across, exposure, peak)
+    enlarged = _enlargement(view.size)
+    text = f", enlarged {enlarged} times (bicubic)" if enlarged > 1 else ""
+    pictures, lines = [], [f"{output / PICTURE_NAME}: reference, fit, and fit - reference{text}"]
     for across, facts, found in zip(view.tiles_across, known, errors, strict=True):
         pictures.append({"tiles_across": across, "relative_noise": facts["relative_noise"], **found})
         seen = [_rms_text(found), *filter(None, visibility(found))]
@@ -127,9 +134,19 @@ def compare(config: ComparisonConfig, output: Path, console: Console, *, overwri
     lines.append(
         "% of the mean value; unexplained variance is (RMS error / contrast)², large where contrast is low"
     )
-    lines.append(describe_exposure(exposure))
+    lines.append(f"PSNR has the peak {white_of(peak):.3g} 1/sr; pictures: {describe_exposure(exposure)}")
     report = {"file": output / PICTURE_NAME, "exposure": exposure, "foreign_inputs": foreign}
     console.report({**report, "pictures": pictures}, "\n".join(lines))
+
+
+def _enlargement(size: int) -> int:
+    """How many times a picture of so many pixels across is enlarged."""
+    return max(1, _SHOWN // size)
+
+
+def _enlarged(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    side = len(picture) * _enlargement(len(picture))
+    return np.asarray(Image.fromarray(picture).resize((side, side), Image.Resampling.BICUBIC))
 
 
 def _rms_text(found: dict[str, Any]) -> str:
@@ -139,10 +156,15 @@ def _rms_text(found: dict[str, Any]) -> str:
 
 
 def _draw(
-    folder: OutputFolder, material: Material, names: list[str], widths: list[float], exposure: float
+    folder: OutputFolder,
+    material: Material,
+    names: list[str],
+    widths: list[float],
+    exposure: float,
+    peak: float,
 ) -> list[dict[str, Any]]:
-    """Write the picture; the noise-free errors by width, as :func:`mbtf_fit.formatting.visibility` takes
-    them."""
+    """Write the picture at an exposure; the noise-free errors by width, as
+    :func:`mbtf_fit.formatting.visibility` takes them, with the exposure of their `peak`."""
     columns: list[list[Any]] = [[], [], []]
     differences, errors = [], []
     for name in names:
@@ -156,7 +178,7 @@ def _draw(
         mse, unexplained = noise_free_mse(fit, *halves), unexplained_variance(fit, *halves)
         mean, variance = float(reference.mean()), signal_variance(*halves).value
         contrast = math.sqrt(max(0.0, variance)) / mean if mean > 0 else 0.0
-        numbers = {"exposure": exposure, "mean": mean, "contrast": contrast}
+        numbers = {"exposure": peak, "mean": mean, "contrast": contrast}
         errors.append({"mse": mse.as_dict(), "unexplained": unexplained.as_dict(), **numbers})
         columns[0].append(to_display(reference.reshape(shape), exposure))
         columns[1].append(to_display(fit.reshape(shape), exposure))
@@ -165,6 +187,7 @@ def _draw(
     columns[2] = [palette("signed")[indices(difference / scale, "signed")] for difference in differences]
     captions = ["reference", "fit", f"fit - reference\n±{scale:.3g} of white"]
     path = folder.path / PICTURE_NAME
-    write_png(path, grid(columns, captions, list(map(width_label, widths)), 3))
+    shown = [[_enlarged(picture) for picture in column] for column in columns]
+    write_png(path, grid(shown, captions, list(map(width_label, widths)), 3))
     folder.keep(PICTURE_NAME, [path], {"exposure": exposure})
     return errors

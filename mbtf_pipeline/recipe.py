@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from mbtf_core.app.options import Quality
+from mbtf_core.color import ALBEDO_EXPOSURE
 from mbtf_core.config.settings import Settings, explicit_options, resolve
 from mbtf_core.config.yaml_file import dump_yaml, line_of, read_yaml
 from mbtf_core.errors import InputError
@@ -105,7 +106,7 @@ class ReportSection(Settings):
     """Options of the report."""
 
     title: str | None = Field(None, description="title; default: the recipe's name")
-    exposure: Exposure = Field(None, description=EXPOSURE)
+    exposure: Exposure = Field(ALBEDO_EXPOSURE, description=EXPOSURE)
     max_megabytes: float = Field(9.5, ge=1, le=100, description="size limit of the file")
 
 

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from mbtf_core.app.console import Console
 from mbtf_core.errors import InputError, PartialError
@@ -347,14 +347,14 @@ def survey(recipe: Recipe, folder: Path) -> dict[str, str]:
     return out
 
 
-def rerender(folder: Path, exposure: float | None = None) -> tuple[Path, float]:
+def rerender(folder: Path, exposure: float | Literal["auto"] | None = None) -> tuple[Path, float]:
     """Write the report of a finished run again.
 
     Parameters
     ----------
     folder : Path
         Folder of the run.
-    exposure : float, optional
+    exposure : float or "auto", optional
         Exposure in EV; that of the recipe by default.
 
     Returns
@@ -380,4 +380,4 @@ def rerender(folder: Path, exposure: float | None = None) -> tuple[Path, float]:
         run_stages(folder, [stage], force=True)
     comparison = read_json(folder / COMPARE / COMPARISON_NAME)
     used = recipe.report.exposure
-    return folder / REPORT, float(comparison["exposure"]) if used is None else used
+    return folder / REPORT, float(comparison["exposure"]) if used == "auto" else used

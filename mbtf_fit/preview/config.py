@@ -7,12 +7,26 @@ from typing import Annotated, Any, Self
 from pydantic import BeforeValidator, Field, model_validator
 
 from mbtf_core.app.options import Flag
+from mbtf_core.color import ALBEDO_EXPOSURE
 from mbtf_core.config.settings import Settings
 from mbtf_core.units import parse_numbers
-from mbtf_gen.config.pictures import EXPOSURE, Direction, Exposure, ViewSection
+from mbtf_gen.config.generator import Paths
+from mbtf_gen.config.pictures import (
+    EXPOSURE,
+    PATHS_PER_PIXEL,
+    Direction,
+    DirectionsSection,
+    Exposure,
+    Size,
+    TilesAcross,
+    ViewSection,
+)
 
 # Limits the memory of sheet and turntable to a gigabyte.
 MOST_PIXELS = 1 << 25
+# Of a comparison: texels across a pixel, and paths per pixel.
+_TEXELS = (1, 2, 4)
+_SPP, _FIBER_SPP = 128, 64
 
 
 def _listed(value: Any) -> Any:
@@ -71,7 +85,7 @@ class MaterialPreviewConfig(Settings):
     material: str = Field(description="folder made by mbtf-fit")
     sheet: SheetSection = SheetSection()
     turntable: TurntableSection = TurntableSection()
-    exposure: Exposure = Field(None, description=EXPOSURE)
+    exposure: Exposure = Field(ALBEDO_EXPOSURE, description=EXPOSURE)
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
@@ -82,10 +96,35 @@ class MaterialPreviewConfig(Settings):
         return self
 
 
+class ComparisonSection(DirectionsSection):
+    """Pictures of the plane, path-traced and of the fit, as coarse as the data."""
+
+    tiles_across: Annotated[TilesAcross | None, Flag("--tiles-across", "1,2,4")] = Field(
+        None,
+        description="widths of the field of view at the target, in tile widths; default: pixels cover 1, 2 "
+        "and 4 texels of the data",
+    )
+    size: Annotated[Size, Flag("--size")] = Field(128, description="pixels along each side of a picture")
+    spp: Annotated[Paths | None, Flag("--spp")] = Field(
+        None, description=f"{PATHS_PER_PIXEL}; default: {_SPP}, {_FIBER_SPP} through fibers"
+    )
+
+    def resolved(self, resolution: int, fibers: bool) -> ViewSection:
+        """The pictures of data with so many texels across, of fibers or not."""
+        finest = self.size / resolution
+        return ViewSection(
+            view=self.view,
+            light=self.light,
+            tiles_across=self.tiles_across or [finest * texels for texels in _TEXELS],
+            size=self.size,
+            spp=self.spp or (_FIBER_SPP if fibers else _SPP),
+        )
+
+
 class ComparisonConfig(Settings):
     """Every option of ``mbtf-fit compare``."""
 
     material: str = Field(description="folder made by mbtf-fit")
     shards: str = Field(description="folder made by mbtf-gen, or its URL")
-    picture: ViewSection = ViewSection()
-    exposure: Exposure = Field(None, description=EXPOSURE)
+    picture: ComparisonSection = ComparisonSection()
+    exposure: Exposure = Field(ALBEDO_EXPOSURE, description=EXPOSURE)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.app.console import Console
-from mbtf_core.color import auto_exposure, brightness, describe_exposure, to_display
+from mbtf_core.color import brightness, chosen_exposure, describe_exposure, to_display
 from mbtf_core.directions import from_angles
 from mbtf_core.files.folders import OutputFolder, check_space
 from mbtf_core.pictures import PNG_BYTES, Camera, claim_pictures, write_png
@@ -49,11 +49,6 @@ def panels(evaluator: Evaluator, section: SheetSection) -> F32:
         pictures.append(evaluator.evaluate(q.u, q.sigma, q.omega_i, q.omega_o))
     lead = (len(section.view), len(lights), len(section.tiles_across))
     return np.stack(pictures).reshape(*lead, size, size, 3)
-
-
-def exposure_of(values: F32) -> float:
-    """The automatic exposure of a sheet, in EV."""
-    return auto_exposure(map(brightness, values.reshape(-1, *values.shape[-3:])))
 
 
 def contact_sheet(values: F32, section: SheetSection, exposure: float) -> NDArray[np.uint8]:
@@ -131,7 +126,9 @@ def _draw_missing(
     with console.progress(1 + turns * config.turntable.frames, label="drawing", unit="pictures") as bar:
         if not kept[SHEET_NAME]:
             values = panels(bsdf.evaluator, config.sheet)
-            exposure = exposure_of(values) if config.exposure is None else config.exposure
+            exposure = chosen_exposure(
+                config.exposure, map(brightness, values.reshape(-1, *values.shape[-3:]))
+            )
             write_png(folder.path / SHEET_NAME, contact_sheet(values, config.sheet, exposure))
             facts = {"exposure": exposure, "of": config.exposure}
             folder.keep(SHEET_NAME, [folder.path / SHEET_NAME], facts)

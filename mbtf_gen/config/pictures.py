@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from mbtf_core.app.options import Flag
+from mbtf_core.color import ALBEDO_EXPOSURE
 from mbtf_core.config.settings import Settings
 from mbtf_core.units import parse_numbers
 from mbtf_gen.config.generator import GeneratorConfig, Paths
@@ -45,14 +46,17 @@ TilesAcross = Annotated[
     AfterValidator(_distinct),
 ]
 PATHS_PER_PIXEL = "paths per pixel"
-Exposure = Annotated[float | None, Field(ge=-40, le=40), Flag("--exposure", "EV")]
-EXPOSURE = "exposure of the pictures: a value v in 1/sr is shown as 2^EV v; default: from the pictures"
+Exposure = Annotated[Annotated[float, Field(ge=-40, le=40)] | Literal["auto"], Flag("--exposure", "EV|auto")]
+EXPOSURE = (
+    "exposure of the pictures: a value v in 1/sr is shown as 2^EV v. 1.65 shows a white diffuse surface as "
+    "white; auto shows the 95th percentile of the pictures as 0.8 of white"
+)
 # Sections of the generator's configuration that decide what a picture shows.
 RENDERING = ("geometry", "light", "transport", "effects", "seed")
 
 
-class ViewSection(Settings):
-    """Path-traced pictures of the plane: one view and light, several widths of the field of view."""
+class DirectionsSection(Settings):
+    """One view and light."""
 
     view: Annotated[Direction, Flag("--view", "ELEVATION,AZIMUTH")] = Field(
         Direction(elevation=60, azimuth=-90), description="direction of the camera in degrees"
@@ -60,6 +64,11 @@ class ViewSection(Settings):
     light: Annotated[Direction, Flag("--light", "ELEVATION,AZIMUTH")] = Field(
         Direction(elevation=45, azimuth=45), description="direction of the light in degrees"
     )
+
+
+class ViewSection(DirectionsSection):
+    """Path-traced pictures of the plane: one view and light, several widths of the field of view."""
+
     tiles_across: Annotated[TilesAcross, Flag("--tiles-across", "1,2,4")] = Field(
         [1.0, 2.0, 4.0], description="widths of the field of view at the target, in tile widths"
     )
@@ -97,11 +106,11 @@ class ReferenceConfig(GeneratorConfig):
     """Everything ``mbtf-gen reference`` needs."""
 
     reference: ReferenceSection = ReferenceSection()
-    exposure: Exposure = Field(None, description=EXPOSURE)
+    exposure: Exposure = Field(ALBEDO_EXPOSURE, description=EXPOSURE)
 
 
 class PreviewConfig(GeneratorConfig):
     """Everything ``mbtf-gen preview`` needs."""
 
     preview: PreviewSection = PreviewSection()
-    exposure: Exposure = Field(None, description=EXPOSURE)
+    exposure: Exposure = Field(ALBEDO_EXPOSURE, description=EXPOSURE)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.app.console import Console
-from mbtf_core.color import auto_exposure, brightness, describe_exposure
+from mbtf_core.color import brightness, chosen_exposure, describe_exposure
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import InputError, PartialError
@@ -56,9 +56,7 @@ class _Scene:
         image = render_reference(
             estimator, self.camera, self.omega_i, kind="pixel", spp=options.spp, seed=self.config.seed
         )
-        exposure = self.config.exposure
-        if exposure is None:
-            exposure = auto_exposure([brightness(image.value)])
+        exposure = chosen_exposure(self.config.exposure, [brightness(image.value)])
         write_display(file.with_suffix(""), image.value, exposure)
         shows = f"the infinite plane from the same camera, path-traced with {options.spp} paths per pixel"
         return {"shows": shows, "exposure": exposure}

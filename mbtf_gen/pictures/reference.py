@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.app.console import Console
-from mbtf_core.color import auto_exposure, brightness, describe_exposure
+from mbtf_core.color import brightness, chosen_exposure, describe_exposure
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.data.schema import Queries
 from mbtf_core.data.shard_files import row_bytes
@@ -309,9 +309,7 @@ def render_references(
         )
         rendered = render_missing(folder, job, wanted, kinds, console, bar.advance, cluster)
         known = {name: folder.finished(name) or {} for name in names.values()}
-        exposure = config.exposure
-        if exposure is None:
-            exposure = auto_exposure([facts["brightness"] for facts in known.values()])
+        exposure = chosen_exposure(config.exposure, [facts["brightness"] for facts in known.values()])
         for name in known:
             if folder.finished(f"{name}.png", exposure=exposure) is None:
                 png = write_display(folder.path / name, read_value(folder.path / f"{name}.exr"), exposure)

@@ -13,6 +13,7 @@ from typing import Any
 
 import jinja2
 
+from mbtf_core.color import ALBEDO_EXPOSURE, describe_exposure
 from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.units import size_text
 from mbtf_gen.planning.effects import EFFECTS
@@ -106,6 +107,7 @@ def card_text(facts: Facts) -> str:
     split = "test" if "test" in facts.samples else next(iter(facts.samples))
     return environment.from_string(resources(__package__).joinpath("card.md.j2").read_text()).render(
         facts=facts,
+        exposure=describe_exposure(ALBEDO_EXPOSURE),
         manifest=facts.data.manifest,
         front_matter=front_matter(facts),
         row_shape=partial(_row_shape, facts),

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.color import auto_exposure, brightness, to_display
+from mbtf_core.color import ALBEDO_EXPOSURE, to_display
 from mbtf_core.data.geometry import Geometry
 from mbtf_core.data.lattice import level_of_sigma
 from mbtf_core.data.shard_files import Arrays
@@ -82,10 +82,9 @@ def _queries(arrays: Arrays) -> tuple[F64, F64, F64, F64]:
 
 
 def displayed(image: F64) -> NDArray[np.uint8]:
-    """8-bit sRGB of an image (..., 3) at its own exposure; pixels without queries are light gray."""
+    """8-bit sRGB of an image (..., 3) that keeps albedos; pixels without queries are light gray."""
     known = np.asarray(np.isfinite(image).all(axis=-1))
-    exposure = auto_exposure([brightness(image[known])] if known.any() else [0.0])
-    shown = to_display(np.where(known[..., None], image, 0.0), exposure)
+    shown = to_display(np.where(known[..., None], image, 0.0), ALBEDO_EXPOSURE)
     shown[~known] = _EMPTY
     return shown
 

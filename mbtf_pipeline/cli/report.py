@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
-from cyclopts.validators import Number
 
 from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.errors import UsageError
+
+
+def _check_exposure(kind: object, exposure: object) -> None:
+    """Refuse what recipes refuse."""
+    if isinstance(exposure, float) and not -40 <= exposure <= 40:
+        raise ValueError("must be at least -40 and at most 40")
 
 
 def report(
@@ -17,7 +22,8 @@ def report(
     /,
     *,
     exposure: Annotated[
-        float | None, Parameter(metavar="EV", show_default=False, validator=Number(gte=-40, lte=40))
+        float | Literal["auto"] | None,
+        Parameter(metavar="EV|auto", show_default=False, validator=_check_exposure),
     ] = None,
     console: Console = CONSOLE,
 ) -> None:
@@ -28,7 +34,7 @@ def report(
     folder
         Folder of the run.
     exposure
-        Exposure of the pictures: a value v in 1/sr is shown as 2^EV v.
+        Exposure of the pictures: a value v in 1/sr is shown as 2^EV v; auto: from the pictures.
     """
     from mbtf_core.color import describe_exposure
     from mbtf_pipeline.collection.run import is_collection, write_again

@@ -82,7 +82,7 @@ class FinishedRun:
         return None if found is None else estimate(found)
 
     def preview(self, name: str, label: str, line: str = "") -> Thumbnail:
-        """An image of the comparison (path without suffix) at its exposure."""
+        """An image of the comparison (path without suffix) as PNG."""
         return Thumbnail(file_uri(with_ending(self.folder / COMPARE / name, ".png")), label, line)
 
 

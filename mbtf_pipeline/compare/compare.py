@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.color import auto_exposure, brightness, white_of
+from mbtf_core.color import ALBEDO_EXPOSURE, auto_exposure, brightness, white_of
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import PartialError
 from mbtf_core.files.atomic import write_json
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 COMPARISON_NAME = "comparison.json"
 COMPARISON_FORMAT = "mbtf-comparison"
 # Raised when the record or its files change; part of the stage's key.
-COMPARISON_SCHEMA = 12
+COMPARISON_SCHEMA = 13
 
 F32 = NDArray[np.float32]
 Progress = Callable[[str], None]
@@ -88,11 +88,11 @@ def compare(
     estimator = picture_estimator(job)
     rendered = _render_references(section, job, progress, runner)
     seconds = time.perf_counter() - start
-    # From the query references if there are any, otherwise from the pixel references.
+    # White of the metrics: from the query references if there are any, otherwise from the pixel references.
     exposure = auto_exposure(brightness(next(iter(images.values())).value) for _, images in rendered)
     white = white_of(exposure)
     pictures = [
-        _compare_scene(scene, images, materials, exposure, section.st_lpips, out, progress)
+        _compare_scene(scene, images, materials, white, section.st_lpips, out, progress)
         for scene, images in rendered
     ]
     data = Dataset.open(shards)
@@ -114,7 +114,7 @@ def compare(
         "seconds": {"references": round(seconds, 3)},
     }
     if section.unmodified_mitsuba:
-        record["unmodified_mitsuba"] = write_agreement(section, job.config, job.material, exposure, out)
+        record["unmodified_mitsuba"] = write_agreement(section, job.config, job.material, out)
     if section.timing:
         import torch
 
@@ -156,7 +156,7 @@ def _compare_scene(
     scene: Scene,
     images: Mapping[PixelKind, ReferenceImage],
     materials: Mapping[str, Material],
-    exposure: float,
+    white: float,
     with_st_lpips: bool,
     out: Path,
     progress: Progress,
@@ -166,7 +166,6 @@ def _compare_scene(
     from mbtf_core.pictures import write_display
     from mbtf_core.stats import mse_difference, pooled_relative_error
 
-    white = white_of(exposure)
     record: dict[str, Any] = {
         "name": scene.name,
         "view": scene.view.model_dump(),
@@ -178,7 +177,7 @@ def _compare_scene(
     for kind, image in images.items():
         file = scene.file(f"reference-{kind}")
         image.write(out / file)
-        write_display(out / file, image.value, exposure)
+        write_display(out / file, image.value, ALBEDO_EXPOSURE)
         noise = pooled_relative_error(image.value_a.reshape(-1, 3), image.value_b.reshape(-1, 3))
         record["references"][kind] = {"file": file, "noise": noise.as_dict()}
     if len(images) == 2:
@@ -197,7 +196,7 @@ def _compare_scene(
         flat_value, seconds = timed(partial(material.evaluate, *arrays))
         value = flat_value.reshape(main.value.shape)
         file = scene.file(f"fit-{name}")
-        write_picture(out / file, value, exposure)
+        write_picture(out / file, value, ALBEDO_EXPOSURE)
         scores, hdr_flip = perceptual_scores(value, main.value, white, with_st_lpips)
         write_map(out / file, hdr_flip)
         errors = {kind: image_errors(value, x.value_a, x.value_b, white) for kind, x in images.items()}

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.color import ALBEDO_EXPOSURE
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import UsageError
 from mbtf_core.pictures import PIXEL_SIGMA, Camera
@@ -122,7 +123,7 @@ def pick_scene(section: CompareSection) -> tuple[SceneView, SceneDirection, floa
 
 
 def write_agreement(
-    section: CompareSection, generate: GeneratorConfig, material: Tile, exposure: float, out: Path
+    section: CompareSection, generate: GeneratorConfig, material: Tile, out: Path
 ) -> dict[str, Any]:
     """Compare with unmodified Mitsuba and write the images below `out`; returns plain data."""
     view, light, tiles_across = pick_scene(section)
@@ -131,7 +132,7 @@ def write_agreement(
         stem = f"{PICTURES}/check-{surface.replace(' ', '-')}"
         files = {renderer: f"{stem}-{renderer}" for renderer in ("mbtf", "mitsuba")}
         for renderer, file in files.items():
-            write_picture(out / file, getattr(found, renderer), exposure)
+            write_picture(out / file, getattr(found, renderer), ALBEDO_EXPOSURE)
         errors = {"mean": found.mean.as_dict(), "square": found.square.as_dict()}
         surfaces.append({"surface": surface, **errors, "files": files})
     scene = {"view": view.model_dump(), "light": light.model_dump(), "tiles_across": tiles_across}

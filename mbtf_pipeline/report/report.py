@@ -31,7 +31,7 @@ from mbtf_pipeline.report.sections import (
 from mbtf_pipeline.stages import COMPARE, FITS, REPORT, RUN, SHARDS, VIEWER
 
 # Raised when the report or the viewer's page changes; part of the stage's key.
-LAYOUT = 14
+LAYOUT = 15
 # Path-traced pictures in the viewer's page.
 _MOST_PICTURES = 4
 
@@ -71,7 +71,7 @@ def write_report(folder: Path, recipe: Recipe, stages: Sequence[str]) -> None:
     manifest = read_json(folder / SHARDS / "manifest.json")
     run = read_json(folder / RUN.record)
     asked = recipe.report.exposure
-    exposure = comparison["exposure"] if asked is None else asked
+    exposure = comparison["exposure"] if asked == "auto" else asked
     gallery: Gallery = {}
     shown = picture_section(folder / COMPARE, comparison, exposure, gallery)
     fit_folders = {name: folder / FITS / name for name in comparison["fits"]}

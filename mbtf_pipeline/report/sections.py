@@ -19,7 +19,7 @@ from mbtf_gen.tile.loading import latest_material
 from mbtf_pipeline.report.embed import U8, Pixels, data_uri, shrink
 from mbtf_pipeline.report.plots import Series, plot, points
 from mbtf_pipeline.stages import FITS, read_stamp
-from mbtf_pipeline.tables import data_errors, estimate
+from mbtf_pipeline.tables import NOT_SIGNIFICANT, data_errors, estimate, is_significant
 
 UNEXPLAINED = "unexplained variance"
 # Ways to group queries: key in the record, title, axis of the plot, and head of the table.
@@ -37,6 +37,7 @@ def error_context(comparison: Mapping[str, Any]) -> dict[str, Any]:
     groupings = [_grouping(tests, *grouping) for grouping in _GROUPINGS]
     return {
         "facts": _facts(comparison, tests),
+        "ranking": _ranking(comparison),
         "test": next(iter(tests.values())),
         "error_table": _error_table(comparison),
         "error_plots": [shown for shown, _ in groupings],
@@ -45,8 +46,10 @@ def error_context(comparison: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _facts(comparison: Mapping[str, Any], tests: Mapping[str, Any]) -> list[dict[str, str]]:
-    out = [{"value": data_errors(e)[0], "what": f"{UNEXPLAINED} of {fit}"} for fit, e in tests.items()]
-    fit = comparison["fits"][0]
+    fit, out = comparison["fits"][0], []
+    for name, errors in tests.items():
+        equal = "" if _differs(comparison, name) else f"; difference from {fit} {NOT_SIGNIFICANT}"
+        out.append({"value": data_errors(errors)[0], "what": f"{UNEXPLAINED} of {name}{equal}"})
     records = [p["fits"][fit] for p in comparison["pictures"]]
     decibels = [r["errors"][comparison["kinds"][0]]["psnr"]["value"] for r in records]
     if finite := [d for d in decibels if d is not None]:
@@ -58,6 +61,40 @@ def _facts(comparison: Mapping[str, Any], tests: Mapping[str, Any]) -> list[dict
     size = 4 * (record["network_weights"] + record["texels"]) / 1024
     out.append({"value": f"{size:,.0f} KiB", "what": f"{fit}: textures and networks as float32"})
     return out
+
+
+def _differs(comparison: Mapping[str, Any], fit: str) -> bool:
+    """Whether a fit is the first one, or differs from it significantly on the test queries."""
+    difference = comparison["test"][fit].get("mse_minus_first")
+    return difference is None or is_significant(estimate(difference))
+
+
+def _ranking(comparison: Mapping[str, Any]) -> str:
+    """Why test queries and images rank the fits differently; empty if they do not."""
+    first, kind = comparison["fits"][0], comparison["kinds"][0]
+
+    def of_images(fit: str) -> float:
+        found = [p["fits"][fit]["errors"][kind]["mse"]["value"] for p in comparison["pictures"]]
+        return float(np.mean([math.inf if mse is None else mse for mse in found]))
+
+    def of_queries(fit: str) -> float:
+        mse = comparison["test"][fit]["splits"]["test"]["mse"]["value"]
+        return math.inf if mse is None else mse
+
+    queries, images = (sorted(comparison["fits"], key=key) for key in (of_queries, of_images))
+    if queries == images:
+        return ""
+    text = (
+        f"From the best fit on, test queries rank {', '.join(queries)}, but the mean MSE of the images ranks "
+        f"{', '.join(images)}. Test queries have footprints, lights and views of all kinds; the images weigh "
+        "the few that they show."
+    )
+    equal = [fit for fit in comparison["fits"] if not _differs(comparison, fit)]
+    return (
+        f"{text} On test queries, {first} and {', '.join(equal)} do not differ significantly."
+        if equal
+        else text
+    )
 
 
 def _error_table(comparison: Mapping[str, Any]) -> dict[str, Any]:

@@ -18,14 +18,20 @@ function statusLine(viewer, test) {
   return `level ${level.toFixed(1)} of ${material.content.finest}, ${tilesText(camera.tiles_across)} across, ${progress}${beyond}`;
 }
 
+// Until the browser has shown what has changed.
+const painted = () => new Promise((done) => requestAnimationFrame(() => setTimeout(done)));
+
 async function show(content) {
   const viewer = new Viewer(content);
   await viewer.start();
   bindPanel(viewer);
   viewer.layout();
-  const tests = viewer.materials.map((material) => testQueries(viewer.renderer, material));
+  byId("message").textContent = "Compiling the material …";
+  await painted();
   viewer.draw();
   byId("message").textContent = "";
+  await painted();
+  const tests = viewer.materials.map((material) => testQueries(viewer.renderer, material));
   // For tests and scripts.
   window.mbtf = { viewer, tests, showPoint };
   window.addEventListener("hashchange", () => viewer.restore(location.hash));

@@ -151,7 +151,7 @@ function bindPanel(viewer) {
       viewer.redraw();
       viewer.saveLater();
     },
-    () => `${(state.exposure ?? 0).toFixed(1)} EV`,
+    () => `${(state.exposure ?? 0).toFixed(2)} EV`,
   );
   bind(
     "material",

@@ -4,10 +4,11 @@ const FIRST = {
   camera: { elevation: 50, azimuth: -90, tiles_across: 3, target: [0.5, 0.5, 0] },
   shape: "plane",
   tiles: 4,
-  lights: [{ direction: fromAngles(45, -30), color: [1, 1, 1], intensity: 3 }],
+  // Irradiance 1 on the plane, where the exposure keeps albedos (mbtf_core/color.py).
+  lights: [{ direction: fromAngles(45, -30), color: [1, 1, 1], intensity: Math.SQRT2 }],
   environment: { name: "none", intensity: 1, angle: 0 },
-  // In EV; null: from the first picture.
-  exposure: null,
+  // In EV; null: from the next picture.
+  exposure: 1.65,
   divide: 0.5,
   material: 0,
   against: "none",

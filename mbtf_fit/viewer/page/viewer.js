@@ -2,16 +2,18 @@
 
 const byId = (id) => document.getElementById(id);
 const SHADERS = CONTENT.shaders;
-// Seconds of drawing after which the page answers; frames after which nothing moves any more.
+// Seconds of drawing after which the page answers; frames after which nothing moves any more; smallest scale of
+// coarse pictures, also that of the first one.
 const SLOW = 0.06,
-  STILL = 4;
-// Seconds in which the light of the first view moves in a circle, once, and the circle's radius on the dome.
-const ROUND = 20,
-  RADIUS = 0.3;
+  STILL = 4,
+  COARSEST = 0.15;
+// Seconds in which the light of the first view swings to both sides, once, and by how many degrees.
+const SWING = 20,
+  AMPLITUDE = 50;
 
 class Viewer {
   constructor(content) {
-    Object.assign(this, { content, materials: [], scale: 0.3, full: 1, chosen: 0, still: 0 });
+    Object.assign(this, { content, materials: [], scale: COARSEST, full: 1, chosen: 0, still: 0 });
     this.renderer = new Renderer(byId("canvas"));
     this.state = stateOf("");
     this.camera = new Camera();
@@ -33,10 +35,10 @@ class Viewer {
     state.material = clamp(Math.round(state.material), 0, this.materials.length - 1);
     // While a fit is trained, what is compared may come later.
     if (!this.content.live && !this.picture && !this.shown[1]) state.against = "none";
-    Object.assign(this, { chosen: 0, automatic: false, round: undefined });
+    Object.assign(this, { chosen: 0, automatic: false, swing: undefined });
     // A link shows what its author chose. Drawing would slow down a fit that is running.
     if (fragment.length < 2 && !this.content.live && !matchMedia("(prefers-reduced-motion: reduce)").matches)
-      this.round = performance.now();
+      this.swing = performance.now();
     this.shapeChanged();
     this.environmentChanged();
     this.againstChanged();
@@ -108,15 +110,15 @@ class Viewer {
     this.saveLater();
   }
 
-  // Move the light of the first view on its circle; it ends where it began.
+  // Move the light of the first view; it ends where it began. Its elevation, and so the irradiance, stays, and
+  // the mirror direction of the view is far: nothing is overexposed.
   moveLight() {
-    if (this.round === undefined) return;
-    const turns = Math.min((performance.now() - this.round) / (1000 * ROUND), 1),
-      [x0, y0] = FIRST.lights[0].direction,
-      angle = 2 * Math.PI * turns;
-    // Far from the mirror direction, whose highlight the exposure of the first picture would show white.
-    const [x, y] = [x0 + RADIUS * (Math.cos(angle) - 1), y0 + RADIUS * Math.sin(angle)];
-    this.state.lights[0].direction = [x, y, Math.sqrt(1 - x * x - y * y)];
+    if (this.swing === undefined) return;
+    const turns = Math.min((performance.now() - this.swing) / (1000 * SWING), 1),
+      [x0, y0, z] = FIRST.lights[0].direction,
+      angle = Math.atan2(y0, x0) + radians(AMPLITUDE) * Math.sin(2 * Math.PI * turns),
+      radius = Math.hypot(x0, y0);
+    this.state.lights[0].direction = [radius * Math.cos(angle), radius * Math.sin(angle), z];
     if (turns === 1) this.stopLight();
     this.changed();
     this.refresh?.();
@@ -124,7 +126,7 @@ class Viewer {
 
   // The user moves light and picture from now on.
   stopLight() {
-    this.round = undefined;
+    this.swing = undefined;
   }
 
   saveLater() {
@@ -248,7 +250,7 @@ class Viewer {
     // Time of a full frame, from the part that was drawn.
     this.full = moving ? seconds / (scale * scale) : (seconds * mean.height) / Math.min(rows, mean.height);
     this.seconds = moving ? seconds : this.full;
-    if (moving) this.scale = clamp(Math.sqrt(SLOW / this.full), 0.15, 1);
+    if (moving) this.scale = clamp(Math.sqrt(SLOW / this.full), COARSEST, 1);
     // Until the first full frame is complete, the coarse picture stays.
     if (mean.frames) this._show(mean);
     return true;
@@ -259,7 +261,7 @@ class Viewer {
     this.renderer.show(mean, this.state.exposure, this.state.divide, this.pictureTexture);
   }
 
-  // The exposure that shows the 95th percentile of the mean channel as 0.8, as mbtf-fit preview does.
+  // The exposure that shows the 95th percentile of the mean channel as 0.8, as `--exposure auto` does.
   _expose(mean) {
     const values = [];
     mean.columns(this.state.divide).forEach(([first, count], side) => {

@@ -102,10 +102,18 @@ def test_the_background_is_added_to_light(page: Page) -> None:
     np.testing.assert_allclose(found, [shown([0.1] * 3), 255 * BACKGROUND], atol=1.5)
 
 
-def test_the_first_picture_sets_the_exposure(page: Page) -> None:
-    """95 % of the pixels are darker than 0.8, as in mbtf-fit preview; of both sides of a comparison."""
+def test_the_first_view_keeps_albedos(page: Page) -> None:
+    """Value 0.1 under unit irradiance: a Lambertian surface of albedo 0.1 π."""
+    page.js(STATE + "viewer.restore('')")
+    page.js(STATE + "viewer.stopLight(); viewer.changed()")
+    np.testing.assert_allclose(page.screen([(0.5, 0.5)])[0], shown([0.1 * np.pi] * 3), atol=1.5)
+
+
+def test_the_automatic_exposure_is_that_of_the_picture(page: Page) -> None:
+    """95 % of the pixels are darker than 0.8, as with --exposure auto; of both sides of a comparison."""
     for against, brightest in (("none", 0.1), ("material 1", 0.3)):
         page.set({"camera": TOP, "lights": [ABOVE], "against": against})
+        page.js("document.getElementById('automatic').click()")
         np.testing.assert_allclose(page.screen([(0.9, 0.5)])[0], shown([0.8] * 3), atol=1.5)
         assert page.js(STATE + "return state.exposure") == pytest.approx(np.log2(0.8 / brightest), abs=0.006)
     # Later changes keep it, until it is asked for again.
@@ -166,7 +174,7 @@ def test_inputs_set_what_they_say(page: Page) -> None:
         ("color", "#bc8000", "state.lights[0].color", srgb_to_linear(np.array([188, 128, 0]) / 255), ""),
         ("environment_intensity", -1, "state.environment.intensity", 0.5, "0.50"),
         ("environment_angle", 30, "state.environment.angle", 30, "30°"),
-        ("exposure", 1.5, "state.exposure", 1.5, "1.5 EV"),
+        ("exposure", 1.5, "state.exposure", 1.5, "1.50 EV"),
         ("tiles", 3, "state.tiles", 8, "8"),
         ("zoom", 1, "camera.tiles_across", 0.5, "0.5 tiles"),
         ("zoom", 0, "camera.tiles_across", 1, "1 tile"),
@@ -196,23 +204,19 @@ def test_inputs_set_what_they_say(page: Page) -> None:
     assert page.driver.find_element("id", "dark").is_displayed()
 
 
-def test_the_light_of_the_first_view_moves_once_around(page: Page) -> None:
+def test_the_light_of_the_first_view_swings_once(page: Page) -> None:
     """From its first direction back to it, until the user moves a light; not in views of links, nor for
     users who prefer reduced motion."""
     moved = (
-        STATE + "viewer.round &&= viewer.round - 1000 * arguments[0]; viewer.moveLight();"
-        "return [state.lights[0].direction, viewer.round === undefined]"
+        STATE + "viewer.swing &&= viewer.swing - 1000 * arguments[0]; viewer.moveLight();"
+        "return [state.lights[0].direction, viewer.swing === undefined]"
     )
     page.js(STATE + "viewer.restore('')")
-    x, y, _ = from_angles(45.0, -30.0)
-    for seconds, at, ended in (
-        (5, (x - 0.3, y + 0.3), False),
-        (5, (x - 0.6, y), False),
-        (15, (x, y), True),
-    ):
+    for seconds, azimuth, ended in ((5, 20.0, False), (10, -80.0, False), (15, -30.0, True)):
         direction, stopped = page.js(moved, seconds)
-        assert direction[:2] == pytest.approx(at, abs=0.1)
-        assert np.linalg.norm(direction) == pytest.approx(1)
+        assert direction == pytest.approx(from_angles(45.0, azimuth).tolist(), abs=0.1)
+        # The irradiance of the plane stays.
+        assert direction[2] == pytest.approx(np.sqrt(0.5))
         assert stopped == ended
     for touched in (lambda: drag(page, "dome", (0.2, 0.1), (5, 5)), lambda: page.set(FLAT)):
         page.js(STATE + "viewer.restore('')")

@@ -61,7 +61,8 @@ def drawing(work: Path) -> None:
 def batch(work: Path) -> dict[str, Done]:
     lines = {
         "tilted": f"preview maps -o tilted --tiles 1 {FAST} --json",
-        "darker": f"preview flat.npy -o darker {FAST} --json",
+        "flat": f"preview flat.npy -o flat {FAST}",
+        "darker": f"preview flat.npy -o darker --exposure auto {FAST} --json",
         "darker again": f"preview flat.npy -o darker --exposure -0.5 {FAST} --json",
         "lonely": "preview lonely -o lonely-pictures --json",
         "settled": "preview data -o nowhere --min-cos 0.2",
@@ -94,7 +95,9 @@ def test_colors_lie_in_the_quadrants_of_the_map(batch: dict[str, Done], work: Pa
 
 @pytest.mark.usefixtures("drawing")
 def test_another_exposure_shows_the_same_values(batch: dict[str, Done], work: Path) -> None:
-    """A flat gray tile of albedo 1/2: the automatic exposure shows it as 0.8 of white, 2^EV / (2 π)."""
+    """A flat gray tile of albedo 1/2, shown as it is by default, and by the automatic exposure as 0.8 of
+    white, 2^EV / (2 π)."""
+    assert srgb_to_linear(pixels(work / "flat/beauty.png")).mean() == pytest.approx(0.5, rel=0.03)
     mesh, beauty, _ = batch["darker"].result()["pictures"]
     assert beauty["exposure"] == mesh["exposure"] == pytest.approx(np.log2(0.8 * 2 * np.pi), abs=0.05)
     mesh, beauty, queries = batch["darker again"].result()["pictures"]

@@ -16,7 +16,7 @@ from support.browser import browser
 from support.paths import ROOT
 
 from mbtf_core.app.console import run
-from mbtf_core.color import to_display
+from mbtf_core.color import ALBEDO_EXPOSURE, to_display
 from mbtf_pipeline.cli.app import app
 from mbtf_pipeline.compare.image_files import read_picture
 
@@ -80,7 +80,7 @@ class Page:
         picture = self.record["pictures"][scene]
         file = (picture["references"] if what in ("query", "pixel") else picture["fits"])[what]["file"]
         value = read_picture(self.folder / "compare" / file)
-        return to_display(value, self.record["exposure"]).astype(np.int64)
+        return to_display(value, ALBEDO_EXPOSURE).astype(np.int64)
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mbtf_core.color import auto_exposure, brightness, describe_exposure, to_display, white_of
+from mbtf_core.color import (
+    ALBEDO_EXPOSURE,
+    auto_exposure,
+    brightness,
+    chosen_exposure,
+    describe_exposure,
+    srgb_to_linear,
+    to_display,
+    white_of,
+)
 
 RAMP = np.repeat(np.linspace(0, 1, 1001)[:, None], 3, axis=1).reshape(-1, 1, 3)
 
@@ -17,6 +26,14 @@ def test_the_automatic_exposure_shows_bright_values_as_four_fifths_of_white() ->
         # The printed number gives the same picture.
         assert found == float(describe_exposure(found).split()[1])
     assert auto_exposure([brightness(0 * RAMP)]) == 0.0
+
+
+def test_the_default_exposure_keeps_albedos() -> None:
+    """Lambert: albedo/π under unit irradiance."""
+    for albedo in (0.03, 0.5, 0.9):
+        shown = to_display(np.full(3, albedo / np.pi), chosen_exposure(ALBEDO_EXPOSURE, [7.0]))
+        np.testing.assert_allclose(srgb_to_linear(shown / 255), albedo, rtol=0.02)
+    assert chosen_exposure("auto", [7.0]) == auto_exposure([7.0])
 
 
 def test_a_stop_is_a_factor_of_two() -> None:

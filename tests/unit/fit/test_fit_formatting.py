@@ -53,7 +53,7 @@ def test_the_summary_has_one_number_of_one_split() -> None:
     lines = report_errors(found, None)
     assert lines == [
         "unexplained variance 0.160 ± 0.003 of 4096 test queries (0: exact, 1: as good as the mean value)",
-        "PSNR 30.0 dB at exposure +0.00 EV (1 1/sr is white): visible beside the reference",
+        "PSNR 30.0 dB at exposure +0.00 EV (1 1/sr, albedo 3.1, is white): visible beside the reference",
         "test directions 0.300 ± 0.003",
     ]
     verbose = report_errors(found, None, verbose=True)

@@ -41,8 +41,7 @@ def test_pictures_are_ordered_by_view_light_and_width(model: str, tmp_path: Path
     material = write_material(tmp_path, model=model, aspect=2.0, contrast=1.0)
     values = sheet.panels(Evaluator(read_material(tmp_path), "cooperative"), SECTION)
     assert values.shape == (2, 2, 3, 64, 64, 3)
-    exposure = sheet.exposure_of(values)
-    pixels = sheet.contact_sheet(values, SECTION, exposure)
+    pixels = sheet.contact_sheet(values, SECTION, exposure := 2.0)
     pitch = 64 + grid.GAP
     for view, light, row in np.ndindex(2, 2, 3):
         v, i = SECTION.view[view], SECTION.light[light]

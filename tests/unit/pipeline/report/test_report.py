@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from mbtf_pipeline.compare import timing
-from mbtf_pipeline.report.sections import error_context
+from mbtf_pipeline.report.sections import _ranking, error_context
 
 
 def number(value: float, error: float) -> dict[str, Any]:
@@ -47,6 +47,27 @@ def test_both_errors_of_a_group_are_significant_or_neither() -> None:
     assert levels[1] == ["1", "50", "0.200 ± 0.010", "0.400 ± 0.010"]
     assert cosines[0][0] == "0.2–0.4"
     assert context["facts"][0]["value"] == "0.200 ± 0.010"
+
+
+@pytest.mark.parametrize(
+    ("images", "difference"), [((1e-4, 2e-4), 9e-5), ((2e-4, 1e-4), 9e-5), ((2e-4, 1e-4), 1e-5)]
+)
+def test_other_ranks_in_images_are_explained(images: tuple[float, float], difference: float) -> None:
+    """The test queries rank a before b."""
+    fits = dict(zip("ab", images, strict=True))
+    record: dict[str, Any] = {
+        "fits": list(fits),
+        "kinds": ["query"],
+        "pictures": [{"fits": {k: {"errors": {"query": {"mse": number(v, 1e-6)}}} for k, v in fits.items()}}],
+        "test": {
+            k: {"splits": {"test": {"mse": number(v, 1e-6)}}}
+            for k, v in (("a", 3e-4), ("b", 3e-4 + difference))
+        },
+    }
+    record["test"]["b"]["mse_minus_first"] = number(difference, 2e-5)
+    text = _ranking(record)
+    assert ("rank a, b, but the mean MSE of the images ranks b, a" in text) == (images[0] > images[1])
+    assert ("a and b do not differ significantly" in text) == (difference < 2e-5)
 
 
 def test_the_warm_up_and_an_outlier_do_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
