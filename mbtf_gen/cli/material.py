@@ -120,6 +120,7 @@ def plan(
     from mbtf_gen.planning.run_plan import plan_effects, skips_pilots
 
     job = prepare_job(options, material, quality)
+    job.announce_briefly()
     found = plan_effects(job)
     note = ""
     if skips_pilots(job) and any(decision.reason == "pilot" for decision in found.effects):

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from mbtf_core.app.console import CONSOLE, run
 from mbtf_core.data.shard_files import row_bytes
@@ -17,6 +18,7 @@ from mbtf_gen import forecast
 from mbtf_gen.cli.app import app
 from mbtf_gen.generation import run as generation
 from mbtf_gen.pictures import reference
+from mbtf_gen.tile.loading import load_material
 
 DRAFT = 400 * 128**2 + 65536
 
@@ -177,3 +179,26 @@ def test_the_resolution_of_a_material_overrides_that_of_a_preset(heights: Path) 
     file.write_text(f"height: {heights.name}\nresolution: 32\n")
     config = build(GeneratorConfig, {"material": str(file), "queries": {"resolution": 128}}, source="")
     assert limit_resolution(Job.load(config)).lattice.shape() == (32, 32)
+
+
+def test_notes_on_maps_are_logged_where_data_are_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Other commands, and one that finds all shards finished, do not repeat them."""
+    codes = np.random.default_rng(0).integers(0, 256, (32, 32), np.uint8)
+    Image.fromarray(codes).save(tmp_path / "height.png")
+    path = str(tmp_path / "height.png")
+
+    def printed(*words: str) -> str:
+        run(app, [*words, "-o", str(tmp_path / "out")] if words[0] == path else list(words))
+        return capsys.readouterr().err
+
+    monkeypatch.setattr(generation, "generate", stop)
+    notes = load_material(path).notes + load_material(path).warnings_in_use()
+    assert len(notes) > 2
+    assert all(note in printed(path) for note in notes)
+    planned = printed("plan", path, "--no-measure")
+    assert not any(note in planned for note in notes)
+    assert f"mbtf-gen inspect {path}" in planned
+    monkeypatch.setattr(generation, "unfinished", lambda *_: [])
+    assert not any(note in printed(path) for note in notes)

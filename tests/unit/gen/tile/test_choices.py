@@ -156,7 +156,7 @@ class TestWarning:
             {"material": str(maps), "geometry": {"height_scale": given, "make_tileable": "mirror"}}
         )
         with caplog.at_level(logging.INFO):
-            Job.prepare(config)
+            Job.load(config).announce()
         (warning,) = (r.getMessage() for r in caplog.records if r.levelno == logging.WARNING)
         assert f"both agree at --height-scale 0.012 ({factor:g} is in use)" in warning
         header = next(r.getMessage() for r in caplog.records if r.getMessage().startswith("mesh: "))

@@ -159,10 +159,10 @@ def test_jobs_use_it(tmp_path: Path) -> None:
     path = save_heights(tmp_path / "h.png", cut(fractal(64, 64)))
     config = {"material": str(path), "geometry": {"make_tileable": "mirror"}}
     assert GeneratorConfig.model_validate({"material": "m"}).geometry.make_tileable is None
-    job = Job.prepare(GeneratorConfig.model_validate(config))
+    job = Job.load(GeneratorConfig.model_validate(config))
     assert job.material.height.shape == (96, 96)
     config["geometry"] = {"max_pixels": 48 * 48 - 1}
     with pytest.raises(InputError, match="at most 2,303 are read"):
-        Job.prepare(GeneratorConfig.model_validate(config))
+        Job.load(GeneratorConfig.model_validate(config))
     assert run(app, ["inspect", str(path), "--set", "geometry.max_pixels=2303"]) == 3
     assert job.material.tiling == "mirror"
