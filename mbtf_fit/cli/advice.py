@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,8 +14,8 @@ def advise(
     material: Material,
     folder: Path,
     shards: Path | DataFolder,
-    history: Sequence[Mapping[str, Any]],
-    errors: Mapping[str, Any],
+    history: list[dict[str, Any]],
+    errors: dict[str, Any],
 ) -> tuple[str | None, list[str]]:
     """What reduces the error of a fit most.
 
@@ -40,8 +39,8 @@ def advise(
     from mbtf_fit.training.validation import marginal_cost_of
 
     config, training = material.config, material.description["training"]
-    cost = marginal_cost_of([*history], {**errors}, training.get("noise_variance"))
-    if cost is None or not errors or config.training.shared_decoder or reached(config, [*history]):
+    cost = marginal_cost_of(history, errors, training.get("noise_variance"))
+    if cost is None or not errors or config.training.shared_decoder or reached(config, history):
         return None, []
     step = next_step(cost, errors)
     command = step.command(config, training["seconds"], Dataset.open(shards), folder)

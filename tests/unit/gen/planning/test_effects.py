@@ -203,13 +203,13 @@ def test_a_plan_never_measures_a_rare_change_as_exactly_zero() -> None:
 @pytest.mark.parametrize(
     ("bound", "error", "text"),
     [
-        (0.13, 0.004, "< 14 %"),
-        (0.0041, 0.0004, "< 0.49 %"),
-        (0.2, None, "< 20 %"),
-        (0.98, 0.3, "may exceed 100 %"),
-        (1.1, 0.2, "may exceed 100 %"),
+        (0.13, 0.004, "< 14%"),
+        (0.0041, 0.0004, "< 0.49%"),
+        (0.2, None, "< 20%"),
+        (0.98, 0.3, "may exceed 100%"),
+        (1.1, 0.2, "may exceed 100%"),
     ],
 )
 def test_bounds_are_upper_ends(bound: float, error: float | None, text: str) -> None:
-    """No number beyond 100 %, and none that is a bound with an error bar."""
+    """No number beyond 100%, and none that is a bound with an error bar."""
     assert bound_text(bound, error) == text

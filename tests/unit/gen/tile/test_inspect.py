@@ -120,7 +120,7 @@ class TestText:
             "displaces the mesh",
             "slopes     median",
             "OpenGL",
-            "slopes agree best at --height-scale 0.1",
+            "agree at --height-scale 0.1",
             "holes 25.0%",
         ):
             assert part in text
