@@ -196,7 +196,7 @@ def test_what_is_left_out_has_its_bound(tmp_path: Path) -> None:
     data = Dataset.open(tmp_path / "data")
     samples = {split: data.load(split) for split in data.splits}
     text = card_text(Facts(data, PublishConfig(license="MIT"), "a", samples, {}))
-    assert "| shadowing | left out, bias &lt; 0.49 % | few \\| &lt;slopes&gt; |" in text
+    assert "| shadowing | left out, bias &lt; 0.49% | few \\| &lt;slopes&gt; |" in text
     assert "| parallax and masking | simulated |" in text
 
 

@@ -28,7 +28,7 @@ SETS: dict[str, tuple[str, float, tuple[float, float]]] = {
 ODDITIES = {
     "knit_fabric": "8-bit heights with 132 distinct values;holes 1.2%;--mesh 1024 keeps all",
     "leather_fine": "8-bit heights with 256 distinct values;JPG;--mesh 1024 keeps all",
-    "metal_plate": "constant 0.5, 0.5, 0.5",
+    "metal_plate": "base_color constant 0.5  ",
     "rock_cliff": "8-bit heights with 115 distinct values 2.238 codes apart",
     "stone_bricks": "8-bit heights with 219 distinct values;tile 1 x 0.5;JPG",
     "tree_bark": "8-bit heights with 104 distinct values;104 distinct, codes 109 .. 237;JPG",
