@@ -126,7 +126,7 @@ def measure_ratios(name: str, arguments: argparse.Namespace) -> dict[str, Any]:
             "queries": {"resolution": RESOLUTION},
         }
     )
-    runs, pilot, queries = sides(Job.prepare(config), arguments.queries, arguments.spp)
+    runs, pilot, queries = sides(Job.load(config), arguments.queries, arguments.spp)
     labels = level_groups(queries.sigma, LEVELS)
     variance: dict[str, list[NDArray[np.float64]]] = {side: [] for side in runs}
     seconds: dict[str, list[float]] = {side: [] for side in runs}
@@ -188,7 +188,7 @@ def measure_target(
     config = GeneratorConfig.model_validate(
         {"material": str(material), "geometry": {"height_scale": height}, "queries": queries}
     )
-    job = Job.prepare(config)
+    job = Job.load(config)
     plan = plan_run(job)
     estimator, q = build_estimator(job, plan.effects), job.query_plan.draw("train", 0, n)
     assert plan.allocation is not None

@@ -76,6 +76,18 @@ class LockedError(PartialError):
     """Another process works on the same files; later, they may be free or finished."""
 
 
+def check_type(value: object, kinds: type | tuple[type, ...], where: str, hint: str) -> None:
+    """Refuse an argument of another type, as callers from Python may pass.
+
+    Raises
+    ------
+    UsageError : `value` is of none of the `kinds`
+    """
+    if not isinstance(value, kinds):
+        given = "None" if value is None else f"of the type {type(value).__name__}"
+        raise UsageError(f"is {given}", where=where, hint=hint)
+
+
 def unwritable(path: Path, error: OSError) -> PartialError:
     """The error for a file or folder that cannot be written."""
     return PartialError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from typing import Annotated, Any
@@ -118,3 +119,12 @@ def clock(seconds: float) -> str:
     hours, rest = divmod(whole, 3600)
     minutes, rest = divmod(rest, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def percent(share: float, digits: int = 2) -> str:
+    """A share in percent, rounded to some digits but written out: ``0.49%``."""
+    number = 100.0 * share
+    if number <= 0.0:
+        return "0%"
+    places = digits - 1 - math.floor(math.log10(number))
+    return f"{round(number, places):.{max(0, places)}f}%"

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from pydantic import ValidationError
 
 from mbtf_core.app.console import Console
 from mbtf_core.color import auto_exposure, chosen_exposure, describe_exposure, to_display, white_of
@@ -60,13 +59,15 @@ def _job_of(data: Dataset) -> Job:
             hint="compare with its queries: mbtf-fit evaluate MATERIAL SHARDS",
         )
     try:
-        job = Job.prepare(GeneratorConfig.model_validate(data.manifest["config"]))
-    except ValidationError:
+        config = GeneratorConfig.model_validate(data.manifest["config"])
+    except InputError:
         raise InputError(
             "is of another version, whose configuration is not read",
             where=data.folder,
             hint="generate it again",
         ) from None
+    try:
+        job = Job.load(config)
     except InputError as error:
         hint = error.hint or "the reference is path-traced from it: run this where mbtf-gen ran"
         raise InputError(error.what, where=error.where, hint=hint) from None

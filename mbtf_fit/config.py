@@ -54,7 +54,7 @@ class FitConfig(Settings):
 
     Raises
     ------
-    pydantic.ValidationError
+    InputError
         A key is unknown, or a value is out of range.
     """
 

@@ -150,7 +150,7 @@ def foreign_inputs(material: Material, data: Dataset) -> list[str]:
     return [role for role in both if trained.get(role) != given.get(role)]
 
 
-def evaluate(material: Material, shards: str | Path | DataFolder) -> dict[str, dict[str, Any]]:
+def evaluate(material: Material | str | Path, shards: str | Path | DataFolder) -> dict[str, dict[str, Any]]:
     """Evaluate a fitted material on a data set of any layout.
 
     Held-out queries are selected by the material's own configuration; they are held out only in the data set
@@ -158,10 +158,10 @@ def evaluate(material: Material, shards: str | Path | DataFolder) -> dict[str, d
 
     Parameters
     ----------
-    material : Material
-        The fitted material.
+    material : Material, str or Path
+        The fitted material, or its folder.
     shards : str or Path
-        Folder made by ``mbtf-gen``.
+        Folder made by ``mbtf-gen``, or its URL.
 
     Returns
     -------
@@ -176,6 +176,10 @@ def evaluate(material: Material, shards: str | Path | DataFolder) -> dict[str, d
     InputError
         Shards are missing, corrupt, or of another aspect ratio.
     """
+    from mbtf_fit.material.material import Material
+
+    if not isinstance(material, Material):
+        material = Material.load(material)
     data = Dataset.open(shards)
     if data.lattice.aspect != material.lattice.aspect:
         raise InputError(

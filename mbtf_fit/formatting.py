@@ -113,17 +113,27 @@ def _remarks(errors: Mapping[str, Any], foreign: bool) -> list[str]:
 
 
 def _table_of(errors: Mapping[str, Any]) -> list[str]:
-    """A table of unexplained variance: overall, by level and by lowest cosine; a column per split."""
-    rows = [["unexplained variance", *(SPLIT_NAMES.get(name, name) for name in errors)]]
-    rows.append(["all", *(format_estimate(split["unexplained"]) for split in errors.values())])
+    """A table of unexplained variance: overall, by level and by lowest cosine; a column per split. Rows and
+    columns without any are left out."""
+
+    def cells(found: list[Mapping[str, Any] | None]) -> list[str]:
+        known = [e if e is not None and e["unexplained"]["value"] is not None else None for e in found]
+        return ["-" if e is None else format_estimate(e["unexplained"]) for e in known]
+
+    shown = {name: split for name, split in errors.items() if split["unexplained"]["value"] is not None}
+    rows = [["unexplained variance", *(SPLIT_NAMES.get(name, name) for name in shown)]]
+    rows.append(["all", *cells([*shown.values()])])
     for grouping, label in (("levels", "level"), ("elevations", "cosine")):
-        groups = {group for split in errors.values() for group in split[grouping]}
+        groups = {group for split in shown.values() for group in split[grouping]}
         for group in sorted(groups, key=lambda g: float(g.split("-")[0])):
-            found = [split[grouping].get(group) for split in errors.values()]
-            cells = ["-" if e is None else format_estimate(e["unexplained"]) for e in found]
-            rows.append([f"{label} {group}", *cells])
-    rows.append(["queries", *(str(split["n"]) for split in errors.values())])
-    return format_table(rows).splitlines()
+            rows.append(
+                [f"{label} {group}", *cells([split[grouping].get(group) for split in shown.values()])]
+            )
+    rows = [row for row in rows if {*row[1:]} != {"-"}]
+    partial = any("-" in row for row in rows)
+    rows.append(["queries", *(str(split["n"]) for split in shown.values())])
+    why = ["-: too few queries, or values that vary less than their noise"] if partial else []
+    return [*format_table(rows).splitlines(), *why] if shown else []
 
 
 def format_table(rows: list[list[str]]) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import os
+import shlex
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -84,17 +85,20 @@ class Job:
         }
         return cls(config.model_copy(update=own), tile)
 
-    @classmethod
-    def prepare(cls, config: GeneratorConfig) -> Job:
-        """:meth:`load`, and log the material's notes and warnings."""
-        job = cls.load(config)
-        for note in job.material.notes:
+    def announce(self) -> None:
+        """Log how the material's files are read: its notes, warnings, and the options in use."""
+        for note in self.material.notes:
             log.info(note)
-        for warning in job.material.warnings_in_use():
+        for warning in self.material.warnings_in_use():
             log.warning(warning)
-        if (text := job.material.summary()) is not None:
+        if (text := self.material.summary()) is not None:
             log.info(text)
-        return job
+
+    def announce_briefly(self) -> None:
+        """Log how many warnings there are about the material, for commands that make no data."""
+        if count := len(self.material.warnings_in_use()):
+            warnings = f"{count} warnings" if count > 1 else "1 warning"
+            log.info(f"{warnings} about this material: mbtf-gen inspect {shlex.quote(self.config.material)}")
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickled, it is its configuration and hash: the receiver, perhaps on another machine, loads the

@@ -148,7 +148,8 @@ class _RecipeRun:
         from mbtf_gen.generation.run import generate
         from mbtf_gen.job import Job
 
-        job = Job.prepare(data.config)
+        job = Job.load(data.config)
+        job.announce()
         shards = self.folder / data.sub
         for path in decision.changed_files:
             if path.name != MANIFEST_NAME:

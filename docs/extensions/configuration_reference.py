@@ -16,6 +16,8 @@ from pydantic import BaseModel, TypeAdapter
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
+from mbtf_core.errors import MbtfError
+
 _HEADER = ("key", "values", "default", "meaning")
 # What Markdown would read as more than text.
 _SPECIAL = re.compile(r"[<$*~\[\]]|\b_|_\b")
@@ -174,7 +176,7 @@ def _is_section(info: FieldInfo) -> bool:
         return False
     try:
         return value == type(value)()
-    except ValueError:
+    except (ValueError, MbtfError):
         return False
 
 

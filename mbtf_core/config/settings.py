@@ -12,11 +12,12 @@ import types
 import typing
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, TypeVar, Union
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, TypeVar, Union
 
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Field,
     ValidationError,
@@ -27,6 +28,11 @@ from pydantic import (
 from mbtf_core.config.yaml_file import line_of, parse_value, read_yaml, shortened
 from mbtf_core.errors import InputError, MbtfError, UsageError
 from mbtf_core.paths import named_file, suggest_name
+
+if TYPE_CHECKING:
+    from pydantic._internal._model_construction import ModelMetaclass
+else:
+    ModelMetaclass = type(BaseModel)
 
 _COMMAND_LINE = "command line"
 
@@ -43,8 +49,24 @@ def parts_of(annotation: Any, *, containers: bool = True) -> list[Any]:
     return [annotation]
 
 
-class Settings(BaseModel):
+class _Checked(ModelMetaclass):
+    """Makes configurations whose faults are an InputError of one line; sections within are made by pydantic,
+    which collects theirs."""
+
+    if not TYPE_CHECKING:
+
+        def __call__(cls, *values: object, **options: object) -> Any:
+            if values:
+                first = next(key for key in cls.model_fields if key != "version")
+                hint = f"such as {cls.__name__}({first}=...)"
+                raise InputError("takes named values only", where=cls.__name__, hint=hint)
+            return build(cls, options, source=cls.__name__)
+
+
+class Settings(BaseModel, metaclass=_Checked):
     """Base of every configuration section: unknown keys are errors, numbers are finite, values are fixed.
+
+    Making one, or its ``model_validate``, raises an :class:`InputError` for a value or a key that is wrong.
 
     Attributes
     ----------
@@ -54,6 +76,14 @@ class Settings(BaseModel):
 
     exclusive: ClassVar[tuple[tuple[str, str], ...]] = ()
     model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False)
+
+    @classmethod
+    def model_validate(cls, obj: Any) -> Self:  # type: ignore[override]
+        return build(cls, obj, source=cls.__name__)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        kind = type(self).__name__
+        raise InputError(f"'{name}' cannot be changed", where=kind, hint=f"make another {kind}")
 
     @field_validator("*", mode="before")
     @classmethod
@@ -87,8 +117,12 @@ def _file_name(name: str) -> str:
     return name
 
 
+def _path_text(name: Any) -> Any:
+    return os.fspath(name) if isinstance(name, os.PathLike) else name
+
+
 # The name of a file, or a path to it.
-FileName = Annotated[str, Field(min_length=1), AfterValidator(_file_name)]
+FileName = Annotated[str, BeforeValidator(_path_text), Field(min_length=1), AfterValidator(_file_name)]
 
 
 def _separated(name: str) -> str:
@@ -175,7 +209,7 @@ def build(
     error : with the key, its line where `data` came from :func:`read_yaml`, and the nearest valid key
     """
     try:
-        return model.model_validate(data)
+        return typing.cast(B, model.__pydantic_validator__.validate_python(data))
     except ValidationError as fault:
         where, what, hint = _explain(fault, model, data, source, spelled or {})
         raise error(what, where=where, hint=hint) from None

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import os
 import re
 import tempfile
 import threading
@@ -24,7 +25,7 @@ from typing import Any
 from mbtf_core.data.file_cache import FileCache
 from mbtf_core.data.schema import CONFIG_NAME, GEOMETRY_NAME, MANIFEST_NAME, SPLITS
 from mbtf_core.data.store import LocalStore, Store, StoredFile, open_store
-from mbtf_core.errors import InputError, MbtfError, PartialError, unwritable
+from mbtf_core.errors import InputError, MbtfError, PartialError, check_type, unwritable
 from mbtf_core.files.atomic import (
     TEMPORARY,
     Stored,
@@ -87,14 +88,17 @@ class DataFolder:
 
     @classmethod
     def open(cls, where: str | Path | DataFolder) -> DataFolder:
-        """The folder at a path or a URL, as it is now.
+        """The folder at a path or a URL, as it is now; also that of an opened data set.
 
         Raises
         ------
+        UsageError : `where` is something else
         EngineError : the package of the protocol is not installed
         InputError : the URL is invalid, or the store refuses the request
         PartialError : the store cannot be reached
         """
+        where = getattr(where, "folder", where)
+        check_type(where, (str, os.PathLike, DataFolder), "data set", "give the path or URL of its folder")
         found = where if isinstance(where, DataFolder) else cls(open_store(where))
         if found.local is None:
             make_folder(found.workspace)

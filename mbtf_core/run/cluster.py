@@ -348,11 +348,13 @@ def _local_workers(config: ClusterConfig, environment: dict[str, str]) -> Iterat
     try:
         yield cluster
     finally:
+        nannies = [*cluster.workers.values()]
         try:
             cluster.close(timeout=_CLOSE_SECONDS)
         except TimeoutError:
             # Dask before 2026.8 waits for ever for a worker that was killed while it was started again.
             cluster.shutdown_on_close = False
+            own = {nanny.pid for nanny in nannies}
             for child in multiprocessing.active_children():
-                if child.name.startswith("Dask Worker"):
+                if child.pid in own:
                     child.kill()

@@ -89,9 +89,10 @@ def pooled_error(a: ArrayLike, b: ArrayLike) -> Estimate:
 
 
 def pooled_relative_error(a: ArrayLike, b: ArrayLike, weights: ArrayLike | None = None) -> Estimate:
-    """Noise of the values relative to the values, pooled; a pure number.
+    """Noise of one query's value relative to the mean value, pooled; a pure number.
 
-    The RMS noise over the RMS value, ``√(mean (a-b)²/4 / mean ab)``, which is consistent.
+    The RMS noise over the mean, ``√(mean (a-b)²/4) / mean (a+b)/2``: what runs, forecasts, manifests, cards
+    and pictures state as their noise.
 
     Parameters
     ----------
@@ -99,8 +100,11 @@ def pooled_relative_error(a: ArrayLike, b: ArrayLike, weights: ArrayLike | None 
     weights : (n,) array_like, optional
     """
     first, second = _pair(a, b)
-    w = _weights(weights, len(first))
-    return _root(_ratio(w * per_unit((first - second) ** 2 / 4.0), w * per_unit(first * second)))
+    w, value = _weights(weights, len(first)), per_unit((first + second) / 2.0)
+    mean = float((w * value).mean())
+    # The square of the mean, linear in the values.
+    square = w * mean * (2.0 * value - mean)
+    return _root(_ratio(w * per_unit((first - second) ** 2 / 4.0), square))
 
 
 def noise_free_mse(

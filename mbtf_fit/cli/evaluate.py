@@ -6,6 +6,7 @@ from pathlib import Path
 
 from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.options import Verbose
+from mbtf_fit.cli.advice import advise
 from mbtf_fit.formatting import report_errors
 
 
@@ -15,6 +16,8 @@ def evaluate(
     """Measure the errors of a material, or of other code's predictions, without the noise of the data.
 
     Measured data have one value per query: errors on them include their noise, and say so.
+
+    It ends with the command that is expected to reduce the error most.
 
     No fit is trained on test queries and directions. --verbose adds the training queries, and errors by level
     of detail and by elevation.
@@ -31,6 +34,7 @@ def evaluate(
     from mbtf_core.data.folder import DataFolder
     from mbtf_fit.evaluation import evaluate, foreign_inputs, score_predictions
     from mbtf_fit.material.material import Material
+    from mbtf_fit.training.fit_folder import read_history
 
     folder = DataFolder.open(shards)
     if material.suffix == ".npz":
@@ -47,9 +51,13 @@ def evaluate(
             "materials and do not measure the quality of the fit"
         )
     found = evaluate(loaded, folder)
+    history = [] if foreign else read_history(material)
+    command, advice = advise(loaded, material, folder, history, found["errors"])
     lines = [
         f"{material}: {loaded.config.model} on {folder}",
         *report_errors(found["errors"], found.get("transmittance"), verbose, foreign=bool(foreign)),
+        *advice,
     ]
     report = {"material": material, "shards": shards, "foreign_inputs": foreign, **found}
+    report["next_command"] = command
     console.report(report, "\n".join(lines))

@@ -27,6 +27,7 @@ from mbtf_core.app.progress import Progress
 from mbtf_core.errors import InputError, PartialError, UsageError
 from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.units import expectation
+from mbtf_fit.cli.advice import advise
 from mbtf_fit.cli.live import Live, live_view
 from mbtf_fit.config import DEFAULT_MODEL, FIBER_MODEL, FitConfig, ModelName, decoder_models
 from mbtf_fit.formatting import describe_fit, fits_table
@@ -128,12 +129,10 @@ def _fit_one(
     console: Console,
 ) -> None:
     """Fit a data set, watched by whoever asks for it."""
-    from mbtf_core.data.dataset import Dataset
     from mbtf_fit.material.format import DESCRIPTION_NAME
     from mbtf_fit.training.endings import describe_ending
     from mbtf_fit.training.fit import fit
     from mbtf_fit.training.fit_folder import EventLog
-    from mbtf_fit.training.next_step import next_step
 
     finished = not overwrite and (output / DESCRIPTION_NAME).exists()
     if not finished:
@@ -162,14 +161,10 @@ def _fit_one(
             shown.finished(output.name, output)
     if finished:
         console.note(f"{output}: this fit is already finished; --overwrite trains it again")
-    summary = {**result.as_dict(), "next_command": None}
+    command, advice = advise(result.material, output, shards, result.history, result.errors)
+    summary = {**result.as_dict(), "next_command": command}
     ending = describe_ending(config, result.history)
-    more = [ending] if ending is not None else []
-    if result.marginal_cost is not None and not summary["reached"]:
-        step = next_step(result.marginal_cost, result.errors)
-        command = step.command(config, result.seconds, Dataset.open(shards), output)
-        summary["next_command"] = command
-        more.append(step.reason if command is None else f"{step.reason}:\n  {command}")
+    more = [*([] if ending is None else [ending]), *advice]
     console.report(summary, "\n".join([describe_fit(summary, verbose), *more]))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,16 +46,33 @@ def _shards_info(folder: DataFolder) -> tuple[dict[str, Any], str]:
         s: {"shards": len(data.shards(s)), "rows": sum(x.rows for x in data.shards(s))} for s in data.splits
     }
     kind = {"shuffled": "queries", "image": "images", "slices": "positions"}[data.layout]
+    # Data sets of other programs may lack these.
+    manifest = data.manifest
+    config, measured = manifest.get("config") or {}, manifest.get("measured")
+    material = measured["file"] if measured else config.get("material")
+    width = (config.get("light") or {}).get("width")
+    least = (config.get("queries") or config).get("min_cos")
+    noise = (manifest.get("summary") or {}).get("relative_error")
+    light = (
+        "light of unknown width" if width is None else f"light {width:g}° wide" if width else "delta light"
+    )
+    if least is not None:
+        light += f", elevations from {math.degrees(math.asin(least)):.0f}° (cosine {least:g})"
     lines = [
-        f"{folder}: shards, {data.layout} layout",
-        f"levels 0 to {lattice.finest}, finest {columns} x {rows} texels, aspect {lattice.aspect:g}",
+        f"{folder}: shards{' of ' + material if material else ''}, {data.layout} layout",
+        f"levels 0 to {lattice.finest}, finest {columns} x {rows} texels, aspect {lattice.aspect:g}; {light}",
         *(
             f"{s}: {n['rows']} {kind} in {n['shards']} {'shard' if n['shards'] == 1 else 'shards'}"
             for s, n in splits.items()
         ),
+        "noise unknown" if noise is None else f"noise of a training query {noise:.1%} of the mean value",
     ]
     return {
         "shards": str(folder),
+        "material": material,
+        "light_width": width,
+        "min_cos": least,
+        "relative_noise": noise,
         "layout": data.layout,
         "levels": {"finest": lattice.finest, "shape": [rows, columns]},
         "aspect": lattice.aspect,

@@ -13,6 +13,7 @@ from torch.utils.data import IterableDataset, get_worker_info
 from mbtf_core.data.dataset import Dataset, Shard
 from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.shard_files import check_values
+from mbtf_core.errors import InputError, check_type
 from mbtf_fit.data.images import philox
 from mbtf_fit.data.queries import ShardQueries, needed
 
@@ -82,8 +83,9 @@ class QueryDataset(IterableDataset[QueryBatch]):
         self, folder: str | Path | DataFolder, split: str = "train", batch_size: int = 4096, seed: int = 0
     ) -> None:
         super().__init__()
+        check_type(batch_size, int, "batch_size", "give a whole number")
         if batch_size < 1:
-            raise ValueError(f"batch_size is {batch_size}, but must be at least 1")
+            raise InputError(f"is {batch_size}, but must be at least 1", where="batch_size")
         self.data, self.batch_size, self.seed = Dataset.open(folder), batch_size, seed
         # Shared with workers, also with those that live for several epochs.
         self._epoch = zeros((), dtype=int64).share_memory_()

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mbtf_core.extras import import_extra
 from mbtf_fit.export import Export, ExportTarget
-from mbtf_fit.export.images import BASE_COLOR, HEIGHT, IMAGE_NAMES, NORMAL, ORM, MapOptions, write_maps
+from mbtf_fit.export.images import BASE_COLOR, COAT, HEIGHT, IMAGE_NAMES, NORMAL, ORM, MapOptions, write_maps
 
 if TYPE_CHECKING:
     from mbtf_fit.material.maps import Maps
@@ -41,10 +41,20 @@ def gltf(maps: Maps, name: str, described: dict[str, Any]) -> str:
         if name == "POSITION":
             accessor.min, accessor.max = array.min(0).tolist(), array.max(0).tolist()
         accessors.append(accessor)
+    images, extensions = [BASE_COLOR, NORMAL, ORM], dict[str, Any]()
+    if maps.coat is not None:
+        images.append(COAT)
+        extensions["KHR_materials_clearcoat"] = {
+            "clearcoatFactor": 1.0,
+            "clearcoatTexture": {"index": 3},
+            "clearcoatRoughnessFactor": 1.0,
+            "clearcoatRoughnessTexture": {"index": 3},
+            "clearcoatNormalTexture": {"index": 1},
+        }
     if maps.dielectric > 0:
-        extensions = {"KHR_materials_ior": {"ior": round(maps.refractive_index, 6)}}
+        extensions["KHR_materials_ior"] = {"ior": round(maps.refractive_index, 6)}
     else:
-        extensions = {"KHR_materials_specular": {"specularFactor": 0.0}}
+        extensions["KHR_materials_specular"] = {"specularFactor": 0.0}
     material = gl.Material(
         name=name,
         pbrMetallicRoughness=gl.PbrMetallicRoughness(
@@ -69,9 +79,9 @@ def gltf(maps: Maps, name: str, described: dict[str, Any]) -> str:
         nodes=[gl.Node(mesh=0, name=name)],
         meshes=[gl.Mesh(primitives=[primitive])],
         materials=[material],
-        textures=[gl.Texture(sampler=0, source=n) for n in range(3)],
+        textures=[gl.Texture(sampler=0, source=n) for n in range(len(images))],
         samplers=[sampler],
-        images=[gl.Image(uri=name) for name in (BASE_COLOR, NORMAL, ORM)],
+        images=[gl.Image(uri=name) for name in images],
         buffers=[gl.Buffer(byteLength=len(data))],
         bufferViews=views,
         accessors=accessors,

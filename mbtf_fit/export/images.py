@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from mbtf_fit.material.maps import Maps
 
 BASE_COLOR, NORMAL, ORM, HEIGHT = "base_color.png", "normal.png", "roughness_metallic.png", "height.png"
-IMAGE_NAMES = (BASE_COLOR, NORMAL, ORM, HEIGHT)
+COAT = "clearcoat.png"
+IMAGE_NAMES = (BASE_COLOR, NORMAL, ORM, HEIGHT, COAT)
 
 
 class MapOptions(Settings):
@@ -91,6 +92,7 @@ def write_images(maps: Maps, folder: Path) -> list[str]:
     - ``base_color.png``: with opacity as its alpha where there are holes.
     - ``normal.png``: normals n as (n + 1) / 2; x along u, which is right in the image, y along v, up.
     - ``roughness_metallic.png``: green roughness, blue metallic, red 1.
+    - ``clearcoat.png``, of coated surfaces: red weight, green roughness of the clear coat.
     - ``height.png``: 16 bits, 0 the lowest and 65535 the highest vertex; the range is in the document. Models
       that know no surface have none.
     """
@@ -103,6 +105,8 @@ def write_images(maps: Maps, folder: Path) -> list[str]:
         color = np.concatenate([color, maps.opacity[..., None]], -1)
     packed = np.stack([np.ones_like(maps.roughness), maps.roughness, maps.metallic], -1)
     images = {BASE_COLOR: color, NORMAL: 0.5 * maps.normals + 0.5, ORM: packed}
+    if maps.coat is not None:
+        images[COAT] = np.concatenate([maps.coat, np.zeros_like(maps.coat[..., :1])], -1)
     if maps.heights is not None:
         images[HEIGHT] = (maps.heights - maps.heights.min()) / (maps.height_range or 1.0)
     for name, image in images.items():

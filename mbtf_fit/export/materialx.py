@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from mbtf_core.extras import import_extra
 from mbtf_fit.export import Export, ExportTarget
-from mbtf_fit.export.images import BASE_COLOR, HEIGHT, IMAGE_NAMES, NORMAL, ORM, MapOptions, write_maps
+from mbtf_fit.export.images import BASE_COLOR, COAT, HEIGHT, IMAGE_NAMES, NORMAL, ORM, MapOptions, write_maps
 
 if TYPE_CHECKING:
     from mbtf_fit.material.maps import Maps
@@ -55,6 +55,14 @@ def materialx(maps: Maps, name: str, described: dict[str, Any]) -> str:
         connect(surface, channel, "float", channel)
     connect(surface, "base_color", "color3", "base")
     connect(surface, "normal", "vector3", "normal")
+    if maps.coat is not None:
+        node("image", "coat", "vector3", file=("filename", COAT))
+        for index, name in enumerate(("clearcoat", "clearcoat_roughness")):
+            node("extract", name, "float", node_in=("vector3", "coat"), index=("integer", index))
+            connect(surface, name, "float", name)
+        coat_normal = surface.addInput("clearcoat_normal", "vector3")
+        coat_normal.setNodeGraphString("maps")
+        coat_normal.setOutputString("normal_out")
     surface.addInput("ior", "float").setValueString(f"{maps.refractive_index:.6g}")
     if maps.dielectric == 0:
         surface.addInput("specular", "float").setValueString("0")

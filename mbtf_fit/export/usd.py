@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from mbtf_core.extras import import_extra
 from mbtf_fit.export import Export, ExportTarget
-from mbtf_fit.export.images import BASE_COLOR, HEIGHT, IMAGE_NAMES, NORMAL, ORM, MapOptions, write_maps
+from mbtf_fit.export.images import BASE_COLOR, COAT, HEIGHT, IMAGE_NAMES, NORMAL, ORM, MapOptions, write_maps
 
 if TYPE_CHECKING:
     from mbtf_fit.material.maps import Maps
@@ -74,6 +74,10 @@ def usd(maps: Maps, name: str, described: dict[str, Any]) -> str:
     connect("normal", types.Normal3f, normal, "rgb")
     connect("roughness", types.Float, packed, "g")
     connect("metallic", types.Float, packed, "b")
+    if maps.coat is not None:
+        coat = texture("clearcoat", COAT)
+        connect("clearcoat", types.Float, coat, "r")
+        connect("clearcoatRoughness", types.Float, coat, "g")
     if maps.has_holes:
         connect("opacity", types.Float, color, "a")
     material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", types.Token))

@@ -11,7 +11,9 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from mbtf_core.errors import InputError
 from mbtf_fit.backends.cpu.model import NativeModel, supports
+from mbtf_fit.material.format import QUERY
 from mbtf_fit.native import kernel
 from mbtf_fit.native.library import QueryPointers
 from mbtf_fit.pytorch.material import NeuralMaterial
@@ -52,6 +54,11 @@ def predict(
 ) -> NDArray[np.float32]:
     """Values (n, 3) of a material in 1/sr, clamped at 0. `hints` (n, 7) of its surface are computed where
     they are not given."""
+    given = [tuple(np.shape(a)) for a in (u, sigma, omega_i, omega_o)]
+    n = next(iter(given[1]), 0)
+    if given != [(n, 2), (n,), (n, 3), (n, 3)]:
+        what = f"have the shapes {', '.join(map(str, given))}"
+        raise InputError(what, where=", ".join(QUERY), hint="they must be (n, 2), (n,), (n, 3) and (n, 3)")
     found = kernel()
     if found is not None and supports(model):
         return _predict_natively(NativeModel(found, model), hints, u, sigma, omega_i, omega_o)
@@ -65,9 +72,6 @@ def predict(
 def _predict_natively(native: NativeModel, hints: Tensor | None, *arrays: ArrayLike) -> NDArray[np.float32]:
     inputs = [np.ascontiguousarray(a, np.float32) for a in arrays]
     n = len(inputs[1])
-    shapes = [(n, 2), (n,), (n, 3), (n, 3)]
-    if [a.shape for a in inputs] != shapes:
-        raise ValueError(f"queries of the shapes {[a.shape for a in inputs]}, not {shapes}")
     out = np.empty((n, 3), np.float32)
     read = list(inputs)
     if native.pattern.displace is not None:

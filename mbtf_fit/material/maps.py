@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from mbtf_core.app.console import Console
 from mbtf_core.data.lattice import texel_centers
+from mbtf_core.data.schema import CLEARCOAT_F0
 from mbtf_core.errors import UsageError
 from mbtf_core.stats import Estimate, unexplained_variance
 from mbtf_fit.material.brdf_fit import BASE, METALLIC, ROUGHNESS, SLOPES, Pairs, fit_tile, reflectance
@@ -31,7 +32,7 @@ from mbtf_fit.material.reference_values import (
     texel_values,
     tile_means,
 )
-from mbtf_fit.ops.constants import DIELECTRIC, GLOSSY_CHANNELS, HEIGHTS, MAPS
+from mbtf_fit.ops.constants import COATED_CHANNELS, DIELECTRIC, GLOSSY_CHANNELS, HEIGHTS, MAPS
 
 F64 = NDArray[np.float64]
 # Least roughness: smaller lobes are narrower than those that data are made with.
@@ -62,6 +63,8 @@ class Maps:
         F0 of the dielectric; 0 for a surface without gloss.
     heights : (H, W) array or None
         In tile widths, at most 0, on the grid that rays are traced to; None of a model that knows no surface.
+    coat : (rows, columns, 2) array or None
+        Weight and roughness of the clear coat, whose normal is that of the rest; None without one.
     """
 
     level: int
@@ -73,6 +76,7 @@ class Maps:
     opacity: F64
     dielectric: float
     heights: F64 | None
+    coat: F64 | None = None
 
     @property
     def normals(self) -> F64:
@@ -112,8 +116,17 @@ class Maps:
         lobes = [*self.slopes.reshape(-1, 2).T, self.roughness.ravel(), self.metallic.ravel()]
         pairs = Pairs.of(omega_i, omega_o, torch.float64)
         found = reflectance(torch.from_numpy(np.stack(lobes)[..., None]), self.dielectric, pairs)
-        constant, factor = (c.numpy() * self.opacity.reshape(-1, 1) for c in found)
-        return constant, factor
+        opacity = self.opacity.reshape(-1, 1)
+        constant, factor = (c.numpy() * opacity for c in found)
+        if self.coat is None:
+            return constant, factor
+        # The extension KHR_materials_clearcoat: a dielectric of 1.5, mixed by its reflectance at the normal.
+        weight, roughness = self.coat.reshape(-1, 2).T
+        mirror = np.stack([*lobes[:2], roughness, np.ones_like(weight)])
+        lobe = sum(c.numpy() for c in reflectance(torch.from_numpy(mirror[..., None]), 0.0, pairs))
+        cosine = np.clip(self.normals.reshape(-1, 3) @ np.asarray(omega_o, np.float64).T, 0.0, 1.0)
+        share = weight[:, None] * (CLEARCOAT_F0 + (1.0 - CLEARCOAT_F0) * (1.0 - cosine) ** 5)
+        return (1.0 - share) * constant + share * lobe * opacity, (1.0 - share) * factor
 
     def evaluate(self, omega_i: F64, omega_o: F64) -> F64:
         """Reflectance M (texels, k, 3) of all texels in 1/sr, for unit vectors (k, 3)."""
@@ -125,7 +138,8 @@ class Maps:
         """The maps at evenly spread texels, at most `side` squared, and their uv (n, 2)."""
         shape = self.roughness.shape
         j, i = (np.unique(np.linspace(0, n - 1, min(n, side)).round().astype(int)) for n in shape)
-        names = ("base_color", "slopes", "roughness", "metallic", "opacity")
+        names = ["base_color", "slopes", "roughness", "metallic", "opacity"]
+        names += [] if self.coat is None else ["coat"]
         picked = {name: getattr(self, name)[j][:, i] for name in names}
         return replace(self, **picked), texel_centers(*shape)[j][:, i].reshape(-1, 2)
 
@@ -153,18 +167,26 @@ def surface_maps(material: Material, level: int) -> Maps:
         (maps[..., 8], maps[..., 9]) if glossy else (np.ones_like(base[..., 0]), np.zeros_like(base[..., 0]))
     )
     # Facets are isotropic: the mean of both axes of 2C.
-    alpha2 = alpha2 + np.maximum(maps[..., 2] + maps[..., 4] - (slopes**2).sum(-1), 0.0)
+    scatter = np.maximum(maps[..., 2] + maps[..., 4] - (slopes**2).sum(-1), 0.0)
+    coat = None
+    if maps.shape[2] == COATED_CHANNELS:
+        coat = np.stack([np.clip(maps[..., 10], 0.0, 1.0), _roughness(maps[..., 11] + scatter)], -1)
     return Maps(
         level,
         material.lattice.aspect,
         np.clip(base, 0.0, 1.0),
         slopes,
-        np.clip(alpha2, _LEAST_ALPHA2, 1.0) ** 0.25,
+        _roughness(alpha2 + scatter),
         np.clip(metallic, 0.0, 1.0),
         opacity_of(material, level),
         float(weights[DIELECTRIC]) if glossy else 0.0,
         weights[HEIGHTS][..., 0].cpu().double().numpy(),
+        coat,
     )
+
+
+def _roughness(alpha2: F64) -> F64:
+    return np.asarray(np.clip(alpha2, _LEAST_ALPHA2, 1.0) ** 0.25)
 
 
 def fitted_maps(material: Material, level: int, console: Console) -> Maps:

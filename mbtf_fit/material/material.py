@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +17,7 @@ from mbtf_core.config.settings import build
 from mbtf_core.data.lattice import Lattice, sigma_of_level
 from mbtf_core.data.schema import CONVENTIONS
 from mbtf_core.directions import check_unit, from_projected_disk
-from mbtf_core.errors import InputError, reason
+from mbtf_core.errors import InputError, check_type, reason
 from mbtf_core.files.atomic import write_json
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries
@@ -108,6 +109,7 @@ class Material:
         InputError
             The folder is missing, corrupt, or of another schema.
         """
+        check_type(folder, (str, os.PathLike), "material", "give the path of its folder")
         description, weights = read_description(Path(folder))
         config = build(FitConfig, description["config"], source=str(weights.with_name(DESCRIPTION_NAME)))
         lattice = lattice_of(description)

@@ -43,6 +43,8 @@ HEIGHT_SCALE, FIRST_DEPTH, LEAST_FACING = 0.25, 0.04, 0.3
 # Of the models `rainer2019` and `rainer2020`: channels besides the latents, mean and standard deviation of
 # each color; smallest cosine of the light that values are divided by.
 STATISTICS, LEAST_COSINE = 6, 0.01
+# Largest ratio of the radii of a footprint in pictures, by default. At 5° above a plane the ratio is 11.
+MAX_ANISOTROPY = 16.0
 # Knots of the cosine in a fitted table of calibration factors: 0, 1/16, ..., 1.
 KNOTS = 17
 # Tensors of the surface in a material, before the level.

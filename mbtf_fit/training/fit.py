@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -14,7 +15,7 @@ from typing import Any
 import torch
 
 from mbtf_core.data.folder import DataFolder
-from mbtf_core.errors import InputError, PartialError
+from mbtf_core.errors import InputError, PartialError, check_type
 from mbtf_core.files.folders import ELSEWHERE, owned
 from mbtf_core.paths import real_path
 from mbtf_core.run.signals import stop_on_interruption
@@ -171,6 +172,8 @@ def fit(
         The disk is full, another process writes to the folder, or the store cannot be reached; the same
         command resumes.
     """
+    check_type(config, FitConfig, "config", "such as FitConfig(training={'time': '2min'})")
+    check_type(out, (str, os.PathLike), "out", "give the path of a folder")
     if config.training.shared_decoder:
         raise InputError(
             "a shared network takes several data sets",
@@ -221,6 +224,9 @@ def fit_jointly(
     InputError, EngineError, PartialError
         As :func:`fit`; or there are too few data sets.
     """
+    check_type(config, FitConfig, "config", "such as FitConfig(training={'shared_decoder': True})")
+    check_type(shards, (list, tuple), "shards", "give a list of folders")
+    check_type(folders, (list, tuple), "folders", "give a list of folders")
     decoder, outs = Path(decoder), [Path(folder) for folder in folders]
     if not config.training.shared_decoder:
         raise InputError("is not set", where="training.shared_decoder", hint="set it to true")

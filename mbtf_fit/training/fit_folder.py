@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.data.dataset import Dataset
+from mbtf_core.errors import InputError
 from mbtf_core.extras import import_extra
 from mbtf_core.files.atomic import data_sha256, write_text
 from mbtf_core.files.folders import OutputFolder, OutputKind
-from mbtf_core.paths import refuse_special
+from mbtf_core.paths import refuse_special, suggest_path
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.material.decoder import DECODER_NAME, Decoder
@@ -131,8 +132,15 @@ def read_history(folder: str | Path) -> list[dict[str, Any]]:
             Unexplained variance of the validation subset (1 - R²), and its standard error.
         queries_per_second : int
             Training throughput.
+
+    Raises
+    ------
+    InputError
+        There is no such folder.
     """
     path = Path(folder) / HISTORY_NAME
+    if not path.parent.is_dir():
+        raise InputError("no such folder", where=folder, hint=suggest_path(path.parent, Path.is_dir))
     refuse_special(path)
     out = []
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []:

@@ -22,6 +22,7 @@ from mbtf_fit.backends.shader.program import TRANSMITTANCE, program_of
 from mbtf_fit.backends.shader.syntax import GLSL
 from mbtf_fit.material.format import DEFAULT_MIN_COS, QUERY
 from mbtf_fit.material.material import Material, conformance_values
+from mbtf_fit.ops.constants import MAX_ANISOTROPY
 from mbtf_fit.viewer.textures import F32, PackedTexture, pack
 
 PAGE_NAME = "viewer.html"
@@ -68,6 +69,8 @@ def write_page(content: Mapping[str, Any], title: str, *, live: bool = False) ->
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     names = sorted(file.name for file in files(__package__).joinpath("page").iterdir())
     shaders = {name: _read(name) for name in names if name.endswith((".vert", ".frag"))}
+    scene = "scene.frag"
+    shaders[scene] = shaders[scene].replace("$MAX_ANISOTROPY", f"{MAX_ANISOTROPY:.1f}")
     script = 'const CONTENT = JSON.parse(document.getElementById("content").textContent);\n'
     # Our own files: nothing in them is escaped.
     return environment.from_string(_read("viewer.html")).render(

@@ -57,7 +57,7 @@ def prepare_job(
     from mbtf_gen.job import Job, limit_resolution
 
     preset = generator_options(quality, options.explicit())
-    job = Job.prepare(resolve_config(options, material, preset))
+    job = Job.load(resolve_config(options, material, preset))
     return limit_resolution(job) if RESOLUTION in preset else job
 
 
@@ -107,6 +107,8 @@ def generate(
 
     folder = DataFolder.open(output)
     left = unfinished(job, folder, index, count, overwrite)
+    if left:
+        job.announce()
     size = data_bytes(job, left)
     console.note(
         f"{job.config.material} -> {folder}: {split_queries(job, 'train')} training + "

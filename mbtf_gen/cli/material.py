@@ -120,10 +120,11 @@ def plan(
     from mbtf_gen.planning.run_plan import plan_effects, skips_pilots
 
     job = prepare_job(options, material, quality)
+    job.announce_briefly()
     found = plan_effects(job)
     note = ""
     if skips_pilots(job) and any(decision.reason == "pilot" for decision in found.effects):
-        note = "\nthe run is too small for pilots: it simulates what only a pilot leaves out"
+        note = "\nthis run is too small to measure effects by a pilot: it simulates all that the bounds keep"
     if not measure:
         console.report({**found.to_manifest(), "forecast": None}, found.describe() + note)
         return

@@ -141,7 +141,7 @@ def _job(folder: DataFolder, manifest: dict[str, Any] | None, material: str | No
             where=folder,
             hint="give its path: mbtf-gen repair FOLDER --material PATH",
         )
-    job = Job.prepare(config)
+    job = Job.load(config)
     if manifest is not None and manifest["config_hash"] != job.config_hash:
         changes = in_short(differences(manifest["inputs"], job.material.digests))
         raise InputError(

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from mbtf_core.data.documents import finished_record, plan_digest, upload_waiting
 from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.schema import MANIFEST_NAME, Queries, ShardEntry
-from mbtf_core.errors import InputError, LockedError, PartialError
+from mbtf_core.errors import InputError, LockedError, PartialError, UsageError, check_type
 from mbtf_core.locks import lock_owner, take_lock
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item, Result
@@ -74,7 +74,8 @@ def generate(
     Parameters
     ----------
     source : GeneratorConfig or Job
-        The configuration, or the job of one whose material is loaded already.
+        The configuration, or the job of one whose material is loaded already. Notes and warnings about the
+        material of a configuration are logged.
     folder : str, Path or DataFolder
         Output folder, or a URL such as ``s3://bucket/data``. An unfinished data set of the same configuration
         is resumed.
@@ -100,13 +101,21 @@ def generate(
     ------
     InputError
         Material or folder cannot be used.
+    UsageError
+        An argument is of another type or out of range.
     PartialError
         Other processes render some of the shards, the disk is full, the store cannot be reached, or too many
         samples are non-finite. The same command resumes.
     """
+    check_type(source, (GeneratorConfig, Job), "source", "such as GeneratorConfig(material='heights.exr')")
+    if not 1 <= slice_index <= slice_count:
+        what = f"is {slice_index} of {slice_count}, but must be from 1 to slice_count"
+        raise UsageError(what, where="slice_index")
     folder = DataFolder.open(folder)
     start = time.perf_counter()
-    job = source if isinstance(source, Job) else Job.prepare(source)
+    job = source if isinstance(source, Job) else Job.load(source)
+    if job is not source:
+        job.announce()
     overwrite = overwrite and not (slice_count > 1 and has_dataset(folder, job.config_hash))
     plans: list[RunPlan] = []
 

@@ -169,8 +169,10 @@ def _scene(config: PreviewConfig, dataset: Dataset | None, console: Console) -> 
     """The scene of the 3D pictures; None with a data set whose material cannot be read."""
     options = config.preview
     try:
-        job = Job.prepare(config)
-        if dataset is not None and job.material.digests != dataset.manifest["inputs"]:
+        job = Job.load(config)
+        if dataset is None:
+            job.announce_briefly()
+        elif job.material.digests != dataset.manifest["inputs"]:
             raise InputError("has changed since the data set was made", where=config.material)
     except InputError as error:
         if dataset is None:

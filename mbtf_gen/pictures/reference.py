@@ -289,7 +289,8 @@ def render_references(
     InputError : the folder holds something else, or the pictures do not fit on the disk
     PartialError : a picture failed; the same command renders the missing ones
     """
-    wanted, job = config.reference, Job.prepare(config)
+    wanted, job = config.reference, Job.load(config)
+    job.announce_briefly()
     kinds: tuple[PixelKind, ...] = ("query", "pixel") if wanted.kind == "both" else (wanted.kind,)
     names = picture_names(wanted, kinds)
     check_view(job, wanted, output, len(kinds))

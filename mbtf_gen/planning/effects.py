@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.images.resample import resample
+from mbtf_core.units import percent
 from mbtf_gen.planning.scene import Effect, EffectDecision, PlanScene
 from mbtf_gen.sampling.light_kernel import LightKernel
 
@@ -68,7 +69,7 @@ class Specular(ReflectionLayer):
 
     name, description = "specular", "specular lobe"
     # A specular of 1/4 (F0 = 2 %) is the smallest that reflects everything at grazing angles.
-    scale, text, unit = 4.0, "F0 up to {:.2g} %", 8.0
+    scale, text, unit = 4.0, "F0 up to {:.2g}%", 8.0
     lacking = "no roughness, metallic or specular, or specular 0"
 
     def propose(self, scene: PlanScene) -> EffectDecision:
@@ -91,7 +92,7 @@ class Clearcoat(ReflectionLayer):
     """The clear coat above the base layer."""
 
     name, description = "clearcoat", "clearcoat"
-    text, unit = "covers up to {:.2g} %", 100.0
+    text, unit = "covers up to {:.3g}%", 100.0
 
 
 class Sheen(ReflectionLayer):
@@ -116,7 +117,7 @@ class NormalMap(Effect):
         rms = float(np.sqrt(np.mean(np.sum(slopes**2, axis=-1))))
         text = f"adds slopes of {np.degrees(np.arctan(rms)):.2g}° (RMS)"
         if scene.normal_mode == "residual" and not scene.flat:
-            part = "" if share > 0.995 else f"{100.0 * share:.0f} % of "
+            part = "" if share > 0.995 else f"{100.0 * share:.0f}% of "
             text += f"; {part}the mesh's slopes are also in the map and are counted once"
         if rms == 0.0:
             return self.decision(False, text, 0.0)
@@ -139,7 +140,7 @@ class Opacity(Effect):
             if "opacity" in tile.maps:
                 text = "own BSDF" if tile.bsdf_type is not None else "opaque everywhere"
             return self.decision(False, text, 0.0, present=False)
-        text = f"{100.0 * through.mean():.2g} % of the rays that meet the surface pass through"
+        text = f"{percent(float(through.mean()))} of the rays that meet the surface pass through"
         if not scene.lambert:
             return self.decision(True, text)
         if not scene.flat:
@@ -213,7 +214,7 @@ class Parallax(Displacement):
     def propose(self, scene: PlanScene) -> EffectDecision:
         """On where the tile is no height field: no plane has its gaps and its parts, even if it is flat."""
         if scene.tile.grid is None:
-            text = f"{scene.tile.kind}, {100.0 * scene.tile.thickness:.2g} % of the tile's width thick"
+            text = f"{scene.tile.kind}, {percent(scene.tile.thickness)} of the tile's width thick"
             return self.decision(True, text, present=False)
         return super().propose(scene)
 
@@ -224,7 +225,7 @@ class Parallax(Displacement):
     def on_displaced(self, scene: PlanScene) -> EffectDecision:
         """Off where the sum of the bounds of all effects of displacement is small enough."""
         bounds = scene.bounds
-        text = f"displacement range {100.0 * scene.tile.thickness:.2g} % of the tile's width"
+        text = f"displacement range {percent(scene.tile.thickness)} of the tile's width"
         if bounds is None:
             return self.decision(True, text, None, "pilot")
         bounces = bounce_bound(scene) if bounds.parallax <= scene.left else 0.0
@@ -326,7 +327,7 @@ class Interreflection(Displacement):
             if upper <= scene.left:
                 scene.cap, scene.cap_bound = cap, upper
                 text += f"; paths end after {cap} interactions; "
-                text += f"further ones add less than {100.0 * upper:.1g} %"
+                text += f"further ones add less than {percent(upper, 1)}"
                 return self.decision(True, text, change.rms, "pilot")
         text += "; Russian roulette ends paths, without a limit"
         return self.decision(True, text, change.rms, "pilot")

@@ -7,12 +7,12 @@ leaving out all of them (Minkowski's inequality), so a tolerance can be divided 
 
 from __future__ import annotations
 
-import math
 import textwrap
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from mbtf_core.errors import UsageError
+from mbtf_core.units import percent
 from mbtf_gen.planning.effects import EFFECTS
 from mbtf_gen.planning.scene import EffectDecision, EffectsRequest
 
@@ -75,8 +75,8 @@ class EffectsPlan:
             lines.append(f"{EFFECTS[e.name].description:<{_NAME}}{state:<5}{bias_text(e):<{_BOUND}}{first}")
             lines += [" " * before + more for more in rest]
         bound = self.bias_bound
-        share = "0 %" if bound == 0 else f"at most {_percent(bound)}"
-        lines.append(f"bias of all omitted effects: {share}; effects.tolerance is {_percent(self.tolerance)}")
+        share = "0%" if bound == 0 else f"at most {percent(bound)}"
+        lines.append(f"bias of all omitted effects: {share}; effects.tolerance is {percent(self.tolerance)}")
         if self.closed_form:
             lines.append("M has a closed form: no paths are traced")
         elif self.max_depth:
@@ -119,20 +119,11 @@ def bias_text(effect: EffectDecision) -> str:
     """The bias of leaving an effect out, as :func:`bound_text`."""
     if effect.reason == "exact" and effect.bias_bound == 0:
         return "0 (exact)"
-    return "-" if effect.bias_bound is None else bound_text(effect.bias_bound, effect.error)
+    return "unknown" if effect.bias_bound is None else bound_text(effect.bias_bound, effect.error)
 
 
 def bound_text(bound: float, error: float | None) -> str:
     """An upper bound of a bias relative to the mean of M, as text: with two standard errors where it is
-    measured, and no number above 100 %, which would only mean that nothing is known."""
+    measured, and no number above 100%, which would only mean that nothing is known."""
     upper = bound + 2.0 * (error or 0.0)
-    return "may exceed 100 %" if upper >= 1.0 else f"< {_percent(upper)}"
-
-
-def _percent(share: float) -> str:
-    """A share in percent, rounded to two digits but written out."""
-    percent = 100.0 * share
-    if percent <= 0.0:
-        return "0 %"
-    places = 1 - math.floor(math.log10(percent))
-    return f"{round(percent, places):.{max(0, places)}f} %"
+    return "may exceed 100%" if upper >= 1.0 else f"< {percent(upper)}"

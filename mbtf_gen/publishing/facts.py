@@ -103,7 +103,7 @@ class Facts:
         return [mean_estimate(value[..., channel], weight) for channel in range(3)]
 
     def noise(self, split: str) -> Estimate | None:
-        """RMS noise of the value of one query over the RMS value; None of measured data: it is unknown."""
+        """RMS noise of the value of one query over the mean value; None of measured data: it is unknown."""
         arrays = self.samples[split]
         if "value_b" not in arrays:
             return None

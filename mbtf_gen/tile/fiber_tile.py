@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mbtf_gen.config.generator import GeometrySection
 from mbtf_gen.tile.fibers.curves import F64, Bundle, Curve
 from mbtf_gen.tile.fibers.draft import Weave
-from mbtf_gen.tile.protocol import REFLECTION, Tile
+from mbtf_gen.tile.protocol import REFLECTION, Tile, brief_warnings
 from mbtf_gen.tile.tracers.protocol import TileGeometry
 
 # Coefficients of σ_a from the color of many fibers, of a polynomial in the azimuthal roughness: Chiang et al.
@@ -237,8 +237,8 @@ class FiberTile(Tile):
         lines = [
             f"{name}: tile 1 x {found['aspect']:.4g}, fibers, resolution {found['resolution']}",
             "",
-            f"fibers      {f['count']:,} of {f['segments']:,} segments, radius {radius}, together "
-            f"{f['length']:.3g} tile widths long",
+            f"fibers      {f['count']:,} with {f['segments']:,} segments, radius {radius}, total length "
+            f"{f['length']:,.5g} tile widths",
             f"cloth       {f['thickness']:.3g} tile widths thick, {f['share_of_volume']:.0%} of it fibers",
         ]
         for key, yarn in found["yarns"].items():
@@ -248,7 +248,7 @@ class FiberTile(Tile):
                 f"along and {yarn['azimuthal_roughness']:g} around the fiber, scale tilt "
                 f"{yarn['scale_tilt']:g}°, ior {yarn['ior']:g}"
             )
-        lines += [f"warning     {text}" for text in found["warnings"]]
+        lines += [f"warning     {text}" for text in brief_warnings(found)]
         return "\n".join(lines if self.weave is None else [*lines, *self.weave.describe()])
 
 

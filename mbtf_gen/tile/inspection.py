@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from mbtf_gen.tile.maps.checks import CONVENTION_NAMES, signed
+from mbtf_gen.tile.maps.checks import CONVENTION_NAMES, far_off, signed
 from mbtf_gen.tile.maps.material_file import ROLES, layers_above
+from mbtf_gen.tile.protocol import brief_warnings
 
 # Luminance from charcoal to fresh snow; outside, a color map is probably not albedo.
 ALBEDO_RANGE = (0.02, 0.95)
@@ -68,11 +69,7 @@ def inspection_text(found: Mapping[str, Any], name: str) -> str:
     if exported := found.get("exported"):
         rows, columns = found["geometry"]["mesh"]
         lines.append(f"exported   {exported}: {columns} x {rows} heights z in tile widths")
-    # Warnings without the folders of their files, which the heading names.
-    warnings = [
-        f"{Path(path).name}: {rest}" for path, _, rest in (w.partition(": ") for w in found["warnings"])
-    ]
-    for title, texts in (("warnings", warnings), ("remarks", found["oddities"])):
+    for title, texts in (("warnings", brief_warnings(found)), ("remarks", found["oddities"])):
         lines += ["", title] if texts else []
         for text in texts:
             lines += _wrapped("  - ", text)
@@ -99,7 +96,9 @@ def _maps(found: Mapping[str, Any]) -> list[str]:
         rows.append([role, name, size, kind, USES[role] + decoded + linear])
     for role, value in found["constants"].items():
         if role not in found["maps"]:
-            shown = ", ".join(f"{number:.3g}" for number in np.atleast_1d(value))
+            numbers = np.atleast_1d(value)
+            gray = numbers[:1] if np.ptp(numbers) == 0 else numbers
+            shown = ", ".join(f"{number:.3g}" for number in gray)
             rows.append([role, f"constant {shown}", "", "", USES[role]])
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     padded = (map(str.ljust, row, widths) for row in rows)
@@ -134,7 +133,7 @@ def _geometry(found: Mapping[str, Any]) -> list[str]:
     if found["tiling"]:
         axes = ", ".join(f"along {t['axis']} {'yes' if t['tiles'] else 'NO'}" for t in found["tiling"])
         steps = " and ".join(f"{t['ratio']:.2g}" for t in found["tiling"])
-        out.append(f"tiling     {axes}; steps across the border are {steps} of the 99th percentile inside")
+        out.append(f"tiling     {axes}; steps across the border are {steps} times the 99th percentile inside")
         if found["make_tileable"] != "none":
             out.append(f"           before make-tileable {found['make_tileable']}, which closes the seams")
     return out
@@ -169,11 +168,13 @@ def _normals(found: Mapping[str, Any]) -> list[str]:
     if n["misfit"]:
         how = f"the {n['image']} map {n['turn']}" if n["turn"] else "heights upside down"
         out.append(f"           DOES NOT FIT; fits with {how}: correlation {n['best']:.2f}")
-    elif n["suggested_height_scale"] is not None:
-        out.append(
-            f"           slopes agree best at --height-scale {n['suggested_height_scale']:.3g}; "
-            f"{found['geometry']['height_scale']:.3g} is in use"
-        )
+    elif (scale := n["suggested_height_scale"]) is not None:
+        # A warning names a scale that is far off.
+        if not far_off(found["geometry"]["height_scale"], scale):
+            out.append(
+                f"           slopes agree best at --height-scale {scale:.3g}; "
+                f"{found['geometry']['height_scale']:.3g} is in use"
+            )
     else:
         out.append("           at no height scale do the slopes agree: the normal map shows other details")
     return out

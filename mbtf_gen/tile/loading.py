@@ -6,12 +6,12 @@ import contextlib
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from mbtf_core.config.settings import build
 from mbtf_core.config.yaml_file import read_yaml
 from mbtf_core.data.schema import Tiling
-from mbtf_core.errors import InputError
+from mbtf_core.errors import InputError, UsageError, check_type
 from mbtf_core.files.atomic import file_sha256
 from mbtf_core.images.limits import MAX_PIXELS
 from mbtf_core.images.read import SUFFIXES, is_image
@@ -69,6 +69,9 @@ def load_material(path: str | Path, tiling: Tiling | None = None, max_pixels: in
     InputError
         A file is missing, unreadable or ambiguous, a value is out of range, or aspects differ.
     """
+    check_type(path, (str, os.PathLike), "material", "give the path of a height map, a folder or a file")
+    if tiling not in (None, *get_args(Tiling)):
+        raise UsageError(f"'{tiling}' is none of {', '.join(get_args(Tiling))}", where="tiling")
     spec, folder, found = described(Path(path))
     return _load(spec, folder, found, spec.tiling(tiling), max_pixels)
 

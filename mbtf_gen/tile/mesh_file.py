@@ -100,6 +100,7 @@ def read_mesh(spec: MeshFile, folder: Path) -> MeshTile:
     files = {"mesh": path, **{f"{COMPANION}{name}": file for name, file in content.files.items()}}
     _, seam = tile.open_edges()
     what = f"{seam} edges at the border have no partner on the opposite side"
+    parts_of_file = f"{len(tile.parts)} part{'s' * (len(tile.parts) != 1)}"
     return replace(
         tile,
         files=files,
@@ -113,7 +114,7 @@ def read_mesh(spec: MeshFile, folder: Path) -> MeshTile:
             *([f"{path}: {what}: the tile may have a seam; check 'period'"] if seam else ()),
         ),
         notes=(
-            f"mesh: {len(tile.faces):,} triangles in {len(tile.parts)} parts of {path.name}, "
+            f"mesh: {len(tile.faces):,} triangles in {parts_of_file} of {path.name}, "
             f"{tile.thickness:.3g} tile widths thick",
         ),
         resolution=spec.resolution,

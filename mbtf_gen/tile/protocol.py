@@ -233,6 +233,12 @@ class Tile(ABC):
         return self.warnings
 
 
+def brief_warnings(found: Mapping[str, Any]) -> list[str]:
+    """Warnings of a description without the folders of their files, which its heading names."""
+    parts = (text.partition(": ") for text in found["warnings"])
+    return [f"{Path(path).name}: {rest}" for path, _, rest in parts]
+
+
 def layer_weight(maps: Mapping[str, Any], effect: str) -> float:
     """Largest weight of a layer in some maps and constants by role; its color counts."""
     weight = float(np.max(numbers_of(maps.get(effect, 0.0))))

@@ -197,7 +197,7 @@ def _generated(
     # Data that an interrupted study left behind were not timed.
     shutil.rmtree(folder, ignore_errors=True)
     start = time.perf_counter()
-    # `Job.prepare` would log the material's warnings for every data set.
+    # Of a configuration, it would log the material's warnings for every data set.
     generate(Job.load(GeneratorConfig.model_validate(data)), folder)
     return folder, time.perf_counter() - start
 

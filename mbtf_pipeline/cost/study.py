@@ -303,7 +303,7 @@ def run_study(
     def note(text: str) -> None:
         progress(min(1.0, spent() / (seconds + refine)), text)
 
-    job = Job.prepare(study_config(recipe.generate, seed))
+    job = Job.load(study_config(recipe.generate, seed))
     config = job.config
     with owned(folder):
         (there,) = runner.map(measuring_machine, [Item("machine")])

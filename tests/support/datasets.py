@@ -52,7 +52,7 @@ def write_dataset(
     folder.parent.mkdir(parents=True, exist_ok=True)
     np.save(heights, 0.1 * np.random.default_rng(0).random((rows, columns)))
     config = GeneratorConfig.model_validate({"material": str(heights), **options})
-    job = Job.prepare(config)
+    job = Job.load(config)
     plan = RunPlan(reference_plan(job), highlights=highlights)
     files = DataFolder.open(folder)
     open_folder(job, files, lambda job: plan)

@@ -22,6 +22,7 @@ from mbtf_core.errors import UsageError
 from mbtf_core.pictures import PIXEL_SIGMA
 from mbtf_fit.backends.mitsuba.bsdf import MbtfBSDF, check_scene
 from mbtf_fit.backends.mitsuba.names import INTEGRATOR_NAME, footprints_provided, refuse_unknown
+from mbtf_fit.ops.constants import MAX_ANISOTROPY
 from mbtf_gen.engine.types import (
     DirectionSample3f,
     Float,
@@ -36,8 +37,6 @@ from mbtf_gen.engine.types import (
     Vector3f,
 )
 
-# Largest ratio of a footprint's radii by default. At 5° above a plane the ratio is 11.
-MAX_ANISOTROPY = 16.0
 # Least spread of a scattered ray's cone, relative to 1/√density, the side of the solid angle per sample.
 SCATTERED = 0.25
 

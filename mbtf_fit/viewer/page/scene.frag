@@ -29,7 +29,7 @@ uint hash(uint x) {
 }
 
 // Of more elongated footprints the minor radius is enlarged.
-const float MAX_ANISOTROPY = 16.0;
+const float MAX_ANISOTROPY = $MAX_ANISOTROPY;
 
 // Quantile of the normal distribution (Winitzki's approximation of the inverse error function).
 float normal_quantile(float p) {

@@ -122,14 +122,19 @@ def signed(correlation: float) -> str:
     return "undefined" if math.isnan(correlation) else f"{correlation:+.2f}"
 
 
+def far_off(factor: float, suggested: float) -> bool:
+    """Whether a height scale is over 1.5 times, or under 1/1.5 of, the one that the normal map suggests."""
+    return suggested != 0 and not 1 / _FAR_OFF <= factor / suggested <= _FAR_OFF
+
+
 def suggestion_warning(path: Path, fit: NormalFit | None, factor: float) -> str | None:
     """The warning that the height scale in use is over 1.5 times, or under 1/1.5 of, the one that the normal
     map suggests."""
     if fit is None or not fit.fits or fit.scale == 0:
         return None
-    ratio = factor / fit.scale
-    if 1 / _FAR_OFF <= ratio <= _FAR_OFF:
+    if not far_off(factor, fit.scale):
         return None
+    ratio = factor / fit.scale
     return (
         f"{path}: the heights are {ratio:{'.0f' if abs(ratio) >= 10 else '.2g'}} times as steep as its "
         f"slopes; both agree at --height-scale {fit.scale:.3g} ({factor:.3g} is in use)"

@@ -215,7 +215,7 @@ def job_of(path: Path, mesh: int = MESH, mode: str = "residual", scale: float = 
         "effects": {"normal": mode},
         "transport": {"max_depth": 1},
     }
-    return Job.prepare(GeneratorConfig.model_validate(config))
+    return Job.load(GeneratorConfig.model_validate(config))
 
 
 def stored(folder: Path) -> Array:

@@ -14,6 +14,7 @@ from mbtf_core.stats import (
     mse_difference,
     noise_free_mse,
     pooled_error,
+    pooled_relative_error,
     pooled_variance,
     signal_variance,
     unexplained_variance,
@@ -62,7 +63,12 @@ SIGNAL = (0.5**2 + 1.0**2 + 1.5**2) / 3.0
 
 @pytest.mark.parametrize(
     ("estimator", "truth"),
-    [(pooled_variance, VARIANCE), (pooled_error, float(np.sqrt(VARIANCE))), (signal_variance, SIGNAL)],
+    [
+        (pooled_variance, VARIANCE),
+        (pooled_error, float(np.sqrt(VARIANCE))),
+        (pooled_relative_error, float(np.sqrt(VARIANCE)) / 2.0),
+        (signal_variance, SIGNAL),
+    ],
 )
 def test_variances_of_noise_and_signal(estimator: Callable[[Floats, Floats], Estimate], truth: float) -> None:
     assert_honest(lambda rng: estimator(*draw(rng)[1:]), truth)

@@ -187,7 +187,7 @@ def test_slices_equal_a_run(kind: str, config: GeneratorConfig, small_pilots: No
 
 @pytest.mark.parametrize("kind", ["target", "noise"])
 def test_counts_ignore_launches_and_threads(kind: str, config: GeneratorConfig, small_pilots: None) -> None:
-    job = Job.prepare(of_kind(config, kind))
+    job = Job.load(of_kind(config, kind))
     plan = plan_run(job)
     n = 600
     q = job.query_plan.draw("train", 1, n)

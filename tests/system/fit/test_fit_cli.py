@@ -58,10 +58,12 @@ def test_export_writes_the_reported_files(material: Path, tmp_path: Path) -> Non
 
 
 def test_all_commands_print_the_same_summary(shards: Path, material: Path) -> None:
-    """Of the same numbers, which JSON holds in full."""
-    lines = {}
+    """Of the same numbers, which JSON holds in full; `evaluate` ends with the next command, as a fit does."""
+    lines, advice = {}, []
     for name, words in (("evaluate", (str(material), str(shards))), ("info", (str(material),))):
         lines[name] = call(["mbtf-fit", name, *words]).out.splitlines()
+        if name == "evaluate":
+            lines[name], advice = lines[name][:-2], lines[name][-2:]
         # Five steps are too few, which is said, too.
         assert len([line for line in lines[name] if not line.startswith("above 1")]) <= 5, lines[name]
         table = call(["mbtf-fit", name, *words, "-v"]).out
@@ -69,6 +71,9 @@ def test_all_commands_print_the_same_summary(shards: Path, material: Path) -> No
         assert table.splitlines()[: len(lines[name])] == lines[name]
     assert lines["evaluate"][1:] == lines["info"][2:]
     found = json.loads(call(["mbtf-fit", "evaluate", str(material), str(shards), "--json"]).out)
+    again = json.loads(call(["mbtf-fit", str(shards), "-o", str(material), *QUICK, "--json"]).out)
+    assert found["next_command"] == again["next_command"] == advice[1].strip()
+    assert advice[1].strip().startswith("mbtf-")
     test = found["errors"]["test"]
     psnr = 10 * math.log10(2 ** (-2 * test["exposure"]) / test["mse"]["value"])
     assert test["psnr"]["value"] == pytest.approx(psnr)

@@ -102,5 +102,5 @@ def test_workers_make_the_same_data(folder: Path) -> None:
     assert {material["state"] for material in record(two).values()} == {"done"}
     config = read_resolved(two / "runs" / "rough").generate
     material = str(folder / "materials" / "rough")
-    generate(Job.prepare(config.model_copy(update={"material": material})), folder / "own")
+    generate(Job.load(config.model_copy(update={"material": material})), folder / "own")
     assert contents(folder / "own") == contents(two / "runs/rough/shards")

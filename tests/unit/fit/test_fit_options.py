@@ -114,7 +114,7 @@ def test_hash_covers_data_and_options_but_not_the_device() -> None:
 
 @pytest.mark.parametrize("direction", [(1.0, 2.0), (0.8, -0.7), (1.0, 0.0)])
 def test_a_held_out_direction_lies_on_the_disk(direction: tuple[float, float]) -> None:
-    with pytest.raises(ValueError, match="within the unit disk"):
+    with pytest.raises(InputError, match="within the unit disk"):
         FitConfig.model_validate({"held_out": {"direction": direction}})
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from mbtf_core.app.console import CONSOLE, run
 from mbtf_core.data.shard_files import row_bytes
@@ -17,6 +18,7 @@ from mbtf_gen import forecast
 from mbtf_gen.cli.app import app
 from mbtf_gen.generation import run as generation
 from mbtf_gen.pictures import reference
+from mbtf_gen.tile.loading import load_material
 
 DRAFT = 400 * 128**2 + 65536
 
@@ -136,3 +138,26 @@ def test_a_preset_sets_the_resolution_up_to_that_of_the_map(
     arguments = dict(bound.arguments)
     job = prepare_job(arguments.get("options", GenerateOptions()), str(heights), arguments["quality"])
     assert job.lattice.shape() == (resolution, resolution)
+
+
+def test_notes_on_maps_are_logged_where_data_are_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Other commands, and one that finds all shards finished, do not repeat them."""
+    codes = np.random.default_rng(0).integers(0, 256, (32, 32), np.uint8)
+    Image.fromarray(codes).save(tmp_path / "height.png")
+    path = str(tmp_path / "height.png")
+
+    def printed(*words: str) -> str:
+        run(app, [*words, "-o", str(tmp_path / "out")] if words[0] == path else list(words))
+        return capsys.readouterr().err
+
+    monkeypatch.setattr(generation, "generate", stop)
+    notes = load_material(path).notes + load_material(path).warnings_in_use()
+    assert len(notes) > 2
+    assert all(note in printed(path) for note in notes)
+    planned = printed("plan", path, "--no-measure")
+    assert not any(note in planned for note in notes)
+    assert f"mbtf-gen inspect {path}" in planned
+    monkeypatch.setattr(generation, "unfinished", lambda *_: [])
+    assert not any(note in printed(path) for note in notes)

@@ -24,7 +24,7 @@ def job_of(heights: Path, **queries: Any) -> Job:
     """A job of 100 training and 30 test queries on 4 x 8 texels, in shards of 40 queries."""
     options = {"train": "100", "test": "30", "spp": 2, "test_spp": 4, **queries}
     config = {"material": str(heights), "queries": options, "output": {"shard_queries": 40}}
-    return Job.prepare(GeneratorConfig.model_validate(config))
+    return Job.load(GeneratorConfig.model_validate(config))
 
 
 def rows(job: Job, split: str = "train") -> list[tuple[str, int]]:
@@ -51,7 +51,7 @@ def test_absurd_heights_are_refused(tmp_path: Path, factor: float) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         with pytest.raises(InputError) as caught:
-            job_of(tmp_path / "tall.npy")
+            job_of(tmp_path / "tall.npy").announce()
     assert caught.value.where == str(tmp_path / "tall.npy")
     assert "need a height scale" in caught.value.what or "beyond 1e+15" in caught.value.what
 
@@ -63,10 +63,10 @@ def test_the_limit_of_the_displacement_range_can_be_raised(tmp_path: Path) -> No
         return GeneratorConfig.model_validate({"material": str(tmp_path / "tall.npy"), "geometry": geometry})
 
     with pytest.raises(InputError, match=r"200 tile widths; at most 100"):
-        Job.prepare(config(height_scale=1.0))
-    raised = Job.prepare(config(height_scale=1.0, max_displacement=300.0))
+        Job.load(config(height_scale=1.0)).announce()
+    raised = Job.load(config(height_scale=1.0, max_displacement=300.0))
     assert raised.material.thickness == 200.0
-    assert Job.prepare(config(height_scale=0.4)).material.thickness == 80.0
+    assert Job.load(config(height_scale=0.4)).material.thickness == 80.0
     # The limit does not change the data.
     assert raised.config_hash == Job.of(config(height_scale=1.0), raised.material).config_hash
 

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from itertools import pairwise
@@ -117,11 +118,16 @@ def test_workers_that_dask_cannot_close_are_killed(monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr(distributed.Nanny, "close", close)
     monkeypatch.setattr(module, "_CLOSE_SECONDS", 0.5)
+    # A worker of another cluster.
+    other = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(100,), name="Dask Worker")
+    other.start()
     before = set(multiprocessing.active_children())
     with open_runner("local:1", lambda line: None):
         (worker,) = set(multiprocessing.active_children()) - before
     worker.join()
     assert worker.exitcode == -signal.SIGKILL
+    assert other.is_alive()
+    other.kill()
 
 
 def test_tasks_for_gpus_run_where_none_is_stated(cluster: Runner) -> None:

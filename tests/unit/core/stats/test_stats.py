@@ -56,7 +56,7 @@ def test_halves_by_hand() -> None:
     assert mean_of_halves(a, b) == Estimate(2.5, 0.5, 2, 1.0)
     assert noise_free_mse(np.array([[2.0], [5.0]]), a, b).value == pytest.approx((-1.0 + 4.0) / 2.0)
     a, b = np.tile(a, (10, 1)), np.tile(b, (10, 1))
-    assert pooled_relative_error(a, b).value == pytest.approx(math.sqrt(0.5 / 6.0))
+    assert pooled_relative_error(a, b).value == pytest.approx(math.sqrt(0.5) / 2.5)
 
 
 def test_effective_degrees_of_freedom() -> None:

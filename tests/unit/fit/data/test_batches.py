@@ -117,7 +117,7 @@ def test_the_truth_has_no_error(shards: Path) -> None:
 
 
 def test_what_cannot_be_read_is_refused(shards: Path, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="batch_size"):
+    with pytest.raises(InputError, match="batch_size"):
         QueryDataset(shards, batch_size=0)
     with pytest.raises(InputError):
         QueryDataset(tmp_path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping
 from itertools import islice
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from support.datasets import write_dataset
 from support.fit_data import constant, parallax, random_queries, write_data
 from support.image_data import random_images, write_images
 
@@ -18,10 +20,11 @@ from mbtf_core.errors import InputError
 from mbtf_fit import FitConfig, Material, evaluate, fit
 from mbtf_fit.config import build_model
 from mbtf_fit.data.images import Patches, TrainingImages, nearest_shapes, strides
-from mbtf_fit.data.loader import Partition, in_region, load_training
+from mbtf_fit.data.loader import Partition, in_region, load_training, open_data
 from mbtf_fit.sections import HeldOutSection
 from mbtf_fit.training.loop import TrainingLoop
 from mbtf_fit.training.trainer import BETAS, prepare_trainer
+from mbtf_gen.cli.app import app
 from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan
 
 HELD_OUT = HeldOutSection(queries=0.1, radius=0.3)
@@ -237,3 +240,17 @@ def test_the_other_layout_is_refused_with_a_hint(tmp_path: Path) -> None:
         message = rf"image layout, but {config.model} .*\n.*--layout shuffled"
         with pytest.raises(InputError, match=message):
             fit(config, image, tmp_path / "m")
+
+
+def test_the_hint_generates_what_the_model_needs(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "s p", queries={"train": "5/texel", "test": "40", "spp": 8}, seed=3)
+    with pytest.raises(InputError) as refused:
+        open_data(data.folder, "image", "hierarchical")
+    generate, fit_again = refused.value.hint.removeprefix("generate them: ").split(" && ")
+    line = shlex.split(generate)
+    arguments = app.parse_args(line[1:], exit_on_error=False, print_error=False)[1].arguments
+    config = arguments["options"].resolve(material=arguments["material"])
+    assert (config.queries.layout, config.queries.train, config.seed) == ("image", "100/texel", 3)
+    assert config.queries.spp == 8
+    assert Path(config.material).exists()
+    assert shlex.split(fit_again)[1] == str(arguments["output"]) != str(data.folder)

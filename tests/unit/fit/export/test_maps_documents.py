@@ -184,6 +184,40 @@ def test_materialx(glossy: Path) -> None:
     np.testing.assert_allclose(extremes, [heights.min(), heights.max()], atol=1e-6)
 
 
+def test_clear_coats(tmp_path: Path) -> None:
+    """Weight and roughness in the channels where each format looks for them, and the normals of the rest."""
+    out = exported(tmp_path, coated=True)
+    coat = surface_maps(Material.load(out.parent / "material"), 3).coat
+    assert coat is not None
+    stored = np.asarray(Image.open(out / "clearcoat.png"), np.float64) / 255
+    np.testing.assert_allclose(stored[..., :2], coat, atol=0.002)
+    document = json.loads((out / "material.gltf").read_text())
+    (material,) = document["materials"]
+    found = material["extensions"]["KHR_materials_clearcoat"]
+    assert set(material["extensions"]) == set(document["extensionsUsed"])
+    assert (found["clearcoatFactor"], found["clearcoatRoughnessFactor"]) == (1, 1)
+    files = ["clearcoatTexture", "clearcoatRoughnessTexture", "clearcoatNormalTexture"]
+    names = [document["images"][document["textures"][found[key]["index"]]["source"]]["uri"] for key in files]
+    assert names == ["clearcoat.png", "clearcoat.png", "normal.png"]
+    shade = pytest.importorskip("pxr.UsdShade")
+    stage = pytest.importorskip("pxr.Usd").Stage.Open(str(out / "material.usda"))
+    surface = shade.Shader(stage.GetPrimAtPath("/Tile/Material/Surface"))
+    for name, expected in (("clearcoat", "r"), ("clearcoatRoughness", "g")):
+        source, channel, _ = surface.GetInput(name).GetConnectedSource()
+        texture = shade.Shader(source.GetPrim())
+        assert Path(texture.GetInput("file").Get().resolvedPath).name == "clearcoat.png"
+        assert (channel, texture.GetInput("sourceColorSpace").Get()) == (expected, "raw")
+    mx = pytest.importorskip("MaterialX")
+    read = read_materialx(out)
+    (node,) = mx.getShaderNodes(read.getMaterialNodes()[0], "surfaceshader")
+    graph = read.getNodeGraph("maps")
+    for index, name in enumerate(("clearcoat", "clearcoat_roughness")):
+        assert node.getInput(name).getConnectedOutput().getNodeName() == name
+        assert graph.getNode(name).getInput("index").getValue() == index
+    assert node.getInput("clearcoat_normal").getConnectedOutput().getNodeName() == "normal"
+    assert graph.getNode("coat").getInput("file").getValue() == "clearcoat.png"
+
+
 def test_names_outside_of_ascii(tmp_path: Path) -> None:
     name = '日本 a\'b "c"'
     pxr = pytest.importorskip("pxr.Usd")

@@ -124,3 +124,16 @@ def test_levels_that_are_missing_are_refused(tmp_path: Path) -> None:
     for level in (-1, 4):
         with pytest.raises(UsageError, match="has the levels 0 to 3"):
             make_maps(material, level, Console(quiet=True))
+
+
+def test_a_clear_coat_at_its_peak(tmp_path: Path) -> None:
+    """Along the normal D V = 1/(4πα²), the coat reflects 4% of its weight; the rest gets what is left."""
+    maps = surface_maps(known(tmp_path, roughness=0.8, clearcoat=(0.6, 0.3)), 3)
+    assert maps.coat is not None
+    np.testing.assert_allclose(maps.coat, np.broadcast_to((0.6, 0.3), maps.coat.shape), rtol=1e-4)
+    up = np.array([[0.0, 0.0, 1.0]])
+    weight, roughness = maps.coat[0, 0]
+    share = 0.04 * weight
+    below = (1 - share) * replace(maps, coat=None).evaluate(up, up)
+    expected = share / (4 * math.pi * roughness**4)
+    np.testing.assert_allclose(maps.evaluate(up, up) - below, expected, rtol=1e-5)

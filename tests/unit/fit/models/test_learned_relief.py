@@ -13,6 +13,7 @@ from support.fit_data import parallax, random_queries, training_queries
 from torch import Tensor
 
 from mbtf_core.data.lattice import Lattice
+from mbtf_core.errors import InputError
 from mbtf_fit import FitConfig
 from mbtf_fit.backends.cpu.gradients import NativeGradients
 from mbtf_fit.backends.cpu.model import NativeModel, supports
@@ -228,5 +229,5 @@ def test_a_material_stores_the_surface_alone() -> None:
 
 
 def test_several_view_rays_are_refused() -> None:
-    with pytest.raises(ValueError, match="has no option " + re.escape("network.relief.places")):
+    with pytest.raises(InputError, match="has no option " + re.escape("network.relief.places")):
         FitConfig.model_validate({"model": "neumip+", "network": {"relief": {"places": 2}}})

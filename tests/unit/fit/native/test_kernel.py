@@ -13,6 +13,7 @@ from support.fit_data import make_trainer, parallax, random_queries, train_fully
 from torch import Tensor
 
 from mbtf_core.data.lattice import Lattice
+from mbtf_core.errors import InputError
 from mbtf_fit.backends.cpu.gradients import NativeGradients, query_pointers
 from mbtf_fit.backends.cpu.model import NativeModel, supports
 from mbtf_fit.backends.cpu.stepper import Blur, adam
@@ -344,7 +345,7 @@ def test_nan_does_not_read_outside_the_tables(bad: float, name: str) -> None:
 def test_queries_of_another_shape_are_refused() -> None:
     model, batch = random_model("neumip", LATTICE), random_batch(10)
     arrays = [t.numpy() for t in inputs_of(batch)]
-    with pytest.raises(ValueError, match="shapes"):
+    with pytest.raises(InputError, match="shapes"):
         predict(model, arrays[0], arrays[1][:3], arrays[2], arrays[3])
 
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from pydantic import ValidationError
 from torch import Tensor
 
 from mbtf_core.data.lattice import Lattice
+from mbtf_core.errors import InputError
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.objective.losses import FourthRoot, Log, LossCurve, Objective
 from mbtf_fit.objective.noise import NoiseModel
@@ -156,5 +156,5 @@ def test_a_term_counts_from_its_start_on() -> None:
     assert mixed.quadratic() is None
     mixed.fraction = 0.4
     assert mixed.quadratic() is not None
-    with pytest.raises(ValidationError, match="no term counts from the start"):
+    with pytest.raises(InputError, match="no term counts from the start"):
         TrainingSection.model_validate({"losses": terms[1:]})

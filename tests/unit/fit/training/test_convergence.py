@@ -164,15 +164,23 @@ def test_the_next_command_is_complete(tmp_path: Path) -> None:
         return None if found is None else found.replace(f"{tmp_path}/", "")
 
     fitted = "--config material/config.yaml"
-    assert command("time") == f"mbtf-fit shards {fitted} --time 1min -o material2"
+    assert command("time") == f"mbtf-fit shards {fitted} --time 1min -o material-2"
     # The fewest steps took longer than the time.
-    assert command("time", seconds=41.0) == f"mbtf-fit shards {fitted} --time 90s -o material2"
+    assert command("time", seconds=41.0) == f"mbtf-fit shards {fitted} --time 90s -o material-2"
     steps = FitConfig.model_validate({"training": {"steps": 300}})
-    assert command("time", steps) == f"mbtf-fit shards {fitted} --steps 600 -o material2"
-    made, fit = "mbtf-gen 'wool maps' --config shards/config.yaml", f"mbtf-fit shards2 {fitted} -o material2"
-    assert command("queries") == f"{made} --queries 100/texel -o shards2 && {fit}"
+    assert command("time", steps) == f"mbtf-fit shards {fitted} --steps 600 -o material-2"
+    made, fit = (
+        "mbtf-gen 'wool maps' --config shards/config.yaml",
+        f"mbtf-fit shards-2 {fitted} -o material-2",
+    )
+    assert command("queries") == f"{made} --queries 100/texel -o shards-2 && {fit}"
     more = "--test-queries 32768 --test-highlights 75%"
-    assert command("test") == f"{made} {more} -o shards2 && mbtf-fit evaluate material shards2"
+    assert command("test") == f"{made} {more} -o shards-2 && mbtf-fit evaluate material shards-2"
+    # The digits of a name count nothing; a second sequel does.
+    for name, following in (("b2_500", "b2_500-2"), ("m-2/", "m-3"), ("m-9", "m-10"), ("m-128", "m-128-2")):
+        found = NextStep("time", "").command(config, 30.0, data, Path(name))
+        assert found is not None
+        assert found.endswith(f" -o {following}")
     assert command("none") is None
     for made in ({"queries": queries}, {"material": "wool maps"}, None):
         manifest["config"] = made

@@ -364,7 +364,7 @@ def test_other_architectures_are_refused(data: dict[str, Path], tmp_path: Path) 
 @pytest.mark.parametrize("option", ["decoder", "shared_decoder"])
 def test_other_models_are_refused(model: str, option: str) -> None:
     given: dict[str, Any] = {"decoder": "m"} if option == "decoder" else {"training": {option: True}}
-    with pytest.raises(ValueError, match=r"has no option .*decoder, which neumip and relief have"):
+    with pytest.raises(InputError, match=r"has no option .*decoder, which neumip and relief have"):
         FitConfig.model_validate({"model": model, **given})
 
 

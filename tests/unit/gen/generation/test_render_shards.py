@@ -32,7 +32,7 @@ def run(tmp_path: Path) -> ShardRun:
     queries = {"train": "400", "test": "10", "spp": 4, "test_spp": 4}
     options = {"material": str(tmp_path / "plane.npy"), "queries": queries}
     config = GeneratorConfig.model_validate(options | {"output": {"shard_queries": 100}})
-    job = Job.prepare(config)
+    job = Job.load(config)
     folder = DataFolder.open(tmp_path / "out")
     return ShardRun(job, folder, open_folder(job, folder, plan_run))
 
@@ -102,7 +102,7 @@ def test_a_full_disk_ends_the_run(run: ShardRun) -> None:
     config = run.job.config.model_copy(
         update={"output": run.job.config.output.model_copy(update={"shard_queries": 4})}
     )
-    job, disk = Job.prepare(config), FullDisk()
+    job, disk = Job.load(config), FullDisk()
     first = r"8 shard\(s\) failed, 103 are left.*no space left \(on node:1\)\n  make room"
     with pytest.raises(PartialError, match=first):
         render_shards(ShardRun(job, run.folder, run.plan), job.shards, disk)

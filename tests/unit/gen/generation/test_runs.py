@@ -60,7 +60,7 @@ def test_shards_hold_what_was_drawn_and_estimated(
 ) -> None:
     """To the last bit."""
     engine.bad = ()
-    job = Job.prepare(changed(config, queries={"layout": layout}))
+    job = Job.load(changed(config, queries={"layout": layout}))
     generate(job, tmp_path / "out")
     for entry in job.shards:
         drawn = job.query_plan.draw(entry.split, entry.index, entry.rows)
@@ -244,7 +244,7 @@ def test_foreign_folders_are_refused_untouched(
 def test_paths_left_are_those_of_unfinished_shards(
     config: GeneratorConfig, engine: Formula, out: Path
 ) -> None:
-    job = Job.prepare(config)
+    job = Job.load(config)
     # Shards of 40, 40, 20 training queries at 2 paths and 30 test queries at 4.
     assert left_of(job, out) == 80 + 80 + 40 + 120
     assert [left_of(job, out, i, 2) for i in (1, 2)] == [80 + 40, 80 + 120]

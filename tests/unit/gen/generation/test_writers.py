@@ -50,7 +50,7 @@ def write_while_planning(patch: pytest.MonkeyPatch, out: Path, job: Job, plan: R
 def test_the_second_writer_adopts_the_plan_of_the_first(
     config: GeneratorConfig, monkeypatch: pytest.MonkeyPatch, out: Path
 ) -> None:
-    job = Job.prepare(config)
+    job = Job.load(config)
     other = RunPlan(dataclasses.replace(reference_plan(job), cap_bias_bound=0.125))
     write_while_planning(monkeypatch, out, job, other)
     assert generate(config, out).complete
@@ -75,7 +75,7 @@ def test_the_unfinished_geometry_of_another_writer_is_left_alone(config: Generat
 def test_a_concurrent_writer_of_another_data_set_is_refused(
     config: GeneratorConfig, monkeypatch: pytest.MonkeyPatch, out: Path
 ) -> None:
-    another = Job.prepare(changed(config, queries={"spp": 8}))
+    another = Job.load(changed(config, queries={"spp": 8}))
     content = write_while_planning(monkeypatch, out, another, cheap_plan(another))
     with pytest.raises(InputError, match=r"another configuration: queries\.spp"):
         generate(config, out)

@@ -106,7 +106,7 @@ def test_stored_queries_are_those_that_the_configuration_samples(layout: str, tm
         output={"shard_queries": 40},
     )
     config = GeneratorConfig.model_validate(dataset.manifest["config"])
-    a, b = stored_queries(dataset), sampled_queries(Job.prepare(config))
+    a, b = stored_queries(dataset), sampled_queries(Job.load(config))
     data = dataset.load("train")
     for sample in (a, b):
         for name, axes in (("u", 2), ("sigma", 1), ("omega_i", 2), ("omega_o", 2)):

@@ -1,0 +1,60 @@
+"""Mistakes in Python are refused as on the command line: in one line, with what to write instead."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import mbtf_fit
+import mbtf_gen
+from mbtf_fit import FitConfig, Material, evaluate, fit, fit_jointly, read_history
+from mbtf_gen import Dataset, GeneratorConfig, generate, load_material, verify
+
+CONFIG = GeneratorConfig(material="rock")
+MISTAKES: dict[str, tuple[Callable[[], object], str]] = {
+    "misspelt section": (lambda: GeneratorConfig(material="rock", quries={}), "'queries'"),
+    "key of a section": (lambda: GeneratorConfig(material="rock", spp=4), "'queries.spp'"),
+    "value of a section": (lambda: GeneratorConfig(material="rock", queries={"spp": 3}), "queries.spp"),
+    "wrong type": (lambda: FitConfig(training={"steps": "many"}), "training.steps"),
+    "option of another model": (
+        lambda: FitConfig.model_validate({"model": "svbrdf", "decoder": "a"}),
+        "svbrdf",
+    ),
+    "no names": (lambda: GeneratorConfig("rock"), "GeneratorConfig(material="),
+    "change": (lambda: setattr(CONFIG, "seed", 1), "make another GeneratorConfig"),
+    "plain data to generate": (lambda: generate({"material": "rock"}, "out"), "GeneratorConfig("),
+    "slice beyond the last": (lambda: generate(CONFIG, "out", slice_index=3, slice_count=2), "slice_index"),
+    "no folder": (lambda: generate(CONFIG, None), "path or URL"),
+    "number to open": (lambda: Dataset.open(3), "path or URL"),
+    "missing data set": (lambda: verify("missing"), "no such folder"),
+    "method of tiling": (lambda: load_material("rock", "mirro"), "mirror"),
+    "arguments swapped": (lambda: fit("shards", FitConfig(), "out"), "FitConfig("),
+    "one folder of several": (lambda: fit_jointly(FitConfig(), "a", "b", "c"), "list of folders"),
+    "no material": (lambda: Material.load(None), "path"),
+    "missing material": (lambda: evaluate("missing", "shards"), "no such folder"),
+    "missing fit": (lambda: read_history("missing"), "no such folder"),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_mistakes_are_one_line_and_a_hint(
+    mistake: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    make, expected = MISTAKES[mistake]
+    with pytest.raises(mbtf_gen.MbtfError) as fault:
+        make()
+    assert expected in fault.value.message
+    assert len(fault.value.message.splitlines()) <= 2
+
+
+def test_paths_are_taken_where_names_are(tmp_path: Path) -> None:
+    assert GeneratorConfig(material=tmp_path).material == str(tmp_path)
+    assert FitConfig(init_from=tmp_path).init_from == str(tmp_path)
+
+
+def test_notebooks_complete_the_public_names() -> None:
+    assert {"GeneratorConfig", "generate"} <= set(dir(mbtf_gen))
+    assert {"FitConfig", "fit"} <= set(dir(mbtf_fit))
