@@ -130,7 +130,7 @@ def _fit_one(
     """Fit a data set, watched by whoever asks for it."""
     from mbtf_core.data.dataset import Dataset
     from mbtf_fit.material.format import DESCRIPTION_NAME
-    from mbtf_fit.training.endings import describe_ending
+    from mbtf_fit.training.endings import describe_ending, describe_kept
     from mbtf_fit.training.fit import fit
     from mbtf_fit.training.fit_folder import EventLog
     from mbtf_fit.training.next_step import next_step
@@ -164,7 +164,8 @@ def _fit_one(
         console.note(f"{output}: this fit is already finished; --overwrite trains it again")
     summary = {**result.as_dict(), "next_command": None}
     ending = describe_ending(config, result.history)
-    more = [ending] if ending is not None else []
+    kept = describe_kept(result.history, result.kept_step)
+    more = [line for line in (kept, ending) if line is not None]
     if result.marginal_cost is not None and not summary["reached"]:
         step = next_step(result.marginal_cost, result.errors)
         command = step.command(config, result.seconds, Dataset.open(shards), output)
