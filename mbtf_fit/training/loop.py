@@ -28,7 +28,7 @@ from mbtf_core.run.task import worker_threads
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.material.format import read_tensors, write_tensors
 from mbtf_fit.objective.parallel import Workers
-from mbtf_fit.training.best_state import SIGNIFICANT, BestState, excess_error
+from mbtf_fit.training.best_state import BestState, excess_error, overfits
 from mbtf_fit.training.trainer import Trainer, TrainingProgress
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
@@ -124,8 +124,7 @@ class TrainingLoop:
         if self.best is None or self.best.progress.step == self.progress.step:
             return
         predictions = [t.predict(queries) for t, queries in zip(self.trainers, subsets, strict=True)]
-        excess = excess_error(predictions, self.best.predictions, subsets)
-        if excess.value > SIGNIFICANT * excess.error:
+        if overfits(predictions, self.best.predictions, subsets):
             load_weights(self, self.best.tensors, self.best.progress)
 
     def _steps(self, workers: Workers) -> Iterator[Tensor]:

@@ -25,7 +25,7 @@ def validation_set(data: Dataset, partition: Partition) -> tuple[str, ShardQueri
 
     The test split, because it has more paths per query: four paths often do not resolve the error of glossy
     materials. Those of the train split where there is no test split, or a small one. No option is selected
-    by it; an earlier state than the last is, where it is better by three standard errors.
+    by it; an earlier state than the last is, where it is clearly better.
     """
     held_out = partition.held_out_queries
     test = load_split(data, "test") if "test" in data.splits and data.shards("test") else None
