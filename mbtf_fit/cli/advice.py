@@ -39,7 +39,7 @@ def advise(
     from mbtf_fit.training.validation import marginal_cost_of
 
     config, training = material.config, material.description["training"]
-    cost = marginal_cost_of(history, errors, training.get("noise_variance"))
+    cost = marginal_cost_of(history, errors, training.get("noise_variance"), training.get("kept_step"))
     if cost is None or not errors or config.training.shared_decoder or reached(config, history):
         return None, []
     step = next_step(cost, errors)

@@ -130,7 +130,7 @@ def _fit_one(
 ) -> None:
     """Fit a data set, watched by whoever asks for it."""
     from mbtf_fit.material.format import DESCRIPTION_NAME
-    from mbtf_fit.training.endings import describe_ending
+    from mbtf_fit.training.endings import describe_ending, describe_kept
     from mbtf_fit.training.fit import fit
     from mbtf_fit.training.fit_folder import EventLog
 
@@ -164,7 +164,8 @@ def _fit_one(
     command, advice = advise(result.material, output, shards, result.history, result.errors)
     summary = {**result.as_dict(), "next_command": command}
     ending = describe_ending(config, result.history)
-    more = [*([] if ending is None else [ending]), *advice]
+    kept = describe_kept(result.history, result.kept_step)
+    more = [*(line for line in (kept, ending) if line is not None), *advice]
     console.report(summary, "\n".join([describe_fit(summary, verbose), *more]))
 
 

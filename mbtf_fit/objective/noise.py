@@ -30,8 +30,9 @@ _LEAST_CELLS = 12
 _TRIMMED = 0.05
 # Largest noise-to-signal ratio, also of constant values.
 _MOST_NOISE = 5.0
-# Fraction of the queries, those with the largest difference of halves, that the ratio omits as outliers.
-_OUTLIERS = 1e-4
+# Fraction of the queries, the brightest, that the ratio omits: highlights, whose variance would hide the
+# noise of all others, and outliers.
+_BRIGHTEST = 0.01
 
 
 def typical_value(values: ArrayLike) -> float:
@@ -62,7 +63,7 @@ class NoiseModel:
     levels : (k+1, 3) c by nearest level
     bands : factors by band of the lower cosine (``ELEVATION_BANDS``)
     ratio : noise-to-signal ratio, noise variance over variance of the true values, of all queries but the
-        outliers; at most 5
+        brightest hundredth; at most 5
     """
 
     scale: float
@@ -127,8 +128,8 @@ class NoiseModel:
 
 def _ratio(queries: ShardQueries) -> float:
     n = len(queries)
-    apart = np.abs(queries.value_a - queries.value_b).reshape(n, -1).max(1)
-    kept = np.sort(np.argsort(apart)[: max(1, n - math.ceil(_OUTLIERS * n))])
+    bright = (queries.value_a + queries.value_b).reshape(n, -1).mean(1)
+    kept = np.sort(np.argsort(bright)[: max(1, n - math.ceil(_BRIGHTEST * n))])
     halves = queries.value_a[kept], queries.value_b[kept]
     noise, signal = pooled_variance(*halves).value, signal_variance(*halves).value
     if not noise > 0:

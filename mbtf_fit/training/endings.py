@@ -32,6 +32,18 @@ def reached(config: FitConfig, history: Sequence[dict[str, Any]]) -> bool | None
     return value is not None and error is not None and value + error <= config.training.error
 
 
+def describe_kept(history: Sequence[dict[str, Any]], kept: int | None) -> str | None:
+    """That a fit returned to the state of a step, in one line; None if it kept the last."""
+    best = next((r for r in history if r["step"] == kept), None)
+    if best is None:
+        return None
+    last = history[-1]
+    return (
+        f"validation error rose from {best['unexplained']:.2g} after {kept} steps to "
+        f"{last['unexplained']:.2g} after {last['step']}: kept the state after {kept} steps"
+    )
+
+
 def describe_ending(config: FitConfig, history: Sequence[dict[str, Any]]) -> str | None:
     """Why training ended, in one line; None if it had no error to reach."""
     found = reached(config, history)

@@ -112,7 +112,14 @@ class FitResult:
     def marginal_cost(self) -> MarginalCost | None:
         """Expected gain by longer training and by more data; None where the history is incomplete."""
         noise = self.material.description["training"].get("noise_variance")
-        return marginal_cost_of(self.history, self.errors, noise)
+        return marginal_cost_of(self.history, self.errors, noise, self.kept_step)
+
+    @property
+    def kept_step(self) -> int | None:
+        """Step of the state that is kept, if it is not the last: later, the fit overfitted."""
+        training = self.material.description["training"]
+        kept: int | None = training.get("kept_step")
+        return None if kept == training["steps"] else kept
 
 
 def _check_folder(config: FitConfig, out: Path) -> None:
@@ -307,6 +314,7 @@ def _train(
         subsets.append((name, validation_subset(trainers[-1].model.positions, queries)))
         del queries
     names = [member.folder.name for member in members] if len(members) > 1 else [""]
+    validation = [queries for _, queries in subsets]
     loop = TrainingLoop(trainers, names)
     checkpoint = home / CHECKPOINT_NAME
     resumed = checkpoint.exists()
@@ -317,8 +325,15 @@ def _train(
 
     def report() -> bool:
         records = []
-        for member, trainer, (_, subset) in zip(members, trainers, subsets, strict=True):
-            records.append(history_record(trainer, subset))
+        predictions = [
+            trainer.predict(queries) for trainer, queries in zip(trainers, validation, strict=True)
+        ]
+        if all(map(len, validation)):
+            loop.validate(predictions, validation)
+        for member, trainer, subset, predicted in zip(
+            members, trainers, validation, predictions, strict=True
+        ):
+            records.append(history_record(trainer, subset, predicted))
             append_history(member.folder, records[-1])
             if observe is not None:
                 observe(records[-1], trainer, subset)
@@ -329,8 +344,17 @@ def _train(
     # A fit that was killed after it had reached its error is exported as it is.
     if not all(reached(config, read_history(member.folder)) for member in members):
         _spend_budget(loop, report, checkpoint)
+    trained = loop.progress
+    loop.keep_best(validation)
     export_fits(
-        config, loop, members, partitions, [name for name, _ in subsets], home, partial(progress, 1.0)
+        config,
+        loop,
+        trained,
+        members,
+        partitions,
+        [name for name, _ in subsets],
+        home,
+        partial(progress, 1.0),
     )
     return resumed
 

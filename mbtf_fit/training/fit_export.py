@@ -20,7 +20,7 @@ from mbtf_fit.material.decoder import Decoder, write_decoder
 from mbtf_fit.material.material import export
 from mbtf_fit.material.transmittance import evaluate_transmittance, fit_transmittance
 from mbtf_fit.training.loop import TrainingLoop
-from mbtf_fit.training.trainer import Trainer
+from mbtf_fit.training.trainer import Trainer, TrainingProgress
 
 # Interval at which a stage says how far it is.
 _REPORT_SECONDS = 2.0
@@ -38,18 +38,22 @@ class Member:
 def export_fits(
     config: FitConfig,
     loop: TrainingLoop,
+    trained: TrainingProgress,
     members: Sequence[Member],
     partitions: Sequence[Partition],
     validated: Sequence[str],
     home: Path,
     announce: Callable[[str], None],
 ) -> None:
-    """Write the materials, and the network that they share."""
-    steps, seconds = loop.progress.step, round(loop.progress.seconds, 3)
+    """Write the materials, and the network that they share; `trained`: progress at the end of training, of
+    which the loop may have kept an earlier state."""
+    steps, seconds, kept = trained.step, round(trained.seconds, 3), loop.progress.step
     summary: dict[str, Any] = {"materials": list(loop.names), "steps": steps, "seconds": seconds}
+    summary["kept_step"] = kept
     for k, (member, partition) in enumerate(zip(members, partitions, strict=True)):
         mine = loop.batches_of(k, steps)
         share: dict[str, Any] = {"steps": mine, "seconds": round(seconds * mine / steps, 3)}
+        share["kept_step"] = loop.batches_of(k, kept)
         if config.training.shared_decoder:
             share["shared_decoder"] = summary
         if config.decoder is not None:

@@ -37,12 +37,12 @@ def evaluation_seconds(queries: float) -> float:
 
 
 def fit_bytes(config: FitConfig, lattice: Lattice) -> int:
-    """Bytes that a fit writes at most: a checkpoint of weights and two moments, while it replaces another,
-    and the known surface."""
+    """Bytes that a fit writes at most: a checkpoint of weights, two moments and the best weights, while it
+    replaces another, and the known surface."""
     with torch.device("meta"):
         model = material_of(config.model, lattice, config.network)
     surface = surface_bytes(lattice) if model.tracing is not None else 0
-    return 6 * sum(p.nbytes for p in model.parameters()) + surface
+    return 8 * sum(p.nbytes for p in model.parameters()) + surface
 
 
 @dataclass(frozen=True)

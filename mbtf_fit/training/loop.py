@@ -16,15 +16,19 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from threading import Event
-from typing import NoReturn
+from typing import Any, NoReturn
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from mbtf_core.errors import EngineError, InputError
 from mbtf_core.run.task import worker_threads
+from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.material.format import read_tensors, write_tensors
 from mbtf_fit.objective.parallel import Workers
+from mbtf_fit.training.best_state import BestState, excess_error, overfits
 from mbtf_fit.training.trainer import Trainer, TrainingProgress
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
@@ -79,10 +83,12 @@ class TrainingLoop:
     Attributes
     ----------
     progress : steps done, of all materials together
+    best : state of the smallest validation error so far
     """
 
     def __init__(self, trainers: Sequence[Trainer], names: Sequence[str] = ("",)) -> None:
         self.trainers, self.names = trainers, names
+        self.best: BestState | None = None
         decay = shared_decay([trainer.weight_decay.weights for trainer in trainers])
         for trainer in trainers:
             trainer.weight_decay = replace(trainer.weight_decay, weights=decay)
@@ -106,6 +112,20 @@ class TrainingLoop:
     def batches_of(self, index: int, step: int) -> int:
         """Batches that a material has had before a step."""
         return (step - index + len(self.trainers) - 1) // len(self.trainers)
+
+    def validate(self, predictions: Sequence[NDArray[np.float32]], subsets: Sequence[ShardQueries]) -> None:
+        """Remember the current state if none before has smaller errors; `predictions` of `subsets`: the
+        validation queries of each material."""
+        if self.best is None or excess_error(predictions, self.best.predictions, subsets).value <= 0:
+            self.best = BestState(weights_of(self), replace(self.progress), list(predictions))
+
+    def keep_best(self, subsets: Sequence[ShardQueries]) -> None:
+        """Return to the best state, if its errors are significantly smaller than the current ones."""
+        if self.best is None or self.best.progress.step == self.progress.step:
+            return
+        predictions = [t.predict(queries) for t, queries in zip(self.trainers, subsets, strict=True)]
+        if overfits(predictions, self.best.predictions, subsets):
+            load_weights(self, self.best.tensors, self.best.progress)
 
     def _steps(self, workers: Workers) -> Iterator[Tensor]:
         """Endless steps from the current one on; each yields its mean loss."""
@@ -190,8 +210,14 @@ def snapshot(loop: TrainingLoop) -> dict[str, Tensor]:
     return {name: tensor.detach().clone() for name, tensor in state_tensors(loop).items()}
 
 
-def restore(loop: TrainingLoop, tensors: dict[str, Tensor], progress: TrainingProgress) -> None:
-    """Set the loop's state to that of a snapshot or a checkpoint, and its progress."""
+def weights_of(loop: TrainingLoop) -> dict[str, Tensor]:
+    """Copies of the loop's state without that of its optimizers, which :func:`load_weights` takes."""
+    tensors = state_tensors(loop).items()
+    return {name: tensor.detach().clone() for name, tensor in tensors if ".adam." not in name}
+
+
+def load_weights(loop: TrainingLoop, tensors: dict[str, Tensor], progress: TrainingProgress) -> None:
+    """Set parameters and progress to those of :func:`weights_of`, at the end of training."""
     for k, trainer in enumerate(loop.trainers):
         mine = {n.removeprefix(f"{k}."): t for n, t in tensors.items() if n.startswith(f"{k}.")}
         _load(trainer, _own_parameters(loop, k), mine)
@@ -199,9 +225,27 @@ def restore(loop: TrainingLoop, tensors: dict[str, Tensor], progress: TrainingPr
     loop.link()
 
 
+def restore(loop: TrainingLoop, tensors: dict[str, Tensor], progress: TrainingProgress) -> None:
+    """Set the loop's state to that of a snapshot or a checkpoint, and its progress."""
+    load_weights(loop, tensors, progress)
+    for k, trainer in enumerate(loop.trainers):
+        for name, p in _own_parameters(loop, k).items():
+            trainer.optimizer.state[p] = {
+                key: tensors[stored].to(p.device, copy=True)
+                for key in _MOMENTS
+                if (stored := f"{k}.adam.{key}.{name}") in tensors
+            }
+    loop.link()
+
+
 def write_checkpoint(loop: TrainingLoop, path: Path) -> None:
-    """Write parameters, optimizer state and progress."""
-    write_tensors(path, state_tensors(loop), asdict(loop.progress))
+    """Write parameters, optimizer state, progress, and the best state."""
+    tensors, data = state_tensors(loop), asdict(loop.progress)
+    if loop.best is not None:
+        tensors |= {f"best.{name}": tensor for name, tensor in loop.best.tensors.items()}
+        tensors |= {f"predictions.{k}": torch.from_numpy(p) for k, p in enumerate(loop.best.predictions)}
+        data["best"] = asdict(loop.best.progress)
+    write_tensors(path, tensors, data)
 
 
 def read_checkpoint(loop: TrainingLoop, path: Path) -> None:
@@ -213,8 +257,11 @@ def read_checkpoint(loop: TrainingLoop, path: Path) -> None:
     """
     try:
         tensors, found = read_tensors(path)
-        progress = TrainingProgress(int(found["step"]), float(found["seconds"]), float(found["loss"]))
-        restore(loop, tensors, progress)
+        restore(loop, tensors, _progress(found))
+        if (best := found.get("best")) is not None:
+            weights = {n.removeprefix("best."): t for n, t in tensors.items() if n.startswith("best.")}
+            predictions = [tensors[f"predictions.{k}"].numpy() for k in range(len(loop.trainers))]
+            loop.best = BestState(weights, _progress(best), predictions)
     except (InputError, KeyError, TypeError, ValueError, RuntimeError):
         raise InputError(
             "is not a checkpoint of this fit: corrupt, or of an older version",
@@ -223,15 +270,14 @@ def read_checkpoint(loop: TrainingLoop, path: Path) -> None:
         ) from None
 
 
+def _progress(found: dict[str, Any]) -> TrainingProgress:
+    return TrainingProgress(int(found["step"]), float(found["seconds"]), float(found["loss"]))
+
+
 def _load(trainer: Trainer, parameters: dict[str, Tensor], tensors: dict[str, Tensor]) -> None:
-    """Set parameters, optimizer state and the model's own state of a trainer."""
+    """Set parameters and the model's own state of a trainer."""
     with torch.no_grad():
         for name, p in parameters.items():
             p.copy_(tensors[f"model.{name}"])
-            trainer.optimizer.state[p] = {
-                key: tensors[f"adam.{key}.{name}"].to(p.device, copy=True)
-                for key in _MOMENTS
-                if f"adam.{key}.{name}" in tensors
-            }
     state = {n.removeprefix("state."): t for n, t in tensors.items() if n.startswith("state.")}
     trainer.hooks.restore(state)

@@ -97,6 +97,14 @@ def next_step(cost: MarginalCost, errors: Mapping[str, Any]) -> NextStep:
     if value >= 1.0 and own is not None and own < 1.0:
         return NextStep("queries", "the training queries are too few or too noisy")
     data = 1.0 if cost.noise_share is None else 1.0 - 0.5 * cost.noise_share
+    if cost.kept_step is not None:
+        reason = f"the fit overfits noise after {cost.kept_step} steps; "
+        reason += (
+            "twice the queries let it train longer"
+            if data >= FLAT
+            else (f"expect at most {data:.2g} of this error with twice the queries")
+        )
+        return NextStep("queries", reason)
     time = cost.doubling
     if data < min(FLAT, 1.0 if time is None else time):
         reason = f"the fit overfits noise; expect about {data:.2g} of this error with twice the queries"

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.stats import by_group, level_groups, unexplained_variance
@@ -24,7 +25,7 @@ def validation_set(data: Dataset, partition: Partition) -> tuple[str, ShardQueri
 
     The test split, because it has more paths per query: four paths often do not resolve the error of glossy
     materials. Those of the train split where there is no test split, or a small one. No option is selected
-    by it.
+    by it; an earlier state than the last is, where it is clearly better.
     """
     held_out = partition.held_out_queries
     test = load_split(data, "test") if "test" in data.splits and data.shards("test") else None
@@ -52,12 +53,12 @@ def errors_by_level(trainer: Trainer, queries: ShardQueries) -> dict[str, float 
     return {str(s): finite(e.value) for s, e in by_group(unexplained_variance, level, *values).items()}
 
 
-def history_record(trainer: Trainer, subset: ShardQueries) -> dict[str, Any]:
-    """Progress and validation error of the current model."""
+def history_record(trainer: Trainer, subset: ShardQueries, prediction: NDArray[np.float32]) -> dict[str, Any]:
+    """Progress and validation error of the current model; `prediction`: its values (n, 3) of the subset."""
     state = trainer.progress
     found: dict[str, Any] = {}
     if len(subset):
-        found = unexplained_variance(trainer.predict(subset), *subset.halves).as_dict()
+        found = unexplained_variance(prediction, *subset.halves).as_dict()
     return {
         "step": state.step,
         "seconds": round(state.seconds, 3),
@@ -100,12 +101,14 @@ class MarginalCost:
         training queries; None where it is not significant
     steps : number of training steps
     noise_share_error : two standard errors of `noise_share`
+    kept_step : step of the state that is kept, if it is not the last: later, the fit overfitted
     """
 
     doubling: float | None
     noise_share: float | None
     steps: int
     noise_share_error: float = 0.0
+    kept_step: int | None = None
 
     def as_dict(self) -> dict[str, float | int | None]:
         """Plain data for JSON."""
@@ -118,14 +121,18 @@ class MarginalCost:
 
 
 def marginal_cost_of(
-    history: list[dict[str, Any]], errors: dict[str, Any], noise: float | None = None
+    history: list[dict[str, Any]],
+    errors: dict[str, Any],
+    noise: float | None = None,
+    kept: int | None = None,
 ) -> MarginalCost | None:
-    """Marginal cost of a finished fit, from the records of its history, its errors by split, and the variance
-    of the noise of training values in 1/sr² (None: unknown); None where the history is incomplete."""
+    """Marginal cost of a finished fit, from the records of its history, its errors by split, the variance
+    of the noise of training values in 1/sr² (None: unknown), and the step of the state that is kept (None:
+    the last); None where the history is incomplete."""
     if not history or history[-1].get("fraction", 0.0) < 1.0:
         return None
     share, error = _noise_share(errors, noise) or (None, 0.0)
-    return MarginalCost(_doubling(history), share, int(history[-1]["step"]), error)
+    return MarginalCost(_doubling(history), share, int(history[-1]["step"]), error, kept)
 
 
 def _doubling(history: list[dict[str, Any]]) -> float | None:

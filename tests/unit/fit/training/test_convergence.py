@@ -118,6 +118,7 @@ def test_incomplete_histories_say_nothing() -> None:
         "noise_share": None,
         "steps": 4000,
         "noise_share_error": 0.0,
+        "kept_step": None,
     }
 
 
@@ -150,6 +151,21 @@ def test_the_next_step_is_what_pays_most(
 def test_overfitting_is_named_beside_an_uncertain_error(training: float, overfits: bool) -> None:
     found = next_step(MarginalCost(0.8, 0.9, 4000), fitted(0.28, 0.08, training))
     assert (found.kind, "overfits" in found.reason) == ("test", overfits)
+
+
+@pytest.mark.parametrize(
+    ("share", "reason"),
+    [
+        (0.4, "expect at most 0.8 of this error with twice the queries"),
+        (None, "twice the queries let it train longer"),
+    ],
+)
+def test_a_fit_that_kept_an_earlier_state_needs_more_queries(share: float | None, reason: str) -> None:
+    """Whatever the curve shows; with twice the queries the best state is a later one, so the factor of equal
+    states is a bound."""
+    for doubling in (0.6, None, 1.5):
+        found = next_step(MarginalCost(doubling, share, 4000, kept_step=480), fitted(0.2, 0.002))
+        assert found == NextStep("queries", f"the fit overfits noise after 480 steps; {reason}")
 
 
 def test_the_next_command_is_complete(tmp_path: Path) -> None:

@@ -24,6 +24,8 @@ from mbtf_fit.training.loop import TrainingLoop
 from mbtf_fit.training.trainer import Trainer
 
 STEPS = 4000
+# Error that repeated queries add.
+ADDED = 0.1
 
 
 @pytest.fixture(scope="module")
@@ -37,8 +39,8 @@ def config(**training: object) -> FitConfig:
 
 @pytest.fixture
 def law(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
-    """(steps, queries) of pilots, which do not train: their errors are a law of the steps, more by 0.1 where
-    queries are repeated. One of fifty test queries has all of the error. Each pilot starts anew, and is
+    """(steps, queries) of pilots, which do not train: their errors are a law of the steps, more by `ADDED`
+    where queries are repeated. One of fifty test queries has all of the error. Each pilot starts anew, and is
     calibrated."""
     pilots: list[tuple[int, int]] = []
 
@@ -50,7 +52,7 @@ def law(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
         repeated = len(trainer.queries) < pilots[0][1] if pilots else False
         pilots.append((steps, len(trainer.queries)))
         a, b = queries.value_a.astype(float), queries.value_b
-        error = (0.03 + 3.0 * steps**-0.7 + 0.1 * repeated) * signal_variance(a, b).value
+        error = (0.03 + 3.0 * steps**-0.7 + ADDED * repeated) * signal_variance(a, b).value
         squares = np.where(np.arange(len(a)) % 50 == 0, 50 * error, 0.0)[:, None]
         # (p - a)(p - b) are these squares.
         return 0.5 * (a + b) + np.sqrt(squares + 0.25 * (a - b) ** 2)
@@ -90,6 +92,15 @@ def test_the_law_of_the_pilots_predicts_the_fit(law: list[tuple[int, int]], shar
     # Below the level at which the law ends.
     below = forecast_fit(config(steps=STEPS, error=0.01), shards).error.describe()
     assert below.splitlines()[-1].startswith("error 0.01: not reachable with these queries")
+
+
+def test_a_pilot_that_gains_by_repeated_queries_adds_no_error(
+    law: list[tuple[int, int]], shards: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(globals(), "ADDED", -0.02)
+    found = forecast_fit(config(steps=STEPS), shards).error
+    assert found.excess.value == 0.0
+    assert found.excess.error > 0.0
 
 
 @pytest.mark.parametrize(("time", "seconds"), [("2s", 8.0), ("20s", 20.0)])

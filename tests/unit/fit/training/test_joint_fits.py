@@ -19,7 +19,6 @@ import mbtf_fit.training.trainer
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
 from mbtf_fit import FitConfig, FitResult, Material, fit
-from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.evaluation import evaluate
 from mbtf_fit.material.decoder import Decoder, network_tensors
 from mbtf_fit.training.fit import fit_jointly
@@ -272,10 +271,10 @@ def test_training_stops_once_all_materials_have_reached_the_error(
             raise Killed
         return step(self, *arguments)
 
-    def record(trainer: Trainer, subset: ShardQueries) -> dict[str, Any]:
+    def record(trainer: Trainer, *validation: Any) -> dict[str, Any]:
         least = 2 if trainer.model.lattice.finest == 3 else 5
         error = 0.1 if trainer.progress.step >= least else 0.9
-        return history_record(trainer, subset) | {"unexplained": error, "unexplained_error": 0.01}
+        return history_record(trainer, *validation) | {"unexplained": error, "unexplained_error": 0.01}
 
     def dying_export(*arguments: Any, **more: Any) -> None:
         raise Killed

@@ -1,0 +1,75 @@
+"""The state of a fit with the smallest validation error.
+
+A fit that overfits is best before its end. Its last state is replaced only where an earlier one is better
+beyond noise and by a twentieth, by the difference of both errors on the same validation queries, whose noise
+mostly cancels. So the choice among states hardly biases the errors that are reported, and other fits are as
+they were.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mbtf_core.stats import Estimate, mse_difference, noise_free_mse, signal_variance
+from mbtf_fit.data.queries import ShardQueries
+from mbtf_fit.training.trainer import TrainingProgress
+
+# Standard errors that make a difference significant: the best of many states is compared. Its least share of
+# the best error: paired errors resolve differences that do not matter.
+_SIGNIFICANT, _LEAST = 3.0, 0.05
+
+
+@dataclass(frozen=True)
+class BestState:
+    """State of a training loop at a validation.
+
+    Attributes
+    ----------
+    tensors : parameters by name, as :func:`~mbtf_fit.training.loop.weights_of`
+    progress : steps done
+    predictions : values (n, 3) of the validation queries of each material
+    """
+
+    tensors: dict[str, Tensor]
+    progress: TrainingProgress
+    predictions: list[NDArray[np.float32]]
+
+
+def excess_error(
+    predictions: Sequence[NDArray[np.float32]],
+    others: Sequence[NDArray[np.float32]],
+    subsets: Sequence[ShardQueries],
+) -> Estimate:
+    """Mean squared error of predictions (n, 3) minus that of others, free of noise and compared query by
+    query, over the variance of the values; summed over materials with queries `subsets`."""
+    found = [
+        mse_difference(prediction, other, *queries.halves).scaled(1.0 / _unit(queries))
+        for prediction, other, queries in zip(predictions, others, subsets, strict=True)
+    ]
+    error = math.hypot(*(e.error for e in found))
+    return Estimate(sum(e.value for e in found), error, sum(e.n for e in found))
+
+
+def overfits(
+    predictions: Sequence[NDArray[np.float32]],
+    best: Sequence[NDArray[np.float32]],
+    subsets: Sequence[ShardQueries],
+) -> bool:
+    """Whether predictions are worse than the best ones, beyond noise and by a twentieth of the error."""
+    excess = excess_error(predictions, best, subsets)
+    errors = [
+        noise_free_mse(prediction, *queries.halves).value / _unit(queries)
+        for prediction, queries in zip(best, subsets, strict=True)
+    ]
+    return excess.value > max(_SIGNIFICANT * excess.error, _LEAST * sum(errors))
+
+
+def _unit(queries: ShardQueries) -> float:
+    variance = signal_variance(*queries.halves).value
+    return variance if variance > 0 else 1.0

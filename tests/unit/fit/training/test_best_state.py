@@ -1,0 +1,144 @@
+"""A fit that overfits ends with its best state; others end with their last one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from support.fit_data import parallax, random_queries, write_data
+
+import mbtf_fit.training.fit as fits
+from mbtf_core.data.lattice import Lattice
+from mbtf_fit.config import FitConfig
+from mbtf_fit.data.queries import ShardQueries
+from mbtf_fit.training.best_state import excess_error, overfits
+from mbtf_fit.training.endings import describe_kept
+from mbtf_fit.training.fit import FitResult, fit
+from mbtf_fit.training.trainer import Trainer
+
+STEPS, BEST = 8, 3
+NOISE = 0.05
+
+
+class Killed(BaseException):
+    """Nothing that runs after it may tidy up: stands for SIGKILL."""
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_data(tmp_path_factory.mktemp("data") / "shards", parallax, train=2000, test=300, noise=0.02)
+
+
+def config(**training: Any) -> FitConfig:
+    options = {"steps": STEPS, "batch": 200, "warmup": 0, "energy_calibration": False, **training}
+    return FitConfig.model_validate({"model": "neumip", "training": options})
+
+
+@pytest.fixture
+def weights_at(monkeypatch: pytest.MonkeyPatch) -> dict[int, dict[str, torch.Tensor]]:
+    """Weights by step. Validation and checkpoint follow each step; the error of predictions is least after
+    step 3."""
+    seen: dict[int, dict[str, torch.Tensor]] = {}
+
+    def predict(trainer: Trainer, queries: ShardQueries) -> NDArray[np.float32]:
+        # The first one counts: the errors of the kept state are evaluated at its step.
+        seen.setdefault(
+            trainer.progress.step, {n: p.detach().clone() for n, p in trainer.parameters().items()}
+        )
+        excess = 0.1 * abs(trainer.progress.step - BEST)
+        return (0.5 * (queries.value_a + queries.value_b) * (1.0 + excess)).astype(np.float32)
+
+    monkeypatch.setattr(Trainer, "predict", predict)
+    monkeypatch.setattr(fits, "_REPORT_SECONDS", 0.0)
+    monkeypatch.setattr(fits, "_CHECKPOINT_SECONDS", 0.0)
+    return seen
+
+
+def check_kept(found: FitResult, weights: dict[str, torch.Tensor]) -> None:
+    training = found.material.description["training"]
+    assert (training["steps"], training["kept_step"], found.kept_step) == (STEPS, BEST, BEST)
+    assert found.history[-1]["step"] == STEPS
+    mine = dict(found.material.model.named_parameters())
+    # The networks are exported as they are, textures with their blur.
+    networks = [name for name in mine if name.startswith("decoder")]
+    assert networks
+    assert all(torch.equal(mine[name], weights[name]) for name in networks)
+    # Errors are those of the kept state.
+    assert found.errors["test"]["mse"]["value"] < 0.01 * found.errors["test"]["variance"]["value"]
+
+
+def test_a_fit_that_overfits_returns_to_its_best_state(
+    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, weights_at: dict[int, Any]
+) -> None:
+    """Also one that is killed after its best step, whose checkpoint has both states."""
+    found = fit(config(), shards, tmp_path / "whole")
+    check_kept(found, weights_at[BEST])
+    assert not torch.equal(weights_at[BEST]["decoder.0.weight"], weights_at[STEPS]["decoder.0.weight"])
+    line = str(describe_kept(found.history, found.kept_step))
+    assert line.startswith("validation error rose from ")
+    assert line.endswith(f"after {STEPS}: kept the state after {BEST} steps")
+
+    step = Trainer._step
+
+    def dying(self: Trainer, *arguments: Any) -> torch.Tensor:
+        if self.progress.step == STEPS - 2:
+            raise Killed
+        return step(self, *arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "_step", dying)
+        with pytest.raises(Killed):
+            fit(config(), shards, tmp_path / "killed")
+    resumed = fit(config(), shards, tmp_path / "killed")
+    assert resumed.resumed
+    check_kept(resumed, weights_at[BEST])
+    mine, other = resumed.material.model.weights(), found.material.model.weights()
+    assert all(torch.equal(mine[name], other[name]) for name in other)
+
+
+def test_a_fit_keeps_its_last_state_unless_another_is_better_beyond_noise(
+    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Validations of states that are equally good, of which one happens to be best."""
+
+    def predict(trainer: Trainer, queries: ShardQueries) -> NDArray[np.float32]:
+        random = np.random.default_rng(trainer.progress.step)
+        value = 0.5 * (queries.value_a + queries.value_b)
+        return (value + 0.02 * random.normal(size=value.shape)).astype(np.float32)
+
+    monkeypatch.setattr(Trainer, "predict", predict)
+    monkeypatch.setattr(fits, "_REPORT_SECONDS", 0.0)
+    found = fit(config(), shards, tmp_path / "m")
+    errors = [record["unexplained"] for record in found.history]
+    assert min(errors) < 0.98 * errors[-1]
+    assert found.kept_step is None
+    assert found.material.description["training"]["kept_step"] == STEPS
+    assert describe_kept(found.history, found.kept_step) is None
+
+
+def test_the_excess_is_paired_and_relative_to_the_variance() -> None:
+    """Of a prediction that is off by a constant, over one that is off by half of it; noise of the reference
+    hides neither."""
+    random = np.random.default_rng(0)
+    arrays = random_queries(random, 4000, Lattice(3))
+    true = parallax(*arrays.values())
+    a, b = (true + random.normal(0.0, NOISE, true.shape) for _ in range(2))
+    queries = ShardQueries(*arrays.values(), a.astype(np.float32), b.astype(np.float32))
+    near, far = (np.float32(true + offset) for offset in (0.005, 0.01))
+    expected = (0.01**2 - 0.005**2) / true.var(0).mean()
+    found = excess_error([far], [near], [queries])
+    assert abs(found.value - expected) < 4 * found.error
+    assert found.value > 3 * found.error
+    # Significant differences below a twentieth of the error do not count.
+    for offset, worse in ((0.0101, False), (0.0105, True)):
+        assert overfits([np.float32(true + offset)], [far], [queries]) is worse
+    # Two materials of other units, of which one is worse and one as much better.
+    other = replace(queries, value_a=7 * queries.value_a, value_b=7 * queries.value_b)
+    both = excess_error([far, 7 * near], [near, 7 * far], [queries, other])
+    assert abs(both.value) < 1e-3 * expected
+    assert both.error == pytest.approx(found.error * 2**0.5, rel=1e-3)
