@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -10,6 +11,7 @@ from cyclopts import Parameter
 from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.options import (
     ClusterOption,
+    DryRun,
     ErrorOption,
     Output,
     Set,
@@ -29,15 +31,16 @@ def cost(
     refine: Annotated[str | None, Parameter(metavar="DURATION")] = None,
     error: ErrorOption = None,
     seed: Annotated[int | None, Parameter(converter=whole_number, show_default="the recipe's")] = None,
+    dry_run: DryRun = False,
     cluster: ClusterOption = None,
     assignments: Set = None,
     console: Console = CONSOLE,
 ) -> None:
     """Measure error against time for this material and machine: mbtf-pipeline cost RECIPE
 
-    Writes cost.html, cost.csv and PNGs, and answers which error a time gives, from 160 s on. The same command
-    resumes. A longer time keeps all measurements and adds longer runs. With --cluster, workers measure, each
-    for itself.
+    Writes cost.html, cost.csv and PNGs: the errors of complete runs, and from 2min on a forecast for up to
+    four times as long. The same command resumes. A longer time keeps all measurements and adds longer runs.
+    With --cluster, workers measure, each for itself.
 
     Parameters
     ----------
@@ -55,10 +58,10 @@ def cost(
     from mbtf_core.run.signals import keep_on_interruption
     from mbtf_core.units import asked_duration
     from mbtf_pipeline.collection.recipes import load
-    from mbtf_pipeline.cost.answers import page_answers
+    from mbtf_pipeline.cost.answers import answers
     from mbtf_pipeline.cost.measurement import pareto_front
     from mbtf_pipeline.cost.page import write_page
-    from mbtf_pipeline.cost.study import rounded, run_study
+    from mbtf_pipeline.cost.study import plan_study, rounded, run_study
     from mbtf_pipeline.recipe import Recipe
 
     loaded = load(recipe, assignments or [])
@@ -68,6 +71,10 @@ def cost(
     seconds = asked_duration(time, "--time")
     more = 0.0 if refine is None else asked_duration(refine, "--refine")
     folder = output if output is not None else loaded.folder.with_name(f"{loaded.folder.name}-cost")
+    if dry_run:
+        plan = plan_study(loaded, folder, seconds=seconds, seed=seed)
+        console.report(asdict(plan), plan.describe(seconds))
+        return
     keep_on_interruption(f"the measurements are kept in {folder}")
     with (
         open_runner(cluster, console.note) as runner,
@@ -93,11 +100,11 @@ def cost(
             progress=lambda share, note: bar.update(round(100 * share, 1), note),
             runner=runner,
         )
-    if error is not None and (asked := study.evidence.time_of(error)) is not None:
-        study.asked = asked[1]
+    if error is not None:
+        study.asked = study.evidence.time_of(error)
     with owned(folder):
         page = write_page(study)
-    front, rows = pareto_front(study.measurements), page_answers(study.evidence)
+    front, rows = pareto_front(study.measurements), answers(study.evidence)
     data = {
         "page": page,
         "measurements": len(study.measurements),
@@ -113,15 +120,15 @@ def cost(
     }
     runs = [m for m in study.measurements if m.study == "run"]
     generator = len(study.measurements) - len(runs)
-    counts = f"{generator} configurations of the generator and {len(runs)} of complete runs measured"
-    lines = [f"{page}: {counts}; no time for {len(study.skipped)} others"]
+    counts = f"measured: {len(runs)} of complete runs, {generator} of the generator"
+    lines = [f"{page}: configurations {counts}, {len(study.skipped)} without time"]
     lines += [f"failed: {text}" for text in study.failed]
     lines += [row["line"] for row in rows]
     lines += [study.asked] if study.asked else []
-    if not rows and study.least is not None:
+    if study.least is not None:
         lines.append(
-            "too few complete runs to tell what a time gives: the same command with --time "
+            "too few complete runs for a forecast: the same command with --time "
             f"{rounded(study.least)} keeps these and measures enough on this machine"
         )
-    lines += [f"  {m.seconds.value:.0f} s: unexplained variance {m.error}   {m.command}" for m in front]
+    lines += [f"  {m.seconds.value:.0f} s: {m.command}" for m in front]
     console.report(data, "\n".join(lines))

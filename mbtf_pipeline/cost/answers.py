@@ -1,7 +1,8 @@
-"""What a time is expected to give, and how long an error is expected to take, by the runs of a cost study."""
+"""What a time gives, and how long an error takes, by the runs of a cost study."""
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections import Counter
 from collections.abc import Sequence
@@ -9,101 +10,117 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from mbtf_core.forecast import INSUFFICIENT, expected_error, expected_seconds
+from mbtf_core.forecast import INSUFFICIENT, expected_seconds
 from mbtf_core.stats import Estimate, Interval, LearningCurve
 from mbtf_core.units import clock, format_duration
 from mbtf_pipeline.cost.measurement import Measurement
+from mbtf_pipeline.cost.runs import FEWEST_TOTALS
 
-# Times of everything that the page answers, in seconds.
-_TIMES = (60.0, 300.0, 900.0, 3600.0)
+# Forecasts reach so many times beyond the work of the longest run.
+FARTHEST = 4.0
+# Total times that are forecast, in seconds, where they lie beyond the longest run by this factor.
+_TIMES = (60.0, 120.0, 300.0, 600.0, 1200.0, 3600.0, 7200.0, 18000.0, 36000.0)
+_BEYOND = 1.3
 # What limits the error of a study's runs, whose data grow with their time.
 _LIMITS = "with this network, however many queries"
 
 
+def _work(run: Measurement) -> float:
+    return run.details["generation_seconds"] + run.details["training_seconds"]
+
+
 @dataclass(frozen=True)
 class Evidence:
-    """Complete runs of a study with the same share of generating.
+    """Complete runs of a study with the same share of generating, the shortest first.
 
     Attributes
     ----------
-    seconds, errors, seeds : total time, unexplained variance, and number of seeds of each
-    work : seconds of generating and training, part of `seconds`; the error is a law of these
-    deviation, degrees : relative deviation of a single run over seeds, and its degrees of freedom
-    test : relative standard error by the test queries
+    runs : their measurements, each the mean of its seeds
+    deviation : relative standard deviation of a single run over seeds
     """
 
-    seconds: tuple[float, ...]
-    errors: tuple[float, ...]
-    seeds: tuple[float, ...]
-    work: tuple[float, ...]
-    deviation: float
-    degrees: float
-    test: float
+    runs: Sequence[Measurement]
+    deviation: Estimate
 
     @classmethod
-    def of(cls, found: Sequence[Measurement], deviation: Estimate | None) -> Evidence:
+    def of(cls, found: Sequence[Measurement], deviation: Estimate) -> Evidence:
         """From the measurements of a study."""
         runs = [m for m in found if m.study == "run" and m.error.value > 0 and m.error.error < m.error.value]
         for series, _ in Counter(m.series for m in runs).most_common(1):
-            runs = sorted((m for m in runs if m.series == series), key=lambda m: m.seconds.value)
-        return cls(
-            tuple(m.seconds.value for m in runs),
-            tuple(m.error.value for m in runs),
-            tuple(m.details["seeds"] for m in runs),
-            tuple(m.details["generation_seconds"] + m.details["training_seconds"] for m in runs),
-            0.0 if deviation is None else deviation.value,
-            0.0 if deviation is None else deviation.degrees,
-            statistics.median([m.details["test_error"] for m in runs] or [0.0]),
-        )
+            runs = sorted((m for m in runs if m.series == series), key=_work)
+        return cls(runs, deviation)
+
+    @cached_property
+    def work(self) -> list[float]:
+        """Seconds of generating and training; the error is a law of these."""
+        return [_work(m) for m in self.runs]
 
     @cached_property
     def curve(self) -> LearningCurve | None:
         """The law of their errors; None where they are too few."""
-        deviation = Estimate(self.deviation, 0.0, 1, self.degrees) if self.degrees > 0 else None
-        try:
-            return LearningCurve(self.work, self.errors, deviation, self.seeds, self.test)
-        except ValueError:
+        if len(self.runs) < FEWEST_TOTALS:
             return None
+        errors, seeds = [m.error.value for m in self.runs], [m.details["seeds"] for m in self.runs]
+        test = statistics.median(m.details["test_error"] for m in self.runs)
+        return LearningCurve(self.work, errors, self.deviation, seeds, test)
 
     @property
     def overhead(self) -> float:
         """Seconds of a run besides its work, which longer runs need no more of."""
-        return statistics.median(s - w for s, w in zip(self.seconds, self.work, strict=True))
+        return statistics.median(m.seconds.value - w for m, w in zip(self.runs, self.work, strict=True))
 
-    def range_text(self, seconds: float) -> str:
-        """Whether a time lies within those that were measured."""
-        longest = self.seconds[-1]
-        if seconds < 0.95 * self.seconds[0]:
-            return f"extrapolated below the shortest run, {clock(self.seconds[0])}"
-        if seconds <= 1.05 * longest:
-            return f"measured: {len(self.seconds)} runs of {clock(self.seconds[0])} to {clock(longest)}"
-        return f"extrapolated, {seconds / longest:.2g} times the longest run"
+    @property
+    def farthest(self) -> float:
+        """Longest total time that is forecast, in seconds."""
+        return self.overhead + FARTHEST * self.work[-1]
 
-    def error_after(self, seconds: float) -> tuple[Interval, str] | None:
-        """Expected error of a run of a time, and one line; None where the runs are too few, or all longer."""
-        curve = self.curve
-        if curve is None or seconds < 0.95 * self.seconds[0]:
+    def error_after(self, seconds: float) -> Interval | None:
+        """Forecast of the error after a total time; None where runs are too few, or the time is too long."""
+        if self.curve is None or seconds > self.farthest:
             return None
-        error = curve.error_at(max(seconds - self.overhead, min(self.work)))
-        return error, f"{expected_error(seconds, error)} ({self.range_text(seconds)})"
+        return self.curve.error_at(max(seconds - self.overhead, min(self.work)))
 
-    def time_of(self, error: float) -> tuple[Interval, str] | None:
-        """Expected time of an error, and one line; None where the runs are too few."""
+    def times(self) -> list[float]:
+        """Total times to forecast: one at least."""
+        if self.curve is None:
+            return []
+        shortest = _BEYOND * self.runs[-1].seconds.value
+        return [t for t in _TIMES if shortest <= t <= self.farthest] or [self.farthest]
+
+    def time_of(self, error: float) -> str:
+        """Forecast of the time of an error, in one line."""
         curve = self.curve
         if curve is None:
-            return None
+            return f"error {error:g}: runs of {FEWEST_TOTALS} lengths are needed to forecast its time"
         found, least = curve.time_of(error), self.overhead
         time = Interval(found.value + least, found.low + least, found.high + least)
-        text = expected_seconds(error, time, curve.limit, _LIMITS)
-        return time, f"{text} ({self.range_text(time.value)})" if time.suffices else text
+        if self.farthest < time.value < math.inf:
+            return (
+                f"error {error:g}: takes more than {clock(self.farthest)}, which is as far as these runs "
+                "forecast; a longer --time forecasts further"
+            )
+        return expected_seconds(error, time, curve.limit, _LIMITS)
 
 
-def page_answers(evidence: Evidence) -> list[dict[str, Any]]:
-    """Rows of the page: time, expected error, whether it is measured."""
+def answers(evidence: Evidence) -> list[dict[str, Any]]:
+    """What each time gives, measured or forecast: texts for page and console, and numbers for JSON."""
     rows = []
-    for seconds in _TIMES:
-        if (found := evidence.error_after(seconds)) is not None:
-            text = str(found[0]) if found[0].suffices else INSUFFICIENT
-            basis = evidence.range_text(seconds)
-            rows.append({"time": format_duration(seconds), "error": text, "basis": basis, "line": found[1]})
+    for m in evidence.runs:
+        spent = [m.details[f"{part}_seconds"] for part in ("generation", "training", "overhead")]
+        basis = "measured: {:.0f} s generating, {:.0f} s training, {:.0f} s loading".format(*spent)
+        number = {"seconds": m.seconds.value, "unexplained": m.error.as_dict(), "forecast": False}
+        rows.append(_row(clock(m.seconds.value), str(m.error), basis, number))
+    for seconds in evidence.times():
+        found = evidence.error_after(seconds)
+        assert found is not None
+        text = str(found) if found.suffices else INSUFFICIENT
+        basis = f"forecast, {seconds / evidence.runs[-1].seconds.value:.2g} times the longest run"
+        time = format_duration(seconds) if seconds in _TIMES else clock(seconds)
+        number = {"seconds": seconds, "unexplained": found.as_dict(), "forecast": True}
+        rows.append(_row(time, text, basis, number))
     return rows
+
+
+def _row(time: str, error: str, basis: str, number: dict[str, Any]) -> dict[str, Any]:
+    line = f"{time}: unexplained variance {error}   {basis}"
+    return {"time": time, "error": error, "basis": basis, "line": line, **number}

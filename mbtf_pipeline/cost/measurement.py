@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -18,12 +18,15 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.tables import estimate
 
 # Raised when the method of measuring changes: older measurements are then repeated.
-SCHEMA = 9
+SCHEMA = 10
 FOLDER = "measurements"
 # Relative half-width of a 95 % interval that a study aims at, and that half-width over the standard error.
 HALF_WIDTH = 0.1
 NORMAL = 1.96
 ESTIMATES = ("seconds", "error", "bias", "noise")
+# Relative standard deviation of a run over seeds before any run is repeated, and the degrees of freedom that
+# it counts for: studies of four materials found 1.5 to 6 % (docs/results/cost.md).
+PRIOR, PRIOR_DEGREES = 0.05, 4
 
 
 @dataclass(frozen=True)
@@ -91,6 +94,7 @@ class Measurement:
     error : relative RMS error of the generator's values, or unexplained variance of a fit
     bias, noise : the two parts of the generator's error; error² = bias² + noise²
     details : further numbers by name: generation and training seconds, bytes, milliseconds
+    curve : (total seconds, error) of a run that had been stopped there
     """
 
     study: str
@@ -102,6 +106,7 @@ class Measurement:
     bias: Estimate | None = None
     noise: Estimate | None = None
     details: dict[str, float] = field(default_factory=dict)
+    curve: tuple[tuple[float, float], ...] = ()
 
 
 def measure(configuration: Configuration, conditions: Conditions) -> Measurement:
@@ -125,7 +130,10 @@ class MeasurementFolder:
             data = read_json(self._path(of))
             numbers = {name: data[name] and estimate(data[name]) for name in ESTIMATES}
             command = of.command(self.conditions)
-            return Measurement(of.study, of.series, of.name, command, **numbers, details=data["details"])
+            curve = tuple((seconds, error) for seconds, error in data["curve"])
+            return Measurement(
+                of.study, of.series, of.name, command, **numbers, details=data["details"], curve=curve
+            )
         except (InputError, KeyError, TypeError):
             return None
 
@@ -133,38 +141,38 @@ class MeasurementFolder:
         """Store a measurement."""
         self.folder.mkdir(parents=True, exist_ok=True)
         numbers = {name: e and e.as_dict() for name in ESTIMATES for e in (getattr(found, name),)}
-        write_json(self._path(of), {"label": of.label, **numbers, "details": found.details})
+        rest = {"details": found.details, "curve": found.curve}
+        write_json(self._path(of), {"label": of.label, **numbers, **rest})
 
 
-def seed_deviation(groups: Sequence[Sequence[Measurement]]) -> Estimate | None:
-    """Relative standard deviation of the error over seeds, pooled over configurations with their degrees of
-    freedom; each group holds the runs of one configuration. None without any repeat."""
-    squares, dof = 0.0, 0
+def seed_deviation(groups: Iterable[Sequence[Measurement]]) -> Estimate:
+    """Relative standard deviation of the error over seeds, pooled over configurations and the prior with
+    their degrees of freedom; each group holds the runs of one configuration."""
+    squares, degrees = PRIOR_DEGREES * PRIOR**2, PRIOR_DEGREES
     for group in groups:
         errors = [m.error.value for m in group if m.error.value > 0]
         if len(errors) > 1:
             squares += (len(errors) - 1) * statistics.variance(errors) / statistics.fmean(errors) ** 2
-            dof += len(errors) - 1
-    if dof == 0:
-        return None
-    value = math.sqrt(squares / dof)
-    return Estimate(value, value / math.sqrt(2 * dof), dof)
+            degrees += len(errors) - 1
+    value = math.sqrt(squares / degrees)
+    return Estimate(value, value / math.sqrt(2 * degrees), degrees, degrees)
 
 
-def combined(group: Sequence[Measurement], deviation: Estimate | None) -> Measurement:
-    """The runs of one configuration as one measurement: name and command of the first one, means of all."""
+def combined(group: Sequence[Measurement], deviation: Estimate) -> Measurement:
+    """The runs of one configuration as one measurement: name, command and curve of the first one, means of
+    all. The error of the test set is common to all runs, and does not become less by repeats."""
     error = statistics.fmean(m.error.value for m in group)
-    spread = 0.0 if deviation is None else deviation.value * error
-    test = math.sqrt(statistics.fmean(m.error.error**2 for m in group))
+    spread = deviation.value * error / math.sqrt(len(group))
+    test = statistics.fmean(m.error.error for m in group)
     details = {k: statistics.fmean(m.details[k] for m in group) for k in group[0].details}
     return replace(
         group[0],
         seconds=mean_estimate([m.seconds.value for m in group]),
-        error=Estimate(error, max(spread, test) / math.sqrt(len(group)), group[0].error.n),
+        error=Estimate(error, math.hypot(spread, test), group[0].error.n),
         details={
             **details,
             "seeds": float(len(group)),
-            "test_error": test / error / math.sqrt(len(group)) if error > 0 else math.inf,
+            "test_error": test / error if error > 0 else math.inf,
         },
     )
 

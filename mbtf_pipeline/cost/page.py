@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Callable, Sequence
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mbtf_core.files.editable import write_document
 from mbtf_core.units import clock
-from mbtf_pipeline.cost.answers import page_answers
+from mbtf_pipeline.cost.answers import Evidence, answers
 from mbtf_pipeline.cost.measurement import Measurement, pareto_front
 from mbtf_pipeline.cost.study import Study, rounded
 from mbtf_pipeline.report.plots import Series, plot
@@ -31,27 +34,28 @@ def _detail(title: str, name: str, **options: Any) -> Column:
     return Column(title, name, lambda m: m.details.get(name), **options)
 
 
-_TITLE = Column("configuration", "", lambda m: ", ".join(filter(None, (m.series, m.name))))
 _COMMAND = _field("command", "command")
 _PARTS = [_field(f"{name}, %", name, factor=100.0) for name in ("bias", "noise", "error")]
 _SECONDS = _field("seconds per million queries", "seconds")
-_DETAILS = [
+_SPENT = [
     _detail("total, s", "total_seconds", digits=".1f"),
     _detail("generating, s", "generation_seconds", digits=".1f"),
     _detail("training, s", "training_seconds", digits=".1f"),
     _detail("steps", "training_steps", digits=".0f"),
-    _detail("loading, s", "overhead_seconds", digits=".1f"),
-    _detail("evaluating, s", "evaluating_seconds", digits=".1f"),
+]
+_SIZES = [
     _detail("million queries", "queries", factor=1e-6, digits=".2f"),
     _detail("paths each", "spp", digits="g"),
     _detail("1080p, ms", "evaluation_ms_1080p", digits=".0f"),
     _detail("MB", "bytes", factor=1e-6, digits=".2f"),
     _detail("seeds", "seeds", digits="g"),
 ]
+_REST = [_detail("", name) for name in ("overhead_seconds", "evaluating_seconds")]
+_TITLE = Column("configuration", "", lambda m: ", ".join(filter(None, (m.series, m.name))))
 _GENERATOR = [_TITLE, _SECONDS, *_PARTS, _COMMAND]
-_RUNS = [_TITLE, _field("unexplained variance", "error"), *_DETAILS, _COMMAND]
+_RUNS = [*_SPENT[:1], _field("unexplained variance", "error"), *_SPENT[1:], *_SIZES, _COMMAND]
 _NAMES = [_field("", name) for name in ("study", "series", "name")]
-_CSV = [*_NAMES, _SECONDS, *reversed(_PARTS), *_DETAILS, _COMMAND]
+_CSV = [*_NAMES, _SECONDS, *reversed(_PARTS), *_SPENT, *_REST, *_SIZES, _COMMAND]
 
 
 def _table(columns: Sequence[Column], found: Sequence[Measurement]) -> Table:
@@ -85,23 +89,29 @@ def _figure(
     if not shown:
         return {"svg": "", "caption": f"No {y} could be measured."}
     if max(len(one.x) for one in shown) < 2:
-        return {"svg": "", "caption": caption or "One measurement; a longer --time takes more."}
+        return {"svg": "", "caption": ""}
     return {"svg": plot(shown, x, y, f"cost {png.stem}", png=png, **options), "caption": caption}
 
 
-def _front_section(runs: Sequence[Measurement], png: Path) -> dict[str, Any]:
-    """All runs and their Pareto front, whose points have names."""
+def _front_section(runs: Sequence[Measurement], evidence: Evidence, png: Path) -> dict[str, Any]:
+    """All runs and their Pareto front, the longest one while it trained, and the forecast."""
     front = pareto_front(runs)
 
     def name(m: Measurement) -> str:
-        return f"{m.details['queries'] / 1e6:.2g} M × {m.details['spp']:g}" if m in front else ""
+        return f"{m.error.value:.2g} in {m.seconds.value:.0f} s" if m in front else ""
 
     axes = "seconds in total, from height map to material", "unexplained variance of test queries"
-    caption = "Names on the front: training queries × paths per query."
-    stepped = [(m.seconds.value, m.error.value) for m in front]
+    caption = "Names on the front: error and total time."
     series = [_series("complete runs", runs, label=name, style="points")]
-    if len(front) < 2:
-        caption, stepped = "One run alone is no front: give the study a longer --time.", []
+    if front and len(stops := front[-1].curve) > 0:
+        x, y = zip(*stops, (front[-1].seconds.value, front[-1].error.value), strict=True)
+        series.append(Series("the longest of them, if stopped early", x, y))
+    if evidence.curve is not None:
+        x = np.geomspace(evidence.runs[-1].seconds.value, evidence.farthest, 12).tolist()
+        found = [one for seconds in x if (one := evidence.error_after(seconds)) is not None]
+        bounds = [one.value - one.low for one in found], [one.high - one.value for one in found]
+        series.append(Series("forecast, 95 % interval", x, [one.value for one in found], bounds))
+    stepped = [(m.seconds.value, m.error.value) for m in front] if len(front) > 1 else []
     return {
         "figure": _figure(series, *axes, png, caption, front=stepped),
         "table": _table(_RUNS, front).for_page(),
@@ -134,25 +144,25 @@ def _generator_section(found: Sequence[Measurement], png: Path) -> dict[str, Any
 def write_page(study: Study) -> Path:
     """Write CSV, page and plots into the study's folder; returns the path of the page."""
     write_document(study.folder / CSV_NAME, to_csv(study.measurements))
-    sections = {}
+    sections, evidence = {}, study.evidence
     for kind in ("run", *_COMPARISONS):
         found = [m for m in study.measurements if m.study == kind]
         if found and kind == "run":
-            sections["front"] = _front_section(found, study.folder / "front.png")
-        elif found:
+            sections["front"] = _front_section(found, evidence, study.folder / "front.png")
+        elif len(found) > 1:
             sections[kind] = _generator_section(found, study.folder / f"{kind}.png")
     html = render(
         "cost.html",
         study=study.description,
         time=clock(study.description["time"]),
         sections=sections,
-        answers=page_answers(study.evidence),
+        answers=answers(evidence),
         asked=study.asked,
         least=None if study.least is None else rounded(study.least),
         skipped=study.skipped,
         failed=study.failed,
-        deviation=None if study.deviation is None else f"{study.deviation.scaled(100.0)} %",
-        seeds=round(max((m.details.get("seeds", 0.0) for m in study.measurements), default=0.0)),
+        deviation=f"{study.deviation.scaled(100.0)} %",
+        test=statistics.median([100 * m.details["test_error"] for m in evidence.runs] or [0.0]),
     )
     write_document(study.folder / PAGE_NAME, html)
     return study.folder / PAGE_NAME

@@ -1,13 +1,15 @@
 """One run of the whole chain: training data of a size, a fit of a length, and its error on a test set.
 
-All runs of a seed are evaluated on the same test set, which no fit is trained on: many queries of few paths.
+All runs are evaluated on the same test set, which no fit is trained on: many queries of few paths.
 With halves a, b of its values and a prediction p, ``E[(p - a)(p - b)]`` is the squared error of p,
 free of the noise of the test values. Its error bar depends on the number of queries more than on that of
-paths. Data and fits come from the generator and the fitter, called as the programs call them.
+paths. Data and fits come from the generator and the fitter, called as the programs call them. While a run
+trains, the test set also gives the errors that it would have if it were stopped.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import socket
@@ -17,6 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,11 +39,13 @@ from mbtf_pipeline.run_time import round_down
 
 if TYPE_CHECKING:
     from mbtf_fit.data.queries import ShardQueries
+    from mbtf_fit.material.material import Material
+    from mbtf_fit.training.trainer import Trainer
 
-# Seeds that every run gets, and at most.
-FEWEST_SEEDS, MOST_SEEDS = 2, 12
-# Shares of a study's time that the generator and the runs get, of two seeds each. The rest is left for
-# start-up, the test set and evaluation.
+# Most seeds of a run.
+MOST_SEEDS = 12
+# Shares of a study's time that the generator and the runs get. The rest is left for start-up, the test set,
+# loading and evaluation.
 GENERATOR, RUNS = 0.1, 0.7
 # Total times of runs, seconds: this one, twice, four times, ...; the share of each that generates.
 SHORTEST = 8.0
@@ -48,7 +53,7 @@ SHARE, OTHER_SHARES = 0.35, (0.6, 0.15)
 _FEWEST_QUERIES = 20_000
 # Fewest total times that tell how the error falls, and the study's seconds in which they are measured.
 FEWEST_TOTALS = 3
-LEAST_SECONDS = FEWEST_SEEDS * SHORTEST * (2**FEWEST_TOTALS - 1) / RUNS
+LEAST_SECONDS = SHORTEST * (2**FEWEST_TOTALS - 1 + 2 ** (FEWEST_TOTALS - 1) - 1) / RUNS
 # Test queries, and paths of each.
 TEST = (1 << 20, 8)
 # The smallest split that the generator takes.
@@ -57,6 +62,8 @@ _NO_QUERIES = (1, 2)
 PIXELS = 1920 * 1080
 _TIMED_QUERIES = 1 << 18
 _TIMED = 5
+# First training time after which the error of a run that is stopped is measured, and the factor to the next.
+_STOP, _NEXT_STOP = 2.0, 2.0**0.5
 
 
 @dataclass(frozen=True)
@@ -107,23 +114,25 @@ class Run(Configuration):
         """
         from mbtf_fit import FitConfig, fit
 
-        test = test_set(conditions, self.seed)
+        test = test_set(conditions)
         start = time.perf_counter()
         shards, generation_seconds = _generated(conditions, self.seed, (self.queries, self.spp), _NO_QUERIES)
         options = nested({"seed": conditions.config.seed + self.seed, **self.fit})
         out = _own_folder(conditions) / f"fit-{data_sha256(self.key)[:12]}"
         shutil.rmtree(out, ignore_errors=True)
-        result = fit(FitConfig.model_validate(options), shards, out)
-        halves = test.value_a, test.value_b
-        error = unexplained_variance(result.material.predict(test), *halves, test.weight)
-        seconds = generation_seconds + result.total_seconds
+        stops = _Stops(test)
+        result = fit(FitConfig.model_validate(options), shards, out, observe=stops)
+        error = _error(result.material, test)
+        # Of a fit without the evaluations here.
+        fit_seconds = result.total_seconds - stops.spent
+        seconds = generation_seconds + fit_seconds
         details = {
             "queries": float(self.queries),
             "spp": float(self.spp),
             "generation_seconds": generation_seconds,
             "training_seconds": result.seconds,
             "training_steps": float(result.history[-1]["step"]),
-            "overhead_seconds": result.total_seconds - result.seconds,
+            "overhead_seconds": fit_seconds - result.seconds,
             "total_seconds": seconds,
             "evaluation_ms_1080p": 1e3 * _evaluation_seconds(result.material, test),
             "bytes": float(sum(p.stat().st_size for p in out.glob("weights*"))),
@@ -135,47 +144,72 @@ class Run(Configuration):
         details["evaluating_seconds"] = details["run_seconds"] - seconds
         took = Estimate(seconds, 0.0, 1)
         command = self.command(conditions)
-        return Measurement(self.study, self.series, self.name, command, took, error, details=details)
+        early = seconds - result.seconds
+        curve = tuple((early + trained, value) for trained, value in stops.found if math.isfinite(value))
+        return Measurement(
+            self.study, self.series, self.name, command, took, error, details=details, curve=curve
+        )
+
+
+class _Stops:
+    """Observes a fit: (training seconds, error) at times that grow by a factor, and the seconds it took."""
+
+    def __init__(self, test: ShardQueries) -> None:
+        self.test, self.next, self.spent = test, _STOP, 0.0
+        self.found: list[tuple[float, float]] = []
+
+    def __call__(self, record: dict[str, Any], trainer: Trainer, subset: ShardQueries) -> None:
+        if self.next <= record["seconds"] and record["fraction"] < 1.0:
+            start = time.perf_counter()
+            self.found.append((record["seconds"], _error(trainer, self.test).value))
+            self.next = record["seconds"] * _NEXT_STOP
+            self.spent += time.perf_counter() - start
+
+
+def _error(fitted: Material | Trainer, test: ShardQueries) -> Estimate:
+    """Unexplained variance of a material, or of a fit in training."""
+    return unexplained_variance(fitted.predict(test), test.value_a, test.value_b, test.weight)
 
 
 def planned_runs(seconds: float, spp: int, path_seconds: float) -> list[Run]:
-    """All runs of a study of some seconds, in the order of measuring, each with the study's own seed and
-    `spp` paths per query of `path_seconds` each.
+    """All runs of a study of some seconds, in the order of measuring, with `spp` paths per query of
+    `path_seconds` each.
 
-    Total times double; the time that is then left goes to other shares of generating, shortest first.
+    Total times double: first each of them, then a second seed of all but the longest. The time that is then
+    left goes to other shares of generating, shortest first, and to further second seeds.
     """
-    seconds *= RUNS / FEWEST_SEEDS
+    left = seconds * RUNS
     totals = [SHORTEST]
-    while sum(totals) + 2 * totals[-1] <= seconds:
+    while 2 * sum(totals) + 2 * totals[-1] <= left:
         totals.append(2 * totals[-1])
-    left = seconds - sum(totals)
-    planned = [(total, SHARE) for total in totals]
-    for total, share in product(totals, OTHER_SHARES):
-        if total <= left:
-            planned.append((total, share))
-            left -= total
-    runs = []
-    for total, share in planned:
+    others = list(product(OTHER_SHARES, (0, 1)))
+    order = [(total, SHARE, 0) for total in totals] + [(total, SHARE, 1) for total in totals]
+    order += [(total, share, seed) for total in totals for share, seed in sorted(others, key=itemgetter(1))]
+    runs: list[Run] = []
+    for total, share, seed in order:
+        if runs and total > left:
+            continue
+        left -= total
         queries = round_down(max(_FEWEST_QUERIES, share * total / (spp * path_seconds)))
         training = (1 - share) * total
         fit = {"model": DEFAULT_MODEL, **best_options(training), "training.time": f"{training:.3g}s"}
         series = f"{100 * share:.0f} % of the time for generating"
-        runs.append(Run("run", series, f"planned for {total:g} s", queries, spp, fit))
+        runs.append(Run("run", series, f"planned for {total:g} s", queries, spp, fit, seed))
     return runs
 
 
 def disk_bytes(runs: Sequence[Run]) -> int:
-    """Disk space that runs take at most: the test set, and data of one seed."""
+    """Disk space that runs take at most: the test set, and the data of one run."""
     return (TEST[0] + max((run.queries for run in runs), default=0)) * row_bytes(holes=True)
 
 
-@lru_cache(maxsize=FEWEST_SEEDS)
-def test_set(conditions: Conditions, seed: int) -> ShardQueries:
-    """The test queries of all runs with an offset of the seed; this process keeps those of two seeds."""
+@lru_cache(maxsize=1)
+def test_set(conditions: Conditions) -> ShardQueries:
+    """The test queries of all runs, which this process keeps."""
     from mbtf_core.data.dataset import Dataset
     from mbtf_fit.data.loader import load_split
 
-    folder, _ = _generated(conditions, seed, _NO_QUERIES, TEST)
+    folder, _ = _generated(conditions, 0, _NO_QUERIES, TEST)
     found = load_split(Dataset.open(folder), "test")
     shutil.rmtree(folder, ignore_errors=True)
     return found

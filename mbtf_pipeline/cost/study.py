@@ -28,8 +28,9 @@ from mbtf_core.run.task import Item, worker_threads
 from mbtf_core.stats import Estimate
 from mbtf_core.units import clock, expectation, format_duration
 from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.forecast import forecast
 from mbtf_gen.job import Job
-from mbtf_pipeline.cost.answers import Evidence
+from mbtf_pipeline.cost.answers import FARTHEST, Evidence
 from mbtf_pipeline.cost.generator import benchmark_of, generator_configurations, path_seconds
 from mbtf_pipeline.cost.measurement import (
     HALF_WIDTH,
@@ -43,7 +44,6 @@ from mbtf_pipeline.cost.measurement import (
     seed_deviation,
 )
 from mbtf_pipeline.cost.runs import (
-    FEWEST_SEEDS,
     FEWEST_TOTALS,
     GENERATOR,
     LEAST_SECONDS,
@@ -63,7 +63,11 @@ WORK = ".work"
 # About as many configurations of the generator share its time.
 _CONFIGURATIONS = 35
 # Seconds by which a run exceeds generating and training, until one has been measured.
-_OVERHEAD = 2.0
+_OVERHEAD = 5.0
+# Paths of the reference and of the generator's rate, which come before runs.
+_SETUP_PATHS = 6_000_000
+# Studies so many times the least one have time for most comparisons of the generator.
+_COMPARISONS = 4.0
 _RESUMES = "the same command resumes"
 
 
@@ -76,12 +80,12 @@ class Study:
     description: dict[str, Any]
     # One per configuration.
     measurements: list[Measurement] = field(default_factory=list)
-    # Relative standard deviation of runs over seeds, part of their error bars; None without repeats.
-    deviation: Estimate | None = None
+    # Relative standard deviation of runs over seeds, part of their error bars.
+    deviation: Estimate = field(default_factory=lambda: seed_deviation([]))
     # Configurations for which no time was left, and runs that failed, with the reason.
     skipped: list[str] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
-    # Answer to the error that was asked for, and seconds of a study that can answer; None where this one can.
+    # Forecast of the error that was asked for; seconds of a study that forecasts, None where this one does.
     asked: str = ""
     least: float | None = None
 
@@ -116,10 +120,10 @@ def rounded(seconds: float) -> str:
 
 
 def too_short(seconds: float, least: float) -> str:
-    """Warning of a study that is too short to answer questions."""
+    """Warning of a study that is too short for forecasts."""
     return (
-        f"warning: --time {format_duration(seconds)} is too short to tell how the error falls: complete runs "
-        f"of {FEWEST_TOTALS} lengths with two seeds take about {rounded(least)} on this machine"
+        f"warning: --time {format_duration(seconds)} measures errors, but is too short to forecast others: "
+        f"complete runs of {FEWEST_TOTALS} lengths take about {rounded(least)} on this machine"
     )
 
 
@@ -152,8 +156,8 @@ class Measurements:
     path_seconds: float = 0.0
     # Taken, but not measured yet.
     _pending: dict[str, Configuration] = field(default_factory=dict)
-    # Seeds with a test set, and most seconds of a run besides test set, generating and training.
-    _seeds: set[int] = field(default_factory=set)
+    # Whether a run has made the test set, and most seconds of a run besides it, generating and training.
+    tested: bool = False
     _overhead: float = _OVERHEAD
 
     def recall(self, configuration: Configuration) -> bool:
@@ -199,22 +203,23 @@ class Measurements:
             self.note(f"{done.name}: done")
             self.store.put(configuration, done.value)
             if isinstance(configuration, Run):
-                self._seeds.add(configuration.seed)
+                self.tested = True
                 planned = configuration.planned_seconds(self.path_seconds)
                 self._overhead = max(self._overhead, done.value.details["run_seconds"] - planned)
 
     def expected_seconds(self, run: Run) -> float:
-        """Expected seconds of measuring a run, the first one of a seed with its test set."""
-        test = 0.0 if run.seed in self._seeds else TEST[0] * TEST[1] * self.path_seconds
+        """Expected seconds of measuring a run, the first one with the test set."""
+        test = 0.0 if self.tested else TEST[0] * TEST[1] * self.path_seconds
         return run.planned_seconds(self.path_seconds) + test + self._overhead
 
-    def least_seconds(self, spp: int) -> float | None:
-        """Seconds of a study that measures all runs that tell how the error falls, by what runs have taken on
-        this machine; None where they are measured."""
+    def least_seconds(self, spp: int, before: float) -> float | None:
+        """Seconds of a study that measures runs of enough lengths for a forecast, by what runs have taken on
+        this machine, after `before` seconds without runs; None where they are measured."""
         needed = planned_runs(LEAST_SECONDS, spp, self.path_seconds)[:FEWEST_TOTALS]
-        seeds = [replace(run, seed=seed) for run in needed for seed in range(FEWEST_SEEDS)]
-        missing = [self.expected_seconds(run) for run in seeds if not self.recall(run)]
-        return max(LEAST_SECONDS, sum(missing) / (1.0 - 1.2 * GENERATOR)) if missing else None
+        missing = [run for run in needed if not self.recall(run)]
+        test = sum(self.expected_seconds(run) for run in missing[:1])
+        rest = sum(run.planned_seconds(self.path_seconds) + self._overhead for run in missing[1:])
+        return max(LEAST_SECONDS, before + test + rest) if missing else None
 
     def fits(self, run: Run, seconds: float) -> bool:
         """Whether the workers can begin and finish a run in a time, besides those that they have taken."""
@@ -226,28 +231,115 @@ class Measurements:
         labels = (replace(run, seed=seed).label for seed in range(MOST_SEEDS))
         return [self.found[label] for label in takewhile(self.found.__contains__, labels)]
 
-    def measure_runs(self, runs: Sequence[Run], fits: Callable[[Run], bool], seeds: int) -> None:
-        """Measure every run with two seeds before the next one, then runs whose 95 % interval is too wide
-        with further seeds, up to `seeds`, while they fit into the remaining time."""
+    def measure_runs(self, runs: Sequence[Run], fits: Callable[[Run], bool], seeds: int = 0) -> None:
+        """Measure runs in their order, then, up to so many seeds, further seeds of those whose error bar over
+        seeds is too wide, while they fit into the remaining time."""
 
-        def missing(order: Iterable[Run], deviation: Estimate | None) -> Iterator[Run]:
+        def missing(order: Iterable[Run], wanted: Callable[[Run], bool]) -> Iterator[Run]:
             for run in order:
-                before = replace(run, seed=max(0, run.seed - 1)).label
-                begun = run.seed == 0 or before in self.found or before in self._pending
-                if not begun or run.label in self.failed or self.recall(run):
-                    continue
-                own = self.group(run)
-                few = run.seed < FEWEST_SEEDS
-                if not few and len(own) == run.seed < seeds:
-                    few = NORMAL * combined(own, deviation).error.relative_error > HALF_WIDTH
-                if few and fits(run):
+                failed = {run.label, replace(run, seed=0).label} & self.failed.keys()
+                if not failed and not self.recall(run) and wanted(run) and fits(run):
                     yield run
 
-        rounds = [[replace(run, seed=seed) for run in runs for seed in range(FEWEST_SEEDS)]]
-        rounds += [[replace(run, seed=seed) for run in runs] for seed in range(1, MOST_SEEDS)]
-        for order in rounds:
-            deviation = seed_deviation([self.group(run) for run in runs])
-            self.measure(missing(order, deviation), independent=True)
+        self.measure(missing(runs, lambda run: True), independent=True)
+        first = [run for run in runs if run.seed == 0]
+        for seed in range(1, MOST_SEEDS):
+            deviation = seed_deviation(self.group(run) for run in first)
+
+            def wide(run: Run, deviation: float = deviation.value) -> bool:
+                own = len(self.group(run))
+                return own == run.seed < seeds and NORMAL * deviation / math.sqrt(own) > HALF_WIDTH
+
+            self.measure(missing([replace(run, seed=seed) for run in first], wide), independent=True)
+
+
+@dataclass(frozen=True)
+class StudyPlan:
+    """What a study would measure.
+
+    Attributes
+    ----------
+    runs : labels of the runs that its time suffices for and that are not measured yet
+    measured : runs that are
+    seconds, bytes : that it takes, and on disk
+    longest : total seconds of the longest run
+    least : seconds of a study that forecasts
+    generator : whether it compares configurations of the generator
+    """
+
+    runs: list[str]
+    measured: int
+    seconds: float
+    bytes: int
+    longest: float
+    least: float
+    generator: bool
+
+    def describe(self, asked: float) -> str:
+        """Lines: what it measures, and what it can and cannot answer in the time that is asked for."""
+        known = f"; {self.measured} measured already" if self.measured else ""
+        lines = [f"{expectation(self.seconds, self.bytes)}; complete runs{known}:"]
+        lines += [f"  {label}" for label in self.runs]
+        lines.append(f"answers: the error after times of up to about {clock(self.longest)}, measured")
+        if asked >= self.least:
+            far = clock(FARTHEST * self.longest)
+            lines.append(
+                f"answers: a forecast for up to {FARTHEST:g} times as long, {far}, with its 95 % interval"
+            )
+        else:
+            lines.append(f"cannot forecast errors of longer times: that takes --time {rounded(self.least)}")
+        if not self.generator:
+            lines.append(
+                "cannot tell what effects, mesh and number of paths cost: that takes "
+                f"--time {rounded(_COMPARISONS * LEAST_SECONDS)}"
+            )
+        return "\n".join(lines)
+
+
+def _generator_seconds(seconds: float) -> float:
+    """Time for comparisons of the generator: a share of what a study has beyond the least that forecasts."""
+    return GENERATOR * max(0.0, seconds - LEAST_SECONDS)
+
+
+def _conditions(job: Job, folder: Path, seconds: float) -> Conditions:
+    config = job.config
+    return Conditions(
+        config.model_dump_json(),
+        config.hash(job.material.digests),
+        folder / WORK,
+        0.5 * GENERATOR * seconds / _CONFIGURATIONS,
+        shlex.join(["mbtf-gen", config.material, "--config", str(folder / CONFIG_NAME)]),
+    )
+
+
+def plan_study(recipe: Recipe, folder: Path, *, seconds: float, seed: int | None = None) -> StudyPlan:
+    """What :func:`run_study` would measure, by a pilot of the generator on this machine; nothing is written.
+
+    Raises
+    ------
+    InputError
+        The folder holds something else.
+    """
+    STUDY.check(folder)
+    job = Job.prepare(study_config(recipe.generate, seed))
+    spp, pilot = job.config.queries.spp, forecast(job, seconds=1.0)
+    conditions = _conditions(job, folder, seconds)
+    found = Measurements(conditions, MeasurementFolder(folder, conditions), Runner())
+    found.path_seconds = pilot.query_seconds / spp
+    before = 2.0 * pilot.start + _SETUP_PATHS * found.path_seconds + _generator_seconds(seconds)
+    planned = planned_runs(seconds, spp, found.path_seconds)
+    least = found.least_seconds(spp, before) or LEAST_SECONDS
+    spent, runs, measured = before, [], 0
+    for run in planned:
+        if found.recall(run):
+            measured += 1
+        elif spent + (expected := found.expected_seconds(run)) <= seconds:
+            spent, found.tested = spent + expected, True
+            runs.append(run)
+    longest = max((run.planned_seconds(found.path_seconds) for run in runs), default=0.0) + _OVERHEAD
+    labels = [f"{run.label}: {run.queries:,} queries × {spp} paths" for run in runs]
+    generator = seconds >= _COMPARISONS * LEAST_SECONDS
+    return StudyPlan(labels, measured, spent, disk_bytes(runs), longest, least, generator)
 
 
 def run_study(
@@ -310,13 +402,7 @@ def run_study(
         if there.error:
             raise PartialError(f"no worker answers: {there.error}", hint=there.hint or _RESUMES)
         claim(folder, there.value)
-        conditions = Conditions(
-            config.model_dump_json(),
-            config.hash(job.material.digests),
-            folder / WORK,
-            0.5 * GENERATOR * seconds / _CONFIGURATIONS,
-            shlex.join(["mbtf-gen", config.material, "--config", str(folder / CONFIG_NAME)]),
-        )
+        conditions = _conditions(job, folder, seconds)
         benchmark = benchmark_of(conditions)
         note("reference")
         # Before anything is written: a refused study leaves the folder as it was.
@@ -335,7 +421,7 @@ def run_study(
         measurements = Measurements(conditions, MeasurementFolder(folder, conditions), runner, note)
         configurations = list(generator_configurations(benchmark))
         # Configurations take longer than their share where kernels are compiled; workers start anew.
-        until = 1.2 * GENERATOR * seconds + (0.0 if runner.here else spent())
+        until = 1.2 * _generator_seconds(seconds) + (0.0 if runner.here else spent())
 
         def missing() -> Iterator[Configuration]:
             for number, configuration in enumerate(configurations):
@@ -350,20 +436,22 @@ def run_study(
             size = disk_bytes(runs) * runner.workers
             check_space(folder, size, "give a shorter --time, or choose another folder with -o")
             announce(expectation(seconds + refine, size))
-            least = measurements.least_seconds(config.queries.spp)
+            before = spent()
+            least = measurements.least_seconds(config.queries.spp, before)
             if least is not None and seconds < least:
                 announce(too_short(seconds, least))
             measurements.measure_runs(
                 runs,
                 lambda run: measurements.fits(run, seconds + (refine if run.seed else 0.0) - spent()),
-                MOST_SEEDS if refine else FEWEST_SEEDS,
+                MOST_SEEDS if refine else 0,
             )
         finally:
             shutil.rmtree(conditions.folder, ignore_errors=True)
             for kept in (benchmark_of, test_set):
                 kept.cache_clear()
     progress(1.0, "finished")
-    groups = [measurements.group(run) for run in runs]
+    first = [run for run in runs if run.seed == 0]
+    groups = [measurements.group(run) for run in first]
     deviation = seed_deviation(groups)
     known, failed = measurements.found, measurements.failed
     return Study(
@@ -371,7 +459,7 @@ def run_study(
         description,
         measured + [combined(group, deviation) for group in groups if group],
         deviation,
-        [c.label for c in (*configurations, *runs) if c.label not in known and c.label not in failed],
+        [c.label for c in (*configurations, *first) if c.label not in known and c.label not in failed],
         [f"{label}: {why}" for label, why in failed.items()],
-        least=measurements.least_seconds(config.queries.spp),
+        least=measurements.least_seconds(config.queries.spp, before),
     )

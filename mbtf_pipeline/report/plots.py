@@ -44,7 +44,8 @@ class Series:
 
     Attributes
     ----------
-    x, y : (n,); x_error, y_error : their standard errors, (n,) or none; those not finite are not drawn
+    x, y : (n,); x_error, y_error : their standard errors, (n,), those of y also (2, n), below and above, or
+        none; those not finite are not drawn
     labels : (n,), one per point, or none
     style : a line with a band, points, or points joined by a line; hollow : whether markers are hollow
     """
@@ -52,7 +53,7 @@ class Series:
     name: str
     x: Sequence[float]
     y: Sequence[float]
-    y_error: Sequence[float] | None = None
+    y_error: Sequence[float] | Sequence[Sequence[float]] | None = None
     x_error: Sequence[float] | None = None
     labels: Sequence[str] = ()
     style: Literal["line", "points", "joined"] = "line"
@@ -156,8 +157,8 @@ def _draw(axes: Any, index: int, one: Series, low: float, high: float) -> tuple[
     if one.style == "line":
         (mark,) = axes.plot(x, y, color=color, linewidth=1.7)
         if one.y_error is not None:
-            error = np.asarray(one.y_error, float)
-            below, above = (np.clip(exact + side, low, high) for side in (-error, error))
+            lower, upper = np.broadcast_to(np.asarray(one.y_error, float), (2, len(y)))
+            below, above = (np.clip(exact + side, low, high) for side in (-lower, upper))
             axes.fill_between(x, below, above, color=color, alpha=0.18, linewidth=0)
         return mark, one.name
     x_error, y_error = (
@@ -192,7 +193,7 @@ def _plain_ticks(axis: Any) -> None:
     low, high = axis.get_view_interval()
     decades = float(np.log10(high / low)) if 0 < low < high else 9.0
     dense = np.arange(1.0, 10.0, 0.5)
-    densities = ((0.35, dense), (0.6, (1, 1.5, 2, 3, 4, 5, 7)), (2.2, (1, 2, 5)), (np.inf, (1,)))
+    densities = ((0.35, dense), (1.0, (1, 1.5, 2, 3, 4, 5, 7)), (2.2, (1, 2, 5)), (np.inf, (1,)))
     subs = next(subs for most, subs in densities if decades < most)
     axis.set_major_locator(LogLocator(base=10, subs=subs))
     axis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))

@@ -8,16 +8,18 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from support.paths import ROOT
 
 from mbtf_core.app.console import run
 from mbtf_core.stats import Estimate
+from mbtf_core.units import clock
 from mbtf_pipeline.cli.app import app
 from mbtf_pipeline.cost import forecast as module
-from mbtf_pipeline.cost.answers import Evidence, page_answers
+from mbtf_pipeline.cost.answers import Evidence, answers
 from mbtf_pipeline.cost.forecast import forecast_errors, has_error
-from mbtf_pipeline.cost.measurement import Measurement
+from mbtf_pipeline.cost.measurement import Measurement, combined, seed_deviation
 from mbtf_pipeline.cost.runs import LEAST_SECONDS, planned_runs
 from mbtf_pipeline.cost.study import too_short
 from mbtf_pipeline.recipe import Recipe, load_recipe
@@ -36,57 +38,84 @@ def law(seconds: float) -> float:
 
 def times_of(seconds: float) -> dict[str, float]:
     work = seconds - OVERHEAD
-    return {"generation_seconds": 0.35 * work, "training_seconds": 0.65 * work}
+    return {
+        "generation_seconds": 0.35 * work, "training_seconds": 0.65 * work, "overhead_seconds": OVERHEAD
+    }  # fmt: skip
 
 
-def evidence() -> Evidence:
+def evidence(times: tuple[float, ...] = SECONDS) -> Evidence:
     found = [
         Measurement(
             "run", series, f"{s:g}", "command", Estimate(s, 0.0, 1),
             Estimate(law(s) * factor, 0.001, 9),
             details={"seeds": 2.0, "test_error": 0.02, **times_of(s)},
         )
-        for series, factor, times in (("35 %", 1.0, SECONDS), ("60 %", 2.0, SECONDS[:2]))
-        for s in times
+        for series, factor, shown in (("35 %", 1.0, times), ("60 %", 2.0, times[:2]))
+        for s in shown
     ]  # fmt: skip
     return Evidence.of(found, Estimate(0.03, 0.01, 6, 6))
 
 
-def test_a_study_answers_times_and_errors() -> None:
+def test_a_study_forecasts_times_and_errors() -> None:
     """By the law that its runs follow; runs of other shares, twice as bad here, do not count."""
     found = evidence()
-    assert found.seconds == SECONDS
-    for seconds, basis in ((60.0, "measured: 6 runs of 0:10 to 5:20"), (900.0, "2.8 times the longest run")):
-        answer = found.error_after(seconds)
-        assert answer is not None
-        assert answer[0].low < law(seconds) < answer[0].high < 1.5 * answer[0].low
-        assert basis in answer[1]
-    time = found.time_of(law(200.0))
-    assert time is not None
-    assert time[0].low < 200.0 < time[0].high
-    assert time[1].startswith(f"error {law(200.0):g}: about ")
-    never = found.time_of(0.01)
-    assert never is not None
-    assert "not reachable with this network, however many queries" in never[1]
-    assert [row["time"] for row in page_answers(found)] == ["1min", "5min", "15min", "1h"]
-    # Shorter than all runs, or too few of them: no answer.
-    assert found.error_after(5.0) is None
-    few = replace(
-        found, seconds=SECONDS[:2], errors=found.errors[:2], seeds=found.seeds[:2], work=found.work[:2]
+    assert [m.seconds.value for m in found.runs] == list(SECONDS)
+    for seconds in (60.0, 900.0):
+        error = found.error_after(seconds)
+        assert error is not None
+        assert error.low < law(seconds) < error.high < 1.5 * error.low
+    assert found.time_of(law(200.0)).startswith(f"error {law(200.0):g}: about ")
+    assert "not reachable with this network, however many queries" in found.time_of(0.01)
+    # The work of the longest run takes 313 s.
+    assert "takes more than 20:59, which is as far as" in found.time_of(law(1900.0))
+    assert found.error_after(1300.0) is None
+
+
+def test_answers_are_measured_or_forecast_for_up_to_four_times_as_long() -> None:
+    rows = answers(evidence())
+    assert [row["time"] for row in rows if not row["forecast"]] == [clock(s) for s in SECONDS]
+    assert rows[0]["line"] == (
+        f"0:10: unexplained variance {law(10.0):.4f} ± 0.0010   "
+        "measured: 1 s generating, 2 s training, 7 s loading"
     )
-    assert few.error_after(60.0) is None
-    assert few.time_of(0.1) is None
-    assert page_answers(Evidence.of([], None)) == []
+    assert [(row["time"], row["basis"]) for row in rows if row["forecast"]] == [
+        ("10min", "forecast, 1.9 times the longest run"), ("20min", "forecast, 3.8 times the longest run")
+    ]  # fmt: skip
+    assert rows[-1]["unexplained"]["low"] < law(1200.0) < rows[-1]["unexplained"]["high"]
+    # Three lengths forecast, two do not; what is measured is an answer all the same.
+    assert [row["time"] for row in answers(evidence(SECONDS[:3]))] == ["0:10", "0:20", "0:40", "1min", "2min"]
+    few = evidence(SECONDS[:2])
+    assert [row["time"] for row in answers(few)] == ["0:10", "0:20"]
+    assert "runs of 3 lengths are needed" in few.time_of(0.1)
+    assert answers(Evidence.of([], few.deviation)) == []
+
+
+def test_forecasts_of_short_studies_contain_the_truth() -> None:
+    """Studies of two minutes, whose runs deviate as much as those of measured materials."""
+    random, inside, times = np.random.default_rng(0), [], SECONDS[:3]
+    for number in range(150):
+        deviation = (0.015, 0.06)[number % 2]
+        runs = [
+            [replace(m, error=m.error.scaled(f)) for f in 1 + deviation * random.normal(size=n)]
+            for m, n in zip(evidence(times).runs, (2, 2, 1), strict=True)
+        ]
+        pooled = seed_deviation(runs)
+        error = Evidence.of([combined(group, pooled) for group in runs], pooled).error_after(120.0)
+        assert error is not None
+        assert error.suffices
+        inside.append(error.low < law(120.0) < error.high)
+    assert np.mean(inside) > 0.9
 
 
 def test_the_least_time_has_room_for_three_lengths() -> None:
     def lengths(seconds: float) -> int:
         return len({r.name for r in planned_runs(seconds, 4, 1e-7) if r.series.startswith("35")})
 
+    assert LEAST_SECONDS <= 120.0
     assert lengths(LEAST_SECONDS) == 3
     assert lengths(0.99 * LEAST_SECONDS) == 2
-    assert "--time 1min is too short" in too_short(60.0, 401.0)
-    assert "3 lengths with two seeds take about 7min" in too_short(60.0, 401.0)
+    assert "--time 1min measures errors, but is too short" in too_short(60.0, 401.0)
+    assert "3 lengths take about 7min" in too_short(60.0, 401.0)
 
 
 @pytest.fixture

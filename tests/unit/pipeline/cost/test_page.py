@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
 from PIL import Image
@@ -46,15 +47,32 @@ def test_an_undefined_error_is_shown_as_such(tmp_path: Path) -> None:
     page = write_page(Study(tmp_path, DESCRIPTION, [measured("run", 10.0, math.nan)])).read_text()
     assert not re.search(r"\b(nan|inf)\b", page)
     assert "No unexplained variance of test queries could be measured" in page
-    # Without repeats the error bars of runs are too narrow, and the page warns of it.
-    assert "are too narrow" in page
 
 
-def test_one_measurement_is_no_plot(tmp_path: Path) -> None:
-    page = write_page(Study(tmp_path, DESCRIPTION, [measured("run", 10.0, 0.3)])).read_text()
+def test_one_run_is_an_answer_without_a_front(tmp_path: Path) -> None:
+    """Its plot is that of the run while it trained; a comparison of one configuration is left out."""
+    run, paths = measured("run", 10.0, 0.3), measured("paths", 1.0, 0.3)
+    study = Study(tmp_path, DESCRIPTION, [paths, run], skipped=["paths, 8 paths"], least=131.0)
+    page = write_page(study).read_text()
     assert list(tmp_path.glob("*.png")) == []
-    assert "One run alone is no front" in page
-    assert "<td>700</td>" in page
+    assert 'id="paths"' not in page
+    assert '<td>0:10</td><td class="text">0.300 ± 0.010</td>' in page
+    assert "with <code>--time 140s</code> measures enough" in page
+    assert "Not measured: 1 configuration, for" in page
+    study.measurements[1] = replace(run, curve=((6.0, 0.5), (8.0, 0.4)))
+    page = write_page(study).read_text()
+    assert "the longest of them, if stopped early" in page
+    assert "Pareto front</text>" not in page
+
+
+def test_forecasts_are_marked_as_such(tmp_path: Path) -> None:
+    found = [measured("run", seconds, 2.0 * seconds**-0.7) for seconds in (10.0, 20.0, 40.0)]
+    page = write_page(Study(tmp_path, DESCRIPTION, found, skipped=["a", "b"])).read_text()
+    rows = page.split('id="answers"')[1].split("</section>")[0].split("<tr")[2:]
+    for mark in ("class=forecast", "forecast, "):
+        assert [mark in row for row in rows] == [False] * 3 + [True] * 2
+    assert "forecast, 95 % interval" in page
+    assert "Not measured: 2 configurations, for" in page
 
 
 def test_the_page_shows_the_front_with_commands_and_what_is_biased(tmp_path: Path) -> None:
@@ -76,7 +94,7 @@ def test_the_page_shows_the_front_with_commands_and_what_is_biased(tmp_path: Pat
     # Two of the three runs, each with a command that one click selects.
     command = "<code>mbtf-gen a &amp;&amp; mbtf-fit b</code></td></tr>"
     # In a row of its own, so that the table fits narrow windows.
-    assert front.count(f"<tr class=command><td class=command colspan=13>{command}") == 2
+    assert front.count(f"<tr class=command><td class=command colspan=10>{command}") == 2
     assert "<th>command</th>" not in page
     assert front.count("<td>700</td>") == 2
     assert "<details>" not in front

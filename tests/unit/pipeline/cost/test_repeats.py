@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,15 @@ from support.fake_runs import TRUE, FakeRuns, MemoryStore, conditions, run
 
 from mbtf_core.run.runner import Runner
 from mbtf_core.stats import Estimate
-from mbtf_pipeline.cost.measurement import HALF_WIDTH, NORMAL, Measurement, combined, seed_deviation
+from mbtf_pipeline.cost.measurement import (
+    HALF_WIDTH,
+    NORMAL,
+    PRIOR,
+    PRIOR_DEGREES,
+    Measurement,
+    combined,
+    seed_deviation,
+)
 from mbtf_pipeline.cost.runs import MOST_SEEDS, Run
 from mbtf_pipeline.cost.study import Measurements
 
@@ -28,28 +37,30 @@ def repeat(monkeypatch: pytest.MonkeyPatch) -> Repeat:
     def measured(store: MemoryStore, fake: FakeRuns, seeds: int = 2, most: int = 10**6) -> Any:
         monkeypatch.setattr(Run, "measure", lambda run, conditions: fake.measure(run))
         found = Measurements(conditions(), store, Runner())  # type: ignore[arg-type]
-        found.measure_runs(RUNS, lambda run: len(fake.measured) < most, seeds)
+        planned = [replace(run, seed=seed) for seed in range(2) for run in RUNS]
+        found.measure_runs(planned, lambda run: len(fake.measured) < most, seeds)
         return [found.group(run) for run in RUNS]
 
     return measured
 
 
-def test_every_run_gets_two_seeds_before_the_next_one(repeat: Repeat) -> None:
+def test_runs_are_measured_in_their_order(repeat: Repeat) -> None:
     fake = FakeRuns()
     # A failed run leaves the others, and is not tried with another seed.
     fake.failing = {"one", "3"}
     assert [len(group) for group in repeat(MemoryStore(), fake)] == [2, 2, 0, 2, 2, 2, 2, 0, 2, 2, 2, 2]
-    assert [(r.name, r.seed) for r in fake.measured[:3]] == [("long", 0), ("long", 1), ("short", 0)]
+    assert [(r.name, r.seed) for r in fake.measured[:2]] == [("long", 0), ("short", 0)]
+    assert [r.seed for r in fake.measured] == [0] * 12 + [1] * 10
     assert sum(r.name in fake.failing for r in fake.measured) == 2
 
 
 def test_nothing_is_measured_twice(repeat: Repeat) -> None:
     store = MemoryStore()
     first, second, third = FakeRuns(0.2), FakeRuns(0.2, study_seed=1), FakeRuns()
-    some = repeat(store, first, most=5)
-    assert [len(group) for group in some] == [2, 2, 1] + 9 * [0]
+    some = repeat(store, first, most=14)
+    assert [len(group) for group in some] == [2, 2] + 10 * [1]
     found = repeat(store, second)
-    assert len(second.measured) == 2 * len(RUNS) - 5
+    assert len(second.measured) == 2 * len(RUNS) - 14
     assert not {str(r.key) for r in first.measured} & {str(r.key) for r in second.measured}
     assert found[0] == some[0]
     assert repeat(store, third) == found
@@ -62,9 +73,8 @@ def test_nothing_is_measured_twice(repeat: Repeat) -> None:
 def test_refining_stops_where_the_intervals_are_narrow(repeat: Repeat) -> None:
     found = repeat(MemoryStore(), FakeRuns(), seeds=MOST_SEEDS)
     deviation = seed_deviation(found)
-    assert deviation is not None
     for group in found:
-        narrow = NORMAL * combined(group, deviation).error.relative_error <= 1.2 * HALF_WIDTH
+        narrow = NORMAL * deviation.value / math.sqrt(len(group)) <= 1.2 * HALF_WIDTH
         assert narrow or len(group) == MOST_SEEDS
         assert 2 <= len(group) <= MOST_SEEDS
     # About the number that the deviation asks for.
@@ -72,9 +82,12 @@ def test_refining_stops_where_the_intervals_are_narrow(repeat: Repeat) -> None:
     assert 0.8 * needed < np.mean([len(group) for group in found]) < 2.5 * needed
     sure = repeat(MemoryStore(), FakeRuns(0.01, 0.02), seeds=MOST_SEEDS)
     assert {len(group) for group in sure} == {2}
+    # No repeat reduces the error of the test set.
+    unsure = repeat(MemoryStore(), FakeRuns(0.01, 0.5), seeds=MOST_SEEDS)
+    assert {len(group) for group in unsure} == {2}
 
 
-@pytest.mark.parametrize(("deviation", "test"), [(0.1, 0.02), (0.03, 0.05)])
+@pytest.mark.parametrize(("deviation", "test"), [(0.06, 0.02), (0.03, 0.05)])
 def test_error_bars_are_honest(repeat: Repeat, deviation: float, test: float) -> None:
     """Studies with other seeds: the difference from the truth over the error bar has mean 0 and deviation 1.
     An error bar too narrow by a factor 2 gives a deviation of 2."""
@@ -85,7 +98,7 @@ def test_error_bars_are_honest(repeat: Repeat, deviation: float, test: float) ->
         for group in found:
             error = combined(group, pooled).error
             deviations.append((error.value - TRUE) / error.error)
-    # All runs of a seed share the error of its test set, so there are fewer independent values.
+    # All runs of a study share the error of its test set, so there are fewer independent values.
     assert abs(np.mean(deviations)) < 4 / math.sqrt(60)
     assert 0.8 < np.std(deviations) < 1.2
     assert 0.9 < np.mean(np.abs(deviations) < NORMAL) < 0.99
@@ -105,24 +118,21 @@ def test_the_seed_deviation_is_pooled_and_unbiased() -> None:
             for level, n in ((0.5, 2), (0.1, 2), (0.02, 3))
         ]
         found = seed_deviation(groups)
-        assert found is not None
-        assert found.n == 4
-        variances.append(found.value**2)
+        assert found.degrees == PRIOR_DEGREES + 4
+        # Of the repeats alone.
+        variances.append((found.degrees * found.value**2 - PRIOR_DEGREES * PRIOR**2) / 4)
     assert np.mean(variances) == pytest.approx(0.05**2, rel=0.12)
-    assert seed_deviation([[measured(0.5)], []]) is None
+    assert seed_deviation([[measured(0.5)], []]).value == PRIOR
 
 
 def test_a_mean_has_the_error_of_its_seeds_and_test_sets() -> None:
     group = [measured(0.2, total_seconds=4.0), measured(0.3, total_seconds=6.0)]
     found = combined(group, Estimate(0.1, 0.02, 9))
     assert found.error.value == pytest.approx(0.25)
-    assert found.error.error == pytest.approx(0.1 * 0.25 / math.sqrt(2))
+    assert found.error.error == pytest.approx(math.hypot(0.1 * 0.25 / math.sqrt(2), 0.0025))
     assert found.seconds.value == 5.0
     assert found.details == {
         "total_seconds": 5.0,
         "seeds": 2.0,
-        "test_error": pytest.approx(math.hypot(0.002, 0.003) / 2 / 0.25),
+        "test_error": pytest.approx(0.01),
     }
-    # Without repeats it is the test set's.
-    assert combined(group[:1], None).error.error == pytest.approx(0.002)
-    assert combined(group, Estimate(1e-4, 1e-5, 9)).error.error == pytest.approx(math.hypot(0.002, 0.003) / 2)

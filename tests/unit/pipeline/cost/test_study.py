@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import math
+import re
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -16,11 +18,13 @@ import pytest
 from support.fake_runs import FakeRuns, MemoryStore, conditions, run
 from support.paths import ROOT
 
+from mbtf_core.app.console import run as main
 from mbtf_core.errors import InputError, PartialError
 from mbtf_core.files import folders
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item, Result, packed, run_task
 from mbtf_core.stats import Estimate
+from mbtf_pipeline.cli.app import app
 from mbtf_pipeline.cost import study as module
 from mbtf_pipeline.cost.generator import GeneratorBenchmark, GeneratorConfiguration
 from mbtf_pipeline.cost.measurement import (
@@ -100,7 +104,7 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
         if self.name == "diverges":
             raise InputError("training diverged at step 7")
         found.append((self.name, self.seed))
-        return point(5.0, 0.1 + 0.03 * self.seed + 0.01 * len(self.name), run_seconds=12.0)
+        return point(5.0, 0.1 + 0.03 * self.seed + 0.01 * len(self.name), run_seconds=17.0)
 
     monkeypatch.setattr(Run, "measure", measure)
     return found
@@ -111,7 +115,8 @@ def test_workers_measure_the_runs_of_one_process(measured: list[tuple[str, int]]
     groups, names = [], []
     for runner in (Runner(), Workers()):
         found = Measurements(conditions(), MemoryStore(), runner)  # type: ignore[arg-type]
-        found.measure_runs(runs, lambda run: True, MOST_SEEDS)
+        planned = [replace(run, seed=seed) for seed in range(2) for run in runs]
+        found.measure_runs(planned, lambda run: True, MOST_SEEDS)
         groups.append([found.group(run) for run in runs])
         names.append(sorted(measured))
         assert found.failed[runs[2].label] == "training diverged at step 7"
@@ -126,13 +131,14 @@ def test_workers_begin_what_fits_into_the_time_of_all(measured: list[tuple[str, 
     found = Measurements(conditions(), MemoryStore(), Workers())  # type: ignore[arg-type]
     found.path_seconds = 1e-9
     test = 1e-9 * TEST[0] * TEST[1]
-    # Two workers for 14 s; a run takes 9 or 5 s of training and 2 s besides.
+    # Two workers for 17 s; a run takes 9 or 5 s of training and 5 s besides.
     runs = [run(3000, "long", 9.0), run(2000, "one"), run(2000, "two")]
-    assert found.expected_seconds(runs[0]) == pytest.approx(11.0 + test, abs=1e-4)
-    found.measure_runs(runs, lambda run: found.fits(run, 14.0), 2)
+    assert found.expected_seconds(runs[0]) == pytest.approx(14.0 + test, abs=1e-4)
+    planned = [replace(run, seed=seed) for run in runs for seed in range(2)]
+    found.measure_runs(planned, lambda run: found.fits(run, 17.0))
     assert sorted(measured) == [("long", 0), ("long", 1)]
-    # The test set is there, and the runs took 3 s beyond their plan.
-    assert found.expected_seconds(runs[1]) == pytest.approx(5.0 + 3.0, abs=1e-4)
+    # The test set is there, and the runs took 8 s beyond their plan.
+    assert found.expected_seconds(runs[1]) == pytest.approx(5.0 + 8.0, abs=1e-4)
 
 
 def test_a_full_disk_ends_the_study(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -142,7 +148,7 @@ def test_a_full_disk_ends_the_study(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Run, "measure", full)
     found = Measurements(conditions(), MemoryStore(), Runner())  # type: ignore[arg-type]
     with pytest.raises(PartialError, match="no space left"):
-        found.measure_runs([run()], lambda run: True, 2)
+        found.measure_runs([run()], lambda run: True)
 
 
 def test_a_study_is_of_the_machine_of_its_workers(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -170,7 +176,8 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> FakeRuns:
     monkeypatch.setattr(Run, "measure", measure)
     monkeypatch.setattr(module, "generator_configurations", lambda benchmark: [configuration])
     monkeypatch.setattr(GeneratorBenchmark, "check_variation", lambda benchmark: None)
-    monkeypatch.setattr(module, "planned_runs", lambda *_: RUNS)
+    planned = [replace(run, seed=seed) for run in RUNS for seed in range(2)]
+    monkeypatch.setattr(module, "planned_runs", lambda *_: planned)
     monkeypatch.setattr(module, "path_seconds", lambda *_: 1e-9)
     return found
 
@@ -189,15 +196,14 @@ def test_a_study_keeps_its_time_and_resumes(fake: FakeRuns, tmp_path: Path) -> N
         announce=said.append,
         progress=lambda share, note: shown.append((share, note)),
     )
-    # The shortest study that answers, by the runs that it takes; the time of the next run.
-    assert "two seeds take about 277min" in said[-1]
-    assert "run, neumip, short, about 1:02" in [note for _, note in shown]
+    # The shortest study that forecasts, by the runs that it takes; the time of the next run.
+    assert "3 lengths take about 242min" in said[-1]
+    assert "run, neumip, short, about 1:05" in [note for _, note in shown]
     assert shown[-1][0] == 1.0
     assert [share for share, _ in shown] == sorted(share for share, _ in shown)
     assert [m.details.get("seeds") for m in first.measurements] == [None, 2, 1]
     assert sum(r.planned_seconds(0.0) for r in runs) <= 190.0
     assert first.skipped == ["run, neumip, long"]
-    assert first.deviation is not None
     # Only what is missing is measured: the second seed of the last run.
     second, runs = measured(seconds=190.0)
     assert [(r.name, r.seed) for r in runs] == [("m", 1)]
@@ -207,6 +213,32 @@ def test_a_study_keeps_its_time_and_resumes(fake: FakeRuns, tmp_path: Path) -> N
     assert {r.seed for r in runs} >= {2}
     assert all(r.name != "long" for r in runs)
     assert sum(r.planned_seconds(0.0) for r in runs) <= 3790.0
+
+
+def test_a_dry_run_plans_what_a_study_measures(
+    fake: FakeRuns, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By a pilot of the generator; it writes nothing, and what is measured costs no time."""
+    pilot = SimpleNamespace(start=2.0, query_seconds=4e-9)
+    monkeypatch.setattr(module, "forecast", lambda *_, **__: pilot)
+    folder = tmp_path / "study"
+    command = ["cost", str(RECIPE), "-o", str(folder), "--dry-run"]
+    assert main(app, [*command, "--time", "190s"]) == 0
+    text = capsys.readouterr().out
+    assert not folder.exists()
+    # As in the study: two runs of 60 s and one of 40 s, each with 5 s besides; 4 s to start, and 8 s that the
+    # generator gets.
+    assert text.splitlines()[0].startswith("expected: about 3:07, ")
+    assert re.findall(r"neumip, (.*?):", text) == ["short", "short, seed + 1", "m"]
+    assert "up to about 1:05, measured" in text
+    assert "cannot forecast errors of longer times: that takes --time 242min" in text
+    assert "cannot tell what effects, mesh and number of paths cost" in text
+    module.run_study(load_recipe(RECIPE, []), folder, seconds=190.0)
+    assert main(app, [*command, "--time", "5h", "--json"]) == 0
+    plan = json.loads(capsys.readouterr().out)
+    assert (plan["measured"], len(plan["runs"])) == (3, 3)
+    assert plan["longest"] == pytest.approx(7205.0, abs=1.0)
+    assert plan["seconds"] > 2 * 7200.0 + 40.0
 
 
 def test_runs_that_do_not_fit_on_the_disk_are_refused(
