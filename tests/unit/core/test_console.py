@@ -67,13 +67,6 @@ def test_flag_positions(app: App, arguments: str, printed: str, capsys: pytest.C
     assert capsys.readouterr().out.strip() == printed
 
 
-def test_json_is_one_object(app: App, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(app, ["doctor", "--json", "--code", "3"]) == 3
-    assert json.loads(capsys.readouterr().out) == {"code": 3}
-    assert run(app, ["doctor"]) == 0
-    assert capsys.readouterr().out == "code 0\n"
-
-
 @pytest.mark.parametrize(
     ("error", "text", "code"),
     [
@@ -158,14 +151,6 @@ def test_a_line_that_fails_suggests_the_command_that_it_may_mean(
     assert "did you mean: prog doctor" in capsys.readouterr().err
 
 
-def test_completion_is_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, app: App) -> None:
-    monkeypatch.setenv("HOME", str(tmp_path))
-    assert run(app, ["--install-completion", "--shell", "bash"]) == 0
-    (script,) = tmp_path.glob(".local/**/prog")
-    assert "doctor" in script.read_text()
-    assert str(script) in (tmp_path / ".bashrc").read_text()
-
-
 @pytest.mark.parametrize(
     ("error", "code", "message"),
     [
@@ -211,31 +196,6 @@ def test_warnings_of_the_packages_reach_standard_error(capsys: pytest.CaptureFix
     assert capsys.readouterr().err == "mesh: 64 cells\nwarning: 8-bit heights were smoothed\n"
     assert run(app, ["--quiet"]) == 0
     assert capsys.readouterr().err == "warning: 8-bit heights were smoothed\n"
-
-
-def test_plain_progress_ends_with_a_line(capsys: pytest.CaptureFixture[str]) -> None:
-    with CONSOLE.progress(4, "rendering", "shards") as bar:
-        for index in range(4):
-            bar.advance(note=f"shard {index}")
-    captured = capsys.readouterr()
-    assert re.fullmatch(
-        r"rendering: 4/4 shards \(100%\), \d+:\d\d elapsed, shard 3", captured.err.splitlines()[-1]
-    )
-    assert captured.out == ""
-
-
-def test_progress_intervals(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    now = 0.0
-    monkeypatch.setattr("mbtf_core.app.progress.time.monotonic", lambda: now)
-    with CONSOLE.progress(100, "fitting", "steps") as bar:
-        for _ in range(50):
-            now += 0.5
-            bar.advance()
-    assert capsys.readouterr().err.splitlines() == [
-        "fitting: 20/100 steps (20%), 0:10 elapsed, 0:40 left",
-        "fitting: 40/100 steps (40%), 0:20 elapsed, 0:30 left",
-        "fitting: 50/100 steps (50%), 0:25 elapsed, 0:25 left",
-    ]
 
 
 def test_the_time_left_counts_neither_set_up_nor_earlier_runs(
@@ -309,11 +269,3 @@ def test_progress_on_a_terminal_is_a_bar() -> None:
     lines = [line.strip() for line in re.split(r"[\r\n]+", plain) if line.strip()]
     assert all(re.match(r"rendering ━+ |loss ", line) and len(line) <= 60 for line in lines), lines
     assert done.stdout == b"result\n"
-
-
-def test_help_and_version_answer(app: App, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(app, ["--help"]) == 0
-    text = capsys.readouterr().out
-    assert all(word in text for word in ("plan", "doctor", "--queries", "--json", "--debug"))
-    assert run(app, ["--version"]) == 0
-    assert re.fullmatch(r"prog \d+\.\d+\.\d+\S*\n", capsys.readouterr().out)

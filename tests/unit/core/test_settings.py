@@ -116,40 +116,12 @@ def test_faults_name_line_and_hint(write: Any, text: str, where: int, what: str,
     assert caught.value.hint == hint
 
 
-@pytest.mark.parametrize(
-    ("assignment", "what"),
-    [
-        ("hight=2", "unknown key 'hight'"),
-        ("height=tall", "'height': must be a valid number"),
-        ("light.width_deg=31", "'light.width_deg': must be less than or equal to 30"),
-        ("height", "'height' is not of the form key=value"),
-        ("height=1e400", "'height': must be a finite number (given inf)"),
-    ],
-)
-def test_bad_assignments_are_usage_errors(assignment: str, what: str) -> None:
-    with pytest.raises(UsageError) as caught:
-        resolve(Whole, assignments=[assignment])
-    assert caught.value.what.startswith(what)
-    assert caught.value.exit_code == 2
-
-
 def test_required_keys_may_come_from_flags(write: Any) -> None:
     assert resolve(Needy, file=write("spp: 2\n"), flags={"source": "map.exr"}) == Needy(
         source="map.exr", spp=2
     )
     with pytest.raises(UsageError, match="'source' is missing"):
         resolve(Needy)
-
-
-@pytest.mark.parametrize(
-    ("text", "what", "line"),
-    [("a: [1\nb: 2\n", "not valid YAML", 2), ("just text\n", "must hold a mapping", None)],
-)
-def test_files_that_are_no_mapping_are_refused(write: Any, text: str, what: str, line: int | None) -> None:
-    path = write(text)
-    with pytest.raises(InputError, match=what) as caught:
-        read_yaml(path)
-    assert caught.value.where == (str(path) if line is None else f"{path}:{line}")
 
 
 def test_missing_and_unreadable_files_are_refused(tmp_path: Path) -> None:

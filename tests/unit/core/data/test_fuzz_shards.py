@@ -96,19 +96,6 @@ def test_an_altered_manifest_or_sidecar(data: st.DataObject, whole: Path) -> Non
         (whole / MANIFEST_NAME).write_text(manifest)
 
 
-@given(data=st.data())
-@examples(100)
-def test_damaged_bytes_of_a_data_set(data: st.DataObject, whole: Path) -> None:
-    files = {n: (whole / n).read_bytes() for n in (MANIFEST_NAME, "train-00000.json", "train-00000.npz")}
-    name, content = data.draw(damaged(files))
-    try:
-        (whole / name).write_bytes(content)
-        read_all(whole)
-    finally:
-        for each, content in files.items():
-            (whole / each).write_bytes(content)
-
-
 def archive(members: dict[str, bytes], compression: int = zipfile.ZIP_STORED) -> bytes:
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", compression) as out:

@@ -19,7 +19,6 @@ from typing import Any
 
 import pytest
 from support import run_tasks
-from support.object_stores import silent_server
 
 from mbtf_core.errors import InputError, PartialError
 from mbtf_core.run import cluster as module
@@ -77,15 +76,11 @@ def test_an_interruption_while_waiting_for_jobs_is_one(tmp_path: Path) -> None:
     assert done.stdout == "interrupted\n", done.stderr
 
 
-def test_a_task_is_run_again_when_its_worker_dies(cluster: Runner, tmp_path: Path) -> None:
+@pytest.mark.parametrize("task", [run_tasks.die_at_first, run_tasks.fail_at_first])
+def test_a_task_is_run_again(task: Callable[..., int], cluster: Runner, tmp_path: Path) -> None:
+    """When its worker dies, and when it fails by a bug."""
     arguments = {"marks": str(tmp_path), "times": 2}
-    (done,) = cluster.map(run_tasks.die_at_first, [Item("dies", arguments)])
-    assert (done.value, done.error) == (3, "")
-
-
-def test_a_task_is_run_again_when_it_fails_by_a_bug(cluster: Runner, tmp_path: Path) -> None:
-    arguments = {"marks": str(tmp_path), "times": 2}
-    (done,) = cluster.map(run_tasks.fail_at_first, [Item("flaky", arguments)])
+    (done,) = cluster.map(task, [Item("again", arguments)])
     assert (done.value, done.error) == (3, "")
 
 
@@ -124,11 +119,6 @@ def test_workers_that_dask_cannot_close_are_killed(monkeypatch: pytest.MonkeyPat
     assert worker.exitcode == -signal.SIGKILL
 
 
-def test_tasks_for_gpus_run_where_none_is_stated(cluster: Runner) -> None:
-    (done,) = cluster.map(run_tasks.double, [Item("gpu", {"x": 3}, gpu=True)])
-    assert done.value == 6
-
-
 def test_other_versions_are_refused() -> None:
     call, _, folder = packed(run_tasks.double, Item("x", {"x": 1}))
     found = run_task(call, "0.0.0", folder)
@@ -152,17 +142,6 @@ def test_a_scheduler_that_is_not_there_is_bad_input(tmp_path: Path) -> None:
     ):
         pass
     assert "dask scheduler" in caught.value.hint
-
-
-def test_a_scheduler_that_never_answers_is_given_up(tmp_path: Path) -> None:
-    pytest.importorskip("distributed")
-    with (
-        silent_server() as port,
-        pytest.raises(InputError, match="no answer within 1 s") as caught,
-        open_runner(scheduler_file(tmp_path, f"tcp://127.0.0.1:{port}"), lambda line: None),
-    ):
-        pass
-    assert "timeout" in caught.value.hint
 
 
 @pytest.fixture
@@ -195,20 +174,6 @@ def test_a_scheduler_that_hangs_leaves_resumable_work(one_worker: Any, tmp_path:
                 list(results)
     finally:
         answers.set()
-
-
-def test_a_cluster_without_workers_is_not_waited_for_for_ever(
-    one_worker: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, "_LOOK_SECONDS", 0.2)
-    path = tmp_path / "scheduler.yaml"
-    path.write_text(f"address: {one_worker.scheduler_address}\nstart_timeout: 1s\n")
-    with open_runner(str(path), lambda line: None) as opened:
-        results = opened.map(run_tasks.double, (Item(f"x{i}", {"x": i}) for i in range(10**6)))
-        next(results)
-        one_worker.scale(0)
-        with pytest.raises(PartialError, match=r"the cluster is lost .no worker within 1s"):
-            list(results)
 
 
 def test_a_worker_with_several_threads_runs_one_task_at_a_time() -> None:
@@ -344,13 +309,6 @@ def test_old_names_of_options_are_understood(
     assert {"#SBATCH -A graphics", "#SBATCH --qos=low"} <= set(job)
     assert not any("--mem=" in line for line in job)
     assert "--local-directory /scratch" in job[-1]
-
-
-def test_one_line_in_place_of_a_list(job_of: Callable[..., list[str]], tmp_path: Path) -> None:
-    logs = str(tmp_path / "logs")
-    job = job_of(env_extra="module load x", job_extra="--qos=low", header_skip="--mem", log_directory=logs)
-    assert {"module load x", "#SBATCH --qos=low", OURS} <= set(job)
-    assert "#SBATCH -n 1" in job
 
 
 def test_options_that_would_be_ignored_are_refused_or_named(
