@@ -12,7 +12,6 @@ from support.plugin_materials import write_material
 from support.shader_cases import make
 from support.viewer_page import Page
 
-from mbtf_core.color import linear_to_srgb
 from mbtf_core.directions import from_angles
 from mbtf_core.pictures import Camera
 from mbtf_fit.material.material import Material
@@ -321,23 +320,3 @@ def test_frames_add_up_to_their_mean(page: Page) -> None:
     assert (found[0][..., 3][inside] == 1).all()
     edge = (found[0][..., 3] > 0) & (found[0][..., 3] < 1)
     assert 20 < edge.sum() < 140
-
-
-def test_plots_have_y_up(page: Page) -> None:
-    """Pictures of the values over all views, against the values."""
-    page.set({"camera": view(60, -70, 1, 0.5, 0.25), "lights": [{**LIGHT, "direction": [0.6, 0, 0.8]}]})
-    code = """
-        const { viewer, showPoint } = window.mbtf, { renderer } = viewer, [x, y] = [0.4, 0.3];
-        showPoint(viewer, x, y);
-        const canvas = document.getElementById("over_views"), { width, height } = canvas;
-        const plot = canvas.getContext("2d").getImageData(0, 0, width, height).data;
-        const point = renderer.pick(viewer.material, viewer.scene, x, y);
-        const values = renderer.overDirections(viewer.material, width, point, [0.6, 0, 0.8], true);
-        return [[...plot], [...values]];
-    """
-    plot, values = (np.array(x, np.float64).reshape(128, 128, 4)[..., :3] for x in page.js(code))
-    # Row 0 of the values is at y = -1.
-    expected = 255 * linear_to_srgb(values[::-1] / values.max())
-    # All but the circle of the view.
-    assert (np.abs(plot - expected).max(2) < 1.5).mean() > 0.97
-    assert (np.abs(plot - expected[::-1]).max(2) < 1.5).mean() < 0.6
