@@ -116,35 +116,6 @@ def test_every_command_that_is_shown_can_be_given() -> None:
     assert faults == []
 
 
-# Flags that are not named after the key that they set.
-OTHER_NAMES = {
-    "--queries": "queries.train",
-    "--test-queries": "queries.test",
-    "--effects": "effects.mode",
-    "--tiles-around": "turntable.tiles",
-    "--turn-size": "turntable.size",
-}
-
-
-def test_a_flag_sets_the_key_that_it_is_named_after() -> None:
-    found = {
-        (option.flag, option.key)
-        for app in APPS.values()
-        for command in commands(app).values()
-        for option in getattr(options_of(command.default_command), "table", ())
-    }
-    assert len(found) > 20
-    for flag, key in found:
-        name = flag.removeprefix("--").replace("-", "_")
-        # A flag that may be repeated has the singular of its key.
-        named = name in (
-            key.rpartition(".")[2].removesuffix("s"),
-            key.rpartition(".")[2],
-            key.replace(".", "_"),
-        )
-        assert key == OTHER_NAMES[flag] if flag in OTHER_NAMES else named, (flag, key)
-
-
 def test_an_option_has_one_help_and_one_meaning() -> None:
     helps: dict[str, set[str | None]] = {}
     keys: dict[str, set[str]] = {}

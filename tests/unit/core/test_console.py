@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import logging
 import math
@@ -227,19 +226,6 @@ def test_the_time_left_counts_neither_set_up_nor_earlier_runs(
         "fitting: 100%, 1:35 elapsed, evaluating",
         "fitting: 100%, 1:36 elapsed, writing",
     ]
-
-
-def test_progress_of_percentages_unknown_totals_and_nothing(capsys: pytest.CaptureFixture[str]) -> None:
-    with CONSOLE.progress(100, "fitting", "%") as bar:
-        bar.update(29.6)
-    assert capsys.readouterr().err.startswith("fitting: 30%, ")
-    with contextlib.suppress(InputError), CONSOLE.progress(None, "reading", "rows") as bar:
-        bar.update(7)
-        raise InputError("torn")
-    assert capsys.readouterr().err.startswith("reading: 7 rows, ")
-    with CONSOLE.progress(4, "rendering", "shards"):
-        pass
-    assert capsys.readouterr().err == ""
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no pseudo-terminals")

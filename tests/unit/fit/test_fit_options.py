@@ -78,12 +78,6 @@ def test_shared_networks_have_a_smaller_batch(tmp_path: Path) -> None:
     assert config_of("--config", str(tmp_path / "c.yaml")).training.batch == 1 << 14
 
 
-def test_presets_keep_what_flags_set() -> None:
-    assert config_of("--quality", "draft", "--model", "hierarchical").network.width == 25
-    assert config_of("--quality", "draft", "--init-from", "material/").network.width == 25
-    assert config_of("--quality", "draft").network.width == 40
-
-
 @pytest.mark.parametrize(
     ("text", "seconds"),
     [("90s", 90.0), ("2min", 120.0), ("2 m", 120.0), ("1.5h", 5400.0), (45, 45.0), ("0.5s", 0.5)],
@@ -145,10 +139,3 @@ def test_a_model_that_is_not_installed_is_named(tmp_path: Path, source: str) -> 
         build(FitConfig, {"model": "texel-lobe"}, source=str(tmp_path / source))
     for part in (source, "'texel-lobe'", ", ".join(NAMES), "entry point of mbtf.models"):
         assert part in caught.value.message
-
-
-def test_every_model_has_a_line(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(app, ["models"]) == 0
-    rows = capsys.readouterr().out.splitlines()[1:]
-    assert [row.split()[0] for row in rows] == sorted(NAMES)
-    assert all(len(row.split()) > 3 for row in rows)

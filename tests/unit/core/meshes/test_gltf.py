@@ -318,15 +318,3 @@ def test_more_instances_than_fit_are_refused_before_they_are_made(tmp_path: Path
     builder.node(mesh, extensions=extension)
     with pytest.raises(InputError, match="25,000,000 triangles"):
         content_of(builder, tmp_path)
-
-
-def test_what_is_not_used_is_named_once(tmp_path: Path) -> None:
-    builder = with_triangle()
-    builder.document["animations"] = [{}]
-    builder.document["extensions"] = {"KHR_lights_punctual": {"lights": []}}
-    builder.document["nodes"][0]["extensions"] = {"KHR_lights_punctual": {"light": 0}}
-    builder.document["nodes"][0]["extras"] = {"extensions": {"of_a_program": 1}}
-    assert sorted(content_of(builder, tmp_path).warnings) == [
-        "KHR_lights_punctual is not used",
-        "animations are not used",
-    ]

@@ -318,25 +318,6 @@ def test_factors_out_of_range_are_refused(tmp_path: Path, key: str, value: Any) 
         read_mesh_content(path)
 
 
-UNUSED = {
-    "normal": {"normalTexture": {"index": 0}},
-    "occlusion": {"occlusionTexture": {"index": 0}},
-    "emission": {"emissiveFactor": [0, 0, 2]},
-    "KHR_materials_unlit": {"extensions": {"KHR_materials_unlit": {}}},
-    "KHR_materials_transmission": {"extensions": {"KHR_materials_transmission": {}}},
-    "normal textures": {"extensions": {"KHR_materials_clearcoat": {"clearcoatNormalTexture": {"index": 0}}}},
-}
-
-
-@pytest.mark.parametrize("word", UNUSED)
-def test_what_is_not_used_is_named_once(tmp_path: Path, word: str) -> None:
-    builder = GltfBuilder()
-    for name in "ab":
-        builder.plate(builder.material({}, name=name, **UNUSED[word]))
-    (text,) = content_of(builder, tmp_path).warnings
-    assert word in text
-
-
 def fault_of(texture: dict[str, Any], image: dict[str, Any] | None, folder: Path) -> InputError:
     builder = GltfBuilder()
     if image is not None:

@@ -295,12 +295,6 @@ def test_what_is_not_used_is_said(tmp_path: Path, text: str, says: str) -> None:
         assert word in warning
 
 
-def test_elements_that_are_not_used_are_said(tmp_path: Path) -> None:
-    (warning,) = read(tmp_path, SQUARE + "l 1 2\np 3\ncurv 0 1 1 2\n#MRGB ff808080\n" + FACES).warnings
-    for word in ("lines", "points", "curves", "ZBrush"):
-        assert word in warning
-
-
 def test_statements_of_no_effect_are_silent(tmp_path: Path) -> None:
     blender = "Ns 250\nKa 1 1 1\nKd 0.8 0.8 0.8\nKs 0 0 0\nKe 0 0 0\nNi 1.45\nd 1\nillum 2\nPr 0.5\nPm 0\n"
     blender += "Ps 0\nPc 0\nPcr 0.03\naniso 0\nanisor 0"

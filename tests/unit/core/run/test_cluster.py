@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import multiprocessing
 import os
 import signal
@@ -287,28 +286,6 @@ def test_what_a_site_configures_is_kept(
     assert job.index("module load mine") < job.index(OURS)
     assert "module load site" not in job
     assert {"#SBATCH --constraint=site", "#SBATCH -A mine"} <= set(job)
-
-
-@pytest.mark.parametrize("where", ["options", "site"])
-def test_old_names_of_options_are_understood(
-    job_of: Callable[..., list[str]], where: str, tmp_path: Path
-) -> None:
-    old = {
-        "project": "graphics",
-        "job_extra": ["--qos=low"],
-        "env_extra": ["module load python"],
-        "header_skip": ["--mem"],
-        "extra": ["--local-directory", "/scratch"],
-        "log_directory": str(tmp_path / "logs"),
-    }
-    if where == "options":
-        job = job_of(**old)
-    else:
-        job = job_of(json.dumps({"jobqueue": {"slurm": {k.replace("_", "-"): v for k, v in old.items()}}}))
-    assert job.index("module load python") < job.index(OURS)
-    assert {"#SBATCH -A graphics", "#SBATCH --qos=low"} <= set(job)
-    assert not any("--mem=" in line for line in job)
-    assert "--local-directory /scratch" in job[-1]
 
 
 def test_options_that_would_be_ignored_are_refused_or_named(

@@ -252,16 +252,3 @@ def test_the_same_export_again_has_the_same_bytes(glossy: Path, capsys: pytest.C
     assert run(app, ["export", str(glossy.parent / "material"), *words, "-o", str(glossy)]) == 0
     assert "unexplained variance against the material" in capsys.readouterr().out
     assert {path.name: path.read_bytes() for path in glossy.iterdir()} == before
-
-
-def test_options_of_maps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_material(tmp_path / "relief", model="relief")
-    out = ["-o", str(tmp_path / "out")]
-    for words, code, what in (
-        (["relief", "--level", "1"], 2, "--level: is an option of gltf, materialx, usd"),
-        (["relief", "--to", "usd", "--level", "9"], 2, "has the levels 0 to 3"),
-    ):
-        assert run(app, ["export", str(tmp_path / words[0]), *words[1:], *out]) == code
-        assert what in capsys.readouterr().err
-    assert run(app, ["export", str(tmp_path / "relief"), "--to", "usd", "--level", "1", *out, "-q"]) == 0
-    assert Image.open(tmp_path / "out" / "normal.png").size == (2, 2)

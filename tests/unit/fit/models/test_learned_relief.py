@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from typing import Any
 
@@ -225,8 +224,3 @@ def test_a_material_stores_the_surface_alone() -> None:
     again.load_weights(tensors)
     arrays = queries_of(batch_of(hooks, 50))[:4]
     torch.testing.assert_close(again(*arrays), model(*arrays), atol=0, rtol=0)
-
-
-def test_several_view_rays_are_refused() -> None:
-    with pytest.raises(ValueError, match="has no option " + re.escape("network.relief.places")):
-        FitConfig.model_validate({"model": "neumip+", "network": {"relief": {"places": 2}}})

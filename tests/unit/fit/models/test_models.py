@@ -13,7 +13,6 @@ from mbtf_core.errors import InputError, UsageError
 from mbtf_fit.config import FitConfig, build_model
 from mbtf_fit.ops import read_operations
 from mbtf_fit.pytorch.material import NeuralMaterial
-from mbtf_fit.pytorch.networks import Mlp, initialize_layers
 from mbtf_fit.pytorch.operations import FUNCTIONS
 from mbtf_fit.sections import OutputTransform
 
@@ -109,28 +108,13 @@ def test_unset_options_are_the_models_own() -> None:
     ("assignments", "words"),
     [
         (["model=neumip-baseline", "network.offset=depth"], "has no option network.offset"),
-        (["model=neumip", "network.relief.places=4"], "has no option network.relief.places"),
+        (["model=neumip+", "network.relief.places=4"], "has no option network.relief.places"),
         (["network.decoder=inception"], "has no option network.decoder, which hierarchical has"),
     ],
 )
 def test_options_that_contradict_the_model_are_refused(assignments: list[str], words: str) -> None:
     with pytest.raises(UsageError, match=words):
         resolve(FitConfig, assignments=assignments)
-
-
-@pytest.mark.parametrize("activation", ["relu", "leaky-relu", "sine"])
-def test_mlp_equals_its_reference(activation: Any) -> None:
-    torch.manual_seed(0)
-    network = Mlp([6, 25, 25, 3], activation).double()
-    initialize_layers(network, torch.Generator().manual_seed(1))
-    x = torch.randn(100, 6, dtype=F64, requires_grad=True)
-    weight = torch.randn(100, 3, dtype=F64)
-    inputs = [x, *network.parameters()]
-    fast, reference = network(x), network.reference(x)
-    torch.testing.assert_close(fast, reference)
-    gradients = [torch.autograd.grad((out * weight).sum(), inputs) for out in (fast, reference)]
-    for mine, plain in zip(*gradients, strict=True):
-        torch.testing.assert_close(mine, plain)
 
 
 @variants
@@ -219,13 +203,6 @@ def test_exported_weights_make_the_same_model(variant: str) -> None:
     weights.pop(lost)
     with pytest.raises(InputError, match=lost.replace(".", r"\.")):
         other.load_weights(weights)
-
-
-@pytest.mark.parametrize("sigma", [0.0, 1e-9, 0.5, 3.0])
-def test_footprints_beyond_the_levels_take_the_nearest(sigma: float) -> None:
-    model = random_model("baseline")
-    level = model.level(torch.tensor([sigma]))
-    assert level.item() == (3.0 if sigma < 0.1 else 0.0)
 
 
 @pytest.mark.parametrize("variant", ["neumip", "concatenated"])
