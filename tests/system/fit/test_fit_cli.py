@@ -34,27 +34,6 @@ def material(shards: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_export_writes_the_reported_files(material: Path, tmp_path: Path) -> None:
-    out = tmp_path / "export"
-    done = call(["mbtf-fit", "export", str(material), "--half", "-o", str(out), "--json"])
-    assert done.code == 0, done.err
-    found = json.loads(done.out)
-    assert found["files"] == {p.name: p.stat().st_size for p in out.iterdir() if p.name != "export.json"}
-    assert set(found["files"]) == {"textures.exr", "layers.json"}
-    assert 0 < found["half"]["relative"] < 0.01
-    again = tmp_path / "half"
-    done = call(["mbtf-fit", "export", str(material), "--to", "material", "--half", "-o", str(again)])
-    assert done.code == 0, done.err
-    assert "half precision: rms error" in done.out
-    done = call(["mbtf-fit", "info", str(again)])
-    deviation = re.search(r"largest deviation (\S+)", done.out)
-    assert deviation is not None
-    # Between the values of PyTorch, which are stored, and those of whatever evaluates here.
-    assert float(deviation[1]) < 1e-6
-    message = fails(3, "export", str(material), "--to", "material")
-    assert "choose another folder with -o" in message
-
-
 def test_all_commands_print_the_same_summary(shards: Path, material: Path) -> None:
     """Of the same numbers, which JSON holds in full."""
     lines = {}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +10,8 @@ import numpy as np
 import pytest
 from support.browser import NO_WEBGL, browser
 from support.fit_data import parallax, write_data
+from support.material_cases import CASES, make
 from support.plugin_materials import write_material
-from support.shader_cases import CASES, make
 from support.viewer_page import Page
 
 from mbtf_core.directions import from_angles
@@ -133,24 +132,6 @@ def test_surroundings_light_a_plane(driver: Any, tmp_path: Path) -> None:
     page.js("window.mbtf.viewer.state.lights.length = 0")
     assert page.picture(64, 96)[..., :3].mean() == pytest.approx(0.2, rel=0.03)
     assert page.faults() == []
-
-
-@pytest.mark.parametrize("size", [(320, 560), (1280, 720)])
-def test_the_page_fits_its_window(driver: Any, tmp_path: Path, size: tuple[int, int]) -> None:
-    make("calibrated", tmp_path / "material")
-    driver.set_window_size(*size)
-    page = Page(
-        driver, write_page({"materials": [material_content(tmp_path / "material")[0]]}, "size"), tmp_path
-    )
-    page.ready()
-    width, height = page.js("return [innerWidth, innerHeight]")
-    box = page.js("return document.getElementById('canvas').getBoundingClientRect().toJSON()")
-    assert box["width"] * box["height"] > 0.3 * width * height
-    assert page.js("return document.documentElement.scrollWidth") <= width
-    status = r"level \S+ of 4, 3 tiles across, (full picture: \d+ % of|frame \d+ of 64,) \d+ m?s"
-    text = "return document.getElementById('status').textContent"
-    page.until(lambda: re.match(status, page.js(text)))
-    driver.set_window_size(700, 500)
 
 
 def test_damaged_pages_say_so(driver: Any, tmp_path: Path) -> None:

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from support.material_cases import make
 from support.plugin_materials import write_material
-from support.shader_cases import make
 from support.viewer_page import Page
 
 from mbtf_core.directions import from_angles

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
-from support.image_files import exr, png, rng
+from support.image_files import png, rng
 
 from mbtf_core.errors import InputError
 from mbtf_core.images.exr import choose_channels
@@ -103,12 +103,6 @@ class TestLayers:
         assert np.array_equal(image.pixels[..., 0], disp + 1)
         assert image.channels == ("disp.Y",)
         assert np.array_equal(read_image(tmp_path / "x.exr", "rough.Y").pixels[..., 0], rough)
-
-    def test_whole_numbers_matter_only_where_they_are_meant(self, tmp_path: Path) -> None:
-        path = exr(tmp_path / "x.exr", {"Y": np.ones((4, 6), np.float32), "id": np.zeros((4, 6), np.uint32)})
-        assert read_image(path).pixels.shape == (4, 6, 1)
-        with pytest.raises(InputError, match="'id' stores integers"):
-            read_image(path, "id")
 
 
 def test_single_channels_of_other_kinds(tmp_path: Path) -> None:

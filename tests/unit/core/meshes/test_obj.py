@@ -323,13 +323,6 @@ def test_colors_of_vertices_are_srgb_factors(tmp_path: Path) -> None:
     assert "multiplies" in content.warnings[0]
 
 
-def test_weights_of_vertices_are_those_of_curves_alone(tmp_path: Path) -> None:
-    text = "v 1 0 0 2\nv 3 0 0 2\nv 3 4 0 2\nf 1 2 3\n"
-    (shape,) = read(tmp_path, text).shapes
-    assert shape.vertices.tolist() == [[1, 0, 0], [3, 0, 0], [3, 4, 0]]
-    assert shape.colors is None
-
-
 def test_y_up_is_noticed() -> None:
     rng = np.random.default_rng(0)
     n = 8

@@ -6,8 +6,6 @@ import asyncio
 import multiprocessing
 import os
 import signal
-import subprocess
-import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator
@@ -51,28 +49,6 @@ def test_a_batch_system_that_refuses_the_jobs_is_no_wait(
     ):
         pass
     assert "Traceback" not in capfd.readouterr().err
-
-
-def test_an_interruption_while_waiting_for_jobs_is_one(tmp_path: Path) -> None:
-    pytest.importorskip("dask_jobqueue", reason="no dask-jobqueue; to enable: pip install 'mbtf[cluster]'")
-    for name, text in (("sbatch", "echo Submitted batch job 5"), ("scancel", "exit 0")):
-        (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n")
-        (tmp_path / name).chmod(0o755)
-    (tmp_path / "site.yaml").write_text("engine: slurm\nworkers: 1\noptions: {interface: lo}\n")
-    program = (
-        "import os, signal\n"
-        "from mbtf_core.run.cluster import open_runner\n"
-        "def note(line): signal.setitimer(signal.ITIMER_REAL, 0.5)\n"
-        "signal.signal(signal.SIGALRM, lambda *_: os.kill(os.getpid(), signal.SIGINT))\n"
-        "try:\n"
-        "    with open_runner('site.yaml', note): pass\n"
-        "except KeyboardInterrupt: print('interrupted')\n"
-    )
-    environment = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
-    done = subprocess.run(
-        [sys.executable, "-c", program], cwd=tmp_path, env=environment, capture_output=True, text=True
-    )
-    assert done.stdout == "interrupted\n", done.stderr
 
 
 @pytest.mark.parametrize("task", [run_tasks.die_at_first, run_tasks.fail_at_first])

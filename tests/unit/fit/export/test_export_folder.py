@@ -82,22 +82,6 @@ def test_a_file_beside_the_material_is_replaced_on_request_only(
     assert "mine" not in (material / "layers.json").read_text()
 
 
-def test_another_export_is_refused_unless_told(
-    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "out"
-    assert export(source, out) == 0
-    before = stamps(out)
-    capsys.readouterr()
-    assert export(source, out, "--half") == 3
-    message = capsys.readouterr().err
-    assert "half: False -> True" in message
-    assert "--overwrite" in message
-    assert stamps(out) == before
-    assert export(source, out, "--half", "--overwrite") == 0
-    assert Material.load(out).description["weights"]["dtype"] == "float16"
-
-
 def test_one_export_does_not_mix_with_another(
     source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

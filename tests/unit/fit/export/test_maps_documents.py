@@ -184,21 +184,6 @@ def test_materialx(glossy: Path) -> None:
     np.testing.assert_allclose(extremes, [heights.min(), heights.max()], atol=1e-6)
 
 
-def test_names_outside_of_ascii(tmp_path: Path) -> None:
-    name = '日本 a\'b "c"'
-    pxr = pytest.importorskip("pxr.Usd")
-    write_material(tmp_path / name, model="relief", finest=2)
-    out = tmp_path / "out"
-    assert (
-        run(app, ["export", str(tmp_path / name), "--to", "usd", "--to", "gltf", "-q", "-o", str(out)]) == 0
-    )
-    stage = pxr.Stage.Open(str(out / "material.usda"))
-    linked = stage.GetPrimAtPath("/Tile").GetCustomData()
-    extras = json.loads((out / "material.gltf").read_text())["materials"][0]["extras"]
-    for data in (linked, extras):
-        assert (out / data["neural_material"] / "material.json").is_file()
-
-
 def test_a_surface_without_gloss_with_holes(tmp_path: Path) -> None:
     lattice = Lattice(3, 0.5)
     levels = [np.zeros((*lattice.shape(s), 6), np.float32) for s in range(4)]

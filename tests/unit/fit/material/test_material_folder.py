@@ -53,15 +53,6 @@ def test_a_fit_states_the_lowest_direction_of_its_data(tmp_path: Path) -> None:
     assert fit(config(), folder, tmp_path / "m").material.description["data"]["min_cos"] == 0.3
 
 
-@pytest.mark.parametrize("model", ["neumip", "neumip-baseline", "neumip+"])
-def test_a_homogeneous_constant_is_fitted(model: str, tmp_path: Path) -> None:
-    folder = write_data(tmp_path / "d", constant(0.25), noise=0.05)
-    result = fit(config(200, model=model), folder, tmp_path / "m")
-    found = result.material.evaluate(*random_queries(np.random.default_rng(5), 500, Lattice(3)).values())
-    assert found.mean() == pytest.approx(0.25, abs=0.003)
-    assert np.sqrt(((found - 0.25) ** 2).mean()) < 0.01
-
-
 class Diffuse(Model):
     """Three learned numbers per texel, and nothing else: smaller than any model with a network."""
 

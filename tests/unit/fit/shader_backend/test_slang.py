@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.shader_cases import CASES, make
+from support.material_cases import CASES, make
 
 from mbtf_core.app.console import run
 from mbtf_core.directions import from_angles

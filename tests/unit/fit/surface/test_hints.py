@@ -272,14 +272,6 @@ def test_a_wave_keeps_its_phase_and_the_gaussian_share_of_its_amplitude(
     np.testing.assert_allclose(found, share * cosine(*shape), atol=2e-6)
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (3, 8), (6, 7), (40, 9)])
-def test_means_are_kept(shape: tuple[int, int]) -> None:
-    image = torch.from_numpy(np.random.default_rng(0).random((6, 8, 2)))
-    for sigma in (0.0, 0.3):
-        found = prefilter(image, shape, sigma, 0.75)
-        torch.testing.assert_close(found.mean((0, 1)), image.float().mean((0, 1)), atol=1e-6, rtol=0)
-
-
 def test_lookups_are_gaussian_averages_wherever_they_fall() -> None:
     """Direct sums over a random map, at the centers and the corners of texels of two levels. Textures of
     twice the texels of a level have little error of interpolation."""
