@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import math
-import re
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -117,25 +115,6 @@ def test_errors_are_two_lines(error: type[MbtfError], code: int, capsys: pytest.
     assert captured.out == ""
 
 
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
-        ("map.exr --querie 3", "--queries"),
-        ("doctor --code many", "prog doctor --help"),
-        ("map.exr second.exr", "second.exr"),
-        ("map.exr --queries 1 --queries 2", "--queries"),
-    ],
-)
-def test_usage_errors(app: App, arguments: str, expected: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(app, arguments.split()) == 2
-    captured = capsys.readouterr()
-    lines = captured.err.splitlines()
-    assert len(lines) <= 2
-    assert lines[0].startswith("error: ")
-    assert expected in captured.err
-    assert captured.out == "" or "--json" in arguments
-
-
 @pytest.mark.parametrize("line", ["doctr", "--json doctor", "doctr --code 3", "--json doctor more"])
 def test_a_line_that_fails_suggests_the_command_that_it_may_mean(
     app: App, line: str, capsys: pytest.CaptureFixture[str]
@@ -226,32 +205,3 @@ def test_the_time_left_counts_neither_set_up_nor_earlier_runs(
         "fitting: 100%, 1:35 elapsed, evaluating",
         "fitting: 100%, 1:36 elapsed, writing",
     ]
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="no pseudo-terminals")
-def test_progress_on_a_terminal_is_a_bar() -> None:
-    import os
-    import pty
-    import subprocess
-
-    code = (
-        "from mbtf_core.app.console import CONSOLE\n"
-        "with CONSOLE.progress(3, 'rendering') as bar:\n"
-        "    bar.advance(3, 'loss 0.123, unexplained 0.250 ± 0.010, 1.23 M queries/s')\n"
-        "CONSOLE.report({}, 'result')\n"
-    )
-    reader, writer = pty.openpty()
-    environment = {**os.environ, "TERM": "xterm", "COLUMNS": "60"}
-    done = subprocess.run(
-        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=writer, env=environment, check=True
-    )
-    os.close(writer)
-    shown = os.read(reader, 65536).decode()
-    os.close(reader)
-    assert "━" in shown
-    assert "100%" in shown
-    assert "loss 0.123, unexplained 0.250 ± 0.010, 1.23 M queries/s" in shown
-    plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown)
-    lines = [line.strip() for line in re.split(r"[\r\n]+", plain) if line.strip()]
-    assert all(re.match(r"rendering ━+ |loss ", line) and len(line) <= 60 for line in lines), lines
-    assert done.stdout == b"result\n"

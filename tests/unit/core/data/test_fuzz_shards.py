@@ -149,13 +149,3 @@ def test_a_manifest_cannot_name_files_elsewhere(whole: Path) -> None:
     with pytest.raises(InputError, match=r"splits\.train\.shards\.1\.file"):
         Dataset.open(whole)
     manifest.write_text(before)
-
-
-@pytest.mark.parametrize("rows", ["ten", None, -1, 1.5, [10], {}, 10**9])
-def test_a_sidecar_states_the_number_of_rows_that_the_manifest_lists(rows: object, whole: Path) -> None:
-    sidecar = whole / "train-00001.json"
-    before = sidecar.read_text()
-    edit(sidecar, lambda record: record.update(rows=rows))
-    with pytest.raises(InputError, match=r"has the rows .*, manifest\.json says 10|corrupt sidecar"):
-        Dataset.open(whole).shards("train")
-    sidecar.write_text(before)

@@ -340,15 +340,6 @@ def test_images_that_cannot_be_read_are_named(tmp_path: Path) -> None:
     assert "images.3" in fault_of({"source": 3}, None, tmp_path).what
 
 
-def test_the_fallback_of_another_format_is_used(tmp_path: Path) -> None:
-    builder = GltfBuilder()
-    builder.texture(np.full((1, 1, 3), 255, np.uint8))
-    builder.document["textures"][0]["extensions"] = {"EXT_texture_webp": {"source": 5}}
-    found = content_of(plate_of({"baseColorTexture": {"index": 0}}, builder), tmp_path)
-    assert found.shapes[0].faults == {}
-    assert any("webp" in text for text in found.warnings)
-
-
 def test_specular_and_glossiness_alone_are_a_fault(tmp_path: Path) -> None:
     extensions = {"KHR_materials_pbrSpecularGlossiness": {"diffuseFactor": [1, 0, 0, 1]}}
     (shape,) = content_of(plate_of(None, extensions=extensions), tmp_path).shapes

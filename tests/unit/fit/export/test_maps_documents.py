@@ -88,7 +88,6 @@ def test_gltf(glossy: Path) -> None:
     assert f0_of(material.extensions["KHR_materials_ior"]["ior"]) == pytest.approx(f0(glossy), rel=1e-4)
     assert document.extensionsUsed == ["KHR_materials_ior"]
     extras = material.extras
-    assert (glossy / extras["neural_material"] / "material.json").is_file()
     description = json.loads((glossy / extras["neural_material"] / "material.json").read_text())
     assert extras["weights_sha256"] == description["weights"]["sha256"]
     data = base64.b64decode(document.buffers[0].uri.partition(",")[2])
@@ -150,8 +149,6 @@ def test_usd(glossy: Path) -> None:
     assert height.GetInput("scale").Get()[0] == pytest.approx(np.ptp(heights), rel=1e-5)
     assert height.GetInput("bias").Get()[0] == pytest.approx(heights.min(), rel=1e-5)
     assert f0_of(surface.GetInput("ior").Get()) == pytest.approx(f0(glossy), rel=1e-4)
-    data = stage.GetPrimAtPath("/Tile").GetCustomData()
-    assert (glossy / data["neural_material"] / "material.json").is_file()
 
 
 def test_materialx(glossy: Path) -> None:
@@ -163,11 +160,6 @@ def test_materialx(glossy: Path) -> None:
     assert f0_of(surface.getInput("ior").getValue()) == pytest.approx(f0(glossy), rel=1e-4)
     image = document.getNodeGraph("maps").getNode("base")
     assert image.getInput("file").getAttribute("colorspace") == "srgb_texture"
-    assert (glossy / image.getInput("file").getValue()).is_file()
-    assert (
-        document.getNodeGraph("maps").getNode("normal_image").getInput("file").getAttribute("colorspace")
-        == ""
-    )
     (moved,) = mx.getShaderNodes(material, "displacementshader")
     graph = document.getNodeGraph("maps")
     assert [graph.getNode(name).getInput("index").getValue() for name in ("roughness", "metallic")] == [1, 2]

@@ -345,12 +345,3 @@ def test_hierarchical_depends_on_its_neighborhood_alone() -> None:
     touched = features.grad.view(9, 9, -1).abs().sum(2) > 0
     assert touched[[0, 0, 4, 8, 8], [0, 8, 4, 0, 8]].float().mean() > 0.5
     assert touched.float().mean() > 0.8
-
-
-def test_a_value_does_not_depend_on_other_queries() -> None:
-    model = random_model("hierarchical")
-    at = arguments(40)
-    together = model(*at)
-    order = torch.randperm(40)
-    torch.testing.assert_close(model(*(a[order] for a in at)), together[order])
-    torch.testing.assert_close(model(*(a[7:8] for a in at)), together[7:8])
