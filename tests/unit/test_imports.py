@@ -17,19 +17,6 @@ from conftest import RunPython
 from support.paths import ROOT
 
 PACKAGES = ("mbtf_core", "mbtf_gen", "mbtf_fit", "mbtf_pipeline")
-HEAVY = {
-    "torch",
-    "mitsuba",
-    "drjit",
-    "matplotlib",
-    "scipy",
-    "trimesh",
-    "pyvista",
-    "OpenEXR",
-    "h5py",
-    "dask",
-    "distributed",
-}
 # The rooms from the lowest to the highest: folders, or single files, of the packages. A room imports from its
 # own line and from those above it. A package's name stands for its files that no line names.
 ROOMS = """
@@ -199,14 +186,6 @@ def graph_of(name_of: Callable[[str], str]) -> dict[str, set[str]]:
 @pytest.mark.parametrize("name_of", [lambda module: module, room], ids=["modules", "rooms"])
 def test_no_circle(name_of: Callable[[str], str]) -> None:
     TopologicalSorter(graph_of(name_of)).prepare()
-
-
-def test_importing_the_packages_loads_nothing_heavy(run_python: RunPython) -> None:
-    done = run_python(
-        "-c", f"import sys, {', '.join(PACKAGES)}; print(*sorted({HEAVY!r} & set(sys.modules)))"
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == []
 
 
 def public_classes() -> dict[str, list[str]]:

@@ -163,47 +163,6 @@ def test_a_worker_with_several_threads_runs_one_task_at_a_time() -> None:
         assert [done.value for done in found] == 16 * [True]
 
 
-def test_jobs_of_batch_systems(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a site needs comes beside what tasks need."""
-    dask_jobqueue = pytest.importorskip("dask_jobqueue")
-    scripts = []
-    monkeypatch.setattr("shutil.which", lambda command: f"/usr/bin/{command}")
-    for system in ("SLURMCluster", "PBSCluster"):
-        monkeypatch.setattr(
-            getattr(dask_jobqueue, system), "adapt", lambda self, **numbers: scripts.append(self.job_script())
-        )
-    own = {
-        "job_script_prologue": ["module load python"],
-        "worker_extra_args": ["--local-directory", "/scratch"],
-        "queue": "short",
-    }
-    for name in ("slurm", "pbs"):
-        config = ClusterConfig(
-            engine=name,
-            threads=8,
-            gpus=1,
-            memory=16e9,
-            walltime=7200,
-            options=own,  # type: ignore[arg-type]
-        )
-        with module._started(config, [], print):
-            pass
-    for script in scripts:
-        lines = script.splitlines()
-        assert lines.index("module load python") < lines.index(f"export {task.THREADS_VARIABLE}=8")
-        assert "export DASK_DISTRIBUTED__WORKER__MEMORY__PAUSE=False" in lines
-        for words in (
-            "--nthreads 1",
-            "--preload mbtf_core.run.task",
-            "--resources GPU=1",
-            "--lifetime 6480s",
-            "--local-directory /scratch",
-        ):
-            assert words in script
-    assert "--cpus-per-task=8" in scripts[0]
-    assert "-p short" in scripts[0]
-
-
 @pytest.fixture
 def job_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., list[str]]]:
     """Lines of the job that options, and a file of Dask's configuration, ask for; then those for the user."""
@@ -218,13 +177,13 @@ def job_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable
         lambda self, **numbers: found.extend(self.job_script().splitlines()),
     )
 
-    def lines(site: str = "", **options: Any) -> list[str]:
+    def lines(site: str = "", config: dict[str, Any] | None = None, **options: Any) -> list[str]:
         (tmp_path / "site.yaml").write_text(site)
         found.clear()
         site_config = dask.config.collect(paths=[str(tmp_path / "site.yaml")], env={})
         with dask.config.set(dask.config.merge(dask.config.config, site_config)):
-            config = ClusterConfig(engine="slurm", options={"interface": "lo", **options})
-            with warnings.catch_warnings(), module._started(config, [], found.append):
+            slurm = ClusterConfig(engine="slurm", options={"interface": "lo", **options}, **(config or {}))
+            with warnings.catch_warnings(), module._started(slurm, [], found.append):
                 warnings.simplefilter("error")
         return found
 
@@ -243,6 +202,26 @@ jobqueue:
     account: site
 distributed: {worker: {preload: [site_module]}}
 """
+
+
+def test_what_a_job_needs_comes_beside_what_tasks_need(
+    job_of: Callable[..., list[str]], tmp_path: Path
+) -> None:
+    own: dict[str, Any] = {
+        "job_script_prologue": ["module load python"],
+        "worker_extra_args": ["--local-directory", "/scratch"],
+        "queue": "short",
+        "log_directory": str(tmp_path / "logs"),
+    }
+    job = job_of(config={"threads": 8, "gpus": 1, "memory": 16e9, "walltime": 7200}, **own)
+    assert job.index("module load python") < job.index(f"export {task.THREADS_VARIABLE}=8")
+    assert "export DASK_DISTRIBUTED__WORKER__MEMORY__PAUSE=False" in job
+    assert {"#SBATCH --cpus-per-task=8", "#SBATCH -p short"} <= set(job)
+    for words in (
+        *("--nthreads 1", "--preload mbtf_core.run.task", "--resources GPU=1"),
+        *("--lifetime 6480s", "--local-directory /scratch"),
+    ):
+        assert words in job[-1]
 
 
 def test_what_a_site_configures_is_kept(
