@@ -100,7 +100,9 @@ def make(case: str, folder: Path, **more: Any) -> Material:
         return export(model, FitConfig(), folder, data={"hash": "0" * 64}, training=TRAINING)
     options = {"finest": 4, "aspect": 0.5, **ALL[case], **more}
     if case in ("calibrated", "calibrated relief", "holes"):
-        options["weights"] = {"calibration": 0.7 + 0.6 * torch.rand((2, 5, 6, 3), generator=generator)}
+        options["weights"] = {
+            "calibration": 0.7 + 0.6 * torch.rand((2, options["finest"] + 1, 6, 3), generator=generator)
+        }
     if case == "holes":
         shapes = [(*lattice.shape(s), 6) for s in range(5)]
         coefficients = [0.3 + 0.2 * torch.randn(s, generator=generator).numpy() for s in shapes]

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import logging
 import math
+import re
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -205,3 +207,52 @@ def test_the_time_left_counts_neither_set_up_nor_earlier_runs(
         "fitting: 100%, 1:35 elapsed, evaluating",
         "fitting: 100%, 1:36 elapsed, writing",
     ]
+
+
+def test_plain_progress_has_a_line_at_intervals(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = 0.0
+    monkeypatch.setattr("mbtf_core.app.progress.time.monotonic", lambda: now)
+    with CONSOLE.progress(100, "fitting", "steps") as bar:
+        for step in range(25):
+            now += 1
+            bar.advance(2, f"step {step}")
+    with CONSOLE.progress(None, "reading", "rows") as bar:
+        bar.update(7)
+    with CONSOLE.progress(4, "rendering", "shards"):
+        pass
+    captured = capsys.readouterr()
+    assert captured.err.splitlines() == [
+        "fitting: 20/100 steps (20%), 0:10 elapsed, 0:40 left, step 9",
+        "fitting: 40/100 steps (40%), 0:20 elapsed, 0:30 left, step 19",
+        "fitting: 50/100 steps (50%), 0:25 elapsed, 0:25 left, step 24",
+        "reading: 7 rows, 0:00 elapsed",
+    ]
+    assert captured.out == ""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no pseudo-terminals")
+def test_progress_on_a_terminal_is_a_bar() -> None:
+    import os
+    import pty
+    import subprocess
+
+    note = "loss 0.123, unexplained 0.250 ± 0.010, 1.23 M queries/s"
+    code = "from mbtf_core.app.console import CONSOLE\n"
+    code += f"with CONSOLE.progress(3, 'rendering') as bar: bar.advance(3, {note!r})"
+    reader, writer = pty.openpty()
+    environment = {**os.environ, "TERM": "xterm", "COLUMNS": "60"}
+    subprocess.run([sys.executable, "-c", code], stderr=writer, env=environment, check=True)
+    os.close(writer)
+    plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", os.read(reader, 65536).decode())
+    os.close(reader)
+    lines = [line.strip() for line in re.split(r"[\r\n]+", plain) if line.strip()]
+    assert note in lines
+    assert any("━" in line and "100%" in line for line in lines)
+    assert all(re.match(r"rendering ━+ |loss ", line) and len(line) <= 60 for line in lines), lines
+
+
+def test_the_version_is_said(app: App, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(app, ["--version"]) == 0
+    assert re.fullmatch(r"prog \d+\.\d+\.\d+\S*\n", capsys.readouterr().out)

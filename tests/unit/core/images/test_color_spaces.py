@@ -111,6 +111,10 @@ def test_profiles_of_gray_and_of_floats(tmp_path: Path) -> None:
     Pillow.fromarray(codes).save(tmp_path / "g.png", icc_profile=icc("Gray 1.8", (), para(0, 1.8), gray=True))
     expected = np.repeat((codes[..., None] / 255.0) ** 1.8, 3, axis=2)
     assert linear_rgb(read_image(tmp_path / "g.png")) == pytest.approx(expected, abs=1e-4)
+    # A curve to Lab is one of lightness.
+    lab = icc("L*", (), para(0, 1.0), gray=True).replace(b"GRAYXYZ ", b"GRAYLab ")
+    Pillow.fromarray(codes).save(tmp_path / "g.png", icc_profile=lab)
+    assert read_image(tmp_path / "g.png").tags.foreign is not None
     # Another library than Pillow reads floats of three channels.
     numbers = rng().random((8, 8, 3)).astype(np.float32)
     profile = icc("P3 linear", P3_COLUMNS, para(0, 1.0))

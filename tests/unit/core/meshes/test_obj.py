@@ -10,7 +10,7 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 from PIL import Image
-from support.image_files import P3_COLUMNS, SRGB_CURVE, icc
+from support.image_files import P3_COLUMNS, SRGB_CURVE, exr, icc
 
 from mbtf_core.errors import InputError
 from mbtf_core.meshes.content import MeshContent, MeshShape, Texture
@@ -228,6 +228,14 @@ def test_colors_of_images_are_converted_from_the_space_that_they_declare(tmp_pat
     assert texture_of(content)[0].pixels == pytest.approx(np.array(expected), abs=1e-3)
     assert any("Rec.709" in text for text in content.warnings)
     assert texture_of(content, "metallic")[0].pixels.tolist() == [[0, 1], [0, 1]]
+    numbers = np.full((2, 2), 0.5, np.float32)
+    channels = {"R": numbers, "G": 0.5 * numbers, "B": 0.5 * numbers}
+    exr(tmp_path / "a.exr", channels, chromaticities=(0.68, 0.32, 0.265, 0.69, 0.15, 0.06, 0.3127, 0.329))
+    content = with_material(tmp_path, "map_Kd a.exr")
+    # Apple's P3 to Rec.709: 1.2249, -0.0421, -0.0196 in the column of red.
+    found = texture_of(content)[0].pixels[0, 0]
+    assert found == pytest.approx(np.array([0.5562, 0.2395, 0.2451]), abs=1e-3)
+    assert not content.warnings
 
 
 @pytest.mark.parametrize(
@@ -332,3 +340,9 @@ def test_y_up_is_noticed() -> None:
     blades = np.array([[0, 0, 0], [0.1, 0, 0], [0.05, 0, 1], [3, 0.3, 0], [3, 0.31, 0], [3, 0.3, 1]])
     floor = np.array([[0, 0, 0], [3, 0, 0], [3, 0.4, 0]])
     assert not seems_up("y", np.concatenate([blades, floor]), np.arange(9).reshape(3, 3))
+
+
+def test_elements_that_are_not_used_are_said(tmp_path: Path) -> None:
+    (warning,) = read(tmp_path, SQUARE + "l 1 2\np 3\ncurv 0 1 1 2\n#MRGB ff808080\n" + FACES).warnings
+    for word in ("lines", "points", "curves", "ZBrush"):
+        assert word in warning

@@ -283,3 +283,13 @@ def test_workers_of_this_machine_divide_its_gpus(monkeypatch: pytest.MonkeyPatch
         assert os.environ["CUDA_VISIBLE_DEVICES"] == expected
     # The signal of Ctrl-C is the command's.
     assert handlers == {signal.SIGINT: signal.SIG_IGN}
+
+
+def test_old_names_of_options_are_understood(job_of: Callable[..., list[str]], tmp_path: Path) -> None:
+    old = {"project": "graphics", "job_extra": "--qos=low", "env_extra": ["module load python"]}
+    more = {"header_skip": "--mem", "extra": ["--local-directory", "/scratch"]}
+    job = job_of(**old, **more, log_directory=str(tmp_path / "logs"))
+    assert job.index("module load python") < job.index(OURS)
+    assert {"#SBATCH -A graphics", "#SBATCH --qos=low", "#SBATCH -n 1"} <= set(job)
+    assert not any("--mem=" in line for line in job)
+    assert "--local-directory /scratch" in job[-1]

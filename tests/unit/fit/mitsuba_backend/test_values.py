@@ -39,7 +39,7 @@ SHAPES: dict[str, dict[str, Any]] = {
     "tall tile": {"case": "neumip", "aspect": 2.3},
     "flat tile": {"case": "neumip", "aspect": 0.1},
     "tall surface": {"case": "relief", "aspect": 2.3},
-    **{f"one texel, {case}": {"case": case, "finest": 0} for case in ("neumip", "relief")},
+    **{f"one texel, {case}": {"case": case, "finest": 0} for case in ("neumip", "relief", "calibrated")},
     "one texel, concatenated": {"case": "concatenated, softplus", "finest": 0},
 }
 SHAPES |= {case: {"case": case} for case in ALL.keys() - HIERARCHICAL.keys() - {"black"}}
