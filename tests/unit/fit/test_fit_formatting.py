@@ -49,3 +49,10 @@ def test_errors_above_1_are_worse_than_the_mean_value(value: float, remark: bool
     assert ("above 1: worse than the mean value" in report_errors(found, None)[-1]) == remark
     # The data of another material say nothing of the number of queries.
     assert "above 1" not in report_errors(found, None, foreign=True)[-1]
+
+
+def test_where_the_unexplained_variance_is_undefined_the_psnr_is_the_number() -> None:
+    """A material of one value, or few noisy queries."""
+    lines = report_errors({"test": split(1e-5, 1e-6, None), "training": split(1e-5, 1e-6, None)}, None)
+    assert lines[0].startswith("PSNR 50.0 dB of 4096 test queries at exposure +0.00 EV")
+    assert lines[-1].startswith("undefined unexplained variance: the noise exceeds")

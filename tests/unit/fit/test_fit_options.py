@@ -135,3 +135,10 @@ def test_a_model_that_is_not_installed_is_named(tmp_path: Path, source: str) -> 
         build(FitConfig, {"model": "texel-lobe"}, source=str(tmp_path / source))
     for part in (source, "'texel-lobe'", ", ".join(NAMES), "entry point of mbtf.models"):
         assert part in caught.value.message
+
+
+def test_every_model_has_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(app, ["models"]) == 0
+    rows = capsys.readouterr().out.splitlines()[1:]
+    assert [row.split()[0] for row in rows] == sorted(NAMES)
+    assert all(len(row.split()) > 3 for row in rows)
