@@ -6,6 +6,7 @@ This file needs nothing of the project. Exports are checked by it.
 # mypy: ignore-errors
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -29,9 +30,9 @@ OPERATIONS = {
     "gate": lambda gate, x, floor, scale, plus=0.0, unit=1.0: (
         (floor + scale * expit(gate)) * x * (unit > 0) + plus
     ),
+    "product": lambda x: x,
     "standardize": lambda x, mean, deviation: mean + deviation * x,
     "divide_by_cosine": lambda x, omega, least: x / max(omega[2], least),
-    "product": lambda x: x.reshape(-1, 3).prod(0),
 }
 
 
@@ -134,6 +135,8 @@ class NumpyMaterial:
             execute = OPERATIONS.get(kind) or getattr(self, kind, None)
             if execute is None:
                 raise NotImplementedError(f"NumPy does not support the operation '{kind}'")
+            if kind == "product":
+                fields["x"] = math.prod(map(self.read, fields["x"]))
             self.values[name] = execute(**{key: self.read(x) for key, x in fields.items()})
         return np.maximum(self.values[name], 0)
 

@@ -321,7 +321,7 @@ def plan_study(recipe: Recipe, folder: Path, *, seconds: float, seed: int | None
         The folder holds something else.
     """
     STUDY.check(folder)
-    job = Job.prepare(study_config(recipe.generate, seed))
+    job = Job.load(study_config(recipe.generate, seed))
     spp, pilot = job.config.queries.spp, forecast(job, seconds=1.0)
     conditions = _conditions(job, folder, seconds)
     found = Measurements(conditions, MeasurementFolder(folder, conditions), Runner())

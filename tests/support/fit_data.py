@@ -12,17 +12,15 @@ from numpy.typing import NDArray
 
 from mbtf_core.data.geometry import Geometry, encode_geometry, geometry_record
 from mbtf_core.data.lattice import Lattice, sigma_of_level
-from mbtf_core.data.schema import FORMAT_NAME, GEOMETRY_NAME, MANIFEST_NAME, SCHEMA_VERSION
-from mbtf_core.data.shard_files import write_shard
+from mbtf_core.data.schema import GEOMETRY_NAME, SCHEMA_VERSION
 from mbtf_core.directions import from_projected_disk
-from mbtf_core.files.atomic import checksummed
 from mbtf_fit.config import FitConfig, build_model
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.objective.noise import NoiseModel, typical_value
 from mbtf_fit.training.loop import TrainingLoop
 from mbtf_fit.training.trainer import Trainer
 
-from .datasets import write_sidecar
+from .datasets import write_manifest, write_part
 
 F32 = NDArray[np.float32]
 # (u, sigma, omega_i, omega_o) → (n, 3)
@@ -91,7 +89,7 @@ def write_data(
     geometry = geometry or flat_geometry(lattice)
     (folder / GEOMETRY_NAME).write_bytes(encode_geometry(geometry))
     config_hash = f"{function.__name__}-{seed}-{noise}"
-    splits: dict[str, dict[str, object]] = {}
+    splits: dict[str, Any] = {}
     for split, total, count in (("train", train, shards), ("test", test, 1)):
         entries = []
         for index in range(count):
@@ -106,26 +104,11 @@ def write_data(
             if through is not None:
                 seen = through(queries["u"], queries["sigma"], queries["omega_o"])
                 arrays["transmittance"] = seen.astype(np.float32)
-            name = f"{split}-{index:05d}{suffix}"
-            write_shard(folder / name, arrays)
-            write_sidecar(folder / name, split, index, config_hash)
-            entries.append({"file": name, "rows": n})
-        splits[split] = {"queries": total, "shards": entries}
-    manifest = {
-        "format": FORMAT_NAME,
-        "schema": schema,
-        "config_hash": config_hash,
-        "layout": layout,
-        "levels": {"finest": finest},
-        "tile": {"aspect": aspect},
-        "config": {"light": {"width": 1.0}},
-        "geometry": geometry_record(geometry),
-        "splits": splits,
-    }
-    if through is not None:
-        manifest["arrays"] = {"transmittance": {}}
-    (folder / MANIFEST_NAME).write_bytes(checksummed(manifest))
-    return folder
+            entries.append(write_part(folder, split, index, arrays, config_hash, suffix))
+        splits[split] = total, entries
+    more: dict[str, Any] = {} if through is None else {"arrays": {"transmittance": {}}}
+    more |= {"config": {"light": {"width": 1.0}}, "geometry": geometry_record(geometry), "schema": schema}
+    return write_manifest(folder, layout, lattice, config_hash, splits, **more)
 
 
 def flat_geometry(lattice: Lattice) -> Geometry:

@@ -9,12 +9,9 @@ from typing import Any
 import numpy as np
 
 from mbtf_core.data.lattice import Lattice, sigma_of_level, texel_centers
-from mbtf_core.data.schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION
-from mbtf_core.data.shard_files import write_shard
-from mbtf_core.files.atomic import checksummed
 from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan
 
-from .datasets import write_sidecar
+from .datasets import write_manifest, write_part
 from .fit_data import F32, Function, random_directions
 
 
@@ -57,7 +54,7 @@ def write_images(
     folder.mkdir(parents=True, exist_ok=True)
     lattice, random = Lattice(finest, aspect), np.random.default_rng(seed)
     config_hash = f"images-{function.__name__}-{seed}-{noise}"
-    splits: dict[str, dict[str, object]] = {}
+    splits: dict[str, Any] = {}
     for split, counts in (("train", (train // 2, train - train // 2)), ("test", (test,))):
         entries = []
         for index, items in enumerate(counts):
@@ -75,23 +72,8 @@ def write_images(
             if through is not None:
                 seen = through(flat["u"], flat["sigma"], flat["omega_o"])
                 halves["transmittance"] = seen.reshape(shape).astype(np.float32)
-            name = f"{split}-{index:05d}.npz"
-            write_shard(folder / name, {**queries, **halves, "spp": np.full(shape, 2, np.float32)})
-            write_sidecar(folder / name, split, index, config_hash)
-            entries.append({"file": name, "rows": items})
-        splits[split] = {"queries": sum(counts), "shards": entries}
-    manifest: dict[str, Any] = {
-        "format": FORMAT_NAME,
-        "schema": SCHEMA_VERSION,
-        "config_hash": config_hash,
-        "layout": "image",
-        "levels": {"finest": finest},
-        "tile": {"aspect": aspect},
-        "geometry": None,
-        "splits": splits,
-        "patch_size": patch_size,
-    }
-    if through is not None:
-        manifest["arrays"] = {"transmittance": {}}
-    (folder / MANIFEST_NAME).write_bytes(checksummed(manifest))
-    return folder
+            arrays = {**queries, **halves, "spp": np.full(shape, 2, np.float32)}
+            entries.append(write_part(folder, split, index, arrays, config_hash))
+        splits[split] = sum(counts), entries
+    more: dict[str, Any] = {} if through is None else {"arrays": {"transmittance": {}}}
+    return write_manifest(folder, "image", lattice, config_hash, splits, patch_size=patch_size, **more)

@@ -10,14 +10,11 @@ import numpy as np
 import torch
 
 from mbtf_core.data.lattice import Lattice
-from mbtf_core.data.schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION
-from mbtf_core.data.shard_files import write_shard
-from mbtf_core.files.atomic import checksummed
 from mbtf_fit.models.registry import MODELS
 from mbtf_fit.pytorch.material import NeuralMaterial
 from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan, slice_directions
 
-from .datasets import write_sidecar
+from .datasets import write_manifest, write_part
 from .fit_data import F32, Function
 
 
@@ -70,26 +67,10 @@ def write_slices(
                 arrays["transmittance"] = through(queries.u)
             if change is not None and (split, index) == ("train", 0):
                 change(arrays)
-            name = f"{split}-{index:05d}.npz"
-            write_shard(folder / name, arrays)
-            write_sidecar(folder / name, split, index, config_hash)
-            entries.append({"file": name, "rows": lead[0]})
-        splits[split] = {"queries": total, "shards": entries}
-    manifest: dict[str, Any] = {
-        "format": FORMAT_NAME,
-        "schema": SCHEMA_VERSION,
-        "config_hash": config_hash,
-        "layout": "slices",
-        "slice_size": lights**2,
-        "levels": {"finest": finest},
-        "tile": {"aspect": aspect},
-        "geometry": None,
-        "splits": splits,
-    }
-    if through is not None:
-        manifest["arrays"] = {"transmittance": {}}
-    (folder / MANIFEST_NAME).write_bytes(checksummed(manifest))
-    return folder
+            entries.append(write_part(folder, split, index, arrays, config_hash))
+        splits[split] = total, entries
+    more: dict[str, Any] = {} if through is None else {"arrays": {"transmittance": {}}}
+    return write_manifest(folder, "slices", lattice, config_hash, splits, slice_size=lights**2, **more)
 
 
 def prepared(material: NeuralMaterial, name: str, pairs: int, device: torch.device) -> Any:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from conftest import RunPython
 from PIL import Image
 from support.paths import ROOT
@@ -77,9 +76,3 @@ def test_the_notebook_renders_a_ball(tmp_path: Path, run_python: RunPython) -> N
     assert 20 < ball[15:30, 18:32].mean() < 240
     assert ball[15:30, 18:32].std() > 5
     assert ball[30:].std() > 5
-
-
-@pytest.mark.parametrize("name", ["ball.xml", "maps_to_ball.ipynb", "train_your_own.ipynb"])
-def test_examples_are_named_in_the_documentation(name: str) -> None:
-    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
-    assert any(f"examples/{name}" in page.read_text(encoding="utf-8") for page in pages)

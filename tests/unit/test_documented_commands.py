@@ -9,9 +9,8 @@ from dataclasses import replace
 from functools import cache
 from typing import Any
 
-import pytest
 from cyclopts import App, CycloptsError, MissingArgumentError
-from support.documented import Shown, in_markdown, in_strings, shown_commands
+from support.documented import Shown, shown_commands
 from support.paths import ROOT
 
 from mbtf_core.config.settings import resolve
@@ -115,74 +114,6 @@ def test_every_command_that_is_shown_can_be_given() -> None:
     texts = {(shown.text, shown.whole): shown for shown in found}.values()
     faults = [f"{shown.where}: {shown.text}: {text}" for shown in texts if (text := fault(shown))]
     assert faults == []
-
-
-@pytest.mark.parametrize(
-    "line",
-    [
-        "mbtf-gen verfy set/",
-        "mbtf-gen plan a.exr --levels 7",
-        "mbtf-gen [MATERIAL] --levels 7",
-        "mbtf-gen a.exr --queries many",
-        "mbtf-gen a.exr --set queries.levels=7",
-        "mbtf-gen a.exr b.exr",
-        "mbtf-fit evaluate material/",
-        "mbtf-fit shards/ --model other",
-        "mbtf-fit shards/ --time soon",
-        "mbtf-pipeline run pipelines/quickstart.yaml --set fit.other=1",
-        "mbtf-pipeline run pipelines/paper_methods.yaml --set other=1",
-    ],
-)
-def test_planted_faults_are_found(line: str) -> None:
-    assert fault(Shown("here", line))
-
-
-def test_commands_are_found_where_they_stand() -> None:
-    page = (
-        "Run `mbtf-gen doctor` first.\n\n"
-        "```sh\n$ A=1 .venv/bin/mbtf-gen a.exr \\\n    -o out/   # a note\n```\n\n"
-        "    mbtf-fit out/ && mbtf-pipeline list | head\n"
-    )
-    assert {shown.text for shown in in_markdown(page, "")} == {
-        "mbtf-gen doctor",
-        "mbtf-gen a.exr      -o out/",
-        "mbtf-fit out/",
-        "mbtf-pipeline list",
-    }
-    source = 'x = f"mbtf-fit {folder} --many; then"\ny = "no; mbtf-gen merge FOLDER, then go"\n'
-    assert list(in_strings(source, "")) == [
-        Shown("", "mbtf-fit X --many"),
-        Shown("", "mbtf-gen merge FOLDER", whole=False),
-    ]
-
-
-# Flags that are not named after the key that they set.
-OTHER_NAMES = {
-    "--queries": "queries.train",
-    "--test-queries": "queries.test",
-    "--effects": "effects.mode",
-    "--tiles-around": "turntable.tiles",
-    "--turn-size": "turntable.size",
-}
-
-
-def test_a_flag_sets_the_key_that_it_is_named_after() -> None:
-    found = {
-        (option.flag, option.key)
-        for app in APPS.values()
-        for command in commands(app).values()
-        for option in getattr(options_of(command.default_command), "table", ())
-    }
-    assert len(found) > 20
-    for flag, key in found:
-        name = flag.removeprefix("--").replace("-", "_")
-        # A flag that may be repeated has the singular of its key.
-        named = name in (
-            key.rpartition(".")[2].removesuffix("s"),
-            key.rpartition(".")[2],
-            key.replace(".", "_"),
-        )
-        assert key == OTHER_NAMES[flag] if flag in OTHER_NAMES else named, (flag, key)
 
 
 def test_an_option_has_one_help_and_one_meaning() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import tomllib
 
 from support.paths import ROOT
 
@@ -22,16 +21,3 @@ def test_every_file_that_pages_name_exists() -> None:
 def where(name: str) -> str:
     """Pattern of a path, or of a test's file name, which tables give without its folder."""
     return name if "/" in name else f"tests/**/{name}"
-
-
-def test_extras_are_installed_by_one_form_of_the_command() -> None:
-    """``pip install 'mbtf[NAME]'`` works in any folder once mbtf is installed."""
-    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
-    sources = [path for folder in ROOT.glob("mbtf_*") for path in folder.rglob("*.py")]
-    text = {path: path.read_text() for path in (*pages, *sources)}
-    extras = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"])
-    named = {
-        name for content in text.values() for name in re.findall(r"pip install\s+'mbtf\[(\w+)\]'", content)
-    }
-    assert named == extras - {"dev"}
-    assert [path for path, content in text.items() if re.search(r"'\.\[\w+\]'", content)] == []

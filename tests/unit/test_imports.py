@@ -8,6 +8,7 @@ import sys
 import tomllib
 from collections.abc import Callable, Iterable, Iterator
 from functools import cache
+from graphlib import TopologicalSorter
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
@@ -16,19 +17,6 @@ from conftest import RunPython
 from support.paths import ROOT
 
 PACKAGES = ("mbtf_core", "mbtf_gen", "mbtf_fit", "mbtf_pipeline")
-HEAVY = {
-    "torch",
-    "mitsuba",
-    "drjit",
-    "matplotlib",
-    "scipy",
-    "trimesh",
-    "pyvista",
-    "OpenEXR",
-    "h5py",
-    "dask",
-    "distributed",
-}
 # The rooms from the lowest to the highest: folders, or single files, of the packages. A room imports from its
 # own line and from those above it. A package's name stands for its files that no line names.
 ROOMS = """
@@ -186,63 +174,6 @@ def test_imports_run_downwards() -> None:
     assert found == []
 
 
-@pytest.mark.parametrize(
-    ("module", "source", "broken"),
-    [
-        ("mbtf_gen.render.a", "import torch.nn", True),
-        ("mbtf_gen.cli.a", "def f():\n    from mbtf_fit import training", True),
-        ("mbtf_gen.render.a", "import mitsuba", False),
-        ("mbtf_gen.render.a", "from mbtf_gen.planning.run_plan import Pilot", True),
-        (
-            "mbtf_gen.config.a",
-            "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import mbtf_gen.job",
-            True,
-        ),
-        ("mbtf_gen.planning.a", "from mbtf_gen.render.estimator import Stream", False),
-        ("mbtf_core.a", "from mbtf_gen.config import presets", True),
-        ("mbtf_fit.data.a", "from mbtf_core.errors import InputError", False),
-        ("mbtf_fit.data.a", "from mbtf_gen.tile import protocol", True),
-        ("mbtf_fit.data.a", "from mbtf_core.data.dataset import Dataset", False),
-        ("mbtf_core.errors", "from mbtf_core.data.dataset import Dataset", True),
-        ("mbtf_fit.cli.b", "from mbtf_pipeline.stages import run", True),
-        ("mbtf_fit.data.a", "import drjit as dr", True),
-        ("mbtf_fit.backends.mitsuba.a", "import drjit as dr", False),
-        ("mbtf_fit.backends.mitsuba.a", "import torch", True),
-        ("mbtf_pipeline.run", "import mbtf_fit, mbtf_gen, torch", False),
-    ],
-)
-def test_the_check_finds_planted_faults(module: str, source: str, broken: bool) -> None:
-    assert bool(faults(imported(source), module)) is broken
-
-
-def circles(graph: dict[str, set[str]]) -> list[list[str]]:
-    """Groups of modules that import each other, however indirectly (Tarjan 1972)."""
-    index: dict[str, int] = {}
-    low: dict[str, int] = {}
-    stack: list[str] = []
-    found: list[list[str]] = []
-
-    def visit(name: str) -> None:
-        index[name] = low[name] = len(index)
-        stack.append(name)
-        for other in graph.get(name, ()):
-            if other not in index:
-                visit(other)
-                low[name] = min(low[name], low[other])
-            elif other in stack:
-                low[name] = min(low[name], index[other])
-        if low[name] == index[name]:
-            group = stack[stack.index(name) :]
-            del stack[stack.index(name) :]
-            if len(group) > 1:
-                found.append(sorted(group))
-
-    for name in graph:
-        if name not in index:
-            visit(name)
-    return found
-
-
 def graph_of(name_of: Callable[[str], str]) -> dict[str, set[str]]:
     """Who imports whom, of all sources by the names that `name_of` gives them."""
     graph: dict[str, set[str]] = {}
@@ -252,24 +183,9 @@ def graph_of(name_of: Callable[[str], str]) -> dict[str, set[str]]:
     return graph
 
 
-def test_no_circle_of_modules() -> None:
-    assert circles(graph_of(lambda module: module)) == []
-
-
-def test_no_circle_of_rooms() -> None:
-    assert circles(graph_of(room)) == []
-
-
-def test_a_planted_circle_is_found() -> None:
-    assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": set()}) == [["b", "c"]]
-
-
-def test_importing_the_packages_loads_nothing_heavy(run_python: RunPython) -> None:
-    done = run_python(
-        "-c", f"import sys, {', '.join(PACKAGES)}; print(*sorted({HEAVY!r} & set(sys.modules)))"
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == []
+@pytest.mark.parametrize("name_of", [lambda module: module, room], ids=["modules", "rooms"])
+def test_no_circle(name_of: Callable[[str], str]) -> None:
+    TopologicalSorter(graph_of(name_of)).prepare()
 
 
 def public_classes() -> dict[str, list[str]]:

@@ -118,12 +118,6 @@ def empty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     assert list(folder.iterdir()) == []
 
 
-def test_all_configurations_are_found() -> None:
-    found = {model.__name__ for model in models()}
-    assert {"GeneratorConfig", "FitConfig", "Recipe", "ClusterConfig", "MaterialFile"} <= found, found
-    assert len(COMMANDS) >= 20
-
-
 @pytest.mark.parametrize("model", models(), ids=lambda m: f"{m.__module__}.{m.__name__}")
 def test_a_file_is_refused_with_line_and_key(model: type[Settings], tmp_path: Path) -> None:
     path = tmp_path / "a.yaml"

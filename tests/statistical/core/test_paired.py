@@ -108,19 +108,6 @@ def test_weighted_queries_are_those_of_the_distribution() -> None:
     assert deviations.std(ddof=1) == pytest.approx(1, abs=0.2)
 
 
-def test_channels_of_a_query_are_no_extra_samples() -> None:
-    """Counting correlated channels as independent queries makes error bars too small, which
-    the test detects."""
-
-    def wrong(rng: np.random.Generator) -> Estimate:
-        _, a, b = draw(rng)
-        return signal_variance(a[:, [0, 0, 0]].ravel(), b[:, [0, 0, 0]].ravel())
-
-    with pytest.raises(AssertionError):
-        assert_honest(wrong, 0.25)
-    assert_honest(lambda rng: signal_variance(*(h[:, [0, 0, 0]] for h in draw(rng)[1:])), 0.25)
-
-
 # Texels of an image share directions; with few images the correction for their means matters.
 @pytest.mark.parametrize("shape", [(2, 3), (5, 3), (4, 3, 5, 3)])
 def test_signal_variance_is_unbiased_for_few_queries_and_images(shape: tuple[int, ...]) -> None:

@@ -37,18 +37,15 @@ def uniform(n: int, seed: int) -> tuple[Any, Any]:
     return mi.Float(xi[0]), mi.Point2f(xi[1:])
 
 
-def p_value(seed: int, distort: float = 1.0) -> float:
-    """χ² of a random mixture's samples; `distort` scales the slopes of the samples."""
+def p_value(seed: int) -> float:
+    """χ² of a random mixture's samples."""
     n = 40_000
     viewer = random_directions(np.random.default_rng(100 + seed), 1)[0]
 
     def mixture(width: int) -> Mixture:
         return random_mixture(np.random.default_rng(seed), viewer, width)
 
-    sampled = mixture(n)
-    lobe = sampled.lobe
-    wrong = SlopeLobe(lobe.l11 * distort, lobe.l21, lobe.l22, lobe.x, lobe.y)
-    wo = np.array(Mixture(wrong, sampled.weight, sampled.viewer).sample(*uniform(n, seed))).T
+    wo = np.array(mixture(n).sample(*uniform(n, seed))).T
 
     def density(w: np.ndarray) -> np.ndarray:
         return np.array(mixture(len(w)).density(mi.Vector3f(w.T.astype(np.float32))), np.float64)
@@ -60,10 +57,6 @@ def test_samples_have_the_stated_density() -> None:
     p = np.sort([p_value(seed) for seed in range(COUNT)])
     assert p[0] > 0.01 / COUNT, p
     assert np.median(p) > 0.1, p
-
-
-def test_the_chi_square_test_detects_lobes_a_tenth_too_wide() -> None:
-    assert min(p_value(seed, 1.1) for seed in range(COUNT)) < 1e-6
 
 
 class Glossy:

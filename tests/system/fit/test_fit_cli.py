@@ -5,12 +5,10 @@ from __future__ import annotations
 import json
 import math
 import re
-import shutil
 from pathlib import Path
 
 import pytest
 from support.command_lines import call, fails
-from support.datasets import edit
 from support.fit_data import parallax, write_data
 
 QUICK = ("--steps", "5", "--batch", "500")
@@ -34,27 +32,6 @@ def material(shards: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert command.startswith("  mbtf-")
     assert re.search(r"^unexplained variance [\d.]+ ± [\d.]+ of \d+ test queries", done.out, re.M)
     return folder
-
-
-def test_export_writes_the_reported_files(material: Path, tmp_path: Path) -> None:
-    out = tmp_path / "export"
-    done = call(["mbtf-fit", "export", str(material), "--half", "-o", str(out), "--json"])
-    assert done.code == 0, done.err
-    found = json.loads(done.out)
-    assert found["files"] == {p.name: p.stat().st_size for p in out.iterdir() if p.name != "export.json"}
-    assert set(found["files"]) == {"textures.exr", "layers.json"}
-    assert 0 < found["half"]["relative"] < 0.01
-    again = tmp_path / "half"
-    done = call(["mbtf-fit", "export", str(material), "--to", "material", "--half", "-o", str(again)])
-    assert done.code == 0, done.err
-    assert "half precision: rms error" in done.out
-    done = call(["mbtf-fit", "info", str(again)])
-    deviation = re.search(r"largest deviation (\S+)", done.out)
-    assert deviation is not None
-    # Between the values of PyTorch, which are stored, and those of whatever evaluates here.
-    assert float(deviation[1]) < 1e-6
-    message = fails(3, "export", str(material), "--to", "material")
-    assert "choose another folder with -o" in message
 
 
 def test_all_commands_print_the_same_summary(shards: Path, material: Path) -> None:
@@ -95,26 +72,6 @@ def test_a_finished_fit_is_not_trained_again(shards: Path, material: Path) -> No
     done = call(["mbtf-fit", str(shards), "-o", str(material), *QUICK, "--overwrite"])
     assert "training for 5 steps" in done.err
     assert "already finished" not in done.err
-
-
-def test_data_of_another_material_cause_a_warning(shards: Path, tmp_path: Path) -> None:
-    """Those that were made from other heights, whatever their values."""
-    made = {name: shutil.copytree(shards, tmp_path / name) for name in ("own", "other")}
-    for digest, folder in enumerate(made.values()):
-        inputs = {"height": str(digest), "settings": "same"}
-        edit(folder / "manifest.json", lambda manifest, inputs=inputs: manifest.update(inputs=inputs))
-    fitted = tmp_path / "fitted"
-    done = call(["mbtf-fit", str(made["own"]), "-o", str(fitted), "--steps", "1", "--json"])
-    assert done.code == 0, done.err
-    found = json.loads(done.out)
-    assert found["training"]["steps"] == 1
-    assert set(found["errors"]) == {"test", "held_out_queries", "held_out_directions", "training"}
-    for name, foreign in (("own", []), ("other", ["height"])):
-        done = call(["mbtf-fit", "evaluate", str(fitted), str(made[name]), "--json"])
-        assert done.code == 0, done.err
-        assert json.loads(done.out)["foreign_inputs"] == foreign
-        assert ("made from another material" in done.err) == bool(foreign)
-        assert ("(height differs)" in done.err) == bool(foreign)
 
 
 def test_bad_input_exits_with_3_and_a_hint(shards: Path, material: Path, tmp_path: Path) -> None:

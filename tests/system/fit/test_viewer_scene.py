@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from support.material_cases import make
 from support.plugin_materials import write_material
-from support.shader_cases import make
 from support.viewer_page import Page
 
-from mbtf_core.color import linear_to_srgb
 from mbtf_core.directions import from_angles
 from mbtf_core.pictures import Camera
 from mbtf_fit.material.material import Material
@@ -161,33 +160,6 @@ def test_each_side_has_the_tile_of_its_material(page: Page, tmp_path: Path) -> N
         assert np.abs(found - expected).mean() < 0.08 * expected.mean()
 
 
-def test_low_directions_are_raised_and_lights_add_up(page: Page, tmp_path: Path) -> None:
-    """Views and lights below the data's smallest cosine, and two lights of different colors."""
-    material = make("calibrated", tmp_path / "half")
-    low, high = from_angles(3.0, 20.0), from_angles(60.0, 110.0)
-    raised = np.array([*low[:2] / np.hypot(*low[:2]) * np.sqrt(0.99), 0.1])
-    page.set(
-        {
-            "camera": view(60, -90, 2, 0.5, 0.5),
-            "lights": [
-                {"direction": low.tolist(), "color": [1, 0, 0], "intensity": 16},
-                {"direction": high.tolist(), "color": [0, 1, 0.5], "intensity": 0.5},
-            ],
-        }
-    )
-    found = page.picture(24, 32)[..., :3]
-    camera = Camera(60, -90, 2, rows=24, columns=32)
-    expected = evaluate(material, camera, raised) * low[2] * 16 * (1, 0, 0)
-    expected += evaluate(material, camera, high) * high[2] * 0.5 * (0, 1, 0.5)
-    assert (np.abs(found - expected).mean((0, 1)) < 0.08 * expected.mean((0, 1))).all()
-    # A view from 3 degrees keeps its azimuth.
-    page.set({"camera": view(3, -60, 2, 0.5, 0.5)})
-    found_at = page.pick(0.5, 0.5)
-    assert found_at is not None
-    seen = np.array([0.5, -np.sqrt(0.75)]) * np.sqrt(0.99)
-    assert found_at["omega_o"] == pytest.approx([*seen, 0.1], abs=0.01)
-
-
 @pytest.mark.parametrize("angle", [0, 90])
 def test_a_bright_pixel_of_a_sky_is_a_directional_light(page: Page, angle: int) -> None:
     """Of irradiance 1 on the plane: at the azimuth of an envmap of Mitsuba, plus the rotation."""
@@ -298,46 +270,3 @@ def test_frames_of_shapes_are_the_derivatives_of_their_texture(page: Page, shape
     assert np.median(np.linalg.norm(by_v, axis=1)) == pytest.approx(ASPECT, rel=0.1)
     if shape != "sphere":
         assert np.median(np.linalg.norm(by_u, axis=1)) == pytest.approx(1, rel=0.2)
-
-
-def test_frames_add_up_to_their_mean(page: Page) -> None:
-    page.set({"camera": view(20, -60, 1.8), "shape": "sphere", "tiles": 4})
-    code = """
-        const { viewer } = window.mbtf, { renderer } = viewer, [rows, columns, count] = arguments;
-        const mean = renderer.mean("test", columns, rows, 1), frames = [];
-        mean.restart();
-        for (let k = 0; k < count; k++) {
-            renderer.frame(mean, viewer.shown, viewer.scene, rows);
-            frames.push([...mean.latest.read(0, 0, columns, rows)]);
-        }
-        return [frames, [...mean.sides[0][0].read(0, 0, columns, rows)]];
-    """
-    frames, found = (np.array(x).reshape(-1, 24, 32, 4) for x in page.js(code, 24, 32, 12))
-    np.testing.assert_allclose(found[0], frames.mean(0), rtol=1e-4, atol=1e-5)
-    # Frames differ by less than a pixel: where all neighbors are covered, a pixel is.
-    first = frames[0, ..., 3]
-    inside = np.min([np.roll(first, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)], 0) > 0
-    assert inside.mean() > 0.2
-    assert (found[0][..., 3][inside] == 1).all()
-    edge = (found[0][..., 3] > 0) & (found[0][..., 3] < 1)
-    assert 20 < edge.sum() < 140
-
-
-def test_plots_have_y_up(page: Page) -> None:
-    """Pictures of the values over all views, against the values."""
-    page.set({"camera": view(60, -70, 1, 0.5, 0.25), "lights": [{**LIGHT, "direction": [0.6, 0, 0.8]}]})
-    code = """
-        const { viewer, showPoint } = window.mbtf, { renderer } = viewer, [x, y] = [0.4, 0.3];
-        showPoint(viewer, x, y);
-        const canvas = document.getElementById("over_views"), { width, height } = canvas;
-        const plot = canvas.getContext("2d").getImageData(0, 0, width, height).data;
-        const point = renderer.pick(viewer.material, viewer.scene, x, y);
-        const values = renderer.overDirections(viewer.material, width, point, [0.6, 0, 0.8], true);
-        return [[...plot], [...values]];
-    """
-    plot, values = (np.array(x, np.float64).reshape(128, 128, 4)[..., :3] for x in page.js(code))
-    # Row 0 of the values is at y = -1.
-    expected = 255 * linear_to_srgb(values[::-1] / values.max())
-    # All but the circle of the view.
-    assert (np.abs(plot - expected).max(2) < 1.5).mean() > 0.97
-    assert (np.abs(plot - expected[::-1]).max(2) < 1.5).mean() < 0.6

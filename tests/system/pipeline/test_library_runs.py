@@ -8,13 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from support.small_runs import contents
 
 from mbtf_core.app.console import run
-from mbtf_gen.generation.run import generate
-from mbtf_gen.job import Job
 from mbtf_pipeline.cli.app import app
-from mbtf_pipeline.recipe import read_resolved
 
 RECIPE = """
 name: test
@@ -87,20 +83,3 @@ def test_failures_are_named_and_the_rest_is_kept(folder: Path, capsys: pytest.Ca
     assert record(out)["broken"]["state"] == "done"
     assert weights(out, "flat", "rough") == kept
     assert run(app, ["report", str(out), "-q"]) == 0
-
-
-TWO = RECIPE.replace("[materials]", "[materials/flat, materials/rough]")
-
-
-# Tasks of workers: `test_cluster_runs`, data sets; `test_runner`, results.
-@pytest.mark.slow
-def test_workers_make_the_same_data(folder: Path) -> None:
-    pytest.importorskip("distributed", reason="no Dask; to enable: pip install 'mbtf[cluster]'")
-    (folder / "two.yaml").write_text(TWO)
-    two = folder / "clustered"
-    assert run(app, ["run", str(folder / "two.yaml"), "-o", str(two), "-q", "--cluster", "local:2"]) == 0
-    assert {material["state"] for material in record(two).values()} == {"done"}
-    config = read_resolved(two / "runs" / "rough").generate
-    material = str(folder / "materials" / "rough")
-    generate(Job.load(config.model_copy(update={"material": material})), folder / "own")
-    assert contents(folder / "own") == contents(two / "runs/rough/shards")

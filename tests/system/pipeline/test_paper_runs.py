@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -116,16 +115,3 @@ def test_the_same_command_runs_nothing_again(made: Path, capsys: pytest.CaptureF
     rows.unlink()
     assert run(app, ["report", str(made / "out")]) == 0
     assert (page.read_bytes(), rows.read_bytes()) == before
-
-
-def test_an_incomplete_page_is_marked(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    shutil.copytree(made / "out", tmp_path / "out")
-    record = tmp_path / "out" / "collection.json"
-    data = json.loads(record.read_text())
-    pending = data["runs"][0] | {"name": "other", "state": "pending"}
-    record.write_text(json.dumps(data | {"runs": [*data["runs"], pending]}))
-    assert run(app, ["report", str(tmp_path / "out")]) == 0
-    assert "1 of 2 runs are finished" in (tmp_path / "out" / "paper.html").read_text()
-    record.write_text(json.dumps(data | {"runs": [pending]}))
-    assert run(app, ["report", str(tmp_path / "out")]) == 3
-    assert "contains no finished run" in capsys.readouterr().err

@@ -20,8 +20,6 @@ from mbtf_core.app.console import run
 from mbtf_core.directions import from_angles
 from mbtf_pipeline.cli.app import app
 from mbtf_pipeline.compare.image_files import read_picture
-from mbtf_pipeline.recipe import load_recipe
-from mbtf_pipeline.run import run_recipe
 
 RECIPE = ROOT / "pipelines" / "ci.yaml"
 STAGES = ["generate", "fit neumip", "compare", "report"]
@@ -70,30 +68,6 @@ def test_a_run_ends_with_the_page_of_its_fits(first: dict[str, Any], folder: Pat
     np.testing.assert_allclose(picture["light"], from_angles(light["elevation"], light["azimuth"]), atol=1e-6)
 
 
-def test_a_live_page_is_told_what_a_run_has(first: dict[str, Any], folder: Path) -> None:
-    """Also of stages that are up to date."""
-    told: list[tuple[str, ...]] = []
-
-    class Page:
-        def stage(self, name: str, state: str) -> None:
-            told.append(("stage", name, state))
-
-        def finished(self, name: str, path: Path) -> None:
-            assert (path / "material.json").is_file()
-            told.append(("fit", name))
-
-        def pictures(self, pictures: list[dict[str, Any]]) -> None:
-            told.append(("pictures", str(len(pictures))))
-
-    run_recipe(load_recipe(RECIPE), folder, live=Page())  # type: ignore[arg-type]
-    up = "up to date"
-    states = [entry for entry in told if entry[0] == "stage" and entry[2] == up]
-    assert [name for _, name, _ in states] == STAGES
-    assert told.index(("fit", "neumip")) < told.index(("stage", "compare", up))
-    count = len(json.loads((folder / "compare" / "comparison.json").read_text())["pictures"])
-    assert ("pictures", str(min(4, count))) in told
-
-
 def test_every_stage_runs_and_the_material_is_learned(first: dict[str, Any], folder: Path) -> None:
     assert {name: s["ran"] for name, s in first["stages"].items()} == dict.fromkeys(STAGES, True)
     assert Path(first["report"]) == folder / "report.html"
@@ -121,13 +95,6 @@ def test_images_and_numbers_are_consistent(first: dict[str, Any], folder: Path) 
     splits = record["test"]["neumip"]["splits"]
     assert set(splits) == {"test", "held_out_queries", "held_out_directions", "training"}
     assert sum(g["mse"]["n"] for g in splits["test"]["levels"].values()) == splits["test"]["n"] == 4096
-
-
-def test_the_report_links_its_exr_files_and_shows_the_material(first: dict[str, Any], folder: Path) -> None:
-    html = (folder / "report.html").read_text(encoding="utf-8")
-    links = set(re.findall(r'<a href="(compare/[^"]*)"', html))
-    assert links == {str(p.relative_to(folder)) for p in (folder / "compare").rglob("*.exr")}
-    assert 'alt="Height: height.exr"' in html
 
 
 def test_the_report_is_self_contained(first: dict[str, Any], folder: Path) -> None:
@@ -176,14 +143,6 @@ def test_a_size_limit_reduces_the_images(again: Any, folder: Path) -> None:
     assert "reduced to limit the file size" in report.read_text()
     assert "<h1>A &lt;b&gt; &amp; c</h1>" in report.read_text()
     assert list(again()) == ["compare", "report"]
-
-
-def test_a_finished_fit_without_a_stamp_is_not_trained_again(again: Any, folder: Path) -> None:
-    weights = folder / "fits" / "neumip" / "weights.safetensors"
-    before = weights.stat().st_mtime_ns
-    (folder / "stages" / "fit-neumip.json").unlink()
-    assert list(again()) == ["fit neumip", "compare", "report"]
-    assert weights.stat().st_mtime_ns == before
 
 
 def test_a_flipped_byte_is_detected_and_repaired(again: Any, folder: Path) -> None:

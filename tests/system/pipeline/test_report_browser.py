@@ -141,25 +141,6 @@ def test_keys_move_the_border(page: Page, stage: Any) -> None:
     assert matches(shown[:, border:], fit[:, border:])
 
 
-@pytest.mark.parametrize("kind", ["mouse", "touch"])
-def test_dragging_moves_the_border(page: Page, stage: Any, kind: str) -> None:
-    from selenium.webdriver.common.action_chains import ActionChains
-    from selenium.webdriver.common.actions.pointer_input import PointerInput
-
-    reference, fit = page.expected(0, "query"), page.expected(0, "neumip")
-    page.js("arguments[0].scrollIntoView({block: 'center', behavior: 'instant'})", stage)
-    for share in (-0.25, 0.25):
-        chain = ActionChains(page.driver, devices=[PointerInput(kind, f"{kind}{share}")])
-        chain.move_to_element(stage).click_and_hold()
-        chain.move_by_offset(int(share * STAGE / 2), 0).move_by_offset(int(share * STAGE / 2), 0)
-        chain.release().perform()
-        border = int((0.5 + share) * PIXELS)
-        assert stage.get_attribute("aria-valuenow") == str(round(100 * (0.5 + share)))
-        shown = page.screen()
-        assert matches(shown[:, :border], reference[:, :border])
-        assert matches(shown[:, border:], fit[:, border:])
-
-
 def test_selections_change_the_images(page: Page, stage: Any) -> None:
     def choose(name: str, value: str) -> None:
         page.js(f"document.querySelector(`input[name={name}][value='{value}']`).click()")
@@ -195,25 +176,6 @@ def test_error_maps_match_the_selection(page: Page, stage: Any) -> None:
     # Blue is too dark, orange too bright.
     assert colors[difference > 40, 0].mean() > colors[difference > 40, 2].mean()
     assert colors[difference < -40, 2].mean() > colors[difference < -40, 0].mean()
-
-
-def test_an_image_of_the_sheet_opens_in_the_viewer(page: Page, stage: Any) -> None:
-    page.js("document.querySelector(\"button.zoom[data-scene='2'][data-fit='1'][data-map=flip]\").click()")
-    page.wait_for(2, 0, 1)
-    assert page.js("return document.activeElement.id") == "stage"
-    assert page.js("return document.querySelector('input[name=map][value=flip]').checked")
-
-
-def test_every_control_has_an_accessible_name(page: Page, stage: Any) -> None:
-    code = """
-        const named = e => e.getAttribute('aria-label') || e.alt
-            || (!e.hasAttribute('role') && e.textContent.trim())
-            || [...(e.labels || [])].map(l => l.textContent.trim()).join('')
-            || e.querySelector('[alt],[aria-label]');
-        return [...document.querySelectorAll('img, button, input, [role=img], [role=slider]')]
-            .filter(e => e.checkVisibility() && !named(e)).map(e => e.outerHTML.slice(0, 120));
-    """
-    assert page.js(code) == []
 
 
 def test_images_are_visible_without_scripts(page: Page) -> None:

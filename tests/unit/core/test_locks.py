@@ -168,16 +168,6 @@ def test_a_living_owner_renews_its_lock(shard: Path, monkeypatch: pytest.MonkeyP
     assert not lock_of(shard).exists()
 
 
-@pytest.mark.usefixtures("no_advisory_locks")
-def test_without_advisory_locks(shard: Path) -> None:
-    with shard_lock(shard) as held:
-        assert held
-        with shard_lock(shard) as second:
-            assert not second
-    with shard_lock(shard) as held:
-        assert held
-
-
 def test_lock_owners_are_named(shard: Path) -> None:
     assert lock_owner(shard) is None
     # The clock of its machine may be wrong.

@@ -102,18 +102,6 @@ def test_values_go_over_presets_and_files(tmp_path: Path) -> None:
     assert options.resolve(material="here.exr").material == "here.exr"
 
 
-def test_a_wrong_value_names_its_flag(capsys: pytest.CaptureFixture[str]) -> None:
-    app = new_app("mbtf-test", "A test.")
-
-    @app.default
-    def command(*, options: Some = Some()) -> None:  # noqa: B008
-        options.resolve(material="map.exr")
-
-    assert run(app, ["--spp", "1"]) == 2
-    assert capsys.readouterr().err.startswith("error: --spp: 'queries.spp': must be ")
-    assert run(app, ["--layout", "image"]) == 2
-
-
 def test_a_command_line_can_be_given_to_a_shell() -> None:
     options = {"quick": True, "force": False, "time": None, "output": Path("o"), "set": ["a=1"]}
     line = command_line("mbtf-pipeline", "run", Path("a b.yaml"), **options)

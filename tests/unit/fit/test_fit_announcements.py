@@ -15,7 +15,6 @@ from mbtf_core.files import folders
 from mbtf_fit.cli.app import app
 from mbtf_fit.config import FitConfig
 from mbtf_fit.training import fit as fits
-from mbtf_fit.training import fit_export
 from mbtf_fit.training.forecast import fit_bytes
 
 
@@ -54,20 +53,3 @@ def test_the_size_is_that_of_two_checkpoints(shards: Path, tmp_path: Path) -> No
     relief = FitConfig.model_validate({"training": {"steps": 2, "batch": 500}})
     fits.fit(relief, shards, tmp_path / "relief")
     assert fit_bytes(relief, Lattice(3)) > (tmp_path / "relief" / "weights.safetensors").stat().st_size
-
-
-def test_a_fit_announces_each_stage(shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reading counts as no progress; after the last step, nothing takes its time in silence."""
-    for module in (fits, fit_export):
-        monkeypatch.setattr(module, "_REPORT_SECONDS", 0.0)
-    training = {"steps": 3, "batch": 500}
-    config = FitConfig.model_validate({"model": "neumip", "network": {"width": 8}, "training": training})
-    said: list[tuple[float, str]] = []
-    fits.fit(config, shards, tmp_path / "material", progress=lambda *state: said.append(state))
-    assert said[:2] == [(0.0, f"reading {shards}"), (0.0, "training")]
-    assert [fraction for fraction, _ in said[2:5]] == pytest.approx([1 / 3, 2 / 3, 1.0])
-    assert {fraction for fraction, _ in said[5:]} == {1.0}
-    notes = [note for _, note in said[5:]]
-    assert list(dict.fromkeys(note.split()[0] for note in notes)) == ["calibrating", "evaluating", "writing"]
-    # Models without the compiled kernel calibrate for long.
-    assert "calibrating material: 100%" in notes

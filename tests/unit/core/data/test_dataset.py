@@ -147,19 +147,3 @@ def test_images_have_one_direction_and_the_size_of_the_lattice(runs: dict[str, P
     assert found(**smaller) == "has 4 x 4 queries per row, manifest.json says 4 x 8"
     flat = {name: array[:, 0, 0] for name, array in intact.items()}
     assert found(**flat) == "has 1 queries per row, manifest.json says 4 x 8"
-
-
-@pytest.mark.parametrize("damage", ["deleted", "flipped", "cut", "other format"])
-def test_a_lost_manifest_is_answered_by_repair(damage: str, runs: dict[str, Path], tmp_path: Path) -> None:
-    folder = tmp_path / "set"
-    shutil.copytree(runs["shuffled-npz"], folder)
-    path = folder / "manifest.json"
-    text = path.read_text()
-    path.write_text(
-        {"flipped": text.replace("0.5", "0.4"), "cut": text[:99], "other format": "{}"}.get(damage, "")
-    )
-    if damage == "deleted":
-        path.unlink()
-    with pytest.raises(InputError) as caught:
-        Dataset.open(folder)
-    assert caught.value.hint == f"repair it with: mbtf-gen repair {folder}"

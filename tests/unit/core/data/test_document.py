@@ -72,25 +72,3 @@ def test_every_key_of_manifest_and_sidecar_is_explained(tmp_path: Path) -> None:
         # Two keys are those of measured data alone.
         measured = {"estimates", "measured"} if title == "Manifest" else set()
         assert set(re.findall(r"`([^`]+)`", first_cells)) == {*top, "checksum", *measured}
-
-
-def test_the_page_names_the_version() -> None:
-    assert f"Schema {SCHEMA_VERSION}." in DOCUMENT
-
-
-def test_members_lie_where_the_document_says(tmp_path: Path) -> None:
-    """The recipe for mapping a member by hand, followed literally."""
-    import zipfile
-
-    data = write_dataset(tmp_path / "shards", queries=QUERIES)
-    path = data.shards("train")[0].local()
-    whole = path.read_bytes()
-    with zipfile.ZipFile(path) as archive:
-        for info in archive.infolist():
-            name, extra = (int.from_bytes(whole[info.header_offset + i :][:2], "little") for i in (26, 28))
-            start = info.header_offset + 30 + name + extra
-            assert whole[start : start + 6] == b"\x93NUMPY"
-            numbers = start + 10 + int.from_bytes(whole[start + 8 : start + 10], "little")
-            assert numbers % 64 == 0
-            first = np.frombuffer(whole, "<f4", 1, numbers)[0]
-            assert first == np.load(path)[info.filename.removesuffix(".npy")].flat[0]

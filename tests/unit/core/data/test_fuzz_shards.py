@@ -96,19 +96,6 @@ def test_an_altered_manifest_or_sidecar(data: st.DataObject, whole: Path) -> Non
         (whole / MANIFEST_NAME).write_text(manifest)
 
 
-@given(data=st.data())
-@examples(100)
-def test_damaged_bytes_of_a_data_set(data: st.DataObject, whole: Path) -> None:
-    files = {n: (whole / n).read_bytes() for n in (MANIFEST_NAME, "train-00000.json", "train-00000.npz")}
-    name, content = data.draw(damaged(files))
-    try:
-        (whole / name).write_bytes(content)
-        read_all(whole)
-    finally:
-        for each, content in files.items():
-            (whole / each).write_bytes(content)
-
-
 def archive(members: dict[str, bytes], compression: int = zipfile.ZIP_STORED) -> bytes:
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", compression) as out:
@@ -162,13 +149,3 @@ def test_a_manifest_cannot_name_files_elsewhere(whole: Path) -> None:
     with pytest.raises(InputError, match=r"splits\.train\.shards\.1\.file"):
         Dataset.open(whole)
     manifest.write_text(before)
-
-
-@pytest.mark.parametrize("rows", ["ten", None, -1, 1.5, [10], {}, 10**9])
-def test_a_sidecar_states_the_number_of_rows_that_the_manifest_lists(rows: object, whole: Path) -> None:
-    sidecar = whole / "train-00001.json"
-    before = sidecar.read_text()
-    edit(sidecar, lambda record: record.update(rows=rows))
-    with pytest.raises(InputError, match=r"has the rows .*, manifest\.json says 10|corrupt sidecar"):
-        Dataset.open(whole).shards("train")
-    sidecar.write_text(before)

@@ -13,7 +13,6 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
-from typing import BinaryIO
 
 import pytest
 
@@ -23,20 +22,6 @@ from mbtf_core.files import atomic
 
 def no_leftovers(folder: Path) -> bool:
     return not any(p.name.endswith(".tmp") for p in folder.iterdir())
-
-
-def test_a_failing_writer_leaves_the_old_file(tmp_path: Path) -> None:
-    path = tmp_path / "a.bin"
-    path.write_bytes(b"old")
-
-    def write(stream: BinaryIO) -> None:
-        stream.write(b"half of the ne")
-        raise RuntimeError("crash")
-
-    with pytest.raises(RuntimeError, match="crash"):
-        atomic.write_file(path, write)
-    assert path.read_bytes() == b"old"
-    assert no_leftovers(tmp_path)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
@@ -101,24 +86,6 @@ def test_json_refuses_what_is_no_number(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="not JSON compliant"):
         atomic.write_json(tmp_path / "a.json", {"loss": float("nan")})
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("content", "what"),
-    [
-        (None, "no such file"),
-        (b"{", "not readable as JSON"),
-        (b"\xff", "not readable"),
-        (b"[1]", "a JSON object"),
-    ],
-)
-def test_bad_json_is_bad_input(tmp_path: Path, content: bytes | None, what: str) -> None:
-    path = tmp_path / "a.json"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(InputError, match=what) as caught:
-        atomic.read_json(path)
-    assert caught.value.where == str(path)
 
 
 def test_of_several_creators_one_wins_and_its_content_stays(tmp_path: Path) -> None:

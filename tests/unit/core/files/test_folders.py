@@ -26,7 +26,6 @@ from mbtf_core.files.folders import (
     check_space,
     make_folder,
     owned,
-    remove_unfinished,
 )
 from mbtf_core.units import expectation
 
@@ -79,13 +78,6 @@ def test_files_of_others_are_refused(tmp_path: Path, name: str) -> None:
         check_folder(tmp_path / name, is_ours, "record")
     with pytest.raises(InputError, match="cannot be created"):
         make_folder(tmp_path / name / "below")
-
-
-def test_only_unfinished_files_of_ours_are_removed(tmp_path: Path) -> None:
-    for name in ("a.npz", "b.npz"):
-        temporary_of(tmp_path / name).touch()
-    remove_unfinished(tmp_path, ["a.npz"])
-    assert [p.name for p in tmp_path.iterdir()] == [temporary_of(tmp_path / "b.npz").name]
 
 
 def test_what_does_not_fit_on_the_disk_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -39,12 +39,6 @@ def read(folder: Path, name: str, content: bytes) -> None:
 
 
 @pytest.mark.parametrize("kind", ["png", "jpg", "tif", "npy", "exr", "tga", "bmp"])
-def test_the_undamaged_files(kind: str, samples: dict[str, dict[str, bytes]], folder: Path) -> None:
-    for name, content in samples[kind].items():
-        read(folder, name, content)
-
-
-@pytest.mark.parametrize("kind", ["png", "jpg", "tif", "npy", "exr", "tga", "bmp"])
 @given(data=st.data())
 @examples(200)
 def test_a_damaged_image(

@@ -52,20 +52,16 @@ print(json.dumps([rise, found]))
 """
 
 
-def _tiff(*entries: tuple[int, int, int, int], following: int = 0, big: bool = False) -> bytes:
-    """A TIFF file of one directory: (tag, type, count, value or offset) each."""
-    form = "<HHQQ" if big else "<HHII"
-    head = struct.pack("<2sHHHQ", b"II", 43, 8, 0, 16) if big else struct.pack("<2sHI", b"II", 42, 8)
-    count = struct.pack("<Q" if big else "<H", len(entries))
-    listed = b"".join(struct.pack(form, *entry) for entry in sorted(entries))
-    return head + count + listed + struct.pack("<Q" if big else "<I", following) + bytes(64)
-
-
-def _gray(columns: int, rows: int, bits: int = 8, compression: int = 1) -> list[tuple[int, int, int, int]]:
-    return [
-        *((256, 4, 1, columns), (257, 4, 1, rows), (258, 3, 1, bits), (259, 3, 1, compression)),
-        *((262, 3, 1, 1), (273, 4, 1, 8), (277, 3, 1, 1), (278, 4, 1, rows), (279, 4, 1, 60)),
-    ]
+def _tiff(side: int, big: bool = False) -> bytes:
+    """A TIFF file whose directory claims another size."""
+    stream = io.BytesIO()
+    Image.new("L", (8, 8)).save(stream, "TIFF", big_tiff=big)
+    content = bytearray(stream.getvalue())
+    for tag in (256, 257):
+        entry = struct.pack("<HHQ" if big else "<HHI", tag, 4, 1)
+        at = content.index(entry) + len(entry)
+        content[at : at + 4] = struct.pack("<I", side)
+    return bytes(content)
 
 
 def _jpg(side: int) -> bytes:
@@ -126,9 +122,9 @@ def write_claims(folder: Path, beside: Path) -> dict[str, str]:
         "side.jpg": (_jpg(SIDE), "claims 60000 x 60000 pixels"),
         "scans.jpg": (_scans(200), "scans; at most 100 are read"),
         "alike.png": (png(10900, 10900, 16, 6, bytes(20_000)), "0.89 GiB, in 20,0"),
-        "side.tif": (_tiff(*_gray(SIDE, SIDE)), "claims 60000 x 60000 pixels"),
-        "cap.tif": (_tiff(*_gray(11000, 11000)), "cannot hold 11000 x 11000 pixels"),
-        "big.tif": (_tiff(*_gray(SIDE, SIDE), big=True), "claims 60000 x 60000 pixels"),
+        "side.tif": (_tiff(SIDE), "claims 60000 x 60000 pixels"),
+        "cap.tif": (_tiff(11000), "cannot hold 11000 x 11000 pixels"),
+        "big.tif": (_tiff(SIDE, big=True), "claims 60000 x 60000 pixels"),
         "side.npy": (_npy("'<f4'", f"({SIDE}, {SIDE})"), "cannot be read as an npy array"),
         "pickle.npy": (_npy("'|O'", "(4, 4)"), "cannot be read as an npy array"),
         "giant.npy": (_npy("'|V2000000000'", "(4, 4)"), "cannot be read as an npy array"),

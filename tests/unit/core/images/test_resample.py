@@ -37,18 +37,6 @@ def test_reduction_preserves_the_mean_and_constants(rows: int, columns: int, r: 
     assert resample(np.full((rows, columns), 0.3), r, c) == pytest.approx(0.3, abs=1e-12)
 
 
-def test_reduction_by_hand() -> None:
-    image = np.array([[1.0, 2.0, 4.0]])
-    assert resample(image, 1, 2) == pytest.approx(np.array([[(1 + 2 * 0.5) / 1.5, (0.5 * 2 + 4) / 1.5]]))
-    assert resample(np.arange(8.0).reshape(2, 4), 1, 2) == pytest.approx(np.array([[2.5, 4.5]]))
-
-
-def test_enlargement_by_hand_wraps() -> None:
-    """New centers lie a quarter texel beside the old ones; the first one looks across the edge."""
-    image = np.array([[0.0, 4.0, 8.0]])
-    assert resample(image, 1, 6) == pytest.approx(np.array([[2.0, 1.0, 3.0, 5.0, 7.0, 6.0]]))
-
-
 @pytest.mark.parametrize(
     ("rows", "columns", "enlarge", "tolerance"),
     [

@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pygltflib
 import pytest
 import trimesh
-from support.gltf_files import SQUARE, SQUARE_UV, TWO_TRIANGLES, GltfBuilder
+from support.gltf_files import SQUARE, SQUARE_UV, GltfBuilder
 
 from mbtf_core.errors import InputError
 from mbtf_core.meshes.content import MeshContent, MeshShape
@@ -52,19 +51,6 @@ def test_both_containers_hold_the_same(tmp_path: Path, name: str) -> None:
     assert shape.uv.tolist() == [[0, 0], [1, 0], [1, 1], [0, 1]]
 
 
-@pytest.mark.parametrize("file", ["my tile.bin", "50%.bin", "grün.bin", "sub/a.bin"])
-@pytest.mark.parametrize("encoded", [True, False])
-def test_names_of_buffers_may_be_percent_encoded(tmp_path: Path, file: str, encoded: bool) -> None:
-    builder = with_triangle()
-    (tmp_path / file).parent.mkdir(exist_ok=True)
-    (tmp_path / file).write_bytes(bytes(builder.blob))
-    uri = file.replace("%", "%25").replace(" ", "%20").replace("ü", "%C3%BC") if encoded else file
-    (tmp_path / "a.gltf").write_text(json.dumps(builder.finished(uri)))
-    found = read_mesh_content(tmp_path / "a.gltf")
-    assert found.files == {uri: tmp_path / file}
-    assert found.shapes[0].vertices.tolist() == TRIANGLE.tolist()
-
-
 def test_a_data_uri_and_a_wrong_suffix_are_read(tmp_path: Path) -> None:
     builder = with_triangle()
     uri = "data:application/octet-stream;base64," + base64.b64encode(bytes(builder.blob)).decode()
@@ -96,15 +82,6 @@ def test_triangles_strips_and_fans(
             content_of(builder, tmp_path)
 
 
-def test_points_and_lines_are_named(tmp_path: Path) -> None:
-    builder = with_triangle()
-    for mode in (0, 1, 3):
-        builder.node(builder.mesh(SQUARE, None, mode=mode))
-    found = content_of(builder, tmp_path)
-    assert len(found.shapes[0].vertices) == 3
-    assert sum("points and lines" in text for text in found.warnings) == 1
-
-
 @pytest.mark.parametrize(
     ("kind", "normalized", "factor"),
     [
@@ -118,17 +95,12 @@ def test_points_and_lines_are_named(tmp_path: Path) -> None:
     ],
 )
 def test_components_of_all_types(tmp_path: Path, kind: Any, normalized: bool, factor: int) -> None:
-    codes = np.array([[1, 2, 3], [100, 0, 5], [7, 120, 9]]).astype(kind)
+    codes = np.array([[1, 2, 3], [-128, 0, 5], [7, 120, 9]]).astype(kind)
     builder = GltfBuilder()
     builder.node(builder.mesh(builder.accessor(codes, normalized), None))
-    assert shape_of(builder, tmp_path).vertices == pytest.approx(codes / factor, rel=1e-12)
-
-
-def test_the_smallest_signed_code_is_minus_one(tmp_path: Path) -> None:
-    builder = GltfBuilder()
-    codes = np.array([[-128, -127, 0], [127, 0, 0], [0, 127, 0]], np.int8)
-    builder.node(builder.mesh(builder.accessor(codes, True), None))
-    assert shape_of(builder, tmp_path).vertices[0].tolist() == [-1, -1, 0]
+    # The smallest signed code is -1, too.
+    expected = np.maximum(codes / factor, -1) if factor > 1 else codes
+    assert shape_of(builder, tmp_path).vertices == pytest.approx(expected, rel=1e-12)
 
 
 def test_strides_offsets_and_sparse_elements(tmp_path: Path) -> None:
@@ -168,12 +140,6 @@ def test_nodes_multiply_from_the_root(tmp_path: Path) -> None:
     assert shape.vertices == pytest.approx(moved[:, [2, 0, 1]] + (1, 2, 3))
     # A mirrored triangle is counterclockwise from outside again.
     assert shape.faces.tolist() == [[2, 1, 0]]
-
-
-def test_rotations_turn_by_the_right_hand(tmp_path: Path) -> None:
-    # 90 degrees about y: z → x, x → -z.
-    shape = shape_of(with_triangle(rotation=[0, HALF, 0, HALF], scale=[1, 1, 2]), tmp_path)
-    assert shape.vertices == pytest.approx(np.array([[0, 0, 0], [0, 0, -2], [6, 1, 0]]), abs=1e-6)
 
 
 def test_instances_are_placed_within_their_node(tmp_path: Path) -> None:
@@ -257,9 +223,6 @@ def test_other_readers_agree_on_positions(tmp_path: Path) -> None:
         return flat[np.lexsort(np.round(flat, 6).T)]
 
     assert corners(ours.vertices[ours.faces]) == pytest.approx(corners(theirs.triangles), abs=1e-6)
-    read = pygltflib.GLTF2().load(str(path))
-    assert len(read.nodes) == 4
-    assert read.accessors[0].count == 9
 
 
 def changed(change: Callable[[dict[str, Any]], object]) -> GltfBuilder:
@@ -358,19 +321,14 @@ def test_more_instances_than_fit_are_refused_before_they_are_made(tmp_path: Path
 
 
 def test_what_is_not_used_is_named_once(tmp_path: Path) -> None:
-    builder = with_triangle()
-    builder.document["animations"] = [{}]
-    builder.document["extensions"] = {"KHR_lights_punctual": {"lights": []}}
-    builder.document["nodes"][0]["extensions"] = {"KHR_lights_punctual": {"light": 0}}
-    builder.document["nodes"][0]["extras"] = {"extensions": {"of_a_program": 1}}
-    assert sorted(content_of(builder, tmp_path).warnings) == [
-        "KHR_lights_punctual is not used",
-        "animations are not used",
-    ]
-
-
-def test_compressed_primitives_with_plain_accessors_are_read(tmp_path: Path) -> None:
-    builder = GltfBuilder()
-    more = {"extensions": {"KHR_draco_mesh_compression": {"bufferView": 0}}}
-    builder.node(builder.mesh(SQUARE, TWO_TRIANGLES, more=more))
-    assert shape_of(builder, tmp_path).vertices.tolist() == SQUARE.tolist()
+    builder = with_triangle(extensions={"KHR_lights_punctual": {"light": 0}})
+    for mode in (0, 1, 3):
+        builder.node(builder.mesh(SQUARE, None, mode=mode))
+    unused = {"normalTexture": {"index": 0}, "occlusionTexture": {"index": 0}, "emissiveFactor": [0, 0, 2]}
+    for name in "ab":
+        builder.plate(builder.material({}, name=name, **unused))
+    builder.document |= {"animations": [{}], "extensions": {"KHR_lights_punctual": {"lights": []}}}
+    found = content_of(builder, tmp_path)
+    assert len(found.shapes[0].vertices) == 3
+    for word in ("KHR_lights_punctual", "points and lines", "animations", "normal", "occlusion", "emission"):
+        assert sum(word in warning for warning in found.warnings) == 1, word

@@ -18,9 +18,18 @@ from mbtf_core.meshes.read import read_mesh_content
 CODES = {0: 0.0, 10: 0.0030353, 128: 0.2158605, 200: 0.5775804, 255: 1.0}
 
 
+def placed(builder: GltfBuilder, value: Any) -> Any:
+    """Data with textures in place of their pixels."""
+    if isinstance(value, np.ndarray):
+        return {"index": builder.texture(value)}
+    if isinstance(value, dict):
+        return {key: placed(builder, item) for key, item in value.items()}
+    return value
+
+
 def plate_of(base: dict[str, Any] | None, builder: GltfBuilder | None = None, **more: Any) -> GltfBuilder:
     builder = builder or GltfBuilder()
-    return builder.plate(builder.material(base, **more))
+    return builder.plate(builder.material(placed(builder, base), **placed(builder, more)))
 
 
 def content_of(builder: GltfBuilder, folder: Path) -> MeshContent:
@@ -33,64 +42,107 @@ def shape_of(builder: GltfBuilder, folder: Path) -> MeshShape:
     return shape
 
 
-def numbers(shape: MeshShape, role: str) -> list[Any]:
-    return np.round(numbers_of(shape.values[role]).astype(np.float64), 6).tolist()
-
-
 def texture_of(shape: MeshShape, role: str = "base_color") -> Texture:
     value = shape.values[role]
     assert isinstance(value, tuple)
     return value[0]
 
 
-@pytest.mark.parametrize("material", [None, {}, {"name": "x"}])
-def test_absent_factors_are_one(tmp_path: Path, material: dict[str, Any] | None) -> None:
-    builder = GltfBuilder()
-    builder.plate(None if material is None else builder.add("materials", material))
-    shape = shape_of(builder, tmp_path)
-    assert numbers(shape, "base_color") == [1, 1, 1]
-    assert (shape.values["roughness"], shape.values["metallic"]) == (1, 1)
+def extension(name: str, **values: Any) -> dict[str, Any]:
+    return {f"KHR_materials_{name}": values}
+
+
+def codes(*pixels: Any, dtype: Any = np.uint8) -> np.ndarray:
+    """An image of one row."""
+    return np.array([pixels], dtype)
+
+
+FOUR = codes((51, 102, 153, 204))
+SHEEN_COLOR = codes((128, 128, 255))
+COAT = {"clearcoatFactor": 0.5, "clearcoatTexture": FOUR}
+COAT |= {"clearcoatRoughnessFactor": 0.25, "clearcoatRoughnessTexture": FOUR}
+SHEEN = {"sheenColorFactor": [1, 0.5, 0], "sheenColorTexture": SHEEN_COLOR}
+SHEEN |= {"sheenRoughnessFactor": 0.5, "sheenRoughnessTexture": FOUR}
+ALPHA = {alpha: codes((255, 255, 255, alpha), (255, 255, 255, 255)) for alpha in (0, 51, 204, 255)}
+HALF = {"baseColorFactor": [1, 1, 1, 0.5]}
+# Material (its metallic and roughness, and the rest), and values by role; None: there are none.
+VALUES: dict[str, tuple[dict[str, Any] | None, dict[str, Any], dict[str, Any]]] = {
     # An index of refraction of 1.5 reflects 4 %, half of what `specular` 1 does.
-    assert shape.values.keys() == {"base_color", "roughness", "metallic", "specular"}
-    assert numbers(shape, "specular") == 0.5
+    "nothing": (None, {}, {"base_color": [1, 1, 1], "roughness": 1, "metallic": 1, "specular": 0.5}),
+    "factors": (
+        {"baseColorFactor": [0.0018, 0.0055, 0.0137, 1], "metallicFactor": 0, "roughnessFactor": 0.9},
+        {},
+        {"base_color": [0.0018, 0.0055, 0.0137], "roughness": 0.9, "metallic": 0},
+    ),
+    "colors are sRGB": (
+        {"baseColorTexture": codes((0, 10, 128), (200, 255, 255)), "baseColorFactor": [1, 1, 0.5, 1]},
+        {},
+        {"base_color": [[[0, CODES[10], CODES[128] / 2], [CODES[200], 1, 0.5]]]},
+    ),
+    "gray": ({"baseColorTexture": codes(128)}, {}, {"base_color": [[[CODES[128]] * 3]]}),
+    "numbers are linear": (
+        {"metallicRoughnessTexture": codes((65535, 13107, 26214), dtype=np.uint16), "roughnessFactor": 0.5},
+        {},
+        {"roughness": [[0.1]], "metallic": [[0.4]]},
+    ),
+    "coat": ({}, extension("clearcoat", **COAT), {"clearcoat": [[0.1]], "clearcoat_roughness": [[0.1]]}),
+    "sheen": (
+        {},
+        extension("sheen", **SHEEN),
+        {"sheen": 1, "sheen_color": [[[CODES[128], CODES[128] / 2, 0]]], "sheen_roughness": [[0.4]]},
+    ),
+    "layers of no weight": (
+        {},
+        extension("clearcoat") | extension("sheen"),
+        {"clearcoat": None, "sheen": None},
+    ),
+    "bare coat": ({}, extension("clearcoat", clearcoatFactor=1), {"clearcoat": 1, "clearcoat_roughness": 0}),
+    "specular weight": (
+        {"metallicFactor": 0},
+        extension("specular", specularTexture=FOUR),
+        {"specular": [[0.5 * 0.8]]},
+    ),
+    "specular color": (
+        {"metallicFactor": 0},
+        extension("specular", specularColorTexture=codes((128, 128, 128))),
+        {"specular": [[0.5 * CODES[128]]]},
+    ),
+    "opaque": ({"baseColorTexture": ALPHA[0], **HALF}, {}, {"opacity": None}),
+    "blended": (
+        {"baseColorTexture": ALPHA[51], **HALF},
+        {"alphaMode": "BLEND"},
+        {"opacity": [[0.1, 0.5]], "opacity_cutoff": None},
+    ),
+    "blended, without holes": ({"baseColorTexture": ALPHA[255]}, {"alphaMode": "BLEND"}, {"opacity": None}),
+    "blended, without alpha": (
+        {"baseColorTexture": codes((51, 51, 51)), **HALF},
+        {"alphaMode": "BLEND"},
+        {"opacity": [[0.5]]},
+    ),
+    "masked": (
+        {"baseColorTexture": ALPHA[0]},
+        {"alphaMode": "MASK"},
+        {"opacity": [[0, 1]], "opacity_cutoff": 0.5},
+    ),
+    "masked, all above the cutoff": (
+        {"baseColorTexture": ALPHA[204]},
+        {"alphaMode": "MASK"},
+        {"opacity": None, "opacity_cutoff": None},
+    ),
+}
 
 
-def test_factors_are_linear_floats(tmp_path: Path) -> None:
-    base = {"baseColorFactor": [0.0018, 0.0055, 0.0137, 1], "metallicFactor": 0, "roughnessFactor": 0.9}
-    shape = shape_of(plate_of(base), tmp_path)
-    assert numbers(shape, "base_color") == [0.0018, 0.0055, 0.0137]
-    assert (shape.values["roughness"], shape.values["metallic"]) == (0.9, 0)
-
-
-def test_base_colors_are_srgb_times_the_factor(tmp_path: Path) -> None:
-    builder = GltfBuilder()
-    pixels = np.array([[[0, 10, 128], [200, 255, 255]]], np.uint8)
-    base = {"baseColorTexture": {"index": builder.texture(pixels)}, "baseColorFactor": [1, 1, 0.5, 1]}
-    expected = [[[0, CODES[10], CODES[128] / 2], [CODES[200], 1, 0.5]]]
-    assert numbers_of(shape_of(plate_of(base, builder), tmp_path).values["base_color"]) == pytest.approx(
-        np.array(expected), abs=1e-6
-    )
-
-
-def test_channels_of_metallic_and_roughness_are_linear(tmp_path: Path) -> None:
-    builder = GltfBuilder()
-    texture = {"index": builder.texture(np.array([[[255, 51, 102]]], np.uint8))}
-    base = {"metallicRoughnessTexture": texture, "roughnessFactor": 0.5}
-    shape = shape_of(plate_of(base, builder), tmp_path)
-    assert numbers(shape, "roughness") == [[0.1]]
-    assert numbers(shape, "metallic") == [[0.4]]
-
-
-def test_sixteen_bits_and_gray_images_are_read(tmp_path: Path) -> None:
-    builder = GltfBuilder()
-    deep = np.array([[[0, 1, 65535]]], np.uint16)
-    base = {
-        "metallicRoughnessTexture": {"index": builder.texture(deep)},
-        "baseColorTexture": {"index": builder.texture(np.array([[128]], np.uint8))},
-    }
-    shape = shape_of(plate_of(base, builder), tmp_path)
-    assert numbers_of(shape.values["roughness"]) == pytest.approx(1 / 65535, rel=1e-6)
-    assert numbers_of(shape.values["base_color"]) == pytest.approx(np.full((1, 1, 3), CODES[128]), abs=1e-6)
+@pytest.mark.parametrize("name", VALUES)
+def test_values_of_materials(tmp_path: Path, name: str) -> None:
+    base, more, expected = VALUES[name]
+    known = {key: more[key] for key in more.keys() & {"alphaMode"}}
+    extensions = {key: more[key] for key in more.keys() - known.keys()}
+    values = shape_of(plate_of(base, extensions=extensions, **known), tmp_path).values
+    for role, wanted in expected.items():
+        if wanted is None:
+            assert role not in values
+        else:
+            assert numbers_of(values[role]) == pytest.approx(np.array(wanted), abs=1e-6), role
 
 
 def test_jpeg_files_beside_it_are_read_whatever_their_name(tmp_path: Path) -> None:
@@ -194,39 +246,6 @@ def test_a_part_without_texture_coordinates_is_a_fault(tmp_path: Path) -> None:
     assert second.faults.keys() == {"base_color"}
 
 
-def test_layers_have_their_channels(tmp_path: Path) -> None:
-    builder = GltfBuilder()
-    texture = {"index": builder.texture(np.array([[[51, 102, 153, 204]]], np.uint8))}
-    clearcoat = {
-        "clearcoatFactor": 0.5,
-        "clearcoatTexture": texture,
-        "clearcoatRoughnessFactor": 0.25,
-        "clearcoatRoughnessTexture": texture,
-    }
-    sheen = {
-        "sheenColorFactor": [1, 0.5, 0],
-        "sheenColorTexture": {"index": builder.texture(np.array([[[128, 128, 255]]], np.uint8))},
-        "sheenRoughnessFactor": 0.5,
-        "sheenRoughnessTexture": texture,
-    }
-    extensions = {"KHR_materials_clearcoat": clearcoat, "KHR_materials_sheen": sheen}
-    shape = shape_of(plate_of({}, builder, extensions=extensions), tmp_path)
-    assert numbers(shape, "clearcoat") == [[0.1]]
-    assert numbers(shape, "clearcoat_roughness") == [[0.1]]
-    assert numbers(shape, "sheen") == 1.0
-    assert numbers_of(shape.values["sheen_color"])[0, 0] == pytest.approx([CODES[128], CODES[128] / 2, 0])
-    assert numbers(shape, "sheen_roughness") == [[0.4]]
-
-
-def test_layers_of_zero_weight_are_none_and_a_bare_clear_coat_is_smooth(tmp_path: Path) -> None:
-    extensions: dict[str, Any] = {"KHR_materials_clearcoat": {}, "KHR_materials_sheen": {}}
-    shape = shape_of(plate_of({}, extensions=extensions), tmp_path)
-    assert not shape.values.keys() & {"clearcoat", "sheen"}
-    extensions["KHR_materials_clearcoat"] = {"clearcoatFactor": 1}
-    shape = shape_of(plate_of({}, extensions=extensions), tmp_path)
-    assert (shape.values["clearcoat"], shape.values["clearcoat_roughness"]) == (1, 0)
-
-
 @pytest.mark.parametrize(
     ("ior", "specular", "expected", "warned"),
     [
@@ -249,46 +268,6 @@ def test_dielectrics(
     found = content_of(plate_of({"metallicFactor": 0}, extensions=extensions), tmp_path)
     assert found.shapes[0].values["specular"] == pytest.approx(expected, rel=1e-9)
     assert any("specular" in text for text in found.warnings) == warned
-
-
-def test_textures_of_the_specular_lobe(tmp_path: Path) -> None:
-    builder = GltfBuilder()
-    texture = {"index": builder.texture(np.array([[[128, 128, 128, 51]]], np.uint8))}
-    for key, expected in (("specularTexture", 0.5 * 0.2), ("specularColorTexture", 0.5 * CODES[128])):
-        extensions = {"KHR_materials_specular": {key: texture}}
-        builder.document.pop("nodes", None)
-        shape = shape_of(plate_of({"metallicFactor": 0}, builder, extensions=extensions), tmp_path)
-        assert numbers_of(shape.values["specular"]) == pytest.approx(expected, rel=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("mode", "alphas", "factor", "expected"),
-    [
-        ("OPAQUE", [0, 255], 0.5, None),
-        ("BLEND", [51, 255], 0.5, [[0.1, 0.5]]),
-        ("BLEND", [255, 255], 1.0, None),
-        ("MASK", [0, 255], 1.0, [[0.0, 1.0]]),
-        # All of it is above the cutoff of 0.5.
-        ("MASK", [204, 255], 1.0, None),
-    ],
-)
-def test_alpha(
-    tmp_path: Path, mode: str, alphas: list[int], factor: float, expected: list[list[float]] | None
-) -> None:
-    builder = GltfBuilder()
-    pixels = np.full((1, 2, 4), 255, np.uint8)
-    pixels[0, :, 3] = alphas
-    base = {"baseColorTexture": {"index": builder.texture(pixels)}, "baseColorFactor": [1, 1, 1, factor]}
-    shape = shape_of(plate_of(base, builder, alphaMode=mode), tmp_path)
-    assert (numbers(shape, "opacity") if "opacity" in shape.values else None) == expected
-    assert shape.values.get("opacity_cutoff") == (0.5 if mode == "MASK" and expected else None)
-
-
-def test_images_without_alpha_are_opaque(tmp_path: Path) -> None:
-    builder = GltfBuilder()
-    texture = {"index": builder.texture(np.full((1, 1, 3), 51, np.uint8))}
-    base = {"baseColorTexture": texture, "baseColorFactor": [1, 1, 1, 0.5]}
-    assert numbers(shape_of(plate_of(base, builder, alphaMode="BLEND"), tmp_path), "opacity") == [[0.5]]
 
 
 def test_vertex_colors_are_clamped_and_linear(tmp_path: Path) -> None:
@@ -339,25 +318,6 @@ def test_factors_out_of_range_are_refused(tmp_path: Path, key: str, value: Any) 
         read_mesh_content(path)
 
 
-UNUSED = {
-    "normal": {"normalTexture": {"index": 0}},
-    "occlusion": {"occlusionTexture": {"index": 0}},
-    "emission": {"emissiveFactor": [0, 0, 2]},
-    "KHR_materials_unlit": {"extensions": {"KHR_materials_unlit": {}}},
-    "KHR_materials_transmission": {"extensions": {"KHR_materials_transmission": {}}},
-    "normal textures": {"extensions": {"KHR_materials_clearcoat": {"clearcoatNormalTexture": {"index": 0}}}},
-}
-
-
-@pytest.mark.parametrize("word", UNUSED)
-def test_what_is_not_used_is_named_once(tmp_path: Path, word: str) -> None:
-    builder = GltfBuilder()
-    for name in "ab":
-        builder.plate(builder.material({}, name=name, **UNUSED[word]))
-    (text,) = content_of(builder, tmp_path).warnings
-    assert word in text
-
-
 def fault_of(texture: dict[str, Any], image: dict[str, Any] | None, folder: Path) -> InputError:
     builder = GltfBuilder()
     if image is not None:
@@ -378,15 +338,6 @@ def test_images_that_cannot_be_read_are_named(tmp_path: Path) -> None:
     assert "KTX2" in fault_of({"extensions": {"KHR_texture_basisu": {"source": 0}}}, None, tmp_path).hint
     assert "no image" in fault_of({}, None, tmp_path).what
     assert "images.3" in fault_of({"source": 3}, None, tmp_path).what
-
-
-def test_the_fallback_of_another_format_is_used(tmp_path: Path) -> None:
-    builder = GltfBuilder()
-    builder.texture(np.full((1, 1, 3), 255, np.uint8))
-    builder.document["textures"][0]["extensions"] = {"EXT_texture_webp": {"source": 5}}
-    found = content_of(plate_of({"baseColorTexture": {"index": 0}}, builder), tmp_path)
-    assert found.shapes[0].faults == {}
-    assert any("webp" in text for text in found.warnings)
 
 
 def test_specular_and_glossiness_alone_are_a_fault(tmp_path: Path) -> None:

@@ -295,12 +295,6 @@ def test_what_is_not_used_is_said(tmp_path: Path, text: str, says: str) -> None:
         assert word in warning
 
 
-def test_elements_that_are_not_used_are_said(tmp_path: Path) -> None:
-    (warning,) = read(tmp_path, SQUARE + "l 1 2\np 3\ncurv 0 1 1 2\n#MRGB ff808080\n" + FACES).warnings
-    for word in ("lines", "points", "curves", "ZBrush"):
-        assert word in warning
-
-
 def test_statements_of_no_effect_are_silent(tmp_path: Path) -> None:
     blender = "Ns 250\nKa 1 1 1\nKd 0.8 0.8 0.8\nKs 0 0 0\nKe 0 0 0\nNi 1.45\nd 1\nillum 2\nPr 0.5\nPm 0\n"
     blender += "Ps 0\nPc 0\nPcr 0.03\naniso 0\nanisor 0"
@@ -329,13 +323,6 @@ def test_colors_of_vertices_are_srgb_factors(tmp_path: Path) -> None:
     assert "multiplies" in content.warnings[0]
 
 
-def test_weights_of_vertices_are_those_of_curves_alone(tmp_path: Path) -> None:
-    text = "v 1 0 0 2\nv 3 0 0 2\nv 3 4 0 2\nf 1 2 3\n"
-    (shape,) = read(tmp_path, text).shapes
-    assert shape.vertices.tolist() == [[1, 0, 0], [3, 0, 0], [3, 4, 0]]
-    assert shape.colors is None
-
-
 def test_y_up_is_noticed() -> None:
     rng = np.random.default_rng(0)
     n = 8
@@ -353,3 +340,9 @@ def test_y_up_is_noticed() -> None:
     blades = np.array([[0, 0, 0], [0.1, 0, 0], [0.05, 0, 1], [3, 0.3, 0], [3, 0.31, 0], [3, 0.3, 1]])
     floor = np.array([[0, 0, 0], [3, 0, 0], [3, 0.4, 0]])
     assert not seems_up("y", np.concatenate([blades, floor]), np.arange(9).reshape(3, 3))
+
+
+def test_elements_that_are_not_used_are_said(tmp_path: Path) -> None:
+    (warning,) = read(tmp_path, SQUARE + "l 1 2\np 3\ncurv 0 1 1 2\n#MRGB ff808080\n" + FACES).warnings
+    for word in ("lines", "points", "curves", "ZBrush"):
+        assert word in warning

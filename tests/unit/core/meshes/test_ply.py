@@ -187,17 +187,6 @@ def test_damaged_and_other_files_are_refused(tmp_path: Path, data: bytes, says: 
     assert "\n" not in error.value.what
 
 
-def test_what_is_not_used_is_said(tmp_path: Path) -> None:
-    vertices = [(*p, 0.5, 100) for p in SQUARE]
-    elements = {
-        "vertex": ([*XYZ, "float quality", "uchar alpha"], vertices),
-        "face": ([CORNERS], TRIANGLES),
-        "edge": (["int vertex1"], [(0,)]),
-    }
-    warnings = read(tmp_path, ply(elements) + b"1 2 3\n").warnings
-    assert ["quality, alpha" in warnings[0], "edge" in warnings[1], "after" in warnings[2]] == [True] * 3
-
-
 @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
 def test_trimesh_and_mitsuba_read_the_same(tmp_path: Path, encoding: str) -> None:
     from mbtf_gen.engine.runtime import load_mitsuba
@@ -225,3 +214,15 @@ def test_altered_files_are_read_or_refused(
     with contextlib.suppress(InputError):
         for shape in read(tmp_path_factory.mktemp("fuzz"), altered).shapes:
             assert shape.faces.max() < len(shape.vertices)
+
+
+def test_what_is_not_used_is_said(tmp_path: Path) -> None:
+    elements = {
+        "vertex": ([*XYZ, "float quality", "uchar alpha"], [(*p, 0.5, 100) for p in SQUARE]),
+        "edge": (["int vertex1", "list uchar int more"], [(0, [1, 2]), (1, [])]),
+        "face": ([CORNERS], TRIANGLES),
+    }
+    content = read(tmp_path, ply(elements, "binary_little_endian") + b"more")
+    assert content.shapes[0].faces.tolist() == [[0, 1, 2], [0, 2, 3]]
+    for word, warning in zip(("quality, alpha", "edge", "after"), content.warnings, strict=True):
+        assert word in warning

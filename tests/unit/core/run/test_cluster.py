@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import multiprocessing
 import os
 import signal
-import subprocess
-import sys
 import threading
 import time
 import warnings
@@ -20,7 +17,6 @@ from typing import Any
 
 import pytest
 from support import run_tasks
-from support.object_stores import silent_server
 
 from mbtf_core.errors import InputError, PartialError
 from mbtf_core.run import cluster as module
@@ -56,37 +52,11 @@ def test_a_batch_system_that_refuses_the_jobs_is_no_wait(
     assert "Traceback" not in capfd.readouterr().err
 
 
-def test_an_interruption_while_waiting_for_jobs_is_one(tmp_path: Path) -> None:
-    pytest.importorskip("dask_jobqueue", reason="no dask-jobqueue; to enable: pip install 'mbtf[cluster]'")
-    for name, text in (("sbatch", "echo Submitted batch job 5"), ("scancel", "exit 0")):
-        (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n")
-        (tmp_path / name).chmod(0o755)
-    (tmp_path / "site.yaml").write_text("engine: slurm\nworkers: 1\noptions: {interface: lo}\n")
-    program = (
-        "import os, signal\n"
-        "from mbtf_core.run.cluster import open_runner\n"
-        "def note(line): signal.setitimer(signal.ITIMER_REAL, 0.5)\n"
-        "signal.signal(signal.SIGALRM, lambda *_: os.kill(os.getpid(), signal.SIGINT))\n"
-        "try:\n"
-        "    with open_runner('site.yaml', note): pass\n"
-        "except KeyboardInterrupt: print('interrupted')\n"
-    )
-    environment = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
-    done = subprocess.run(
-        [sys.executable, "-c", program], cwd=tmp_path, env=environment, capture_output=True, text=True
-    )
-    assert done.stdout == "interrupted\n", done.stderr
-
-
-def test_a_task_is_run_again_when_its_worker_dies(cluster: Runner, tmp_path: Path) -> None:
+@pytest.mark.parametrize("task", [run_tasks.die_at_first, run_tasks.fail_at_first])
+def test_a_task_is_run_again(task: Callable[..., int], cluster: Runner, tmp_path: Path) -> None:
+    """When its worker dies, and when it fails by a bug."""
     arguments = {"marks": str(tmp_path), "times": 2}
-    (done,) = cluster.map(run_tasks.die_at_first, [Item("dies", arguments)])
-    assert (done.value, done.error) == (3, "")
-
-
-def test_a_task_is_run_again_when_it_fails_by_a_bug(cluster: Runner, tmp_path: Path) -> None:
-    arguments = {"marks": str(tmp_path), "times": 2}
-    (done,) = cluster.map(run_tasks.fail_at_first, [Item("flaky", arguments)])
+    (done,) = cluster.map(task, [Item("again", arguments)])
     assert (done.value, done.error) == (3, "")
 
 
@@ -130,11 +100,6 @@ def test_workers_that_dask_cannot_close_are_killed(monkeypatch: pytest.MonkeyPat
     other.kill()
 
 
-def test_tasks_for_gpus_run_where_none_is_stated(cluster: Runner) -> None:
-    (done,) = cluster.map(run_tasks.double, [Item("gpu", {"x": 3}, gpu=True)])
-    assert done.value == 6
-
-
 def test_other_versions_are_refused() -> None:
     call, _, folder = packed(run_tasks.double, Item("x", {"x": 1}))
     found = run_task(call, "0.0.0", folder)
@@ -158,17 +123,6 @@ def test_a_scheduler_that_is_not_there_is_bad_input(tmp_path: Path) -> None:
     ):
         pass
     assert "dask scheduler" in caught.value.hint
-
-
-def test_a_scheduler_that_never_answers_is_given_up(tmp_path: Path) -> None:
-    pytest.importorskip("distributed")
-    with (
-        silent_server() as port,
-        pytest.raises(InputError, match="no answer within 1 s") as caught,
-        open_runner(scheduler_file(tmp_path, f"tcp://127.0.0.1:{port}"), lambda line: None),
-    ):
-        pass
-    assert "timeout" in caught.value.hint
 
 
 @pytest.fixture
@@ -203,20 +157,6 @@ def test_a_scheduler_that_hangs_leaves_resumable_work(one_worker: Any, tmp_path:
         answers.set()
 
 
-def test_a_cluster_without_workers_is_not_waited_for_for_ever(
-    one_worker: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, "_LOOK_SECONDS", 0.2)
-    path = tmp_path / "scheduler.yaml"
-    path.write_text(f"address: {one_worker.scheduler_address}\nstart_timeout: 1s\n")
-    with open_runner(str(path), lambda line: None) as opened:
-        results = opened.map(run_tasks.double, (Item(f"x{i}", {"x": i}) for i in range(10**6)))
-        next(results)
-        one_worker.scale(0)
-        with pytest.raises(PartialError, match=r"the cluster is lost .no worker within 1s"):
-            list(results)
-
-
 def test_a_worker_with_several_threads_runs_one_task_at_a_time() -> None:
     distributed = pytest.importorskip("distributed")
     with (
@@ -227,47 +167,6 @@ def test_a_worker_with_several_threads_runs_one_task_at_a_time() -> None:
     ):
         found = list(opened.map(run_tasks.alone, (Item(f"x{i}") for i in range(16))))
         assert [done.value for done in found] == 16 * [True]
-
-
-def test_jobs_of_batch_systems(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a site needs comes beside what tasks need."""
-    dask_jobqueue = pytest.importorskip("dask_jobqueue")
-    scripts = []
-    monkeypatch.setattr("shutil.which", lambda command: f"/usr/bin/{command}")
-    for system in ("SLURMCluster", "PBSCluster"):
-        monkeypatch.setattr(
-            getattr(dask_jobqueue, system), "adapt", lambda self, **numbers: scripts.append(self.job_script())
-        )
-    own = {
-        "job_script_prologue": ["module load python"],
-        "worker_extra_args": ["--local-directory", "/scratch"],
-        "queue": "short",
-    }
-    for name in ("slurm", "pbs"):
-        config = ClusterConfig(
-            engine=name,
-            threads=8,
-            gpus=1,
-            memory=16e9,
-            walltime=7200,
-            options=own,  # type: ignore[arg-type]
-        )
-        with module._started(config, [], print):
-            pass
-    for script in scripts:
-        lines = script.splitlines()
-        assert lines.index("module load python") < lines.index(f"export {task.THREADS_VARIABLE}=8")
-        assert "export DASK_DISTRIBUTED__WORKER__MEMORY__PAUSE=False" in lines
-        for words in (
-            "--nthreads 1",
-            "--preload mbtf_core.run.task",
-            "--resources GPU=1",
-            "--lifetime 6480s",
-            "--local-directory /scratch",
-        ):
-            assert words in script
-    assert "--cpus-per-task=8" in scripts[0]
-    assert "-p short" in scripts[0]
 
 
 @pytest.fixture
@@ -284,13 +183,13 @@ def job_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable
         lambda self, **numbers: found.extend(self.job_script().splitlines()),
     )
 
-    def lines(site: str = "", **options: Any) -> list[str]:
+    def lines(site: str = "", config: dict[str, Any] | None = None, **options: Any) -> list[str]:
         (tmp_path / "site.yaml").write_text(site)
         found.clear()
         site_config = dask.config.collect(paths=[str(tmp_path / "site.yaml")], env={})
         with dask.config.set(dask.config.merge(dask.config.config, site_config)):
-            config = ClusterConfig(engine="slurm", options={"interface": "lo", **options})
-            with warnings.catch_warnings(), module._started(config, [], found.append):
+            slurm = ClusterConfig(engine="slurm", options={"interface": "lo", **options}, **(config or {}))
+            with warnings.catch_warnings(), module._started(slurm, [], found.append):
                 warnings.simplefilter("error")
         return found
 
@@ -311,6 +210,26 @@ distributed: {worker: {preload: [site_module]}}
 """
 
 
+def test_what_a_job_needs_comes_beside_what_tasks_need(
+    job_of: Callable[..., list[str]], tmp_path: Path
+) -> None:
+    own: dict[str, Any] = {
+        "job_script_prologue": ["module load python"],
+        "worker_extra_args": ["--local-directory", "/scratch"],
+        "queue": "short",
+        "log_directory": str(tmp_path / "logs"),
+    }
+    job = job_of(config={"threads": 8, "gpus": 1, "memory": 16e9, "walltime": 7200}, **own)
+    assert job.index("module load python") < job.index(f"export {task.THREADS_VARIABLE}=8")
+    assert "export DASK_DISTRIBUTED__WORKER__MEMORY__PAUSE=False" in job
+    assert {"#SBATCH --cpus-per-task=8", "#SBATCH -p short"} <= set(job)
+    for words in (
+        *("--nthreads 1", "--preload mbtf_core.run.task", "--resources GPU=1"),
+        *("--lifetime 6480s", "--local-directory /scratch"),
+    ):
+        assert words in job[-1]
+
+
 def test_what_a_site_configures_is_kept(
     job_of: Callable[..., list[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -328,35 +247,6 @@ def test_what_a_site_configures_is_kept(
     assert job.index("module load mine") < job.index(OURS)
     assert "module load site" not in job
     assert {"#SBATCH --constraint=site", "#SBATCH -A mine"} <= set(job)
-
-
-@pytest.mark.parametrize("where", ["options", "site"])
-def test_old_names_of_options_are_understood(
-    job_of: Callable[..., list[str]], where: str, tmp_path: Path
-) -> None:
-    old = {
-        "project": "graphics",
-        "job_extra": ["--qos=low"],
-        "env_extra": ["module load python"],
-        "header_skip": ["--mem"],
-        "extra": ["--local-directory", "/scratch"],
-        "log_directory": str(tmp_path / "logs"),
-    }
-    if where == "options":
-        job = job_of(**old)
-    else:
-        job = job_of(json.dumps({"jobqueue": {"slurm": {k.replace("_", "-"): v for k, v in old.items()}}}))
-    assert job.index("module load python") < job.index(OURS)
-    assert {"#SBATCH -A graphics", "#SBATCH --qos=low"} <= set(job)
-    assert not any("--mem=" in line for line in job)
-    assert "--local-directory /scratch" in job[-1]
-
-
-def test_one_line_in_place_of_a_list(job_of: Callable[..., list[str]], tmp_path: Path) -> None:
-    logs = str(tmp_path / "logs")
-    job = job_of(env_extra="module load x", job_extra="--qos=low", header_skip="--mem", log_directory=logs)
-    assert {"module load x", "#SBATCH --qos=low", OURS} <= set(job)
-    assert "#SBATCH -n 1" in job
 
 
 def test_options_that_would_be_ignored_are_refused_or_named(
@@ -399,3 +289,13 @@ def test_workers_of_this_machine_divide_its_gpus(monkeypatch: pytest.MonkeyPatch
         assert os.environ["CUDA_VISIBLE_DEVICES"] == expected
     # The signal of Ctrl-C is the command's.
     assert handlers == {signal.SIGINT: signal.SIG_IGN}
+
+
+def test_old_names_of_options_are_understood(job_of: Callable[..., list[str]], tmp_path: Path) -> None:
+    old = {"project": "graphics", "job_extra": "--qos=low", "env_extra": ["module load python"]}
+    more = {"header_skip": "--mem", "extra": ["--local-directory", "/scratch"]}
+    job = job_of(**old, **more, log_directory=str(tmp_path / "logs"))
+    assert job.index("module load python") < job.index(OURS)
+    assert {"#SBATCH -A graphics", "#SBATCH --qos=low", "#SBATCH -n 1"} <= set(job)
+    assert not any("--mem=" in line for line in job)
+    assert "--local-directory /scratch" in job[-1]

@@ -103,11 +103,6 @@ def test_a_signal_while_a_command_works(command: str, number: signal.Signals, tm
     assert [path.name for path in (tmp_path / "out").glob("[!.]*")] == ["file"]
 
 
-def test_a_signal_after_the_last_act_changes_nothing(tmp_path: Path) -> None:
-    code = f"{SEND}\nfrom mbtf_core.run.signals import *\nhandle_signals()\ncode = finish(4)\nsend()"
-    assert run_program(signal.SIGTERM, tmp_path, "-c", code).returncode == 4
-
-
 # What a command may leave to the end of the interpreter, and what it may not: objects of modules would be
 # removed after the default actions of signals are restored.
 ENDING = """

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from pathlib import Path
 
@@ -53,15 +52,6 @@ def test_files_that_are_at_fault(tmp_path: Path, text: str, word: str) -> None:
     file.write_text(text, "latin-1")
     with pytest.raises(InputError, match=re.escape(word)):
         read_cluster(str(file))
-
-
-@pytest.mark.parametrize("target", ["/dev/zero", "/dev/null", "folder", "fifo"])
-def test_files_that_are_none(tmp_path: Path, target: str) -> None:
-    (tmp_path / "folder").mkdir()
-    os.mkfifo(tmp_path / "fifo")
-    (tmp_path / "site.yaml").symlink_to(target)
-    with pytest.raises(InputError, match=r"site\.yaml"):
-        read_cluster(str(tmp_path / "site.yaml"))
 
 
 @pytest.mark.parametrize("where", ["lokal", "local:0", "local:", "local:-1", "http://x", ""])

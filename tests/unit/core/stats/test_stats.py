@@ -120,15 +120,6 @@ def test_level_and_elevation_groups() -> None:
     assert elevation_groups(up, omega).tolist() == [0, 0, 1, 3, 3]
 
 
-def test_the_kit_imports_without_scipy() -> None:
-    """scipy costs a tenth of a second of start-up; only the tests themselves need it."""
-    import subprocess
-    import sys
-
-    code = "import mbtf_core.stats, sys; sys.exit('scipy' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
-
-
 def test_weights_are_refused_unless_positive_and_one_per_query() -> None:
     values = np.ones((3, 2))
     for weights in ([1.0, 2.0], [1.0, 2.0, 0.0], [[1.0], [1.0], [1.0]]):

@@ -17,7 +17,6 @@ from torch.utils.data import DataLoader
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.shard_files import write_shard
 from mbtf_core.errors import InputError
-from mbtf_core.stats import noise_free_mse, pooled_variance
 from mbtf_fit import QueryDataset
 from mbtf_fit.data import batches
 from mbtf_fit.data.queries import NEEDED, needed
@@ -101,19 +100,6 @@ def test_every_layout_is_read(layout: str, tmp_path: Path) -> None:
     for split in ("train", "test"):
         found = rows(QueryDataset(folder, split))
         np.testing.assert_array_equal(in_order(found), in_order(stored(folder, split)))
-
-
-def test_the_truth_has_no_error(shards: Path) -> None:
-    """A Lambert plane is albedo/π: without noise the error is 0, and the noise is that of the data."""
-    a, b = (
-        torch.cat([getattr(batch, name) for batch in QueryDataset(shards)]) for name in ("value_a", "value_b")
-    )
-    error = noise_free_mse(np.full(a.shape, ALBEDO / np.pi), a, b)
-    assert abs(error.value) < 3 * error.error
-    assert error.error < 0.02 * NOISE**2
-    assert noise_free_mse(np.full(a.shape, 1.1 * ALBEDO / np.pi), a, b).value > 3 * error.error
-    # Of the mean of two estimates.
-    assert pooled_variance(a, b).value == pytest.approx(NOISE**2 / 2, rel=0.03)
 
 
 def test_what_cannot_be_read_is_refused(shards: Path, tmp_path: Path) -> None:

@@ -78,13 +78,6 @@ def test_a_fit_is_identical(tmp_path: Path, url: str, local: Path, memory: str, 
     assert all((mine[name] == theirs[name]).all() for name in mine)
 
 
-def test_batches_are_those_of_local_data(url: str, local: Path) -> None:
-    mine, theirs = (load_training(Dataset.open(f), HELD_OUT, 0, memory=1.0).training for f in (local, url))
-    assert isinstance(theirs, StreamedQueries)
-    for a, b in zip(*(islice(q.batches(700, 0, 5), 30) for q in (mine, theirs)), strict=True):
-        assert all((getattr(a, n) == getattr(b, n)).all() for n in ("u", "sigma", "omega_i", "value"))
-
-
 def test_shards_are_downloaded_once(url: str, local: Path, downloads: list[tuple[str, str]]) -> None:
     data = Dataset.open(url)
     training = load_training(data, HELD_OUT, 0, memory=1.0).training

@@ -67,22 +67,6 @@ def test_rays_that_pass_an_edge_may_differ(source: Path, tmp_path: Path, wrong: 
     assert file.exists() is not refused
 
 
-@pytest.mark.parametrize(("to", "name"), [("json", "layers.json"), ("web", "viewer.html")])
-def test_an_edited_file_is_replaced_on_request_only(
-    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], to: str, name: str
-) -> None:
-    out = tmp_path / "out"
-    line = ["export", str(source), "--to", to, "-o", str(out)]
-    assert run(app, line) == 0
-    content = (out / name).read_text()
-    (out / name).write_text(content.replace("mbtf", "mine", 1))
-    assert run(app, line) == 3
-    assert f"{name}: has been edited" in capsys.readouterr().err
-    assert "mine" in (out / name).read_text()
-    assert run(app, [*line, "--overwrite"]) == 0
-    assert (out / name).read_text() == content
-
-
 def test_a_file_beside_the_material_is_replaced_on_request_only(
     source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -96,32 +80,6 @@ def test_a_file_beside_the_material_is_replaced_on_request_only(
     assert (material / "layers.json").read_text() == "mine"
     assert run(app, [*line, "--overwrite"]) == 0
     assert "mine" not in (material / "layers.json").read_text()
-
-
-def test_another_export_is_refused_unless_told(
-    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "out"
-    assert export(source, out) == 0
-    before = stamps(out)
-    capsys.readouterr()
-    assert export(source, out, "--half") == 3
-    message = capsys.readouterr().err
-    assert "half: False -> True" in message
-    assert "--overwrite" in message
-    assert stamps(out) == before
-    assert export(source, out, "--half", "--overwrite") == 0
-    assert Material.load(out).description["weights"]["dtype"] == "float16"
-
-
-@pytest.mark.parametrize("name", ["material.json", "notes.txt"])
-def test_what_is_no_export_is_refused(source: Path, tmp_path: Path, name: str) -> None:
-    out = tmp_path / "out"
-    out.mkdir()
-    (out / name).write_text("mine")
-    assert export(source, out, "--overwrite") == 3
-    assert os.listdir(out) == [name]
-    assert (out / name).read_text() == "mine"
 
 
 def test_one_export_does_not_mix_with_another(
@@ -155,16 +113,6 @@ def test_a_target_names_all_files_that_it_writes(source: Path, tmp_path: Path, n
     written = set(os.listdir(tmp_path / "out")) - {"export.json"}
     assert written
     assert written <= set(targets()[name].files)
-
-
-def test_a_failed_export_claims_nothing(source: Path, tmp_path: Path) -> None:
-    out = ["-o", str(tmp_path / "out"), "-q"]
-    assert run(app, ["export", str(source), "--to", "web", "--against", str(tmp_path / "none"), *out]) == 3
-    assert not (tmp_path / "out").exists()
-    (tmp_path / "notes").mkdir()
-    (tmp_path / "notes" / "notes.txt").write_text("mine")
-    assert run(app, ["export", str(source), "--to", "web", "-o", str(tmp_path / "notes"), "--overwrite"]) == 3
-    assert os.listdir(tmp_path / "notes") == ["notes.txt"]
 
 
 def test_files_of_formats_may_lie_beside_the_material(source: Path, tmp_path: Path) -> None:

@@ -4,54 +4,32 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from support.plugin_materials import net, write_material
+from support.material_cases import make
+from support.plugin_materials import write_material
 
 from mbtf_core.app.console import CONSOLE
-from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
 from mbtf_fit import Material
 from mbtf_fit.export import Export, targets
 from mbtf_fit.material.material import export, to_half
 from mbtf_fit.material.numpy_reader import NumpyMaterial
-from mbtf_fit.material.transmittance import Transmittance
 
 F64 = NDArray[np.float64]
 
 
-FILTERED = {"raw": True, "band_attenuation": True, "footprint_filtered": True}
-# Every model's operations are read in test_read_material.py; these differ in what the files hold.
-CASES: dict[str, dict[str, Any]] = {
-    "calibrated": {},
-    "with holes": {},
-    "hierarchical": {"model": "hierarchical"},
-    "eleven channels": {
-        "model": "hierarchical",
-        **net(decoder="mlp", channels=11, encoding={"raw": True, "direction_xyz": True}),
-    },
-    "neumip": {},
-    "learned heights": {"model": "neumip+", "glossy": False},
-    "calibrated relief": {"model": "relief"},
-    "encoded": net(encoding={"position": 4, "direction": 2, "direction_pi": False, **FILTERED}),
-}
-
-
-def make(case: str, folder: Path, contrast: float = 1.0) -> Material:
-    generator, lattice = torch.Generator().manual_seed(0), Lattice(4, 0.5)
-    options = {"finest": 4, "aspect": 0.5, "contrast": contrast, **CASES[case]}
-    if case.startswith("calibrated"):
-        calibration = 0.7 + 0.6 * torch.rand((2, 5, 6, 3), generator=generator)
-        options["weights"] = {"calibration": calibration}
-    if case == "with holes":
-        shapes = [(*lattice.shape(s), 6) for s in range(5)]
-        coefficients = [0.3 + 0.2 * torch.randn(s, generator=generator).numpy() for s in shapes]
-        options["transmittance"] = Transmittance(lattice, coefficients)
-    return write_material(folder, **options)
+# Every operation is read in test_read_material.py; these differ in what the files hold.
+CASES = (
+    "calibrated",
+    "holes",
+    "hierarchical, eleven channels",
+    "calibrated relief",
+    "learned heights, diffuse",
+)
 
 
 class Reader(NumpyMaterial):
@@ -90,7 +68,7 @@ class Reader(NumpyMaterial):
 @pytest.mark.parametrize("case", CASES)
 def test_an_export_is_sufficient_for_evaluation(case: str, half: bool, tmp_path: Path) -> None:
     """An evaluation written from the description alone, in NumPy, meets the conformance values."""
-    material = make(case, tmp_path)
+    material = make(case, tmp_path, contrast=1.0)
     written = to_half(material)[0] if half else material
     for name in ("exr", "json"):
         targets()[name].write(Export(tmp_path, tmp_path, written, half, False, CONSOLE), None)
@@ -102,9 +80,9 @@ def test_an_export_is_sufficient_for_evaluation(case: str, half: bool, tmp_path:
     np.testing.assert_allclose(found, expected, rtol=2e-3, atol=1e-5)
     assert (expected.astype(np.float32) == material.conformance["rgb"]).all() != half
     kinds = {op["operation"] for op in reader.document["operations"]}
-    assert ("calibrate" in kinds) == case.startswith("calibrated")
-    assert ("transmittance" in reader.document) == (case == "with holes")
-    if case == "with holes":
+    assert ("calibrate" in kinds) == (case in ("calibrated", "calibrated relief", "holes"))
+    assert ("transmittance" in reader.document) == (case == "holes")
+    if case == "holes":
         through = np.array(reader.document["conformance"]["transmittance"])
         assert through.std() > 0.1
         np.testing.assert_allclose(reader.transmittance(), through, atol=2e-5)

@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 from safetensors.numpy import load_file
 from support.datasets import edit
-from support.fit_data import F32, constant, parallax, random_queries, write_data
+from support.fit_data import constant, parallax, random_queries, write_data
 
 import mbtf_fit.material.material
 from mbtf_core.data.dataset import Dataset
@@ -25,10 +24,7 @@ from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.evaluation import split_errors
 from mbtf_fit.formatting import report_errors
 from mbtf_fit.material.material import conformance_queries, export
-from mbtf_fit.models.model import Model
 from mbtf_fit.models.registry import MODELS
-from mbtf_fit.ops import Lookup, Operation
-from mbtf_fit.sections import NetworkSection
 from mbtf_fit.training.trainer import prepare_trainer
 
 
@@ -51,41 +47,6 @@ def test_a_fit_states_the_lowest_direction_of_its_data(tmp_path: Path) -> None:
     folder = write_data(tmp_path / "d", constant(0.25))
     edit(folder / "manifest.json", lambda manifest: manifest.update(config={"queries": {"min_cos": 0.3}}))
     assert fit(config(), folder, tmp_path / "m").material.description["data"]["min_cos"] == 0.3
-
-
-@pytest.mark.parametrize("model", ["neumip", "neumip-baseline", "neumip+"])
-def test_a_homogeneous_constant_is_fitted(model: str, tmp_path: Path) -> None:
-    folder = write_data(tmp_path / "d", constant(0.25), noise=0.05)
-    result = fit(config(200, model=model), folder, tmp_path / "m")
-    found = result.material.evaluate(*random_queries(np.random.default_rng(5), 500, Lattice(3)).values())
-    assert found.mean() == pytest.approx(0.25, abs=0.003)
-    assert np.sqrt(((found - 0.25) ** 2).mean()) < 0.01
-
-
-class Diffuse(Model):
-    """Three learned numbers per texel, and nothing else: smaller than any model with a network."""
-
-    name, takes, calibrates = "diffuse", (), False
-
-    @classmethod
-    def operations(cls, lattice: Lattice, network: NetworkSection) -> list[Operation]:
-        return [Lookup("value", "u", "level", "albedo", channels=3)]
-
-
-def waves(u: F32, sigma: F32, omega_i: F32, omega_o: F32) -> NDArray[np.float64]:
-    """Waves of three colors, averaged over Gaussian footprints, from all directions."""
-    wave = np.sin(2 * np.pi * u[:, 0]) * np.exp(-2 * (np.pi * sigma) ** 2)
-    return (1 + 0.5 * wave)[:, None] * [0.1, 0.2, 0.3]
-
-
-def test_a_model_of_three_numbers_a_texel_is_fitted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(MODELS, "svbrdf", Diffuse)
-    # So many texels that they outweigh the conformance queries; those of the finest levels get few queries.
-    folder = write_data(tmp_path / "d", waves, finest=6)
-    fit(config(150, model="svbrdf", training={"texture_learning_rate": 0.05}), folder, tmp_path / "m")
-    queries = random_queries(np.random.default_rng(5), 500, Lattice(4))
-    found = Material.load(tmp_path / "m").evaluate(*queries.values())
-    assert found == pytest.approx(waves(**queries), rel=0.1)
 
 
 def test_the_first_parameters_follow_the_seed(data: Path) -> None:

@@ -317,16 +317,6 @@ def test_a_mesh_without_uv_is_refused(material: tuple[Path, Material], tmp_path:
     assert "no texture coordinates" in str(caught.value.__cause__ or caught.value.__context__)
 
 
-def test_a_refused_material_does_not_affect_later_renders(material: tuple[Path, Material]) -> None:
-    """A traceback, as notebooks keep it, holds the instance that failed."""
-    folder, fitted = material
-    with pytest.raises(Exception, match="uv_scale must be a positive number") as kept:
-        mi.load_dict(bsdf(folder, uv_scale=-1.0))
-    found = shown(plane(bsdf(folder), aspect=fitted.lattice.aspect))
-    assert kept.tb is not None
-    assert found.mean() > 0.0
-
-
 @pytest.mark.parametrize(("model", "allowed"), [("neumip", 0), ("relief", 2)])
 def test_deviations_from_conformance_values_are_refused(model: str, allowed: int, tmp_path: Path) -> None:
     """A material whose conformance values say otherwise than its weights. Few of those of `relief` may."""

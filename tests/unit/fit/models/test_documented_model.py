@@ -61,27 +61,17 @@ def test_another_package_brings_a_model(tmp_path: Path, run_python: RunPython) -
     """By an entry point: fitted, listed, exported."""
     path = install(tmp_path)
     write_data(tmp_path / "shards", constant(0.3), train=2000, test=200, finest=2)
-    out, exported = tmp_path / "out", tmp_path / "exported"
-    options = ["--model", "texel-lobe", "--steps", "20", "-o", str(out)]
-    for line in (
-        [str(tmp_path / "shards"), *options],
-        [
-            "export",
-            str(out),
-            "--to",
-            "exr",
-            "--to",
-            "json",
-            "--to",
-            "slang",
-            "-o",
-            str(tmp_path / "exported"),
-        ],
-    ):
-        done = run_python("-m", "mbtf_fit", *line, PYTHONPATH=path)
-        assert done.returncode == 0, done.stderr
-    assert '"model": "texel-lobe"' in (exported / "layers.json").read_text()
-    assert "texel-lobe" in run_python("-m", "mbtf_fit", "--help", PYTHONPATH=path).stdout
+    fit = ["shards", "--model", "texel-lobe", "--steps", "20", "-o", "out"]
+    export = ["export", "out", "--to", "exr", "--to", "json", "--to", "slang", "-o", "exported"]
+    code = (
+        f"import os; os.chdir({str(tmp_path)!r})\n"
+        "from mbtf_core.app.console import run\nfrom mbtf_fit.cli.app import app\n"
+        f"for line in ({fit!r}, {export!r}, ['--help']): assert run(app, line) == 0\n"
+    )
+    done = run_python("-c", code, PYTHONPATH=path)
+    assert done.returncode == 0, done.stderr
+    assert '"model": "texel-lobe"' in (tmp_path / "exported" / "layers.json").read_text()
+    assert "texel-lobe" in done.stdout
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from typing import Any
 
@@ -13,7 +12,6 @@ from support.fit_data import parallax, random_queries, training_queries
 from torch import Tensor
 
 from mbtf_core.data.lattice import Lattice
-from mbtf_core.errors import InputError
 from mbtf_fit import FitConfig
 from mbtf_fit.backends.cpu.gradients import NativeGradients
 from mbtf_fit.backends.cpu.model import NativeModel, supports
@@ -226,8 +224,3 @@ def test_a_material_stores_the_surface_alone() -> None:
     again.load_weights(tensors)
     arrays = queries_of(batch_of(hooks, 50))[:4]
     torch.testing.assert_close(again(*arrays), model(*arrays), atol=0, rtol=0)
-
-
-def test_several_view_rays_are_refused() -> None:
-    with pytest.raises(InputError, match="has no option " + re.escape("network.relief.places")):
-        FitConfig.model_validate({"model": "neumip+", "network": {"relief": {"places": 2}}})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 import torch
 
@@ -27,30 +26,6 @@ def test_a_lookup_at_texel_centers_returns_the_texels(aspect: float) -> None:
     table = asymmetric(rows, columns)
     found = lookup(table, Packing.of(lattice, [3]), centers)
     torch.testing.assert_close(found, table, rtol=0, atol=1e-12)
-
-
-def test_textures_wrap_in_both_directions() -> None:
-    lattice = Lattice(3, 0.5)
-    table = torch.rand(lattice.texels(), 3, dtype=F64)
-    packing = Packing.of(lattice, [3])
-    u = torch.rand(200, 2, dtype=F64)
-    shift = torch.from_numpy(np.random.default_rng(1).integers(-3, 4, (200, 2)).astype(np.float64))
-    torch.testing.assert_close(lookup(table, packing, u + shift), lookup(table, packing, u))
-    # Half a texel beyond the last center lies the mean of the last and the first texel.
-    texture = table.view(4, 8, 3)
-    seam = lookup(table, packing, torch.tensor([[0.0, 1 - 0.5 / 4]], dtype=F64))
-    torch.testing.assert_close(seam[0], (texture[0, 0] + texture[0, 7]) / 2)
-    seam = lookup(table, packing, torch.tensor([[0.5 / 8, 0.0]], dtype=F64))
-    torch.testing.assert_close(seam[0], (texture[0, 0] + texture[3, 0]) / 2)
-
-
-def test_levels_blend_with_the_fraction() -> None:
-    packing = Packing.of(Lattice(3), range(4))
-    table = torch.cat([torch.full((4**s, 1), 2.0**s, dtype=F64) for s in range(4)])
-    level = torch.tensor([0.0, 1.0, 2.0, 3.0, 0.25, 1.5, 2.75, -1.0, 4.5], dtype=F64)
-    found = lookup(table, packing, torch.rand(len(level), 2, dtype=F64), level).flatten()
-    expected = [1, 2, 4, 8, 0.75 * 1 + 0.25 * 2, 3, 0.25 * 4 + 0.75 * 8, 1, 8]
-    torch.testing.assert_close(found, torch.tensor(expected, dtype=F64))
 
 
 def lookup_reference(

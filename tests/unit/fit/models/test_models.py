@@ -13,7 +13,6 @@ from mbtf_core.errors import InputError, UsageError
 from mbtf_fit.config import FitConfig, build_model
 from mbtf_fit.ops import read_operations
 from mbtf_fit.pytorch.material import NeuralMaterial
-from mbtf_fit.pytorch.networks import Mlp, initialize_layers
 from mbtf_fit.pytorch.operations import FUNCTIONS
 from mbtf_fit.sections import OutputTransform
 
@@ -109,28 +108,13 @@ def test_unset_options_are_the_models_own() -> None:
     ("assignments", "words"),
     [
         (["model=neumip-baseline", "network.offset=depth"], "has no option network.offset"),
-        (["model=neumip", "network.relief.places=4"], "has no option network.relief.places"),
+        (["model=neumip+", "network.relief.places=4"], "has no option network.relief.places"),
         (["network.decoder=inception"], "has no option network.decoder, which hierarchical has"),
     ],
 )
 def test_options_that_contradict_the_model_are_refused(assignments: list[str], words: str) -> None:
     with pytest.raises(UsageError, match=words):
         resolve(FitConfig, assignments=assignments)
-
-
-@pytest.mark.parametrize("activation", ["relu", "leaky-relu", "sine"])
-def test_mlp_equals_its_reference(activation: Any) -> None:
-    torch.manual_seed(0)
-    network = Mlp([6, 25, 25, 3], activation).double()
-    initialize_layers(network, torch.Generator().manual_seed(1))
-    x = torch.randn(100, 6, dtype=F64, requires_grad=True)
-    weight = torch.randn(100, 3, dtype=F64)
-    inputs = [x, *network.parameters()]
-    fast, reference = network(x), network.reference(x)
-    torch.testing.assert_close(fast, reference)
-    gradients = [torch.autograd.grad((out * weight).sum(), inputs) for out in (fast, reference)]
-    for mine, plain in zip(*gradients, strict=True):
-        torch.testing.assert_close(mine, plain)
 
 
 @variants
@@ -166,16 +150,6 @@ def test_the_offset_follows_the_papers_formula() -> None:
     straight = torch.tensor([[0.0, 0.0, 1.0]], dtype=F64).expand(50, 3)
     assert model.offset(u, straight).abs().max() == 0
     assert random_model("baseline").offset(u, omega_o).abs().max() == 0
-
-
-@pytest.mark.parametrize("variant", ["neumip", "direct offset"])
-@pytest.mark.parametrize("aspect", [1.0, 0.5])
-def test_the_offset_is_a_length_in_tile_widths(variant: str, aspect: float) -> None:
-    model = random_model(variant, aspect)
-    u, sigma, _, omega_o = arguments(50)
-    moved = u + model.offset(u, omega_o) / torch.tensor([1.0, aspect], dtype=F64)
-    (wanted,) = model.run(["features"], {"moved": moved, "level": model.level(sigma)})
-    torch.testing.assert_close(model.stage1(u, sigma, omega_o)["features"], wanted)
 
 
 @variants
@@ -221,31 +195,6 @@ def test_exported_weights_make_the_same_model(variant: str) -> None:
         other.load_weights(weights)
 
 
-@pytest.mark.parametrize("sigma", [0.0, 1e-9, 0.5, 3.0])
-def test_footprints_beyond_the_levels_take_the_nearest(sigma: float) -> None:
-    model = random_model("baseline")
-    level = model.level(torch.tensor([sigma]))
-    assert level.item() == (3.0 if sigma < 0.1 else 0.0)
-
-
-@pytest.mark.parametrize("variant", ["neumip", "concatenated"])
-def test_the_value_is_continuous_across_levels(variant: str) -> None:
-    model = random_model(variant)
-    u, _, light, view = arguments(30)
-    for level in (1.0, 2.0):
-        near = [torch.full((30,), 0.5 * 2.0 ** -(level + e), dtype=F64) for e in (-1e-9, 1e-9)]
-        torch.testing.assert_close(*(model(u, sigma, light, view) for sigma in near), rtol=1e-6, atol=1e-8)
-
-
-def test_concatenated_levels_are_two_weighted_lookups() -> None:
-    model = random_model("concatenated")
-    u, level = torch.rand(2, 2, dtype=F64), torch.tensor([1.25, 2.25], dtype=F64)
-    one, two, three = (model.pyramid(u, torch.full((2,), s, dtype=F64)) for s in (1.0, 2.0, 3.0))
-    expected = [torch.cat([0.25 * two[0], 0.75 * one[0]]), torch.cat([0.75 * two[1], 0.25 * three[1]])]
-    (found,) = model.run(["features"], {"moved": u, "level": level})
-    torch.testing.assert_close(found, torch.stack(expected))
-
-
 @pytest.mark.parametrize("output", get_args(OutputTransform))
 def test_training_starts_from_the_datas_brightness(output: Any) -> None:
     model = build_model("neumip", LATTICE, output_transform=output).requires_grad_(False)
@@ -269,18 +218,6 @@ def test_six_outputs_are_luma_chroma_and_a_gate() -> None:
     r, g, b = value(red, "identity")[0]
     assert r > 0 > g
     assert b == 0
-
-
-def test_encodings_are_sines_and_cosines_of_doubling_frequencies() -> None:
-    pi = torch.pi
-    u = torch.tensor([[0.75, -0.75]], dtype=F64)  # p = 0.5, -0.5
-    expected = [(k * p, f) for f in (torch.sin, torch.cos) for p in (0.5, -0.5) for k in (pi, 2 * pi)]
-    level = torch.zeros(1, dtype=F64)
-    found = encoded("position", u, level, position=2)[0]
-    torch.testing.assert_close(found, torch.stack([f(torch.tensor(x, dtype=F64)) for x, f in expected]))
-    omega = torch.tensor([[0.6, 0.0, 0.8]], dtype=F64)
-    found = encoded("light", omega, level, direction=1, direction_pi=False, raw=True, direction_xyz=True)
-    torch.testing.assert_close(found, torch.cat([omega, omega.sin(), omega.cos()], 1))
 
 
 def test_attenuated_bands_have_equal_slopes() -> None:
@@ -356,24 +293,3 @@ def test_hierarchical_sees_nine_by_nine_texels_of_the_nearest_level() -> None:
         torch.testing.assert_close(places[4, 4], u[0])
         torch.testing.assert_close(places[4, 5] - places[4, 4], torch.tensor([1 / columns, 0.0], dtype=F64))
         torch.testing.assert_close(places[5, 4] - places[4, 4], torch.tensor([0.0, -1 / rows], dtype=F64))
-
-
-def test_hierarchical_depends_on_its_neighborhood_alone() -> None:
-    model = random_model("hierarchical")
-    values = model.stage1(*(a[:1] for a in (*arguments(1)[:2], directions(1))))
-    features = values["features"].detach().requires_grad_()
-    light, view = directions(1), directions(1)
-    model.stage2({**values, "features": features}, light, view).sum().backward()
-    assert features.grad is not None
-    touched = features.grad.view(9, 9, -1).abs().sum(2) > 0
-    assert touched[[0, 0, 4, 8, 8], [0, 8, 4, 0, 8]].float().mean() > 0.5
-    assert touched.float().mean() > 0.8
-
-
-def test_a_value_does_not_depend_on_other_queries() -> None:
-    model = random_model("hierarchical")
-    at = arguments(40)
-    together = model(*at)
-    order = torch.randperm(40)
-    torch.testing.assert_close(model(*(a[order] for a in at)), together[order])
-    torch.testing.assert_close(model(*(a[7:8] for a in at)), together[7:8])

@@ -33,7 +33,7 @@ NAMES = ("rainer2019", "rainer2020")
 
 
 def config(name: str, **training: Any) -> FitConfig:
-    options = {"steps": 300, "batch": 1024, "warmup": 20, **training}
+    options = {"steps": 250, "batch": 1024, "warmup": 20, **training}
     return FitConfig.model_validate({"model": name, "training": options})
 
 

@@ -25,7 +25,6 @@ from mbtf_fit.backends.cpu.gradients import NativeGradients
 from mbtf_fit.backends.cpu.model import NativeModel, supports
 from mbtf_fit.config import build_model
 from mbtf_fit.material.inference import predict
-from mbtf_fit.models.relief import known_surface
 from mbtf_fit.native import library
 from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.noise import NoiseModel
@@ -106,22 +105,6 @@ def test_two_stages_are_the_whole(name: str) -> None:
     torch.testing.assert_close(staged, whole, atol=1e-5, rtol=1e-4)
 
 
-def test_depth_weights_move_the_lookup() -> None:
-    """Without weight a lookup stays in its place; with weight 1 it is that of the intersection."""
-    model = model_of("default")
-    batch = batch_of(model, 100)
-    level, height = model.level(batch.sigma), batch.hints[:, :1]
-    with torch.no_grad():
-        model.depth_weights.zero_()
-        given = {"u": batch.u, "level": level, "z": height, "omega_o": batch.omega_o}
-        (still,) = model.run(["moved"], given)
-        model.depth_weights.fill_(1.0)
-        (moved,) = model.run(["moved"], given)
-    torch.testing.assert_close(still, batch.u)
-    hits = model.known.intersections(known_surface(1)[0], batch.u, level, batch.omega_o)[1]
-    torch.testing.assert_close(moved, hits, atol=1e-5, rtol=1e-5)
-
-
 def test_gradients_by_depth_weights_are_finite_differences() -> None:
     """In double precision, at given intersections."""
     model = model_of("default").double()
@@ -166,15 +149,6 @@ def test_the_difference_vector_is_the_light_about_the_half_vector() -> None:
     (opposite,) = model.run(["difference"], {"omega_i": view, "omega_o": light})
     opposite = opposite * torch.tensor([-1.0, -1.0, 1.0])
     torch.testing.assert_close(opposite, difference, atol=2e-5, rtol=1e-4)
-
-
-def test_black_data_stay_black() -> None:
-    model = model_of("default")
-    model.unit.zero_()
-    batch = batch_of(model, 50)
-    arrays = (batch.u, batch.sigma, batch.omega_i, batch.omega_o)
-    assert float(model(*arrays).detach().abs().max()) == 0
-    assert np.abs(predict(model, *arrays)).max() == 0
 
 
 def test_weights_survive_a_round_trip_and_others_are_refused() -> None:

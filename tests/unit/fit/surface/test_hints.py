@@ -55,15 +55,6 @@ def test_a_flat_lambert_tile(places: int) -> None:
     torch.testing.assert_close(found, wanted.expand(500, 7), atol=1e-5, rtol=1e-5)
 
 
-def test_a_tilted_facet_gets_its_cosine() -> None:
-    u, sigma, light, view = queries(500)
-    found = hints_of(surface(slope=(0.5, -0.2)), u, sigma, light, view, places=1)
-    normal = torch.tensor([-0.5, 0.2, 1.0]) / math.sqrt(1 + 0.5**2 + 0.2**2)
-    wanted = (light @ normal).clamp_min(0) / light[:, 2]
-    torch.testing.assert_close(found[:, 1], wanted, atol=1e-4, rtol=1e-4)
-    torch.testing.assert_close(found[:, 2:4], normal[:2].expand(500, 2), atol=1e-5, rtol=0)
-
-
 def conductor(alpha: tuple[float, float], light: Tensor, view: Tensor) -> np.ndarray:
     """BRDF (n,) of unmodified Mitsuba's GGX facets without Fresnel term, for directions (n, 3)."""
     description = {"type": "roughconductor", "distribution": "ggx", "material": "none"}
@@ -170,21 +161,6 @@ def test_footprints_beyond_the_levels_are_clamped(size: float, compiled: bool) -
     torch.testing.assert_close(found, wanted, atol=0, rtol=0)
 
 
-def test_a_smooth_mirror_of_facets_keeps_the_energy() -> None:
-    """White metal facets of α = 0.09 reflect 99 % of the light from above."""
-    n = 400
-    cosine, azimuth = (np.arange(n) + 0.5) / n, 2 * np.pi * (np.arange(16) + 0.5) / 16
-    c, a = (x.ravel() for x in np.meshgrid(cosine, azimuth))
-    s = np.sqrt(1 - c * c)
-    light = torch.from_numpy(np.stack([s * np.cos(a), s * np.sin(a), c], -1).astype(np.float32))
-    view = torch.tensor([[0.0, 0.0, 1.0]]).expand(len(light), 3)
-    white = surface(color=(1.0, 1.0, 1.0), roughness=0.3, metallic=1.0)
-    u, sigma = torch.full((len(light), 2), 0.3), torch.full((len(light),), 0.1)
-    core = hints_of(white, u, sigma, light, view, places=1)[:, 4].numpy()
-    # ∫ f cos dω: means over cosine and azimuth times 2π.
-    assert 2 * np.pi * (core * c).mean() == pytest.approx(0.99, abs=0.01)
-
-
 @needs_kernel
 @pytest.mark.parametrize(("glossy", "coated"), [(True, False), (False, False), (True, True)])
 @pytest.mark.parametrize("aspect", [1.0, 0.5])
@@ -270,14 +246,6 @@ def test_a_wave_keeps_its_phase_and_the_gaussian_share_of_its_amplitude(
     found = prefilter(torch.from_numpy(cosine(*given))[..., None], shape, sigma, aspect)[..., 0]
     share = np.exp(-2 * (np.pi * sigma) ** 2 * ((wave[0] / aspect) ** 2 + wave[1] ** 2))
     np.testing.assert_allclose(found, share * cosine(*shape), atol=2e-6)
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (3, 8), (6, 7), (40, 9)])
-def test_means_are_kept(shape: tuple[int, int]) -> None:
-    image = torch.from_numpy(np.random.default_rng(0).random((6, 8, 2)))
-    for sigma in (0.0, 0.3):
-        found = prefilter(image, shape, sigma, 0.75)
-        torch.testing.assert_close(found.mean((0, 1)), image.float().mean((0, 1)), atol=1e-6, rtol=0)
 
 
 def test_lookups_are_gaussian_averages_wherever_they_fall() -> None:

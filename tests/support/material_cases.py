@@ -1,4 +1,4 @@
-"""Materials of random weights that need all that a shader may have to evaluate."""
+"""Materials of random weights that need all that a reader or a back end may have to evaluate."""
 
 from __future__ import annotations
 
@@ -62,9 +62,34 @@ LISTS: dict[str, list[ops.Operation]] = {
     ],
 }
 CASES |= {case: {} for case in LISTS}
+HIERARCHICAL = {
+    "hierarchical": {"model": "hierarchical"},
+    "hierarchical, one module": {"model": "hierarchical", **net(layers=3, offset="none", width=12)},
+    "hierarchical, eleven channels": {
+        "model": "hierarchical",
+        **net(decoder="mlp", channels=11, encoding={"raw": True, "direction_xyz": True}),
+    },
+}
+# The same, and those that take long in a browser.
+ALL: dict[str, dict[str, Any]] = {
+    **CASES,
+    "neumip": {},
+    "encoded with pi": net(encoding={"position": 3, "direction": 1}, output_transform="identity"),
+    "half vector": net(encoding={"half_vector": True}, output_transform="exp", channels=9, width=8, layers=2),
+    "rainer2020": {"model": "rainer2020"},
+    "calibrated relief": {"model": "relief"},
+    "tracing alone": {
+        "model": "relief",
+        "coated": True,
+        "glossy": False,
+        **net(relief={"hints": False, "frame": False, "gate": False}, oversampling=2),
+    },
+    "learned heights, diffuse": {"model": "neumip+", "glossy": False},
+    **HIERARCHICAL,
+}
 
 
-def make(case: str, folder: Path) -> Material:
+def make(case: str, folder: Path, **more: Any) -> Material:
     """A material of random weights on a tile that is half as high as wide."""
     lattice, generator = Lattice(4, 0.5), torch.Generator().manual_seed(0)
     if case in LISTS:
@@ -73,9 +98,11 @@ def make(case: str, folder: Path) -> Material:
             torch.nn.init.normal_(textures.texels, std=0.5, generator=generator)
         folder.mkdir(parents=True)
         return export(model, FitConfig(), folder, data={"hash": "0" * 64}, training=TRAINING)
-    options = {"finest": 4, "aspect": 0.5, **CASES[case]}
-    if case in ("calibrated", "holes"):
-        options["weights"] = {"calibration": 0.7 + 0.6 * torch.rand((2, 5, 6, 3), generator=generator)}
+    options = {"finest": 4, "aspect": 0.5, **ALL[case], **more}
+    if case in ("calibrated", "calibrated relief", "holes"):
+        options["weights"] = {
+            "calibration": 0.7 + 0.6 * torch.rand((2, options["finest"] + 1, 6, 3), generator=generator)
+        }
     if case == "holes":
         shapes = [(*lattice.shape(s), 6) for s in range(5)]
         coefficients = [0.3 + 0.2 * torch.randn(s, generator=generator).numpy() for s in shapes]
