@@ -94,14 +94,28 @@ def shown(omega, center, matrix):
     return projections(omega, center, matrix).sum() / 2
 
 
-def reflected(alpha2, c, spread, h, omega_o, light_width, least_view):
+def reflected(alpha2, c, spread, h, omega_o, light, least_view):
     middle = (1 - alpha2) / (1 + alpha2 * c @ c) * c
     facets = alpha2 * (1 + c @ c) / (1 + alpha2 * c @ c) * (np.eye(2) + np.outer(middle, c)) + spread
-    widened, g = facets + np.eye(2) * light_width**2 / 2, h[:2] + h[2] * middle
-    density = (
-        1 / (h[2] ** 2 + g @ np.linalg.solve(widened, g)) ** 2 / (np.pi * np.sqrt(np.linalg.det(widened)))
-    )
-    return density / (4 * max(shown(omega_o, middle, facets), least_view))
+    own, width = (np.sqrt(max(1e-20, np.linalg.det(x))) for x in (facets, light))
+    s, forms = h[:2] / h[2] + middle, []
+    for matrix in facets + 2.5 * light, light + (0.6 + 0.5 / (own / width + 0.6)) * facets:
+        forms += [np.sqrt(np.linalg.det(matrix)), s @ np.linalg.solve(matrix, s)]
+    wide, d, narrow, e = forms
+    density = own / wide**2 / (1 + d) ** 2 + (1 - own / wide) * np.exp(-e / 2) / (2 * narrow)
+    return density / h[2] ** 4 / (4 * np.pi * max(shown(omega_o, middle, facets), least_view))
+
+
+def light_widening(omega_i, omega_o, width):
+    both = omega_i + omega_o
+    s = -both[:2] / both[2]
+    q = omega_i[:2] + omega_i[2] * s
+    return (width / both[2]) ** 2 * (np.eye(2) + np.outer(s, s) - np.outer(q, q))
+
+
+def coat_albedo(alpha2, cosine):
+    cosine2 = min(1, cosine**2)
+    return fresnel(0.04, np.sqrt(cosine2 + (1 - cosine2) * alpha2 / (0.06 + 2.5 * np.sqrt(alpha2))))
 
 
 def doubled_scatter(center, moments):
@@ -189,7 +203,8 @@ class NumpyMaterial:
             spread = doubled_scatter(c, known[2:5])
             irradiance = light * n[2] * shown(omega_i, c, spread)
             core, h = irradiance * base / np.pi, unit(omega_i + omega_o)
-            shared = c, spread, h, omega_o, light_width, least_view
+            widening = light_widening(omega_i, omega_o, light_width)
+            shared = c, spread, h, omega_o, widening, least_view
             if len(known) >= 10:
                 metal, grazing = known[9], min(1, 50 * dielectric)
                 f = fresnel(
@@ -197,10 +212,11 @@ class NumpyMaterial:
                 )
                 core = (1 - metal) * core + light * f * reflected(np.clip(known[8], *alpha2), *shared)
             if len(known) == 12:
+                weight, rough = known[10], np.clip(known[11], *alpha2)
                 for omega in (omega_i, omega_o):
-                    core = core * (1 - known[10] * fresnel(0.04, n[2] * projections(omega, c, spread)[1]))
-                f = known[10] * fresnel(0.04, omega_o @ h)
-                core = core + light * f * reflected(np.clip(known[11], *alpha2), *shared)
+                    cosine = n[2] * projections(omega, c, spread)[1]
+                    core = core * (1 - weight * coat_albedo(rough, cosine))
+                core = core + light * weight * fresnel(0.04, omega_o @ h) * reflected(rough, *shared)
             hints.append(np.array([irradiance, *n[:2], *core]))
         return np.mean(hints, 0)
 

@@ -35,18 +35,30 @@ class Shade(Operation):
         (R5) V F D(h) / (4 ω_i,z max(P(ω_o; c', A'), least_view)),
 
     with ``F = F0 + (F90 - F0) (1 - h·ω_o)⁵`` (Schlick 1994), ``F0 = (1-m) dielectric + m b``, ``F90 = (1-m)
-    min(1, 50 dielectric) + m``, the half vector h, and ``D(h) = 1 / (π √det B (h_z² + gᵀ B⁻¹ g)²)``, ``g =
-    h_xy + h_z c'`` (GGX: Walter et al. 2007). GGX facets of α² about n are, in slopes of the plane, such
-    facets about κ c with ``ρ (I + κ c cᵀ)``, where ``κ = (1-α²) / (1 + α² ‖c‖²)`` and ``ρ = α² (1 + ‖c‖²) /
-    (1 + α² ‖c‖²)``. Below a footprint ``c' = κ c``, ``A' = ρ (I + κ c cᵀ) + 2C``,
-    and the light widens them to ``B = A' + light_width²/2 I``. α² is clamped to `alpha2`.
+    min(1, 50 dielectric) + m``, the half vector h, and the density D(h) of facets. GGX facets of α² about n
+    are, in slopes of the plane, such facets about κ c with ``ρ (I + κ c cᵀ)``, where ``κ = (1-α²) / (1 + α²
+    ‖c‖²)`` and ``ρ = α² (1 + ‖c‖²) / (1 + α² ‖c‖²)``. Below a footprint ``c' = κ c`` and ``A' = ρ (I + κ c
+    cᵀ) + 2C``. α² is clamped to `alpha2`.
 
-    A clear coat with ``F_c(x) = w (0.04 + 0.96 (1 - min(1, x))⁵)`` adds such a lobe of its own α² and of the
+    The light gives the slopes ``s = -h_xy / h_z`` of half vectors the covariance
+
+        (R7) W = (light_width / (ω_i,z + ω_o,z))² (I + s sᵀ - q qᵀ),    q = ω_i,xy + ω_i,z s.
+
+    D averaged over the light is about a Voigt profile, a mixture of GGX facets and of a Gaussian:
+
+        (R8) D = η / (π √det B (h_z² + gᵀ B⁻¹ g)²) + (1-η) exp(-gᵀ S⁻¹ g / (2 h_z²)) / (2π √det S h_z⁴),
+
+    with ``g = h_xy + h_z c'``, ``B = A' + 2.5 W``, ``η = √(det A' / det B)``, ``S = W + (0.6 + 0.5 / (0.6 +
+    √(det A' / det W))) A'``. The share η keeps the tails of GGX (Walter et al. 2007), which light does not
+    widen; a delta light leaves η = 1.
+
+    A clear coat with ``F_c(x) = w (0.04 + 0.96 (1 - x)⁵)`` adds such a lobe of its own α² and of the
     reflectance ``F_c(h·ω_o)``. Of the core below it the share
 
-        (R6) (1 - F_c(n_z R(ω_i))) (1 - F_c(n_z R(ω_o))),    R(ω) = √(p² + ω_xyᵀ 2C ω_xy),
+        (R6) (1 - E_c(ω_i)) (1 - E_c(ω_o)),    E_c(ω) = F_c(√(x² + α² (1 - x²) / (0.06 + 2.5 α))),
 
-    is left, where ``n_z R`` is about the mean cosine of the facets that a direction sees.
+    is left, with ``x = min(1, n_z √(p² + ω_xyᵀ 2C ω_xy))``, which is about the mean cosine of the facets that
+    a direction sees. E_c is the albedo of the coat to 0.02 at cosines from 0.1.
 
     Attributes
     ----------
@@ -102,7 +114,7 @@ class Lobe(Operation):
     omega_i: Value
     omega_o: Value
     weight: Value | None = None
-    least_alpha2: float = ALPHA2[0]
+    least_alpha2: float = 1e-4
     least_light: float = LEAST_LIGHT
     least_view: float = LEAST_VIEW
 

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from mbtf_core.data.schema import CLEARCOAT_F0
+from mbtf_fit.ops.constants import COAT_SPREAD, VOIGT_SCALE, VOIGT_WIDENING
 
 
 def schlick(cosine: Tensor) -> Tensor:
@@ -28,20 +29,51 @@ def coat_reflectance(weight: Tensor, grazing: Tensor) -> Tensor:
     return weight * (CLEARCOAT_F0 + (1.0 - CLEARCOAT_F0) * grazing)
 
 
-def slope_density(half: Tensor, center: Tensor, matrix: Tensor) -> Tensor:
-    """Density D(h) (n, 1) of facets per area of the reference plane.
+def coat_albedo(weight: Tensor, alpha2: Tensor, cosine: Tensor) -> Tensor:
+    """(R6) Directional albedo of a clear coat of a weight and of α², by the cosine of the direction."""
+    rough = alpha2 / (COAT_SPREAD[0] + COAT_SPREAD[1] * alpha2.sqrt())
+    cosine2 = cosine.square().clamp_max(1.0)
+    return coat_reflectance(weight, schlick((cosine2 + rough * (1.0 - cosine2)).sqrt()))
+
+
+def light_widening(omega_i: Tensor, omega_o: Tensor, width: float) -> Tensor:
+    """Covariance W (n, 3) of the slopes of half vectors, by the light's RMS angle per axis in radians."""
+    both = omega_i + omega_o
+    s = -both[:, :2] / both[:, 2:]
+    (x, y), (p, q) = s.split(1, 1), (omega_i[:, :2] + omega_i[:, 2:] * s).split(1, 1)
+    turned = torch.cat([1.0 + x * x - p * p, x * y - p * q, 1.0 + y * y - q * q], 1)
+    return (width / both[:, 2:]).square() * turned
+
+
+def slope_density(half: Tensor, center: Tensor, matrix: Tensor, widening: Tensor, least: Tensor) -> Tensor:
+    """Density D(h) (n, 1) of facets per area of the reference plane, averaged over the light.
 
     Parameters
     ----------
     half : (n, 3) unit vectors
     center : (n, 2) center of the slopes
     matrix : (n, 3) A (xx, xy, yy)
+    widening : (n, 3) W of :func:`light_widening`
+    least : (n, 1) smallest eigenvalue that A may have
     """
-    xx, xy, yy = matrix.split(1, 1)
     x, y = (half[:, :2] + half[:, 2:] * center).split(1, 1)
-    determinant = xx * yy - xy * xy
-    inside = half[:, 2:].square() + (yy * x * x - 2.0 * xy * x * y + xx * y * y) / determinant
-    return 1.0 / (math.pi * determinant.sqrt() * inside.square())
+    up2 = half[:, 2:].square()
+
+    def inverse(matrix: Tensor) -> tuple[Tensor, Tensor]:
+        """Root of the determinant, and gᵀ B⁻¹ g."""
+        xx, xy, yy = matrix.split(1, 1)
+        determinant = torch.maximum(xx * yy - xy * xy, 0.25 * least * (xx + yy))
+        square = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / determinant
+        return determinant.sqrt(), square.clamp_min(0.0)
+
+    xx, xy, yy = widening.split(1, 1)
+    light = (xx * yy - xy * xy).clamp_min(1e-20).sqrt()
+    own, _ = inverse(matrix)
+    wide, distance = inverse(matrix + VOIGT_WIDENING * widening)
+    share = own / wide
+    narrow, deviations = inverse(widening + (VOIGT_SCALE + 0.5 / (own / light + VOIGT_SCALE)) * matrix)
+    gaussian = torch.exp(-0.5 * deviations / up2) / (2.0 * narrow * up2.square())
+    return (share / (wide * (up2 + distance).square()) + (1.0 - share) * gaussian) / math.pi
 
 
 def projections(omega: Tensor, center: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor]:

@@ -46,8 +46,10 @@ from mbtf_fit.ops.constants import (
 from mbtf_fit.ops.lookup import Trace
 from mbtf_fit.ops.shade import Shade, grazing_reflectance
 from mbtf_fit.surface.facets import (
+    coat_albedo,
     coat_reflectance,
     doubled_scatter,
+    light_widening,
     own_facets,
     projections,
     schlick,
@@ -63,6 +65,8 @@ if TYPE_CHECKING:
 
 # Reflectance of the surface where the data set states none.
 UNKNOWN_COLOR = 0.5
+# Added to the weight of a clear coat where its roughness is averaged.
+LEAST_COAT = 1e-3
 # F0 of a dielectric per unit of `specular`, as in mbtf_gen.render.bsdf.surface.
 DIELECTRIC_F0 = 0.08
 
@@ -236,28 +240,28 @@ class KnownSurface:
             return torch.cat([irradiance, normal[:, :2], core], 1)
         half = torch.nn.functional.normalize(omega_i + omega_o, dim=1)
         rest = schlick((omega_o * half).sum(1, keepdim=True))
+        widening = light_widening(omega_i, omega_o, self.light_width)
 
         def lobe(alpha2: Tensor, reflectance: Tensor) -> Tensor:
             """(R5) Light (n, 1 or 3) that facets of α² (n, 1) and of a reflectance (n, 1 or 3) reflect."""
-            middle, own = own_facets(alpha2.clamp(*op.alpha2), center)
+            middle, own = own_facets(alpha2, center)
             facets = own + spread
             facing = shown(omega_o, middle, facets).clamp_min(op.least_view)
-            widening = facets.new_tensor([1.0, 0.0, 1.0]) * (0.5 * self.light_width**2)
-            density = slope_density(half, middle, facets + widening)
+            density = slope_density(half, middle, facets, widening, alpha2)
             return light * (reflectance * density / (4.0 * facing))
 
         metallic = maps[:, 9:10]
         f0 = torch.lerp(base.new_tensor(self.dielectric), base, metallic)
         grazing = grazing_reflectance(self.dielectric)
         f90 = grazing + metallic * (1.0 - grazing)
-        core = (1.0 - metallic) * core + lobe(maps[:, 8:9], f0 + (f90 - f0) * rest)
+        core = (1.0 - metallic) * core + lobe(maps[:, 8:9].clamp(*op.alpha2), f0 + (f90 - f0) * rest)
         if self.coated:
-            weight = maps[:, 10:11]
+            weight, alpha2 = maps[:, 10:11], maps[:, 11:12].clamp(*op.alpha2)
             # (R6)
             for omega in (omega_i, omega_o):
                 cosine = normal[:, 2:] * projections(omega, center, spread)[1]
-                core = core * (1.0 - coat_reflectance(weight, schlick(cosine)))
-            core = core + lobe(maps[:, 11:12], coat_reflectance(weight, rest))
+                core = core * (1.0 - coat_albedo(weight, alpha2, cosine))
+            core = core + lobe(alpha2, coat_reflectance(weight, rest))
         return torch.cat([irradiance, normal[:, :2], core], 1)
 
     def visibility(self, op: Shade, hit: Tensor, level: Tensor, omega_i: Tensor) -> Tensor:
@@ -307,8 +311,12 @@ def _map_levels(geometry: Geometry, lattice: Lattice) -> list[Tensor]:
         # A Lambert surface below the coat: a dielectric of F0 = 0, which has no lobe.
         rest += [np.ones_like(base[..., :1]), np.zeros_like(base[..., :1])]
     if coat is not None and coat_roughness is not None:
-        rest += [coat[..., None], coat_roughness[..., None] ** 4]
+        # Where there is little coat, its roughness counts little.
+        rest += [coat[..., None], (coat[..., None] + LEAST_COAT) * coat_roughness[..., None] ** 4]
     filtered = prefiltered_levels(torch.from_numpy(np.concatenate(rest, -1)), lattice)
+    if coat is not None:
+        for level in filtered:
+            level[..., -1] = (level[..., -1] / (level[..., -2].clamp_min(0.0) + LEAST_COAT)).clamp(0.0, 1.0)
     return [
         torch.cat(
             [

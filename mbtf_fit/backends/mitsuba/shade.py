@@ -19,10 +19,13 @@ from mbtf_fit.backends.mitsuba.textures import GROUP, Textures
 from mbtf_fit.material.format import WEIGHTS_NAME
 from mbtf_fit.ops.constants import (
     AZIMUTHS,
+    COAT_SPREAD,
     COATED_CHANNELS,
     DIFFUSE_CHANNELS,
     GLOSSY_CHANNELS,
     MAP_CHANNELS,
+    VOIGT_SCALE,
+    VOIGT_WIDENING,
 )
 from mbtf_fit.ops.shade import grazing_reflectance
 from mbtf_gen.engine.types import Color3f, Float, Normal3f, Point2f, Vector3f
@@ -47,7 +50,7 @@ def _shade(op: ops.Shade, loader: Loader) -> Step:
     )
     width, f0 = loader.scalar(op.light_width), loader.scalar(op.dielectric)
     dielectric, grazing = opaque(f0), opaque(grazing_reflectance(f0))
-    blur, widening = opaque((op.light_blur * width) ** 2), opaque(0.5 * width**2)
+    blur, width2 = opaque((op.light_blur * width) ** 2), opaque(width**2)
 
     def visibility(hit: Point2f, level: Float, omega_i: Vector3f) -> Float:
         """Share of footprints from which the light is visible."""
@@ -75,27 +78,26 @@ def _shade(op: ops.Shade, loader: Loader) -> Step:
             return [irradiance, -upright * x, -upright * y, *core]
         half = dr.normalize(omega_i + omega_o)
         rest = _schlick(dr.dot(omega_o, half))
+        widening = _light_widening(omega_i, omega_o, width2)
 
         def lobe(alpha2: Float) -> Float:
             """(R5) Light that facets of reflectance 1 reflect."""
-            alpha2 = dr.clip(alpha2, *op.alpha2)
             below = dr.rcp(dr.fma(alpha2, length2, 1.0))
             kappa, rho = (1.0 - alpha2) * below, alpha2 * (1.0 + length2) * below
             middle = kappa * center
             own = (dr.fma(middle.x, x, 1.0), middle.x * y, dr.fma(middle.y, y, 1.0))
             facets = [dr.fma(rho, a, b) for a, b in zip(own, spread, strict=True)]
             facing = dr.maximum(_shown(omega_o, middle, facets), op.least_view)
-            widened = (facets[0] + widening, facets[1], facets[2] + widening)
-            return light * _density(half, middle, widened) / (4.0 * facing)
+            return light * _density(half, middle, facets, widening, alpha2) / (4.0 * facing)
 
         metallic = found[9]
         f0, f90 = dr.lerp(mi.Color3f(dielectric), base, metallic), dr.fma(metallic, 1.0 - grazing, grazing)
-        core = (1.0 - metallic) * core + (f0 + (f90 - f0) * rest) * lobe(found[8])
+        core = (1.0 - metallic) * core + (f0 + (f90 - f0) * rest) * lobe(dr.clip(found[8], *op.alpha2))
         if channels == COATED_CHANNELS:
-            weight, alpha2 = found[10:12]
+            weight, alpha2 = found[10], dr.clip(found[11], *op.alpha2)
             for omega in (omega_i, omega_o):
                 cosine = upright * _projections(omega, center, spread)[1]
-                core *= 1.0 - weight * _coat_reflectance(_schlick(cosine))
+                core *= 1.0 - weight * _coat_albedo(alpha2, cosine)
             core += weight * _coat_reflectance(rest) * lobe(alpha2)
         return [irradiance, -upright * x, -upright * y, *core]
 
@@ -161,13 +163,41 @@ def _shown(omega: Vector3f, center: Point2f, matrix: Sequence[Float]) -> Float:
     return 0.5 * (p + root)
 
 
-def _density(half: Vector3f, center: Point2f, matrix: Sequence[Float]) -> Float:
-    """Density D(h) of facets per area of the reference plane (Walter et al. 2007)."""
-    xx, xy, yy = matrix
+def _light_widening(omega_i: Vector3f, omega_o: Vector3f, width2: Float) -> tuple[Float, Float, Float]:
+    """Covariance W (xx, xy, yy) of the slopes of half vectors, by the light's variance per axis."""
+    both = omega_i + omega_o
+    up = dr.rcp(both.z)
+    x, y = -both.x * up, -both.y * up
+    p, q = dr.fma(omega_i.z, x, omega_i.x), dr.fma(omega_i.z, y, omega_i.y)
+    scale = width2 * dr.square(up)
+    return scale * (1.0 + x * x - p * p), scale * (x * y - p * q), scale * (1.0 + y * y - q * q)
+
+
+def _density(
+    half: Vector3f, center: Point2f, matrix: Sequence[Float], widening: Sequence[Float], least: Float
+) -> Float:
+    """Density D(h) of facets per area of the reference plane, averaged over the light."""
     x, y = dr.fma(half.z, center.x, half.x), dr.fma(half.z, center.y, half.y)
-    determinant = xx * yy - xy * xy
-    square = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / determinant
-    return 1.0 / (math.pi * dr.sqrt(determinant) * dr.square(dr.fma(half.z, half.z, square)))
+    up2 = dr.square(half.z)
+
+    def inverse(matrix: Sequence[Float]) -> tuple[Float, Float]:
+        """Root of the determinant, and gᵀ B⁻¹ g."""
+        xx, xy, yy = matrix
+        determinant = dr.maximum(xx * yy - xy * xy, 0.25 * least * (xx + yy))
+        square = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / determinant
+        return dr.sqrt(determinant), dr.maximum(square, 0.0)
+
+    def combined(a: Sequence[Float], factor: Float | float, b: Sequence[Float]) -> list[Float]:
+        return [dr.fma(factor, y, x) for x, y in zip(a, b, strict=True)]
+
+    light = dr.sqrt(dr.maximum(widening[0] * widening[2] - dr.square(widening[1]), 1e-20))
+    own, _ = inverse(matrix)
+    wide, distance = inverse(combined(matrix, VOIGT_WIDENING, widening))
+    share = own / wide
+    factor = VOIGT_SCALE + 0.5 * dr.rcp(own / light + VOIGT_SCALE)
+    narrow, deviations = inverse(combined(widening, factor, matrix))
+    gaussian = dr.exp(-0.5 * deviations / up2) / (2.0 * narrow * dr.square(up2))
+    return (share / (wide * dr.square(up2 + distance)) + (1.0 - share) * gaussian) / math.pi
 
 
 def _schlick(cosine: Float) -> Float:
@@ -178,6 +208,13 @@ def _schlick(cosine: Float) -> Float:
 def _coat_reflectance(grazing: Float) -> Float:
     """Reflectance of a clear coat, by the weight of its grazing reflectance."""
     return dr.fma(1.0 - CLEARCOAT_F0, grazing, CLEARCOAT_F0)
+
+
+def _coat_albedo(alpha2: Float, cosine: Float) -> Float:
+    """(R6) Directional albedo of a clear coat of α², by the cosine of the direction."""
+    rough = alpha2 / dr.fma(COAT_SPREAD[1], dr.sqrt(alpha2), COAT_SPREAD[0])
+    cosine2 = dr.minimum(dr.square(cosine), 1.0)
+    return _coat_reflectance(_schlick(dr.sqrt(dr.fma(rough, 1.0 - cosine2, cosine2))))
 
 
 def _adjacent_azimuths(horizons: F32) -> F32:

@@ -107,7 +107,7 @@ def _shade(op: ops.Shade, code: Code, hits: Value, level: Value, omega_i: Value,
         at, finer = code.variable("float2", "at", count, kept=False), f"{level} + {number(op.finer)}"
         p, q = (code.pair(image, finer, f"{at}[k]") for image in (maps, horizons))
         coats = code.variable("Coat", "coats", count, kept=True) if coated else ""
-        given = f"{omega_o}, {number(0.5 * width**2)}, {number(op.least_view)}, {vector(op.alpha2)}"
+        given = f"{omega_o}, {number(op.least_view)}, {vector(op.alpha2)}"
         code.write(
             *(f"{at}[{k}] = {hits[2 * k : 2 * k + 2]};" for k in range(count)),
             f"for (int k = 0; k < {count}; k++) {{",
@@ -123,15 +123,16 @@ def _shade(op: ops.Shade, code: Code, hits: Value, level: Value, omega_i: Value,
     core = "irradiance * at.base / PI"
     if glossy:
         f0 = code.scalar(op.dielectric)
-        lobe = f"reflected(at, {vector((f0, grazing_reflectance(f0)))}, {omega_i}, {omega_o})"
+        lobe = f"reflected(at, {vector((f0, grazing_reflectance(f0)))}, widening, {omega_i}, {omega_o})"
         core = f"(1.0 - at.metallic) * {core} + light * {lobe}"
     if coated:
-        core = f"coated({core}, {coats}[k], at, {coat_f0}, light, {omega_i}, {omega_o})"
+        core = f"coated({core}, {coats}[k], at, {coat_f0}, light, widening, {omega_i}, {omega_o})"
     hints, sum_ = code.variable("float3", op.output), code.variable("float3", op.output)
     blur = f"{number((op.light_blur * width) ** 2)}, {number(op.least_variance)}"
     code.write(
         f"{hints} = float3(0.0, 0.0, 0.0);",
         f"{sum_} = float3(0.0, 0.0, 0.0);",
+        f"float3 widening = light_widening({omega_i}, {omega_o}, {number(width)});",
         f"for (int k = 0; k < {count}; k++) {{",
         f"  Place at = {places}[k];",
         "  float3 normal = normal_of(at);",

@@ -114,24 +114,57 @@ static matrix spread(const float *m) {
     return (matrix){2.0f * a.xx, 2.0f * clamped(a.xy, -most, most), 2.0f * a.yy};
 }
 
-/* Light that facets of a squared alpha reflect of half vector w about slopes, where their reflectance is 1. */
-static float reflected(const mbtf_surface *s, float light, float alpha2, const float *m, matrix a, const float *w,
-                       const float *o) {
+/* Covariance of the slopes of half vectors, whose light has a width. */
+static matrix light_widening(const float *i, const float *o, float width) {
+    const float up = i[2] + o[2], sx = -(i[0] + o[0]) / up, sy = -(i[1] + o[1]) / up;
+    const float x = i[0] + i[2] * sx, y = i[1] + i[2] * sy, scale = width * width / (up * up);
+    return (matrix){scale * (1.0f + sx * sx - x * x), scale * (sx * sy - x * y), scale * (1.0f + sy * sy - y * y)};
+}
+
+/* a + factor b */
+static matrix combined(matrix a, float factor, matrix b) {
+    return (matrix){a.xx + factor * b.xx, a.xy + factor * b.xy, a.yy + factor * b.yy};
+}
+
+/* Root of the determinant of a matrix a, and x' a^-1 x. */
+typedef struct {
+    float root, square;
+} form;
+
+static form inverse(matrix a, float least, float x, float y) {
+    float determinant = a.xx * a.yy - a.xy * a.xy;
+    const float bound = 0.25f * least * (a.xx + a.yy);
+    determinant = determinant > bound ? determinant : bound;
+    const float square = (a.yy * x * x - 2.0f * a.xy * x * y + a.xx * y * y) / determinant;
+    return (form){sqrtf(determinant), square > 0.0f ? square : 0.0f};
+}
+
+/* Light that facets of a squared alpha reflect of half vector w about slopes, where their reflectance is 1;
+ * the light widens the slopes by b. */
+static float reflected(const mbtf_surface *s, float light, float alpha2, const float *m, matrix a, matrix b,
+                       const float *w, const float *o) {
     const float length2 = m[0] * m[0] + m[1] * m[1];
-    alpha2 = clamped(alpha2, s->alpha2[0], s->alpha2[1]);
     const float below = 1.0f / (1.0f + alpha2 * length2);
     const float kappa = (1.0f - alpha2) * below, rho = alpha2 * (1.0f + length2) * below;
     const float cx = kappa * m[0], cy = kappa * m[1];
-    a.xx += rho * (1.0f + cx * m[0]);
-    a.xy += rho * cx * m[1];
-    a.yy += rho * (1.0f + cy * m[1]);
+    a = combined(a, rho, (matrix){1.0f + cx * m[0], cx * m[1], 1.0f + cy * m[1]});
     const float facing = shown(project(o, cx, cy, a));
-    a.xx += 0.5f * s->light_width * s->light_width;
-    a.yy += 0.5f * s->light_width * s->light_width;
-    const float gx = w[0] + w[2] * cx, gy = w[1] + w[2] * cy, determinant = a.xx * a.yy - a.xy * a.xy;
-    const float inside = w[2] * w[2] + (a.yy * gx * gx - 2.0f * a.xy * gx * gy + a.xx * gy * gy) / determinant;
-    const float density = 1.0f / (PI * sqrtf(determinant) * inside * inside);
+    const float x = w[0] + w[2] * cx, y = w[1] + w[2] * cy, up2 = w[2] * w[2];
+    const float own = inverse(a, alpha2, x, y).root, square = b.xx * b.yy - b.xy * b.xy;
+    const float ratio = own / sqrtf(square > 1e-20f ? square : 1e-20f);
+    const form wide = inverse(combined(a, s->voigt[0], b), alpha2, x, y);
+    const form narrow = inverse(combined(b, s->voigt[1] + 0.5f / (ratio + s->voigt[1]), a), alpha2, x, y);
+    const float share = own / wide.root, inside = up2 + wide.square;
+    const float gaussian = expf(-0.5f * narrow.square / up2) / (2.0f * narrow.root * up2 * up2);
+    const float density = (share / (wide.root * inside * inside) + (1.0f - share) * gaussian) / PI;
     return light * density / (4.0f * (facing > s->least_view ? facing : s->least_view));
+}
+
+/* Albedo of a clear coat towards a direction of some cosine. */
+static float coat_albedo(const mbtf_surface *s, float weight, float alpha2, float cosine) {
+    const float cosine2 = clamped(cosine * cosine, 0.0f, 1.0f);
+    const float rough = alpha2 / (s->coat_spread[0] + s->coat_spread[1] * sqrtf(alpha2));
+    return weight * (s->coat + (1.0f - s->coat) * schlick(sqrtf(cosine2 + rough * (1.0f - cosine2))));
 }
 
 /* Adds irradiance, normal (x, y) and core at a surface point. */
@@ -154,16 +187,18 @@ static void shade(const mbtf_surface *s, const hit *h, const float *i, const flo
         const float length = sqrtf(w[0] * w[0] + w[1] * w[1] + w[2] * w[2]);
         for (int c = 0; c < 3; c++) w[c] /= length;
         const float rest = schlick(o[0] * w[0] + o[1] * w[1] + o[2] * w[2]);
-        const float lobe = reflected(s, light, m[8], m, a, w, o), edge = s->edge + m[9] * (1.0f - s->edge);
+        const matrix b = light_widening(i, o, s->light_width);
+        const float alpha2 = clamped(m[8], s->alpha2[0], s->alpha2[1]);
+        const float lobe = reflected(s, light, alpha2, m, a, b, w, o), edge = s->edge + m[9] * (1.0f - s->edge);
         for (int c = 0; c < 3; c++) {
             const float f0 = s->dielectric + m[9] * (m[5 + c] - s->dielectric);
             core[c] = (1.0f - m[9]) * core[c] + (f0 + (edge - f0) * rest) * lobe;
         }
         if (channels == COATED) {
-            const float f0 = s->coat, seen = project(o, m[0], m[1], a).root;
-            const float coat = m[10] * (f0 + (1.0f - f0) * rest) * reflected(s, light, m[11], m, a, w, o);
-            const float below = (1.0f - m[10] * (f0 + (1.0f - f0) * schlick(nz * lit.root))) *
-                                (1.0f - m[10] * (f0 + (1.0f - f0) * schlick(nz * seen)));
+            const float f0 = s->coat, rough = clamped(m[11], s->alpha2[0], s->alpha2[1]);
+            const float coat = m[10] * (f0 + (1.0f - f0) * rest) * reflected(s, light, rough, m, a, b, w, o);
+            const float below = (1.0f - coat_albedo(s, m[10], rough, nz * lit.root)) *
+                                (1.0f - coat_albedo(s, m[10], rough, nz * project(o, m[0], m[1], a).root));
             for (int c = 0; c < 3; c++) core[c] = below * core[c] + coat;
         }
     }
