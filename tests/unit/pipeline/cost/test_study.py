@@ -226,7 +226,7 @@ def test_a_dry_run_plans_what_a_study_measures(
     assert main(app, [*command, "--time", "230s"]) == 0
     text = capsys.readouterr().out
     assert not folder.exists()
-    # Two runs of 60 s and one of 40 s, each with 12 s besides; 4 s to start, and 14 s that the generator gets.
+    # Two runs of 60 s and one of 40 s, each with 12 s besides; 4 s to start, and 14 s of the generator.
     assert text.splitlines()[0].startswith("expected: about 3:34, ")
     assert re.findall(r"neumip, (.*?):", text) == ["short", "short, seed + 1", "m"]
     assert "up to about 1:12, measured" in text
