@@ -63,7 +63,7 @@ WORK = ".work"
 # About as many configurations of the generator share its time.
 _CONFIGURATIONS = 35
 # Seconds by which a run exceeds generating and training, until one has been measured.
-_OVERHEAD = 5.0
+_OVERHEAD = 12.0
 # Paths of the reference and of the generator's rate, which come before runs.
 _SETUP_PATHS = 6_000_000
 # Studies so many times the least one have time for most comparisons of the generator.
