@@ -53,12 +53,36 @@ def shown(linear: Any) -> Any:
     return 255 * linear_to_srgb(np.asarray(linear, np.float64))
 
 
-def drag(page: Page, name: str, by: tuple[int, int]) -> None:
-    """Drag from the center of an element by pixels."""
+def canvas_box(page: Page) -> dict[str, float]:
+    box: dict[str, float] = page.js(
+        "return document.getElementById('canvas').getBoundingClientRect().toJSON()"
+    )
+    return box
+
+
+def touch(page: Page, *moments: tuple[tuple[float, float], ...]) -> None:
+    """Touch the page with fingers that move from moment to moment."""
+    for k, fingers in enumerate(moments):
+        points = [{"x": x, "y": y, "id": n} for n, (x, y) in enumerate(fingers)]
+        kind = "touchMove" if k else "touchStart"
+        page.driver.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+    page.driver.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+
+
+def drag(page: Page, name: str, at: tuple[float, float], by: tuple[int, int], key: str | None = None) -> None:
+    """Drag from a place of an element, in shares of its size from its center, by pixels."""
     from selenium.webdriver.common.action_chains import ActionChains
 
     element = page.driver.find_element("id", name)
-    ActionChains(page.driver, duration=10).click_and_hold(element).move_by_offset(*by).release().perform()
+    actions = ActionChains(page.driver, duration=10)
+    if key:
+        actions.key_down(key)
+    size = element.size
+    actions.move_to_element_with_offset(element, int(at[0] * size["width"]), int(at[1] * size["height"]))
+    actions.click_and_hold().move_by_offset(*by).release()
+    if key:
+        actions.key_up(key)
+    actions.perform()
 
 
 def test_the_screen_shows_both_sides_at_an_exposure(page: Page) -> None:
@@ -106,7 +130,7 @@ def test_a_reference_picture_fixes_view_shape_and_light(page: Page) -> None:
     for name, value in (("shape", "cloth"), ("environment", "studio"), ("color", "#ff0000"), ("zoom", 3)):
         page.choose(name, value)
     page.js("document.getElementById('add_light').click(); document.getElementById('remove_light').click()")
-    drag(page, "canvas", (30, 20))
+    drag(page, "canvas", (-0.2, 0.1), (30, 20))
     found = page.js(
         STATE + "return [renderer.lit, state.shape, state.lights, camera.tiles_across, camera.azimuth]"
     )
@@ -220,3 +244,70 @@ def test_values_of_links_are_brought_into_their_range(page: Page) -> None:
     page.js("location.hash = encodeURIComponent(JSON.stringify({ tiles: 7 }))")
     page.until(lambda: page.js(STATE + "return state.tiles") == 7)
     assert np.isfinite(page.picture(4, 4)).all()
+
+
+def test_the_dome_is_seen_from_above(page: Page) -> None:
+    """A light at +v is at the top, one that is dragged to the right is at +u."""
+    page.set({**FLAT, "lights": [{**ABOVE, "direction": [0, 0.8, 0.6], "color": [1, 0, 0]}]})
+    dots = page.js(
+        "const canvas = document.getElementById('dome'), size = canvas.width / 2;"
+        "const ink = canvas.getContext('2d');"
+        "return [[0, 1], [0, -1]].map(([x, y]) =>"
+        "  [...ink.getImageData(size * (1 + 0.736 * x), size * (1 - 0.736 * y), 1, 1).data].slice(0, 3));"
+    )
+    assert dots[0] == [255, 0, 0]
+    assert dots[1] != [255, 0, 0]
+    drag(page, "dome", (0, -0.35), (30, 30))
+    x, y, _ = page.js(STATE + "return state.lights[0].direction")
+    width = page.driver.find_element("id", "dome").size["width"]
+    assert [x, y] == pytest.approx([60 / width / 0.92, (0.7 - 60 / width) / 0.92], abs=0.03)
+    # Shift-drag moves the light, and the way to the right is that of growing azimuth.
+    page.set({**FLAT, "lights": [{**ABOVE, "direction": from_angles(40.0, 10.0).tolist()}]})
+    drag(page, "canvas", (0, 0), (50, 0), "\ue008")
+    box = canvas_box(page)
+    direction = from_angles(40.0, 10.0 + 180 * 50 / box["width"])
+    assert page.js(STATE + "return state.lights[0].direction") == pytest.approx(direction.tolist(), abs=1e-3)
+
+
+def test_a_texel_moves_with_pointer_and_fingers(page: Page) -> None:
+    box = canvas_box(page)
+    w, h = box["width"], box["height"]
+
+    def texel(x: float, y: float) -> list[float]:
+        found = page.pick(x / w, y / h)
+        assert found is not None
+        return list(found["u"])
+
+    page.set({**FLAT, "camera": {**TOP, "target": [0.3, 0.6, 0]}})
+    before = texel(0.5 * w, 0.5 * h)
+    drag(page, "canvas", (0, 0), (40, -30), "\ue009")
+    assert texel(0.5 * w + 40, 0.5 * h - 30) == pytest.approx(before, abs=0.02)
+    # Two fingers: the place between them stays while they spread, and moves with them.
+    before = texel(180, 120)
+    touch(page, ((160, 120), (200, 120)), ((140, 120), (220, 120)), ((170, 150), (250, 150)))
+    assert page.js(STATE + "return [camera.tiles_across, camera.azimuth]") == pytest.approx(
+        [1, -90], abs=0.01
+    )
+    assert texel(210, 150) == pytest.approx(before, abs=0.02)
+    touch(page, ((160, 120),), ((200, 120),))
+    assert page.js(STATE + "return [camera.tiles_across, camera.azimuth]") == pytest.approx(
+        [1, -90 - 180 * 40 / w], abs=0.01
+    )
+    # A tap is a click.
+    touch(page, ((100, 100),))
+    assert "dim at u" in page.js("return document.getElementById('point').textContent")
+
+
+def test_the_picture_turns_with_the_azimuth_up_to_the_top(page: Page) -> None:
+    found = page.js(
+        STATE + "return [89.8, 89.95, 90].map((elevation) => {"
+        "  Object.assign(camera, { elevation, azimuth: 40 }); return camera.frame; })"
+    )
+    for frame in np.array(found)[1:]:
+        np.testing.assert_allclose(frame, found[0], atol=0.01)
+    # A reference from there has +v up.
+    page.js(STATE + "viewer.pictures[0].camera.elevation = 90; viewer.pictures[0].camera.azimuth = 30")
+    page.set({**FLAT, "against": "picture 0"})
+    right, up = page.js(STATE + "return camera.frame.slice(1)")
+    assert [*right, *up] == pytest.approx([1, 0, 0, 0, 1, 0], abs=1e-9)
+    page.js(STATE + "Object.assign(viewer.pictures[0].camera, { elevation: 50, azimuth: -90 })")

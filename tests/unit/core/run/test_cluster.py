@@ -6,6 +6,8 @@ import asyncio
 import multiprocessing
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 import warnings
@@ -299,3 +301,44 @@ def test_old_names_of_options_are_understood(job_of: Callable[..., list[str]], t
     assert {"#SBATCH -A graphics", "#SBATCH --qos=low", "#SBATCH -n 1"} <= set(job)
     assert not any("--mem=" in line for line in job)
     assert "--local-directory /scratch" in job[-1]
+
+
+def test_an_interruption_while_waiting_for_jobs_is_one(tmp_path: Path) -> None:
+    pytest.importorskip("dask_jobqueue", reason="no dask-jobqueue; to enable: pip install 'mbtf[cluster]'")
+    for name, text in (("sbatch", "echo Submitted batch job 5"), ("scancel", "exit 0")):
+        (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n")
+        (tmp_path / name).chmod(0o755)
+    (tmp_path / "site.yaml").write_text("engine: slurm\nworkers: 1\noptions: {interface: lo}\n")
+    program = (
+        "import os, signal\n"
+        "from mbtf_core.run.cluster import open_runner\n"
+        "def note(line): signal.setitimer(signal.ITIMER_REAL, 0.5)\n"
+        "signal.signal(signal.SIGALRM, lambda *_: os.kill(os.getpid(), signal.SIGINT))\n"
+        "try:\n"
+        "    with open_runner('site.yaml', note): pass\n"
+        "except KeyboardInterrupt: print('interrupted')\n"
+    )
+    environment = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, env=environment, capture_output=True, text=True
+    )
+    assert done.stdout == "interrupted\n", done.stderr
+
+
+def test_tasks_for_gpus_run_where_none_is_stated(cluster: Runner) -> None:
+    (done,) = cluster.map(run_tasks.double, [Item("gpu", {"x": 3}, gpu=True)])
+    assert done.value == 6
+
+
+def test_a_cluster_without_workers_is_not_waited_for_for_ever(
+    one_worker: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_LOOK_SECONDS", 0.2)
+    path = tmp_path / "scheduler.yaml"
+    path.write_text(f"address: {one_worker.scheduler_address}\nstart_timeout: 1s\n")
+    with open_runner(str(path), lambda line: None) as opened:
+        results = opened.map(run_tasks.double, (Item(f"x{i}", {"x": i}) for i in range(10**6)))
+        next(results)
+        one_worker.scale(0)
+        with pytest.raises(PartialError, match=r"the cluster is lost .no worker within 1s"):
+            list(results)

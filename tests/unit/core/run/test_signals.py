@@ -159,3 +159,8 @@ def test_work_stops_at_a_step_and_then_as_usual(monkeypatch: pytest.MonkeyPatch)
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_signal_after_the_last_act_changes_nothing(tmp_path: Path) -> None:
+    code = f"{SEND}\nfrom mbtf_core.run.signals import *\nhandle_signals()\ncode = finish(4)\nsend()"
+    assert run_program(signal.SIGTERM, tmp_path, "-c", code).returncode == 4
