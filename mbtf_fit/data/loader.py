@@ -75,7 +75,7 @@ def _generated_again(data: Dataset, layout: Layout, model: str) -> str:
     """The commands that generate a data set again in a layout, and fit a model to it."""
     material = (data.manifest.get("config") or {}).get("material")
     if material is None:
-        return f"mbtf-gen MATERIAL --layout {layout}"
+        return f"mbtf-gen ... --layout {layout}"
     folder = f"{data.folder}-{layout}"
     words = ["mbtf-gen", material, "--config", data.folder.at(CONFIG_NAME), "--layout", layout]
     if data.manifest["splits"]["train"].get("queries", 0) < _FEWEST_PER_TEXEL * data.lattice.texels():

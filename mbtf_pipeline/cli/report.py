@@ -9,6 +9,7 @@ from cyclopts import Parameter
 
 from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.errors import UsageError
+from mbtf_gen.config.pictures import EXPOSURE
 
 
 def _check_exposure(kind: object, exposure: object) -> None:
@@ -23,7 +24,12 @@ def report(
     *,
     exposure: Annotated[
         float | Literal["auto"] | None,
-        Parameter(metavar="EV|auto", show_default=False, validator=_check_exposure),
+        Parameter(
+            metavar="EV|auto",
+            show_default=False,
+            validator=_check_exposure,
+            help=f"{EXPOSURE[0].upper()}{EXPOSURE[1:]}.",
+        ),
     ] = None,
     console: Console = CONSOLE,
 ) -> None:
@@ -33,8 +39,6 @@ def report(
     ----------
     folder
         Folder of the run.
-    exposure
-        Exposure of the pictures: a value v in 1/sr is shown as 2^EV v; auto: from the pictures.
     """
     from mbtf_core.color import describe_exposure
     from mbtf_pipeline.collection.run import is_collection, write_again
