@@ -23,6 +23,17 @@ from mbtf_fit.training.trainer import TrainingProgress
 # Standard errors that make a difference significant: the best of many states is compared. Its least share of
 # the best error: paired errors resolve differences that do not matter.
 _SIGNIFICANT, _LEAST = 3.0, 0.05
+# Steps of the first state that may be kept, and how many there are until twice the steps.
+_FIRST, _PER_OCTAVE = 32, 2
+
+
+def is_candidate(step: int) -> bool:
+    """Whether the state after so many steps may be kept; these follow from their number alone, so that the
+    speed of the machine has no influence."""
+    if step < _FIRST:
+        return False
+    k = round(_PER_OCTAVE * math.log2(step / _FIRST))
+    return step == round(_FIRST * 2.0 ** (k / _PER_OCTAVE))
 
 
 @dataclass(frozen=True)

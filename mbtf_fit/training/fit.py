@@ -368,7 +368,7 @@ def _spend_budget(loop: TrainingLoop, report: Callable[[], bool], checkpoint: Pa
     with stop_on_interruption() as stop:
         while not (done or stop.is_set()):
             try:
-                done = loop.train(seconds, stop)
+                done = loop.train(seconds, stop, pause=True)
             except PartialError:
                 # The store of streamed queries cannot be reached.
                 write_checkpoint(loop, checkpoint)

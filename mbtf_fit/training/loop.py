@@ -28,7 +28,7 @@ from mbtf_core.run.task import worker_threads
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.material.format import read_tensors, write_tensors
 from mbtf_fit.objective.parallel import Workers
-from mbtf_fit.training.best_state import BestState, excess_error, overfits
+from mbtf_fit.training.best_state import BestState, excess_error, is_candidate, overfits
 from mbtf_fit.training.trainer import Trainer, TrainingProgress
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
@@ -114,8 +114,10 @@ class TrainingLoop:
         return (step - index + len(self.trainers) - 1) // len(self.trainers)
 
     def validate(self, predictions: Sequence[NDArray[np.float32]], subsets: Sequence[ShardQueries]) -> None:
-        """Remember the current state if none before has smaller errors; `predictions` of `subsets`: the
-        validation queries of each material."""
+        """Remember the current state if it is a candidate and none before had smaller errors; `predictions`:
+        of `subsets`, the validation queries of each material."""
+        if not is_candidate(self.progress.step):
+            return
         if self.best is None or excess_error(predictions, self.best.predictions, subsets).value <= 0:
             self.best = BestState(weights_of(self), replace(self.progress), list(predictions))
 
@@ -137,9 +139,9 @@ class TrainingLoop:
     def _is_finite(self) -> bool:
         return all(bool(p.isfinite().all()) for t in self.trainers for p in t.parameters().values())
 
-    def train(self, seconds: float, stop: Event | None = None) -> bool:
+    def train(self, seconds: float, stop: Event | None = None, *, pause: bool = False) -> bool:
         """Train for about so long, or until the budget is spent; returns whether it is. Once `stop` is set,
-        training ends after the current step."""
+        training ends after the current step, and with `pause` at a candidate for the state to keep."""
         until = time.perf_counter() + seconds
         first = self.progress.step
         losses: list[Tensor] = []
@@ -149,7 +151,7 @@ class TrainingLoop:
             steps = self._steps(workers)
             while self.fraction < 1.0 and not (stop is not None and stop.is_set() and losses):
                 start = time.perf_counter()
-                if start >= until and losses:
+                if losses and (start >= until or (pause and is_candidate(self.progress.step))):
                     break
                 try:
                     losses.append(next(steps))

@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from support.fit_data import parallax, random_queries, write_data
 
 import mbtf_fit.training.fit as fits
+import mbtf_fit.training.loop as loop
 from mbtf_core.data.lattice import Lattice
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries
-from mbtf_fit.training.best_state import excess_error, overfits
+from mbtf_fit.training.best_state import excess_error, is_candidate, overfits
 from mbtf_fit.training.endings import describe_kept
 from mbtf_fit.training.fit import FitResult, fit
 from mbtf_fit.training.trainer import Trainer
@@ -54,7 +55,7 @@ def weights_at(monkeypatch: pytest.MonkeyPatch) -> dict[int, dict[str, torch.Ten
         return (0.5 * (queries.value_a + queries.value_b) * (1.0 + excess)).astype(np.float32)
 
     monkeypatch.setattr(Trainer, "predict", predict)
-    monkeypatch.setattr(fits, "_REPORT_SECONDS", 0.0)
+    monkeypatch.setattr(loop, "is_candidate", lambda step: True)
     monkeypatch.setattr(fits, "_CHECKPOINT_SECONDS", 0.0)
     return seen
 
@@ -101,6 +102,21 @@ def test_a_fit_that_overfits_returns_to_its_best_state(
     assert all(torch.equal(mine[name], other[name]) for name in other)
 
 
+@pytest.mark.parametrize("seconds", [0.0, 1e9])
+def test_the_choice_does_not_depend_on_the_speed_of_the_machine(
+    seconds: float, shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, weights_at: dict[int, Any]
+) -> None:
+    """Reports between candidates, here the even steps, choose nothing."""
+    monkeypatch.setattr(loop, "is_candidate", lambda step: step % 2 == 0)
+    monkeypatch.setattr(fits, "_REPORT_SECONDS", seconds)
+    assert fit(config(), shards, tmp_path / "m").kept_step == BEST + 1
+
+
+def test_candidates_are_half_octaves() -> None:
+    found = [step for step in range(400) if is_candidate(step)]
+    assert found == [32, 45, 64, 91, 128, 181, 256, 362]
+
+
 def test_a_fit_keeps_its_last_state_unless_another_is_better_beyond_noise(
     shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -112,7 +128,7 @@ def test_a_fit_keeps_its_last_state_unless_another_is_better_beyond_noise(
         return (value + 0.02 * random.normal(size=value.shape)).astype(np.float32)
 
     monkeypatch.setattr(Trainer, "predict", predict)
-    monkeypatch.setattr(fits, "_REPORT_SECONDS", 0.0)
+    monkeypatch.setattr(loop, "is_candidate", lambda step: True)
     found = fit(config(), shards, tmp_path / "m")
     errors = [record["unexplained"] for record in found.history]
     assert min(errors) < 0.98 * errors[-1]
