@@ -69,6 +69,11 @@ Kinds = Annotated[
 TilesAcross = Annotated[float, Field(gt=0, le=1e4)]
 
 
+Widths = Annotated[list[TilesAcross], Field(min_length=1), AfterValidator(_distinct)]
+# Texels of the finest level that a pixel covers at the target, in the pictures of a comparison.
+PIXEL_TEXELS = (1.0, 4.0)
+
+
 class CompareSection(Settings):
     """Images of the plane for every view, light and width of the field of view: references and fits."""
 
@@ -80,8 +85,10 @@ class CompareSection(Settings):
         [SceneDirection(elevation=45, azimuth=45), SceneDirection(elevation=20, azimuth=160)],
         description="directions of the light",
     )
-    tiles_across: Annotated[list[TilesAcross], Field(min_length=1), AfterValidator(_distinct)] = Field(
-        [1.0, 4.0], description="widths of the field of view at the target, in tile widths"
+    tiles_across: Widths | None = Field(
+        None,
+        description="widths of the field of view at the target, in tile widths; default: pixels cover 1 "
+        "and 4 texels of the data",
     )
     size: int = Field(256, ge=8, le=4096, description="pixels along each side of an image")
     spp: Paths = Field(128, description="paths per pixel, both estimates together")
@@ -100,6 +107,11 @@ class CompareSection(Settings):
     )
     timing: bool = Field(False, description="time the evaluation of a 1080p image, part by part")
     seed: int = Field(0, ge=0, lt=1 << 63, description="root seed of the images")
+
+    def at(self, texels: int) -> CompareSection:
+        """With the fields of view of data that have so many texels across."""
+        widths = self.tiles_across or [covered * self.size / texels for covered in PIXEL_TEXELS]
+        return self.model_copy(update={"tiles_across": widths})
 
 
 class ReportSection(Settings):

@@ -79,12 +79,13 @@ def compare(
 
     if section.st_lpips:
         require()
-    if section.unmodified_mitsuba:
-        pick_scene(section)
     (out / PICTURES).mkdir(parents=True, exist_ok=True)
     materials = {name: Material.load(folder) for name, folder in fits.items()}
     start = time.perf_counter()
     job = Job.load(generate)
+    section = section.at(job.lattice.shape()[1])
+    if section.unmodified_mitsuba:
+        pick_scene(section)
     estimator = picture_estimator(job)
     rendered = _render_references(section, job, progress, runner)
     seconds = time.perf_counter() - start

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
 from mbtf_core.pictures import Camera
-from mbtf_pipeline.recipe import FIELD_OF_VIEW, CompareSection, SceneDirection, SceneView
+from mbtf_pipeline.recipe import FIELD_OF_VIEW, PIXEL_TEXELS, CompareSection, SceneDirection, SceneView
 
 F32 = NDArray[np.float32]
 PICTURES = "pictures"
@@ -55,11 +55,12 @@ class Scene:
 
 
 def scenes(compare: CompareSection) -> Iterator[Scene]:
-    """All scenes of a comparison: views outermost, widths innermost."""
+    """All scenes of a comparison: views outermost, widths innermost. Only their number is right where the
+    widths are those of the data."""
     index = 0
     for v, view in enumerate(compare.views, 1):
         for n, light in enumerate(compare.lights, 1):
-            for s, tiles_across in enumerate(compare.tiles_across, 1):
+            for s, tiles_across in enumerate(compare.tiles_across or PIXEL_TEXELS, 1):
                 yield Scene(index, f"v{v}-l{n}-s{s}", view, light, tiles_across)
                 index += 1
 

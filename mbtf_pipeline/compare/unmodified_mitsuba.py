@@ -119,6 +119,7 @@ def pick_scene(section: CompareSection) -> tuple[SceneView, SceneDirection, floa
             where="compare.unmodified_mitsuba",
             hint="add them to compare.views and compare.lights, or remove the option",
         )
+    assert section.tiles_across is not None
     return views[0], lights[0], min(section.tiles_across)
 
 

@@ -245,7 +245,7 @@ def test_runs_that_do_not_fit_on_the_disk_are_refused(
 ) -> None:
     recipe, said = load_recipe(RECIPE, []), list[str]()
     monkeypatch.setattr(folders.shutil, "disk_usage", lambda path: SimpleNamespace(free=1e6))
-    with pytest.raises(InputError, match=r"needs 72 MB; 1.0 MB are free\n.*--time"):
+    with pytest.raises(InputError, match=r"needs 18 MB; 1.0 MB are free\n.*--time"):
         module.run_study(recipe, tmp_path / "study", seconds=150.0, announce=said.append)
     assert not said
     assert not fake.measured
