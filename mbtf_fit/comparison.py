@@ -20,7 +20,7 @@ from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.shard_files import read_exr
 from mbtf_core.errors import InputError
 from mbtf_core.files.folders import OutputFolder, owned
-from mbtf_core.palettes import common_scale, indices, palette
+from mbtf_core.palettes import indices, palette
 from mbtf_core.pictures import claim_pictures, write_png
 from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.stats import noise_free_mse, signal_variance, unexplained_variance
@@ -42,6 +42,8 @@ from mbtf_gen.pictures.reference import (
 PICTURE_NAME = "comparison.png"
 # Smaller pictures are enlarged to about so many pixels across.
 _SHOWN = 384
+# Share of the references' mean value at which the picture of differences saturates.
+_DIFFERENCE = 0.25
 _QUERY = ("u", "sigma", "omega_i", "omega_o")
 
 
@@ -130,6 +132,8 @@ def compare(config: ComparisonConfig, output: Path, console: Console, *, overwri
         pictures.append({"tiles_across": across, "relative_noise": facts["relative_noise"], **found})
         seen = [_rms_text(found), *filter(None, visibility(found))]
         seen.append(f"unexplained variance {format_estimate(found['unexplained'])}")
+        if found["mean_ratio"] is not None:
+            seen.append(f"mean {found['mean_ratio']:.3f} of the reference's")
         of = f"reference: contrast {found['contrast']:.1%}, noise {facts['relative_noise']:.1%}"
         lines.append(f"{width_label(across)}: {', '.join(seen)}; {of}")
     lines.append(
@@ -179,14 +183,16 @@ def _draw(
         mse, unexplained = noise_free_mse(fit, *halves), unexplained_variance(fit, *halves)
         mean, variance = float(reference.mean()), signal_variance(*halves).value
         contrast = math.sqrt(max(0.0, variance)) / mean if mean > 0 else 0.0
-        numbers = {"exposure": peak, "mean": mean, "contrast": contrast}
+        ratio = float(fit.mean()) / mean if mean > 0 else None
+        numbers = {"exposure": peak, "mean": mean, "mean_ratio": ratio, "contrast": contrast}
         errors.append({"mse": mse.as_dict(), "unexplained": unexplained.as_dict(), **numbers})
         columns[0].append(to_display(reference.reshape(shape), exposure))
         columns[1].append(to_display(fit.reshape(shape), exposure))
-        differences.append((fit - reference).mean(axis=-1).reshape(shape[:2]) / white_of(exposure))
-    scale = common_scale(differences)
+        differences.append((fit - reference).mean(axis=-1).reshape(shape[:2]))
+    # Of the references alone, so that the fits of a material can be compared.
+    scale = _DIFFERENCE * float(np.mean([found["mean"] for found in errors])) or 1.0
     columns[2] = [palette("signed")[indices(difference / scale, "signed")] for difference in differences]
-    captions = ["reference", "fit", f"fit - reference\n±{scale:.3g} of white"]
+    captions = ["reference", "fit", f"fit - reference\n±{_DIFFERENCE:.0%} of the mean"]
     path = folder.path / PICTURE_NAME
     shown = [[_enlarged(picture) for picture in column] for column in columns]
     write_png(path, grid(shown, captions, list(map(width_label, widths)), 3))

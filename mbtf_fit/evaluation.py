@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -235,9 +236,19 @@ def score_predictions(file: str | Path, shards: str | Path | DataFolder) -> dict
     return {"errors": {"test": errors}}
 
 
+# What NumPy raises of files that are damaged, encrypted or something else.
+_NO_NPZ = (
+    *(AttributeError, EOFError, KeyError, MemoryError, RuntimeError, TypeError, ValueError),
+    *(BadZipFile, zlib.error),
+)
+
+
 def _read_values(file: Path) -> F32:
     try:
         with opened(file) as stream, np.load(stream) as arrays:
-            return np.asarray(arrays["value"], np.float32)
-    except (EOFError, ValueError, TypeError, AttributeError, KeyError, BadZipFile) as error:
+            value = arrays["value"]
+            # What float32 cannot hold is infinite, which is refused.
+            with np.errstate(over="ignore"):
+                return value.astype(np.float32, casting="same_kind")
+    except _NO_NPZ as error:
         raise InputError("is no npz file with the array 'value'", where=file) from error

@@ -45,7 +45,7 @@ class SceneDirection(Settings):
 
 
 class SceneView(SceneDirection):
-    """SceneDirection of the camera; high enough that no horizon is visible."""
+    """Direction of the camera; high enough that no horizon is visible."""
 
     elevation: float = Field(
         ge=FIELD_OF_VIEW * 0.7 + 2, le=90, description="above the reference plane, in degrees"

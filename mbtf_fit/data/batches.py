@@ -48,7 +48,7 @@ class QueryBatch(NamedTuple):
 
 
 class QueryDataset(IterableDataset[QueryBatch]):
-    """All queries of a split once per epoch, in batches of random order, in all layouts.
+    """All queries of a split once per epoch, in batches, in all layouts: training queries in random order.
 
     An epoch visits blocks of about 4096 queries of all shards in random order, and shuffles 32 of them at a
     time: memory does not grow with the data set. The order depends on seed, epoch and number of workers
@@ -65,6 +65,9 @@ class QueryDataset(IterableDataset[QueryBatch]):
         Queries per batch; the last batch of each worker has fewer.
     seed : int
         Of the order.
+    shuffle : bool, optional
+        Whether batches have random order; by default those of the train split alone. Otherwise, without
+        workers of a loader, queries have the order of the shards.
 
     Attributes
     ----------
@@ -80,12 +83,18 @@ class QueryDataset(IterableDataset[QueryBatch]):
     """
 
     def __init__(
-        self, folder: str | Path | DataFolder, split: str = "train", batch_size: int = 4096, seed: int = 0
+        self,
+        folder: str | Path | DataFolder,
+        split: str = "train",
+        batch_size: int = 4096,
+        seed: int = 0,
+        shuffle: bool | None = None,
     ) -> None:
         super().__init__()
         check_type(batch_size, int, "batch_size", "give a whole number")
         if batch_size < 1:
             raise InputError(f"is {batch_size}, but must be at least 1", where="batch_size")
+        self.shuffle = split == "train" if shuffle is None else shuffle
         self.data, self.batch_size, self.seed = Dataset.open(folder), batch_size, seed
         # Shared with workers, also with those that live for several epochs.
         self._epoch = zeros((), dtype=int64).share_memory_()
@@ -105,13 +114,17 @@ class QueryDataset(IterableDataset[QueryBatch]):
         worker = get_worker_info()
         number, workers = (0, 1) if worker is None else (worker.id, worker.num_workers)
         epoch = int(self._epoch)
-        order = philox(self.seed, 2 * epoch).permutation(len(self._blocks))[number::workers]
+        order = np.arange(len(self._blocks))
+        if self.shuffle:
+            order = philox(self.seed, 2 * epoch).permutation(order)
+        order = order[number::workers]
         # As in the loader's batches, even streams order an epoch, odd ones what is below.
         random = np.random.Generator(np.random.Philox(key=[self.seed, 2 * epoch + 1], counter=number))
         left: list[ShardQueries] = []
         for start in range(0, len(order), _MIXED):
             mixed = ShardQueries.join([*left, *map(self._read, order[start : start + _MIXED])])
-            mixed = mixed.take(random.permutation(len(mixed)))
+            if self.shuffle:
+                mixed = mixed.take(random.permutation(len(mixed)))
             whole = len(mixed) // self.batch_size * self.batch_size
             for at in range(0, whole, self.batch_size):
                 yield _batch(mixed.take(slice(at, at + self.batch_size)))

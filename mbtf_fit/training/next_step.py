@@ -86,13 +86,13 @@ def next_step(cost: MarginalCost, errors: Mapping[str, Any]) -> NextStep:
     own = training.get("value")
     value, error = split["unexplained"]["value"], split["unexplained"]["error"]
     if value is None or error is None or error > _UNCERTAIN * abs(value) or few_decide(split):
-        reason = "few test queries decide the error; four times as many, by highlights, tell more"
+        reason = "few test queries decide the error; four times as many, by highlights, measure it better"
         if (
             value is not None
             and own is not None
             and value - own > 2.0 * math.hypot(error or 0, training["error"] or 0)
         ):
-            reason += f"; that of training queries is {own:.2g}: the fit overfits noise"
+            reason += f"; the fit overfits noise (error of training queries: {own:.2g})"
         return NextStep("test", reason)
     if value >= 1.0 and own is not None and own < 1.0:
         return NextStep("queries", "the training queries are too few or too noisy")

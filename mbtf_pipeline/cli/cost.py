@@ -127,8 +127,8 @@ def cost(
     lines += [study.asked] if study.asked else []
     if study.least is not None:
         lines.append(
-            "too few complete runs for a forecast: the same command with --time "
-            f"{rounded(study.least)} keeps these and measures enough on this machine"
+            f"too few complete runs for a forecast: repeat the command with --time {rounded(study.least)}; "
+            "it keeps these runs and adds others"
         )
     lines += [f"  {m.seconds.value:.0f} s: {m.command}" for m in front]
     console.report(data, "\n".join(lines))

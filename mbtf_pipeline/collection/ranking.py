@@ -20,7 +20,7 @@ from mbtf_pipeline.collection.recipes import Published, seedless
 from mbtf_pipeline.stages import SHARDS
 from mbtf_pipeline.tables import Cell, Column, Table, estimate, rows_of
 
-# Beside the runs: SUBMISSIONS/METHOD/MATERIAL.npz with predictions of foreign code.
+# Beside the runs: SUBMISSIONS/METHOD/RUN.npz with predictions of foreign code; runs are named for materials.
 SUBMISSIONS = "submissions"
 
 
@@ -92,8 +92,9 @@ def entries(runs: Sequence[FinishedRun]) -> Iterator[Entry]:
         for method in dict.fromkeys(map(seedless, run.fits)):
             records = [run.fit(fit) for fit in run.fits if seedless(fit) == method]
             yield Entry(run, method, [record["splits"]["test"] for record in records], records)
-        for file in sorted((run.folder.parent.parent / SUBMISSIONS).glob(f"*/{run.material}.npz")):
-            yield _submission(run, file)
+        for folder in sorted((run.folder.parent.parent / SUBMISSIONS).glob("*/")):
+            if (file := folder / f"{run.folder.name}.npz").exists():
+                yield _submission(run, file)
 
 
 def _submission(run: FinishedRun, file: Path) -> Entry:
@@ -119,7 +120,7 @@ def _error_cell(entry: Entry) -> Cell:
 
 
 _COLUMNS = (
-    Column(MATERIAL.title, MATERIAL.key, lambda entry, _: entry.run.title),
+    Column(MATERIAL.title, MATERIAL.key, lambda entry, _: f"{entry.run.title} {entry.run.variant}".strip()),
     Column(METHOD.title, METHOD.key, lambda entry, _: entry.method),
     Column("seeds", "seeds", lambda entry, _: len(entry.records) or None),
     Column("unexplained variance", "unexplained", lambda entry, _: _error_cell(entry)),
@@ -132,19 +133,19 @@ _COLUMNS = (
 )
 
 
-def _ratio(entry: Entry, first: Entry) -> Estimate | None:
-    """Error relative to that of the material's first method."""
-    if entry.method == first.method:
-        return Estimate(1.0, 0.0, first.errors[0]["n"])
-    upper, lower = entry.error(), first.error()
-    return None if upper is None or lower is None else ratio_of(upper, lower)
+def _ratio(entry: Entry, first: Entry | None) -> Estimate | None:
+    """Error relative to that of the first method on the same material."""
+    upper, lower = entry.error(), None if first is None else first.error()
+    if upper is None or lower is None:
+        return None
+    return Estimate(1.0, 0.0, upper.n) if entry is first else ratio_of(upper, lower)
 
 
 def ranking(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[Table]:
     """Methods by the geometric mean of their errors, and every method on every material."""
     found = list(entries(runs))
-    firsts = {entry.run.material: entry for entry in reversed(found)}
-    pairs = [(entry, firsts[entry.run.material]) for entry in found]
+    firsts = {entry.run.folder: entry for entry in found if entry.method == found[0].method}
+    pairs = [(entry, firsts.get(entry.run.folder)) for entry in found]
     rows: list[list[Cell]] = []
     for method in dict.fromkeys(entry.method for entry in found):
         own = [(entry, first) for entry, first in pairs if entry.method == method]

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self, TypeVar
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from mbtf_core.config.settings import FileName, Settings, build, deep_merge, resolve
 from mbtf_core.config.yaml_file import read_yaml
@@ -27,6 +27,15 @@ TableName = Literal[
 _SEEDED = re.compile(r"(.+)-seed([0-9]+)")
 
 
+def _distinct(seeds: list[int]) -> list[int]:
+    if len({*seeds}) < len(seeds):
+        raise ValueError("seeds must differ")
+    return seeds
+
+
+Seeds = Annotated[list[Annotated[int, Field(ge=0, lt=1 << 63)]], AfterValidator(_distinct)]
+
+
 class Layer(Settings):
     """Nested options of a recipe; missing ones are inherited from the layer below."""
 
@@ -35,7 +44,7 @@ class Layer(Settings):
     fit: dict[Name, dict[str, Any] | None] = Field({}, description="name → options of a fit")
     compare: dict[str, Any] = Field({}, description="of the comparison")
     without: list[Name] = Field([], description="fits that are left out, for example of a material")
-    seeds: list[int] | None = Field(None, description="repeats each fit with each seed; default: its own")
+    seeds: Seeds | None = Field(None, description="repeats each fit with each seed; default: its own")
 
 
 def _layer(data: Any) -> Any:
@@ -213,11 +222,16 @@ class Collection(Settings):
         """The recipe of one run: the options of all runs, overridden by the layers."""
         data: dict[str, Any] = {}
         seeds: list[int] = []
-        for layer in (self.base, *([self.quick] if quick else []), *layers):
+        own_layers = (self.base, *([self.quick] if quick else []), *layers)
+        for layer in own_layers:
             data = deep_merge(data, layer.model_dump(mode="json", exclude={"seeds", "without"}))
             seeds = seeds if layer.seeds is None else layer.seeds
         each, fits = data.pop("each_fit"), data["fit"] or {_model_for(path): None}
-        left_out = {fit for layer in (self.base, *layers) for fit in layer.without}
+        left_out = {fit for layer in own_layers for fit in layer.without}
+        if unknown := sorted(left_out - fits.keys()):
+            raise InputError(f"'without' names no fit: {', '.join(unknown)}", where=f"{file}: {name}")
+        if left_out >= fits.keys():
+            raise InputError("'without' leaves no fit", where=f"{file}: {name}")
         data["fit"] = {
             fit: deep_merge(each, {"model": fit, **(own or {})})
             for fit, own in fits.items()

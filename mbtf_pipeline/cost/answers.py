@@ -107,7 +107,9 @@ def answers(evidence: Evidence) -> list[dict[str, Any]]:
     rows = []
     for m in evidence.runs:
         spent = [m.details[f"{part}_seconds"] for part in ("generation", "training", "overhead")]
-        basis = "measured: {:.0f} s generating, {:.0f} s training, {:.0f} s loading".format(*spent)
+        basis = "measured: {:.0f} s generating, {:.0f} s training, {:.0f} s start-up and calibration".format(
+            *spent
+        )
         number = {"seconds": m.seconds.value, "unexplained": m.error.as_dict(), "forecast": False}
         rows.append(_row(clock(m.seconds.value), str(m.error), basis, number))
     for seconds in evidence.times():

@@ -193,7 +193,11 @@ def planned_runs(seconds: float, spp: int, path_seconds: float) -> list[Run]:
         left -= total
         queries = round_down(max(_FEWEST_QUERIES, share * total / (spp * path_seconds)))
         training = (1 - share) * total
-        fit = {"model": DEFAULT_MODEL, **best_options(training), "training.time": f"{training:.3g}s"}
+        fit = {
+            "model": DEFAULT_MODEL,
+            **best_options(training),
+            "training.time": f"{round(training, 1):.15g}s",
+        }
         series = f"{100 * share:.0f} % of the time for generating"
         runs.append(Run("run", series, f"planned for {total:g} s", queries, spp, fit, seed))
     return runs

@@ -57,6 +57,15 @@ def test_what_cannot_be_scored_is_refused(shards: Path, tmp_path: Path) -> None:
         np.savez(file, **arrays)
         with pytest.raises(InputError, match="no npz file"):
             score_predictions(file, shards)
+    np.savez_compressed(file, value=np.ones((1500, 3)))
+    damaged = bytearray(file.read_bytes())
+    damaged[60:90] = bytes(30)
+    file.write_bytes(damaged)
+    with pytest.raises(InputError, match="no npz file"):
+        score_predictions(file, shards)
+    np.savez(file, value=np.full((1500, 3), 1j))
+    with pytest.raises(InputError, match="no npz file"):
+        score_predictions(file, shards)
     for shape in ((), (4500,), (1499, 3), (3, 1500)):
         np.savez(file, value=np.zeros(shape))
         with pytest.raises(InputError, match=r"shape .* 1500 test queries"):

@@ -77,7 +77,7 @@ def test_an_epoch_has_each_query_once(shards: Path, workers: int, monkeypatch: p
 
 
 def test_workers_that_stay_follow_the_epoch(shards: Path) -> None:
-    data = QueryDataset(shards, "test", seed=1)
+    data = QueryDataset(shards, "test", seed=1, shuffle=True)
     loader = DataLoader(data, batch_size=None, num_workers=1, persistent_workers=True)
     found = []
     for epoch in (0, 1, 0):
@@ -88,6 +88,17 @@ def test_workers_that_stay_follow_the_epoch(shards: Path) -> None:
     received = ForkingPickler.loads(ForkingPickler.dumps(data))
     data.set_epoch(1)
     assert torch.cat([batch.sigma for batch in received]).tolist() == found[1]
+
+
+def test_test_queries_have_the_order_of_the_shards(shards: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In which predictions are scored; training queries on request."""
+    monkeypatch.setattr(batches, "_BLOCK", 70)
+    monkeypatch.setattr(batches, "_MIXED", 3)
+    for data, split in (
+        (QueryDataset(shards, "test", 64), "test"),
+        (QueryDataset(shards, shuffle=False), "train"),
+    ):
+        np.testing.assert_array_equal(rows(data), stored(shards, split))
 
 
 @pytest.mark.parametrize("layout", ["image", "slices"])

@@ -81,6 +81,7 @@ def test_means_over_seeds_and_materials(runs: list[FinishedRun]) -> None:
 
 
 def test_an_error_of_unknown_size_is_not_ranked(runs: list[FinishedRun]) -> None:
+    assert ranking([], [])[0].rows == []
     runs[0].comparison["test"]["relief-seed1"]["splits"]["test"]["unexplained"]["value"] = None
     ranked, by_material = map(cells, ranking(runs, []))
     assert by_material["rock", "relief"]["unexplained"] is None
@@ -107,3 +108,21 @@ def test_foreign_predictions_are_ranked_and_faulty_ones_named(
     # Its run has no data set here: the row says so.
     assert "shards" in by_material["wool", "poor"]["unexplained"]
     assert list(ranked) == [("good",), ("relief",), ("neumip",), ("svbrdf",), ("poor",)]
+
+
+def test_a_material_without_the_first_method_has_no_ratio(runs: list[FinishedRun]) -> None:
+    test = runs[1].comparison["test"]
+    names = [name for name in test if not name.startswith("neumip")]
+    runs[1].comparison.update(fits=names, test={name: test[name] for name in names})
+    ranked, by_material = map(cells, ranking(runs, []))
+    assert by_material["wool", "relief"]["ratio"] is None
+    assert ranked["relief",]["ratio"] is None
+    assert ranked["neumip",]["ratio"].value == 1
+
+
+def test_variants_are_compared_with_their_own_first_method(tmp_path: Path) -> None:
+    runs = [make(tmp_path / variant, material) for variant, material in (("a", "rock"), ("b", "wool"))]
+    both = [FinishedRun("stone", r.folder.parent.parent.name, r.folder, r.comparison, {}) for r in runs]
+    by_material = cells(ranking(both, [])[1])
+    assert by_material["stone a", "relief"]["ratio"].value == pytest.approx(0.5)
+    assert by_material["stone b", "relief"]["ratio"].value == pytest.approx(0.25)

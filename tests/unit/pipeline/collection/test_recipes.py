@@ -235,6 +235,20 @@ def test_fits_are_repeated_with_seeds_or_left_out(tmp_path: Path) -> None:
     assert list(full["here"].fit) == ["neumip-baseline-seed3", "neumip-baseline-seed5"]
     assert list(quick["here"].fit) == ["neumip-baseline-seed7"]
     assert [recipes.seedless(name) for name in wanted[:2]] == ["neumip-baseline", "wide"]
+    quickly = text.replace("quick:\n", "quick:\n  without: [neumip-baseline]\n")
+    (tmp_path / "small.yaml").write_text(quickly)
+    assert list(planned(tmp_path / "small.yaml", quick=True)[0]["steep"].fit) == ["wide-seed7"]
+    for faulty, what in (
+        ("without: [wdie]", "names no fit: wdie"),
+        ("without: [wide, neumip-baseline]", "leaves no fit"),
+        ("seeds: [3, 3]", "must differ"),
+        ("seeds: [-1]", "seeds"),
+    ):
+        key = faulty.split(":")[0]
+        lines = [line for line in TEXT.splitlines() if not line.startswith(f"  {key}")]
+        (tmp_path / "small.yaml").write_text("\n".join(lines).replace("base:", f"base:\n  {faulty}"))
+        with pytest.raises(InputError, match=what):
+            planned(tmp_path / "small.yaml")
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=[p.stem for p in SHIPPED])

@@ -76,7 +76,7 @@ def test_answers_are_measured_or_forecast_for_up_to_four_times_as_long() -> None
     assert [row["time"] for row in rows if not row["forecast"]] == [clock(s) for s in SECONDS]
     assert rows[0]["line"] == (
         f"0:10: unexplained variance {law(10.0):.4f} ± 0.0010   "
-        "measured: 1 s generating, 2 s training, 7 s loading"
+        "measured: 1 s generating, 2 s training, 7 s start-up and calibration"
     )
     assert [(row["time"], row["basis"]) for row in rows if row["forecast"]] == [
         ("10min", "forecast, 1.9 times the longest run"), ("20min", "forecast, 3.8 times the longest run")
