@@ -118,8 +118,10 @@ class FitResult:
     def kept_step(self) -> int | None:
         """Step of the state that is kept, if it is not the last: later, the fit overfitted."""
         training = self.material.description["training"]
-        kept: int | None = training.get("kept_step")
-        return None if kept == training["steps"] else kept
+        # The history of materials that share a network counts the steps of all.
+        counted = training.get("shared_decoder") or training
+        kept: int | None = counted.get("kept_step")
+        return None if kept == counted["steps"] else kept
 
 
 def _check_folder(config: FitConfig, out: Path) -> None:
