@@ -200,7 +200,7 @@ def test_a_cost_study_measures_reports_and_resumes(
     monkeypatch.setattr(study, "planned_runs", lambda *arguments: planned_runs(30.0, *arguments[1:])[:runs])
     monkeypatch.setattr(study, "_CONFIGURATIONS", 1000)
     monkeypatch.setattr("mbtf_pipeline.cost.runs.SHORTEST", 4.0)
-    monkeypatch.setattr("mbtf_pipeline.cost.runs.TEST", (4096, 8))
+    monkeypatch.setattr("mbtf_pipeline.cost.runs.TEST", (16384, 32))
     out = tmp_path / "study"
     # Long enough never to decide what is measured.
     command = ["cost", str(RECIPE), "--time", "1h", "-o", str(out), "--json", "--quiet"]
