@@ -34,12 +34,12 @@ def advise(
         error that it was asked for, or shares a network.
     """
     from mbtf_core.data.dataset import Dataset
-    from mbtf_fit.training.endings import reached
+    from mbtf_fit.training.endings import kept_step, reached
     from mbtf_fit.training.next_step import next_step
     from mbtf_fit.training.validation import marginal_cost_of
 
     config, training = material.config, material.description["training"]
-    cost = marginal_cost_of(history, errors, training.get("noise_variance"), training.get("kept_step"))
+    cost = marginal_cost_of(history, errors, training.get("noise_variance"), kept_step(training))
     if cost is None or not errors or config.training.shared_decoder or reached(config, history):
         return None, []
     step = next_step(cost, errors)

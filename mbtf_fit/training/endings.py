@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mbtf_core.units import clock
@@ -30,6 +30,14 @@ def reached(config: FitConfig, history: Sequence[dict[str, Any]]) -> bool | None
         return None
     value, error = (history[-1].get(key) if history else None for key in ("unexplained", "unexplained_error"))
     return value is not None and error is not None and value + error <= config.training.error
+
+
+def kept_step(training: Mapping[str, Any]) -> int | None:
+    """Step of the state that a fit has kept, from the record of its training, if it is not the last: later,
+    the fit overfitted. The history of materials that share a network counts the steps of all."""
+    counted = training.get("shared_decoder") or training
+    kept: int | None = counted.get("kept_step")
+    return None if kept == counted["steps"] else kept
 
 
 def describe_kept(history: Sequence[dict[str, Any]], kept: int | None) -> str | None:

@@ -26,7 +26,7 @@ from mbtf_fit.material.decoder import DECODER_NAME, Decoder
 from mbtf_fit.material.format import DESCRIPTION_NAME
 from mbtf_fit.material.material import Material
 from mbtf_fit.models.registry import MODELS
-from mbtf_fit.training.endings import describe_validations, reached
+from mbtf_fit.training.endings import describe_validations, kept_step, reached
 from mbtf_fit.training.fit_export import Member, export_fits
 from mbtf_fit.training.fit_folder import (
     append_history,
@@ -117,11 +117,7 @@ class FitResult:
     @property
     def kept_step(self) -> int | None:
         """Step of the state that is kept, if it is not the last: later, the fit overfitted."""
-        training = self.material.description["training"]
-        # The history of materials that share a network counts the steps of all.
-        counted = training.get("shared_decoder") or training
-        kept: int | None = counted.get("kept_step")
-        return None if kept == counted["steps"] else kept
+        return kept_step(self.material.description["training"])
 
 
 def _check_folder(config: FitConfig, out: Path) -> None:

@@ -128,11 +128,10 @@ def marginal_cost_of(
 ) -> MarginalCost | None:
     """Marginal cost of a finished fit, from the records of its history, its errors by split, the variance
     of the noise of training values in 1/sr² (None: unknown), and the step of the state that is kept (None:
-    the last, or unknown); None where the history is incomplete."""
+    the last); None where the history is incomplete."""
     if not history or history[-1].get("fraction", 0.0) < 1.0:
         return None
     share, error = _noise_share(errors, noise) or (None, 0.0)
-    kept = None if kept == history[-1]["step"] else kept
     return MarginalCost(_doubling(history), share, int(history[-1]["step"]), error, kept)
 
 

@@ -61,7 +61,8 @@ def cost(
     from mbtf_pipeline.cost.answers import answers
     from mbtf_pipeline.cost.measurement import pareto_front
     from mbtf_pipeline.cost.page import write_page
-    from mbtf_pipeline.cost.study import plan_study, rounded, run_study
+    from mbtf_pipeline.cost.plan import plan_study
+    from mbtf_pipeline.cost.study import rounded, run_study
     from mbtf_pipeline.recipe import Recipe
 
     loaded = load(recipe, assignments or [])

@@ -33,14 +33,14 @@ class Entry:
     run : the run of the material
     method : name of the fit without its seed, or of the submission
     errors : errors of the test queries, one record per seed
-    records : records of the fits; none of a submission
+    fits : names of the fits, one per seed; none of a submission
     problem : why a submission has no errors
     """
 
     run: FinishedRun
     method: str
     errors: Sequence[Any]
-    records: Sequence[Any] = ()
+    fits: Sequence[str] = ()
     problem: str = ""
 
     def error(self, *keys: str) -> Estimate | None:
@@ -53,8 +53,8 @@ class Entry:
         return Estimate(fmean(e.value for e in found), math.hypot(seeds, noise), found[0].n)
 
     def mean(self, key: str) -> float | None:
-        """Mean over the seeds of a number of the fits' records."""
-        return fmean(record[key] for record in self.records) if self.records else None
+        """Mean over the seeds of a number in the records of the fits."""
+        return fmean(self.run.fit(fit)[key] for fit in self.fits) if self.fits else None
 
     def kib(self) -> float | None:
         """Size of weights and textures in float32."""
@@ -63,8 +63,7 @@ class Entry:
 
     def flip(self) -> float | None:
         """Mean LDR-FLIP of the pictures, over the seeds."""
-        fits = [fit for fit in self.run.fits if seedless(fit) == self.method] if self.records else []
-        values = [p["fits"][fit]["flip"]["ldr"] for p in self.run.pictures for fit in fits]
+        values = [p["fits"][fit]["flip"]["ldr"] for p in self.run.pictures for fit in self.fits]
         return fmean(values) if values else None
 
     def milliseconds(self) -> float | None:
@@ -72,9 +71,8 @@ class Entry:
         timing = self.run.comparison.get("timing", {})
         found = [
             record["evaluate_ms"]
-            for fit, records in timing.items()
-            if seedless(fit) == self.method
-            for record in records
+            for fit in self.fits
+            for record in timing.get(fit, ())
             if record["device"] == "cpu"
         ]
         return fmean(found) if found else None
@@ -90,8 +88,8 @@ def entries(runs: Sequence[FinishedRun]) -> Iterator[Entry]:
     """All methods on all materials, submissions last."""
     for run in runs:
         for method in dict.fromkeys(map(seedless, run.fits)):
-            records = [run.fit(fit) for fit in run.fits if seedless(fit) == method]
-            yield Entry(run, method, [record["splits"]["test"] for record in records], records)
+            fits = [fit for fit in run.fits if seedless(fit) == method]
+            yield Entry(run, method, [run.fit(fit)["splits"]["test"] for fit in fits], fits)
         for folder in sorted((run.folder.parent.parent / SUBMISSIONS).glob("*/")):
             if (file := folder / f"{run.folder.name}.npz").exists():
                 yield _submission(run, file)
@@ -122,7 +120,7 @@ def _error_cell(entry: Entry) -> Cell:
 _COLUMNS = (
     Column(MATERIAL.title, MATERIAL.key, lambda entry, _: f"{entry.run.title} {entry.run.variant}".strip()),
     Column(METHOD.title, METHOD.key, lambda entry, _: entry.method),
-    Column("seeds", "seeds", lambda entry, _: len(entry.records) or None),
+    Column("seeds", "seeds", lambda entry, _: len(entry.fits) or None),
     Column("unexplained variance", "unexplained", lambda entry, _: _error_cell(entry)),
     Column("relative to the first", "ratio", lambda entry, first: _ratio(entry, first)),
     Column("grazing", "grazing", lambda entry, _: _lowest(entry)),

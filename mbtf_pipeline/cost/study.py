@@ -28,9 +28,8 @@ from mbtf_core.run.task import Item, worker_threads
 from mbtf_core.stats import Estimate
 from mbtf_core.units import clock, expectation, format_duration
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.forecast import forecast
 from mbtf_gen.job import Job
-from mbtf_pipeline.cost.answers import FARTHEST, Evidence
+from mbtf_pipeline.cost.answers import Evidence
 from mbtf_pipeline.cost.generator import benchmark_of, generator_configurations, path_seconds
 from mbtf_pipeline.cost.measurement import (
     HALF_WIDTH,
@@ -63,11 +62,7 @@ WORK = ".work"
 # About as many configurations of the generator share its time.
 _CONFIGURATIONS = 35
 # Seconds by which a run exceeds generating and training, until one has been measured.
-_OVERHEAD = 12.0
-# Paths of the reference and of the generator's rate, which come before runs.
-_SETUP_PATHS = 6_000_000
-# Studies so many times the least one have time for most comparisons of the generator.
-_COMPARISONS = 4.0
+OVERHEAD = 12.0
 _RESUMES = "the same command resumes"
 
 
@@ -158,7 +153,7 @@ class Measurements:
     _pending: dict[str, Configuration] = field(default_factory=dict)
     # Whether a run has made the test set, and most seconds of a run besides it, generating and training.
     tested: bool = False
-    _overhead: float = _OVERHEAD
+    _overhead: float = OVERHEAD
 
     def recall(self, configuration: Configuration) -> bool:
         """Whether a measurement is stored; it then counts as found."""
@@ -253,55 +248,13 @@ class Measurements:
             self.measure(missing([replace(run, seed=seed) for run in first], wide), independent=True)
 
 
-@dataclass(frozen=True)
-class StudyPlan:
-    """What a study would measure.
-
-    Attributes
-    ----------
-    runs : labels of the runs that its time suffices for and that are not measured yet
-    measured : runs that are
-    seconds, bytes : that it takes, and on disk
-    longest : total seconds of the longest run
-    least : seconds of a study that forecasts
-    generator : whether it compares configurations of the generator
-    """
-
-    runs: list[str]
-    measured: int
-    seconds: float
-    bytes: int
-    longest: float
-    least: float
-    generator: bool
-
-    def describe(self, asked: float) -> str:
-        """Lines: what it measures, and what it can and cannot answer in the time that is asked for."""
-        known = f"; {self.measured} measured already" if self.measured else ""
-        lines = [f"{expectation(self.seconds, self.bytes)}; complete runs{known}:"]
-        lines += [f"  {label}" for label in self.runs]
-        lines.append(f"answers: the error after times of up to about {clock(self.longest)}, measured")
-        if asked >= self.least:
-            far = clock(FARTHEST * self.longest)
-            lines.append(
-                f"answers: a forecast for up to {FARTHEST:g} times as long, {far}, with its 95 % interval"
-            )
-        else:
-            lines.append(f"cannot forecast errors of longer times: that takes --time {rounded(self.least)}")
-        if not self.generator:
-            lines.append(
-                "cannot tell what effects, mesh and number of paths cost: that takes "
-                f"--time {rounded(_COMPARISONS * LEAST_SECONDS)}"
-            )
-        return "\n".join(lines)
-
-
-def _generator_seconds(seconds: float) -> float:
+def generator_seconds(seconds: float) -> float:
     """Time for comparisons of the generator: a share of what a study has beyond the least that forecasts."""
     return GENERATOR * max(0.0, seconds - LEAST_SECONDS)
 
 
-def _conditions(job: Job, folder: Path, seconds: float) -> Conditions:
+def conditions_of(job: Job, folder: Path, seconds: float) -> Conditions:
+    """Conditions of the measurements of a study in a folder."""
     config = job.config
     return Conditions(
         config.model_dump_json(),
@@ -310,36 +263,6 @@ def _conditions(job: Job, folder: Path, seconds: float) -> Conditions:
         0.5 * GENERATOR * seconds / _CONFIGURATIONS,
         shlex.join(["mbtf-gen", config.material, "--config", str(folder / CONFIG_NAME)]),
     )
-
-
-def plan_study(recipe: Recipe, folder: Path, *, seconds: float, seed: int | None = None) -> StudyPlan:
-    """What :func:`run_study` would measure, by a pilot of the generator on this machine; nothing is written.
-
-    Raises
-    ------
-    InputError
-        The folder holds something else.
-    """
-    STUDY.check(folder)
-    job = Job.load(study_config(recipe.generate, seed))
-    spp, pilot = job.config.queries.spp, forecast(job, seconds=1.0)
-    conditions = _conditions(job, folder, seconds)
-    found = Measurements(conditions, MeasurementFolder(folder, conditions), Runner())
-    found.path_seconds = pilot.query_seconds / spp
-    before = 2.0 * pilot.start + _SETUP_PATHS * found.path_seconds + _generator_seconds(seconds)
-    planned = planned_runs(seconds, spp, found.path_seconds)
-    least = found.least_seconds(spp, before) or LEAST_SECONDS
-    spent, runs, measured = before, [], 0
-    for run in planned:
-        if found.recall(run):
-            measured += 1
-        elif spent + (expected := found.expected_seconds(run)) <= seconds:
-            spent, found.tested = spent + expected, True
-            runs.append(run)
-    longest = max((run.planned_seconds(found.path_seconds) for run in runs), default=0.0) + _OVERHEAD
-    labels = [f"{run.label}: {run.queries:,} queries × {spp} paths" for run in runs]
-    generator = seconds >= _COMPARISONS * LEAST_SECONDS
-    return StudyPlan(labels, measured, spent, disk_bytes(runs), longest, least, generator)
 
 
 def run_study(
@@ -402,7 +325,7 @@ def run_study(
         if there.error:
             raise PartialError(f"no worker answers: {there.error}", hint=there.hint or _RESUMES)
         claim(folder, there.value)
-        conditions = _conditions(job, folder, seconds)
+        conditions = conditions_of(job, folder, seconds)
         benchmark = benchmark_of(conditions)
         note("reference")
         # Before anything is written: a refused study leaves the folder as it was.
@@ -421,7 +344,7 @@ def run_study(
         measurements = Measurements(conditions, MeasurementFolder(folder, conditions), runner, note)
         configurations = list(generator_configurations(benchmark))
         # Configurations take longer than their share where kernels are compiled; workers start anew.
-        until = 1.2 * _generator_seconds(seconds) + (0.0 if runner.here else spent())
+        until = 1.2 * generator_seconds(seconds) + (0.0 if runner.here else spent())
 
         def missing() -> Iterator[Configuration]:
             for number, configuration in enumerate(configurations):

@@ -25,6 +25,7 @@ from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item, Result, packed, run_task
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.cli.app import app
+from mbtf_pipeline.cost import plan as plan_module
 from mbtf_pipeline.cost import study as module
 from mbtf_pipeline.cost.generator import GeneratorBenchmark, GeneratorConfiguration
 from mbtf_pipeline.cost.measurement import (
@@ -220,7 +221,8 @@ def test_a_dry_run_plans_what_a_study_measures(
 ) -> None:
     """By a pilot of the generator; it writes nothing, and what is measured costs no time."""
     pilot = SimpleNamespace(start=2.0, query_seconds=4e-9)
-    monkeypatch.setattr(module, "forecast", lambda *_, **__: pilot)
+    monkeypatch.setattr(plan_module, "forecast", lambda *_, **__: pilot)
+    monkeypatch.setattr(plan_module, "planned_runs", module.planned_runs)
     folder = tmp_path / "study"
     command = ["cost", str(RECIPE), "-o", str(folder), "--dry-run"]
     assert main(app, [*command, "--time", "230s"]) == 0

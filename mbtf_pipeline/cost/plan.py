@@ -1,0 +1,103 @@
+"""What a cost study would measure, and what it can and cannot answer, without measuring it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from mbtf_core.run.runner import Runner
+from mbtf_core.units import clock, expectation
+from mbtf_gen.forecast import forecast
+from mbtf_gen.job import Job
+from mbtf_pipeline.cost.answers import FARTHEST
+from mbtf_pipeline.cost.measurement import MeasurementFolder
+from mbtf_pipeline.cost.runs import LEAST_SECONDS, disk_bytes, planned_runs
+from mbtf_pipeline.cost.study import (
+    OVERHEAD,
+    STUDY,
+    Measurements,
+    conditions_of,
+    generator_seconds,
+    rounded,
+    study_config,
+)
+from mbtf_pipeline.recipe import Recipe
+
+# Paths of the reference and of the generator's rate, which come before runs.
+_SETUP_PATHS = 6_000_000
+# Studies so many times the least one have time for most comparisons of the generator.
+_COMPARISONS = 4.0
+
+
+@dataclass(frozen=True)
+class StudyPlan:
+    """What a study would measure.
+
+    Attributes
+    ----------
+    runs : labels of the runs that its time suffices for and that are not measured yet
+    measured : runs that are
+    seconds, bytes : that it takes, and on disk
+    longest : total seconds of the longest run
+    least : seconds of a study that forecasts
+    generator : whether it compares configurations of the generator
+    """
+
+    runs: list[str]
+    measured: int
+    seconds: float
+    bytes: int
+    longest: float
+    least: float
+    generator: bool
+
+    def describe(self, asked: float) -> str:
+        """Lines: what it measures, and what it can and cannot answer in the time that is asked for."""
+        known = f"; {self.measured} measured already" if self.measured else ""
+        lines = [f"{expectation(self.seconds, self.bytes)}; complete runs{known}:"]
+        lines += [f"  {label}" for label in self.runs]
+        lines.append(f"answers: the error after times of up to about {clock(self.longest)}, measured")
+        if asked >= self.least:
+            far = clock(FARTHEST * self.longest)
+            lines.append(
+                f"answers: a forecast for up to {FARTHEST:g} times as long, {far}, with its 95 % interval"
+            )
+        else:
+            lines.append(f"cannot forecast errors of longer times: that takes --time {rounded(self.least)}")
+        if not self.generator:
+            lines.append(
+                "cannot tell what effects, mesh and number of paths cost: that takes "
+                f"--time {rounded(_COMPARISONS * LEAST_SECONDS)}"
+            )
+        return "\n".join(lines)
+
+
+def plan_study(recipe: Recipe, folder: Path, *, seconds: float, seed: int | None = None) -> StudyPlan:
+    """What :func:`~mbtf_pipeline.cost.study.run_study` would measure, by a pilot of the generator on this
+    machine; nothing is written.
+
+    Raises
+    ------
+    InputError
+        The folder holds something else.
+    """
+    STUDY.check(folder)
+    job = Job.load(study_config(recipe.generate, seed))
+    spp, pilot = job.config.queries.spp, forecast(job, seconds=1.0)
+    conditions = conditions_of(job, folder, seconds)
+    found = Measurements(conditions, MeasurementFolder(folder, conditions), Runner())
+    found.path_seconds = pilot.query_seconds / spp
+    before = 2.0 * pilot.start + _SETUP_PATHS * found.path_seconds + generator_seconds(seconds)
+    planned = planned_runs(seconds, spp, found.path_seconds)
+    least = found.least_seconds(spp, before) or LEAST_SECONDS
+    spent, runs, measured = before, [], 0
+    for run in planned:
+        if found.recall(run):
+            measured += 1
+        elif spent + (expected := found.expected_seconds(run)) <= seconds:
+            spent, found.tested = spent + expected, True
+            runs.append(run)
+    longest = max((run.planned_seconds(found.path_seconds) for run in runs), default=0.0) + OVERHEAD
+    labels = [f"{run.label}: {run.queries:,} queries × {spp} paths" for run in runs]
+    generator = seconds >= _COMPARISONS * LEAST_SECONDS
+    return StudyPlan(labels, measured, spent, disk_bytes(runs), longest, least, generator)
