@@ -242,6 +242,14 @@ class NumpyMaterial:
         z = axis[2] if len(axis) == 3 else np.sqrt(max(0, 1 - xy @ xy))
         return np.array([*omega[:2] - xy * (omega[2] + t / (1 + z)), z * omega[2] + t])
 
+    def to_frame(self, axes, omega):
+        x, _, z = np.eye(3)
+        n, t = axes[:3] + z, axes[3:] + x
+        n = n / np.sqrt(n @ n)
+        t = t - (t @ n) * n
+        t = t / np.sqrt(t @ t)
+        return np.array([t, np.cross(n, t), n]) @ omega
+
     def frequencies(self, x, level, bands, pi, raw, attenuated):
         f = 2.0 ** np.arange(bands) * (np.pi if pi else 1)
         left = 1 if level is None else np.exp(-(((0.5**level / self.scale)[:, None] * f) ** 2) / 2)

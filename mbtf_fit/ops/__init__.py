@@ -3,7 +3,16 @@
 from __future__ import annotations
 
 from mbtf_fit.ops.lookup import Displace, Lookup, Neighborhood, Offset, Trace
-from mbtf_fit.ops.network import Frequencies, HalfVector, Inception, Network, Position, Rotate, Stereographic
+from mbtf_fit.ops.network import (
+    Frequencies,
+    HalfVector,
+    Inception,
+    Network,
+    Position,
+    Rotate,
+    Stereographic,
+    ToFrame,
+)
 from mbtf_fit.ops.operation import Backend, Operation, read_operations, sizes_of, stages
 from mbtf_fit.ops.shade import Lobe, Shade
 from mbtf_fit.ops.value import Calibrate, DivideByCosine, Gate, Matrix, Product, Standardize, Transform
@@ -30,6 +39,7 @@ __all__ = [
     "Shade",
     "Standardize",
     "Stereographic",
+    "ToFrame",
     "Trace",
     "Transform",
     "read_operations",

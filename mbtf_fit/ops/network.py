@@ -102,6 +102,28 @@ class Rotate(Operation):
 
 
 @dataclass(frozen=True)
+class ToFrame(Operation):
+    """A direction in a frame of a normal and a tangent: ``(t·ω, (n × t)·ω, n·ω)`` (3).
+
+    ``n = (a + e_z) / ‖a + e_z‖``; t is ``b + e_x`` without its part along n, normalized. Where a and b are 0,
+    the frame is the tile's.
+
+    Attributes
+    ----------
+    axes : a and b (6)
+    omega : direction (3)
+    """
+
+    axes: Value
+    omega: Value
+
+    def size(self, sizes: Sequence[int]) -> int:
+        if sizes != [6, 3]:
+            raise ValueError(f"'{self.output}' needs axes of 6 numbers and a direction of 3, not {sizes}")
+        return 3
+
+
+@dataclass(frozen=True)
 class Stereographic(Operation):
     """A direction, projected from the nadir: ``ω_xy / (1 + ω_z)`` (2)."""
 

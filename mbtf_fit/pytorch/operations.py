@@ -215,6 +215,17 @@ def _rotate(op: ops.Rotate, run: Execution, axis: Tensor, omega: Tensor) -> Tens
     return rotate_to_z(axis, omega)
 
 
+@PYTORCH.implements(ops.ToFrame)
+def _to_frame(op: ops.ToFrame, run: Execution, axes: Tensor, omega: Tensor) -> Tensor:
+    x, _, z = torch.eye(3, dtype=axes.dtype, device=axes.device)
+    normal = torch.nn.functional.normalize(axes[:, :3] + z, dim=1)
+    tangent = axes[:, 3:] + x
+    tangent = tangent - (tangent * normal).sum(1, keepdim=True) * normal
+    tangent = torch.nn.functional.normalize(tangent, dim=1)
+    frame = torch.stack([tangent, torch.linalg.cross(normal, tangent), normal], 1)
+    return (frame * omega[:, None]).sum(2)
+
+
 @PYTORCH.implements(ops.Stereographic)
 def _stereographic(op: ops.Stereographic, run: Execution, omega: Tensor) -> Tensor:
     return stereographic(omega)

@@ -44,6 +44,7 @@ CASES: dict[str, dict[str, Any]] = {
     "black": {"model": "relief", "weights": {"unit": torch.zeros(())}},
     "rainer2019": {"model": "rainer2019"},
     "svbrdf": {"model": "svbrdf"},
+    "zeltner2024": {"model": "zeltner2024", **net(width=12, layers=3)},
 }
 
 # Operations that no model of the papers has, and values of more than four numbers.

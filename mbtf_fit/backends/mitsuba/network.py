@@ -132,6 +132,18 @@ def _rotate(op: ops.Rotate, loader: Loader) -> Step:
     return step
 
 
+@MITSUBA.implements(ops.ToFrame)
+def _to_frame(op: ops.ToFrame, loader: Loader) -> Step:
+    def step(axes: Numbers, omega: Numbers) -> Numbers:
+        a, b, direction = mi.Vector3f(*axes[:3]), mi.Vector3f(*axes[3:]), mi.Vector3f(*omega)
+        normal = dr.normalize(a + mi.Vector3f(0.0, 0.0, 1.0))
+        tangent = b + mi.Vector3f(1.0, 0.0, 0.0)
+        tangent = dr.normalize(tangent - dr.dot(tangent, normal) * normal)
+        return [dr.dot(axis, direction) for axis in (tangent, dr.cross(normal, tangent), normal)]
+
+    return step
+
+
 @MITSUBA.implements(ops.Stereographic)
 def _stereographic(op: ops.Stereographic, loader: Loader) -> Step:
     return lambda omega: [c * dr.rcp(1.0 + omega[2]) for c in omega[:2]]

@@ -190,6 +190,12 @@ def _rotate(op: ops.Rotate, code: Code, axis: Value, omega: Value) -> str:
     return f"rotate_to_z(float3({axis}, sqrt(max(0.0, 1.0 - dot({axis}, {axis})))), {omega})"
 
 
+@SHADER.implements(ops.ToFrame)
+def _to_frame(op: ops.ToFrame, code: Code, axes: Value, omega: Value) -> str:
+    code.include("shading")
+    return f"in_frame({axes[:3]}, {axes[3:]}, {omega})"
+
+
 @SHADER.implements(ops.Stereographic)
 def _stereographic(op: ops.Stereographic, code: Code, omega: Value) -> str:
     return f"{omega[:2]} / (1.0 + {omega[2:]})"
