@@ -147,6 +147,7 @@ def fit_calibration(
         done += n
         progress(min(1.0, done / work))
 
+    progress(0.0)
     sums, squares = np.zeros((2, _BINS, 3)), np.zeros((2, _BINS, 3))
     largest = 0.0
     for start in range(0, used, _CHUNK):
