@@ -258,8 +258,8 @@ class Trainer:
 
     def calibrate(self, steps: int, progress: Callable[[float], None] = lambda fraction: None) -> None:
         """Fit the calibration factors (:mod:`~mbtf_fit.training.calibration`), if it :attr:`calibrates`; with
-        at most half as many evaluations as training took, whose `steps` for this material take about three
-        each. `progress` is called with the fraction that is done."""
+        at most a quarter as many evaluations as the queries of its `steps`: with the hints of `relief`, an
+        evaluation takes as long as two of these. `progress` is called with the fraction that is done."""
         model = self.model
         if not self.calibrates:
             return
@@ -272,7 +272,7 @@ class Trainer:
             self.queries,
             self.config.held_out,
             self.loss.bound,
-            steps * self.batch // 2,
+            steps * self.batch // 4,
             progress,
         )
         model.calibrate(torch.from_numpy(found).to(self.device))
