@@ -120,9 +120,15 @@ def _grouped(labels: NDArray[np.int64], *arrays: NDArray[np.float32] | None) -> 
     return {k: _errors(mse[k].n, mse[k], variance[k], unexplained[k]) for k in mse}
 
 
-def evaluate_splits(predict: Predict, data: Dataset, partition: Partition) -> dict[str, dict[str, Any]]:
+def evaluate_splits(
+    predict: Predict,
+    data: Dataset,
+    partition: Partition,
+    progress: Callable[[float], None] = lambda fraction: None,
+) -> dict[str, dict[str, Any]]:
     """Errors of a prediction on ``test``, ``held_out_queries``, ``held_out_directions`` and ``training``
-    queries; a set without queries is left out. The exposure of all is that of the first.
+    queries; a set without queries is left out. The exposure of all is that of the first. `progress` is called
+    with the fraction of the queries that is done.
 
     The error on training queries is underestimated by twice the covariance of prediction and noise: its
     distance from the error on held-out queries measures overfitting.
@@ -138,8 +144,14 @@ def evaluate_splits(predict: Predict, data: Dataset, partition: Partition) -> di
     )
     parts = {name: queries for name, queries in parts.items() if len(queries)}
     exposure = exposure_of(next(iter(parts.values()))) if parts else None
-    found = {name: split_errors(predict, queries, data, exposure) for name, queries in parts.items()}
-    return {name: errors for name, errors in found.items() if errors is not None}
+    found, done, total = dict[str, dict[str, Any]](), 0, sum(map(len, parts.values()))
+    for name, queries in parts.items():
+        progress(done / total)
+        errors = split_errors(predict, queries, data, exposure)
+        done += len(queries)
+        if errors is not None:
+            found[name] = errors
+    return found
 
 
 def foreign_inputs(material: Material, data: Dataset) -> list[str]:

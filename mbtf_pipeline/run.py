@@ -182,14 +182,14 @@ class _RecipeRun:
             if done.error:
                 raise PartialError(done.error, where=fit_stage(name), hint="the same command resumes the run")
             return 0.0
-        steps = config.training.steps
-        budget, unit = (config.training.time.seconds, "s") if steps is None else (steps, "steps")
-        with self.console.progress(budget, fit_stage(name), unit) as bar:
+        with self.console.progress(100, fit_stage(name), "%") as bar:
             done = fit(
                 config,
                 shards,
                 out,
-                progress=lambda share, note: bar.update(round(share * budget, 1), note),
+                progress=lambda phase, share, note: bar.update(
+                    round(100 * share, 1), note, label=f"{fit_stage(name)} {phase}"
+                ),
                 observe=None if self.live is None else self.live.observer(name),
             )
         return done.seconds

@@ -106,7 +106,7 @@ class RunForecaster:
     ) -> RunForecast:
         """Forecast of some stages of a recipe of this material, by default of all, at the pilot's speed;
         `training`: seconds of the fits whose steps have been timed."""
-        from mbtf_fit.training.forecast import evaluation_seconds, fit_bytes
+        from mbtf_fit.training.forecast import closing_seconds, fit_bytes, preparing_seconds
         from mbtf_gen.job import data_bytes
 
         start, path = self.speed if speed is None else speed
@@ -131,7 +131,7 @@ class RunForecaster:
             start=_START + (start if paths else 0.0),
             generating=paths * path,
             training=sum(training.values()) + sum(budget.seconds for budget in by_time),
-            evaluating=len(fits) * evaluation_seconds(queries),
+            evaluating=len(fits) * (preparing_seconds(queries) + closing_seconds(queries)),
             comparing=comparing,
             bytes=size,
             by_steps=tuple(name for name, budget in untimed.items() if budget.steps is not None),

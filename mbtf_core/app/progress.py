@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 # Seconds between two plain progress lines.
 _LINE_SECONDS = 10.0
+# Letters of the longest label of a part of a job.
+_LABEL = 11
 
 
 class Progress:
@@ -55,8 +57,13 @@ class Progress:
         """Count `step` more as done."""
         self.update(self.done + step, note)
 
-    def update(self, done: float, note: str | None = None, total: float | None = None) -> None:
-        """Set the units done; `note` and `total` stay until the next ones."""
+    def update(
+        self, done: float, note: str | None = None, total: float | None = None, label: str | None = None
+    ) -> None:
+        """Set the units done; `note`, `total` and `label` stay until the next ones. A new label begins
+        another part of the job, whose units count from 0."""
+        if label is not None and label != self.label:
+            self.label, self._base = label, (self._start, 0.0)
         self.done = done
         if not self._base[1]:
             self._base = (time.monotonic(), done)
@@ -74,17 +81,19 @@ class Progress:
 
 
 class LineProgress(Progress):
-    """Plain lines at intervals, for logs and pipes. While nothing or all is done, each new note has one."""
+    """Plain lines at intervals, for logs and pipes. While nothing or all is done, each new note has one, as
+    has each part of the job."""
 
     def __init__(self, total: float | None, label: str, unit: str) -> None:
         super().__init__(total, label, unit)
         self._next = self._start + _LINE_SECONDS
-        self._shown: tuple[float, str] | None = None
+        self._shown = ("", 0.0, "")
 
     def _show(self) -> None:
         outside = not self.done or (self.total is not None and self.done >= self.total)
         is_stage = outside and self.note and self._state != self._shown
-        if is_stage or time.monotonic() >= self._next:
+        begins = self._shown[0] not in ("", self.label)
+        if is_stage or begins or time.monotonic() >= self._next:
             self._next = time.monotonic() + _LINE_SECONDS
             self._print()
 
@@ -93,8 +102,8 @@ class LineProgress(Progress):
             self._print()
 
     @property
-    def _state(self) -> tuple[float, str]:
-        return self.done, self.note
+    def _state(self) -> tuple[str, float, str]:
+        return self.label, self.done, self.note
 
     def _print(self) -> None:
         self._shown = self._state
@@ -133,7 +142,7 @@ class BarProgress(Progress):
 
         console = RichConsole(stderr=True)
         # What the label, the percentage and the two times leave.
-        width = min(40, max(4, console.width - len(label) - 24))
+        width = min(40, max(4, console.width - max(len(label), _LABEL) - 24))
         self._rich = Rows(
             progress.TextColumn("{task.description}", markup=False),
             progress.BarColumn(width),
@@ -145,9 +154,13 @@ class BarProgress(Progress):
             redirect_stdout=False,
         )
         self._task = self._rich.add_task(label, total=total, note="")
+        self._shown = label
         self._rich.start()
 
     def _show(self) -> None:
+        if self.label != self._shown:
+            self._rich.reset(self._task, description=self.label)
+            self._shown = self.label
         self._rich.update(self._task, completed=self.done, total=self.total, note=self.note)
 
     def _close(self) -> None:

@@ -63,11 +63,11 @@ def fit(
 ) -> None:
     """Fit a material to a data set: mbtf-fit shards/ -o material/
 
-    The same command again resumes an unfinished fit. --time is that of training, without loading, validation
-    and evaluation. Errors are those of test queries, which no fit is trained on. --quality trains 800 steps
-    at least, even if they take longer, as does --time "12s, at least 800 steps". --dry-run forecasts time and
-    size by some seconds of training on this machine. With --many, the output folder holds one folder per
-    material.
+    The same command again resumes an unfinished fit. --time is that of training; the first line says about
+    how long reading, calibration and errors take beside it. Errors are those of test queries, which no fit is
+    trained on. --quality trains 800 steps at least, even if they take longer, as does --time "12s, at least
+    800 steps". --dry-run forecasts time and size by some seconds of training on this machine. With --many,
+    the output folder holds one folder per material.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def _fit_one(
     with (
         nullcontext() if tensorboard is None else EventLog(tensorboard) as log,
         live_view(str(output), live, console) as shown,
-        console.progress(total=100, label="fitting", unit="%") as bar,
+        console.progress(total=100, label="reading", unit="%") as bar,
     ):
         curves = None if shown is None else shown.observer(output.name)
         observers = [observer for observer in (curves, log) if observer is not None]
@@ -169,14 +169,14 @@ def _fit_one(
     console.report(summary, "\n".join([describe_fit(summary, verbose), *more]))
 
 
-def _training_progress(bar: Progress, folder: Path) -> Callable[[float, str], None]:
+def _training_progress(bar: Progress, folder: Path) -> Callable[[str, float, str], None]:
     """Progress of a fit whose checkpoint lies in a folder."""
 
-    def update(fraction: float, note: str) -> None:
-        if fraction:
+    def update(phase: str, fraction: float, note: str) -> None:
+        if phase == "training" and fraction:
             # Before, there is no checkpoint.
             keep_on_interruption(f"the last checkpoint is kept in {folder}")
-        bar.update(round(100 * fraction, 1), note)
+        bar.update(round(100 * fraction, 1), note, label=phase)
 
     return update
 
@@ -190,16 +190,20 @@ def _announce(
     from mbtf_fit.data.loader import open_data
     from mbtf_fit.models.registry import MODELS
     from mbtf_fit.native import missing_reason
-    from mbtf_fit.training.forecast import evaluation_seconds, fit_bytes
+    from mbtf_fit.training.forecast import closing_seconds, fit_bytes, preparing_seconds
 
     data = [open_data(folder, MODELS[config.model].layout, config.model) for folder in shards]
     size = sum(fit_bytes(config, one.lattice) for one in data)
     check_space(output, size, "reduce network.channels, or choose another folder with -o")
     training = config.training
     budget = training.time if training.steps is None else f"{training.steps} steps"
-    console.note(f"{what}, training for {budget} (change it with --time or --steps)")
     queries = sum(int(one.manifest["splits"]["train"].get("queries", 0)) for one in data)
-    seconds = evaluation_seconds(queries) + (training.time.seconds if training.steps is None else 0.0)
+    beside = preparing_seconds(queries) + closing_seconds(queries)
+    console.note(
+        f"{what}, training for {budget} (change it with --time or --steps); reading, calibration and errors "
+        f"take about {beside:.0f} s beside it"
+    )
+    seconds = beside + (training.time.seconds if training.steps is None else 0.0)
     if is_long(seconds, size):
         console.note(expectation(seconds, size))
     if missing := missing_reason():
@@ -270,12 +274,13 @@ def _fit_many(
         flag = "--cluster" if processes is None else "--processes"
         raise UsageError(f"a shared network is one fit: leave out {flag}")
     from mbtf_fit.material.decoder import DECODER_FOLDER, Decoder
+    from mbtf_fit.training.endings import describe_kept
     from mbtf_fit.training.fit import fit_jointly
 
     decoder = output / DECODER_FOLDER
     what = f"{len(shards)} data sets -> {output}: {config.model} with a shared network"
     _announce(config, shards, output, what, console)
-    with console.progress(total=100, label="fitting", unit="%") as bar:
+    with console.progress(total=100, label="reading", unit="%") as bar:
         results = fit_jointly(
             config,
             shards,
@@ -290,8 +295,11 @@ def _fit_many(
         for data, fitted in zip(shards, fits, strict=True)
     ]
     shared = {"folder": decoder, "sha256": Decoder.find(decoder).sha256}
-    table = fits_table({folder.name: fitted for folder, fitted in zip(folders, fits, strict=True)})
-    console.report({"decoder": shared, "fits": outcomes}, table)
+    lines = [fits_table({folder.name: fitted for folder, fitted in zip(folders, fits, strict=True)})]
+    for folder, fitted in zip(folders, results, strict=True):
+        if (kept := describe_kept(fitted.history, fitted.kept_step)) is not None:
+            lines.append(f"{folder.name}: {kept}")
+    console.report({"decoder": shared, "fits": outcomes}, "\n".join(lines))
 
 
 def _fit_each(

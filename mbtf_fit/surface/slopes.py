@@ -24,8 +24,8 @@ from torch import Tensor
 # Steps of the fit; standard deviations of a footprint that its window has on each side; samples per standard
 # deviation, at least, where texels are finer.
 _STEPS, _REACH, _DENSITY = 10, 2.5, 24.0
-# Least variance of slopes along an axis, added to the scatter in distances; numbers in memory at once.
-_LEAST, _AT_ONCE = 1e-4, 1 << 21
+# Least variance of slopes along an axis, added to the scatter in distances; numbers at once, for the cache.
+_LEAST, _AT_ONCE = 1e-4, 1 << 18
 
 
 def slope_distributions(

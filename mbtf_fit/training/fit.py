@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -59,8 +58,8 @@ _CHECKPOINT_SECONDS = 15.0
 
 # Called with the record of a validation, the trainer, and the queries of the validation.
 Observer = Callable[[dict[str, Any], Trainer, ShardQueries], None]
-# Called with the fraction of the budget that is spent, and one line of text.
-ProgressCallback = Callable[[float, str], None]
+# Called with a phase, the fraction of it that is done, and one line of text.
+ProgressCallback = Callable[[str, float, str], None]
 
 
 @dataclass(frozen=True)
@@ -157,8 +156,8 @@ def fit(
     overwrite : bool
         Replace a fit of another configuration.
     progress : callable, optional
-        Called with the fraction of the budget that is spent, in [0, 1], and one line of text. It is 0 while
-        the data are read, and 1 during calibration, evaluation and export.
+        Called with the phase (``reading``, ``preparing``, ``training``, ``calibrating``, ``predicting``,
+        ``writing``), the fraction of it that is done, in [0, 1], and one line of text.
     observe : callable, optional
         Called after each validation with its record, the trainer, and the queries of the validation.
 
@@ -217,7 +216,7 @@ def fit_jointly(
     overwrite : bool
         Replace fits of another configuration.
     progress : callable, optional
-        Called with the fraction of the budget that is spent, in [0, 1], and one line of text.
+        As of :func:`fit`.
 
     Returns
     -------
@@ -279,7 +278,7 @@ def _fit(
         finished = all((folder / DESCRIPTION_NAME).exists() for folder in folders)
         finished = finished and (not shared or (home / DECODER_NAME).exists())
         resumed = finished or _train(
-            config, members, home, device, progress or (lambda fraction, note: None), observe
+            config, members, home, device, progress or (lambda phase, fraction, note: None), observe
         )
         (home / CHECKPOINT_NAME).unlink(missing_ok=True)
         total = time.perf_counter() - begin
@@ -303,8 +302,9 @@ def _train(
     partitions: list[Partition] = []
     subsets: list[tuple[str, ShardQueries]] = []
     for member in members:
-        progress(0.0, f"reading {member.data.folder}")
+        progress("reading", 0.0, str(member.data.folder))
         part = load_training(member.data, own.held_out, own.seed, own.data.memory)
+        progress("preparing", 0.0, str(member.data.folder))
         network = trainers[0].model if trainers else None
         trainers.append(prepare_trainer(own, member.data, part, device, network))
         partitions.append(part)
@@ -335,10 +335,10 @@ def _train(
             append_history(member.folder, records[-1])
             if observe is not None:
                 observe(records[-1], trainer, subset)
-        progress(loop.fraction, describe_validations(records))
+        progress("training", loop.fraction, describe_validations(records))
         return all(reached(config, [record]) for record in records)
 
-    progress(loop.fraction, "training")
+    progress("training", loop.fraction, "")
     # A fit that was killed after it had reached its error is exported as it is.
     if not all(reached(config, read_history(member.folder)) for member in members):
         _spend_budget(loop, report, checkpoint)
@@ -352,7 +352,7 @@ def _train(
         partitions,
         [name for name, _ in subsets],
         home,
-        partial(progress, 1.0),
+        progress,
     )
     return resumed
 

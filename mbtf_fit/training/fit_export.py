@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -22,9 +21,6 @@ from mbtf_fit.material.transmittance import evaluate_transmittance, fit_transmit
 from mbtf_fit.training.loop import TrainingLoop
 from mbtf_fit.training.trainer import Trainer, TrainingProgress
 
-# Interval at which a stage says how far it is.
-_REPORT_SECONDS = 2.0
-
 
 @dataclass(frozen=True)
 class Member:
@@ -43,10 +39,11 @@ def export_fits(
     partitions: Sequence[Partition],
     validated: Sequence[str],
     home: Path,
-    announce: Callable[[str], None],
+    announce: Callable[[str, float, str], None],
 ) -> None:
     """Write the materials, and the network that they share; `trained`: progress at the end of training, of
-    which the loop may have kept an earlier state."""
+    which the loop may have kept an earlier state; `announce` receives each phase, the fraction of it that is
+    done, and the material."""
     steps, seconds, kept = trained.step, round(trained.seconds, 3), loop.progress.step
     summary: dict[str, Any] = {"materials": list(loop.names), "steps": steps, "seconds": seconds}
     summary["kept_step"] = kept
@@ -71,23 +68,21 @@ def export_fit(
     config: FitConfig,
     member: Member,
     partition: Partition,
-    announce: Callable[[str], None],
+    announce: Callable[[str, float, str], None],
     *,
     validated: str,
     share: dict[str, Any],
 ) -> None:
-    """Write the material of a finished training, with its errors; `announce` receives each stage,
+    """Write the material of a finished training, with its errors; `announce` as of :func:`export_fits`,
     `validated`: name of the set of the validations, `share`: what the summary says of the material's part in
     the training."""
     data = member.data
-    of = f" {member.folder.name}"
+    name = member.folder.name
     trainer.fill_levels(float(level_of_sigma(partition.sample.sigma.max())))
-    if trainer.calibrates:
-        announce(f"calibrating{of}")
-    tell = _now_and_then(lambda fraction: announce(f"calibrating{of}: {fraction:.0%}"))
-    trainer.calibrate(share["steps"], tell)
-    announce(f"evaluating the errors of{of}")
-    errors = evaluate_splits(trainer.predict, data, partition)
+    trainer.calibrate(share["steps"], lambda fraction: announce("calibrating", fraction, name))
+    errors = evaluate_splits(
+        trainer.predict, data, partition, lambda fraction: announce("predicting", fraction, name)
+    )
     variance = errors["training"]["variance"]["value"]
     sample = partition.sample
     noise = pooled_variance(sample.value_a, sample.value_b).value if data.estimates == 2 else None
@@ -112,7 +107,7 @@ def export_fit(
         found = evaluate_transmittance(transmittance, data, partition.selection)
         training["transmittance"] = {split: e.as_dict() for split, e in found.items()}
     described = member.identity["data"]
-    announce(f"writing{of}")
+    announce("writing", 0.0, name)
     export(
         trainer.model,
         config,
@@ -121,16 +116,4 @@ def export_fit(
         training=training | share,
         transmittance=transmittance,
     )
-
-
-def _now_and_then(tell: Callable[[float], None]) -> Callable[[float], None]:
-    """The same, but at most once in some seconds."""
-    last = time.monotonic()
-
-    def sparse(fraction: float) -> None:
-        nonlocal last
-        if time.monotonic() - last > _REPORT_SECONDS:
-            last = time.monotonic()
-            tell(fraction)
-
-    return sparse
+    announce("writing", 1.0, name)

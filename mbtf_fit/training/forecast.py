@@ -27,13 +27,19 @@ from mbtf_fit.training.validation import validation_set, validation_subset
 # Seconds of the pilot, and of each of its pieces, whose rates give the error.
 _PILOT_SECONDS, _PIECE_SECONDS = 5.0, 1.0
 _ENDLESS = 1e9
-# Seconds of a fit besides training (loading, calibration, evaluation), and of each query of its data.
-_FIT_SECONDS, _QUERY_SECONDS = 4.0, 1.1e-6
+# Seconds of a fit before its training and after it, and those of each query of its data: of the default model
+# at 64 and 128 texels, on two cores.
+_BEFORE, _AFTER = (3.0, 0.6e-6), (2.0, 0.1e-6)
 
 
-def evaluation_seconds(queries: float) -> float:
-    """Seconds of a fit besides training, for so many queries of data."""
-    return _FIT_SECONDS + _QUERY_SECONDS * queries
+def preparing_seconds(queries: float) -> float:
+    """Expected seconds of a fit before training, for so many queries of data: start, reading, hints."""
+    return _BEFORE[0] + _BEFORE[1] * queries
+
+
+def closing_seconds(queries: float) -> float:
+    """Expected seconds of a fit after training: energy calibration, errors, writing."""
+    return _AFTER[0] + _AFTER[1] * queries
 
 
 def fit_bytes(config: FitConfig, lattice: Lattice) -> int:
@@ -47,12 +53,13 @@ def fit_bytes(config: FitConfig, lattice: Lattice) -> int:
 
 @dataclass(frozen=True)
 class FitForecast:
-    """Expected cost of a fit: seconds of training and their standard error, seconds of loading, training
-    steps and queries per second, bytes of the material's numbers, and the error."""
+    """Expected cost of a fit: seconds of training and their standard error, of loading before and of closing
+    after it, training steps and queries per second, bytes of the material's numbers, and the error."""
 
     seconds: float
     seconds_se: float
     loading: float
+    closing: float
     steps: int
     queries_per_second: float
     bytes: int
@@ -66,10 +73,12 @@ class FitForecast:
     def describe(self) -> str:
         """Lines."""
         error = f" ± {clock(self.seconds_se)}" if self.seconds_se >= 0.5 else ""
+        closing = f"about {self.closing:.0f} s of calibration and errors after"
+        beside = f"{self.loading:.0f} s of reading before, {closing}"
         return (
             f"forecast: {clock(self.seconds)}{error} of training, {self.steps} steps at "
-            f"{self.queries_per_second / 1e6:.2f} M queries/s, after {self.loading:.0f} s of loading; "
-            f"{self.bytes / 1e6:.2f} MB\n{self.error.describe()}"
+            f"{self.queries_per_second / 1e6:.2f} M queries/s; {beside}; {self.bytes / 1e6:.2f} MB\n"
+            f"{self.error.describe()}"
         )
 
 
@@ -97,10 +106,10 @@ def forecast_fit(config: FitConfig, shards: str | Path | DataFolder) -> FitForec
     data = open_data(shards, MODELS[config.model].layout, config.model, config.data.cache)
     keep_freed_memory()
     partition = load_training(data, config.held_out, config.seed, config.data.memory)
-    loading = time.perf_counter() - began
     pilot = {"training": config.training.model_copy(update={"time": TimeBudget(_ENDLESS), "steps": None})}
     device = choose_device(config.device)
     trainer = prepare_trainer(config.model_copy(update=pilot), data, partition, device)
+    loading = time.perf_counter() - began
     loop = TrainingLoop([trainer])
     start = snapshot(loop)
     # In the middle of the annealing, whose steps take as long as the average.
@@ -124,6 +133,7 @@ def forecast_fit(config: FitConfig, shards: str | Path | DataFolder) -> FitForec
         seconds=total.value,
         seconds_se=total.error,
         loading=loading,
+        closing=closing_seconds(len(partition.training)),
         steps=steps,
         queries_per_second=trainer.batch / step.value,
         bytes=sum(tensor.nbytes for tensor in trainer.model.weights().values()),

@@ -89,6 +89,8 @@ class TrainingLoop:
     def __init__(self, trainers: Sequence[Trainer], names: Sequence[str] = ("",)) -> None:
         self.trainers, self.names = trainers, names
         self.best: BestState | None = None
+        # Step of the last validation, and its predictions.
+        self._validated: tuple[int, Sequence[NDArray[np.float32]]] = (-1, [])
         decay = shared_decay([trainer.weight_decay.weights for trainer in trainers])
         for trainer in trainers:
             trainer.weight_decay = replace(trainer.weight_decay, weights=decay)
@@ -116,6 +118,7 @@ class TrainingLoop:
     def validate(self, predictions: Sequence[NDArray[np.float32]], subsets: Sequence[ShardQueries]) -> None:
         """Remember the current state if it is a candidate and none before had smaller errors; `predictions`:
         of `subsets`, the validation queries of each material."""
+        self._validated = self.progress.step, predictions
         if not is_candidate(self.progress.step):
             return
         if self.best is None or excess_error(predictions, self.best.predictions, subsets).value <= 0:
@@ -125,7 +128,9 @@ class TrainingLoop:
         """Return to the best state, if its errors are significantly smaller than the current ones."""
         if self.best is None or self.best.progress.step == self.progress.step:
             return
-        predictions = [t.predict(queries) for t, queries in zip(self.trainers, subsets, strict=True)]
+        step, predictions = self._validated
+        if step != self.progress.step:
+            predictions = [t.predict(queries) for t, queries in zip(self.trainers, subsets, strict=True)]
         if overfits(predictions, self.best.predictions, subsets):
             load_weights(self, self.best.tensors, self.best.progress)
 
@@ -229,7 +234,6 @@ def load_weights(loop: TrainingLoop, tensors: dict[str, Tensor], progress: Train
 
 def restore(loop: TrainingLoop, tensors: dict[str, Tensor], progress: TrainingProgress) -> None:
     """Set the loop's state to that of a snapshot or a checkpoint, and its progress."""
-    load_weights(loop, tensors, progress)
     for k, trainer in enumerate(loop.trainers):
         for name, p in _own_parameters(loop, k).items():
             trainer.optimizer.state[p] = {
@@ -237,7 +241,7 @@ def restore(loop: TrainingLoop, tensors: dict[str, Tensor], progress: TrainingPr
                 for key in _MOMENTS
                 if (stored := f"{k}.adam.{key}.{name}") in tensors
             }
-    loop.link()
+    load_weights(loop, tensors, progress)
 
 
 def write_checkpoint(loop: TrainingLoop, path: Path) -> None:

@@ -17,7 +17,7 @@ from torch import Tensor
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.errors import InputError
 from mbtf_fit.backends.cpu.model import supports
-from mbtf_fit.backends.cpu.stepper import NativeStepper
+from mbtf_fit.backends.cpu.stepper import Adam, NativeStepper
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.images import TrainingImages
 from mbtf_fit.data.loader import Partition, load_training, open_data
@@ -139,14 +139,17 @@ class Trainer:
         self.progress = TrainingProgress()
         self.batch = min(config.training.batch, len(queries))
         texels, weights = self.hooks.trained()
-        self.optimizer = torch.optim.Adam([{"params": texels}, {"params": weights}], betas=BETAS, fused=True)
         self.noise = noise
         self.loss = Objective(config.training, noise)
         self.weight_decay = WeightDecay.of(config.training, noise.ratio, len(queries))
-        found = kernel()
-        self._stepper = (
-            NativeStepper(found, model, self.optimizer) if found is not None and supports(model) else None
-        )
+        found, groups = kernel(), [texels, weights]
+        self.optimizer: Adam | torch.optim.Adam
+        self._stepper: NativeStepper | None = None
+        if found is not None and supports(model):
+            self.optimizer = Adam(groups, BETAS)
+            self._stepper = NativeStepper(found, model, self.optimizer)
+        else:
+            self.optimizer = torch.optim.Adam([{"params": g} for g in groups], betas=BETAS, fused=True)
 
     @property
     def backend(self) -> str:
@@ -231,6 +234,7 @@ class Trainer:
             # Gradients of convolutions have the channels last in memory, which PyTorch's fused Adam does not
             # support on CPUs: it would mix up the weights.
             p.grad = g.contiguous()
+        assert isinstance(self.optimizer, torch.optim.Adam)
         self.optimizer.step()
         return loss
 
@@ -254,8 +258,8 @@ class Trainer:
 
     def calibrate(self, steps: int, progress: Callable[[float], None] = lambda fraction: None) -> None:
         """Fit the calibration factors (:mod:`~mbtf_fit.training.calibration`), if it :attr:`calibrates`; with
-        at most half as many evaluations as training took, whose `steps` for this material take about three
-        each. `progress` is called with the fraction that is done."""
+        at most a quarter as many evaluations as the queries of its `steps`: with the hints of `relief`, an
+        evaluation takes as long as two of these. `progress` is called with the fraction that is done."""
         model = self.model
         if not self.calibrates:
             return
@@ -268,7 +272,7 @@ class Trainer:
             self.queries,
             self.config.held_out,
             self.loss.bound,
-            steps * self.batch // 2,
+            steps * self.batch // 4,
             progress,
         )
         model.calibrate(torch.from_numpy(found).to(self.device))

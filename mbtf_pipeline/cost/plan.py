@@ -11,9 +11,8 @@ from mbtf_gen.forecast import forecast
 from mbtf_gen.job import Job
 from mbtf_pipeline.cost.answers import FARTHEST
 from mbtf_pipeline.cost.measurement import MeasurementFolder
-from mbtf_pipeline.cost.runs import LEAST_SECONDS, disk_bytes, planned_runs
+from mbtf_pipeline.cost.runs import LEAST_SECONDS, Run, disk_bytes, planned_runs
 from mbtf_pipeline.cost.study import (
-    OVERHEAD,
     STUDY,
     Measurements,
     conditions_of,
@@ -38,7 +37,7 @@ class StudyPlan:
     runs : labels of the runs that its time suffices for and that are not measured yet
     measured : runs that are
     seconds, bytes : that it takes, and on disk
-    longest : total seconds of the longest run
+    longest : total seconds of the longest run, measured or not
     least : seconds of a study that forecasts
     generator : whether it compares configurations of the generator
     """
@@ -73,8 +72,8 @@ class StudyPlan:
 
 
 def plan_study(recipe: Recipe, folder: Path, *, seconds: float, seed: int | None = None) -> StudyPlan:
-    """What :func:`~mbtf_pipeline.cost.study.run_study` would measure, by a pilot of the generator on this
-    machine; nothing is written.
+    """What :func:`~mbtf_pipeline.cost.study.run_study` would measure, by the rate of the generator that
+    the folder has, or that of a pilot on this machine; nothing is written.
 
     Raises
     ------
@@ -86,18 +85,19 @@ def plan_study(recipe: Recipe, folder: Path, *, seconds: float, seed: int | None
     spp, pilot = job.config.queries.spp, forecast(job, seconds=1.0)
     conditions = conditions_of(job, folder, seconds)
     found = Measurements(conditions, MeasurementFolder(folder, conditions), Runner())
-    found.path_seconds = pilot.query_seconds / spp
+    if not found.recall_rate(spp):
+        found.path_seconds = pilot.query_seconds / spp
     before = 2.0 * pilot.start + _SETUP_PATHS * found.path_seconds + generator_seconds(seconds)
     planned = planned_runs(seconds, spp, found.path_seconds)
     least = found.least_seconds(spp, before) or LEAST_SECONDS
-    spent, runs, measured = before, [], 0
+    measured = [run for run in planned if found.recall(run)]
+    spent, runs = before, list[Run]()
     for run in planned:
-        if found.recall(run):
-            measured += 1
-        elif spent + (expected := found.expected_seconds(run)) <= seconds:
+        if run not in measured and spent + (expected := found.expected_seconds(run)) <= seconds:
             spent, found.tested = spent + expected, True
             runs.append(run)
-    longest = max((run.planned_seconds(found.path_seconds) for run in runs), default=0.0) + OVERHEAD
+    planned_seconds = (run.planned_seconds(found.path_seconds) for run in (*measured, *runs))
+    longest = max(planned_seconds, default=0.0) + found.overhead
     labels = [f"{run.label}: {run.queries:,} queries × {spp} paths" for run in runs]
     generator = seconds >= _COMPARISONS * LEAST_SECONDS
-    return StudyPlan(labels, measured, spent, disk_bytes(runs), longest, least, generator)
+    return StudyPlan(labels, len(measured), spent, disk_bytes(runs), longest, least, generator)

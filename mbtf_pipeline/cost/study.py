@@ -151,16 +151,45 @@ class Measurements:
     path_seconds: float = 0.0
     # Taken, but not measured yet.
     _pending: dict[str, Configuration] = field(default_factory=dict)
-    # Whether a run has made the test set, and most seconds of a run besides it, generating and training.
+    # Whether a run has made the test set.
     tested: bool = False
-    _overhead: float = OVERHEAD
+    # Seconds of measured runs besides the test set, generating and training.
+    _besides: list[float] = field(default_factory=list)
+
+    @property
+    def overhead(self) -> float:
+        """Seconds that a run takes besides the test set, generating and training, at most."""
+        return max(self._besides, default=OVERHEAD)
+
+    @cached_property
+    def configurations(self) -> list[Configuration]:
+        """Those of the generator, the most important first."""
+        return list(generator_configurations(benchmark_of(self.conditions)))
+
+    def of_generator(self) -> list[Measurement]:
+        """Measurements of the generator's configurations."""
+        return [self.found[c.label] for c in self.configurations if c.label in self.found or self.recall(c)]
+
+    def recall_rate(self, spp: int) -> bool:
+        """Set `path_seconds` by what is measured of the generator with about so many paths; whether any
+        is."""
+        found = self.of_generator()
+        if found:
+            self.path_seconds = path_seconds(found, spp)
+        return bool(found)
 
     def recall(self, configuration: Configuration) -> bool:
         """Whether a measurement is stored; it then counts as found."""
         stored = self.store.get(configuration)
         if stored is not None:
-            self.found[configuration.label] = stored
+            self._add(configuration, stored)
         return stored is not None
+
+    def _add(self, configuration: Configuration, measurement: Measurement) -> None:
+        if isinstance(configuration, Run) and configuration.label not in self.found:
+            planned = configuration.planned_seconds(self.path_seconds)
+            self._besides.append(measurement.details["run_seconds"] - planned)
+        self.found[configuration.label] = measurement
 
     def measure(self, wanted: Iterable[Configuration], *, independent: bool) -> None:
         """Measure configurations; each is taken once a worker is nearly free.
@@ -194,18 +223,15 @@ class Measurements:
                 # The other runs are worth a page all the same.
                 self.failed[done.name] = done.error
                 continue
-            self.found[done.name] = done.value
+            self._add(configuration, done.value)
             self.note(f"{done.name}: done")
             self.store.put(configuration, done.value)
-            if isinstance(configuration, Run):
-                self.tested = True
-                planned = configuration.planned_seconds(self.path_seconds)
-                self._overhead = max(self._overhead, done.value.details["run_seconds"] - planned)
+            self.tested = self.tested or isinstance(configuration, Run)
 
     def expected_seconds(self, run: Run) -> float:
         """Expected seconds of measuring a run, the first one with the test set."""
         test = 0.0 if self.tested else TEST[0] * TEST[1] * self.path_seconds
-        return run.planned_seconds(self.path_seconds) + test + self._overhead
+        return run.planned_seconds(self.path_seconds) + test + self.overhead
 
     def least_seconds(self, spp: int, before: float) -> float | None:
         """Seconds of a study that measures runs of enough lengths for a forecast, by what runs have taken on
@@ -213,7 +239,7 @@ class Measurements:
         needed = planned_runs(LEAST_SECONDS, spp, self.path_seconds)[:FEWEST_TOTALS]
         missing = [run for run in needed if not self.recall(run)]
         test = sum(self.expected_seconds(run) for run in missing[:1])
-        rest = sum(run.planned_seconds(self.path_seconds) + self._overhead for run in missing[1:])
+        rest = sum(run.planned_seconds(self.path_seconds) + self.overhead for run in missing[1:])
         return max(LEAST_SECONDS, before + test + rest) if missing else None
 
     def fits(self, run: Run, seconds: float) -> bool:
@@ -326,10 +352,9 @@ def run_study(
             raise PartialError(f"no worker answers: {there.error}", hint=there.hint or _RESUMES)
         claim(folder, there.value)
         conditions = conditions_of(job, folder, seconds)
-        benchmark = benchmark_of(conditions)
         note("reference")
         # Before anything is written: a refused study leaves the folder as it was.
-        benchmark.check_variation()
+        benchmark_of(conditions).check_variation()
         description = {
             "name": recipe.name,
             "command": command,
@@ -342,7 +367,7 @@ def run_study(
         STUDY.write(folder, description)
         write_document(folder / CONFIG_NAME, dump_yaml(config.model_dump(mode="json")))
         measurements = Measurements(conditions, MeasurementFolder(folder, conditions), runner, note)
-        configurations = list(generator_configurations(benchmark))
+        configurations = measurements.configurations
         # Configurations take longer than their share where kernels are compiled; workers start anew.
         until = 1.2 * generator_seconds(seconds) + (0.0 if runner.here else spent())
 
@@ -353,8 +378,7 @@ def run_study(
 
         try:
             measurements.measure(missing(), independent=False)
-            measured = [m for c in configurations if (m := measurements.found.get(c.label))]
-            measurements.path_seconds = path_seconds(measured, config.queries.spp)
+            measurements.recall_rate(config.queries.spp)
             runs = planned_runs(seconds, config.queries.spp, measurements.path_seconds)
             size = disk_bytes(runs) * runner.workers
             check_space(folder, size, "give a shorter --time, or choose another folder with -o")
@@ -380,7 +404,7 @@ def run_study(
     return Study(
         folder,
         description,
-        measured + [combined(group, deviation) for group in groups if group],
+        measurements.of_generator() + [combined(group, deviation) for group in groups if group],
         deviation,
         [c.label for c in (*configurations, *first) if c.label not in known and c.label not in failed],
         [f"{label}: {why}" for label, why in failed.items()],

@@ -1,12 +1,14 @@
-"""One step of training by the kernel, with the blur of its textures. Adam works on the state of PyTorch's own
-optimizer, so that both are interchangeable. The blur is that of
+"""One step of training by the kernel, with the blur of its textures. Adam's state is laid out as that of
+PyTorch's own optimizer, so that both are interchangeable. The blur is that of
 :func:`mbtf_fit.pytorch.textures.blur_texture`."""
 
 from __future__ import annotations
 
 import ctypes
 import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -87,10 +89,27 @@ def _taps(sigma: float, size: int) -> NDArray[np.float32]:
     return np.ascontiguousarray(gaussian_taps(sigma, size).numpy(), np.float32)
 
 
+class Adam:
+    """Groups of parameters with their options, and the moments of each parameter, as ``torch.optim.Adam`` has
+    them. Making that one would import PyTorch's compiler, which takes a second.
+
+    Parameters
+    ----------
+    groups : parameters of each group
+    betas : decay rates of the moments
+    """
+
+    def __init__(self, groups: Sequence[Sequence[Tensor]], betas: tuple[float, float]) -> None:
+        self.param_groups: list[dict[str, Any]] = [
+            {"params": list(params), "lr": 0.0, "betas": betas, "eps": 1e-8} for params in groups
+        ]
+        self.state: defaultdict[Tensor, dict[str, Tensor]] = defaultdict(dict)
+
+
 class NativeStepper:
     """Training steps of a material that the kernel supports."""
 
-    def __init__(self, kernel: Kernel, model: NeuralMaterial, optimizer: torch.optim.Adam) -> None:
+    def __init__(self, kernel: Kernel, model: NeuralMaterial, optimizer: Adam) -> None:
         self.kernel = kernel
         self.optimizer = optimizer
         self._native = NativeModel(kernel, model)
@@ -127,10 +146,13 @@ class NativeStepper:
 
 
 def adam(
-    kernel: Kernel, optimizer: torch.optim.Adam, gradients: Mapping[Tensor, Tensor], workers: Workers
+    kernel: Kernel,
+    optimizer: Adam | torch.optim.Adam,
+    gradients: Mapping[Tensor, Tensor],
+    workers: Workers,
 ) -> None:
     """One step for the parameters that have a gradient (contiguous float32, same shape), as
-    ``optimizer.step()`` takes it, on the same state: without weight decay, with the groups' rates and
+    ``torch.optim.Adam.step()`` takes it, on the same state: without weight decay, with the groups' rates and
     decays."""
     tasks: list[tuple[AdamStep, Tensor, Tensor, Tensor, Tensor]] = []
     for group in optimizer.param_groups:

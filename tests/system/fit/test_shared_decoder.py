@@ -11,7 +11,7 @@ from support.command_lines import call, fails
 from support.datasets import edit
 from support.fit_data import constant, parallax, write_data
 
-from mbtf_fit import Material
+from mbtf_fit import FitResult, Material
 from mbtf_fit.material.decoder import Decoder, network_tensors
 
 QUICK = ("--steps", "6", "--batch", "300", "--device", "cpu")
@@ -55,7 +55,9 @@ def test_a_fit_takes_model_and_network_from_the_folder(materials: Path, data: Pa
     assert all((own[name] == wanted[name]).all() for name in wanted)
 
 
-def test_the_same_command_keeps_a_finished_fit(data: Path, tmp_path: Path) -> None:
+def test_the_same_command_keeps_a_finished_fit(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     words = ["--many", str(data), "--shared-decoder", "-o", str(tmp_path / "m"), *QUICK]
     first = call(["mbtf-fit", *words, "--json"])
     assert first.code == 0, first.err
@@ -65,6 +67,12 @@ def test_the_same_command_keeps_a_finished_fit(data: Path, tmp_path: Path) -> No
     again = json.loads(call(["mbtf-fit", *words, "--json"]).out)
     assert again["decoder"] == found["decoder"]
     assert [fit["result"]["resumed"] for fit in again["fits"]] == [True] * 3
+    # As a single fit, each material says if it returned to an earlier state.
+    monkeypatch.setattr(FitResult, "kept_step", 6)
+    said = call(["mbtf-fit", *words]).out
+    assert re.findall(r"^(\w): validation error rose from .* kept the state after 6 steps$", said, re.M) == [
+        *"abc"
+    ]
     other = fails(3, *words, "--seed", "1")
     assert "holds a fit of another configuration: seed" in other
 

@@ -209,6 +209,30 @@ def test_the_time_left_counts_neither_set_up_nor_earlier_runs(
     ]
 
 
+def test_each_part_of_a_job_has_its_own_count(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its first line comes at once, and its time left counts from its own start."""
+    now = 0.0
+    monkeypatch.setattr("mbtf_core.app.progress.time.monotonic", lambda: now)
+    with CONSOLE.progress(100, "training", "%") as bar:
+        for now in (1.0, 2.0):
+            bar.update(50 * now, "loss 1")
+        now = 3.0
+        bar.update(20, "m", label="calibrating")
+        now = 12.0
+        bar.update(50, label="calibrating")
+        now = 13.0
+        bar.update(80, label="calibrating")
+        bar.update(10, label="predicting")
+    assert capsys.readouterr().err.splitlines() == [
+        "training: 100%, 0:02 elapsed, loss 1",
+        "calibrating: 20%, 0:03 elapsed, m",
+        "calibrating: 80%, 0:13 elapsed, 0:03 left, m",
+        "predicting: 10%, 0:13 elapsed, m",
+    ]
+
+
 def test_plain_progress_has_a_line_at_intervals(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

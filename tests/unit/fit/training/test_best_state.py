@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -77,8 +78,17 @@ def test_a_fit_that_overfits_returns_to_its_best_state(
     shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, weights_at: dict[int, Any]
 ) -> None:
     """Also one that is killed after its best step, whose checkpoint has both states."""
+    predicted, predict = Counter[int](), Trainer.predict
+
+    def counted(trainer: Trainer, queries: ShardQueries) -> NDArray[np.float32]:
+        predicted[trainer.progress.step] += 1
+        return predict(trainer, queries)
+
+    monkeypatch.setattr(Trainer, "predict", counted)
     found = fit(config(), shards, tmp_path / "whole")
     check_kept(found, weights_at[BEST])
+    # Its last validation also decides which state is kept.
+    assert predicted[STEPS] == 1
     assert not torch.equal(weights_at[BEST]["decoder.0.weight"], weights_at[STEPS]["decoder.0.weight"])
     line = str(describe_kept(found.history, found.kept_step))
     assert line.startswith("validation error rose from ")

@@ -109,14 +109,22 @@ def test_fits_are_calibrated_by_default(tmp_path: Path) -> None:
     q["omega_i"][:, 2] = 0.8
     q["omega_i"][:, :2] *= 0.6 / np.linalg.norm(q["omega_i"][:, :2], axis=1, keepdims=True)
     wanted = 0.2 + 0.6 * 0.8**4
-    off = {}
+    off, phases = {}, dict[str, list[float]]()
     for calibrate in (True, False):
         training = {"steps": 40, "batch": 2000, "energy_calibration": calibrate}
         result = fit(
             FitConfig.model_validate({"model": "neumip", "training": training}),
             folder,
             tmp_path / str(calibrate),
+            progress=lambda phase, share, note: phases.setdefault(phase, []).append(share),
         )
+        # Each phase has its own count.
+        closing = ["calibrating", "predicting", "writing"] if calibrate else ["predicting", "writing"]
+        assert [*phases] == ["reading", "preparing", "training", *closing]
+        assert all(shares == sorted(shares) and shares[0] == 0.0 for shares in phases.values())
+        assert len(phases["predicting"]) == 4
+        assert phases["training"][-1] == phases["writing"][-1] == 1.0
+        phases.clear()
         model = result.material.model
         assert (model.calibration is not None) == calibrate
         assert (

@@ -306,7 +306,7 @@ def test_a_calibration_takes_a_share_of_the_steps_of_its_material(
 
     monkeypatch.setattr(mbtf_fit.training.trainer, "fit_calibration", recorded)
     fit_two(joint_config(steps=9), data, tmp_path)
-    assert granted == [5 * 512 // 2, 4 * 512 // 2]
+    assert granted == [5 * 512 // 4, 4 * 512 // 4]
 
 
 def test_a_lost_material_is_fitted_again(data: dict[str, Path], tmp_path: Path) -> None:

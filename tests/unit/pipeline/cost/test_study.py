@@ -132,7 +132,7 @@ def test_workers_begin_what_fits_into_the_time_of_all(measured: list[tuple[str, 
     found = Measurements(conditions(), MemoryStore(), Workers())  # type: ignore[arg-type]
     found.path_seconds = 1e-9
     test = 1e-9 * TEST[0] * TEST[1]
-    # Two workers for 24 s; a run takes 9 or 5 s of training and 12 s besides.
+    # Two workers for 24 s; a run takes 9 or 5 s of training and, until one is measured, 12 s besides.
     runs = [run(3000, "long", 9.0), run(2000, "one"), run(2000, "two")]
     assert found.expected_seconds(runs[0]) == pytest.approx(21.0 + test, abs=1e-4)
     planned = [replace(run, seed=seed) for run in runs for seed in range(2)]
@@ -140,6 +140,10 @@ def test_workers_begin_what_fits_into_the_time_of_all(measured: list[tuple[str, 
     assert sorted(measured) == [("long", 0), ("long", 1)]
     # The test set is there, and the runs took 15 s beyond their plan.
     assert found.expected_seconds(runs[1]) == pytest.approx(5.0 + 15.0, abs=1e-4)
+    # Less than was expected counts as well.
+    quick = Measurements(conditions(), MemoryStore(), Runner(), path_seconds=1e-9)  # type: ignore[arg-type]
+    quick.measure_runs([run(2000, "slow", 21.0)], lambda run: True)
+    assert quick.expected_seconds(runs[1]) == pytest.approx(5.0 + 3.0, abs=1e-4)
 
 
 def test_a_full_disk_ends_the_study(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -238,8 +242,16 @@ def test_a_dry_run_plans_what_a_study_measures(
     assert main(app, [*command, "--time", "5h", "--json"]) == 0
     plan = json.loads(capsys.readouterr().out)
     assert (plan["measured"], len(plan["runs"])) == (3, 3)
-    assert plan["longest"] == pytest.approx(7212.0, abs=1.0)
+    # The runs that are measured took 1 s more than planned.
+    assert plan["longest"] == pytest.approx(7201.0, abs=1.0)
     assert plan["seconds"] > 2 * 7200.0 + 40.0
+    # Nothing fits; the longest run is a measured one, and the rate that of the study, not of the pilot.
+    pilot.query_seconds = 1.0
+    assert main(app, [*command, "--time", "30s", "--json"]) == 0
+    plan = json.loads(capsys.readouterr().out)
+    assert (plan["measured"], plan["runs"]) == (3, [])
+    assert plan["longest"] == pytest.approx(61.0, abs=0.1)
+    assert plan["seconds"] < 30.0
 
 
 def test_runs_that_do_not_fit_on_the_disk_are_refused(
