@@ -208,7 +208,11 @@ class TrainingSection(Settings):
         description="weight decay (L2) of the networks per step, times the learning rate and r min(1, 2r) "
         "over the number of queries (r: noise-to-signal ratio), at most 1",
     )
-    warmup: int = Field(100, ge=0, description="steps in which the learning rates rise to their peaks")
+    warmup: int = Field(
+        100,
+        ge=0,
+        description="steps in which the learning rates rise to their peaks; at most a fifth of the training",
+    )
     materials: tuple[str, ...] = Field(
         (),
         description="rainer2020: folders of other materials' slices that the network also learns",

@@ -326,12 +326,13 @@ def _train(
         predictions = [
             trainer.predict(queries) for trainer, queries in zip(trainers, validation, strict=True)
         ]
+        before: Sequence[Any] = loop.validated[1] or [None] * len(trainers)
         if all(map(len, validation)):
             loop.validate(predictions, validation)
-        for member, trainer, subset, predicted in zip(
-            members, trainers, validation, predictions, strict=True
+        for member, trainer, subset, predicted, previous in zip(
+            members, trainers, validation, predictions, before, strict=True
         ):
-            records.append(history_record(trainer, subset, predicted))
+            records.append(history_record(trainer, subset, predicted, previous))
             append_history(member.folder, records[-1])
             if observe is not None:
                 observe(records[-1], trainer, subset)

@@ -84,13 +84,13 @@ class TrainingLoop:
     ----------
     progress : steps done, of all materials together
     best : state of the smallest validation error so far
+    validated : step of the last validation, and its predictions
     """
 
     def __init__(self, trainers: Sequence[Trainer], names: Sequence[str] = ("",)) -> None:
         self.trainers, self.names = trainers, names
         self.best: BestState | None = None
-        # Step of the last validation, and its predictions.
-        self._validated: tuple[int, Sequence[NDArray[np.float32]]] = (-1, [])
+        self.validated: tuple[int, Sequence[NDArray[np.float32]]] = (-1, [])
         decay = shared_decay([trainer.weight_decay.weights for trainer in trainers])
         for trainer in trainers:
             trainer.weight_decay = replace(trainer.weight_decay, weights=decay)
@@ -118,7 +118,7 @@ class TrainingLoop:
     def validate(self, predictions: Sequence[NDArray[np.float32]], subsets: Sequence[ShardQueries]) -> None:
         """Remember the current state if it is a candidate and none before had smaller errors; `predictions`:
         of `subsets`, the validation queries of each material."""
-        self._validated = self.progress.step, predictions
+        self.validated = self.progress.step, predictions
         if not is_candidate(self.progress.step):
             return
         if self.best is None or excess_error(predictions, self.best.predictions, subsets).value <= 0:
@@ -128,7 +128,7 @@ class TrainingLoop:
         """Return to the best state, if its errors are significantly smaller than the current ones."""
         if self.best is None or self.best.progress.step == self.progress.step:
             return
-        step, predictions = self._validated
+        step, predictions = self.validated
         if step != self.progress.step:
             predictions = [t.predict(queries) for t, queries in zip(self.trainers, subsets, strict=True)]
         if overfits(predictions, self.best.predictions, subsets):

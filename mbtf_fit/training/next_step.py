@@ -15,8 +15,10 @@ from mbtf_core.data.schema import CONFIG_NAME
 from mbtf_core.units import format_duration
 from mbtf_fit.config import FitConfig
 from mbtf_fit.formatting import few_decide, headline
-from mbtf_fit.training.validation import FLAT, MarginalCost
+from mbtf_fit.training.validation import FEWEST_STEPS, FLAT, MarginalCost
 
+# Below so many steps, the error itself says little.
+_UNTRAINED = 100
 # Relative standard error of the test error from which more test queries come first.
 _UNCERTAIN = 0.25
 
@@ -29,10 +31,12 @@ class NextStep:
     ----------
     kind : what to take more of: test queries, training time, training queries; or nothing
     reason : one sentence
+    factor : of the training time or its steps
     """
 
     kind: Literal["test", "time", "queries", "none"]
     reason: str
+    factor: int = 2
 
     def command(self, config: FitConfig, seconds: float, data: Dataset, material: Path) -> str | None:
         """The whole command, which writes to new folders; None where there is nothing to do, or where the
@@ -51,9 +55,9 @@ class NextStep:
             return None
         if self.kind == "time":
             training = config.training
-            more = ["--time", _twice(training.time.seconds, seconds)]
+            more = ["--time", _times_as_long(training.time.seconds, seconds, self.factor)]
             if training.steps is not None:
-                more = ["--steps", str(2 * training.steps)]
+                more = ["--steps", str(self.factor * training.steps)]
             return shlex.join(["mbtf-fit", str(data.folder), *fitted, *more, *out])
         made, shards = data.manifest.get("config") or {}, _numbered(str(data.folder))
         if not {"material", "queries"} <= made.keys():
@@ -85,6 +89,10 @@ def next_step(cost: MarginalCost, errors: Mapping[str, Any]) -> NextStep:
     training: Mapping[str, Any] = errors["training"]["unexplained"] if "training" in errors else {}
     own = training.get("value")
     value, error = split["unexplained"]["value"], split["unexplained"]["error"]
+    untrained = cost.steps < _UNTRAINED and cost.doubling is None
+    if cost.few and (value is None or value >= 1.0 or untrained):
+        factor = 2 ** math.ceil(math.log2(FEWEST_STEPS / cost.steps))
+        return NextStep("time", f"{cost.steps} steps are few: train {factor} times as long", factor)
     if value is None or error is None or error > _UNCERTAIN * abs(value) or few_decide(split):
         reason = "few test queries decide the error; four times as many, by highlights, measure it better"
         if (
@@ -123,10 +131,11 @@ def _numbered(folder: str) -> str:
     return f"{stem}-{int(digit or 1) + 1}"
 
 
-def _twice(planned: float, spent: float) -> str:
-    """Twice a time, which was exceeded where the least number of steps took longer."""
-    seconds = planned if spent <= 1.1 * planned else spent
-    return format_duration(2.0 * seconds if seconds == planned else 10.0 * math.ceil(0.2 * seconds))
+def _times_as_long(planned: float, spent: float, factor: int) -> str:
+    """A multiple of a time, which was exceeded where the least number of steps took longer."""
+    if spent <= 1.1 * planned:
+        return format_duration(factor * planned)
+    return format_duration(10.0 * math.ceil(0.1 * factor * spent))
 
 
 def _times(count: str, factor: int) -> str:

@@ -50,6 +50,8 @@ _SHARED = ("pyramid", "offset_texture", "offset_network")
 _DEPTH_WEIGHTS = "depth_weights"
 # Difference of fractional levels that rounding explains.
 _SAME_LEVEL = 1e-4
+# Largest share of the budget that the warm-up takes.
+_WARMUP_SHARE = 0.2
 # Noise-to-signal ratio above which the decay of texels grows. Below it the decay of weights falls
 # quadratically, so that few but clean queries are fitted without bias.
 _REFERENCE_NOISE = 0.5
@@ -58,8 +60,11 @@ _MOST_DECAY = 1.0
 
 
 def learning_rate_factor(training: TrainingSection, step: int, fraction: float) -> float:
-    """Factor of the learning rates after a fraction of the budget: linear warm-up, then cosine decay."""
-    rise = min(1.0, (step + 1) / (training.warmup + 1))
+    """Factor of the learning rates after a fraction of the budget: linear warm-up, then cosine decay.
+
+    The warm-up takes a fifth of the budget at most: short fits would not reach the full rates otherwise.
+    """
+    rise = min(1.0, max((step + 1) / (training.warmup + 1), fraction / _WARMUP_SHARE))
     last = training.final_learning_rate_factor
     fall = last + (1 - last) * 0.5 * (1 + math.cos(math.pi * min(fraction, 1.0)))
     return rise * fall

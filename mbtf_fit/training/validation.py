@@ -11,7 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.data.dataset import Dataset
-from mbtf_core.stats import by_group, level_groups, unexplained_variance
+from mbtf_core.stats import (
+    Estimate,
+    by_group,
+    level_groups,
+    mse_difference,
+    signal_variance,
+    unexplained_variance,
+)
 from mbtf_fit.data.loader import Partition, load_split
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.training.trainer import Trainer
@@ -53,12 +60,29 @@ def errors_by_level(trainer: Trainer, queries: ShardQueries) -> dict[str, float 
     return {str(s): finite(e.value) for s, e in by_group(unexplained_variance, level, *values).items()}
 
 
-def history_record(trainer: Trainer, subset: ShardQueries, prediction: NDArray[np.float32]) -> dict[str, Any]:
-    """Progress and validation error of the current model; `prediction`: its values (n, 3) of the subset."""
+def history_record(
+    trainer: Trainer,
+    subset: ShardQueries,
+    prediction: NDArray[np.float32],
+    previous: NDArray[np.float32] | None = None,
+) -> dict[str, Any]:
+    """Progress and validation error of the current model.
+
+    Parameters
+    ----------
+    trainer : of the model
+    subset : validation queries
+    prediction : their values (n, 3)
+    previous : those of the record before, None for the first of a run: with them, the record has the standard
+        error of the change since then, compared query by query
+    """
     state = trainer.progress
     found: dict[str, Any] = {}
+    change: Estimate | None = None
     if len(subset):
         found = unexplained_variance(prediction, *subset.halves).as_dict()
+        if previous is not None and (variance := signal_variance(*subset.halves).value) > 0:
+            change = mse_difference(prediction, previous, *subset.halves).scaled(1.0 / variance)
     return {
         "step": state.step,
         "seconds": round(state.seconds, 3),
@@ -66,6 +90,7 @@ def history_record(trainer: Trainer, subset: ShardQueries, prediction: NDArray[n
         "loss": state.loss,
         "unexplained": found.get("value"),
         "unexplained_error": found.get("error"),
+        "change_error": None if change is None else finite(change.error),
         "queries_per_second": round(state.step * trainer.batch / max(state.seconds, 1e-9)),
     }
 
@@ -82,7 +107,7 @@ _EARLY_STEPS, _LAW_SCATTER = 50.0, 0.1
 _LASTING, _LASTING_SCATTER = 0.5, 0.05
 # Below so many steps, twice the steps reduce the error by a tenth or more: in the mean over seven materials
 # to 0.84 of it after 200 steps, to 0.92 after 400.
-_FEWEST_STEPS = 400
+FEWEST_STEPS = 400
 # Expected remainder of the error from which longer training hardly helps.
 FLAT = 0.95
 # Relative standard error of the validation above which it does not tell convergence.
@@ -117,7 +142,7 @@ class MarginalCost:
     @property
     def few(self) -> bool:
         """Whether so few steps ask for more, whatever the curve shows."""
-        return self.steps < _FEWEST_STEPS
+        return self.steps < FEWEST_STEPS
 
 
 def marginal_cost_of(
@@ -150,14 +175,18 @@ def _doubling(history: list[dict[str, Any]]) -> float | None:
         return None
     known = [(r, error) for r in history if (error := _relative_error(r)) is not None]
     middle = [pair for pair in known if _MIDDLE[0] <= pair[0]["fraction"] <= _MIDDLE[1]]
-    few = steps < _FEWEST_STEPS
+    few = steps < FEWEST_STEPS
     if not middle:
         return math.exp(law) if few else None
     half, before = min(middle, key=lambda pair: abs(pair[0]["fraction"] - 0.5))
     doublings = -math.log2(half["fraction"])
     slope = _LASTING * math.log(last["unexplained"] / half["unexplained"]) / doublings
-    # Both records are of the same queries, so this spread is an upper bound.
-    spread = _LASTING * math.hypot(after, before) / doublings
+    # Both records are of the same queries: without the errors of changes, this spread is an upper bound.
+    changes: list[Any] = [r.get("change_error") for r in history[history.index(half) + 1 :]]
+    relative = math.hypot(after, before)
+    if all(map(_number, changes)):
+        relative = min(relative, math.hypot(*changes) / last["unexplained"])
+    spread = _LASTING * relative / doublings
     # The number of steps alone would say that longer training is useless.
     if spread > _LAW_SCATTER and not few:
         return None

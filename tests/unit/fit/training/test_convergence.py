@@ -55,7 +55,12 @@ def test_twice_the_time_gains_half_of_what_the_second_half_did(power: float) -> 
     assert found.doubling is not None
     assert uncertain.doubling is not None
     assert math.log(uncertain.doubling) > 0.7 * math.log(found.doubling)
-    assert cost(history(power, error=0.2), {}).doubling is None
+    records = history(power, error=0.2)
+    assert cost(records, {}).doubling is None
+    # The same queries tell how the error changed better than how large it is.
+    paired = cost([r | {"change_error": 1e-4} for r in records], {})
+    assert paired.doubling == pytest.approx(found.doubling, rel=1e-3)
+    assert cost([r | {"change_error": 0.2} for r in records], {}).doubling is None
 
 
 def test_the_middle_record_counts_by_its_fraction() -> None:
@@ -83,6 +88,14 @@ def test_few_steps_ask_for_more_whatever_the_curve_shows() -> None:
         assert found.reason.startswith("expect about 0.")
     found = next_step(cost(history(0.0, error=0.4, steps=146), {}), fitted(0.2, 0.002))
     assert found.reason == "146 steps are few; try twice the training"
+    # An error that is large, or not known after so few steps, is no question of queries.
+    for steps, test, factor in (
+        (39, fitted(16.6, 4.7), 16),
+        (91, fitted(0.4, 0.2), 8),
+        (300, fitted(1.7, 0.1), 2),
+    ):
+        found = next_step(cost(history(0.0, error=0.4, steps=steps), {}), test)
+        assert found == NextStep("time", f"{steps} steps are few: train {factor} times as long", factor)
     # Without a record in the middle, the number of steps decides: the error is about 1 + 50 / N.
     for steps, expected in ((50, 0.75), (150, 0.875)):
         found = cost(history(0.5, steps=steps)[-1:], {})
@@ -183,6 +196,9 @@ def test_the_next_command_is_complete(tmp_path: Path) -> None:
     assert command("time") == f"mbtf-fit shards {fitted} --time 1min -o material-2"
     # The fewest steps took longer than the time.
     assert command("time", seconds=41.0) == f"mbtf-fit shards {fitted} --time 90s -o material-2"
+    found = NextStep("time", "", 8).command(config, 41.0, data, Path("material"))
+    assert found is not None
+    assert "--time 330s" in found or "--time 5.5min" in found
     steps = FitConfig.model_validate({"training": {"steps": 300}})
     assert command("time", steps) == f"mbtf-fit shards {fitted} --steps 600 -o material-2"
     made, fit = (

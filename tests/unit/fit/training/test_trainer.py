@@ -10,6 +10,7 @@ import pytest
 import torch
 from support.fit_data import make_trainer, parallax, random_queries, train_fully, training_queries, write_data
 
+import mbtf_fit.training.trainer
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
 from mbtf_fit.config import FitConfig, ModelName, build_model
@@ -32,6 +33,12 @@ LATTICE = Lattice(3)
 def queries(n: int = 5000) -> TrainingQueries:
     arrays = random_queries(np.random.default_rng(0), n, LATTICE)
     return training_queries(arrays, parallax(*arrays.values()))
+
+
+@pytest.fixture(params=[True, False], ids=["compiled", "PyTorch"])
+def with_and_without_the_kernel(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not request.param:
+        monkeypatch.setattr(mbtf_fit.training.trainer, "kernel", lambda: None)
 
 
 def trainer(data: TrainingQueries, model: str = "neumip", **training: Any) -> Trainer:
@@ -71,16 +78,18 @@ def test_rates_rise_and_fall() -> None:
     training = FitConfig().training.model_copy(update={"warmup": 10, "final_learning_rate_factor": 0.05})
     assert learning_rate_factor(training, 0, 0.0) == pytest.approx(1 / 11)
     assert learning_rate_factor(training, 10, 0.0) == 1.0
+    # In a fit of 20 steps, the warm-up takes four.
+    assert learning_rate_factor(training, 2, 0.1) == pytest.approx(0.5, abs=0.02)
+    assert learning_rate_factor(training, 4, 0.2) == pytest.approx(0.91, abs=0.01)
     assert learning_rate_factor(training, 1000, 0.5) == pytest.approx(0.525)
     assert learning_rate_factor(training, 1000, 1.0) == pytest.approx(0.05)
 
 
-@pytest.mark.parametrize("compiled", [True, False])
-def test_textures_and_networks_learn_at_their_own_rates(compiled: bool) -> None:
+@pytest.mark.usefixtures("with_and_without_the_kernel")
+def test_textures_and_networks_learn_at_their_own_rates() -> None:
     """The first step of Adam is as long as the rate, whatever the gradient."""
     rates = {"texture_learning_rate": 1e-3, "learning_rate": 1e-4, "warmup": 0}
     t = trainer(queries(), steps=1, blur={"initial_sigma": 0.0, "offset_sigma": 0.0}, **rates)
-    t._stepper = t._stepper if compiled else None
     groups = t.model.parameter_groups()
     before = [[p.detach().clone() for p in group] for group in groups]
     train_fully(t)
@@ -89,14 +98,13 @@ def test_textures_and_networks_learn_at_their_own_rates(compiled: bool) -> None:
         assert longest == pytest.approx(rate, rel=0.01)
 
 
-@pytest.mark.parametrize("compiled", [True, False])
-def test_texels_without_a_gradient_decay_with_the_rate(compiled: bool) -> None:
+@pytest.mark.usefixtures("with_and_without_the_kernel")
+def test_texels_without_a_gradient_decay_with_the_rate() -> None:
     arrays = random_queries(np.random.default_rng(0), 64, LATTICE)
     arrays["sigma"][:] = 0.5
     data = training_queries(arrays, parallax(*arrays.values()))
     rates = {"texture_learning_rate": 0.05, "warmup": 0, "final_learning_rate_factor": 0.1}
     t = trainer(data, steps=5, texture_weight_decay=2.0, blur={"initial_sigma": 0.0}, **rates)
-    t._stepper = t._stepper if compiled else None
     first = t.model.textures()[0].texels.detach().clone()
     rates = [0.05 * learning_rate_factor(t.config.training, k, k / 5) for k in range(5)]
     train_fully(t)
@@ -159,11 +167,10 @@ def test_each_texture_keeps_its_least_blur() -> None:
     torch.testing.assert_close(pyramid.export()["3"].reshape(64, -1), pyramid.blurred(0.7)[-64:].detach())
 
 
-@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.usefixtures("with_and_without_the_kernel")
 @pytest.mark.parametrize("poison", ["pyramid.texels", "offset_texture.texels", "offset_network.3.bias"])
-def test_divergence_is_one_error_with_a_hint(poison: str, compiled: bool) -> None:
+def test_divergence_is_one_error_with_a_hint(poison: str) -> None:
     t = trainer(queries())
-    t._stepper = t._stepper if compiled else None
     with torch.no_grad():
         t.model.get_parameter(poison).fill_(torch.nan)
     with pytest.raises(InputError, match=r"diverged at step 1: its batch .*\n.*--learning-rate 0\.01 "):
