@@ -15,6 +15,7 @@ the distance ``d² = (s - c)ᵀ C⁻¹ (s - c)`` have the weight ``4 / (2 + d²)
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import torch
@@ -64,12 +65,23 @@ def slope_distributions(
     count = j.shape[1] * i.shape[1]
     out = torch.empty(*shape, 5)
     rows = max(1, _AT_ONCE // (count * shape[1]))
-    for start in range(0, shape[0], rows):
+
+    def fit_rows(start: int) -> None:
         part = slice(start, start + rows)
         at = j[part, None, :, None], i[None, :, None, :]
         weight = (by_row[part, None, :, None] * by_column[None, :, None, :]).reshape(-1, count)
         found = _fit(sample[at].reshape(-1, count, 2), within[at].reshape(-1, count, 3), weight)
         out[part] = found.reshape(-1, shape[1], 5)
+
+    threads = torch.get_num_threads()
+    # Each thread takes whole rows: operations that share their work would wait for every core that another
+    # process uses.
+    torch.set_num_threads(1)
+    try:
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(fit_rows, range(0, shape[0], rows)))
+    finally:
+        torch.set_num_threads(threads)
     return out
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 from scipy.optimize import minimize
 
 from mbtf_fit.surface.slopes import slope_distributions
@@ -86,3 +87,17 @@ def test_finer_maps_of_the_same_slopes_have_the_same_distribution(size: int) -> 
     coarse = slopes[:: size // 64, :: size // 64]
     wanted = slope_distributions(coarse, moments_of(coarse), 1.0, (1, 1), 0.5)[0, 0].numpy()
     np.testing.assert_allclose(found, wanted, atol=0.03)
+
+
+def test_the_bits_do_not_depend_on_the_number_of_threads() -> None:
+    slopes = np.random.default_rng(3).normal(size=(256, 256, 2)).astype(np.float32)
+    threads, found = torch.get_num_threads(), []
+    try:
+        for count in (1, 2, 3):
+            torch.set_num_threads(count)
+            found.append(slope_distributions(slopes, moments_of(slopes), 1.0, (1, 1), 0.18))
+            assert torch.get_num_threads() == count
+    finally:
+        torch.set_num_threads(threads)
+    assert torch.equal(found[0], found[1])
+    assert torch.equal(found[0], found[2])
