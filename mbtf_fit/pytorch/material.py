@@ -258,6 +258,22 @@ class NeuralMaterial(nn.Module):
         """(texels, network weights)."""
         return [texture.texels for texture in self.textures()], [*self._layers().values()]
 
+    def feature_weights(self) -> list[Tensor]:
+        """Parts of the networks' first matrices that multiply features of textures, where they are
+        trained."""
+        sizes, networks, out = sizes_of(self._own), self.networks(), []
+        features = {op.output for op in self._own if isinstance(op, ops.Lookup)}
+        for op in self._own:
+            if not isinstance(op, ops.Network | ops.Inception):
+                continue
+            first, start = next(networks[op.weights].parameters()), 0
+            for reference in (*op.x,) if isinstance(op, ops.Network) else (*op.features, *op.shared):
+                stop = start + _size(reference, sizes)
+                if parse(reference)[0] in features and first.requires_grad:
+                    out.append(first[:, start:stop])
+                start = stop
+        return out
+
     def networks(self) -> dict[str, nn.Module]:
         """Networks by name, the last one first: materials can share them."""
         return {n: module for n, module in self.named_children() if not isinstance(module, FeatureTextures)}

@@ -89,9 +89,13 @@ class TrainingLoop:
     def __init__(self, trainers: Sequence[Trainer], names: Sequence[str] = ("",)) -> None:
         self.trainers, self.names = trainers, names
         self.best: BestState | None = None
-        decay = shared_decay([trainer.weight_decay.weights for trainer in trainers])
+        found = [trainer.regularization for trainer in trainers]
+        decay = {
+            name: shared_decay([getattr(one, name) for one in found])
+            for name in ("feature_weights", "weights")
+        }
         for trainer in trainers:
-            trainer.weight_decay = replace(trainer.weight_decay, weights=decay)
+            trainer.regularization = replace(trainer.regularization, **decay)
         self.link()
 
     def link(self) -> None:
