@@ -92,7 +92,7 @@ class TrainingLoop:
         found = [trainer.regularization for trainer in trainers]
         decay = {
             name: shared_decay([getattr(one, name) for one in found])
-            for name in ("feature_weights", "weights")
+            for name in ("spatial_weights", "weights")
         }
         for trainer in trainers:
             trainer.regularization = replace(trainer.regularization, **decay)

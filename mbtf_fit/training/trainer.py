@@ -53,12 +53,12 @@ _SAME_LEVEL = 1e-4
 # Noise-to-signal ratio below which the decay of weights falls quadratically, so that few but clean queries
 # are fitted without bias.
 _REFERENCE_NOISE = 0.5
-# Decay per noise-to-signal ratio over the number of queries: of weights that multiply texels, and of others;
-# and the largest one.
-_FEATURE_WEIGHTS, _WEIGHTS, _MOST_DECAY = 2e5, 1e4, 1.0
+# Decay per noise-to-signal ratio over the number of queries: of weights that multiply what depends on the
+# position, and of others; and the largest one.
+_SPATIAL_WEIGHTS, _WEIGHTS, _MOST_DECAY = 2e5, 3e4, 1.0
 # Decay of texels, and squared sigma of their blur, per noise-to-signal ratio over the number of queries per
 # texel; and the largest decay.
-_TEXELS, _BLUR, _MOST_TEXEL_DECAY = 150.0, 50.0, 50.0
+_TEXELS, _BLUR, _MOST_TEXEL_DECAY = 150.0, 25.0, 50.0
 
 
 def learning_rate_factor(training: TrainingSection, step: int, fraction: float) -> float:
@@ -76,19 +76,20 @@ class Regularization:
     After many epochs a network overfits the noise of few queries. Texels see few of them each: their decay,
     as the penalty of ridge regression (Hoerl and Kennard, Technometrics 12, 1970), and the area over which
     they are blurred grow with the noise-to-signal ratio over the number of queries per texel. Decay alone has
-    no effect where the weights that multiply the texels grow instead, so these decay too. All queries share
-    the other weights, whose decay flattens the dependence on directions: it is much smaller. Decays are
-    applied to the parameters themselves, not to the gradients (Loshchilov and Hutter, ICLR 2019).
+    no effect where the weights that multiply the texels grow instead, so these decay too, and those that
+    multiply hints, which are large at few highlights. Decay of the other weights flattens the dependence on
+    directions: it is much smaller. Decays are applied to the parameters themselves, not to the gradients
+    (Loshchilov and Hutter, ICLR 2019).
 
     Attributes
     ----------
-    texels, feature_weights, weights : decay per step, relative to the learning rate: of texels, of the
-        network weights that multiply them, and of all matrices
+    texels, spatial_weights, weights : decay per step, relative to the learning rate: of texels, of the
+        network weights that multiply what depends on the position, and of all matrices
     min_sigma : minimum blur of the feature textures, in texels; at most that of the first step
     """
 
     texels: float
-    feature_weights: float
+    spatial_weights: float
     weights: float
     min_sigma: float
 
@@ -100,7 +101,7 @@ class Regularization:
         shared = strength * min(1.0, noise_ratio / _REFERENCE_NOISE)
         return cls(
             training.texture_weight_decay + min(_MOST_TEXEL_DECAY, _TEXELS * strength * texels),
-            min(_MOST_DECAY, _FEATURE_WEIGHTS * shared),
+            min(_MOST_DECAY, _SPATIAL_WEIGHTS * shared),
             min(_MOST_DECAY, _WEIGHTS * shared),
             math.sqrt(_BLUR * strength * texels),
         )
@@ -112,7 +113,7 @@ class Regularization:
         matrices = [p for p in weights if p.ndim > 1 and p.requires_grad]
         groups = (
             (texels, texture_rate * self.texels),
-            (model.feature_weights(), rate * self.feature_weights),
+            (model.spatial_weights(), rate * self.spatial_weights),
             (matrices, rate * self.weights),
         )
         with torch.no_grad():

@@ -152,7 +152,7 @@ def test_noisy_materials_do_not_decide_the_decay_alone(data: dict[str, Path], tm
     fits = fit_two(joint_config(steps=2), data, tmp_path)
     for found, alone in zip(fits, own, strict=True):
         decay = found.material.description["training"]["regularization"]
-        for of in ("feature_weights", "weights"):
+        for of in ("spatial_weights", "weights"):
             assert decay[of] == pytest.approx(sum(o[of] for o in own) / 2 / np.sqrt(2))
         assert decay["texels"] == alone["texels"]
 

@@ -205,12 +205,12 @@ def test_coverage_counts_texels_that_gradients_have_reached() -> None:
     ("ratio", "queries", "strength", "expected"),
     [
         (0.0, 400_000, 1.0, (2.0, 0.0, 0.0, 0.0)),
-        (0.4, 400_000, 1.0, (2.75, 0.16, 0.008, 0.5)),
-        (2.0, 400_000, 1.0, (5.75, 1.0, 0.05, 1.118034)),
-        (2.0, 100_000, 1.0, (17.0, 1.0, 0.2, 2.236068)),
-        (2.0, 100_000, 0.1, (3.5, 0.4, 0.02, 0.707107)),
+        (0.4, 400_000, 1.0, (2.75, 0.16, 0.024, 0.3535534)),
+        (2.0, 400_000, 1.0, (5.75, 1.0, 0.15, 0.790569)),
+        (2.0, 100_000, 1.0, (17.0, 1.0, 0.6, 1.581139)),
+        (2.0, 100_000, 0.1, (3.5, 0.4, 0.06, 0.5)),
         (5.0, 10, 0.0, (2.0, 0.0, 0.0, 0.0)),
-        (5.0, 10_000, 1.0, (52.0, 1.0, 1.0, 11.18034)),
+        (5.0, 10_000, 1.0, (52.0, 1.0, 1.0, 7.905694)),
     ],
 )
 def test_noise_per_query_increases_regularization(
@@ -227,20 +227,20 @@ def test_noise_per_query_increases_regularization(
 @pytest.mark.parametrize(
     ("model", "network", "columns"),
     [
-        ("neumip", {}, {"decoder.0.weight": 7, "offset_network.0.weight": 7}),
-        ("neumip-baseline", {"blending": "concatenate"}, {"decoder.0.weight": 14}),
-        ("neumip-baseline", {"encoding": {"position": 2}}, {"decoder.0.weight": 7}),
-        ("hierarchical", {}, {"decoder.first.weight": 7, "offset_network.0.weight": 7}),
+        ("neumip", {}, {"decoder.0.weight": [*range(7)], "offset_network.0.weight": [*range(7)]}),
+        ("neumip-baseline", {"blending": "concatenate"}, {"decoder.0.weight": [*range(14)]}),
+        ("relief", {}, {"decoder.0.weight": [*range(8), *range(20, 32)]}),
+        ("hierarchical", {"offset": "none"}, {"decoder.first.weight": [*range(47)]}),
     ],
 )
-def test_weights_that_multiply_texels_decay_more_and_biases_not(
-    model: ModelName, network: dict[str, Any], columns: dict[str, int]
+def test_weights_of_the_position_decay_more_and_biases_not(
+    model: ModelName, network: dict[str, Any], columns: dict[str, list[int]]
 ) -> None:
     found = build_model(model, LATTICE, **network)
     with torch.no_grad():
         for p in found.parameters():
             p.fill_(1.0)
-    decay = Regularization(texels=3.0, feature_weights=20.0, weights=2.0, min_sigma=0.0)
+    decay = Regularization(texels=3.0, spatial_weights=20.0, weights=2.0, min_sigma=0.0)
     decay.decay(found, 0.1, 0.01)
     texels, _ = found.parameter_groups()
     for name, p in found.named_parameters():
@@ -249,7 +249,7 @@ def test_weights_that_multiply_texels_decay_more_and_biases_not(
             expected *= np.exp(-0.3)
         elif p.ndim > 1:
             expected *= np.exp(-0.02)
-            expected[:, : columns.get(name, 0)] *= np.exp(-0.2)
+            expected[:, columns.get(name, [])] *= np.exp(-0.2)
         torch.testing.assert_close(p.detach(), expected)
 
 
@@ -265,7 +265,7 @@ def test_a_frozen_network_does_not_decay() -> None:
     found.initialize(torch.Generator().manual_seed(0), 1.0)
     found.freeze()
     before = {name: p.clone() for name, p in found.named_parameters()}
-    Regularization(texels=0.0, feature_weights=1.0, weights=1.0, min_sigma=0.0).decay(found, 1.0, 1.0)
+    Regularization(texels=0.0, spatial_weights=1.0, weights=1.0, min_sigma=0.0).decay(found, 1.0, 1.0)
     assert all(torch.equal(p, before[name]) for name, p in found.named_parameters())
 
 
