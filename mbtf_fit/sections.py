@@ -198,15 +198,14 @@ class TrainingSection(Settings):
         0.0,
         ge=0,
         le=10,
-        description="weight decay (L2) of the texels per step, times the learning rate, and 2r where the "
-        "noise-to-signal ratio r exceeds 1/2",
+        description="weight decay (L2) of the texels per step, times the learning rate; noise adds to it",
     )
     noise_regularization: float = Field(
-        2e5,
+        1.0,
         ge=0,
-        le=1e9,
-        description="weight decay (L2) of the networks per step, times the learning rate and r min(1, 2r) "
-        "over the number of queries (r: noise-to-signal ratio), at most 1",
+        le=1e4,
+        description="strength of the weight decay and blur that follow from noise and number of the queries; "
+        "0: none",
     )
     warmup: int = Field(
         100,

@@ -11,7 +11,7 @@ from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
 from mbtf_fit import ops
 from mbtf_fit.ops.constants import DIELECTRIC, HEIGHTS, HORIZONS, LIGHT_WIDTH, MAPS
-from mbtf_fit.ops.operation import needed_for, output_names, parse, sizes_of
+from mbtf_fit.ops.operation import needed_for, output_names, parse, reached_from, sizes_of
 from mbtf_fit.ops.value import calibrated
 from mbtf_fit.pytorch.networks import InceptionDecoder, Mlp, initialize_layers
 from mbtf_fit.pytorch.operations import FUNCTIONS, PYTORCH, Execution, displacement
@@ -257,6 +257,22 @@ class NeuralMaterial(nn.Module):
     def parameter_groups(self) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
         """(texels, network weights)."""
         return [texture.texels for texture in self.textures()], [*self._layers().values()]
+
+    def spatial_weights(self) -> list[Tensor]:
+        """Parts of the networks' first matrices that multiply what depends on the position, such as features
+        and hints, where they are trained."""
+        sizes, networks, out = sizes_of(self._own), self.networks(), []
+        spatial = reached_from(self._own, "u")
+        for op in self._own:
+            if not isinstance(op, ops.Network | ops.Inception):
+                continue
+            first, start = next(networks[op.weights].parameters()), 0
+            for reference in op.x if isinstance(op, ops.Network) else (*op.features, *op.shared):
+                stop = start + _size(reference, sizes)
+                if parse(reference)[0] in spatial and first.requires_grad:
+                    out.append(first[:, start:stop])
+                start = stop
+        return out
 
     def networks(self) -> dict[str, nn.Module]:
         """Networks by name, the last one first: materials can share them."""

@@ -26,7 +26,7 @@ from mbtf_core.stats import (
 )
 from mbtf_fit.data.queries import ShardQueries, TrainingQueries
 from mbtf_fit.training.loop import TrainingLoop, restore, snapshot
-from mbtf_fit.training.trainer import TrainingProgress, WeightDecay
+from mbtf_fit.training.trainer import TrainingProgress
 
 # Pilots together take this share of the fit's steps, but each of them at least the warm-up; there is no
 # forecast if that takes more than the larger share.
@@ -104,7 +104,7 @@ def forecast_error(loop: TrainingLoop, queries: ShardQueries, step: Estimate, st
     ErrorForecast
     """
     (trainer,) = loop.trainers
-    config, data, decay = trainer.config, trainer.queries, trainer.weight_decay
+    config, data, usual = trainer.config, trainer.queries, trainer.regularization
     total, seconds = float(_LENGTHS.sum() + _LENGTHS[-1]), steps * step.value
     first = max(_SHARE * steps / total, config.training.warmup, 2.0)
     if not isinstance(data, TrainingQueries):
@@ -128,12 +128,12 @@ def forecast_error(loop: TrainingLoop, queries: ShardQueries, step: Estimate, st
         predictions = [pilot(count, number) for number, count in enumerate(counts)]
         few = min(len(data), max(trainer.batch, len(data) * counts[-1] // steps))
         trainer.queries = data.slice(0, few)
-        trainer.weight_decay = WeightDecay.of(config.training, trainer.noise.ratio, few)
+        trainer.regularization = trainer.regularization_of(few)
         repeated = pilot(counts[-1], len(counts))
     except InputError as diverged:
         return ErrorForecast(seconds, reason=diverged.message.splitlines()[0])
     finally:
-        trainer.config, trainer.queries, trainer.weight_decay = config, data, decay
+        trainer.config, trainer.queries, trainer.regularization = config, data, usual
     found = [unexplained_variance(prediction, *queries.halves) for prediction in predictions]
     shared = float(np.median([e.relative_error for e in found]))
     try:

@@ -91,7 +91,7 @@ def export_fit(
         "queries": len(partition.training),
         "loss": trainer.progress.loss,
         "validation_set": validated,
-        "weight_decay": asdict(trainer.weight_decay),
+        "regularization": asdict(trainer.regularization),
         "coverage": {str(level): fraction for level, fraction in trainer.coverage().items()},
         "device": str(trainer.device),
         "threads": torch.get_num_threads(),

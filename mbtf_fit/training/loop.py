@@ -91,9 +91,13 @@ class TrainingLoop:
         self.trainers, self.names = trainers, names
         self.best: BestState | None = None
         self.validated: tuple[int, Sequence[NDArray[np.float32]]] = (-1, [])
-        decay = shared_decay([trainer.weight_decay.weights for trainer in trainers])
+        found = [trainer.regularization for trainer in trainers]
+        decay = {
+            name: shared_decay([getattr(one, name) for one in found])
+            for name in ("spatial_weights", "weights")
+        }
         for trainer in trainers:
-            trainer.weight_decay = replace(trainer.weight_decay, weights=decay)
+            trainer.regularization = replace(trainer.regularization, **decay)
         self.link()
 
     def link(self) -> None:

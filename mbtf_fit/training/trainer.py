@@ -52,11 +52,15 @@ _DEPTH_WEIGHTS = "depth_weights"
 _SAME_LEVEL = 1e-4
 # Largest share of the budget that the warm-up takes.
 _WARMUP_SHARE = 0.2
-# Noise-to-signal ratio above which the decay of texels grows. Below it the decay of weights falls
-# quadratically, so that few but clean queries are fitted without bias.
+# Noise-to-signal ratio below which the decay of weights falls quadratically, so that few but clean queries
+# are fitted without bias.
 _REFERENCE_NOISE = 0.5
-# Largest decay of the network weights.
-_MOST_DECAY = 1.0
+# Decay per noise-to-signal ratio over the number of queries: of weights that multiply what depends on the
+# position, and of others; and the largest one.
+_SPATIAL_WEIGHTS, _WEIGHTS, _MOST_DECAY = 2e5, 3e4, 1.0
+# Decay of texels, and squared sigma of their blur, per noise-to-signal ratio over the number of queries per
+# texel; and the largest decay.
+_TEXELS, _BLUR, _MOST_TEXEL_DECAY = 150.0, 25.0, 50.0
 
 
 def learning_rate_factor(training: TrainingSection, step: int, fraction: float) -> float:
@@ -71,32 +75,54 @@ def learning_rate_factor(training: TrainingSection, step: int, fraction: float) 
 
 
 @dataclass(frozen=True)
-class WeightDecay:
-    """Decay per step, relative to the learning rate: of the textures, and of the networks' matrices.
+class Regularization:
+    """What keeps a fit from learning the noise of its queries.
 
-    After many epochs a network overfits the noise of few queries. As the penalty of ridge regression does
-    (Hoerl and Kennard, Technometrics 12, 1970), both decays grow with the noise-to-signal ratio. The decay of
-    the network weights, which all queries share, falls with the number of queries. Both are applied to the
-    parameters themselves, not to the gradients (Loshchilov and Hutter, ICLR 2019).
+    After many epochs a network overfits the noise of few queries. Texels see few of them each: their decay,
+    as the penalty of ridge regression (Hoerl and Kennard, Technometrics 12, 1970), and the area over which
+    they are blurred grow with the noise-to-signal ratio over the number of queries per texel. Decay alone has
+    no effect where the weights that multiply the texels grow instead, so these decay too, and those that
+    multiply hints, which are large at few highlights. Decay of the other weights flattens the dependence on
+    directions: it is much smaller. Decays are applied to the parameters themselves, not to the gradients
+    (Loshchilov and Hutter, ICLR 2019).
+
+    Attributes
+    ----------
+    texels, spatial_weights, weights : decay per step, relative to the learning rate: of texels, of the
+        network weights that multiply what depends on the position, and of all matrices
+    min_sigma : minimum blur of the feature textures, in texels; at most that of the first step
     """
 
     texels: float
+    spatial_weights: float
     weights: float
+    min_sigma: float
 
     @classmethod
-    def of(cls, training: TrainingSection, noise_ratio: float, queries: int) -> WeightDecay:
-        """Decay for a number of training queries with a noise-to-signal ratio (of variances)."""
-        relative = noise_ratio / _REFERENCE_NOISE
-        weights = training.noise_regularization * noise_ratio * min(1.0, relative) / queries
-        return cls(training.texture_weight_decay * max(1.0, relative), min(_MOST_DECAY, weights))
+    def of(cls, training: TrainingSection, noise_ratio: float, queries: int, texels: int) -> Regularization:
+        """For numbers of training queries, with a noise-to-signal ratio (of variances), and of texels that a
+        network decodes."""
+        strength = training.noise_regularization * noise_ratio / queries
+        shared = strength * min(1.0, noise_ratio / _REFERENCE_NOISE)
+        return cls(
+            training.texture_weight_decay + min(_MOST_TEXEL_DECAY, _TEXELS * strength * texels),
+            min(_MOST_DECAY, _SPATIAL_WEIGHTS * shared),
+            min(_MOST_DECAY, _WEIGHTS * shared),
+            math.sqrt(_BLUR * strength * texels),
+        )
 
-    def apply(self, model: NeuralMaterial, texture_rate: float, rate: float) -> None:
+    def decay(self, model: NeuralMaterial, texture_rate: float, rate: float) -> None:
         """Decay a model's parameters by one step at these learning rates."""
         texels, weights = model.parameter_groups()
         # Biases do not decay: they keep the mean value.
         matrices = [p for p in weights if p.ndim > 1 and p.requires_grad]
+        groups = (
+            (texels, texture_rate * self.texels),
+            (model.spatial_weights(), rate * self.spatial_weights),
+            (matrices, rate * self.weights),
+        )
         with torch.no_grad():
-            for parameters, amount in ((texels, texture_rate * self.texels), (matrices, rate * self.weights)):
+            for parameters, amount in groups:
                 if amount > 0:
                     for p in parameters:
                         p.mul_(math.exp(-amount))
@@ -146,7 +172,7 @@ class Trainer:
         texels, weights = self.hooks.trained()
         self.noise = noise
         self.loss = Objective(config.training, noise)
-        self.weight_decay = WeightDecay.of(config.training, noise.ratio, len(queries))
+        self.regularization = self.regularization_of(len(queries))
         found, groups = kernel(), [texels, weights]
         self.optimizer: Adam | torch.optim.Adam
         self._stepper: NativeStepper | None = None
@@ -155,6 +181,12 @@ class Trainer:
             self._stepper = NativeStepper(found, model, self.optimizer)
         else:
             self.optimizer = torch.optim.Adam([{"params": g} for g in groups], betas=BETAS, fused=True)
+
+    def regularization_of(self, queries: int) -> Regularization:
+        """For so many queries of the data's noise. Texels of `svbrdf` are its parameters: decay would move
+        them towards an arbitrary material."""
+        texels = len(self.model.textures()[0].texels) if self.model.networks() else 0
+        return Regularization.of(self.config.training, self.noise.ratio, queries, texels)
 
     @property
     def backend(self) -> str:
@@ -194,9 +226,8 @@ class Trainer:
         blur, model = self.config.training.blur, self.model
         start = min(blur.initial_sigma, max(WIDEST_BLUR * min(model.lattice.shape()), blur.final_sigma))
         sigma = annealed_sigma(self.fraction / blur.fraction, start, blur.final_sigma)
-        return [
-            max(sigma, blur.offset_sigma if t.moves_lookups else blur.min_sigma) for t in model.textures()
-        ]
+        least = max(blur.min_sigma, min(self.regularization.min_sigma, start))
+        return [max(sigma, blur.offset_sigma if t.moves_lookups else least) for t in model.textures()]
 
     def _tables(self) -> list[Tensor]:
         """The textures with the current blur."""
@@ -211,7 +242,7 @@ class Trainer:
         rates = (training.texture_learning_rate * factor, training.learning_rate * factor)
         for group, rate in zip(self.optimizer.param_groups, rates, strict=True):
             group["lr"] = rate
-        self.weight_decay.apply(self.model, *rates)
+        self.regularization.decay(self.model, *rates)
         sigmas = self._sigmas()
         named = {
             name: sigma

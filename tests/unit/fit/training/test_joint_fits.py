@@ -148,11 +148,12 @@ def test_noisy_materials_do_not_decide_the_decay_alone(data: dict[str, Path], tm
     own = []
     for name in NAMES[:2]:
         fit(single_config(steps=1), data[name], tmp_path / "own" / name)
-        own.append(Material.load(tmp_path / "own" / name).description["training"]["weight_decay"])
+        own.append(Material.load(tmp_path / "own" / name).description["training"]["regularization"])
     fits = fit_two(joint_config(steps=2), data, tmp_path)
     for found, alone in zip(fits, own, strict=True):
-        decay = found.material.description["training"]["weight_decay"]
-        assert decay["weights"] == pytest.approx(sum(o["weights"] for o in own) / 2 / np.sqrt(2))
+        decay = found.material.description["training"]["regularization"]
+        for of in ("spatial_weights", "weights"):
+            assert decay[of] == pytest.approx(sum(o[of] for o in own) / 2 / np.sqrt(2))
         assert decay["texels"] == alone["texels"]
 
 

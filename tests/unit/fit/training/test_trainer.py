@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import astuple, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +21,9 @@ from mbtf_fit.objective.parallel import Workers
 from mbtf_fit.sections import TrainingSection
 from mbtf_fit.training.loop import TrainingLoop, restore, snapshot, state_tensors
 from mbtf_fit.training.trainer import (
+    Regularization,
     Trainer,
     TrainingProgress,
-    WeightDecay,
     learning_rate_factor,
     prepare_trainer,
 )
@@ -112,7 +113,7 @@ def test_texels_without_a_gradient_decay_with_the_rate() -> None:
     expected = first[finest:] * np.exp(-2.0 * sum(rates))
     torch.testing.assert_close(t.model.textures()[0].texels.detach()[finest:], expected)
     weights = [p.detach().clone() for p in t.model.parameter_groups()[1]]
-    t.weight_decay.apply(t.model, 0.1, 0.1)
+    t.regularization.decay(t.model, 0.1, 0.1)
     for before, after in zip(weights, t.model.parameter_groups()[1], strict=True):
         torch.testing.assert_close(after.detach(), before, rtol=0, atol=0)
 
@@ -208,46 +209,78 @@ def test_coverage_counts_texels_that_gradients_have_reached() -> None:
 
 
 @pytest.mark.parametrize(
-    ("ratio", "queries", "strength", "texels", "weights"),
+    ("ratio", "queries", "strength", "expected"),
     [
-        (0.0, 5000, 1000.0, 2.0, 0.0),
-        (0.4, 5000, 1000.0, 2.0, 0.064),
-        (2.0, 5000, 1000.0, 8.0, 0.4),
-        (5.0, 10, 0.0, 20.0, 0.0),
-        (5.0, 50, 1000.0, 20.0, 1.0),
+        (0.0, 400_000, 1.0, (2.0, 0.0, 0.0, 0.0)),
+        (0.4, 400_000, 1.0, (2.75, 0.16, 0.024, 0.3535534)),
+        (2.0, 400_000, 1.0, (5.75, 1.0, 0.15, 0.790569)),
+        (2.0, 100_000, 1.0, (17.0, 1.0, 0.6, 1.581139)),
+        (2.0, 100_000, 0.1, (3.5, 0.4, 0.06, 0.5)),
+        (5.0, 10, 0.0, (2.0, 0.0, 0.0, 0.0)),
+        (5.0, 10_000, 1.0, (52.0, 1.0, 1.0, 7.905694)),
     ],
 )
-def test_noise_increases_weight_decay(
-    ratio: float, queries: int, strength: float, texels: float, weights: float
+def test_noise_per_query_increases_regularization(
+    ratio: float, queries: int, strength: float, expected: tuple[float, ...]
 ) -> None:
-    """Of texels from a ratio of a half on; of weights with its square up to there, then with it, over the
-    number of queries; at most 1, or few queries would decay all weights to 0."""
-    section = TrainingSection(texture_weight_decay=2.0, noise_regularization=strength)
-    found = WeightDecay.of(section, ratio, queries)
-    assert (found.texels, found.weights) == (pytest.approx(texels), pytest.approx(weights))
+    """Decay of texels, and the area of their blur, grow with the noise ratio over the queries per texel;
+    decay of weights with its square up to a ratio of a half, then with it, over the number of queries; there
+    is a limit, or few queries would decay everything to 0."""
+    options = {"texture_weight_decay": 2.0, "noise_regularization": strength}
+    found = Regularization.of(TrainingSection.model_validate(options), ratio, queries, texels=5000)
+    assert astuple(found) == pytest.approx(expected)
 
 
-@pytest.mark.parametrize("model", ["neumip", "neumip-baseline", "hierarchical"])
-def test_texels_and_matrices_decay_and_biases_do_not(model: ModelName) -> None:
-    found = build_model(model, LATTICE)
+@pytest.mark.parametrize(
+    ("model", "network", "columns"),
+    [
+        ("neumip", {}, {"decoder.0.weight": [*range(7)], "offset_network.0.weight": [*range(7)]}),
+        ("neumip-baseline", {"blending": "concatenate"}, {"decoder.0.weight": [*range(14)]}),
+        ("relief", {}, {"decoder.0.weight": [*range(8), *range(20, 32)]}),
+        ("hierarchical", {"offset": "none"}, {"decoder.first.weight": [*range(47)]}),
+    ],
+)
+def test_weights_of_the_position_decay_more_and_biases_not(
+    model: ModelName, network: dict[str, Any], columns: dict[str, list[int]]
+) -> None:
+    found = build_model(model, LATTICE, **network)
     with torch.no_grad():
         for p in found.parameters():
             p.fill_(1.0)
-    WeightDecay(texels=3.0, weights=2.0).apply(found, 0.1, 0.01)
+    decay = Regularization(texels=3.0, spatial_weights=20.0, weights=2.0, min_sigma=0.0)
+    decay.decay(found, 0.1, 0.01)
     texels, _ = found.parameter_groups()
     for name, p in found.named_parameters():
-        texel = any(p is t for t in texels)
-        matrix = not texel and p.ndim > 1
-        assert matrix == ("weight" in name)
-        expected = np.exp(-0.3) if texel else np.exp(-0.02) if matrix else 1.0
-        torch.testing.assert_close(p.detach(), torch.full_like(p, expected))
+        expected = torch.ones_like(p)
+        if any(p is t for t in texels):
+            expected *= np.exp(-0.3)
+        elif p.ndim > 1:
+            expected *= np.exp(-0.02)
+            expected[:, columns.get(name, [])] *= np.exp(-0.2)
+        torch.testing.assert_close(p.detach(), expected)
+
+
+def test_texels_without_a_network_are_not_regularized() -> None:
+    t = trainer(queries(), "svbrdf")
+    t.noise = replace(t.noise, ratio=5.0)
+    found = t.regularization_of(1000)
+    assert (found.texels, found.min_sigma) == (0.0, 0.0)
+
+
+def test_a_frozen_network_does_not_decay() -> None:
+    found = build_model("neumip", LATTICE)
+    found.initialize(torch.Generator().manual_seed(0), 1.0)
+    found.freeze()
+    before = {name: p.clone() for name, p in found.named_parameters()}
+    Regularization(texels=0.0, spatial_weights=1.0, weights=1.0, min_sigma=0.0).decay(found, 1.0, 1.0)
+    assert all(torch.equal(p, before[name]) for name, p in found.named_parameters())
 
 
 def test_a_fit_estimates_the_noise_ratio_of_its_data(tmp_path: Path) -> None:
     """Noise of 0.02 in each half is 2e-4 of variance in their mean."""
     folder = write_data(tmp_path / "data", parallax, train=20_000, noise=0.02)
-    training = {"noise_regularization": 1000.0, "texture_weight_decay": 1.0}
-    config = FitConfig.model_validate({"training": training})
+    training = {"steps": 9, "noise_regularization": 0.005, "texture_weight_decay": 1.0}
+    config = FitConfig.model_validate({"model": "neumip", "training": training})
     data = open_data(folder, "shuffled", "neumip")
     partition = load_training(data, config.held_out, config.seed, config.data.memory)
     trainer = prepare_trainer(config, data, partition, torch.device("cpu"))
@@ -255,5 +288,11 @@ def test_a_fit_estimates_the_noise_ratio_of_its_data(tmp_path: Path) -> None:
     ratio = 2e-4 / parallax(*arrays.values()).var(0).mean()
     assert ratio > 0.5
     n = len(partition.training)
-    assert trainer.weight_decay.weights == pytest.approx(1000 * ratio / n, rel=0.1)
-    assert trainer.weight_decay.texels == pytest.approx(2 * ratio, rel=0.1)
+    texels = len(trainer.model.textures()[0].texels)
+    expected = Regularization.of(config.training, ratio, n, texels)
+    assert astuple(trainer.regularization) == pytest.approx(astuple(expected), rel=0.1)
+    trainer.progress.step = trainer.config.training.steps or 0
+    assert trainer.fraction == 1.0
+    assert trainer._sigmas()[0] == trainer.regularization.min_sigma > 0.0
+    trainer.regularization = replace(trainer.regularization, min_sigma=9.0)
+    assert trainer._sigmas()[0] == 1.0

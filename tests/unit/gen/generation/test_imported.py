@@ -144,7 +144,7 @@ def test_no_noise_is_claimed(opened: Open, tmp_path: Path) -> None:
     config = FitConfig.model_validate({"model": "neumip-baseline"})
     partition = load_training(data, config.held_out, 0)
     trainer = prepare_trainer(config, data, partition, torch.device("cpu"))
-    assert trainer.weight_decay.weights == 0
+    assert trainer.regularization.weights == 0
 
 
 @pytest.mark.parametrize("test", [100, 300, 499])
