@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from support.browser import NO_WEBGL, browser
 from support.fit_data import parallax, write_data
 from support.material_cases import CASES, make
 from support.plugin_materials import write_material
 from support.viewer_page import Page
 
+from mbtf_core.color import ALBEDO_EXPOSURE, to_display
 from mbtf_core.directions import from_angles
 from mbtf_core.pictures import Camera
-from mbtf_fit import fit
+from mbtf_fit import Material, fit
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.training.trainer import Trainer
+from mbtf_fit.viewer.extras import poster
 from mbtf_fit.viewer.live import LiveView
 from mbtf_fit.viewer.page import as_read, encode, material_content, pack_textures, write_page
 
@@ -168,11 +173,30 @@ def test_names_are_text(driver: Any, tmp_path: Path) -> None:
 
 def test_a_browser_without_webgl_gets_a_sentence(tmp_path: Path) -> None:
     make("calibrated", tmp_path / "material")
-    html = write_page({"materials": [material_content(tmp_path / "material")[0]]}, "no WebGL")
+    first = poster(Material.load(tmp_path / "material"))
+    html = write_page(
+        {"materials": [material_content(tmp_path / "material")[0]], "poster": first}, "no WebGL"
+    )
     with browser(tmp_path / "profile", NO_WEBGL) as started:
         page = Page(started, html, tmp_path)
         page.until(lambda: not page.message().startswith("Loading"))
         assert "WebGL 2" in page.message()
+        # The poster stays behind it.
+        assert first in page.js("return getComputedStyle(document.getElementById('poster')).backgroundImage")
+
+
+def test_the_poster_is_the_first_picture(driver: Any, tmp_path: Path) -> None:
+    material = make("relief", tmp_path / "material")
+    first, held = poster(material), material_content(tmp_path / "material")[0]
+    page = Page(driver, write_page({"materials": [held], "poster": first}, "poster"), tmp_path).ready()
+    assert page.js("return document.getElementById('poster')") is None
+    with Image.open(io.BytesIO(base64.b64decode(first.partition(",")[2]))) as image:
+        shown = np.asarray(image.resize((24, 18), Image.Resampling.BOX), float)
+    # The light begins to swing; its first direction is that of a new page.
+    page.js("window.mbtf.viewer.draw = () => false; window.mbtf.viewer.restore('')")
+    drawn = to_display(page.picture(18, 24)[..., :3], ALBEDO_EXPOSURE).astype(float)
+    assert np.corrcoef(shown.ravel(), drawn.ravel())[0, 1] > 0.9
+    np.testing.assert_allclose(shown.mean((0, 1)), drawn.mean((0, 1)), atol=4)
 
 
 def test_a_page_follows_a_fit(driver: Any, tmp_path: Path) -> None:
