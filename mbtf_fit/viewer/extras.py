@@ -29,7 +29,7 @@ MOST_TRIANGLES = 200_000
 # Rows of an environment, and pixels along the longer side of a reference picture, in a page.
 _ENVIRONMENT_ROWS, _PICTURE_SIZE = 64, 512
 # Rows and columns of the poster.
-_POSTER = (540, 720)
+_POSTER = (640, 640)
 
 
 def mesh_content(path: Path) -> dict[str, Any]:
