@@ -192,7 +192,8 @@ def _draw(
     # Of the references alone, so that the fits of a material can be compared.
     scale = _DIFFERENCE * float(np.mean([found["mean"] for found in errors])) or 1.0
     columns[2] = [palette("signed")[indices(difference / scale, "signed")] for difference in differences]
-    captions = ["reference", "fit", f"fit - reference\n±{_DIFFERENCE:.0%} of the mean"]
+    colors = f"fit - reference, ±{_DIFFERENCE:.0%} of the mean\nblue: too dark, orange: too bright"
+    captions = [f"path-traced reference\nexposure {exposure:+.2f} EV", "fit", colors]
     path = folder.path / PICTURE_NAME
     shown = [[_enlarged(picture) for picture in column] for column in columns]
     write_png(path, grid(shown, captions, list(map(width_label, widths)), 3))

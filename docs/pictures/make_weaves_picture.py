@@ -5,11 +5,9 @@ From the repository's root, in twenty minutes: ``.venv/bin/python docs/pictures/
 
 from __future__ import annotations
 
-import tempfile
 from pathlib import Path
 
-from make_contact_sheet import GAP, INK, PAPER, TITLE, render
-from PIL import Image, ImageDraw, ImageFont
+from make_contact_sheet import ROOT, render, sheet
 
 # Title and first lines of each material file, and tiles across its picture.
 WEAVES = (
@@ -38,19 +36,15 @@ def material(title: str, start: str) -> str:
 
 def main() -> None:
     """Write the picture."""
-    pitch = SIZE + GAP
-    sheet = Image.new("RGB", (ACROSS * pitch - GAP, len(WEAVES) // ACROSS * (TITLE + pitch) - GAP), PAPER)
-    draw = ImageDraw.Draw(sheet)
-    with tempfile.TemporaryDirectory() as folder:
-        for number, (title, start, tiles) in enumerate(WEAVES):
-            file = Path(folder) / "material.yaml"
-            file.write_text(material(title, start))
-            left, top = number % ACROSS * pitch, number // ACROSS * (TITLE + pitch)
-            draw.text((left + 2, top + 2), title, INK, ImageFont.load_default(16))
-            options = f"--view 90,-90 --light 50,140 --tiles-across {tiles}"
-            sheet.paste(render(str(file), options, SIZE, SPP), (left, top + TITLE))
+    pictures = {}
+    for title, start, tiles in WEAVES:
+        folder = ROOT / "out" / "weaves" / title.replace("/", "-").replace(" ", "_")
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "material.yaml").write_text(material(title, start))
+        options = f"--view 90,-90 --light 50,140 --tiles-across {tiles}"
+        pictures[title] = render(str(folder / "material.yaml"), options, SIZE, SPP, folder / "picture")
     # Few colors keep the file small.
-    sheet.quantize(128).save(Path(__file__).with_name("weaves.png"), optimize=True)
+    sheet(pictures, ACROSS).quantize(128).save(Path(__file__).with_name("weaves.png"), optimize=True)
 
 
 if __name__ == "__main__":

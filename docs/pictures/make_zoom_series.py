@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from mbtf_core.color import auto_exposure, brightness, to_display
+from mbtf_core.color import ALBEDO_EXPOSURE, to_display
 from mbtf_core.data.shard_files import read_exr
 from mbtf_core.directions import from_angles
 from mbtf_core.pictures import Camera
@@ -33,7 +33,7 @@ from mbtf_gen.engine.runtime import load_mitsuba
 
 ROOT = Path(__file__).parents[2]
 MATERIAL = ROOT / "out" / "quickstart" / "fits" / "relief"
-LIGHT, SIZE, SPP = (45.0, 45.0), 160, 64
+LIGHT, SIZE, SPP = (45.0, 45.0), 160, 128
 # As the recipe generates its data.
 OPTIONS = ("--mesh", "256")
 ELONGATED = {"type": "mbtf_path", "max_depth": 2}
@@ -153,14 +153,13 @@ def draw_series(mi: Any, name: str, series: Series) -> None:
         level = 0.5 * (a.mean() + b.mean())
         contrast = ((a - a.mean()) * (b - b.mean())).mean()
         pictures = [truth, *(rendered(mi, series.view, tiles_across, *way) for way in series.ways.values())]
-        exposure = auto_exposure([brightness(truth)])
         for row, (way, picture) in enumerate(zip(rows, pictures, strict=True)):
             place = (column * (SIZE + GAP), row * (SIZE + CAPTION))
             words = [way] if column == 0 else []
-            words += [f"{tiles_across:g} tiles across"] if row == 0 else []
+            words += [f"{tiles_across:g} tile{'s' * (tiles_across != 1)} across"] if row == 0 else []
             caption = ", ".join(words)
             draw.text((place[0] + 2, place[1] + 3), caption, (30, 30, 30), ImageFont.load_default(12))
-            display = to_display(picture.astype(np.float32), exposure)
+            display = to_display(picture.astype(np.float32), ALBEDO_EXPOSURE)
             sheet.paste(Image.fromarray(display), (place[0], place[1] + CAPTION))
             gray = picture.mean(-1)
             error, true = (

@@ -38,12 +38,14 @@ def make_page(material: Path, options: PageOptions) -> tuple[str, str]:
     InputError
         A material or another file is at fault.
     """
-    from mbtf_fit.viewer.extras import environment_content, mesh_content, pictures_content
+    from mbtf_fit.material.material import Material
+    from mbtf_fit.viewer.extras import environment_content, mesh_content, pictures_content, poster
     from mbtf_fit.viewer.page import material_content, write_page
 
     materials = [material_content(folder) for folder in (material, *(options.against or []))]
     content = {
         "materials": [held for held, _ in materials],
+        "poster": poster(Material.load(material)),
         **({} if options.reference is None else {"pictures": pictures_content(options.reference)}),
         **({} if options.shape is None else {"mesh": mesh_content(options.shape)}),
         **({} if options.environment is None else {"environment": environment_content(options.environment)}),

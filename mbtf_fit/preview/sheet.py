@@ -60,7 +60,7 @@ def contact_sheet(values: F32, section: SheetSection, exposure: float) -> NDArra
 
 
 def _caption(name: str, direction: Direction) -> str:
-    return f"{name} {direction.elevation:g}°, {direction.azimuth:g}°"
+    return f"{name} el. {direction.elevation:g}°, az. {direction.azimuth:g}°"
 
 
 SHEET_NAME, GIF_NAME = "sheet.png", "turntable.gif"

@@ -1,19 +1,25 @@
-"""What a page shows besides materials: a mesh, a picture of the surroundings, reference pictures."""
+"""What a page shows besides materials: a mesh, an environment, reference pictures, a poster."""
 
 from __future__ import annotations
 
+import base64
+import io
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from PIL import Image
 
+from mbtf_core.color import ALBEDO_EXPOSURE, to_display
+from mbtf_core.directions import from_angles
 from mbtf_core.errors import InputError
 from mbtf_core.images.environment import read_environment
 from mbtf_core.images.resample import resample
 from mbtf_core.meshes.content import joined
 from mbtf_core.meshes.read import read_mesh_content
 from mbtf_core.pictures import Camera, read_references
+from mbtf_fit.material.material import Material
 from mbtf_fit.viewer.page import encode
 from mbtf_fit.viewer.textures import pack
 
@@ -22,6 +28,8 @@ F64 = NDArray[np.float64]
 MOST_TRIANGLES = 200_000
 # Rows of an environment, and pixels along the longer side of a reference picture, in a page.
 _ENVIRONMENT_ROWS, _PICTURE_SIZE = 64, 512
+# Rows and columns of the poster.
+_POSTER = (640, 640)
 
 
 def mesh_content(path: Path) -> dict[str, Any]:
@@ -77,6 +85,19 @@ def pictures_content(folder: Path) -> list[dict[str, Any]]:
         picture_content(f"path-traced, {tiles_text(camera.tiles_across)} across", value, camera, light)
         for value, camera, light in read_references(folder)
     ]
+
+
+def poster(material: Material) -> str:
+    """The first view of a page as a ``data:`` URI, shown while the browser compiles the shaders.
+
+    Camera, light and exposure are ``FIRST`` of ``page/state.js``; the light has irradiance 1 on the plane.
+    """
+    aspect = material.lattice.aspect
+    q = Camera(50, -90, 3, rows=_POSTER[0], columns=_POSTER[1]).queries(from_angles(45, -30), aspect).flat()
+    value = material.evaluate(q.u, q.sigma, q.omega_i, q.omega_o).reshape(*_POSTER, 3)
+    stream = io.BytesIO()
+    Image.fromarray(to_display(value, ALBEDO_EXPOSURE)).save(stream, "jpeg", quality=85)
+    return f"data:image/jpeg;base64,{base64.b64encode(stream.getvalue()).decode()}"
 
 
 def tiles_text(count: float) -> str:

@@ -61,7 +61,7 @@ def write_page(content: Mapping[str, Any], title: str, *, live: bool = False) ->
 
     Parameters
     ----------
-    content : ``materials``, and optionally ``pictures``, ``mesh`` and ``environment``
+    content : ``materials``, and optionally ``poster``, ``pictures``, ``mesh`` and ``environment``
         (:mod:`mbtf_fit.viewer.page`, :mod:`mbtf_fit.viewer.extras`)
     title : shown by the browser
     live : whether the page may connect to the server that sent it

@@ -112,7 +112,8 @@ def picture_section(
         scenes.append({"group": len(groups) - 1, **_scene(comparison, picture)})
     bars, images, beyond = scaled_maps(maps)
     gallery |= images
-    for cell in (c for g in groups for block in g["blocks"] for row in block["rows"] for c in row if c):
+    blocks = (block for group in groups for block in group["blocks"])
+    for cell in (c for block in blocks for row in block["maps"].values() for c in row):
         if (share := beyond.get(cell["image"])) is not None:
             cell["lines"].append(f"{share:.0%} of the pixels exceed the scale")
     return {"groups": groups, "scenes": scenes, "color_bars": bars}
@@ -152,30 +153,36 @@ def _title(comparison: Mapping[str, Any], picture: Mapping[str, Any]) -> str:
 
 
 def _block(comparison: Mapping[str, Any], picture: Mapping[str, Any], number: int) -> dict[str, Any]:
-    """Figures of one scene: rows of four, references in the first column."""
+    """Figures of one scene: references and fits, side by side; below each fit, its error maps."""
     where = f": view {direction(picture['view'])}, light {direction(picture['light'])}, "
     where += width(picture["tiles_across"])
-    fits, kinds = comparison["fits"], comparison["kinds"]
-    rows: list[list[dict[str, Any] | None]] = [[None] for _ in range(max(len(kinds), len(fits)))]
-    for row, kind in zip(rows, kinds, strict=False):
+    references, fits, kinds = [], [], comparison["kinds"]
+    for kind in kinds:
         reference = picture["references"][kind]
         lines = [f"noise per pixel {100 * estimate(reference['noise']).value:.1f} %"]
         if kind != kinds[0]:
             other = estimate_text(estimate(picture["between_references"]), 1e3)
             lines.append(f"MSE to the other reference {other} · 10⁻³/sr²")
-        row[0] = _figure(reference["file"], _KIND[kind], lines, where, exr=True)
-    for row, fit in zip(rows, fits, strict=False):
+        references.append(_figure(reference["file"], _KIND[kind], lines, where, exr=True))
+    maps: dict[Palette, list[dict[str, Any]]] = {"local": [], "flip": []}
+    for fit in comparison["fits"]:
         record = picture["fits"][fit]
         file, errors = record["file"], record["errors"][kinds[0]]
-        mse, of_fit = estimate(errors["mse"]), f" of {fit}{where}"
+        mse = estimate(errors["mse"])
         psnr = f"PSNR {decibel(estimate(errors['psnr']), mse)}"
-        local = f"MSE {estimate_text(mse, 1e3)} · 10⁻³/sr²"
-        row += [
-            _figure(file, fit, [psnr], where, exr=True),
-            _figure(f"{file}-local", _MAPS["local"][0], [local], of_fit),
-            _figure(f"{file}-flip", _MAPS["flip"][0], [f"mean {record['flip']['hdr']:.3f}"], of_fit),
-        ]
-    return {"title": _title(comparison, picture), "rows": rows, "scene": number}
+        fits.append(_figure(file, fit, [psnr], where, exr=True))
+        numbers: dict[Palette, str] = {
+            "local": f"MSE {estimate_text(mse, 1e3)} · 10⁻³/sr²",
+            "flip": f"mean {record['flip']['hdr']:.3f}",
+        }
+        for kind, line in numbers.items():
+            # Of several fits, the head of the row names the map.
+            label = fit if len(comparison["fits"]) > 1 else _MAPS[kind][0]
+            cell = _figure(f"{file}-{kind}", label, [line], where)
+            maps[kind].append(cell | {"alt": f"{_MAPS[kind][0]} of {fit}{where}"})
+    # The main reference stands beside the fits.
+    title = _title(comparison, picture)
+    return {"title": title, "references": references[::-1], "fits": fits, "maps": maps, "scene": number}
 
 
 def _scene(comparison: Mapping[str, Any], picture: Mapping[str, Any]) -> dict[str, Any]:

@@ -31,7 +31,7 @@ from mbtf_pipeline.report.sections import (
 from mbtf_pipeline.stages import COMPARE, FITS, REPORT, RUN, SHARDS, VIEWER
 
 # Raised when the report or the viewer's page changes; part of the stage's key.
-LAYOUT = 15
+LAYOUT = 16
 # Path-traced pictures in the viewer's page.
 _MOST_PICTURES = 4
 
@@ -124,6 +124,8 @@ def write_viewer(folder: Path, title: str, comparison: Mapping[str, Any]) -> Non
     comparison : mapping
         Content of ``comparison.json``.
     """
+    from mbtf_fit import Material
+    from mbtf_fit.viewer.extras import poster
     from mbtf_fit.viewer.page import material_content, write_page
 
     path = folder / VIEWER
@@ -136,7 +138,9 @@ def write_viewer(folder: Path, title: str, comparison: Mapping[str, Any]) -> Non
     if not materials:
         path.unlink(missing_ok=True)
         return
-    write_document(path, write_page({"materials": materials, "pictures": run_pictures(folder)}, title))
+    first = poster(Material.load(folder / FITS / materials[0]["name"]))
+    content = {"materials": materials, "poster": first, "pictures": run_pictures(folder)}
+    write_document(path, write_page(content, title))
 
 
 def run_pictures(folder: Path) -> list[dict[str, Any]]:

@@ -53,10 +53,11 @@ def _facts(comparison: Mapping[str, Any], tests: Mapping[str, Any]) -> list[dict
     records = [p["fits"][fit] for p in comparison["pictures"]]
     decibels = [r["errors"][comparison["kinds"][0]]["psnr"]["value"] for r in records]
     if finite := [d for d in decibels if d is not None]:
-        what = f"median PSNR of {fit} over {len(decibels)} images"
+        images = "the image" if len(decibels) == 1 else f"{len(decibels)} images (median)"
+        what = f"PSNR of {fit} over {images}"
         out.append({"value": f"{median_high(finite):.1f} dB", "what": what})
     flip = median_high(r["flip"]["hdr"] for r in records)
-    out.append({"value": f"{flip:.3f}", "what": f"median HDR-FLIP of {fit} (0 is best)"})
+    out.append({"value": f"{flip:.3f}", "what": f"HDR-FLIP of {fit}, likewise (0 is best)"})
     record = comparison["test"][fit]
     size = 4 * (record["network_weights"] + record["texels"]) / 1024
     out.append({"value": f"{size:,.0f} KiB", "what": f"{fit}: textures and networks as float32"})

@@ -22,13 +22,17 @@ function statusLine(viewer, test) {
 const painted = () => new Promise((done) => requestAnimationFrame(() => setTimeout(done)));
 
 async function show(content) {
+  // A link shows another view than the poster's.
+  if (content.poster && location.hash.length < 2)
+    byId("poster").style.backgroundImage = `url(${content.poster})`;
   const viewer = new Viewer(content);
   await viewer.start();
   bindPanel(viewer);
   viewer.layout();
-  byId("message").textContent = "Compiling the material …";
+  byId("message").textContent = "Compiling shaders …";
   await painted();
   viewer.draw();
+  byId("poster").remove();
   byId("message").textContent = "";
   await painted();
   const tests = viewer.materials.map((material) => testQueries(viewer.renderer, material));

@@ -178,6 +178,28 @@ def test_error_maps_match_the_selection(page: Page, stage: Any) -> None:
     assert colors[difference < -40, 2].mean() > colors[difference < -40, 0].mean()
 
 
+def test_the_reference_stays_beside_every_fit(page: Page) -> None:
+    """On a narrow page, too, where a row of pictures scrolls."""
+    try:
+        screen = {"width": 420, "height": 900, "deviceScaleFactor": 1, "mobile": False}
+        page.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
+        for fit in ("neumip", "plain"):
+            tops, reference, shown = page.js(
+                "const at = what => document.getElementById(`pictures/v1-l1-s1-${what}`)"
+                ".getBoundingClientRect(), [reference, fit] = ['reference-query', arguments[0]].map(at),"
+                "row = document.querySelector('.sheet').parentElement;"
+                "row.scrollLeft += fit.right - row.getBoundingClientRect().right;"
+                "return [[reference.top, fit.top], at('reference-query'), at(arguments[0])]",
+                f"fit-{fit}",
+            )
+            assert tops[0] == tops[1], fit
+            assert 0 <= reference["left"] < reference["right"] <= shown["left"] + 1, fit
+            assert shown["right"] <= 420, fit
+        assert page.js("return document.querySelector('.sheet').parentElement.scrollLeft") > 0
+    finally:
+        page.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
 def test_images_are_visible_without_scripts(page: Page) -> None:
     driver = page.driver
     driver.switch_to.new_window("window")
