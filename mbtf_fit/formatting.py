@@ -10,8 +10,8 @@ from mbtf_core.units import clock
 
 SPLIT_NAMES = {
     "test": "test queries",
-    "held_out_queries": "test queries of the train split",
-    "held_out_directions": "test directions",
+    "held_out_queries": "held-out queries",
+    "held_out_directions": "held-out directions",
     "training": "training queries",
 }
 # Smallest PSNR in dB of each word for a fit beside its reference. There, the mean HDR-FLIP of pictures is
@@ -50,7 +50,7 @@ def visibility(split: Mapping[str, Any]) -> tuple[str, str | None]:
 
 
 def headline(errors: Mapping[str, Any]) -> str:
-    """The split whose errors are reported first: test, else test queries of the train split, else any."""
+    """The split whose errors are reported first: test, else held-out queries of the train split, else any."""
     return next((name for name in ("test", "held_out_queries") if name in errors), next(iter(errors)))
 
 

@@ -20,8 +20,8 @@ def evaluate(
 
     It ends with the command that is expected to reduce the error most.
 
-    No fit is trained on test queries and directions. --verbose adds the training queries, and errors by level
-    of detail and by elevation.
+    No fit is trained on test queries and held-out directions. --verbose adds the training queries, and
+    errors by level of detail and by elevation.
 
     Parameters
     ----------
