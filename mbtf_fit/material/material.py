@@ -89,7 +89,10 @@ def _broadcast(
         what = f"have the shapes {', '.join(str(a.shape) for a in arrays)}"
         wanted = ", ".join(f"(..., {axis[0]})" if axis else "(...)" for axis in own)
         raise InputError(what, where=", ".join(inputs), hint=f"they must broadcast to {wanted}") from None
-    return lead, [a.reshape(-1, *axis) for a, axis in zip(full, own, strict=True)]
+    # Tensors must be writable, which arrays of files and broadcast ones are not.
+    return lead, [
+        np.require(a.reshape(-1, *axis), requirements=["C", "W"]) for a, axis in zip(full, own, strict=True)
+    ]
 
 
 @dataclass(frozen=True)
