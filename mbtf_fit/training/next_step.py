@@ -114,7 +114,7 @@ def next_step(cost: MarginalCost, errors: Mapping[str, Any]) -> NextStep:
         return NextStep("time", f"{reason}; try twice the training")
     if time < FLAT or cost.few:
         return NextStep("time", f"expect about {time:.2g} of this error after twice the training")
-    return NextStep("none", "neither twice the training nor twice the queries would reduce the error by 5 %")
+    return NextStep("none", "neither twice the training nor twice the queries would reduce the error by 5%")
 
 
 def _numbered(folder: str) -> str:

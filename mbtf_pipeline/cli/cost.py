@@ -49,7 +49,7 @@ def cost(
     time
         Time budget: 90s, 2min, 1h.
     refine
-        Additional time: repeats runs with further seeds until their 95 % intervals are within ±10 %.
+        Additional time: repeats runs with further seeds until their 95% intervals are within ±10%.
     seed
         Root seed of all random numbers.
     """
