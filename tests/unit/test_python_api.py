@@ -17,6 +17,7 @@ MISTAKES: dict[str, tuple[Callable[[], object], str]] = {
     "misspelt section": (lambda: GeneratorConfig(material="rock", quries={}), "'queries'"),
     "key of a section": (lambda: GeneratorConfig(material="rock", spp=4), "'queries.spp'"),
     "value of a section": (lambda: GeneratorConfig(material="rock", queries={"spp": 3}), "queries.spp"),
+    "value for a section": (lambda: GeneratorConfig(material="rock", queries="9/texel"), "keys: train"),
     "wrong type": (lambda: FitConfig(training={"steps": "many"}), "training.steps"),
     "option of another model": (
         lambda: FitConfig.model_validate({"model": "svbrdf", "decoder": "a"}),
