@@ -38,7 +38,7 @@ from mbtf_gen.tile.loading import load_material
 from mbtf_gen.tile.protocol import Tile
 
 # Ratio of the times, auto over all, that the surfaces are held to: at least 20 times faster, or never slower
-# beyond 3 %.
+# beyond 3%.
 THRESHOLDS = {"flat Lambert": 0.05, "black": 0.05, "dark (albedo 0.05)": 1.0, "mid-gray": 1.03}
 
 

@@ -6,7 +6,7 @@ For each material, one fit is evaluated on two test sets: one with the distribut
 and one with ``queries.test_highlights``, whose pilot counts as paths, too. The fit is ``relief``, or
 ``neumip`` on cloth, at 64 texels across. FOLDER keeps fits and figures, so the same command resumes.
 
-The last line is one JSON object. Thresholds: the standard error with highlights is at most 5 % of the error,
+The last line is one JSON object. Thresholds: the standard error with highlights is at most 5% of the error,
 and both errors agree within four standard errors where that of the plain set is at most a quarter of its
 error.
 """

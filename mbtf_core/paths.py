@@ -57,11 +57,16 @@ def suggest_path(path: Path, wanted: Callable[[Path], bool] | None = None) -> st
 
 
 def named_file(folder: Path, name: str) -> Path:
-    """Path of a name in a folder; with backslashes as separators, as in Windows, where only that exists."""
+    """Path of a name in a folder, without ``..`` in it; with backslashes as separators, as in Windows, where
+    only that exists. A name in the current folder, ``Path()``, stays as it was typed."""
     path = folder / name
     portable = folder / name.replace("\\", "/")
     try:
-        return portable if portable != path and not path.exists() and portable.exists() else path
+        if portable != path and not path.exists() and portable.exists():
+            path = portable
+        # Behind a symbolic link, ``..`` is another folder.
+        short = Path(os.path.normpath(path))
+        return short if folder != Path() and real_path(short) == real_path(path) else path
     except (OSError, ValueError):
         return path
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mbtf_core.color import to_display
 from mbtf_core.data.schema import Queries
@@ -116,14 +116,19 @@ class Camera:
         slant = float(np.sin(np.radians(self.elevation)))
         return float(self.distance) * self.pixel_pitch / slant**0.5
 
-    def queries(self, omega_i: NDArray[np.float64], aspect: float = 1.0) -> Queries:
+    def queries(self, omega_i: ArrayLike, aspect: float = 1.0) -> Queries:
         """One query per pixel, leading axes (rows, columns).
 
         Parameters
         ----------
         omega_i : (3,) float array
-            Direction towards the light.
+            Unit vector towards the light.
         aspect : H/W of the tile
+
+        Returns
+        -------
+        Queries
+            ``u``, ``sigma``, ``omega_i`` and ``omega_o`` of the pixels.
 
         Raises
         ------

@@ -64,10 +64,10 @@ class FitConfig(Settings):
     model: Annotated[ModelName, Flag("--model")] = Field(
         DEFAULT_MODEL, description="model to fit; mbtf-fit models describes them"
     )
-    init_from: Annotated[LocalName | None, Flag("--init-from", "FOLDER")] = Field(
+    init_from: Annotated[LocalName | None, Flag("--init-from", "FOLDER", rare=True)] = Field(
         None, description="folder of a material that initializes textures and offset"
     )
-    decoder: Annotated[LocalName | None, Flag("--decoder", "FOLDER")] = Field(
+    decoder: Annotated[LocalName | None, Flag("--decoder", "FOLDER", rare=True)] = Field(
         None,
         description="folder of a shared network or of a material, whose network is kept: only textures are "
         "trained",
@@ -76,7 +76,7 @@ class FitConfig(Settings):
     training: TrainingSection = TrainingSection()
     held_out: HeldOutSection = HeldOutSection()
     data: DataSection = DataSection()
-    seed: Annotated[int, Flag("--seed")] = Field(
+    seed: Annotated[int, Flag("--seed", rare=True)] = Field(
         0, ge=0, lt=1 << 63, description="root seed of all random numbers"
     )
     device: Annotated[Literal["auto", "cpu", "cuda"], Flag("--device")] = Field(

@@ -181,8 +181,9 @@ def evaluate(material: Material | str | Path, shards: str | Path | DataFolder) -
     dict
         ``errors``: those of values by split, ``test``, ``held_out_queries``, ``held_out_directions`` and
         ``training``; ``transmittance``: its errors by split, where both material and data have one. The same
-        plain data as in ``material.json``: estimates with ``value``, ``error`` and ``n``, among them the
-        ``unexplained`` variance (1 - R²).
+        plain data as in ``material.json``, see :func:`split_errors`: estimates with ``value``, ``error`` (one
+        standard error) and ``n``, among them the ``unexplained`` variance (1 - R²). Values that the noise
+        hides are None.
 
     Raises
     ------

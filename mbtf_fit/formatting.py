@@ -11,7 +11,7 @@ from mbtf_core.units import clock
 SPLIT_NAMES = {
     "test": "test queries",
     "held_out_queries": "held-out queries",
-    "held_out_directions": "test directions",
+    "held_out_directions": "held-out directions",
     "training": "training queries",
 }
 # Smallest PSNR in dB of each word for a fit beside its reference. There, the mean HDR-FLIP of pictures is

@@ -155,7 +155,7 @@ class TrainingSection(Settings):
     time: Annotated[
         TimeBudget, BeforeValidator(TimeBudget.parse), PlainSerializer(str), Flag("--time", "DURATION")
     ] = Field(TimeBudget(120.0), description="time budget: 90s, 2min, 1h")
-    steps: Annotated[int | None, Flag("--steps")] = Field(
+    steps: Annotated[int | None, Flag("--steps", rare=True)] = Field(
         None, ge=1, description="number of training steps, in place of a time"
     )
     error: Annotated[float | None, Flag("--error")] = Field(
@@ -165,7 +165,9 @@ class TrainingSection(Settings):
         description="unexplained variance at which training stops: validation error plus its standard "
         "error; forecasts state the time",
     )
-    batch: Annotated[int, Flag("--batch")] = Field(1 << 15, ge=1, le=1 << 24, description="queries per step")
+    batch: Annotated[int, Flag("--batch", rare=True)] = Field(
+        1 << 15, ge=1, le=1 << 24, description="queries per step"
+    )
     patch_size: int = Field(
         32,
         ge=1,
@@ -187,7 +189,7 @@ class TrainingSection(Settings):
         description="Huber threshold: errors beyond this multiple of value and noise count linearly; null: "
         "none",
     )
-    learning_rate: Annotated[float, Flag("--learning-rate")] = Field(
+    learning_rate: Annotated[float, Flag("--learning-rate", rare=True)] = Field(
         3e-2, gt=0, lt=1, description="peak learning rate of the networks (Adam)"
     )
     texture_learning_rate: float = Field(1e-2, gt=0, lt=1, description="peak learning rate of the textures")
@@ -239,10 +241,10 @@ class TrainingSection(Settings):
 class DataSection(Settings):
     """Reading of the data; the fit does not depend on it."""
 
-    memory: Annotated[Size, Flag("--memory", "SIZE")] = Field(
+    memory: Annotated[Size, Flag("--memory", "SIZE", rare=True)] = Field(
         4e9, description="memory for training queries: 500MB, 4GB; larger data are streamed from disk"
     )
-    cache: Annotated[Size, Flag("--cache", "SIZE")] = Field(
+    cache: Annotated[Size, Flag("--cache", "SIZE", rare=True)] = Field(
         20e9, description="local disk for shards of object stores: 500MB, 20GB"
     )
 

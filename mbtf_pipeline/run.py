@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from mbtf_core.app.console import Console
-from mbtf_core.errors import InputError, PartialError
+from mbtf_core.config.settings import build
+from mbtf_core.errors import InputError, PartialError, UsageError
 from mbtf_core.files.atomic import file_sha256, read_json
 from mbtf_core.files.folders import owned
 from mbtf_core.run.runner import Runner
@@ -367,11 +368,15 @@ def rerender(folder: Path, exposure: float | Literal["auto"] | None = None) -> t
     ------
     InputError
         The folder contains no run of this version, or its comparison is not finished.
+    UsageError
+        The exposure is out of range.
     """
     RUN.read(folder)
     recipe = read_resolved(folder)
     if exposure is not None:
-        recipe = recipe.model_copy(update={"report": recipe.report.model_copy(update={"exposure": exposure})})
+        given, flags = {**recipe.report.model_dump(), "exposure": exposure}, {"exposure": "--exposure"}
+        report = build(type(recipe.report), given, source="report", error=UsageError, spelled=flags)
+        recipe = recipe.model_copy(update={"report": report})
     stage = _RecipeRun(recipe, folder, Console(quiet=True)).stages({})[-1]
     with owned(folder):
         for name in stage.needs:

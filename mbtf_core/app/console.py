@@ -33,9 +33,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-from cyclopts import App, CycloptsError, Parameter, UnusedCliTokensError
+from cyclopts import App, CycloptsError, Group, Parameter, UnusedCliTokensError
 from pydantic_core import to_jsonable_python
 
+from mbtf_core.app.help import HELP_ALL, MORE, show_whole_page
 from mbtf_core.app.options import Switch
 from mbtf_core.app.progress import BarProgress, LineProgress, Progress
 from mbtf_core.errors import (
@@ -62,7 +63,7 @@ def _plain(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
-@Parameter(name="*", group="Output")
+@Parameter(name="*", group=MORE)
 @dataclass(frozen=True)
 class Console:
     """Output of a command; every command has a keyword parameter `console` of this type.
@@ -115,8 +116,15 @@ class Console:
 CONSOLE = Console()
 
 
-def new_app(name: str, description: str) -> App:
-    """A cyclopts application for :func:`run`, with ``--help`` and ``--version``; `name` is the program's."""
+def new_app(name: str, description: str, *examples: str) -> App:
+    """A cyclopts application for :func:`run`, with ``--help``, ``--help-all`` and ``--version``.
+
+    Parameters
+    ----------
+    name : of the program
+    description : one sentence
+    examples : command lines that its help shows
+    """
 
     def version() -> str:
         from importlib.metadata import version as installed
@@ -125,7 +133,9 @@ def new_app(name: str, description: str) -> App:
 
     app = App(
         name=name,
-        help=description,
+        help="\n".join([f"{description}\n", *(f"- `{example}`" for example in examples)]),
+        group_parameters=Group.create_default_parameters("Options"),
+        help_flags=("--help", "-h", HELP_ALL),
         version=version,
         help_format="markdown",
         default_parameter=Parameter(negative_iterable=()),
@@ -134,7 +144,9 @@ def new_app(name: str, description: str) -> App:
         suppress_keyboard_interrupt=False,
         result_action="return_value",
     )
-    app.register_install_completion_command()
+    app.register_install_completion_command(group=MORE)
+    app["--version"].group = MORE
+    app["--help"].show = False
     return app
 
 
@@ -245,6 +257,7 @@ def run(app: App, argv: Sequence[str] | None = None) -> int:
     tokens = sys.argv[1:] if argv is None else list(argv)
     # Known before the line is parsed, which may fail.
     debug, as_json = "--debug" in tokens, "--json" in tokens
+    show_whole_page(HELP_ALL in tokens)
     _route_logs(tokens, debug)
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):

@@ -32,6 +32,7 @@ from cyclopts import Parameter, Token
 from pydantic import BaseModel, TypeAdapter
 from pydantic.fields import FieldInfo
 
+from mbtf_core.app.help import MORE
 from mbtf_core.config.settings import Settings, explicit_options, resolve
 from mbtf_core.errors import UsageError
 from mbtf_core.paths import split_url
@@ -69,6 +70,10 @@ def _refuse_url(kind: object, path: Path) -> None:
 
 Output = Annotated[Path, Parameter(name=["--output", "-o"], help="Output folder.", validator=_refuse_url)]
 DataOutput = Annotated[Path, Parameter(name=["--output", "-o"], help="Output folder or URL.")]
+MovedMaterial = Annotated[
+    PathText | None,
+    Parameter(name="--material", metavar="PATH", help="Path of the material, if it was moved."),
+]
 Overwrite = Annotated[Switch, Parameter(help="Replace existing output.")]
 Time = Annotated[str | None, Parameter(metavar="DURATION", help="Time budget: 90s, 2min, 1h.")]
 ErrorOption = Annotated[
@@ -98,6 +103,7 @@ ClusterOption = Annotated[
     Parameter(
         name="--cluster",
         metavar="WHERE",
+        group=MORE,
         help="Run on workers: local, local:4, a YAML file of a batch system, or tcp://scheduler:8786.",
     ),
 ]
@@ -107,14 +113,17 @@ Quality = Literal["draft", "standard", "high", "paper"]
 QualityOption = Annotated[
     Quality | None,
     Parameter(
-        help="Preset of sizes and times; overrides the file of --config; other options override the preset."
+        help="Preset of sizes and times; other options override it, and it overrides the file of --config."
     ),
 ]
-Config = Annotated[Path | None, Parameter(help="YAML file with the options.")]
+Config = Annotated[Path | None, Parameter(group=MORE, help="YAML file with the options.")]
 Set = Annotated[
     list[str] | None,
     Parameter(
-        name="--set", metavar="KEY=VALUE", help="Set any key of the configuration, such as a.b=c. Repeatable."
+        name="--set",
+        metavar="KEY=VALUE",
+        group=MORE,
+        help="Set any key of the configuration, such as a.b=c. Repeatable.",
     ),
 ]
 
@@ -127,10 +136,12 @@ class Flag:
     ----------
     name : such as ``--queries``
     metavar : what the help shows for its value; by default the field's type
+    rare : whether few people need it: ``--help`` only names it, ``--help-all`` describes it
     """
 
     name: str
     metavar: str | None = None
+    rare: bool = False
 
 
 @dataclass(frozen=True)
@@ -146,6 +157,7 @@ class ConfigOption:
     default : as one would write it; empty if there is none
     help : one sentence
     is_list : whether its value is several numbers, of which the first may be negative
+    rare : see :class:`Flag`
     """
 
     flag: str
@@ -155,6 +167,7 @@ class ConfigOption:
     default: str
     help: str
     is_list: bool
+    rare: bool
 
     @property
     def parameter(self) -> str:
@@ -164,17 +177,15 @@ class ConfigOption:
     @property
     def annotation(self) -> Any:
         """Type of the Python parameter, with what the help shows."""
-        default = self.default or False
-        return Annotated[
-            self.type | None,
-            Parameter(
-                name=self.flag,
-                metavar=self.metavar,
-                help=self.help,
-                show_default=default,
-                allow_leading_hyphen=self.is_list,
-            ),
-        ]
+        shown = Parameter(
+            name=self.flag,
+            metavar=self.metavar,
+            help=self.help,
+            show_default=self.default or False,
+            allow_leading_hyphen=self.is_list,
+        )
+        group = [Parameter(group=MORE)] if self.rare else []
+        return Annotated[self.type | None, shown, *group]
 
 
 def config_options(model: type[BaseModel], *keys: str) -> list[ConfigOption]:
@@ -211,6 +222,7 @@ def _option(flag: Flag, key: str, field: FieldInfo) -> ConfigOption:
         default or _default_text(field),
         f"{text[:1].upper()}{text[1:]}.",
         typing.get_origin(kind) is list or (isinstance(kind, type) and issubclass(kind, BaseModel)),
+        flag.rare,
     )
 
 

@@ -182,6 +182,10 @@ def _explain(
         return where, f"unknown key '{dotted}'", _suggest_key(model, location)
     if fault["type"] == "missing":
         return where, f"key '{dotted}' is missing", "add it"
+    if fault["type"] == "model_type":
+        keys = dict.fromkeys(key for m in _models_at(model, location) for key in m.model_fields)
+        what = f"'{dotted}' must be a section of keys (given {shortened(fault['input'])})"
+        return where, what, f"valid keys: {', '.join(keys)}"
     what = fault["msg"].removeprefix("Value error, ").replace("Input should", "must")
     given = fault["input"]
     shown = "" if isinstance(given, Mapping | BaseModel) else f" (given {shortened(given)})"

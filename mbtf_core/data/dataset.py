@@ -189,6 +189,12 @@ class Dataset:
         check_document(Manifest, manifest, path, _MAKE_AGAIN)
         return cls(folder, manifest)
 
+    def __repr__(self) -> str:
+        splits = ", ".join(f"{found['queries']} {name}" for name, found in self.manifest["splits"].items())
+        return (
+            f"<Dataset {self.folder}: {splits} queries, {self.layout}, resolution {self.lattice.shape()[1]}>"
+        )
+
     @property
     def layout(self) -> Layout:
         """``shuffled``, ``image`` or ``slices``."""
@@ -309,7 +315,7 @@ class Dataset:
         ------
         InputError : see :meth:`shards` and :meth:`Shard.read`
         """
-        wanted = None if names is None else list(names)
+        wanted = None if names is None else [names] if isinstance(names, str) else list(names)
         yield from (shard.read(wanted) for shard in ahead(self.shards(split)))
 
     def load(self, split: str, names: Iterable[str] | None = None) -> Arrays:

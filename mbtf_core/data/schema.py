@@ -144,7 +144,7 @@ GEOMETRY: tuple[ArraySpec, ...] = (
     _array("metallic", "", "1", "mean metallic", optional=True),
     _array("specular", "", "1", "mean specular", optional=True),
     _array("opacity", "", "1", "mean opacity", optional=True),
-    _array("clearcoat", "", "1", "mean weight of the clear coat, whose F0 is 4 %", optional=True),
+    _array("clearcoat", "", "1", "mean weight of the clear coat, whose F0 is 4%", optional=True),
     _array("clearcoat_roughness", "", "1", "mean roughness of the clear coat", optional=True),
 )
 

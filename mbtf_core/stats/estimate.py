@@ -65,7 +65,7 @@ class Estimate:
         exponent = _exponent(max(abs(self.value), self.error))
         scale = exponent if exponent < -3 or exponent > 5 else 0
         value, error = self.value / 10.0**scale, self.error / 10.0**scale
-        # One digit of the error, two where the first is a 1, so that rounding costs less than 10 %.
+        # One digit of the error, two where the first is a 1, so that rounding costs less than 10%.
         first = _exponent(error)
         places = max(0, -first + (1 if error / 10.0**first < 1.95 else 0))
         text = f"{value:.{places}f} ± {error:.{places}f}"

@@ -21,7 +21,13 @@ def _description(module: str, function: str) -> str:
     return (ast.get_docstring(next(nodes)) or "").partition("\n\nParameters\n")[0]
 
 
-app = new_app("mbtf-fit", "Fit neural materials to multi-resolution BTF (MBTF) data.")
+app = new_app(
+    "mbtf-fit",
+    "Fit neural materials to multi-resolution BTF (MBTF) data.",
+    "mbtf-fit shards/ --quality draft -o material/",
+    "mbtf-fit evaluate material/ shards/",
+)
+app.usage = "Usage: mbtf-fit SHARDS [OPTIONS]\n       mbtf-fit COMMAND [OPTIONS]"
 app.default(fit)
 for name, function in _COMMANDS.items():
     app.command(f"mbtf_fit.cli.{name}:{function}", name=name, help=_description(name, function))

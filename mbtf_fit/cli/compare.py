@@ -25,7 +25,9 @@ def compare(
     overwrite: Overwrite = False,
     console: Console = CONSOLE,
 ) -> None:
-    """Show a fit beside the path-traced reference: mbtf-fit compare material/ shards/
+    """Show a fit beside the path-traced reference.
+
+    For example: mbtf-fit compare material/ shards/
 
     Writes comparison.png, with columns for the reference, the fit and their difference, and the references
     as EXR. Prints the errors without the noise of the references.

@@ -13,14 +13,15 @@ from mbtf_fit.formatting import report_errors
 def evaluate(
     material: Path, shards: Path, /, *, verbose: Verbose = False, console: Console = CONSOLE
 ) -> None:
-    """Measure the errors of a material, or of other code's predictions, without the noise of the data.
+    """Measure the errors of a material, free of the data's noise.
 
-    Measured data have one value per query: errors on them include their noise, and say so.
+    The predictions of other code are evaluated too. Measured data have one value per query: errors on them
+    include their noise, and say so.
 
     It ends with the command that is expected to reduce the error most.
 
-    No fit is trained on test queries and directions. --verbose adds the training queries, and errors by level
-    of detail and by elevation.
+    No fit is trained on test queries and held-out directions. --verbose adds the training queries, and
+    errors by level of detail and by elevation.
 
     Parameters
     ----------

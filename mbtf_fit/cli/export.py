@@ -8,7 +8,7 @@ from dataclasses import asdict, make_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Optional, TypeVar
 
-from cyclopts import Parameter
+from cyclopts import Group, Parameter
 
 from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.options import Output, Overwrite, Switch
@@ -53,7 +53,8 @@ def flags_of(*kinds: type[Settings]) -> Callable[[type[F]], type[F]]:
     fields: list[tuple[str, Any, None]] = []
     for kind in kinds:
         for key, field in kind.model_fields.items():
-            text, group = f"{field.description or ''}.", kind.__name__.removesuffix("Options")
+            text = f"{field.description or ''}."
+            group = Group(kind.__name__.removesuffix("Options"), sort_key=0)
             default = False if field.default is None else str(field.default)
             shown = Parameter(help=text[:1].upper() + text[1:], group=group, show_default=default)
             fields.append((key, Annotated[Optional[field.annotation], shown], None))  # noqa: UP045
@@ -90,7 +91,9 @@ def export_material(
     overwrite: Overwrite = False,
     console: Console = CONSOLE,
 ) -> None:
-    """Export a material to other programs: mbtf-fit export material/ --to exr
+    """Export a material to other programs.
+
+    For example: mbtf-fit export material/ --to exr
 
     Parameters
     ----------

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 from mbtf_core.app.console import CONSOLE, Console
+from mbtf_core.app.help import MORE
 from mbtf_core.app.options import (
     ClusterOption,
     DryRun,
@@ -50,11 +51,11 @@ def fit(
     options: FitOptions = FitOptions(),  # noqa: B008
     many: Annotated[list[Path] | None, Parameter(consume_multiple=True)] = None,
     processes: Annotated[
-        int | None, Parameter(converter=whole_number, show_default="one per GPU, or 1")
+        int | None, Parameter(converter=whole_number, show_default="one per GPU, or 1", group=MORE)
     ] = None,
-    shared_decoder: Switch = False,
+    shared_decoder: Annotated[Switch, Parameter(group=MORE)] = False,
     live: Live = False,
-    tensorboard: Annotated[Path | None, Parameter(metavar="FOLDER")] = None,
+    tensorboard: Annotated[Path | None, Parameter(metavar="FOLDER", group=MORE)] = None,
     cluster: ClusterOption = None,
     dry_run: DryRun = False,
     overwrite: Overwrite = False,

@@ -6,7 +6,7 @@ from mbtf_core.app.console import CONSOLE, Console
 
 
 def models(*, console: Console = CONSOLE) -> None:
-    """List the models that --model takes, and the layout of the data that each is trained on."""
+    """List the models that --model takes, with the layout of their data."""
     from mbtf_fit.formatting import format_table
     from mbtf_fit.models.registry import MODELS
 

@@ -25,7 +25,7 @@ def preview(
     overwrite: Overwrite = False,
     console: Console = CONSOLE,
 ) -> None:
-    """Draw a material: a contact sheet of views, lights and zooms, and a turntable.
+    """Draw a contact sheet and a turntable of a material.
 
     Needs neither a scene nor PyTorch. Writes sheet.png and turntable.gif. --view and --light replace all
     views and lights of the sheet. Sheet and turntable have one exposure.

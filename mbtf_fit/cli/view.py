@@ -28,7 +28,9 @@ def view(
     port: Annotated[int, Parameter(converter=whole_number)] = 0,
     console: Console = CONSOLE,
 ) -> None:
-    """Show a material in the browser: mbtf-fit view material/
+    """Show a material in the browser.
+
+    For example: mbtf-fit view material/
 
     Turn it under lights with the mouse, zoom, and compare it with other materials or with reference
     pictures. The page is served on this machine alone until Ctrl-C. For a file, see mbtf-fit export --to

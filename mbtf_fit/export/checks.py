@@ -28,7 +28,7 @@ def check_values(found: ArrayLike, material: Material, where: Path) -> None:
     Raises
     ------
     InputError
-        More than 2 % of them deviate by more than 0.001 of value and mean value, or are not finite.
+        More than 2% of them deviate by more than 0.001 of value and mean value, or are not finite.
     """
     expected: NDArray[np.float64] = material.conformance["rgb"].astype(np.float64)
     with np.errstate(invalid="ignore"):

@@ -64,6 +64,37 @@ def conformance_queries(lattice: Lattice) -> dict[str, NDArray[np.float32]]:
     return {name: np.ascontiguousarray(array, np.float32) for name, array in arrays.items()}
 
 
+def _broadcast(
+    inputs: Mapping[str, tuple[ArrayLike, int]],
+) -> tuple[tuple[int, ...], list[NDArray[np.float32]]]:
+    """Common leading axes of inputs, and each with a single one.
+
+    Parameters
+    ----------
+    inputs : name → (values, size of its last axis, which leads nothing; 0 for numbers)
+
+    Raises
+    ------
+    InputError : a last axis has another size, or the others do not broadcast
+    """
+    arrays = [np.asarray(values, np.float32) for values, _ in inputs.values()]
+    own = [(size,) * (size > 0) for _, size in inputs.values()]
+    leads = [a.shape[: a.ndim - len(axis)] for a, axis in zip(arrays, own, strict=True)]
+    try:
+        lead = np.broadcast_shapes(*leads)
+        full = [np.broadcast_to(a, (*lead, *axis)) for a, axis in zip(arrays, own, strict=True)]
+        if any(a.shape[-len(axis) :] != axis for a, axis in zip(arrays, own, strict=True) if axis):
+            raise ValueError
+    except ValueError:
+        what = f"have the shapes {', '.join(str(a.shape) for a in arrays)}"
+        wanted = ", ".join(f"(..., {axis[0]})" if axis else "(...)" for axis in own)
+        raise InputError(what, where=", ".join(inputs), hint=f"they must broadcast to {wanted}") from None
+    # Tensors must be writable, which arrays of files and broadcast ones are not.
+    return lead, [
+        np.require(a.reshape(-1, *axis), requirements=["C", "W"]) for a, axis in zip(full, own, strict=True)
+    ]
+
+
 @dataclass(frozen=True)
 class Material:
     """A fitted material.
@@ -129,6 +160,9 @@ class Material:
         model.to(device).requires_grad_(False)
         return cls(model, config, description, conformance, read_transmittance(Path(folder), description))
 
+    def __repr__(self) -> str:
+        return f"<Material: {self.config.model}, resolution {self.lattice.shape()[1]}>"
+
     @property
     def lattice(self) -> Lattice:
         """Texel grids of the tile."""
@@ -137,53 +171,57 @@ class Material:
     def evaluate(
         self, u: ArrayLike, sigma: ArrayLike, omega_i: ArrayLike, omega_o: ArrayLike
     ) -> NDArray[np.float32]:
-        """Values M(u, σ, ω_i, ω_o) in 1/sr, linear RGB, at least 0.
+        """Values M(u, σ, ω_i, ω_o) in 1/sr, linear RGB, at least 0. The leading axes ``...`` broadcast.
 
         Parameters
         ----------
-        u : (n, 2) float array
+        u : (..., 2) float array
             Positions on the reference plane, uv; the tile repeats.
-        sigma : (n,) float array
+        sigma : (...) float array
             Standard deviations of the footprints in tile widths, clamped to the material's levels.
-        omega_i, omega_o : (n, 3) float array
-            Unit vectors towards light and viewer, z > 0.
+        omega_i, omega_o : (..., 3) float array
+            Unit vectors towards light and viewer, z > 0. Below the plane, values mean nothing.
 
         Returns
         -------
-        (n, 3) float32 array
+        (..., 3) float32 array
 
         Raises
         ------
         InputError
-            A direction is not a unit vector.
+            A direction is not a unit vector, or the shapes do not broadcast.
         """
         check_unit(omega_i, "omega_i")
         check_unit(omega_o, "omega_o")
-        return predict(self.model, u, sigma, omega_i, omega_o)
+        lead, flat = _broadcast(
+            {"u": (u, 2), "sigma": (sigma, 0), "omega_i": (omega_i, 3), "omega_o": (omega_o, 3)}
+        )
+        return predict(self.model, *flat).reshape(*lead, 3)
 
     def offset(self, u: ArrayLike, omega_o: ArrayLike) -> NDArray[np.float32]:
-        """Evaluate the neural offset of the texture lookup.
+        """Evaluate the neural offset of the texture lookup. The leading axes ``...`` broadcast.
 
         Parameters
         ----------
-        u : (n, 2) float array
+        u : (..., 2) float array
             Positions on the reference plane, uv.
-        omega_o : (n, 3) float array
+        omega_o : (..., 3) float array
             Unit vectors towards the viewer, z > 0.
 
         Returns
         -------
-        (n, 2) float32 array
+        (..., 2) float32 array
             Offsets along u and v in tile widths; zero for a model without offset.
 
         Raises
         ------
         InputError
-            A direction is not a unit vector.
+            A direction is not a unit vector, or the shapes do not broadcast.
         """
         check_unit(omega_o, "omega_o")
         device = next(self.model.parameters()).device
-        return evaluate_in_chunks(self.model.offset, device, 2, u, omega_o)
+        lead, flat = _broadcast({"u": (u, 2), "omega_o": (omega_o, 3)})
+        return evaluate_in_chunks(self.model.offset, device, 2, *flat).reshape(*lead, 2)
 
     def predict(self, queries: ShardQueries) -> NDArray[np.float32]:
         """:meth:`evaluate` at queries of a data set."""

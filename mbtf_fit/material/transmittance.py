@@ -50,7 +50,7 @@ _PRIOR, _FIRST_PRIOR = 4.0, 1e-3
 _TRAILING = {"u": (2,), "sigma": (), "omega_o": (3,), "transmittance": (), "spp": ()}
 # Queries and texels per block; most queries of a split that are evaluated.
 _BLOCK, _TEXELS, _EVALUATED = 1 << 16, 1 << 16, 1 << 18
-# Training queries per texel of the finest level, at most; three times as many lower the error by 3 %.
+# Training queries per texel of the finest level, at most; three times as many lower the error by 3%.
 _PER_TEXEL = 128
 # Upper triangle of a texel's matrix.
 _FIRST, _SECOND = np.triu_indices(COEFFICIENTS)

@@ -87,7 +87,7 @@ class Shade(Operation):
 
 
 def grazing_reflectance(f0: float) -> float:
-    """Reflectance of a dielectric at grazing angles, from that along the normal: less than 1 below 2 %."""
+    """Reflectance of a dielectric at grazing angles, from that along the normal: less than 1 below 2%."""
     return min(1.0, 50.0 * f0)
 
 

@@ -1,6 +1,6 @@
 r"""Energy calibration: the mean reflectance at every elevation is scaled to that of the data.
 
-Networks of this size have errors by direction, and so have the tile's means: 1 to 6 % at single elevations,
+Networks of this size have errors by direction, and so have the tile's means: 1 to 6% at single elevations,
 30 times the uncertainty of the data. Two factors per color correct them,
 
     M' = M · G_i(l, ω_i,z) · G_o(l, ω_o,z),

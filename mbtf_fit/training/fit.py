@@ -21,6 +21,7 @@ from mbtf_core.run.signals import stop_on_interruption
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import Partition, load_training, open_data
 from mbtf_fit.data.queries import ShardQueries
+from mbtf_fit.formatting import format_estimate, headline
 from mbtf_fit.material.decoder import DECODER_NAME, Decoder
 from mbtf_fit.material.format import DESCRIPTION_NAME
 from mbtf_fit.material.material import Material
@@ -91,6 +92,13 @@ class FitResult:
     total_seconds: float
     errors: dict[str, dict[str, Any]]
     resumed: bool
+
+    def __repr__(self) -> str:
+        error = ""
+        if self.errors:
+            first = headline(self.errors)
+            error = f", unexplained variance {format_estimate(self.errors[first]['unexplained'])}"
+        return f"<FitResult {self.folder}: {self.material.config.model}, {self.seconds:.0f} s{error}>"
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON, without the history."""

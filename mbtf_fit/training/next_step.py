@@ -122,13 +122,14 @@ def next_step(cost: MarginalCost, errors: Mapping[str, Any]) -> NextStep:
         return NextStep("time", f"{reason}; try twice the training")
     if time < FLAT or cost.few:
         return NextStep("time", f"expect about {time:.2g} of this error after twice the training")
-    return NextStep("none", "neither twice the training nor twice the queries would reduce the error by 5 %")
+    return NextStep("none", "neither twice the training nor twice the queries would reduce the error by 5%")
 
 
 def _numbered(folder: str) -> str:
-    """Name of the next folder: ``material-2`` after ``material``, ``rock_128-2`` after ``rock_128``."""
-    stem, digit = re.fullmatch(r"(.*?)(?:-([2-9]))?/*", folder, re.DOTALL).groups()  # type: ignore[union-attr]
-    return f"{stem}-{int(digit or 1) + 1}"
+    """Name of the next folder: ``material-2`` after ``material``, ``material-10`` after ``material-9``, but
+    ``rock-16-2`` after ``rock-16``: numbers from 16 are resolutions."""
+    stem, digits = re.fullmatch(r"(.*?)(?:-([2-9]|1[0-5]))?/*", folder, re.DOTALL).groups()  # type: ignore[union-attr]
+    return f"{stem}-{int(digits or 1) + 1}"
 
 
 def _times_as_long(planned: float, spent: float, factor: int) -> str:

@@ -11,7 +11,13 @@ from mbtf_gen.cli.measured import export, import_measured
 from mbtf_gen.cli.pictures import preview, reference
 from mbtf_gen.cli.publish import publish
 
-app = new_app("mbtf-gen", "Generate multi-resolution BTF (MBTF) data sets from displaced materials.")
+app = new_app(
+    "mbtf-gen",
+    "Generate multi-resolution BTF (MBTF) data sets from displaced materials.",
+    "mbtf-gen assets/cliff_rock --quality draft -o shards/",
+    "mbtf-gen heightfield.exr --height-scale 0.1 --queries 400/texel -o shards/",
+)
+app.usage = "Usage: mbtf-gen MATERIAL [OPTIONS]\n       mbtf-gen COMMAND [OPTIONS]"
 app.default(generate)
 for command in (inspect, plan, preview, merge, verify, repair, reference, selftest, doctor):
     app.command(command)

@@ -7,7 +7,7 @@ from mbtf_core.app.options import Time
 
 
 def doctor(*, console: Console = CONSOLE) -> int:
-    """Test each part of the installation, and suggest a fix for each failure."""
+    """Test the installation, and suggest a fix for each failure."""
     from mbtf_gen.checks import report, run_checks
     from mbtf_gen.doctor import all_checks
     from mbtf_gen.engine.runtime import use_shipped_llvm
@@ -19,10 +19,10 @@ def doctor(*, console: Console = CONSOLE) -> int:
 
 
 def selftest(*, time: Time = "2min", console: Console = CONSOLE) -> int:
-    """Check the physics against known results on this machine, and report the largest deviation.
+    """Check the physics against known results on this machine.
 
-    Each check runs at least once; a longer time means smaller statistical errors. Exit code 0 when every
-    check passed, 3 otherwise.
+    It reports the largest deviation. Each check runs at least once; a longer time means smaller statistical
+    errors. Exit code 0 when every check passed, 3 otherwise.
     """
     from mbtf_core.units import asked_duration, expectation
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mbtf_core.app.console import CONSOLE, Console
-from mbtf_core.app.options import PathText
+from mbtf_core.app.options import MovedMaterial
 from mbtf_core.errors import EXIT_BAD_INPUT, EXIT_OK, EXIT_PARTIAL
 from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.units import clock
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def merge(folder: Path, /, *, console: Console = CONSOLE) -> int:
-    """Complete the manifest of a data set after all of its slices (--slice i/n) are finished.
+    """Complete a data set of which all slices (--slice i/n) are done.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ def merge(folder: Path, /, *, console: Console = CONSOLE) -> int:
 
 
 def verify(folder: Path, /, *, digests: Path | None = None, console: Console = CONSOLE) -> int:
-    """Check every byte of a data set against its checksums and the manifest.
+    """Check every byte of a data set against its checksums.
 
     Parameters
     ----------
@@ -84,15 +84,15 @@ def verify(folder: Path, /, *, digests: Path | None = None, console: Console = C
     return EXIT_BAD_INPUT if faults or data.get("differences") else EXIT_OK
 
 
-def repair(folder: Path, /, *, material: PathText | None = None, console: Console = CONSOLE) -> int:
-    """Generate missing and corrupt files again; the data set is then identical to the original.
+def repair(folder: Path, /, *, material: MovedMaterial = None, console: Console = CONSOLE) -> int:
+    """Generate missing and corrupt files again.
+
+    The data set is then identical to the original.
 
     Parameters
     ----------
     folder
         Folder of shards, or its URL.
-    material
-        Path of the material, if it was moved.
     """
     from mbtf_core.data.folder import DataFolder
     from mbtf_gen.generation.repair import repair as run

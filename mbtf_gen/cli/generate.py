@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 from cyclopts import Parameter
 
 from mbtf_core.app.console import CONSOLE, Console
+from mbtf_core.app.help import MORE
 from mbtf_core.app.options import (
     ClusterOption,
     DataOutput,
@@ -80,7 +81,7 @@ def generate(
     output: DataOutput = Path("shards"),
     quality: QualityOption = None,
     options: GenerateOptions = GenerateOptions(),  # noqa: B008
-    slice: Annotated[str, Parameter(metavar="I/N")] = "1/1",
+    slice: Annotated[str, Parameter(metavar="I/N", group=MORE)] = "1/1",
     cluster: ClusterOption = None,
     overwrite: Overwrite = False,
     console: Console = CONSOLE,
@@ -92,7 +93,7 @@ def generate(
     Parameters
     ----------
     material
-        Height map, folder of maps, material.yaml, mesh, or file of yarns or fibers.
+        Height map, folder of maps, material.yaml, mesh, yarns or fibers.
     slice
         Render only every n-th shard, from the i-th; finish with mbtf-gen merge.
     """

@@ -32,12 +32,14 @@ def inspect(
     overwrite: Overwrite = False,
     console: Console = CONSOLE,
 ) -> None:
-    """Describe a material and each of its maps: sizes, heights, slopes, tiling, albedo, warnings.
+    """Describe a material and each of its maps.
+
+    It prints sizes, heights, slopes, tiling, albedo and warnings.
 
     Parameters
     ----------
     material
-        Height map, folder of maps, material.yaml, mesh, or file of yarns or fibers.
+        Height map, folder of maps, material.yaml, mesh, yarns or fibers.
     write
         Store the height scale, tiling, resolution, normal convention and color space in a material.yaml, as
         given or as the maps suggest. Other commands then need no flags.
@@ -104,15 +106,16 @@ def plan(
     measure: Annotated[bool, Parameter(show_default=False)] = True,
     console: Console = CONSOLE,
 ) -> None:
-    """Report which effects of light a run would simulate and why, and forecast its time, size and noise.
+    """Forecast a run: effects of light, time, size and noise.
 
-    The bias bound of an effect is the root mean square change of M over the run's queries if the effect is
-    left out, in percent of its mean value. The forecast is measured by a pilot run on this machine.
+    It says which effects the run would simulate, and why. The bias bound of an effect is the root mean square
+    change of M over the run's queries if the effect is left out, in percent of its mean value. The forecast
+    is measured by a pilot run on this machine.
 
     Parameters
     ----------
     material
-        Height map, folder of maps, material.yaml, mesh, or file of yarns or fibers.
+        Height map, folder of maps, material.yaml, mesh, yarns or fibers.
     measure
         Measure the bias of omitting each simulated effect by a pilot run, and forecast the run.
     """

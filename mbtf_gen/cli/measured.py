@@ -30,7 +30,9 @@ def import_measured(
     overwrite: Overwrite = False,
     console: Console = CONSOLE,
 ) -> None:
-    """Import a measured BTF as a data set: mbtf-gen import carpet07.btf -o shards/
+    """Import a measured BTF as a data set.
+
+    For example: mbtf-gen import carpet07.btf -o shards/
 
     The same command again resumes an unfinished import.
 
@@ -76,7 +78,7 @@ def export(
     overwrite: Overwrite = False,
     console: Console = CONSOLE,
 ) -> None:
-    """Write the training queries of a data set as HDF5 for other programs.
+    """Write training queries as HDF5 for other programs.
 
     Parameters
     ----------

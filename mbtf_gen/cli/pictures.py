@@ -27,13 +27,12 @@ def preview(
     overwrite: Overwrite = False,
     console: Console = CONSOLE,
 ) -> None:
-    """Draw the mesh, a path-traced picture, and the queries of a material or of a folder of shards.
+    """Draw the mesh, a path-traced picture, and the queries.
 
     Parameters
     ----------
     material
-        Height map, folder of maps, material.yaml, mesh, file of yarns or fibers, or a folder of shards or its
-        URL.
+        Height map, folder of maps, material.yaml, mesh, yarns or fibers; or a folder of shards, or its URL.
     """
     from mbtf_core.data.dataset import Dataset, is_dataset
     from mbtf_core.data.folder import DataFolder
@@ -77,15 +76,15 @@ def reference(
     overwrite: Overwrite = False,
     console: Console = CONSOLE,
 ) -> None:
-    """Render reference pictures of the micro-geometry on the plane: EXR with two estimates, and PNG.
+    """Render reference pictures of the micro-geometry.
 
-    The same command again renders the missing pictures. All pictures have one exposure. Another --exposure
-    renders nothing again.
+    It writes EXR with two estimates, and PNG. The same command again renders the missing pictures. All
+    pictures have one exposure. Another --exposure renders nothing again.
 
     Parameters
     ----------
     material
-        Height map, folder of maps, material.yaml, mesh, or file of yarns or fibers.
+        Height map, folder of maps, material.yaml, mesh, yarns or fibers.
     """
     resolved = resolve_config(options, material)
     from mbtf_gen.pictures.reference import render_references

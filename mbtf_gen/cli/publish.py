@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from mbtf_core.app.console import CONSOLE, Console
-from mbtf_core.app.options import Options, Output, Overwrite, PathText, Switch, options_from
+from mbtf_core.app.options import MovedMaterial, Options, Output, Overwrite, Switch, options_from
 from mbtf_core.errors import UsageError
 from mbtf_core.paths import real_path
 from mbtf_core.run.signals import keep_on_interruption
@@ -26,11 +26,13 @@ def publish(
     output: Output = Path("card"),
     options: PublishOptions = PublishOptions(),  # noqa: B008
     with_maps: Switch = False,
-    material: PathText | None = None,
+    material: MovedMaterial = None,
     overwrite: Overwrite = False,
     console: Console = CONSOLE,
 ) -> None:
-    """Write a folder to share: mbtf-gen publish shards/ --license CC-BY-4.0 -o card/
+    """Write a folder to share, with a data card.
+
+    For example: mbtf-gen publish shards/ --license CC-BY-4.0 -o card/
 
     It holds a data card with a picture, the data, croissant.json, and the recipe that makes the data again.
 
@@ -40,8 +42,6 @@ def publish(
         Folder of shards, or its URL.
     with_maps
         Publish the input files of the material too, which their license must allow.
-    material
-        Path of the material, if it was moved.
     """
     given = [*options.given, *(text.partition("=")[0].strip() for text in options.assignments or ())]
     if options.config is None and "license" not in given:

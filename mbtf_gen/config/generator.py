@@ -101,16 +101,18 @@ NormalMode = Literal["residual", "absolute", "off"]
 
 Count = Annotated[str, BeforeValidator(_count)]
 Resolution = Annotated[int, AfterValidator(_power_of_two)]
-Seed = Annotated[int, Field(ge=0, lt=1 << 63, description="root seed of all random numbers"), Flag("--seed")]
+Seed = Annotated[
+    int, Field(ge=0, lt=1 << 63, description="root seed of all random numbers"), Flag("--seed", rare=True)
+]
 TestCount = Annotated[
     Count,
     Field(description="test queries, in total or per texel of the finest level"),
-    Flag("--test-queries", "N|N/texel"),
+    Flag("--test-queries", "N|N/texel", rare=True),
 ]
 MinCos = Annotated[
     float,
     Field(gt=0, lt=1, description="smallest cosine of light and view directions to the normal"),
-    Flag("--min-cos"),
+    Flag("--min-cos", rare=True),
 ]
 Paths = Annotated[int, Field(ge=2, le=1 << 20), AfterValidator(_even)]
 
@@ -145,14 +147,14 @@ class GeometrySection(Settings):
         le=1 << 31,
         description="largest map in pixels; each takes about 30 bytes of memory, 60 for 8-bit heights",
     )
-    mesh: Annotated[int | None, Flag("--mesh")] = Field(
+    mesh: Annotated[int | None, Flag("--mesh", rare=True)] = Field(
         None, ge=1, le=8192, description="mesh cells across the tile; default: the map's width, at most 512"
     )
-    tracer: Annotated[Tracer, Flag("--tracer")] = Field(
+    tracer: Annotated[Tracer, Flag("--tracer", rare=True)] = Field(
         "heightfield",
         description="how rays find the surface: cell by cell, or by Mitsuba as triangles",
     )
-    make_tileable: Annotated[Tiling | None, Flag("--make-tileable")] = Field(
+    make_tileable: Annotated[Tiling | None, Flag("--make-tileable", rare=True)] = Field(
         None,
         description="method for maps that do not tile: 2 x 2 mirrored copies, or blended edges; "
         "default: the material's own, else none",
@@ -176,10 +178,12 @@ class QueriesSection(Settings):
     spp: Annotated[Paths, Flag("--spp")] = Field(
         4, description="mean number of paths per training query, both estimates together (even)"
     )
-    test_spp: Annotated[Paths, Flag("--test-spp")] = Field(
+    test_spp: Annotated[Paths, Flag("--test-spp", rare=True)] = Field(
         256, description="mean number of paths per test query, both estimates together (even)"
     )
-    test_highlights: Annotated[float, BeforeValidator(_share), Flag("--test-highlights", "75%")] = Field(
+    test_highlights: Annotated[
+        float, BeforeValidator(_share), Flag("--test-highlights", "75%", rare=True)
+    ] = Field(
         0.0,
         ge=0,
         le=0.95,
@@ -190,7 +194,9 @@ class QueriesSection(Settings):
         "noise",
         description="paths per query: more where a pilot (2.6 million paths) expects noise, or equal",
     )
-    target_error: Annotated[float | None, BeforeValidator(_share), Flag("--target-error", "2%")] = Field(
+    target_error: Annotated[
+        float | None, BeforeValidator(_share), Flag("--target-error", "2%", rare=True)
+    ] = Field(
         None,
         gt=0,
         lt=1,
@@ -205,7 +211,7 @@ class QueriesSection(Settings):
     )
     mixture: MixtureSection = MixtureSection()
     min_cos: MinCos = 0.1
-    layout: Annotated[Layout, Flag("--layout")] = Field(
+    layout: Annotated[Layout, Flag("--layout", rare=True)] = Field(
         "shuffled",
         description="shuffled queries, images of one light, view and footprint each, or slices: all finest "
         "texels at the same lights and views",
@@ -215,7 +221,7 @@ class QueriesSection(Settings):
         description="slices layout: spirals of n lights and n views for n² queries per texel, or the 81 "
         "directions of Bonn 2003 (6561/texel)",
     )
-    patch_size: Annotated[int | None, Flag("--patch-size")] = Field(
+    patch_size: Annotated[int | None, Flag("--patch-size", rare=True)] = Field(
         None,
         ge=1,
         le=256,
@@ -232,7 +238,7 @@ class QueriesSection(Settings):
 class LightSection(Settings):
     """The smoothed directional light."""
 
-    width: Annotated[float, AfterValidator(_light_width), Flag("--light-width")] = Field(
+    width: Annotated[float, AfterValidator(_light_width), Flag("--light-width", rare=True)] = Field(
         1.0, ge=0, le=MAX_WIDTH_DEG, description="RMS angle of the light per axis in degrees; 0: delta light"
     )
 
@@ -240,7 +246,7 @@ class LightSection(Settings):
 class TransportSection(Settings):
     """Depth limits of light paths."""
 
-    max_depth: Annotated[int, Flag("--max-depth")] = Field(
+    max_depth: Annotated[int, Flag("--max-depth", rare=True)] = Field(
         0, ge=0, le=1000, description="surface interactions per path; 0: no limit (Russian roulette)"
     )
     roulette_depth: int = Field(1, ge=1, le=1000, description="interactions before Russian roulette begins")
@@ -270,7 +276,9 @@ class EffectsSection(Settings):
 class OutputSection(Settings):
     """File format and size of the shards."""
 
-    format: Annotated[ArrayFormat, Flag("--format")] = Field("npz", description="file format of the shards")
+    format: Annotated[ArrayFormat, Flag("--format", rare=True)] = Field(
+        "npz", description="file format of the shards"
+    )
     shard_queries: int = Field(1 << 18, ge=1, le=1 << 24, description="queries per shard")
 
 

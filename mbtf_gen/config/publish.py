@@ -72,13 +72,13 @@ class PublishConfig(Settings):
     author: Annotated[Names, Flag("--author")] = Field(
         (), description="authors of the data set, as in BibTeX: NAME and NAME"
     )
-    url: Annotated[Url | None, Flag("--url", "URL")] = Field(
+    url: Annotated[Url | None, Flag("--url", "URL", rare=True)] = Field(
         None, description="address where the data set will be found"
     )
-    citation: Annotated[Citation | None, Flag("--citation")] = Field(
+    citation: Annotated[Citation | None, Flag("--citation", rare=True)] = Field(
         None, description="how to cite the data set: BibTeX or plain text"
     )
-    date: Annotated[datetime.date | None, Flag("--date", "YYYY-MM-DD")] = Field(
+    date: Annotated[datetime.date | None, Flag("--date", "YYYY-MM-DD", rare=True)] = Field(
         None, description="date of publication"
     )
     form: Annotated[Form, Flag("--form")] = Field(

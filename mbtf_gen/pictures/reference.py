@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mbtf_core.app.console import Console
 from mbtf_core.color import brightness, chosen_exposure, describe_exposure
@@ -23,7 +23,7 @@ from mbtf_core.data.lattice import Lattice
 from mbtf_core.data.schema import Queries
 from mbtf_core.data.shard_files import row_bytes
 from mbtf_core.directions import from_angles
-from mbtf_core.errors import PartialError
+from mbtf_core.errors import PartialError, check_type
 from mbtf_core.files.folders import OutputFolder, check_space, owned
 from mbtf_core.pictures import (
     PIXEL_SIGMA,
@@ -39,6 +39,7 @@ from mbtf_core.run.cluster import open_runner
 from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.run.task import Item
 from mbtf_core.stats import pooled_relative_error
+from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.pictures import ReferenceConfig, ViewSection
 from mbtf_gen.forecast import announce
 from mbtf_gen.job import Job
@@ -111,23 +112,24 @@ def picture_seconds(estimator: Estimator, camera: Camera, omega_i: NDArray[np.fl
 
 
 def render_reference(
-    estimator: Estimator,
+    source: GeneratorConfig | Job | Estimator,
     camera: Camera,
-    omega_i: NDArray[np.float64],
+    omega_i: ArrayLike,
     *,
     kind: PixelKind = "query",
     spp: int = 256,
     seed: int = 0,
     index: int = 0,
 ) -> ReferenceImage:
-    """Render one picture of the tile.
+    """Path-trace one picture of a material on the plane.
 
     Parameters
     ----------
-    estimator : estimator of the tile
+    source : GeneratorConfig, Job or Estimator
+        The material, the light and the effects; without ``effects.mode``, all that the material has.
     camera : the camera
     omega_i : (3,) float array
-        Direction towards the light.
+        Unit vector towards the light.
     kind : {"query", "pixel"}
         Meaning of a pixel, see :mod:`mbtf_core.pictures`.
     spp : paths per pixel, both halves together; even
@@ -141,13 +143,18 @@ def render_reference(
     Raises
     ------
     UsageError : the picture shows the horizon
+    InputError : the material cannot be used, or `omega_i` is not a unit vector
     """
     from mbtf_gen.render.estimates import Stream
 
+    job = Job.load(source) if isinstance(source, GeneratorConfig) else source
+    if not isinstance(job, Job) and not hasattr(job, "estimate"):
+        check_type(job, GeneratorConfig, "source", "such as GeneratorConfig(material='heights.exr')")
+    estimator: Any = picture_estimator(job) if isinstance(job, Job) else job
     queries = camera.queries(omega_i, estimator.tile.aspect)
-    source = _camera_rays(camera, estimator) if kind == "pixel" else None
+    rays = _camera_rays(camera, estimator) if kind == "pixel" else None
     stream = Stream(seed, "reference", 2 * index + (kind == "pixel"))
-    estimates = estimator.estimate(queries.flat(), spp, stream, source)
+    estimates = estimator.estimate(queries.flat(), spp, stream, rays)
     shape, through = (*queries.lead, 3), estimates.transmittance
     return ReferenceImage(
         kind,
@@ -166,11 +173,6 @@ def picture_estimator(job: Job) -> Any:
     if _kept is None or _kept[0] is not job:
         _kept = job, build_estimator(job, reference_plan(job))
     return _kept[1]
-
-
-def render_picture(job: Job, camera: Camera, omega_i: NDArray[np.float64], **options: Any) -> ReferenceImage:
-    """Render one picture of a job's material; a task, with the options of :func:`render_reference`."""
-    return render_reference(picture_estimator(job), camera, omega_i, **options)
 
 
 def cameras_of(view: ViewSection) -> list[Camera]:
@@ -239,7 +241,7 @@ def render_missing(
         Item(
             name,
             {
-                **{"job": job, "camera": camera, "omega_i": omega_i, "kind": kind},
+                **{"source": job, "camera": camera, "omega_i": omega_i, "kind": kind},
                 **{"spp": view.spp, "seed": job.config.seed, "index": cameras.index(camera)},
             },
         )
@@ -252,7 +254,7 @@ def render_missing(
             size, fibers = len(missing) * _picture_bytes(job, view), job.material.scatters
             faster = f"--size {max(1, view.size // 2)}, --spp {max(2, view.spp // 4 * 2)}"
             announce(console, paths, seconds, size, fibers, faster)
-        for done in runner.map(render_picture, items):
+        for done in runner.map(render_reference, items):
             if done.error:
                 hint = "the same command renders the missing pictures"
                 raise PartialError(f"picture {done.name} failed: {done.error}", hint=hint)

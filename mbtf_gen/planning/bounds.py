@@ -24,7 +24,7 @@ POINTS = 4096
 CAUTION = 2.0
 # If fewer samples than these change, the largest change may be unsampled.
 FEW = 8
-# An event that occurs in none of n samples has a probability below 3/n, at 95 % confidence (rule of three).
+# An event that occurs in none of n samples has a probability below 3/n, at 95% confidence (rule of three).
 NONE_OF = 3.0
 # The contribution to the mean square of changes larger than the largest sampled one, in units of its own
 # contribution: α/(α-1) for a power-law tail of exponent α, so 10 is safe for α = 1.1.

@@ -68,7 +68,7 @@ class Specular(ReflectionLayer):
     """The dielectric lobe; that of an own BSDF cannot be switched."""
 
     name, description = "specular", "specular lobe"
-    # A specular of 1/4 (F0 = 2 %) is the smallest that reflects everything at grazing angles.
+    # A specular of 1/4 (F0 = 2%) is the smallest that reflects everything at grazing angles.
     scale, text, unit = 4.0, "F0 up to {:.2g}%", 8.0
     lacking = "no roughness, metallic or specular, or specular 0"
 

@@ -36,7 +36,7 @@ def cost(
     assignments: Set = None,
     console: Console = CONSOLE,
 ) -> None:
-    """Measure error against time for this material and machine: mbtf-pipeline cost RECIPE
+    """Measure error against time for this material and machine.
 
     Writes cost.html, cost.csv and PNGs: the errors of complete runs, and from 2min on a forecast for up to
     four times as long. The same command resumes. A longer time keeps all measurements and adds longer runs.
@@ -49,7 +49,7 @@ def cost(
     time
         Time budget: 90s, 2min, 1h.
     refine
-        Additional time: repeats runs with further seeds until their 95 % intervals are within ±10 %.
+        Additional time: repeats runs with further seeds until their 95% intervals are within ±10%.
     seed
         Root seed of all random numbers.
     """

@@ -12,12 +12,6 @@ from mbtf_core.errors import UsageError
 from mbtf_gen.config.pictures import EXPOSURE
 
 
-def _check_exposure(kind: object, exposure: object) -> None:
-    """Refuse what recipes refuse."""
-    if isinstance(exposure, float) and not -40 <= exposure <= 40:
-        raise ValueError("must be at least -40 and at most 40")
-
-
 def report(
     folder: Path,
     /,
@@ -27,13 +21,14 @@ def report(
         Parameter(
             metavar="EV|auto",
             show_default=False,
-            validator=_check_exposure,
             help=f"{EXPOSURE[0].upper()}{EXPOSURE[1:]}.",
         ),
     ] = None,
     console: Console = CONSOLE,
 ) -> None:
-    """Write the report of a finished run again, or the page of a paper recipe or a library.
+    """Write the report of a finished run again.
+
+    The page of a paper recipe or of a library too.
 
     Parameters
     ----------

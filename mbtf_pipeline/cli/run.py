@@ -51,7 +51,9 @@ def run(
     assignments: Set = None,
     console: Console = CONSOLE,
 ) -> None:
-    """Run a recipe: mbtf-pipeline run pipelines/quickstart.yaml
+    """Run a recipe.
+
+    For example: mbtf-pipeline run pipelines/quickstart.yaml
 
     A stage whose inputs have not changed is skipped; the same command again resumes an interrupted run.
     --time is the time of everything: it takes the best preset of --quality that fits, trains for the rest,
@@ -230,7 +232,9 @@ def list_recipes(
     verbose: Verbose = False,
     console: Console = CONSOLE,
 ) -> None:
-    """List the recipes of a folder; with --verbose also the stages that would run, given earlier runs.
+    """List the recipes of a folder.
+
+    With --verbose also the stages that would run, given earlier runs.
 
     Parameters
     ----------

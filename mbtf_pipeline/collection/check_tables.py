@@ -139,9 +139,9 @@ def _rms_text(square: Estimate) -> str | None:
     if square.n < MIN_BLOCKS:
         return None
     if square.value <= 0 or not is_significant(square):
-        return f"below {100 * math.sqrt(max(square.value, 0.0) + 2.0 * square.error):.2g} %"
+        return f"below {100 * math.sqrt(max(square.value, 0.0) + 2.0 * square.error):.2g}%"
     root = math.sqrt(square.value)
-    return f"{Estimate(100 * root, 100 * square.error / (2 * root), square.n)} %"
+    return f"{Estimate(100 * root, 100 * square.error / (2 * root), square.n)}%"
 
 
 def _detectable(square: Estimate) -> float | None:

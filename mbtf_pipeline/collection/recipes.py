@@ -168,7 +168,7 @@ class Collection(Settings):
                 where = f"{file}: materials.{name}"
                 raise InputError("has no path", where=where, hint="add generate.material")
         return {
-            name: Path(os.path.normpath(named_file(file.parent, str(layer.generate["material"]))))
+            name: named_file(file.parent, str(layer.generate["material"]))
             for name, layer in self.materials.items()
         }
 

@@ -132,16 +132,16 @@ def _render_references(
 ) -> list[tuple[Scene, dict[PixelKind, ReferenceImage]]]:
     """References by scene and kind."""
     from mbtf_core.run.task import Item
-    from mbtf_gen.pictures.reference import render_picture
+    from mbtf_gen.pictures.reference import render_reference
 
-    common = {"job": job, "spp": section.spp, "seed": section.seed}
+    common = {"source": job, "spp": section.spp, "seed": section.seed}
     items = []
     for scene, kind in product(scenes(section), section.kinds):
         omega_i = from_angles(scene.light.elevation, scene.light.azimuth)
         own = {"camera": scene.camera(section.size), "omega_i": omega_i, "kind": kind, "index": scene.index}
         items.append(Item(f"{scene.name}-{kind}", {**common, **own}))
     rendered: dict[str, ReferenceImage] = {}
-    for done in runner.map(render_picture, items):
+    for done in runner.map(render_reference, items):
         if done.error:
             hint = "the same command resumes the run"
             raise PartialError(f"picture {done.name} failed: {done.error}", hint=hint)

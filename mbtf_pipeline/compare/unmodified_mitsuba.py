@@ -38,7 +38,7 @@ F64 = NDArray[np.float64]
 # Lowest elevations of view and light for which the finite block suffices.
 LOWEST_VIEW, LOWEST_LIGHT = 75.0, 30.0
 # Pixels along every edge that are ignored, and the side of the blocks taken as independent: neighboring
-# pixels share samples of the Gaussian filter. Correlation across borders makes error bars 5 % too small.
+# pixels share samples of the Gaussian filter. Correlation across borders makes error bars 5% too small.
 _MARGIN, _BLOCK = 4, 8
 # With fewer blocks the error bars are too uncertain to decide anything.
 MIN_BLOCKS = 9

@@ -217,7 +217,7 @@ class GeneratorBenchmark:
             times.append(seconds_per_million)
             squares.append(((found.value_a.astype(np.float64) - found.value_b) ** 2 / 4.0).mean(axis=1))
             variance = mean_estimate(np.concatenate(squares)).scaled(1.0 / mean**2)
-            # The 95 % interval of its root.
+            # The 95% interval of its root.
             narrow = NORMAL * variance.error <= 2 * HALF_WIDTH * variance.value
             late = time.perf_counter() - began > seconds
             if len(squares) >= _FEWEST_BATCHES and (narrow or late):
@@ -272,7 +272,7 @@ def generator_configurations(benchmark: GeneratorBenchmark) -> Iterator[Generato
     for n in PATHS[1::2]:
         yield paths("by expected noise", f"{n} paths", allocation="noise", spp=n)
     for error in TARGETS:
-        yield paths("by target error", error.replace("%", " %"), target_error=error)
+        yield paths("by target error", error, target_error=error)
 
 
 def path_seconds(found: Sequence[Measurement], spp: int) -> float:

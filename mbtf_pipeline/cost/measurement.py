@@ -20,12 +20,12 @@ from mbtf_pipeline.tables import estimate
 # Raised when the method of measuring changes: older measurements are then repeated.
 SCHEMA = 10
 FOLDER = "measurements"
-# Relative half-width of a 95 % interval that a study aims at, and that half-width over the standard error.
+# Relative half-width of a 95% interval that a study aims at, and that half-width over the standard error.
 HALF_WIDTH = 0.1
 NORMAL = 1.96
 ESTIMATES = ("seconds", "error", "bias", "noise")
 # Relative standard deviation of a run over seeds before any run is repeated, and the degrees of freedom that
-# it counts for: studies of four materials found 1.5 to 6 % (docs/results/cost.md).
+# it counts for: studies of four materials found 1.5 to 6% (docs/results/cost.md).
 PRIOR, PRIOR_DEGREES = 0.05, 4
 
 

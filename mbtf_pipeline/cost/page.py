@@ -110,7 +110,7 @@ def _front_section(runs: Sequence[Measurement], evidence: Evidence, png: Path) -
         x = np.geomspace(evidence.runs[-1].seconds.value, evidence.farthest, 12).tolist()
         found = [one for seconds in x if (one := evidence.error_after(seconds)) is not None]
         bounds = [one.value - one.low for one in found], [one.high - one.value for one in found]
-        series.append(Series("forecast, 95 % interval", x, [one.value for one in found], bounds))
+        series.append(Series("forecast, 95% interval", x, [one.value for one in found], bounds))
     stepped = [(m.seconds.value, m.error.value) for m in front] if len(front) > 1 else []
     return {
         "figure": _figure(series, *axes, png, caption, front=stepped),
@@ -133,7 +133,7 @@ def _generator_section(found: Sequence[Measurement], png: Path) -> dict[str, Any
         series = [_series(n, [m for m in found if m.series == n], style="joined") for n in names]
     if unbiased:
         limit = 100 * max(2 * max(m.bias.error, m.bias.value) for m in unbiased if m.bias)
-        most = f"at most {limit:.2g} %" if limit < 100 else "though it may exceed 100 %"
+        most = f"at most {limit:.2g}%" if limit < 100 else "though it may exceed 100%"
         caption = f"Labels at the noise: the bias is not significant, {most} of the mean value."
     return {
         "figure": _figure(series, "seconds per million queries", _NOISE_AXIS, png, caption),
@@ -161,7 +161,7 @@ def write_page(study: Study) -> Path:
         least=None if study.least is None else rounded(study.least),
         skipped=study.skipped,
         failed=study.failed,
-        deviation=f"{study.deviation.scaled(100.0)} %",
+        deviation=f"{study.deviation.scaled(100.0)}%",
         test=statistics.median([100 * m.details["test_error"] for m in evidence.runs] or [0.0]),
     )
     write_document(study.folder / PAGE_NAME, html)

@@ -59,7 +59,7 @@ class StudyPlan:
         if asked >= self.least:
             far = clock(FARTHEST * self.longest)
             lines.append(
-                f"answers: a forecast for up to {FARTHEST:g} times as long, {far}, with its 95 % interval"
+                f"answers: a forecast for up to {FARTHEST:g} times as long, {far}, with its 95% interval"
             )
         else:
             lines.append(f"cannot forecast errors of longer times: that takes --time {rounded(self.least)}")

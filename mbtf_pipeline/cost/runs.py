@@ -198,7 +198,7 @@ def planned_runs(seconds: float, spp: int, path_seconds: float) -> list[Run]:
             **best_options(training),
             "training.time": f"{round(training, 1):.15g}s",
         }
-        series = f"{100 * share:.0f} % of the time for generating"
+        series = f"{100 * share:.0f}% of the time for generating"
         runs.append(Run("run", series, f"planned for {total:g} s", queries, spp, fit, seed))
     return runs
 

@@ -1,4 +1,5 @@
-"""The notebooks of ``examples/`` run: from maps to a rendered ball, and a network of one's own."""
+"""The notebooks of ``examples/`` run: from maps to a rendered ball, and a network of one's own; and so do the
+pages on the use from Python."""
 
 from __future__ import annotations
 
@@ -76,3 +77,33 @@ def test_the_notebook_renders_a_ball(tmp_path: Path, run_python: RunPython) -> N
     assert 20 < ball[15:30, 18:32].mean() < 240
     assert ball[15:30, 18:32].std() > 5
     assert ball[30:].std() > 5
+
+
+def test_the_pages_on_python_run(tmp_path: Path, run_python: RunPython) -> None:
+    """Their blocks one after the other, at small sizes; the model that knows the surface has less error."""
+    pages = [ROOT / "docs/how-to" / name for name in ("use-python.md", "read-the-data.md")]
+    blocks = re.compile(r"```python\n(.*?)```", re.DOTALL)
+    text = "\n".join(block for page in pages for block in blocks.findall(page.read_text(encoding="utf-8")))
+    for large, small in (
+        ('"resolution": 64, "train": "50/texel"', '"resolution": 16, "test": 1024, "test_spp": 16'),
+        ('"time": "10s"', '"steps": 60, "batch": 2048'),
+        ("rows=128, columns=128", "rows=24, columns=24"),
+        ("spp=64", "spp=8"),
+        ("small/", "wool_shards/"),
+    ):
+        assert large in text
+        text = text.replace(large, small)
+    (tmp_path / "assets").symlink_to(ROOT / "assets")
+    script = tmp_path / "pages.py"
+    main = "\n    ".join(
+        ["if __name__ == '__main__':", f"import os; os.chdir({str(tmp_path)!r})", *text.splitlines()]
+    )
+    script.write_text(main, encoding="utf-8")
+    done = run_python("-W", "error::UserWarning", str(script), MPLBACKEND="Agg")
+    assert done.returncode == 0, done.stderr
+    unexplained, difference, verdict, error, *_ = done.stdout.splitlines()
+    assert 0 < float(unexplained.split()[0]) < 1
+    assert float(difference.split()[-2]) < 0
+    assert float(verdict.rpartition("p = ")[2]) < 1e-3
+    assert "±" in error
+    assert np.asarray(Image.open(tmp_path / "pair.png").convert("RGB")).shape == (24, 48, 3)

@@ -27,7 +27,7 @@ print("loaded:", *({heavy!r} & set(sys.modules)))
 def test_help_answers_without_heavy_modules(program: str, run_python: RunPython) -> None:
     """Of the program and of each of its commands."""
     code = CODE.format(program=program, package=PROGRAMS[program], heavy=HEAVY)
-    done = run_python("-c", code, COLUMNS="100")
+    done = run_python("-c", code, COLUMNS="80")
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     text, _, loaded = done.stdout.rpartition("loaded:")
@@ -36,5 +36,8 @@ def test_help_answers_without_heavy_modules(program: str, run_python: RunPython)
     assert f"Usage: {program}" in whole
     assert "--version" in whole
     assert len(commands) > 3
+    # One screen, with two examples.
+    assert len(whole.splitlines()) <= 50
+    assert whole.count(f" • {program} ") == 2
     for answer in commands:
         assert f"Usage: {program} {answer.split()[0]}" in answer

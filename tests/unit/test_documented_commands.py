@@ -22,7 +22,7 @@ from mbtf_pipeline.collection.recipes import load
 from mbtf_pipeline.recipe import Recipe
 
 APPS = {"mbtf-gen": generate, "mbtf-fit": fit, "mbtf-pipeline": pipeline}
-COMMON = {"--help", "--version", "--debug"}
+COMMON = {"--help", "--help-all", "--version", "--debug"}
 # Optional parts, alternatives, omissions.
 SYNOPSIS = re.compile(r"[\[\]|…<>]|\.\.\.")
 

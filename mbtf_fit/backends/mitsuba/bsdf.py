@@ -307,7 +307,7 @@ def _check_conformance(evaluator: Evaluator, stored: StoredMaterial) -> None:
     worst = float(deviations[len(expected) - 1 - allowed])
     if not worst <= TOLERANCE[evaluator.arithmetic]:
         raise InputError(
-            f"the renderer's plugin does not reproduce its conformance values ({100 * worst:.2g} % off)",
+            f"the renderer's plugin does not reproduce its conformance values ({100 * worst:.2g}% off)",
             where=stored.folder,
             hint="set 'networks' to 'unrolled': half precision is too coarse for this material"
             if evaluator.arithmetic == "half"

@@ -151,7 +151,7 @@ def _check_environment(scene: Scene, clamp: bool) -> None:
         data.update()
     elif bad.any():
         _log.warning(
-            "the environment map '%s' has texels that are negative or not finite (%.2g %%, the lowest %.3g): "
+            "the environment map '%s' has texels that are negative or not finite (%.2g%%, the lowest %.3g): "
             "they darken the picture; load_scene(..., clamp_environment=True) sets them to 0",
             emitter.id(),
             100.0 * bad.mean(),

@@ -105,7 +105,7 @@ def _shade(op: ops.Shade, loader: Loader) -> Step:
         places = [mi.Point2f(*hits[k : k + 2]) for k in range(0, len(hits), 2)]
         common = (level[0] + op.finer, mi.Vector3f(*omega_i), mi.Vector3f(*omega_o))
         read = [maps.blended(hit, common[0]) for hit in places]
-        # A basic block of its own: four places in one spill registers, which takes 5 % of the kernel's time.
+        # A basic block of its own: four places in one spill registers, which takes 5% of the kernel's time.
         dr.detail.new_scope(dr.backend_v(mi.Float))
         parts = [at(hit, found, *common) for hit, found in zip(places, read, strict=True)]
         return [sum(column) / len(parts) for column in zip(*parts, strict=True)]

@@ -63,7 +63,7 @@ function follow(begin) {
       text = (x) => (x === null ? "undefined" : x.toPrecision(3));
     drawCurves(byId("curve"), records);
     byId("curve_text").textContent =
-      `${name}: step ${last.step}, ${(100 * last.fraction).toFixed(0)} %, loss ${text(last.loss)} (gray), validation error ${text(last.unexplained)} (blue)`;
+      `${name}: step ${last.step}, ${(100 * last.fraction).toFixed(0)}%, loss ${text(last.loss)} (gray), validation error ${text(last.unexplained)} (blue)`;
   });
   on("levels", (levels) =>
     tableOf("levels", [

@@ -94,7 +94,7 @@ def schlick(cosine: Float) -> Float:
 
 
 def grazing_reflectance(normal_reflectance: Color3f) -> Color3f:
-    """F90 from F0: one, except below F0 = 2 %, less than that of any dielectric in air. There it falls to
+    """F90 from F0: one, except below F0 = 2%, less than that of any dielectric in air. There it falls to
     zero with F0, so that F0 = 0 means no reflection at all."""
     return dr.minimum(1.0, 50.0 * normal_reflectance)
 

@@ -12,7 +12,7 @@ reflect (Kelemen and Szirmay-Kalos 2001, "A Microfacet Based Coupled Specular-Ma
 term adds multiple scattering between metal facets (Kulla and Conty 2017, "Revisiting Physically Based Shading
 at Imageworks"), with ``Fms = F̄²Ā/(1-F̄(1-Ā))``. Both are reciprocal, and a white surface has albedo 1.
 
-A clear coat of weight c and F0 = 4 % attenuates both directions by its directional albedo E_c:
+A clear coat of weight c and F0 = 4% attenuates both directions by its directional albedo E_c:
 ``f = c·f_c + (1-cE_c(μi))(1-cE_c(μo))·f``. Sheen of weight w and color k is the topmost layer. It attenuates
 once, by the larger of its two albedos: ``f = w·k·f_s + min(t(μi), t(μo))·f`` with ``t = 1 - w·max(k)·E_s``.
 

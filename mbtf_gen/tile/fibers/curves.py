@@ -21,10 +21,10 @@ F64 = NDArray[np.float64]
 # Least number of points of a curve: fewer have no cubic spline.
 LEAST_POINTS = 4
 # Longest segment over its smallest radius. Embree misses rays near a tube's silhouette, the more the longer
-# the segment is: 0.03 % of the hits at 100 radii, 0.1 % at 400, 5 to 40 % at 10⁴.
+# the segment is: 0.03% of the hits at 100 radii, 0.1% at 400, 5 to 40% at 10⁴.
 LONGEST_SEGMENT = 100.0
 # Smallest radius over the longest side of the box around a tile. The rounding of positions to float32 costs
-# 0.1 % of the hits there, 0.2 % at half of it; scattered rays start a tenth of it from the surface.
+# 0.1% of the hits there, 0.2% at half of it; scattered rays start a tenth of it from the surface.
 THINNEST = 1e-5
 
 
@@ -118,7 +118,7 @@ class Bundle:
         return np.asarray(out[self.first])
 
     def heights(self) -> tuple[float, float]:
-        """Lowest and highest z of the tubes, at eight points per segment: within 2 % of a radius for curves
+        """Lowest and highest z of the tubes, at eight points per segment: within 2% of a radius for curves
         that bend no more than their radius per segment."""
         z, radius = self.points[:, 2], self.points[:, 3]
         sides = np.column_stack([z - radius, z + radius])

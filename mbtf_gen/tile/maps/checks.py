@@ -29,7 +29,7 @@ _FAR_OFF = 1.5
 
 
 def refuse_color(image: Image, role: Literal["height", "opacity"]) -> None:
-    """Refuse a color image as a gray map: channels that differ by more than 2 % on average."""
+    """Refuse a color image as a gray map: channels that differ by more than 2% on average."""
     if image.stored.shape[2] < 3:
         return
     rgb = image.pixels[..., :3]

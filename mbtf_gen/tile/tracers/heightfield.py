@@ -28,7 +28,7 @@ from mbtf_gen.engine.types import (
 from mbtf_gen.tile.tracers.protocol import Vertex
 
 # Ray offset relative to the largest coordinate: a few units in the last place of float32. An offset four
-# times as large made points on a tile of aspect 64 too bright by 0.1 %.
+# times as large made points on a tile of aspect 64 too bright by 0.1%.
 _RELATIVE_OFFSET = 5.0e-7
 
 
@@ -52,7 +52,7 @@ class HeightField:
     bottom, top : z of the lowest and of the highest vertex
     offset : distance from the surface at which scattered rays start
     two_sided : whether rays may be below the surface
-    powers : whether columns and rows are powers of two, which makes a step 15 % cheaper
+    powers : whether columns and rows are powers of two, which makes a step 15% cheaper
     """
 
     nodes: Float

@@ -123,7 +123,7 @@ def test_positions_far_away_repeat_the_tile(material: Material) -> None:
 
 def test_half_precision_is_accurate_for_values_of_any_size(material: Material, tmp_path: Path) -> None:
     """Half precision ends at 65504, but weights are of order one for data of any scale. With all weights but
-    the unit in half precision, values change by less than 1 % of the largest one."""
+    the unit in half precision, values change by less than 1% of the largest one."""
     weights = material.model.weights()
     large = {name: tensor.clone() for name, tensor in weights.items()}
     large["unit"] = large["unit"] * 1e6

@@ -170,7 +170,7 @@ def test_outliers_do_not_dominate() -> None:
 
 @pytest.mark.parametrize("level", [0.0, 0.5])
 def test_a_constant_channel_is_constant_and_costs_the_others_little(level: float) -> None:
-    """RMS error below 2 % of the mean of the brightest channel; the error of the others at most three times
+    """RMS error below 2% of the mean of the brightest channel; the error of the others at most three times
     that of fits without a constant channel. Over six seeds, a far brighter constant doubles it."""
     value = parallax(*arrays().values())
     free = missed(predictions(fitted(value))[:, [0, 2]], unseen()[:, [0, 2]])
@@ -182,7 +182,7 @@ def test_a_constant_channel_is_constant_and_costs_the_others_little(level: float
 
 @pytest.mark.parametrize("level", [0.3, 1e-8, 1e5])
 def test_constant_data_give_a_constant(level: float) -> None:
-    """Within 2 % RMS, 10 % anywhere."""
+    """Within 2% RMS, 10% anywhere."""
     found = predictions(fitted(np.full((4000, 3), level)))
     assert rms(found / level - 1) < 0.02
     np.testing.assert_allclose(found, level, rtol=0.1)

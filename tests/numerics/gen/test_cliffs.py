@@ -78,7 +78,7 @@ def test_black_is_exactly_black(relief: HeightGrid, light: LightKernel | None) -
 
 
 def test_tile_mean_is_reciprocal(relief: HeightGrid) -> None:
-    """Light and view exchanged, interreflection included: t-test, error bars below 2 %."""
+    """Light and view exchanged, interreflection included: t-test, error bars below 2%."""
     one, other = direction(35, 25), direction(60, 250)
 
     def mean(omega_i: object, omega_o: object, seed: int) -> Estimate:

@@ -36,7 +36,7 @@ def test_a_vanishing_footprint_is_a_point(
 
 @pytest.mark.parametrize("sigma", [2.0, 10.0, 1e3])
 def test_a_huge_footprint_is_the_tile_mean(sigma: float) -> None:
-    """The closed form of the tile mean at every position, by t-test with an error bar below 0.5 %."""
+    """The closed form of the tile mean at every position, by t-test with an error bar below 0.5%."""
     omega_i, omega_o = direction(35, 10), direction(50, 200)
     expected = GROOVE.tile_mean(omega_i, omega_o)
     for u in ([0.25, 0.0], [0.75, 0.5]):

@@ -278,7 +278,7 @@ def test_values(folder: Path, name: str) -> None:
 
 
 def test_reflectance_at_grazing_angles_is_per_channel() -> None:
-    """A metal whose channels lie below and above F0 = 2 %, smooth enough for single scattering alone."""
+    """A metal whose channels lie below and above F0 = 2%, smooth enough for single scattering alone."""
     wi = np.array([math.sin(1.45), 0, math.cos(1.45)])
     wo = np.array([-math.sin(1.40), 0, math.cos(1.40)])
     base = np.array([0.3, 0.01, 0.002])

@@ -64,7 +64,7 @@ def test_mirror_under_a_lobe_shows_the_lobe(width: float, roughness: float) -> N
 
 
 def test_polished_dielectric_mirrors_and_scatters_the_rest() -> None:
-    """Mirror of F0 = 4 % over a base of 0.5: both terms in closed form, with the Fresnel reflectance as E."""
+    """Mirror of F0 = 4% over a base of 0.5: both terms in closed form, with the Fresnel reflectance as E."""
     light = LightKernel(1.0)
     omega_o = towards(np.array([0.9, 0.5, 0.15]), 30.0)
     omega_i = mirrored(omega_o)

@@ -51,7 +51,7 @@ def normalized_deviations(experiment: Experiment, truth: float) -> tuple[Floats,
 
 
 def assert_honest(experiment: Experiment, truth: float) -> None:
-    """Unbiased values (4.5σ); normalized deviations have standard deviation 1 (4.5σ, 3 % for skewness)."""
+    """Unbiased values (4.5σ); normalized deviations have standard deviation 1 (4.5σ, 3% for skewness)."""
     values, deviations = normalized_deviations(experiment, truth)
     assert abs(values.mean() - truth) < 4.5 * values.std(ddof=1) / np.sqrt(EXPERIMENTS)
     assert abs(deviations.std(ddof=1) - 1.0) < 4.5 / np.sqrt(2.0 * EXPERIMENTS) + 0.03
@@ -119,7 +119,7 @@ def test_signal_variance_is_unbiased_for_few_queries_and_images(shape: tuple[int
 
 
 def test_unexplained_variance() -> None:
-    """A prediction that regresses to the mean by 40 % leaves 16 % of the variance."""
+    """A prediction that regresses to the mean by 40% leaves 16% of the variance."""
 
     def experiment(rng: np.random.Generator) -> Estimate:
         truth, a, b = draw(rng)

@@ -145,7 +145,7 @@ WAVES += [(1, -3, 1.5)]
 
 
 def test_the_offset_of_a_sunk_plane_is_its_depth(tmp_path: Path) -> None:
-    """The learned offset is ``-d ω_o,xy / ω_o,z`` within 5 %."""
+    """The learned offset is ``-d ω_o,xy / ω_o,z`` within 5%."""
     folder = write_data(tmp_path / "d", sunk_plane, train=60_000, test=1000, finest=4, noise=0.01)
     options = {"steps": 500, "batch": 4000, "warmup": 20, "losses": [{"kind": "squared"}]}
     result = fit(FitConfig.model_validate({"model": "neumip", "training": options}), folder, tmp_path / "m")

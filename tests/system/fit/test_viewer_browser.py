@@ -229,7 +229,7 @@ def test_a_page_follows_a_fit(driver: Any, tmp_path: Path) -> None:
     page.ready()
     page.until(lambda: page.js("return window.mbtf.viewer.materials.length") == 2)
     text = page.js("return document.getElementById('curve_text').textContent")
-    assert f"first: step {seen[-1]['step']}, 100 %" in text
+    assert f"first: step {seen[-1]['step']}, 100%" in text
     assert "ended" in text
     assert page.js("return document.getElementById('stages').textContent") == "fitrunning"
     assert "level" in page.js("return document.getElementById('levels').textContent")

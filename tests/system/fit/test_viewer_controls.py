@@ -110,7 +110,7 @@ def test_the_first_view_keeps_albedos(page: Page) -> None:
 
 
 def test_the_automatic_exposure_is_that_of_the_picture(page: Page) -> None:
-    """95 % of the pixels are darker than 0.8, as with --exposure auto; of both sides of a comparison."""
+    """95% of the pixels are darker than 0.8, as with --exposure auto; of both sides of a comparison."""
     for against, brightest in (("none", 0.1), ("material 1", 0.3)):
         page.set({"camera": TOP, "lights": [ABOVE], "against": against})
         page.js("document.getElementById('automatic').click()")

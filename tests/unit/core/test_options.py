@@ -17,7 +17,9 @@ class Query(Settings):
     train: Annotated[str, Flag("--queries", "N")] = Field("100/texel", description="number of queries")
     spp: Annotated[int, Flag("--spp")] = Field(4, ge=2, description="paths per query")
     mixture: float = 0.5
-    mesh: Annotated[int | None, Flag("--mesh")] = Field(None, description="cells; default: the map's width")
+    mesh: Annotated[int | None, Flag("--mesh", rare=True)] = Field(
+        None, description="cells; default: the map's width"
+    )
 
 
 class Config(Settings):
@@ -75,17 +77,21 @@ def test_a_command_takes_them_as_its_own(capsys: pytest.CaptureFixture[str]) -> 
     assert given.given == {"queries.spp": "8", "layout": "image"}
     assert given.assignments == ["queries.mixture=1", "a=b"]
     assert run(app, ["map.exr", "--layout", "other"]) == 2
-    assert run(app, ["--help"]) == 0
-    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    for text in (
-        "--queries N Number of queries. [default: 100/texel]",
-        "--mesh INT Cells. [default: the map's width]",
-        "[choices: shuffled, image]",
-        "--config PATH",
-        "--set KEY=VALUE",
-    ):
-        assert text in shown
-    assert shown.index("--widths") < shown.index("--config") < shown.index("--last")
+    pages = []
+    for flag in ("--help", "--help-all", "--help"):
+        assert run(app, [flag]) == 0
+        pages.append(" ".join(capsys.readouterr().out.replace("│", " ").split()))
+    short, whole, again = pages
+    assert short == again
+    rare = ("--mesh INT Cells. [default: the map's width]", "--config PATH", "--set KEY=VALUE")
+    for text in ("--queries N Number of queries. [default: 100/texel]", "[choices: shuffled, image]"):
+        assert text in short
+        assert text in whole
+    for text in rare:
+        assert text not in short
+        assert text in whole
+    # The short page names them, after the others.
+    assert short.index("--last") < short.index("--help-all") < short.index("--mesh, --config, --set")
 
 
 def test_values_go_over_presets_and_files(tmp_path: Path) -> None:

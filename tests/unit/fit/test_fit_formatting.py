@@ -66,7 +66,7 @@ def test_the_table_holds_what_is_defined() -> None:
     found = {"test": test, "training": training, "held_out_directions": unknown}
     table = report_errors(found, None, verbose=True)
     head = next(k for k, line in enumerate(table) if line.startswith("unexplained variance  "))
-    assert "test directions" not in table[head]
+    assert "held-out directions" not in table[head]
     assert [line.split("  ")[0] for line in table[head + 1 :]] == [
         *("all", "level 1", "level 2", "queries"),
         table[-1],

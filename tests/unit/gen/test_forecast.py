@@ -93,7 +93,7 @@ def test_seconds_and_noise(faked: None, layout: str) -> None:
 
 
 def test_a_target_error_decides_paths_and_seconds(faked: None) -> None:
-    """All queries need the paths that bring 0.8 to 8 % of 0.25 or so, unless the cap is lower."""
+    """All queries need the paths that bring 0.8 to 8% of 0.25 or so, unless the cap is lower."""
     for cap in (8192, 512):
         job = job_of(train="1000000", test="20000", test_spp=64, target_error="8%", max_spp=cap)
         plan = allocate(job, plan_effects(job, pilots=False))

@@ -21,7 +21,7 @@ def gpu(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 def halves(seed: int, n: int = 4000) -> dict[str, NDArray[np.float32]]:
-    """Values of known means with independent noise of 20 %."""
+    """Values of known means with independent noise of 20%."""
     truth, noise = np.random.default_rng(7), np.random.default_rng(seed)
     value = 0.2 + truth.random((n, 3))
     sigma = sigma_of_level(FINEST * truth.random(n))

@@ -19,7 +19,7 @@ def test_values_within_two_error_bars_are_marked(value: float) -> None:
 
 
 def test_other_values_are_printed_as_they_are() -> None:
-    assert estimate_text(Estimate(0.123, 0.004, 100), 100.0, " %") == "12.3 ± 0.4 %"
+    assert estimate_text(Estimate(0.123, 0.004, 100), 100.0, "%") == "12.3 ± 0.4%"
     assert estimate_text(Estimate(-0.123, 0.004, 100)) == "−0.123 ± 0.004"
     assert estimate_text(Estimate(math.nan, math.inf, 1)) == "undefined"
 

@@ -67,7 +67,7 @@ ALPHA = {alpha: codes((255, 255, 255, alpha), (255, 255, 255, 255)) for alpha in
 HALF = {"baseColorFactor": [1, 1, 1, 0.5]}
 # Material (its metallic and roughness, and the rest), and values by role; None: there are none.
 VALUES: dict[str, tuple[dict[str, Any] | None, dict[str, Any], dict[str, Any]]] = {
-    # An index of refraction of 1.5 reflects 4 %, half of what `specular` 1 does.
+    # An index of refraction of 1.5 reflects 4%, half of what `specular` 1 does.
     "nothing": (None, {}, {"base_color": [1, 1, 1], "roughness": 1, "metallic": 1, "specular": 0.5}),
     "factors": (
         {"baseColorFactor": [0.0018, 0.0055, 0.0137, 1], "metallicFactor": 0, "roughnessFactor": 0.9},

@@ -59,7 +59,7 @@ def test_shards_are_divided_independently(tmp_path: Path) -> None:
     folder = write_data(tmp_path / "d", parallax, train=2000)
     t = partition(folder, held_out=HeldOutSection(queries=0.3, radius=0)).selection
     kept = [{int(row) for _, some in t.pieces(*t.starts[k : k + 2]) for row in some} for k in (0, 1)]
-    # Of rows that the one keeps the other keeps 70 % too.
+    # Of rows that the one keeps the other keeps 70% too.
     assert 0.6 < len(kept[0] & kept[1]) / len(kept[0]) < 0.8
 
 

@@ -57,7 +57,7 @@ def test_an_unfinished_export_is_resumed(source: Path, tmp_path: Path, lost: tup
 
 @pytest.mark.parametrize(("wrong", "refused"), [(5, False), (6, True)])
 def test_rays_that_pass_an_edge_may_differ(source: Path, tmp_path: Path, wrong: int, refused: bool) -> None:
-    """2 % of the 256 conformance values."""
+    """2% of the 256 conformance values."""
     material, file = Material.load(source), tmp_path / "file"
     file.touch()
     found = material.conformance["rgb"].copy()

@@ -91,7 +91,7 @@ def test_lambert_stays_lambert(tmp_path: Path) -> None:
 
 
 def test_noise_makes_no_lobes(tmp_path: Path) -> None:
-    """Networks deviate from their data: a Lambert surface with an error of 20 % stays rough and no metal."""
+    """Networks deviate from their data: a Lambert surface with an error of 20% stays rough and no metal."""
     known, random = asymmetric_maps(), np.random.default_rng(0)
 
     def noisy(texel: np.ndarray, light: np.ndarray, view: np.ndarray) -> np.ndarray:

@@ -261,3 +261,33 @@ def test_cuda_where_there_is_none_is_refused(data: Path, tmp_path: Path) -> None
         pytest.skip("this machine has a CUDA device")
     with pytest.raises(EngineError, match="no CUDA device"):
         fit(config(3, device="cuda"), data, tmp_path / "m")
+
+
+def test_evaluation_broadcasts_as_numpy_does(fitted: FitResult) -> None:
+    """A picture of (rows, columns) points under one light and one view."""
+    material = fitted.material
+    u = np.random.default_rng(3).random((4, 1, 2))
+    sigma, light, views = 0.05, [0.6, 0.0, 0.8], np.array([[0.0, 0.0, 1.0], [0.0, 0.6, 0.8], [0.8, 0.0, 0.6]])
+    picture, offsets = material.evaluate(u, sigma, light, views), material.offset(u, views)
+    assert picture.shape == (4, 3, 3)
+    assert offsets.shape == (4, 3, 2)
+    for i, j in ((0, 0), (3, 1), (1, 2)):
+        single = material.evaluate(u[i], [sigma], [light], views[j : j + 1])
+        np.testing.assert_allclose(picture[i, j], single[0], atol=1e-6)
+        np.testing.assert_allclose(offsets[i, j], material.offset(u[i], views[j : j + 1])[0], atol=1e-6)
+    assert material.evaluate(u[0, 0], sigma, light, views[0]).shape == (3,)
+
+
+@pytest.mark.parametrize(
+    ("u", "sigma"), [(np.zeros((5, 2)), np.ones(4)), (np.zeros((5, 1)), 0.1), (0.5, 0.1), (np.zeros(3), 0.1)]
+)
+def test_shapes_that_do_not_broadcast_are_refused(fitted: FitResult, u: Any, sigma: Any) -> None:
+    with pytest.raises(InputError, match=r"u, sigma, omega_i, omega_o: have the shapes") as fault:
+        fitted.material.evaluate(u, sigma, [0, 0, 1], [0, 0, 1])
+    assert fault.value.hint == "they must broadcast to (..., 2), (...), (..., 3), (..., 3)"
+
+
+def test_representations_are_one_line(fitted: FitResult, data: Path) -> None:
+    assert repr(fitted.material) == "<Material: neumip, resolution 8>"
+    assert repr(fitted).startswith(f"<FitResult {fitted.folder}: neumip, ")
+    assert repr(Dataset.open(data)).startswith(f"<Dataset {data}: 8000 train, ")

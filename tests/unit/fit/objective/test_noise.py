@@ -34,7 +34,7 @@ def noisy(n: int = 60_000, wild: int = 0) -> tuple[ShardQueries, np.ndarray, np.
 
 @pytest.mark.parametrize("wild", [0, 5])
 def test_variance_by_level_and_elevation_is_found(wild: int) -> None:
-    """To 25 % in every group (the factors are pooled where the levels' footprints are); wild values decide
+    """To 25% in every group (the factors are pooled where the levels' footprints are); wild values decide
     nothing."""
     queries, true, variance = noisy(wild=wild)
     model = NoiseModel.of(queries, LATTICE, 0.05)
@@ -58,7 +58,7 @@ def test_data_without_noise_have_none() -> None:
 
 @pytest.mark.parametrize(("wild", "highlights"), [(0, 0), (5, 0), (0, 300)])
 def test_the_ratio_is_noise_to_signal(wild: int, highlights: int) -> None:
-    """To 15 %, as the brightest are left out, with wild values or highlights or not; where true values do not
+    """To 15%, as the brightest are left out, with wild values or highlights or not; where true values do not
     vary and for a single query, it is the upper bound."""
     queries, true, variance = noisy(wild=wild)
     queries.value_a[:highlights] = queries.value_b[:highlights] = 5.0

@@ -78,7 +78,7 @@ def test_the_lobe_is_that_of_unmodified_mitsuba(
     compiled: bool,
 ) -> None:
     """Of a facet that is lit along its normal, where facets mask each other from the viewer alone. If it is
-    tilted, microfacets face up from the plane instead of from itself. A dielectric of F0 < 2 % reflects 50 F0
+    tilted, microfacets face up from the plane instead of from itself. A dielectric of F0 < 2% reflects 50 F0
     at grazing angles, which dark colors show; a metal reflects all light there."""
     color = (1.0, 0.8, 0.6) if specular == 0.5 else (0.02 * metallic,) * 3
     known = surface(color=color, roughness=roughness, metallic=metallic, specular=specular, slope=slope)

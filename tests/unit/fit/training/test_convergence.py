@@ -209,7 +209,7 @@ def test_the_next_command_is_complete(tmp_path: Path) -> None:
     more = "--test-queries 32768 --test-highlights 75%"
     assert command("test") == f"{made} {more} -o shards-2 && mbtf-fit evaluate material shards-2"
     # The digits of a name count nothing; a second sequel does.
-    for name, following in (("b2_500", "b2_500-2"), ("m-2/", "m-3"), ("m-9", "m-10"), ("m-128", "m-128-2")):
+    for name, following in (("b2_500", "b2_500-2"), ("m-2/", "m-3"), ("m-10", "m-11"), ("m-64", "m-64-2")):
         found = NextStep("time", "").command(config, 30.0, data, Path(name))
         assert found is not None
         assert found.endswith(f" -o {following}")

@@ -26,7 +26,7 @@ def check(btf: Ubo2003) -> None:
     pair, row, column = pair[order], quarter[order] // 2, quarter[order] % 2
     values = btf.values(pair, (3 + 8 * row) * 24 + 5 + 12 * column)
     light, view = btf.light[pair].astype(np.float64), btf.view[pair].astype(np.float64)
-    # JPEG rounds, and a code is up to 0.9 % of the value 1.
+    # JPEG rounds, and a code is up to 0.9% of the value 1.
     np.testing.assert_allclose(values, files.value(2 * row, 2 * column, light, view), atol=0.012)
 
 

@@ -50,7 +50,7 @@ def evidence(times: tuple[float, ...] = SECONDS) -> Evidence:
             Estimate(law(s) * factor, 0.001, 9),
             details={"seeds": 2.0, "test_error": 0.02, **times_of(s)},
         )
-        for series, factor, shown in (("35 %", 1.0, times), ("60 %", 2.0, times[:2]))
+        for series, factor, shown in (("35%", 1.0, times), ("60%", 2.0, times[:2]))
         for s in shown
     ]  # fmt: skip
     return Evidence.of(found, Estimate(0.03, 0.01, 6, 6))

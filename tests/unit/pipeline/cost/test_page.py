@@ -71,7 +71,7 @@ def test_forecasts_are_marked_as_such(tmp_path: Path) -> None:
     rows = page.split('id="answers"')[1].split("</section>")[0].split("<tr")[2:]
     for mark in ("class=forecast", "forecast, "):
         assert [mark in row for row in rows] == [False] * 3 + [True] * 2
-    assert "forecast, 95 % interval" in page
+    assert "forecast, 95% interval" in page
     assert "Not measured: 2 configurations, for" in page
 
 
@@ -102,6 +102,6 @@ def test_the_page_shows_the_front_with_commands_and_what_is_biased(tmp_path: Pat
     # A significant bias with its error, and one that is not.
     for cell in ("<td>5.0 ± 0.4</td>", "not significant (0.2 ± 0.3)</td>"):
         assert cell in section
-    assert "at most 0.6 % of the mean value" in section
-    assert "one run is 4.0 ± 1.0 %" in page
+    assert "at most 0.6% of the mean value" in section
+    assert "one run is 4.0 ± 1.0%" in page
     assert not re.search(r"\bnan\b", page)

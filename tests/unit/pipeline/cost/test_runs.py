@@ -36,7 +36,7 @@ def test_planned_runs_fit_into_the_time(seconds: float) -> None:
     assert len({str(run.key) for run in found}) == len(found)
     # Total times double, so that a longer study keeps the runs of a shorter one.
     longer = planned_runs(2 * seconds, 4, 7.5e-7)
-    doubling = [run for run in found if "35 %" in run.series and run.seed == 0]
+    doubling = [run for run in found if "35%" in run.series and run.seed == 0]
     # They come first, then their second seeds.
     assert found[: len(doubling)] == doubling
     assert [replace(run, seed=0) for run in found[len(doubling) :]][: len(doubling) - 1] == doubling[:-1]

@@ -150,7 +150,7 @@ def test_sequences_begin_at_the_left_and_at_the_top(tmp_path: Path) -> None:
 
 
 def test_hexadecimal_colors_are_decoded(tmp_path: Path) -> None:
-    """IEC 61966-2-1: half of the code is 21.4 % of the light."""
+    """IEC 61966-2-1: half of the code is 21.4% of the light."""
     found = fibers(tmp_path, WEAVE.replace("fibers: 3", "fibers: 3, color: '#7f00FF'"))
     assert found.colors[0] == pytest.approx([((127 / 255 + 0.055) / 1.055) ** 2.4, 0.0, 1.0])
 

@@ -232,6 +232,19 @@ class TestNamesOfFiles:
         assert hint in caught.value.hint
 
 
+def test_warnings_name_files_without_parent_folders(heights: Path) -> None:
+    """Behind a symbolic link ``..`` is another folder, and the path stays as it is."""
+    folder = heights.parent / "elsewhere/inside"
+    folder.mkdir(parents=True)
+    (heights / "link").symlink_to(folder)
+    os.link(heights / "height.npy", folder.parent / "height.npy")
+    (heights / "nested").mkdir()
+    for name, expected in (("nested", heights), ("link", heights / "link/..")):
+        path = heights / name / "material.yaml"
+        path.write_text("height: ../height.npy\n")
+        assert load_material(path).files["height"] == expected / "height.npy"
+
+
 def test_orientation_is_ignored_with_a_warning(heights: Path) -> None:
     from PIL import Image as Pillow
 
