@@ -159,7 +159,7 @@ def _block(comparison: Mapping[str, Any], picture: Mapping[str, Any], number: in
     references, fits, kinds = [], [], comparison["kinds"]
     for kind in kinds:
         reference = picture["references"][kind]
-        lines = [f"noise per pixel {100 * estimate(reference['noise']).value:.1f} %"]
+        lines = [f"noise per pixel {100 * estimate(reference['noise']).value:.1f}%"]
         if kind != kinds[0]:
             other = estimate_text(estimate(picture["between_references"]), 1e3)
             lines.append(f"MSE to the other reference {other} · 10⁻³/sr²")

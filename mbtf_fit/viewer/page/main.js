@@ -13,7 +13,7 @@ function statusLine(viewer, test) {
   // The first full frame replaces the coarse picture; more of them remove its noise and jagged edges.
   const progress = frames
     ? `frame ${frames} of ${FRAMES}, ${timeText(full)} each`
-    : `full picture: ${Math.floor((100 * row) / height)} %${full < 1 ? "" : ` of ${timeText(full)}`}`;
+    : `full picture: ${Math.floor((100 * row) / height)}%${full < 1 ? "" : ` of ${timeText(full)}`}`;
   const beyond = test?.beyond ? `, ${test.beyond} of ${test.count} test queries deviate` : "";
   return `level ${level.toFixed(1)} of ${material.content.finest}, ${tilesText(camera.tiles_across)} across, ${progress}${beyond}`;
 }
