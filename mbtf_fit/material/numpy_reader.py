@@ -113,9 +113,16 @@ def light_widening(omega_i, omega_o, width):
     return (width / both[2]) ** 2 * (np.eye(2) + np.outer(s, s) - np.outer(q, q))
 
 
-def coat_albedo(alpha2, cosine):
-    cosine2 = min(1, cosine**2)
-    return fresnel(0.04, np.sqrt(cosine2 + (1 - cosine2) * alpha2 / (0.06 + 2.5 * np.sqrt(alpha2))))
+def left(f0, f90, alpha2, *cosines):
+    added = alpha2 / (0.06 + 2.5 * np.sqrt(alpha2))
+    t = 1 - np.sqrt(added)
+    mean = 1 - f0 - (f90 - f0) * 2 * t**6 * (1 / 6 - t / 7) / (1 - added)
+    return np.prod([1 - fresnel(f0, np.sqrt(x**2 + (1 - x**2) * added), f90) for x in cosines]), mean
+
+
+def own_shadowing(alpha2, light, view):
+    a, b = (np.sqrt(alpha2 + (1 - alpha2) * x**2) for x in (light, view))
+    return light * (view + b) / (light * b + view * a)
 
 
 def doubled_scatter(center, moments):
@@ -205,18 +212,21 @@ class NumpyMaterial:
             core, h = irradiance * base / np.pi, unit(omega_i + omega_o)
             widening = light_widening(omega_i, omega_o, light_width)
             shared = c, spread, h, omega_o, widening, least_view
+            cosines = [min(1, n[2] * projections(omega, c, spread)[1]) for omega in (omega_i, omega_o)]
             if len(known) >= 10:
                 metal, grazing = known[9], min(1, 50 * dielectric)
                 f = fresnel(
                     dielectric + metal * (base - dielectric), omega_o @ h, grazing + metal * (1 - grazing)
                 )
-                core = (1 - metal) * core + light * f * reflected(np.clip(known[8], *alpha2), *shared)
+                rough = np.clip(known[8], *alpha2)
+                below, mean = left(dielectric, grazing, rough, *cosines)
+                lobe = light * own_shadowing(rough, *cosines) * reflected(rough, *shared)
+                core = (1 - metal) * below / mean * core + f * lobe
             if len(known) == 12:
                 weight, rough = known[10], np.clip(known[11], *alpha2)
-                for omega in (omega_i, omega_o):
-                    cosine = n[2] * projections(omega, c, spread)[1]
-                    core = core * (1 - weight * coat_albedo(rough, cosine))
-                core = core + light * weight * fresnel(0.04, omega_o @ h) * reflected(rough, *shared)
+                lobe = light * own_shadowing(rough, *cosines) * reflected(rough, *shared)
+                core = left(0.04 * weight, weight, rough, *cosines)[0] * core
+                core = core + weight * fresnel(0.04, omega_o @ h) * lobe
             hints.append(np.array([irradiance, *n[:2], *core]))
         return np.mean(hints, 0)
 

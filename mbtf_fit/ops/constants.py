@@ -29,8 +29,8 @@ LEAST_LIGHT, LEAST_VIEW, ALPHA2, LEAST_VARIANCE = 0.01, 0.05, (1e-6, 1.0), 1e-8
 # Of GGX facets under a light of some width: multiples of the light's covariance that widen their tails, and
 # of their own that widen the peak.
 VOIGT_WIDENING, VOIGT_SCALE = 2.5, 0.6
-# Of the squared cosine α² / (a + b α) that facets of a clear coat add at grazing angles: a and b.
-COAT_SPREAD = (0.06, 2.5)
+# Of the squared cosine α² / (a + b α) that facets add to the albedo of a lobe at grazing angles: a and b.
+ALBEDO_SPREAD = (0.06, 2.5)
 # Tile borders that a view ray may cross; a ray at a cosine of 1e-4 crosses more above deep surfaces.
 MAX_CROSSINGS = 64
 # Offsets of the places from the footprint's center, across and along the view's azimuth, in σ; levels that

@@ -30,9 +30,9 @@ class Shade(Operation):
         (R4) P(ω; c, A) = (p + √(p² + ω_xyᵀ A ω_xy)) / 2,    p = ω_z - c·ω_xy.
 
     Irradiance: ``e = V n_z P(ω_i; c, 2C) / ω_i,z``, 1 on the reference plane. Core, in 1/sr: ``e b/π``, or of
-    a glossy surface ``e (1-m) b/π`` and the light that the visible facets reflect,
+    a glossy surface ``e T (1-m) b/π`` and the light that the visible facets reflect,
 
-        (R5) V F D(h) / (4 ω_i,z max(P(ω_o; c', A'), least_view)),
+        (R5) V S F D(h) / (4 ω_i,z max(P(ω_o; c', A'), least_view)),
 
     with ``F = F0 + (F90 - F0) (1 - h·ω_o)⁵`` (Schlick 1994), ``F0 = (1-m) dielectric + m b``, ``F90 = (1-m)
     min(1, 50 dielectric) + m``, the half vector h, and the density D(h) of facets. GGX facets of α² about n
@@ -52,13 +52,23 @@ class Shade(Operation):
     √(det A' / det W))) A'``. The share η keeps the tails of GGX (Walter et al. 2007), which light does not
     widen; a delta light leaves η = 1.
 
+    The mean cosine of the facets that a direction sees is about ``x(ω) = min(1, n_z √(p² + ω_xyᵀ 2C ω_xy))``.
     A clear coat with ``F_c(x) = w (0.04 + 0.96 (1 - x)⁵)`` adds such a lobe of its own α² and of the
     reflectance ``F_c(h·ω_o)``. Of the core below it the share
 
-        (R6) (1 - E_c(ω_i)) (1 - E_c(ω_o)),    E_c(ω) = F_c(√(x² + α² (1 - x²) / (0.06 + 2.5 α))),
+        (R6) (1 - E_c(ω_i)) (1 - E_c(ω_o)),    E_c(ω) = F_c(√(x² + k (1 - x²))),    k = α² / (0.06 + 2.5 α),
 
-    is left, with ``x = min(1, n_z √(p² + ω_xyᵀ 2C ω_xy))``, which is about the mean cosine of the facets that
-    a direction sees. E_c is the albedo of the coat to 0.02 at cosines from 0.1.
+    is left. E_c is the albedo of the coat to 0.02 at cosines from 0.1. The lobe of the dielectric, of F0 and
+    F90 with m = 0, has such an albedo E; its base scatters the rest (Kelemen and Szirmay-Kalos 2001),
+
+        (R9) T = (1 - E(ω_i)) (1 - E(ω_o)) / (1 - F0 - (F90 - F0) 2 t⁶ (1/6 - t/7) / (1 - k)),    t = 1 - √k,
+
+    with the cosine-weighted mean of E below the bar. Facets of a surface's own α² shadow each other, by Smith
+    (Heitz 2014): of those that the viewer sees, the share
+
+        (R10) S = x_i (x_o + a_o) / (x_i a_o + x_o a_i),    a = √(α² + (1 - α²) x²),
+
+    is in the light; horizons know nothing of them.
 
     Attributes
     ----------

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from mbtf_core.data.schema import CLEARCOAT_F0
-from mbtf_fit.ops.constants import COAT_SPREAD, VOIGT_SCALE, VOIGT_WIDENING
+from mbtf_fit.ops.constants import ALBEDO_SPREAD, VOIGT_SCALE, VOIGT_WIDENING
 
 
 def schlick(cosine: Tensor) -> Tensor:
@@ -29,11 +29,28 @@ def coat_reflectance(weight: Tensor, grazing: Tensor) -> Tensor:
     return weight * (CLEARCOAT_F0 + (1.0 - CLEARCOAT_F0) * grazing)
 
 
-def coat_albedo(weight: Tensor, alpha2: Tensor, cosine: Tensor) -> Tensor:
-    """(R6) Directional albedo of a clear coat of a weight and of α², by the cosine of the direction."""
-    rough = alpha2 / (COAT_SPREAD[0] + COAT_SPREAD[1] * alpha2.sqrt())
-    cosine2 = cosine.square().clamp_max(1.0)
-    return coat_reflectance(weight, schlick((cosine2 + rough * (1.0 - cosine2)).sqrt()))
+def grazing_albedo(alpha2: Tensor, cosine: Tensor) -> Tensor:
+    """(R6) Weight of the grazing reflectance in the albedo of a lobe of α², by the direction's cosine."""
+    rough, cosine2 = _added(alpha2), cosine.square()
+    return schlick((cosine2 + rough * (1.0 - cosine2)).sqrt())
+
+
+def mean_grazing_albedo(alpha2: Tensor) -> Tensor:
+    """(R9) Mean of :func:`grazing_albedo`, weighted by the cosine."""
+    rough = _added(alpha2)
+    t = 1.0 - rough.sqrt()
+    return 2.0 * t**6 * (1.0 / 6.0 - t / 7.0) / (1.0 - rough)
+
+
+def _added(alpha2: Tensor) -> Tensor:
+    """Squared cosine that facets add at grazing angles."""
+    return alpha2 / (ALBEDO_SPREAD[0] + ALBEDO_SPREAD[1] * alpha2.sqrt())
+
+
+def own_shadowing(alpha2: Tensor, light: Tensor, view: Tensor) -> Tensor:
+    """(R10) Share of the facets of α² in the light, of those that the viewer sees, by both cosines."""
+    a, b = ((alpha2 + (1.0 - alpha2) * x * x).sqrt() for x in (light, view))
+    return light * (view + b) / (light * b + view * a)
 
 
 def light_widening(omega_i: Tensor, omega_o: Tensor, width: float) -> Tensor:

@@ -17,7 +17,7 @@ from mbtf_fit.native.library import (
     TexturesStruct,
     kernel,
 )
-from mbtf_fit.ops.constants import COAT_SPREAD, HINTS, VOIGT_SCALE, VOIGT_WIDENING
+from mbtf_fit.ops.constants import ALBEDO_SPREAD, HINTS, VOIGT_SCALE, VOIGT_WIDENING
 from mbtf_fit.ops.lookup import Trace
 from mbtf_fit.ops.shade import Shade, grazing_reflectance
 from mbtf_fit.surface.known import KnownSurface
@@ -80,7 +80,7 @@ def compute_hints(
     description.light_width, description.light_blur = surface.light_width, shade.light_blur
     description.dielectric, description.edge = surface.dielectric, grazing_reflectance(surface.dielectric)
     description.coat, description.least_view = CLEARCOAT_F0, shade.least_view
-    description.coat_spread[:], description.alpha2[:] = COAT_SPREAD, shade.alpha2
+    description.albedo_spread[:], description.alpha2[:] = ALBEDO_SPREAD, shade.alpha2
     description.voigt[:] = VOIGT_WIDENING, VOIGT_SCALE
 
     def task(start: int) -> None:

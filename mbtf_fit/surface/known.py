@@ -46,11 +46,13 @@ from mbtf_fit.ops.constants import (
 from mbtf_fit.ops.lookup import Trace
 from mbtf_fit.ops.shade import Shade, grazing_reflectance
 from mbtf_fit.surface.facets import (
-    coat_albedo,
     coat_reflectance,
     doubled_scatter,
+    grazing_albedo,
     light_widening,
+    mean_grazing_albedo,
     own_facets,
+    own_shadowing,
     projections,
     schlick,
     shown,
@@ -241,6 +243,11 @@ class KnownSurface:
         half = torch.nn.functional.normalize(omega_i + omega_o, dim=1)
         rest = schlick((omega_o * half).sum(1, keepdim=True))
         widening = light_widening(omega_i, omega_o, self.light_width)
+        # Mean cosines of the facets that the light and the viewer see.
+        cosines = tuple(
+            (normal[:, 2:] * projections(omega, center, spread)[1]).clamp_max(1.0)
+            for omega in (omega_i, omega_o)
+        )
 
         def lobe(alpha2: Tensor, reflectance: Tensor) -> Tensor:
             """(R5) Light (n, 1 or 3) that facets of α² (n, 1) and of a reflectance (n, 1 or 3) reflect."""
@@ -248,19 +255,25 @@ class KnownSurface:
             facets = own + spread
             facing = shown(omega_o, middle, facets).clamp_min(op.least_view)
             density = slope_density(half, middle, facets, widening, alpha2)
-            return light * (reflectance * density / (4.0 * facing))
+            return light * own_shadowing(alpha2, *cosines) * (reflectance * density / (4.0 * facing))
 
-        metallic = maps[:, 9:10]
+        metallic, own2 = maps[:, 9:10], maps[:, 8:9].clamp(*op.alpha2)
         f0 = torch.lerp(base.new_tensor(self.dielectric), base, metallic)
         grazing = grazing_reflectance(self.dielectric)
         f90 = grazing + metallic * (1.0 - grazing)
-        core = (1.0 - metallic) * core + lobe(maps[:, 8:9].clamp(*op.alpha2), f0 + (f90 - f0) * rest)
+
+        def below(weight: Tensor) -> Tensor:
+            """Energy that the dielectric's lobe leaves, by the weight of its grazing reflectance."""
+            return 1.0 - self.dielectric - (grazing - self.dielectric) * weight
+
+        # (R9)
+        left = math.prod(below(grazing_albedo(own2, x)) for x in cosines) / below(mean_grazing_albedo(own2))
+        core = (1.0 - metallic) * left * core + lobe(own2, f0 + (f90 - f0) * rest)
         if self.coated:
             weight, alpha2 = maps[:, 10:11], maps[:, 11:12].clamp(*op.alpha2)
             # (R6)
-            for omega in (omega_i, omega_o):
-                cosine = normal[:, 2:] * projections(omega, center, spread)[1]
-                core = core * (1.0 - coat_albedo(weight, alpha2, cosine))
+            for cosine in cosines:
+                core = core * (1.0 - coat_reflectance(weight, grazing_albedo(alpha2, cosine)))
             core = core + lobe(alpha2, coat_reflectance(weight, rest))
         return torch.cat([irradiance, normal[:, :2], core], 1)
 

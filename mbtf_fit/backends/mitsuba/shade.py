@@ -18,8 +18,8 @@ from mbtf_fit.backends.mitsuba.stored_material import F32
 from mbtf_fit.backends.mitsuba.textures import GROUP, Textures
 from mbtf_fit.material.format import WEIGHTS_NAME
 from mbtf_fit.ops.constants import (
+    ALBEDO_SPREAD,
     AZIMUTHS,
-    COAT_SPREAD,
     COATED_CHANNELS,
     DIFFUSE_CHANNELS,
     GLOSSY_CHANNELS,
@@ -80,6 +80,10 @@ def _shade(op: ops.Shade, loader: Loader) -> Step:
         rest = _schlick(dr.dot(omega_o, half))
         widening = _light_widening(omega_i, omega_o, width2)
 
+        cosines = [
+            dr.minimum(upright * _projections(omega, center, spread)[1], 1.0) for omega in (omega_i, omega_o)
+        ]
+
         def lobe(alpha2: Float) -> Float:
             """(R5) Light that facets of reflectance 1 reflect."""
             below = dr.rcp(dr.fma(alpha2, length2, 1.0))
@@ -88,17 +92,18 @@ def _shade(op: ops.Shade, loader: Loader) -> Step:
             own = (dr.fma(middle.x, x, 1.0), middle.x * y, dr.fma(middle.y, y, 1.0))
             facets = [dr.fma(rho, a, b) for a, b in zip(own, spread, strict=True)]
             facing = dr.maximum(_shown(omega_o, middle, facets), op.least_view)
-            return light * _density(half, middle, facets, widening, alpha2) / (4.0 * facing)
+            lit = light * _own_shadowing(alpha2, *cosines)
+            return lit * _density(half, middle, facets, widening, alpha2) / (4.0 * facing)
 
         metallic = found[9]
         f0, f90 = dr.lerp(mi.Color3f(dielectric), base, metallic), dr.fma(metallic, 1.0 - grazing, grazing)
-        core = (1.0 - metallic) * core + (f0 + (f90 - f0) * rest) * lobe(dr.clip(found[8], *op.alpha2))
+        alpha2 = dr.clip(found[8], *op.alpha2)
+        left, mean = _left(dielectric, grazing, alpha2, cosines)
+        core = (1.0 - metallic) * left / mean * core + (f0 + (f90 - f0) * rest) * lobe(alpha2)
         if channels == COATED_CHANNELS:
             weight, alpha2 = found[10], dr.clip(found[11], *op.alpha2)
-            for omega in (omega_i, omega_o):
-                cosine = upright * _projections(omega, center, spread)[1]
-                core *= 1.0 - weight * _coat_albedo(alpha2, cosine)
-            core += weight * _coat_reflectance(rest) * lobe(alpha2)
+            core *= _left(CLEARCOAT_F0 * weight, weight, alpha2, cosines)[0]
+            core += weight * dr.fma(1.0 - CLEARCOAT_F0, rest, CLEARCOAT_F0) * lobe(alpha2)
         return [irradiance, -upright * x, -upright * y, *core]
 
     def step(hits: Numbers, level: Numbers, omega_i: Numbers, omega_o: Numbers) -> Numbers:
@@ -154,7 +159,7 @@ def _projections(omega: Vector3f, center: Point2f, matrix: Sequence[Float]) -> t
     xx, xy, yy = matrix
     p = omega.z - center.x * omega.x - center.y * omega.y
     square = xx * dr.square(omega.x) + 2.0 * xy * omega.x * omega.y + yy * dr.square(omega.y)
-    return p, dr.safe_sqrt(dr.fma(p, p, square))
+    return p, dr.sqrt(dr.maximum(dr.fma(p, p, square), 1e-20))
 
 
 def _shown(omega: Vector3f, center: Point2f, matrix: Sequence[Float]) -> Float:
@@ -205,16 +210,20 @@ def _schlick(cosine: Float) -> Float:
     return (1.0 - dr.clip(cosine, 0.0, 1.0)) ** 5
 
 
-def _coat_reflectance(grazing: Float) -> Float:
-    """Reflectance of a clear coat, by the weight of its grazing reflectance."""
-    return dr.fma(1.0 - CLEARCOAT_F0, grazing, CLEARCOAT_F0)
+def _left(f0: Float, f90: Float, alpha2: Float, cosines: Sequence[Float]) -> tuple[Float, Float]:
+    """(R6, R9) Energy that a lobe of α² leaves of both directions, by their cosines; its mean over one."""
+    added = alpha2 / dr.fma(ALBEDO_SPREAD[1], dr.sqrt(alpha2), ALBEDO_SPREAD[0])
+    t = 1.0 - dr.sqrt(added)
+    mean = 2.0 * t**6 * (1.0 / 6.0 - t / 7.0) / (1.0 - added)
+    a, b = (_schlick(dr.sqrt(dr.fma(added, 1.0 - dr.square(x), dr.square(x)))) for x in cosines)
+    a, b, mean = (1.0 - f0 - (f90 - f0) * weight for weight in (a, b, mean))
+    return a * b, mean
 
 
-def _coat_albedo(alpha2: Float, cosine: Float) -> Float:
-    """(R6) Directional albedo of a clear coat of α², by the cosine of the direction."""
-    rough = alpha2 / dr.fma(COAT_SPREAD[1], dr.sqrt(alpha2), COAT_SPREAD[0])
-    cosine2 = dr.minimum(dr.square(cosine), 1.0)
-    return _coat_reflectance(_schlick(dr.sqrt(dr.fma(rough, 1.0 - cosine2, cosine2))))
+def _own_shadowing(alpha2: Float, light: Float, view: Float) -> Float:
+    """(R10) Share of the facets of α² in the light, of those that the viewer sees, by both cosines."""
+    a, b = (dr.sqrt(dr.fma(1.0 - alpha2, dr.square(x), alpha2)) for x in (light, view))
+    return light * (view + b) / dr.fma(light, b, view * a)
 
 
 def _adjacent_azimuths(horizons: F32) -> F32:

@@ -114,7 +114,7 @@ def _shade(op: ops.Shade, code: Code, hits: Value, level: Value, omega_i: Value,
             f"  Pair p = {p}, q = {q};",
             f"  {places}[k] = "
             + (f"glossy_place_at({maps}, p, q, {given});" if glossy else f"place_at({maps}, p, q);"),
-            *([f"  {coats}[k] = coat_at({maps}, p, {places}[k], {coat_f0}, {given});"] if coated else []),
+            *([f"  {coats}[k] = coat_at({maps}, p, {places}[k], {given});"] if coated else []),
             "}",
         )
         if glossy and not code.lit:
@@ -123,8 +123,8 @@ def _shade(op: ops.Shade, code: Code, hits: Value, level: Value, omega_i: Value,
     core = "irradiance * at.base / PI"
     if glossy:
         f0 = code.scalar(op.dielectric)
-        lobe = f"reflected(at, {vector((f0, grazing_reflectance(f0)))}, widening, {omega_i}, {omega_o})"
-        core = f"(1.0 - at.metallic) * {core} + light * {lobe}"
+        lobe = vector((f0, grazing_reflectance(f0)))
+        core = f"glossy(at, {lobe}, irradiance, light, widening, {omega_i}, {omega_o})"
     if coated:
         core = f"coated({core}, {coats}[k], at, {coat_f0}, light, widening, {omega_i}, {omega_o})"
     hints, sum_ = code.variable("float3", op.output), code.variable("float3", op.output)

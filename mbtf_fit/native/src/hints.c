@@ -100,6 +100,9 @@ static projection project(const float *w, float cx, float cy, matrix a) {
 
 static float shown(projection p) { return 0.5f * (p.plane + p.root); }
 
+/* Mean cosine of the facets that a direction sees, whose center has a normal of some z. */
+static float mean_cosine(projection p, float nz) { return clamped(nz * p.root, 1e-10f, 1.0f); }
+
 static float schlick(float cosine) {
     const float rest = 1.0f - clamped(cosine, 0.0f, 1.0f);
     return rest * rest * rest * rest * rest;
@@ -160,11 +163,28 @@ static float reflected(const mbtf_surface *s, float light, float alpha2, const f
     return light * density / (4.0f * (facing > s->least_view ? facing : s->least_view));
 }
 
-/* Albedo of a clear coat towards a direction of some cosine. */
-static float coat_albedo(const mbtf_surface *s, float weight, float alpha2, float cosine) {
-    const float cosine2 = clamped(cosine * cosine, 0.0f, 1.0f);
-    const float rough = alpha2 / (s->coat_spread[0] + s->coat_spread[1] * sqrtf(alpha2));
-    return weight * (s->coat + (1.0f - s->coat) * schlick(sqrtf(cosine2 + rough * (1.0f - cosine2))));
+/* Squared cosine that facets add to the albedo of a lobe at grazing angles. */
+static float added(const mbtf_surface *s, float alpha2) {
+    return alpha2 / (s->albedo_spread[0] + s->albedo_spread[1] * sqrtf(alpha2));
+}
+
+/* Energy that a lobe leaves of a direction, by what its facets add. */
+static float left(float f0, float f90, float added, float cosine) {
+    const float cosine2 = cosine * cosine;
+    return 1.0f - f0 - (f90 - f0) * schlick(sqrtf(cosine2 + added * (1.0f - cosine2)));
+}
+
+/* Mean of that over directions, weighted by the cosine. */
+static float mean_left(float f0, float f90, float added) {
+    const float t = 1.0f - sqrtf(added), t2 = t * t;
+    return 1.0f - f0 - (f90 - f0) * 2.0f * t2 * t2 * t2 * (1.0f / 6.0f - t / 7.0f) / (1.0f - added);
+}
+
+/* Share of the facets in the light, of those that the viewer sees. */
+static float own_shadowing(float alpha2, float light, float view) {
+    const float a = sqrtf(alpha2 + (1.0f - alpha2) * light * light);
+    const float b = sqrtf(alpha2 + (1.0f - alpha2) * view * view);
+    return light * (view + b) / (light * b + view * a);
 }
 
 /* Adds irradiance, normal (x, y) and core at a surface point. */
@@ -189,16 +209,21 @@ static void shade(const mbtf_surface *s, const hit *h, const float *i, const flo
         const float rest = schlick(o[0] * w[0] + o[1] * w[1] + o[2] * w[2]);
         const matrix b = light_widening(i, o, s->light_width);
         const float alpha2 = clamped(m[8], s->alpha2[0], s->alpha2[1]);
-        const float lobe = reflected(s, light, alpha2, m, a, b, w, o), edge = s->edge + m[9] * (1.0f - s->edge);
+        const float xi = mean_cosine(lit, nz), xo = mean_cosine(project(o, m[0], m[1], a), nz);
+        const float more = added(s, alpha2), dielectric = s->dielectric, grazing = s->edge;
+        const float base = (1.0f - m[9]) * left(dielectric, grazing, more, xi) * left(dielectric, grazing, more, xo) /
+                           mean_left(dielectric, grazing, more);
+        const float lobe = own_shadowing(alpha2, xi, xo) * reflected(s, light, alpha2, m, a, b, w, o);
+        const float edge = grazing + m[9] * (1.0f - grazing);
         for (int c = 0; c < 3; c++) {
-            const float f0 = s->dielectric + m[9] * (m[5 + c] - s->dielectric);
-            core[c] = (1.0f - m[9]) * core[c] + (f0 + (edge - f0) * rest) * lobe;
+            const float f0 = dielectric + m[9] * (m[5 + c] - dielectric);
+            core[c] = base * core[c] + (f0 + (edge - f0) * rest) * lobe;
         }
         if (channels == COATED) {
             const float f0 = s->coat, rough = clamped(m[11], s->alpha2[0], s->alpha2[1]);
-            const float coat = m[10] * (f0 + (1.0f - f0) * rest) * reflected(s, light, rough, m, a, b, w, o);
-            const float below = (1.0f - coat_albedo(s, m[10], rough, nz * lit.root)) *
-                                (1.0f - coat_albedo(s, m[10], rough, nz * project(o, m[0], m[1], a).root));
+            const float coat = m[10] * (f0 + (1.0f - f0) * rest) * own_shadowing(rough, xi, xo) *
+                               reflected(s, light, rough, m, a, b, w, o);
+            const float over = added(s, rough), below = left(m[10] * f0, m[10], over, xi) * left(m[10] * f0, m[10], over, xo);
             for (int c = 0; c < 3; c++) core[c] = below * core[c] + coat;
         }
     }

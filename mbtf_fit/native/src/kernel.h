@@ -10,7 +10,7 @@
 #include <stdint.h>
 
 /* Version of what the functions mean; raised where sizes of structures do not show a change. */
-#define INTERFACE 5
+#define INTERFACE 6
 #define BLOCK 128
 #define MAX_CHANNELS 64
 #define MAX_WIDTH 128
@@ -69,7 +69,7 @@ typedef struct {
     mbtf_textures maps, horizons;
     int32_t places;
     float offsets[2 * MAX_PLACES];
-    float finer, light_width, light_blur, dielectric, edge, coat, least_view, coat_spread[2], alpha2[2], voigt[2];
+    float finer, light_width, light_blur, dielectric, edge, coat, least_view, albedo_spread[2], alpha2[2], voigt[2];
 } mbtf_surface;
 
 /* u (n, 2), sigma (n), omega_i and omega_o (n, 3), hints (n, HINTS) for relief. */

@@ -12,6 +12,7 @@ import torch
 from support.fit_data import random_queries
 from support.known_surfaces import geometry, rough_heights, rough_surface
 from support.scenes import mi
+from support.surfaces import point, vectors
 from torch import Tensor
 
 from mbtf_core.data.lattice import Lattice, sigma_of_level
@@ -21,6 +22,7 @@ from mbtf_fit.surface import hints
 from mbtf_fit.surface.hints import compute_hints
 from mbtf_fit.surface.known import KnownSurface, prefilter, prefiltered_levels
 from mbtf_fit.surface.lookup import Packing, lookup
+from mbtf_gen.render.bsdf.surface import SurfaceParts
 from mbtf_gen.sampling.light_kernel import LightKernel
 
 LATTICE = Lattice(3)
@@ -68,20 +70,18 @@ def conductor(alpha: tuple[float, float], light: Tensor, view: Tensor) -> np.nda
 @pytest.mark.parametrize(
     ("slope", "roughness", "tolerance"), [((0, 0), 0.3, 3e-3), ((0, 0), 0.6, 3e-3), ((0.7, -0.4), 0.3, 0.02)]
 )
-@pytest.mark.parametrize(("metallic", "specular"), [(1.0, 0.5), (0.0, 0.5), (1.0, 0.1), (0.0, 0.1)])
+@pytest.mark.parametrize("color", [(1.0, 0.8, 0.6), (0.02, 0.02, 0.02)])
 def test_the_lobe_is_that_of_unmodified_mitsuba(
     slope: tuple[float, float],
     roughness: float,
     tolerance: float,
-    metallic: float,
-    specular: float,
+    color: tuple[float, float, float],
     compiled: bool,
 ) -> None:
     """Of a facet that is lit along its normal, where facets mask each other from the viewer alone. If it is
-    tilted, microfacets face up from the plane instead of from itself. A dielectric of F0 < 2% reflects 50 F0
-    at grazing angles, which dark colors show; a metal reflects all light there."""
-    color = (1.0, 0.8, 0.6) if specular == 0.5 else (0.02 * metallic,) * 3
-    known = surface(color=color, roughness=roughness, metallic=metallic, specular=specular, slope=slope)
+    tilted, microfacets face up from the plane instead of from itself. A metal reflects all light at grazing
+    angles."""
+    known = surface(color=color, roughness=roughness, metallic=1.0, slope=slope)
     u, sigma, view, _ = queries(300)
     normal = torch.nn.functional.normalize(torch.tensor([[-slope[0], -slope[1], 1.0]]), dim=1)
     light = normal.expand(300, 3).contiguous()
@@ -94,11 +94,29 @@ def test_the_lobe_is_that_of_unmodified_mitsuba(
     value = conductor((alpha, alpha), light[seen] @ frame.T, view[seen] @ frame.T)
     half = torch.nn.functional.normalize(light + view, dim=1)[seen]
     schlick = ((1 - (half * view[seen]).sum(1, keepdim=True)) ** 5).numpy()
-    f0 = np.array(color) if metallic else np.full(3, 0.08 * specular)
-    wanted = value[:, None] * (f0 + (np.minimum(1, 50 * f0) - f0) * schlick)
-    if not metallic:
-        wanted += np.array(color) / np.pi
+    wanted = value[:, None] * (np.array(color) + (1 - np.array(color)) * schlick)
     np.testing.assert_allclose(found, wanted / float(normal[0, 2]), rtol=tolerance)
+
+
+@pytest.mark.parametrize(
+    ("roughness", "specular", "tolerance"),
+    [(0.1, 0.5, 0.002), (0.3, 0.5, 0.006), (0.5, 0.1, 0.004), (0.5, 0.5, 0.008), (1.0, 0.5, 0.03)],
+)
+def test_a_dielectric_is_that_of_the_generator(
+    roughness: float, specular: float, tolerance: float, compiled: bool
+) -> None:
+    """Its base scatters what its lobe leaves, and its facets shadow each other. One of F0 < 2% reflects
+    50 F0 at grazing angles, which dark colors show."""
+    color = (0.8, 0.3, 0.0)
+    u, sigma, light, view = queries(4000)
+    known = surface(color=color, roughness=roughness, specular=specular)
+    found = hints_of(known, u, sigma, light, view, places=1)[:, 4:].numpy()
+    base = np.tile(np.array(color)[:, None], (1, 4000))
+    at = view.double().numpy()
+    there = point(SurfaceParts(specular=True), at, base_color=base, specular=specular, roughness=roughness)
+    wanted = (np.array(there.eval_pdf(vectors(light.numpy()))[0]) / light[:, 2].numpy()).T
+    assert np.all(((found - wanted) ** 2).mean(0) < tolerance**2 * (wanted**2).mean(0))
+    np.testing.assert_allclose(found.mean(0), wanted.mean(0), rtol=tolerance)
 
 
 def test_scattered_slopes_are_anisotropic_facets(compiled: bool) -> None:
@@ -127,13 +145,13 @@ def test_scattered_slopes_are_anisotropic_facets(compiled: bool) -> None:
         (1, 0.5, 0.05, 0.05),
         (1, 0.15, 0.1, 0.09),
         (3, 0.5, 0.2, 0.04),
-        (3, 0.3, 0.5, 0.03),
+        (3, 0.3, 0.5, 0.04),
     ],
 )
 def test_the_lobe_is_averaged_over_the_light(
     width: float, cosine: float, roughness: float, tolerance: float
 ) -> None:
-    """Means of unmodified Mitsuba's facets, which mask each other from the viewer alone, over the
+    """Means of unmodified Mitsuba's facets, whose masking and shadowing are correlated by height, over the
     generator's light. Half vectors are up to three standard deviations from the normal."""
     count, draws, kernel, random = 8, 40_000, LightKernel(width), np.random.default_rng(3)
     alpha, azimuth = roughness**2, np.linspace(0, 2 * np.pi, count, endpoint=False)
@@ -145,8 +163,8 @@ def test_the_lobe_is_averaged_over_the_light(
     view = view[view[:, 2] > 0.1]
     drawn = kernel.sample(np.tile(light, (draws, 1)), random)
     up = np.maximum(drawn[:, 2], 1e-3)
-    masking = 2 / (1 + np.sqrt(1 + alpha**2 * (1 / up**2 - 1)))
-    weight = np.where(drawn[:, 2] > 0, up / masking, 0) / kernel.irradiance(light)
+    a, b = ((np.sqrt(1 + alpha**2 * (1 / c**2 - 1)) - 1) / 2 for c in (up, view[:, 2:].clip(1e-3)))
+    weight = np.where(drawn[:, 2] > 0, up, 0) * (1 + a) * (1 + b) / (1 + a + b) / kernel.irradiance(light)
     lights, views = (
         torch.from_numpy(a).float() for a in (np.tile(drawn, (len(view), 1)), view.repeat(draws, 0))
     )
