@@ -35,7 +35,7 @@ class Formula:
         self.bad = (BadSample(7, "direct light"),)
         self.more = 1
 
-    def estimate(self, queries: Any, spp: int, stream: Any) -> Any:
+    def estimate(self, queries: Any, spp: int, stream: Any, **_: Any) -> Any:
         if self.fail_at == len(self.estimated):
             raise KeyboardInterrupt
         self.estimated.append((stream.split, stream.shard))
