@@ -76,7 +76,7 @@ def test_half_the_difference_of_the_halves_is_the_error(
 ) -> None:
     estimate = engine.estimate
 
-    def noisy(queries: Any, spp: int, stream: Any) -> Any:
+    def noisy(queries: Any, spp: int, stream: Any, **_: Any) -> Any:
         found = estimate(queries, spp, stream)
         return replace(found, value_a=1.1 * found.value_a, value_b=0.9 * found.value_b)
 
