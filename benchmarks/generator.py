@@ -2,6 +2,7 @@
 
     python benchmarks/generator.py [speed] [--material PATH] [--runs 5] [--queries 262144] [--spp 16]
     python benchmarks/generator.py steps [--runs 3]
+    python benchmarks/generator.py lights [--material PATH] [--runs 3] [--queries 65536] [--spp 8]
 
 ``speed`` measures paths per second in three ways that alternate:
 
@@ -17,6 +18,9 @@ queries and pixels differ, so compare it only within one way.
 
 ``steps`` traces the same queries with one step of light transport after the other: the plane alone, the first
 ray, the ray to the light, light that BSDF sampling finds, and up to six interactions.
+
+``lights`` compares training queries that share their paths, by processor time: 1, 2, 4 and 8 lights per path,
+equally many paths per query, no limit on interactions.
 
 The last line is one JSON object. The threshold holds on two cores; elsewhere the ratio is only reported.
 """
@@ -264,9 +268,53 @@ def measure_steps(material: Tile, arguments: argparse.Namespace) -> int:
     return finish(rows, {}, None)
 
 
+def measure_lights(material: Tile, arguments: argparse.Namespace) -> int:
+    """Processor time and noise of a query with several lights per path."""
+    from mbtf_gen.render.estimates import Stream
+    from mbtf_gen.render.estimator import Estimator
+    from mbtf_gen.render.path_tracer import Transport
+    from mbtf_gen.render.scene import build_scene
+    from mbtf_gen.sampling.light_kernel import LightKernel
+
+    estimator = Estimator(build_scene(material, material.surface()), LightKernel(LIGHT_WIDTH), Transport())
+    plan, spp = query_plan(material.lattice(), arguments.queries), arguments.spp
+    rows: list[dict[str, Any]] = []
+    for lights in (1, 2, 4, 8):
+        seconds, squares, correlations = [], [], []
+        for number in range(arguments.runs + 1):
+            queries = replace(plan, lights=lights).draw("train", number, arguments.queries)
+            began = time.process_time()
+            found = estimator.estimate(queries, spp, Stream(lights, "train", number), lights=lights)
+            seconds.append(time.process_time() - began)
+            error = (found.value_a.astype(np.float64) - found.value_b).mean(axis=1).reshape(lights, -1) / 2.0
+            square = np.mean(error**2)
+            squares.append(square / np.mean(found.value_a + found.value_b) ** 2 * 4.0)
+            pairs = (np.square(error.sum(axis=0)).mean() / lights - square) / max(lights - 1, 1)
+            correlations.append(pairs / square)
+        # The first run compiles.
+        each = 1e6 * statistics.median(seconds[1:]) / arguments.queries
+        noise, shared = (float(np.mean(x)) for x in (squares, correlations))
+        ratio = rows[0]["microseconds"] / each if rows else 1.0
+        rows.append(
+            {
+                "lights": lights,
+                "microseconds": each,
+                "queries per second over one light's": ratio,
+                "relative noise": noise**0.5,
+                "correlation within groups": shared,
+            }
+        )
+        print(
+            f"{lights} lights {each:8.2f} µs of processor time per query, {ratio:.2f} times the queries, "
+            f"noise {noise**0.5:.0%} of the mean, correlation {shared:.2f}",
+            flush=True,
+        )
+    return finish(rows, {}, None)
+
+
 def main() -> int:
     parser = parser_of(__doc__)
-    parser.add_argument("part", nargs="?", choices=("speed", "steps"), default="speed")
+    parser.add_argument("part", nargs="?", choices=("speed", "steps", "lights"), default="speed")
     parser.add_argument("--material", type=Path, help="height map, folder or material.yaml")
     parser.add_argument("--height-scale", type=float, help="factor on its stored heights")
     parser.add_argument("--runs", type=int, default=5, help="timed runs of each way")
@@ -275,11 +323,8 @@ def main() -> int:
     arguments = parser.parse_args()
     load_mitsuba()
     material = load_material(arguments.material) if arguments.material else rocky()
-    return (
-        measure_speed(material, arguments)
-        if arguments.part == "speed"
-        else measure_steps(material, arguments)
-    )
+    measures = {"speed": measure_speed, "steps": measure_steps, "lights": measure_lights}
+    return measures[arguments.part](material, arguments)
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mbtf_core.app.console import Console
 from mbtf_core.data.schema import ShardEntry
@@ -16,12 +17,23 @@ from mbtf_core.data.shard_files import write_shard
 from mbtf_core.forecast import pilot_seconds
 from mbtf_core.stats import pooled_error
 from mbtf_core.units import clock, expectation, size_text
-from mbtf_gen.job import Job, data_bytes, most_paths, planned_paths, split_queries, split_spp, split_target
+from mbtf_gen.job import (
+    Job,
+    data_bytes,
+    most_paths,
+    path_work,
+    planned_work,
+    split_lights,
+    split_queries,
+    split_spp,
+    split_target,
+)
 from mbtf_gen.planning.adaptive import estimate_shard
 from mbtf_gen.planning.run_plan import RunPlan, allocate, plan_effects
 from mbtf_gen.planning.simulation import build_estimator, pilot_queries
 from mbtf_gen.render.estimates import Estimates, Stream, Target
 
+_HALVES = ("value_a", "value_b")
 # Paths of one piece of the pilot.
 _PIECE_PATHS = 1 << 19
 # Fewer paths take less than a minute at half a million paths per second.
@@ -90,18 +102,21 @@ def forecast(job: Job, plan: RunPlan | None = None, seconds: float = 2.0) -> For
     estimator = build_estimator(job, plan.effects)
     spp, target = split_spp(job.config, "train"), split_target(job.config, "train")
     count, test_paths = split_queries(job, "train"), split_queries(job, "test") * job.config.queries.test_spp
+    lights = split_lights(job.config, "train")
     size = max(1, _PIECE_PATHS // (spp if target is None else target.max_spp))
     found: list[Estimates] = []
 
     def stored(estimates: Estimates) -> int:
-        return spp * len(estimates.value_a) if estimates.spp is None else int(estimates.spp.sum())
+        spent = spp * len(estimates.value_a) if estimates.spp is None else int(estimates.spp.sum())
+        return spent // lights
 
     def piece(number: int) -> int:
         """Estimate and write some queries as in the run; returns their paths."""
-        queries = pilot_queries(job, max(1, min(size, count)), number)
+        # Whole groups: `count` is a multiple of the lights.
+        queries = pilot_queries(job, lights * max(1, min(size, count // lights)), number, lights)
         stream = Stream(job.config.seed, "pilot", number)
-        found.append(estimate_shard(estimator, queries, spp, target, stream, plan.allocation))
-        arrays = vars(queries) | {name: getattr(found[-1], name) for name in ("value_a", "value_b")}
+        found.append(estimate_shard(estimator, queries, spp, target, stream, plan.allocation, lights))
+        arrays = vars(queries) | {name: getattr(found[-1], name) for name in _HALVES}
         with tempfile.TemporaryDirectory(prefix="mbtf-forecast-") as folder:
             write_shard(Path(folder) / "piece.npz", arrays)
         return max(found[-1].paths, stored(found[-1]))
@@ -109,25 +124,32 @@ def forecast(job: Job, plan: RunPlan | None = None, seconds: float = 2.0) -> For
     # Piece 0 compiles the kernels. Under a target error it traces fewer paths than the cap allows.
     first = piece(0)
     start = time.perf_counter() - began
-    size = max(1, _PIECE_PATHS * len(found.pop().value_a) // max(first, 1))
+    size = max(1, _PIECE_PATHS * len(found.pop().value_a) // (lights * max(first, 1)))
     path = pilot_seconds(piece, seconds)
-    a, b = (np.concatenate([getattr(one, name) for one in found]) for name in ("value_a", "value_b"))
+    a, b = (np.concatenate([getattr(one, name) for one in found]) for name in _HALVES)
     per_query = sum(max(one.paths, stored(one)) for one in found) / len(a)
     paths = round(count * per_query) + test_paths
-    total = path.scaled(paths)
+    total = path.scaled(count * per_query + test_paths / path_work(lights))
     mean = 0.5 * float(np.mean(a, dtype=np.float64) + np.mean(b, dtype=np.float64))
-    error = pooled_error(a, b).scaled(1.0 / mean if mean > 0 else 0.0)
+    # Queries of a group are one unit: their errors are correlated.
+    by_group = (np.concatenate([_by_group(getattr(one, name), lights) for one in found]) for name in _HALVES)
+    error = pooled_error(*by_group).scaled(1.0 / mean if mean > 0 else 0.0)
     return Forecast(
         seconds=total.value,
         seconds_se=total.error,
         start=start,
         query_seconds=path.value * per_query,
         paths=paths,
-        paths_per_query=sum(map(stored, found)) / len(a),
+        paths_per_query=lights * sum(map(stored, found)) / len(a),
         bytes=data_bytes(job, job.shards),
         relative_error=error.value,
         relative_error_se=error.error,
     )
+
+
+def _by_group(values: NDArray[np.float32], lights: int) -> NDArray[np.float32]:
+    """Values (n, 3) of queries as (groups, lights, 3)."""
+    return values.reshape(lights, -1, 3).swapaxes(0, 1)
 
 
 def announce(
@@ -158,7 +180,7 @@ def announce_shards(
     console: Console, job: Job, plan: RunPlan, entries: Sequence[ShardEntry], size: float
 ) -> None:
     """:func:`announce` for rendering some of the job's shards."""
-    share = planned_paths(job, entries) / max(planned_paths(job, job.shards), 1)
+    share = planned_work(job, entries) / max(planned_work(job, job.shards), 1)
 
     def seconds() -> float:
         expected = forecast(job, plan, seconds=1.0)

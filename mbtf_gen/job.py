@@ -77,6 +77,9 @@ class Job:
         """The job of a loaded material, whose height scale, tiling and resolution replace unset ones; a
         UsageError where options are for another kind of material."""
         geometry, queries = config.geometry, config.queries
+        if queries.lights_per_path > 1 and queries.layout != "shuffled":
+            what = f"{queries.layout} layout: its queries do not share paths"
+            raise UsageError(what, where="--lights-per-path", hint="use 1, or --layout shuffled")
         tile = material.configured(geometry)
         found = {"height_scale": tile.height_scale, "make_tileable": tile.tiling}
         own = {
@@ -160,6 +163,7 @@ class Job:
             shard_rows(self),
             queries.patch_size,
             self.slice_directions,
+            queries.lights_per_path,
         )
 
     @cached_property
@@ -199,8 +203,9 @@ def row_queries(job: Job, split: Split) -> int:
 
 
 def shard_rows(job: Job) -> int:
-    """Rows of a full shard."""
-    return max(1, job.config.output.shard_queries // row_queries(job, "train"))
+    """Rows of a full shard, whole groups."""
+    lights = split_lights(job.config, "train")
+    return lights * max(1, job.config.output.shard_queries // (lights * row_queries(job, "train")))
 
 
 def _shards(job: Job, split: Split) -> list[ShardEntry]:
@@ -209,7 +214,8 @@ def _shards(job: Job, split: Split) -> list[ShardEntry]:
     rows = math.ceil(count_queries(count, job.lattice.texels()) / row_queries(job, split))
     if split == "train" and config.queries.layout == "slices":
         rows = job.lattice.texels()
-    size = shard_rows(job)
+    lights, size = split_lights(config, split), shard_rows(job)
+    rows = lights * math.ceil(rows / lights)
     if rows > size * MAX_SHARD_FILES:
         raise UsageError(
             f"{count} {split} queries are more than {MAX_SHARD_FILES} shards of {size}",
@@ -230,6 +236,18 @@ def split_spp(config: GeneratorConfig, split: Split) -> int:
     return config.queries.spp if split == "train" else config.queries.test_spp
 
 
+def split_lights(config: GeneratorConfig, split: Split) -> int:
+    """Lights of each path of a split, the queries of a group. Test queries have paths of their own: error
+    bars take them as independent."""
+    return config.queries.lights_per_path if split == "train" else 1
+
+
+def path_work(lights: int) -> float:
+    """Time of a path of several lights over that of a path of one: each vertex has a ray of the path, and one
+    towards each light."""
+    return 0.5 * (1 + lights)
+
+
 def split_target(config: GeneratorConfig, split: Split) -> Target | None:
     """Target error of a split; None where it has a number of paths."""
     error = config.queries.target_error
@@ -237,14 +255,30 @@ def split_target(config: GeneratorConfig, split: Split) -> Target | None:
 
 
 def split_queries(job: Job, split: Split) -> int:
-    """Queries of a split; the image layout rounds up to whole images, the slices layout down to n² per
+    """Queries of a split; rounded up to whole groups and images, in the slices layout down to n² per
     texel."""
     return row_queries(job, split) * sum(entry.rows for entry in job.shards if entry.split == split)
 
 
 def planned_paths(job: Job, entries: Iterable[ShardEntry]) -> int:
     """Paths of some shards; a target error may change them."""
-    return sum(e.rows * row_queries(job, e.split) * split_spp(job.config, e.split) for e in entries)
+    return round(sum(_paths(job, entry) for entry in entries))
+
+
+def query_work(job: Job) -> float:
+    """Number of paths of one light that take as long as a training query."""
+    lights = split_lights(job.config, "train")
+    return split_spp(job.config, "train") / lights * path_work(lights)
+
+
+def planned_work(job: Job, entries: Iterable[ShardEntry]) -> float:
+    """Number of paths of one light that take as long as the paths of some shards."""
+    return sum(path_work(split_lights(job.config, entry.split)) * _paths(job, entry) for entry in entries)
+
+
+def _paths(job: Job, entry: ShardEntry) -> float:
+    config, split = job.config, entry.split
+    return entry.rows * row_queries(job, split) * split_spp(config, split) / split_lights(config, split)
 
 
 def most_paths(job: Job) -> int:
@@ -253,7 +287,7 @@ def most_paths(job: Job) -> int:
     for split in SPLITS:
         target = split_target(job.config, split)
         spp = split_spp(job.config, split) if target is None else target.max_spp + TARGET_PILOT_SPP
-        total += split_queries(job, split) * spp
+        total += split_queries(job, split) * spp // split_lights(job.config, split)
     return total
 
 

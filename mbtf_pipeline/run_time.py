@@ -23,7 +23,7 @@ from mbtf_core.files.folders import check_space, free_space, owned
 from mbtf_core.forecast import is_long
 from mbtf_core.units import clock, expectation
 from mbtf_fit.config import FitConfig
-from mbtf_gen.job import Job, planned_paths, split_queries
+from mbtf_gen.job import Job, planned_work, query_work, split_queries
 from mbtf_pipeline.compare.image_files import scenes
 from mbtf_pipeline.recipe import Recipe, preset_recipe
 from mbtf_pipeline.run import COMPARE_STAGE, data_sets, fit_stage, layout_of, survey
@@ -95,7 +95,7 @@ class RunForecaster:
 
         job = Job.of(self.recipe.generate, self.material)
         found = forecast(job, seconds=1.0)
-        return found.start, found.query_seconds / self.recipe.generate.queries.spp
+        return found.start, found.query_seconds / query_work(job)
 
     def of(
         self,
@@ -110,12 +110,12 @@ class RunForecaster:
         from mbtf_gen.job import data_bytes
 
         start, path = self.speed if speed is None else speed
-        paths = size = queries = 0
+        paths, size, queries = 0.0, 0, 0
         for data in data_sets(recipe):
             job = Job.of(data.config, self.material)
             queries = split_queries(job, "train")
             if stages is None or data.stage in stages:
-                paths += planned_paths(job, job.shards)
+                paths += planned_work(job, job.shards)
                 size += data_bytes(job, job.shards)
         fits = {name: fit for name, fit in recipe.fit.items() if stages is None or fit_stage(name) in stages}
         size += sum(fit_bytes(fit, job.lattice) for fit in fits.values())

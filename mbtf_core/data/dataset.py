@@ -207,6 +207,11 @@ class Dataset:
         size: int | None = self.manifest.get("patch_size")
         return size
 
+    def lights_per_path(self, split: str) -> int:
+        """Queries of a group that share paths, position, footprint and view: in a shard of n, the queries
+        i, i + n/L, i + 2n/L, …"""
+        return int(self.manifest["splits"][split].get("lights_per_path", 1))
+
     @property
     def estimates(self) -> int:
         """Independent estimates of every value: 2, or 1 of measured data, which have no array ``value_b``."""

@@ -10,9 +10,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, model_validator
 
 from mbtf_core.config.settings import check_document
 from mbtf_core.data.folder import DataFolder, sidecar_name
@@ -36,6 +36,13 @@ class _Entry(BaseModel):
 
 class _Split(BaseModel):
     shards: list[_Entry]
+    lights_per_path: Annotated[int, Field(strict=True, ge=1)] = 1
+
+    @model_validator(mode="after")
+    def _whole_groups(self) -> Self:
+        if any(entry.rows % self.lights_per_path for entry in self.shards):
+            raise ValueError("rows must be multiples of lights_per_path")
+        return self
 
 
 class _Levels(BaseModel):

@@ -43,7 +43,12 @@ def _shards_info(folder: DataFolder) -> tuple[dict[str, Any], str]:
     lattice = data.lattice
     rows, columns = lattice.shape()
     splits = {
-        s: {"shards": len(data.shards(s)), "rows": sum(x.rows for x in data.shards(s))} for s in data.splits
+        s: {
+            "shards": len(data.shards(s)),
+            "rows": sum(x.rows for x in data.shards(s)),
+            "lights_per_path": data.lights_per_path(s),
+        }
+        for s in data.splits
     }
     kind = {"shuffled": "queries", "image": "images", "slices": "positions"}[data.layout]
     # Data sets of other programs may lack these.
@@ -63,6 +68,7 @@ def _shards_info(folder: DataFolder) -> tuple[dict[str, Any], str]:
         f"levels 0 to {lattice.finest}, finest {columns} x {rows} texels, aspect {lattice.aspect:g}; {light}",
         *(
             f"{s}: {n['rows']} {kind} in {n['shards']} {'shard' if n['shards'] == 1 else 'shards'}"
+            + (f", {n['lights_per_path']} lights per path" if n["lights_per_path"] > 1 else "")
             for s, n in splits.items()
         ),
         "noise unknown" if noise is None else f"noise of a training query {noise:.1%} of the mean value",

@@ -98,9 +98,13 @@ def in_region(held_out: HeldOutSection, omega: NDArray[np.float32]) -> NDArray[n
         return ((omega[:, :2] - center) ** 2).sum(1) < np.float32(held_out.radius) ** 2
 
 
-def label_queries(held_out: HeldOutSection, queries: ShardQueries, seed: int, shard: int) -> NDArray[np.int8]:
-    """Label of each query of a shard."""
-    random = np.random.Generator(np.random.Philox(key=[seed, shard])).random(len(queries))
+def label_queries(
+    held_out: HeldOutSection, queries: ShardQueries, seed: int, shard: int, lights: int
+) -> NDArray[np.int8]:
+    """Label of each query of a shard. Held-out queries are whole groups of `lights` queries, whose noise is
+    correlated: errors of a fit to some of a group would seem small at the others."""
+    groups = np.random.Generator(np.random.Philox(key=[seed, shard])).random(len(queries) // lights)
+    random = np.tile(groups, lights)
     labels = np.where(random < held_out.queries, HELD_OUT_QUERY, TRAINING)
     region = in_region(held_out, queries.omega_i) | in_region(held_out, queries.omega_o)
     return np.where(region, HELD_OUT_DIRECTION, labels)
@@ -173,10 +177,10 @@ def load_training(
     store = {name: np.empty((capacity, *shape), np.float32) for name, shape in columns.items()}
     kept_out: tuple[list[ShardQueries], list[ShardQueries]] = ([], [])
     sample: list[ShardQueries] = []
-    selection = Selection()
+    selection, lights = Selection(), data.lights_per_path("train")
     for index, shard in enumerate(ahead(shards)):
         queries = read_checked(shard)
-        labels = label_queries(held_out, queries, seed, index)
+        labels = label_queries(held_out, queries, seed, index, lights)
         for group, label in zip(kept_out, (HELD_OUT_QUERY, HELD_OUT_DIRECTION), strict=True):
             missing = MAX_HELD_OUT - sum(map(len, group))
             group.append(queries.take(np.flatnonzero(labels == label)[:missing]))

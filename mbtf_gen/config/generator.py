@@ -190,6 +190,12 @@ class QueriesSection(Settings):
         description="share of test queries drawn where highlights are, with weights that keep errors "
         "unbiased; glossy materials need fewer",
     )
+    lights_per_path: Annotated[int, Flag("--lights-per-path")] = Field(
+        1,
+        ge=1,
+        le=64,
+        description="training queries that share their paths, each under a light of its own; shuffled layout",
+    )
     allocation: Literal["noise", "uniform"] = Field(
         "noise",
         description="paths per query: more where a pilot (2.6 million paths) expects noise, or equal",

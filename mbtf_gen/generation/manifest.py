@@ -35,7 +35,7 @@ from mbtf_core.locks import brief_lock
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.measured import ImportConfig
 from mbtf_gen.generation.shard_record import ShardStatistics
-from mbtf_gen.job import Job, split_queries, split_spp
+from mbtf_gen.job import Job, split_lights, split_queries, split_spp
 from mbtf_gen.planning.effects import EFFECTS
 from mbtf_gen.planning.effects_plan import EffectsPlan
 from mbtf_gen.planning.highlights import Highlights
@@ -129,7 +129,11 @@ def build_manifest(job: Job, plan: RunPlan, geometry: Mapping[str, Any] | None) 
         job,
         arrays=dict.fromkeys(stored, ""),
         splits={
-            split: {"queries": split_queries(job, split), "spp": split_spp(job.config, split)}
+            split: {
+                "queries": split_queries(job, split),
+                "spp": split_spp(job.config, split),
+                "lights_per_path": split_lights(job.config, split),
+            }
             for split in SPLITS
         },
         entries=job.shards,

@@ -30,7 +30,7 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.folder import has_dataset, open_folder, read_run_plan
 from mbtf_gen.generation.manifest import Summary, finish
 from mbtf_gen.generation.shard_record import ShardStatistics, store_shard
-from mbtf_gen.job import Job, most_paths, planned_paths, received_job, split_spp, split_target
+from mbtf_gen.job import Job, most_paths, planned_paths, received_job, split_lights, split_spp, split_target
 from mbtf_gen.planning.adaptive import estimate_shard
 from mbtf_gen.planning.run_plan import RunPlan, plan_run
 from mbtf_gen.planning.simulation import build_estimator
@@ -249,6 +249,7 @@ def render_shard(run: ShardRun, entry: ShardEntry) -> Generator[None, None, dict
             Stream(config.seed, entry.split, entry.index),
             # The allocation has the requested mean over the distribution of queries without weights.
             run.plan.allocation if weight is None else None,
+            split_lights(config, entry.split),
         )
         seconds = time.perf_counter() - began
         yield

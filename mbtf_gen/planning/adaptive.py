@@ -56,6 +56,7 @@ def estimate_shard(
     target: Target | None,
     stream: Stream,
     allocation: Allocation | None,
+    lights: int = 1,
 ) -> Estimates:
     """Both halves of a shard's queries (one leading axis).
 
@@ -63,18 +64,21 @@ def estimate_shard(
     ----------
     spp : mean number of paths without a target
     allocation : the run's allocation; without one all queries get `spp` paths
+    lights : queries of a group that share their paths, see
+        :meth:`~mbtf_gen.render.estimator.Estimator.estimate`; a target error holds for each of them
     """
     found: Estimates
     if allocation is None or target is None:
-        planned = spp if allocation is None else allocation.counts(queries, spp)
-        found = estimator.estimate(queries, planned, stream)
+        planned = spp if allocation is None else allocation.counts(queries, spp, lights)
+        found = estimator.estimate(queries, planned, stream, lights=lights)
         return found
     pilot_stream = replace(stream, first_pass=PILOT_PASS)
-    pilot = estimator.estimate(queries, TARGET_PILOT_SPP, pilot_stream, path_variance=True)
+    pilot = estimator.estimate(queries, TARGET_PILOT_SPP, pilot_stream, path_variance=True, lights=lights)
     predicted = allocation.deviation(queries), allocation.tile_mean(queries)
     needed, scale = needed_paths(pilot, TARGET_PILOT_SPP, *predicted, target.error)
+    needed = np.tile(needed.reshape(lights, -1).max(axis=0), lights)
     counts = round_up(np.minimum(needed, target.max_spp), target.max_spp)
-    found = estimator.estimate(queries, counts, stream)
+    found = estimator.estimate(queries, counts, stream, lights=lights)
     return replace(
         found,
         **{k: getattr(found, k) + getattr(pilot, k) for k in ("paths", "lost", "capped", "nonfinite")},

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.data.schema import Queries
-from mbtf_gen.job import Job
+from mbtf_gen.job import Job, split_lights
 from mbtf_gen.planning.effects_plan import EffectsPlan
 from mbtf_gen.planning.simulation import build_estimator, pilot_queries
 from mbtf_gen.render.estimates import Estimates, Stream
@@ -142,11 +142,15 @@ class Allocation:
         """Predicted tile mean (n,) at the queries' directions, 1/sr."""
         return evaluate_terms(self.mean_weights, direction_terms(queries, levels=False))
 
-    def counts(self, queries: Queries, spp: int) -> NDArray[np.int64]:
-        """Numbers of paths (n,), powers of two, with a mean of `spp` over the run."""
+    def counts(self, queries: Queries, spp: int, lights: int = 1) -> NDArray[np.int64]:
+        """Numbers of paths (n,), powers of two, with a mean of `spp` over the run; those of a group of
+        `lights` queries are equal, by their root mean square deviation."""
         if self.typical <= 0.0:
             return np.full(len(queries.sigma), spp, np.int64)
-        return _round_counts(self.deviation(queries) * (self.scale * spp / self.typical), spp)
+        # Column by column: the rounding of a sum may depend on the processor.
+        square = sum(one * one for one in self.deviation(queries).reshape(lights, -1))
+        deviation = np.tile(np.sqrt(square / lights), lights)
+        return _round_counts(deviation * (self.scale * spp / self.typical), spp)
 
 
 def evaluate_terms(weights: tuple[float, ...], terms: list[F64]) -> F64:
@@ -190,8 +194,11 @@ def mean_values(estimates: Estimates) -> F64:
     return 0.5 * np.mean(estimates.value_a.astype(np.float64) + estimates.value_b, axis=-1)
 
 
-def fit_allocation(queries: Queries, estimates: Estimates, paths: int, spp: int) -> Allocation:
-    """Allocation for a mean of `spp` paths, from a pilot's queries (one leading axis) of `paths` paths each.
+def fit_allocation(
+    queries: Queries, estimates: Estimates, paths: int, spp: int, lights: int = 1
+) -> Allocation:
+    """Allocation for a mean of `spp` paths, from a pilot's queries (one leading axis) of `paths` paths each,
+    in groups of `lights` queries.
     A constant replaces a fit that does not converge, with a warning."""
     difference = estimates.value_a.astype(np.float64) - estimates.value_b
     noise = np.sqrt(np.mean(difference**2, axis=-1))
@@ -214,12 +221,12 @@ def fit_allocation(queries: Queries, estimates: Estimates, paths: int, spp: int)
     low, high = 1e-3, 1e3
     for _ in range(60):
         middle = math.sqrt(low * high)
-        if replace(flat, scale=middle).counts(queries, spp).mean() > spp:
+        if replace(flat, scale=middle).counts(queries, spp, lights).mean() > spp:
             high = middle
         else:
             low = middle
     fitted = replace(flat, scale=low)
-    ratio = spp / fitted.counts(queries, spp)
+    ratio = spp / fitted.counts(queries, spp, lights)
     return replace(fitted, gain=float(np.mean(noise**2) / np.mean(noise**2 * ratio)))
 
 
@@ -228,8 +235,9 @@ def measure_allocation(
 ) -> Allocation:
     """Allocation of a job under an effects plan, by a pilot with its own random numbers; `tiles` as of
     :func:`~mbtf_gen.planning.simulation.build_estimator`."""
-    queries = pilot_queries(job, PILOT_QUERIES)
+    lights = split_lights(job.config, "train")
+    queries = pilot_queries(job, PILOT_QUERIES - PILOT_QUERIES % lights, lights=lights)
     # The effects plan's pilot uses shard 0 of this split.
     stream = Stream(job.config.seed, "pilot", 1)
-    estimates = build_estimator(job, plan, tiles).estimate(queries, PILOT_SPP, stream)
-    return fit_allocation(queries, estimates, PILOT_SPP, job.config.queries.spp)
+    estimates = build_estimator(job, plan, tiles).estimate(queries, PILOT_SPP, stream, lights=lights)
+    return fit_allocation(queries, estimates, PILOT_SPP, job.config.queries.spp, lights)

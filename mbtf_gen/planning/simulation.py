@@ -26,7 +26,9 @@ class ClosedForm:
     def __init__(self, albedo: NDArray[np.float64]) -> None:
         self.value = (np.asarray(albedo, np.float64) / np.pi).astype(np.float32)
 
-    def estimate(self, queries: Queries, spp: int | NDArray[np.int64], stream: Stream) -> Estimates:
+    def estimate(
+        self, queries: Queries, spp: int | NDArray[np.int64], stream: Stream, *, lights: int = 1
+    ) -> Estimates:
         """Both halves of each query (one leading axis), equal."""
         value = np.broadcast_to(self.value, (len(queries.sigma), 3))
         return Estimates(value.copy(), value.copy(), None, 0, 0, 0, 0)
@@ -75,13 +77,15 @@ def build_estimator(
     return Estimator(tiles[key], LightKernel(job.config.light.width), transport)
 
 
-def pilot_queries(job: Job, count: int, shard: int = 0) -> Queries:
+def pilot_queries(job: Job, count: int, shard: int = 0, lights: int = 1) -> Queries:
     """`count` queries (one leading axis) with the run's distribution, from a random stream of their own per
     `shard`.
 
     In both layouts every query has its own footprint and directions: a few images would have few of them.
+    With several `lights`, groups of so many queries share footprint and view.
     """
-    return replace(job.query_plan, layout="shuffled", patch_size=None).draw("pilot", shard, count)
+    plan = replace(job.query_plan, layout="shuffled", patch_size=None, lights=lights)
+    return plan.draw("pilot", shard, count)
 
 
 def shading_slopes(job: Job, plan: EffectsPlan) -> NDArray[np.float64] | None:

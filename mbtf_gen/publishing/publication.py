@@ -200,18 +200,21 @@ class Publication:
     def _write_shards(
         self, folder: OutputFolder, progress: Callable[[float], None]
     ) -> tuple[dict[str, Stored], dict[str, Arrays], dict[str, dict[str, str]]]:
-        """Write the shards: the files, evenly spaced rows of each split, and the digests of all arrays."""
+        """Write the shards: the files, evenly spaced rows of each split, no two of a group, and the digests
+        of all arrays."""
         files, digests, samples = {}, {}, {}
         form, described = self.config.form, self.data.manifest["arrays"]
         for split, shards in self.shards.items():
-            step = -(-int(self.data.manifest["splits"][split]["queries"]) // _SAMPLE)
+            lights = self.data.lights_per_path(split)
+            step = -(-int(self.data.manifest["splits"][split]["queries"]) // (_SAMPLE * lights))
             parts = []
             for shard in shards:
                 arrays = shard.read()
                 for name, write in shard_writers(shard, arrays, form, described).items():
                     files[f"data/{name}"] = folder.add(f"data/{name}", write)
                 digests[shard.file.rpartition(".")[0]] = array_digests(arrays)
-                parts.append({name: np.array(array[::step]) for name, array in arrays.items()})
+                own = slice(None, shard.rows // lights, step)
+                parts.append({name: np.array(array[own]) for name, array in arrays.items()})
                 progress(1)
             samples[split] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
         return files, samples, digests

@@ -21,6 +21,7 @@ from mbtf_core.errors import PartialError
 from mbtf_gen.engine.types import Color3f, Float, Float64, Point2f, Ray3f, UInt32, padded
 from mbtf_gen.render.directional_light import DirectionalLight
 from mbtf_gen.render.estimates import MOST_LOCATED, Estimates, Stream
+from mbtf_gen.render.group_tracer import GroupTracer
 from mbtf_gen.render.path_tracer import PathTracer, Transport
 from mbtf_gen.render.scene import CLEARANCE, TileScene
 from mbtf_gen.sampling.light_kernel import LightKernel
@@ -83,6 +84,7 @@ class Estimator:
         limit: int | None = None,
         roulette: int | None = None,
         path_variance: bool = False,
+        lights: int = 1,
     ) -> Estimates:
         """Estimate M at queries.
 
@@ -90,12 +92,14 @@ class Estimator:
         ----------
         queries : Queries
             n queries, with one leading axis.
-        spp : int or (n,) int64 array; paths per query, both halves together; even
+        spp : int or (n,) int64 array; paths per query, both halves together; even, equal within a group
         stream : random numbers to use
         source : source of the first rays; the query sensor by default
         limit : largest number of surface interactions of a path; that of the transport by default
         roulette : interactions before Russian roulette starts; that of the transport by default
         path_variance : also estimate the sample variance of single paths
+        lights : L queries i, i + n/L, i + 2n/L, … are a group with one position, footprint and view, whose
+            lights share the group's paths
 
         Returns
         -------
@@ -104,7 +108,7 @@ class Estimator:
 
         Raises
         ------
-        ValueError : a number of paths is odd or zero
+        ValueError : a number of paths is odd or zero, or the queries are not whole groups
         InputError : a direction is not a unit vector
         PartialError : samples stay non-finite after several draws; says which query and which effect
         """
@@ -113,24 +117,39 @@ class Estimator:
         counts = np.full(len(queries.sigma), spp, np.int64) if isinstance(spp, int) else spp
         if counts.min() < 2 or (counts % 2).any():
             raise ValueError(f"spp must be even, for two equal halves, not {spp}")
+        shared = counts[: len(counts) // lights]
+        if not np.array_equal(np.tile(shared, lights), counts):
+            raise ValueError(f"queries must be groups of {lights} with equal numbers of paths")
+        groups = np.arange(len(counts)).reshape(lights, -1)
         most = dr.opaque(mi.UInt32, self.transport.limit if limit is None else limit)
         late = dr.opaque(mi.UInt32, self.transport.roulette_depth if roulette is None else roulette)
         parts = [
             _Launch(
-                self, queries.take(rows), rows.start, counts[rows], stream, source or self._sensor, most, late
+                self,
+                queries.take(groups[:, rows].ravel()),
+                rows.start,
+                shared[rows],
+                stream,
+                source or self._sensor,
+                most,
+                late,
+                lights,
             ).estimates(path_variance)
-            for rows in _launches(counts, self.launch)
+            for rows in _launches(shared, max(1, self.launch // lights))
         ]
 
         def joined(name: str) -> Any:
             arrays = [getattr(p, name) for p in parts]
-            return None if arrays[0] is None else np.concatenate(arrays)
+            if arrays[0] is None:
+                return None
+            by_light = [a.reshape(lights, -1, *a.shape[1:]) for a in arrays]
+            return np.concatenate(by_light, axis=1).reshape(len(counts), *arrays[0].shape[1:])
 
         return Estimates(
             joined("value_a"),
             joined("value_b"),
             joined("transmittance"),
-            int(counts.sum()),
+            int(shared.sum()),
             sum(p.lost for p in parts),
             sum(p.capped for p in parts),
             sum(p.nonfinite for p in parts),
@@ -141,13 +160,18 @@ class Estimator:
 
 
 class _Launch:
-    """All paths of consecutive queries, one lane per path, one query after the other.
+    """All paths of consecutive groups of queries, one lane per path, one group after the other.
+
+    Radiance has a *slot* for each light of each path: those of the first lights of all paths, of the second
+    ones, and so on.
 
     Parameters
     ----------
-    queries : the launch's queries; first : number of the first of them in the shard
-    counts : (n,) paths of each query
+    queries : of the groups: those of all first lights, of all second ones, …
+    first : number of the first of the groups in the shard
+    counts : (n,) paths of each group
     limit, roulette : as of :class:`~mbtf_gen.render.path_tracer.PathTracer`
+    lights : queries of a group
     """
 
     def __init__(
@@ -160,28 +184,31 @@ class _Launch:
         source: RaySource,
         limit: UInt32,
         roulette: UInt32,
+        lights: int,
     ) -> None:
         self.estimator, self.first, self.counts, self.stream = estimator, first, counts, stream
         self.source, self.limit, self.roulette = source, limit, roulette
-        source.set_queries(queries, first)
+        self.paths, self.group_size = int(counts.sum()), lights
+        source.set_queries(queries.take(slice(len(counts))), first)
         self.lights = DirectionalLight.of(estimator.light, queries.omega_i)
-        # First lane of each query, and the paths of one half of it.
+        # First lane of each group, and the paths of one half of it.
         self.starts = np.cumsum(counts) - counts
         self.start, self.half = _aligned(self.starts), _aligned(counts // 2)
-        # Query of each lane.
-        self.query = _aligned(np.repeat(np.arange(len(counts), dtype=np.uint32), counts))
+        # Group of each lane.
+        self.group = _aligned(np.repeat(np.arange(len(counts), dtype=np.uint32), counts))
         # Lower half of the sorting key: 4 bits each of the cosines of ω_o and ω_i.
         view, light = (
-            np.clip(16.0 * w[:, 2], 0, 15).astype(np.uint32) for w in (queries.omega_o, queries.omega_i)
+            np.clip(16.0 * w[:, 2].reshape(lights, -1).mean(axis=0), 0, 15).astype(np.uint32)
+            for w in (queries.omega_o, queries.omega_i)
         )
         self.direction_key = _aligned(view << 4 | light)
 
     def estimates(self, path_variance: bool) -> Estimates:
-        """Estimates of the queries; samples that are not finite are drawn again."""
+        """Estimates of the queries; paths with a sample that is not finite are traced again."""
         radiance, passed, lost, capped = self._trace()
-        values = self._halves(radiance)
+        values = self._halves(radiance, self.group_size)
         # Few launches have non-finite samples: their lanes are searched only then.
-        bad = np.zeros(0, np.uint32) if np.isfinite(values).all() else _nonfinite(radiance)
+        bad = np.zeros(0, np.uint32) if np.isfinite(values).all() else self._nonfinite(radiance, self.paths)
         located = self._located(bad[:MOST_LOCATED])
         nonfinite = len(bad)
         for attempt in range(1, MAX_RESAMPLES + 1):
@@ -189,12 +216,13 @@ class _Launch:
                 break
             lanes = mi.UInt32(padded(bad))
             again, through, more_lost, more_capped = self._trace(lanes, attempt)
-            dr.scatter(radiance, again, lanes)
+            slots = np.concatenate([bad + np.uint32(k * self.paths) for k in range(self.group_size)])
+            dr.scatter(radiance, again, mi.UInt32(padded(slots)))
             if self.estimator.holes:
                 dr.scatter(passed, through, lanes)
             dr.eval(radiance, passed)
             lost, capped = lost + more_lost, capped + more_capped
-            bad = bad[_nonfinite(again)]
+            bad = bad[self._nonfinite(again, len(bad))]
             nonfinite += len(bad)
         if len(bad):
             raise PartialError(
@@ -204,12 +232,13 @@ class _Launch:
                 hint="check the material's values",
             )
         if nonfinite:
-            values = self._halves(radiance)
+            values = self._halves(radiance, self.group_size)
+        through = self._halves(passed).mean(axis=(1, 2)).astype(np.float32) if self.estimator.holes else None
         return Estimates(
             values[:, 0].astype(np.float32),
             values[:, 1].astype(np.float32),
-            self._halves(passed).mean(axis=(1, 2)).astype(np.float32) if self.estimator.holes else None,
-            int(self.counts.sum()),
+            None if through is None else np.tile(through, self.group_size),
+            self.paths,
             lost,
             capped,
             nonfinite,
@@ -218,41 +247,53 @@ class _Launch:
         )
 
     def _number(self, lane: int) -> int:
-        """Number of a lane's query in the shard."""
+        """Number in the shard of the first query of a lane."""
         return self.first + int(np.searchsorted(self.starts, lane, side="right")) - 1
 
-    def _halves(self, x: Float | Color3f) -> NDArray[np.float64]:
-        """Mean of each half of each query, (n, 2, channels), of one number or color per lane."""
-        which = dr.arange(mi.UInt32, 2 * len(self.counts))
+    def _halves(self, x: Float | Color3f, lights: int = 1) -> NDArray[np.float64]:
+        """Mean of each half of each query, (n, 2, channels), of one number or color per slot; with one light,
+        of each group and of one per lane."""
+        groups = dr.opaque(mi.UInt32, len(self.counts))
+        which = dr.arange(mi.UInt32, 2 * lights * len(self.counts))
         query, second = which >> 1, which & 1
-        half = dr.gather(mi.UInt32, self.half, query)
-        begin = dr.gather(mi.UInt32, self.start, query) + second * half
+        light = query // groups
+        group = query - light * groups
+        half = dr.gather(mi.UInt32, self.half, group)
+        begin = dr.gather(mi.UInt32, self.start, group) + second * half
+        begin += light * dr.opaque(mi.UInt32, self.paths)
         totals = [_sum_of(channel, begin, begin + half) for channel in (x if dr.depth_v(x) == 2 else [x])]
         dr.eval(totals)
         total = np.stack([np.array(t) for t in totals], axis=-1)
-        return total.reshape(len(self.counts), 2, -1) / (self.counts // 2)[:, None, None]
+        halves = np.tile(self.counts // 2, lights)
+        return total.reshape(len(halves), 2, -1) / halves[:, None, None]
+
+    def _nonfinite(self, radiance: Color3f, width: int) -> NDArray[np.uint32]:
+        """Numbers of the traced paths, `width` of them, with a color that is NaN or infinite."""
+        return np.unique(_nonfinite(radiance) % np.uint32(width))
 
     def _variances(self, radiance: Color3f, values: NDArray[np.float64]) -> NDArray[np.float32]:
         """Sample variance of each query's paths, mean over channels."""
-        square = self._halves(dr.squared_norm(radiance)).mean(axis=(1, 2)) / 3.0
+        square = self._halves(dr.squared_norm(radiance), self.group_size).mean(axis=(1, 2)) / 3.0
         spread = square - np.mean(values.mean(axis=1) ** 2, axis=-1)
-        return np.maximum(spread * self.counts / (self.counts - 1), 0.0).astype(np.float32)
+        counts = np.tile(self.counts, self.group_size)
+        return np.maximum(spread * counts / (counts - 1), 0.0).astype(np.float32)
 
     def _located(self, bad: NDArray[np.uint32]) -> tuple[BadSample, ...]:
         """Queries of non-finite lanes, and the effect at fault: direct light, if their paths are non-finite
         after one interaction."""
         if not len(bad):
             return ()
-        direct = _nonfinite(self._trace(mi.UInt32(padded(bad)), limit=dr.opaque(mi.UInt32, 1))[0])
+        first = self._trace(mi.UInt32(padded(bad)), limit=dr.opaque(mi.UInt32, 1))[0]
+        direct = self._nonfinite(first, len(bad))
         return tuple(
             BadSample(self._number(lane), "direct light" if k in direct else "interreflection")
             for k, lane in enumerate(bad)
         )
 
-    def _points(self, lane: UInt32, query: UInt32, purpose: Purpose, attempt: int) -> SobolSampler:
+    def _points(self, lane: UInt32, group: UInt32, purpose: Purpose, attempt: int) -> SobolSampler:
         """Random numbers of paths."""
-        path = lane - dr.gather(mi.UInt32, self.start, query)
-        half = dr.gather(mi.UInt32, self.half, query)
+        path = lane - dr.gather(mi.UInt32, self.start, group)
+        half = dr.gather(mi.UInt32, self.half, group)
         second = path >= half
         # Both halves take the same points, of differently scrambled sequences.
         s, number = self.stream, self.stream.first_pass + attempt
@@ -261,44 +302,50 @@ class _Launch:
             dr.select(second, *(dr.opaque(mi.UInt32, key >> shift & 0xFFFFFFFF) for key in keys))
             for shift in (0, 32)
         )
-        of_shard = query + dr.opaque(mi.UInt32, self.first)
+        of_shard = group + dr.opaque(mi.UInt32, self.first)
         return sequence(low, high, of_shard, dr.select(second, path - half, path))
 
     def _trace(
         self, which: UInt32 | None = None, attempt: int = 0, limit: UInt32 | None = None
     ) -> tuple[Color3f, Float, int, int]:
-        """Radiance of some of the lanes (all, if None); where rays can pass, 1 where the first ray was
-        transmitted; counts of lost and capped rays."""
+        """Radiance of each slot of some of the lanes (all, if None); where rays can pass, 1 where the first
+        ray of a lane was transmitted; counts of lost and capped rays."""
         everything = which is None
         if everything:
-            which, query = dr.arange(mi.UInt32, int(self.counts.sum())), self.query
+            which, group = dr.arange(mi.UInt32, self.paths), self.group
         else:
-            query = dr.gather(mi.UInt32, self.query, which)
-        xi = self._points(which, query, Purpose.FOOTPRINT, attempt).next_2d()
-        point = self.source.footprint(query, xi)
-        key = _position_key(point) | dr.gather(mi.UInt32, self.direction_key, query)
+            group = dr.gather(mi.UInt32, self.group, which)
+        xi = self._points(which, group, Purpose.FOOTPRINT, attempt).next_2d()
+        point = self.source.footprint(group, xi)
+        key = _position_key(point) | dr.gather(mi.UInt32, self.direction_key, group)
         dr.eval(point, key)
         order = _aligned(np.argsort(np.array(key).astype(np.uint16), kind="stable"))
 
         lane = order if everything else dr.gather(mi.UInt32, which, order)
-        query = dr.gather(mi.UInt32, self.query, lane)
-        tracer = PathTracer(
-            self.estimator.tile,
-            self.estimator.transport,
-            self.lights.at(query),
-            self.limit if limit is None else limit,
-            self.roulette,
-        )
-        ray = self.source.ray(query, dr.gather(mi.Point2f, point, order))
-        path = tracer.trace(ray, self._points(lane, query, Purpose.PATH, attempt))
+        group = dr.gather(mi.UInt32, self.group, lane)
+        tracer = self._tracer(group, order, self.limit if limit is None else limit)
+        ray = self.source.ray(group, dr.gather(mi.Point2f, point, order))
+        path = tracer.trace(ray, self._points(lane, group, Purpose.PATH, attempt))
         radiance = dr.zeros(mi.Color3f, dr.width(which))
         dr.scatter(radiance, path.radiance, order)
+        if isinstance(tracer, GroupTracer):
+            radiance = dr.tile(radiance, self.group_size) + tracer.radiance
         passed = None
         if self.estimator.holes:
             passed = dr.zeros(mi.Float, dr.width(which))
             dr.scatter(passed, dr.select(path.passed, 1.0, 0.0), order)
         dr.eval(radiance, passed, path.lost, path.capped)
         return radiance, passed, int(dr.count(path.lost)[0]), int(dr.sum(path.capped)[0])
+
+    def _tracer(self, group: UInt32, slot: UInt32, limit: UInt32) -> PathTracer:
+        """Tracer of lanes of given groups, whose first slots are `slot`."""
+        tile, transport = self.estimator.tile, self.estimator.transport
+        if self.group_size == 1:
+            return PathTracer(tile, transport, self.lights.at(group), limit, self.roulette)
+        groups = len(self.counts)
+        return GroupTracer.of(
+            tile, transport, self.lights, limit, self.roulette, group, groups, slot, self.group_size
+        )
 
 
 def _nonfinite(radiance: Color3f) -> NDArray[np.uint32]:
@@ -329,7 +376,7 @@ def _aligned(numbers: NDArray[Any]) -> UInt32:
 
 
 def _launches(counts: NDArray[np.int64], launch: int) -> list[slice]:
-    """Consecutive queries that together have at most `launch` paths, or one query that has more."""
+    """Consecutive groups that together have at most `launch` paths, or one group that has more."""
     ends = np.cumsum(counts)
     out, start, traced = [], 0, 0
     while start < len(counts):

@@ -175,6 +175,15 @@ class PathTracer:
         return self.tile.geometry.open or self._holes is not None
 
     @property
+    def _of_lanes(self) -> Any:
+        """What of the tracer differs between lanes."""
+        return self.light
+
+    def _compacted(self, lanes: UInt32) -> PathTracer:
+        """The tracer of some of the lanes."""
+        return replace(self, light=_gather_lanes(self.light, lanes))
+
+    @property
     def _bsdf_sampling(self) -> bool:
         """Whether light is also found by sampling the BSDF, which alone finds constant light."""
         return self.transport.bsdf_sampling or self.light.kind == "constant"
@@ -224,12 +233,12 @@ class PathTracer:
         if not self.transport.interreflection:
             return path
         # The lights as well: the second kernel gathers those of its lanes.
-        dr.eval(path, self.light)
+        dr.eval(path, self._of_lanes)
         lanes = dr.compress(path.active)
         if len(lanes):
             rest = _gather_lanes(path, lanes)
             rest.radiance, rest.capped, rest.lost = mi.Spectrum(0.0), mi.UInt32(0), mi.Bool(False)
-            rest = replace(self, light=_gather_lanes(self.light, lanes))._loop(rest)
+            rest = self._compacted(lanes)._loop(rest)
             dr.eval(rest.radiance, rest.capped, rest.lost)
 
             def scattered_back(values: Any) -> Any:

@@ -9,7 +9,7 @@ uniform on the projected disk, ``r ≤ √(1 - cos²_min)``. All arithmetic is e
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,6 +92,7 @@ class QueryPlan:
         covers the finest level
     directions : (n, 3) float32 array
         Lights and views of the slices layout.
+    lights : queries of a group, which share position, footprint and view
     """
 
     lattice: Lattice
@@ -102,6 +103,7 @@ class QueryPlan:
     shard_rows: int
     patch_size: int | None = None
     directions: F32 | None = None
+    lights: int = 1
 
     def draw(self, split: str, shard: int, rows: int) -> Queries:
         """Sample `rows` queries (shuffled layout), images (image layout) or positions (slices layout) of a
@@ -110,7 +112,12 @@ class QueryPlan:
         The split is ``train``, ``test``, or a stream of :mod:`mbtf_gen.sampling.sobol`. Leading axes are
         ``(rows,)``, or ``(rows, height, width)`` of images. Slices are ``(rows, n²)``, one at the center of
         each texel of the finest level; those of other splits hold one query, as of the shuffled layout.
+
+        With L lights the queries i, i + rows/L, i + 2 rows/L, … are a group, so that neighbors are
+        independent; test queries have no groups.
         """
+        if self.lights > 1 and split != "test":
+            return self._groups(split, shard, rows)
         if self.layout == "slices" and split == "train":
             return self._slices(self._texels(split, shard * self.shard_rows, rows))
         generator = self.generator(split, shard)
@@ -158,6 +165,18 @@ class QueryPlan:
             for sweep in range(first, -(-(start + count) // texels))
         ]
         return np.concatenate(orders)[start - first * texels :][:count]
+
+    def _groups(self, split: str, shard: int, rows: int) -> Queries:
+        count = self.lights
+        alone = replace(self, lights=1, shard_rows=self.shard_rows // count)
+        views = alone.draw(split, shard, rows // count)
+        light = self._directions(numpy_generator(self.root, split, shard, Purpose.LIGHTS), rows)
+        return Queries(
+            np.tile(views.u, (count, 1)),
+            np.tile(views.sigma, count),
+            light,
+            np.tile(views.omega_o, (count, 1)),
+        )
 
     def _slices(self, texel: NDArray[np.int64]) -> Queries:
         """All pairs of light and view at the centers of texels (n,), with the finest footprint."""

@@ -25,6 +25,7 @@ class Purpose(IntEnum):
     FOOTPRINT = 2
     PATH = 3
     CHOICE = 4
+    LIGHTS = 5
 
 
 def stream_number(split: str, shard: int, purpose: Purpose, pass_index: int = 0, half: int = 0) -> int:

@@ -102,8 +102,9 @@ def claim(folder: Path, on: Mapping[str, str]) -> None:
 
 def study_config(config: GeneratorConfig, seed: int | None) -> GeneratorConfig:
     """A recipe's generator as its study uses it: without a target error, which would override the numbers of
-    paths, and with shuffled queries."""
-    queries = config.queries.model_copy(update={"target_error": None, "layout": "shuffled"})
+    paths, and with shuffled queries that share no paths."""
+    own = {"target_error": None, "layout": "shuffled", "lights_per_path": 1}
+    queries = config.queries.model_copy(update=own)
     seeds = {} if seed is None else {"seed": seed}
     return config.model_copy(update={"queries": queries, **seeds})
 

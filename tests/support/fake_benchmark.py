@@ -29,7 +29,7 @@ class FakeEstimator:
         self.shift = SHIFT if job.config.transport.max_depth == 1 else 0.0
 
     def estimate(
-        self, queries: Queries, spp: Any, stream: Stream, *, path_variance: bool = False
+        self, queries: Queries, spp: Any, stream: Stream, *, path_variance: bool = False, lights: int = 1
     ) -> Estimates:
         # A biased configuration traces other paths.
         key = [stream.root, stream.shard, stream.first_pass, len(queries.sigma), self.shift > 0]

@@ -27,18 +27,20 @@ FILES = ["train-00000.npz", "train-00001.npz", "train-00002.npz", "test-00000.np
 
 
 class Formula:
-    """Replaces the estimator: values from a formula, and a list of the shards that it estimated."""
+    """Replaces the estimator: values from a formula, and lists of the shards that it estimated."""
 
     def __init__(self) -> None:
         self.estimated: list[tuple[str, int]] = []
+        self.lights: list[tuple[str, int]] = []
         self.fail_at: int | None = None
         self.bad = (BadSample(7, "direct light"),)
         self.more = 1
 
-    def estimate(self, queries: Any, spp: int, stream: Any) -> Any:
+    def estimate(self, queries: Any, spp: int, stream: Any, *, lights: int = 1) -> Any:
         if self.fail_at == len(self.estimated):
             raise KeyboardInterrupt
         self.estimated.append((stream.split, stream.shard))
+        self.lights.append((stream.split, lights))
         value = formula(queries).astype(np.float32)
         return Estimates(value, value, None, self.more * len(value) * spp, 1, 2, len(self.bad), self.bad)
 

@@ -20,7 +20,9 @@ from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.sampling.rng import Purpose, numpy_generator
 
 
-def noisy_plane(self: ClosedForm, queries: Queries, spp: int, stream: Stream) -> Estimates:
+def noisy_plane(
+    self: ClosedForm, queries: Queries, spp: int, stream: Stream, *, lights: int = 1
+) -> Estimates:
     """In place of :meth:`ClosedForm.estimate`: values that no two shards share."""
     rng = numpy_generator(stream.root, stream.split, stream.shard, Purpose.FOOTPRINT)
     a, b = ((self.value * rng.random((len(queries.sigma), 3))).astype(np.float32) for _ in range(2))

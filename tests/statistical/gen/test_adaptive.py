@@ -99,6 +99,19 @@ def test_the_pilot_draws_random_numbers_of_its_own(skewed: tuple[Queries, Alloca
     assert abs(pilot.first_pass - stored.first_pass) > MAX_RESAMPLES
 
 
+def test_a_group_has_the_paths_of_its_noisiest_query(skewed: tuple[Queries, Allocation]) -> None:
+    q, allocation = skewed
+    some, stream = q.take(slice(400)), Stream(1, "train", 0)
+    alone, shared = (
+        estimate_shard(FewBrightPaths(), some, 4, Target(0.2, 512), stream, allocation, n) for n in (1, 4)
+    )
+    assert alone.spp is not None
+    assert shared.spp is not None
+    expected = alone.spp.reshape(4, -1).max(axis=0)
+    assert (shared.spp.reshape(4, -1) == expected).all()
+    assert expected.min() < expected.max()
+
+
 @pytest.mark.parametrize(("most", "low", "high"), [(8192, 0.2, 0.24), (8, 1.0, 9.0)])
 def test_a_skewed_scene_comes_near_its_target_and_what_is_reported_is_so(
     most: int, low: float, high: float, skewed: tuple[Queries, Allocation]

@@ -95,7 +95,7 @@ class Recorder:
         self.plans.append(plan)
         return self
 
-    def estimate(self, queries: Queries, spp: int, stream: Stream) -> Estimates:
+    def estimate(self, queries: Queries, spp: int, stream: Stream, **_: Any) -> Estimates:
         value = np.zeros((len(queries.sigma), 3), np.float32)
         through = queries.u[:, 0].astype(np.float32)
         return Estimates(value, value, through, len(value) * spp, 0, 0, 0)

@@ -219,7 +219,9 @@ def test_an_interrupted_run_keeps_its_shards(
     prepare(small)
     line, rendered = line_of(small), 0
 
-    def interrupted(self: ClosedForm, queries: Queries, spp: int, stream: Stream) -> Estimates:
+    def interrupted(
+        self: ClosedForm, queries: Queries, spp: int, stream: Stream, *, lights: int = 1
+    ) -> Estimates:
         nonlocal rendered
         if rendered == 1:
             os.kill(os.getpid(), number)

@@ -89,6 +89,7 @@ CHANGES = (
     *("transport.max_depth=3", "transport.roulette_depth=5", "transport.max_crossings=9"),
     *("output.format=exr", "output.shard_queries=99", "queries.train=3", "queries.test=3"),
     *("queries.spp=8", "queries.test_spp=8", "queries.allocation=uniform"),
+    "queries.lights_per_path=2",
     *("queries.test_highlights=0.5", "queries.target_error=5%"),
     *("queries.max_spp=64", "queries.resolution=2", "queries.mixture.finest=0.3", "queries.min_cos=0.2"),
     *("queries.layout=image", "queries.patch_size=8", "queries.slice_directions=ubo2003"),

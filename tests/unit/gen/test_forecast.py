@@ -38,20 +38,24 @@ class Clock:
 
 
 class Fake:
-    """Estimates of known noise, one standard deviation of 0.8 per path at a mean value of 0.25."""
+    """Estimates of known noise, one standard deviation of 0.8 per path at a mean value of 0.25. Queries of a
+    group have the same noise, and one more light takes half the time of a path of one."""
 
     def __init__(self, clock: Clock) -> None:
         self.clock = clock
 
-    def estimate(self, queries: Queries, spp: Any, stream: Stream, path_variance: bool = False) -> Estimates:
+    def estimate(
+        self, queries: Queries, spp: Any, stream: Stream, path_variance: bool = False, lights: int = 1
+    ) -> Estimates:
         assert stream.split == "pilot"
         rng = np.random.default_rng([stream.shard, stream.first_pass])
         n = len(queries.sigma)
         counts = np.broadcast_to(np.asarray(spp, np.int64), (n,))
-        paths = int(counts.sum())
-        self.clock.now += paths / RATE
+        paths = int(counts.sum()) // lights
+        self.clock.now += 0.5 * (1 + lights) * paths / RATE
         noise = 0.8 * np.sqrt(2.0 / counts)[:, None]
-        a, b = ((0.25 + noise * rng.normal(size=(n, 3))).astype(np.float32) for _ in range(2))
+        a, b = (np.tile(rng.normal(size=(n // lights, 3)), (lights, 1)) for _ in range(2))
+        a, b = ((0.25 + noise * x).astype(np.float32) for x in (a, b))
         every = None if isinstance(spp, int) else counts
         variance = np.full(n, 0.8**2, np.float32) if path_variance else None
         return Estimates(a, b, None, paths, 0, 0, 0, spp=every, path_variance=variance)
@@ -90,6 +94,20 @@ def test_seconds_and_noise(faked: None, layout: str) -> None:
     noise = 0.8 / math.sqrt(8) / 0.25
     assert abs(found.relative_error - noise) < 5 * found.relative_error_se
     assert found.relative_error_se < 0.02 * noise
+
+
+def test_lights_of_one_path_take_less_time_and_their_noise_is_no_new_knowledge(faked: None) -> None:
+    plan = RunPlan(plan_effects(job_of(), pilots=False))
+    alone, shared = (
+        forecast(job_of(train="1000000", spp=8, test="20000", test_spp=64, lights_per_path=n), plan, 0.0)
+        for n in (1, 4)
+    )
+    assert shared.paths == pytest.approx(1e6 * 8 / 4 + 2e4 * 64, rel=1e-6)
+    assert shared.seconds == pytest.approx((2.5 * 1e6 * 8 / 4 + 2e4 * 64) / RATE, rel=1e-6)
+    assert shared.paths_per_query == 8
+    # Both trace 2^19 paths at once, but with equal noise within groups.
+    assert shared.relative_error_se == pytest.approx(alone.relative_error_se, rel=0.1)
+    assert abs(shared.relative_error - alone.relative_error) < 5 * shared.relative_error_se
 
 
 def test_a_target_error_decides_paths_and_seconds(faked: None) -> None:

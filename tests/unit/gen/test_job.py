@@ -11,7 +11,7 @@ import pytest
 
 from mbtf_core.errors import InputError, UsageError
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.job import Job, most_paths, planned_paths, split_queries
+from mbtf_gen.job import Job, most_paths, planned_paths, planned_work, query_work, split_queries
 
 
 @pytest.fixture
@@ -80,3 +80,24 @@ def test_most_paths_include_pilots_and_cap(heights: Path) -> None:
     job = job_of(heights)
     assert most_paths(job) == planned_paths(job, job.shards) == 320
     assert most_paths(job_of(heights, target_error=0.02, max_spp=128)) == 100 * (128 + 16) + 30 * 4
+
+
+def test_lights_of_a_path_share_it_in_whole_groups(heights: Path) -> None:
+    job = job_of(heights, lights_per_path=3)
+    # 100 queries are 34 groups, 13 of them per shard of 40 queries.
+    assert [n for _, n in rows(job)] == [39, 39, 24]
+    assert rows(job, "test") == [("test-00000.npz", 30)]
+    assert split_queries(job, "train") == 102
+    assert planned_paths(job, job.shards) == most_paths(job) == 34 * 2 + 30 * 4
+    # A vertex has four rays instead of two.
+    assert planned_work(job, job.shards) == 34 * 2 * 2 + 30 * 4
+    assert query_work(job) == pytest.approx(2 * 2 / 3)
+    # Groups that do not fit into a shard make larger shards.
+    assert [n for _, n in rows(job_of(heights, lights_per_path=64))] == [64, 64]
+
+
+@pytest.mark.parametrize("layout", ["image", "slices"])
+def test_other_layouts_share_no_paths(heights: Path, layout: str) -> None:
+    with pytest.raises(UsageError, match=f"{layout} layout") as caught:
+        job_of(heights, layout=layout, lights_per_path=2)
+    assert caught.value.where == "--lights-per-path"

@@ -19,6 +19,7 @@ from mbtf_core.data.geometry import Geometry
 from mbtf_core.data.shard_files import read_shard
 from mbtf_core.data.verify import verify
 from mbtf_core.errors import InputError, PartialError
+from mbtf_core.files.atomic import checksummed
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.generation import folder
@@ -54,6 +55,29 @@ def test_a_run_is_complete_and_counts(config: GeneratorConfig, out: Path) -> Non
     assert not list(out.glob(".*"))
 
 
+def test_queries_that_share_paths_are_stored_as_the_manifest_says(
+    config: GeneratorConfig, engine: Formula, out: Path
+) -> None:
+    generate(changed(config, queries={"lights_per_path": 3}), out)
+    assert {lights for split, lights in engine.lights if split == "train"} == {3}
+    assert {lights for split, lights in engine.lights if split == "test"} == {1}
+    data = Dataset.open(out)
+    assert (data.lights_per_path("train"), data.lights_per_path("test")) == (3, 1)
+    for shard in data.shards("train"):
+        arrays = shard.read()
+        for name in ("u", "sigma", "omega_o", "spp"):
+            groups = arrays[name].reshape(3, shard.rows // 3, -1)
+            assert (groups == groups[0]).all()
+        assert len(np.unique(arrays["omega_i"], axis=0)) == shard.rows
+    assert verify(out) == []
+    # A shard of other than whole groups cannot be read as groups.
+    manifest = json.loads((out / "manifest.json").read_text())
+    manifest["splits"]["train"]["lights_per_path"] = 7
+    (out / "manifest.json").write_bytes(checksummed(manifest))
+    with pytest.raises(InputError, match="multiples of lights_per_path"):
+        Dataset.open(out)
+
+
 @pytest.mark.parametrize("layout", ["shuffled", "image"])
 def test_shards_hold_what_was_drawn_and_estimated(
     config: GeneratorConfig, engine: Formula, tmp_path: Path, layout: str
@@ -76,7 +100,7 @@ def test_half_the_difference_of_the_halves_is_the_error(
 ) -> None:
     estimate = engine.estimate
 
-    def noisy(queries: Any, spp: int, stream: Any) -> Any:
+    def noisy(queries: Any, spp: int, stream: Any, **_: Any) -> Any:
         found = estimate(queries, spp, stream)
         return replace(found, value_a=1.1 * found.value_a, value_b=0.9 * found.value_b)
 

@@ -214,9 +214,9 @@ def test_shards_that_could_not_be_uploaded_wait(
             raise error("the store cannot be reached", where=self.url)
         return original(self, name, content, new=new)
 
-    def counted(self: ClosedForm, *arguments: Any) -> Any:
+    def counted(self: ClosedForm, *arguments: Any, **options: Any) -> Any:
         rendered.append("")
-        return estimate(self, *arguments)
+        return estimate(self, *arguments, **options)
 
     monkeypatch.setattr(ClosedForm, "estimate", counted)
     with monkeypatch.context() as patch:

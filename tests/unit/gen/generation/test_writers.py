@@ -140,7 +140,7 @@ def test_the_run_that_ends_last_finishes_the_data_set(
     assert lock is not None
     estimate = engine.estimate
 
-    def meanwhile(queries: Any, spp: int, stream: Any) -> Any:
+    def meanwhile(queries: Any, spp: int, stream: Any, **_: Any) -> Any:
         if stream.split == "test":
             for path in (out / FILES[1], sidecar_of(out / FILES[1])) if finished else ():
                 shutil.copy(whole / path.name, path)

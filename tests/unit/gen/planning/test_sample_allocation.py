@@ -50,6 +50,21 @@ def fitted() -> Allocation:
     return fit_allocation(q, pilot(q), SPP, SPP)
 
 
+def test_a_group_of_lights_has_the_paths_that_its_noise_takes() -> None:
+    q = some_queries()
+    # The noise follows the lights, which differ within a group: neighbors are queries of their own here.
+    found = fit_allocation(q, pilot(q), SPP, SPP, lights=4)
+    counts = found.counts(q, SPP, 4).reshape(4, -1)
+    assert (counts == counts[0]).all()
+    assert counts.mean() == pytest.approx(SPP, rel=0.02)
+    # Neyman: in proportion to the root mean square of a group's deviations, rounded to powers of two.
+    share = counts[0] / np.sqrt(np.mean(found.deviation(q).reshape(4, -1) ** 2, axis=0))
+    middle = (counts[0] > 2) & (counts[0] < counts.max())
+    assert share[middle].max() / share[middle].min() <= 2.0 + 1e-6
+    alone = fit_allocation(q, pilot(q), SPP, SPP)
+    assert 1.0 < found.gain < alone.gain
+
+
 def test_a_log_linear_mean_is_recovered() -> None:
     rng = np.random.default_rng(0)
     x = rng.normal(size=20_000)

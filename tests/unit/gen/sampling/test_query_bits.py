@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 import pytest
 from conftest import RunPython
 from numpy.typing import NDArray
+from scipy.stats import kstest
 
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.data.schema import Queries
@@ -165,6 +167,26 @@ def test_a_shard_does_not_depend_on_the_others() -> None:
     for s in (5, 0, 3):
         assert equal(plan(LATTICES[1], 50).draw("train", s, 50), many[s])
     assert not equal(many[0], many[1])
+
+
+def test_lights_of_a_group_share_one_query_of_a_plan_without_groups() -> None:
+    company = replace(plan(LATTICES[1], 3000), lights=3)
+    for shard in (0, 2):
+        alone = plan(LATTICES[1], 1000).draw("train", shard, 1000)
+        found = company.draw("train", shard, 3000)
+        for name in ("u", "sigma", "omega_o"):
+            assert (getattr(found, name).reshape(3, 1000, -1) == getattr(alone, name).reshape(1000, -1)).all()
+        # As independent as those of other queries, and as uniform: r² on the projected disk, and the azimuth.
+        lights = found.omega_i.astype(np.float64).reshape(3, 1000, 3)
+        radius2 = (lights[..., 0] ** 2 + lights[..., 1] ** 2) / (1 - 0.2**2)
+        turns = np.arctan2(lights[..., 1], lights[..., 0]) / (2 * np.pi) + 0.5
+        for numbers in (radius2, turns):
+            assert kstest(numbers.ravel(), "uniform").pvalue > 1e-3
+            others = (alone.omega_i[:, 2], alone.omega_o[:, 2], *numbers[1:])
+            for other in others:
+                assert abs(np.corrcoef(numbers[0], other)[0, 1]) < 5 / np.sqrt(1000)
+    # Test queries have paths of their own.
+    assert equal(company.draw("test", 1, 3000), plan(LATTICES[1], 3000).draw("test", 1, 3000))
 
 
 def test_splits_shards_and_roots_have_different_queries() -> None:
