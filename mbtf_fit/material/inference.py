@@ -11,7 +11,9 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from mbtf_core.errors import InputError
 from mbtf_fit.backends.cpu.model import NativeModel, supports
+from mbtf_fit.material.format import QUERY
 from mbtf_fit.native import kernel
 from mbtf_fit.native.library import QueryPointers
 from mbtf_fit.pytorch.material import NeuralMaterial
@@ -50,8 +52,13 @@ def predict(
     *,
     hints: Tensor | None = None,
 ) -> NDArray[np.float32]:
-    """Values (n, 3) of a material in 1/sr, clamped at 0, at queries (n, 2), (n,), (n, 3) and (n, 3). `hints`
-    (n, 7) of its surface are computed where they are not given."""
+    """Values (n, 3) of a material in 1/sr, clamped at 0. `hints` (n, 7) of its surface are computed where
+    they are not given."""
+    given = [tuple(np.shape(a)) for a in (u, sigma, omega_i, omega_o)]
+    n = next(iter(given[1]), 0)
+    if given != [(n, 2), (n,), (n, 3), (n, 3)]:
+        what = f"have the shapes {', '.join(map(str, given))}"
+        raise InputError(what, where=", ".join(QUERY), hint="they must be (n, 2), (n,), (n, 3) and (n, 3)")
     found = kernel()
     if found is not None and supports(model):
         return _predict_natively(NativeModel(found, model), hints, u, sigma, omega_i, omega_o)
