@@ -207,7 +207,7 @@ def test_images_are_visible_without_scripts(page: Page) -> None:
     driver.set_window_size(1300, 2400)
     driver.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})
     driver.get((page.folder / "report.html").as_uri())
-    png = page.find("button.zoom img").screenshot_as_png
+    png = page.find(".sheet .reference img").screenshot_as_png
     image = Image.open(io.BytesIO(png)).convert("RGB")
     shown = np.asarray(image.resize((PIXELS, PIXELS), Image.Resampling.BOX))
     expected = page.expected(0, "query")

@@ -111,7 +111,7 @@ def test_fits_are_calibrated_by_default(tmp_path: Path) -> None:
     wanted = 0.2 + 0.6 * 0.8**4
     off, phases = {}, dict[str, list[float]]()
     for calibrate in (True, False):
-        training = {"steps": 40, "batch": 2000, "energy_calibration": calibrate}
+        training = {"steps": 20, "batch": 2000, "energy_calibration": calibrate}
         result = fit(
             FitConfig.model_validate({"model": "neumip", "training": training}),
             folder,
