@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -65,6 +66,29 @@ def test_data_are_out_of_date_when_a_map_has_changed(tmp_path: Path) -> None:
     assert not survey(recipe, folder)["generate"]
     np.save(path, np.ones((4, 4), np.float32))
     assert survey(recipe, folder)["generate"] == "input changed: height"
+
+
+def test_a_fit_is_out_of_date_when_the_file_of_its_model_has_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The model is named by its class, and its path is relative to the current folder."""
+    monkeypatch.chdir(tmp_path)
+    file = tmp_path / "mine.py"
+    file.write_text("from mbtf_fit.models.svbrdf import Svbrdf\n\n\nclass Lobes(Svbrdf):\n    pass\n")
+    recipe = load_recipe(written(tmp_path, HEAD + "fit: {model: mine.py:Lobes}\n"))
+    assert list(recipe.fit) == ["Lobes"]
+    assert recipe.fit["Lobes"].training.texture_learning_rate == 0.1
+
+    def inputs() -> Mapping[str, str]:
+        (stage,) = (
+            s for s in _RecipeRun(recipe, tmp_path, Console(quiet=True)).stages({}) if s.name == "fit Lobes"
+        )
+        return stage.inputs
+
+    before = inputs()
+    assert inputs() == before
+    file.write_text(file.read_text().replace("pass", "calibrates = True"))
+    assert inputs() != before
 
 
 def test_an_assigned_material_is_relative_to_the_current_folder(
