@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import mbtf_fit.models
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError, MbtfError, reason
+from mbtf_core.paths import refuse_special
 from mbtf_fit.models import FOREIGN, is_file
 from mbtf_fit.models.model import Model
 from mbtf_fit.ops import Operation
@@ -72,6 +73,7 @@ def model_class(name: str) -> type[Model]:
         return MODELS[name]
     file, _, wanted = name.rpartition(":")
     path = Path(file)
+    refuse_special(path)
     with _faults_of(name):
         try:
             text = path.read_text(encoding="utf-8")
