@@ -5,31 +5,40 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, ValidationInfo, model_validator
 
 from mbtf_core.app.options import Flag, Quality
-from mbtf_core.config.settings import LocalName, Settings, deep_merge, leaves
+from mbtf_core.config.settings import LocalName, Settings, build, deep_merge, leaves
 from mbtf_core.files.atomic import data_sha256
+from mbtf_core.paths import named_file, suggest_name
 from mbtf_core.units import parse_duration
-from mbtf_fit.models import NAMES
+from mbtf_fit.models import NAMES, is_file
 from mbtf_fit.sections import DataSection, HeldOutSection, NetworkSection, TrainingSection
 
+# Context of the validators for the configuration of a material, see :func:`stored_config`.
+_STORED = "stored"
 
-def _installed(name: object) -> object:
-    """The name of a model.
+
+def _known(name: object, info: ValidationInfo) -> object:
+    """The name of a model, or its file and class.
 
     Raises
     ------
     ValueError : there is none of this name
     """
-    if isinstance(name, str) and name not in NAMES:
-        raise ValueError(
-            f"must be an installed model: {', '.join(NAMES)}, or one that another package registers by an "
-            f"entry point of mbtf.models; '{name}' is none"
-        )
-    return name
+    if not isinstance(name, str) or name in NAMES or info.context == _STORED:
+        return name
+    if is_file(name):
+        path, _, wanted = name.rpartition(":")
+        return f"{named_file(Path(), path)}:{wanted}"
+    suggestion = suggest_name(name, NAMES)
+    raise ValueError(
+        f"must be an installed model: {', '.join(NAMES)}, one that another package registers by an "
+        f"entry point of mbtf.models, or FILE.py:CLASS{suggestion and f'; {suggestion}'}"
+    )
 
 
 if TYPE_CHECKING:
@@ -38,7 +47,7 @@ if TYPE_CHECKING:
 
     ModelName = str
 else:
-    ModelName = Annotated[Literal[NAMES], BeforeValidator(_installed)]
+    ModelName = Annotated[Literal[NAMES] | str, BeforeValidator(_known)]
 
 # The best of them where the data set has a geometry.
 DEFAULT_MODEL = "relief"
@@ -62,7 +71,7 @@ class FitConfig(Settings):
 
     version: Literal[2] = 2
     model: Annotated[ModelName, Flag("--model")] = Field(
-        DEFAULT_MODEL, description="model to fit; mbtf-fit models describes them"
+        DEFAULT_MODEL, description="model to fit, or FILE.py:CLASS; mbtf-fit models describes them"
     )
     init_from: Annotated[LocalName | None, Flag("--init-from", "FOLDER", rare=True)] = Field(
         None, description="folder of a material that initializes textures and offset"
@@ -85,9 +94,9 @@ class FitConfig(Settings):
 
     @model_validator(mode="before")
     @classmethod
-    def _preset(cls, data: Any) -> Any:
+    def _preset(cls, data: Any, info: ValidationInfo) -> Any:
         """Fill unset keys with the model's defaults."""
-        if not isinstance(data, Mapping):
+        if not isinstance(data, Mapping) or info.context == _STORED:
             return data
         from mbtf_fit.models.registry import defaults_of
 
@@ -99,14 +108,17 @@ class FitConfig(Settings):
         return deep_merge(preset, data)
 
     @model_validator(mode="after")
-    def _consistent(self) -> FitConfig:
+    def _consistent(self, info: ValidationInfo) -> FitConfig:
         from mbtf_fit.models.model import SPECIAL
-        from mbtf_fit.models.registry import MODELS, defaults_of, with_option
+        from mbtf_fit.models.registry import defaults_of, model_class, with_option
 
+        if info.context == _STORED:
+            return self
+        model = model_class(self.model)
         mine = dict(leaves(self.model_dump()))
         usual = dict(leaves(deep_merge(_GENERAL, defaults_of(self.model))))
         for key in SPECIAL:
-            if key in MODELS[self.model].takes:
+            if key in model.takes:
                 continue
             given, default = (
                 {k: v for k, v in d.items() if f"{k}.".startswith(f"{key}.")} for d in (mine, usual)
@@ -115,7 +127,7 @@ class FitConfig(Settings):
                 others = with_option(key)
                 raise ValueError(f"{self.model} has no option {key}, which {_listed(others)}")
         gradient = any(term.kind == "gradient" for term in self.training.losses)
-        if gradient and MODELS[self.model].layout != "image":
+        if gradient and model.layout != "image":
             raise ValueError(
                 "training.losses: the gradient loss compares neighboring texels, which "
                 f"{self.model} never sees together; use a model of the image layout"
@@ -138,6 +150,17 @@ class FitConfig(Settings):
     def hash(self, data_hash: str) -> str:
         """SHA-256 over :meth:`fields` and the data set's own hash, hexadecimal."""
         return data_sha256({**self.fields(), "data": data_hash})
+
+
+def stored_config(data: Mapping[str, Any], where: Path) -> FitConfig:
+    """The configuration that a file of a material states. It is complete: the code of its model is neither
+    needed nor run.
+
+    Raises
+    ------
+    InputError : a key is unknown, or a value is out of range
+    """
+    return build(FitConfig, data, source=str(where), context=_STORED)
 
 
 def _listed(names: list[str]) -> str:

@@ -183,7 +183,7 @@ def evaluate(material: Material | str | Path, shards: str | Path | DataFolder) -
         ``training``; ``transmittance``: its errors by split, where both material and data have one. The same
         plain data as in ``material.json``, see :func:`split_errors`: estimates with ``value``, ``error`` (one
         standard error) and ``n``, among them the ``unexplained`` variance (1 - R²). Values that the noise
-        hides are None.
+        hides are None. ``Estimate.from_dict`` (:mod:`mbtf_core.stats`) makes an object of each.
 
     Raises
     ------

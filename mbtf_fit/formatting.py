@@ -22,6 +22,7 @@ VISIBILITY = (
     (26.0, "visible"),
     (-math.inf, "clearly visible"),
 )
+ABOVE_ONE = "above 1: worse than the mean value"
 # Share of an error that ten of so many queries at least make up.
 _DECISIVE, _MANY = 0.5, 1000
 # Standard errors of a significant difference from zero.
@@ -109,7 +110,7 @@ def _remarks(errors: Mapping[str, Any], foreign: bool) -> list[str]:
         found.append("these errors include the noise of the data, which have one value per query")
     if value is None or value < 1 or foreign:
         return found
-    return [*found, "above 1: worse than the mean value"]
+    return [*found, ABOVE_ONE]
 
 
 def _table_of(errors: Mapping[str, Any]) -> list[str]:

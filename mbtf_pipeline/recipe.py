@@ -135,7 +135,8 @@ def _named(fits: Any) -> Any:
     if not fits:
         raise ValueError("contains no fit")
     if _is_single(fits):
-        return {str(fits.get("model", FitConfig.model_fields["model"].default)): fits}
+        # That of a file by its class.
+        return {str(fits.get("model", DEFAULT_MODEL)).rpartition(":")[2]: fits}
     return {str(name): {"model": name, **(options or {})} for name, options in fits.items()}
 
 

@@ -18,6 +18,7 @@ from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item
 from mbtf_core.units import clock
 from mbtf_fit.config import FitConfig
+from mbtf_fit.models import is_file
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.compare.compare import COMPARISON_NAME, COMPARISON_SCHEMA
 from mbtf_pipeline.recipe import Recipe, read_resolved
@@ -62,9 +63,9 @@ class DataSet(NamedTuple):
 
 def layout_of(config: FitConfig) -> str:
     """Data layout that a fit's model requires."""
-    from mbtf_fit.models.registry import MODELS
+    from mbtf_fit.models.registry import model_class
 
-    return MODELS[config.model].layout
+    return model_class(config.model).layout
 
 
 def data_sets(recipe: Recipe) -> list[DataSet]:
@@ -132,7 +133,8 @@ class _RecipeRun:
             others = [_manifest_digest(Path(folder)) for folder in fit.training.materials]
             fields["training"] = {**fields["training"], "materials": others}
             run, remote = partial(self._fit, name, data), not self.runner.here
-            out.append(Stage(fit_stage(name), (data.stage,), fields, {}, (f"{FITS}/{name}",), run, remote))
+            code = {"model": file_sha256(Path(fit.model.rpartition(":")[0]))} if is_file(fit.model) else {}
+            out.append(Stage(fit_stage(name), (data.stage,), fields, code, (f"{FITS}/{name}",), run, remote))
         needs = (GENERATE_STAGE, *map(fit_stage, recipe.fit))
         compared = {"record": COMPARISON_SCHEMA, **recipe.compare.model_dump(mode="json")}
         out.append(Stage(COMPARE_STAGE, needs, compared, {}, (COMPARE,), self._compare))

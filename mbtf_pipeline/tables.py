@@ -16,10 +16,7 @@ SIGNIFICANT = 2.0
 NOT_SIGNIFICANT = "not significant"
 
 
-def estimate(record: Mapping[str, Any]) -> Estimate:
-    """An estimate read from JSON, where values that are not finite are null."""
-    value, error = record["value"], record["error"]
-    return Estimate(math.nan if value is None else value, math.inf if error is None else error, record["n"])
+estimate = Estimate.from_dict
 
 
 def is_significant(e: Estimate) -> bool:

@@ -213,7 +213,8 @@ def _walk(model: type[BaseModel], prefix: str) -> Iterator[ConfigOption]:
 def _option(flag: Flag, key: str, field: FieldInfo) -> ConfigOption:
     text, _, default = (field.description or "").partition(_DEFAULT)
     kind = _bare(field.annotation)
-    choices = typing.get_origin(kind) is Literal
+    parts = typing.get_args(kind) if typing.get_origin(kind) is Union else (kind,)
+    choices = any(typing.get_origin(part) is Literal for part in parts) and flag.metavar is None
     return ConfigOption(
         flag.name,
         key,

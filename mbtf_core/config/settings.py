@@ -199,6 +199,7 @@ def build(
     source: str,
     error: type[MbtfError] = InputError,
     spelled: Mapping[str, str] | None = None,
+    context: Any = None,
 ) -> B:
     """Check `data` against `model`.
 
@@ -207,13 +208,14 @@ def build(
     source : where the data come from, for messages: a file, "command line"
     error : class of the error to raise
     spelled : dotted key → the flag that gave it, named in place of `source`
+    context : for the validators of `model`
 
     Raises
     ------
     error : with the key, its line where `data` came from :func:`read_yaml`, and the nearest valid key
     """
     try:
-        return typing.cast(B, model.__pydantic_validator__.validate_python(data))
+        return typing.cast(B, model.__pydantic_validator__.validate_python(data, context=context))
     except ValidationError as fault:
         where, what, hint = _explain(fault, model, data, source, spelled or {})
         raise error(what, where=where, hint=hint) from None

@@ -4,7 +4,7 @@ Estimates that are pooled from two halves are in :mod:`mbtf_core.stats.paired`."
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -54,6 +54,12 @@ class Estimate:
             "error": self.error if math.isfinite(self.error) else None,
             "n": self.n,
         }
+
+    @classmethod
+    def from_dict(cls, record: Mapping[str, Any]) -> Estimate:
+        """Inverse of :meth:`as_dict`: None becomes ``nan``, or ``inf`` of an error."""
+        value, error = record["value"], record["error"]
+        return cls(math.nan if value is None else value, math.inf if error is None else error, record["n"])
 
     def __str__(self) -> str:
         if not math.isfinite(self.value):

@@ -55,7 +55,7 @@ def evaluate(
     history = [] if foreign else read_history(material)
     command, advice = advise(loaded, material, folder, history, found["errors"])
     lines = [
-        f"{material}: {loaded.config.model} on {folder}",
+        f"{material}: {loaded.model.name} on {folder}",
         *report_errors(found["errors"], found.get("transmittance"), verbose, foreign=bool(foreign)),
         *advice,
     ]

@@ -189,11 +189,11 @@ def _announce(
     from mbtf_core.files.folders import check_space
     from mbtf_core.forecast import is_long
     from mbtf_fit.data.loader import open_data
-    from mbtf_fit.models.registry import MODELS
+    from mbtf_fit.models.registry import model_class
     from mbtf_fit.native import missing_reason
     from mbtf_fit.training.forecast import closing_seconds, fit_bytes, preparing_seconds
 
-    data = [open_data(folder, MODELS[config.model].layout, config.model) for folder in shards]
+    data = [open_data(folder, model_class(config.model).layout, config.model) for folder in shards]
     size = sum(fit_bytes(config, one.lattice) for one in data)
     check_space(output, size, "reduce network.channels, or choose another folder with -o")
     training = config.training

@@ -53,7 +53,8 @@ class QueryDataset(IterableDataset[QueryBatch]):
     An epoch visits blocks of about 4096 queries of all shards in random order, and shuffles 32 of them at a
     time: memory does not grow with the data set. The order depends on seed, epoch and number of workers
     alone. A loader takes batches as they are: ``DataLoader(queries, batch_size=None, num_workers=2)``; each
-    worker reads blocks of its own.
+    worker reads blocks of its own. There is no ``len()``: each worker ends with a batch of its own size, so
+    that the number of batches depends on the loader; without workers it is ``ceil(count / batch_size)``.
 
     Parameters
     ----------

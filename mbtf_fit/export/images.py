@@ -77,7 +77,7 @@ def write_maps(
     maps, images = export.shared["maps"]
     described = {
         "neural_material": Path(os.path.relpath(export.source, export.folder)).as_posix(),
-        "model": export.material.config.model,
+        "model": export.material.model.name,
         "weights_sha256": export.material.description["weights"]["sha256"],
         "level": maps.level,
         **({} if maps.heights is None else {"height_range_in_tile_widths": round(maps.height_range, 9)}),

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
-from mbtf_core.config.settings import build, leaves
+from mbtf_core.config.settings import leaves
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import write_json
 from mbtf_core.paths import suggest_path
-from mbtf_fit.config import FitConfig, decoder_models
+from mbtf_fit.config import FitConfig, decoder_models, stored_config
 from mbtf_fit.material.format import (
     DESCRIPTION_NAME,
     WEIGHTS_NAME,
@@ -98,7 +98,7 @@ class Decoder:
                 where=folder,
                 hint="make both with: mbtf-fit --many SHARDS SHARDS --shared-decoder -o FOLDER",
             )
-        config = build(FitConfig, description["config"], source=str(path))
+        config = stored_config(description["config"], path)
         shared = decoder_models()
         if config.model not in shared:
             what = f"has the network of {config.model}; only those of {' and '.join(shared)} are shared"

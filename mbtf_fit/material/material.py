@@ -13,13 +13,12 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from mbtf_core.config.settings import build
 from mbtf_core.data.lattice import Lattice, sigma_of_level
 from mbtf_core.data.schema import CONVENTIONS
 from mbtf_core.directions import check_unit, from_projected_disk
 from mbtf_core.errors import InputError, check_type, reason
 from mbtf_core.files.atomic import write_json
-from mbtf_fit.config import FitConfig
+from mbtf_fit.config import FitConfig, stored_config
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.material.format import (
     AGAIN,
@@ -142,12 +141,14 @@ class Material:
         """
         check_type(folder, (str, os.PathLike), "material", "give the path of its folder")
         description, weights = read_description(Path(folder))
-        config = build(FitConfig, description["config"], source=str(weights.with_name(DESCRIPTION_NAME)))
+        config = stored_config(description["config"], weights.with_name(DESCRIPTION_NAME))
         lattice = lattice_of(description)
         try:
             # Without memory at first: a small file cannot ask for that of a large model.
             with torch.device("meta"):
-                model = NeuralMaterial(lattice, read_operations(description["operations"]), config.model)
+                model = NeuralMaterial(
+                    lattice, read_operations(description["operations"]), description["model"]
+                )
         except (ValueError, TypeError, RuntimeError) as error:
             raise InputError(reason(error), where=weights.with_name(DESCRIPTION_NAME), hint=AGAIN) from None
         if 2 * sum(p.numel() for p in model.parameters()) > weights.stat().st_size:
@@ -161,7 +162,7 @@ class Material:
         return cls(model, config, description, conformance, read_transmittance(Path(folder), description))
 
     def __repr__(self) -> str:
-        return f"<Material: {self.config.model}, resolution {self.lattice.shape()[1]}>"
+        return f"<Material: {self.model.name}, resolution {self.lattice.shape()[1]}>"
 
     @property
     def lattice(self) -> Lattice:

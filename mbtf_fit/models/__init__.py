@@ -14,6 +14,11 @@ FOREIGN = {point.name: point for point in entry_points(group="mbtf.models")}
 """Entry points of other packages that give a model, by its name."""
 
 
+def is_file(name: str) -> bool:
+    """Whether a model is given by its file: ``FILE.py:CLASS``."""
+    return name.rpartition(":")[0].endswith(".py")
+
+
 def names_in(text: str) -> list[str]:
     """Names of the models that a file declares, read from its text: to import it takes longer than a help."""
     return _NAME.findall(text)

@@ -72,7 +72,8 @@ class Model:
     """A model: what it computes, and how it is trained. An object accompanies one training.
 
     Subclasses in files of this folder are found by their `name`, a line that begins with ``name = "``; a
-    file is a model of its own.
+    file is a model of its own. Those of other files are given as ``FILE.py:CLASS``, and named as their class
+    unless they have a `name`.
 
     Attributes
     ----------

@@ -1,17 +1,27 @@
 """The models by name: those of this folder, whose every file is read, so that a new model is one new file,
-and those of other packages, which declare them as entry points of the group ``mbtf.models``."""
+and those of other packages, which declare them as entry points of the group ``mbtf.models``. And models of
+any file, by its path and their class."""
 
 from __future__ import annotations
 
 import importlib
 import pkgutil
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import lru_cache
+from pathlib import Path
+from traceback import extract_tb
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import mbtf_fit.models
 from mbtf_core.data.lattice import Lattice
-from mbtf_core.errors import InputError, reason
-from mbtf_fit.models import FOREIGN
+from mbtf_core.errors import InputError, MbtfError, reason
+from mbtf_core.paths import refuse_special
+from mbtf_fit.models import FOREIGN, is_file
 from mbtf_fit.models.model import Model
+from mbtf_fit.ops import Operation
 from mbtf_fit.sections import NetworkSection
 
 if TYPE_CHECKING:
@@ -51,11 +61,87 @@ def _unusable(name: str, why: str) -> InputError:
 MODELS = _find()
 
 
+def model_class(name: str) -> type[Model]:
+    """The model of a name, or of a file: ``FILE.py:CLASS``. Without a name of its own, that of the class is
+    the model's name.
+
+    Raises
+    ------
+    InputError : the file is missing or raises an exception, or has no such model
+    """
+    if name in MODELS:
+        return MODELS[name]
+    file, _, wanted = name.rpartition(":")
+    path = Path(file)
+    refuse_special(path)
+    with _faults_of(name):
+        try:
+            text = path.read_text(encoding="utf-8")
+        except FileNotFoundError:
+            hint = f"the path is relative to the current folder, {Path().absolute()}"
+            raise InputError("no such file", where=file, hint=hint) from None
+        found = vars(_run(path, text))
+    model = found.get(wanted)
+    if not (isinstance(model, type) and issubclass(model, Model) and model is not Model):
+        own = [n for n, c in found.items() if isinstance(c, type) and issubclass(c, Model) and c is not Model]
+        what = f"'{wanted}' is no subclass of Model" if wanted in found else f"has no class '{wanted}'"
+        raise InputError(what, where=file, hint=f"models in it: {', '.join(own) or 'none'}")
+    if "name" not in vars(model):
+        model.name = wanted
+    if model.name in MODELS:
+        hint = "give the class another name = ..."
+        raise InputError(f"its name '{model.name}' is that of an installed model", where=name, hint=hint)
+    return model
+
+
+@lru_cache(maxsize=16)
+def _run(path: Path, text: str) -> ModuleType:
+    """The module of a file, run once per content."""
+    module = ModuleType(str(path))
+    module.__file__ = str(path)
+    # Dataclasses look up the module of their annotations.
+    sys.modules[module.__name__] = module
+    exec(compile(text, path, "exec"), vars(module))
+    return module
+
+
+@contextmanager
+def _faults_of(name: str) -> Iterator[None]:
+    """Name the file and the line of whatever exception a model's file raises."""
+    try:
+        yield
+    except Exception as error:
+        if name in MODELS or isinstance(error, MbtfError):
+            raise
+        path = name.rpartition(":")[0]
+        lines = [frame.lineno for frame in extract_tb(error.__traceback__) if frame.filename == path]
+        where = f"{path}:{lines[-1]}" if lines else path
+        hint = "correct the file; --debug shows the traceback"
+        raise InputError(f"{type(error).__name__}: {reason(error)}", where=where, hint=hint) from error
+
+
+def operations_of(name: str, lattice: Lattice, network: NetworkSection) -> list[Operation]:
+    """The operations of a model, for texel grids and an architecture.
+
+    Raises
+    ------
+    InputError : the code of a model's file raises an exception
+    """
+    with _faults_of(name):
+        return model_class(name).operations(lattice, network)
+
+
 def material_of(name: str, lattice: Lattice, network: NetworkSection) -> NeuralMaterial:
-    """An uninitialized material of a model and an architecture."""
+    """An uninitialized material of a model and an architecture.
+
+    Raises
+    ------
+    InputError : the code of a model's file raises an exception, or its operations do not fit together
+    """
     from mbtf_fit.pytorch.material import NeuralMaterial
 
-    return NeuralMaterial(lattice, MODELS[name].operations(lattice, network), name)
+    with _faults_of(name):
+        return NeuralMaterial(lattice, operations_of(name, lattice, network), model_class(name).name)
 
 
 def with_option(option: str) -> list[str]:
@@ -65,4 +151,4 @@ def with_option(option: str) -> list[str]:
 
 def defaults_of(name: str) -> dict[str, Any]:
     """Options of a model that differ from the general defaults, nested."""
-    return dict(MODELS[name].defaults) if name in MODELS else {}
+    return dict(model_class(name).defaults) if name in MODELS or is_file(name) else {}

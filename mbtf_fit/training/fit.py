@@ -25,7 +25,7 @@ from mbtf_fit.formatting import format_estimate, headline
 from mbtf_fit.material.decoder import DECODER_NAME, Decoder
 from mbtf_fit.material.format import DESCRIPTION_NAME
 from mbtf_fit.material.material import Material
-from mbtf_fit.models.registry import MODELS
+from mbtf_fit.models.registry import model_class
 from mbtf_fit.training.endings import describe_validations, kept_step, reached
 from mbtf_fit.training.fit_export import Member, export_fits
 from mbtf_fit.training.fit_folder import (
@@ -98,14 +98,14 @@ class FitResult:
         if self.errors:
             first = headline(self.errors)
             error = f", unexplained variance {format_estimate(self.errors[first]['unexplained'])}"
-        return f"<FitResult {self.folder}: {self.material.config.model}, {self.seconds:.0f} s{error}>"
+        return f"<FitResult {self.folder}: {self.material.model.name}, {self.seconds:.0f} s{error}>"
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON, without the history."""
         cost = self.marginal_cost
         return {
             "material": str(self.folder),
-            "model": self.material.config.model,
+            "model": self.material.model.name,
             "seconds": self.seconds,
             "total_seconds": self.total_seconds,
             "resumed": self.resumed,
@@ -269,7 +269,7 @@ def _fit(
     """Fit materials to data sets; `home` has the checkpoint, and the network where they share one."""
     begin = time.perf_counter()
     device = choose_device(config.device)
-    layout, shared = MODELS[config.model].layout, config.training.shared_decoder
+    layout, shared = model_class(config.model).layout, config.training.shared_decoder
     data = [open_data(folder, layout, config.model, config.data.cache) for folder in shards]
     group = data if shared else ()
     members = [

@@ -20,7 +20,7 @@ from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.material.decoder import DECODER_NAME, Decoder
 from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME, read_description
 from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME
-from mbtf_fit.models.registry import MODELS
+from mbtf_fit.models.registry import operations_of
 from mbtf_fit.training.loop import CHECKPOINT_NAME
 from mbtf_fit.training.trainer import Trainer
 from mbtf_fit.training.validation import errors_by_level
@@ -50,7 +50,7 @@ def identity_of(config: FitConfig, data: Dataset, group: Sequence[Dataset] = ())
     located = config.model_copy(update={"training": training})
     config_hash = located.hash(data_sha256({**described, "files": files}))
     # A model whose file has changed is another one.
-    operations = MODELS[config.model].operations(data.lattice, config.network)
+    operations = operations_of(config.model, data.lattice, config.network)
     model = data_sha256([operation.as_json() for operation in operations])
     config_hash += f"-{model}"
     if config.init_from is not None:

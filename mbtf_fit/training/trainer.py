@@ -28,7 +28,7 @@ from mbtf_fit.material.decoder import Decoder
 from mbtf_fit.material.inference import predict
 from mbtf_fit.material.material import Material
 from mbtf_fit.models.model import Model, Preparation
-from mbtf_fit.models.registry import MODELS, material_of
+from mbtf_fit.models.registry import material_of, model_class
 from mbtf_fit.native import kernel
 from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.noise import NoiseModel, typical_value
@@ -162,7 +162,7 @@ class Trainer:
     ) -> None:
         self.config = config
         self.model = model
-        self.hooks = MODELS[config.model](model) if hooks is None else hooks
+        self.hooks = model_class(config.model)(model) if hooks is None else hooks
         if isinstance(queries, TrainingImages):
             queries = replace(queries, patch_size=config.training.patch_size)
         self.queries: TrainingData = self.hooks.precompute(queries, config.data.memory)
@@ -345,12 +345,12 @@ def prepare_trainer(
     model.initialize(torch.Generator().manual_seed(config.seed), unit)
 
     def load(folder: str) -> tuple[TrainingData, float]:
-        other = open_data(folder, MODELS[config.model].layout, config.model, config.data.cache)
+        other = open_data(folder, model_class(config.model).layout, config.model, config.data.cache)
         part = load_training(other, config.held_out, config.seed)
         typical = typical_value(mean_value(part.sample.value_a, part.sample.value_b))
         return part.training.to(device), typical
 
-    hooks, training = MODELS[config.model](model), partition.training.to(device)
+    hooks, training = model_class(config.model)(model), partition.training.to(device)
     training = hooks.prepare(Preparation(data, training, config.training, unit, config.seed, load))
     if config.init_from is not None:
         _initialize_from(hooks, config.init_from)

@@ -21,6 +21,7 @@ from mbtf_core.stats import (
 )
 from mbtf_fit.data.loader import Partition, load_split
 from mbtf_fit.data.queries import ShardQueries
+from mbtf_fit.formatting import ABOVE_ONE
 from mbtf_fit.training.trainer import Trainer
 
 # Queries of the validation subset, and the fewest queries of the test split that are preferred over others.
@@ -112,6 +113,13 @@ FEWEST_STEPS = 400
 FLAT = 0.95
 # Relative standard error of the validation above which it does not tell convergence.
 _RESOLVED = 0.25
+
+
+def caveat(steps: int, error: float | None) -> str:
+    """Why the error of a fit does not rank its model: few steps, or an unexplained variance above 1; empty
+    where it does."""
+    few = [f"{steps} steps: not converged"] if steps < FEWEST_STEPS else []
+    return ", ".join([*few, *([ABOVE_ONE] if error is not None and error >= 1.0 else [])])
 
 
 @dataclass(frozen=True)

@@ -191,7 +191,7 @@ def content_of(material: Material, name: str, packed: dict[str, PackedTexture]) 
     uniforms = [GLSL.image.format(kind=kind, name=image) for image, kind in kinds]
     return {
         "name": name,
-        "model": material.config.model,
+        "model": material.model.name,
         "aspect": material.lattice.aspect,
         "finest": material.lattice.finest,
         "min_cos": known["data"].get("min_cos", DEFAULT_MIN_COS),

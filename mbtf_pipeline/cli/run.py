@@ -190,6 +190,7 @@ def _report_collection(done: CollectionResult, folder: Path, console: Console) -
 def _report(result: RunResult, console: Console, quality: Quality | None) -> None:
     from mbtf_fit.training.endings import describe_ending
     from mbtf_fit.training.fit_folder import read_history
+    from mbtf_fit.training.validation import caveat
     from mbtf_pipeline.recipe import read_resolved
     from mbtf_pipeline.stages import FITS
     from mbtf_pipeline.tables import estimate
@@ -198,6 +199,10 @@ def _report(result: RunResult, console: Console, quality: Quality | None) -> Non
     folder, recipe = result.report.parent, read_resolved(result.report.parent)
     endings = {
         name: describe_ending(fit, read_history(folder / FITS / name)) for name, fit in recipe.fit.items()
+    }
+    caveats = {
+        fit: caveat(result.comparison["test"][fit]["training_steps"], e["unexplained"]["value"])
+        for fit, e in tests.items()
     }
     ran = {name: stage.seconds for name, stage in result.stages.items() if stage.reason}
     data = {
@@ -211,14 +216,20 @@ def _report(result: RunResult, console: Console, quality: Quality | None) -> Non
             for name, stage in result.stages.items()
         },
         "test": {
-            fit: {"unexplained_variance": e["unexplained"], "mse": e["mse"], "ending": endings.get(fit)}
+            fit: {
+                "unexplained_variance": e["unexplained"],
+                "mse": e["mse"],
+                "ending": endings.get(fit),
+                "caveat": caveats[fit] or None,
+            }
             for fit, e in tests.items()
         },
     }
     times = ", ".join(f"{name} {clock(seconds)}" for name, seconds in ran.items())
     lines = [f"{result.report}: {times or 'everything up to date'}"]
     for fit, e in tests.items():
-        lines.append(f"  {fit}: unexplained variance {estimate(e['unexplained'])}")
+        name = f"{fit} ({caveats[fit]})" if caveats[fit] else fit
+        lines.append(f"  {name}: unexplained variance {estimate(e['unexplained'])}")
         lines += [f"    {ending}"] if (ending := endings.get(fit)) is not None else []
     if result.viewer is not None:
         lines.append(f"{result.viewer}: open it in a browser to turn the fits under lights")

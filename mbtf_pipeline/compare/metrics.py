@@ -128,5 +128,5 @@ def _parameter_counts(material: Material) -> dict[str, Any]:
         "texels": weights["texels"],
         "training_seconds": material.description["training"]["seconds"],
         "training_steps": material.description["training"]["steps"],
-        "model": material.config.model,
+        "model": material.model.name,
     }

@@ -49,7 +49,8 @@ def _facts(comparison: Mapping[str, Any], tests: Mapping[str, Any]) -> list[dict
     fit, out = comparison["fits"][0], []
     for name, errors in tests.items():
         equal = "" if _differs(comparison, name) else f"; difference from {fit} {NOT_SIGNIFICANT}"
-        out.append({"value": data_errors(errors)[0], "what": f"{UNEXPLAINED} of {name}{equal}"})
+        what = f"{UNEXPLAINED} of {_with_caveat(name, comparison)}{equal}"
+        out.append({"value": data_errors(errors)[0], "what": what})
     records = [p["fits"][fit] for p in comparison["pictures"]]
     decibels = [r["errors"][comparison["kinds"][0]]["psnr"]["value"] for r in records]
     if finite := [d for d in decibels if d is not None]:
@@ -62,6 +63,15 @@ def _facts(comparison: Mapping[str, Any], tests: Mapping[str, Any]) -> list[dict
     size = 4 * (record["network_weights"] + record["texels"]) / 1024
     out.append({"value": f"{size:,.0f} KiB", "what": f"{fit}: textures and networks as float32"})
     return out
+
+
+def _with_caveat(fit: str, comparison: Mapping[str, Any]) -> str:
+    """The name of a fit, and why its error does not rank its model."""
+    from mbtf_fit.training.validation import caveat
+
+    record = comparison["test"][fit]
+    text = caveat(record["training_steps"], record["splits"]["test"]["unexplained"]["value"])
+    return f"{fit} ({text})" if text else fit
 
 
 def _differs(comparison: Mapping[str, Any], fit: str) -> bool:
@@ -106,7 +116,9 @@ def _error_table(comparison: Mapping[str, Any]) -> dict[str, Any]:
         cells = [data_errors(record["splits"][s])[0] if s in record["splits"] else "–" for s in splits]
         mse = data_errors(record["splits"]["test"])[1]
         cells += [mse, f"{record['training_steps']:,}", f"{record['training_seconds']:.0f}"]
-        rows.append([fit, *cells, f"{record['network_weights']:,}", f"{record['texels']:,}"])
+        rows.append(
+            [_with_caveat(fit, comparison), *cells, f"{record['network_weights']:,}", f"{record['texels']:,}"]
+        )
     head = ["fit", *errors, "MSE, test [10⁻³/sr²]", "training steps", "training [s]"]
     head += ["network weights", "texture values"]
     return {"head": head, "rows": rows}

@@ -7,10 +7,12 @@ import re
 import shlex
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
+import pytest
 from cyclopts import App, CycloptsError, MissingArgumentError
-from support.documented import Shown, shown_commands
+from support.documented import Shown, code_block, shown_commands
 from support.paths import ROOT
 
 from mbtf_core.config.settings import resolve
@@ -106,7 +108,10 @@ def check_values(command: Any, arguments: dict[str, Any]) -> None:
             resolve(Recipe, file=recipe, assignments=arguments["assignments"])
 
 
-def test_every_command_that_is_shown_can_be_given() -> None:
+def test_every_command_that_is_shown_can_be_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beside the model that the page on models has in a file."""
+    monkeypatch.chdir(tmp_path)
+    Path("my_model.py").write_text(code_block("how-to/add-a-model.md", "python"))
     found = shown_commands()
     assert len(found) > 60
     assert {shown.text.split()[0] for shown in found} == set(APPS)

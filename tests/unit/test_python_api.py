@@ -30,6 +30,8 @@ MISTAKES: dict[str, tuple[Callable[[], object], str]] = {
     "slice beyond the last": (lambda: generate(CONFIG, "out", slice_index=3, slice_count=2), "slice_index"),
     "no folder": (lambda: generate(CONFIG, None), "path or URL"),
     "number to open": (lambda: Dataset.open(3), "path or URL"),
+    "data set not opened": (lambda: Dataset("small"), "Dataset.open('small')"),
+    "folder to load": (lambda: Dataset.load("small"), "Dataset.open('small').load"),
     "missing data set": (lambda: verify("missing"), "no such folder"),
     "method of tiling": (lambda: load_material("rock", "mirro"), "mirror"),
     "arguments swapped": (lambda: fit("shards", FitConfig(), "out"), "FitConfig("),

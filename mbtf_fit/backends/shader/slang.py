@@ -42,7 +42,7 @@ def module_of(material: Material) -> tuple[str, F32]:
         program.code,
     ]
     head, tail = files(__package__).joinpath("module.slang").read_text().split("//MATERIAL\n")
-    head = head.replace("//MODEL", f"// Model: {material.config.model}.")
+    head = head.replace("//MODEL", f"// Model: {material.model.name}.")
     return head + "\n".join([*own, tail]), buffer
 
 

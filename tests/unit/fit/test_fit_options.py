@@ -133,7 +133,7 @@ def test_a_model_that_is_not_installed_is_named(tmp_path: Path, source: str) -> 
     """With the models that are, and how a package adds others."""
     with pytest.raises(InputError) as caught:
         build(FitConfig, {"model": "texel-lobe"}, source=str(tmp_path / source))
-    for part in (source, "'texel-lobe'", ", ".join(NAMES), "entry point of mbtf.models"):
+    for part in (source, "'texel-lobe'", ", ".join(NAMES), "entry point of mbtf.models", "FILE.py"):
         assert part in caught.value.message
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,8 +13,9 @@ import pytest
 from mbtf_core.app.console import Console, run
 from mbtf_core.errors import InputError
 from mbtf_pipeline.cli.app import app
+from mbtf_pipeline.cli.run import _report
 from mbtf_pipeline.recipe import load_recipe, read_resolved, write_recipe
-from mbtf_pipeline.run import _material_inputs, _RecipeRun, survey
+from mbtf_pipeline.run import RunResult, _material_inputs, _RecipeRun, survey
 from mbtf_pipeline.stages import run_stages
 
 HEAD = """\
@@ -65,6 +67,46 @@ def test_data_are_out_of_date_when_a_map_has_changed(tmp_path: Path) -> None:
     assert not survey(recipe, folder)["generate"]
     np.save(path, np.ones((4, 4), np.float32))
     assert survey(recipe, folder)["generate"] == "input changed: height"
+
+
+def test_a_fit_is_out_of_date_when_the_file_of_its_model_has_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The model is named by its class, and its path is relative to the current folder."""
+    monkeypatch.chdir(tmp_path)
+    file = tmp_path / "mine.py"
+    file.write_text("from mbtf_fit.models.svbrdf import Svbrdf\n\n\nclass Lobes(Svbrdf):\n    pass\n")
+    recipe = load_recipe(written(tmp_path, HEAD + "fit: {model: mine.py:Lobes}\n"))
+    assert list(recipe.fit) == ["Lobes"]
+    assert recipe.fit["Lobes"].training.texture_learning_rate == 0.1
+
+    def inputs() -> Mapping[str, str]:
+        (stage,) = (
+            s for s in _RecipeRun(recipe, tmp_path, Console(quiet=True)).stages({}) if s.name == "fit Lobes"
+        )
+        return stage.inputs
+
+    before = inputs()
+    assert inputs() == before
+    file.write_text(file.read_text().replace("pass", "calibrates = True"))
+    assert inputs() != before
+
+
+def test_last_lines_say_which_errors_do_not_rank_models(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recipe, folder = load_recipe(written(tmp_path, NAMED)), tmp_path / "out"
+    for name in recipe.fit:
+        (folder / "fits" / name).mkdir(parents=True)
+    write_recipe(recipe, folder)
+    error = {"unexplained": {"value": 0.5, "error": 0.01, "n": 9}, "mse": None}
+    steps = {"neumip": 400, "quick": 91}
+    tests = {fit: {"splits": {"test": error}, "training_steps": n} for fit, n in steps.items()}
+    _report(RunResult(folder / "report.html", None, {}, {"test": tests}), Console(), None)
+    assert capsys.readouterr().out.splitlines()[1:] == [
+        "  neumip: unexplained variance 0.500 ± 0.010",
+        "  quick (91 steps: not converged): unexplained variance 0.500 ± 0.010",
+    ]
 
 
 def test_an_assigned_material_is_relative_to_the_current_folder(

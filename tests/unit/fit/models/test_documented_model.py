@@ -1,52 +1,117 @@
-"""The model of the page on models is evaluated; its package of two files brings it, without a change here."""
+"""The model of the page on models is fitted from its file; its package brings it, without changes here."""
 
 from __future__ import annotations
 
 import os
-import re
 import tomllib
 from pathlib import Path
-from typing import Any
 
+import numpy as np
 import pytest
-import torch
 from conftest import RunPython
+from support.documented import code_block
 from support.fit_data import constant, write_data
 from support.paths import ROOT
 
+from mbtf_core.config.settings import explicit_options
 from mbtf_core.data.lattice import Lattice
+from mbtf_core.errors import InputError
+from mbtf_fit import Material, evaluate, fit
+from mbtf_fit.config import FitConfig, build_model
 from mbtf_fit.models import names_in
-from mbtf_fit.models.model import Model
-from mbtf_fit.pytorch.material import NeuralMaterial
-from mbtf_fit.sections import NetworkSection
 
 
 def documented(language: str = "python") -> str:
     """The one block of a language."""
-    page = (ROOT / "docs" / "how-to" / "add-a-model.md").read_text(encoding="utf-8")
-    (code,) = re.findall(rf"```{language}\n(.*?)```", page, re.DOTALL)
-    return str(code)
+    return code_block("how-to/add-a-model.md", language)
 
 
-def test_the_documented_model_works() -> None:
-    code, made = documented(), dict[str, Any]()
-    exec(compile(code, "add-a-model.md", "exec"), made)
-    (model,) = (m for m in made.values() if isinstance(m, type) and issubclass(m, Model) and m is not Model)
-    assert names_in(code) == [model.name]
-    lattice = Lattice(3, 1.0)
-    material = NeuralMaterial(lattice, model.operations(lattice, NetworkSection()), model.name)
-    material.initialize(torch.Generator().manual_seed(0), 1.0)
-    up = torch.tensor([[0.0, 0.0, 1.0]]).repeat(5, 1)
-    value = material(torch.rand(5, 2), torch.full((5,), 0.1), up, up)
-    assert value.shape == (5, 3)
-    assert (value > 0).all()
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the documented file, which is removed after its fit to a constant."""
+    folder = tmp_path_factory.mktemp("own")
+    write_data(folder / "shards", constant(0.2), train=4000, test=200, finest=2)
+    file = folder / "my_model.py"
+    file.write_text(documented())
+    assert names_in(documented()) == ["texel-diffuse"]
+    config = FitConfig.model_validate({"model": f"{file}:TexelDiffuse", "training": {"steps": 200}})
+    assert fit(config, folder / "shards", folder / "out").as_dict()["model"] == "texel-diffuse"
+    file.unlink()
+    return folder
+
+
+def test_a_model_of_a_file_is_fitted_and_read_without_the_file(fitted: Path) -> None:
+    """Against the data's constant, in all directions; its name is stored, and its operations."""
+    material = Material.load(fitted / "out")
+    up = np.tile(np.float32([0.0, 0.0, 1.0]), (50, 1))
+    u = np.random.default_rng(0).random((50, 2))
+    value = material.evaluate(u, np.full(50, 0.1), up, up)
+    assert np.abs(value - 0.2).max() < 0.01
+    assert material.model.name == "texel-diffuse"
+    assert evaluate(fitted / "out", fitted / "shards")["errors"]["test"]["psnr"]["value"] > 25
+
+
+def test_to_fit_again_needs_the_file(fitted: Path) -> None:
+    """Its stored options name it; the material alone never runs it."""
+    options = explicit_options(fitted / "out" / "config.yaml", [])
+    with pytest.raises(InputError, match="no such file") as caught:
+        FitConfig.model_validate(options)
+    assert caught.value.where == str(fitted / "my_model.py")
+
+
+@pytest.mark.parametrize(
+    ("changes", "name", "where", "what"),
+    [
+        ({}, "missing.py:TexelDiffuse", "missing.py", "no such file"),
+        ({}, "my_model.py:Missing", "my_model.py", "has no class 'Missing'"),
+        ({}, "my_model.py:math", "my_model.py", "'math' is no subclass of Model"),
+        ({"import math": "import mathematics"}, None, "my_model.py:1", "ModuleNotFoundError"),
+        ({"1 / math.pi": "1 / math.tau0"}, None, "my_model.py:18", "AttributeError"),
+        ({'"albedo", "texel"': '"albedo", "text"'}, None, "my_model.py", "reads 'text'"),
+        ({'"texel-diffuse"': '"svbrdf"'}, None, "my_model.py:TexelDiffuse", "that of an installed model"),
+    ],
+)
+def test_a_file_at_fault_is_named_with_its_line(
+    changes: dict[str, str],
+    name: str | None,
+    where: str,
+    what: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    text = documented()
+    for old, new in changes.items():
+        assert old in text
+        text = text.replace(old, new)
+    Path("my_model.py").write_text(text)
+    with pytest.raises(InputError) as caught:
+        build_model(name or "my_model.py:TexelDiffuse", Lattice(2, 1.0))
+    assert caught.value.where == where
+    assert what in caught.value.what
+
+
+def test_an_edited_file_is_read_again(tmp_path: Path) -> None:
+    """And a class without a name has that of the class."""
+    file = tmp_path / "my_model.py"
+    texels = []
+    for channels in (3, 4):
+        text = documented().replace("channels=3", f"channels={channels}").replace('"texel"', '"texel[0:3]"')
+        text = text.replace('Lookup("texel[0:3]"', 'Lookup("texel"').replace(
+            "name, description = ", "said = "
+        )
+        file.write_text(text)
+        material = build_model(f"{file}:TexelDiffuse", Lattice(2, 1.0))
+        assert material.name == "TexelDiffuse"
+        texels.append(sum(p.numel() for p in material.parameters()))
+    assert texels[1] * 3 == texels[0] * 4
 
 
 def install(folder: Path, point: str = "") -> str:
     """Install the documented package, or one with another entry point; returns the path to import from."""
     project = tomllib.loads(documented("toml"))
     (module,) = project["tool"]["setuptools"]["py-modules"]
-    named = "\n\nclass Named(TexelLobe):\n    name, description = 'neumip', 'theirs'\n"
+    named = "\n\nclass Named(TexelDiffuse):\n    name, description = 'neumip', 'theirs'\n"
     (folder / f"{module}.py").write_text(documented() + named)
     ((group, points),) = project["project"]["entry-points"].items()
     lines = [point] if point else [f"{name} = {value}" for name, value in points.items()]
@@ -61,7 +126,7 @@ def test_another_package_brings_a_model(tmp_path: Path, run_python: RunPython) -
     """By an entry point: fitted, listed, exported."""
     path = install(tmp_path)
     write_data(tmp_path / "shards", constant(0.3), train=2000, test=200, finest=2)
-    fit = ["shards", "--model", "texel-lobe", "--steps", "20", "-o", "out"]
+    fit = ["shards", "--model", "texel-diffuse", "--steps", "20", "-o", "out"]
     export = ["export", "out", "--to", "exr", "--to", "json", "--to", "slang", "-o", "exported"]
     code = (
         f"import os; os.chdir({str(tmp_path)!r})\n"
@@ -70,16 +135,16 @@ def test_another_package_brings_a_model(tmp_path: Path, run_python: RunPython) -
     )
     done = run_python("-c", code, PYTHONPATH=path)
     assert done.returncode == 0, done.stderr
-    assert '"model": "texel-lobe"' in (tmp_path / "exported" / "layers.json").read_text()
-    assert "texel-lobe" in done.stdout
+    assert '"model": "texel-diffuse"' in (tmp_path / "exported" / "layers.json").read_text()
+    assert "texel-diffuse" in done.stdout
 
 
 @pytest.mark.parametrize(
     ("point", "fault"),
     [
-        ("texel-lobe = their_models:Missing", "has no attribute 'Missing'"),
-        ("other = their_models:TexelLobe", "no model of this name"),
-        ("neumip = their_models:Named", "has the same name"),
+        ("texel-diffuse = my_model:Missing", "has no attribute 'Missing'"),
+        ("other = my_model:TexelDiffuse", "no model of this name"),
+        ("neumip = my_model:Named", "has the same name"),
     ],
 )
 def test_a_package_at_fault_is_named(tmp_path: Path, run_python: RunPython, point: str, fault: str) -> None:

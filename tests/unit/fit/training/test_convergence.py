@@ -12,7 +12,7 @@ from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.folder import DataFolder
 from mbtf_fit.config import FitConfig
 from mbtf_fit.training.next_step import NextStep, next_step
-from mbtf_fit.training.validation import FLAT, MarginalCost, marginal_cost_of
+from mbtf_fit.training.validation import FLAT, MarginalCost, caveat, marginal_cost_of
 
 
 def history(power: float, error: float = 1e-4, steps: int = 4000) -> list[dict[str, Any]]:
@@ -43,6 +43,21 @@ def cost(records: list[dict[str, Any]], *arguments: Any, **options: Any) -> Marg
     found = marginal_cost_of(records, *arguments, **options)
     assert found is not None
     return found
+
+
+@pytest.mark.parametrize(
+    ("steps", "error", "text"),
+    [
+        (400, 0.99, ""),
+        (399, None, "399 steps: not converged"),
+        (400, 1.0, "above 1: worse than the mean value"),
+        (9, 1.5, "9 steps: not converged, above 1: worse than the mean value"),
+    ],
+)
+def test_fits_of_few_steps_or_large_errors_do_not_rank_models(
+    steps: int, error: float | None, text: str
+) -> None:
+    assert caveat(steps, error) == text
 
 
 @pytest.mark.parametrize("power", [0.2, 0.4, 0.8])

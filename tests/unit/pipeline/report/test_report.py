@@ -47,6 +47,8 @@ def test_both_errors_of_a_group_are_significant_or_neither() -> None:
     assert levels[1] == ["1", "50", "0.200 ± 0.010", "0.400 ± 0.010"]
     assert cosines[0][0] == "0.2–0.4"
     assert context["facts"][0]["value"] == "0.200 ± 0.010"
+    assert context["facts"][0]["what"].endswith(" of a (9 steps: not converged)")
+    assert context["error_table"]["rows"][0][0] == "a (9 steps: not converged)"
 
 
 @pytest.mark.parametrize(
