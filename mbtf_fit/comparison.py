@@ -194,7 +194,7 @@ def _draw(
     captions = [
         f"path-traced reference\nexposure {exposure:+.2f} EV",
         f"fit\n{pixels}",
-        f"local RMS error, without noise\nwindow of {LOCAL_WINDOW:g} pixels (sigma), % of the mean value",
+        f"local RMS error, without noise\n% of the mean value; Gaussian window of {LOCAL_WINDOW:g} pixels",
     ]
     path = folder.path / PICTURE_NAME
     shown = [[_enlarged(picture) for picture in column] for column in columns]
