@@ -1,6 +1,6 @@
 """Make docs/pictures/weaves.png: the named weaves of docs/how-to/make-cloth.md, path-traced from above.
 
-From the repository's root, in twenty minutes: ``.venv/bin/python docs/pictures/make_weaves_picture.py``.
+From the repository's root, in ten minutes: ``.venv/bin/python docs/pictures/make_weaves_picture.py``.
 """
 
 from __future__ import annotations
