@@ -51,6 +51,11 @@ def round_scale(x: float) -> float:
     return next(m * power for m in (1.0, 2.0, 5.0, 10.0) if m * power >= x * (1 - 1e-9))
 
 
+def tick_labels(low: float, high: float, factor: float = 1.0) -> list[str]:
+    """Five evenly spaced numbers of a color bar, times a factor to its unit."""
+    return [f"{factor * x:.3g}".replace("-", "−") for x in np.linspace(low, high, 5)]
+
+
 def common_scale(maps: Sequence[ArrayLike]) -> float:
     """Rounded end of the scale of several maps: the 99th percentile of all magnitudes."""
     return round_scale(_extent(maps))

@@ -20,15 +20,15 @@ from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.shard_files import read_exr
 from mbtf_core.errors import InputError
 from mbtf_core.files.folders import OutputFolder, owned
-from mbtf_core.palettes import indices, palette
+from mbtf_core.palettes import indices, palette, robust_scale
 from mbtf_core.pictures import claim_pictures, write_png
 from mbtf_core.run.signals import keep_on_interruption
-from mbtf_core.stats import noise_free_mse, signal_variance, unexplained_variance
+from mbtf_core.stats import LOCAL_WINDOW, local_error, noise_free_mse, signal_variance, unexplained_variance
 from mbtf_fit.evaluation import foreign_inputs
 from mbtf_fit.formatting import format_estimate, visibility
 from mbtf_fit.material.material import Material
 from mbtf_fit.preview.config import ComparisonConfig
-from mbtf_fit.preview.grid import grid, width_label
+from mbtf_fit.preview.grid import color_bar, grid, width_label, with_bar
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
 from mbtf_gen.pictures.reference import (
@@ -42,8 +42,6 @@ from mbtf_gen.pictures.reference import (
 PICTURE_NAME = "comparison.png"
 # Smaller pictures are enlarged to about so many pixels across.
 _SHOWN = 384
-# Share of the references' mean value at which the picture of differences saturates.
-_DIFFERENCE = 0.25
 _QUERY = ("u", "sigma", "omega_i", "omega_o")
 
 
@@ -79,7 +77,7 @@ def _job_of(data: Dataset) -> Job:
 
 
 def compare(config: ComparisonConfig, output: Path, console: Console, *, overwrite: bool = False) -> None:
-    """Write references, and one picture of reference, fit and difference; report the errors.
+    """Write references, and one picture of reference, fit and local error; report the errors.
 
     Parameters
     ----------
@@ -125,9 +123,7 @@ def compare(config: ComparisonConfig, output: Path, console: Console, *, overwri
         bright = [facts["brightness"] for facts in known]
         exposure, peak = chosen_exposure(config.exposure, bright), auto_exposure(bright)
         errors = _draw(folder, material, [*names.values()], view.tiles_across, exposure, peak)
-    enlarged = _enlargement(view.size)
-    text = f", enlarged {enlarged} times (bicubic)" if enlarged > 1 else ""
-    pictures, lines = [], [f"{output / PICTURE_NAME}: reference, fit, and fit - reference{text}"]
+    pictures, lines = [], [f"{output / PICTURE_NAME}: reference, fit, and local RMS error"]
     for across, facts, found in zip(view.tiles_across, known, errors, strict=True):
         pictures.append({"tiles_across": across, "relative_noise": facts["relative_noise"], **found})
         seen = [_rms_text(found), *filter(None, visibility(found))]
@@ -171,7 +167,7 @@ def _draw(
     """Write the picture at an exposure; the noise-free errors by width, as
     :func:`mbtf_fit.formatting.visibility` takes them, with the exposure of their `peak`."""
     columns: list[list[Any]] = [[], [], []]
-    differences, errors = [], []
+    maps, errors = [], []
     for name in names:
         stored = read_exr(folder.path / f"{name}.exr", (*_QUERY, "value_a", "value_b"))
         stored = {key: array[0] for key, array in stored.items()}
@@ -188,14 +184,21 @@ def _draw(
         errors.append({"mse": mse.as_dict(), "unexplained": unexplained.as_dict(), **numbers})
         columns[0].append(to_display(reference.reshape(shape), exposure))
         columns[1].append(to_display(fit.reshape(shape), exposure))
-        differences.append((fit - reference).mean(axis=-1).reshape(shape[:2]))
-    # Of the references alone, so that the fits of a material can be compared.
-    scale = _DIFFERENCE * float(np.mean([found["mean"] for found in errors])) or 1.0
-    columns[2] = [palette("signed")[indices(difference / scale, "signed")] for difference in differences]
-    colors = f"fit - reference, ±{_DIFFERENCE:.0%} of the mean\nblue: too dark, orange: too bright"
-    captions = [f"path-traced reference\nexposure {exposure:+.2f} EV", "fit", colors]
+        maps.append(local_error(fit.reshape(shape), stored["value_a"], stored["value_b"]))
+    # Relative to the mean value, as the errors that are printed.
+    unit = float(np.mean([found["mean"] for found in errors])) or 1.0
+    scale = robust_scale([[found / unit for found in maps]])
+    columns[2] = [palette("local")[indices(found / (scale * unit), "local")] for found in maps]
+    size, times = len(maps[0]), _enlargement(len(maps[0]))
+    pixels = f"{size} x {size} pixels" + (f", enlarged {times} times" if times > 1 else "")
+    captions = [
+        f"path-traced reference\nexposure {exposure:+.2f} EV",
+        f"fit\n{pixels}",
+        f"local RMS error, without noise\n% of the mean value; Gaussian window of {LOCAL_WINDOW:g} pixels",
+    ]
     path = folder.path / PICTURE_NAME
     shown = [[_enlarged(picture) for picture in column] for column in columns]
-    write_png(path, grid(shown, captions, list(map(width_label, widths)), 3))
+    sheet = grid(shown, captions, list(map(width_label, widths)), 3)
+    write_png(path, with_bar(sheet, color_bar(size * times, "local", 100.0 * scale, "%")))
     folder.keep(PICTURE_NAME, [path], {"exposure": exposure})
     return errors

@@ -6,6 +6,8 @@ Needs numpy and scipy alone. ``docs/explanation/statistics.md`` explains when to
 from mbtf_core.stats.estimate import Estimate, by_group, elevation_groups, level_groups, mean_estimate
 from mbtf_core.stats.learning_curve import Interval, LearningCurve
 from mbtf_core.stats.paired import (
+    LOCAL_WINDOW,
+    local_error,
     mean_of_halves,
     mse_difference,
     noise_free_mse,
@@ -19,6 +21,7 @@ from mbtf_core.stats.paired import (
 from mbtf_core.stats.significance import Aggregate, Comparison, Outcome, aggregate_test, holm, t_test
 
 __all__ = [
+    "LOCAL_WINDOW",
     "Aggregate",
     "Comparison",
     "Estimate",
@@ -30,6 +33,7 @@ __all__ = [
     "elevation_groups",
     "holm",
     "level_groups",
+    "local_error",
     "mean_estimate",
     "mean_of_halves",
     "mse_difference",

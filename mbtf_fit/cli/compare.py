@@ -29,8 +29,8 @@ def compare(
 
     For example: mbtf-fit compare material/ shards/
 
-    Writes comparison.png, with columns for the reference, the fit and their difference, and the references
-    as EXR. Prints the errors without the noise of the references.
+    Writes comparison.png, with columns for the reference, the fit and its local error, and the references as
+    EXR. Prints the errors without the noise of the references.
 
     Parameters
     ----------

@@ -26,7 +26,7 @@ from mbtf_gen.config.pictures import (
 MOST_PIXELS = 1 << 25
 # Of a comparison: texels across a pixel, and paths per pixel.
 _TEXELS = (1, 2, 4)
-_SPP, _FIBER_SPP = 128, 64
+_SPP, _FIBER_SPP = 256, 64
 
 
 def _listed(value: Any) -> Any:

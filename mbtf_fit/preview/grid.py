@@ -9,9 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from mbtf_core.palettes import Palette, palette, tick_labels
+
 U8 = NDArray[np.uint8]
 GAP, MARGIN, CAPTION = 4, 8, 34
 INK, PAPER = (30, 30, 30), (255, 255, 255)
+# Heights of a color bar, and of it with its numbers.
+_BAR, BAR_STRIP = 10, 30
 
 
 def grid(
@@ -46,6 +50,28 @@ def grid(
             if column == 0:
                 _label(draw, (left, top + size), label, font)
     return np.asarray(sheet)
+
+
+def color_bar(width: int, name: Palette, high: float, unit: str) -> U8:
+    """A color bar of magnitudes from 0 to `high`, so many pixels wide, with its numbers and their unit below,
+    as (BAR_STRIP, width, 3) sRGB."""
+    strip = np.full((BAR_STRIP, width, 3), PAPER, np.uint8)
+    strip[:_BAR] = palette(name)[np.arange(width) * 256 // width]
+    image, font = Image.fromarray(strip), ImageFont.load_default(11)
+    draw = ImageDraw.Draw(image)
+    ticks = tick_labels(0.0, high)
+    ticks[-1] += unit
+    anchors = ("lt", *("mt" for _ in ticks[2:]), "rt")
+    for x, tick, anchor in zip(np.linspace(0, width - 1, len(ticks)), ticks, anchors, strict=True):
+        draw.text((float(x), _BAR + 5), tick, INK, font, anchor=anchor)
+    return np.asarray(image)
+
+
+def with_bar(sheet: U8, bar: U8) -> U8:
+    """A :func:`grid` with a color bar below its last column, which is as wide."""
+    footer = np.full((BAR_STRIP, sheet.shape[1], 3), PAPER, np.uint8)
+    footer[:, -MARGIN - bar.shape[1] : -MARGIN] = bar
+    return np.concatenate([sheet, footer])
 
 
 def width_label(tiles_across: float) -> str:

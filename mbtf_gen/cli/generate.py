@@ -135,6 +135,8 @@ def generate(
             runner=runner,
         )
     console.report(asdict(summary), describe(summary))
+    if left and (warning := job.material.scale_warning()) is not None:
+        console.note(f"warning: {warning}")
 
 
 def describe(summary: Summary, *, ran: bool = True) -> str:

@@ -168,7 +168,7 @@ def _directions(axes: Any, omega: NDArray[np.float32], min_cos: float, title: st
     axes.set(title=title, xlabel="x", ylabel="y", xlim=(-1.05, 1.05), ylim=(-1.05, 1.05), aspect="equal")
     _spread(axes, x, y, (_bins(len(x)),) * 2, ((-1, 1), (-1, 1)))
     angle = np.linspace(0.0, 2.0 * np.pi, 361)
-    ring = np.stack([np.cos(angle), np.sin(angle)])
-    axes.plot(*ring, color="0.6", linewidth=1.0, label="horizon")
-    axes.plot(*(radius * ring), color=_STATED, linewidth=1.5, label=f"cos = {min_cos:g}")
-    axes.legend(loc="upper right", frameon=False, fontsize="small")
+    # The horizon is the unit circle, so near that it would only hide this one.
+    ring = radius * np.stack([np.cos(angle), np.sin(angle)])
+    axes.plot(*ring, color=_STATED, linewidth=1.5, label=f"smallest cosine: {min_cos:g}")
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), frameon=False, fontsize="small")

@@ -1,7 +1,7 @@
 """The picture of a card: the tile, its apparent BRDF and its heights, drawn from the stored numbers alone.
 
 Queries lie uniformly on the tile. Averages over all positions are therefore the tile mean, and those over
-directions are pictures of the tile. Nothing is rendered.
+directions are pictures of the tile; where the heights are known, without parallax. Nothing is rendered.
 """
 
 from __future__ import annotations
@@ -15,19 +15,26 @@ from numpy.typing import NDArray
 
 from mbtf_core.color import ALBEDO_EXPOSURE, to_display
 from mbtf_core.data.geometry import Geometry
-from mbtf_core.data.lattice import level_of_sigma
 from mbtf_core.data.shard_files import Arrays
 from mbtf_core.files.atomic import Stored, write_chunks
 from mbtf_gen.measured.exported import mean_of
 
 F64 = NDArray[np.float64]
 PICTURE_NAME = "contact_sheet.png"
-# Panels of the tile: the side that lights come from; (0, 0) takes all.
-_SIDES = {"all lights": (0, 0), "light from the left": (-1, 0), "light from the top": (0, 1)}
-# Queries per pixel, and pixels across at least and at most.
+# Panels of the tile: the side that grazing lights come from; (0, 0) takes all lights.
+_SIDES = {"all lights": (0, 0), "grazing light from the left": (-1, 0), "grazing light from the top": (0, 1)}
+# Elevations of grazing lights, and of the lights of the BRDF, in degrees.
+_GRAZING, _ELEVATIONS = (20.0, 45.0), (35.0, 65.0)
+# Smallest cosine of views in panels of the tile; without heights, parallax blurs them.
+_WITH_HEIGHTS, _FROM_ABOVE = 0.5, 0.85
+# Pixels across a panel, queries that its smoothing averages, its largest standard deviation in tile widths.
+_ACROSS, _PER_WINDOW, _WIDEST = 192, 32, 0.1
+# Share of the queries, those with the finest footprints, that is shown at least.
+_FINEST = 0.2
+# Queries per pixel of the BRDF, and pixels across at least and at most.
 _PER_PIXEL, _LEAST, _MOST = 48, 4, 128
-# Smallest cosine of views in panels of the tile, as parallax blurs it; elevations of the light of the BRDF.
-_FROM_ABOVE, _ELEVATIONS = 0.85, (35.0, 65.0)
+# Steps along a view ray, from the reference plane to the lowest height.
+_STEPS = 48
 # What is shown where there is no query.
 _EMPTY = 238
 
@@ -41,22 +48,68 @@ def mean_image(x: F64, y: F64, value: F64, rows: int, columns: int) -> F64:
     return np.moveaxis(np.asarray(found), 0, -1)
 
 
-def tile_images(arrays: Arrays, aspect: float) -> dict[str, F64]:
-    """Mean value by position, of views within 32° of the normal and of fine footprints, under some lights.
+def tile_images(arrays: Arrays, aspect: float, geometry: Geometry | None) -> dict[str, F64]:
+    """Mean value by visible position, under some lights.
 
     Images (rows, columns, 3) in 1/sr by title, row 0 at ``v → 1``, of a tile of this height over its width.
+    They are smoothed as wide as few queries require; NaN where there are none.
     """
     u, light, view, value = _queries(arrays)
-    above = view[:, 2] > _FROM_ABOVE
-    sharp = level_of_sigma(arrays["sigma"].reshape(-1)) > 0.5
-    above = above & sharp if (above & sharp).any() else above
+    sigma = np.asarray(arrays["sigma"], np.float64).reshape(-1)
+    if geometry is None:
+        known = view[:, 2] > _FROM_ABOVE
+    else:
+        known = view[:, 2] > _WITH_HEIGHTS
+        u[known] = visible_positions(u[known], view[known], geometry)
+    elevation = np.degrees(np.arcsin(np.clip(light[:, 2], 0.0, 1.0)))
+    grazing = (elevation >= _GRAZING[0]) & (elevation <= _GRAZING[1])
     out = {}
     for title, side in _SIDES.items():
-        found = above & (light[:, :2] @ side >= 0.5 * np.hypot(*light[:, :2].T) * np.hypot(*side))
-        columns = int(np.clip(np.sqrt(found.sum() / _PER_PIXEL / aspect), _LEAST, _MOST))
-        rows = max(1, round(aspect * columns))
-        out[title] = mean_image(u[found, 0], u[found, 1], value[found], rows, columns)
+        from_side = light[:, :2] @ side >= 0.5 * np.hypot(*light[:, :2].T)
+        found = known & grazing & from_side if any(side) else known
+        out[title] = _smoothed(u[found], sigma[found], value[found], aspect)
     return out
+
+
+def visible_positions(u: F64, view: F64, geometry: Geometry) -> F64:
+    """Positions (n, 2) in [0, 1)² where view rays through positions u of the reference plane meet heights, to
+    a 48th of their range."""
+    rows, columns = geometry.heights.shape
+    step = -float(geometry.heights.min()) / _STEPS
+    # Per unit of depth, in the coordinates of u.
+    slope = -view[:, :2] / view[:, 2:] / (1.0, geometry.aspect)
+    at, left = u.copy(), np.arange(len(u))
+    for number in range(1, _STEPS + 1):
+        x, y = at[left].T
+        row = np.floor((1.0 - y) * rows).astype(int) % rows
+        below = geometry.heights[row, np.floor(x * columns).astype(int) % columns] < -number * step
+        left = left[below]
+        at[left] += step * slope[left]
+    return np.asarray(at % 1.0)
+
+
+def _smoothed(u: F64, sigma: F64, value: F64, aspect: float) -> F64:
+    """Mean value of queries by position, smoothed over a number of them on the torus."""
+    from scipy.ndimage import gaussian_filter
+
+    columns, rows = _ACROSS, max(1, round(aspect * _ACROSS))
+    if len(u) == 0:
+        return np.full((rows, columns, 3), np.nan)
+
+    def width(count: int) -> float:
+        # A Gaussian average has the variance of one over 4πσ² times the density of queries.
+        return float(min(np.sqrt(_PER_WINDOW * aspect / (4.0 * np.pi * count)), _WIDEST))
+
+    # Footprints that blur more than the smoothing are left out.
+    sharp = sigma <= max(width(len(u)), float(np.quantile(sigma, _FINEST)))
+    x, y = u[sharp].T
+    weights = [np.ones(len(x)), *value[sharp].T]
+    unit = ((0.0, 1.0), (0.0, 1.0))
+    sums = np.stack([np.histogram2d(1.0 - y, x, (rows, columns), unit, weights=w)[0] for w in weights], -1)
+    smooth = gaussian_filter(sums, columns * width(len(x)), mode="wrap", axes=(0, 1))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        image = np.where(smooth[..., :1] > 0, smooth[..., 1:] / smooth[..., :1], np.nan)
+    return np.asarray(image)
 
 
 def brdf_image(arrays: Arrays) -> F64:
@@ -93,7 +146,9 @@ def write_picture(arrays: Arrays, aspect: float, geometry: Geometry | None, path
     """Write the contact sheet of training queries and of a geometry as a PNG, atomically."""
     from matplotlib.figure import Figure
 
-    panels = [(title, image, (0, 1, 0, aspect)) for title, image in tile_images(arrays, aspect).items()]
+    panels = [
+        (title, image, (0, 1, 0, aspect)) for title, image in tile_images(arrays, aspect, geometry).items()
+    ]
     panels.append(("apparent BRDF by ω_o", brdf_image(arrays), (-1, 1, -1, 1)))
     figure = Figure(figsize=(3.0 * (len(panels) + (geometry is not None)), 3.3), layout="constrained")
     axes: Any = figure.subplots(1, len(panels) + (geometry is not None))

@@ -248,7 +248,7 @@ class FiberTile(Tile):
                 f"along and {yarn['azimuthal_roughness']:g} around the fiber, scale tilt "
                 f"{yarn['scale_tilt']:g}°, ior {yarn['ior']:g}"
             )
-        lines += [f"warning     {text}" for text in brief_warnings(found)]
+        lines += [f"warning     {text}" for text in brief_warnings(found["warnings"])]
         return "\n".join(lines if self.weave is None else [*lines, *self.weave.describe()])
 
 

@@ -292,6 +292,7 @@ class HeightFieldTile(Tile):
             "opacity": self._opacity(),
             "unused": self.unused,
             "warnings": [*self.warnings_in_use(), *refused],
+            "scale_warning": self.scale_warning(),
             "notes": list(self.notes),
         }
         return {**found, "oddities": oddities(found)}
@@ -344,15 +345,20 @@ class HeightFieldTile(Tile):
             f"displacement range {self.thickness:.4g} tile widths"
         )
 
-    def warnings_in_use(self) -> tuple[str, ...]:
+    def scale_warning(self) -> str | None:
         path, extent = self.files["height"], float(np.ptp(self.height))
-        text = None
         if extent == 0:
-            text = f"{path}: its heights are constant: the tile is flat"
-        elif "normal" in self.files:
+            return None
+        if "normal" in self.files:
             text = suggestion_warning(self.files["normal"], self.normal_fit, self.height_scale)
+            if text is not None:
+                return text
         extent *= abs(self.height_scale)
-        refused = self.unit_fault() is not None
-        if text is None and self.height_from == "default" and extent > _STEEP and not refused:
-            text = f"{path}: the displacement range is {extent:.4g} tile widths; check --height-scale"
-        return self.warnings if text is None else (*self.warnings, text)
+        if self.height_from == "default" and extent > _STEEP and self.unit_fault() is None:
+            return f"{path}: the displacement range is {extent:.4g} tile widths; check --height-scale"
+        return None
+
+    def warnings_in_use(self) -> tuple[str, ...]:
+        flat = f"{self.files['height']}: its heights are constant: the tile is flat"
+        found = (flat if np.ptp(self.height) == 0 else None, self.scale_warning())
+        return (*self.warnings, *filter(None, found))

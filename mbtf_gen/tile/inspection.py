@@ -69,10 +69,13 @@ def inspection_text(found: Mapping[str, Any], name: str) -> str:
     if exported := found.get("exported"):
         rows, columns = found["geometry"]["mesh"]
         lines.append(f"exported   {exported}: {columns} x {rows} heights z in tile widths")
-    for title, texts in (("warnings", brief_warnings(found)), ("remarks", found["oddities"])):
+    # The most important one comes last.
+    scale, others = found["scale_warning"], [w for w in found["warnings"] if w != found["scale_warning"]]
+    for title, texts in (("warnings", brief_warnings(others)), ("remarks", found["oddities"])):
         lines += ["", title] if texts else []
         for text in texts:
             lines += _wrapped("  - ", text)
+    lines += ["", f"warning: {brief_warnings([scale])[0]}"] if scale is not None else []
     return "\n".join(lines)
 
 

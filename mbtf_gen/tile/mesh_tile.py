@@ -198,7 +198,7 @@ class MeshTile(Tile):
             lines.append(
                 f"part     {part['name']}: {part['triangles']:,} triangles, mean color {color}, {gloss}{rest}"
             )
-        return "\n".join([*lines, *(f"warning  {text}" for text in brief_warnings(found))])
+        return "\n".join([*lines, *(f"warning  {text}" for text in brief_warnings(found["warnings"]))])
 
 
 def _mean(value: Value) -> float | list[float]:

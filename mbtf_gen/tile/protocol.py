@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -228,14 +228,18 @@ class Tile(ABC):
         """The options in use, in a line; None where there are none."""
         return None
 
+    def scale_warning(self) -> str | None:
+        """The warning that the height scale in use is implausible; None where it is not."""
+        return None
+
     def warnings_in_use(self) -> tuple[str, ...]:
         """Warnings, those that depend on the options included."""
         return self.warnings
 
 
-def brief_warnings(found: Mapping[str, Any]) -> list[str]:
-    """Warnings of a description without the folders of their files, which its heading names."""
-    parts = (text.partition(": ") for text in found["warnings"])
+def brief_warnings(warnings: Iterable[str]) -> list[str]:
+    """Warnings without the folders of their files."""
+    parts = (text.partition(": ") for text in warnings)
     return [f"{Path(path).name}: {rest}" for path, _, rest in parts]
 
 

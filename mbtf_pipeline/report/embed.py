@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.color import to_display
-from mbtf_core.palettes import Palette, indices, palette
+from mbtf_core.palettes import Palette, indices, palette, tick_labels
 
 U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
@@ -31,7 +31,7 @@ def color_bar(
     where values are `clipped`, its ends say so."""
     low = -high if key == "signed" else 0.0
     colors = palette(key)[np.linspace(0, 255, 17).round().astype(int)].tolist()
-    ticks = [f"{factor * x:.3g}".replace("-", "−") for x in np.linspace(low, high, 5)]
+    ticks = tick_labels(low, high, factor)
     if clipped:
         ticks[-1] = f"≥ {ticks[-1]}"
         ticks[0] = f"≤ {ticks[0]}" if low else ticks[0]

@@ -10,16 +10,15 @@ from typing import Any
 from urllib.parse import quote
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mbtf_core.color import white_of
 from mbtf_core.palettes import Palette, common_scale, robust_scale
+from mbtf_core.stats import local_error
 from mbtf_pipeline.compare.image_files import read_halves, read_map, read_picture
 from mbtf_pipeline.compare.offsets import read_offset, towards_view
 from mbtf_pipeline.compare.perceptual_metrics import available_metrics
 from mbtf_pipeline.recipe import SceneView
 from mbtf_pipeline.report.embed import (
-    F32,
     Gallery,
     Pixels,
     color_bar,
@@ -39,8 +38,6 @@ from mbtf_pipeline.tables import (
 )
 
 _KIND = {"query": "Reference", "pixel": "Reference, filtered pixel"}
-# Standard deviation in pixels of the averaging window of local errors.
-WINDOW = 2.0
 # Share of a map's pixels beyond the scale from which it is marked.
 _CLIPPED = 0.05
 # Error maps: title, unit, and factor to that unit.
@@ -49,20 +46,6 @@ _MAPS: dict[Palette, tuple[str, str, float]] = {
     "flip": ("HDR-FLIP", "from 0 to 1", 1.0),
     "signed": ("Fit − reference", "% of white", 100.0),
 }
-
-
-def local_error(picture: F32, value_a: F32, value_b: F32) -> NDArray[np.float64]:
-    """Local noise-free root mean square error (rows, columns) in 1/sr.
-
-    The root of the Gaussian average (σ = 2 pixels) of the mean over channels of ``(p-a)(p-b)``. Single
-    products are often negative where the error is small compared to the noise, so they are averaged. The
-    map is 0 where the average is negative: the error lies below the noise.
-    """
-    from scipy.ndimage import gaussian_filter
-
-    p, a, b = (np.asarray(x, np.float64) for x in (picture, value_a, value_b))
-    squared = gaussian_filter(((p - a) * (p - b)).mean(axis=-1), WINDOW, mode="nearest")
-    return np.sqrt(np.maximum(squared, 0.0))
 
 
 def picture_section(

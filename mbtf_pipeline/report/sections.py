@@ -12,6 +12,7 @@ import numpy as np
 
 from mbtf_core.color import linear_to_srgb
 from mbtf_core.errors import MbtfError
+from mbtf_core.stats import Estimate
 from mbtf_fit.formatting import SPLIT_NAMES
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.tile.inspection import USES
@@ -34,7 +35,7 @@ _THUMBNAIL = 192
 def error_context(comparison: Mapping[str, Any]) -> dict[str, Any]:
     """Data about errors."""
     tests = {fit: record["splits"]["test"] for fit, record in comparison["test"].items()}
-    groupings = [_grouping(tests, *grouping) for grouping in _GROUPINGS]
+    groupings = [shown for grouping in _GROUPINGS if (shown := _grouping(tests, *grouping)) is not None]
     return {
         "facts": _facts(comparison, tests),
         "ranking": _ranking(comparison),
@@ -126,9 +127,17 @@ def _error_table(comparison: Mapping[str, Any]) -> dict[str, Any]:
 
 def _grouping(
     tests: Mapping[str, Any], key: str, title: str, axis: str, head: str
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Plot and table of the errors by level or by cosine."""
+) -> tuple[dict[str, Any], dict[str, Any]] | None:
+    """Plot and table of the errors by level or by cosine; None where none is defined. The table begins with
+    the groups where a fit has a significant error."""
     names = sorted({n for test in tests.values() for n in test[key]}, key=lambda n: float(n.split("-")[0]))
+    names = [
+        n
+        for n in names
+        if any(math.isfinite(_unexplained(test[key].get(n)).value) for test in tests.values())
+    ]
+    if not names:
+        return None
     labels = [name.replace("-", "–") for name in names]
     series: dict[str, list[tuple[float, float] | None]] = {fit: [] for fit in tests}
     rows = []
@@ -137,14 +146,21 @@ def _grouping(
         count = next(group["mse"]["n"] for group in groups.values() if group is not None)
         row = [label, f"{count:,}"]
         for fit, group in groups.items():
-            found = None if group is None else estimate(group["unexplained"])
-            series[fit].append(None if found is None else (found.value, found.error))
+            found = _unexplained(group)
+            series[fit].append((found.value, found.error) if math.isfinite(found.value) else None)
             row += ("–", "–") if group is None else data_errors(group)
         rows.append(row)
+    rows.sort(
+        key=lambda row: all(NOT_SIGNIFICANT in text or text in ("–", "undefined") for text in row[2::2])
+    )
     svg = points(labels, series, axis, UNEXPLAINED, f"{UNEXPLAINED} {title}")
     heads = [h for fit in tests for h in (f"{fit}: {UNEXPLAINED}", f"{fit}: MSE [10⁻³/sr²]")]
     table = {"title": f"{title}, test split", "head": [head, "queries", *heads], "rows": rows}
     return {"title": title, "svg": svg}, table
+
+
+def _unexplained(group: Mapping[str, Any] | None) -> Estimate:
+    return Estimate(math.nan, math.inf, 0) if group is None else estimate(group["unexplained"])
 
 
 def training_context(fits: Mapping[str, Path]) -> dict[str, Any]:

@@ -137,7 +137,7 @@ def suggestion_warning(path: Path, fit: NormalFit | None, factor: float) -> str 
     ratio = factor / fit.scale
     return (
         f"{path}: the heights are {ratio:{'.0f' if abs(ratio) >= 10 else '.2g'}} times as steep as its "
-        f"slopes; both agree at --height-scale {fit.scale:.3g} ({factor:.3g} is in use)"
+        f"slopes ({factor:.3g} is in use); add --height-scale {fit.scale:.3g} to agree"
     )
 
 

@@ -10,6 +10,8 @@ import numpy as np
 import OpenEXR
 import pytest
 from PIL import Image
+from scipy.ndimage import gaussian_filter
+from scipy.stats import spearmanr
 from support.command_lines import call, fails
 from support.commands import Done
 from support.datasets import edit, read_checksummed, write_dataset
@@ -17,7 +19,7 @@ from support.plugin_materials import write_material
 
 from mbtf_core.color import to_display
 from mbtf_fit.comparison import _rms_text
-from mbtf_fit.preview.grid import CAPTION, GAP, MARGIN
+from mbtf_fit.preview.grid import BAR_STRIP, CAPTION, GAP, MARGIN
 from mbtf_gen.pictures import reference
 
 VALUE = (0.1, 0.12, 0.15)
@@ -69,15 +71,20 @@ def test_errors_and_panels_are_those_of_reference_and_fit(work: Path) -> None:
         ratio = found["mse"]["value"] / (found["mean"] * found["contrast"]) ** 2
         # In the distance, the noise exceeds the contrast.
         assert row == 2 or found["unexplained"]["value"] == pytest.approx(ratio, rel=1e-3)
-        shown, fit, signed = (panels[row, :, column] for column in range(3))
+        shown, fit, local = (panels[row, :, column] for column in range(3))
         # Labels cover the lower part of the first column.
         assert np.abs(shown - to_display(0.5 * (a + b), exposure))[: SIZE // 2].max() <= 1
         assert np.abs(fit - to_display(VALUE, exposure)).max() <= 1
-        brighter = (VALUE - 0.5 * (a + b)).mean(-1)
-        clear = np.abs(brighter) > 0.2 * np.abs(brighter).max()
-        # Orange where the fit is too bright, blue where it is too dark.
-        assert ((signed[..., 0] > signed[..., 2]) == (brighter > 0))[clear].all()
-        assert clear.mean() > 0.3
+        # Lightness grows with the local error up to the end of the scale, which is common to all rows.
+        smooth = np.sqrt(np.maximum(gaussian_filter(spread, 2.0, mode="nearest"), 0.0))
+        lightness = local @ [0.2126, 0.7152, 0.0722]
+        inside = lightness < 200
+        assert inside.mean() > 0.5
+        assert spearmanr(lightness[inside], smooth[inside]).statistic > 0.98
+    # The numbers of the color bar lie below the errors alone.
+    below = image[-BAR_STRIP:].min(axis=(0, 2))
+    assert (below[: MARGIN + 2 * pitch - GAP] == 255).all()
+    assert below[MARGIN + 2 * pitch : -MARGIN].max() < 255
 
 
 @pytest.mark.parametrize(("error", "text"), [(0.004, "RMS error 20.0%"), (0.006, "RMS error within noise")])

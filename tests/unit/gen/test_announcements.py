@@ -17,6 +17,7 @@ from mbtf_core.pictures import Camera
 from mbtf_gen import forecast
 from mbtf_gen.cli.app import app
 from mbtf_gen.generation import run as generation
+from mbtf_gen.generation.manifest import Summary
 from mbtf_gen.pictures import reference
 from mbtf_gen.tile.loading import load_material
 
@@ -161,3 +162,18 @@ def test_notes_on_maps_are_logged_where_data_are_made(
     assert f"mbtf-gen inspect {path}" in planned
     monkeypatch.setattr(generation, "unfinished", lambda *_: [])
     assert not any(note in printed(path) for note in notes)
+
+
+def test_an_implausible_height_scale_is_the_last_line_of_a_run(
+    heights: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    np.save(heights, np.tile(0.4 + 0.4 * np.sin(np.linspace(0, 2 * np.pi, 64, endpoint=False)), (64, 1)))
+    done = Summary(
+        "out", True, 9, {"train": 9}, 9, 1.0, 9.0, 0.0, 0.0, 1.0, None, [0.1] * 3, 0, 0, 0, [], None
+    )
+    monkeypatch.setattr(generation, "generate", lambda *_, **__: done)
+    for scale, warned in (("0.1", False), (None, True)):
+        words = [] if scale is None else ["--height-scale", scale]
+        assert run(app, [str(heights), *words, "--resolution", "8", "-o", str(heights.parent / "out")]) == 0
+        last = capsys.readouterr().err.splitlines()[-1]
+        assert ("check --height-scale" in last) == warned

@@ -14,6 +14,7 @@ from mbtf_core.stats import (
     by_group,
     elevation_groups,
     level_groups,
+    local_error,
     mean_estimate,
     mean_of_halves,
     noise_free_mse,
@@ -126,3 +127,17 @@ def test_weights_are_refused_unless_positive_and_one_per_query() -> None:
         with pytest.raises(ValueError, match="weights must be 3 positive numbers"):
             mean_estimate(values, weights)
     assert mean_estimate([1.0, 4.0], [2.0, 1.0]).value == pytest.approx(2.0)
+
+
+def test_local_error_is_not_biased_by_noise() -> None:
+    random = np.random.default_rng(1)
+    truth = np.full((96, 96, 3), 0.5, np.float32)
+    a, b = (truth + np.float32(0.2) * random.standard_normal(truth.shape, np.float32) for _ in range(2))
+    picture = truth.copy()
+    picture[:, 48:] += 0.3
+    found = local_error(picture, a, b)
+    assert found[:, 56:].mean() == pytest.approx(0.3, rel=0.05)
+    # Without an error, the map lies far below the noise, and half of it is 0.
+    assert np.median(found[:, :40]) < 0.05
+    assert 0.3 < np.mean(found[:, :40] == 0) < 0.7
+    assert (found >= 0).all()

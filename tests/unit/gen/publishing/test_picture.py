@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from support.fit_data import write_data
 from support.published import LAYOUTS, small
 
 from mbtf_core.data.dataset import Dataset
-from mbtf_gen.publishing.picture import brdf_image, displayed, tile_images, write_picture
+from mbtf_gen.publishing.picture import brdf_image, displayed, tile_images, visible_positions, write_picture
 
 
 def test_images_have_v_and_the_light_where_they_belong(tmp_path: Path) -> None:
@@ -23,8 +24,7 @@ def test_images_have_v_and_the_light_where_they_belong(tmp_path: Path) -> None:
 
     write_data(tmp_path / "data", value, train=60_000, test=10, finest=4)
     arrays = Dataset.open(tmp_path / "data").load("train")
-    tile = tile_images(arrays, 1.0)["all lights"]
-    assert len(tile) >= 8
+    tile = tile_images(arrays, 1.0, None)["all lights"]
     at = (np.arange(len(tile)) + 0.5) / len(tile)
     wave = np.broadcast_to(1.0 + 0.5 * np.sin(2 * np.pi * at), tile.shape[:2])
     np.testing.assert_allclose(tile[..., 0], wave, atol=0.1)
@@ -43,11 +43,26 @@ def test_lights_come_from_their_sides(tmp_path: Path) -> None:
         return omega_i + 1.0
 
     write_data(tmp_path / "data", lit, train=20_000, test=10, finest=2)
-    images = tile_images(Dataset.open(tmp_path / "data").load("train"), 1.0)
+    images = tile_images(Dataset.open(tmp_path / "data").load("train"), 1.0, None)
     mean = {title: np.nanmean(image - 1, axis=(0, 1)) for title, image in images.items()}
-    assert mean["light from the left"][0] < -0.3
-    assert mean["light from the top"][1] > 0.3
+    assert mean["grazing light from the left"][0] < -0.6
+    assert mean["grazing light from the top"][1] > 0.6
     assert np.abs(mean["all lights"][:2]).max() < 0.05
+
+
+def test_parallax_is_removed_where_heights_are_known() -> None:
+    """The tile is twice as wide as high; its half v > 1/2 is deeper."""
+    heights = np.full((64, 128), -0.02, np.float32)
+    heights[:32] = -0.1
+    heights[0, 0] = 0.0
+    geometry = SimpleNamespace(heights=heights, aspect=0.5)
+    u = np.array([[0.5, 0.75], [0.5, 0.25], [0.98, 0.2]])
+    view = np.array([[0.6, 0.0, 0.8], [0.0, 0.6, 0.8], [-0.6, 0.0, 0.8]])
+    # At slopes of 3/4.
+    expected = [[0.5 - 0.075, 0.75], [0.5, 0.25 - 2 * 0.015], [0.995, 0.2]]
+    seen = visible_positions(u, view, geometry)  # type: ignore[arg-type]
+    np.testing.assert_allclose(seen, expected, atol=2 * 0.1 / 48)
+    assert visible_positions(np.array([[0.99, 0.7]]), view[2:], geometry)[0, 0] < 0.07  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)

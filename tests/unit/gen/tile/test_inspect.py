@@ -110,8 +110,12 @@ class TestText:
         save_normals(folder / "normal.png", normals_of(fractal(48, 96), 0.01))
 
         def warned(height: float | None = None) -> bool:
-            warnings = load_material(folder).inspect(GeometrySection(height_scale=height))["warnings"]
-            return any("are 5 times as steep as its slopes; both agree at" in warning for warning in warnings)
+            found = load_material(folder).inspect(GeometrySection(height_scale=height))
+            shown = inspection_text(found, "wool").splitlines()
+            last = shown[-1].startswith("warning: normal.png: the heights are 5 times as steep as its slopes")
+            assert shown[-1].endswith("add --height-scale 0.00998 to agree") == last
+            assert sum("as steep as" in line for line in shown) == last
+            return last
 
         assert warned()
         assert warned(0.05)

@@ -46,7 +46,7 @@ def test_every_oddity_is_named_and_nothing_else(name: str) -> None:
     assert [t["tiles"] for t in found["tiling"]] == [True, True]
     allowed = ("8-bit heights", "opacity: read", "as steep as its slopes")
     assert [w for w in found["warnings"] if not any(part in w for part in allowed)] == []
-    assert any("agree at --height-scale" in w for w in found["warnings"]) == (scale < 0.033)
+    assert any("add --height-scale" in w for w in found["warnings"]) == (scale < 0.033)
     normal = found["normal"]
     assert normal["convention"] == "gl"
     assert normal["fits"]

@@ -17,7 +17,8 @@ def number(value: float, error: float) -> dict[str, Any]:
 def test_both_errors_of_a_group_are_significant_or_neither() -> None:
     close = {"n": 50, "unexplained": number(0.11, 0.06), "mse": number(2e-4, 0.9e-4)}
     clear = {"n": 50, "unexplained": number(0.2, 0.01), "mse": number(4e-4, 1e-5)}
-    split = {**clear, "levels": {"0": close, "1": clear}, "elevations": {"0.2-0.4": clear}}
+    unknown = {"n": 50, "unexplained": {"value": None, "error": None, "n": 50}, "mse": number(4e-4, 1e-5)}
+    split = {**clear, "levels": {"0": close, "1": clear, "2": unknown}, "elevations": {"0.2-0.4": clear}}
     error = {"psnr": number(30, 1), "mse": number(1e-4, 1e-6), "relative_mse": number(0.1, 0.01)}
     flip = {"ldr": 0.1, "hdr": 0.2}
     direction = {"elevation": 45, "azimuth": 0}
@@ -43,12 +44,17 @@ def test_both_errors_of_a_group_are_significant_or_neither() -> None:
     record |= {"pictures": [picture], "test": test}
     context = error_context(record)
     levels, cosines = (table["rows"] for table in context["group_tables"])
-    assert levels[0] == ["0", "50", "not significant (0.11 ± 0.06)", "not significant (0.20 ± 0.09)"]
-    assert levels[1] == ["1", "50", "0.200 ± 0.010", "0.400 ± 0.010"]
+    # What tells something comes first, and what tells nothing is left out.
+    assert levels == [
+        ["1", "50", "0.200 ± 0.010", "0.400 ± 0.010"],
+        ["0", "50", "not significant (0.11 ± 0.06)", "not significant (0.20 ± 0.09)"],
+    ]
     assert cosines[0][0] == "0.2–0.4"
     assert context["facts"][0]["value"] == "0.200 ± 0.010"
     assert context["facts"][0]["what"].endswith(" of a (9 steps: not converged)")
     assert context["error_table"]["rows"][0][0] == "a (9 steps: not converged)"
+    split["elevations"] = {"0.2-0.4": unknown}
+    assert len(error_context(record)["group_tables"]) == len(error_context(record)["error_plots"]) == 1
 
 
 @pytest.mark.parametrize(
