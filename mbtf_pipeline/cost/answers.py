@@ -46,7 +46,7 @@ class Evidence:
     def of(cls, found: Sequence[Measurement], deviation: Estimate) -> Evidence:
         """From the measurements of a study."""
         runs = [m for m in found if m.study == "run" and m.error.value > 0 and m.error.error < m.error.value]
-        for series, _ in Counter(m.series for m in runs).most_common(1):
+        for series, _ in Counter(m.series for m in reversed(runs)).most_common(1):
             runs = sorted((m for m in runs if m.series == series), key=_work)
         return cls(runs, deviation)
 
