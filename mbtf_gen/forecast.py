@@ -15,7 +15,7 @@ from mbtf_core.data.schema import ShardEntry
 from mbtf_core.data.shard_files import write_shard
 from mbtf_core.forecast import pilot_seconds
 from mbtf_core.stats import pooled_error
-from mbtf_core.units import clock, expectation, size_text
+from mbtf_core.units import clock, expectation, rate_text, size_text
 from mbtf_gen.job import Job, data_bytes, most_paths, planned_paths, split_queries, split_spp, split_target
 from mbtf_gen.planning.adaptive import estimate_shard
 from mbtf_gen.planning.run_plan import RunPlan, allocate, plan_effects
@@ -65,7 +65,7 @@ class Forecast:
         error = f" ± {clock(self.seconds_se)}" if self.seconds_se >= 0.5 else ""
         line = (
             f"forecast: {clock(total)}{error}, "
-            f"{self.paths / max(total, 1e-9) / 1e6:.2f} M paths/s ({self.start:.0f} s of startup included), "
+            f"{rate_text(self.paths / max(total, 1e-9))} ({self.start:.0f} s of startup included), "
             f"{size_text(self.bytes)}, noise of one training value {self.relative_error:.0%} of the mean "
             "value"
         )
