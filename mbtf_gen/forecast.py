@@ -16,6 +16,7 @@ from mbtf_core.data.shard_files import write_shard
 from mbtf_core.forecast import pilot_seconds
 from mbtf_core.stats import pooled_error
 from mbtf_core.units import clock, expectation, rate_text, size_text
+from mbtf_gen.config.generator import parse_count
 from mbtf_gen.job import Job, data_bytes, most_paths, planned_paths, split_queries, split_spp, split_target
 from mbtf_gen.planning.adaptive import estimate_shard
 from mbtf_gen.planning.run_plan import RunPlan, allocate, plan_effects
@@ -28,6 +29,8 @@ _PIECE_PATHS = 1 << 19
 LONG_RUN = 30_000_000
 # Likewise through fibers, which scatter light many times.
 LONG_FIBER_RUN = 1_000_000
+# Data of fewer paths per query take little less time.
+FEWEST_SPP = 4
 # Time from which a shorter command is named.
 _LONG_SECONDS = 120.0
 
@@ -164,4 +167,9 @@ def announce_shards(
         expected = forecast(job, plan, seconds=1.0)
         return expected.start + share * expected.seconds
 
-    announce(console, 0 if plan.effects.closed_form else share * most_paths(job), seconds, size)
+    paths, queries = 0 if plan.effects.closed_form else share * most_paths(job), job.config.queries
+    number, per_texel = parse_count(queries.train)
+    faster = f"--queries {max(1, round(number / 4))}{'/texel' * per_texel}"
+    if queries.target_error is None and queries.spp > FEWEST_SPP:
+        faster += f", --spp {queries.spp // 4 * 2}"
+    announce(console, paths, seconds, size, job.material.scatters, faster)

@@ -54,6 +54,8 @@ SHARE, OTHER_SHARES = 0.35, (0.6, 0.15)
 _FEWEST_QUERIES = 20_000
 # Fewest training steps of a run: the error of a shorter fit says nothing about longer ones.
 FEWEST_STEPS = 200
+# Series of a run for which they took longer than planned.
+SLOW_SERIES = f"{FEWEST_STEPS} training steps"
 # Fewest total times that tell how the error falls, and the study's seconds in which they are measured.
 FEWEST_TOTALS = 3
 LEAST_SECONDS = SHORTEST * (2**FEWEST_TOTALS - 1 + 2 ** (FEWEST_TOTALS - 1) - 1) / RUNS

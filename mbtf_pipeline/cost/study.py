@@ -43,12 +43,12 @@ from mbtf_pipeline.cost.measurement import (
     seed_deviation,
 )
 from mbtf_pipeline.cost.runs import (
-    FEWEST_STEPS,
     FEWEST_TOTALS,
     GENERATOR,
     LEAST_SECONDS,
     MOST_SEEDS,
     SHORTEST,
+    SLOW_SERIES,
     TEST,
     Run,
     disk_bytes,
@@ -212,7 +212,7 @@ class Measurements:
             self.step_seconds = _step_seconds(self.found[first.label])
         runs = planned_runs(seconds, spp, self.path_seconds, self.step_seconds)
         # With its few queries it follows another law than the others.
-        return runs if first in runs else [replace(first, series=f"{FEWEST_STEPS} training steps"), *runs]
+        return runs if first in runs else [replace(first, series=SLOW_SERIES), *runs]
 
     def recall(self, configuration: Configuration) -> bool:
         """Whether a measurement is stored; it then counts as found."""
