@@ -23,8 +23,9 @@ from mbtf_gen.planning.run_plan import RunPlan, allocate, plan_effects
 from mbtf_gen.planning.simulation import build_estimator, pilot_queries
 from mbtf_gen.render.estimates import Estimates, Stream, Target
 
-# Paths of one piece of the pilot.
-_PIECE_PATHS = 1 << 19
+# Paths of one piece of the pilot at most, and of the first pieces, which compile the kernels and measure the
+# speed; the time that a piece may take.
+_PIECE_PATHS, _FIRST_PATHS, _PIECE_SECONDS = 1 << 19, 1 << 13, 0.5
 # Fewer paths take less than a minute at half a million paths per second.
 LONG_RUN = 30_000_000
 # Likewise through fibers, which scatter light many times.
@@ -93,7 +94,7 @@ def forecast(job: Job, plan: RunPlan | None = None, seconds: float = 2.0) -> For
     estimator = build_estimator(job, plan.effects)
     spp, target = split_spp(job.config, "train"), split_target(job.config, "train")
     count, test_paths = split_queries(job, "train"), split_queries(job, "test") * job.config.queries.test_spp
-    size = max(1, _PIECE_PATHS // (spp if target is None else target.max_spp))
+    size = max(1, _FIRST_PATHS // (spp if target is None else target.max_spp))
     found: list[Estimates] = []
 
     def stored(estimates: Estimates) -> int:
@@ -110,10 +111,14 @@ def forecast(job: Job, plan: RunPlan | None = None, seconds: float = 2.0) -> For
         return max(found[-1].paths, stored(found[-1]))
 
     # Piece 0 compiles the kernels. Under a target error it traces fewer paths than the cap allows.
-    first = piece(0)
+    piece(0)
+    warm = time.perf_counter()
+    first = piece(1)
     start = time.perf_counter() - began
-    size = max(1, _PIECE_PATHS * len(found.pop().value_a) // max(first, 1))
-    path = pilot_seconds(piece, seconds)
+    affordable = _PIECE_SECONDS * first / max(time.perf_counter() - warm, 1e-9)
+    size = max(1, round(min(_PIECE_PATHS, affordable) * len(found[1].value_a) / max(first, 1)))
+    found.clear()
+    path = pilot_seconds(lambda number: piece(number + 1), seconds)
     a, b = (np.concatenate([getattr(one, name) for one in found]) for name in ("value_a", "value_b"))
     per_query = sum(max(one.paths, stored(one)) for one in found) / len(a)
     paths = round(count * per_query) + test_paths

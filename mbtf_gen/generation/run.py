@@ -123,10 +123,13 @@ def generate(
     plans: list[RunPlan] = []
 
     def new_plan(job: Job) -> RunPlan:
-        if progress is not None:
-            progress(0.0, "building the scene, compiling kernels, pilot paths of the effects", None)
-        plans.append(plan_run(job))
+        def note(phase: str) -> None:
+            if progress is not None:
+                progress(0.0, phase, None)
+
+        plans.append(plan_run(job, note))
         if planned is not None:
+            note("forecasting the time")
             planned(plans[0])
         return plans[0]
 

@@ -95,7 +95,7 @@ def test_progress_counts_traced_paths(config: GeneratorConfig, engine: Formula, 
     # The test split, of 120 planned paths, comes last: until then it counts as planned.
     train, test = 7 * 200, 7 * 120
     expected = [(560, train + 120), (1120, train + 120), (train, train + 120), (train + test,) * 2]
-    assert seen == [(0, None), (0, None), *expected]
+    assert seen == [(0, None)] * 2 + expected
     assert summary.paths == train + test
 
 
@@ -113,7 +113,7 @@ def test_progress_names_the_phases_and_counts_launches(
     monkeypatch.setattr(engine, "estimate", launched)
     seen: list[tuple[float, str, float | None]] = []
     generate(config, out, progress=lambda *now: seen.append(now))
-    assert [note.split(",")[0] for _, note, _ in seen[:2]] == ["building the scene"] * 2
+    assert [note.split(",")[0] for _, note, _ in seen[:2]] == ["pilot paths", "building the scene"]
     done = [paths for paths, _, _ in seen]
     assert done == sorted(done)
     assert {40, 80, 120, 160, 180, 200, 260, 320} <= set(done)
