@@ -85,6 +85,13 @@ def size_text(size: float) -> str:
     return f"{size / 1e3:.0f} kB"
 
 
+def rate_text(paths_per_second: float) -> str:
+    """Readable rate: ``1.26 M paths/s``, ``28 k paths/s``, ``0.8 k paths/s``."""
+    if paths_per_second >= 1e5:
+        return f"{paths_per_second / 1e6:.2f} M paths/s"
+    return f"{paths_per_second / 1e3:.{1 if paths_per_second < 1e4 else 0}f} k paths/s"
+
+
 def expectation(seconds: float | None, size: float) -> str:
     """What a command expects to take, in one line; unknown seconds are left out."""
     time = "" if seconds is None else f"about {clock(seconds)}, "

@@ -16,7 +16,8 @@ from mbtf_core.data.schema import ShardEntry
 from mbtf_core.data.shard_files import write_shard
 from mbtf_core.forecast import pilot_seconds
 from mbtf_core.stats import pooled_error
-from mbtf_core.units import clock, expectation, size_text
+from mbtf_core.units import clock, expectation, rate_text, size_text
+from mbtf_gen.config.generator import parse_count
 from mbtf_gen.job import (
     Job,
     data_bytes,
@@ -34,12 +35,15 @@ from mbtf_gen.planning.simulation import build_estimator, pilot_queries
 from mbtf_gen.render.estimates import Estimates, Stream, Target
 
 _HALVES = ("value_a", "value_b")
-# Paths of one piece of the pilot.
-_PIECE_PATHS = 1 << 19
+# Paths of one piece of the pilot at most, and of the first pieces, which compile the kernels and measure the
+# speed; the time that a piece may take.
+_PIECE_PATHS, _FIRST_PATHS, _PIECE_SECONDS = 1 << 19, 1 << 13, 0.5
 # Fewer paths take less than a minute at half a million paths per second.
 LONG_RUN = 30_000_000
 # Likewise through fibers, which scatter light many times.
 LONG_FIBER_RUN = 1_000_000
+# Data of fewer paths per query take little less time.
+FEWEST_SPP = 4
 # Time from which a shorter command is named.
 _LONG_SECONDS = 120.0
 
@@ -77,7 +81,7 @@ class Forecast:
         error = f" ± {clock(self.seconds_se)}" if self.seconds_se >= 0.5 else ""
         line = (
             f"forecast: {clock(total)}{error}, "
-            f"{self.paths / max(total, 1e-9) / 1e6:.2f} M paths/s ({self.start:.0f} s of startup included), "
+            f"{rate_text(self.paths / max(total, 1e-9))} ({self.start:.0f} s of startup included), "
             f"{size_text(self.bytes)}, noise of one training value {self.relative_error:.0%} of the mean "
             "value"
         )
@@ -103,7 +107,7 @@ def forecast(job: Job, plan: RunPlan | None = None, seconds: float = 2.0) -> For
     spp, target = split_spp(job.config, "train"), split_target(job.config, "train")
     count, test_paths = split_queries(job, "train"), split_queries(job, "test") * job.config.queries.test_spp
     lights = split_lights(job.config, "train")
-    size = max(1, _PIECE_PATHS // (spp if target is None else target.max_spp))
+    size = max(1, _FIRST_PATHS // (spp if target is None else target.max_spp))
     found: list[Estimates] = []
 
     def stored(estimates: Estimates) -> int:
@@ -122,10 +126,15 @@ def forecast(job: Job, plan: RunPlan | None = None, seconds: float = 2.0) -> For
         return max(found[-1].paths, stored(found[-1]))
 
     # Piece 0 compiles the kernels. Under a target error it traces fewer paths than the cap allows.
-    first = piece(0)
+    piece(0)
+    warm = time.perf_counter()
+    first = piece(1)
     start = time.perf_counter() - began
-    size = max(1, _PIECE_PATHS * len(found.pop().value_a) // (lights * max(first, 1)))
-    path = pilot_seconds(piece, seconds)
+    affordable = _PIECE_SECONDS * first / max(time.perf_counter() - warm, 1e-9)
+    paths_of_query = max(first, 1) / len(found[1].value_a)
+    size = max(1, round(min(_PIECE_PATHS, affordable) / (lights * paths_of_query)))
+    found.clear()
+    path = pilot_seconds(lambda number: piece(number + 1), seconds)
     a, b = (np.concatenate([getattr(one, name) for one in found]) for name in _HALVES)
     per_query = sum(max(one.paths, stored(one)) for one in found) / len(a)
     paths = round(count * per_query) + test_paths
@@ -186,4 +195,9 @@ def announce_shards(
         expected = forecast(job, plan, seconds=1.0)
         return expected.start + share * expected.seconds
 
-    announce(console, 0 if plan.effects.closed_form else share * most_paths(job), seconds, size)
+    paths, queries = 0 if plan.effects.closed_form else share * most_paths(job), job.config.queries
+    number, per_texel = parse_count(queries.train)
+    faster = f"--queries {max(1, round(number / 4))}{'/texel' * per_texel}"
+    if queries.target_error is None and queries.spp > FEWEST_SPP:
+        faster += f", --spp {queries.spp // 4 * 2}"
+    announce(console, paths, seconds, size, job.material.scatters, faster)

@@ -24,7 +24,7 @@ from mbtf_core.app.options import (
 )
 from mbtf_core.errors import UsageError
 from mbtf_core.run.signals import keep_on_interruption
-from mbtf_core.units import clock, size_text
+from mbtf_core.units import clock, rate_text, size_text
 from mbtf_gen.config.generator import RESOLUTION, GeneratorConfig, generator_options
 
 if TYPE_CHECKING:
@@ -153,7 +153,7 @@ def describe(summary: Summary, *, ran: bool = True) -> str:
     if ran and summary.paths:
         lines.append(
             f"  this run: {summary.paths} paths in {clock(summary.seconds)} "
-            f"({summary.paths_per_second / 1e6:.2f} M paths/s), "
+            f"({rate_text(summary.paths_per_second)}), "
             f"{summary.waiting_seconds:.1f} s of it waiting for the disk"
         )
     elif ran:

@@ -96,10 +96,17 @@ class PreviewSection(Settings):
     tiles: Annotated[int, Field(ge=1, le=4), Flag("--tiles")] = Field(
         2, description="tiles along each side of the drawn plane"
     )
-    size: Annotated[int, Field(ge=64, le=8192), Flag("--size")] = Field(
-        640, description="pixels along each side of a picture"
+    size: Annotated[Annotated[int, Field(ge=64, le=8192)] | None, Flag("--size")] = Field(
+        None, description="pixels along each side of a picture; default: 640, or 320 for fibers"
     )
-    spp: Annotated[Paths, Flag("--spp")] = Field(16, description=PATHS_PER_PIXEL)
+    spp: Annotated[Paths | None, Flag("--spp")] = Field(
+        None, description=f"{PATHS_PER_PIXEL}; default: 16, or 8 for fibers"
+    )
+
+    def sizes(self, fibers: bool) -> tuple[int, int]:
+        """Size and paths per pixel; by default, no material takes much longer than a minute."""
+        size, spp = (320, 8) if fibers else (640, 16)
+        return self.size or size, self.spp or spp
 
 
 class ReferenceConfig(GeneratorConfig):

@@ -26,6 +26,7 @@ from mbtf_core.errors import InputError, LockedError, PartialError, UsageError, 
 from mbtf_core.locks import lock_owner, take_lock
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item, Result
+from mbtf_core.units import rate_text
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.folder import has_dataset, open_folder, read_run_plan
 from mbtf_gen.generation.manifest import Summary, finish
@@ -36,7 +37,8 @@ from mbtf_gen.planning.run_plan import RunPlan, plan_run
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream
 
-# Called with the paths so far, a note, and the paths expected in all (None: not known yet).
+# Called with the paths so far, a note (the phase, or the rate), and the paths expected in all (None: not
+# known yet).
 ProgressCallback = Callable[[float, str, float | None], None]
 
 # Failures in a row of workers after which the other shards are not tried: the disk is full.
@@ -87,8 +89,9 @@ def generate(
     planned : callable, optional
         Called with the run's plan. A new data set is not yet written then.
     progress : callable, optional
-        Called after every shard with the paths of this run so far, a note, and the paths that the run is
-        expected to trace (None where a target error leaves it open).
+        Called at the begin of each phase, and after every launch of this process and every shard, with the
+        paths of this run so far, a note, and the paths that the run is expected to trace (None where a
+        target error leaves it open).
     runner : Runner, optional
         Renders the shards, with the same values wherever; in this process by default.
 
@@ -120,8 +123,13 @@ def generate(
     plans: list[RunPlan] = []
 
     def new_plan(job: Job) -> RunPlan:
-        plans.append(plan_run(job))
+        def note(phase: str) -> None:
+            if progress is not None:
+                progress(0.0, phase, None)
+
+        plans.append(plan_run(job, note))
         if planned is not None:
+            note("forecasting the time")
             planned(plans[0])
         return plans[0]
 
@@ -150,6 +158,8 @@ class ShardRun:
 
     def __init__(self, job: Job, folder: DataFolder, plan: RunPlan, received: bool = False) -> None:
         self.job, self.folder, self.plan, self.received = job, folder, plan, received
+        # Called with the paths of each launch of this process.
+        self.observe: Callable[[int], None] = lambda paths: None
         self.digest = plan_digest(plan.to_manifest())
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -240,6 +250,7 @@ def render_shard(run: ShardRun, entry: ShardEntry) -> Generator[None, None, dict
         queries, weight = run.draw(entry)
         yield
         began, config = time.perf_counter(), run.job.config
+        run.estimator.observe = run.observe
         # The values depend on seed, split and index, not on the process.
         estimates = estimate_shard(
             run.estimator,
@@ -282,8 +293,8 @@ def render_shards(
     Parameters
     ----------
     runner : maps :func:`render_shard` over the shards
-    progress : called once per shard. Paths per second count from the end of the first shard, once there are
-        others: it compiles the kernels
+    progress : as of :func:`generate`. Paths per second count from the end of the first launch or shard, once
+        there are others: it compiles the kernels
 
     Raises
     ------
@@ -302,6 +313,34 @@ def render_shards(
     items = [Item(file, {"run": run, "entry": entry}) for file, entry in pending.items()]
     busy, failed, row = list[str](), list[Result](), 0
     planned_so_far, traced_so_far = Counter[str](), Counter[str]()
+    launched = 0
+
+    def show() -> None:
+        """Report the paths so far, and their rate."""
+        nonlocal start, first
+        if progress is None:
+            return
+        now, paths = time.perf_counter(), max(traced.paths, launched)
+        # Without the first launch, which compiles; small ones that end together say nothing yet.
+        since, before = (start, first) if now - start >= 1.0 else (began, 0)
+        rate = (paths - before) / max(now - since, 1e-9)
+        if not first:
+            start, first = now, paths
+        where = "" if runner.here else f" on {runner.workers} workers"
+        noise = totals.relative_error() if totals.train else None
+        error = "" if noise is None else f", noise {noise:.2%}"
+        left = _expected_paths(job, list(pending.values()), planned_so_far, traced_so_far)
+        total = None if left is None else max(traced.paths + left, paths)
+        progress(paths, f"{rate_text(rate)}{where}{error}", total)
+
+    def observe(paths: int) -> None:
+        nonlocal launched
+        launched += paths
+        show()
+
+    if items and progress is not None:
+        progress(0.0, "building the scene, compiling kernels, first paths", None)
+    run.observe = observe
     with closing(runner.map(render_shard, items)) as results:
         for done in results:
             if done.locked:
@@ -321,19 +360,7 @@ def render_shards(
                     traced.paths += (paths := done.value["record"]["paths"])
                     planned_so_far[entry.split] += planned_paths(job, [entry])
                     traced_so_far[entry.split] += paths
-            if progress is not None:
-                now = time.perf_counter()
-                # Without the first shard, which compiles; small shards that end together say nothing yet.
-                since, before = (start, first) if now - start >= 1.0 else (began, 0)
-                rate = (traced.paths - before) / max(now - since, 1e-9) / 1e6
-                if not first:
-                    start, first = now, traced.paths
-                where = "" if runner.here else f" on {runner.workers} workers"
-                noise = totals.relative_error() if totals.train else None
-                error = "" if noise is None else f", noise {noise:.2%}"
-                left = _expected_paths(job, list(pending.values()), planned_so_far, traced_so_far)
-                total = None if left is None else traced.paths + left
-                progress(traced.paths, f"{rate:.2f} M paths/s{where}{error}", total)
+            show()
     _refuse_failed(failed, len(pending), runner, folder)
     if busy:
         owner = lock_owner(folder.workspace / busy[0])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,8 @@ from mbtf_core.extras import extra_error, has_extra
 from mbtf_core.files.folders import check_space, owned
 from mbtf_core.pictures import PNG_BYTES, Camera, claim_pictures, tiles_camera, write_display
 from mbtf_core.run.signals import keep_on_interruption
+from mbtf_core.stats import pooled_relative_error
+from mbtf_core.units import rate_text
 from mbtf_gen.config.pictures import PreviewConfig
 from mbtf_gen.forecast import announce
 from mbtf_gen.job import Job
@@ -41,25 +44,42 @@ class _Scene:
     camera: Camera
     omega_i: NDArray[np.float64]
     console: Console
+    size: int
+    spp: int
 
-    def beauty(self, file: Path) -> dict[str, Any]:
-        """Write the path-traced picture; returns what it shows, and its exposure."""
-        options, estimator = self.config.preview, picture_estimator(self.job)
-        paths = self.camera.rows * self.camera.columns * options.spp
+    def beauty(self, file: Path, advance: Callable[[float, str], None]) -> dict[str, Any]:
+        """Write the path-traced picture; returns what it shows, its noise, and its exposure. `advance` is
+        called with the share of its paths that are traced, and their rate."""
+        advance(0.0, "building the scene, compiling kernels")
+        estimator = picture_estimator(self.job)
+        paths = self.camera.rows * self.camera.columns * self.spp
         announce(
             self.console,
             paths,
             lambda: picture_seconds(estimator, self.camera, self.omega_i, paths),
-            PNG_BYTES * options.size**2,
+            PNG_BYTES * self.size**2,
             self.job.material.scatters,
+            f"--size {max(64, self.size // 2)}, --spp {max(2, self.spp // 4 * 2)}",
         )
+        traced, began = 0, time.perf_counter()
+
+        def observe(count: int) -> None:
+            nonlocal traced
+            traced += count
+            advance(traced / paths, rate_text(traced / (time.perf_counter() - began)))
+
+        estimator.observe = observe
         image = render_reference(
-            estimator, self.camera, self.omega_i, kind="pixel", spp=options.spp, seed=self.config.seed
+            estimator, self.camera, self.omega_i, kind="pixel", spp=self.spp, seed=self.config.seed
         )
+        noise = pooled_relative_error(image.value_a.reshape(-1, 3), image.value_b.reshape(-1, 3)).value
         exposure = chosen_exposure(self.config.exposure, [brightness(image.value)])
         write_display(file.with_suffix(""), image.value, exposure)
-        shows = f"the infinite plane from the same camera, path-traced with {options.spp} paths per pixel"
-        return {"shows": shows, "exposure": exposure}
+        shows = (
+            f"the infinite plane from the same camera, path-traced with {self.spp} paths per pixel, noise "
+            f"{noise:.0%} of the mean value"
+        )
+        return {"shows": shows, "relative_noise": noise, "exposure": exposure}
 
     def mesh(self, file: Path, exposure: float) -> dict[str, Any]:
         """Write the picture of the mesh; returns what it shows and its exposure, or the ``fault``."""
@@ -115,7 +135,7 @@ def draw_preview(
             del states["mesh"]
         note_fine_pixels([scene.camera], scene.job.lattice, console)
         inputs |= scene.job.material.digests
-    size = len(states) * PNG_BYTES * config.preview.size**2
+    size = len(states) * PNG_BYTES * config.preview.sizes(fibers=False)[0] ** 2
     check_space(path, size, "reduce --size, or choose another folder with -o")
     keep_on_interruption(f"the finished pictures are kept in {path}")
     found: dict[str, dict[str, Any]] = {}
@@ -137,13 +157,16 @@ def draw_preview(
                 facts = {**maker(file), "of": states[name]}
                 if "fault" not in facts:
                     folder.keep(name, [file], facts)
-            bar.advance(1)
+            bar.update(len(found) + 1, "")
             found[name] = {"file": file, "kept": kept} | {k: v for k, v in facts.items() if k != "of"}
             return found[name]
 
         if scene is not None:
             # The mesh has the exposure of the path-traced picture.
-            exposure = draw("beauty", scene.beauty)["exposure"]
+            def beauty(file: Path) -> dict[str, Any]:
+                return scene.beauty(file, lambda share, note: bar.update(round(share, 2), note))
+
+            exposure = draw("beauty", beauty)["exposure"]
             if "mesh" in states:
                 draw("mesh", lambda file: scene.mesh(file, exposure))
         draw("queries", lambda file: _queries(file, scene, dataset))
@@ -179,17 +202,20 @@ def _scene(config: PreviewConfig, dataset: Dataset | None, console: Console) -> 
             raise
         console.note(f"only the queries are drawn: {error.where}: {error.what}")
         return None
+    size, spp = options.sizes(job.material.scatters)
     camera = tiles_camera(
         options.view.elevation,
         options.view.azimuth,
         tiles=options.tiles,
         aspect=job.material.aspect,
         displacement_range=job.material.thickness,
-        columns=options.size,
+        columns=size,
     )
     omega_i = from_angles(options.light.elevation, options.light.azimuth)
     camera.queries(omega_i, job.material.aspect)  # refuses a view of the horizon
-    return _Scene(config.model_copy(update=dict(job.config)), job, camera, omega_i, console)
+    options = options.model_copy(update={"size": size, "spp": spp})
+    config = config.model_copy(update={**dict(job.config), "preview": options})
+    return _Scene(config, job, camera, omega_i, console, size, spp)
 
 
 def _queries(file: Path, scene: _Scene | None, dataset: Dataset | None) -> dict[str, Any]:

@@ -66,9 +66,12 @@ def skips_pilots(job: Job) -> bool:
     return _training_paths(job) < SMALL_RUN
 
 
-def plan_run(job: Job) -> RunPlan:
-    """Plan a run, by pilots where they pay."""
-    return allocate(job, plan_effects(job, pilots=not skips_pilots(job)))
+def plan_run(job: Job, note: Callable[[str], None] = lambda phase: None) -> RunPlan:
+    """Plan a run, by pilots where they pay; `note` is called with each phase."""
+    note("building the scene, compiling kernels, pilot paths of the effects")
+    effects = plan_effects(job, pilots=not skips_pilots(job))
+    note("pilot paths of noise and highlights")
+    return allocate(job, effects)
 
 
 def allocate(job: Job, effects: EffectsPlan) -> RunPlan:

@@ -7,6 +7,8 @@ number in the shard, so values do not depend on how queries are grouped into lau
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable, Iterator
 from typing import Any, Protocol
 
 import drjit as dr
@@ -30,6 +32,10 @@ from mbtf_gen.sampling.sobol import SobolSampler, sequence
 
 # Paths per launch: enough to fill any machine, few enough to fit into memory.
 LAUNCH_PATHS = 1 << 20
+# Paths of the first launch. Launches grow twofold while one takes less than the first time, in seconds, and
+# shrink after one that takes longer than the second.
+FIRST_LAUNCH = 1 << 15
+_SHORT, _LONG = 2.0, 8.0
 # Passes in which non-finite samples are drawn again before the run stops.
 MAX_RESAMPLES = 4
 
@@ -56,11 +62,12 @@ class Estimator:
     light : smoothed directional light; None for constant radiance 1, from below as well where rays can pass
         through the tile (white furnace)
     transport : effects that are simulated
-    launch : paths per kernel launch; does not change the values
+    launch : paths per kernel launch at most; does not change the values
 
     Attributes
     ----------
     holes : whether rays can pass through the tile, so that the transmittance is estimated
+    observe : called with the paths of each launch once it is traced
     """
 
     def __init__(
@@ -70,6 +77,8 @@ class Estimator:
         self.light = light
         self.transport = transport
         self.launch = launch
+        self.observe: Callable[[int], None] = lambda paths: None
+        self._size = FIRST_LAUNCH
         self.holes = bool(tile.surface.parts.opacity) or tile.geometry.open
         self._sensor = mi.load_dict(
             {"type": "mbtf_queries", "unit": tile.unit, "aspect": tile.aspect, "start": CLEARANCE}
@@ -135,7 +144,7 @@ class Estimator:
                 late,
                 lights,
             ).estimates(path_variance)
-            for rows in _launches(shared, max(1, self.launch // lights))
+            for rows in self._launches(shared, lights)
         ]
 
         def joined(name: str) -> Any:
@@ -157,6 +166,24 @@ class Estimator:
             spp=None if isinstance(spp, int) else counts,
             path_variance=joined("path_variance"),
         )
+
+    def _launches(self, counts: NDArray[np.int64], lights: int) -> Iterator[slice]:
+        """Consecutive groups to trace in one launch: few enough that each ends soon; one group at least."""
+        ends = np.cumsum(counts)
+        start, traced = 0, 0
+        while start < len(counts):
+            size = max(1, min(self._size, self.launch) // lights)
+            stop = max(start + 1, int(np.searchsorted(ends, traced + size, side="right")))
+            began = time.perf_counter()
+            yield slice(start, stop)
+            seconds = time.perf_counter() - began
+            paths = int(ends[stop - 1]) - traced
+            if seconds > _LONG:
+                self._size = max(FIRST_LAUNCH, lights * size // 2)
+            elif seconds < _SHORT and paths > size // 2:
+                self._size = 2 * lights * size
+            start, traced = stop, int(ends[stop - 1])
+            self.observe(paths)
 
 
 class _Launch:
@@ -373,17 +400,6 @@ def _aligned(numbers: NDArray[Any]) -> UInt32:
     copied = mi.UInt32(padded(numbers.astype(np.uint32))) + dr.opaque(mi.UInt32, 0)
     dr.eval(copied)
     return copied
-
-
-def _launches(counts: NDArray[np.int64], launch: int) -> list[slice]:
-    """Consecutive groups that together have at most `launch` paths, or one group that has more."""
-    ends = np.cumsum(counts)
-    out, start, traced = [], 0, 0
-    while start < len(counts):
-        stop = max(start + 1, int(np.searchsorted(ends, traced + launch, side="right")))
-        out.append(slice(start, stop))
-        start, traced = stop, int(ends[stop - 1])
-    return out
 
 
 @dr.syntax

@@ -56,13 +56,13 @@ def cost(
     from mbtf_core.files.folders import owned
     from mbtf_core.run.cluster import open_runner
     from mbtf_core.run.signals import keep_on_interruption
-    from mbtf_core.units import asked_duration
+    from mbtf_core.units import asked_duration, clock
     from mbtf_pipeline.collection.recipes import load
     from mbtf_pipeline.cost.answers import answers
     from mbtf_pipeline.cost.measurement import pareto_front
     from mbtf_pipeline.cost.page import write_page
     from mbtf_pipeline.cost.plan import plan_study
-    from mbtf_pipeline.cost.study import rounded, run_study
+    from mbtf_pipeline.cost.study import run_study
     from mbtf_pipeline.recipe import Recipe
 
     loaded = load(recipe, assignments or [])
@@ -114,6 +114,7 @@ def cost(
         "answers": rows,
         "asked": study.asked or None,
         "least_seconds": study.least,
+        "seconds": study.description["taken"],
         "front": [
             {"seconds": m.seconds.value, "unexplained": m.error.as_dict(), "command": m.command}
             for m in front
@@ -122,14 +123,13 @@ def cost(
     runs = [m for m in study.measurements if m.study == "run"]
     generator = len(study.measurements) - len(runs)
     counts = f"measured: {len(runs)} of complete runs, {generator} of the generator"
-    lines = [f"{page}: configurations {counts}, {len(study.skipped)} without time"]
+    taken = f"planned for {clock(seconds + more)}, took {clock(study.description['taken'])}"
+    lines = [f"{page}: {taken}", f"configurations {counts}"]
+    if study.skipped:
+        lines[-1] += f"; not measured for lack of time: {len(study.skipped)}"
     lines += [f"failed: {text}" for text in study.failed]
     lines += [row["line"] for row in rows]
     lines += [study.asked] if study.asked else []
-    if study.least is not None:
-        lines.append(
-            f"too few complete runs for a forecast: repeat the command with --time {rounded(study.least)}; "
-            "it keeps these runs and adds others"
-        )
+    lines += [study.more] if study.more else []
     lines += [f"  {m.seconds.value:.0f} s: {m.command}" for m in front]
     console.report(data, "\n".join(lines))

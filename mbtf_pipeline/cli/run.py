@@ -119,7 +119,7 @@ def run(
 
             loaded, generated = has_error(preset_recipe(recipe, quality, own), error), None
             if not dry_run and (expected := forecast_left(loaded, folder)) is not None:
-                console.note(expected.describe())
+                console.note(f"{expected.describe()}; faster: --quality draft, or --time 2min")
         else:
             from mbtf_core.units import asked_duration
             from mbtf_pipeline.run_time import TimedRun

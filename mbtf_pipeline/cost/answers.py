@@ -14,7 +14,7 @@ from mbtf_core.forecast import INSUFFICIENT, expected_seconds
 from mbtf_core.stats import Estimate, Interval, LearningCurve
 from mbtf_core.units import clock, format_duration
 from mbtf_pipeline.cost.measurement import Measurement
-from mbtf_pipeline.cost.runs import FEWEST_TOTALS
+from mbtf_pipeline.cost.runs import FEWEST_TOTALS, SLOW_SERIES
 
 # Forecasts reach so many times beyond the work of the longest run.
 FARTHEST = 4.0
@@ -37,18 +37,22 @@ class Evidence:
     ----------
     runs : their measurements, each the mean of its seeds
     deviation : relative standard deviation of a single run over seeds
+    slow : runs of the fewest steps, which follow another law
     """
 
     runs: Sequence[Measurement]
     deviation: Estimate
+    slow: Sequence[Measurement] = ()
 
     @classmethod
     def of(cls, found: Sequence[Measurement], deviation: Estimate) -> Evidence:
         """From the measurements of a study."""
         runs = [m for m in found if m.study == "run" and m.error.value > 0 and m.error.error < m.error.value]
+        slow = [m for m in runs if m.series == SLOW_SERIES]
+        runs = [m for m in runs if m.series != SLOW_SERIES]
         for series, _ in Counter(m.series for m in runs).most_common(1):
             runs = sorted((m for m in runs if m.series == series), key=_work)
-        return cls(runs, deviation)
+        return cls(runs, deviation, slow)
 
     @cached_property
     def work(self) -> list[float]:
@@ -105,7 +109,7 @@ class Evidence:
 def answers(evidence: Evidence) -> list[dict[str, Any]]:
     """What each time gives, measured or forecast: texts for page and console, and numbers for JSON."""
     rows = []
-    for m in evidence.runs:
+    for m in (*evidence.slow, *evidence.runs):
         spent = [m.details[f"{part}_seconds"] for part in ("generation", "training", "overhead")]
         basis = "measured: {:.0f} s generating, {:.0f} s training, {:.0f} s start-up and calibration".format(
             *spent

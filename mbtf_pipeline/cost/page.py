@@ -15,7 +15,7 @@ from mbtf_core.files.editable import write_document
 from mbtf_core.units import clock
 from mbtf_pipeline.cost.answers import Evidence, answers
 from mbtf_pipeline.cost.measurement import Measurement, pareto_front
-from mbtf_pipeline.cost.study import Study, rounded
+from mbtf_pipeline.cost.study import Study
 from mbtf_pipeline.report.plots import Series, plot
 from mbtf_pipeline.report.report import render
 from mbtf_pipeline.tables import Column, Table, is_significant, rows_of
@@ -94,14 +94,20 @@ def _figure(
 
 
 def _front_section(runs: Sequence[Measurement], evidence: Evidence, png: Path) -> dict[str, Any]:
-    """All runs and their Pareto front, the longest one while it trained, and the forecast."""
+    """All runs and their Pareto front, the longest one while it trained, and the forecast; of a single run
+    its numbers."""
     front = pareto_front(runs)
+    table = _table(_RUNS, front).for_page()
+    if len(runs) < 2 and front:
+        png.unlink(missing_ok=True)
+        figure = {"svg": "", "caption": "One complete run was measured; a plot and a Pareto front take two."}
+        return {"figure": figure, "table": table}
 
     def name(m: Measurement) -> str:
         return f"{m.error.value:.2g} in {m.seconds.value:.0f} s" if m in front else ""
 
     axes = "seconds in total, from height map to material", "unexplained variance of test queries"
-    caption = "Names on the front: error and total time."
+    caption = "Labels: error and total time of the runs on the Pareto front."
     series = [_series("complete runs", runs, label=name, style="points")]
     if front and len(stops := front[-1].curve) > 0:
         x, y = zip(*stops, (front[-1].seconds.value, front[-1].error.value), strict=True)
@@ -112,10 +118,8 @@ def _front_section(runs: Sequence[Measurement], evidence: Evidence, png: Path) -
         bounds = [one.value - one.low for one in found], [one.high - one.value for one in found]
         series.append(Series("forecast, 95% interval", x, [one.value for one in found], bounds))
     stepped = [(m.seconds.value, m.error.value) for m in front] if len(front) > 1 else []
-    return {
-        "figure": _figure(series, *axes, png, caption, front=stepped),
-        "table": _table(_RUNS, front).for_page(),
-    }
+    figure = _figure(series, *axes, png, caption, front=stepped)
+    return {"figure": figure, "table": table}
 
 
 def _generator_section(found: Sequence[Measurement], png: Path) -> dict[str, Any]:
@@ -154,11 +158,12 @@ def write_page(study: Study) -> Path:
     html = render(
         "cost.html",
         study=study.description,
-        time=clock(study.description["time"]),
+        planned=clock(study.description["time"]),
+        taken=clock(study.description["taken"]),
         sections=sections,
         answers=answers(evidence),
         asked=study.asked,
-        least=None if study.least is None else rounded(study.least),
+        more=study.more,
         skipped=study.skipped,
         failed=study.failed,
         deviation=f"{study.deviation.scaled(100.0)}%",

@@ -11,12 +11,13 @@ from mbtf_gen.forecast import forecast
 from mbtf_gen.job import Job
 from mbtf_pipeline.cost.answers import FARTHEST
 from mbtf_pipeline.cost.measurement import MeasurementFolder
-from mbtf_pipeline.cost.runs import LEAST_SECONDS, Run, disk_bytes, planned_runs
+from mbtf_pipeline.cost.runs import LEAST_SECONDS, disk_bytes
 from mbtf_pipeline.cost.study import (
     STUDY,
     Measurements,
     conditions_of,
     generator_seconds,
+    no_run,
     rounded,
     study_config,
 )
@@ -38,6 +39,7 @@ class StudyPlan:
     measured : runs that are
     seconds, bytes : that it takes, and on disk
     longest : total seconds of the longest run, measured or not
+    least_run : seconds of a study that measures a run; None where any is measured
     least : seconds of a study that forecasts
     generator : whether it compares configurations of the generator
     """
@@ -47,14 +49,19 @@ class StudyPlan:
     seconds: float
     bytes: int
     longest: float
+    least_run: float | None
     least: float
     generator: bool
 
     def describe(self, asked: float) -> str:
         """Lines: what it measures, and what it can and cannot answer in the time that is asked for."""
-        known = f"; {self.measured} measured already" if self.measured else ""
-        lines = [f"{expectation(self.seconds, self.bytes)}; complete runs{known}:"]
+        known = f", {self.measured} measured already" if self.measured else ""
+        ends = ":" if self.runs else ""
+        expected = expectation(self.seconds, self.bytes)
+        lines = [f"{expected}; complete runs to measure: {len(self.runs) or 'none'}{known}{ends}"]
         lines += [f"  {label}" for label in self.runs]
+        if not self.runs and self.least_run is not None:
+            return "\n".join([*lines, no_run(self.least_run, self.least)])
         lines.append(f"answers: the error after times of up to about {clock(self.longest)}, measured")
         if asked >= self.least:
             far = clock(FARTHEST * self.longest)
@@ -80,24 +87,31 @@ def plan_study(recipe: Recipe, folder: Path, *, seconds: float, seed: int | None
     InputError
         The folder holds something else.
     """
-    STUDY.check(folder)
+    record = STUDY.read(folder) if STUDY.check(folder) else None
     job = Job.load(study_config(recipe.generate, seed))
     spp, pilot = job.config.queries.spp, forecast(job, seconds=1.0)
     conditions = conditions_of(job, folder, seconds)
     found = Measurements(conditions, MeasurementFolder(folder, conditions), Runner())
     if not found.recall_rate(spp):
         found.path_seconds = pilot.query_seconds / spp
-    before = 2.0 * pilot.start + _SETUP_PATHS * found.path_seconds + generator_seconds(seconds)
-    planned = planned_runs(seconds, spp, found.path_seconds)
-    least = found.least_seconds(spp, before) or LEAST_SECONDS
+    setup = 2.0 * pilot.start + _SETUP_PATHS * found.path_seconds
+    if record is not None:
+        setup = record["setup_seconds"]
+    planned = found.plan_runs(seconds, spp)
+    least, least_run = found.least_seconds(spp, setup), found.least_run_seconds(spp, setup)
     measured = [run for run in planned if found.recall(run)]
-    spent, runs = before, list[Run]()
-    for run in planned:
-        if run not in measured and spent + (expected := found.expected_seconds(run)) <= seconds:
-            spent, found.tested = spent + expected, True
-            runs.append(run)
-    planned_seconds = (run.planned_seconds(found.path_seconds) for run in (*measured, *runs))
-    longest = max(planned_seconds, default=0.0) + found.overhead
+    runs, spent = found.fitting(planned, setup + generator_seconds(seconds), seconds)
+    times = (run.planned_seconds(found.path_seconds, found.step_seconds) for run in (*measured, *runs))
+    longest = max(times, default=0.0) + found.overhead
     labels = [f"{run.label}: {run.queries:,} queries × {spp} paths" for run in runs]
     generator = seconds >= _COMPARISONS * LEAST_SECONDS
-    return StudyPlan(labels, len(measured), spent, disk_bytes(runs), longest, least, generator)
+    return StudyPlan(
+        labels,
+        len(measured),
+        spent,
+        disk_bytes(runs),
+        longest,
+        least_run,
+        least or LEAST_SECONDS,
+        generator,
+    )

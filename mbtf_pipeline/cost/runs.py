@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 import os
+import shlex
 import shutil
 import socket
 import time
@@ -29,8 +30,8 @@ from mbtf_core.config.settings import deep_merge, nested
 from mbtf_core.data.shard_files import row_bytes
 from mbtf_core.files.atomic import data_sha256
 from mbtf_core.stats import Estimate, unexplained_variance
-from mbtf_core.units import parse_duration
 from mbtf_fit.config import DEFAULT_MODEL, best_options
+from mbtf_fit.sections import TimeBudget
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.run import generate
 from mbtf_gen.job import Job
@@ -51,6 +52,10 @@ GENERATOR, RUNS = 0.1, 0.7
 SHORTEST = 6.0
 SHARE, OTHER_SHARES = 0.35, (0.6, 0.15)
 _FEWEST_QUERIES = 20_000
+# Fewest training steps of a run: the error of a shorter fit says nothing about longer ones.
+FEWEST_STEPS = 200
+# Series of a run for which they took longer than planned.
+SLOW_SERIES = f"{FEWEST_STEPS} training steps"
 # Fewest total times that tell how the error falls, and the study's seconds in which they are measured.
 FEWEST_TOTALS = 3
 LEAST_SECONDS = SHORTEST * (2**FEWEST_TOTALS - 1 + 2 ** (FEWEST_TOTALS - 1) - 1) / RUNS
@@ -91,15 +96,17 @@ class Run(Configuration):
     def key(self) -> dict[str, Any]:
         return {"queries": self.queries, "spp": self.spp, "seed": self.seed, "fit": self.fit}
 
-    def planned_seconds(self, path_seconds: float) -> float:
-        """Seconds of generating and training, from those of a path."""
-        return self.queries * self.spp * path_seconds + parse_duration(self.fit["training.time"])
+    def planned_seconds(self, path_seconds: float, step_seconds: float = 0.0) -> float:
+        """Seconds of generating and training, from those of a path and of a training step."""
+        training = TimeBudget.parse(self.fit["training.time"]).seconds
+        return self.queries * self.spp * path_seconds + max(training, FEWEST_STEPS * step_seconds)
 
     def command(self, conditions: Conditions) -> str:
         """The commands that reproduce it; the test split is that of the recipe."""
         seed = conditions.config.seed + self.seed
         own = f" --seed {seed}" if self.seed else ""
-        flags = "".join(f" --set {k}={v}" for k, v in (self.fit | ({"seed": seed} if seed else {})).items())
+        options = self.fit | ({"seed": seed} if seed else {})
+        flags = "".join(f" --set {shlex.quote(f'{k}={v}')}" for k, v in options.items())
         return (
             f"{conditions.command} --queries {self.queries} --spp {self.spp}{own} -o shards/ && "
             f"mbtf-fit shards/{flags} -o material/"
@@ -172,15 +179,23 @@ def _error(fitted: Material | Trainer, test: ShardQueries) -> Estimate:
     return unexplained_variance(fitted.predict(test), test.value_a, test.value_b, test.weight)
 
 
-def planned_runs(seconds: float, spp: int, path_seconds: float) -> list[Run]:
+def shortest_total(step_seconds: float) -> float:
+    """Shortest total time of a run that has the fewest steps of `step_seconds` each."""
+    total = SHORTEST
+    while (1 - SHARE) * total < FEWEST_STEPS * step_seconds:
+        total *= 2
+    return total
+
+
+def planned_runs(seconds: float, spp: int, path_seconds: float, step_seconds: float = 0.0) -> list[Run]:
     """All runs of a study of some seconds, in the order of measuring, with `spp` paths per query of
-    `path_seconds` each.
+    `path_seconds` each, and no fewer training steps than :data:`FEWEST_STEPS` of `step_seconds` each.
 
     Total times double: first each of them, then a second seed of all but the longest. The time that is then
     left goes to other shares of generating, shortest first, and to further second seeds.
     """
     left = seconds * RUNS
-    totals = [SHORTEST]
+    totals = [shortest_total(step_seconds)]
     while 2 * sum(totals) + 2 * totals[-1] <= left:
         totals.append(2 * totals[-1])
     others = list(product(OTHER_SHARES, (0, 1)))
@@ -188,7 +203,7 @@ def planned_runs(seconds: float, spp: int, path_seconds: float) -> list[Run]:
     order += [(total, share, seed) for total in totals for share, seed in sorted(others, key=itemgetter(1))]
     runs: list[Run] = []
     for total, share, seed in order:
-        if runs and total > left:
+        if runs and (total > left or (1 - share) * total < FEWEST_STEPS * step_seconds):
             continue
         left -= total
         queries = round_down(max(_FEWEST_QUERIES, share * total / (spp * path_seconds)))
@@ -196,7 +211,7 @@ def planned_runs(seconds: float, spp: int, path_seconds: float) -> list[Run]:
         fit = {
             "model": DEFAULT_MODEL,
             **best_options(training),
-            "training.time": f"{round(training, 1):.15g}s",
+            "training.time": str(TimeBudget(round(training, 1), FEWEST_STEPS)),
         }
         series = f"{100 * share:.0f}% of the time for generating"
         runs.append(Run("run", series, f"planned for {total:g} s", queries, spp, fit, seed))

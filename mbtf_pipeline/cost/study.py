@@ -47,10 +47,13 @@ from mbtf_pipeline.cost.runs import (
     GENERATOR,
     LEAST_SECONDS,
     MOST_SEEDS,
+    SHORTEST,
+    SLOW_SERIES,
     TEST,
     Run,
     disk_bytes,
     planned_runs,
+    shortest_total,
     test_set,
 )
 from mbtf_pipeline.recipe import Recipe
@@ -63,6 +66,8 @@ WORK = ".work"
 _CONFIGURATIONS = 35
 # Seconds by which a run exceeds generating and training, until one has been measured.
 OVERHEAD = 12.0
+# By how much the generator's configurations exceed their share, as kernels are compiled.
+_COMPILING = 1.2
 _RESUMES = "the same command resumes"
 
 
@@ -71,7 +76,7 @@ class Study:
     """What a study has measured."""
 
     folder: Path
-    # Name, command, time, seed, machine and date.
+    # Name, command, planned time and time taken, seed, machine and date.
     description: dict[str, Any]
     # One per configuration.
     measurements: list[Measurement] = field(default_factory=list)
@@ -80,14 +85,27 @@ class Study:
     # Configurations for which no time was left, and runs that failed, with the reason.
     skipped: list[str] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
-    # Forecast of the error that was asked for; seconds of a study that forecasts, None where this one does.
+    # Forecast of the error that was asked for.
     asked: str = ""
+    # Seconds of a study that measures a run, and of one that forecasts; None where this one does.
+    least_run: float | None = None
     least: float | None = None
 
     @cached_property
     def evidence(self) -> Evidence:
         """What the complete runs say of other times and errors."""
         return Evidence.of(self.measurements, self.deviation)
+
+    @property
+    def more(self) -> str:
+        """Which longer study would measure a run or forecast, in one sentence; empty where this one does."""
+        if self.least is None:
+            return ""
+        if self.least_run is not None:
+            return no_run(self.least_run, self.least)
+        enough = self.least <= self.description["time"]
+        how = "the same command" if enough else f"the command with --time {rounded(self.least)}"
+        return f"too few complete runs for a forecast: repeat {how}; it keeps these runs and adds others"
 
 
 def claim(folder: Path, on: Mapping[str, str]) -> None:
@@ -115,6 +133,14 @@ def rounded(seconds: float) -> str:
     return format_duration(unit * math.ceil(seconds / unit))
 
 
+def no_run(least_run: float, least: float) -> str:
+    """That a study has no time for a complete run, and the times of those that have."""
+    return (
+        f"no complete run fits into the time: one takes --time {rounded(least_run)}, and a forecast "
+        f"--time {rounded(least)}"
+    )
+
+
 def too_short(seconds: float, least: float) -> str:
     """Warning of a study that is too short for forecasts."""
     return (
@@ -140,7 +166,7 @@ class Measurements:
     conditions, store, runner : what measures, and where the results are kept
     note : called when a configuration is taken, with its label and the time that it is expected to take
     failed : why runs failed
-    path_seconds : seconds of generating a query over its number of paths
+    path_seconds, step_seconds : seconds of generating a query over its number of paths; of a training step
     """
 
     conditions: Conditions
@@ -150,6 +176,7 @@ class Measurements:
     found: dict[str, Measurement] = field(default_factory=dict)
     failed: dict[str, str] = field(default_factory=dict)
     path_seconds: float = 0.0
+    step_seconds: float = 0.0
     # Taken, but not measured yet.
     _pending: dict[str, Configuration] = field(default_factory=dict)
     # Whether a run has made the test set.
@@ -179,6 +206,15 @@ class Measurements:
             self.path_seconds = path_seconds(found, spp)
         return bool(found)
 
+    def plan_runs(self, seconds: float, spp: int) -> list[Run]:
+        """The runs of a study: the first one, by whose steps the others are planned once it is measured."""
+        first = planned_runs(0.0, spp, self.path_seconds)[0]
+        if self.recall(first):
+            self.step_seconds = _step_seconds(self.found[first.label])
+        runs = planned_runs(seconds, spp, self.path_seconds, self.step_seconds)
+        # With its few queries it follows another law than the others.
+        return runs if first in runs else [replace(first, series=SLOW_SERIES), *runs]
+
     def recall(self, configuration: Configuration) -> bool:
         """Whether a measurement is stored; it then counts as found."""
         stored = self.store.get(configuration)
@@ -188,7 +224,7 @@ class Measurements:
 
     def _add(self, configuration: Configuration, measurement: Measurement) -> None:
         if isinstance(configuration, Run) and configuration.label not in self.found:
-            planned = configuration.planned_seconds(self.path_seconds)
+            planned = configuration.planned_seconds(self.path_seconds, _step_seconds(measurement))
             self._besides.append(measurement.details["run_seconds"] - planned)
         self.found[configuration.label] = measurement
 
@@ -229,19 +265,48 @@ class Measurements:
             self.store.put(configuration, done.value)
             self.tested = self.tested or isinstance(configuration, Run)
 
+    @property
+    def test_seconds(self) -> float:
+        """Expected seconds of making the test set."""
+        return TEST[0] * TEST[1] * self.path_seconds
+
     def expected_seconds(self, run: Run) -> float:
         """Expected seconds of measuring a run, the first one with the test set."""
-        test = 0.0 if self.tested else TEST[0] * TEST[1] * self.path_seconds
-        return run.planned_seconds(self.path_seconds) + test + self.overhead
+        planned = run.planned_seconds(self.path_seconds, self.step_seconds)
+        return planned + (0.0 if self.tested else self.test_seconds) + self.overhead
 
-    def least_seconds(self, spp: int, before: float) -> float | None:
+    def fitting(self, runs: Sequence[Run], before: float, seconds: float) -> tuple[list[Run], float]:
+        """The runs that are not measured yet and are expected to fit into a time, after `before` seconds
+        without runs; and the seconds of everything."""
+        found, spent, test = list[Run](), before, 0.0 if self.tested else self.test_seconds
+        for run in runs:
+            after = spent + run.planned_seconds(self.path_seconds, self.step_seconds) + self.overhead + test
+            if not self.recall(run) and after <= seconds:
+                found.append(run)
+                spent, test = after, 0.0
+        return found, spent
+
+    def least_seconds(self, spp: int, setup: float) -> float | None:
         """Seconds of a study that measures runs of enough lengths for a forecast, by what runs have taken on
-        this machine, after `before` seconds without runs; None where they are measured."""
-        needed = planned_runs(LEAST_SECONDS, spp, self.path_seconds)[:FEWEST_TOTALS]
+        this machine, after `setup` seconds of loading and reference; None where they are measured."""
+        enough = LEAST_SECONDS * shortest_total(self.step_seconds) / SHORTEST
+        needed = planned_runs(enough, spp, self.path_seconds, self.step_seconds)[:FEWEST_TOTALS]
         missing = [run for run in needed if not self.recall(run)]
-        test = sum(self.expected_seconds(run) for run in missing[:1])
-        rest = sum(run.planned_seconds(self.path_seconds) + self.overhead for run in missing[1:])
-        return max(LEAST_SECONDS, before + test + rest) if missing else None
+        return max(LEAST_SECONDS, self._study_seconds(missing, setup)) if missing else None
+
+    def least_run_seconds(self, spp: int, setup: float) -> float | None:
+        """Likewise of a study that measures one run; None where any is measured."""
+        return (
+            None if self._besides else self._study_seconds(planned_runs(0.0, spp, self.path_seconds), setup)
+        )
+
+    def _study_seconds(self, runs: Sequence[Run], setup: float) -> float:
+        """Seconds of a study that has time for some runs, and makes the test set anew."""
+        planned = (run.planned_seconds(self.path_seconds, self.step_seconds) for run in runs)
+        needed = setup + self.test_seconds + sum(planned) + len(runs) * self.overhead
+        # Of what exceeds the least time of all machines, the generator gets its share.
+        share = _COMPILING * GENERATOR
+        return max(needed, (needed - share * LEAST_SECONDS) / (1.0 - share))
 
     def fits(self, run: Run, seconds: float) -> bool:
         """Whether the workers can begin and finish a run in a time, besides those that they have taken."""
@@ -273,6 +338,10 @@ class Measurements:
                 return own == run.seed < seeds and NORMAL * deviation / math.sqrt(own) > HALF_WIDTH
 
             self.measure(missing([replace(run, seed=seed) for run in first], wide), independent=True)
+
+
+def _step_seconds(run: Measurement) -> float:
+    return run.details["training_seconds"] / run.details["training_steps"]
 
 
 def generator_seconds(seconds: float) -> float:
@@ -353,24 +422,25 @@ def run_study(
             raise PartialError(f"no worker answers: {there.error}", hint=there.hint or _RESUMES)
         claim(folder, there.value)
         conditions = conditions_of(job, folder, seconds)
-        note("reference")
+        note("reference, which compiles the kernels")
         # Before anything is written: a refused study leaves the folder as it was.
         benchmark_of(conditions).check_variation()
         description = {
             "name": recipe.name,
             "command": command,
-            "time": seconds,
+            "time": seconds + refine,
             "seed": config.seed,
             "material": config.material,
             "date": time.strftime("%Y-%m-%d"),
             "machine": there.value,
         }
+        setup = description["setup_seconds"] = spent()
         STUDY.write(folder, description)
         write_document(folder / CONFIG_NAME, dump_yaml(config.model_dump(mode="json")))
         measurements = Measurements(conditions, MeasurementFolder(folder, conditions), runner, note)
         configurations = measurements.configurations
         # Configurations take longer than their share where kernels are compiled; workers start anew.
-        until = 1.2 * generator_seconds(seconds) + (0.0 if runner.here else spent())
+        until = _COMPILING * generator_seconds(seconds) + (0.0 if runner.here else spent())
 
         def missing() -> Iterator[Configuration]:
             for number, configuration in enumerate(configurations):
@@ -379,20 +449,26 @@ def run_study(
 
         try:
             measurements.measure(missing(), independent=False)
-            measurements.recall_rate(config.queries.spp)
-            runs = planned_runs(seconds, config.queries.spp, measurements.path_seconds)
+            spp = config.queries.spp
+            measurements.recall_rate(spp)
+            runs = measurements.plan_runs(seconds, spp)
             size = disk_bytes(runs) * runner.workers
             check_space(folder, size, "give a shorter --time, or choose another folder with -o")
-            announce(expectation(seconds + refine, size))
-            before = spent()
-            least = measurements.least_seconds(config.queries.spp, before)
+            _, expected = measurements.fitting(runs, spent(), seconds)
+            announce(expectation((expected if runner.here else seconds) + refine, size))
+
+            def fits(run: Run) -> bool:
+                return measurements.fits(run, seconds + (refine if run.seed else 0.0) - spent())
+
+            # The first run measures how long runs and training steps take here.
+            measurements.measure_runs(runs[:1], fits)
+            runs = measurements.plan_runs(seconds, spp)
+            least = measurements.least_seconds(spp, setup)
             if least is not None and seconds < least:
                 announce(too_short(seconds, least))
-            measurements.measure_runs(
-                runs,
-                lambda run: measurements.fits(run, seconds + (refine if run.seed else 0.0) - spent()),
-                MOST_SEEDS if refine else 0,
-            )
+            measurements.measure_runs(runs, fits, MOST_SEEDS if refine else 0)
+            description["taken"] = spent()
+            STUDY.write(folder, description)
         finally:
             shutil.rmtree(conditions.folder, ignore_errors=True)
             for kept in (benchmark_of, test_set):
@@ -409,5 +485,6 @@ def run_study(
         deviation,
         [c.label for c in (*configurations, *first) if c.label not in known and c.label not in failed],
         [f"{label}: {why}" for label, why in failed.items()],
-        least=measurements.least_seconds(config.queries.spp, before),
+        least_run=measurements.least_run_seconds(spp, setup),
+        least=measurements.least_seconds(spp, setup),
     )

@@ -47,6 +47,8 @@ class FakeRuns:
             raise InputError("training diverged at step 7")
         error = TRUE * self.shift * (1 + self.seeds * self.random.normal())
         seconds = run.planned_seconds(0.0)
+        details = {"run_seconds": seconds + 1.0, "seed": float(run.seed), "queries": 1e6, "spp": 4.0}
+        details |= {"training_seconds": seconds, "training_steps": 1000 * seconds}
         return Measurement(
             run.study,
             run.series,
@@ -54,7 +56,7 @@ class FakeRuns:
             f"command of {run.label}",
             Estimate(seconds, 0.0, 1),
             Estimate(error, self.test * error, 1000),
-            details={"run_seconds": seconds + 1.0, "seed": float(run.seed), "queries": 1e6, "spp": 4.0},
+            details=details,
         )
 
 

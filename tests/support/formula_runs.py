@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +46,8 @@ class Formula:
         return Estimates(value, value, None, self.more * len(value) * spp, 1, 2, len(self.bad), self.bad)
 
 
-def cheap_plan(job: Job) -> RunPlan:
+def cheap_plan(job: Job, note: Callable[[str], None] = lambda phase: None) -> RunPlan:
+    note("pilot paths")
     return RunPlan(reference_plan(job))
 
 

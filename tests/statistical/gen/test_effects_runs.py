@@ -128,7 +128,7 @@ def test_resumed_and_sliced_runs_follow_the_plan_of_the_manifest(
     manifest["effects"] = stored.to_manifest()
     write_checksummed(out / "manifest.json", manifest)
 
-    def never(job: Job) -> RunPlan:
+    def never(*_: Any) -> RunPlan:
         raise AssertionError("planned again although the manifest has a plan")
 
     monkeypatch.setattr("mbtf_gen.generation.run.plan_run", never)

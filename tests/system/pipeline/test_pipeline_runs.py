@@ -197,9 +197,11 @@ def test_a_cost_study_measures_reports_and_resumes(
     some, runs = 2, 0
     all_of = generator_configurations
     monkeypatch.setattr(study, "generator_configurations", lambda benchmark: islice(all_of(benchmark), some))
-    monkeypatch.setattr(study, "planned_runs", lambda *arguments: planned_runs(30.0, *arguments[1:])[:runs])
+    monkeypatch.setattr(study, "planned_runs", lambda *arguments: planned_runs(30.0, *arguments[1:])[:1])
+    monkeypatch.setattr(study.Measurements, "fits", lambda *_: runs > 0)
     monkeypatch.setattr(study, "_CONFIGURATIONS", 1000)
     monkeypatch.setattr("mbtf_pipeline.cost.runs.SHORTEST", 4.0)
+    monkeypatch.setattr("mbtf_pipeline.cost.runs.FEWEST_STEPS", 2)
     monkeypatch.setattr("mbtf_pipeline.cost.runs.TEST", (16384, 32))
     out = tmp_path / "study"
     # Long enough never to decide what is measured.
@@ -221,6 +223,6 @@ def test_a_cost_study_measures_reports_and_resumes(
     assert "mbtf-fit shards/" in point["command"]
     html = (out / "cost.html").read_text()
     assert not loads(html).external
-    for text in ("Paths per query", "if stopped early", "--time 1h"):
+    for text in ("Paths per query", "One complete run was measured", "--time 1h"):
         assert text in html
     assert len((out / "cost.csv").read_text().splitlines()) == 1 + 4

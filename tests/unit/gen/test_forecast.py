@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -125,6 +126,15 @@ def test_a_target_error_decides_paths_and_seconds(faked: None) -> None:
         assert found.relative_error == pytest.approx(0.8 / np.sqrt(stored) / 0.25, rel=0.1)
         lines = found.describe(split_target(job.config, "train")).splitlines()
         assert f"{stored:.0f} paths per training query for an error of 8.00% of" in lines[1]
+
+
+def test_a_forecast_of_slow_paths_is_short(faked: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of cloth on a busy machine."""
+    monkeypatch.setattr(sys.modules[__name__], "RATE", 5e3)
+    job = job_of(train="1000000", spp=8, test="20000", test_spp=64)
+    found = forecast(job, RunPlan(plan_effects(job, pilots=False)), seconds=1.0)
+    assert found.seconds == pytest.approx(found.paths / RATE, rel=1e-6)
+    assert module.time.now < 6.0  # type: ignore[attr-defined]
 
 
 def test_bytes_are_those_of_the_arrays(tmp_path: Path) -> None:

@@ -43,7 +43,7 @@ def test_a_run_is_complete_and_counts(config: GeneratorConfig, out: Path) -> Non
     seen: list[float] = []
     summary = generate(config, out, progress=lambda done, note, total: seen.append(done))
     # Progress counts paths: a test query takes twice as many as a training query.
-    assert seen == [80, 160, 200, 320]
+    assert seen == [0, 0, 80, 160, 200, 320]
     assert (summary.complete, summary.queries, summary.paths) == (True, 130, 100 * 2 + 30 * 4)
     assert summary.splits == {"train": 100, "test": 30}
     assert (summary.lost, summary.capped, summary.nonfinite) == (4, 8, 4)
@@ -118,8 +118,31 @@ def test_progress_counts_traced_paths(config: GeneratorConfig, engine: Formula, 
     summary = generate(config, out, progress=lambda done, note, total: seen.append((done, total)))
     # The test split, of 120 planned paths, comes last: until then it counts as planned.
     train, test = 7 * 200, 7 * 120
-    assert seen == [(560, train + 120), (1120, train + 120), (train, train + 120), (train + test,) * 2]
+    expected = [(560, train + 120), (1120, train + 120), (train, train + 120), (train + test,) * 2]
+    assert seen == [(0, None)] * 2 + expected
     assert summary.paths == train + test
+
+
+def test_progress_names_the_phases_and_counts_launches(
+    config: GeneratorConfig, engine: Formula, monkeypatch: pytest.MonkeyPatch, out: Path
+) -> None:
+    """The first shard of slow paths takes minutes."""
+    estimate = engine.estimate
+
+    def launched(queries: Any, spp: int, stream: Any) -> Any:
+        for _ in range(2):
+            engine.observe(len(queries.sigma) * spp // 2)  # type: ignore[attr-defined]
+        return estimate(queries, spp, stream)
+
+    monkeypatch.setattr(engine, "estimate", launched)
+    seen: list[tuple[float, str, float | None]] = []
+    generate(config, out, progress=lambda *now: seen.append(now))
+    assert [note.split(",")[0] for _, note, _ in seen[:2]] == ["pilot paths", "building the scene"]
+    done = [paths for paths, _, _ in seen]
+    assert done == sorted(done)
+    assert {40, 80, 120, 160, 180, 200, 260, 320} <= set(done)
+    assert all("paths/s" in note for _, note, _ in seen[2:])
+    assert {total for _, _, total in seen[2:]} == {320}
 
 
 def test_too_many_nonfinite_samples_fail_the_run(config: GeneratorConfig, engine: Formula, out: Path) -> None:
@@ -280,7 +303,7 @@ def test_paths_left_are_those_of_unfinished_shards(
     seen: list[tuple[float, float | None]] = []
     generate(config, out, progress=lambda done, note, total: seen.append((done, total)))
     # Finished shards do not count, so that the time left is not underestimated.
-    assert seen == [(80, 240), (120, 240), (240, 240)]
+    assert seen == [(0, None), (80, 240), (120, 240), (240, 240)]
     assert left_of(job, out) == 0
     assert len(unfinished(job, out, overwrite=True)) == len(job.shards)
 

@@ -38,7 +38,7 @@ def write_while_planning(patch: pytest.MonkeyPatch, out: Path, job: Job, plan: R
     record = geometry_record(geometry_of(job, plan.effects))
     content = checksummed(build_manifest(job, plan, record))
 
-    def plan_run(job: Job) -> RunPlan:
+    def plan_run(job: Job, note: Any) -> RunPlan:
         out.mkdir()
         assert create_file(out / "manifest.json", content)
         return cheap_plan(job)

@@ -16,6 +16,7 @@ from mbtf_core.errors import InputError
 from mbtf_core.pictures import Camera
 from mbtf_core.run.processes import run_child
 from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.config.pictures import PreviewSection
 from mbtf_gen.job import Job
 from mbtf_gen.pictures import mesh
 from mbtf_gen.pictures.mesh import MOST_CELLS, draw, tiled_mesh
@@ -130,6 +131,14 @@ def test_unfinished_shards_are_left_out(tmp_path: Path) -> None:
         (tmp_path / "set" / name).unlink()
     with pytest.raises(InputError, match="no finished train shard"):
         stored_queries(dataset)
+
+
+def test_cloth_gets_smaller_pictures_unless_asked_otherwise() -> None:
+    assert PreviewSection().sizes(fibers=False) == (640, 16)
+    size, spp = PreviewSection().sizes(fibers=True)
+    # A minute at the 15 000 paths per second of two busy cores.
+    assert size**2 * spp < 60 * 15_000
+    assert PreviewSection(size=512, spp=64).sizes(fibers=True) == (512, 64)
 
 
 def test_a_crash_while_drawing_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

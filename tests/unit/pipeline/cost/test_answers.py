@@ -20,7 +20,7 @@ from mbtf_pipeline.cost import forecast as module
 from mbtf_pipeline.cost.answers import Evidence, answers
 from mbtf_pipeline.cost.forecast import forecast_errors, has_error
 from mbtf_pipeline.cost.measurement import Measurement, combined, seed_deviation
-from mbtf_pipeline.cost.runs import LEAST_SECONDS, planned_runs
+from mbtf_pipeline.cost.runs import LEAST_SECONDS, SLOW_SERIES, planned_runs
 from mbtf_pipeline.cost.study import too_short
 from mbtf_pipeline.recipe import Recipe, load_recipe
 from mbtf_pipeline.run_time import RunForecaster
@@ -88,6 +88,11 @@ def test_answers_are_measured_or_forecast_for_up_to_four_times_as_long() -> None
     assert [row["time"] for row in answers(few)] == ["0:10", "0:20"]
     assert "runs of 3 lengths are needed" in few.time_of(0.1)
     assert answers(Evidence.of([], few.deviation)) == []
+    # The run of the fewest steps is an answer, too, but no evidence.
+    slow = replace(evidence().runs[0], series=SLOW_SERIES)
+    with_slow = Evidence.of([slow, *few.runs], few.deviation)
+    assert [row["time"] for row in answers(with_slow)] == ["0:10", "0:10", "0:20"]
+    assert with_slow.curve is None
 
 
 def test_forecasts_of_short_studies_contain_the_truth() -> None:

@@ -16,7 +16,7 @@ from mbtf_pipeline.cost.study import Study
 from mbtf_pipeline.report.plots import Series, plot
 
 DESCRIPTION = {
-    "name": "a study", "machine": {"system": "a machine"}, "date": "today", "time": 600.0,
+    "name": "a study", "machine": {"system": "a machine"}, "date": "today", "time": 600.0, "taken": 273.0,
     "material": "rock", "command": "mbtf-pipeline cost rock",
 }  # fmt: skip
 
@@ -50,19 +50,24 @@ def test_an_undefined_error_is_shown_as_such(tmp_path: Path) -> None:
 
 
 def test_one_run_is_an_answer_without_a_front(tmp_path: Path) -> None:
-    """Its plot is that of the run while it trained; a comparison of one configuration is left out."""
+    """Neither has a comparison of one configuration a plot."""
     run, paths = measured("run", 10.0, 0.3), measured("paths", 1.0, 0.3)
     study = Study(tmp_path, DESCRIPTION, [paths, run], skipped=["paths, 8 paths"], least=131.0)
     page = write_page(study).read_text()
     assert list(tmp_path.glob("*.png")) == []
+    assert "planned for 10:00 and took 4:33" in page
+    assert "One complete run was measured" in page
+    assert page.count("Pareto front") == 1
+    assert "<td>700</td>" in page
     assert 'id="paths"' not in page
     assert '<td>0:10</td><td class="text">0.300 ± 0.010</td>' in page
-    assert "with <code>--time 140s</code>" in page
+    assert "Too few complete runs for a forecast: repeat the same command; it keeps" in page
     assert "Not measured: 1 configuration, for" in page
     study.measurements[1] = replace(run, curve=((6.0, 0.5), (8.0, 0.4)))
+    study.description = {**DESCRIPTION, "time": 60.0}
     page = write_page(study).read_text()
-    assert "the longest of them, if stopped early" in page
-    assert "Pareto front</text>" not in page
+    assert list(tmp_path.glob("*.png")) == []
+    assert "repeat the command with --time 140s;" in page
 
 
 def test_forecasts_are_marked_as_such(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from mbtf_core.files import folders
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item, Result, packed, run_task
 from mbtf_core.stats import Estimate
+from mbtf_core.units import parse_duration
 from mbtf_pipeline.cli.app import app
 from mbtf_pipeline.cost import plan as plan_module
 from mbtf_pipeline.cost import study as module
@@ -105,7 +106,8 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
         if self.name == "diverges":
             raise InputError("training diverged at step 7")
         found.append((self.name, self.seed))
-        return point(5.0, 0.1 + 0.03 * self.seed + 0.01 * len(self.name), run_seconds=24.0)
+        spent = {"run_seconds": 24.0, "training_seconds": 5.0, "training_steps": 5000.0}
+        return point(5.0, 0.1 + 0.03 * self.seed + 0.01 * len(self.name), **spent)
 
     monkeypatch.setattr(Run, "measure", measure)
     return found
@@ -201,8 +203,12 @@ def test_a_study_keeps_its_time_and_resumes(fake: FakeRuns, tmp_path: Path) -> N
         announce=said.append,
         progress=lambda share, note: shown.append((share, note)),
     )
-    # The shortest study that forecasts, by the runs that it takes; the time of the next run.
-    assert "3 lengths take about 242min" in said[-1]
+    # The shortest study that forecasts, by the runs that it takes, of which the generator gets a share; the
+    # time of the next run.
+    assert "3 lengths take about 275min" in said[-1]
+    # Runs take 1 s besides, not the 12 s that were expected.
+    assert "--time 273min" in first.more
+    assert first.description["taken"] == sum(r.planned_seconds(0.0) for r in runs)
     assert "run, neumip, short, about 1:12" in [note for _, note in shown]
     assert shown[-1][0] == 1.0
     assert [share for share, _ in shown] == sorted(share for share, _ in shown)
@@ -226,7 +232,6 @@ def test_a_dry_run_plans_what_a_study_measures(
     """By a pilot of the generator; it writes nothing, and what is measured costs no time."""
     pilot = SimpleNamespace(start=2.0, query_seconds=4e-9)
     monkeypatch.setattr(plan_module, "forecast", lambda *_, **__: pilot)
-    monkeypatch.setattr(plan_module, "planned_runs", module.planned_runs)
     folder = tmp_path / "study"
     command = ["cost", str(RECIPE), "-o", str(folder), "--dry-run"]
     assert main(app, [*command, "--time", "230s"]) == 0
@@ -236,9 +241,12 @@ def test_a_dry_run_plans_what_a_study_measures(
     assert text.splitlines()[0].startswith("expected: about 3:34, ")
     assert re.findall(r"neumip, (.*?):", text) == ["short", "short, seed + 1", "m"]
     assert "up to about 1:12, measured" in text
-    assert "cannot forecast errors of longer times: that takes --time 242min" in text
+    assert "cannot forecast errors of longer times: that takes --time 275min" in text
     assert "cannot tell what effects, mesh and number of paths cost" in text
-    module.run_study(load_recipe(RECIPE, []), folder, seconds=190.0)
+    study = module.run_study(load_recipe(RECIPE, []), folder, seconds=190.0)
+    # Both name the same time.
+    assert main(app, [*command, "--time", "190s", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["least"] == pytest.approx(study.least, rel=1e-8)
     assert main(app, [*command, "--time", "5h", "--json"]) == 0
     plan = json.loads(capsys.readouterr().out)
     assert (plan["measured"], len(plan["runs"])) == (3, 3)
@@ -252,6 +260,49 @@ def test_a_dry_run_plans_what_a_study_measures(
     assert (plan["measured"], plan["runs"]) == (3, [])
     assert plan["longest"] == pytest.approx(61.0, abs=0.1)
     assert plan["seconds"] < 30.0
+
+
+@pytest.mark.parametrize("path_seconds", [2e-7, 1e-5])
+def test_the_times_that_a_dry_run_names_suffice(
+    path_seconds: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """On a fast and on a busy machine."""
+    pilot = SimpleNamespace(start=4.0, query_seconds=4 * path_seconds)
+    monkeypatch.setattr(plan_module, "forecast", lambda *_, **__: pilot)
+
+    def planned(seconds: float) -> plan_module.StudyPlan:
+        return plan_module.plan_study(load_recipe(RECIPE, []), tmp_path / "study", seconds=seconds)
+
+    none = planned(10.0)
+    assert none.runs == []
+    assert none.least_run is not None
+    named = (
+        r"runs to measure: none\nno complete run fits into the time: one takes --time (\w+), and .* (\w+)$"
+    )
+    found = re.search(named, none.describe(10.0))
+    assert found
+    one, three = (planned(parse_duration(time)) for time in found.groups())
+    assert one.runs
+    assert len({label.split(":")[0] for label in three.runs if "seed" not in label}) >= 3
+    assert "a forecast for up to 4 times as long" in three.describe(parse_duration(found[2]))
+
+
+def test_a_slow_first_run_makes_the_others_fewer_and_longer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its fewest steps took longer than planned, so that it does not count among them."""
+    found = Measurements(conditions(), MemoryStore(), Runner(), path_seconds=1e-7)  # type: ignore[arg-type]
+    fast = found.plan_runs(600.0, 4)
+    spent = {"training_seconds": 20.0, "training_steps": 200.0, "run_seconds": 40.0}
+    monkeypatch.setattr(Run, "measure", lambda *_: point(35.0, 0.2, **spent))
+    found.measure_runs(fast[:1], lambda run: True)
+    slow = found.plan_runs(600.0, 4)
+    assert [run.label.split(", ")[1:] for run in slow[:3]] == [
+        ["200 training steps", "planned for 6 s"],
+        ["35% of the time for generating", "planned for 48 s"],
+        ["35% of the time for generating", "planned for 96 s"],
+    ]
+    assert len(slow) < len(fast)
+    # The excess of training is none of the time besides: 6 s are planned, of which 2.1 s generate.
+    assert found.overhead == pytest.approx(40.0 - 20.0 - 2.1, abs=0.1)
 
 
 def test_runs_that_do_not_fit_on_the_disk_are_refused(
