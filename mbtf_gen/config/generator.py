@@ -190,7 +190,7 @@ class QueriesSection(Settings):
         description="share of test queries drawn where highlights are, with weights that keep errors "
         "unbiased; glossy materials need fewer",
     )
-    lights_per_path: Annotated[int, Flag("--lights-per-path")] = Field(
+    lights_per_path: Annotated[int, Flag("--lights-per-path", rare=True)] = Field(
         1,
         ge=1,
         le=64,

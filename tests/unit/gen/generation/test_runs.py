@@ -129,10 +129,10 @@ def test_progress_names_the_phases_and_counts_launches(
     """The first shard of slow paths takes minutes."""
     estimate = engine.estimate
 
-    def launched(queries: Any, spp: int, stream: Any) -> Any:
+    def launched(queries: Any, spp: int, stream: Any, lights: int) -> Any:
         for _ in range(2):
             engine.observe(len(queries.sigma) * spp // 2)  # type: ignore[attr-defined]
-        return estimate(queries, spp, stream)
+        return estimate(queries, spp, stream, lights=lights)
 
     monkeypatch.setattr(engine, "estimate", launched)
     seen: list[tuple[float, str, float | None]] = []

@@ -25,7 +25,7 @@ def test_launches_grow_until_one_takes_seconds(
     estimator: Any = SimpleNamespace(launch=1 << 20, _size=module.FIRST_LAUNCH, observe=observed.append)
     counts = np.full(1 << 19, 8, np.int64)
     queries = 0
-    for rows in module.Estimator._launches(estimator, counts):
+    for rows in module.Estimator._launches(estimator, counts, 1):
         assert rows.start == queries
         queries = rows.stop
         clock.now += 8 * (rows.stop - rows.start) / rate
@@ -34,6 +34,6 @@ def test_launches_grow_until_one_takes_seconds(
     assert (observed[0], max(observed)) == (module.FIRST_LAUNCH, largest)
     assert max(observed) / rate < longest
     # Another process begins to use the machine.
-    for rows in module.Estimator._launches(estimator, counts):
+    for rows in module.Estimator._launches(estimator, counts, 1):
         clock.now += 8 * (rows.stop - rows.start) / 1e3
     assert observed[-2] == module.FIRST_LAUNCH
