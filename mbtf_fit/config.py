@@ -18,8 +18,8 @@ from mbtf_core.units import parse_duration
 from mbtf_fit.models import NAMES, is_file
 from mbtf_fit.sections import DataSection, HeldOutSection, NetworkSection, TrainingSection
 
-# Context of the validators for the configuration of a material, see :func:`stored_config`.
-_STORED = "stored"
+# Context of the validators for a complete configuration that was stored, see :func:`stored_config`.
+STORED = "stored"
 
 
 def _known(name: object, info: ValidationInfo) -> object:
@@ -29,7 +29,7 @@ def _known(name: object, info: ValidationInfo) -> object:
     ------
     ValueError : there is none of this name
     """
-    if not isinstance(name, str) or name in NAMES or info.context == _STORED:
+    if not isinstance(name, str) or name in NAMES or info.context == STORED:
         return name
     if is_file(name):
         path, _, wanted = name.rpartition(":")
@@ -96,7 +96,7 @@ class FitConfig(Settings):
     @classmethod
     def _preset(cls, data: Any, info: ValidationInfo) -> Any:
         """Fill unset keys with the model's defaults."""
-        if not isinstance(data, Mapping) or info.context == _STORED:
+        if not isinstance(data, Mapping) or info.context == STORED:
             return data
         from mbtf_fit.models.registry import defaults_of
 
@@ -112,7 +112,7 @@ class FitConfig(Settings):
         from mbtf_fit.models.model import SPECIAL
         from mbtf_fit.models.registry import defaults_of, model_class, with_option
 
-        if info.context == _STORED:
+        if info.context == STORED:
             return self
         model = model_class(self.model)
         mine = dict(leaves(self.model_dump()))
@@ -160,7 +160,7 @@ def stored_config(data: Mapping[str, Any], where: Path) -> FitConfig:
     ------
     InputError : a key is unknown, or a value is out of range
     """
-    return build(FitConfig, data, source=str(where), context=_STORED)
+    return build(FitConfig, data, source=str(where), context=STORED)
 
 
 def _listed(names: list[str]) -> str:

@@ -12,11 +12,11 @@ from pydantic import AfterValidator, BeforeValidator, Field
 
 from mbtf_core.app.options import Quality
 from mbtf_core.color import ALBEDO_EXPOSURE
-from mbtf_core.config.settings import Settings, explicit_options, resolve
+from mbtf_core.config.settings import Settings, build, explicit_options, resolve
 from mbtf_core.config.yaml_file import dump_yaml, line_of, read_yaml
 from mbtf_core.errors import InputError
 from mbtf_core.paths import named_file
-from mbtf_fit.config import DEFAULT_MODEL, FitConfig, fitter_options
+from mbtf_fit.config import DEFAULT_MODEL, STORED, FitConfig, fitter_options
 from mbtf_gen.config.generator import RESOLUTION, GeneratorConfig, Paths, generator_options
 from mbtf_gen.config.pictures import EXPOSURE, Exposure
 
@@ -302,7 +302,8 @@ def write_recipe(recipe: Recipe, folder: Path, *, overwrite: bool = False) -> No
 
 
 def read_resolved(folder: Path) -> Recipe:
-    """The resolved recipe of a run's folder; its material may be missing.
+    """The resolved recipe of a run's folder; its material may be missing, and the code of its models is
+    neither needed nor run.
 
     Raises
     ------
@@ -312,4 +313,4 @@ def read_resolved(folder: Path) -> Recipe:
     if not path.exists():
         hint = "create one: mbtf-pipeline run RECIPE -o FOLDER"
         raise InputError(f"contains no run (no {RECIPE_NAME})", where=folder, hint=hint)
-    return resolve(Recipe, file=path)
+    return build(Recipe, read_yaml(path), source=str(path), context=STORED)

@@ -138,10 +138,15 @@ class _RecipeRun:
         needs = (GENERATE_STAGE, *map(fit_stage, recipe.fit))
         compared = {"record": COMPARISON_SCHEMA, **recipe.compare.model_dump(mode="json")}
         out.append(Stage(COMPARE_STAGE, needs, compared, {}, (COMPARE,), self._compare))
+        return [*out, self.report_stage()]
+
+    def report_stage(self) -> Stage:
+        """The last stage, which needs no code of the fits' models."""
+        recipe = self.recipe
         shown = {"name": recipe.name, "description": recipe.description, "layout": LAYOUT}
         shown |= recipe.report.model_dump(mode="json")
-        needs = (*needs, COMPARE_STAGE)
-        return [*out, Stage(REPORT_STAGE, needs, shown, {}, (REPORT, VIEWER), self._report)]
+        needs = (GENERATE_STAGE, *map(fit_stage, recipe.fit), COMPARE_STAGE)
+        return Stage(REPORT_STAGE, needs, shown, {}, (REPORT, VIEWER), self._report)
 
     def _generate(self, data: DataSet, decision: Decision) -> float:
         from mbtf_core.data.dataset import is_dataset
@@ -379,7 +384,7 @@ def rerender(folder: Path, exposure: float | Literal["auto"] | None = None) -> t
         given, flags = {**recipe.report.model_dump(), "exposure": exposure}, {"exposure": "--exposure"}
         report = build(type(recipe.report), given, source="report", error=UsageError, spelled=flags)
         recipe = recipe.model_copy(update={"report": report})
-    stage = _RecipeRun(recipe, folder, Console(quiet=True)).stages({})[-1]
+    stage = _RecipeRun(recipe, folder, Console(quiet=True)).report_stage()
     with owned(folder):
         for name in stage.needs:
             if read_stamp(folder, name) is None:

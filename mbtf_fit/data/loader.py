@@ -101,12 +101,15 @@ def in_region(held_out: HeldOutSection, omega: NDArray[np.float32]) -> NDArray[n
 def label_queries(
     held_out: HeldOutSection, queries: ShardQueries, seed: int, shard: int, lights: int
 ) -> NDArray[np.int8]:
-    """Label of each query of a shard. Held-out queries are whole groups of `lights` queries, whose noise is
-    correlated: errors of a fit to some of a group would seem small at the others."""
+    """Label of each query of a shard. Both held-out sets are whole groups of `lights` queries, whose noise is
+    correlated: errors of a fit to some of a group would seem small at the others. Queries beside one of the
+    region are therefore held out, too."""
     groups = np.random.Generator(np.random.Philox(key=[seed, shard])).random(len(queries) // lights)
     random = np.tile(groups, lights)
     labels = np.where(random < held_out.queries, HELD_OUT_QUERY, TRAINING)
     region = in_region(held_out, queries.omega_i) | in_region(held_out, queries.omega_o)
+    beside = np.tile(region.reshape(lights, -1).any(axis=0), lights)
+    labels = np.where(beside, HELD_OUT_QUERY, labels)
     return np.where(region, HELD_OUT_DIRECTION, labels)
 
 

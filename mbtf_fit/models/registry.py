@@ -110,7 +110,7 @@ def _faults_of(name: str) -> Iterator[None]:
     """Name the file and the line of whatever exception a model's file raises."""
     try:
         yield
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         if name in MODELS or isinstance(error, MbtfError):
             raise
         path = name.rpartition(":")[0]

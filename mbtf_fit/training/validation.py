@@ -193,7 +193,8 @@ def _doubling(history: list[dict[str, Any]]) -> float | None:
     changes: list[Any] = [r.get("change_error") for r in history[history.index(half) + 1 :]]
     relative = math.hypot(after, before)
     if all(map(_number, changes)):
-        relative = min(relative, math.hypot(*changes) / last["unexplained"])
+        # Changes of the same queries are correlated: the sum of their errors is safe.
+        relative = min(relative, sum(changes) / last["unexplained"])
     spread = _LASTING * relative / doublings
     # The number of steps alone would say that longer training is useless.
     if spread > _LAW_SCATTER and not few:

@@ -75,7 +75,8 @@ class GroupTracer(PathTracer):
 
     def _add(self, radiance: Spectrum, k: UInt32, active: Mask) -> None:
         """Add to the radiance from each lane's k-th light."""
-        at, mode = self.slot + k * self.stride, dr.ReduceMode.NoConflicts
+        # Other modes lose NaN, which is searched for later.
+        at, mode = self.slot + k * self.stride, dr.ReduceMode.Direct
         dr.scatter_reduce(dr.ReduceOp.Add, self.radiance, mi.Color3f(radiance), at, active, mode)
 
     @dr.syntax

@@ -96,7 +96,7 @@ def plan_study(recipe: Recipe, folder: Path, *, seconds: float, seed: int | None
         found.path_seconds = pilot.query_seconds / spp
     setup = 2.0 * pilot.start + _SETUP_PATHS * found.path_seconds
     if record is not None:
-        setup = record["setup_seconds"]
+        setup = record.get("setup_seconds", setup)
     planned = found.plan_runs(seconds, spp)
     least, least_run = found.least_seconds(spp, setup), found.least_run_seconds(spp, setup)
     measured = [run for run in planned if found.recall(run)]

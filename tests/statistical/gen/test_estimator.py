@@ -102,13 +102,14 @@ class Faulty(mi.BSDF):  # type: ignore[misc]
         return self.inner.sample(ctx, si, s1, s2, active)
 
 
+@pytest.mark.parametrize("lights", [1, 4])
 @pytest.mark.parametrize("bad", [np.inf, np.nan])
-def test_nonfinite_samples_are_resampled_and_counted(bad: float) -> None:
+def test_nonfinite_samples_are_resampled_and_counted(bad: float, lights: int) -> None:
     n, spp = 500, 8
     tile = build_scene(flat(), Faulty(mi.Properties(), bad))
     e = Estimator(tile, LightKernel(0.0), Transport(max_depth=1))
-    values = e.estimate(same_query(n), spp, Stream(0, "train", 0))
-    # One in twenty, and of those one in twenty again; none is left in the values.
+    values = e.estimate(same_query(n * lights), spp, Stream(0, "train", 0), lights=lights)
+    # One path in twenty, and of those one in twenty again; none is left in the values.
     assert values.nonfinite == pytest.approx(n * spp / 19, rel=0.3)
     np.testing.assert_allclose([values.value_a, values.value_b], 0.5 / np.pi, rtol=1e-5)
 
