@@ -204,6 +204,20 @@ def test_the_resolved_recipe_can_be_run_again(tmp_path: Path) -> None:
     assert read_resolved(folder).fit == recipe.fit
 
 
+def test_a_stored_recipe_runs_no_code(tmp_path: Path) -> None:
+    """Of a run that somebody else has made: drawing its report again needs the configuration alone."""
+    recipe, ran = load_recipe(written(tmp_path, NAMED)), tmp_path / "ran"
+    code = tmp_path / "model.py"
+    code.write_text(f"open({str(ran)!r}, 'w').close()\n")
+    fits = {name: fit.model_copy(update={"model": f"{code}:Theirs"}) for name, fit in recipe.fit.items()}
+    write_recipe(recipe.model_copy(update={"fit": fits}), tmp_path)
+    assert read_resolved(tmp_path).fit == fits
+    assert not ran.exists()
+    with pytest.raises(InputError):
+        load_recipe(tmp_path / "recipe.yaml")
+    assert ran.exists()
+
+
 def test_listing_shows_recipes_and_errors(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

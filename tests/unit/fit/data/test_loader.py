@@ -61,6 +61,10 @@ def test_queries_that_share_paths_are_held_out_together(tmp_path: Path) -> None:
     labels = label_queries(held_out, queries, 0, 0, 3).reshape(3, 1000)
     assert (labels == labels[0]).all()
     assert labels.mean() == pytest.approx(0.2, abs=0.05)
+    # Beside a query of the region, none is trained on.
+    labels = label_queries(HELD_OUT, queries, 0, 0, 3).reshape(3, 1000)
+    assert ((labels == 0).all(axis=0) | (labels != 0).all(axis=0)).all()
+    assert (labels[in_region(HELD_OUT, queries.omega_i).reshape(3, 1000)] == labels.max()).all()
 
 
 def test_shards_are_divided_independently(tmp_path: Path) -> None:
