@@ -9,6 +9,9 @@ if TYPE_CHECKING:
     from mbtf_core.data.folder import DataFolder
     from mbtf_fit.material.material import Material
 
+# Least share of the stored training queries that a fit trains on.
+_LEAST_SHARE = 0.75
+
 
 def advise(
     material: Material,
@@ -42,6 +45,12 @@ def advise(
     cost = marginal_cost_of(history, errors, training.get("noise_variance"), kept_step(training))
     if cost is None or not errors or config.training.shared_decoder or reached(config, history):
         return None, []
+    data = Dataset.open(shards)
+    stored = data.manifest["splits"].get("train", {}).get("queries", 0)
+    # Those of the training are the stored ones but for the held-out ones.
+    if not _LEAST_SHARE * stored <= training["queries"] <= stored:
+        line = "the fit had other training data: evaluate it on them to see what would reduce its error"
+        return None, [f"{line} ({stored:,} training queries here, {training['queries']:,} in its training)"]
     step = next_step(cost, errors)
-    command = step.command(config, training["seconds"], Dataset.open(shards), folder)
+    command = step.command(config, training["seconds"], data, folder)
     return command, [step.reason if command is None else f"{step.reason}:\n  {command}"]

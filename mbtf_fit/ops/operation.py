@@ -20,11 +20,12 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
-from typing import Annotated, Any, ClassVar, Generic, TypeVar, get_args, get_type_hints
+from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from mbtf_core.errors import InputError
+from mbtf_core.paths import suggest_name
 
 Value = Annotated[str, "value"]
 Values = tuple[Value, ...]
@@ -59,6 +60,20 @@ class Operation:
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid", allow_inf_nan=False)
 
     output: str
+
+    def __post_init__(self) -> None:
+        """
+        Raises
+        ------
+        ValueError : a field is none of the names that it may be
+        """
+        for name, choices in _choices_of(self.kind()).items():
+            if (given := getattr(self, name)) not in choices:
+                hint = suggest_name(str(given), choices)
+                raise ValueError(
+                    f"{self.kind()} '{self.output}': {name} must be one of {', '.join(choices)}, not "
+                    f"'{given}'{hint and f'; {hint}'}"
+                )
 
     def __init_subclass__(cls) -> None:
         other = _KINDS.setdefault(cls.kind(), cls)
@@ -135,6 +150,13 @@ def _fields_of(operation: str, kind: str) -> list[str]:
     cls = _KINDS[operation]
     hints = get_type_hints(cls, include_extras=True)
     return [f.name for f in fields(cls) if kind in _marks(hints[f.name])]
+
+
+@cache
+def _choices_of(operation: str) -> dict[str, tuple[str, ...]]:
+    """The fields that are one of some names, and these."""
+    hints = get_type_hints(_KINDS[operation])
+    return {name: get_args(hint) for name, hint in hints.items() if get_origin(hint) is Literal}
 
 
 def _marks(hint: Any) -> Iterator[str]:

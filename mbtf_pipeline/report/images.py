@@ -236,7 +236,7 @@ def _offset_file(record: Mapping[str, Any], fit: str | None) -> str:
 def _offset_row(
     folder: Path, records: list[dict[str, Any]], fit: str | None, gallery: Gallery
 ) -> dict[str, Any]:
-    title = "Traced through the heights" if fit is None else f"Learned by {fit}"
+    title = "Traced through the heights" if fit is None else f"Offset of {fit}"
     maps, medians, scale = displacements(folder, records, fit)
     cells = []
     for number, (record, values, median) in enumerate(zip(records, maps, medians, strict=True)):

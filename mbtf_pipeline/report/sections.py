@@ -131,14 +131,18 @@ def _grouping(
     """Plot and table of the errors by level or by cosine; None where none is defined. The table begins with
     the groups where a fit has a significant error."""
     names = sorted({n for test in tests.values() for n in test[key]}, key=lambda n: float(n.split("-")[0]))
-    names = [
+    known = [
         n
         for n in names
         if any(math.isfinite(_unexplained(test[key].get(n)).value) for test in tests.values())
     ]
-    if not names:
+    if not known:
         return None
-    labels = [name.replace("-", "–") for name in names]
+    unknown = [name.replace("-", "–") for name in names if name not in known]
+    note = f"Without {', '.join(unknown)}: too few queries, or values that vary less than their noise." * (
+        len(unknown) > 0
+    )
+    names, labels = known, [name.replace("-", "–") for name in known]
     series: dict[str, list[tuple[float, float] | None]] = {fit: [] for fit in tests}
     rows = []
     for name, label in zip(names, labels, strict=True):
@@ -155,7 +159,7 @@ def _grouping(
     )
     svg = points(labels, series, axis, UNEXPLAINED, f"{UNEXPLAINED} {title}")
     heads = [h for fit in tests for h in (f"{fit}: {UNEXPLAINED}", f"{fit}: MSE [10⁻³/sr²]")]
-    table = {"title": f"{title}, test split", "head": [head, "queries", *heads], "rows": rows}
+    table = {"title": f"{title}, test split", "head": [head, "queries", *heads], "rows": rows, "note": note}
     return {"title": title, "svg": svg}, table
 
 

@@ -10,6 +10,7 @@ import torch
 from mbtf_core.config.settings import resolve
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError, UsageError
+from mbtf_fit import ops
 from mbtf_fit.config import FitConfig, build_model
 from mbtf_fit.ops import read_operations
 from mbtf_fit.pytorch.material import NeuralMaterial
@@ -293,3 +294,12 @@ def test_hierarchical_sees_nine_by_nine_texels_of_the_nearest_level() -> None:
         torch.testing.assert_close(places[4, 4], u[0])
         torch.testing.assert_close(places[4, 5] - places[4, 4], torch.tensor([1 / columns, 0.0], dtype=F64))
         torch.testing.assert_close(places[5, 4] - places[4, 4], torch.tensor([0.0, -1 / rows], dtype=F64))
+
+
+def test_operations_refuse_unknown_names() -> None:
+    for wrong in (
+        lambda: ops.Transform("a", "b", "sgmoid"),  # type: ignore[arg-type]
+        lambda: ops.Network("a", ("b",), "n", (), 3, "sigmoid"),  # type: ignore[arg-type]
+    ):
+        with pytest.raises(ValueError, match=r"'a': \w+ must be one of .*, not 's\w+'"):
+            wrong()

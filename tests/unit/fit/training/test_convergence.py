@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from support.fit_data import parallax, write_data
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.folder import DataFolder
+from mbtf_fit.cli.advice import advise
 from mbtf_fit.config import FitConfig
 from mbtf_fit.training.next_step import NextStep, next_step
 from mbtf_fit.training.validation import FLAT, MarginalCost, caveat, marginal_cost_of
@@ -135,6 +138,21 @@ def test_overfitting_is_bounded_by_the_noise(noise: float | None, share: float |
     """Few queries without noise leave the same distance: what lies between them was not learned."""
     found = cost(history(0.5), errors(0.25, 0.15), noise).noise_share
     assert found == (share if share is None else pytest.approx(share))
+
+
+@pytest.mark.parametrize(("trained_on", "advised"), [(990, True), (2000, False), (400, False)])
+def test_a_fit_to_other_training_queries_gets_no_advice(
+    trained_on: int, advised: bool, tmp_path: Path
+) -> None:
+    """Their errors say nothing of its overfitting."""
+    shards = write_data(tmp_path / "shards", parallax, train=1000, test=10)
+    training = {"queries": trained_on, "seconds": 30.0, "steps": 4000}
+    material: Any = SimpleNamespace(config=FitConfig(), description={"training": training})
+    found = errors(0.25, 0.25)
+    found = {name: of | {"n": 99, "unexplained": {"value": 0.2, "error": 0.01}} for name, of in found.items()}
+    command, lines = advise(material, Path("material"), shards, history(0.8), found)
+    assert (command is not None) == advised
+    assert lines[0].startswith("expect" if advised else "the fit had other training data")
 
 
 def test_incomplete_histories_say_nothing() -> None:

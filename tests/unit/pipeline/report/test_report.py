@@ -53,6 +53,7 @@ def test_both_errors_of_a_group_are_significant_or_neither() -> None:
     assert context["facts"][0]["value"] == "0.200 ± 0.010"
     assert context["facts"][0]["what"].endswith(" of a (9 steps: not converged)")
     assert context["error_table"]["rows"][0][0] == "a (9 steps: not converged)"
+    assert [table["note"][:9] for table in context["group_tables"]] == ["Without 2", ""]
     split["elevations"] = {"0.2-0.4": unknown}
     assert len(error_context(record)["group_tables"]) == len(error_context(record)["error_plots"]) == 1
 
