@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mbtf_core.run.runner import Runner
-from mbtf_core.units import clock, expectation
+from mbtf_core.units import clock, expectation, rounded_duration
 from mbtf_gen.forecast import forecast
 from mbtf_gen.job import Job
 from mbtf_pipeline.cost.answers import FARTHEST
@@ -18,7 +18,6 @@ from mbtf_pipeline.cost.study import (
     conditions_of,
     generator_seconds,
     no_run,
-    rounded,
     study_config,
 )
 from mbtf_pipeline.recipe import Recipe
@@ -69,11 +68,13 @@ class StudyPlan:
                 f"answers: a forecast for up to {FARTHEST:g} times as long, {far}, with its 95% interval"
             )
         else:
-            lines.append(f"cannot forecast errors of longer times: that takes --time {rounded(self.least)}")
+            lines.append(
+                f"cannot forecast errors of longer times: that takes --time {rounded_duration(self.least)}"
+            )
         if not self.generator:
             lines.append(
                 "cannot tell what effects, mesh and number of paths cost: that takes "
-                f"--time {rounded(_COMPARISONS * LEAST_SECONDS)}"
+                f"--time {rounded_duration(_COMPARISONS * LEAST_SECONDS)}"
             )
         return "\n".join(lines)
 

@@ -8,7 +8,6 @@ figures are of the workers' machine and threads.
 from __future__ import annotations
 
 import math
-import shlex
 import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -24,12 +23,18 @@ from mbtf_core.files.atomic import read_json
 from mbtf_core.files.editable import write_document
 from mbtf_core.files.folders import ELSEWHERE, OutputKind, check_space, owned
 from mbtf_core.run.runner import Runner
-from mbtf_core.run.task import Item, worker_threads
+from mbtf_core.run.task import Item
 from mbtf_core.stats import Estimate
-from mbtf_core.units import clock, expectation, format_duration
-from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_core.units import clock, expectation, format_duration, rounded_duration
 from mbtf_gen.job import Job
 from mbtf_pipeline.cost.answers import Evidence
+from mbtf_pipeline.cost.conditions import (
+    CONFIG_NAME,
+    conditions_of,
+    generator_seconds,
+    measuring_machine,
+    study_config,
+)
 from mbtf_pipeline.cost.generator import benchmark_of, generator_configurations, path_seconds
 from mbtf_pipeline.cost.measurement import (
     HALF_WIDTH,
@@ -57,13 +62,8 @@ from mbtf_pipeline.cost.runs import (
     test_set,
 )
 from mbtf_pipeline.recipe import Recipe
-from mbtf_pipeline.stages import machine
 
 STUDY = OutputKind("study.json", "mbtf-cost", 2, "a cost study")
-CONFIG_NAME = "generate.yaml"
-WORK = ".work"
-# About as many configurations of the generator share its time.
-_CONFIGURATIONS = 35
 # Seconds by which a run exceeds generating and training, until one has been measured.
 OVERHEAD = 12.0
 # By how much the generator's configurations exceed their share, as kernels are compiled.
@@ -104,7 +104,7 @@ class Study:
         if self.least_run is not None:
             return no_run(self.least_run, self.least)
         enough = self.least <= self.description["time"]
-        how = "the same command" if enough else f"the command with --time {rounded(self.least)}"
+        how = "the same command" if enough else f"the command with --time {rounded_duration(self.least)}"
         return f"too few complete runs for a forecast: repeat {how}; it keeps these runs and adds others"
 
 
@@ -118,26 +118,11 @@ def claim(folder: Path, on: Mapping[str, str]) -> None:
         raise InputError(problem, where=folder, hint=ELSEWHERE)
 
 
-def study_config(config: GeneratorConfig, seed: int | None) -> GeneratorConfig:
-    """A recipe's generator as its study uses it: without a target error, which would override the numbers of
-    paths, and with shuffled queries that share no paths."""
-    own = {"target_error": None, "layout": "shuffled", "lights_per_path": 1}
-    queries = config.queries.model_copy(update=own)
-    seeds = {} if seed is None else {"seed": seed}
-    return config.model_copy(update={"queries": queries, **seeds})
-
-
-def rounded(seconds: float) -> str:
-    """A duration, rounded up to ten seconds, or to minutes."""
-    unit = 10.0 if seconds < 300.0 else 60.0
-    return format_duration(unit * math.ceil(seconds / unit))
-
-
 def no_run(least_run: float, least: float) -> str:
     """That a study has no time for a complete run, and the times of those that have."""
     return (
-        f"no complete run fits into the time: one takes --time {rounded(least_run)}, and a forecast "
-        f"--time {rounded(least)}"
+        f"no complete run fits into the time: one takes --time {rounded_duration(least_run)}, and a forecast "
+        f"--time {rounded_duration(least)}"
     )
 
 
@@ -145,16 +130,8 @@ def too_short(seconds: float, least: float) -> str:
     """Warning of a study that is too short for forecasts."""
     return (
         f"warning: --time {format_duration(seconds)} measures errors, but is too short to forecast others: "
-        f"complete runs of {FEWEST_TOTALS} lengths take about {rounded(least)} on this machine"
+        f"complete runs of {FEWEST_TOTALS} lengths take about {rounded_duration(least)} on this machine"
     )
-
-
-def measuring_machine() -> dict[str, str]:
-    """Record of the machine that runs it; a task."""
-    found = machine()
-    if (threads := worker_threads()) is not None:
-        found["system"] += f", workers of {threads} thread{'s' * (threads != 1)}"
-    return found
 
 
 @dataclass
@@ -342,23 +319,6 @@ class Measurements:
 
 def _step_seconds(run: Measurement) -> float:
     return run.details["training_seconds"] / run.details["training_steps"]
-
-
-def generator_seconds(seconds: float) -> float:
-    """Time for comparisons of the generator: a share of what a study has beyond the least that forecasts."""
-    return GENERATOR * max(0.0, seconds - LEAST_SECONDS)
-
-
-def conditions_of(job: Job, folder: Path, seconds: float) -> Conditions:
-    """Conditions of the measurements of a study in a folder."""
-    config = job.config
-    return Conditions(
-        config.model_dump_json(),
-        config.hash(job.material.digests),
-        folder / WORK,
-        0.5 * GENERATOR * seconds / _CONFIGURATIONS,
-        shlex.join(["mbtf-gen", config.material, "--config", str(folder / CONFIG_NAME)]),
-    )
 
 
 def run_study(
