@@ -15,7 +15,7 @@ from mbtf_core.config.settings import LocalName, Settings, build, deep_merge, le
 from mbtf_core.files.atomic import data_sha256
 from mbtf_core.paths import named_file, suggest_name
 from mbtf_core.units import parse_duration
-from mbtf_fit.models import NAMES, is_file
+from mbtf_fit.models import NAMES, file_and_class
 from mbtf_fit.sections import DataSection, HeldOutSection, NetworkSection, TrainingSection
 
 # Context of the validators for a complete configuration that was stored, see :func:`stored_config`.
@@ -31,9 +31,8 @@ def _known(name: object, info: ValidationInfo) -> object:
     """
     if not isinstance(name, str) or name in NAMES or info.context == STORED:
         return name
-    if is_file(name):
-        path, _, wanted = name.rpartition(":")
-        return f"{named_file(Path(), path)}:{wanted}"
+    if (given := file_and_class(name)) is not None:
+        return f"{named_file(Path(), given[0])}:{given[1]}"
     suggestion = suggest_name(name, NAMES)
     raise ValueError(
         f"must be an installed model: {', '.join(NAMES)}, one that another package registers by an "

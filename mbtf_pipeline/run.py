@@ -18,7 +18,7 @@ from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item
 from mbtf_core.units import clock
 from mbtf_fit.config import FitConfig
-from mbtf_fit.models import is_file
+from mbtf_fit.models import code_of
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.compare.compare import COMPARISON_NAME, COMPARISON_SCHEMA
 from mbtf_pipeline.recipe import Recipe, read_resolved
@@ -133,7 +133,7 @@ class _RecipeRun:
             others = [_manifest_digest(Path(folder)) for folder in fit.training.materials]
             fields["training"] = {**fields["training"], "materials": others}
             run, remote = partial(self._fit, name, data), not self.runner.here
-            code = {"model": file_sha256(Path(fit.model.rpartition(":")[0]))} if is_file(fit.model) else {}
+            code = code_of(fit.model)
             out.append(Stage(fit_stage(name), (data.stage,), fields, code, (f"{FITS}/{name}",), run, remote))
         needs = (GENERATE_STAGE, *map(fit_stage, recipe.fit))
         compared = {"record": COMPARISON_SCHEMA, **recipe.compare.model_dump(mode="json")}

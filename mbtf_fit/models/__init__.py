@@ -7,6 +7,8 @@ import re
 from importlib.metadata import entry_points
 from pathlib import Path
 
+from mbtf_core.files.atomic import file_sha256
+
 # A class's line that gives its name, alone or before others.
 _NAME = re.compile(r'^    name(?:, \w+)* = "([^"]+)"', re.MULTILINE)
 
@@ -14,9 +16,16 @@ FOREIGN = {point.name: point for point in entry_points(group="mbtf.models")}
 """Entry points of other packages that give a model, by its name."""
 
 
-def is_file(name: str) -> bool:
-    """Whether a model is given by its file: ``FILE.py:CLASS``."""
-    return name.rpartition(":")[0].endswith(".py")
+def file_and_class(name: str) -> tuple[str, str] | None:
+    """The path and the class of a model that is given by them, ``FILE.py:CLASS``; None for other names."""
+    file, _, wanted = name.rpartition(":")
+    return (file, wanted) if file.endswith(".py") else None
+
+
+def code_of(name: str) -> dict[str, str]:
+    """SHA-256 of the file of such a model, by ``model``; nothing for other names."""
+    found = file_and_class(name)
+    return {} if found is None else {"model": file_sha256(Path(found[0]))}
 
 
 def names_in(text: str) -> list[str]:

@@ -19,7 +19,7 @@ import mbtf_fit.models
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError, MbtfError, reason
 from mbtf_core.paths import refuse_special
-from mbtf_fit.models import FOREIGN, is_file
+from mbtf_fit.models import FOREIGN, file_and_class
 from mbtf_fit.models.model import Model
 from mbtf_fit.ops import Operation
 from mbtf_fit.sections import NetworkSection
@@ -71,7 +71,7 @@ def model_class(name: str) -> type[Model]:
     """
     if name in MODELS:
         return MODELS[name]
-    file, _, wanted = name.rpartition(":")
+    file, wanted = file_and_class(name) or ("", name)
     path = Path(file)
     refuse_special(path)
     with _faults_of(name):
@@ -113,7 +113,7 @@ def _faults_of(name: str) -> Iterator[None]:
     except (Exception, SystemExit) as error:
         if name in MODELS or isinstance(error, MbtfError):
             raise
-        path = name.rpartition(":")[0]
+        path, _ = file_and_class(name) or ("", name)
         lines = [frame.lineno for frame in extract_tb(error.__traceback__) if frame.filename == path]
         where = f"{path}:{lines[-1]}" if lines else path
         hint = "correct the file; --debug shows the traceback"
@@ -151,4 +151,4 @@ def with_option(option: str) -> list[str]:
 
 def defaults_of(name: str) -> dict[str, Any]:
     """Options of a model that differ from the general defaults, nested."""
-    return dict(model_class(name).defaults) if name in MODELS or is_file(name) else {}
+    return dict(model_class(name).defaults) if name in MODELS or file_and_class(name) else {}

@@ -12,7 +12,7 @@ from typing import Any
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.errors import InputError
 from mbtf_core.extras import import_extra
-from mbtf_core.files.atomic import data_sha256, file_sha256, write_text
+from mbtf_core.files.atomic import data_sha256, write_text
 from mbtf_core.files.folders import OutputFolder, OutputKind
 from mbtf_core.paths import refuse_special, suggest_path
 from mbtf_fit.config import FitConfig
@@ -20,7 +20,7 @@ from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.material.decoder import DECODER_NAME, Decoder
 from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME, read_description
 from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME
-from mbtf_fit.models import is_file
+from mbtf_fit.models import code_of
 from mbtf_fit.models.registry import operations_of
 from mbtf_fit.training.loop import CHECKPOINT_NAME
 from mbtf_fit.training.trainer import Trainer
@@ -53,9 +53,7 @@ def identity_of(config: FitConfig, data: Dataset, group: Sequence[Dataset] = ())
     # A model whose operations or file have changed is another one.
     operations = operations_of(config.model, data.lattice, config.network)
     model = data_sha256([operation.as_json() for operation in operations])
-    config_hash += f"-{model}"
-    if is_file(config.model):
-        config_hash += f"-{file_sha256(Path(config.model.rpartition(':')[0]))}"
+    config_hash += "".join(f"-{digest}" for digest in (model, *code_of(config.model).values()))
     if config.init_from is not None:
         description, _ = read_description(Path(config.init_from))
         config_hash += f"-{description['weights']['sha256']}"

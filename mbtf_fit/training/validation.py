@@ -12,16 +12,14 @@ from numpy.typing import NDArray
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.stats import (
-    Estimate,
     by_group,
     level_groups,
-    mse_difference,
-    signal_variance,
     unexplained_variance,
 )
 from mbtf_fit.data.loader import Partition, load_split
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.formatting import ABOVE_ONE
+from mbtf_fit.training.best_state import excess_error
 from mbtf_fit.training.trainer import Trainer
 
 # Queries of the validation subset, and the fewest queries of the test split that are preferred over others.
@@ -79,11 +77,11 @@ def history_record(
     """
     state = trainer.progress
     found: dict[str, Any] = {}
-    change: Estimate | None = None
+    change = None
     if len(subset):
         found = unexplained_variance(prediction, *subset.halves).as_dict()
-        if previous is not None and (variance := signal_variance(*subset.halves).value) > 0:
-            change = mse_difference(prediction, previous, *subset.halves).scaled(1.0 / variance)
+        if previous is not None:
+            change = finite(excess_error([prediction], [previous], [subset]).error)
     return {
         "step": state.step,
         "seconds": round(state.seconds, 3),
@@ -91,7 +89,7 @@ def history_record(
         "loss": state.loss,
         "unexplained": found.get("value"),
         "unexplained_error": found.get("error"),
-        "change_error": None if change is None else finite(change.error),
+        "change_error": change,
         "queries_per_second": round(state.step * trainer.batch / max(state.seconds, 1e-9)),
     }
 

@@ -138,17 +138,16 @@ def _grouping(
     ]
     if not known:
         return None
-    unknown = [name.replace("-", "–") for name in names if name not in known]
-    note = f"Without {', '.join(unknown)}: too few queries, or values that vary less than their noise." * (
-        len(unknown) > 0
-    )
-    names, labels = known, [name.replace("-", "–") for name in known]
+    labels = {name: name.replace("-", "–") for name in names}
+    unknown = ", ".join(labels[name] for name in names if name not in known)
+    why = "too few queries, or values that vary less than their noise"
+    note = f"Without {unknown}: {why}." if unknown else ""
     series: dict[str, list[tuple[float, float] | None]] = {fit: [] for fit in tests}
     rows = []
-    for name, label in zip(names, labels, strict=True):
+    for name in known:
         groups = {fit: test[key].get(name) for fit, test in tests.items()}
         count = next(group["mse"]["n"] for group in groups.values() if group is not None)
-        row = [label, f"{count:,}"]
+        row = [labels[name], f"{count:,}"]
         for fit, group in groups.items():
             found = _unexplained(group)
             series[fit].append((found.value, found.error) if math.isfinite(found.value) else None)
@@ -157,7 +156,7 @@ def _grouping(
     rows.sort(
         key=lambda row: all(NOT_SIGNIFICANT in text or text in ("–", "undefined") for text in row[2::2])
     )
-    svg = points(labels, series, axis, UNEXPLAINED, f"{UNEXPLAINED} {title}")
+    svg = points([labels[name] for name in known], series, axis, UNEXPLAINED, f"{UNEXPLAINED} {title}")
     heads = [h for fit in tests for h in (f"{fit}: {UNEXPLAINED}", f"{fit}: MSE [10⁻³/sr²]")]
     table = {"title": f"{title}, test split", "head": [head, "queries", *heads], "rows": rows, "note": note}
     return {"title": title, "svg": svg}, table
