@@ -1,5 +1,5 @@
-"""Tables of the options of a pydantic model, in Markdown: one table for the model's own keys and one for each
-nested section, with key, values, default, and the field's description."""
+"""The options of a pydantic model, in Markdown: one list for the model's own keys and one for each nested
+section, with key and default, values, and the field's description."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from pydantic_core import PydanticUndefined
 
 from mbtf_core.errors import MbtfError
 
-_HEADER = ("key", "values", "default", "meaning")
 # What Markdown would read as more than text.
 _SPECIAL = re.compile(r"[<$*~\[\]]|\b_|_\b")
 _LITERAL = re.compile(r"``(.+?)``|`(.+?)`")
@@ -30,17 +29,16 @@ _BOUNDS = ("ge", "gt", "le", "lt")
 
 @dataclass
 class Row:
-    """One option, as the table shows it."""
+    """One option, as the list shows it."""
 
     key: str
     values: str
-    default: str
     meaning: str
 
 
 @dataclass
 class Section:
-    """A table: the keys whose value it describes, and its rows."""
+    """A list: the keys whose value it describes, and its rows."""
 
     keys: list[str]
     text: str
@@ -120,10 +118,6 @@ def _plain_default(info: FieldInfo) -> Any:
     return TypeAdapter(annotated).dump_python(value, mode="json")
 
 
-def _default(info: FieldInfo) -> str:
-    return "required" if info.is_required() else f"`{_value(_plain_default(info))}`"
-
-
 def _found_bounds(info: FieldInfo) -> dict[str, Any]:
     """Limits of a number, as pydantic names them, and the largest ``length`` of a list or text."""
     said, inside = list(info.metadata), info.annotation
@@ -165,12 +159,22 @@ def _row(prefix: str, name: str, info: FieldInfo) -> Row:
         and isinstance(_plain_default(info), str)
     ):
         kind = "number with unit"
-    values = f"{kind} {_range(info)}".rstrip()
-    return Row(f"{prefix}{name}", values, _default(info), info.description or "")
+    key, values = f"{prefix}{name}", f"{kind} {_range(info)}".rstrip()
+    if info.is_required():
+        values = f"{values}; required"
+    elif (default := _value(_plain_default(info))) != "null":
+        # As `--set` takes it; with spaces, it would need quotes.
+        key, values = (key, f"{values}: `{default}`") if " " in default else (f"{key}={default}", values)
+    return Row(key, values, info.description or "")
+
+
+def _is_version(info: FieldInfo) -> bool:
+    """The version of the format has one value."""
+    return get_origin(info.annotation) is Literal and len(get_args(info.annotation)) == 1
 
 
 def _is_section(info: FieldInfo) -> bool:
-    """A nested model at its own defaults gets a table of its own and no row."""
+    """A nested model at its own defaults gets a list of its own and no row."""
     value = PydanticUndefined if info.is_required() else info.get_default(call_default_factory=True)
     if not isinstance(value, BaseModel):
         return False
@@ -185,7 +189,7 @@ def _text(model: type[BaseModel]) -> str:
 
 
 def sections(model: type[BaseModel], only: Sequence[str] = (), skip: Sequence[str] = ()) -> list[Section]:
-    """Tables of a model: its own keys, then those of each nested section, depth first."""
+    """Lists of a model: its own keys, then those of each nested section, depth first."""
     out: list[Section] = []
     _collect(model, [""], only, skip, out)
     return [s for s in out if s.rows]
@@ -194,20 +198,19 @@ def sections(model: type[BaseModel], only: Sequence[str] = (), skip: Sequence[st
 def _collect(
     model: type[BaseModel], prefixes: list[str], only: Sequence[str], skip: Sequence[str], out: list[Section]
 ) -> None:
-    """Append the tables of a model that lies at each of some dotted prefixes."""
+    """Append the lists of a model that lies at each of some dotted prefixes."""
     at = [p for p in prefixes if p]
     section = Section([p.removesuffix(".") for p in at], _text(model))
     out.append(section)
     nested: dict[type[BaseModel], list[str]] = {}
     prefix = prefixes[0] if len(prefixes) == 1 else ""
     for name, info in model.model_fields.items():
-        if only and name not in only:
+        if (only and name not in only) or _is_version(info):
             continue
-        if not _is_section(info):
+        inside, skipped = list(_models(info.annotation)), f"{prefix}{name}" in skip
+        if not _is_section(info) and (inside or not skipped):
             section.rows.append(_row(prefix, name, info))
-        if f"{prefix}{name}" in skip:
-            continue
-        for inner in _models(info.annotation):
+        for inner in () if skipped else inside:
             nested.setdefault(inner, []).append(name)
     for inner, names in nested.items():
         _collect(inner, [f"{p}{n}." for p in prefixes for n in names], (), skip, out)
@@ -228,20 +231,23 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join([lines[0], "|---" * len(header) + "|", *lines[1:]])
 
 
+def _meaning(row: Row) -> str:
+    return f": {cell(row.meaning)}" if row.meaning else ""
+
+
 def configuration(name: str, only: Sequence[str] = (), skip: Sequence[str] = ()) -> str:
-    """The tables of a model with this dotted name.
+    """The lists of a model with this dotted name.
 
     Parameters
     ----------
     only : keys of the model that are shown; all by default
-    skip : dotted keys whose own options are documented elsewhere
+    skip : dotted keys that are documented elsewhere; of a section, its own options
     """
     module, _, attribute = name.rpartition(".")
     parts = []
     for section in sections(getattr(importlib.import_module(module), attribute), only, skip):
         if section.keys:
-            parts.append(", ".join(f"**`{key}`**" for key in section.keys))
-            parts += [cell(section.text)] if section.text else []
-        rows = [[f"`{row.key}`", *map(cell, (row.values, row.default, row.meaning))] for row in section.rows]
-        parts.append(table(_HEADER, rows))
+            keys = ", ".join(f"**`{key}`**" for key in section.keys)
+            parts.append(f"{keys}: {cell(section.text)}" if section.text else keys)
+        parts.append("\n".join(f"- `{row.key}` ({cell(row.values)}){_meaning(row)}" for row in section.rows))
     return "\n\n".join(parts)

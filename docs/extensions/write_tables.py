@@ -1,4 +1,5 @@
-"""Writes the tables of the pages from the configurations and the schema of the data: run it after a change::
+"""Writes the tables of the pages from configurations, operations and the schema of the data: run it after a
+change::
 
     python docs/extensions/write_tables.py
 
@@ -8,20 +9,31 @@ Tables stand between a comment that names them and the next one::
     <!-- end -->
     <!-- schema arrays -->
     <!-- end -->
+    <!-- operations lookup shade -->
+    <!-- end -->
 """
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import re
 from pathlib import Path
 
 from configuration_reference import cell, configuration, table
 
 from mbtf_core.data.schema import ARRAYS, CONVENTIONS, GEOMETRY
+from mbtf_fit.ops import Operation
 
 DOCS = Path(__file__).parents[1]
-PAGES = (DOCS / "reference" / "configuration.md", DOCS / "reference" / "data-format.md")
-_TABLE = re.compile(r"(<!-- (configuration|schema) ([^>]*) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
+PAGES = (
+    DOCS / "reference" / "configuration.md",
+    DOCS / "reference" / "data-format.md",
+    DOCS / "how-to" / "add-a-model.md",
+)
+_TABLE = re.compile(r"(<!-- (configuration|schema|operations) ([^>]*) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
+# A role of Sphinx, such as :class:`~mbtf_fit.ops.lookup.Trace`, by the name that it shows.
+_ROLE = re.compile(r":\w+:`~?(?:\w+\.)*(\w+)`")
 
 
 def schema(name: str) -> str:
@@ -35,13 +47,28 @@ def schema(name: str) -> str:
     return table(("array", "unit", "components, and channels in EXR", "meaning"), rows)
 
 
+def operations(modules: list[str]) -> str:
+    """The operations of some modules of ``mbtf_fit.ops``, with the first paragraphs of their docstrings."""
+    rows = []
+    for name in modules:
+        module = importlib.import_module(f"mbtf_fit.ops.{name}")
+        for found in vars(module).values():
+            if inspect.isclass(found) and issubclass(found, Operation) and found.__module__ == module.__name__:
+                text = " ".join((inspect.getdoc(found) or "").split("\n\n")[0].split())
+                rows.append([f"`{found.__name__}`", cell(_ROLE.sub(r"`\1`", text))])
+    return table(("operation", "result"), rows)
+
+
 def written(page: str) -> str:
     """A page with its tables as they are now."""
 
     def replaced(found: re.Match[str]) -> str:
-        name, *options = found[3].split()
-        keys = {key: value.split(",") for key, _, value in (option.partition("=") for option in options)}
-        text = schema(name) if found[2] == "schema" else configuration(name, **keys)
+        name, *options = words = found[3].split()
+        if found[2] == "configuration":
+            keys = (option.partition("=") for option in options)
+            text = configuration(name, **{key: value.split(",") for key, _, value in keys})
+        else:
+            text = schema(name) if found[2] == "schema" else operations(words)
         return f"{found[1]}\n{text}\n\n{found[5]}"
 
     return _TABLE.sub(replaced, page)

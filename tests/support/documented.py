@@ -43,11 +43,10 @@ def _name(path: Path) -> str:
     return str(path.relative_to(ROOT))
 
 
-def code_block(page: str, language: str) -> str:
-    """The one block of a language in a page, whose path is relative to the documentation."""
+def code_block(page: str, language: str, number: int = 0) -> str:
+    """A block of a language in a page, whose path is relative to the documentation."""
     text = (ROOT / "docs" / page).read_text(encoding="utf-8")
-    (code,) = re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL)
-    return str(code)
+    return str(re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL)[number])
 
 
 def in_blocks(text: str, where: str) -> Iterator[Shown]:

@@ -1,4 +1,4 @@
-"""Tables of options and stored arrays in the pages are those of the programs."""
+"""Tables of options, stored arrays and operations in the pages are those of the programs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SCRIPT = "docs/extensions/write_tables.py"
 def test_tables_are_up_to_date(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str((ROOT / SCRIPT).parent))
     tables = importlib.import_module("write_tables")
-    assert [path.stem for path in tables.PAGES] == ["configuration", "data-format"]
+    assert [path.stem for path in tables.PAGES] == ["configuration", "data-format", "add-a-model"]
     for path in tables.PAGES:
         page = path.read_text(encoding="utf-8")
         assert tables.written(page) == page, f"run: python {SCRIPT}"

@@ -22,7 +22,7 @@ from mbtf_fit.models import names_in
 
 
 def documented(language: str = "python") -> str:
-    """The one block of a language."""
+    """The first block of a language."""
     return code_block("how-to/add-a-model.md", language)
 
 
@@ -49,6 +49,20 @@ def test_a_model_of_a_file_is_fitted_and_read_without_the_file(fitted: Path) -> 
     assert np.abs(value - 0.2).max() < 0.01
     assert material.model.name == "texel-diffuse"
     assert evaluate(fitted / "out", fitted / "shards")["errors"]["test"]["psnr"]["value"] > 25
+
+
+def test_the_network_of_the_page_is_fitted(tmp_path: Path) -> None:
+    """To a constant, at the width that the user sets."""
+    write_data(tmp_path / "shards", constant(0.2), train=4000, test=200, finest=2)
+    file = tmp_path / "my_network.py"
+    file.write_text(code_block("how-to/add-a-model.md", "python", 1))
+    options = {"model": f"{file}:HalfVectorDecoder", "network": {"width": 8}, "training": {"steps": 100}}
+    material = fit(FitConfig.model_validate(options), tmp_path / "shards", tmp_path / "out").material
+    up = np.tile(np.float32([0.0, 0.0, 1.0]), (50, 1))
+    value = material.evaluate(np.random.default_rng(0).random((50, 2)), np.full(50, 0.1), up, up)
+    assert np.abs(value - 0.2).max() < 0.02
+    weights = {name: tuple(tensor.shape) for name, tensor in material.model.state_dict().items()}
+    assert weights["decoder.0.weight"] == (8, 7 + 4 * 3)
 
 
 def test_to_fit_again_needs_the_file(fitted: Path) -> None:
