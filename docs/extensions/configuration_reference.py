@@ -24,6 +24,8 @@ _LITERAL = re.compile(r"``(.+?)``|`(.+?)`")
 _SCALARS = {bool: "true/false", int: "integer", float: "number", str: "text", Any: "any"}
 # Powers of two from here on are written as such.
 _LARGE = 1 << 15
+# Limits of lengths from here on only guard against files that are none.
+_LONG = 100
 _BOUNDS = ("ge", "gt", "le", "lt")
 
 
@@ -119,7 +121,7 @@ def _plain_default(info: FieldInfo) -> Any:
 
 
 def _found_bounds(info: FieldInfo) -> dict[str, Any]:
-    """Limits of a number, as pydantic names them, and the largest ``length`` of a list or text."""
+    """Limits of a number, as pydantic names them, and the largest ``length`` of a short list."""
     said, inside = list(info.metadata), info.annotation
     inside, more = _arguments(inside)
     said += more
@@ -130,7 +132,7 @@ def _found_bounds(info: FieldInfo) -> dict[str, Any]:
         if isinstance(limit, FieldInfo):
             out |= _found_bounds(limit)
         elif isinstance(limit, annotated_types.MaxLen):
-            out["length"] = limit.max_length
+            out |= {"length": limit.max_length} if limit.max_length < _LONG else {}
         else:
             out |= {name: n for name in _BOUNDS if (n := getattr(limit, name, None)) is not None}
     return out
@@ -161,8 +163,11 @@ def _row(prefix: str, name: str, info: FieldInfo) -> Row:
         kind = "number with unit"
     key, values = f"{prefix}{name}", f"{kind} {_range(info)}".rstrip()
     if info.is_required():
-        values = f"{values}; required"
-    elif (default := _value(_plain_default(info))) != "null":
+        return Row(key, f"{values}; required", info.description or "")
+    if kind in ("true/false", "text", "mapping") or (kind == "section" and info.get_default() is None):
+        # The default, the meaning or a list of its own says so.
+        values = ""
+    if (default := _value(_plain_default(info))) != "null":
         # As `--set` takes it; with spaces, it would need quotes.
         key, values = (key, f"{values}: `{default}`") if " " in default else (f"{key}={default}", values)
     return Row(key, values, info.description or "")
@@ -231,8 +236,9 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join([lines[0], "|---" * len(header) + "|", *lines[1:]])
 
 
-def _meaning(row: Row) -> str:
-    return f": {cell(row.meaning)}" if row.meaning else ""
+def _line(row: Row) -> str:
+    values = f" ({cell(row.values)})" if row.values else ""
+    return f"- `{row.key}`{values}" + (f": {cell(row.meaning)}" if row.meaning else "")
 
 
 def configuration(name: str, only: Sequence[str] = (), skip: Sequence[str] = ()) -> str:
@@ -249,5 +255,5 @@ def configuration(name: str, only: Sequence[str] = (), skip: Sequence[str] = ())
         if section.keys:
             keys = ", ".join(f"**`{key}`**" for key in section.keys)
             parts.append(f"{keys}: {cell(section.text)}" if section.text else keys)
-        parts.append("\n".join(f"- `{row.key}` ({cell(row.values)}){_meaning(row)}" for row in section.rows))
+        parts.append("\n".join(map(_line, section.rows)))
     return "\n\n".join(parts)

@@ -39,7 +39,7 @@ _ROLE = re.compile(r":\w+:`~?(?:\w+\.)*(\w+)`")
 def schema(name: str) -> str:
     """The stored ``arrays``, those of ``geometry``, or the manifest's ``conventions``."""
     if name == "conventions":
-        return table(("key", "meaning"), [[f"`{key}`", cell(text)] for key, text in CONVENTIONS.items()])
+        return "\n".join(f"- `{key}`: {cell(text)}" for key, text in CONVENTIONS.items())
     rows = [
         [f"`{a.name}`", cell(a.unit), " ".join(f"`{c}`" for c in a.channels), cell(a.meaning)]
         for a in {"arrays": ARRAYS, "geometry": GEOMETRY}[name]
@@ -52,11 +52,12 @@ def operations(modules: list[str]) -> str:
     rows = []
     for name in modules:
         module = importlib.import_module(f"mbtf_fit.ops.{name}")
-        for found in vars(module).values():
-            if inspect.isclass(found) and issubclass(found, Operation) and found.__module__ == module.__name__:
+        for found in filter(inspect.isclass, vars(module).values()):
+            if issubclass(found, Operation) and found.__module__ == module.__name__:
                 text = " ".join((inspect.getdoc(found) or "").split("\n\n")[0].split())
-                rows.append([f"`{found.__name__}`", cell(_ROLE.sub(r"`\1`", text))])
-    return table(("operation", "result"), rows)
+                text = _ROLE.sub(r"`\1`", text)
+                rows.append(f"- `{found.__name__}`: {cell(text)}")
+    return "\n".join(rows)
 
 
 def written(page: str) -> str:

@@ -68,7 +68,8 @@ def test_every_key_of_manifest_and_sidecar_is_explained(tmp_path: Path) -> None:
         missing = [key for found in objects for key in found if f"`{key}`" not in section(title)]
         assert not missing, f"{title} does not explain {missing}"
     for title, top in (("Manifest", manifest), ("Sidecar", sidecar)):
-        first_cells = "".join(re.findall(r"^\| (`[^|]*) \|", section(title), re.M))
+        first_list = next(block for block in section(title).split("\n\n") if "- `" in block[:4])
+        keys = "".join(re.findall(r"^- (`[^:]*):", first_list, re.M))
         # Two keys are those of measured data alone.
         measured = {"estimates", "measured"} if title == "Manifest" else set()
-        assert set(re.findall(r"`([^`]+)`", first_cells)) == {*top, "checksum", *measured}
+        assert set(re.findall(r"`([^`]+)`", keys)) == {*top, "checksum", *measured}
