@@ -12,7 +12,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, HttpUrl
 from mbtf_core.app.options import Flag
 from mbtf_core.config.settings import Settings
 
-Form = Literal["parquet", "webdataset", "npz"]
+Form = Literal["parquet", "npz"]
 # Longest citation; BibTeX of several papers fits.
 _LONGEST = 20_000
 
@@ -82,5 +82,5 @@ class PublishConfig(Settings):
         None, description="date of publication"
     )
     form: Annotated[Form, Flag("--form")] = Field(
-        "parquet", description="file format of the published data: Parquet, tar files of .npy, or the shards"
+        "parquet", description="file format of the published data: Parquet, or the shards as they are"
     )
