@@ -23,7 +23,7 @@ from mbtf_core.data.folder import sidecar_name
 from mbtf_core.data.shard_files import Arrays
 from mbtf_core.extras import import_extra
 from mbtf_core.files.atomic import Stored, file_sha256, sync_folder, temporary_of, write_chunks, write_through
-from mbtf_gen.config.publish import Form
+from mbtf_gen.config.exchange import Form
 
 Described = Mapping[str, Mapping[str, Any]]
 # Suffix of a shard in each form.

@@ -19,7 +19,7 @@ from mbtf_core.errors import InputError, UsageError
 from mbtf_core.extras import extra_error, has_extra
 from mbtf_core.files.atomic import Stored, data_sha256, write_chunks
 from mbtf_core.files.folders import OutputFolder, OutputKind, check_space, owned
-from mbtf_gen.config.publish import PublishConfig
+from mbtf_gen.config.exchange import PublishConfig
 from mbtf_gen.publishing.card import CARD_NAME, card_text
 from mbtf_gen.publishing.croissant import CROISSANT_NAME, croissant_text
 from mbtf_gen.publishing.facts import Facts, name_of

@@ -18,8 +18,7 @@ from support.published import LAYOUTS, publish, python_blocks, small, stored
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.errors import UsageError
-from mbtf_gen.config.measured import ImportConfig
-from mbtf_gen.config.publish import PublishConfig
+from mbtf_gen.config.exchange import ImportConfig, PublishConfig
 from mbtf_gen.generation.imported import Import, import_measured
 from mbtf_gen.planning.highlights import Highlights
 from mbtf_gen.publishing.card import card_text, code, escaped, fenced

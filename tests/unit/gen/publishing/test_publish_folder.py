@@ -13,7 +13,7 @@ from support.published import contents, publish, small
 
 from mbtf_core.errors import EngineError, InputError, PartialError, UsageError
 from mbtf_core.files.atomic import Stored
-from mbtf_gen.config.publish import PublishConfig
+from mbtf_gen.config.exchange import PublishConfig
 from mbtf_gen.publishing import publication as module
 from mbtf_gen.publishing.publication import Publication
 

@@ -15,8 +15,8 @@ from mbtf_core.config.settings import resolve
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.files.atomic import file_sha256
+from mbtf_gen.config.exchange import PublishConfig
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.config.publish import PublishConfig
 from mbtf_gen.generation import run as generation
 from mbtf_gen.publishing.publication import Publication
 from mbtf_gen.tile.loading import load_material
