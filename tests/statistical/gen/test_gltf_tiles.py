@@ -22,8 +22,9 @@ from support.scenes import (
     queries,
     tile_mean_queries,
 )
+from support.significance import aggregate_test
 
-from mbtf_core.stats import aggregate_test, elevation_groups, mean_of_halves
+from mbtf_core.stats import elevation_groups, mean_of_halves
 from mbtf_gen.render.scene import LONG_SIDE
 from mbtf_gen.tile.loading import load_material
 from mbtf_gen.tile.mesh_tile import MeshTile
