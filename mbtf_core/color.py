@@ -2,7 +2,8 @@
 
 An exposure is a number of stops (EV): a value v in 1/sr is displayed as sRGB of ``min(1, 2^EV v)``. Pictures
 with the same exposure can be compared by eye, whichever command made them. The default keeps albedos: under
-unit irradiance a Lambertian surface of albedo 0.5 is displayed as 0.5 of white.
+unit irradiance a Lambertian surface of albedo 0.5 is displayed as 0.5 of white. Palettes show maps of
+magnitudes and of signed differences.
 """
 
 from __future__ import annotations

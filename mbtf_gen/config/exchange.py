@@ -1,4 +1,4 @@
-"""Configuration of ``mbtf-gen import`` and of ``mbtf-gen publish``, which people alone can fill in."""
+"""Configuration of ``mbtf-gen import`` and of ``mbtf-gen publish``."""
 
 from __future__ import annotations
 

@@ -56,6 +56,12 @@ MEASURED_CONVENTIONS = {
 TEST_PAIRS = 0.05
 # Queries of a list that are read at once.
 _BLOCK = 1 << 22
+# First bytes of files: of zip archives, and of other archives and single compressed files.
+_ZIP = b"PK"
+_PACKED = (b"Rar!", b"7z\xbc\xaf", b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"\x28\xb5\x2f\xfd")
+_KNOWN = "a .btf file (Bonn, DFMF), a folder or zip of photographs named by angles, or HDF5 of NeuMIP"
+# The first bytes, which tell what a file is.
+_START = 1 << 10
 
 
 class Import(ABC):
@@ -337,14 +343,6 @@ def _digest(path: Path) -> str:
         return file_sha256(path)
     files = sorted(p for p in path.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
     return data_sha256({p.relative_to(path).as_posix(): file_sha256(p) for p in files})
-
-
-_ZIP = b"PK"
-# Other archives, and single compressed files.
-_PACKED = (b"Rar!", b"7z\xbc\xaf", b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"\x28\xb5\x2f\xfd")
-_KNOWN = "a .btf file (Bonn, DFMF), a folder or zip of photographs named by angles, or HDF5 of NeuMIP"
-# The first bytes, which tell what a file is.
-_START = 1 << 10
 
 
 def open_measured(path: str | Path) -> MeasuredBtf | NeumipQueries:
