@@ -35,38 +35,23 @@ _SHORT = "ends before its last element: check that the file is complete"
 
 
 @dataclass(frozen=True)
-class Property:
-    """A property of an element.
-
-    Attributes
-    ----------
-    name : str
-    kind : NumPy's name of its type
-    length : that of the length of a list; None for a single number
-    """
+class _Property:
+    """A property of an element."""
 
     name: str
+    # NumPy's names of its type, and of the type of the length of a list; None for a single number.
     kind: str
     length: str | None = None
 
 
 @dataclass
-class Element:
-    """Rows of one kind, such as vertices.
-
-    Attributes
-    ----------
-    name : str
-    count : number of rows
-    properties : list of Property
-    columns : dict of str to (count,) float64 array; single numbers of the rows
-    lists : dict of str to (float64 array, (count,) int64 array); lists: all of their numbers, one row after
-        the other, and their lengths
-    """
+class _Element:
+    """Rows of one kind, such as vertices."""
 
     name: str
     count: int
-    properties: list[Property] = field(default_factory=list)
+    properties: list[_Property] = field(default_factory=list)
+    # Single numbers (count,) of the rows; lists: their numbers, row after row, and their lengths (count,).
     columns: dict[str, F64] = field(default_factory=dict)
     lists: dict[str, tuple[F64, I64]] = field(default_factory=dict)
 
@@ -76,28 +61,16 @@ class Element:
 
 
 @dataclass(frozen=True)
-class Elements:
-    """Content of a PLY file.
+class _Elements:
+    """Content of a PLY file; `rest` is bytes, or numbers of a text, after the last element."""
 
-    Attributes
-    ----------
-    elements : dict of str to Element
-    comments : list of str
-    rest : bytes, or numbers of a text, after the last element
-    """
-
-    elements: dict[str, Element]
+    elements: dict[str, _Element]
     comments: list[str]
     rest: int
 
 
-def read_elements(path: Path) -> Elements:
-    """Read all elements of a PLY file.
-
-    Raises
-    ------
-    InputError : the file is no PLY file, ends early, or claims more rows than it has bytes
-    """
+def _read_elements(path: Path) -> _Elements:
+    """All elements of a PLY file."""
     data = read_bytes(path)
     end = re.search(rb"(?:^|[\r\n])end_header[ \t]*(\r\n|\n|\r)", data[:_MOST_HEADER])
     if not data.startswith(b"ply") or end is None:
@@ -106,12 +79,12 @@ def read_elements(path: Path) -> Elements:
     body = _Body(data[end.end() :], order, path)
     for element in elements:
         body.read(element)
-    return Elements({element.name: element for element in elements}, comments, body.rest)
+    return _Elements({element.name: element for element in elements}, comments, body.rest)
 
 
-def _header(text: str, path: Path) -> tuple[Literal["", "<", ">"], list[Element], list[str]]:
+def _header(text: str, path: Path) -> tuple[Literal["", "<", ">"], list[_Element], list[str]]:
     """Byte order, elements without rows, and comments."""
-    order, elements, comments = None, list[Element](), list[str]()
+    order, elements, comments = None, list[_Element](), list[str]()
     for number, line in enumerate(re.split(r"\r\n|\n|\r", text), 1):
         match line.split():
             case ["comment" | "obj_info", *_]:
@@ -119,13 +92,13 @@ def _header(text: str, path: Path) -> tuple[Literal["", "<", ">"], list[Element]
             case ["format", name, *_] if name in _FORMATS:
                 order = _FORMATS[name]
             case ["element", name, count] if count.isdecimal():
-                elements.append(Element(name, int(count)))
+                elements.append(_Element(name, int(count)))
             case ["property", "list", length, kind, name] if (
                 elements and kind in _TYPES and _TYPES.get(length, "float")[0] != "f"
             ):
-                elements[-1].properties.append(Property(name, _TYPES[kind], _TYPES[length]))
+                elements[-1].properties.append(_Property(name, _TYPES[kind], _TYPES[length]))
             case ["property", kind, name] if elements and kind in _TYPES:
-                elements[-1].properties.append(Property(name, _TYPES[kind]))
+                elements[-1].properties.append(_Property(name, _TYPES[kind]))
             case [] | ["ply"]:
                 pass
             case _:
@@ -153,7 +126,7 @@ class _Body:
         """Cells that are left."""
         return len(self.cells) - self.position
 
-    def read(self, element: Element) -> None:
+    def read(self, element: _Element) -> None:
         """Read the rows of an element."""
         least = sum(self._size(one.length or one.kind) for one in element.properties)
         if element.count * least > self.rest:
@@ -165,7 +138,7 @@ class _Body:
         if element.count and least and not self._read_alike(element):
             self._read_ragged(element)
 
-    def _read_alike(self, element: Element) -> bool:
+    def _read_alike(self, element: _Element) -> bool:
         """Read rows at once, if all are as long as the first one."""
         ranges, width = [], 0
         for one in element.properties:
@@ -194,7 +167,7 @@ class _Body:
         self.position = end
         return True
 
-    def _read_ragged(self, element: Element) -> None:
+    def _read_ragged(self, element: _Element) -> None:
         """Read rows one by one."""
         position = self.position
         places = {one.name: (list[int](), list[int]()) for one in element.properties}
@@ -271,7 +244,7 @@ def read_ply(path: Path) -> MeshContent:
     ------
     InputError : the file is no PLY file, is damaged or cut, or has no triangles
     """
-    content = read_elements(path)
+    content = _read_elements(path)
     vertex, face = _element(content, "vertex", path), content.elements.get("face")
     if face is None or not face.count:
         strips = "tristrips" in content.elements
@@ -326,23 +299,23 @@ def read_ply(path: Path) -> MeshContent:
     return MeshContent(shapes, companions.files, None, [*warnings, *companions.warnings])
 
 
-def _element(content: Elements, name: str, path: Path) -> Element:
+def _element(content: _Elements, name: str, path: Path) -> _Element:
     if name not in content.elements:
         raise InputError(f"has no element '{name}'", where=path)
     return content.elements[name]
 
 
-def _stacked(element: Element, names: tuple[str, ...]) -> F64:
+def _stacked(element: _Element, names: tuple[str, ...]) -> F64:
     """(n, k) numbers of some properties."""
     return np.stack([element.columns[name] for name in names], axis=-1)
 
 
-def _first(element: Element, choices: tuple[tuple[str, ...], ...]) -> tuple[str, ...]:
+def _first(element: _Element, choices: tuple[tuple[str, ...], ...]) -> tuple[str, ...]:
     """The first choice of properties that an element has; empty for none."""
     return next((names for names in choices if set(names) <= element.columns.keys()), ())
 
 
-def _uv(vertex: Element, face: Element, number: I64, sizes: I64) -> F64:
+def _uv(vertex: _Element, face: _Element, number: I64, sizes: I64) -> F64:
     """Texture coordinates (c, 2) of corners, NaN where they have none."""
     out = np.full((len(number), 2), np.nan)
     if _WEDGE in face.lists:
@@ -354,12 +327,12 @@ def _uv(vertex: Element, face: Element, number: I64, sizes: I64) -> F64:
     return out
 
 
-def _face_colors(vertex: Element, face: Element) -> tuple[str, ...]:
+def _face_colors(vertex: _Element, face: _Element) -> tuple[str, ...]:
     """Properties of the colors of faces, of which those of vertices take the place."""
     return () if _first(vertex, _COLORS) else _first(face, _COLORS)
 
 
-def _colors(vertex: Element, face: Element, number: I64, sizes: I64) -> F64 | None:
+def _colors(vertex: _Element, face: _Element, number: I64, sizes: I64) -> F64 | None:
     """Linear colors (c, 3) of corners; None without any."""
     of_face = _face_colors(vertex, face)
     element, names = (face, of_face) if of_face else (vertex, _first(vertex, _COLORS))
@@ -389,7 +362,7 @@ def _base_color(
         return {}, {"base_color": fault}
 
 
-def _unused(content: Elements) -> list[str]:
+def _unused(content: _Elements) -> list[str]:
     """Warnings of what the file has that is not used."""
     vertex, face = content.elements["vertex"], content.elements["face"]
     wedge = _WEDGE in face.lists
