@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Mapping, Sequence, Set
 from datetime import date
 from pathlib import Path
@@ -13,8 +14,9 @@ from mbtf_core.paths import refuse_special, suggest_path
 
 # Bounds on the length, the depth and (because of YAML's aliases) the number of values of a configuration.
 _MAX_CHARACTERS = 1 << 17
-# The reader takes up to a millisecond for each line, colon and comma.
+# The reader takes up to a millisecond for each line, colon and comma, and for each key that is merged (<<).
 _MAX_MARKS = 10_000
+_MAX_MERGED = 200_000
 _MAX_DEPTH = 100
 _MAX_VALUES = 100_000
 _TOO_DEEP = f"is nested more than {_MAX_DEPTH} levels deep"
@@ -48,6 +50,11 @@ def read_yaml(path: Path) -> Any:
     marks = sum(text.count(mark) for mark in ("\n", ":", ","))
     if marks > _MAX_MARKS:
         raise InputError(f"is too long: more than {_MAX_MARKS:,} lines, colons and commas", where=path)
+    if "<<" in text and text.count("*") * marks > _MAX_MERGED:
+        raise InputError("merges (<<) too many keys", where=path)
+    bracket = _deep_bracket(text)
+    if bracket is not None:
+        raise InputError(_TOO_DEEP, where=_place(path, text, bracket))
     try:
         data = _yaml().load(text)
     except MarkedYAMLError as error:
@@ -76,7 +83,12 @@ def read_yaml(path: Path) -> Any:
 
 
 def _text_of(path: Path) -> str:
-    """Text of a file, at most about as much as is read of a configuration."""
+    """Text of a file, at most about as much as is read of a configuration.
+
+    Raises
+    ------
+    InputError : the file is missing, unreadable or not UTF-8
+    """
     refuse_special(path)
     try:
         with path.open("rb") as stream:
@@ -101,8 +113,24 @@ def _place(path: Path, text: str, position: int) -> str:
     return f"{path}:{line}"
 
 
+def _deep_bracket(text: str) -> int | None:
+    """Where brackets are nested too deeply: the reader's time grows with the square of their depth."""
+    depth = 0
+    for bracket in re.finditer(r"[\[\]{}]", text):
+        depth += 1 if bracket[0] in "[{" else -1
+        if depth > _MAX_DEPTH:
+            return bracket.start()
+    return None
+
+
 def _check_tree(data: Any, where: object) -> None:
-    """Refuse YAML that no configuration contains: endless aliases, keys that are no text, foreign tags."""
+    """Refuse YAML that no configuration contains.
+
+    Raises
+    ------
+    InputError : nested too deeply, repeated through aliases (or holding itself), keys that are no text, or
+        tags of some program's own
+    """
     # Each value with its depth and the line of the last key on the way to it.
     waiting: list[tuple[Any, int, int | None]] = [(data, 1, None)]
     seen = 0

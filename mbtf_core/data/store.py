@@ -180,8 +180,19 @@ class ObjectStore:
             ) from None
 
     def _request(self, name: str, function: Callable[[], T], size: int = 0) -> T:
-        """Result of a request for an object, or for the folder without a name, that moves `size` bytes; tried
-        again where the connection fails."""
+        """Result of a request, tried again where the connection fails.
+
+        Parameters
+        ----------
+        name : of the object; empty for the folder
+        size : bytes that the request moves
+
+        Raises
+        ------
+        FileNotFoundError, FileExistsError : as the store says
+        InputError : the store refuses the request
+        PartialError : the store cannot be reached
+        """
         where = f"{self.url}/{name}" if name else self.url
         pause, give_up = _FIRST_PAUSE, time.monotonic() + self.patience * (1 + size / _BLOCK_BYTES)
         failed: Exception | None = None

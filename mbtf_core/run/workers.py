@@ -127,7 +127,12 @@ def site_preload() -> list[str]:
 
 
 def _completed(engine: str, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Options of a file, with those of Dask's configuration that ours are added to."""
+    """Options of a file, with those of Dask's configuration that ours are added to.
+
+    Raises
+    ------
+    ValueError : an option is a key of the file
+    """
     for key in options.keys() & _OURS.keys():
         raise ValueError(f"options: '{key}' follows from '{_OURS[key]}' of the file: give that")
     dask = import_extra("dask", "--cluster")

@@ -28,7 +28,7 @@ from mbtf_gen.generation.folder import claim_folder
 from mbtf_gen.generation.manifest import Summary, finish, new_manifest
 from mbtf_gen.generation.shard_record import store_shard
 from mbtf_gen.job import shard_entries
-from mbtf_gen.measured.hdf5 import COLOR, MAGIC, NeumipQueries, hdf5_file
+from mbtf_gen.measured.hdf5 import COLOR, MAGIC, RADIUS, NeumipQueries, NeuralBtf, hdf5_file
 from mbtf_gen.measured.interface import MeasuredBtf
 from mbtf_gen.measured.ubo2003 import SUFFIXES, Ubo2003
 from mbtf_gen.measured.ubo2014 import Ubo2014
@@ -59,7 +59,9 @@ _BLOCK = 1 << 22
 # First bytes of files: of zip archives, and of other archives and single compressed files.
 _ZIP = b"PK"
 _PACKED = (b"Rar!", b"7z\xbc\xaf", b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"\x28\xb5\x2f\xfd")
-_KNOWN = "a .btf file (Bonn, DFMF), a folder or zip of photographs named by angles, or HDF5 of NeuMIP"
+_KNOWN = (
+    "a .btf file (Bonn, DFMF), a folder or zip of photographs named by angles, or HDF5 of NeuMIP or NeuralBTF"
+)
 # The first bytes, which tell what a file is.
 _START = 1 << 10
 
@@ -367,7 +369,7 @@ def open_measured(path: str | Path) -> MeasuredBtf | NeumipQueries:
         names = set(file)
     if COLOR not in names:
         raise InputError(f"is an HDF5 file without '{COLOR}'", where=path, hint=f"known are {_KNOWN}")
-    return NeumipQueries(path)
+    return NeumipQueries(path) if RADIUS in names or "ground_valid" in names else NeuralBtf(path)
 
 
 def _unknown(path: Path, start: bytes) -> InputError:

@@ -31,7 +31,7 @@ from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError, reason
 from mbtf_core.images.environment import read_linear
 from mbtf_core.paths import opened, real_path
-from mbtf_gen.measured.interface import COMPLETE, I64, MeasuredBtf, check_texels, from_angles
+from mbtf_gen.measured.interface import COMPLETE, I64, ImageBtf, check_texels, from_angles
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".exr", ".hdr")
 _ANGLES = tuple(
@@ -52,7 +52,7 @@ _LINEAR = srgb_to_linear(np.arange(256) / 255.0).astype(np.float32)
 Content = Callable[[str], bytes]
 
 
-class Ubo2003(MeasuredBtf):
+class Ubo2003(ImageBtf):
     """Photographs in a folder, which may have sub-folders, or in a zip archive. Nothing is unpacked to disk.
 
     Raises
@@ -97,15 +97,6 @@ class Ubo2003(MeasuredBtf):
         else:
             with _archive(self.path) as archive:
                 yield lambda name: _read_member(archive, name, self.path)
-
-    def _values(self, number: I64, texel: I64) -> NDArray[np.float32]:
-        out = np.empty((len(number), 3), np.float32)
-        order = np.argsort(number, kind="stable")
-        used, starts = np.unique(number[order], return_index=True)
-        with self._opened() as content:
-            for image, group in zip(used, np.split(order, starts[1:]), strict=True):
-                out[group] = self._texels(content, int(image), *np.divmod(texel[group], self.columns))
-        return out
 
     def _texels(self, file: Content, number: int, row: I64, column: I64) -> NDArray[np.float32]:
         pixels = self._decoded(file, number)

@@ -248,7 +248,10 @@ def _mixed(
 
 
 def _shift(image: Floats, axis: int) -> float:
-    """The share of the tile by which a map is most like itself within the bands; its seam lies outside."""
+    """The share of the tile by which a shifted map is most like itself within the bands.
+
+    The seam of the shifted map lies outside both bands.
+    """
     gray = image.mean(axis=-1, keepdims=True)
     cells = round(1 / _STEP)
     rows, columns = (min(size, cells) if k != axis else cells for k, size in enumerate(gray.shape[:2]))

@@ -50,6 +50,7 @@ def test_from_data_to_pictures(work: Path, monkeypatch: pytest.MonkeyPatch) -> N
         ("mbtf-fit felt -o other --model rainer2019 --steps 1", "measured data have no other layout"),
         ("mbtf-gen repair felt", "cannot be generated again"),
         ("mbtf-gen preview felt -o other", "whose surface is unknown"),
+        ("mbtf-gen export felt other.hdf5 --program neuralbtf", "under fixed lights and views"),
     ],
 )
 def test_what_does_not_apply_is_refused(

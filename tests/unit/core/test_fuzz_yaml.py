@@ -178,6 +178,11 @@ HOSTILE = {
     "dashes": ("a:\n" + " - " * 5000, "nested more than 100 levels deep"),
     "a flood": ("a: 1\n" * 100_000, "is too long"),
     "a list of many": (f"a: [{'1,' * 20_000}]", "is too long"),
+    "merges": (
+        f"a: &a {{{', '.join(f'k{k}: 1' for k in range(1000))}}}\n"
+        + "".join(f"b{k}:\n  <<: *a\n" for k in range(200)),
+        "too many keys",
+    ),
     "a long number": ("a: " + "9" * 5000, "not valid YAML"),
     "a date of no calendar": ("a: 2001-99-99", "not valid YAML"),
     "a foreign object": ("a: !!python/object/apply:os.system ['true']", "holds the tag"),
@@ -211,6 +216,7 @@ def test_hostile_yaml(case: str, write: Callable[[str], Path]) -> None:
         (b"a: 1\nb: x\0y\n", 2),
         ("# caf\u00e9\na: caf\u00e9\n".encode("latin-1"), 1),
         ("a: 1\n".encode("utf-16"), 1),
+        (b"a: 1\nb: " + 101 * b"[", 2),
         (b"a: 1\nb:\n\t- 1\n", 3),
         (b"a: {b: 1,\n  b: 2}\n", 2),
     ],
@@ -228,3 +234,13 @@ def test_a_value_that_holds_itself(text: str, write: Callable[[str], Path]) -> N
     path = write(text)
     loads_or_refuses(lambda: resolve(GeneratorConfig, file=path))
     loads_or_refuses(lambda: load_material(path))
+
+
+@pytest.mark.parametrize("text", ["a: " + "[" * 100_000, "a: " + "{a: " * 5_000])
+def test_brackets_are_counted_first(
+    text: str, write: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The reader's time grows with the square of their depth.
+    monkeypatch.setattr("mbtf_core.config.yaml_file._yaml", lambda: pytest.fail("the text was read"))
+    with pytest.raises(InputError, match="levels deep"):
+        read_yaml(write(text))

@@ -1,4 +1,4 @@
-"""HDF5 of NeuMIP: conventions, exports, and files that are refused."""
+"""HDF5 of NeuMIP and NeuralBTF: conventions, exports, and files that are refused."""
 
 from __future__ import annotations
 
@@ -8,14 +8,16 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from support import measured_files as files
 from support.datasets import write_dataset
 from support.measured_files import write_hdf5
 
 from mbtf_core.errors import InputError
 from mbtf_gen.generation.imported import open_measured
-from mbtf_gen.measured.exported import export_neumip
-from mbtf_gen.measured.hdf5 import NeumipQueries
+from mbtf_gen.measured.exported import export_neumip, export_neural_btf
+from mbtf_gen.measured.hdf5 import NeumipQueries, NeuralBtf
 
+TEXELS = files.ROWS * files.COLUMNS
 FIELDS = ("u", "sigma", "omega_i", "omega_o", "value")
 
 
@@ -146,19 +148,82 @@ def test_numbers_that_are_not_in_the_file(tmp_path: Path) -> None:
         NeumipQueries(tmp_path / "d.hdf5")
 
 
+def pairs() -> tuple[np.ndarray, np.ndarray]:
+    """Nine lights and views above the horizon, as float32."""
+    light, view = files.unit(files.LIGHTS), files.unit(files.VIEWS[:3])
+    return np.tile(light, (3, 1)).astype(np.float32), np.repeat(view, 3, axis=0).astype(np.float32)
+
+
+def images() -> dict[str, np.ndarray]:
+    """A file of the known function whose third light is at the horizon."""
+    light, view = pairs()
+    color = np.array([files.image(i, o) for i, o in zip(light, view, strict=True)], np.float32)
+    light[2, :2] = [1, 0]
+    return {"ground_light": light[:, :2], "ground_camera_dir": view[:, :2], "ground_color": color}
+
+
+def test_images_of_the_known_function(tmp_path: Path) -> None:
+    btf = NeuralBtf(write_hdf5(tmp_path / "a.hdf5", images()))
+    assert (btf.rows, btf.columns, btf.left_out, btf.cosine) == (files.ROWS, files.COLUMNS, 1, None)
+    assert len(btf.light) == 8
+    order = np.random.default_rng(2).permutation(8 * TEXELS)
+    pair, texel = order // TEXELS, order % TEXELS
+    row, column = np.divmod(texel, files.COLUMNS)
+    light, view = btf.light[pair].astype(np.float64), btf.view[pair].astype(np.float64)
+    np.testing.assert_allclose(btf.values(pair, texel), files.value(row, column, light, view), rtol=1e-5)
+    # A few texels of the last rows of one image.
+    at = (files.ROWS - 2) * files.COLUMNS + np.array([1, 6])
+    np.testing.assert_array_equal(
+        btf.values(np.array([3, 3]), at), images()["ground_color"][4].reshape(-1, 3)[at]
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "array", "message"),
+    [
+        ("ground_light", None, "no data set 'ground_light'"),
+        ("ground_light", np.zeros((8, 2)), "the shape"),
+        ("ground_camera_dir", np.zeros((9, files.ROWS, files.COLUMNS, 2)), "direction for each pixel"),
+        ("ground_camera_dir", np.full((9, 2), np.nan), "unit vectors"),
+        ("ground_camera_dir", np.full((9, 2), 0.8), "unit vectors"),
+        ("ground_light", np.ones((9, 2)) * [1, 0], None),
+        ("ground_color", np.zeros((9, 5, 4, 4)), "the shape"),
+        ("ground_color", np.zeros((9, 5, 4, 3), np.uint8), "floats are expected"),
+    ],
+)
+def test_images_that_are_refused(name: str, array: Any, message: str | None, tmp_path: Path) -> None:
+    arrays = {key: a for key, a in (images() | {name: array}).items() if a is not None}
+    path = write_hdf5(tmp_path / "a.hdf5", arrays)
+    if message is None:
+        assert NeuralBtf(path).left_out == 9
+        return
+    with pytest.raises(InputError) as caught:
+        NeuralBtf(path)
+    assert message in caught.value.message
+
+
+def test_nan_values_are_refused_where_they_are_used(tmp_path: Path) -> None:
+    arrays = images()
+    arrays["ground_color"][0, 1, 1, 1] = np.nan
+    btf = NeuralBtf(write_hdf5(tmp_path / "a.hdf5", arrays))
+    btf.values(np.array([0]), np.array([0]))
+    with pytest.raises(InputError, match="NaN or infinite"):
+        btf.values(np.array([0, 0]), np.array([0, files.COLUMNS + 1]))
+
+
 def test_a_filter_that_is_not_installed_is_named(tmp_path: Path) -> None:
     path = tmp_path / "a.hdf5"
     with h5py.File(path, "w") as file:
-        for name, array in stored((2, 3, 40)).items():
+        for name, array in images().items():
             file.create_dataset(name, data=array, compression="gzip")
     content = path.read_bytes()
-    assert NeumipQueries(path).count == 240
+    assert NeuralBtf(path).rows == files.ROWS
     # The number of a filter lies eight bytes before its name.
     changed = content.replace(b"\1\0\x08\0\1\0\1\0deflate\0", b"\1\x7d\x08\0\1\0\1\0blosc\0\0\0")
     assert changed != content
     path.write_bytes(changed)
     with pytest.raises(InputError, match=r"the HDF5 filter 32001 \(blosc\)"):
-        NeumipQueries(path)
+        NeuralBtf(path)
 
 
 def test_numbers_that_a_file_cannot_have(tmp_path: Path) -> None:
@@ -167,8 +232,9 @@ def test_numbers_that_a_file_cannot_have(tmp_path: Path) -> None:
         shape = (30, 512, 512, 3)
         color = file.create_dataset("ground_color", shape, np.float32, chunks=shape, compression="gzip")
         color[...] = 0.0
+        file["ground_light"] = file["ground_camera_dir"] = np.zeros((30, 2), np.float32)
     with pytest.raises(InputError, match="claims 94,371,840 bytes"):
-        NeumipQueries(path)
+        NeuralBtf(path)
 
 
 def test_an_export_for_neumip(tmp_path: Path) -> None:
@@ -195,6 +261,8 @@ def test_what_cannot_be_exported(tmp_path: Path) -> None:
     wide = write_dataset(tmp_path / "wide", queries={"train": "30", "test": "8"})
     with pytest.raises(InputError, match="tiles are square"):
         export_neumip(wide, tmp_path / "a.hdf5")
+    with pytest.raises(InputError, match="learns from images under fixed lights"):
+        export_neural_btf(wide, tmp_path / "a.hdf5")
     slices = write_dataset(tmp_path / "s", queries={"train": "9/texel", "test": "8", "layout": "slices"})
     with pytest.raises(InputError, match="learns from shuffled queries"):
         export_neumip(slices, tmp_path / "a.hdf5")
