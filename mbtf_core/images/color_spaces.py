@@ -31,6 +31,18 @@ _PRIMARIES = {
     "ACEScg": (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767),
     "ACES2065-1": (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767),
     "Adobe RGB (1998)": ADOBE_RGB,
+    "Rec.601 (625 lines)": (0.64, 0.33, 0.29, 0.60, 0.15, 0.06, 0.3127, 0.3290),
+    "Rec.601 (525 lines)": (0.630, 0.340, 0.310, 0.595, 0.155, 0.070, 0.3127, 0.3290),
+}
+# Color primaries of ITU-T H.273 by code.
+_CODED = {
+    1: REC709,
+    5: _PRIMARIES["Rec.601 (625 lines)"],
+    6: _PRIMARIES["Rec.601 (525 lines)"],
+    7: _PRIMARIES["Rec.601 (525 lines)"],
+    9: _PRIMARIES["Rec.2020"],
+    11: _PRIMARIES["DCI-P3"],
+    12: _PRIMARIES["Display P3"],
 }
 # Tolerance of the comparison of chromaticities, of matrices and of curves.
 _SAME = 2e-3
@@ -80,6 +92,11 @@ def srgb(x: F64) -> F64:
     return np.asarray(srgb_to_linear(x), np.float64)
 
 
+def rec709(x: F64) -> F64:
+    """The curve of Rec.709, Rec.601 and Rec.2020 (inverse of the camera's, ITU-R BT.709-6)."""
+    return np.where(x < 0.081, x / 4.5, ((np.maximum(x, 0.0) + 0.099) / 1.099) ** (1.0 / 0.45))
+
+
 def rgb_to_xyz(chromaticities: Sequence[float]) -> F64:
     """The matrix (3, 3) from linear RGB to XYZ whose white has Y = 1.
 
@@ -124,6 +141,26 @@ def from_chromaticities(chromaticities: Sequence[float], *curves: Curve) -> Decl
     named = (n for n, p in _PRIMARIES.items() if np.abs(np.subtract(p, chromaticities)).max() < _SAME)
     name = next(named, "own primaries")
     return DeclaredSpace(name, curves, _to_rec709(to_xyz, to_xyz.sum(axis=1)))
+
+
+def from_cicp(content: bytes) -> DeclaredSpace:
+    """The space of a ``cICP`` chunk of PNG (ITU-T H.273).
+
+    Raises
+    ------
+    ValueError : it is not supported, such as HDR video
+    """
+    primaries, transfer, matrix, full = struct.unpack(">4B", content)
+    curves: dict[int, tuple[Curve, ...]] = {
+        **dict.fromkeys((1, 6, 14, 15), (rec709,) * 3),
+        4: (power(2.2),) * 3,
+        5: (power(2.8),) * 3,
+        8: (),
+        13: (srgb,) * 3,
+    }
+    if primaries not in _CODED or transfer not in curves or matrix != 0 or full != 1:
+        raise ValueError("not supported")
+    return from_chromaticities(_CODED[primaries], *curves[transfer])
 
 
 def from_icc(profile: bytes, name: str) -> DeclaredSpace:

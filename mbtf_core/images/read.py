@@ -300,7 +300,8 @@ def _from_pillow(path: Path, kind: str, max_pixels: int) -> Image:
                     if kind == "BMP" and picture.info.get("compression") in _RUN_LENGTHS:
                         raise InputError("has run lengths", where=path, hint="save it without compression")
                     codes = _codes(picture, path) if codes is None else codes
-                    tags = tags or pillow_tags(picture.info, picture.getexif())
+                    png = path if kind == "PNG" else None
+                    tags = tags or pillow_tags(picture.info, picture.getexif(), png)
     except InputError:
         raise
     except Exception as error:  # a damaged file may make the decoder raise anything

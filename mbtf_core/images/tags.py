@@ -5,8 +5,10 @@ from __future__ import annotations
 import contextlib
 import io
 import math
+import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from mbtf_core.images.color_spaces import (
@@ -16,6 +18,7 @@ from mbtf_core.images.color_spaces import (
     Curve,
     DeclaredSpace,
     from_chromaticities,
+    from_cicp,
     from_icc,
     power,
     srgb,
@@ -62,15 +65,25 @@ NO_TAGS = Tags()
 _Color = tuple[ColorSpace | None, DeclaredSpace | None, str | None]
 
 
-def pillow_tags(info: Mapping[Any, Any], exif: Any) -> Tags:
+def pillow_tags(info: Mapping[Any, Any], exif: Any, path: Path | None = None) -> Tags:
     """Tags from the metadata that Pillow read.
 
-    The profile takes precedence over the ``sRGB`` chunk, and that over ``gAMA`` and ``cHRM`` (PNG
-    specification, third edition, 4.3). Cameras declare Adobe RGB in EXIF (DCF 2.0).
+    ``cICP`` takes precedence over the profile, that over the ``sRGB`` chunk, and that over ``gAMA`` and
+    ``cHRM`` (PNG specification, third edition, 4.3). Cameras declare Adobe RGB in EXIF (DCF 2.0).
+
+    Parameters
+    ----------
+    path : a PNG file, whose ``cICP`` Pillow does not read
     """
+    coded = None if path is None else _cicp_chunk(path)
     gamma, primaries = info.get("gamma"), info.get("chromaticity")
     color: _Color = (None, None, None)
-    if info.get("icc_profile"):
+    if coded is not None:
+        try:
+            color = _color(from_cicp(coded))
+        except (ValueError, struct.error):
+            color = (None, None, f"cICP chunk ({' '.join(map(str, coded[:4]))})")
+    elif info.get("icc_profile"):
         color = _profile(info["icc_profile"])
     elif "srgb" in info:
         color = ("srgb", None, None)
@@ -188,3 +201,17 @@ def _pixel_size(tags: Any) -> float | None:
     except (TypeError, IndexError, ValueError):
         return None
     return float(size) if 0 < size < math.inf else None
+
+
+def _cicp_chunk(path: Path) -> bytes | None:
+    """Content of the chunk ``cICP`` of a PNG file, at most 64 bytes of it."""
+    with path.open("rb") as stream:
+        stream.seek(8)
+        while len(head := stream.read(8)) == 8:
+            size, name = struct.unpack(">I4s", head)
+            if name == b"cICP":
+                return stream.read(min(size, 64))
+            if name in (b"IDAT", b"IEND"):
+                return None
+            stream.seek(size + 4, io.SEEK_CUR)
+    return None

@@ -1,11 +1,12 @@
 """Triangles and materials of glTF 2.0 files (Khronos Group 2021, "glTF 2.0 Specification").
 
-The default scene is read with all transforms applied, in its rest pose. Triangles of one
+The default scene is read with all transforms and instances applied, in its rest pose. Triangles of one
 material are one shape.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
-from mbtf_core.meshes.content import F64, MOST_TRIANGLES, MeshContent, MeshShape
+from mbtf_core.meshes.content import F64, MOST_TRIANGLES, MeshContent, MeshShape, of_faces
 from mbtf_core.meshes.gltf_buffers import FLOAT, HINTS, READ, GltfFile
 from mbtf_core.meshes.gltf_material import Materials
-from mbtf_core.meshes.gltf_schema import GltfMaterial, GltfMesh, GltfNode, GltfPrimitive
+from mbtf_core.meshes.gltf_schema import GltfInstancing, GltfMaterial, GltfMesh, GltfNode, GltfPrimitive
 
 Faces = NDArray[np.int64]
 
@@ -26,6 +27,8 @@ _CUT = "colors of vertices outside of [0, 1] are clamped"
 _AT_REST = {"translation": (0.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0, 1.0), "scale": (1.0, 1.0, 1.0)}
 # Largest deviation of a quaternion's length from one; quantized ones deviate by one hundredth.
 _UNIT = 0.05
+# Largest deviation of texture coordinates that follow from others.
+_SAME_UV = 1e-5
 
 
 @dataclass
@@ -34,18 +37,23 @@ class _Piece:
 
     vertices: F64
     faces: Faces
-    uv: F64 | None
+    uv: dict[int, F64]
     colors: F64 | None
     normals: F64 | None
 
 
 @dataclass
 class _Group:
-    """Primitives of one material, with or without texture coordinates: those of a number, or None."""
+    """Primitives of one material that have the same texture coordinates.
+
+    Attributes
+    ----------
+    places : dict of int to (3, 3) array; texture coordinates (u, v, 1) of each set from those of the first
+    """
 
     name: str
     material: GltfMaterial
-    uv_set: int | None
+    places: dict[int, F64]
     pieces: list[_Piece] = field(default_factory=list)
 
 
@@ -73,7 +81,7 @@ def read_gltf(path: Path) -> MeshContent:
                 continue
             material = materials.of(primitive.material)
             try:
-                piece = _piece(file, primitive, material, materials.uv_set(primitive.material))
+                piece = _piece(file, primitive, material, materials.uv_sets(primitive.material))
             except InputError as error:
                 what = f"'meshes.{number}.primitives.{position}': {error.what}"
                 raise InputError(what, where=error.where, hint=error.hint) from None
@@ -82,10 +90,12 @@ def read_gltf(path: Path) -> MeshContent:
                 raise InputError(f"has {total:,} triangles, more than {MOST_TRIANGLES:,}", where=path)
             if not len(piece.faces):
                 continue
-            key = (primitive.material, piece.uv is None, piece.colors is None, piece.normals is None)
+            places = _related(piece.uv, piece.faces)
+            # One matrix for all primitives, unless several sets of coordinates are placed on one.
+            own = (number, position) if len(places) > 1 else None
+            key = (primitive.material, tuple(places), piece.colors is None, piece.normals is None, own)
             name = material.name or mesh.name or "part"
-            uv_set = None if piece.uv is None else materials.uv_set(primitive.material)
-            group = groups.setdefault(key, _Group(name, material, uv_set))
+            group = groups.setdefault(key, _Group(name, material, places))
             group.pieces.append(_instances(piece, matrices))
     shapes = [_shape(group, materials) for group in groups.values()]
     if others:
@@ -97,7 +107,7 @@ def read_gltf(path: Path) -> MeshContent:
 
 
 def _placements(file: GltfFile) -> dict[int, F64]:
-    """Matrices (k, 4, 4) of each mesh of the default scene, one per node."""
+    """Matrices (k, 4, 4) of each mesh of the default scene, one per instance."""
     document = file.document
     nodes, scenes = document.nodes, document.scenes
     if scenes or document.scene is not None:
@@ -121,20 +131,19 @@ def _placements(file: GltfFile) -> dict[int, F64]:
         if node.mesh is not None:
             mesh = file.entry(document.meshes, node.mesh, "meshes")
             _check_pose(node, mesh, file)
-            found.setdefault(node.mesh, []).append(matrix)
+            instancing = node.extensions.instancing
+            own = matrix[None] if instancing is None else matrix @ _instance_matrices(file, instancing)
+            found.setdefault(node.mesh, []).append(own)
         waiting += [(child, matrix) for child in reversed(node.children)]
     outside = sum(node.mesh is not None for index, node in enumerate(nodes) if index not in seen)
     if outside:
         file.warnings.append(f"{outside} nodes with meshes are not in the scene and not used")
-    return {mesh: np.stack(matrices) for mesh, matrices in found.items()}
+    return {mesh: np.concatenate(matrices) for mesh, matrices in found.items()}
 
 
 def _check_pose(node: GltfNode, mesh: GltfMesh, file: GltfFile) -> None:
-    """Refuse poses that bones and weights define, and instances."""
+    """Refuse poses that bones and weights define."""
     name = node.name or mesh.name
-    if "EXT_mesh_gpu_instancing" in node.extensions:
-        hint = "export it without GPU instances"
-        raise InputError(f"'{name}' has instances, which are not read", where=file.path, hint=hint)
     if node.skin is not None:
         hint = "apply the armature and export it again"
         raise InputError(f"'{name}' is posed by a skeleton, which is not read", where=file.path, hint=hint)
@@ -162,6 +171,27 @@ def _locals(file: GltfFile) -> F64:
     return out
 
 
+def _instance_matrices(file: GltfFile, instancing: GltfInstancing) -> F64:
+    """Matrices (k, 4, 4) of instances."""
+    given, unused = {}, []
+    for name, index in sorted(instancing.attributes.items()):
+        default = _AT_REST.get(name.lower())
+        if default is None:
+            unused.append(name)
+        else:
+            given[name.lower()] = file.vectors(index, (len(default),), name)
+    if unused:
+        file.warnings.append(f"{', '.join(unused)} of instances are not used")
+    counts = {len(values) for values in given.values()}
+    if len(counts) != 1:
+        raise InputError("has instances of attributes of no or of different lengths", where=file.path)
+    count = counts.pop()
+    translation, rotation, scale = (
+        given.get(name, np.tile(default, (count, 1))) for name, default in _AT_REST.items()
+    )
+    return _transforms(translation, rotation, scale, file)
+
+
 def _transforms(translation: F64, rotation: F64, scale: F64, file: GltfFile) -> F64:
     """Matrices (k, 4, 4) from translations (k, 3), quaternions (k, 4) and scales (k, 3)."""
     length = np.linalg.norm(rotation, axis=1, keepdims=True)
@@ -180,11 +210,10 @@ def _transforms(translation: F64, rotation: F64, scale: F64, file: GltfFile) -> 
     return out
 
 
-def _piece(file: GltfFile, primitive: GltfPrimitive, material: GltfMaterial, uv_set: int) -> _Piece:
+def _piece(file: GltfFile, primitive: GltfPrimitive, material: GltfMaterial, sets: list[int]) -> _Piece:
     """A primitive as its file stores it."""
     vertices, faces = _triangles(file, primitive)
-    uv = _attribute(file, primitive, f"TEXCOORD_{uv_set}", (2,), len(vertices))
-    uv = None if uv is None else uv * (1, -1) + (0, 1)
+    uv = _texture_coordinates(file, primitive, sets, len(vertices))
     colors = _colors(file, primitive, material, len(vertices))
     return _Piece(vertices, faces, uv, colors, _attribute(file, primitive, "NORMAL", (3,), len(vertices)))
 
@@ -228,6 +257,14 @@ def _attribute(
     return values
 
 
+def _texture_coordinates(
+    file: GltfFile, primitive: GltfPrimitive, sets: list[int], count: int
+) -> dict[int, F64]:
+    """Texture coordinates (n, 2), v up, of those sets that the primitive has."""
+    found = {number: _attribute(file, primitive, f"TEXCOORD_{number}", (2,), count) for number in sets}
+    return {number: uv * (1, -1) + (0, 1) for number, uv in found.items() if uv is not None}
+
+
 def _colors(file: GltfFile, primitive: GltfPrimitive, material: GltfMaterial, count: int) -> F64 | None:
     """Linear colors (n, 3) of the vertices."""
     colors = _attribute(file, primitive, "COLOR_0", (3, 4), count)
@@ -244,6 +281,23 @@ def _colors(file: GltfFile, primitive: GltfPrimitive, material: GltfMaterial, co
         hint = "bake it into the texture of the base color"
         raise InputError("has vertices with alpha, which is not read", where=file.path, hint=hint)
     return np.clip(colors[:, :3], 0.0, 1.0)
+
+
+def _related(uv: Mapping[int, F64], faces: Faces) -> dict[int, F64]:
+    """Matrices (3, 3) that turn texture coordinates (u, v, 1) of the first set into those of each set; sets
+    that do not follow from the first by a matrix are left out."""
+    out: dict[int, F64] = {}
+    first: F64 | None = None
+    for number, values in uv.items():
+        own = of_faces(values, faces)
+        if first is None:
+            first = np.column_stack([own, np.ones(len(own))])
+            out[number] = np.eye(3)
+        elif np.isfinite(first).all() and np.isfinite(own).all():
+            matrix = np.linalg.lstsq(first, own, rcond=None)[0]
+            if np.abs(first @ matrix - own).max() <= _SAME_UV * max(1.0, float(np.abs(own).max())):
+                out[number] = np.vstack([matrix.T, (0.0, 0.0, 1.0)])
+    return out
 
 
 def _instances(piece: _Piece, matrices: F64) -> _Piece:
@@ -266,7 +320,7 @@ def _instances(piece: _Piece, matrices: F64) -> _Piece:
     return _Piece(
         placed.reshape(-1, 3),
         faces.reshape(-1, 3),
-        None if piece.uv is None else np.tile(piece.uv, (copies, 1)),
+        {number: np.tile(uv, (copies, 1)) for number, uv in piece.uv.items()},
         None if piece.colors is None else np.tile(piece.colors, (copies, 1)),
         normals,
     )
@@ -276,15 +330,15 @@ def _shape(group: _Group, materials: Materials) -> MeshShape:
     """All triangles of a group as one shape."""
     pieces = group.pieces
     starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces[:-1])])
-    values, faults = materials.read(group.material, group.uv_set)
-    uv = [piece.uv for piece in pieces if piece.uv is not None]
+    values, faults = materials.read(group.material, group.places)
+    first = next(iter(group.places), None)
     colors = [piece.colors for piece in pieces if piece.colors is not None]
     normals = [piece.normals for piece in pieces if piece.normals is not None]
     return MeshShape(
         group.name,
         np.concatenate([piece.vertices for piece in pieces]),
         np.concatenate([piece.faces + start for piece, start in zip(pieces, starts, strict=True)]),
-        np.concatenate(uv) if uv else None,
+        None if first is None else np.concatenate([piece.uv[first] for piece in pieces]),
         np.concatenate(colors) if colors else None,
         values,
         faults,

@@ -44,6 +44,7 @@ HINTS = {
 }
 # Those that are read.
 READ = {
+    "EXT_mesh_gpu_instancing",
     "KHR_materials_clearcoat",
     "KHR_materials_ior",
     "KHR_materials_sheen",

@@ -7,7 +7,7 @@ factor alone.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -60,7 +60,7 @@ class Materials:
     def __init__(self, file: GltfFile) -> None:
         self.file = file
         self._maps: dict[tuple[Any, ...], NDArray[np.float32]] = {}
-        self._sets: dict[int | None, int] = {}
+        self._sets: dict[int | None, list[int]] = {}
         self._latest: tuple[int, Image] | None = None
         self._unused: dict[str, None] = {}
 
@@ -70,23 +70,25 @@ class Materials:
             return GltfMaterial()
         return self.file.entry(self.file.document.materials, index, "materials")
 
-    def uv_set(self, index: int | None) -> int:
-        """Number of the texture coordinates that its first texture needs, that of the base color where it
-        has one; 0 without textures."""
+    def uv_sets(self, index: int | None) -> list[int]:
+        """Numbers of the texture coordinates that its textures need, that of the base color first; 0 without
+        textures."""
         if index not in self._sets:
             placed = (source.placed for source in self._sources(self.of(index)).values())
-            self._sets[index] = next((texture.uv_set for texture in placed if texture is not None), 0)
+            found = dict.fromkeys(texture.uv_set for texture in placed if texture is not None)
+            self._sets[index] = list(found) or [0]
         return self._sets[index]
 
     def read(
-        self, material: GltfMaterial, uv_set: int | None
+        self, material: GltfMaterial, places: Mapping[int, F64]
     ) -> tuple[dict[str, Value], dict[str, InputError]]:
         """What a material reflects.
 
         Parameters
         ----------
         material : GltfMaterial
-        uv_set : number of the texture coordinates that the shape has; None without any
+        places : dict of int to (3, 3) array; texture coordinates (u, v, 1) of each set from those of the
+            shape, v up. Others are lacking.
 
         Returns
         -------
@@ -99,7 +101,7 @@ class Materials:
         faults: dict[str, InputError] = {}
         for role, source in self._sources(material).items():
             try:
-                values[role] = self._value(source, uv_set, material)
+                values[role] = self._value(source, places, material)
             except InputError as error:
                 faults[role] = error
         if material.extensions.specular_glossiness is not None and material.pbrMetallicRoughness is None:
@@ -148,15 +150,15 @@ class Materials:
             }
         return found
 
-    def _value(self, source: _Source, uv_set: int | None, material: GltfMaterial) -> Value:
+    def _value(self, source: _Source, places: Mapping[int, F64], material: GltfMaterial) -> Value:
         if (info := source.placed) is None:
             return source.factor
-        if info.uv_set != uv_set:
+        if info.uv_set not in places:
             raise InputError(
-                f"a texture of material '{material.name}' needs TEXCOORD_{info.uv_set}, which a part of it "
-                "lacks, or has beside others",
+                f"a part of material '{material.name}' has no TEXCOORD_{info.uv_set} of its own, "
+                "which a texture of it needs",
                 where=self.file.path,
-                hint="bake its textures to one set of texture coordinates, or unwrap it",
+                hint="bake its textures to the first texture coordinates, or unwrap it",
             )
         document = self.file.document
         texture = self.file.entry(document.textures, info.index, "textures")
@@ -171,7 +173,7 @@ class Materials:
             self._map(texture.source, source),
             (_WRAPS[sampler.wrapS], _WRAPS[sampler.wrapT]),
             sampler.magFilter == _NEAREST,
-            (_FLIP @ _transform(info) @ _FLIP)[:2],
+            (_FLIP @ _transform(info) @ _FLIP @ places[info.uv_set])[:2],
         )
         return placed, source.factor
 

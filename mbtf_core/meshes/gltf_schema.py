@@ -208,6 +208,18 @@ class GltfMesh(_Object):
     weights: list[Number] = []
 
 
+class GltfInstancing(_Object):
+    """``EXT_mesh_gpu_instancing``."""
+
+    attributes: dict[str, Index]
+
+
+class GltfNodeExtensions(_Object):
+    """Extensions of a node that are read."""
+
+    instancing: GltfInstancing | None = Field(None, alias="EXT_mesh_gpu_instancing")
+
+
 class GltfNode(_Object):
     """A place in the scene."""
 
@@ -220,7 +232,7 @@ class GltfNode(_Object):
     mesh: Index | None = None
     skin: Index | None = None
     weights: list[Number] = []
-    extensions: dict[str, Any] = {}
+    extensions: GltfNodeExtensions = GltfNodeExtensions()
 
 
 class GltfScene(_Object):

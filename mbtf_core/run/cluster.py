@@ -19,9 +19,10 @@ from uuid import uuid4
 
 from mbtf_core.errors import InputError, PartialError, reason
 from mbtf_core.extras import extra_error, has_extra, import_extra
+from mbtf_core.run.batch import site_preload, submitted_jobs
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import GPUS_VARIABLE, THREADS_VARIABLE, Item, Result, TaskFunction, packed, run_task
-from mbtf_core.run.workers import MEMORY, ClusterConfig, read_cluster, site_preload, submitted_jobs
+from mbtf_core.run.workers import MEMORY, ClusterConfig, read_cluster
 from mbtf_core.timeouts import NoAnswer, call_within
 from mbtf_core.units import format_duration
 
@@ -285,7 +286,7 @@ def _open_workers(where: str, note: Callable[[str], None]) -> Iterator[DaskRunne
         if config.address is not None:
             note(f"cluster: connecting to {config.address}, at most {limit}")
         try:
-            started = config.address or stack.enter_context(_started(config, refused))
+            started = config.address or stack.enter_context(_started(config, refused, note))
             # Dask's own time limit leaves out the first answer; its error is the better one.
             client = call_within(
                 config.timeout,
@@ -313,11 +314,11 @@ def _open_workers(where: str, note: Callable[[str], None]) -> Iterator[DaskRunne
         yield cluster
 
 
-def _started(config: ClusterConfig, refused: list[str]) -> Any:
+def _started(config: ClusterConfig, refused: list[str], note: Callable[[str], None]) -> Any:
     """A Dask cluster, which ends its workers when its block ends."""
     environment = {THREADS_VARIABLE: str(config.threads), "OMP_NUM_THREADS": str(config.threads)}
     if config.engine != "local":
-        return submitted_jobs(config, environment, refused)
+        return submitted_jobs(config, environment, refused, note)
     return _local_workers(config, environment)
 
 

@@ -15,7 +15,7 @@ from PIL import ImageCms
 from support.image_files import P3_COLUMNS, SRGB_COLUMNS, SRGB_CURVE, exr, icc, png, rng
 
 from mbtf_core.color import linear_to_srgb, srgb_to_linear
-from mbtf_core.images.color_spaces import from_chromaticities
+from mbtf_core.images.color_spaces import adaptation, from_chromaticities, from_cicp
 from mbtf_core.images.environment import read_environment
 from mbtf_core.images.read import linear_rgb, read_image
 
@@ -123,6 +123,7 @@ def test_profiles_of_gray_and_of_floats(tmp_path: Path) -> None:
     assert found == pytest.approx(numbers @ np.array(FROM_P3).T, abs=3e-3)
 
 
+P3_CICP = (b"cICP", bytes([12, 13, 0, 1]))
 GAMMA = (b"gAMA", (45455).to_bytes(4, "big"))
 SRGB = (b"sRGB", b"\0")
 P3_ICC = (b"iCCP", b"x\0\0" + zlib.compress(icc("P3", P3_COLUMNS, SRGB_CURVE)))
@@ -133,6 +134,9 @@ SRGB_ICC = (b"iCCP", b"x\0\0" + zlib.compress(icc("sRGB", SRGB_COLUMNS, SRGB_CUR
 @pytest.mark.parametrize(
     ("chunks", "wide", "gamma"),
     [
+        ((P3_CICP,), True, None),
+        ((P3_CICP, SRGB_ICC), True, None),
+        (((b"cICP", bytes([1, 13, 0, 1])), P3_ICC), False, None),
         ((P3_ICC, SRGB), True, None),
         ((SRGB, chrm(P3_CHRM)), False, None),
         ((SRGB, (b"gAMA", (100000).to_bytes(4, "big"))), False, None),
@@ -152,6 +156,47 @@ def test_precedence_of_png(
     assert found == pytest.approx(expected, abs=2e-3)
 
 
+@pytest.mark.parametrize(
+    ("primaries", "transfer", "code", "expected"),
+    [
+        # ITU-R BT.709-6 encodes 0.5 as 0.705515 and 0.01 as 0.045.
+        (1, 1, 0.705515, 0.5),
+        (1, 14, 0.045, 0.01),
+        (1, 4, 0.5, 0.217638),
+        (1, 5, 0.5, 0.143587),
+        (1, 8, 0.5, 0.5),
+        (1, 13, 0.5, 0.214041),
+    ],
+)
+def test_curves_of_cicp(tmp_path: Path, primaries: int, transfer: int, code: float, expected: float) -> None:
+    codes = np.full((2, 2, 3), round(65535 * code))
+    chunk = (b"cICP", bytes([primaries, transfer, 0, 1]))
+    found = linear_rgb(read_image(png(tmp_path / "x.png", codes, 2, 16, extra=(chunk,))))
+    assert found == pytest.approx(expected, abs=2e-5)
+
+
+@pytest.mark.parametrize(
+    ("code", "xy"),
+    [
+        # Green of ITU-T H.273.
+        (5, (0.29, 0.60)),
+        (6, (0.310, 0.595)),
+        (7, (0.310, 0.595)),
+        (9, (0.170, 0.797)),
+        (11, (0.265, 0.690)),
+        (12, (0.265, 0.690)),
+    ],
+)
+def test_primaries_of_cicp(code: int, xy: tuple[float, float]) -> None:
+    matrix = from_cicp(bytes([code, 8, 0, 1])).matrix
+    assert matrix is not None
+    white = (0.314, 0.351) if code == 11 else (0.3127, 0.3290)
+    # Columns in XYZ, from the white of Rec.709 to the own one.
+    x, y, z = (adaptation(D65, white_xyz(white)) @ TO_XYZ @ matrix)[:, 1]
+    assert (x / (x + y + z), y / (x + y + z)) == pytest.approx(xy, abs=2e-3)
+    assert matrix.sum(axis=1) == pytest.approx(np.ones(3), abs=1e-4)
+
+
 def test_curves_of_profiles_are_constant_below_their_start(tmp_path: Path) -> None:
     # Of the kinds 1 and 2, (aX + b)^g + c from -b/a on, and c below (ICC.1:2022, table 68).
     ramp = np.linspace(0.0, 1.0, 256)
@@ -168,9 +213,15 @@ def test_curves_of_profiles_are_constant_below_their_start(tmp_path: Path) -> No
 def test_unsupported_declarations_are_named(tmp_path: Path) -> None:
     codes = rng().integers(0, 256, (4, 4, 3))
     for chunk, what in (
+        ((b"cICP", bytes([9, 16, 0, 1])), "cICP chunk"),
+        ((b"cICP", bytes([9])), "cICP chunk"),
         ((b"cHRM", bytes(32)), "chromaticities"),
         ((b"iCCP", b"x\0\0" + zlib.compress(icc("Odd", P3_COLUMNS, para(0, -2.0)))), "color profile 'Odd'"),
         ((b"iCCP", b"x\0\0" + zlib.compress(icc("P3", P3_COLUMNS, table(2.0, 9)[:20]))), "color profile"),
+        # Of video, not of full range.
+        ((b"cICP", bytes([12, 13, 0, 0])), "cICP chunk"),
+        # Of Y'CbCr.
+        ((b"cICP", bytes([12, 13, 1, 1])), "cICP chunk"),
     ):
         assert what in (read_image(png(tmp_path / "x.png", codes, 2, 8, extra=(chunk,))).tags.foreign or "")
 

@@ -142,6 +142,27 @@ def test_nodes_multiply_from_the_root(tmp_path: Path) -> None:
     assert shape.faces.tolist() == [[2, 1, 0]]
 
 
+def test_instances_are_placed_within_their_node(tmp_path: Path) -> None:
+    builder = GltfBuilder()
+    codes = np.rint(np.array([[0, 0, 0, 1], [0, HALF, 0, HALF]]) * 127).astype(np.int8)
+    attributes = {
+        "TRANSLATION": builder.accessor(np.array([[1, 0, 0], [0, 0, 5]], np.float32)),
+        "ROTATION": builder.accessor(codes, True),
+        "SCALE": builder.accessor(np.array([[1, 1, 1], [2, 2, 2]], np.float32)),
+        "_ID": builder.accessor(np.zeros(2, np.float32)),
+    }
+    extension = {"EXT_mesh_gpu_instancing": {"attributes": attributes}}
+    builder.node(builder.mesh(TRIANGLE, None), translation=[0, 100, 0], extensions=extension)
+    builder.document["extensionsRequired"] = ["EXT_mesh_gpu_instancing"]
+    found = content_of(builder, tmp_path)
+    (shape,) = found.shapes
+    turned = 2 * TRIANGLE[:, [2, 1, 0]] * (1, 1, -1)
+    expected = np.concatenate([np.add(TRIANGLE, (1, 100, 0)), np.add(turned, (0, 100, 5))])
+    assert shape.vertices == pytest.approx(expected, abs=1e-5)
+    assert shape.faces.tolist() == [[0, 1, 2], [3, 4, 5]]
+    assert ["_ID" in text for text in found.warnings] == [True]
+
+
 def test_the_default_scene_alone_is_used(tmp_path: Path) -> None:
     builder = with_triangle()
     builder.node(builder.mesh(SQUARE), translation=[9, 9, 9])
@@ -292,8 +313,9 @@ def test_more_instances_than_fit_are_refused_before_they_are_made(tmp_path: Path
     # 5000 triangles at 5000 places.
     corners = builder.accessor(np.tile(np.arange(3, dtype=np.uint8), 5000))
     mesh = builder.mesh(TRIANGLE, None, more={"indices": corners})
-    for _ in range(5000):
-        builder.node(mesh)
+    where = builder.accessor(np.zeros((5000, 3), np.float32))
+    extension = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": where}}}
+    builder.node(mesh, extensions=extension)
     with pytest.raises(InputError, match="25,000,000 triangles"):
         content_of(builder, tmp_path)
 

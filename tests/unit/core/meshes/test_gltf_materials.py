@@ -221,6 +221,12 @@ def two_sets(second: np.ndarray) -> GltfBuilder:
     return builder.plate(builder.material(base, name="wood"), TEXCOORD_1=second.astype(np.float32))
 
 
+def test_sets_that_follow_from_each_other_are_one(tmp_path: Path) -> None:
+    shape = shape_of(two_sets(SQUARE_UV * 3 + (0.5, -1)), tmp_path)
+    assert place(texture_of(shape), 0.2, 0.7) == [0.2, 0.7]
+    assert place(texture_of(shape, "roughness"), 0.2, 0.7) == [1.1, 1.1]
+
+
 def test_independent_sets_are_a_fault_of_the_roles_that_need_them(tmp_path: Path) -> None:
     (shape,) = content_of(two_sets(SQUARE_UV**2 + SQUARE_UV[[1, 1, 0, 3]]), tmp_path).shapes
     assert shape.faults.keys() == {"roughness", "metallic"}
