@@ -25,7 +25,6 @@ EXTRAS = {
     "slangpy": ("shaders", "slangpy"),
     "stlpips_pytorch": ("perceptual", "stlpips-pytorch"),
     "tensorboard": ("tensorboard", "tensorboard"),
-    "webdataset": ("publish", "webdataset"),
 }
 
 

@@ -1,4 +1,4 @@
-"""Paths and URLs that users give: names of Windows, misspelt names, special files, object stores."""
+"""Paths and URLs that users give: misspelt names, special files, object stores."""
 
 from __future__ import annotations
 
@@ -16,10 +16,6 @@ from mbtf_core.errors import InputError
 _SPECIAL = {stat.S_IFIFO: "pipe", stat.S_IFSOCK: "socket", stat.S_IFCHR: "device", stat.S_IFBLK: "device"}
 # Smallest similarity, in [0, 1], of a suggested name.
 _LEAST = 0.6
-# Characters that a backslash and a letter stand for in double quotes of YAML.
-_ESCAPES = dict(zip("abtnvfreNLP_", "\a\b\t\n\v\f\r\x1b\x85\u2028\u2029\xa0", strict=True))
-_ESCAPED = {character: f"/{letter}" for letter, character in _ESCAPES.items()}
-_DRIVE = re.compile(r"[A-Za-z]:(\\|$)")
 # pathlib joins the slashes of a URL. One letter is the drive of a Windows path.
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):/{1,3}(.*)", re.DOTALL)
 
@@ -40,8 +36,6 @@ def suggest_path(path: Path, wanted: Callable[[Path], bool] | None = None) -> st
         return ""
     if missing.is_symlink():
         return f"{missing} is a symbolic link to '{os.readlink(missing)}', which leads to no file"
-    if foreign := _foreign_name(path, missing):
-        return foreign
     try:
         beside = sorted(p for p in missing.parent.iterdir() if not p.name.startswith("."))
     except OSError:
@@ -69,23 +63,6 @@ def named_file(folder: Path, name: str) -> Path:
         return short if folder != Path() and real_path(short) == real_path(path) else path
     except (OSError, ValueError):
         return path
-
-
-def _foreign_name(path: Path, missing: Path) -> str:
-    """The hint for a name that was meant for Windows, or that YAML has changed; empty for others."""
-    name, last = missing.name, path.name.rpartition("\\")[2]
-    spelled = "".join(_ESCAPED.get(c, c) for c in name)
-    if spelled != name:
-        return f"in double quotes, YAML reads a backslash as an escape: write '{spelled}'"
-    if os.sep == "/" and _DRIVE.match(name):
-        here = f"did you mean '{last}'?" if (missing.parent / last).exists() else ""
-        return here or "is a path of Windows: write where the file is on this computer"
-    if os.sep == "/" and "\\" in name:
-        return (
-            suggest_path(missing.parent / name.replace("\\", "/"))
-            or "separate the parts of a path by slashes"
-        )
-    return ""
 
 
 def suggest_name(given: str, known: Sequence[str], least: float = _LEAST) -> str:

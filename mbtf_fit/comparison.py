@@ -14,13 +14,21 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from mbtf_core.app.console import Console
-from mbtf_core.color import auto_exposure, chosen_exposure, describe_exposure, to_display, white_of
+from mbtf_core.color import (
+    auto_exposure,
+    chosen_exposure,
+    describe_exposure,
+    indices,
+    palette,
+    robust_scale,
+    to_display,
+    white_of,
+)
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.shard_files import read_exr
 from mbtf_core.errors import InputError
 from mbtf_core.files.folders import OutputFolder, owned
-from mbtf_core.palettes import indices, palette, robust_scale
 from mbtf_core.pictures import claim_pictures, write_png
 from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.stats import LOCAL_WINDOW, local_error, noise_free_mse, signal_variance, unexplained_variance

@@ -3,7 +3,15 @@
 Needs numpy and scipy alone. ``docs/explanation/statistics.md`` explains when to use which.
 """
 
-from mbtf_core.stats.estimate import Estimate, by_group, elevation_groups, level_groups, mean_estimate
+from mbtf_core.stats.estimate import (
+    Estimate,
+    Outcome,
+    by_group,
+    elevation_groups,
+    level_groups,
+    mean_estimate,
+    t_test,
+)
 from mbtf_core.stats.learning_curve import Interval, LearningCurve
 from mbtf_core.stats.paired import (
     LOCAL_WINDOW,
@@ -18,20 +26,15 @@ from mbtf_core.stats.paired import (
     signal_variance,
     unexplained_variance,
 )
-from mbtf_core.stats.significance import Aggregate, Comparison, Outcome, aggregate_test, holm, t_test
 
 __all__ = [
     "LOCAL_WINDOW",
-    "Aggregate",
-    "Comparison",
     "Estimate",
     "Interval",
     "LearningCurve",
     "Outcome",
-    "aggregate_test",
     "by_group",
     "elevation_groups",
-    "holm",
     "level_groups",
     "local_error",
     "mean_estimate",

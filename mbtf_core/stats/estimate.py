@@ -1,4 +1,4 @@
-"""A measured number with its standard error, and statistics by group: levels of detail, elevation bands.
+"""A measured number with its standard error, its test, and statistics by group: levels, elevation bands.
 Estimates that are pooled from two halves are in :mod:`mbtf_core.stats.paired`."""
 
 from __future__ import annotations
@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from mbtf_core.data.lattice import level_of_sigma
 from mbtf_core.directions import ELEVATION_BANDS
 from mbtf_core.errors import InputError
+
+Alternative = Literal["two-sided", "greater", "less"]
 
 
 @dataclass(frozen=True)
@@ -217,3 +219,56 @@ def elevation_groups(*omegas: ArrayLike, edges: tuple[float, ...] = ELEVATION_BA
     """
     cosine = np.min([np.asarray(w, np.float64)[..., 2] for w in omegas], axis=0)
     return np.clip(np.searchsorted(edges, cosine, side="right") - 1, 0, len(edges) - 2).astype(np.int64)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Result of one test.
+
+    Attributes
+    ----------
+    difference : quantity that is tested against zero
+    statistic : difference over its error
+    p_value : probability of a statistic at least as extreme under the null hypothesis
+    """
+
+    difference: Estimate
+    statistic: float
+    p_value: float
+
+    def __str__(self) -> str:
+        return f"difference {self.difference}, {self.statistic:+.2f} standard errors, p = {self.p_value:.3g}"
+
+
+def _difference(x: Estimate, y: Estimate | float) -> Estimate:
+    """x - y for independent x and y, with the degrees of freedom of Welch and Satterthwaite."""
+    if not isinstance(y, Estimate):
+        return Estimate(x.value - float(y), x.error, x.n, x.dof)
+    error = math.hypot(x.error, y.error)
+    if error == 0.0 or not math.isfinite(error):
+        return Estimate(x.value - y.value, error, min(x.n, y.n), min(x.degrees, y.degrees))
+    shares = (x.error / error) ** 4 / x.degrees + (y.error / error) ** 4 / y.degrees
+    return Estimate(x.value - y.value, error, min(x.n, y.n), 1.0 / shares)
+
+
+def t_test(x: Estimate, y: Estimate | float = 0.0, alternative: Alternative = "two-sided") -> Outcome:
+    """Whether x differs from y, a known value or an independent estimate, by Student's statistic.
+
+    The degrees of freedom are the estimate's own (``n-1``, or the effective number that
+    :func:`~mbtf_core.stats.mean_of_halves` gives); those of two combine after Welch and Satterthwaite.
+    Exact for normal noise of equal variance, at any n.
+
+    Raises
+    ------
+    ValueError : an estimate or its error is NaN
+    """
+    from scipy.special import stdtr
+
+    difference = _difference(x, y)
+    value, error = difference.value, difference.error
+    if math.isnan(value) or math.isnan(error):
+        raise ValueError(f"an estimate of {difference} cannot be tested")
+    statistic = 0.0 if value == 0.0 else value / error if error else math.copysign(math.inf, value)
+    signs = {"two-sided": -abs(statistic), "greater": -statistic, "less": statistic}
+    tails = 2.0 if alternative == "two-sided" else 1.0
+    return Outcome(difference, statistic, tails * float(stdtr(difference.degrees, signs[alternative])))

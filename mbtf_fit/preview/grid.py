@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from mbtf_core.palettes import Palette, palette, tick_labels
+from mbtf_core.color import Palette, palette, tick_labels
 
 U8 = NDArray[np.uint8]
 GAP, MARGIN, CAPTION = 4, 8, 34

@@ -33,15 +33,13 @@ def merge(folder: Path, /, *, console: Console = CONSOLE) -> int:
     return EXIT_OK if summary.complete else EXIT_PARTIAL
 
 
-def verify(folder: Path, /, *, digests: Path | None = None, console: Console = CONSOLE) -> int:
+def verify(folder: Path, /, *, console: Console = CONSOLE) -> int:
     """Check every byte of a data set against its checksums.
 
     Parameters
     ----------
     folder
         Folder of shards, or its URL.
-    digests
-        Also compare its arrays with the digests.json of a published recipe.
     """
     from mbtf_core.data.dataset import Dataset
     from mbtf_core.data.documents import ABSENT
@@ -70,18 +68,11 @@ def verify(folder: Path, /, *, digests: Path | None = None, console: Console = C
         "faults": [asdict(f) for f in faults],
         "foreign": foreign,
     }
-    equal = ""
     known = "" if dataset.manifest["geometry"] is None else f" and {GEOMETRY_NAME}"
-    if digests is not None and not faults:
-        from mbtf_gen.publishing.digests import digest_faults
-
-        data["differences"] = digest_faults(dataset, digests)
-        lines = [f"{data_folder}: {text}" for text in data["differences"]]
-        equal = f", and equal to {digests} bit by bit"
-    lines = lines or [f"{data_folder}: {len(files)} shards{known}, all intact{equal}"]
+    lines = lines or [f"{data_folder}: {len(files)} shards{known}, all intact"]
     console.report(data, "\n".join([*lines, *_describe_foreign(data_folder, foreign)]))
     console.note(f"{read / 1e6:.1f} MB read in {clock(seconds)} ({read / 1e6 / max(seconds, 1e-9):.0f} MB/s)")
-    return EXIT_BAD_INPUT if faults or data.get("differences") else EXIT_OK
+    return EXIT_BAD_INPUT if faults else EXIT_OK
 
 
 def repair(folder: Path, /, *, material: MovedMaterial = None, console: Console = CONSOLE) -> int:

@@ -21,16 +21,17 @@ from mbtf_core.data.shard_files import Arrays
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import data_sha256, file_sha256
 from mbtf_core.files.folders import owned
+from mbtf_core.paths import opened
+from mbtf_gen.config.exchange import ImportConfig
 from mbtf_gen.config.generator import count_queries
-from mbtf_gen.config.measured import ImportConfig
 from mbtf_gen.generation.folder import claim_folder
 from mbtf_gen.generation.manifest import Summary, finish, new_manifest
 from mbtf_gen.generation.shard_record import store_shard
 from mbtf_gen.job import shard_entries
-from mbtf_gen.measured.hdf5 import NeumipQueries
+from mbtf_gen.measured.hdf5 import COLOR, MAGIC, RADIUS, NeumipQueries, NeuralBtf, hdf5_file
 from mbtf_gen.measured.interface import MeasuredBtf
-from mbtf_gen.measured.open import open_measured
-from mbtf_gen.measured.ubo2003 import SUFFIXES
+from mbtf_gen.measured.ubo2003 import SUFFIXES, Ubo2003
+from mbtf_gen.measured.ubo2014 import Ubo2014
 from mbtf_gen.sampling.rng import Purpose, numpy_generator
 
 I64 = NDArray[np.int64]
@@ -55,6 +56,14 @@ MEASURED_CONVENTIONS = {
 TEST_PAIRS = 0.05
 # Queries of a list that are read at once.
 _BLOCK = 1 << 22
+# First bytes of files: of zip archives, and of other archives and single compressed files.
+_ZIP = b"PK"
+_PACKED = (b"Rar!", b"7z\xbc\xaf", b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"\x28\xb5\x2f\xfd")
+_KNOWN = (
+    "a .btf file (Bonn, DFMF), a folder or zip of photographs named by angles, or HDF5 of NeuMIP or NeuralBTF"
+)
+# The first bytes, which tell what a file is.
+_START = 1 << 10
 
 
 class Import(ABC):
@@ -336,3 +345,40 @@ def _digest(path: Path) -> str:
         return file_sha256(path)
     files = sorted(p for p in path.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
     return data_sha256({p.relative_to(path).as_posix(): file_sha256(p) for p in files})
+
+
+def open_measured(path: str | Path) -> MeasuredBtf | NeumipQueries:
+    """Open a measured BTF or a data set of another program.
+
+    Raises
+    ------
+    InputError : the file is missing, of no known kind, or damaged
+    """
+    path = Path(path)
+    if path.is_dir():
+        return Ubo2003(path)
+    with opened(path) as stream:
+        start = stream.read(_START)
+    if start.startswith(b"!"):
+        return Ubo2014(path)
+    if start.startswith(_ZIP):
+        return Ubo2003(path)
+    if not start.startswith(MAGIC):
+        raise _unknown(path, start)
+    with hdf5_file(path) as file:
+        names = set(file)
+    if COLOR not in names:
+        raise InputError(f"is an HDF5 file without '{COLOR}'", where=path, hint=f"known are {_KNOWN}")
+    return NeumipQueries(path) if RADIUS in names or "ground_valid" in names else NeuralBtf(path)
+
+
+def _unknown(path: Path, start: bytes) -> InputError:
+    """What a file is that no reader is for."""
+    text = start.removeprefix(b"\xef\xbb\xbf").lstrip().lower()
+    if not start:
+        return InputError("is empty", where=path, hint="download it again")
+    if text.startswith((b"<!doctype", b"<html", b"<?xml")):
+        return InputError("is a web page, not a measured BTF", where=path, hint="download the file again")
+    if start.startswith(_PACKED):
+        return InputError("is an archive that is not read", where=path, hint="unpack it and give the folder")
+    return InputError("is not a measured BTF of a known kind", where=path, hint=f"known are {_KNOWN}")

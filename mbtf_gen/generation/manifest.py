@@ -32,8 +32,8 @@ from mbtf_core.data.schema import (
 )
 from mbtf_core.files.atomic import checksummed
 from mbtf_core.locks import brief_lock
+from mbtf_gen.config.exchange import ImportConfig
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.config.measured import ImportConfig
 from mbtf_gen.generation.shard_record import ShardStatistics
 from mbtf_gen.job import Job, split_lights, split_queries, split_spp
 from mbtf_gen.planning.effects import EFFECTS

@@ -17,7 +17,6 @@ from mbtf_gen.publishing.facts import TAGS, Facts
 CROISSANT_NAME = "croissant.json"
 _FORMATS = {
     ".parquet": "application/x-parquet",
-    ".tar": "application/x-tar",
     ".npz": "application/zip",
     ".exr": "image/x-exr",
     ".png": "image/png",

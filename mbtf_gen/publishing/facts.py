@@ -19,7 +19,7 @@ from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.shard_files import Arrays
 from mbtf_core.files.atomic import Stored
 from mbtf_core.stats import Estimate, mean_estimate, pooled_relative_error
-from mbtf_gen.config.publish import PublishConfig
+from mbtf_gen.config.exchange import PublishConfig
 from mbtf_gen.measured.exported import mean_of
 
 TAGS = (

@@ -19,23 +19,21 @@ from mbtf_core.errors import InputError, UsageError
 from mbtf_core.extras import extra_error, has_extra
 from mbtf_core.files.atomic import Stored, data_sha256, write_chunks
 from mbtf_core.files.folders import OutputFolder, OutputKind, check_space, owned
-from mbtf_gen.config.publish import PublishConfig
+from mbtf_gen.config.exchange import PublishConfig
 from mbtf_gen.publishing.card import CARD_NAME, card_text
 from mbtf_gen.publishing.croissant import CROISSANT_NAME, croissant_text
-from mbtf_gen.publishing.digests import DIGESTS_NAME, Digests, array_digests
 from mbtf_gen.publishing.facts import Facts, name_of
-from mbtf_gen.publishing.formats import LIBRARIES, copied, published_names, shard_writers
+from mbtf_gen.publishing.formats import copied, published_names, shard_writers
 from mbtf_gen.publishing.picture import PICTURE_NAME, write_picture
 from mbtf_gen.publishing.recipe import (
     MATERIAL,
-    RECIPE,
     Content,
     check_inputs,
     public_documents,
     recipe_files,
 )
 
-PUBLICATION = OutputKind("publish.json", "mbtf-publication", 3, "a published data set")
+PUBLICATION = OutputKind("publish.json", "mbtf-publication", 4, "a published data set")
 # Bytes of picture, card and documents.
 _DOCUMENT_BYTES = 4 << 20
 # Queries of a split that the statistics are of, at most.
@@ -85,14 +83,14 @@ class Publication:
         """
         data = Dataset.open(shards)
         manifest, measured = data.manifest, "measured" in data.manifest
-        for library in ("mlcroissant", LIBRARIES[config.form]):
+        for library in ("mlcroissant", *(["pyarrow"] if config.form == "parquet" else [])):
             if not has_extra(library):
                 raise extra_error(library, f"--form {config.form}")
         if config.form == "npz" and manifest["array_format"] != "npz":
             raise UsageError(
                 f"{data.folder} holds shards of another format ({manifest['array_format']})",
                 where="--form npz",
-                hint="use --form parquet or --form webdataset",
+                hint="use --form parquet",
             )
         if (with_maps or material is not None) and measured:
             raise UsageError(f"{data.folder} holds measured data, without maps", where="--with-maps")
@@ -131,7 +129,6 @@ class Publication:
         shards = sum(int(shard.sidecar["bytes"]) for found in self.shards.values() for shard in found)
         contents = self.documents.values()
         documents = sum(c.stat().st_size if isinstance(c, Path) else len(c) for c in contents)
-        # Tar files have a header and up to a block of padding per array.
         return round(1.02 * shards) + documents + _DOCUMENT_BYTES
 
     def _depends(self) -> dict[str, Any]:
@@ -151,8 +148,7 @@ class Publication:
         """Names of all files."""
         shards = [shard for found in self.shards.values() for shard in found]
         data = [f"data/{name}" for shard in shards for name in published_names(shard, self.config.form)]
-        digests = f"{RECIPE}/{DIGESTS_NAME}"
-        return [*self.documents, *data, digests, PICTURE_NAME, CARD_NAME, CROISSANT_NAME]
+        return [*self.documents, *data, PICTURE_NAME, CARD_NAME, CROISSANT_NAME]
 
     def write(
         self, output: Path, *, overwrite: bool = False, progress: Callable[[float], None] = lambda _: None
@@ -184,11 +180,8 @@ class Publication:
             if self.maps:
                 hint = "leave out --with-maps, and add the files of the material to recipe/ by hand"
                 check_inputs(self.data, output / MATERIAL, "its copy is read differently", hint)
-            stored, samples, digests = self._write_shards(folder, progress)
+            stored, samples = self._write_shards(folder, progress)
             files |= stored
-            if "measured" not in self.data.manifest:
-                content, name = Digests.of(self.data, digests).content, f"{RECIPE}/{DIGESTS_NAME}"
-                files[name] = folder.add(name, partial(_store, content))
             drawn = samples["train"], self.data.lattice.aspect, self.data.geometry()
             files[PICTURE_NAME] = folder.add(PICTURE_NAME, partial(write_picture, *drawn))
             facts = Facts(self.data, self.config, self.name, samples, dict(sorted(files.items())), self.maps)
@@ -199,10 +192,9 @@ class Publication:
 
     def _write_shards(
         self, folder: OutputFolder, progress: Callable[[float], None]
-    ) -> tuple[dict[str, Stored], dict[str, Arrays], dict[str, dict[str, str]]]:
-        """Write the shards: the files, evenly spaced rows of each split, no two of a group, and the digests
-        of all arrays."""
-        files, digests, samples = {}, {}, {}
+    ) -> tuple[dict[str, Stored], dict[str, Arrays]]:
+        """Write the shards: the files, and evenly spaced rows of each split, no two of a group."""
+        files, samples = {}, {}
         form, described = self.config.form, self.data.manifest["arrays"]
         for split, shards in self.shards.items():
             lights = self.data.lights_per_path(split)
@@ -212,12 +204,11 @@ class Publication:
                 arrays = shard.read()
                 for name, write in shard_writers(shard, arrays, form, described).items():
                     files[f"data/{name}"] = folder.add(f"data/{name}", write)
-                digests[shard.file.rpartition(".")[0]] = array_digests(arrays)
                 own = slice(None, shard.rows // lights, step)
                 parts.append({name: np.array(array[own]) for name, array in arrays.items()})
                 progress(1)
             samples[split] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-        return files, samples, digests
+        return files, samples
 
 
 def _store(content: Content, path: Path) -> Stored:

@@ -1,4 +1,4 @@
-"""The recipe of a data set: its configuration and, if they are published, the input files of its material."""
+"""The recipe of a data set: its configuration, digests of its files and, if published, its input files."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.data.dataset import Dataset
-from mbtf_core.data.schema import CONFIG_NAME, MANIFEST_NAME
+from mbtf_core.data.schema import CONFIG_NAME, GEOMETRY_NAME, MANIFEST_NAME
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import checksummed
 from mbtf_core.images.limits import MAX_PIXELS
@@ -20,6 +20,8 @@ from mbtf_gen.tile.protocol import Tile
 # Folders of the recipe and of the material in the published folder.
 RECIPE, MATERIAL = "recipe", "recipe/material"
 _MATERIAL_FILE = "material.yaml"
+# Digests of the files that the recipe makes, as ``sha256sum --check`` reads them.
+SUMS_NAME = f"{RECIPE}/SHA256SUMS"
 # Keys of material files that name a file.
 _NAMES = ("file", "filename", "mesh", "pattern", "curves")
 
@@ -50,7 +52,7 @@ def public_documents(manifest: Mapping[str, Any]) -> dict[str, Content]:
 
 
 def recipe_files(data: Dataset, *, with_maps: bool, moved: Path | None) -> dict[str, Content]:
-    """Configuration and material of a recipe, by name in the published folder.
+    """Configuration, digests and material of a recipe, by name in the published folder.
 
     Parameters
     ----------
@@ -63,8 +65,13 @@ def recipe_files(data: Dataset, *, with_maps: bool, moved: Path | None) -> dict[
     InputError : the material cannot be read, has changed since, or consists of files that cannot be copied
     """
     config = public_config(data.manifest)
+    shards = [shard for split in data.splits for shard in data.shards(split)]
+    sums = {shard.file: str(shard.sidecar["sha256"]) for shard in shards}
+    if (geometry := data.manifest["geometry"]) is not None:
+        sums[GEOMETRY_NAME] = geometry["sha256"]
+    lines = "".join(f"{digest}  {name}\n" for name, digest in sums.items())
     if not with_maps:
-        return {f"{RECIPE}/{CONFIG_NAME}": dump_yaml(config).encode()}
+        return {f"{RECIPE}/{CONFIG_NAME}": dump_yaml(config).encode(), SUMS_NAME: lines.encode()}
     path = Path(data.manifest["config"]["material"]) if moved is None else moved
     hint = "name it: --material PATH; or leave out --with-maps"
     try:
@@ -83,6 +90,7 @@ def recipe_files(data: Dataset, *, with_maps: bool, moved: Path | None) -> dict[
     config["material"] = f"{Path(MATERIAL).name}/{_MATERIAL_FILE}"
     return {
         f"{RECIPE}/{CONFIG_NAME}": dump_yaml(config).encode(),
+        SUMS_NAME: lines.encode(),
         f"{MATERIAL}/{_MATERIAL_FILE}": dump_yaml(document).encode(),
         **{f"{MATERIAL}/{name}": source for name, source in files.items()},
     }

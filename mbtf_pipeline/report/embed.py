@@ -11,8 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.color import to_display
-from mbtf_core.palettes import Palette, indices, palette, tick_labels
+from mbtf_core.color import Palette, indices, palette, tick_labels, to_display
 
 U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]

@@ -11,8 +11,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from mbtf_core.color import white_of
-from mbtf_core.palettes import Palette, common_scale, robust_scale
+from mbtf_core.color import Palette, common_scale, robust_scale, white_of
 from mbtf_core.stats import local_error
 from mbtf_pipeline.compare.image_files import read_halves, read_map, read_picture
 from mbtf_pipeline.compare.offsets import read_offset, towards_view

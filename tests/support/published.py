@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.data.dataset import Dataset
-from mbtf_gen.config.publish import PublishConfig
+from mbtf_gen.config.exchange import PublishConfig
 from mbtf_gen.publishing.publication import Publication
 
 from .datasets import write_dataset

@@ -24,7 +24,7 @@ from mbtf_gen.doctor import use_drawing
 from mbtf_gen.measured.exported import export_neumip
 from mbtf_gen.measured.hdf5 import hdf5_file
 from mbtf_gen.publishing.croissant import croissant_text
-from mbtf_gen.publishing.formats import write_parquet, write_tar
+from mbtf_gen.publishing.formats import write_parquet
 from mbtf_pipeline.compare import perceptual_metrics
 
 EXPORT: Any = SimpleNamespace(shared={})
@@ -66,7 +66,6 @@ USES: list[tuple[str, Callable[[Path], object]]] = [
     ("slangpy", lambda folder: SlangCompiler()),
     ("stlpips_pytorch", lambda folder: perceptual_metrics.require()),
     ("tensorboard", EventLog),
-    ("webdataset", lambda folder: write_tar(folder / "a.tar", {})),
 ]
 
 
@@ -90,11 +89,11 @@ def test_every_module_has_a_use() -> None:
 
 
 def test_a_package_that_cannot_be_imported_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "webdataset.py").write_text("import no_such_dependency\n")
+    (tmp_path / "mlcroissant.py").write_text("import no_such_dependency\n")
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delitem(sys.modules, "webdataset", raising=False)
+    monkeypatch.delitem(sys.modules, "mlcroissant", raising=False)
     with pytest.raises(EngineError, match=r"cannot be imported.*no_such_dependency"):
-        import_extra("webdataset", "--form webdataset")
+        import_extra("mlcroissant", "croissant.json")
 
 
 def test_the_extras_of_the_table_install_their_packages() -> None:

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy import stats as reference
+from support.significance import aggregate_test, holm
 
-from mbtf_core.stats import aggregate_test, holm, mean_estimate, mean_of_halves, t_test
+from mbtf_core.stats import mean_estimate, mean_of_halves, t_test
 
 Floats = NDArray[np.float64]
 EXPERIMENTS = 1000

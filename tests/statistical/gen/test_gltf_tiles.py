@@ -22,8 +22,9 @@ from support.scenes import (
     queries,
     tile_mean_queries,
 )
+from support.significance import aggregate_test
 
-from mbtf_core.stats import aggregate_test, elevation_groups, mean_of_halves
+from mbtf_core.stats import elevation_groups, mean_of_halves
 from mbtf_gen.render.scene import LONG_SIDE
 from mbtf_gen.tile.loading import load_material
 from mbtf_gen.tile.mesh_tile import MeshTile
@@ -83,7 +84,7 @@ def bitmap(pixels: NDArray[Any], wrap: str) -> dict[str, Any]:
 
 def test_mitsuba_agrees_on_a_file_of_many_features(tmp_path: Path) -> None:
     """A floor whose texture is turned and mirrored, by a second set of quantized coordinates; golden fins,
-    quantized and instanced, whose roughness varies."""
+    quantized and of several nodes, whose roughness varies."""
     rng = np.random.default_rng(3)
     codes, gloss = rng.integers(0, 256, (4, 5, 3), np.uint8), rng.integers(60, 160, (3, 2, 3), np.uint8)
     builder = GltfBuilder()
@@ -105,14 +106,9 @@ def test_mitsuba_agrees_on_a_file_of_many_features(tmp_path: Path) -> None:
     quaternions = np.zeros((len(FINS), 4))
     quaternions[:, 1], quaternions[:, 3] = np.sin(FINS[:, 2] / 2), np.cos(FINS[:, 2] / 2)
     turned = np.rint(quaternions * 127).astype(np.int8)
-    attributes = {
-        "TRANSLATION": builder.accessor(np.insert(FINS[:, :2], 1, 0.05, axis=1)),
-        "ROTATION": builder.accessor(turned, normalized=True),
-        "SCALE": builder.accessor(
-            np.column_stack([FINS[:, 3], np.full(len(FINS), DEPTH - 0.05), FINS[:, 3] / 3])
-        ),
-    }
-    builder.node(mesh, extensions={"EXT_mesh_gpu_instancing": {"attributes": attributes}})
+    for (x, z, _, size), rotation in zip(FINS, turned / 127, strict=True):
+        scale = [size, DEPTH - 0.05, size / 3]
+        builder.node(mesh, translation=[x, 0.05, z], rotation=rotation.tolist(), scale=scale)
     tile = load(builder, tmp_path)
     assert tile.vertices[:, 0].max() > 1.02
 

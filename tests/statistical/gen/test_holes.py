@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from support.mitsuba_blocks import GRIDS, SPP, block, mitsuba_halves, random_queries
 from support.scenes import HeightGrid, LightKernel, direction, directional, flat, mi, queries, rocks
+from support.significance import aggregate_test
 
-from mbtf_core.stats import aggregate_test, elevation_groups, mean_of_halves
+from mbtf_core.stats import elevation_groups, mean_of_halves
 from mbtf_gen.render.estimates import Stream
 from mbtf_gen.render.estimator import Estimator
 from mbtf_gen.render.path_tracer import Transport

@@ -9,10 +9,11 @@ import pytest
 from numpy.typing import NDArray
 from support.paths import ROOT
 from support.scenes import Estimator, LightKernel, Stream, Transport, build_scene, direction, rocks
+from support.significance import aggregate_test
 
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.data.schema import Queries
-from mbtf_core.stats import aggregate_test, mean_estimate, t_test
+from mbtf_core.stats import mean_estimate, t_test
 from mbtf_gen.render.estimates import Estimates
 from mbtf_gen.render.scene import TileScene
 from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan

@@ -16,9 +16,10 @@ from support.scenes import (
     mi,
     real_heights,
 )
+from support.significance import aggregate_test
 
 from mbtf_core.errors import InputError
-from mbtf_core.stats import aggregate_test, elevation_groups
+from mbtf_core.stats import elevation_groups
 from mbtf_gen.tile.heights import HeightGrid, Tracer
 from mbtf_gen.tile.tracers.protocol import Vertex
 

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from support.mitsuba_blocks import GRIDS, SPP, block, mitsuba_halves, random_queries
 from support.scenes import LightKernel, Transport, direction, directional, estimate, flat, mi, real_heights
+from support.significance import aggregate_test
 
-from mbtf_core.stats import aggregate_test, elevation_groups
+from mbtf_core.stats import elevation_groups
 from mbtf_gen.tile.heights import HeightGrid
 
 

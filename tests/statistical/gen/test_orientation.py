@@ -90,8 +90,8 @@ def test_picture_shows_the_map_the_right_way_up() -> None:
 def test_pixel_kind_and_query_kind_agree_from_above() -> None:
     """At normal incidence both kinds of picture of an asymmetric textured height field agree."""
     from support.scenes import rocks
+    from support.significance import aggregate_test
 
-    from mbtf_core.stats import aggregate_test
     from mbtf_gen.pictures.reference import render_reference
     from mbtf_gen.render.estimator import Estimator
 

@@ -7,10 +7,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.special import kolmogorov
 from support.chi_square import Cap, chi_square_test, uniformity
+from support.significance import holm
 
 from mbtf_core.data.lattice import Lattice, level_of_sigma
 from mbtf_core.data.schema import Queries
-from mbtf_core.stats import holm
 from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan
 
 ROWS = 1 << 16

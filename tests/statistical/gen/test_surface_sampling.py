@@ -13,9 +13,10 @@ from mitsuba.python.chi2 import ChiSquareTest
 from numpy.typing import NDArray
 from support.mitsuba_blocks import GRIDS, block, mitsuba_halves, random_queries
 from support.scenes import LightKernel, Transport, direction, directional, estimate, mi
+from support.significance import aggregate_test
 from support.surfaces import ALL, point, sobol, towards
 
-from mbtf_core.stats import aggregate_test, elevation_groups
+from mbtf_core.stats import elevation_groups
 from mbtf_gen.render.bsdf.surface import SurfaceParts
 
 DIFFUSE = SurfaceParts()

@@ -7,8 +7,9 @@ import pytest
 from numpy.typing import NDArray
 from support.closed_forms import Groove
 from support.scenes import DIRECT, HeightGrid, direction, estimate, lambert, queries, tile_mean_queries
+from support.significance import aggregate_test
 
-from mbtf_core.stats import Estimate, aggregate_test, mean_of_halves, t_test
+from mbtf_core.stats import Estimate, mean_of_halves, t_test
 from mbtf_gen.sampling.light_kernel import LightKernel
 
 ALBEDO = 0.7

@@ -10,8 +10,8 @@ import pytest
 
 from mbtf_core.config.settings import resolve
 from mbtf_core.errors import InputError, UsageError
+from mbtf_gen.config.exchange import PublishConfig
 from mbtf_gen.config.generator import GeneratorConfig, count_queries, parse_count
-from mbtf_gen.config.publish import PublishConfig
 from mbtf_gen.tile.loading import load_material
 
 

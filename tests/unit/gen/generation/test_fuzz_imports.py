@@ -13,7 +13,7 @@ from support import measured_files as files
 from support.fuzzing import damaged, examples, loads_or_refuses
 
 from mbtf_core.data.dataset import Dataset
-from mbtf_gen.config.measured import ImportConfig
+from mbtf_gen.config.exchange import ImportConfig
 from mbtf_gen.generation.imported import Import, import_measured
 
 CONFIG = ImportConfig.model_validate(

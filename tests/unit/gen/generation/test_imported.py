@@ -22,7 +22,7 @@ from mbtf_fit.data.loader import load_split, load_training
 from mbtf_fit.formatting import report_errors
 from mbtf_fit.training.trainer import prepare_trainer
 from mbtf_gen.cli.generate import describe
-from mbtf_gen.config.measured import ImportConfig
+from mbtf_gen.config.exchange import ImportConfig
 from mbtf_gen.generation import imported
 from mbtf_gen.generation.imported import Import, import_measured
 from mbtf_gen.generation.repair import repair

@@ -13,9 +13,9 @@ from support.datasets import write_dataset
 from support.measured_files import write_hdf5
 
 from mbtf_core.errors import InputError
+from mbtf_gen.generation.imported import open_measured
 from mbtf_gen.measured.exported import export_neumip, export_neural_btf
 from mbtf_gen.measured.hdf5 import NeumipQueries, NeuralBtf
-from mbtf_gen.measured.open import open_measured
 
 TEXELS = files.ROWS * files.COLUMNS
 FIELDS = ("u", "sigma", "omega_i", "omega_o", "value")

@@ -18,8 +18,7 @@ from support.published import LAYOUTS, publish, python_blocks, small, stored
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.errors import UsageError
-from mbtf_gen.config.measured import ImportConfig
-from mbtf_gen.config.publish import PublishConfig
+from mbtf_gen.config.exchange import ImportConfig, PublishConfig
 from mbtf_gen.generation.imported import Import, import_measured
 from mbtf_gen.planning.highlights import Highlights
 from mbtf_gen.publishing.card import card_text, code, escaped, fenced
@@ -46,7 +45,7 @@ def run_block(block: str, card: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     return names["value_a"]
 
 
-@pytest.mark.parametrize("form", ["parquet", "webdataset", "npz"])
+@pytest.mark.parametrize("form", ["parquet", "npz"])
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_its_code_loads_the_data(
     layout: str, form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -63,7 +62,7 @@ def test_its_code_loads_the_data(
     assert found.tobytes() == expected.tobytes()
 
 
-@pytest.mark.parametrize("form", ["npz", "parquet", "webdataset"])
+@pytest.mark.parametrize("form", ["npz", "parquet"])
 def test_weights_of_test_queries_are_published(form: str, tmp_path: Path) -> None:
     """Training queries have none: the splits are tables of their own."""
     flat = Highlights((0.0, 0.0, -1.0, *[0.0] * 52))
@@ -80,14 +79,14 @@ def test_weights_of_test_queries_are_published(form: str, tmp_path: Path) -> Non
 
 def test_front_matter_is_that_of_data_hubs(tmp_path: Path) -> None:
     small(tmp_path / "data")
-    card = publish(tmp_path / "data", tmp_path / "card", form="webdataset", license="cc-by-4.0", name=HOSTILE)
+    card = publish(tmp_path / "data", tmp_path / "card", form="parquet", license="cc-by-4.0", name=HOSTILE)
     found = front_matter(card)
     assert found["license"] == "cc-by-4.0"
     assert found["pretty_name"] == HOSTILE
     assert found["configs"] == [
         {
             "config_name": "default",
-            "data_files": [{"split": s, "path": f"data/{s}-*.tar"} for s in ("train", "test")],
+            "data_files": [{"split": s, "path": f"data/{s}-*.parquet"} for s in ("train", "test")],
         }
     ]
     for files in found["configs"][0]["data_files"]:
@@ -148,7 +147,7 @@ def test_measured_data_say_what_they_lack(tmp_path: Path) -> None:
     (tmp_path / "felt.btf").write_bytes(btf())
     config = ImportConfig.model_validate({"queries": {"train": "300", "test": "20", "min_cos": 0.2}})
     import_measured(Import.prepare(tmp_path / "felt.btf", config), tmp_path / "data")
-    card = publish(tmp_path / "data", tmp_path / "card", form="webdataset")
+    card = publish(tmp_path / "data", tmp_path / "card", form="npz")
     text = (card / "README.md").read_text()
     assert "# felt\n" in text
     assert "There is no recipe" in text

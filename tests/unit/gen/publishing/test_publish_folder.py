@@ -13,11 +13,11 @@ from support.published import contents, publish, small
 
 from mbtf_core.errors import EngineError, InputError, PartialError, UsageError
 from mbtf_core.files.atomic import Stored
-from mbtf_gen.config.publish import PublishConfig
+from mbtf_gen.config.exchange import PublishConfig
 from mbtf_gen.publishing import publication as module
 from mbtf_gen.publishing.publication import Publication
 
-CONFIG = PublishConfig(license="CC0-1.0", form="webdataset")
+CONFIG = PublishConfig(license="CC0-1.0", form="parquet")
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def shards(tmp_path: Path) -> Path:
     return tmp_path / "data"
 
 
-@pytest.mark.parametrize("form", ["parquet", "webdataset", "npz"])
+@pytest.mark.parametrize("form", ["parquet", "npz"])
 def test_the_same_command_gives_the_same_bytes(form: str, shards: Path, tmp_path: Path) -> None:
     pytest.importorskip("pyarrow")
     first, second = (publish(shards, tmp_path / name, form=form) for name in ("a", "b"))
@@ -34,17 +34,17 @@ def test_the_same_command_gives_the_same_bytes(form: str, shards: Path, tmp_path
 
 
 def test_what_has_changed_is_replaced_on_request_only(shards: Path, tmp_path: Path) -> None:
-    card = publish(shards, tmp_path / "card", form="webdataset")
+    card = publish(shards, tmp_path / "card", form="parquet")
     whole = contents(card)
-    for name in ("README.md", "croissant.json", "data/train-00000.tar"):
+    for name in ("README.md", "croissant.json", "data/train-00000.parquet"):
         content = bytearray(whole[name])
         content[len(content) // 2] ^= 1
         (card / name).write_bytes(content)
         with pytest.raises(InputError, match=f"{name}: has been edited, or damaged"):
-            publish(shards, card, form="webdataset")
+            publish(shards, card, form="parquet")
         assert (card / name).read_bytes() == content
         (card / name).unlink()
-        publish(shards, card, form="webdataset")
+        publish(shards, card, form="parquet")
         assert contents(card) == whole
     (card / "README.md").write_text("mine")
     Publication.prepare(shards, CONFIG).write(card, overwrite=True)
@@ -58,25 +58,25 @@ def test_a_folder_that_vanishes_is_one_line(
     add = module.OutputFolder.add
 
     def vanishing(folder: Any, name: str, write: Any) -> Stored:
-        if name == "data/train-00000.tar":
+        if name == "data/train-00000.parquet":
             shutil.rmtree(folder.path / below)
         return add(folder, name, write)
 
     monkeypatch.setattr(module.OutputFolder, "add", vanishing)
     with pytest.raises(PartialError, match="vanished"):
-        publish(shards, tmp_path / "card", form="webdataset")
+        publish(shards, tmp_path / "card", form="parquet")
 
 
 def test_other_options_are_refused_and_replace(shards: Path, tmp_path: Path) -> None:
-    card = publish(shards, tmp_path / "card", form="webdataset")
+    card = publish(shards, tmp_path / "card", form="parquet")
     (card / "mine.txt").write_text("kept")
     before = contents(card)
     with pytest.raises(InputError, match=r"another configuration: license: CC0-1\.0 -> CC-BY-4\.0"):
-        publish(shards, card, form="webdataset", license="CC-BY-4.0")
+        publish(shards, card, form="parquet", license="CC-BY-4.0")
     assert contents(card) == before
     config = PublishConfig(license="CC-BY-4.0", form="npz")
     Publication.prepare(shards, config).write(card, overwrite=True)
-    assert not list(card.rglob("*.tar"))
+    assert not list(card.rglob("*.parquet"))
     assert (card / "mine.txt").read_text() == "kept"
     assert "CC-BY-4.0" in (card / "README.md").read_text()
 
@@ -87,7 +87,7 @@ def test_damage_is_found_before_anything_is_written(shards: Path, tmp_path: Path
     content[-200] ^= 1
     path.write_bytes(content)
     with pytest.raises(InputError, match=r"train-00001\.npz: has changed since it was written"):
-        publish(shards, tmp_path / "card", form="webdataset")
+        publish(shards, tmp_path / "card", form="parquet")
     assert not (tmp_path / "card").exists()
 
 
@@ -96,7 +96,7 @@ def test_a_full_disk_is_said_before(shards: Path, tmp_path: Path, monkeypatch: p
         "mbtf_core.files.folders.shutil.disk_usage", lambda _: shutil._ntuple_diskusage(1, 1, 1000)
     )
     with pytest.raises(InputError, match=r"needs .* MB; 1 kB are free"):
-        publish(shards, tmp_path / "card", form="webdataset")
+        publish(shards, tmp_path / "card", form="parquet")
     assert not (tmp_path / "card").exists()
 
 
@@ -117,5 +117,5 @@ def test_shards_of_exr_are_not_npz(tmp_path: Path) -> None:
     write_dataset(tmp_path / "data", queries={"train": "40", "test": "8"}, output={"format": "exr"})
     with pytest.raises(UsageError, match="holds shards of another format"):
         publish(tmp_path / "data", tmp_path / "card", form="npz")
-    card = publish(tmp_path / "data", tmp_path / "card", form="webdataset")
-    assert (card / "data/train-00000.tar").exists()
+    card = publish(tmp_path / "data", tmp_path / "card", form="parquet")
+    assert (card / "data/train-00000.parquet").exists()

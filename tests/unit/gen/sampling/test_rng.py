@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.chi_square import uniformity
+from support.significance import holm
 
-from mbtf_core.stats import holm
 from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.sampling.rng import MAX_SHARDS, Purpose, numpy_generator, stream_key, stream_number
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.chi_square import uniformity
+from support.significance import holm
 
-from mbtf_core.stats import holm, mean_estimate, t_test
+from mbtf_core.stats import mean_estimate, t_test
 from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.sampling.rng import Purpose, stream_key, stream_number
 

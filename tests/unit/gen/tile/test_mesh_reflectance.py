@@ -17,7 +17,7 @@ from mbtf_gen.job import Job
 from mbtf_gen.planning.run_plan import plan_effects, reference_plan
 from mbtf_gen.render.scene import load_surface
 from mbtf_gen.tile.loading import latest_material, load_material
-from mbtf_gen.tile.mesh_textures import with_one_wrap, with_vertex_colors
+from mbtf_gen.tile.mesh_file import with_one_wrap, with_vertex_colors
 from mbtf_gen.tile.mesh_tile import MeshPart, MeshTile
 from mbtf_gen.tile.reflectance import plugin_dictionary
 

@@ -201,7 +201,7 @@ class TestNormals:
 
 
 class TestNamesOfFiles:
-    """Names with the separators of Windows, and names that YAML's double quotes have changed."""
+    """Names with the separators of Windows."""
 
     @pytest.mark.parametrize("name", ["maps\\rough.png", "'maps\\rough.png'", '"maps\\\\rough.png"'])
     def test_backslashes_separate(self, heights: Path, name: str) -> None:
@@ -212,24 +212,6 @@ class TestNamesOfFiles:
         expected = {"height": "height.npy", "roughness": "maps/rough.png"}
         files = load_material(path).files
         assert {role: file.relative_to(heights).as_posix() for role, file in files.items()} == expected
-
-    @pytest.mark.skipif(os.sep != "/", reason="paths of Windows are valid")
-    @pytest.mark.parametrize(
-        ("name", "hint"),
-        [
-            ('"maps\\rough.png"', "'maps/rough.png'"),
-            ('"maps\\Normal.png"', "'maps/Normal.png'"),
-            ("C:\\Users\\me\\rough.png", "path of Windows"),
-            ("C:/Users/me/rough.png", "path of Windows"),
-            ("C:\\Users\\me\\height.npy", "did you mean 'height.npy'?"),
-            ('"C:\\Users\\me\\rough.png"', "backslash"),
-            ('"maps\\metal.png"', "backslash"),
-        ],
-    )
-    def test_what_to_write(self, heights: Path, name: str, hint: str) -> None:
-        with pytest.raises(InputError) as caught:
-            load_material(write(heights, f"height: height.npy\nroughness: {name}\n"))
-        assert hint in caught.value.hint
 
 
 def test_warnings_name_files_without_parent_folders(heights: Path) -> None:

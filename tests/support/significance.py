@@ -1,75 +1,20 @@
-"""Tests of estimates and of whole data sets against known values and each other."""
+"""Tests of whole data sets against known values and each other."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mbtf_core.stats.estimate import Estimate, checked, group_labels, mean_estimate
-from mbtf_core.stats.paired import mean_of_halves
+from mbtf_core.stats import Estimate, Outcome, mean_estimate, mean_of_halves, t_test
+from mbtf_core.stats.estimate import checked, group_labels
 
-Alternative = Literal["two-sided", "greater", "less"]
 Kind = Literal["mean", "scatter"]
 
 # Below this many independent units the t distribution of heavy-tailed noise is not trusted.
 _MINIMUM = 1000
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """Result of one test.
-
-    Attributes
-    ----------
-    difference : quantity that is tested against zero
-    statistic : difference over its error
-    p_value : probability of a statistic at least as extreme under the null hypothesis
-    """
-
-    difference: Estimate
-    statistic: float
-    p_value: float
-
-    def __str__(self) -> str:
-        return f"difference {self.difference}, {self.statistic:+.2f} standard errors, p = {self.p_value:.3g}"
-
-
-def _difference(x: Estimate, y: Estimate | float) -> Estimate:
-    """x - y for independent x and y, with the degrees of freedom of Welch and Satterthwaite."""
-    if not isinstance(y, Estimate):
-        return Estimate(x.value - float(y), x.error, x.n, x.dof)
-    error = math.hypot(x.error, y.error)
-    if error == 0.0 or not math.isfinite(error):
-        return Estimate(x.value - y.value, error, min(x.n, y.n), min(x.degrees, y.degrees))
-    shares = (x.error / error) ** 4 / x.degrees + (y.error / error) ** 4 / y.degrees
-    return Estimate(x.value - y.value, error, min(x.n, y.n), 1.0 / shares)
-
-
-def t_test(x: Estimate, y: Estimate | float = 0.0, alternative: Alternative = "two-sided") -> Outcome:
-    """Whether x differs from y, a known value or an independent estimate, by Student's statistic.
-
-    The degrees of freedom are the estimate's own (``n-1``, or the effective number that
-    :func:`~mbtf_core.stats.mean_of_halves` gives); those of two combine after Welch and Satterthwaite.
-    Exact for normal noise of equal variance, at any n.
-
-    Raises
-    ------
-    ValueError : an estimate or its error is NaN
-    """
-    from scipy.special import stdtr
-
-    difference = _difference(x, y)
-    value, error = difference.value, difference.error
-    if math.isnan(value) or math.isnan(error):
-        raise ValueError(f"an estimate of {difference} cannot be tested")
-    statistic = 0.0 if value == 0.0 else value / error if error else math.copysign(math.inf, value)
-    signs = {"two-sided": -abs(statistic), "greater": -statistic, "less": statistic}
-    tails = 2.0 if alternative == "two-sided" else 1.0
-    return Outcome(difference, statistic, tails * float(stdtr(difference.degrees, signs[alternative])))
 
 
 def holm(p_values: ArrayLike) -> NDArray[np.float64]:

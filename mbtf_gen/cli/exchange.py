@@ -1,4 +1,4 @@
-"""``mbtf-gen import`` and ``mbtf-gen export``: measured BTFs as data sets, data sets for code of others."""
+"""``mbtf-gen import``, ``export`` and ``publish``: data sets from others and for others."""
 
 from __future__ import annotations
 
@@ -7,13 +7,22 @@ from pathlib import Path
 from typing import Literal
 
 from mbtf_core.app.console import CONSOLE, Console
-from mbtf_core.app.options import DataOutput, Options, Overwrite, PathText, options_from
+from mbtf_core.app.options import (
+    DataOutput,
+    MovedMaterial,
+    Options,
+    Output,
+    Overwrite,
+    PathText,
+    Switch,
+    options_from,
+)
 from mbtf_core.errors import UsageError
 from mbtf_core.paths import real_path
 from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.units import size_text
 from mbtf_gen.cli.generate import describe
-from mbtf_gen.config.measured import ImportConfig
+from mbtf_gen.config.exchange import ImportConfig, PublishConfig
 
 
 @options_from(ImportConfig)
@@ -106,3 +115,69 @@ def export(
     total = int(data.manifest["splits"]["train"]["queries"])
     left = f"; {total - count} that do not fill an image are left out" if count < total else ""
     console.report({"file": file, "program": program, "values": count}, f"{file}: {count} values{left}")
+
+
+@options_from(PublishConfig)
+class PublishOptions(Options[PublishConfig]):
+    """Options of ``mbtf-gen publish``."""
+
+
+def publish(
+    shards: Path,
+    /,
+    *,
+    output: Output = Path("card"),
+    options: PublishOptions = PublishOptions(),  # noqa: B008
+    with_maps: Switch = False,
+    material: MovedMaterial = None,
+    overwrite: Overwrite = False,
+    console: Console = CONSOLE,
+) -> None:
+    """Write a folder to share, with a data card.
+
+    For example: mbtf-gen publish shards/ --license CC-BY-4.0 -o card/
+
+    It holds a data card with a picture, the data, croissant.json, and the recipe that makes the data again.
+
+    Parameters
+    ----------
+    shards
+        Folder of shards, or its URL.
+    with_maps
+        Publish the input files of the material too, which their license must allow.
+    """
+    given = [*options.given, *(text.partition("=")[0].strip() for text in options.assignments or ())]
+    if options.config is None and "license" not in given:
+        raise UsageError(
+            "state the license of the published data",
+            where="--license",
+            hint="an SPDX expression such as CC-BY-4.0; that of the material's maps may restrict it",
+        )
+    config = options.resolve()
+    from mbtf_core.data.folder import DataFolder
+
+    data = DataFolder.open(shards)
+    if data.local is not None and real_path(data.local) in (real_path(output), *real_path(output).parents):
+        raise UsageError("is the data set, or inside it", where=f"-o {output}", hint="choose another folder")
+    from mbtf_gen.publishing.publication import Publication
+
+    publication = Publication.prepare(
+        data, config, with_maps=with_maps, material=None if material is None else Path(material)
+    )
+    console.note(f"{data} -> {output}: {config.form}, at most {size_text(publication.size)}")
+    keep_on_interruption(f"the finished files are kept in {output}")
+    with console.progress(publication.count, "publishing", "shards") as bar:
+        files = publication.write(output, overwrite=overwrite, progress=bar.advance)
+    size = sum(stored.bytes for stored in files.values())
+    recipe = "no recipe: measured data" if "measured" in publication.data.manifest else "with a recipe"
+    console.report(
+        {
+            "folder": output,
+            "name": publication.name,
+            "form": config.form,
+            "license": config.license,
+            "bytes": size,
+            "files": {name: asdict(stored) for name, stored in files.items()},
+        },
+        f"{output}: {publication.name}, {len(files)} files, {size_text(size)}, {recipe}",
+    )
