@@ -101,6 +101,8 @@ class FitConfig(Settings):
 
         name = data.get("model", cls.model_fields["model"].default)
         preset = defaults_of(name) if isinstance(name, str) else {}
+        # Their faults are the model's, not those of the options that are given.
+        build(cls, preset, source=f"defaults of {name}", context=STORED)
         training = data.get("training")
         if isinstance(training, Mapping) and training.get("shared_decoder") is True:
             preset = deep_merge(preset, SHARED_PRESET)

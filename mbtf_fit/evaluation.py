@@ -78,7 +78,7 @@ def split_errors(
     found = {
         **_errors(len(queries), mse, signal_variance(*arrays[1:]), unexplained_variance(*arrays)),
         "exposure": exposure,
-        "ten_largest": _ten_largest(*arrays),
+        "ten_largest": _ten_largest(*arrays[:4]),
     }
     bands = _grouped(elevation_groups(queries.omega_i, queries.omega_o), *arrays)
     return {
@@ -113,11 +113,11 @@ def _errors(n: int, mse: Estimate, variance: Estimate, unexplained: Estimate) ->
     }
 
 
-def _grouped(labels: NDArray[np.int64], *arrays: NDArray[np.float32] | None) -> dict[int, dict[str, Any]]:
+def _grouped(labels: NDArray[np.int64], *arrays: NDArray[Any] | None) -> dict[int, dict[str, Any]]:
     mse = by_group(noise_free_mse, labels, *arrays)
     unexplained = by_group(unexplained_variance, labels, *arrays)
     variance = by_group(signal_variance, labels, *arrays[1:])
-    return {k: _errors(mse[k].n, mse[k], variance[k], unexplained[k]) for k in mse}
+    return {k: _errors(int((labels == k).sum()), mse[k], variance[k], unexplained[k]) for k in mse}
 
 
 def evaluate_splits(

@@ -26,7 +26,7 @@ class Estimate:
     ----------
     value : the estimate, in the unit of its quantity
     error : standard error (one standard deviation), same unit; ``inf`` where it is unknown
-    n : number of independent units: queries, or images in the image layout
+    n : number of independent units: queries, groups of queries, or images in the image layout
     dof : degrees of freedom of `error`; None means ``n - 1``
     """
 
@@ -84,8 +84,10 @@ def _exponent(x: float) -> int:
     return math.floor(math.log10(x))
 
 
-def mean_estimate(samples: ArrayLike, weights: ArrayLike | None = None) -> Estimate:
-    """Mean of independent samples, with its standard error.
+def mean_estimate(
+    samples: ArrayLike, weights: ArrayLike | None = None, groups: ArrayLike | None = None
+) -> Estimate:
+    """Mean of samples, with its standard error. Samples are independent, or those of different groups are.
 
     The sample mean is unbiased, and ``s²/n`` with the ``n-1`` divisor an unbiased estimate of its variance.
     Trailing axes (channels of a query, texels of an image) are averaged first, so their correlation does not
@@ -97,6 +99,8 @@ def mean_estimate(samples: ArrayLike, weights: ArrayLike | None = None) -> Estim
     samples : (n, ...) array_like
     weights : (n,) array_like, optional
         Ratio of the density that the mean is over to the density that the samples come from, up to a factor.
+    groups : (n,) int array_like, optional
+        Labels of the groups.
 
     Returns
     -------
@@ -105,13 +109,25 @@ def mean_estimate(samples: ArrayLike, weights: ArrayLike | None = None) -> Estim
     """
     units = per_unit(checked(samples, "samples"))
     n = len(units)
-    if weights is None:
+    if weights is None and groups is None:
         error = float(units.std(ddof=1)) / math.sqrt(n) if n > 1 else math.inf
         return Estimate(float(units.mean()), error, n)
-    w = unit_weights(weights, n)
+    w = np.ones(n) if weights is None else unit_weights(weights, n)
     mean = float((w * units).mean())
-    error = float(np.linalg.norm(w * (units - mean))) / math.sqrt(n * (n - 1)) if n > 1 else math.inf
-    return Estimate(mean, error, n)
+    return Estimate(mean, *standard_error(w * (units - mean), groups))
+
+
+def standard_error(residuals: NDArray[np.float64], groups: ArrayLike | None) -> tuple[float, int]:
+    """Standard error of a mean by the residuals (n,) about it, whose sum is zero, and the number of
+    independent groups: the root of the sum of squares of their sums (Liang and Zeger 1986)."""
+    n = len(residuals)
+    sums: NDArray[Any] = residuals
+    if groups is not None:
+        sums = np.bincount(np.unique(group_labels(groups, n), return_inverse=True)[1], residuals)
+    count = len(sums)
+    if count < 2:
+        return math.inf, count
+    return float(np.linalg.norm(sums)) / math.sqrt(n * (n / count) * (count - 1)), count
 
 
 def unit_weights(weights: ArrayLike, n: int) -> NDArray[np.float64]:

@@ -8,8 +8,10 @@ The halves are arrays ``(n,)``, ``(n, channels)`` or ``(items, rows, columns, ch
 counts the independent units. Everything else is averaged within a unit before an error bar is taken: channels
 of one query are correlated, and texels of one image share its directions.
 
-Units that were not drawn from the distribution that a mean is over have weights (n,), the ratio of both
-densities up to a factor, such as the array ``weight`` of test queries. Weighted means are self-normalized.
+Units of a group, such as the queries of several lights per path, share noise: groups (n,) then label the
+independent ones. Units that were not drawn from the distribution that a mean is over have weights (n,), the
+ratio of both densities up to a factor, such as the array ``weight`` of test queries. Weighted means are
+self-normalized.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mbtf_core.stats.estimate import Estimate, checked, mean_estimate, per_unit, unit_weights
+from mbtf_core.stats.estimate import Estimate, checked, mean_estimate, per_unit, standard_error, unit_weights
 
 # Standard deviation, in pixels, of the averaging window of local errors.
 LOCAL_WINDOW = 2.0
@@ -111,7 +113,11 @@ def pooled_relative_error(a: ArrayLike, b: ArrayLike, weights: ArrayLike | None 
 
 
 def noise_free_mse(
-    prediction: ArrayLike, a: ArrayLike, b: ArrayLike, weights: ArrayLike | None = None
+    prediction: ArrayLike,
+    a: ArrayLike,
+    b: ArrayLike,
+    weights: ArrayLike | None = None,
+    groups: ArrayLike | None = None,
 ) -> Estimate:
     """Mean squared error of a prediction against the truth, without the noise of the reference.
 
@@ -122,14 +128,19 @@ def noise_free_mse(
     Parameters
     ----------
     prediction, a, b : (n, ...) array_like; the estimate has their squared unit
-    weights : (n,) array_like, optional
+    weights, groups : (n,) array_like, optional
     """
     p, first, second = _with_prediction(prediction, a, b)
-    return mean_estimate((p - first) * (p - second), weights)
+    return mean_estimate((p - first) * (p - second), weights, groups)
 
 
 def mse_difference(
-    prediction: ArrayLike, other: ArrayLike, a: ArrayLike, b: ArrayLike, weights: ArrayLike | None = None
+    prediction: ArrayLike,
+    other: ArrayLike,
+    a: ArrayLike,
+    b: ArrayLike,
+    weights: ArrayLike | None = None,
+    groups: ArrayLike | None = None,
 ) -> Estimate:
     """Noise-free mean squared error of `prediction` minus that of `other`, compared query by query.
 
@@ -139,14 +150,16 @@ def mse_difference(
     Parameters
     ----------
     prediction, other, a, b : (n, ...) array_like; the estimate has their squared unit
-    weights : (n,) array_like, optional
+    weights, groups : (n,) array_like, optional
     """
     p, first, second = _with_prediction(prediction, a, b)
     q, _, _ = _with_prediction(other, a, b)
-    return mean_estimate((p - first) * (p - second) - (q - first) * (q - second), weights)
+    return mean_estimate((p - first) * (p - second) - (q - first) * (q - second), weights, groups)
 
 
-def signal_variance(a: ArrayLike, b: ArrayLike, weights: ArrayLike | None = None) -> Estimate:
+def signal_variance(
+    a: ArrayLike, b: ArrayLike, weights: ArrayLike | None = None, groups: ArrayLike | None = None
+) -> Estimate:
     """Variance of the true values over queries, free of noise: per channel about its mean, then averaged.
 
     For ``(n, channels)`` the sample covariance of a and b, ``Σ (a-ā)(b-b̄)/(n-1)``: given the queries, every
@@ -157,18 +170,22 @@ def signal_variance(a: ArrayLike, b: ArrayLike, weights: ArrayLike | None = None
     Parameters
     ----------
     a, b : (n, ...) array_like; the estimate has their squared unit
-    weights : (n,) array_like, optional
+    weights, groups : (n,) array_like, optional
     """
     first, second = _pair(a, b)
     products, correction = _centered_products(first, second, _weights(weights, len(first)))
-    spread = mean_estimate(products, weights)
+    spread = mean_estimate(products, weights, groups)
     if spread.n < 2:
         return Estimate(math.nan, math.inf, spread.n)
     return Estimate(spread.value + correction, spread.error, spread.n)
 
 
 def unexplained_variance(
-    prediction: ArrayLike, a: ArrayLike, b: ArrayLike, weights: ArrayLike | None = None
+    prediction: ArrayLike,
+    a: ArrayLike,
+    b: ArrayLike,
+    weights: ArrayLike | None = None,
+    groups: ArrayLike | None = None,
 ) -> Estimate:
     """Fraction of unexplained variance, 1 - R²: noise-free MSE over signal variance.
 
@@ -182,7 +199,7 @@ def unexplained_variance(
     ----------
     prediction, a, b : (n, ...) array_like
         The prediction, and independent halves of the reference.
-    weights : (n,) array_like, optional
+    weights, groups : (n,) array_like, optional
 
     Raises
     ------
@@ -192,7 +209,7 @@ def unexplained_variance(
     p, first, second = _with_prediction(prediction, a, b)
     w = _weights(weights, len(p))
     products, correction = _centered_products(first, second, w)
-    return _ratio(w * per_unit((p - first) * (p - second)), w * (products + correction))
+    return _ratio(w * per_unit((p - first) * (p - second)), w * (products + correction), groups)
 
 
 def psnr(mse: Estimate, peak: float) -> Estimate:
@@ -235,16 +252,17 @@ def _centered_products(
     return per_unit(x * y), between / (n * (n - 1)) if n > 1 else 0.0
 
 
-def _ratio(numerator: NDArray[np.float64], denominator: NDArray[np.float64]) -> Estimate:
+def _ratio(
+    numerator: NDArray[np.float64], denominator: NDArray[np.float64], groups: ArrayLike | None = None
+) -> Estimate:
     """Ratio of the means of two correlated per-unit arrays (n,), with the delta method's error."""
-    n, below = len(numerator), float(denominator.mean())
-    scale = 1.0 / math.sqrt(n * (n - 1)) if n > 1 else math.inf
-    if n < 2 or below <= 2.0 * scale * float(np.linalg.norm(denominator - below)):
+    below = float(denominator.mean())
+    spread, n = standard_error(denominator - below, groups)
+    if below <= 2.0 * spread:
         return Estimate(math.nan, math.inf, n)
     ratio = float(numerator.mean()) / below
-    # The mean of the residuals is zero.
-    residual = numerator - ratio * denominator
-    return Estimate(ratio, scale * float(np.linalg.norm(residual)) / below, n)
+    error, n = standard_error(numerator - ratio * denominator, groups)
+    return Estimate(ratio, error / below, n)
 
 
 def _root(estimate: Estimate) -> Estimate:

@@ -9,9 +9,6 @@ if TYPE_CHECKING:
     from mbtf_core.data.folder import DataFolder
     from mbtf_fit.material.material import Material
 
-# Least share of the stored training queries that a fit trains on.
-_LEAST_SHARE = 0.75
-
 
 def advise(
     material: Material,
@@ -38,6 +35,7 @@ def advise(
     """
     from mbtf_core.data.dataset import Dataset
     from mbtf_fit.training.endings import kept_step, reached
+    from mbtf_fit.training.fit_folder import training_digest
     from mbtf_fit.training.next_step import next_step
     from mbtf_fit.training.validation import marginal_cost_of
 
@@ -46,11 +44,8 @@ def advise(
     if cost is None or not errors or config.training.shared_decoder or reached(config, history):
         return None, []
     data = Dataset.open(shards)
-    stored = data.manifest["splits"].get("train", {}).get("queries", 0)
-    # Those of the training are the stored ones but for the held-out ones.
-    if not _LEAST_SHARE * stored <= training["queries"] <= stored:
-        line = "the fit had other training data: evaluate it on them to see what would reduce its error"
-        return None, [f"{line} ({stored:,} training queries here, {training['queries']:,} in its training)"]
+    if training["shards_sha256"] != training_digest(data):
+        return None, ["the fit had other training data; evaluate it on them for advice"]
     step = next_step(cost, errors)
     command = step.command(config, training["seconds"], data, folder)
     return command, [step.reason if command is None else f"{step.reason}:\n  {command}"]

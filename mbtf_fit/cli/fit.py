@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -101,7 +101,14 @@ def fit(
     if many is not None:
         if shared_decoder:
             options = options.assigning("training.shared_decoder=true")
-        _fit_many(options, quality, many, output, processes, cluster, overwrite, console)
+        made = not output.exists()
+        try:
+            _fit_many(options, quality, many, output, processes, cluster, overwrite, console)
+        finally:
+            # It is empty where every fit failed at once.
+            with suppress(OSError):
+                if made:
+                    output.rmdir()
         return
     if shards is None:
         raise UsageError("no shards given", hint="mbtf-fit shards/ -o material/")

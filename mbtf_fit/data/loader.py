@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -184,6 +184,10 @@ def load_training(
     for index, shard in enumerate(ahead(shards)):
         queries = read_checked(shard)
         labels = label_queries(held_out, queries, seed, index, lights)
+        if lights > 1:
+            # Numbers that no other shard has.
+            paths = (index << 32) + np.tile(np.arange(len(queries) // lights), lights)
+            queries = replace(queries, group=paths)
         for group, label in zip(kept_out, (HELD_OUT_QUERY, HELD_OUT_DIRECTION), strict=True):
             missing = MAX_HELD_OUT - sum(map(len, group))
             group.append(queries.take(np.flatnonzero(labels == label)[:missing]))

@@ -34,6 +34,7 @@ class ShardQueries:
     ----------
     u : (n, 2) uv; sigma : (n,) tile widths; omega_i, omega_o : (n, 3); value_a, value_b : (n, 3) in 1/sr
     weight : (n,) weights in means over queries; None where all are 1
+    group : (n,) labels of groups that share paths; None where each query has its own
     """
 
     u: NDArray[np.float32]
@@ -43,17 +44,18 @@ class ShardQueries:
     value_a: NDArray[np.float32]
     value_b: NDArray[np.float32]
     weight: NDArray[np.float32] | None = None
+    group: NDArray[np.int64] | None = None
 
     def __len__(self) -> int:
         return len(self.sigma)
 
     @property
-    def halves(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32] | None]:
-        """Both estimates and the weights, as statistics of :mod:`mbtf_core.stats` take them."""
-        return self.value_a, self.value_b, self.weight
+    def halves(self) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any] | None, NDArray[Any] | None]:
+        """Both estimates, weights and groups, as statistics of :mod:`mbtf_core.stats` take them."""
+        return self.value_a, self.value_b, self.weight, self.group
 
     @classmethod
-    def of(cls, arrays: Mapping[str, NDArray[np.float32]]) -> ShardQueries:
+    def of(cls, arrays: Mapping[str, NDArray[Any]]) -> ShardQueries:
         """Queries of the arrays of a shard."""
         return cls(**{"value_b": arrays["value_a"], **arrays})
 
@@ -72,7 +74,7 @@ class ShardQueries:
         """Some of the queries: a slice, an index array or a mask."""
         return ShardQueries(**{name: a[rows] for name, a in self._arrays().items()})
 
-    def _arrays(self) -> dict[str, NDArray[np.float32]]:
+    def _arrays(self) -> dict[str, NDArray[Any]]:
         return {name: array for name, array in vars(self).items() if array is not None}
 
 

@@ -63,6 +63,20 @@ def conformance_queries(lattice: Lattice) -> dict[str, NDArray[np.float32]]:
     return {name: np.ascontiguousarray(array, np.float32) for name, array in arrays.items()}
 
 
+def _numbers(values: ArrayLike, name: str) -> NDArray[np.float32]:
+    try:
+        array = np.asarray(values)
+        if array.dtype.kind not in "biuf":
+            raise TypeError(f"its type is {array.dtype}")
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InputError(f"is no array of real numbers ({reason(error)})", where=name) from None
+    with np.errstate(over="ignore"):
+        found = np.asarray(array, np.float32)
+    if bad := int((~np.isfinite(found)).sum()):
+        raise InputError(f"holds NaN or infinity ({bad} of {found.size} numbers)", where=name)
+    return found
+
+
 def _broadcast(
     inputs: Mapping[str, tuple[ArrayLike, int]],
 ) -> tuple[tuple[int, ...], list[NDArray[np.float32]]]:
@@ -74,9 +88,9 @@ def _broadcast(
 
     Raises
     ------
-    InputError : a last axis has another size, or the others do not broadcast
+    InputError : not numbers, NaN or infinity; a last axis has another size, or the others do not broadcast
     """
-    arrays = [np.asarray(values, np.float32) for values, _ in inputs.values()]
+    arrays = [_numbers(values, name) for name, (values, _) in inputs.items()]
     own = [(size,) * (size > 0) for _, size in inputs.values()]
     leads = [a.shape[: a.ndim - len(axis)] for a, axis in zip(arrays, own, strict=True)]
     try:
@@ -190,13 +204,13 @@ class Material:
         Raises
         ------
         InputError
-            A direction is not a unit vector, or the shapes do not broadcast.
+            Not finite numbers, a direction is not a unit vector, or the shapes do not broadcast.
         """
-        check_unit(omega_i, "omega_i")
-        check_unit(omega_o, "omega_o")
         lead, flat = _broadcast(
             {"u": (u, 2), "sigma": (sigma, 0), "omega_i": (omega_i, 3), "omega_o": (omega_o, 3)}
         )
+        check_unit(omega_i, "omega_i")
+        check_unit(omega_o, "omega_o")
         return predict(self.model, *flat).reshape(*lead, 3)
 
     def offset(self, u: ArrayLike, omega_o: ArrayLike) -> NDArray[np.float32]:
@@ -217,11 +231,11 @@ class Material:
         Raises
         ------
         InputError
-            A direction is not a unit vector, or the shapes do not broadcast.
+            Not finite numbers, a direction is not a unit vector, or the shapes do not broadcast.
         """
-        check_unit(omega_o, "omega_o")
         device = next(self.model.parameters()).device
         lead, flat = _broadcast({"u": (u, 2), "omega_o": (omega_o, 3)})
+        check_unit(omega_o, "omega_o")
         return evaluate_in_chunks(self.model.offset, device, 2, *flat).reshape(*lead, 2)
 
     def predict(self, queries: ShardQueries) -> NDArray[np.float32]:

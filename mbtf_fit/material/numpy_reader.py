@@ -252,12 +252,12 @@ class NumpyMaterial:
         z = axis[2] if len(axis) == 3 else np.sqrt(max(0, 1 - xy @ xy))
         return np.array([*omega[:2] - xy * (omega[2] + t / (1 + z)), z * omega[2] + t])
 
-    def to_frame(self, axes, omega):
+    def to_frame(self, axes, omega, shortest):
         x, _, z = np.eye(3)
-        n, t = axes[:3] + z, axes[3:] + x
-        n = n / np.sqrt(n @ n)
-        t = t - (t @ n) * n
-        t = t / np.sqrt(t @ t)
+        n, toward = axes[:3] + z, axes[3:] + x
+        n = n / max(np.sqrt(n @ n), shortest)
+        t = toward - (toward @ n) * n
+        t = t / max(np.sqrt(t @ t), shortest * (1 + np.sqrt(toward @ toward)))
         return np.array([t, np.cross(n, t), n]) @ omega
 
     def frequencies(self, x, level, bands, pi, raw, attenuated):

@@ -150,5 +150,11 @@ def with_option(option: str) -> list[str]:
 
 
 def defaults_of(name: str) -> dict[str, Any]:
-    """Options of a model that differ from the general defaults, nested."""
-    return dict(model_class(name).defaults) if name in MODELS or file_and_class(name) else {}
+    """Options of a model that differ from the general defaults, nested.
+
+    Raises
+    ------
+    InputError : the code of a model's file raises an exception, or they are no mapping
+    """
+    with _faults_of(name):
+        return dict(model_class(name).defaults) if name in MODELS or file_and_class(name) else {}

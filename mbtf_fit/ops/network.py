@@ -105,17 +105,20 @@ class Rotate(Operation):
 class ToFrame(Operation):
     """A direction in a frame of a normal and a tangent: ``(t·ω, (n × t)·ω, n·ω)`` (3).
 
-    ``n = (a + e_z) / ‖a + e_z‖``; t is ``b + e_x`` without its part along n, normalized. Where a and b are 0,
-    the frame is the tile's.
+    ``n = N / max(‖N‖, ε)`` with ``N = a + e_z``, and ``t = T / max(‖T‖, ε (1 + ‖b + e_x‖))`` with
+    ``T = b + e_x - (n·(b + e_x)) n``. Where a and b are 0, the frame is the tile's. Axes have length 1, but
+    for N that is almost 0, and for b + e_x that is almost 0 or parallel to n: they fade to 0.
 
     Attributes
     ----------
     axes : a and b (6)
     omega : direction (3)
+    shortest : ε, which keeps rounding errors from becoming axes
     """
 
     axes: Value
     omega: Value
+    shortest: float = 1e-2
 
     def size(self, sizes: Sequence[int]) -> int:
         if sizes != [6, 3]:

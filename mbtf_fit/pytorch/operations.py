@@ -215,13 +215,17 @@ def _rotate(op: ops.Rotate, run: Execution, axis: Tensor, omega: Tensor) -> Tens
     return rotate_to_z(axis, omega)
 
 
+def _length(vectors: Tensor) -> Tensor:
+    return torch.linalg.vector_norm(vectors, dim=1, keepdim=True)
+
+
 @PYTORCH.implements(ops.ToFrame)
 def _to_frame(op: ops.ToFrame, run: Execution, axes: Tensor, omega: Tensor) -> Tensor:
     x, _, z = torch.eye(3, dtype=axes.dtype, device=axes.device)
-    normal = torch.nn.functional.normalize(axes[:, :3] + z, dim=1)
-    tangent = axes[:, 3:] + x
-    tangent = tangent - (tangent * normal).sum(1, keepdim=True) * normal
-    tangent = torch.nn.functional.normalize(tangent, dim=1)
+    normal, toward = axes[:, :3] + z, axes[:, 3:] + x
+    normal = normal / _length(normal).clamp_min(op.shortest)
+    tangent = toward - (toward * normal).sum(1, keepdim=True) * normal
+    tangent = tangent / torch.maximum(_length(tangent), op.shortest * (1.0 + _length(toward)))
     frame = torch.stack([tangent, torch.linalg.cross(normal, tangent), normal], 1)
     return (frame * omega[:, None]).sum(2)
 

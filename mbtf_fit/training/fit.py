@@ -279,10 +279,11 @@ def _fit(
     with ExitStack() as stack:
         for folder in dict.fromkeys((home, *folders)):
             stack.enter_context(owned(folder))
-        if shared:
-            claim(home, joint_identity(identities), config, overwrite)
-        for member in members:
-            claim(member.folder, member.identity, config, overwrite)
+        claims = {home: joint_identity(identities)} if shared else {}
+        claims |= {member.folder: member.identity for member in members}
+        for folder, identity in claims.items():
+            # A fit that fails before its first checkpoint leaves no folder.
+            stack.enter_context(claim(folder, identity, config, overwrite))
         finished = all((folder / DESCRIPTION_NAME).exists() for folder in folders)
         finished = finished and (not shared or (home / DECODER_NAME).exists())
         resumed = finished or _train(

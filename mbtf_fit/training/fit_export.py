@@ -18,6 +18,7 @@ from mbtf_fit.evaluation import evaluate_splits
 from mbtf_fit.material.decoder import Decoder, write_decoder
 from mbtf_fit.material.material import export
 from mbtf_fit.material.transmittance import evaluate_transmittance, fit_transmittance
+from mbtf_fit.training.fit_folder import training_digest
 from mbtf_fit.training.loop import TrainingLoop
 from mbtf_fit.training.trainer import Trainer, TrainingProgress
 
@@ -89,6 +90,7 @@ def export_fit(
     training = {
         "batch": trainer.batch,
         "queries": len(partition.training),
+        "shards_sha256": training_digest(data),
         "loss": trainer.progress.loss,
         "validation_set": validated,
         "regularization": asdict(trainer.regularization),

@@ -71,6 +71,11 @@ def identity_of(config: FitConfig, data: Dataset, group: Sequence[Dataset] = ())
     }
 
 
+def training_digest(data: Dataset) -> str:
+    """SHA-256 over those of the shards of training queries."""
+    return data_sha256([shard.sidecar["sha256"] for shard in data.shards("train")])
+
+
 def joint_identity(identities: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
     """Identity of a shared network: that of the first material, with the hash of all; `identities`: name →
     identity of each material."""
@@ -79,9 +84,9 @@ def joint_identity(identities: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
     return {**next(iter(identities.values())), "config_hash": data_sha256(hashes), "data": data}
 
 
-def claim(out: Path, identity: dict[str, Any], config: FitConfig, overwrite: bool) -> None:
+def claim(out: Path, identity: dict[str, Any], config: FitConfig, overwrite: bool) -> OutputFolder:
     """Claim the folder for a fit, or check that it already belongs to it."""
-    OutputFolder.claim(
+    return OutputFolder.claim(
         out,
         FIT,
         {**identity["config"], "operations": identity["operations"], "data": identity["data"]},

@@ -59,7 +59,7 @@ def cost(
     from mbtf_core.units import asked_duration, clock
     from mbtf_pipeline.collection.recipes import load
     from mbtf_pipeline.cost.answers import answers
-    from mbtf_pipeline.cost.measurement import pareto_front
+    from mbtf_pipeline.cost.measurement import other_work, pareto_front
     from mbtf_pipeline.cost.page import write_page
     from mbtf_pipeline.cost.plan import plan_study
     from mbtf_pipeline.cost.study import run_study
@@ -106,6 +106,7 @@ def cost(
     with owned(folder):
         page = write_page(study)
     front, rows = pareto_front(study.measurements), answers(study.evidence)
+    busy = other_work(study.measurements)
     data = {
         "page": page,
         "measurements": len(study.measurements),
@@ -113,6 +114,7 @@ def cost(
         "failed": study.failed,
         "answers": rows,
         "asked": study.asked or None,
+        "busy": busy or None,
         "least_seconds": study.least,
         "seconds": study.description["taken"],
         "front": [
@@ -131,5 +133,6 @@ def cost(
     lines += [row["line"] for row in rows]
     lines += [study.asked] if study.asked else []
     lines += [study.more] if study.more else []
+    lines += [f"warning: {busy}"] if busy else []
     lines += [f"  {m.seconds.value:.0f} s: {m.command}" for m in front]
     console.report(data, "\n".join(lines))

@@ -76,7 +76,7 @@ class GeneratorConfiguration(Configuration):
     def command(self, conditions: Conditions) -> str:
         """The generator's command with the study's configuration, and the changed options."""
         sets = "".join(f" --set {name}={value}" for name, value in self.changes.items())
-        return f"{conditions.command}{sets} -o shards/"
+        return f"{conditions.command}{sets} -o {self.folder}"
 
     def measure(self, conditions: Conditions) -> Measurement:
         """Measure it for the time of the conditions."""

@@ -3,9 +3,13 @@ follows: error bars of seeds, the Pareto front."""
 
 from __future__ import annotations
 
+import hashlib
 import math
+import re
 import statistics
+import time
 from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,12 +17,13 @@ from typing import Any
 
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import data_sha256, read_json, write_json
+from mbtf_core.run.task import available_cores, worker_threads
 from mbtf_core.stats import Estimate, mean_estimate
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.tables import estimate
 
 # Raised when the method of measuring changes: older measurements are then repeated.
-SCHEMA = 10
+SCHEMA = 11
 FOLDER = "measurements"
 # Relative half-width of a 95% interval that a study aims at, and that half-width over the standard error.
 HALF_WIDTH = 0.1
@@ -27,6 +32,10 @@ ESTIMATES = ("seconds", "error", "bias", "noise")
 # Relative standard deviation of a run over seeds before any run is repeated, and the degrees of freedom that
 # it counts for: studies of four materials found 1.5 to 6% (docs/results/cost.md).
 PRIOR, PRIOR_DEGREES = 0.05, 4
+# Share of the processors below which other work is worth a warning.
+_FREE = 0.9
+# Wall time of a probe of the processors, seconds, and bytes of its steps, which run without Python's lock.
+_PROBE_SECONDS, _PROBE_BYTES = 0.05, 1 << 20
 
 
 @dataclass(frozen=True)
@@ -68,6 +77,11 @@ class Configuration:
         return ", ".join(filter(None, (self.study, self.series, self.name)))
 
     @property
+    def folder(self) -> str:
+        """Folder that its command writes to: no two configurations of a study share one."""
+        return re.sub(r"[^a-z0-9.]+", "-", self.label.lower()).strip("-.")
+
+    @property
     def key(self) -> dict[str, Any]:
         """What its measurement depends on besides the study's conditions."""
         raise NotImplementedError
@@ -90,7 +104,7 @@ class Measurement:
     study, series, name : of the configuration
     command : reproduces it with the programs
     seconds : its time: per million queries for the generator; of generating, training and everything
-        around them for a run
+        around them for a run. Its error includes what other work on the machine may have added
     error : relative RMS error of the generator's values, or unexplained variance of a fit
     bias, noise : the two parts of the generator's error; error² = bias² + noise²
     details : further numbers by name: generation and training seconds, bytes, milliseconds
@@ -110,8 +124,43 @@ class Measurement:
 
 
 def measure(configuration: Configuration, conditions: Conditions) -> Measurement:
-    """Measure a configuration; a task, see :mod:`mbtf_core.run.task`."""
-    return configuration.measure(conditions)
+    """Measure a configuration; a task, see :mod:`mbtf_core.run.task`.
+
+    With a share s of the processors, a time t would be between s t and t on a machine without other work.
+    """
+    before = processor_share()
+    found = configuration.measure(conditions)
+    share = statistics.fmean((before, processor_share()))
+    error = math.hypot(found.seconds.error, (1.0 - share) * found.seconds.value)
+    details = {**found.details, "processor_share": share}
+    return replace(found, seconds=replace(found.seconds, error=error), details=details)
+
+
+def processor_share() -> float:
+    """Share of the processors that this process gets while all its threads compute, in (0, 1]; other work
+    takes the rest."""
+    block = bytes(_PROBE_BYTES)
+
+    def share(_: int) -> float:
+        begin, own = time.perf_counter(), time.thread_time()
+        while time.perf_counter() - begin < _PROBE_SECONDS:
+            hashlib.sha256(block)
+        return (time.thread_time() - own) / (time.perf_counter() - begin)
+
+    threads = worker_threads() or available_cores()
+    with ThreadPoolExecutor(threads) as pool:
+        return min(1.0, statistics.fmean(pool.map(share, range(threads))))
+
+
+def other_work(found: Iterable[Measurement]) -> str:
+    """That the machine had other work, in one sentence; empty where it had hardly any."""
+    share = statistics.median([m.details.get("processor_share", 1.0) for m in found] or [1.0])
+    if share >= _FREE:
+        return ""
+    return (
+        f"other work left {100 * share:.0f}% of the processors to this study: its times are up to "
+        f"{1 / share:.1f} times too long; repeat it in another folder on a machine without other work"
+    )
 
 
 class MeasurementFolder:
@@ -160,14 +209,17 @@ def seed_deviation(groups: Iterable[Sequence[Measurement]]) -> Estimate:
 
 def combined(group: Sequence[Measurement], deviation: Estimate) -> Measurement:
     """The runs of one configuration as one measurement: name, command and curve of the first one, means of
-    all. The error of the test set is common to all runs, and does not become less by repeats."""
+    all. The errors by the test set and by other work on the machine are common to all runs, and do not become
+    less by repeats."""
     error = statistics.fmean(m.error.value for m in group)
     spread = deviation.value * error / math.sqrt(len(group))
     test = statistics.fmean(m.error.error for m in group)
     details = {k: statistics.fmean(m.details[k] for m in group) for k in group[0].details}
+    mean = mean_estimate([m.seconds.value for m in group])
+    busy = statistics.fmean(m.seconds.error for m in group)
     return replace(
         group[0],
-        seconds=mean_estimate([m.seconds.value for m in group]),
+        seconds=replace(mean, error=math.hypot(mean.error, busy)),
         error=Estimate(error, math.hypot(spread, test), group[0].error.n),
         details={
             **details,

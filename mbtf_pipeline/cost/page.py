@@ -14,7 +14,7 @@ import numpy as np
 from mbtf_core.files.editable import write_document
 from mbtf_core.units import clock
 from mbtf_pipeline.cost.answers import Evidence, answers
-from mbtf_pipeline.cost.measurement import Measurement, pareto_front
+from mbtf_pipeline.cost.measurement import Measurement, other_work, pareto_front
 from mbtf_pipeline.cost.study import Study
 from mbtf_pipeline.report.plots import Series, plot
 from mbtf_pipeline.report.report import render
@@ -50,7 +50,7 @@ _SIZES = [
     _detail("MB", "bytes", factor=1e-6, digits=".2f"),
     _detail("seeds", "seeds", digits="g"),
 ]
-_REST = [_detail("", name) for name in ("overhead_seconds", "evaluating_seconds")]
+_REST = [_detail("", name) for name in ("overhead_seconds", "evaluating_seconds", "processor_share")]
 _TITLE = Column("configuration", "", lambda m: ", ".join(filter(None, (m.series, m.name))))
 _GENERATOR = [_TITLE, _SECONDS, *_PARTS, _COMMAND]
 _RUNS = [*_SPENT[:1], _field("unexplained variance", "error"), *_SPENT[1:], *_SIZES, _COMMAND]
@@ -164,6 +164,7 @@ def write_page(study: Study) -> Path:
         answers=answers(evidence),
         asked=study.asked,
         more=study.more,
+        busy=other_work(study.measurements),
         skipped=study.skipped,
         failed=study.failed,
         deviation=f"{study.deviation.scaled(100.0)}%",

@@ -108,8 +108,8 @@ class Run(Configuration):
         options = self.fit | ({"seed": seed} if seed else {})
         flags = "".join(f" --set {shlex.quote(f'{k}={v}')}" for k, v in options.items())
         return (
-            f"{conditions.command} --queries {self.queries} --spp {self.spp}{own} -o shards/ && "
-            f"mbtf-fit shards/{flags} -o material/"
+            f"{conditions.command} --queries {self.queries} --spp {self.spp}{own} -o {self.folder}/shards && "
+            f"mbtf-fit {self.folder}/shards{flags} -o {self.folder}/material"
         )
 
     def measure(self, conditions: Conditions) -> Measurement:

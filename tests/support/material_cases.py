@@ -50,6 +50,14 @@ CASES: dict[str, dict[str, Any]] = {
 # Operations that no model of the papers has, and values of more than four numbers.
 LISTS: dict[str, list[ops.Operation]] = {
     "constant light": [ops.Lookup("color", "u", None, "map", 3), ops.Transform("value", "color", "softplus")],
+    "frames without axes": [
+        ops.Lookup("texel", "u", "level", "axes", 18),
+        *(ops.ToFrame(f"local_{k}", f"texel[{6 * k}:{6 * k + 6}]", "omega_o") for k in range(3)),
+        ops.ToFrame("light", "texel[0:6]", "omega_i"),
+        ops.Gate("mixed", "local_0", "local_1", "local_2"),
+        ops.Gate("both", "mixed", "light", "mixed"),
+        ops.Transform("value", "both", "softplus"),
+    ],
     "wide values": [
         ops.Lookup("texel", "u", "level", "lobes", 10),
         ops.Frequencies("waves", "omega_i[0:2]", None, 2, pi=False, attenuated=True),
@@ -62,6 +70,8 @@ LISTS: dict[str, list[ops.Operation]] = {
         ops.Matrix("value", "squares", ((0.2, 0.0, 0.0, 0.0, 0.1), (0.0, 0.2, 0.1, 0.0, 0.0), (0.1,) * 5)),
     ],
 }
+# Numbers of frames: without normal, without tangent, with a tangent along the normal.
+DEGENERATE = [0.0, 0.0, -1.0, 0.3, 0.2, 0.1, 0.3, 0.2, 0.0, -1.0, 0.0, 0.0, 0.3, 0.6, -0.1, -0.4, 1.2, 1.8]
 CASES |= {case: {} for case in LISTS}
 HIERARCHICAL = {
     "hierarchical": {"model": "hierarchical"},
@@ -97,6 +107,8 @@ def make(case: str, folder: Path, **more: Any) -> Material:
         model = NeuralMaterial(lattice, LISTS[case])
         for textures in model.textures():
             torch.nn.init.normal_(textures.texels, std=0.5, generator=generator)
+            if case == "frames without axes":
+                textures.texels.data[:] = torch.tensor(DEGENERATE)
         folder.mkdir(parents=True)
         return export(model, FitConfig(), folder, data={"hash": "0" * 64}, training=TRAINING)
     options = {"finest": 4, "aspect": 0.5, **ALL[case], **more}

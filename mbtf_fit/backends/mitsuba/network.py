@@ -136,9 +136,10 @@ def _rotate(op: ops.Rotate, loader: Loader) -> Step:
 def _to_frame(op: ops.ToFrame, loader: Loader) -> Step:
     def step(axes: Numbers, omega: Numbers) -> Numbers:
         a, b, direction = mi.Vector3f(*axes[:3]), mi.Vector3f(*axes[3:]), mi.Vector3f(*omega)
-        normal = dr.normalize(a + mi.Vector3f(0.0, 0.0, 1.0))
-        tangent = b + mi.Vector3f(1.0, 0.0, 0.0)
-        tangent = dr.normalize(tangent - dr.dot(tangent, normal) * normal)
+        normal, toward = a + mi.Vector3f(0.0, 0.0, 1.0), b + mi.Vector3f(1.0, 0.0, 0.0)
+        normal /= dr.maximum(dr.norm(normal), op.shortest)
+        tangent = toward - dr.dot(toward, normal) * normal
+        tangent /= dr.maximum(dr.norm(tangent), op.shortest * (1.0 + dr.norm(toward)))
         return [dr.dot(axis, direction) for axis in (tangent, dr.cross(normal, tangent), normal)]
 
     return step

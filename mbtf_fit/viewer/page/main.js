@@ -8,14 +8,18 @@ const timeText = (seconds) =>
 function statusLine(viewer, test) {
   const { renderer, camera, material, full } = viewer,
     pitch = camera.tiles_across / renderer.canvas.width,
-    level = clamp(-Math.log2(pitch), 0, material.content.finest);
+    finest = material.content.finest,
+    level = clamp(-Math.log2(pitch), 0, finest),
+    texels = Number((pitch * 2 ** finest).toPrecision(2));
   const { frames = 0, row = 0, height = 1 } = renderer.means.full ?? {};
   // The first full frame replaces the coarse picture; more of them remove its noise and jagged edges.
-  const progress = frames
-    ? `frame ${frames} of ${FRAMES}, ${timeText(full)} each`
-    : `full picture: ${Math.floor((100 * row) / height)}%${full < 1 ? "" : ` of ${timeText(full)}`}`;
+  let progress = "preview in low resolution";
+  if (frames >= FRAMES) progress = "picture complete";
+  else if (frames) progress = `smoothing edges: frame ${frames} of ${FRAMES}, ${timeText(full)} each`;
+  else if (row)
+    progress = `drawing in full resolution: ${Math.floor((100 * row) / height)}%${full < 1 ? "" : ` of ${timeText(full)}`}`;
   const beyond = test?.beyond ? `, ${test.beyond} of ${test.count} test queries deviate` : "";
-  return `level ${level.toFixed(1)} of ${material.content.finest}, ${tilesText(camera.tiles_across)} across, ${progress}${beyond}`;
+  return `${tilesText(camera.tiles_across)} across, a pixel is ${texels} texel${texels === 1 ? "" : "s"} wide (level ${level.toFixed(1)} of ${finest}), ${progress}${beyond}`;
 }
 
 // Until the browser has shown what has changed.

@@ -268,7 +268,8 @@ function showPoint(viewer, x, y) {
   };
   const largest = over("over_lights", found.omega_o, false, towards);
   over("over_views", towards, true, found.omega_o);
-  const level = clamp(-Math.log2(2 * found.sigma), 0, material.content.finest);
+  const finest = material.content.finest,
+    level = clamp(-Math.log2(2 * found.sigma), 0, finest);
   byId("point").textContent =
-    `${material.name} at u = (${found.u.map((c) => c.toFixed(4)).join(", ")}), footprint σ = ${found.sigma.toPrecision(2)} tiles (level ${level.toFixed(1)}), largest value ${largest.toPrecision(3)} 1/sr`;
+    `${material.name} at u = (${found.u.map((c) => c.toFixed(4)).join(", ")}), footprint σ = ${Number((found.sigma * 2 ** finest).toPrecision(2))} texels (level ${level.toFixed(1)} of ${finest}), largest value ${largest.toPrecision(3)} 1/sr`;
 }

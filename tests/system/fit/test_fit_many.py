@@ -33,6 +33,10 @@ def test_one_that_fails_does_not_stop_the_others(tmp_path: Path) -> None:
     assert "train-00000.npz" in broken["error"]
     assert other["error"] is None
     assert other["result"]["training"]["steps"] == 3
+    # Of the failed one nothing is left, nor of a command of which all fail.
+    assert not (tmp_path / "out" / "a").exists()
+    alone = call(["mbtf-fit", "--many", str(shard.parent), "-o", str(tmp_path / "none"), *QUICK])
+    assert (alone.code, (tmp_path / "none").exists()) == (4, False)
     before = (tmp_path / "out" / "b" / "material.json").read_bytes()
     # After the repair, the same command finishes the one and leaves the other as it is.
     arrays["value_a"] = whole

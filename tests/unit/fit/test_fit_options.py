@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from mbtf_core.config.settings import build
 from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.units import format_duration, parse_duration
+from mbtf_fit import ops
 from mbtf_fit.cli.app import app
 from mbtf_fit.cli.fit import FitOptions, resolve_config
 from mbtf_fit.config import FitConfig
@@ -135,6 +137,16 @@ def test_a_model_that_is_not_installed_is_named(tmp_path: Path, source: str) -> 
         build(FitConfig, {"model": "texel-lobe"}, source=str(tmp_path / source))
     for part in (source, "'texel-lobe'", ", ".join(NAMES), "entry point of mbtf.models", "FILE.py"):
         assert part in caught.value.message
+
+
+def test_every_operation_has_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(app, ["models", "--operations", "--json"]) == 0
+    found = {one["name"]: one["description"] for one in json.loads(capsys.readouterr().out)["operations"]}
+    assert found["DivideByCosine"] == "x / max(ω_z, least)."
+    assert found["Inception"].startswith(
+        "1×1 convolution, Inception modules, 1×1 convolution over a Neighborhood ("
+    )
+    assert found.keys() == {name for name in ops.__all__ if name[0].isupper()} - {"Backend", "Operation"}
 
 
 def test_every_model_has_a_line(capsys: pytest.CaptureFixture[str]) -> None:

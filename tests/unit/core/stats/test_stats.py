@@ -51,6 +51,24 @@ def test_mean_estimate_by_hand() -> None:
     assert mean_estimate([1.0]).error == math.inf
 
 
+@pytest.mark.parametrize("weighted", [False, True])
+def test_queries_of_a_group_count_as_one(weighted: bool) -> None:
+    """Four copies of every query know no more than one."""
+    random = np.random.default_rng(0)
+    p, a, b = random.normal(size=(3, 200, 3))
+    b += 2 * a
+    weights = random.uniform(1, 3, 200) if weighted else None
+    groups = np.tile(np.arange(200), 4)
+    for statistic, arrays in (
+        (noise_free_mse, (p, a, b)), (unexplained_variance, (p, a, b)), (signal_variance, (a, b)),
+    ):  # fmt: skip
+        one = statistic(*arrays, weights)  # type: ignore[operator]
+        copies = [None if x is None else np.concatenate([x] * 4) for x in (*arrays, weights)]
+        four = statistic(*copies, groups)  # type: ignore[operator]
+        assert four.error == pytest.approx(one.error, rel=0.01)
+        assert four.n == one.n == 200
+
+
 def test_halves_by_hand() -> None:
     a, b = np.array([[1.0], [3.0]]), np.array([[3.0], [3.0]])
     assert pooled_variance(a, b).value == 0.5

@@ -15,6 +15,7 @@ from mbtf_core.data.shard_files import read_shard
 from mbtf_core.errors import InputError
 from mbtf_fit.data.loader import Partition, in_region, label_queries, load_split, load_training
 from mbtf_fit.data.queries import ShardQueries, batch_starts
+from mbtf_fit.evaluation import split_errors
 from mbtf_fit.sections import HeldOutSection
 
 HELD_OUT = HeldOutSection(queries=0.1, radius=0.3)
@@ -65,6 +66,21 @@ def test_queries_that_share_paths_are_held_out_together(tmp_path: Path) -> None:
     labels = label_queries(HELD_OUT, queries, 0, 0, 3).reshape(3, 1000)
     assert ((labels == 0).all(axis=0) | (labels != 0).all(axis=0)).all()
     assert (labels[in_region(HELD_OUT, queries.omega_i).reshape(3, 1000)] == labels.max()).all()
+
+
+def test_queries_know_their_group(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the errors of held-out queries, each group counts once."""
+    data = Dataset.open(write_data(tmp_path / "d", parallax, train=4000))
+    assert load_training(data, HELD_OUT, 0).held_out_queries.group is None
+    monkeypatch.setattr(Dataset, "lights_per_path", lambda data, split: 4)
+    found = load_training(data, HELD_OUT, 0)
+    labels = [q.group for q in (found.held_out_queries, found.held_out_directions) if q.group is not None]
+    # Whole groups are held out, of both shards.
+    assert (np.unique(np.concatenate(labels), return_counts=True)[1] == 4).all()
+    errors = split_errors(lambda queries: queries.value_a, found.held_out_queries, data)
+    assert errors is not None
+    assert errors["n"] == len(labels[0])
+    assert errors["mse"]["n"] == len(np.unique(labels[0])) < 0.5 * len(labels[0])
 
 
 def test_shards_are_divided_independently(tmp_path: Path) -> None:

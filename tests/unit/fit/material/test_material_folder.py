@@ -287,6 +287,27 @@ def test_shapes_that_do_not_broadcast_are_refused(fitted: FitResult, u: Any, sig
     assert fault.value.hint == "they must broadcast to (..., 2), (...), (..., 3), (..., 3)"
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "what"),
+    [
+        ("u", "here", "no array of real numbers"),
+        ("u", [["0.1", "0.2"]], "no array of real numbers"),
+        ("sigma", [0.1, None], "no array of real numbers"),
+        ("sigma", [[0.1], [0.1, 0.2]], "no array of real numbers"),
+        ("u", [0.5, np.nan], r"NaN or infinity \(1 of 2"),
+        ("sigma", 1e300, r"NaN or infinity \(1 of 1"),
+        ("omega_i", 1.0, "have the shapes"),
+        ("omega_o", [0.0, 1.0], "have the shapes"),
+        ("omega_o", [0.0, 0.0, np.nan], "NaN or infinity"),
+    ],
+)
+def test_odd_inputs_are_refused_by_name(fitted: FitResult, name: str, value: Any, what: str) -> None:
+    given = {"u": [0.5, 0.5], "sigma": 0.1, "omega_i": [0, 0, 1], "omega_o": [0, 0, 1], name: value}
+    with pytest.raises(InputError, match=what) as fault:
+        fitted.material.evaluate(**given)
+    assert name in str(fault.value.where)
+
+
 def test_representations_are_one_line(fitted: FitResult, data: Path) -> None:
     assert repr(fitted.material) == "<Material: neumip, resolution 8>"
     assert repr(fitted).startswith(f"<FitResult {fitted.folder}: neumip, ")

@@ -82,6 +82,8 @@ def test_to_fit_again_needs_the_file(fitted: Path) -> None:
         ({"import math": "import mathematics"}, None, "my_model.py:1", "ModuleNotFoundError"),
         ({"1 / math.pi": "1 / math.tau0"}, None, "my_model.py:18", "AttributeError"),
         ({'"albedo", "texel"': '"albedo", "text"'}, None, "my_model.py", "reads 'text'"),
+        ({"_rate": "_rat"}, None, "defaults of my_model.py:TexelDiffuse", "'training.texture_learning_rat'"),
+        ({'{"training": {"texture_learning_rate": 0.05}}': "[1]"}, None, "my_model.py", "TypeError"),
         ({'"texel-diffuse"': '"svbrdf"'}, None, "my_model.py:TexelDiffuse", "that of an installed model"),
     ],
 )

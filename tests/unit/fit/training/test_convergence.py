@@ -14,6 +14,7 @@ from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.folder import DataFolder
 from mbtf_fit.cli.advice import advise
 from mbtf_fit.config import FitConfig
+from mbtf_fit.training.fit_folder import training_digest
 from mbtf_fit.training.next_step import NextStep, next_step
 from mbtf_fit.training.validation import FLAT, MarginalCost, caveat, marginal_cost_of
 
@@ -140,13 +141,14 @@ def test_overfitting_is_bounded_by_the_noise(noise: float | None, share: float |
     assert found == (share if share is None else pytest.approx(share))
 
 
-@pytest.mark.parametrize(("trained_on", "advised"), [(990, True), (2000, False), (400, False)])
+@pytest.mark.parametrize(("test", "seed", "advised"), [(10, 0, True), (20, 0, True), (10, 1, False)])
 def test_a_fit_to_other_training_queries_gets_no_advice(
-    trained_on: int, advised: bool, tmp_path: Path
+    test: int, seed: int, advised: bool, tmp_path: Path
 ) -> None:
-    """Their errors say nothing of its overfitting."""
+    """Their errors say nothing of its overfitting, however many there are. Test queries may be others."""
     shards = write_data(tmp_path / "shards", parallax, train=1000, test=10)
-    training = {"queries": trained_on, "seconds": 30.0, "steps": 4000}
+    training = {"shards_sha256": training_digest(Dataset.open(shards)), "seconds": 30.0, "steps": 4000}
+    shards = write_data(tmp_path / "others", parallax, train=1000, test=test, seed=seed)
     material: Any = SimpleNamespace(config=FitConfig(), description={"training": training})
     found = errors(0.25, 0.25)
     found = {name: of | {"n": 99, "unexplained": {"value": 0.2, "error": 0.01}} for name, of in found.items()}

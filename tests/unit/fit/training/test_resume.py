@@ -14,6 +14,7 @@ from support.known_surfaces import geometry, rough_heights
 
 import mbtf_fit.training.fit
 from mbtf_core.data.lattice import Lattice
+from mbtf_core.errors import InputError
 from mbtf_core.files import folders
 from mbtf_fit.config import FitConfig
 from mbtf_fit.training.fit import FitResult, fit
@@ -93,6 +94,24 @@ def test_a_fit_killed_at_random_steps_ends_with_the_same_bits(
     steps = [record["step"] for record in read_history(out)]
     assert steps == sorted(set(steps))
     assert steps[-1] == STEPS
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_a_fit_that_fails_at_once_leaves_no_folder(
+    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, often: None, overwrite: bool
+) -> None:
+    held_out = {"direction": [0, 0], "radius": 0.999, "queries": 0.4}
+    nothing = FitConfig.model_validate({"held_out": held_out})
+    with pytest.raises(InputError, match="are held out"):
+        fit(nothing, shards, tmp_path / "m", overwrite=overwrite)
+    assert list(tmp_path.iterdir()) == []
+    # Once there is a checkpoint, it is kept.
+    monkeypatch.setattr(mbtf_fit.training.fit, "export_fits", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        fit(config(), shards, tmp_path / "m", overwrite=overwrite)
+    assert {"fit.json", "config.yaml", "checkpoint.safetensors"} <= {
+        p.name for p in (tmp_path / "m").iterdir()
+    }
 
 
 @pytest.mark.parametrize("at", ["unlink", "write_json", "write_document"])

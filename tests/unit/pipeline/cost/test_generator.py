@@ -25,6 +25,7 @@ from mbtf_pipeline.cost.generator import (
     path_seconds,
 )
 from mbtf_pipeline.cost.measurement import Measurement
+from mbtf_pipeline.cost.runs import planned_runs
 
 
 @pytest.fixture
@@ -78,6 +79,9 @@ def test_every_configuration_is_one_that_the_generator_takes(
 ) -> None:
     monkeypatch.setattr(module, "plan_effects", plan_effects)
     tasks = list(generator_configurations(benchmark))
+    commands = [c.command(conditions()).split() for c in (*tasks, *planned_runs(3600.0, 6, 1.5e-7))]
+    outputs = [words[i + 1] for words in commands for i, word in enumerate(words) if word == "-o"]
+    assert len({*outputs}) == len(outputs) > len(commands)
     for task in tasks:
         job = benchmark.job(task.changes)
         plan_effects(job, pilots=False)

@@ -110,3 +110,13 @@ def test_the_page_shows_the_front_with_commands_and_what_is_biased(tmp_path: Pat
     assert "at most 0.6% of the mean value" in section
     assert "one run is 4.0 ± 1.0%" in page
     assert not re.search(r"\bnan\b", page)
+
+
+def test_the_page_warns_of_other_work(tmp_path: Path) -> None:
+    for share, warns in ((0.5, True), (0.97, False)):
+        run = measured("run", 10.0, 0.3)
+        run = replace(run, details={**run.details, "processor_share": share})
+        page = write_page(Study(tmp_path, DESCRIPTION, [run])).read_text()
+        assert (
+            "Other work left 50% of the processors to this study: its times are up to 2.0 times" in page
+        ) == warns

@@ -12,7 +12,9 @@ import pytest
 from support.fake_runs import TRUE, FakeRuns, MemoryStore, conditions, run
 
 from mbtf_core.run.runner import Runner
+from mbtf_core.run.task import THREADS_VARIABLE, available_cores
 from mbtf_core.stats import Estimate
+from mbtf_pipeline.cost import measurement as module
 from mbtf_pipeline.cost.measurement import (
     HALF_WIDTH,
     NORMAL,
@@ -20,6 +22,8 @@ from mbtf_pipeline.cost.measurement import (
     PRIOR_DEGREES,
     Measurement,
     combined,
+    measure,
+    processor_share,
     seed_deviation,
 )
 from mbtf_pipeline.cost.runs import MOST_SEEDS, Run
@@ -136,3 +140,20 @@ def test_a_mean_has_the_error_of_its_seeds_and_test_sets() -> None:
         "seeds": 2.0,
         "test_error": pytest.approx(0.01),
     }
+
+
+def test_a_time_has_the_error_of_other_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A quarter of the processors was lost, and repeats do not average that."""
+    fake, shares = FakeRuns(), iter([0.8, 0.7] * 2)
+    monkeypatch.setattr(Run, "measure", lambda run, conditions: fake.measure(run))
+    monkeypatch.setattr(module, "processor_share", lambda: next(shares))
+    group = [measure(run(), conditions()) for _ in range(2)]
+    assert group[0].details["processor_share"] == pytest.approx(0.75)
+    assert combined(group, Estimate(0.1, 0.02, 9)).seconds.error == pytest.approx(
+        0.25 * group[0].seconds.value
+    )
+
+
+def test_threads_that_share_a_processor_get_less_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(THREADS_VARIABLE, str(8 * available_cores()))
+    assert 0 < processor_share() < 0.5
