@@ -201,7 +201,7 @@ def _draw(
     pixels = f"{size} x {size} pixels" + (f", enlarged {times} times" if times > 1 else "")
     captions = [
         f"path-traced reference\nexposure {exposure:+.2f} EV",
-        f"fit\n{pixels}",
+        f"fit, one query per pixel\n{pixels}",
         f"local RMS error, without noise\n% of the mean value; Gaussian window of {LOCAL_WINDOW:g} pixels",
     ]
     path = folder.path / PICTURE_NAME

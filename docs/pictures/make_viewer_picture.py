@@ -65,7 +65,7 @@ def main() -> None:
             "document.getElementById('status').textContent = ''"
         )
         picture = Image.open(io.BytesIO(driver.get_screenshot_as_png())).convert("RGB")
-        picture.save(ROOT / "docs" / "pictures" / "viewer.jpg", quality=88)
+        picture.save(ROOT / "docs" / "pictures" / "viewer.jpg", quality=75)
     finally:
         driver.quit()
 

@@ -20,7 +20,7 @@ from mbtf_core.directions import from_angles
 from mbtf_core.files.folders import OutputFolder, check_space
 from mbtf_core.pictures import PNG_BYTES, Camera, claim_pictures, write_png
 from mbtf_core.run.signals import keep_on_interruption
-from mbtf_fit.material.format import read_description
+from mbtf_fit.material.format import lattice_of, read_description
 from mbtf_fit.preview.config import MaterialPreviewConfig, SheetSection
 from mbtf_fit.preview.grid import grid, width_label
 from mbtf_gen.config.pictures import Direction
@@ -93,8 +93,9 @@ def draw(
     )
     shows = {SHEET_NAME: "{} views x {} lights (columns) x {} zooms (rows)".format(*counts)}
     if not sheet_only:
+        tiles = turn.tiles_around(lattice_of(description).shape()[1])
         shows[GIF_NAME] = (
-            f"a ball with {turn.tiles} tiles around its equator on a plate; {turn.frames} frames, "
+            f"a ball with {tiles} tiles around its equator on a plate; {turn.frames} frames, "
             f"{turn.spp} paths per pixel"
         )
     # The exposure in use, by picture; the turntable has that of the sheet.

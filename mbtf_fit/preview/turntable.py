@@ -39,6 +39,8 @@ _KEY, _RIM, _SKY = 2.6, 0.7, 0.22
 _TOTAL = float(_KEY * np.sin(np.radians(KEY[0])) + _RIM * np.sin(np.radians(RIM[0])) + np.pi * _SKY)
 KEY_IRRADIANCE, RIM_IRRADIANCE, SKY = _KEY / _TOTAL, _RIM / _TOTAL, _SKY / _TOTAL
 FIELD_OF_VIEW = 26.0
+# Standard deviation of the pixel filter; Mitsuba's 0.5 shows the noise of a few paths per pixel.
+FILTER = 0.8
 # Milliseconds of one rotation.
 TURN = 2400
 
@@ -108,12 +110,12 @@ def _transforms(turned: float) -> dict[str, Any]:
 
 def scene_of(bsdf: BSDF, section: TurntableSection) -> Scene:
     """The scene before its rotation."""
-    at = _transforms(0.0)
+    at, tiles = _transforms(0.0), section.tiles_around(bsdf.evaluator.lattice.shape()[1])
     return mi.load_dict(
         {
             "type": "scene",
-            "ball": ball(bsdf, section.tiles),
-            "plate": plate(bsdf, section.tiles),
+            "ball": ball(bsdf, tiles),
+            "plate": plate(bsdf, tiles),
             "key": {"type": "directional", "to_world": at["key"], "irradiance": KEY_IRRADIANCE},
             "rim": {"type": "directional", "to_world": at["rim"], "irradiance": RIM_IRRADIANCE},
             "sky": {"type": "constant", "radiance": SKY},
@@ -121,7 +123,12 @@ def scene_of(bsdf: BSDF, section: TurntableSection) -> Scene:
                 "type": "perspective",
                 "fov": FIELD_OF_VIEW,
                 "to_world": at["sensor"],
-                "film": {"type": "hdrfilm", "width": section.size, "height": section.size},
+                "film": {
+                    "type": "hdrfilm",
+                    "width": section.size,
+                    "height": section.size,
+                    "filter": {"type": "gaussian", "stddev": FILTER},
+                },
                 "sampler": {"type": "independent"},
             },
         }

@@ -56,13 +56,14 @@ RENDERING = ("geometry", "light", "transport", "effects", "seed")
 
 
 class DirectionsSection(Settings):
-    """One view and light."""
+    """One view and light; by default an oblique view and, behind the material, a raking light, which show
+    relief, shadows and highlights."""
 
     view: Annotated[Direction, Flag("--view", "ELEVATION,AZIMUTH")] = Field(
-        Direction(elevation=60, azimuth=-90), description="direction of the camera in degrees"
+        Direction(elevation=45, azimuth=-90), description="direction of the camera in degrees"
     )
     light: Annotated[Direction, Flag("--light", "ELEVATION,AZIMUTH")] = Field(
-        Direction(elevation=45, azimuth=45), description="direction of the light in degrees"
+        Direction(elevation=25, azimuth=130), description="direction of the light in degrees"
     )
 
 

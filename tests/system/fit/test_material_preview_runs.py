@@ -55,4 +55,4 @@ def test_pictures_without_pytorch_kept_and_refused(tmp_path: Path, run_python: R
     with Image.open(tmp_path / "sheet/sheet.png") as picture:
         assert picture.width < 2 * 64
     message = fails(3, *words, *SMALL, "--tiles-around", "5")
-    assert "another configuration: turntable.tiles: 8 -> 5" in message
+    assert "another configuration: turntable.tiles: unset -> 5" in message

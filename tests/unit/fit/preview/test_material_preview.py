@@ -106,6 +106,13 @@ def test_rotation_changes_patterned_materials_only(tmp_path: Path) -> None:
     assert np.abs(turned[1] - turned[0]).mean() > 0.12 * turned[0].mean()
 
 
+@pytest.mark.parametrize(("resolution", "tiles"), [(8, 8), (64, 5), (128, 3), (1024, 3)])
+def test_fine_materials_have_few_tiles_around(resolution: int, tiles: int) -> None:
+    """A texel covers two pixels, within limits: 64 texels and 400 pixels leave 4.5 tiles."""
+    assert TurntableSection().tiles_around(resolution) == tiles
+    assert TurntableSection(tiles=7).tiles_around(resolution) == 7
+
+
 def test_a_signal_after_a_frame_interrupts(tmp_path: Path) -> None:
     """Mitsuba's own handler, which ignores the signal, may stay behind after an integrator in Python."""
     section = TurntableSection(frames=3, size=16, spp=1, tiles=1)
