@@ -1,10 +1,18 @@
 r"""Maps of the metallic-roughness model of glTF 2.0 for a material.
 
 They are those of the surface that the model traces. The scatter of slopes below the texels of a level widens
-the lobe (:mod:`mbtf_fit.surface.slopes`). Maps of models that know no surface are fitted to their values
-(:mod:`~mbtf_fit.material.brdf_fit`). Maps show no shadows, interreflection or parallax of their own. Their
-base color is therefore scaled until the mean reflectance of the tile, over cosine-weighted lights and views,
+the lobe (:mod:`mbtf_fit.surface.slopes`). Maps show no shadows, interreflection or parallax of their own.
+Their base color is scaled until the mean reflectance of the tile, over cosine-weighted lights and views,
 is that of the neural material.
+
+The BRDF is that of glTF 2.0, appendix B. A dielectric of diffuse base color c under a GGX lobe of reflectance
+F0 is blended with a metal of GGX alone:
+
+    f = (1 - m) [(1 - F) c / π + F L] + m [c + (1 - c) S] L,    F = F0 + (1 - F0) S,    S = (1 - ω_o·h)^5
+
+with the metallic m, the half vector h and L = D V of the height-correlated Smith masking (Heitz 2014), α the
+square of the roughness. F0 = 0 stands for a surface without gloss: F is 0 at all angles. The value is the
+radiance for unit irradiance of the reference plane, M = f (n·ω_i) / ω_i.z.
 """
 
 from __future__ import annotations
@@ -16,22 +24,16 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
+from torch.quasirandom import SobolEngine
 
-from mbtf_core.app.console import Console
-from mbtf_core.data.lattice import texel_centers
+from mbtf_core.data.lattice import sigma_of_level, texel_centers
 from mbtf_core.data.schema import CLEARCOAT_F0
-from mbtf_core.errors import UsageError
+from mbtf_core.directions import from_projected_disk
+from mbtf_core.errors import InputError, UsageError
 from mbtf_core.stats import Estimate, unexplained_variance
-from mbtf_fit.material.brdf_fit import BASE, METALLIC, ROUGHNESS, SLOPES, Pairs, fit_tile, reflectance
+from mbtf_fit.material.format import DEFAULT_MIN_COS
 from mbtf_fit.material.material import Material
-from mbtf_fit.material.reference_values import (
-    direction_pairs,
-    followed,
-    least_cosine,
-    steep_views,
-    texel_values,
-    tile_means,
-)
 from mbtf_fit.ops.constants import COATED_CHANNELS, DIELECTRIC, GLOSSY_CHANNELS, HEIGHTS, MAPS
 
 F64 = NDArray[np.float64]
@@ -42,6 +44,75 @@ _LEAST_ALPHA2 = 1e-4
 _PAIRS, _AT_ONCE, _TEXELS, _MOST_FACTOR = 512, 32, 128, 64.0
 # Steep views, lights of each, and texels along a side, whose values are compared one by one.
 _VIEWS, _LIGHTS, _COMPARED_TEXELS = 16, 4, 64
+# Greatest sine of steep views, 45° to the normal, which parallax hardly moves.
+_STEEP = 0.7
+# Positions along a side, for the footprint of the whole tile; iterations to find the point that a view sees.
+_SIDE, _ITERATIONS = 4, 4
+# Least cosine to the normal of what is visible.
+_LEAST_COSINE = 1e-6
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Pairs of light and view, k of all texels or (n, k) of each one.
+
+    Attributes
+    ----------
+    light, view, half : (3, k) or (3, n, k) tensors
+        Unit vectors towards light and viewer, and between both.
+    schlick : (k,) or (n, k) tensor
+        ``(1 - ω_o·h)^5``.
+    """
+
+    light: Tensor
+    view: Tensor
+    half: Tensor
+    schlick: Tensor
+
+    @classmethod
+    def of(cls, omega_i: F64, omega_o: F64, dtype: torch.dtype = torch.float32) -> Pairs:
+        """Pairs of unit vectors (..., k, 3), ``z > 0``, which are broadcast."""
+        planes = (np.moveaxis(omega, -1, 0) for omega in np.broadcast_arrays(omega_i, omega_o))
+        light, view = (torch.from_numpy(np.array(plane, order="C")).to(dtype) for plane in planes)
+        half = torch.nn.functional.normalize(light + view, dim=0)
+        return cls(light, view, half, (1.0 - (view * half).sum(0).clamp(0.0, 1.0)) ** 5)
+
+
+def reflectance(lobes: Tensor, dielectric: float, pairs: Pairs) -> tuple[Tensor, Tensor]:
+    """Value of texels in 1/sr, as ``constant + base_color · factor``, which all three colors share.
+
+    Parameters
+    ----------
+    lobes : (4, n, 1) or (4, n, k) tensor
+        ∂z/∂x and ∂z/∂y of the shading normal, the square root of α of GGX (roughness), the share of metal.
+    dielectric : float
+        F0 of the dielectric.
+    pairs : Pairs
+        k pairs.
+
+    Returns
+    -------
+    (constant, factor) : (n, k) tensors
+        0 where the light or the viewer is below the surface.
+    """
+    p, q, roughness, metal = lobes
+    length = (1.0 + p * p + q * q).rsqrt()
+
+    def cosine(omega: Tensor) -> Tensor:
+        return (omega[2] - p * omega[0] - q * omega[1]) * length
+
+    light, view, peak = cosine(pairs.light), cosine(pairs.view), cosine(pairs.half).clamp_min(0.0)
+    visible = (light > 0) & (view > 0)
+    light, view = light.clamp_min(_LEAST_COSINE), view.clamp_min(_LEAST_COSINE)
+    alpha2, schlick = roughness**4, pairs.schlick
+    rest = 1.0 - alpha2
+    masking = light * (view * view * rest + alpha2).sqrt() + view * (light * light * rest + alpha2).sqrt()
+    lobe = alpha2 / (2.0 * math.pi * (1.0 - peak * peak * rest) ** 2 * masking)
+    fresnel = dielectric + (1.0 - dielectric) * schlick if dielectric > 0 else torch.zeros_like(schlick)
+    constant = (fresnel + metal * (schlick - fresnel)) * lobe
+    factor = (1.0 - metal) * ((1.0 - fresnel) / math.pi) + metal * (1.0 - schlick) * lobe
+    foreshortening = torch.where(visible, light, 0.0) / pairs.light[2]
+    return constant * foreshortening, factor * foreshortening
 
 
 @dataclass(frozen=True)
@@ -61,8 +132,8 @@ class Maps:
         In [0, 1]; opacity towards the normal.
     dielectric : float
         F0 of the dielectric; 0 for a surface without gloss.
-    heights : (H, W) array or None
-        In tile widths, at most 0, on the grid that rays are traced to; None of a model that knows no surface.
+    heights : (H, W) array
+        In tile widths, at most 0, on the grid that rays are traced to.
     coat : (rows, columns, 2) array or None
         Weight and roughness of the clear coat, whose normal is that of the rest; None without one.
     """
@@ -75,7 +146,7 @@ class Maps:
     metallic: F64
     opacity: F64
     dielectric: float
-    heights: F64 | None
+    heights: F64
     coat: F64 | None = None
 
     @property
@@ -87,8 +158,8 @@ class Maps:
 
     @property
     def height_range(self) -> float:
-        """Highest minus lowest vertex, in tile widths; 0 without heights."""
-        return 0.0 if self.heights is None else float(np.ptp(self.heights))
+        """Highest minus lowest vertex, in tile widths."""
+        return float(np.ptp(self.heights))
 
     @property
     def has_holes(self) -> bool:
@@ -103,13 +174,11 @@ class Maps:
 
     def as_dict(self) -> dict[str, Any]:
         """What they are, as plain data."""
-        source = "fit" if self.heights is None else "surface"
-        return {"level": self.level, "source": source, "dielectric_f0": self.dielectric}
+        return {"level": self.level, "dielectric_f0": self.dielectric}
 
     def __str__(self) -> str:
         rows, columns = self.roughness.shape
-        kind = "fitted to the values of" if self.heights is None else "of the surface, at"
-        return f"maps {kind} {columns} x {rows} texels (level {self.level})"
+        return f"maps of the surface, at {columns} x {rows} texels (level {self.level})"
 
     def coefficients(self, omega_i: F64, omega_o: F64) -> tuple[F64, F64]:
         """Reflectance M of all texels in 1/sr, as ``constant + base_color · factor``: both (texels, k)."""
@@ -144,11 +213,6 @@ class Maps:
         return replace(self, **picked), texel_centers(*shape)[j][:, i].reshape(-1, 2)
 
 
-def knows_surface(material: Material) -> bool:
-    """Whether the model traces and shades a surface, whose maps then explain its values."""
-    return material.model.tracing is not None
-
-
 def opacity_of(material: Material, level: int) -> F64:
     """Opacity (rows, columns) towards the normal of the texels of a level."""
     if material.transmittance is None:
@@ -158,7 +222,7 @@ def opacity_of(material: Material, level: int) -> F64:
 
 
 def surface_maps(material: Material, level: int) -> Maps:
-    """Maps of a level that a material knows of its surface (:func:`knows_surface`)."""
+    """Maps of a level that a material knows of its surface."""
     weights = material.model.weights()
     maps = weights[f"{MAPS}.{level}"].cpu().double().numpy()
     slopes, base = maps[..., :2], maps[..., 5:8]
@@ -189,12 +253,78 @@ def _roughness(alpha2: F64) -> F64:
     return np.asarray(np.clip(alpha2, _LEAST_ALPHA2, 1.0) ** 0.25)
 
 
-def fitted_maps(material: Material, level: int, console: Console) -> Maps:
-    """Maps of a level, without heights, that are fitted to the values of a material."""
-    with console.progress(total=material.lattice.texels(level), label="fitting maps") as bar:
-        x, dielectric = fit_tile(material, level, bar.advance)
-    lobes = (x[..., BASE], x[..., SLOPES], x[..., ROUGHNESS], x[..., METALLIC])
-    return Maps(level, material.lattice.aspect, *lobes, opacity_of(material, level), dielectric, None)
+def least_cosine(material: Material) -> float:
+    """Least cosine of the directions of the material's data."""
+    return float(material.description["data"].get("min_cos", DEFAULT_MIN_COS))
+
+
+def direction_pairs(count: int, least: float, seed: int = 0) -> tuple[F64, F64]:
+    """Lights and views (count, 3), cosine-weighted, with cosines of at least `least`."""
+    engine = SobolEngine(4, scramble=True, seed=seed)
+    points = np.asarray(engine.draw(count, dtype=torch.float64).numpy(), np.float64)
+    radius = np.sqrt((1.0 - least**2) * points[:, [0, 2]])
+    angle = 2.0 * np.pi * points[:, [1, 3]]
+    omega = from_projected_disk(np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1))
+    return omega[:, 0], omega[:, 1]
+
+
+def steep_views(count: int, seed: int) -> F64:
+    """Views (count, 3), cosine-weighted, within 45° of the normal.
+
+    Maps have no parallax. Steep views show the same points of a surface, wherever its heights are.
+    """
+    return from_projected_disk(_STEEP * direction_pairs(count, 0.0, seed)[1][:, :2])
+
+
+def followed(material: Material, u: F64, views: F64) -> F64:
+    """Positions (n, m, 2) at which views (m, 3) see the points that the normal view sees at `u` (n, 2).
+
+    The offset leads from the reference plane to the point that is seen. Without one they are `u`.
+    """
+    n, m = len(u), len(views)
+    size = np.array([1.0, material.lattice.aspect])
+    up = np.broadcast_to(np.array([0.0, 0.0, 1.0]), (n, 3))
+    seen = np.repeat(u + material.offset(u, up) / size, m, 0)
+    at, all_views = np.repeat(u, m, 0), np.tile(views, (n, 1))
+    for _ in range(_ITERATIONS):
+        at = seen - material.offset(at, all_views) / size
+    return at.reshape(n, m, 2)
+
+
+def texel_values(material: Material, level: int, u: F64, omega_i: F64, omega_o: F64) -> tuple[F64, F64]:
+    """Values of a material with the footprint of a level, and what the views meet of it.
+
+    Parameters
+    ----------
+    material : Material
+    level : int
+    u : (n, k, 2) array
+        Positions, uv.
+    omega_i, omega_o : (k, 3) or (n, k, 3) arrays
+
+    Returns
+    -------
+    values : (n, k, 3) array
+        In 1/sr.
+    opacity : (n, k) array
+        One less the transmittance.
+    """
+    n, k = u.shape[:2]
+    light, view = (np.broadcast_to(omega, (n, k, 3)).reshape(-1, 3) for omega in (omega_i, omega_o))
+    at, sigma = u.reshape(-1, 2), np.full(n * k, float(sigma_of_level(level)))
+    values = material.evaluate(at, sigma, light, view).reshape(n, k, 3).astype(np.float64)
+    if material.transmittance is None:
+        return values, np.ones((n, k))
+    return values, 1.0 - material.transmittance.evaluate(at, sigma, view).reshape(n, k).astype(np.float64)
+
+
+def tile_means(material: Material, omega_i: F64, omega_o: F64) -> F64:
+    """Mean reflectance (n, 3) of the tile for pairs of directions: that of the footprint of the whole tile,
+    at some positions."""
+    u = (np.stack(np.meshgrid(*2 * [np.arange(_SIDE)]), -1).reshape(-1, 1, 2) + 0.5) / _SIDE
+    values, _ = texel_values(material, 0, np.tile(u, (1, len(omega_i), 1)), omega_i, omega_o)
+    mean: F64 = values.mean(0)
+    return mean
 
 
 def scale_color(material: Material, maps: Maps) -> Maps:
@@ -229,7 +359,7 @@ def unexplained(material: Material, maps: Maps) -> Estimate:
     return unexplained_variance(thin.evaluate(omega_i, omega_o), values, values)
 
 
-def make_maps(material: Material, level: int | None, console: Console) -> tuple[Maps, Estimate]:
+def make_maps(material: Material, level: int | None) -> tuple[Maps, Estimate]:
     """Maps of a level, and their unexplained variance.
 
     Parameters
@@ -237,8 +367,6 @@ def make_maps(material: Material, level: int | None, console: Console) -> tuple[
     material : Material
     level : int or None
         The finest by default.
-    console : Console
-        For the progress of a fit.
 
     Returns
     -------
@@ -248,12 +376,17 @@ def make_maps(material: Material, level: int | None, console: Console) -> tuple[
     ------
     UsageError
         The material has no such level.
+    InputError
+        Its model traces no surface.
     """
+    if material.model.tracing is None:
+        raise InputError(
+            f"{material.model.name} traces no surface, whose maps could be written",
+            hint="fit relief or neumip+ to the data: --model relief",
+        )
     finest = material.lattice.finest
     level = finest if level is None else level
     if not 0 <= level <= finest:
         raise UsageError(f"the material has the levels 0 to {finest}", where="--level")
-    known = knows_surface(material)
-    maps = surface_maps(material, level) if known else fitted_maps(material, level, console)
-    maps = scale_color(material, maps)
+    maps = scale_color(material, surface_maps(material, level))
     return maps, unexplained(material, maps)
