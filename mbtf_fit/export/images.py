@@ -42,14 +42,9 @@ def write_maps(
 
     Parameters
     ----------
-    export : Export
-    options : MapOptions
-    name : str
-        Of the document.
-    text : callable
-        Of maps, the material's name, and plain data that identify the neural material and the maps.
-    module : str
-        The library that makes the document.
+    name : of the document
+    text : of maps, the material's name, and plain data that identify the neural material and the maps
+    module : the library that makes the document
 
     Returns
     -------
@@ -58,14 +53,10 @@ def write_maps(
 
     Raises
     ------
-    UsageError
-        The material has no such level.
-    InputError
-        Its model traces no surface.
-    EngineError
-        The library is not installed.
-    PartialError
-        The folder cannot be written.
+    UsageError : the material has no such level
+    InputError : its model traces no surface
+    EngineError : the library is not installed
+    PartialError : the folder cannot be written
     """
     if not has_extra(module):
         raise extra_error(module, name)

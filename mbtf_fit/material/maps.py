@@ -58,10 +58,8 @@ class Pairs:
 
     Attributes
     ----------
-    light, view, half : (3, k) or (3, n, k) tensors
-        Unit vectors towards light and viewer, and between both.
-    schlick : (k,) or (n, k) tensor
-        ``(1 - ω_o·h)^5``.
+    light, view, half : (3, k) or (3, n, k) tensors, unit vectors towards light and viewer, and between both
+    schlick : (k,) or (n, k) tensor, ``(1 - ω_o·h)^5``
     """
 
     light: Tensor
@@ -83,17 +81,14 @@ def reflectance(lobes: Tensor, dielectric: float, pairs: Pairs) -> tuple[Tensor,
 
     Parameters
     ----------
-    lobes : (4, n, 1) or (4, n, k) tensor
-        ∂z/∂x and ∂z/∂y of the shading normal, the square root of α of GGX (roughness), the share of metal.
-    dielectric : float
-        F0 of the dielectric.
-    pairs : Pairs
-        k pairs.
+    lobes : (4, n, 1) or (4, n, k) tensor, ∂z/∂x and ∂z/∂y of the shading normal, the square root of α of GGX
+        (roughness), the share of metal
+    dielectric : F0 of the dielectric
+    pairs : k pairs
 
     Returns
     -------
-    (constant, factor) : (n, k) tensors
-        0 where the light or the viewer is below the surface.
+    (constant, factor) : (n, k) tensors, 0 where the light or the viewer is below the surface
     """
     p, q, roughness, metal = lobes
     length = (1.0 + p * p + q * q).rsqrt()
@@ -121,21 +116,14 @@ class Maps:
 
     Attributes
     ----------
-    level : int
-    aspect : float
-        Height of the tile over its width.
-    base_color : (rows, columns, 3) array
-        Linear, in [0, 1].
-    slopes : (rows, columns, 2) array
-        ∂z/∂x and ∂z/∂y.
-    roughness, metallic, opacity : (rows, columns) arrays
-        In [0, 1]; opacity towards the normal.
-    dielectric : float
-        F0 of the dielectric; 0 for a surface without gloss.
-    heights : (H, W) array
-        In tile widths, at most 0, on the grid that rays are traced to.
-    coat : (rows, columns, 2) array or None
-        Weight and roughness of the clear coat, whose normal is that of the rest; None without one.
+    aspect : height of the tile over its width
+    base_color : (rows, columns, 3) array, linear, in [0, 1]
+    slopes : (rows, columns, 2) array, ∂z/∂x and ∂z/∂y
+    roughness, metallic, opacity : (rows, columns) arrays, in [0, 1]; opacity towards the normal
+    dielectric : F0 of the dielectric; 0 for a surface without gloss
+    heights : (H, W) array, in tile widths, at most 0, on the grid that rays are traced to
+    coat : (rows, columns, 2) array or None, weight and roughness of the clear coat, whose normal is that of
+        the rest; None without one
     """
 
     level: int
@@ -296,18 +284,13 @@ def texel_values(material: Material, level: int, u: F64, omega_i: F64, omega_o: 
 
     Parameters
     ----------
-    material : Material
-    level : int
-    u : (n, k, 2) array
-        Positions, uv.
+    u : (n, k, 2) array, positions, uv
     omega_i, omega_o : (k, 3) or (n, k, 3) arrays
 
     Returns
     -------
-    values : (n, k, 3) array
-        In 1/sr.
-    opacity : (n, k) array
-        One less the transmittance.
+    values : (n, k, 3) array, in 1/sr
+    opacity : (n, k) array, one less the transmittance
     """
     n, k = u.shape[:2]
     light, view = (np.broadcast_to(omega, (n, k, 3)).reshape(-1, 3) for omega in (omega_i, omega_o))
@@ -364,9 +347,7 @@ def make_maps(material: Material, level: int | None) -> tuple[Maps, Estimate]:
 
     Parameters
     ----------
-    material : Material
-    level : int or None
-        The finest by default.
+    level : the finest by default
 
     Returns
     -------
@@ -374,10 +355,8 @@ def make_maps(material: Material, level: int | None) -> tuple[Maps, Estimate]:
 
     Raises
     ------
-    UsageError
-        The material has no such level.
-    InputError
-        Its model traces no surface.
+    UsageError : the material has no such level
+    InputError : its model traces no surface
     """
     if material.model.tracing is None:
         raise InputError(

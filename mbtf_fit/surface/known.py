@@ -79,18 +79,14 @@ class KnownSurface:
 
     Attributes
     ----------
-    lattice : Lattice
-        Levels of the data; maps have one more.
-    heights : (H, W) tensor
-        z of the traced grid in tile widths; row 0 is the side ``v → 1``.
+    lattice : levels of the data; maps have one more
+    heights : (H, W) tensor, z of the traced grid in tile widths; row 0 is the side ``v → 1``
     maps : tuple of (rows, columns, channels) tensors
         Prefiltered maps by level, coarsest first: levels 0 to k + 1.
     horizons : tuple of (rows, columns, 2·azimuths) tensors
         Prefiltered horizon angles in radians by level, then their squares: levels 0 to k.
-    light_width : float
-        RMS angle per axis of the light kernel, in radians.
-    dielectric : float
-        F0 of the surface where it is no metal.
+    light_width : RMS angle per axis of the light kernel, in radians
+    dielectric : F0 of the surface where it is no metal
     """
 
     lattice: Lattice
@@ -106,11 +102,8 @@ class KnownSurface:
 
         Parameters
         ----------
-        geometry : Geometry
-        lattice : Lattice
-            Levels of the data.
-        light_width : float
-            RMS angle per axis of the light kernel, in degrees.
+        lattice : levels of the data
+        light_width : RMS angle per axis of the light kernel, in degrees
         """
         angles = HeightfieldTracer(geometry.heights, geometry.aspect).horizons(AZIMUTHS)
         # A grid coarser than the texels is interpolated linearly: a Fourier series would ring.
@@ -366,14 +359,10 @@ def prefilter(image: Tensor, shape: tuple[int, int], sigma: float, aspect: float
 
     Parameters
     ----------
-    image : (H, W, c) tensor
-        Texels of a tile, row 0 at ``v → 1``.
-    shape : (int, int)
-        Rows and columns of the result. Frequencies beyond its own are left out.
-    sigma : float
-        Standard deviation in tile widths.
-    aspect : float
-        Height of the tile over its width.
+    image : (H, W, c) tensor, texels of a tile, row 0 at ``v → 1``
+    shape : (int, int), rows and columns of the result. Frequencies beyond its own are left out.
+    sigma : standard deviation in tile widths
+    aspect : height of the tile over its width
 
     Returns
     -------
@@ -408,12 +397,9 @@ def prefiltered_levels(image: Tensor, lattice: Lattice, finer: int = 0) -> list[
 
     Parameters
     ----------
-    image : (H, W, c) tensor
-        Texels of the tile, row 0 at ``v → 1``.
-    lattice : Lattice
-        Levels and aspect of the tile.
-    finer : int
-        Texels of level s are those of level ``s + finer`` of the lattice.
+    image : (H, W, c) tensor, texels of the tile, row 0 at ``v → 1``
+    lattice : levels and aspect of the tile
+    finer : texels of level s are those of level ``s + finer`` of the lattice
     """
     grid = Lattice(lattice.finest + finer, lattice.aspect)
     out = []

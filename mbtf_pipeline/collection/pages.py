@@ -42,17 +42,13 @@ def write_page(folder: Path, record: Mapping[str, Any]) -> tuple[Path, list[Path
 
     Parameters
     ----------
-    folder : Path
-        Folder of all runs.
-    record : mapping
-        Content of ``collection.json``.
+    folder : folder of all runs
+    record : content of ``collection.json``
 
     Returns
     -------
-    page : Path
-        HTML file.
-    tables : list of Path
-        CSV files.
+    page : HTML file
+    tables : CSV files
     """
     if "tables" not in record["recipe"]:
         page = folder / "library.html"

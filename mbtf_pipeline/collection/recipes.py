@@ -177,10 +177,8 @@ class Collection(Settings):
 
         Parameters
         ----------
-        file : Path
-            The recipe; paths of materials are relative to it.
-        quick : bool
-            Whether to apply the options of the quick size.
+        file : the recipe; paths of materials are relative to it
+        quick : whether to apply the options of the quick size
 
         Returns
         -------
@@ -188,10 +186,8 @@ class Collection(Settings):
 
         Raises
         ------
-        InputError
-            The options of all runs are at fault, or no material can be run.
-        UsageError
-            A material is listed twice.
+        InputError : the options of all runs are at fault, or no material can be run
+        UsageError : a material is listed twice
         """
         paths = self.paths(file)
         if not paths:

@@ -117,12 +117,9 @@ def write_viewer(folder: Path, title: str, comparison: Mapping[str, Any]) -> Non
 
     Parameters
     ----------
-    folder : Path
-        Folder of the run.
-    title : str
-        Of the page.
-    comparison : mapping
-        Content of ``comparison.json``.
+    folder : folder of the run
+    title : of the page
+    comparison : content of ``comparison.json``
     """
     from mbtf_fit import Material
     from mbtf_fit.viewer.extras import poster

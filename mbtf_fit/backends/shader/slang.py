@@ -83,8 +83,7 @@ class SlangCompiler:
 
     Raises
     ------
-    EngineError
-        The package slangpy is not installed.
+    EngineError : the package slangpy is not installed
     """
 
     def __init__(self) -> None:
@@ -99,8 +98,7 @@ class SlangCompiler:
 
         Raises
         ------
-        EngineError
-            The compiler refuses the module.
+        EngineError : the compiler refuses the module
         """
         request = ctypes.c_void_p(self._lib.spCreateCompileRequest(self._session))
         try:
