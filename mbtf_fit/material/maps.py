@@ -356,11 +356,11 @@ def make_maps(material: Material, level: int | None) -> tuple[Maps, Estimate]:
     Raises
     ------
     UsageError : the material has no such level
-    InputError : its model traces no surface
+    InputError : its model shades no surface
     """
     if material.model.tracing is None:
         raise InputError(
-            f"{material.model.name} traces no surface, whose maps could be written",
+            f"{material.model.name} shades no surface, whose maps could be written",
             hint="fit relief or neumip+ to the data: --model relief",
         )
     finest = material.lattice.finest

@@ -392,18 +392,13 @@ def lookup_sigma(level: int, columns: int) -> float:
     return math.sqrt(max(float(sigma_of_level(level)) ** 2 - width**2 / 6.0, 0.0))
 
 
-def prefiltered_levels(image: Tensor, lattice: Lattice, finer: int = 0) -> list[Tensor]:
+def prefiltered_levels(image: Tensor, lattice: Lattice) -> list[Tensor]:
     """Textures (rows, columns, c) of a map for all levels of a lattice, coarsest first.
 
     Parameters
     ----------
     image : (H, W, c) tensor, texels of the tile, row 0 at ``v → 1``
     lattice : levels and aspect of the tile
-    finer : texels of level s are those of level ``s + finer`` of the lattice
     """
-    grid = Lattice(lattice.finest + finer, lattice.aspect)
-    out = []
-    for level in range(lattice.finest + 1):
-        shape = grid.shape(level + finer)
-        out.append(prefilter(image, shape, lookup_sigma(level, shape[1]), lattice.aspect))
-    return out
+    shapes = [lattice.shape(level) for level in range(lattice.finest + 1)]
+    return [prefilter(image, s, lookup_sigma(k, s[1]), lattice.aspect) for k, s in enumerate(shapes)]

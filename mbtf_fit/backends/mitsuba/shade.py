@@ -14,8 +14,7 @@ from mbtf_core.data.schema import CLEARCOAT_F0
 from mbtf_core.errors import InputError
 from mbtf_fit import ops
 from mbtf_fit.backends.mitsuba.backend import MITSUBA, Loader, Numbers, Step, opaque
-from mbtf_fit.backends.mitsuba.stored_material import F32
-from mbtf_fit.backends.mitsuba.textures import GROUP, Textures
+from mbtf_fit.backends.mitsuba.textures import Textures
 from mbtf_fit.material.format import WEIGHTS_NAME
 from mbtf_fit.ops.constants import (
     ALBEDO_SPREAD,
@@ -27,7 +26,7 @@ from mbtf_fit.ops.constants import (
     VOIGT_SCALE,
     VOIGT_WIDENING,
 )
-from mbtf_fit.ops.shade import grazing_reflectance
+from mbtf_fit.ops.shade import adjacent_azimuths, grazing_reflectance
 from mbtf_gen.engine.types import Color3f, Float, Normal3f, Point2f, Vector3f
 
 
@@ -45,7 +44,7 @@ def _shade(op: ops.Shade, loader: Loader) -> Step:
         )
     maps = loader.texture(op.maps, grids, channels)
     horizons = Textures(
-        [_adjacent_azimuths(level) for level in loader.levels(op.horizons, grids[:-1], 2 * AZIMUTHS)],
+        [adjacent_azimuths(level) for level in loader.levels(op.horizons, grids[:-1], 2 * AZIMUTHS)],
         by_group=True,
     )
     width, f0 = loader.scalar(op.light_width), loader.scalar(op.dielectric)
@@ -224,14 +223,6 @@ def _own_shadowing(alpha2: Float, light: Float, view: Float) -> Float:
     """(R10) Share of the facets of α² in the light, of those that the viewer sees, by both cosines."""
     a, b = (dr.sqrt(dr.fma(1.0 - alpha2, dr.square(x), alpha2)) for x in (light, view))
     return light * (view + b) / dr.fma(light, b, view * a)
-
-
-def _adjacent_azimuths(horizons: F32) -> F32:
-    """Horizons (rows, columns, 2n), means and then squares, as n groups of four: mean and square of an
-    azimuth, and of the next one."""
-    mean, square = np.split(horizons, 2, axis=2)
-    parts = (mean, square, np.roll(mean, -1, 2), np.roll(square, -1, 2))
-    return np.stack(parts, -1).reshape(*mean.shape[:2], GROUP * mean.shape[2])
 
 
 def _ggx(

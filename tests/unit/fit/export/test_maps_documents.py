@@ -231,13 +231,13 @@ def test_a_surface_without_gloss_with_holes(tmp_path: Path) -> None:
     assert surface.getInput("alpha_mode").getValue() == 2
 
 
-def test_a_model_that_traces_no_surface_is_refused(
+def test_a_model_that_shades_no_surface_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_material(tmp_path / "material")
     out = tmp_path / "out"
     assert run(app, ["export", str(tmp_path / "material"), "--to", "gltf", "-o", str(out)]) == 3
-    assert "traces no surface" in capsys.readouterr().err
+    assert "shades no surface" in capsys.readouterr().err
     assert not (out / "material.gltf").exists()
 
 

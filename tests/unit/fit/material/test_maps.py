@@ -115,7 +115,7 @@ def test_the_mean_reflectance_is_that_of_the_network(tmp_path: Path) -> None:
 
 
 def test_levels_that_are_missing_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="neumip traces no surface"):
+    with pytest.raises(InputError, match="neumip shades no surface"):
         make_maps(write_material(tmp_path / "neumip"), None)
     material = write_material(tmp_path / "relief", model="relief")
     assert make_maps(material, None)[0].level == 3
