@@ -42,7 +42,7 @@ from mbtf_fit.sections import NetworkSection
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
-    from mbtf_fit.data.slices import SliceBatch, TrainingSlices
+    from mbtf_fit.data.layouts import SliceBatch, TrainingSlices
     from mbtf_fit.pytorch.material import NeuralMaterial
     from mbtf_fit.pytorch.networks import SetEncoder, SliceEncoder
 
@@ -213,7 +213,7 @@ class Rainer2020(Rainer2019):
 
 def shared_slices(given: Preparation) -> Any:
     """The slices that a network learns: those of one material, or of several, all in units of the first."""
-    from mbtf_fit.data.slices import SharedSlices
+    from mbtf_fit.data.layouts import SharedSlices
 
     own, training = given.queries, given.training
     if not (training.materials or training.own_material):

@@ -1,11 +1,11 @@
-"""``mbtf-pipeline run`` and ``list``: recipes."""
+"""``mbtf-pipeline run``, ``report`` and ``list``: recipes."""
 
 from __future__ import annotations
 
 import time as clocks
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
@@ -28,6 +28,7 @@ from mbtf_core.errors import InputError, MbtfError, PartialError, UsageError
 from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.units import clock
 from mbtf_fit.cli.live import Live, live_view
+from mbtf_gen.config.pictures import EXPOSURE
 
 if TYPE_CHECKING:
     from mbtf_pipeline.collection.run import CollectionResult
@@ -281,3 +282,42 @@ def _entry(path: Path, verbose: bool) -> dict[str, Any]:
         rest = first.removeprefix(f"{path}:")
         entry["error"] = f"line {rest}" if rest[:1].isdigit() and rest != first else rest.strip()
     return entry
+
+
+def report(
+    folder: Path,
+    /,
+    *,
+    exposure: Annotated[
+        float | Literal["auto"] | None,
+        Parameter(
+            metavar="EV|auto",
+            show_default=False,
+            help=f"{EXPOSURE[0].upper()}{EXPOSURE[1:]}.",
+        ),
+    ] = None,
+    console: Console = CONSOLE,
+) -> None:
+    """Write the report of a finished run again.
+
+    The page of a paper recipe or of a library too.
+
+    Parameters
+    ----------
+    folder
+        Folder of the run.
+    """
+    from mbtf_core.color import describe_exposure
+    from mbtf_pipeline.collection.run import is_collection, write_again
+    from mbtf_pipeline.run import rerender
+
+    used = None
+    if is_collection(folder):
+        if exposure is not None:
+            raise UsageError("the page of several runs has no exposure", where="--exposure")
+        path = write_again(folder)
+    else:
+        path, used = rerender(folder, exposure)
+    size = path.stat().st_size
+    text = f"{path}: {size / 1e6:.1f} MB" + ("" if used is None else f", {describe_exposure(used)}")
+    console.report({"report": path, "bytes": size, "exposure": used}, text)

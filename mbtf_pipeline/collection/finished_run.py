@@ -16,7 +16,7 @@ from mbtf_core.files.atomic import read_json
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.compare.compare import COMPARISON_NAME
 from mbtf_pipeline.compare.image_files import with_ending
-from mbtf_pipeline.report.embed import file_uri, map_uri
+from mbtf_pipeline.report.images import file_uri, map_uri
 from mbtf_pipeline.stages import COMPARE, SHARDS
 from mbtf_pipeline.tables import Column, Thumbnail, estimate, is_significant
 

@@ -19,7 +19,7 @@ from mbtf_pipeline.collection.recipes import Published
 from mbtf_pipeline.compare import unmodified_mitsuba
 from mbtf_pipeline.compare.metrics import DEFINITIONS
 from mbtf_pipeline.compare.perceptual_metrics import weights_file
-from mbtf_pipeline.report.embed import file_uri
+from mbtf_pipeline.report.images import file_uri
 from mbtf_pipeline.report.plots import ERROR_BAR_NOTE
 from mbtf_pipeline.report.report import render
 from mbtf_pipeline.stages import REPORT, VIEWER

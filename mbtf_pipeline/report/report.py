@@ -18,8 +18,7 @@ from mbtf_core.pictures import Camera
 from mbtf_pipeline.compare.compare import COMPARISON_NAME, COMPARISON_SCHEMA
 from mbtf_pipeline.compare.image_files import read_picture
 from mbtf_pipeline.recipe import RECIPE_NAME, Recipe
-from mbtf_pipeline.report.embed import REDUCTIONS, Gallery
-from mbtf_pipeline.report.images import offset_section, picture_section
+from mbtf_pipeline.report.images import REDUCTIONS, Gallery, offset_section, picture_section
 from mbtf_pipeline.report.plots import ERROR_BAR_NOTE
 from mbtf_pipeline.report.sections import (
     error_context,
