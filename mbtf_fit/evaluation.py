@@ -203,8 +203,7 @@ def evaluate(material: Material | str | Path, shards: str | Path | DataFolder) -
     partition = load_training(data, material.config.held_out, material.config.seed, memory=None)
     found = {"errors": evaluate_splits(material.predict, data, partition)}
     if material.transmittance is not None and has_transmittance(data):
-        through = evaluate_transmittance(material.transmittance, data, partition.selection)
-        found["transmittance"] = {split: errors.as_dict() for split, errors in through.items()}
+        found["transmittance"] = evaluate_transmittance(material.transmittance, data, partition.selection)
     return found
 
 

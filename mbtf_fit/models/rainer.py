@@ -118,9 +118,13 @@ class Rainer2019(Model):
         return next(op.hidden[0] for op in self.material.operations if isinstance(op, Network))
 
     def prepare(self, given: Preparation) -> Any:
+        from mbtf_fit.pytorch.networks import initialize_layers
+
         queries = given.queries
         self.encoder = self._encoder(len(queries.omega_i))
-        self.encoder.initialize(generator_of(given.seed + 1))
+        generator = generator_of(given.seed + 1)
+        for network in self.encoder.children():
+            initialize_layers(network, generator)
         self.encoder.to(queries.values.device)
         return shared_slices(given)
 

@@ -1,21 +1,9 @@
 r"""Hints: what the geometry of a data set tells about a query before anything is learned.
 
-For a query (u, σ, ω_i, ω_o) the view rays of one or more places of the footprint are traced to the heights.
-At each intersection, maps filtered to the footprint give base color, metallic, roughness, and the
-distribution of slopes (:mod:`mbtf_fit.surface.slopes`). The light is visible from a share V of the footprint:
-the elevation of the horizon in the light's azimuth has the mean h and the variance s² there, and for normally
-distributed horizons
-
-    V = Φ((elevation of ω_i - h) / √(s² + w²)),    w = 0.8 times the light kernel's width.
-
-The hints of a query are means over its places:
-
-- the height z of the intersection, which gives the displacement ``z/ω_o,z · ω_o,xy``;
-- the irradiance e of the visible surface, 1 on the reference plane;
-- the normal's x and y;
-- the core in 1/sr: light that is scattered once, diffusely and by GGX facets.
-
-:mod:`mbtf_fit.ops.shade` has their equations.
+For a query (u, σ, ω_i, ω_o) the view rays of one or more places of the footprint are traced to the heights
+(:class:`~mbtf_fit.ops.lookup.Trace`). At each intersection, maps and horizons that are filtered to the
+footprint give irradiance, normal and single scattering (:class:`~mbtf_fit.ops.shade.Shade`). Hints are means
+over the places: height of the intersection, then those.
 """
 
 from __future__ import annotations
