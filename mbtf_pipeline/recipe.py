@@ -102,9 +102,6 @@ class CompareSection(Settings):
     st_lpips: bool = Field(
         False, description="also compute ST-LPIPS; its weights come with the optional extra `perceptual`"
     )
-    unmodified_mitsuba: bool = Field(
-        False, description="render one reference again with unmodified Mitsuba, as an independent check"
-    )
     timing: bool = Field(False, description="time the evaluation of a 1080p image, part by part")
     seed: int = Field(0, ge=0, lt=1 << 63, description="root seed of the images")
 

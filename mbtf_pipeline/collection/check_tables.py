@@ -1,18 +1,12 @@
-"""Tables besides errors: parameter counts, time of an evaluation, offsets, unmodified Mitsuba."""
+"""Tables besides errors: parameter counts, time of an evaluation, offsets."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
-from mbtf_core.stats import Estimate
 from mbtf_pipeline.collection.finished_run import MATERIAL, METHOD, FinishedRun, each_fit, signed_map
 from mbtf_pipeline.collection.recipes import Published, first_known
-from mbtf_pipeline.compare.image_files import read_picture
-from mbtf_pipeline.compare.unmodified_mitsuba import MAX_STANDARD_ERRORS, MIN_BLOCKS, verdict
 from mbtf_pipeline.report.images import displacements
 from mbtf_pipeline.stages import COMPARE
 from mbtf_pipeline.tables import (
@@ -20,9 +14,6 @@ from mbtf_pipeline.tables import (
     Column,
     Table,
     Thumbnail,
-    direction,
-    estimate,
-    is_significant,
     rows_of,
 )
 
@@ -126,58 +117,3 @@ def _offset_images(run: FinishedRun) -> list[tuple[str, list[Thumbnail]]]:
         ]
         out.append((f"{run.title}, {fit or 'traced'}: ± {scale:.2g} tile widths", row))
     return out
-
-
-_RENDERERS = {"base color": "unmodified Mitsuba", "full": "Mitsuba with the BSDF of mbtf"}
-# The difference images saturate at this fraction of white.
-_SCALE = 0.1
-
-
-def _rms_text(square: Estimate) -> str | None:
-    """Root of a noise-free mean square in percent; an upper limit if it is not significant. None for images
-    that are too small."""
-    if square.n < MIN_BLOCKS:
-        return None
-    if square.value <= 0 or not is_significant(square):
-        return f"below {100 * math.sqrt(max(square.value, 0.0) + 2.0 * square.error):.2g}%"
-    root = math.sqrt(square.value)
-    return f"{Estimate(100 * root, 100 * square.error / (2 * root), square.n)}%"
-
-
-def _detectable(square: Estimate) -> float | None:
-    return math.sqrt(MAX_STANDARD_ERRORS * square.error) if square.n >= MIN_BLOCKS else None
-
-
-# Of a run, the record of a surface, and its differences of the mean and in mean square.
-_INDEPENDENCE = (
-    MATERIAL,
-    Column("surface", "surface", lambda run, found, *_: found["surface"]),
-    Column("renderer", "renderer", lambda run, found, *_: _RENDERERS[found["surface"]]),
-    Column("difference of the means [% of the mean]", "mean", lambda run, found, mean, _: mean, 100.0),
-    Column("RMS difference, noise-free [% of the mean]", "rms", lambda *item: _rms_text(item[-1])),
-    Column("detection limit, RMS [%]", "rms_detectable", lambda *item: _detectable(item[-1]), 100.0, ".2g"),
-    Column("verdict", "verdict", lambda run, found, mean, square: verdict(mean, square)),
-)
-
-
-def independence(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[Table]:
-    """Differences of both renderers, per material and surface."""
-    checks = [(run, run.comparison.get("unmodified_mitsuba")) for run in runs]
-    surfaces = [(run, found) for run, check in checks if check for found in check["surfaces"]]
-    items = [(run, found, estimate(found["mean"]), estimate(found["square"])) for run, found in surfaces]
-    rows, images = rows_of(_INDEPENDENCE, items), [_surface_images(*one) for one in surfaces]
-    title = "References rendered with unmodified Mitsuba"
-    return [Table("independence", title, _INDEPENDENCE, rows, images=images)]
-
-
-def _surface_images(run: FinishedRun, found: Mapping[str, Any]) -> tuple[str, list[Thumbnail]]:
-    check = run.comparison["unmodified_mitsuba"]
-    mbtf, mitsuba = found["files"]["mbtf"], found["files"]["mitsuba"]
-    title = (
-        f"{run.title}, {found['surface']}: view {direction(check['view'])}, light {direction(check['light'])}"
-    )
-    note = f"saturates at ± {_SCALE:.0%} of white; includes the noise of both"
-    own, other = (read_picture(run.folder / COMPARE / name).astype(np.float64) for name in (mbtf, mitsuba))
-    scale = _SCALE * run.comparison["white"]
-    signed = signed_map((own - other).mean(axis=-1), scale, "mbtf − Mitsuba", note)
-    return title, [run.preview(mbtf, "mbtf"), run.preview(mitsuba, "Mitsuba"), signed]

@@ -22,7 +22,6 @@ from mbtf_pipeline.compare.metrics import DEFINITIONS, dataset_errors, image_err
 from mbtf_pipeline.compare.offsets import write_offsets
 from mbtf_pipeline.compare.perceptual_metrics import perceptual_scores, require
 from mbtf_pipeline.compare.timing import measure_timing, timed
-from mbtf_pipeline.compare.unmodified_mitsuba import pick_scene, write_agreement
 from mbtf_pipeline.recipe import CompareSection
 
 if TYPE_CHECKING:
@@ -69,7 +68,6 @@ def compare(
     Raises
     ------
     InputError : the material, the data set or a fit cannot be read
-    UsageError : ``unmodified_mitsuba`` is set and no scene is suitable for it
     EngineError : ST-LPIPS is requested and its weights are not installed
     """
     from mbtf_core.data.dataset import Dataset
@@ -84,8 +82,6 @@ def compare(
     start = time.perf_counter()
     job = Job.load(generate)
     section = section.at(job.lattice.shape()[1])
-    if section.unmodified_mitsuba:
-        pick_scene(section)
     estimator = picture_estimator(job)
     rendered = _render_references(section, job, progress, runner)
     seconds = time.perf_counter() - start
@@ -114,8 +110,6 @@ def compare(
         "offsets": write_offsets(estimator, materials, section.offset_views, data.lattice, out),
         "seconds": {"references": round(seconds, 3)},
     }
-    if section.unmodified_mitsuba:
-        record["unmodified_mitsuba"] = write_agreement(section, job.config, job.material, out)
     if section.timing:
         import torch
 

@@ -8,13 +8,12 @@ import math
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from PIL import Image
 from support.paths import ROOT
 
 from mbtf_core.stats import Estimate
-from mbtf_pipeline.collection.check_tables import independence, timing, weights
+from mbtf_pipeline.collection.check_tables import timing, weights
 from mbtf_pipeline.collection.error_tables import ablations, levels, methods, zooms
 from mbtf_pipeline.collection.finished_run import FinishedRun, mean_of, ratio_of
 from mbtf_pipeline.collection.recipes import PaperRecipe, first_known, load
@@ -156,34 +155,6 @@ def test_zooms_have_one_row_per_span_and_fit(tmp_path: Path) -> None:
         (s, f) for s in ("1", "8") for f in MSE
     ]
     assert [len(row) for _, row in table.images] == [2, 2, 2]
-
-
-def test_unmodified_mitsuba_agrees_or_differs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "mbtf_pipeline.collection.check_tables.read_picture", lambda path: np.zeros((4, 4, 3), np.float32)
-    )
-    direction = {"elevation": 85, "azimuth": 0}
-    files = {"mbtf": "reference", "mitsuba": "neumip"}
-    surfaces = [
-        {"surface": s, "mean": number(1e-3, 1e-3), "square": number(square, 1.2e-4), "files": files}
-        for s, square in (("base color", 1e-5), ("full", 4e-2))
-    ]
-    check = {"view": direction, "light": direction, "surfaces": surfaces}
-
-    def first() -> dict[str, str]:
-        return rows_of(independence([make(tmp_path, unmodified_mitsuba=check)], PUBLISHED)[0])[0]
-
-    same, other = rows_of(independence([make(tmp_path, unmodified_mitsuba=check)], PUBLISHED)[0])
-    rms = "RMS difference, noise-free [% of the mean]"
-    assert (same["verdict"], same[rms]) == ("agree", "below 1.6%")
-    assert (other["verdict"], other[rms]) == ("differ", "20.00 ± 0.03%")
-    # The verdict changes at the detection limit.
-    for factor, verdict in ((0.99, "agree"), (1.01, "differ")):
-        surfaces[0]["square"] = number(3e-3 * factor**2, 1e-3)
-        assert first()["verdict"] == verdict
-    # A single block of pixels has no error bar and is inconclusive.
-    surfaces[0] |= {key: {"value": 0.4, "error": None, "n": 1} for key in ("mean", "square")}
-    assert (first()["verdict"], first()[rms]) == ("inconclusive", "–")
 
 
 def test_cells_are_printed_and_exported() -> None:
