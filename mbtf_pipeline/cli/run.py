@@ -196,18 +196,28 @@ def _report(result: RunResult, console: Console, quality: Quality | None) -> Non
     from mbtf_pipeline.stages import FITS
     from mbtf_pipeline.tables import estimate
 
-    tests = {fit: record["splits"]["test"] for fit, record in result.comparison["test"].items()}
-    folder, recipe = result.report.parent, read_resolved(result.report.parent)
-    endings = {
-        name: describe_ending(fit, read_history(folder / FITS / name)) for name, fit in recipe.fit.items()
-    }
-    caveats = {
-        fit: caveat(result.comparison["test"][fit]["training_steps"], e["unexplained"]["value"])
-        for fit, e in tests.items()
-    }
+    folder = result.report.parent
     ran = {name: stage.seconds for name, stage in result.stages.items() if stage.reason}
+    times = ", ".join(f"{name} {clock(seconds)}" for name, seconds in ran.items())
+    lines = [f"{result.report}: {times or 'everything up to date'}"]
+    fits, recipe = {}, read_resolved(folder)
+    for fit, record in result.comparison["test"].items():
+        errors = record["splits"]["test"]
+        ending = describe_ending(recipe.fit[fit], read_history(folder / FITS / fit))
+        why = caveat(record["training_steps"], errors["unexplained"]["value"])
+        fits[fit] = {
+            "unexplained_variance": errors["unexplained"],
+            "mse": errors["mse"],
+            "ending": ending,
+            "caveat": why or None,
+        }
+        name = f"{fit} ({why})" if why else fit
+        lines.append(f"  {name}: unexplained variance {estimate(errors['unexplained'])}")
+        lines += [] if ending is None else [f"    {ending}"]
+    if result.viewer is not None:
+        lines.append(f"{result.viewer}: open it in a browser to turn the fits under lights")
     data = {
-        "folder": result.report.parent,
+        "folder": folder,
         "report": result.report,
         "viewer": result.viewer,
         "quality": quality,
@@ -216,24 +226,8 @@ def _report(result: RunResult, console: Console, quality: Quality | None) -> Non
             name: {"ran": name in ran, "reason": stage.reason or "up to date", "seconds": stage.seconds}
             for name, stage in result.stages.items()
         },
-        "test": {
-            fit: {
-                "unexplained_variance": e["unexplained"],
-                "mse": e["mse"],
-                "ending": endings.get(fit),
-                "caveat": caveats[fit] or None,
-            }
-            for fit, e in tests.items()
-        },
+        "test": fits,
     }
-    times = ", ".join(f"{name} {clock(seconds)}" for name, seconds in ran.items())
-    lines = [f"{result.report}: {times or 'everything up to date'}"]
-    for fit, e in tests.items():
-        name = f"{fit} ({caveats[fit]})" if caveats[fit] else fit
-        lines.append(f"  {name}: unexplained variance {estimate(e['unexplained'])}")
-        lines += [f"    {ending}"] if (ending := endings.get(fit)) is not None else []
-    if result.viewer is not None:
-        lines.append(f"{result.viewer}: open it in a browser to turn the fits under lights")
     console.report(data, "\n".join(lines))
 
 

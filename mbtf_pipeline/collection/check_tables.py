@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from mbtf_pipeline.collection.finished_run import MATERIAL, METHOD, FinishedRun, each_fit, signed_map
+from mbtf_pipeline.collection.finished_run import MATERIAL, METHOD, FinishedRun, each_fit
 from mbtf_pipeline.collection.recipes import Published, first_known
-from mbtf_pipeline.report.images import displacements
+from mbtf_pipeline.report.images import displacements, map_uri
 from mbtf_pipeline.stages import COMPARE
 from mbtf_pipeline.tables import (
     Cell,
@@ -112,7 +112,7 @@ def _offset_images(run: FinishedRun) -> list[tuple[str, list[Thumbnail]]]:
     for fit in (None, *records[0]["fits"]) if records else ():
         maps, _, scale = displacements(run.folder / COMPARE, records, fit)
         row = [
-            signed_map(m, scale, f"elevation {record['view']['elevation']:g}°")
+            Thumbnail(map_uri(m / scale, "signed"), f"elevation {record['view']['elevation']:g}°")
             for m, record in zip(maps, records, strict=True)
         ]
         out.append((f"{run.title}, {fit or 'traced'}: ± {scale:.2g} tile widths", row))

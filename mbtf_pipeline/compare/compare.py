@@ -17,7 +17,7 @@ from mbtf_core.directions import from_angles
 from mbtf_core.errors import PartialError
 from mbtf_core.files.atomic import write_json
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_pipeline.compare.image_files import PICTURES, Scene, scenes, write_map, write_picture
+from mbtf_pipeline.compare.image_files import PICTURES, Scene, scenes, with_ending, write_channels, write_map
 from mbtf_pipeline.compare.metrics import DEFINITIONS, dataset_errors, image_errors, reference_difference
 from mbtf_pipeline.compare.offsets import write_offsets
 from mbtf_pipeline.compare.perceptual_metrics import perceptual_scores, require
@@ -191,7 +191,8 @@ def _compare_scene(
         flat_value, seconds = timed(partial(material.evaluate, *arrays))
         value = flat_value.reshape(main.value.shape)
         file = scene.file(f"fit-{name}")
-        write_picture(out / file, value, ALBEDO_EXPOSURE)
+        write_channels(with_ending(out / file, ".exr"), value, "RGB")
+        write_display(out / file, value, ALBEDO_EXPOSURE)
         scores, hdr_flip = perceptual_scores(value, main.value, white, with_st_lpips)
         write_map(out / file, hdr_flip)
         errors = {kind: image_errors(value, x.value_a, x.value_b, white) for kind, x in images.items()}
