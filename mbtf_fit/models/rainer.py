@@ -27,15 +27,7 @@ from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
 from mbtf_fit.models.model import Model, Preparation, generator_of
 from mbtf_fit.models.neumip import hidden_layers
-from mbtf_fit.ops import (
-    DivideByCosine,
-    Lookup,
-    Network,
-    Operation,
-    Standardize,
-    Stereographic,
-    Transform,
-)
+from mbtf_fit.ops import DivideByCosine, Lookup, Network, Operation, Standardize, Stereographic, Transform
 from mbtf_fit.ops.constants import LEAST_COSINE, STATISTICS
 from mbtf_fit.sections import NetworkSection
 

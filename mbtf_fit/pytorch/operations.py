@@ -156,13 +156,7 @@ def _shade(
 
 
 def _ggx(
-    f0: Tensor,
-    alpha2: Tensor,
-    normal: Tensor,
-    light: Tensor,
-    view: Tensor,
-    omega_i: Tensor,
-    omega_o: Tensor,
+    f0: Tensor, alpha2: Tensor, normal: Tensor, light: Tensor, view: Tensor, omega_i: Tensor, omega_o: Tensor
 ) -> Tensor:
     """BRDF (n, 3) of GGX facets of reflectance F0 (n, 3) and α² (n, 1) (Walter et al. 2007; Schlick 1994).
 

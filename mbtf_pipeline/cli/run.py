@@ -232,11 +232,7 @@ def _report(result: RunResult, console: Console, quality: Quality | None) -> Non
 
 
 def list_recipes(
-    folder: Path = Path("pipelines"),
-    /,
-    *,
-    verbose: Verbose = False,
-    console: Console = CONSOLE,
+    folder: Path = Path("pipelines"), /, *, verbose: Verbose = False, console: Console = CONSOLE
 ) -> None:
     """List the recipes of a folder.
 
@@ -284,11 +280,7 @@ def report(
     *,
     exposure: Annotated[
         float | Literal["auto"] | None,
-        Parameter(
-            metavar="EV|auto",
-            show_default=False,
-            help=f"{EXPOSURE[0].upper()}{EXPOSURE[1:]}.",
-        ),
+        Parameter(metavar="EV|auto", show_default=False, help=f"{EXPOSURE[0].upper()}{EXPOSURE[1:]}."),
     ] = None,
     console: Console = CONSOLE,
 ) -> None:

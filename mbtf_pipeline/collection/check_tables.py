@@ -9,13 +9,7 @@ from mbtf_pipeline.collection.finished_run import MATERIAL, METHOD, FinishedRun,
 from mbtf_pipeline.collection.recipes import Published, first_known
 from mbtf_pipeline.report.images import displacements, map_uri
 from mbtf_pipeline.stages import COMPARE
-from mbtf_pipeline.tables import (
-    Cell,
-    Column,
-    Table,
-    Thumbnail,
-    rows_of,
-)
+from mbtf_pipeline.tables import Cell, Column, Table, Thumbnail, rows_of
 
 
 def weights(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[Table]:

@@ -9,14 +9,7 @@ from itertools import combinations
 from typing import Any
 
 from mbtf_core.stats import Estimate, psnr
-from mbtf_pipeline.collection.finished_run import (
-    MATERIAL,
-    METHOD,
-    FinishedRun,
-    each_fit,
-    mean_of,
-    ratio_of,
-)
+from mbtf_pipeline.collection.finished_run import MATERIAL, METHOD, FinishedRun, each_fit, mean_of, ratio_of
 from mbtf_pipeline.collection.recipes import Published, first_known
 from mbtf_pipeline.compare.perceptual_metrics import PERCEPTUAL_METRICS, PerceptualMetric
 from mbtf_pipeline.report.plots import points

@@ -97,10 +97,7 @@ def dataset_errors(materials: Mapping[str, Material], data: Dataset) -> dict[str
         found = split_errors(lambda queries: value, test, data)  # noqa: B023
         own = material.description["training"]["errors"]
         splits = {split: errors for split, errors in own.items() if split != "test"}
-        record = {
-            "splits": {"test": found, **splits},
-            **_parameter_counts(material),
-        }
+        record = {"splits": {"test": found, **splits}, **_parameter_counts(material)}
         if first is None:
             first = value
         else:

@@ -19,10 +19,7 @@ from mbtf_fit.ops.constants import LEAST_VARIANCE
 
 T = TypeVar("T", bound=ops.Operation)
 # Inputs of the decoder for light and view, and how many coordinates of each these are.
-_LIGHTS = {
-    ("omega_i[0:2]", "omega_o[0:2]"): 2,
-    ("omega_i", "omega_o"): 3,
-}
+_LIGHTS = {("omega_i[0:2]", "omega_o[0:2]"): 2, ("omega_i", "omega_o"): 3}
 
 
 @dataclass(frozen=True)

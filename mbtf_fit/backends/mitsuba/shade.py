@@ -226,12 +226,7 @@ def _own_shadowing(alpha2: Float, light: Float, view: Float) -> Float:
 
 
 def _ggx(
-    op: ops.Lobe,
-    f0: Color3f,
-    alpha2: Float,
-    normal: Normal3f,
-    omega_i: Vector3f,
-    omega_o: Vector3f,
+    op: ops.Lobe, f0: Color3f, alpha2: Float, normal: Normal3f, omega_i: Vector3f, omega_o: Vector3f
 ) -> Color3f:
     """BRDF of GGX facets of reflectance F0 and α² (Walter et al. 2007; Schlick 1994)."""
     light = dr.maximum(dr.dot(normal, omega_i), op.least_light)
