@@ -14,15 +14,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import conv2d, linear, max_pool2d
 
 from mbtf_fit.ops.constants import LEAK
+from mbtf_fit.ops.network import Activation
 
-Activation = Literal["relu", "leaky-relu", "sine"]
 ACTIVATIONS: dict[Activation, Callable[[Tensor], Tensor]] = {
     "relu": torch.relu,
     "leaky-relu": lambda x: nn.functional.leaky_relu(x, LEAK),
