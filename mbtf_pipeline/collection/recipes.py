@@ -18,20 +18,14 @@ from mbtf_core.units import Duration
 from mbtf_fit.config import DEFAULT_MODEL, FIBER_MODEL
 from mbtf_pipeline.collection.materials import find_materials, name_materials
 from mbtf_pipeline.compare.perceptual_metrics import weights_file
-from mbtf_pipeline.recipe import Name, Recipe, load_recipe
+from mbtf_pipeline.recipe import Name, Recipe, distinct, load_recipe
 
 TableName = Literal["methods", "levels", "weights", "ablations", "timing", "offsets", "zooms", "ranking"]
 # The name of a fit that is repeated: what is trained, and the seed.
 _SEEDED = re.compile(r"(.+)-seed([0-9]+)")
 
 
-def _distinct(seeds: list[int]) -> list[int]:
-    if len({*seeds}) < len(seeds):
-        raise ValueError("seeds must differ")
-    return seeds
-
-
-Seeds = Annotated[list[Annotated[int, Field(ge=0, lt=1 << 63)]], AfterValidator(_distinct)]
+Seeds = Annotated[list[Annotated[int, Field(ge=0, lt=1 << 63)]], AfterValidator(distinct)]
 
 
 class Layer(Settings):

@@ -21,7 +21,6 @@ from mbtf_fit.native.library import (
 )
 from mbtf_fit.ops.constants import HEIGHT_SCALE, LEAST_FACING
 from mbtf_fit.pytorch.material import NeuralMaterial
-from mbtf_fit.pytorch.textures import FeatureTextures
 from mbtf_fit.surface.hints import describe_textures
 
 
@@ -87,7 +86,8 @@ class NativeModel:
         assert pattern is not None, "the kernel cannot evaluate these operations"
         self.kernel, self.material, self.pattern = kernel, material, pattern
         self.frozen = material.frozen
-        self.textures = _textures(material, pattern)
+        features = material.texture(pattern.lookup.textures)
+        self.textures = [features, *(t for t in material.textures() if t is not features)]
         names = [pattern.decoder, *([] if pattern.offset_network is None else [pattern.offset_network])]
         self.networks = [material.get_submodule(op.weights) for op in names]
         self.description = d = ModelStruct()
@@ -156,9 +156,3 @@ class NativeModel:
             state.data_ptr(),
             out,
         )
-
-
-def _textures(material: NeuralMaterial, pattern: Pattern) -> list[FeatureTextures]:
-    """Textures that the kernel reads: the features, then what moves lookups."""
-    found = [material.texture(pattern.lookup.textures)]
-    return found + [textures for textures in material.textures() if textures is not found[0]]

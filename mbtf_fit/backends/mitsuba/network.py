@@ -166,18 +166,16 @@ def _frequencies(op: ops.Frequencies, loader: Loader) -> Step:
         for c, length in zip(x, (1.0, aspect) if level else [1.0] * len(x), strict=True):
             for k, frequency in bands:
                 scale = 0.5**k if op.attenuated else 1.0
-                factor = scale if across is None else scale * _average(across / length * frequency)
+                factor = scale
+                if across is not None:
+                    # The average of the wave over the Gaussian of the footprint.
+                    factor = scale * dr.exp(-0.5 * dr.square(across / length * frequency))
                 s, t = dr.sincos(c * frequency)
                 sines.append(s * factor)
                 cosines.append(t * factor)
         return [*(x if op.raw else ()), *sines, *cosines]
 
     return step
-
-
-def _average(x: mi.Float) -> mi.Float:
-    """Of a wave over a Gaussian of a standard deviation, in radians."""
-    return dr.exp(-0.5 * dr.square(x))
 
 
 FUNCTIONS: dict[str, Callable[[Float], Float]] = {

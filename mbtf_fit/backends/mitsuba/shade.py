@@ -129,7 +129,7 @@ def _lobe(op: ops.Lobe, loader: Loader) -> Step:
         weight: Numbers | None,
     ) -> Numbers:
         light, view = mi.Vector3f(*omega_i), mi.Vector3f(*omega_o)
-        normal = _normal(*slopes)
+        normal = dr.normalize(mi.Normal3f(-slopes[0], -slopes[1], 1.0))
         roughness = dr.maximum(alpha2[0], op.least_alpha2)
         lobe = _ggx(op, mi.Color3f(*specular), roughness, normal, light, view)
         if weight is not None:
@@ -138,11 +138,6 @@ def _lobe(op: ops.Lobe, loader: Loader) -> Step:
         return list(irradiance * (mi.Color3f(*base) / math.pi + lobe))
 
     return step
-
-
-def _normal(x: Float, y: Float) -> Normal3f:
-    """Unit normal of slopes."""
-    return dr.normalize(mi.Normal3f(-x, -y, 1.0))
 
 
 def _spread(x: Float, y: Float, xx: Float, xy: Float, yy: Float) -> tuple[Float, Float, Float]:
