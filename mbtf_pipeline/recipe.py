@@ -103,7 +103,7 @@ class CompareSection(Settings):
     st_lpips: bool = Field(
         False, description="also compute ST-LPIPS; its weights come with the optional extra `perceptual`"
     )
-    timing: bool = Field(False, description="time the evaluation of a 1080p image, part by part")
+    timing: bool = Field(False, description="time the evaluation of a 1080p image, stage by stage")
     seed: int = Field(0, ge=0, lt=1 << 63, description="root seed of the images")
 
     def at(self, texels: int) -> CompareSection:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 from mbtf_pipeline.collection.finished_run import MATERIAL, METHOD, FinishedRun, each_fit
 from mbtf_pipeline.collection.recipes import Published, first_known
@@ -35,7 +34,7 @@ def weights(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list
 
 
 def timing(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[Table]:
-    """Milliseconds of one evaluation of 1080p, in total and by part."""
+    """Milliseconds of one evaluation of 1080p, in total and by stage."""
     items = [
         (fit, record)
         for run in runs
@@ -43,26 +42,21 @@ def timing(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[
         for record in records
     ]
 
-    def milliseconds(title: str, key: str, section: str = "", name: str = "") -> Column:
-        """Milliseconds of a record, or of one of its sections."""
+    def milliseconds(title: str, key: str) -> Column:
+        return Column(title, f"{key}_ms", lambda fit, record: record[f"{key}_ms"], digits=",.1f")
 
-        def get(fit: str, record: Any) -> Cell:
-            return record[section].get(name or key) if section else record[f"{key}_ms"]
-
-        return Column(title, f"{key}_ms", get, digits=",.1f")
+    def of_lights(n: str) -> Column:
+        title = f"{n} light{'s' * (n != '1')}"
+        return Column(title, f"lights_{n}_ms", lambda fit, record: record["lights_ms"][n], digits=",.1f")
 
     lights = items[-1][1]["lights_ms"] if items else ()
     columns = [
         Column("method", "method", lambda fit, record: fit),
         Column("device", "device", lambda fit, record: record["device"]),
         milliseconds("material evaluation", "evaluate"),
-        milliseconds("offset texture", "offset_texture", "parts_ms", "offset texture"),
-        milliseconds("offset network", "offset_network", "parts_ms", "offset network"),
-        milliseconds("pyramid", "pyramid", "parts_ms"),
-        milliseconds("encoded position", "encoding", "parts_ms"),
         milliseconds("stage 1 (per view)", "stage1"),
         milliseconds("stage 2 (per light): decoder", "stage2"),
-        *(milliseconds(f"{n} light{'s' * (n != '1')}", f"lights_{n}", "lights_ms", n) for n in lights),
+        *map(of_lights, lights),
         Column("timed queries", "queries", lambda fit, record: record["queries"]),
     ]
     return [Table("timing", "Time of one evaluation of 1080p", columns, rows_of(columns, items))]

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 COMPARISON_NAME = "comparison.json"
 COMPARISON_FORMAT = "mbtf-comparison"
 # Raised when the record or its files change; part of the stage's key.
-COMPARISON_SCHEMA = 13
+COMPARISON_SCHEMA = 14
 
 F32 = NDArray[np.float32]
 Progress = Callable[[str], None]
