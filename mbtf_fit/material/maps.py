@@ -52,62 +52,43 @@ _SIDE, _ITERATIONS = 4, 4
 _LEAST_COSINE = 1e-6
 
 
-@dataclass(frozen=True)
-class Pairs:
-    """Pairs of light and view, k of all texels or (n, k) of each one.
-
-    Attributes
-    ----------
-    light, view, half : (3, k) or (3, n, k) tensors, unit vectors towards light and viewer, and between both
-    schlick : (k,) or (n, k) tensor, ``(1 - ω_o·h)^5``
-    """
-
-    light: Tensor
-    view: Tensor
-    half: Tensor
-    schlick: Tensor
-
-    @classmethod
-    def of(cls, omega_i: F64, omega_o: F64, dtype: torch.dtype = torch.float32) -> Pairs:
-        """Pairs of unit vectors (..., k, 3), ``z > 0``, which are broadcast."""
-        planes = (np.moveaxis(omega, -1, 0) for omega in np.broadcast_arrays(omega_i, omega_o))
-        light, view = (torch.from_numpy(np.array(plane, order="C")).to(dtype) for plane in planes)
-        half = torch.nn.functional.normalize(light + view, dim=0)
-        return cls(light, view, half, (1.0 - (view * half).sum(0).clamp(0.0, 1.0)) ** 5)
-
-
-def reflectance(lobes: Tensor, dielectric: float, pairs: Pairs) -> tuple[Tensor, Tensor]:
+def reflectance(lobes: F64, dielectric: float, omega_i: F64, omega_o: F64) -> tuple[F64, F64]:
     """Value of texels in 1/sr, as ``constant + base_color · factor``, which all three colors share.
 
     Parameters
     ----------
-    lobes : (4, n, 1) or (4, n, k) tensor, ∂z/∂x and ∂z/∂y of the shading normal, the square root of α of GGX
-        (roughness), the share of metal
+    lobes : (4, n) array, ∂z/∂x and ∂z/∂y of the shading normal, the square root of α of GGX (roughness), the
+        share of metal
     dielectric : F0 of the dielectric
-    pairs : k pairs
+    omega_i, omega_o : (k, 3) unit vectors towards light and viewer, ``z > 0``
 
     Returns
     -------
-    (constant, factor) : (n, k) tensors, 0 where the light or the viewer is below the surface
+    (constant, factor) : (n, k) arrays, 0 where the light or the viewer is below the surface
     """
-    p, q, roughness, metal = lobes
+    to_light, to_view = (
+        torch.from_numpy(np.array(omega.T, np.float64, order="C")) for omega in (omega_i, omega_o)
+    )
+    half = torch.nn.functional.normalize(to_light + to_view, dim=0)
+    schlick = (1.0 - (to_view * half).sum(0).clamp(0.0, 1.0)) ** 5
+    p, q, roughness, metal = torch.from_numpy(lobes)[..., None]
     length = (1.0 + p * p + q * q).rsqrt()
 
     def cosine(omega: Tensor) -> Tensor:
         return (omega[2] - p * omega[0] - q * omega[1]) * length
 
-    light, view, peak = cosine(pairs.light), cosine(pairs.view), cosine(pairs.half).clamp_min(0.0)
+    light, view, peak = cosine(to_light), cosine(to_view), cosine(half).clamp_min(0.0)
     visible = (light > 0) & (view > 0)
     light, view = light.clamp_min(_LEAST_COSINE), view.clamp_min(_LEAST_COSINE)
-    alpha2, schlick = roughness**4, pairs.schlick
+    alpha2 = roughness**4
     rest = 1.0 - alpha2
     masking = light * (view * view * rest + alpha2).sqrt() + view * (light * light * rest + alpha2).sqrt()
     lobe = alpha2 / (2.0 * math.pi * (1.0 - peak * peak * rest) ** 2 * masking)
     fresnel = dielectric + (1.0 - dielectric) * schlick if dielectric > 0 else torch.zeros_like(schlick)
     constant = (fresnel + metal * (schlick - fresnel)) * lobe
     factor = (1.0 - metal) * ((1.0 - fresnel) / math.pi) + metal * (1.0 - schlick) * lobe
-    foreshortening = torch.where(visible, light, 0.0) / pairs.light[2]
-    return constant * foreshortening, factor * foreshortening
+    foreshortening = torch.where(visible, light, 0.0) / to_light[2]
+    return (constant * foreshortening).numpy(), (factor * foreshortening).numpy()
 
 
 @dataclass(frozen=True)
@@ -170,17 +151,15 @@ class Maps:
 
     def coefficients(self, omega_i: F64, omega_o: F64) -> tuple[F64, F64]:
         """Reflectance M of all texels in 1/sr, as ``constant + base_color · factor``: both (texels, k)."""
-        lobes = [*self.slopes.reshape(-1, 2).T, self.roughness.ravel(), self.metallic.ravel()]
-        pairs = Pairs.of(omega_i, omega_o, torch.float64)
-        found = reflectance(torch.from_numpy(np.stack(lobes)[..., None]), self.dielectric, pairs)
+        lobes = np.stack([*self.slopes.reshape(-1, 2).T, self.roughness.ravel(), self.metallic.ravel()])
         opacity = self.opacity.reshape(-1, 1)
-        constant, factor = (c.numpy() * opacity for c in found)
+        constant, factor = (c * opacity for c in reflectance(lobes, self.dielectric, omega_i, omega_o))
         if self.coat is None:
             return constant, factor
         # The extension KHR_materials_clearcoat: a dielectric of 1.5, mixed by its reflectance at the normal.
         weight, roughness = self.coat.reshape(-1, 2).T
         mirror = np.stack([*lobes[:2], roughness, np.ones_like(weight)])
-        lobe = sum(c.numpy() for c in reflectance(torch.from_numpy(mirror[..., None]), 0.0, pairs))
+        lobe = sum(reflectance(mirror, 0.0, omega_i, omega_o))
         cosine = np.clip(self.normals.reshape(-1, 3) @ np.asarray(omega_o, np.float64).T, 0.0, 1.0)
         share = weight[:, None] * (CLEARCOAT_F0 + (1.0 - CLEARCOAT_F0) * (1.0 - cosine) ** 5)
         return (1.0 - share) * constant + share * lobe * opacity, (1.0 - share) * factor
