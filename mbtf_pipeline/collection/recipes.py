@@ -20,7 +20,7 @@ from mbtf_pipeline.collection.materials import find_materials, name_materials
 from mbtf_pipeline.compare.perceptual_metrics import weights_file
 from mbtf_pipeline.recipe import Name, Recipe, distinct, load_recipe
 
-TableName = Literal["methods", "levels", "weights", "ablations", "timing", "offsets", "zooms", "ranking"]
+TableName = Literal["methods", "levels", "ablations", "timing", "offsets", "zooms", "ranking"]
 # The name of a fit that is repeated: what is trained, and the seed.
 _SEEDED = re.compile(r"(.+)-seed([0-9]+)")
 
@@ -60,7 +60,6 @@ class Published(Settings):
     levels: dict[str, dict[str, list[float]]] = Field(
         {}, description="MSE at each level in any unit, the finest first, by material and method"
     )
-    weights: dict[str, str] = Field({}, description="number of network weights in words, by model")
     timing: str = Field("", description="times of one evaluation, a sentence")
 
     def mse_ratio(self, material: str, method: str, base: str) -> float | None:

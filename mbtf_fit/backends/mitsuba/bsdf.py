@@ -20,7 +20,7 @@ from mbtf_core.pictures import pixel_sigma
 from mbtf_fit.backends.mitsuba.backend import Arithmetic
 from mbtf_fit.backends.mitsuba.evaluator import Evaluator
 from mbtf_fit.backends.mitsuba.lobes import LobeTextures, Mixture, fit_lobes
-from mbtf_fit.backends.mitsuba.registration import BSDF_NAME, footprints_provided, refuse_unknown
+from mbtf_fit.backends.mitsuba.names import BSDF_NAME, footprints_provided, refuse_unknown
 from mbtf_fit.backends.mitsuba.stored_material import StoredMaterial, read_material
 from mbtf_fit.material.format import QUERY
 from mbtf_fit.ops import Trace

@@ -21,7 +21,7 @@ import mitsuba as mi
 from mbtf_core.errors import UsageError
 from mbtf_core.pictures import PIXEL_SIGMA
 from mbtf_fit.backends.mitsuba.bsdf import MbtfBSDF, check_scene
-from mbtf_fit.backends.mitsuba.registration import INTEGRATOR_NAME, footprints_provided, refuse_unknown
+from mbtf_fit.backends.mitsuba.names import INTEGRATOR_NAME, footprints_provided, refuse_unknown
 from mbtf_fit.ops.constants import MAX_ANISOTROPY
 from mbtf_gen.engine.types import (
     DirectionSample3f,

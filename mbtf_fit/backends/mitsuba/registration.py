@@ -1,42 +1,17 @@
-"""Names of the plugins, their registration with Mitsuba, and loading of scenes with fitted materials.
-
-This module imports no Mitsuba.
-"""
+"""Registration of the plugins with Mitsuba, and loading of scenes with fitted materials."""
 
 from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Mapping, Sequence
-from contextvars import ContextVar
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from mbtf_core.errors import EngineError, MbtfError, UsageError
-from mbtf_core.paths import suggest_name
-from mbtf_gen.engine.runtime import CPU_VARIANT, CUDA_VARIANT, load_mitsuba, refuse_old_llvm
+from mbtf_fit.backends.mitsuba.names import BSDF_NAME, INTEGRATOR_NAME, VARIANTS
+from mbtf_gen.engine.runtime import CPU_VARIANT, load_mitsuba, refuse_old_llvm
 from mbtf_gen.engine.types import Properties, Scene
-
-BSDF_NAME = "mbtf"
-INTEGRATOR_NAME = "mbtf_path"
-VARIANTS = (CPU_VARIANT, CUDA_VARIANT)
-
-# Whether the integrator that is tracing provides footprints to the BSDFs.
-footprints_provided: ContextVar[bool] = ContextVar("footprints_provided", default=False)
-
-
-def refuse_unknown(props: Properties, known: Sequence[str], where: str) -> None:
-    """Refuse a parameter that a plugin does not have, in one line; Mitsuba's own report has several.
-
-    Raises
-    ------
-    UsageError : there is one
-    """
-    unknown = sorted(set(props.unqueried()) - set(known))
-    if unknown:
-        hint = suggest_name(unknown[0], known) or f"it has: {', '.join(known)}"
-        raise UsageError(f"has no parameter '{unknown[0]}'", where=where, hint=hint)
-
 
 _log = logging.getLogger(__name__)
 # The variant whose classes the plugins derive from.

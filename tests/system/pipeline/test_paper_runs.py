@@ -17,7 +17,7 @@ from mbtf_pipeline.cli.app import app
 RECIPE = """\
 name: tiny
 title: A tiny comparison
-tables: [methods, levels, weights, ablations, timing, offsets, zooms]
+tables: [methods, levels, ablations, timing, offsets, zooms]
 materials:
   bumps: bumps.npy
   elsewhere: nowhere/maps

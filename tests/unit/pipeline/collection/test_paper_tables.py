@@ -13,9 +13,8 @@ from PIL import Image
 from support.paths import ROOT
 
 from mbtf_core.stats import Estimate
-from mbtf_pipeline.collection.check_tables import timing, weights
-from mbtf_pipeline.collection.error_tables import ablations, levels, methods, zooms
 from mbtf_pipeline.collection.finished_run import FinishedRun, mean_of, ratio_of
+from mbtf_pipeline.collection.paper_tables import ablations, levels, methods, timing, zooms
 from mbtf_pipeline.collection.recipes import PaperRecipe, first_known, load
 from mbtf_pipeline.tables import Column, Shown, Table
 
@@ -47,7 +46,7 @@ def record(folder: Path, tiles_across: float = 1.0) -> dict[str, Any]:
     noise = {"file": "reference", "flip": {"ldr": 0.1, "hdr": 0.35}, "ssim": 0.95, "st_lpips": None}
     picture = {"levels": [2.0, 2.0], "references": {"query": noise}, "fits": fits}
     picture["tiles_across"] = tiles_across
-    sizes = {"networks": {"decoder": 1678, "offset_network": 1576}, "texels": 700, "network_weights": 3254}
+    sizes = {"texels": 700, "network_weights": 3254}
     test = {
         fit: {
             "splits": {"test": {**errors(mse), "levels": {"0": errors(mse / 4), "1": errors(mse)}}},
@@ -134,15 +133,12 @@ def test_ablations_compare_with_the_first_row(tmp_path: Path) -> None:
     assert rows[0]["queries_per_texel"] == "400"
 
 
-def test_sizes_and_times(tmp_path: Path) -> None:
+def test_times(tmp_path: Path) -> None:
     times = {"device": "cpu", "queries": 7, "evaluate_ms": 9.0, "stage1_ms": 5.0, "stage2_ms": 2.0}
     times |= {"lights_ms": {"1": 7.0, "16": 37.0}}
     run = make(tmp_path, timing={"neumip": [times]})
     (row,) = rows_of(timing([run], PUBLISHED)[0])
     assert (row["material evaluation"], row["1 light"], row["16 lights"]) == ("9.0", "7.0", "37.0")
-    counted = rows_of(weights([run], PUBLISHED)[0])
-    assert counted[1]["all networks"] == "3,254"
-    assert counted[1]["published"].startswith("3332; 3254")
 
 
 def test_zooms_have_one_row_per_span_and_fit(tmp_path: Path) -> None:
