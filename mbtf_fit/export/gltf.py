@@ -63,7 +63,7 @@ def gltf(maps: Maps, name: str, described: dict[str, Any]) -> str:
         alphaMode=gl.BLEND if maps.has_holes else gl.OPAQUE,
         alphaCutoff=None,
         extensions=extensions,
-        extras=described | {"height_map": HEIGHT},
+        extras=described | ({} if maps.heights is None else {"height_map": HEIGHT}),
     )
     attributes = gl.Attributes(POSITION=0, NORMAL=1, TANGENT=2, TEXCOORD_0=3)
     primitive = gl.Primitive(attributes=attributes, indices=4, material=0)

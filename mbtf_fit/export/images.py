@@ -53,17 +53,19 @@ def write_maps(
 
     Raises
     ------
-    UsageError : the material has no such level
-    InputError : its model shades no surface
-    EngineError : the library is not installed
-    PartialError : the folder cannot be written
+    UsageError
+        The material has no such level.
+    EngineError
+        The library is not installed.
+    PartialError
+        The folder cannot be written.
     """
     if not has_extra(module):
         raise extra_error(module, name)
     if "maps" not in export.shared:
         from mbtf_fit.material.maps import make_maps
 
-        maps, unexplained = make_maps(export.material, options.level)
+        maps, unexplained = make_maps(export.material, options.level, export.console)
         export.shared["maps"] = maps, write_images(maps, export.folder)
         export.notes.append(f"{maps}; unexplained variance against the material {unexplained}")
         export.report["maps"] = {**maps.as_dict(), "unexplained": unexplained.as_dict()}
@@ -73,7 +75,7 @@ def write_maps(
         "model": export.material.model.name,
         "weights_sha256": export.material.description["weights"]["sha256"],
         "level": maps.level,
-        "height_range_in_tile_widths": round(maps.height_range, 9),
+        **({} if maps.heights is None else {"height_range_in_tile_widths": round(maps.height_range, 9)}),
     }
     write_text(export.folder / name, text(maps, real_path(export.source).name, described))
     return [*images, name]
@@ -97,7 +99,8 @@ def write_images(maps: Maps, folder: Path) -> list[str]:
     - ``normal.png``: normals n as (n + 1) / 2; x along u, which is right in the image, y along v, up.
     - ``roughness_metallic.png``: green roughness, blue metallic, red 1.
     - ``clearcoat.png``, of coated surfaces: red weight, green roughness of the clear coat.
-    - ``height.png``: 16 bits, 0 the lowest and 65535 the highest vertex; the range is in the document.
+    - ``height.png``: 16 bits, 0 the lowest and 65535 the highest vertex; the range is in the document. Models
+      that know no surface have none.
     """
     from PIL import Image
 
@@ -110,7 +113,8 @@ def write_images(maps: Maps, folder: Path) -> list[str]:
     images = {BASE_COLOR: color, NORMAL: 0.5 * maps.normals + 0.5, ORM: packed}
     if maps.coat is not None:
         images[COAT] = np.concatenate([maps.coat, np.zeros_like(maps.coat[..., :1])], -1)
-    images[HEIGHT] = (maps.heights - maps.heights.min()) / (maps.height_range or 1.0)
+    if maps.heights is not None:
+        images[HEIGHT] = (maps.heights - maps.heights.min()) / (maps.height_range or 1.0)
     for name, image in images.items():
         kind = np.uint16 if name == HEIGHT else np.uint8
         pixels = np.rint(np.clip(image, 0.0, 1.0) * np.iinfo(kind).max).astype(kind)

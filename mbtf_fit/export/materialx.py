@@ -65,15 +65,18 @@ def materialx(maps: Maps, name: str, described: dict[str, Any]) -> str:
     surface.addInput("ior", "float").setValueString(f"{maps.refractive_index:.6g}")
     if maps.dielectric == 0:
         surface.addInput("specular", "float").setValueString("0")
-    # Value of the image at height 0; heights are at most that.
-    plane = -float(maps.heights.min()) / (maps.height_range or 1.0)
-    node("image", "height", "float", file=("filename", HEIGHT))
-    node("subtract", "below_plane", "float", node_in1=("float", "height"), in2=("float", f"{plane:.9g}"))
-    displacement = document.addNode("displacement", "relief", "displacementshader")
-    connect(displacement, "displacement", "float", "below_plane")
-    displacement.addInput("scale", "float").setValueString(f"{maps.height_range:.9g}")
+    displacement = None
+    if maps.heights is not None:
+        # Value of the image at height 0; heights are at most that.
+        plane = -float(maps.heights.min()) / (maps.height_range or 1.0)
+        node("image", "height", "float", file=("filename", HEIGHT))
+        node("subtract", "below_plane", "float", node_in1=("float", "height"), in2=("float", f"{plane:.9g}"))
+        displacement = document.addNode("displacement", "relief", "displacementshader")
+        connect(displacement, "displacement", "float", "below_plane")
+        displacement.addInput("scale", "float").setValueString(f"{maps.height_range:.9g}")
     material = document.addMaterialNode("Material", surface)
-    material.addInput("displacementshader", "displacementshader").setNodeName("relief")
+    if displacement is not None:
+        material.addInput("displacementshader", "displacementshader").setNodeName("relief")
     return str(mx.writeToXmlString(document))
 
 

@@ -80,12 +80,13 @@ def usd(maps: Maps, name: str, described: dict[str, Any]) -> str:
     if maps.has_holes:
         connect("opacity", types.Float, color, "a")
     material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", types.Token))
-    height = texture("height", HEIGHT)
-    height.CreateInput("scale", types.Float4).Set((maps.height_range, 0, 0, 1))
-    height.CreateInput("bias", types.Float4).Set((float(maps.heights.min()), 0, 0, 0))
-    connect("displacement", types.Float, height, "r")
-    moved = surface.CreateOutput("displacement", types.Token)
-    material.CreateDisplacementOutput().ConnectToSource(moved)
+    if maps.heights is not None:
+        height = texture("height", HEIGHT)
+        height.CreateInput("scale", types.Float4).Set((maps.height_range, 0, 0, 1))
+        height.CreateInput("bias", types.Float4).Set((float(maps.heights.min()), 0, 0, 0))
+        connect("displacement", types.Float, height, "r")
+        moved = surface.CreateOutput("displacement", types.Token)
+        material.CreateDisplacementOutput().ConnectToSource(moved)
     return str(stage.GetRootLayer().ExportToString())
 
 

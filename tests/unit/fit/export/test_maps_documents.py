@@ -231,14 +231,29 @@ def test_a_surface_without_gloss_with_holes(tmp_path: Path) -> None:
     assert surface.getInput("alpha_mode").getValue() == 2
 
 
-def test_a_model_that_shades_no_surface_is_refused(
+def test_a_model_that_knows_no_surface_has_no_heights(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_material(tmp_path / "material")
+    write_material(tmp_path / "material", aspect=0.5)
+    words = [word for name in FORMATS for word in ("--to", name)]
     out = tmp_path / "out"
-    assert run(app, ["export", str(tmp_path / "material"), "--to", "gltf", "-o", str(out)]) == 3
-    assert "shades no surface" in capsys.readouterr().err
-    assert not (out / "material.gltf").exists()
+    assert run(app, ["export", str(tmp_path / "material"), *words, "-o", str(out), "--json"]) == 0
+    reported = json.loads(capsys.readouterr().out)
+    images = {"base_color.png", "normal.png", "roughness_metallic.png"}
+    assert set(reported["files"]) == images | {"material.gltf", "material.usda", "material.mtlx"}
+    assert {path.name for path in out.iterdir()} == set(reported["files"]) | {"export.json"}
+    maps = reported["maps"]
+    assert (maps["source"], maps["level"]) == ("fit", 3)
+    assert maps["dielectric_f0"] in (0, 0.04)
+    assert maps["unexplained"]["value"] > 0
+    assert maps["unexplained"]["error"] > 0
+    for name in ("material.gltf", "material.usda", "material.mtlx"):
+        assert "height" not in (out / name).read_text()
+        assert "displacement" not in (out / name).read_text()
+    mx = pytest.importorskip("MaterialX")
+    document = read_materialx(out)
+    (material,) = document.getMaterialNodes()
+    assert not mx.getShaderNodes(material, "displacementshader")
 
 
 def test_the_same_export_again_has_the_same_bytes(glossy: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -100,18 +101,21 @@ def ripple(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     del _KINDS["ripple"], PYTORCH._functions[Ripple]
 
 
-@pytest.mark.parametrize("name", sorted(targets().keys() - DOCUMENTS))
+@pytest.mark.parametrize("name", targets())
 def test_a_model_of_the_projects_operations_is_exported(supported: Path, tmp_path: Path, name: str) -> None:
     assert command(supported, tmp_path / "out", name) == 0
 
 
-def test_a_surface_that_is_not_shaded_has_no_maps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Its colors are not the model's."""
+def test_maps_are_those_of_the_values(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A surface that a model traces and does not shade has colors that are not the model's."""
     material = write_traced(tmp_path / "material")
     for name in ("exr", "json", "slang"):
         assert command(material, tmp_path / name, name) == 0
-    assert command(material, tmp_path / "gltf", "gltf") == 3
-    assert "own shades no surface" in capsys.readouterr().err
+    capsys.readouterr()
+    assert run(app, ["export", str(material), "--to", "gltf", "-o", str(tmp_path / "gltf"), "--json"]) == 0
+    maps = json.loads(capsys.readouterr().out)["maps"]
+    assert maps["source"] == "fit"
+    assert maps["unexplained"]["value"] < 0.1
 
 
 def test_a_material_has_one_surface() -> None:
@@ -124,7 +128,7 @@ def test_a_material_has_one_surface() -> None:
 def test_an_operation_that_readers_lack_is_refused(
     ripple: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A material folder is read where the operation is."""
+    """Maps are fitted to values, and a material folder is read where the operation is."""
     code = command(ripple, tmp_path / "out", name)
     error = capsys.readouterr().err
     if name == "material":

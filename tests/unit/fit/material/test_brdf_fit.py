@@ -1,0 +1,216 @@
+"""Maps fitted to values: known BRDFs of asymmetric maps are recovered, and the mean reflectance is kept."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.known_brdf import KnownBrdf, gltf_brdf, known_brdf
+from support.plugin_materials import write_material
+
+from mbtf_core.app.console import Console
+from mbtf_core.data.lattice import Lattice, texel_centers
+from mbtf_fit.material.brdf_fit import fit_texels
+from mbtf_fit.material.maps import Maps, fitted_maps, scale_color, unexplained
+from mbtf_fit.material.material import Material
+from mbtf_fit.material.reference_values import (
+    direction_pairs,
+    followed,
+    steep_views,
+    tile_means,
+)
+from mbtf_fit.material.transmittance import Transmittance
+
+
+def fitted(material: Material, level: int) -> Maps:
+    return fitted_maps(material, level, Console(quiet=True))
+
+
+def asymmetric_maps(rows: int = 4, columns: int = 8) -> dict[str, Any]:
+    """Maps without symmetry: a flip or a transposition of any changes them."""
+    j, i = np.mgrid[:rows, :columns] / np.array([rows, columns])[:, None, None]
+    return {
+        "slopes": np.stack([0.5 * np.sin(5 * i + 1) - 0.2 * j, 0.4 * np.cos(4 * j + 2 * i)], -1),
+        "base": np.stack([0.15 + 0.7 * i, 0.8 - 0.6 * j, 0.3 + 0.4 * i * j], -1),
+        "roughness": 0.2 + 0.5 * j + 0.2 * i,
+        "metallic": np.where((i > 0.5) & (j < 0.5), 1.0, 0.0),
+    }
+
+
+def glossy(folder: Path) -> tuple[KnownBrdf, dict[str, Any]]:
+    known = asymmetric_maps()
+    return known_brdf(
+        folder, known["slopes"], gltf_brdf(*(known[n] for n in ("base", "roughness", "metallic")))
+    ), known
+
+
+def test_a_known_metallic_roughness_brdf_is_recovered(tmp_path: Path) -> None:
+    material, known = glossy(tmp_path)
+    maps = fitted(material, 3)
+    assert maps.dielectric == 0.04
+    assert maps.heights is None
+    np.testing.assert_allclose(maps.slopes, known["slopes"], atol=0.01)
+    np.testing.assert_allclose(maps.roughness, known["roughness"], atol=0.01)
+    np.testing.assert_allclose(maps.metallic, known["metallic"], atol=0.02)
+    np.testing.assert_allclose(maps.base_color, known["base"], atol=0.02)
+    for name, map_ in (("slopes", maps.slopes), ("roughness", maps.roughness), ("base", maps.base_color)):
+        for flipped in (map_[::-1], map_[:, ::-1]):
+            assert np.abs(flipped - known[name]).max() > 0.1
+
+
+def test_the_mean_reflectance_and_the_error(tmp_path: Path) -> None:
+    """With other lights and views than those of the fit."""
+    material, _ = glossy(tmp_path)
+    maps = scale_color(material, fitted(material, 3))
+    assert unexplained(material, maps).value < 0.001
+    plain = replace(maps, slopes=0 * maps.slopes, roughness=np.ones((4, 8)), metallic=np.zeros((4, 8)))
+    error = unexplained(material, plain)
+    assert error.value > 0.3
+    assert 0 < error.error < error.value
+    light, view = direction_pairs(512, 0.1, seed=7)
+    ours = maps.evaluate(light, view).mean((0, 1))
+    np.testing.assert_allclose(ours / tile_means(material, light, view).mean(0), 1, rtol=0.01)
+
+
+def test_lambert_stays_lambert(tmp_path: Path) -> None:
+    known = asymmetric_maps()
+
+    def lambert(texel: np.ndarray, light: np.ndarray, view: np.ndarray) -> np.ndarray:
+        return known["base"][tuple(texel.T)] / math.pi * light[:, 2:]
+
+    maps = fitted(known_brdf(tmp_path, known["slopes"], lambert), 3)
+    assert maps.dielectric == 0
+    assert (maps.roughness == 1).all()
+    assert (maps.metallic == 0).all()
+    np.testing.assert_allclose(maps.base_color, known["base"], atol=1e-3)
+    np.testing.assert_allclose(maps.slopes, known["slopes"], atol=2e-3)
+
+
+def test_noise_makes_no_lobes(tmp_path: Path) -> None:
+    """Networks deviate from their data: a Lambert surface with an error of 20% stays rough and no metal."""
+    known, random = asymmetric_maps(), np.random.default_rng(0)
+
+    def noisy(texel: np.ndarray, light: np.ndarray, view: np.ndarray) -> np.ndarray:
+        return (
+            known["base"][tuple(texel.T)]
+            / math.pi
+            * light[:, 2:]
+            * np.exp(0.2 * random.normal(size=light.shape))
+        )
+
+    material = known_brdf(tmp_path, known["slopes"], noisy)
+    assert fitted(material, 3).dielectric == 0
+    x, _, _ = fit_texels(material, 3, texel_centers(4, 8).reshape(-1, 2), 0.04)
+    assert np.quantile(x[:, 2], 0.25) > 0.85
+    assert np.quantile(x[:, 3], 0.75) < 0.1
+
+
+def test_few_glossy_texels_are_enough(tmp_path: Path) -> None:
+    """One of 32 texels of a rough tile, whose noise hides it in the mean."""
+    slopes, random = np.zeros((4, 8, 2)), np.random.default_rng(0)
+    roughness = np.ones((4, 8))
+    roughness[1, 2] = 0.4
+    exact = gltf_brdf(np.full((4, 8, 3), 0.4), roughness, np.zeros((4, 8)))
+
+    def noisy(texel: np.ndarray, light: np.ndarray, view: np.ndarray) -> np.ndarray:
+        rough = roughness[tuple(texel.T)][:, None] == 1
+        scale = np.where(rough, np.exp(0.9 * random.normal(size=light.shape)), 1.0)
+        out: np.ndarray = exact(texel, light, view) * scale
+        return out
+
+    maps = fitted(known_brdf(tmp_path, slopes, noisy), 3)
+    assert maps.dielectric == 0.04
+    assert maps.roughness[1, 2] == pytest.approx(0.4, abs=0.01)
+
+
+def test_rough_conductors_of_mitsuba(tmp_path: Path) -> None:
+    """Another implementation of GGX: its reflectance does not rise to white at grazing angles."""
+    from mbtf_gen.engine.runtime import load_mitsuba
+
+    mi = load_mitsuba()
+    color, alphas = np.array([0.8, 0.5, 0.3]), np.array([0.06, 0.15, 0.3, 0.5])
+    lobes = [
+        mi.load_dict(
+            {
+                "type": "roughconductor",
+                "material": "none",
+                "distribution": "ggx",
+                "alpha": float(alpha),
+                "specular_reflectance": {"type": "rgb", "value": color.tolist()},
+            }
+        )
+        for alpha in alphas
+    ]
+
+    def conductor(texel: np.ndarray, light: np.ndarray, view: np.ndarray) -> np.ndarray:
+        out = np.zeros((len(texel), 3))
+        for column, lobe in enumerate(lobes):
+            some = texel[:, 1] == column
+            si = mi.SurfaceInteraction3f()
+            si.wi = mi.Vector3f(*view[some].T.astype(np.float32))
+            wo = mi.Vector3f(*light[some].T.astype(np.float32))
+            out[some] = np.asarray(lobe.eval(mi.BSDFContext(), si, wo)).reshape(3, -1).T
+        return out
+
+    slopes = np.array([[[0.1, -0.3], [-0.4, 0.2], [0.0, 0.25], [0.3, 0.0]]])
+    maps = fitted(known_brdf(tmp_path, slopes, conductor), 2)
+    np.testing.assert_allclose(maps.slopes, slopes, atol=0.01)
+    np.testing.assert_allclose(maps.roughness[0], np.sqrt(alphas), rtol=0.05)
+    np.testing.assert_allclose(maps.metallic, 1, atol=0.05)
+    np.testing.assert_allclose(maps.base_color, np.broadcast_to(color, (1, 4, 3)), atol=0.06)
+
+
+def test_values_are_divided_by_what_the_view_meets(tmp_path: Path) -> None:
+    """The opacity has a map of its own; texels that no view meets have the mean color."""
+    lattice, value = Lattice(2, 1.0), 0.2
+    levels = [np.zeros((*lattice.shape(s), 6), np.float32) for s in range(3)]
+    levels[2][:, :2, 0] = 0.75
+    levels[2][3, 3, 0] = 1.0
+    through = Transmittance(lattice, levels)
+    slopes = np.zeros((4, 4, 2))
+
+    def premultiplied(texel: np.ndarray, light: np.ndarray, view: np.ndarray) -> np.ndarray:
+        out: np.ndarray = value * (1 - levels[2][tuple(texel.T)][:, :1]) * light[:, 2:] * np.ones(3)
+        return out
+
+    material = known_brdf(tmp_path, slopes, premultiplied, transmittance=through)
+    maps = fitted(material, 2)
+    np.testing.assert_allclose(maps.opacity, 1 - levels[2][..., 0])
+    np.testing.assert_allclose(maps.base_color, math.pi * value, rtol=0.01)
+    np.testing.assert_allclose(maps.evaluate(*direction_pairs(8, 0.5))[0], 0.25 * value, rtol=0.01)
+
+
+@pytest.mark.parametrize("model", ["neumip", "hierarchical", "rainer2020", "neumip+"])
+def test_every_model_has_maps(tmp_path: Path, model: str) -> None:
+    material = write_material(tmp_path, model=model, finest=2, brightness=0.1)
+    maps = scale_color(material, fitted(material, 2))
+    for values in (maps.base_color, maps.roughness, maps.metallic, maps.opacity):
+        assert ((values >= 0) & (values <= 1)).all()
+    assert np.isfinite(maps.slopes).all()
+
+
+def test_views_follow_the_offset(tmp_path: Path) -> None:
+    """They see the point that the normal view sees: position plus offset is the same."""
+    material = write_material(tmp_path, aspect=0.5, contrast=0.05, brightness=0.0)
+    u, views = np.random.default_rng(0).random((20, 2)), steep_views(8)
+    at = followed(material, u, views)
+    size = np.array([1.0, 0.5])
+    seen = u + material.offset(u, np.tile([0.0, 0.0, 1.0], (20, 1))) / size
+    for k, view in enumerate(views):
+        found = at[:, k] + material.offset(at[:, k], np.tile(view, (20, 1))) / size
+        np.testing.assert_allclose(found, seen, atol=2e-3)
+    assert np.abs(at - u[:, None]).max() > 0.005
+
+
+def test_values_of_the_maps_are_those_of_the_specification(tmp_path: Path) -> None:
+    material, known = glossy(tmp_path)
+    lobes = (known[name] for name in ("base", "slopes", "roughness", "metallic"))
+    maps = Maps(3, 0.5, *lobes, np.ones((4, 8)), 0.04, None)
+    light, view = direction_pairs(64, 0.1)
+    u = np.repeat(texel_centers(4, 8).reshape(-1, 2), 64, 0)
+    expected = material.evaluate(u, np.full(len(u), 0.1), np.tile(light, (32, 1)), np.tile(view, (32, 1)))
+    np.testing.assert_allclose(maps.evaluate(light, view).reshape(-1, 3), expected, rtol=1e-3, atol=1e-6)
