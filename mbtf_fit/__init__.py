@@ -19,16 +19,7 @@ _PUBLIC = {
     "read_history": "mbtf_fit.training.fit_folder",
 }
 
-__all__ = [
-    "FitConfig",
-    "FitResult",
-    "Material",
-    "QueryDataset",
-    "evaluate",
-    "fit",
-    "fit_jointly",
-    "read_history",
-]
+__all__ = list(_PUBLIC)
 
 
 def __getattr__(name: str) -> Any:

@@ -32,7 +32,7 @@ from mbtf_core.files.folders import OutputFolder, owned
 from mbtf_core.pictures import claim_pictures, write_png
 from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.stats import LOCAL_WINDOW, local_error, noise_free_mse, signal_variance, unexplained_variance
-from mbtf_fit.evaluation import foreign_inputs
+from mbtf_fit.evaluation import check_aspect, foreign_inputs
 from mbtf_fit.formatting import format_estimate, visibility
 from mbtf_fit.material.material import Material
 from mbtf_fit.preview.config import ComparisonConfig
@@ -103,9 +103,7 @@ def compare(config: ComparisonConfig, output: Path, console: Console, *, overwri
     material, data = Material.load(config.material), Dataset.open(DataFolder.open(config.shards))
     job = _job_of(data)
     view = config.picture.resolved(data.lattice.shape()[1], job.material.scatters)
-    if material.lattice.aspect != data.lattice.aspect:
-        what = f"its tile has the aspect {data.lattice.aspect:g}, the material's {material.lattice.aspect:g}"
-        raise InputError(what, where=data.folder)
+    check_aspect(material, data)
     if foreign := foreign_inputs(material, data):
         differ = f"{', '.join(foreign)} differ{'s' if len(foreign) == 1 else ''}"
         console.note(f"warning: {config.material} was trained on another material ({differ})")

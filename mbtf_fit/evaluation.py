@@ -154,6 +154,14 @@ def evaluate_splits(
     return found
 
 
+def check_aspect(material: Material, data: Dataset) -> None:
+    """Refuse a data set whose tile has another aspect than a material's."""
+    own, other = material.lattice.aspect, data.lattice.aspect
+    if own != other:
+        what = f"its tile has the aspect {other:g}, the material's {own:g}"
+        raise InputError(what, where=data.folder)
+
+
 def foreign_inputs(material: Material, data: Dataset) -> list[str]:
     """Roles of input files (height, base_color, …) that differ from those of the material's training data,
     where both record them."""
@@ -195,16 +203,11 @@ def evaluate(material: Material | str | Path, shards: str | Path | DataFolder) -
     if not isinstance(material, Material):
         material = Material.load(material)
     data = Dataset.open(shards)
-    if data.lattice.aspect != material.lattice.aspect:
-        raise InputError(
-            f"its tile has the aspect {data.lattice.aspect:g}, the material's {material.lattice.aspect:g}",
-            where=data.folder,
-        )
+    check_aspect(material, data)
     partition = load_training(data, material.config.held_out, material.config.seed, memory=None)
     found = {"errors": evaluate_splits(material.predict, data, partition)}
     if material.transmittance is not None and has_transmittance(data):
-        through = evaluate_transmittance(material.transmittance, data, partition.selection)
-        found["transmittance"] = {split: errors.as_dict() for split, errors in through.items()}
+        found["transmittance"] = evaluate_transmittance(material.transmittance, data, partition.selection)
     return found
 
 

@@ -52,24 +52,25 @@ class SceneView(SceneDirection):
     )
 
 
-def _distinct(values: Sequence[Any]) -> Sequence[Any]:
+def distinct(values: Sequence[Any]) -> Sequence[Any]:
+    """The same values; a ValueError if two are equal."""
     if any(value in values[:i] for i, value in enumerate(values)):
         raise ValueError("contains the same entry twice")
     return values
 
 
-Views = Annotated[list[SceneView], Field(min_length=1), AfterValidator(_distinct)]
+Views = Annotated[list[SceneView], Field(min_length=1), AfterValidator(distinct)]
 # The main kind, "query", comes first.
 Kinds = Annotated[
     list[Literal["query", "pixel"]],
     Field(min_length=1),
-    AfterValidator(_distinct),
+    AfterValidator(distinct),
     AfterValidator(partial(sorted, reverse=True)),
 ]
 TilesAcross = Annotated[float, Field(gt=0, le=1e4)]
 
 
-Widths = Annotated[list[TilesAcross], Field(min_length=1), AfterValidator(_distinct)]
+Widths = Annotated[list[TilesAcross], Field(min_length=1), AfterValidator(distinct)]
 # Texels of the finest level that a pixel covers at the target, in the pictures of a comparison.
 PIXEL_TEXELS = (1.0, 4.0)
 
@@ -81,7 +82,7 @@ class CompareSection(Settings):
         [SceneView(elevation=90, azimuth=-90), SceneView(elevation=35, azimuth=-90)],
         description="directions of the cameras",
     )
-    lights: Annotated[list[SceneDirection], Field(min_length=1), AfterValidator(_distinct)] = Field(
+    lights: Annotated[list[SceneDirection], Field(min_length=1), AfterValidator(distinct)] = Field(
         [SceneDirection(elevation=45, azimuth=45), SceneDirection(elevation=20, azimuth=160)],
         description="directions of the light",
     )
@@ -102,10 +103,7 @@ class CompareSection(Settings):
     st_lpips: bool = Field(
         False, description="also compute ST-LPIPS; its weights come with the optional extra `perceptual`"
     )
-    unmodified_mitsuba: bool = Field(
-        False, description="render one reference again with unmodified Mitsuba, as an independent check"
-    )
-    timing: bool = Field(False, description="time the evaluation of a 1080p image, part by part")
+    timing: bool = Field(False, description="time the evaluation of a 1080p image, stage by stage")
     seed: int = Field(0, ge=0, lt=1 << 63, description="root seed of the images")
 
     def at(self, texels: int) -> CompareSection:

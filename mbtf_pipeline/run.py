@@ -361,10 +361,8 @@ def rerender(folder: Path, exposure: float | Literal["auto"] | None = None) -> t
 
     Parameters
     ----------
-    folder : Path
-        Folder of the run.
-    exposure : float or "auto", optional
-        Exposure in EV; that of the recipe by default.
+    folder : folder of the run
+    exposure : exposure in EV; that of the recipe by default
 
     Returns
     -------
@@ -373,10 +371,8 @@ def rerender(folder: Path, exposure: float | Literal["auto"] | None = None) -> t
 
     Raises
     ------
-    InputError
-        The folder contains no run of this version, or its comparison is not finished.
-    UsageError
-        The exposure is out of range.
+    InputError : the folder contains no run of this version, or its comparison is not finished
+    UsageError : the exposure is out of range
     """
     RUN.read(folder)
     recipe = read_resolved(folder)

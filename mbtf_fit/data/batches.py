@@ -14,7 +14,7 @@ from mbtf_core.data.dataset import Dataset, Shard
 from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.shard_files import check_values
 from mbtf_core.errors import InputError, check_type
-from mbtf_fit.data.images import philox
+from mbtf_fit.data.layouts import philox
 from mbtf_fit.data.queries import ShardQueries, needed
 
 # Queries that are read at once from one shard, and how many such blocks are shuffled together.

@@ -15,9 +15,8 @@ from mbtf_core.data.dataset import Dataset, Shard, ahead
 from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.schema import CONFIG_NAME, Layout, Split
 from mbtf_core.errors import InputError
-from mbtf_fit.data.images import TrainingImages, nearest_shapes, philox, strides
+from mbtf_fit.data.layouts import TrainingImages, TrainingSlices, nearest_shapes, philox, strides
 from mbtf_fit.data.queries import QUERY_BYTES, ShardQueries, TrainingQueries, mean_value, needed
-from mbtf_fit.data.slices import TrainingSlices
 from mbtf_fit.data.streaming import Selection, StreamedQueries
 from mbtf_fit.sections import HeldOutSection
 

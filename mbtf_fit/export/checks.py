@@ -27,8 +27,7 @@ def check_values(found: ArrayLike, material: Material, where: Path) -> None:
 
     Raises
     ------
-    InputError
-        More than 2% of them deviate by more than 0.001 of value and mean value, or are not finite.
+    InputError : more than 2% of them deviate by more than 0.001 of value and mean value, or are not finite
     """
     expected: NDArray[np.float64] = material.conformance["rgb"].astype(np.float64)
     with np.errstate(invalid="ignore"):
@@ -57,8 +56,7 @@ def check_stored(
 
     Raises
     ------
-    InputError
-        An operation is not one of the project's, a tensor is missing, or values differ.
+    InputError : an operation is not one of the project's, a tensor is missing, or values differ
     """
     from mbtf_fit.material.format import QUERY
     from mbtf_fit.material.numpy_reader import NumpyMaterial
@@ -82,8 +80,7 @@ def check_shaders(material: Material, where: Path) -> None:
 
     Raises
     ------
-    InputError
-        Names the operation.
+    InputError : names the operation
     """
     from mbtf_fit.backends.shader.program import SHADER
 

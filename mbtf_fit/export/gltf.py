@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.extras import import_extra
-from mbtf_fit.export import Export, ExportTarget
-from mbtf_fit.export.images import BASE_COLOR, COAT, HEIGHT, IMAGE_NAMES, NORMAL, ORM, MapOptions, write_maps
+from mbtf_fit.export.images import BASE_COLOR, COAT, HEIGHT, NORMAL, ORM, document_target
 
 if TYPE_CHECKING:
     from mbtf_fit.material.maps import Maps
@@ -91,9 +90,4 @@ def gltf(maps: Maps, name: str, described: dict[str, Any]) -> str:
     return str(document.to_json(indent=1)) + "\n"
 
 
-def write(export: Export, options: MapOptions) -> list[str]:
-    """Write the maps and the document."""
-    return write_maps(export, options, _NAME, gltf, "pygltflib")
-
-
-TARGET = ExportTarget("gltf", "maps and a glTF 2.0 document", [_NAME, *IMAGE_NAMES], write, MapOptions)
+TARGET = document_target("gltf", "maps and a glTF 2.0 document", _NAME, gltf, "pygltflib")

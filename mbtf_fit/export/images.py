@@ -15,7 +15,7 @@ from mbtf_core.config.settings import Settings
 from mbtf_core.extras import extra_error, has_extra
 from mbtf_core.files.atomic import write_chunks, write_text
 from mbtf_core.paths import real_path
-from mbtf_fit.export import Export
+from mbtf_fit.export import Export, ExportTarget
 
 if TYPE_CHECKING:
     from mbtf_fit.material.maps import Maps
@@ -42,14 +42,9 @@ def write_maps(
 
     Parameters
     ----------
-    export : Export
-    options : MapOptions
-    name : str
-        Of the document.
-    text : callable
-        Of maps, the material's name, and plain data that identify the neural material and the maps.
-    module : str
-        The library that makes the document.
+    name : of the document
+    text : of maps, the material's name, and plain data that identify the neural material and the maps
+    module : the library that makes the document
 
     Returns
     -------
@@ -84,6 +79,17 @@ def write_maps(
     }
     write_text(export.folder / name, text(maps, real_path(export.source).name, described))
     return [*images, name]
+
+
+def document_target(
+    name: str, help: str, file: str, text: Callable[[Maps, str, dict[str, Any]], str], module: str
+) -> ExportTarget:
+    """The target that writes maps and a document; `text` and `module` as in :func:`write_maps`."""
+
+    def write(export: Export, options: MapOptions) -> list[str]:
+        return write_maps(export, options, file, text, module)
+
+    return ExportTarget(name, help, [file, *IMAGE_NAMES], write, MapOptions)
 
 
 def write_images(maps: Maps, folder: Path) -> list[str]:

@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from mbtf_core.extras import import_extra
-from mbtf_fit.export import Export, ExportTarget
-from mbtf_fit.export.images import BASE_COLOR, COAT, HEIGHT, IMAGE_NAMES, NORMAL, ORM, MapOptions, write_maps
+from mbtf_fit.export.images import BASE_COLOR, COAT, HEIGHT, NORMAL, ORM, document_target
 
 if TYPE_CHECKING:
     from mbtf_fit.material.maps import Maps
@@ -81,9 +80,4 @@ def materialx(maps: Maps, name: str, described: dict[str, Any]) -> str:
     return str(mx.writeToXmlString(document))
 
 
-def write(export: Export, options: MapOptions) -> list[str]:
-    """Write the maps and the document."""
-    return write_maps(export, options, _NAME, materialx, "MaterialX")
-
-
-TARGET = ExportTarget("materialx", "maps and a MaterialX document", [_NAME, *IMAGE_NAMES], write, MapOptions)
+TARGET = document_target("materialx", "maps and a MaterialX document", _NAME, materialx, "MaterialX")

@@ -13,8 +13,7 @@ class ShaderOptions(Settings):
     """Options of shader modules."""
 
     shader_target: list[Target] | None = Field(
-        None,
-        description="another language that Slang compiles the module to (extra 'shaders'). Repeatable",
+        None, description="another language that Slang compiles the module to (extra 'shaders'). Repeatable"
     )
 
 

@@ -35,8 +35,7 @@ def make_page(material: Path, options: PageOptions) -> tuple[str, str]:
 
     Raises
     ------
-    InputError
-        A material or another file is at fault.
+    InputError : a material or another file is at fault
     """
     from mbtf_fit.material.material import Material
     from mbtf_fit.viewer.extras import environment_content, mesh_content, pictures_content, poster

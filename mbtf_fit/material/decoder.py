@@ -51,12 +51,9 @@ class Decoder:
 
     Attributes
     ----------
-    folder : Path
-        Folder that it was found in.
-    sha256 : str
-        Digest of the file of its weights.
-    config : FitConfig
-        Options of the fit that trained it.
+    folder : folder that it was found in
+    sha256 : digest of the file of its weights
+    config : options of the fit that trained it
     """
 
     folder: Path
@@ -69,17 +66,11 @@ class Decoder:
 
         Parameters
         ----------
-        folder : str or Path
-            Folder of a network, of materials that share one, or of any material.
-
-        Returns
-        -------
-        Decoder
+        folder : folder of a network, of materials that share one, or of any material
 
         Raises
         ------
-        InputError
-            The folder is missing, has no network, or is corrupt; or its model cannot share it.
+        InputError : the folder is missing, has no network, or is corrupt; or its model cannot share it
         """
         folder = Path(folder)
         if not folder.is_dir():
@@ -118,13 +109,11 @@ class Decoder:
 
         Parameters
         ----------
-        config : FitConfig
-            Options of the fit.
+        config : options of the fit
 
         Raises
         ------
-        InputError
-            The fit cannot have this network.
+        InputError : the fit cannot have this network
         """
         wanted = _architecture(config)
         for key, value in self.options().items():
@@ -140,13 +129,11 @@ class Decoder:
 
         Parameters
         ----------
-        model : NeuralMaterial
-            Model of a fit, initialized.
+        model : model of a fit, initialized
 
         Raises
         ------
-        InputError
-            A tensor is missing.
+        InputError : a tensor is missing
         """
         given = self.tensors()
         for name, tensor in network_tensors(model).items():
@@ -183,25 +170,15 @@ def write_decoder(
 
     Parameters
     ----------
-    folder : Path
-        Folder of the network; it exists.
-    model : NeuralMaterial
-        A model that has the networks.
-    config : FitConfig
-        Options of the fit.
-    materials : mapping
-        Name → data set of each material that shares them.
-    training : dict
-        Steps and seconds of the training.
-
-    Returns
-    -------
-    Decoder
+    folder : folder of the network; it exists
+    model : a model that has the networks
+    config : options of the fit
+    materials : name → data set of each material that shares them
+    training : steps and seconds of the training
 
     Raises
     ------
-    PartialError
-        The folder cannot be written.
+    PartialError : the folder cannot be written
     """
     tensors = network_tensors(model)
     # The description names the weights' digest, so it comes last: a folder with one is complete.

@@ -155,9 +155,7 @@ def check_digest(path: Path, stated: Mapping[str, Any], by: str = DESCRIPTION_NA
         raise InputError(f"no such file, but {by} names it", where=path, hint=AGAIN)
     if file_sha256(path) != stated["sha256"]:
         raise InputError(
-            f"is damaged, or of another material (its SHA-256 is not that in {by})",
-            where=path,
-            hint=AGAIN,
+            f"is damaged, or of another material (its SHA-256 is not that in {by})", where=path, hint=AGAIN
         )
     return path
 

@@ -28,7 +28,7 @@ from mbtf_core.data.lattice import Lattice, level_of_sigma
 from mbtf_core.data.shard_files import Arrays, check_values
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import Stored, write_chunks
-from mbtf_core.stats import Estimate, mean_estimate
+from mbtf_core.stats import mean_estimate
 from mbtf_fit.material.format import check_digest, lattice_of, read_tensors
 
 if TYPE_CHECKING:
@@ -235,61 +235,46 @@ def fit_transmittance(data: Dataset, selection: Selection) -> Transmittance | No
     return Transmittance(lattice, levels)
 
 
-@dataclass(frozen=True)
-class TransmittanceError:
-    """Error of a transmittance model on queries.
-
-    Attributes
-    ----------
-    n : queries
-    mse : mean squared difference from the data, including their noise: each query has a single estimate
-    noise : upper bound of the noise in it, ``t (1 - t) / (paths - 1)``, the variance of independent paths;
-        stratified paths have less
-    variance : of the data's transmittance, noise included
-    """
-
-    n: int
-    mse: Estimate
-    noise: Estimate
-    variance: float
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain data for JSON."""
-        estimates = {"mse": self.mse.as_dict(), "noise": self.noise.as_dict()}
-        return {"n": self.n, **estimates, "variance": self.variance}
-
-
 def evaluate_transmittance(
     model: Transmittance, data: Dataset, selection: Selection
-) -> dict[str, TransmittanceError]:
+) -> dict[str, dict[str, Any]]:
     """Errors on ``test``, ``held_out`` and ``training`` queries: the first 262 144 of each; a split without
-    queries is left out."""
+    queries is left out.
+
+    Returns
+    -------
+    dict
+        By split, as plain data: ``n`` queries; ``mse``, the mean squared difference from the data, including
+        their noise, as each query has a single estimate; ``noise``, an upper bound of the noise in it, ``t (1
+        - t) / (paths - 1)``, the variance of independent paths, of which stratified ones have less;
+        ``variance`` of the data's transmittance, noise included.
+    """
     sets: dict[str, Iterator[Arrays]] = {}
     if "test" in data.splits:
         sets["test"] = (block for shard in data.shards("test") for block in _blocks(shard))
     sets["held_out"] = (block for shard, chosen in selection.masks() for block in _blocks(shard, ~chosen))
     sets["training"] = (block for shard, chosen in selection.masks() for block in _blocks(shard, chosen))
     found = {name: _error(model, blocks) for name, blocks in sets.items()}
-    return {name: error for name, error in found.items() if error is not None}
+    return {name: error for name, error in found.items() if error}
 
 
-def _error(model: Transmittance, blocks: Iterator[Arrays]) -> TransmittanceError | None:
-    squares, noises, values, weights = [], [], [], []
-    left = _EVALUATED
+def _error(model: Transmittance, blocks: Iterator[Arrays]) -> dict[str, Any]:
+    parts, left = list[list[F64]](), _EVALUATED
     for block in blocks:
         part = {name: array[:left] for name, array in block.items()}
         t = part["transmittance"].astype(np.float64)
-        squares.append((model.evaluate(part["u"], part["sigma"], part["omega_o"]) - t) ** 2)
-        noises.append(t * (1.0 - t) / np.maximum(part["spp"].astype(np.float64) - 1.0, 1.0))
-        values.append(t)
-        weights.append(part["weight"].astype(np.float64) if "weight" in part else np.ones(len(t)))
+        square = (model.evaluate(part["u"], part["sigma"], part["omega_o"]) - t) ** 2
+        noise = t * (1.0 - t) / np.maximum(part["spp"].astype(np.float64) - 1.0, 1.0)
+        weight = part["weight"].astype(np.float64) if "weight" in part else np.ones(len(t))
+        parts.append([square, noise, t, weight])
         left -= len(t)
         if left <= 0:
             break
-    if not values:
-        return None
-    parts: tuple[list[F64], ...] = squares, noises, values, weights
-    square, noise, value, weight = (np.concatenate(arrays) for arrays in parts)
-    mse, noise_bound = (mean_estimate(x, weight) for x in (square, noise))
-    variance = float(np.cov(value, ddof=0, aweights=weight))
-    return TransmittanceError(len(value), mse, noise_bound, variance)
+    if not parts:
+        return {}
+    square, noise, t, weight = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    estimates = {
+        "mse": mean_estimate(square, weight).as_dict(),
+        "noise": mean_estimate(noise, weight).as_dict(),
+    }
+    return {"n": len(t), **estimates, "variance": float(np.cov(t, ddof=0, aweights=weight))}

@@ -27,22 +27,14 @@ from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
 from mbtf_fit.models.model import Model, Preparation, generator_of
 from mbtf_fit.models.neumip import hidden_layers
-from mbtf_fit.ops import (
-    DivideByCosine,
-    Lookup,
-    Network,
-    Operation,
-    Standardize,
-    Stereographic,
-    Transform,
-)
+from mbtf_fit.ops import DivideByCosine, Lookup, Network, Operation, Standardize, Stereographic, Transform
 from mbtf_fit.ops.constants import LEAST_COSINE, STATISTICS
 from mbtf_fit.sections import NetworkSection
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
-    from mbtf_fit.data.slices import SliceBatch, TrainingSlices
+    from mbtf_fit.data.layouts import SliceBatch, TrainingSlices
     from mbtf_fit.pytorch.material import NeuralMaterial
     from mbtf_fit.pytorch.networks import SetEncoder, SliceEncoder
 
@@ -118,9 +110,13 @@ class Rainer2019(Model):
         return next(op.hidden[0] for op in self.material.operations if isinstance(op, Network))
 
     def prepare(self, given: Preparation) -> Any:
+        from mbtf_fit.pytorch.networks import initialize_layers
+
         queries = given.queries
         self.encoder = self._encoder(len(queries.omega_i))
-        self.encoder.initialize(generator_of(given.seed + 1))
+        generator = generator_of(given.seed + 1)
+        for network in self.encoder.children():
+            initialize_layers(network, generator)
         self.encoder.to(queries.values.device)
         return shared_slices(given)
 
@@ -213,7 +209,7 @@ class Rainer2020(Rainer2019):
 
 def shared_slices(given: Preparation) -> Any:
     """The slices that a network learns: those of one material, or of several, all in units of the first."""
-    from mbtf_fit.data.slices import SharedSlices
+    from mbtf_fit.data.layouts import SharedSlices
 
     own, training = given.queries, given.training
     if not (training.materials or training.own_material):

@@ -22,15 +22,7 @@ from mbtf_core.errors import InputError
 from mbtf_fit.models.model import PYRAMID, SHARED, Model, Preparation
 from mbtf_fit.models.neumip import color, encode_directions, encode_position, hidden_layers, pyramid
 from mbtf_fit.ops import Displace, Gate, Network, Operation, Rotate, Shade, Trace, Transform
-from mbtf_fit.ops.constants import (
-    DIELECTRIC,
-    HEIGHTS,
-    HORIZONS,
-    IRRADIANCE_SCALE,
-    LIGHT_WIDTH,
-    MAPS,
-    PLACES,
-)
+from mbtf_fit.ops.constants import DIELECTRIC, HEIGHTS, HORIZONS, IRRADIANCE_SCALE, LIGHT_WIDTH, MAPS, PLACES
 from mbtf_fit.sections import NetworkSection
 
 # Bytes of a training query in memory, and of its hints.

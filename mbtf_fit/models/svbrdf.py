@@ -37,10 +37,7 @@ class Svbrdf(Model):
     description = "a diffuse and a GGX lobe per texel, without a network"
     defaults: ClassVar[Mapping[str, Any]] = {
         "network": {"offset": "none"},
-        "training": {
-            "texture_learning_rate": 0.1,
-            "losses": [{"kind": "relative"}, {"kind": "squared"}],
-        },
+        "training": {"texture_learning_rate": 0.1, "losses": [{"kind": "relative"}, {"kind": "squared"}]},
     }
     calibrates = False
     takes = ("init_from",)

@@ -41,7 +41,7 @@ class Zeltner(Model):
     name = "zeltner2024"
     description = "directions in two learned shading frames (Zeltner et al. 2024)"
     defaults: ClassVar[Mapping[str, Any]] = {
-        "network": {"offset": "none", "channels": 8, "width": 64, "layers": 4, "output_transform": "exp"},
+        "network": {"offset": "none", "channels": 8, "width": 64, "layers": 4, "output_transform": "exp"}
     }
     takes = tuple(name for name in PYRAMID if name not in ("network.output_channels", "network.encoding"))
 

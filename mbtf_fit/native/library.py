@@ -55,10 +55,7 @@ class ModelStruct(ctypes.Structure):
 class QueryPointers(ctypes.Structure):
     """``mbtf_queries``"""
 
-    _fields_ = (
-        ("n", _I64),
-        *((name, _POINTER) for name in ("u", "sigma", "omega_i", "omega_o", "hints")),
-    )
+    _fields_ = (("n", _I64), *((name, _POINTER) for name in ("u", "sigma", "omega_i", "omega_o", "hints")))
 
 
 class Heightfield(ctypes.Structure):

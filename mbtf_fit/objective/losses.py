@@ -35,7 +35,7 @@ from mbtf_fit.objective.noise import NoiseModel
 from mbtf_fit.sections import LossKind, TrainingSection
 
 if TYPE_CHECKING:
-    from mbtf_fit.data.images import Patches
+    from mbtf_fit.data.layouts import Patches
     from mbtf_fit.data.queries import TrainingQueries
 
 # Absolute terms are parabolas below this, in units of f.

@@ -15,9 +15,8 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from mbtf_fit.data.images import Patches
+from mbtf_fit.data.layouts import Patches, SliceBatch
 from mbtf_fit.data.queries import TrainingQueries
-from mbtf_fit.data.slices import SliceBatch
 
 # Python code runs in one thread at a time: more threads are not faster.
 MAX_THREADS = 4

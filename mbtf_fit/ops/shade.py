@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from mbtf_fit.ops.constants import ALPHA2, LEAST_LIGHT, LEAST_VARIANCE, LEAST_VIEW, LIGHT_BLUR
 from mbtf_fit.ops.operation import Operation, TensorName, TextureName, Value
 
@@ -94,6 +97,14 @@ class Shade(Operation):
 
     def size(self, sizes: Sequence[int]) -> int:
         return 6
+
+
+def adjacent_azimuths(horizons: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Horizons (rows, columns, 2n), means and then squares, as n groups of four: mean and square of an
+    azimuth, and those of the next one."""
+    mean, square = np.split(horizons, 2, axis=2)
+    both = np.stack([mean, square, np.roll(mean, -1, -1), np.roll(square, -1, -1)], -1)
+    return both.reshape(*mean.shape[:2], 4 * mean.shape[2])
 
 
 def grazing_reflectance(f0: float) -> float:

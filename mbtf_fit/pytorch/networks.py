@@ -14,15 +14,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import conv2d, linear, max_pool2d
 
 from mbtf_fit.ops.constants import LEAK
+from mbtf_fit.ops.network import Activation
 
-Activation = Literal["relu", "leaky-relu", "sine"]
 ACTIVATIONS: dict[Activation, Callable[[Tensor], Tensor]] = {
     "relu": torch.relu,
     "leaky-relu": lambda x: nn.functional.leaky_relu(x, LEAK),
@@ -113,10 +113,6 @@ class Mlp(nn.Sequential):
         return x
 
 
-# Rows and columns that an Inception module crops at each border.
-REACH = 2
-
-
 class Convolution(nn.Conv2d):
     """A convolution of arrays (items, rows, columns, inputs) without padding."""
 
@@ -183,14 +179,9 @@ class InceptionDecoder(nn.Module):
         self.modules_ = nn.ModuleList(InceptionModule(width, activation) for _ in range(modules))
         self.last = Convolution(width, outputs, 1)
 
-    @property
-    def margin(self) -> int:
-        """Radius of the receptive field, in samples."""
-        return REACH * len(self.modules_)
-
     def forward(self, x: Tensor, directions: Tensor) -> Tensor:
-        """Features (items, rows, columns, f) and inputs shared by an item (items, d) → (items, rows-2·margin,
-        columns-2·margin, outputs)."""
+        """Features (items, rows, columns, f) and inputs shared by an item (items, d) →
+        (items, rows-4·modules, columns-4·modules, outputs)."""
         matrix = self.first.matrix
         shared = linear(directions, matrix[:, self.features :], self.first.bias)
         activate = ACTIVATIONS[self.activation]
@@ -215,10 +206,6 @@ class SliceEncoder(nn.Module):
         super().__init__()
         self.network = Mlp([3 * pairs, width, width, latents])
 
-    def initialize(self, generator: torch.Generator) -> None:
-        """Initialize all parameters at random."""
-        initialize_layers(self.network, generator)
-
     def forward(self, values: Tensor, pairs: Tensor) -> Tensor:
         """Latents; `pairs`, the directions (D, 4), are the same for all slices and are not read."""
         out: Tensor = self.network(values.flatten(1))
@@ -238,11 +225,6 @@ class SetEncoder(nn.Module):
         super().__init__()
         self.each = Mlp([3 + 4, width, width])
         self.joined = Mlp([width, width, latents])
-
-    def initialize(self, generator: torch.Generator) -> None:
-        """Initialize all parameters at random."""
-        initialize_layers(self.each, generator)
-        initialize_layers(self.joined, generator)
 
     def forward(self, values: Tensor, pairs: Tensor) -> Tensor:
         """Latents (items, k) of normalized values (items, D, 3) at directions (D, 4)."""

@@ -156,13 +156,7 @@ def _shade(
 
 
 def _ggx(
-    f0: Tensor,
-    alpha2: Tensor,
-    normal: Tensor,
-    light: Tensor,
-    view: Tensor,
-    omega_i: Tensor,
-    omega_o: Tensor,
+    f0: Tensor, alpha2: Tensor, normal: Tensor, light: Tensor, view: Tensor, omega_i: Tensor, omega_o: Tensor
 ) -> Tensor:
     """BRDF (n, 3) of GGX facets of reflectance F0 (n, 3) and α² (n, 1) (Walter et al. 2007; Schlick 1994).
 
@@ -242,8 +236,21 @@ def _position(op: ops.Position, run: Execution, u: Tensor) -> Tensor:
 
 @PYTORCH.implements(ops.Frequencies)
 def _frequencies(op: ops.Frequencies, run: Execution, x: Tensor, level: Tensor | None) -> Tensor:
-    spread = None if level is None else torch.exp2(-level)[..., None] / _per_width(run, x)
-    return frequencies(x, op, spread)
+    bands = 2.0 ** torch.arange(op.bands, dtype=x.dtype, device=x.device)
+    bands = bands * math.pi if op.pi else bands
+    angles = (x[..., None] * bands).flatten(-2)
+    sines, cosines = angles.sin(), angles.cos()
+    if level is not None or op.attenuated:
+        size = torch.ones_like(bands)
+        if op.attenuated:
+            size = size * bands[0] / bands
+        if level is not None:
+            # Averages over a Gaussian of the standard deviation of the footprint.
+            spread = torch.exp2(-level)[..., None] / _per_width(run, x)
+            size = size * (-0.5 * (spread[..., None] * bands).square()).exp()
+        size = size.expand(*size.shape[:-2], x.shape[-1], op.bands).flatten(-2)
+        sines, cosines = sines * size, cosines * size
+    return torch.cat([*([x] if op.raw else []), sines, cosines], -1)
 
 
 @PYTORCH.implements(ops.Network)
@@ -333,26 +340,3 @@ def rotate_to_z(axis: Tensor, omega: Tensor) -> Tensor:
 def stereographic(omega: Tensor) -> Tensor:
     """Directions (n, 3) projected from the nadir: (x, y) / (1 + z)."""
     return omega[..., :2] / (1.0 + omega[..., 2:])
-
-
-def frequencies(x: Tensor, options: ops.Frequencies, spread: Tensor | None) -> Tensor:
-    """Coordinates (..., d) → ``[x,] sin of all frequencies, cos of all frequencies``; the frequencies of one
-    coordinate are adjacent.
-
-    Parameters
-    ----------
-    spread : standard deviation (..., d) of a Gaussian around x, over which sines and cosines are averaged
-    """
-    bands = 2.0 ** torch.arange(options.bands, dtype=x.dtype, device=x.device)
-    bands = bands * math.pi if options.pi else bands
-    angles = (x[..., None] * bands).flatten(-2)
-    sines, cosines = angles.sin(), angles.cos()
-    if spread is not None or options.attenuated:
-        size = torch.ones_like(bands)
-        if options.attenuated:
-            size = size * bands[0] / bands
-        if spread is not None:
-            size = size * (-0.5 * (spread[..., None] * bands).square()).exp()
-        size = size.expand(*size.shape[:-2], x.shape[-1], options.bands).flatten(-2)
-        sines, cosines = sines * size, cosines * size
-    return torch.cat([*([x] if options.raw else []), sines, cosines], -1)

@@ -52,10 +52,8 @@ class HeightfieldTracer:
 
     Parameters
     ----------
-    heights : (H, W) float array
-        z of the vertices in tile widths, maximum 0; row 0 is the side ``v → 1``.
-    aspect : float
-        Height of the tile over its width.
+    heights : (H, W) float array, z of the vertices in tile widths, maximum 0; row 0 is the side ``v → 1``
+    aspect : height of the tile over its width
 
     Attributes
     ----------
@@ -87,10 +85,8 @@ class HeightfieldTracer:
 
         Parameters
         ----------
-        u : (n, 2) tensor
-            Points of the reference plane, uv.
-        omega : (n, 3) tensor
-            Unit vectors towards the viewer, z > 0.
+        u : (n, 2) tensor, points of the reference plane, uv
+        omega : (n, 3) tensor, unit vectors towards the viewer, z > 0
         """
         found = kernel()
         if found is None or u.device.type != "cpu":
@@ -145,8 +141,8 @@ def trace_reference(cells: Tensor, aspect: float, u: Tensor, omega: Tensor) -> T
 
     Parameters
     ----------
-    cells : (rows, columns, 4) tensor
-        Surface of each cell, see :mod:`mbtf_core.height_planes`; row index along +y.
+    cells : (rows, columns, 4) tensor, surface of each cell, see :mod:`mbtf_core.height_planes`; row index
+        along +y
     """
     rows, columns = cells.shape[:2]
     table = cells.reshape(-1, 4)

@@ -49,10 +49,9 @@ def compute_hints(
 
     Parameters
     ----------
-    surface : KnownSurface
     trace, shade : the operations
-    u, sigma, omega_i, omega_o : (n, 2), (n,), (n, 3), (n, 3) tensors
-        Position in uv, footprint in tile widths, light and view.
+    u, sigma, omega_i, omega_o : (n, 2), (n,), (n, 3), (n, 3) tensors, position in uv, footprint in tile
+        widths, light and view
 
     Returns
     -------

@@ -1,21 +1,9 @@
 r"""Hints: what the geometry of a data set tells about a query before anything is learned.
 
-For a query (u, σ, ω_i, ω_o) the view rays of one or more places of the footprint are traced to the heights.
-At each intersection, maps filtered to the footprint give base color, metallic, roughness, and the
-distribution of slopes (:mod:`mbtf_fit.surface.slopes`). The light is visible from a share V of the footprint:
-the elevation of the horizon in the light's azimuth has the mean h and the variance s² there, and for normally
-distributed horizons
-
-    V = Φ((elevation of ω_i - h) / √(s² + w²)),    w = 0.8 times the light kernel's width.
-
-The hints of a query are means over its places:
-
-- the height z of the intersection, which gives the displacement ``z/ω_o,z · ω_o,xy``;
-- the irradiance e of the visible surface, 1 on the reference plane;
-- the normal's x and y;
-- the core in 1/sr: light that is scattered once, diffusely and by GGX facets.
-
-:mod:`mbtf_fit.ops.shade` has their equations.
+For a query (u, σ, ω_i, ω_o) the view rays of one or more places of the footprint are traced to the heights
+(:class:`~mbtf_fit.ops.lookup.Trace`). At each intersection, maps and horizons that are filtered to the
+footprint give irradiance, normal and single scattering (:class:`~mbtf_fit.ops.shade.Shade`). Hints are means
+over the places: height of the intersection, then those.
 """
 
 from __future__ import annotations
@@ -79,18 +67,14 @@ class KnownSurface:
 
     Attributes
     ----------
-    lattice : Lattice
-        Levels of the data; maps have one more.
-    heights : (H, W) tensor
-        z of the traced grid in tile widths; row 0 is the side ``v → 1``.
+    lattice : levels of the data; maps have one more
+    heights : (H, W) tensor, z of the traced grid in tile widths; row 0 is the side ``v → 1``
     maps : tuple of (rows, columns, channels) tensors
         Prefiltered maps by level, coarsest first: levels 0 to k + 1.
     horizons : tuple of (rows, columns, 2·azimuths) tensors
         Prefiltered horizon angles in radians by level, then their squares: levels 0 to k.
-    light_width : float
-        RMS angle per axis of the light kernel, in radians.
-    dielectric : float
-        F0 of the surface where it is no metal.
+    light_width : RMS angle per axis of the light kernel, in radians
+    dielectric : F0 of the surface where it is no metal
     """
 
     lattice: Lattice
@@ -106,11 +90,8 @@ class KnownSurface:
 
         Parameters
         ----------
-        geometry : Geometry
-        lattice : Lattice
-            Levels of the data.
-        light_width : float
-            RMS angle per axis of the light kernel, in degrees.
+        lattice : levels of the data
+        light_width : RMS angle per axis of the light kernel, in degrees
         """
         angles = HeightfieldTracer(geometry.heights, geometry.aspect).horizons(AZIMUTHS)
         # A grid coarser than the texels is interpolated linearly: a Fourier series would ring.
@@ -366,14 +347,10 @@ def prefilter(image: Tensor, shape: tuple[int, int], sigma: float, aspect: float
 
     Parameters
     ----------
-    image : (H, W, c) tensor
-        Texels of a tile, row 0 at ``v → 1``.
-    shape : (int, int)
-        Rows and columns of the result. Frequencies beyond its own are left out.
-    sigma : float
-        Standard deviation in tile widths.
-    aspect : float
-        Height of the tile over its width.
+    image : (H, W, c) tensor, texels of a tile, row 0 at ``v → 1``
+    shape : (int, int), rows and columns of the result. Frequencies beyond its own are left out.
+    sigma : standard deviation in tile widths
+    aspect : height of the tile over its width
 
     Returns
     -------
@@ -403,21 +380,13 @@ def lookup_sigma(level: int, columns: int) -> float:
     return math.sqrt(max(float(sigma_of_level(level)) ** 2 - width**2 / 6.0, 0.0))
 
 
-def prefiltered_levels(image: Tensor, lattice: Lattice, finer: int = 0) -> list[Tensor]:
+def prefiltered_levels(image: Tensor, lattice: Lattice) -> list[Tensor]:
     """Textures (rows, columns, c) of a map for all levels of a lattice, coarsest first.
 
     Parameters
     ----------
-    image : (H, W, c) tensor
-        Texels of the tile, row 0 at ``v → 1``.
-    lattice : Lattice
-        Levels and aspect of the tile.
-    finer : int
-        Texels of level s are those of level ``s + finer`` of the lattice.
+    image : (H, W, c) tensor, texels of the tile, row 0 at ``v → 1``
+    lattice : levels and aspect of the tile
     """
-    grid = Lattice(lattice.finest + finer, lattice.aspect)
-    out = []
-    for level in range(lattice.finest + 1):
-        shape = grid.shape(level + finer)
-        out.append(prefilter(image, shape, lookup_sigma(level, shape[1]), lattice.aspect))
-    return out
+    shapes = [lattice.shape(level) for level in range(lattice.finest + 1)]
+    return [prefilter(image, s, lookup_sigma(k, s[1]), lattice.aspect) for k, s in enumerate(shapes)]

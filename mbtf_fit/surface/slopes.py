@@ -40,16 +40,11 @@ def slope_distributions(
 
     Parameters
     ----------
-    slopes : (H, W, 2) array
-        Mean slopes of the texels of a tile, row 0 at ``v → 1``.
-    moments : (H, W, 3) array
-        Means of ``sx²``, ``sx·sy``, ``sy²`` over each texel.
-    aspect : float
-        Height of the tile over its width.
-    shape : (int, int)
-        Rows and columns of the footprints.
-    sigma : float
-        Standard deviation of the footprints in tile widths.
+    slopes : (H, W, 2) array, mean slopes of the texels of a tile, row 0 at ``v → 1``
+    moments : (H, W, 3) array, means of ``sx²``, ``sx·sy``, ``sy²`` over each texel
+    aspect : height of the tile over its width
+    shape : (int, int), rows and columns of the footprints
+    sigma : standard deviation of the footprints in tile widths
 
     Returns
     -------

@@ -106,8 +106,7 @@ def export_fit(
     }
     transmittance = fit_transmittance(data, partition.selection)
     if transmittance is not None:
-        found = evaluate_transmittance(transmittance, data, partition.selection)
-        training["transmittance"] = {split: e.as_dict() for split, e in found.items()}
+        training["transmittance"] = evaluate_transmittance(transmittance, data, partition.selection)
     described = member.identity["data"]
     announce("writing", 0.0, name)
     export(

@@ -19,10 +19,9 @@ from mbtf_core.errors import InputError
 from mbtf_fit.backends.cpu.model import supports
 from mbtf_fit.backends.cpu.stepper import Adam, NativeStepper
 from mbtf_fit.config import FitConfig
-from mbtf_fit.data.images import TrainingImages
+from mbtf_fit.data.layouts import SharedSlices, TrainingImages, TrainingSlices
 from mbtf_fit.data.loader import Partition, load_training, open_data
 from mbtf_fit.data.queries import ShardQueries, TrainingQueries, mean_value
-from mbtf_fit.data.slices import SharedSlices, TrainingSlices
 from mbtf_fit.data.streaming import StreamedQueries
 from mbtf_fit.material.decoder import Decoder
 from mbtf_fit.material.inference import predict

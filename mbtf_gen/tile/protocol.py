@@ -115,7 +115,7 @@ class Tile(ABC):
         UsageError
             Mitsuba's own shapes do not have this kind of tile.
         """
-        raise UsageError("compares height maps and fibers, not meshes", where="compare.unmodified_mitsuba")
+        raise UsageError("unmodified Mitsuba has no shapes of this kind of tile")
 
     def lattice(self, finest: int | None = None) -> Lattice:
         """Texel grids of the levels up to `finest`; by default up to the material's own resolution."""

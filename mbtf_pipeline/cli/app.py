@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from mbtf_core.app.console import new_app
 from mbtf_pipeline.cli.cost import cost
-from mbtf_pipeline.cli.report import report
-from mbtf_pipeline.cli.run import list_recipes, run
+from mbtf_pipeline.cli.run import list_recipes, report, run
 
 app = new_app(
     "mbtf-pipeline",

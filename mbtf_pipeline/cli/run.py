@@ -1,11 +1,11 @@
-"""``mbtf-pipeline run`` and ``list``: recipes."""
+"""``mbtf-pipeline run``, ``report`` and ``list``: recipes."""
 
 from __future__ import annotations
 
 import time as clocks
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
@@ -28,6 +28,7 @@ from mbtf_core.errors import InputError, MbtfError, PartialError, UsageError
 from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.units import clock
 from mbtf_fit.cli.live import Live, live_view
+from mbtf_gen.config.pictures import EXPOSURE
 
 if TYPE_CHECKING:
     from mbtf_pipeline.collection.run import CollectionResult
@@ -195,18 +196,28 @@ def _report(result: RunResult, console: Console, quality: Quality | None) -> Non
     from mbtf_pipeline.stages import FITS
     from mbtf_pipeline.tables import estimate
 
-    tests = {fit: record["splits"]["test"] for fit, record in result.comparison["test"].items()}
-    folder, recipe = result.report.parent, read_resolved(result.report.parent)
-    endings = {
-        name: describe_ending(fit, read_history(folder / FITS / name)) for name, fit in recipe.fit.items()
-    }
-    caveats = {
-        fit: caveat(result.comparison["test"][fit]["training_steps"], e["unexplained"]["value"])
-        for fit, e in tests.items()
-    }
+    folder = result.report.parent
     ran = {name: stage.seconds for name, stage in result.stages.items() if stage.reason}
+    times = ", ".join(f"{name} {clock(seconds)}" for name, seconds in ran.items())
+    lines = [f"{result.report}: {times or 'everything up to date'}"]
+    fits, recipe = {}, read_resolved(folder)
+    for fit, record in result.comparison["test"].items():
+        errors = record["splits"]["test"]
+        ending = describe_ending(recipe.fit[fit], read_history(folder / FITS / fit))
+        why = caveat(record["training_steps"], errors["unexplained"]["value"])
+        fits[fit] = {
+            "unexplained_variance": errors["unexplained"],
+            "mse": errors["mse"],
+            "ending": ending,
+            "caveat": why or None,
+        }
+        name = f"{fit} ({why})" if why else fit
+        lines.append(f"  {name}: unexplained variance {estimate(errors['unexplained'])}")
+        lines += [] if ending is None else [f"    {ending}"]
+    if result.viewer is not None:
+        lines.append(f"{result.viewer}: open it in a browser to turn the fits under lights")
     data = {
-        "folder": result.report.parent,
+        "folder": folder,
         "report": result.report,
         "viewer": result.viewer,
         "quality": quality,
@@ -215,33 +226,13 @@ def _report(result: RunResult, console: Console, quality: Quality | None) -> Non
             name: {"ran": name in ran, "reason": stage.reason or "up to date", "seconds": stage.seconds}
             for name, stage in result.stages.items()
         },
-        "test": {
-            fit: {
-                "unexplained_variance": e["unexplained"],
-                "mse": e["mse"],
-                "ending": endings.get(fit),
-                "caveat": caveats[fit] or None,
-            }
-            for fit, e in tests.items()
-        },
+        "test": fits,
     }
-    times = ", ".join(f"{name} {clock(seconds)}" for name, seconds in ran.items())
-    lines = [f"{result.report}: {times or 'everything up to date'}"]
-    for fit, e in tests.items():
-        name = f"{fit} ({caveats[fit]})" if caveats[fit] else fit
-        lines.append(f"  {name}: unexplained variance {estimate(e['unexplained'])}")
-        lines += [f"    {ending}"] if (ending := endings.get(fit)) is not None else []
-    if result.viewer is not None:
-        lines.append(f"{result.viewer}: open it in a browser to turn the fits under lights")
     console.report(data, "\n".join(lines))
 
 
 def list_recipes(
-    folder: Path = Path("pipelines"),
-    /,
-    *,
-    verbose: Verbose = False,
-    console: Console = CONSOLE,
+    folder: Path = Path("pipelines"), /, *, verbose: Verbose = False, console: Console = CONSOLE
 ) -> None:
     """List the recipes of a folder.
 
@@ -281,3 +272,38 @@ def _entry(path: Path, verbose: bool) -> dict[str, Any]:
         rest = first.removeprefix(f"{path}:")
         entry["error"] = f"line {rest}" if rest[:1].isdigit() and rest != first else rest.strip()
     return entry
+
+
+def report(
+    folder: Path,
+    /,
+    *,
+    exposure: Annotated[
+        float | Literal["auto"] | None,
+        Parameter(metavar="EV|auto", show_default=False, help=f"{EXPOSURE[0].upper()}{EXPOSURE[1:]}."),
+    ] = None,
+    console: Console = CONSOLE,
+) -> None:
+    """Write the report of a finished run again.
+
+    The page of a paper recipe or of a library too.
+
+    Parameters
+    ----------
+    folder
+        Folder of the run.
+    """
+    from mbtf_core.color import describe_exposure
+    from mbtf_pipeline.collection.run import is_collection, write_again
+    from mbtf_pipeline.run import rerender
+
+    used = None
+    if is_collection(folder):
+        if exposure is not None:
+            raise UsageError("the page of several runs has no exposure", where="--exposure")
+        path = write_again(folder)
+    else:
+        path, used = rerender(folder, exposure)
+    size = path.stat().st_size
+    text = f"{path}: {size / 1e6:.1f} MB" + ("" if used is None else f", {describe_exposure(used)}")
+    console.report({"report": path, "bytes": size, "exposure": used}, text)

@@ -8,15 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.files.atomic import read_json
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.compare.compare import COMPARISON_NAME
 from mbtf_pipeline.compare.image_files import with_ending
-from mbtf_pipeline.report.embed import file_uri, map_uri
+from mbtf_pipeline.report.images import file_uri
 from mbtf_pipeline.stages import COMPARE, SHARDS
 from mbtf_pipeline.tables import Column, Thumbnail, estimate, is_significant
 
@@ -93,11 +90,6 @@ METHOD = Column("method", "method", lambda run, fit, *_: fit)
 def each_fit(runs: Sequence[FinishedRun]) -> Iterator[tuple[FinishedRun, str]]:
     """All (run, fit)."""
     return ((run, fit) for run in runs for fit in run.fits)
-
-
-def signed_map(values: NDArray[np.floating], scale: float, label: str, line: str = "") -> Thumbnail:
-    """A signed map (rows, columns), saturated at ± `scale`."""
-    return Thumbnail(map_uri(values / scale, "signed"), label, line)
 
 
 def mean_of(estimates: Sequence[Estimate]) -> Estimate:

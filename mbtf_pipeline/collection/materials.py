@@ -27,10 +27,6 @@ _LONGEST = 90
 def find_materials(path: Path) -> list[Path]:
     """Materials of an entry of ``library``: a material, a folder of them, or a list of paths.
 
-    Parameters
-    ----------
-    path : Path
-
     Returns
     -------
     list of Path
@@ -39,8 +35,7 @@ def find_materials(path: Path) -> list[Path]:
 
     Raises
     ------
-    InputError
-        A list cannot be read.
+    InputError : a list cannot be read
     """
     path = Path(os.path.normpath(path))
     if path.is_dir():
@@ -112,14 +107,9 @@ def name_materials(paths: Sequence[Path], taken: Collection[str] = ()) -> list[s
     paths : sequence of Path
     taken : other names, which none of them gets
 
-    Returns
-    -------
-    list of str
-
     Raises
     ------
-    UsageError
-        A material is listed twice.
+    UsageError : a material is listed twice
     """
     for real, listed in Counter(os.path.realpath(path) for path in paths).items():
         if listed > 1:

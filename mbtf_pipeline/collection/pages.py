@@ -11,15 +11,13 @@ from typing import Any
 
 from mbtf_core.files.editable import write_document
 from mbtf_core.units import clock
-from mbtf_pipeline.collection.check_tables import independence, offsets, timing, weights
-from mbtf_pipeline.collection.error_tables import ablations, levels, methods, zooms
 from mbtf_pipeline.collection.finished_run import FinishedRun, each_fit
+from mbtf_pipeline.collection.paper_tables import ablations, levels, methods, offsets, timing, zooms
 from mbtf_pipeline.collection.ranking import ranking
 from mbtf_pipeline.collection.recipes import Published
-from mbtf_pipeline.compare import unmodified_mitsuba
 from mbtf_pipeline.compare.metrics import DEFINITIONS
 from mbtf_pipeline.compare.perceptual_metrics import weights_file
-from mbtf_pipeline.report.embed import file_uri
+from mbtf_pipeline.report.images import file_uri
 from mbtf_pipeline.report.plots import ERROR_BAR_NOTE
 from mbtf_pipeline.report.report import render
 from mbtf_pipeline.stages import REPORT, VIEWER
@@ -31,10 +29,7 @@ RUNS, TABLES = "runs", "tables"
 _SIZE = 160
 # States of a material in the order of the page, and their text.
 _STATES = {"done": "done", "failed": "failed", "pending": "not run yet"}
-_TABLES = {
-    f.__name__: f
-    for f in (methods, levels, weights, ablations, timing, offsets, zooms, independence, ranking)
-}
+_TABLES = {f.__name__: f for f in (methods, levels, ablations, timing, offsets, zooms, ranking)}
 
 
 def write_page(folder: Path, record: Mapping[str, Any]) -> tuple[Path, list[Path]]:
@@ -42,17 +37,13 @@ def write_page(folder: Path, record: Mapping[str, Any]) -> tuple[Path, list[Path
 
     Parameters
     ----------
-    folder : Path
-        Folder of all runs.
-    record : mapping
-        Content of ``collection.json``.
+    folder : folder of all runs
+    record : content of ``collection.json``
 
     Returns
     -------
-    page : Path
-        HTML file.
-    tables : list of Path
-        CSV files.
+    page : HTML file
+    tables : CSV files
     """
     if "tables" not in record["recipe"]:
         page = folder / "library.html"
@@ -148,7 +139,6 @@ def paper_page(record: Mapping[str, Any], folder: Path) -> tuple[str, dict[str, 
         skipped=[run["name"] for run in record["runs"] if run["state"] == "skipped"],
         first=runs[0] if runs else None,
         training=max((run.fit(fit)["training_seconds"] for run, fit in each_fit(runs)), default=0.0),
-        check=unmodified_mitsuba,
         definitions=DEFINITIONS,
         error_bar_note=ERROR_BAR_NOTE,
         st_lpips=weights_file() is not None,

@@ -113,15 +113,11 @@ def _lowest(entry: Entry) -> Estimate | None:
     )
 
 
-def _error_cell(entry: Entry) -> Cell:
-    return entry.problem or entry.error()
-
-
 _COLUMNS = (
     Column(MATERIAL.title, MATERIAL.key, lambda entry, _: f"{entry.run.title} {entry.run.variant}".strip()),
     Column(METHOD.title, METHOD.key, lambda entry, _: entry.method),
     Column("seeds", "seeds", lambda entry, _: len(entry.fits) or None),
-    Column("unexplained variance", "unexplained", lambda entry, _: _error_cell(entry)),
+    Column("unexplained variance", "unexplained", lambda entry, _: entry.problem or entry.error()),
     Column("relative to the first", "ratio", lambda entry, first: _ratio(entry, first)),
     Column("grazing", "grazing", lambda entry, _: _lowest(entry)),
     Column("LDR-FLIP", "flip_ldr", lambda entry, _: entry.flip()),

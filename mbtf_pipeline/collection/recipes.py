@@ -18,22 +18,14 @@ from mbtf_core.units import Duration
 from mbtf_fit.config import DEFAULT_MODEL, FIBER_MODEL
 from mbtf_pipeline.collection.materials import find_materials, name_materials
 from mbtf_pipeline.compare.perceptual_metrics import weights_file
-from mbtf_pipeline.recipe import Name, Recipe, load_recipe
+from mbtf_pipeline.recipe import Name, Recipe, distinct, load_recipe
 
-TableName = Literal[
-    "methods", "levels", "weights", "ablations", "timing", "offsets", "zooms", "independence", "ranking"
-]
+TableName = Literal["methods", "levels", "ablations", "timing", "offsets", "zooms", "ranking"]
 # The name of a fit that is repeated: what is trained, and the seed.
 _SEEDED = re.compile(r"(.+)-seed([0-9]+)")
 
 
-def _distinct(seeds: list[int]) -> list[int]:
-    if len({*seeds}) < len(seeds):
-        raise ValueError("seeds must differ")
-    return seeds
-
-
-Seeds = Annotated[list[Annotated[int, Field(ge=0, lt=1 << 63)]], AfterValidator(_distinct)]
+Seeds = Annotated[list[Annotated[int, Field(ge=0, lt=1 << 63)]], AfterValidator(distinct)]
 
 
 class Layer(Settings):
@@ -68,7 +60,6 @@ class Published(Settings):
     levels: dict[str, dict[str, list[float]]] = Field(
         {}, description="MSE at each level in any unit, the finest first, by material and method"
     )
-    weights: dict[str, str] = Field({}, description="number of network weights in words, by model")
     timing: str = Field("", description="times of one evaluation, a sentence")
 
     def mse_ratio(self, material: str, method: str, base: str) -> float | None:
@@ -177,10 +168,8 @@ class Collection(Settings):
 
         Parameters
         ----------
-        file : Path
-            The recipe; paths of materials are relative to it.
-        quick : bool
-            Whether to apply the options of the quick size.
+        file : the recipe; paths of materials are relative to it
+        quick : whether to apply the options of the quick size
 
         Returns
         -------
@@ -188,10 +177,8 @@ class Collection(Settings):
 
         Raises
         ------
-        InputError
-            The options of all runs are at fault, or no material can be run.
-        UsageError
-            A material is listed twice.
+        InputError : the options of all runs are at fault, or no material can be run
+        UsageError : a material is listed twice
         """
         paths = self.paths(file)
         if not paths:

@@ -172,16 +172,11 @@ def run_one(
 
     Parameters
     ----------
-    recipe : Recipe
-        Resolved recipe.
-    folder : Path
-        Folder of the run.
-    command : str
-        For the run's record.
-    force : bool
-        Run every stage.
-    console : Console or None
-        Receives progress.
+    recipe : resolved recipe
+    folder : folder of the run
+    command : for the run's record
+    force : run every stage
+    console : receives progress
 
     Returns
     -------
@@ -190,8 +185,7 @@ def run_one(
 
     Raises
     ------
-    InputError, PartialError
-        As :func:`~mbtf_pipeline.run.run_recipe`.
+    InputError, PartialError : as :func:`~mbtf_pipeline.run.run_recipe`
     """
     result = run_recipe(recipe, folder, force=force, command=command, console=console)
     picture = result.comparison["pictures"][0]

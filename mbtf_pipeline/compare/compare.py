@@ -17,12 +17,11 @@ from mbtf_core.directions import from_angles
 from mbtf_core.errors import PartialError
 from mbtf_core.files.atomic import write_json
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_pipeline.compare.image_files import PICTURES, Scene, scenes, write_map, write_picture
+from mbtf_pipeline.compare.image_files import PICTURES, Scene, scenes, with_ending, write_channels, write_map
 from mbtf_pipeline.compare.metrics import DEFINITIONS, dataset_errors, image_errors, reference_difference
 from mbtf_pipeline.compare.offsets import write_offsets
 from mbtf_pipeline.compare.perceptual_metrics import perceptual_scores, require
 from mbtf_pipeline.compare.timing import measure_timing, timed
-from mbtf_pipeline.compare.unmodified_mitsuba import pick_scene, write_agreement
 from mbtf_pipeline.recipe import CompareSection
 
 if TYPE_CHECKING:
@@ -34,7 +33,7 @@ if TYPE_CHECKING:
 COMPARISON_NAME = "comparison.json"
 COMPARISON_FORMAT = "mbtf-comparison"
 # Raised when the record or its files change; part of the stage's key.
-COMPARISON_SCHEMA = 13
+COMPARISON_SCHEMA = 14
 
 F32 = NDArray[np.float32]
 Progress = Callable[[str], None]
@@ -69,7 +68,6 @@ def compare(
     Raises
     ------
     InputError : the material, the data set or a fit cannot be read
-    UsageError : ``unmodified_mitsuba`` is set and no scene is suitable for it
     EngineError : ST-LPIPS is requested and its weights are not installed
     """
     from mbtf_core.data.dataset import Dataset
@@ -84,8 +82,6 @@ def compare(
     start = time.perf_counter()
     job = Job.load(generate)
     section = section.at(job.lattice.shape()[1])
-    if section.unmodified_mitsuba:
-        pick_scene(section)
     estimator = picture_estimator(job)
     rendered = _render_references(section, job, progress, runner)
     seconds = time.perf_counter() - start
@@ -114,8 +110,6 @@ def compare(
         "offsets": write_offsets(estimator, materials, section.offset_views, data.lattice, out),
         "seconds": {"references": round(seconds, 3)},
     }
-    if section.unmodified_mitsuba:
-        record["unmodified_mitsuba"] = write_agreement(section, job.config, job.material, out)
     if section.timing:
         import torch
 
@@ -197,7 +191,8 @@ def _compare_scene(
         flat_value, seconds = timed(partial(material.evaluate, *arrays))
         value = flat_value.reshape(main.value.shape)
         file = scene.file(f"fit-{name}")
-        write_picture(out / file, value, ALBEDO_EXPOSURE)
+        write_channels(with_ending(out / file, ".exr"), value, "RGB")
+        write_display(out / file, value, ALBEDO_EXPOSURE)
         scores, hdr_flip = perceptual_scores(value, main.value, white, with_st_lpips)
         write_map(out / file, hdr_flip)
         errors = {kind: image_errors(value, x.value_a, x.value_b, white) for kind, x in images.items()}

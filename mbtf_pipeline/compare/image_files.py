@@ -96,15 +96,6 @@ def read_channels(path: Path, *sets: Sequence[str]) -> F32:
     return np.stack([found[name] for name in names], axis=-1).astype(np.float32)
 
 
-def write_picture(path: Path, value: NDArray[Any], exposure: float) -> None:
-    """Write linear RGB (rows, columns, 3) in 1/sr as ``path`` + ``.exr``, and at an exposure in EV as
-    ``.png``."""
-    from mbtf_core.pictures import write_display
-
-    write_channels(with_ending(path, ".exr"), value, "RGB")
-    write_display(path, value, exposure)
-
-
 # Channels of both halves of a reference.
 _HALVES = [f"value_{half}.{color}" for half in "ab" for color in "RGB"]
 

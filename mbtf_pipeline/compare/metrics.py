@@ -97,9 +97,13 @@ def dataset_errors(materials: Mapping[str, Material], data: Dataset) -> dict[str
         found = split_errors(lambda queries: value, test, data)  # noqa: B023
         own = material.description["training"]["errors"]
         splits = {split: errors for split, errors in own.items() if split != "test"}
+        weights, training = material.description["weights"], material.description["training"]
         record = {
             "splits": {"test": found, **splits},
-            **_parameter_counts(material),
+            "network_weights": weights["network_weights"],
+            "texels": weights["texels"],
+            "training_seconds": training["seconds"],
+            "training_steps": training["steps"],
         }
         if first is None:
             first = value
@@ -111,22 +115,3 @@ def dataset_errors(materials: Mapping[str, Material], data: Dataset) -> dict[str
             }
         out[name] = record
     return out
-
-
-def _parameter_counts(material: Material) -> dict[str, Any]:
-    """Parameter counts of a material, per network and of its textures; time and steps of its training."""
-    weights = material.description["weights"]
-    networks: dict[str, int] = {}
-    textures = {id(texture.texels) for texture in material.model.textures()}
-    for name, parameter in material.model.named_parameters():
-        if id(parameter) not in textures:
-            part = name.split(".")[0]
-            networks[part] = networks.get(part, 0) + parameter.numel()
-    return {
-        "network_weights": weights["network_weights"],
-        "networks": networks,
-        "texels": weights["texels"],
-        "training_seconds": material.description["training"]["seconds"],
-        "training_steps": material.description["training"]["steps"],
-        "model": material.model.name,
-    }

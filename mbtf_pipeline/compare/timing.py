@@ -1,8 +1,8 @@
-"""Time of one evaluation, split into offset texture, offset network, pyramid and decoder.
+"""Time of one evaluation, split into what depends on the view alone and what depends on the light.
 
 A model evaluates in two stages. Stage 1 (offset and lookup) depends on the view only, stage 2 also on the
-light, so several lights share stage 1. Both are timed in PyTorch, part by part, at random queries. The
-whole evaluation is also timed through :meth:`~mbtf_fit.Material.evaluate`.
+light, so several lights share stage 1. Both are timed in PyTorch at random queries. The whole evaluation is
+also timed through :meth:`~mbtf_fit.Material.evaluate`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from mbtf_fit import Material
-    from mbtf_fit.ops import Operation
 
 # Numbers of lights per view.
 LIGHTS = (1, 4, 16)
@@ -71,7 +70,7 @@ def _seconds(work: Callable[[], Any]) -> float:
 
 
 def measure_timing(material: Material, pixels: int, device: str) -> dict[str, Any]:
-    """Milliseconds of one evaluation per pixel on a PyTorch device, in total and by part; plain data.
+    """Milliseconds of one evaluation per pixel on a PyTorch device, in total and by stage; plain data.
 
     An eighth of the pixels is evaluated, fewer for models that read several positions per query. The times
     are scaled to all pixels; ``queries`` is the number evaluated.
@@ -102,39 +101,9 @@ def measure_timing(material: Material, pixels: int, device: str) -> dict[str, An
         "stage1_ms": round(first, 3),
         "stage2_ms": round(second, 3),
         "lights_ms": {str(n): round(first + n * second, 3) for n in LIGHTS},
-        "parts_ms": {name: round(milliseconds(part), 3) for name, part in _parts(material).items()},
     }
 
 
 def _first(values: dict[str, Tensor], count: int, of: int) -> dict[str, Tensor]:
     """Values of the first queries."""
     return {name: value[: count * (len(value) // of)] for name, value in values.items()}
-
-
-def _parts(material: Material) -> dict[str, Callable[..., Any]]:
-    """Lookups, networks and encodings of stage 1, evaluated once for each position that the model reads."""
-    from mbtf_fit.ops import Frequencies, Lookup, Network, sizes_of, stages
-    from mbtf_fit.ops.operation import parse
-
-    model = material.model
-    around, sizes = model.positions, sizes_of(model.operations)
-
-    def part(op: Operation) -> Callable[..., Any]:
-        def evaluate(u: Tensor, sigma: Tensor, omega_i: Tensor, omega_o: Tensor) -> Any:
-            at = u.repeat_interleave(around, 0)
-            given = {"level": model.level(sigma).repeat_interleave(around)}
-            for name in {parse(reference)[0] for reference in op.inputs()} - {"level"}:
-                given[name] = at if sizes[name] == 2 else u.new_zeros(len(at), sizes[name])
-            return model.run([op.output], given)
-
-        return evaluate
-
-    out: dict[str, Callable[..., Any]] = {}
-    for op in stages(model.operations)[0]:
-        if isinstance(op, Lookup):
-            out[op.textures.replace("_", " ")] = part(op)
-        elif isinstance(op, Network):
-            out[op.weights.replace("_", " ")] = part(op)
-        elif isinstance(op, Frequencies) and op.x == "p":
-            out["encoding"] = part(op)
-    return out

@@ -76,18 +76,12 @@ def plot(
     Parameters
     ----------
     series : sequence of Series
-    x, y : str
-        Titles of the axes, with units.
-    label : str
-        Of the plot, unique on its page.
-    log : str
-        Logarithmic axes; y is always one of them.
-    groups : sequence of str
-        Names of the positions 0, 1, 2, … along x.
-    front : sequence of (float, float)
-        A Pareto front, drawn as a stepped line.
-    png : Path, optional
-        File for a larger plot of the same on white.
+    x, y : titles of the axes, with units
+    label : of the plot, unique on its page
+    log : logarithmic axes; y is always one of them
+    groups : names of the positions 0, 1, 2, … along x
+    front : a Pareto front, drawn as a stepped line
+    png : file for a larger plot of the same on white
 
     Returns
     -------

@@ -18,8 +18,7 @@ from mbtf_core.pictures import Camera
 from mbtf_pipeline.compare.compare import COMPARISON_NAME, COMPARISON_SCHEMA
 from mbtf_pipeline.compare.image_files import read_picture
 from mbtf_pipeline.recipe import RECIPE_NAME, Recipe
-from mbtf_pipeline.report.embed import REDUCTIONS, Gallery
-from mbtf_pipeline.report.images import offset_section, picture_section
+from mbtf_pipeline.report.images import REDUCTIONS, Gallery, offset_section, picture_section
 from mbtf_pipeline.report.plots import ERROR_BAR_NOTE
 from mbtf_pipeline.report.sections import (
     error_context,
@@ -117,12 +116,9 @@ def write_viewer(folder: Path, title: str, comparison: Mapping[str, Any]) -> Non
 
     Parameters
     ----------
-    folder : Path
-        Folder of the run.
-    title : str
-        Of the page.
-    comparison : mapping
-        Content of ``comparison.json``.
+    folder : folder of the run
+    title : of the page
+    comparison : content of ``comparison.json``
     """
     from mbtf_fit import Material
     from mbtf_fit.viewer.extras import poster

@@ -17,7 +17,7 @@ from mbtf_fit.formatting import SPLIT_NAMES
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.tile.inspection import USES
 from mbtf_gen.tile.loading import latest_material
-from mbtf_pipeline.report.embed import U8, Pixels, data_uri, shrink
+from mbtf_pipeline.report.images import U8, Pixels, data_uri, shrink
 from mbtf_pipeline.report.plots import Series, plot, points
 from mbtf_pipeline.stages import FITS, read_stamp
 from mbtf_pipeline.tables import NOT_SIGNIFICANT, data_errors, estimate, is_significant

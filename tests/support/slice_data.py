@@ -12,6 +12,7 @@ import torch
 from mbtf_core.data.lattice import Lattice
 from mbtf_fit.models.registry import MODELS
 from mbtf_fit.pytorch.material import NeuralMaterial
+from mbtf_fit.pytorch.networks import initialize_layers
 from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan, slice_directions
 
 from .datasets import write_manifest, write_part
@@ -77,6 +78,8 @@ def prepared(material: NeuralMaterial, name: str, pairs: int, device: torch.devi
     """The model of a material, with an encoder of slices at so many pairs."""
     model: Any = MODELS[name](material)
     model.encoder = model._encoder(pairs)
-    model.encoder.initialize(torch.Generator().manual_seed(0))
+    generator = torch.Generator().manual_seed(0)
+    for network in model.encoder.children():
+        initialize_layers(network, generator)
     model.encoder.to(device)
     return model

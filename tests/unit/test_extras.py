@@ -33,7 +33,7 @@ DATA: Any = SimpleNamespace(layout="shuffled", lattice=SQUARE, shards=lambda spl
 
 
 def export(target: Any) -> Callable[[Path], object]:
-    return lambda folder: target.write(EXPORT, None)
+    return lambda folder: target.TARGET.write(EXPORT, None)
 
 
 def workers(where: str) -> Callable[[Path], object]:

@@ -33,18 +33,10 @@ def query_pointers(batch: TrainingQueries, start: int, stop: int) -> QueryPointe
     return QueryPointers(stop - start, *addresses)
 
 
-def total_of(losses: Sequence[Tensor]) -> Tensor:
-    """Sum of the threads' losses, in a fixed order: it does not depend on which thread finishes first."""
-    total = losses[0]
-    for loss in losses[1:]:
-        total = total + loss
-    return total
+class _Sums:
+    """Sums of gradients of one thread, and its working memory for a piece of queries."""
 
-
-class Sums:
-    """Sums of gradients of one thread."""
-
-    def __init__(self, native: NativeModel) -> None:
+    def __init__(self, native: NativeModel, piece: int) -> None:
         lanes = int(native.kernel.library.mbtf_lanes())
         self.textures = [
             aligned(t.packing.texels * (-(-t.texels.shape[1] // 8) * 8)) for t in native.textures
@@ -58,13 +50,6 @@ class Sums:
         network = [0, 0] if native.frozen else network
         self.depth_weights = torch.zeros(MAX_LEVELS)
         self.pointers = GradientSums(*texture, *network, self.depth_weights.data_ptr())
-
-
-class _QuerySums(Sums):
-    """Sums, and working memory for a piece of queries."""
-
-    def __init__(self, native: NativeModel, piece: int) -> None:
-        super().__init__(native)
         self.state = native.state(piece)
         self.scratch = aligned(int(native.kernel.library.mbtf_scratch_floats()))
         self.out = torch.empty(max(piece, 2 * native.kernel.block), 3)
@@ -76,20 +61,26 @@ def quadratic_form(loss: Quadratic) -> QuadraticLoss:
     return QuadraticLoss(loss.relative, loss.squared, loss.scale, bound, loss.bound is not None)
 
 
-class CollectedGradients:
-    """Gradients of one model, collected from the sums of all threads.
+class NativeGradients:
+    """Computes gradients of one model for many batches; holds the memory for it.
 
     Attributes
     ----------
     textures, networks : gradients by the tables and by the weights of each network, of the last batch
+    depth_weights : gradients by the depth weights of relief
     """
 
     def __init__(self, native: NativeModel) -> None:
         self.native = native
         self.textures = [torch.empty_like(t.texels) for t in native.textures]
         self.networks = [[torch.empty_like(w) for w in n] for n in native.network_weights()]
+        self.depth_weights = torch.zeros(MAX_LEVELS)
+        block = native.kernel.block
+        per_block = 4 * native.kernel.library.mbtf_state_floats(ctypes.byref(native.description))
+        self.piece = block * max(4, _PIECE_BYTES // per_block)
+        self._sums: list[_Sums] = []
 
-    def collect(self, sums: Sequence[Sums], workers: Workers) -> None:
+    def _collect(self, sums: Sequence[_Sums], workers: Workers) -> None:
         """Move the threads' sums to the gradients."""
         library = self.native.kernel.library
         for k, gradients in enumerate([] if self.native.frozen else self.networks):
@@ -98,7 +89,7 @@ class CollectedGradients:
             library.mbtf_collect_weights(ctypes.byref(description), addresses, len(sums), pointers(gradients))
         workers.each(lambda part: self._collect_textures(sums, part))
 
-    def _collect_textures(self, sums: Sequence[Sums], part: int) -> None:
+    def _collect_textures(self, sums: Sequence[_Sums], part: int) -> None:
         kernel, count = self.native.kernel, len(sums)
         for k, gradient in enumerate(self.textures):
             texels, channels = gradient.shape
@@ -111,32 +102,10 @@ class CollectedGradients:
     def weights(self) -> dict[Tensor, Tensor]:
         """Gradients by all parameters that are trained but the texels."""
         found: dict[Tensor, Tensor] = {}
-        if self.native.frozen:
-            return found
-        for network, gradients in zip(self.native.networks, self.networks, strict=True):
-            found.update(zip(network.parameters(), gradients, strict=True))
-        return found
-
-
-class NativeGradients(CollectedGradients):
-    """Computes gradients of one model for many batches; holds the memory for it.
-
-    Attributes
-    ----------
-    depth_weights : gradients by the depth weights of relief
-    """
-
-    def __init__(self, native: NativeModel) -> None:
-        super().__init__(native)
-        block = native.kernel.block
-        per_block = 4 * native.kernel.library.mbtf_state_floats(ctypes.byref(native.description))
-        self.piece = block * max(4, _PIECE_BYTES // per_block)
-        self._sums: list[_QuerySums] = []
-        self.depth_weights = torch.zeros(MAX_LEVELS)
-
-    def weights(self) -> dict[Tensor, Tensor]:
-        found, weights = super().weights(), self.native.depth_weights
-        if weights is not None:
+        if not self.native.frozen:
+            for network, gradients in zip(self.native.networks, self.networks, strict=True):
+                found.update(zip(network.parameters(), gradients, strict=True))
+        if (weights := self.native.depth_weights) is not None:
             found[weights] = self.depth_weights[: len(weights)].contiguous()
         return found
 
@@ -144,7 +113,7 @@ class NativeGradients(CollectedGradients):
         """Mean loss of a batch; the gradients by tables and weights are left in :attr:`textures` and
         :attr:`networks`."""
         if len(self._sums) != workers.count:
-            self._sums = [_QuerySums(self.native, self.piece) for _ in range(workers.count)]
+            self._sums = [_Sums(self.native, self.piece) for _ in range(workers.count)]
         self.native.refresh()
         quadratic = objective.quadratic()
 
@@ -159,15 +128,14 @@ class NativeGradients(CollectedGradients):
             return total
 
         losses = workers.each(work)
-        self.collect(self._sums, workers)
+        self._collect(self._sums, workers)
         self.depth_weights = torch.stack([s.depth_weights for s in self._sums]).sum(0)
         for sums in self._sums:
             sums.depth_weights.zero_()
-        return total_of(losses)
+        # In a fixed order, which does not depend on which thread finishes first.
+        return sum(losses[1:], losses[0])
 
-    def _learn(
-        self, sums: _QuerySums, loss: Quadratic, batch: TrainingQueries, start: int, stop: int
-    ) -> Tensor:
+    def _learn(self, sums: _Sums, loss: Quadratic, batch: TrainingQueries, start: int, stop: int) -> Tensor:
         native = self.native
         form = quadratic_form(loss)
         queries = query_pointers(batch, start, stop)
@@ -187,7 +155,7 @@ class NativeGradients(CollectedGradients):
         return torch.tensor(weight * total)
 
     def _piece(
-        self, sums: _QuerySums, objective: Objective, batch: TrainingQueries, start: int, stop: int
+        self, sums: _Sums, objective: Objective, batch: TrainingQueries, start: int, stop: int
     ) -> Tensor:
         native, part = self.native, batch.slice(start, stop)
         queries = query_pointers(batch, start, stop)

@@ -21,7 +21,7 @@ from mbtf_fit.native.library import (
 )
 from mbtf_fit.ops.constants import HEIGHT_SCALE, LEAST_FACING
 from mbtf_fit.pytorch.material import NeuralMaterial
-from mbtf_fit.pytorch.textures import FeatureTextures
+from mbtf_fit.surface.hints import describe_textures
 
 
 def pattern_of(material: NeuralMaterial) -> Pattern | None:
@@ -86,14 +86,15 @@ class NativeModel:
         assert pattern is not None, "the kernel cannot evaluate these operations"
         self.kernel, self.material, self.pattern = kernel, material, pattern
         self.frozen = material.frozen
-        self.textures = _textures(material, pattern)
+        features = material.texture(pattern.lookup.textures)
+        self.textures = [features, *(t for t in material.textures() if t is not features)]
         names = [pattern.decoder, *([] if pattern.offset_network is None else [pattern.offset_network])]
         self.networks = [material.get_submodule(op.weights) for op in names]
         self.description = d = ModelStruct()
         d.aspect = material.lattice.aspect
         d.coordinates, d.half_vector = pattern.coordinates, pattern.half_vector
         d.irradiance_scale = pattern.irradiance_scale
-        d.hints, d.frame, d.gate = pattern.hints, pattern.frame, pattern.gate is not None
+        d.hints, d.frame, d.gate = pattern.hints, pattern.frame, pattern.gate
         if pattern.offset is not None:
             d.offset_scale, d.grazing = pattern.offset.scale, pattern.offset.grazing
         if pattern.displace is not None and pattern.displace.learned is not None:
@@ -108,11 +109,7 @@ class NativeModel:
             self._packed.append((target, packed))
         self._layouts = list(zip(self.textures, (d.pyramid, d.offset_texture), strict=False))
         for texture, layout in self._layouts:
-            shapes = texture.packing.shapes
-            layout.levels, layout.channels = len(shapes), texture.texels.shape[1]
-            layout.rows[: len(shapes)] = [rows for rows, _ in shapes]
-            layout.columns[: len(shapes)] = [columns for _, columns in shapes]
-            layout.starts[: len(shapes) + 1] = texture.packing.starts
+            describe_textures(texture.texels, texture.packing, layout)
         self.refresh()
 
     def network_weights(self) -> list[list[Tensor]]:
@@ -159,9 +156,3 @@ class NativeModel:
             state.data_ptr(),
             out,
         )
-
-
-def _textures(material: NeuralMaterial, pattern: Pattern) -> list[FeatureTextures]:
-    """Textures that the kernel reads: the features, then what moves lookups."""
-    found = [material.texture(pattern.lookup.textures)]
-    return found + [textures for textures in material.textures() if textures is not found[0]]

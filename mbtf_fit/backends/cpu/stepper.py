@@ -146,10 +146,7 @@ class NativeStepper:
 
 
 def adam(
-    kernel: Kernel,
-    optimizer: Adam | torch.optim.Adam,
-    gradients: Mapping[Tensor, Tensor],
-    workers: Workers,
+    kernel: Kernel, optimizer: Adam | torch.optim.Adam, gradients: Mapping[Tensor, Tensor], workers: Workers
 ) -> None:
     """One step for the parameters that have a gradient (contiguous float32, same shape), as
     ``torch.optim.Adam.step()`` takes it, on the same state: without weight decay, with the groups' rates and

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbtf_core.errors import InputError
-from mbtf_fit.backends.mitsuba import lookup, network, shade, value  # noqa: F401
+from mbtf_fit.backends.mitsuba import lookup, network, shade  # noqa: F401
 from mbtf_fit.backends.mitsuba.backend import MITSUBA, Arithmetic, Loader, Numbers, Step
 from mbtf_fit.backends.mitsuba.stored_material import F32, StoredMaterial
 from mbtf_fit.backends.mitsuba.textures import Textures

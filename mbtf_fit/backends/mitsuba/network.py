@@ -1,4 +1,5 @@
-"""Small fully connected networks in Dr.Jit kernels, and their inputs (:mod:`mbtf_fit.ops.network`).
+"""Small fully connected networks in Dr.Jit kernels, their inputs (:mod:`mbtf_fit.ops.network`), and
+what leads from their outputs to the value in 1/sr (:mod:`mbtf_fit.ops.value`).
 
 - ``unrolled``: multiply-adds with the weights as literals of the kernel. Fastest on a CPU, for networks that
   compile in reasonable time. The kernel is compiled for one material.
@@ -10,7 +11,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -19,7 +20,7 @@ import mitsuba as mi
 from drjit import nn
 
 from mbtf_fit import ops
-from mbtf_fit.backends.mitsuba.backend import MITSUBA, Arithmetic, Loader, Numbers, Step
+from mbtf_fit.backends.mitsuba.backend import MITSUBA, Arithmetic, Loader, Numbers, Step, opaque
 from mbtf_fit.backends.mitsuba.stored_material import F32, StoredMaterial
 from mbtf_fit.ops.constants import LEAK
 from mbtf_fit.ops.operation import parse, reached_from
@@ -166,7 +167,10 @@ def _frequencies(op: ops.Frequencies, loader: Loader) -> Step:
         for c, length in zip(x, (1.0, aspect) if level else [1.0] * len(x), strict=True):
             for k, frequency in bands:
                 scale = 0.5**k if op.attenuated else 1.0
-                factor = scale if across is None else scale * _average(across / length * frequency)
+                factor = scale
+                if across is not None:
+                    # The average of the wave over the Gaussian of the footprint.
+                    factor = scale * dr.exp(-0.5 * dr.square(across / length * frequency))
                 s, t = dr.sincos(c * frequency)
                 sines.append(s * factor)
                 cosines.append(t * factor)
@@ -175,6 +179,57 @@ def _frequencies(op: ops.Frequencies, loader: Loader) -> Step:
     return step
 
 
-def _average(x: mi.Float) -> mi.Float:
-    """Of a wave over a Gaussian of a standard deviation, in radians."""
-    return dr.exp(-0.5 * dr.square(x))
+FUNCTIONS: dict[str, Callable[[Float], Float]] = {
+    "identity": lambda x: x,
+    "exp": lambda x: dr.exp(x),
+    "expm1": lambda x: dr.exp(x) - 1.0,
+    "log1p": lambda x: dr.log(1.0 + x),
+    "softplus": lambda x: dr.maximum(x, 0.0) + dr.log(1.0 + dr.exp(-dr.abs(x))),
+    "sigmoid": lambda x: dr.rcp(1.0 + dr.exp(-x)),
+    "fourth-root": lambda x: x * dr.square(x) * dr.abs(x),
+    "square": lambda x: dr.square(x),
+}
+
+
+@MITSUBA.implements(ops.Transform)
+def _transform(op: ops.Transform, loader: Loader) -> Step:
+    function = FUNCTIONS[op.function]
+    divisor = 1.0 if op.divisor is None else loader.scalar(op.divisor)
+    by = opaque(divisor) if op.divisor and divisor else 1.0
+    # A quotient by 0 is 0.
+    scale = op.scale if divisor else 0.0
+    factor = 1.0 if op.factor is None else opaque(loader.scalar(op.factor))
+    return lambda x: [factor * function(scale * (v / by)) for v in x]
+
+
+@MITSUBA.implements(ops.Matrix)
+def _matrix(op: ops.Matrix, loader: Loader) -> Step:
+    return lambda x: [sum(a * v for a, v in zip(row, x, strict=True) if a) for row in op.rows]
+
+
+@MITSUBA.implements(ops.Gate)
+def _gate(op: ops.Gate, loader: Loader) -> Step:
+    on = op.unit is None or loader.scalar(op.unit) > 0
+
+    def step(gate: Numbers, x: Numbers, plus: Numbers | None) -> Numbers:
+        shares = [op.floor + op.scale * FUNCTIONS["sigmoid"](g) for g in gate]
+        shares = shares * len(x) if len(gate) == 1 else shares
+        product = [share * v if on else 0.0 * v for share, v in zip(shares, x, strict=True)]
+        return product if plus is None else [v + p for v, p in zip(product, plus, strict=True)]
+
+    return step
+
+
+@MITSUBA.implements(ops.Standardize)
+def _standardize(op: ops.Standardize, loader: Loader) -> Step:
+    return lambda x, mean, deviation: [dr.fma(d, v, m) for v, m, d in zip(x, mean, deviation, strict=True)]
+
+
+@MITSUBA.implements(ops.DivideByCosine)
+def _divide_by_cosine(op: ops.DivideByCosine, loader: Loader) -> Step:
+    return lambda x, omega: [v / dr.maximum(omega[2], op.least) for v in x]
+
+
+@MITSUBA.implements(ops.Product)
+def _product(op: ops.Product, loader: Loader) -> Step:
+    return lambda x: [math.prod(numbers) for numbers in zip(*x, strict=True)]

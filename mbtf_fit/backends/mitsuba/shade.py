@@ -14,8 +14,7 @@ from mbtf_core.data.schema import CLEARCOAT_F0
 from mbtf_core.errors import InputError
 from mbtf_fit import ops
 from mbtf_fit.backends.mitsuba.backend import MITSUBA, Loader, Numbers, Step, opaque
-from mbtf_fit.backends.mitsuba.stored_material import F32
-from mbtf_fit.backends.mitsuba.textures import GROUP, Textures
+from mbtf_fit.backends.mitsuba.textures import Textures
 from mbtf_fit.material.format import WEIGHTS_NAME
 from mbtf_fit.ops.constants import (
     ALBEDO_SPREAD,
@@ -27,7 +26,7 @@ from mbtf_fit.ops.constants import (
     VOIGT_SCALE,
     VOIGT_WIDENING,
 )
-from mbtf_fit.ops.shade import grazing_reflectance
+from mbtf_fit.ops.shade import adjacent_azimuths, grazing_reflectance
 from mbtf_gen.engine.types import Color3f, Float, Normal3f, Point2f, Vector3f
 
 
@@ -45,7 +44,7 @@ def _shade(op: ops.Shade, loader: Loader) -> Step:
         )
     maps = loader.texture(op.maps, grids, channels)
     horizons = Textures(
-        [_adjacent_azimuths(level) for level in loader.levels(op.horizons, grids[:-1], 2 * AZIMUTHS)],
+        [adjacent_azimuths(level) for level in loader.levels(op.horizons, grids[:-1], 2 * AZIMUTHS)],
         by_group=True,
     )
     width, f0 = loader.scalar(op.light_width), loader.scalar(op.dielectric)
@@ -130,7 +129,7 @@ def _lobe(op: ops.Lobe, loader: Loader) -> Step:
         weight: Numbers | None,
     ) -> Numbers:
         light, view = mi.Vector3f(*omega_i), mi.Vector3f(*omega_o)
-        normal = _normal(*slopes)
+        normal = dr.normalize(mi.Normal3f(-slopes[0], -slopes[1], 1.0))
         roughness = dr.maximum(alpha2[0], op.least_alpha2)
         lobe = _ggx(op, mi.Color3f(*specular), roughness, normal, light, view)
         if weight is not None:
@@ -139,11 +138,6 @@ def _lobe(op: ops.Lobe, loader: Loader) -> Step:
         return list(irradiance * (mi.Color3f(*base) / math.pi + lobe))
 
     return step
-
-
-def _normal(x: Float, y: Float) -> Normal3f:
-    """Unit normal of slopes."""
-    return dr.normalize(mi.Normal3f(-x, -y, 1.0))
 
 
 def _spread(x: Float, y: Float, xx: Float, xy: Float, yy: Float) -> tuple[Float, Float, Float]:
@@ -226,21 +220,8 @@ def _own_shadowing(alpha2: Float, light: Float, view: Float) -> Float:
     return light * (view + b) / dr.fma(light, b, view * a)
 
 
-def _adjacent_azimuths(horizons: F32) -> F32:
-    """Horizons (rows, columns, 2n), means and then squares, as n groups of four: mean and square of an
-    azimuth, and of the next one."""
-    mean, square = np.split(horizons, 2, axis=2)
-    parts = (mean, square, np.roll(mean, -1, 2), np.roll(square, -1, 2))
-    return np.stack(parts, -1).reshape(*mean.shape[:2], GROUP * mean.shape[2])
-
-
 def _ggx(
-    op: ops.Lobe,
-    f0: Color3f,
-    alpha2: Float,
-    normal: Normal3f,
-    omega_i: Vector3f,
-    omega_o: Vector3f,
+    op: ops.Lobe, f0: Color3f, alpha2: Float, normal: Normal3f, omega_i: Vector3f, omega_o: Vector3f
 ) -> Color3f:
     """BRDF of GGX facets of reflectance F0 and α² (Walter et al. 2007; Schlick 1994)."""
     light = dr.maximum(dr.dot(normal, omega_i), op.least_light)

@@ -110,11 +110,7 @@ class Code:
     """
 
     def __init__(
-        self,
-        syntax: Syntax,
-        tensors: Mapping[str, F32],
-        kept: Collection[str],
-        precise: Collection[str],
+        self, syntax: Syntax, tensors: Mapping[str, F32], kept: Collection[str], precise: Collection[str]
     ) -> None:
         self.syntax, self.tensors = syntax, tensors
         self.globals: list[str] = []

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.height_planes import node_table
+from mbtf_fit.ops.shade import adjacent_azimuths
 
 F32 = NDArray[np.float32]
 # What the texels of an image are: channels as they are stored; filtered maps; horizons, of which neighbors
@@ -69,7 +70,7 @@ class TexelImage:
             out = np.zeros((-(-len(nodes) // width) * width, 4), np.float32)
             out[: len(nodes)] = nodes
             return out.reshape(1, -1, width, 4)
-        levels = [_adjacent(t) for t in self.levels] if self.layout == "horizons" else self.levels
+        levels = [adjacent_azimuths(t) for t in self.levels] if self.layout == "horizons" else self.levels
         levels = [t.reshape(-1, *t.shape[-2:]) for t in levels]
         width, height = max(t.shape[1] for t in levels), sum(t.shape[0] for t in levels)
         layers = -(-levels[0].shape[2] // 4)
@@ -79,14 +80,6 @@ class TexelImage:
             stacked[start : start + rows, :columns, :channels] = texels
             start += rows
         return np.ascontiguousarray(np.moveaxis(stacked.reshape(height, width, layers, 4), 2, 0))
-
-
-def _adjacent(horizons: F32) -> F32:
-    """Horizons (rows, columns, 2n), means and then squares: of each azimuth mean and square, and those of the
-    next."""
-    mean, square = np.split(horizons, 2, axis=2)
-    both = np.stack([mean, square, np.roll(mean, -1, -1), np.roll(square, -1, -1)], -1)
-    return both.reshape(*mean.shape[:2], 4 * mean.shape[2])
 
 
 def layer_vectors(weight: F32, bias: F32) -> F32:

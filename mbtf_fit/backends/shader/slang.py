@@ -8,7 +8,6 @@ import importlib.util
 from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import get_args
 
 from mbtf_core.errors import EngineError, reason
 from mbtf_core.extras import extra_error
@@ -19,7 +18,6 @@ from mbtf_fit.backends.shader.syntax import ENDINGS, SLANG, Target, number
 from mbtf_fit.material.format import DEFAULT_MIN_COS
 from mbtf_fit.material.material import Material
 
-TARGETS: tuple[Target, ...] = get_args(Target)
 MODULE_NAME, TEXELS_NAME = "material.slang", "material.bin"
 ENTRY = "evaluate_queries"
 
@@ -83,8 +81,7 @@ class SlangCompiler:
 
     Raises
     ------
-    EngineError
-        The package slangpy is not installed.
+    EngineError : the package slangpy is not installed
     """
 
     def __init__(self) -> None:
@@ -99,8 +96,7 @@ class SlangCompiler:
 
         Raises
         ------
-        EngineError
-            The compiler refuses the module.
+        EngineError : the compiler refuses the module
         """
         request = ctypes.c_void_p(self._lib.spCreateCompileRequest(self._session))
         try:

@@ -19,7 +19,7 @@ from mbtf_core.data.lattice import Lattice, sigma_of_level
 from mbtf_core.errors import InputError
 from mbtf_fit import FitConfig, Material, evaluate, fit
 from mbtf_fit.config import build_model
-from mbtf_fit.data.images import Patches, TrainingImages, nearest_shapes, strides
+from mbtf_fit.data.layouts import Patches, TrainingImages, nearest_shapes, strides
 from mbtf_fit.data.loader import Partition, in_region, load_training, open_data
 from mbtf_fit.sections import HeldOutSection
 from mbtf_fit.training.loop import TrainingLoop

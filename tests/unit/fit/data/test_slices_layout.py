@@ -11,8 +11,8 @@ from support.slice_data import write_slices
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.errors import InputError
+from mbtf_fit.data.layouts import DECODED, SharedSlices, TrainingSlices
 from mbtf_fit.data.loader import load_training
-from mbtf_fit.data.slices import DECODED, SharedSlices, TrainingSlices
 from mbtf_fit.sections import HeldOutSection
 
 

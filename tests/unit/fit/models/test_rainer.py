@@ -17,9 +17,9 @@ from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError, UsageError
 from mbtf_fit import fit
 from mbtf_fit.config import FitConfig, build_model
+from mbtf_fit.data.layouts import SharedSlices, TrainingSlices
 from mbtf_fit.data.loader import load_training
 from mbtf_fit.data.queries import mean_value
-from mbtf_fit.data.slices import SharedSlices, TrainingSlices
 from mbtf_fit.material.material import Material
 from mbtf_fit.models.model import Preparation
 from mbtf_fit.models.rainer import Rainer2019, shared_slices

@@ -14,7 +14,8 @@ from support.material_cases import CASES, make
 from mbtf_core.app.console import run
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import EngineError
-from mbtf_fit.backends.shader.slang import ENTRY, TARGETS, SlangCompiler, module_of
+from mbtf_fit.backends.shader.slang import ENTRY, SlangCompiler, module_of
+from mbtf_fit.backends.shader.syntax import ENDINGS
 from mbtf_fit.cli.app import app
 from mbtf_fit.material.format import QUERY
 
@@ -185,12 +186,12 @@ def test_half_precision_rounds_the_buffer(tmp_path: Path) -> None:
 def test_other_languages(tmp_path: Path) -> None:
     pytest.importorskip("slangpy", reason="no slangpy; to enable: pip install 'mbtf[shaders]'")
     make("relief", tmp_path / "material")
-    words = [word for target in TARGETS for word in ("--shader-target", target)]
+    words = [word for target in ENDINGS for word in ("--shader-target", target)]
     out = tmp_path / "out"
     command = ["export", str(tmp_path / "material"), "--to", "slang", *words, "-o", str(out), "-q"]
     assert run(app, command) == 0
     before = {path.name: path.read_bytes() for path in out.iterdir()}
-    assert len(before) == 3 + len(TARGETS)
+    assert len(before) == 3 + len(ENDINGS)
     marks = {
         ".hlsl": b"StructuredBuffer<float4",
         ".comp": b"#version 450",

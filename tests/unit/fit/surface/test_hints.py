@@ -20,7 +20,7 @@ from mbtf_fit.models.relief import known_surface
 from mbtf_fit.native import library
 from mbtf_fit.surface import hints
 from mbtf_fit.surface.hints import compute_hints
-from mbtf_fit.surface.known import KnownSurface, prefilter, prefiltered_levels
+from mbtf_fit.surface.known import KnownSurface, lookup_sigma, prefilter
 from mbtf_fit.surface.lookup import Packing, lookup
 from mbtf_gen.render.bsdf.surface import SurfaceParts
 from mbtf_gen.sampling.light_kernel import LightKernel
@@ -300,7 +300,10 @@ def test_lookups_are_gaussian_averages_wherever_they_fall() -> None:
     twice the texels of a level have little error of interpolation."""
     size, lattice = 64, Lattice(3)
     image = np.random.default_rng(0).random((size, size, 1)).astype(np.float32)
-    levels = prefiltered_levels(torch.from_numpy(image), lattice, finer=1)
+    levels = [
+        prefilter(torch.from_numpy(image), Lattice(4).shape(s + 1), lookup_sigma(s, 2 ** (s + 1)), 1.0)
+        for s in range(lattice.finest + 1)
+    ]
     table = torch.cat([level.flatten(0, 1) for level in levels])
     packing = Packing.of(Lattice(4), range(1, 5))
     center = (np.arange(size) + 0.5) / size

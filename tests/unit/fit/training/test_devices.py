@@ -12,9 +12,8 @@ from torch import Tensor
 
 from mbtf_core.data.lattice import Lattice
 from mbtf_fit.config import FitConfig, build_model
-from mbtf_fit.data.images import Patches
+from mbtf_fit.data.layouts import Patches, SliceBatch, TrainingSlices
 from mbtf_fit.data.queries import TrainingQueries
-from mbtf_fit.data.slices import SliceBatch, TrainingSlices
 from mbtf_fit.models.registry import MODELS
 from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.noise import NoiseModel

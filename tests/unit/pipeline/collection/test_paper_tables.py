@@ -8,15 +8,13 @@ import math
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from PIL import Image
 from support.paths import ROOT
 
 from mbtf_core.stats import Estimate
-from mbtf_pipeline.collection.check_tables import independence, timing, weights
-from mbtf_pipeline.collection.error_tables import ablations, levels, methods, zooms
 from mbtf_pipeline.collection.finished_run import FinishedRun, mean_of, ratio_of
+from mbtf_pipeline.collection.paper_tables import ablations, levels, methods, timing, zooms
 from mbtf_pipeline.collection.recipes import PaperRecipe, first_known, load
 from mbtf_pipeline.tables import Column, Shown, Table
 
@@ -48,7 +46,7 @@ def record(folder: Path, tiles_across: float = 1.0) -> dict[str, Any]:
     noise = {"file": "reference", "flip": {"ldr": 0.1, "hdr": 0.35}, "ssim": 0.95, "st_lpips": None}
     picture = {"levels": [2.0, 2.0], "references": {"query": noise}, "fits": fits}
     picture["tiles_across"] = tiles_across
-    sizes = {"networks": {"decoder": 1678, "offset_network": 1576}, "texels": 700, "network_weights": 3254}
+    sizes = {"texels": 700, "network_weights": 3254}
     test = {
         fit: {
             "splits": {"test": {**errors(mse), "levels": {"0": errors(mse / 4), "1": errors(mse)}}},
@@ -135,16 +133,12 @@ def test_ablations_compare_with_the_first_row(tmp_path: Path) -> None:
     assert rows[0]["queries_per_texel"] == "400"
 
 
-def test_sizes_and_times(tmp_path: Path) -> None:
+def test_times(tmp_path: Path) -> None:
     times = {"device": "cpu", "queries": 7, "evaluate_ms": 9.0, "stage1_ms": 5.0, "stage2_ms": 2.0}
-    times |= {"lights_ms": {"1": 7.0, "16": 37.0}, "parts_ms": {"pyramid": 4.0}}
+    times |= {"lights_ms": {"1": 7.0, "16": 37.0}}
     run = make(tmp_path, timing={"neumip": [times]})
     (row,) = rows_of(timing([run], PUBLISHED)[0])
-    assert row["offset texture"] == "–"
-    assert (row["pyramid"], row["1 light"], row["16 lights"]) == ("4.0", "7.0", "37.0")
-    counted = rows_of(weights([run], PUBLISHED)[0])
-    assert counted[1]["all networks"] == "3,254"
-    assert counted[1]["published"].startswith("3332; 3254")
+    assert (row["material evaluation"], row["1 light"], row["16 lights"]) == ("9.0", "7.0", "37.0")
 
 
 def test_zooms_have_one_row_per_span_and_fit(tmp_path: Path) -> None:
@@ -156,34 +150,6 @@ def test_zooms_have_one_row_per_span_and_fit(tmp_path: Path) -> None:
         (s, f) for s in ("1", "8") for f in MSE
     ]
     assert [len(row) for _, row in table.images] == [2, 2, 2]
-
-
-def test_unmodified_mitsuba_agrees_or_differs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "mbtf_pipeline.collection.check_tables.read_picture", lambda path: np.zeros((4, 4, 3), np.float32)
-    )
-    direction = {"elevation": 85, "azimuth": 0}
-    files = {"mbtf": "reference", "mitsuba": "neumip"}
-    surfaces = [
-        {"surface": s, "mean": number(1e-3, 1e-3), "square": number(square, 1.2e-4), "files": files}
-        for s, square in (("base color", 1e-5), ("full", 4e-2))
-    ]
-    check = {"view": direction, "light": direction, "surfaces": surfaces}
-
-    def first() -> dict[str, str]:
-        return rows_of(independence([make(tmp_path, unmodified_mitsuba=check)], PUBLISHED)[0])[0]
-
-    same, other = rows_of(independence([make(tmp_path, unmodified_mitsuba=check)], PUBLISHED)[0])
-    rms = "RMS difference, noise-free [% of the mean]"
-    assert (same["verdict"], same[rms]) == ("agree", "below 1.6%")
-    assert (other["verdict"], other[rms]) == ("differ", "20.00 ± 0.03%")
-    # The verdict changes at the detection limit.
-    for factor, verdict in ((0.99, "agree"), (1.01, "differ")):
-        surfaces[0]["square"] = number(3e-3 * factor**2, 1e-3)
-        assert first()["verdict"] == verdict
-    # A single block of pixels has no error bar and is inconclusive.
-    surfaces[0] |= {key: {"value": 0.4, "error": None, "n": 1} for key in ("mean", "square")}
-    assert (first()["verdict"], first()[rms]) == ("inconclusive", "–")
 
 
 def test_cells_are_printed_and_exported() -> None:

@@ -241,7 +241,7 @@ def test_fits_are_repeated_with_seeds_or_left_out(tmp_path: Path) -> None:
     for faulty, what in (
         ("without: [wdie]", "names no fit: wdie"),
         ("without: [wide, neumip-baseline]", "leaves no fit"),
-        ("seeds: [3, 3]", "must differ"),
+        ("seeds: [3, 3]", "same entry twice"),
         ("seeds: [-1]", "seeds"),
     ):
         key = faulty.split(":")[0]

@@ -63,7 +63,6 @@ def test_all_fits_are_evaluated_on_the_same_test_queries(tmp_path: Path) -> None
         mse = found[name]["splits"]["test"]["mse"]
         assert abs(mse["value"] - square) < 4 * mse["error"]
         assert found[name]["splits"]["held_out_queries"] == {"mse": "own"}
-        assert sum(found[name]["networks"].values()) == found[name]["network_weights"]
     less = found["b"]["mse_minus_first"]
     assert abs(less["value"] - (0.0025 - 0.01)) < 4 * less["error"]
     # Shared noise cancels in the paired difference.
@@ -73,16 +72,9 @@ def test_all_fits_are_evaluated_on_the_same_test_queries(tmp_path: Path) -> None
     assert "mse_minus_first" not in found["a"]
 
 
-@pytest.mark.parametrize(
-    ("model", "parts"),
-    [
-        ("neumip-baseline", ["pyramid"]),
-        ("neumip", ["offset texture", "offset network", "pyramid"]),
-        ("hierarchical", ["offset texture", "offset network", "pyramid", "encoding"]),
-    ],
-)
-def test_times_scale_to_all_pixels(model: str, parts: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """If every part takes a second, only the scale remains."""
+@pytest.mark.parametrize("model", ["neumip-baseline", "neumip", "hierarchical"])
+def test_times_scale_to_all_pixels(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """If every stage takes a second, only the scale remains."""
 
     def one_second(work: Any) -> tuple[Any, float]:
         return work(), 1.0
@@ -95,7 +87,6 @@ def test_times_scale_to_all_pixels(model: str, parts: list[str], monkeypatch: py
     found = measure_timing(material, pixels, "cpu")
     count = 20 if model == "hierarchical" else 81 * 20
     assert found["queries"] == count
-    assert list(found["parts_ms"]) == parts
     assert found["stage1_ms"] == pytest.approx(1e3 * pixels / count)
     for n in LIGHTS:
         expected = found["stage1_ms"] + n * found["stage2_ms"]

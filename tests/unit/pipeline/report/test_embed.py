@@ -10,8 +10,7 @@ import pytest
 from PIL import Image
 
 from mbtf_core.color import Palette, common_scale, indices, palette, robust_scale, to_display
-from mbtf_pipeline.report.embed import REDUCTIONS, color_bar, linear_uri, map_uri, shrink
-from mbtf_pipeline.report.images import scaled_maps
+from mbtf_pipeline.report.images import REDUCTIONS, color_bar, linear_uri, map_uri, scaled_maps, shrink
 
 
 def decoded(uri: str) -> np.ndarray:

@@ -20,23 +20,20 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.color import ALBEDO_EXPOSURE
 from mbtf_core.directions import from_angles
-from mbtf_core.errors import UsageError
 from mbtf_core.pictures import PIXEL_SIGMA, Camera
 from mbtf_core.stats import Estimate, mean_estimate
 from mbtf_gen.tile.maps.material_file import ROLES
-from mbtf_pipeline.compare.image_files import PICTURES, write_picture
 
 if TYPE_CHECKING:
     from mbtf_gen.config.generator import GeneratorConfig
     from mbtf_gen.job import Job
     from mbtf_gen.tile.protocol import Tile
-    from mbtf_pipeline.recipe import CompareSection, SceneDirection, SceneView
+    from mbtf_pipeline.recipe import CompareSection
 
 F64 = NDArray[np.float64]
-# Lowest elevations of view and light for which the finite block suffices.
-LOWEST_VIEW, LOWEST_LIGHT = 75.0, 30.0
+# Lowest elevation of the light for which the finite block suffices.
+LOWEST_LIGHT = 30.0
 # Pixels along every edge that are ignored, and the side of the blocks taken as independent: neighboring
 # pixels share samples of the Gaussian filter. Correlation across borders makes error bars 5% too small.
 _MARGIN, _BLOCK = 4, 8
@@ -104,42 +101,6 @@ def _blocks(picture: F64) -> F64:
     return cut.transpose(0, 2, 1, 3, 4).reshape(rows * columns, -1, 3)
 
 
-def pick_scene(section: CompareSection) -> tuple[SceneView, SceneDirection, float]:
-    """The first view and the first light that are high enough, and the smallest field of view.
-
-    Raises
-    ------
-    UsageError : the comparison has none
-    """
-    views = [v for v in section.views if v.elevation >= LOWEST_VIEW]
-    lights = [light for light in section.lights if light.elevation >= LOWEST_LIGHT]
-    if not views or not lights:
-        raise UsageError(
-            f"needs a view at {LOWEST_VIEW:g} degrees or higher and a light at {LOWEST_LIGHT:g} or higher",
-            where="compare.unmodified_mitsuba",
-            hint="add them to compare.views and compare.lights, or remove the option",
-        )
-    assert section.tiles_across is not None
-    return views[0], lights[0], min(section.tiles_across)
-
-
-def write_agreement(
-    section: CompareSection, generate: GeneratorConfig, material: Tile, out: Path
-) -> dict[str, Any]:
-    """Compare with unmodified Mitsuba and write the images below `out`; returns plain data."""
-    view, light, tiles_across = pick_scene(section)
-    surfaces = []
-    for surface, found in compare_with_mitsuba(section, generate, material).items():
-        stem = f"{PICTURES}/check-{surface.replace(' ', '-')}"
-        files = {renderer: f"{stem}-{renderer}" for renderer in ("mbtf", "mitsuba")}
-        for renderer, file in files.items():
-            write_picture(out / file, getattr(found, renderer), ALBEDO_EXPOSURE)
-        errors = {"mean": found.mean.as_dict(), "square": found.square.as_dict()}
-        surfaces.append({"surface": surface, **errors, "files": files})
-    scene = {"view": view.model_dump(), "light": light.model_dump(), "tiles_across": tiles_across}
-    return {**scene, "surfaces": surfaces}
-
-
 def compare_with_mitsuba(
     section: CompareSection, generate: GeneratorConfig, material: Tile
 ) -> dict[str, MitsubaAgreement]:
@@ -150,7 +111,7 @@ def compare_with_mitsuba(
     from mbtf_gen.planning.run_plan import reference_plan
     from mbtf_gen.planning.simulation import build_estimator
 
-    view, light, tiles_across = pick_scene(section)
+    view, light, tiles_across = section.views[0], section.lights[0], min(section.tiles_across or [1.0])
     config = generate.model_copy(update={"light": LightSection(width=0.0)})
     camera = Camera(view.elevation, view.azimuth, tiles_across, rows=section.size, columns=section.size)
     omega_i = from_angles(light.elevation, light.azimuth)
