@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from support.datasets import edit, rewrite, write_dataset
+from support.datasets import rewrite
 from support.formula_runs import SMALL, Formula, cheap_plan
 from support.published import contents, publish, small
 
@@ -22,7 +22,6 @@ from mbtf_gen.config.publish import PublishConfig
 from mbtf_gen.generation import run as generation
 from mbtf_gen.publishing.digests import digest_faults
 from mbtf_gen.publishing.publication import Publication
-from mbtf_gen.tile.loading import load_material
 
 CONFIG = PublishConfig(license="CC0-1.0", form="webdataset")
 
@@ -112,15 +111,6 @@ def test_differences_are_found_and_explained(tmp_path: Path) -> None:
     assert "another data set" in found[1]
 
 
-def test_digests_of_another_data_set(tmp_path: Path) -> None:
-    digests = publish(tmp_path / "a", tmp_path / "card", form="npz") if small(tmp_path / "a") else tmp_path
-    write_dataset(tmp_path / "b", queries={"train": "300", "test": "40"}, seed=1)
-    found = digest_faults(Dataset.open(tmp_path / "b"), digests / "recipe/digests.json")
-    assert found == ["belongs to another configuration, or was made from other maps"]
-    with pytest.raises(InputError, match=r"publish\.json: is damaged"):
-        digest_faults(Dataset.open(tmp_path / "b"), tmp_path / "card/publish.json")
-
-
 @pytest.mark.usefixtures("engine")
 def test_changed_and_lost_maps_are_refused(tmp_path: Path) -> None:
     maps = write_maps(tmp_path / "maps")
@@ -133,15 +123,3 @@ def test_changed_and_lost_maps_are_refused(tmp_path: Path) -> None:
         Publication.prepare(tmp_path / "data", CONFIG, with_maps=True)
     with pytest.raises(UsageError, match="goes with --with-maps"):
         Publication.prepare(tmp_path / "data", CONFIG, material=tmp_path / "moved")
-
-
-def test_a_mesh_of_several_files_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "tile.mtl").write_text("newmtl a\nKd 1 0 0\n")
-    (tmp_path / "tile.obj").write_text(
-        "mtllib tile.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nusemtl a\nf 1 2 4\nf 1 4 3\n"
-    )
-    small(tmp_path / "data")
-    material = load_material(tmp_path / "tile.obj")
-    edit(tmp_path / "data/manifest.json", lambda m: m.update(inputs=dict(material.digests)))
-    with pytest.raises(InputError, match="names other files"):
-        Publication.prepare(tmp_path / "data", CONFIG, with_maps=True, material=tmp_path / "tile.obj")
