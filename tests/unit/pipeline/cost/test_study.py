@@ -3,8 +3,6 @@ and what follows from them."""
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 import re
@@ -24,7 +22,6 @@ from mbtf_core.files import folders
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item, Result, packed, run_task
 from mbtf_core.stats import Estimate
-from mbtf_core.units import parse_duration
 from mbtf_pipeline.cli.app import app
 from mbtf_pipeline.cost import plan as plan_module
 from mbtf_pipeline.cost import study as module
@@ -35,7 +32,6 @@ from mbtf_pipeline.cost.measurement import (
     MeasurementFolder,
     pareto_front,
 )
-from mbtf_pipeline.cost.page import to_csv
 from mbtf_pipeline.cost.runs import MOST_SEEDS, TEST, Run, disk_bytes
 from mbtf_pipeline.cost.study import Measurements
 from mbtf_pipeline.recipe import load_recipe
@@ -71,12 +67,6 @@ def test_measurements_come_back_and_damaged_ones_are_repeated(tmp_path: Path) ->
     (path,) = store.folder.glob("mesh-*")
     path.write_text(path.read_text()[:-20])
     assert store.get(mesh) is None
-
-
-def test_the_csv_holds_every_number_with_its_error() -> None:
-    rows = list(csv.DictReader(io.StringIO(to_csv([point(10, 0.5, bytes=3e5), point(20, math.nan)]))))
-    assert (rows[0]["seconds"], rows[0]["error"], rows[0]["error_se"]) == ("10", "0.5", "0.01")
-    assert (rows[0]["bytes"], rows[0]["bias"], rows[1]["error"]) == ("300000", "", "")
 
 
 def test_studies_of_other_machines_are_refused(tmp_path: Path) -> None:
@@ -156,11 +146,6 @@ def test_a_full_disk_ends_the_study(monkeypatch: pytest.MonkeyPatch) -> None:
     found = Measurements(conditions(), MemoryStore(), Runner())  # type: ignore[arg-type]
     with pytest.raises(PartialError, match="no space left"):
         found.measure_runs([run()], lambda run: True)
-
-
-def test_a_study_is_of_the_machine_of_its_workers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("MBTF_WORKER_THREADS", "1")
-    assert module.measuring_machine()["system"].endswith("workers of 1 thread")
 
 
 RUNS = [run(3000, "long", 7200.0), run(2000, "short", 60.0), run(1000, "m", 40.0)]
@@ -260,31 +245,6 @@ def test_a_dry_run_plans_what_a_study_measures(
     assert (plan["measured"], plan["runs"]) == (3, [])
     assert plan["longest"] == pytest.approx(61.0, abs=0.1)
     assert plan["seconds"] < 30.0
-
-
-@pytest.mark.parametrize("path_seconds", [2e-7, 1e-5])
-def test_the_times_that_a_dry_run_names_suffice(
-    path_seconds: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """On a fast and on a busy machine."""
-    pilot = SimpleNamespace(start=4.0, query_seconds=4 * path_seconds)
-    monkeypatch.setattr(plan_module, "forecast", lambda *_, **__: pilot)
-
-    def planned(seconds: float) -> plan_module.StudyPlan:
-        return plan_module.plan_study(load_recipe(RECIPE, []), tmp_path / "study", seconds=seconds)
-
-    none = planned(10.0)
-    assert none.runs == []
-    assert none.least_run is not None
-    named = (
-        r"runs to measure: none\nno complete run fits into the time: one takes --time (\w+), and .* (\w+)$"
-    )
-    found = re.search(named, none.describe(10.0))
-    assert found
-    one, three = (planned(parse_duration(time)) for time in found.groups())
-    assert one.runs
-    assert len({label.split(":")[0] for label in three.runs if "seed" not in label}) >= 3
-    assert "a forecast for up to 4 times as long" in three.describe(parse_duration(found[2]))
 
 
 def test_a_slow_first_run_makes_the_others_fewer_and_longer(monkeypatch: pytest.MonkeyPatch) -> None:
