@@ -17,8 +17,8 @@ from support.fit_data import constant, parallax, random_queries, write_data
 import mbtf_fit.material.material
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.lattice import Lattice
-from mbtf_core.errors import EngineError, InputError
-from mbtf_fit import FitConfig, FitResult, Material, evaluate, fit, read_history
+from mbtf_core.errors import InputError
+from mbtf_fit import FitConfig, FitResult, Material, evaluate, fit
 from mbtf_fit.data.loader import load_split, load_training
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.evaluation import split_errors
@@ -216,14 +216,6 @@ def test_evaluation_refuses_a_tile_of_another_shape(fitted: FitResult, tmp_path:
         evaluate(fitted.material, other)
 
 
-def test_the_history_records_the_training(fitted: FitResult) -> None:
-    history = read_history(fitted.folder)
-    assert history == fitted.history
-    assert history[-1]["step"] == 30
-    assert history[-1]["fraction"] == 1.0
-    assert {"seconds", "loss", "unexplained", "unexplained_error", "queries_per_second"} <= set(history[-1])
-
-
 def test_another_configuration_is_refused_with_its_differences(data: Path, tmp_path: Path) -> None:
     out = tmp_path / "m"
     fit(config(3), data, out)
@@ -256,13 +248,6 @@ def test_a_folder_of_other_files_is_never_touched(data: Path, tmp_path: Path) ->
     assert [p.name for p in tmp_path.iterdir()] == ["precious"]
 
 
-def test_cuda_where_there_is_none_is_refused(data: Path, tmp_path: Path) -> None:
-    if torch.cuda.is_available():
-        pytest.skip("this machine has a CUDA device")
-    with pytest.raises(EngineError, match="no CUDA device"):
-        fit(config(3, device="cuda"), data, tmp_path / "m")
-
-
 def test_evaluation_broadcasts_as_numpy_does(fitted: FitResult) -> None:
     """A picture of (rows, columns) points under one light and one view."""
     material = fitted.material
@@ -285,9 +270,3 @@ def test_shapes_that_do_not_broadcast_are_refused(fitted: FitResult, u: Any, sig
     with pytest.raises(InputError, match=r"u, sigma, omega_i, omega_o: have the shapes") as fault:
         fitted.material.evaluate(u, sigma, [0, 0, 1], [0, 0, 1])
     assert fault.value.hint == "they must broadcast to (..., 2), (...), (..., 3), (..., 3)"
-
-
-def test_representations_are_one_line(fitted: FitResult, data: Path) -> None:
-    assert repr(fitted.material) == "<Material: neumip, resolution 8>"
-    assert repr(fitted).startswith(f"<FitResult {fitted.folder}: neumip, ")
-    assert repr(Dataset.open(data)).startswith(f"<Dataset {data}: 8000 train, ")
