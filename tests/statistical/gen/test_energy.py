@@ -74,8 +74,8 @@ def tile_mean(
 
 @pytest.mark.parametrize(
     ("heights", "bsdf"),
-    [("turtle_shell", ROUGH), ("rock_cliff", lambert(0.9))],
-    ids=["roughconductor", "lambert"],
+    [("turtle_shell", ROUGH), ("turtle_shell", lambert(0.9)), ("rock_cliff", lambert(0.9))],
+    ids=["roughconductor", "lambert", "lambert cliff"],
 )
 @pytest.mark.parametrize(("light", "view"), PAIRS)
 def test_tile_mean_is_reciprocal(
