@@ -22,9 +22,8 @@ _FLAGS = (
     # No name can be resolved, so no other machine can be reached.
     "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
 )
-# Without a graphics card: drawing by the processor, or no WebGL at all.
+# Without a graphics card: drawing by the processor.
 SOFTWARE = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-NO_WEBGL = ("--disable-gpu", "--disable-3d-apis")
 
 
 @contextmanager

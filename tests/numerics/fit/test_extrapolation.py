@@ -17,8 +17,6 @@ from mbtf_fit.material.material import Material, export
 from mbtf_fit.ops.constants import GRAZING
 
 LATTICE = Lattice(3)
-# Lowest cosine of the directions that are trained on.
-DATA_EDGE = 0.1
 N = 400
 
 

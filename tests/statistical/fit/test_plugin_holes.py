@@ -72,6 +72,7 @@ def test_the_plugin_evaluates_the_fitted_transmittance(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.array(evaluator.transmittance(u, level, -view)), wanted, atol=2e-4)
 
 
+@pytest.mark.parametrize("lace", ["neumip"], indirect=True)
 @pytest.mark.parametrize("integrator", ["path", "mbtf_path"])
 @pytest.mark.parametrize(("elevation", "reflected"), [(50.0, np.pi * GRAY), (-50.0, 0.0)])
 def test_a_sheet_in_a_furnace_conserves_energy(
@@ -82,6 +83,7 @@ def test_a_sheet_in_a_furnace_conserves_energy(
     assert seen == pytest.approx(reflected + SHARE, abs=0.012)
 
 
+@pytest.mark.parametrize("lace", ["relief"], indirect=True)
 def test_light_reaches_surfaces_below_holes(lace: dict[str, Any]) -> None:
     """A point light, two sheets above each other, and the ground visible through neither."""
     sheets = {}
@@ -96,6 +98,7 @@ def test_light_reaches_surfaces_below_holes(lace: dict[str, Any]) -> None:
     assert seen / bare == pytest.approx(SHARE**2, rel=1e-3)
 
 
+@pytest.mark.parametrize("lace", ["relief"], indirect=True)
 @pytest.mark.parametrize("integrator", ["path", "mbtf_path"])
 @pytest.mark.parametrize("kind", ["mbtf", "mask"])
 def test_emitters_behind_holes_are_counted_once(integrator: str, kind: str, lace: dict[str, Any]) -> None:

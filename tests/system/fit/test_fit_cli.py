@@ -8,7 +8,7 @@ import re
 from pathlib import Path
 
 import pytest
-from support.command_lines import call, fails
+from support.command_lines import call
 from support.fit_data import parallax, write_data
 
 QUICK = ("--steps", "5", "--batch", "500")
@@ -73,20 +73,3 @@ def test_a_finished_fit_is_not_trained_again(shards: Path, material: Path) -> No
     done = call(["mbtf-fit", str(shards), "-o", str(material), *QUICK, "--overwrite"])
     assert "training for 5 steps" in done.err
     assert "already finished" not in done.err
-
-
-def test_bad_input_exits_with_3_and_a_hint(shards: Path, material: Path, tmp_path: Path) -> None:
-    out = ["-o", str(tmp_path / "m")]
-    assert "no such folder" in fails(3, str(tmp_path / "none"), *out)
-    empty = tmp_path / "empty"
-    empty.mkdir()
-    assert "mbtf-gen" in fails(3, str(empty), *out)
-    other = write_data(tmp_path / "schema", parallax, train=10, schema=99)
-    assert "schema version 99" in fails(3, str(other), *out)
-    image = write_data(tmp_path / "image", parallax, train=10, layout="image")
-    assert "--layout shuffled" in fails(3, str(image), *out)
-    assert "training.batch: 500 -> 700" in fails(
-        3, str(shards), "-o", str(material), "--steps", "5", "--batch", "700"
-    )
-    assert "no such folder" in fails(3, "info", str(tmp_path / "none"))
-    assert "no material.json" in fails(3, "evaluate", str(empty), str(shards))

@@ -10,8 +10,8 @@ from support.command_lines import call
 from support.fit_data import parallax, write_data
 
 from mbtf_core.data.shard_files import read_shard, write_shard
-from mbtf_core.errors import InputError, UsageError
-from mbtf_fit.training.fit_many import find_data, material_folders
+from mbtf_core.errors import InputError
+from mbtf_fit.training.fit_many import find_data
 
 QUICK = ("--steps", "3", "--batch", "300", "--device", "cpu")
 
@@ -58,12 +58,3 @@ def test_data_sets_come_from_folders_and_folders_of_folders(tmp_path: Path) -> N
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="contains no data sets"):
         find_data([tmp_path / "empty"])
-
-
-def test_materials_are_named_after_their_data(tmp_path: Path) -> None:
-    out = Path("out")
-    assert material_folders([tmp_path / "a", tmp_path / "b"], out) == [out / "a", out / "b"]
-    found = material_folders([tmp_path / "rock" / "shards", tmp_path / "wool" / "shards"], out)
-    assert found == [out / "rock-shards", out / "wool-shards"]
-    with pytest.raises(UsageError, match="2 data sets have the name"):
-        material_folders([tmp_path / "a" / "s", tmp_path / "b" / ".." / "a" / "s"], out)

@@ -40,24 +40,3 @@ def test_from_data_to_pictures(work: Path, monkeypatch: pytest.MonkeyPatch) -> N
     drawn = call(["mbtf-fit", "preview", str(work / "material"), "-o", "pictures", *SMALL.split()])
     assert drawn.code == 0, drawn.err
     assert (work / "pictures/sheet.png").is_file()
-
-
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ("mbtf-fit felt -o other --model relief --steps 1", "--model neumip+"),
-        ("mbtf-fit felt -o other --model hierarchical --steps 1", "measured data have no other layout"),
-        ("mbtf-fit felt -o other --model rainer2019 --steps 1", "measured data have no other layout"),
-        ("mbtf-gen repair felt", "cannot be generated again"),
-        ("mbtf-gen preview felt -o other", "whose surface is unknown"),
-        ("mbtf-gen export felt other.hdf5 --program neuralbtf", "under fixed lights and views"),
-    ],
-)
-def test_what_does_not_apply_is_refused(
-    work: Path, monkeypatch: pytest.MonkeyPatch, line: str, message: str
-) -> None:
-    monkeypatch.chdir(work)
-    done = call(line.split())
-    assert done.code == 3
-    assert message in done.err
-    assert len([text for text in done.err.splitlines() if text.startswith("error:")]) == 1

@@ -93,31 +93,3 @@ else:
         assert int(message.split()[1]) >= OLDEST_LLVM
     else:
         assert message == "no LLVM without ours" or message.startswith("Dr.Jit was imported first")
-
-
-def test_registration_reports_missing_variants(run_python: RunPython) -> None:
-    code = """
-import mbtf_fit.backends.mitsuba
-from mbtf_gen.engine.runtime import use_shipped_llvm
-use_shipped_llvm()
-try:
-    mbtf_fit.backends.mitsuba.register()
-except Exception as error:
-    print(error)
-import mitsuba as mi
-mi.set_variant("scalar_rgb")
-try:
-    mbtf_fit.backends.mitsuba.register()
-except Exception as error:
-    print(error)
-mi.set_variant("llvm_ad_rgb")
-mbtf_fit.backends.mitsuba.register()
-mbtf_fit.backends.mitsuba.register()
-print("done")
-"""
-    done = run_python("-c", code)
-    assert done.returncode == 0, done.stderr
-    lines = done.stdout.splitlines()
-    assert lines[0] == "no variant of Mitsuba is set"
-    assert lines[2] == "the plugin 'mbtf' does not run in the variant scalar_rgb"
-    assert lines[-1] == "done"

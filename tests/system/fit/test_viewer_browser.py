@@ -2,29 +2,23 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
-from support.browser import NO_WEBGL, browser
 from support.fit_data import parallax, write_data
 from support.material_cases import CASES, make
 from support.plugin_materials import write_material
 from support.viewer_page import Page
 
-from mbtf_core.color import ALBEDO_EXPOSURE, to_display
 from mbtf_core.directions import from_angles
 from mbtf_core.pictures import Camera
-from mbtf_fit import Material, fit
+from mbtf_fit import fit
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.training.trainer import Trainer
-from mbtf_fit.viewer.extras import poster
 from mbtf_fit.viewer.live import LiveView
 from mbtf_fit.viewer.page import as_read, encode, material_content, pack_textures, write_page
 
@@ -169,41 +163,6 @@ def test_names_are_text(driver: Any, tmp_path: Path) -> None:
     assert page.js("return document.getElementById('name').textContent") == name
     assert page.js("return document.querySelectorAll('img').length") == 0
     assert page.faults() == []
-
-
-def test_a_browser_without_webgl_gets_a_sentence(tmp_path: Path) -> None:
-    make("calibrated", tmp_path / "material")
-    first = poster(Material.load(tmp_path / "material"))
-    html = write_page(
-        {"materials": [material_content(tmp_path / "material")[0]], "poster": first}, "no WebGL"
-    )
-    with browser(tmp_path / "profile", NO_WEBGL) as started:
-        page = Page(started, html, tmp_path)
-        page.until(lambda: not page.message().startswith("Loading"))
-        assert "WebGL 2" in page.message()
-        # The poster stays behind it.
-        assert first in page.js("return getComputedStyle(document.getElementById('poster')).backgroundImage")
-
-
-def test_the_poster_is_the_first_picture(
-    driver: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    rows, columns = size = (54, 72)
-    monkeypatch.setattr("mbtf_fit.viewer.extras._POSTER", size)
-    first = poster(make("relief", tmp_path / "material"))
-    content = {"materials": [material_content(tmp_path / "material")[0]], "poster": first}
-    page = Page(driver, write_page(content, "poster"), tmp_path).ready()
-    assert page.js("return document.getElementById('poster')") is None
-    with Image.open(io.BytesIO(base64.b64decode(first.partition(",")[2]))) as image:
-        shown = np.asarray(image, float)
-    # The light has begun to swing: back to its first direction.
-    page.js("window.mbtf.viewer.draw = () => false; window.mbtf.viewer.restore('')")
-    drawn = to_display(page.picture(rows, columns)[..., :3], ALBEDO_EXPOSURE).astype(float)
-    means = [picture.mean((0, 1)) for picture in (shown, drawn)]
-    np.testing.assert_allclose(*means, atol=3)
-    # The poster is a JPEG, and the material's texels are random.
-    gray = np.stack([picture.mean(-1).ravel() for picture in (shown, drawn)])
-    assert np.corrcoef(gray)[0, 1] > 0.7
 
 
 def test_a_page_follows_a_fit(driver: Any, tmp_path: Path) -> None:

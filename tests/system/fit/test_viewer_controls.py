@@ -176,32 +176,6 @@ def test_inputs_set_what_they_say(page: Page) -> None:
         assert (page.js(written, name) or "") == text
 
 
-def test_the_light_of_the_first_view_swings_once(page: Page) -> None:
-    """From its first direction back to it, until the user moves a light; not in views of links, nor for
-    users who prefer reduced motion."""
-    moved = (
-        STATE + "viewer.swing &&= viewer.swing - 1000 * arguments[0]; viewer.moveLight();"
-        "return [state.lights[0].direction, viewer.swing === undefined]"
-    )
-    page.js(STATE + "viewer.restore('')")
-    for seconds, azimuth, ended in ((5, 20.0, False), (10, -80.0, False), (15, -30.0, True)):
-        direction, stopped = page.js(moved, seconds)
-        assert direction == pytest.approx(from_angles(45.0, azimuth).tolist(), abs=0.1)
-        # The irradiance of the plane stays.
-        assert direction[2] == pytest.approx(np.sqrt(0.5))
-        assert stopped == ended
-    for touched in (lambda: drag(page, "dome", (0.2, 0.1), (5, 5)), lambda: page.set(FLAT)):
-        page.js(STATE + "viewer.restore('')")
-        touched()
-        before = page.js(STATE + "return state.lights[0].direction")
-        assert page.js(moved, 5) == [before, True]
-    media = {"features": [{"name": "prefers-reduced-motion", "value": "reduce"}]}
-    page.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", media)
-    page.js(STATE + "viewer.restore('')")
-    assert page.js(moved, 5) == [pytest.approx(from_angles(45.0, -30.0).tolist()), True]
-    page.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
-
-
 def test_the_far_side_of_a_sphere_gets_no_light(page: Page) -> None:
     """Also at its silhouette, where interpolated normals may point away from the viewer."""
     lit = 0
@@ -217,33 +191,6 @@ def test_the_far_side_of_a_sphere_gets_no_light(page: Page) -> None:
             lit += int((left[..., :3].max(2) > 0).sum())
     # Of 95,000 pixels.
     assert lit < 5
-
-
-def test_values_of_links_are_brought_into_their_range(page: Page) -> None:
-    light = {"direction": [0, 0, 0], "color": [2, -1, 0.5], "intensity": 1e9}
-    page.set(
-        {
-            "camera": {"tiles_across": -3, "elevation": -500, "target": [1e9, 0, 0], "azimuth": "x"},
-            "lights": [light, {"direction": [0.3, 0, 0.4]}, *[{}] * 9],
-            "environment": {"name": "nope", "intensity": -1, "angle": 700},
-            **{"shape": "nope", "tiles": 1e9, "exposure": 50, "divide": 4},
-            **{"material": 7, "against": "material 7"},
-        }
-    )
-    camera = "[camera.tiles_across, camera.elevation, camera.azimuth, camera.target]"
-    assert page.js(STATE + f"return {camera}") == [0.05, 2, -90, [1000, 0, 0]]
-    found = page.js(STATE + "return state")
-    kept = {"shape": "plane", "tiles": 64, "exposure": 10, "divide": 0.98, "material": 2, "against": "none"}
-    assert kept.items() <= found.items()
-    assert found["environment"] == {"name": "none", "intensity": 0, "angle": 180}
-    first, second = found["lights"][:2]
-    assert (len(found["lights"]), first["color"], first["intensity"]) == (4, [1, 0, 0.5], 16)
-    assert np.linalg.norm(first["direction"]) == pytest.approx(1)
-    assert second["direction"] == pytest.approx([0.6, 0, 0.8])
-    # A link that is opened in the same tab is taken over.
-    page.js("location.hash = encodeURIComponent(JSON.stringify({ tiles: 7 }))")
-    page.until(lambda: page.js(STATE + "return state.tiles") == 7)
-    assert np.isfinite(page.picture(4, 4)).all()
 
 
 def test_the_dome_is_seen_from_above(page: Page) -> None:

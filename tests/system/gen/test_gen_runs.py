@@ -131,18 +131,6 @@ def test_merging_what_is_not_there_is_partial(batch: dict[str, Done]) -> None:
     assert "unfinished" in batch["unmerged"].out
 
 
-def test_another_seed_is_refused_and_overwrite_replaces(
-    batch: dict[str, Done], work: Path, whole: Path
-) -> None:
-    assert batch["changed seed"].code == 3
-    assert "seed: 0 -> 3" in batch["changed seed"].err
-    assert batch["overwrite"].result()["paths"] == 2048 * 4 + 200 * 8
-    assert verify(work / "replaced") == []
-    new, old = load(work / "replaced"), load(whole)
-    for name in ("u", "sigma", "omega_i", "value_a"):
-        assert np.mean(new["train"][name] == old["train"][name]) < 0.1
-
-
 def test_every_form_of_the_command_makes_the_same_data(batch: dict[str, Done], work: Path) -> None:
     for name in ("flags first", "yaml", "set", "file"):
         assert batch[name].result()["complete"] is True
@@ -187,25 +175,3 @@ def test_reference_writes_pictures_for_people_and_programs(batch: dict[str, Done
         assert np.corrcoef(shown.mean(axis=-1).ravel(), value.mean(axis=-1).ravel())[0, 1] > 0.8
     assert batch["one reference"].code == 0
     assert "noise" in batch["one reference"].out
-
-
-def test_pictures_that_are_there_are_kept_and_others_refused(batch: dict[str, Done], work: Path) -> None:
-    first = batch["reference"].result()
-    assert [p["kept"] for p in first["pictures"]] == [False] * 4
-    for name in ("pictures again", "from its own file"):
-        again = batch[name].result()
-        assert [p["kept"] for p in again["pictures"]] == [True] * 4, name
-        assert again["exposure"] == first["exposure"]
-        assert [p["relative_noise"] for p in again["pictures"]] == [
-            p["relative_noise"] for p in first["pictures"]
-        ]
-    # Another exposure writes the PNG files again, and renders nothing.
-    exposed = batch["pictures exposed"].result()
-    assert [p["kept"] for p in exposed["pictures"]] == [True] * 4
-    assert exposed["exposure"] == 1.5 != first["exposure"]
-    record = json.loads((work / "pictures/pictures.json").read_text())["items"]
-    assert {p["facts"]["exposure"] for name, p in record.items() if name.endswith(".png")} == {1.5}
-    refused = batch["pictures changed"]
-    assert refused.code == 3
-    assert "of another configuration: reference.spp: 4 -> 256" in refused.err
-    assert "size: 24" in (work / "pictures/config.yaml").read_text()

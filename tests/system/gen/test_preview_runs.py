@@ -12,7 +12,6 @@ from PIL import Image
 from support.commands import Done, run_named
 from support.datasets import write_dataset
 
-from mbtf_core.color import srgb_to_linear
 from mbtf_core.directions import from_angles
 from mbtf_core.pictures import tiles_camera
 from mbtf_gen.pictures.mesh import draw, tiled_mesh
@@ -91,21 +90,6 @@ def test_colors_lie_in_the_quadrants_of_the_map(batch: dict[str, Done], work: Pa
         for number, (down, right) in enumerate([(-5, -12), (-5, 12), (6, -12), (6, 12)]):
             part = picture[36 + down - 2 : 36 + down + 3, 48 + right - 4 : 48 + right + 5]
             assert (part == number).mean() > 0.8, (file, number)
-
-
-@pytest.mark.usefixtures("drawing")
-def test_another_exposure_shows_the_same_values(batch: dict[str, Done], work: Path) -> None:
-    """A flat gray tile of albedo 1/2, shown as it is by default, and by the automatic exposure as 0.8 of
-    white, 2^EV / (2 π)."""
-    assert srgb_to_linear(pixels(work / "flat/beauty.png")).mean() == pytest.approx(0.5, rel=0.03)
-    mesh, beauty, _ = batch["darker"].result()["pictures"]
-    assert beauty["exposure"] == mesh["exposure"] == pytest.approx(np.log2(0.8 * 2 * np.pi), abs=0.05)
-    mesh, beauty, queries = batch["darker again"].result()["pictures"]
-    assert (mesh["exposure"], beauty["exposure"]) == (-0.5, -0.5)
-    assert (mesh["kept"], beauty["kept"], queries["kept"]) == (False, False, True)
-    shown = srgb_to_linear(pixels(work / "darker/beauty.png")).mean()
-    assert shown == pytest.approx(2**-0.5 / (2 * np.pi), rel=0.03)
-    assert "exposure: -0.5" in (work / "darker/config.yaml").read_text()
 
 
 def test_a_data_set_is_shown_as_it_is(batch: dict[str, Done], work: Path) -> None:

@@ -201,10 +201,3 @@ def test_workers_upload_their_shards(tmp_path: Path, proxy: Proxy, monkeypatch: 
     done = call(*line, URL, "--cluster", "local:2")
     assert done.code == 0, done.err
     assert stored(tmp_path / "copy") == contents(tmp_path / "local")
-
-
-def test_refusals_are_explained(tmp_path: Path, proxy: Proxy) -> None:
-    line = [word.replace(BUCKET, "nosuchbucket") for word in line_at(tmp_path)]
-    done = call(*line)
-    assert done.code == 3
-    assert "cannot be written (The specified bucket does not exist)" in done.err

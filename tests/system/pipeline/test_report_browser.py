@@ -121,26 +121,6 @@ def matches(found: np.ndarray, expected: np.ndarray) -> bool:
     return found.shape == expected.shape and int(np.abs(found - expected).max()) <= 1
 
 
-def test_keys_move_the_border(page: Page, stage: Any) -> None:
-    from selenium.webdriver.common.keys import Keys
-
-    reference, fit = page.expected(0, "query"), page.expected(0, "neumip")
-    # They differ by far more than by rounding.
-    assert not matches(reference, fit)
-    stage.send_keys(Keys.END)
-    assert stage.get_attribute("aria-valuenow") == "100"
-    assert matches(page.screen(), reference)
-    stage.send_keys(Keys.HOME)
-    assert stage.get_attribute("aria-valuenow") == "0"
-    assert matches(page.screen(), fit)
-    stage.send_keys(*[Keys.PAGE_UP] * 2, *[Keys.ARROW_RIGHT] * 5)
-    assert stage.get_attribute("aria-valuenow") == "25"
-    assert "neumip" in stage.get_attribute("aria-valuetext")
-    shown, border = page.screen(), PIXELS // 4
-    assert matches(shown[:, :border], reference[:, :border])
-    assert matches(shown[:, border:], fit[:, border:])
-
-
 def test_selections_change_the_images(page: Page, stage: Any) -> None:
     def choose(name: str, value: str) -> None:
         page.js(f"document.querySelector(`input[name={name}][value='{value}']`).click()")
@@ -176,28 +156,6 @@ def test_error_maps_match_the_selection(page: Page, stage: Any) -> None:
     # Blue is too dark, orange too bright.
     assert colors[difference > 40, 0].mean() > colors[difference > 40, 2].mean()
     assert colors[difference < -40, 2].mean() > colors[difference < -40, 0].mean()
-
-
-def test_the_reference_stays_beside_every_fit(page: Page) -> None:
-    """On a narrow page, too, where a row of pictures scrolls."""
-    try:
-        screen = {"width": 420, "height": 900, "deviceScaleFactor": 1, "mobile": False}
-        page.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
-        for fit in ("neumip", "plain"):
-            tops, reference, shown = page.js(
-                "const at = what => document.getElementById(`pictures/v1-l1-s1-${what}`)"
-                ".getBoundingClientRect(), [reference, fit] = ['reference-query', arguments[0]].map(at),"
-                "row = document.querySelector('.sheet').parentElement;"
-                "row.scrollLeft += fit.right - row.getBoundingClientRect().right;"
-                "return [[reference.top, fit.top], at('reference-query'), at(arguments[0])]",
-                f"fit-{fit}",
-            )
-            assert tops[0] == tops[1], fit
-            assert 0 <= reference["left"] < reference["right"] <= shown["left"] + 1, fit
-            assert shown["right"] <= 420, fit
-        assert page.js("return document.querySelector('.sheet').parentElement.scrollLeft") > 0
-    finally:
-        page.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
 
 def test_images_are_visible_without_scripts(page: Page) -> None:

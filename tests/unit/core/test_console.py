@@ -51,22 +51,6 @@ def failing(error: BaseException) -> App:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "printed"),
-    [
-        ("map.exr", "make map.exr 4 (1, 1) False"),
-        ("--queries 400/texel map.exr", "make map.exr 400/texel (1, 1) False"),
-        ("--queries=9 --size 2 3 map.exr --json", "make map.exr 9 (2, 3) True"),
-        ("plan map.exr --depth 2", "plan map.exr 2 False False"),
-        ("map.exr --queries plan", "make map.exr plan (1, 1) False"),
-        ("./plan", "make plan 4 (1, 1) False"),
-    ],
-)
-def test_flag_positions(app: App, arguments: str, printed: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(app, arguments.split()) == 0
-    assert capsys.readouterr().out.strip() == printed
-
-
-@pytest.mark.parametrize(
     ("error", "text", "code"),
     [
         (InputError("is empty", where="a.npy", hint="fill it"), "a.npy: is empty; fill it", 3),
@@ -209,30 +193,6 @@ def test_the_time_left_counts_neither_set_up_nor_earlier_runs(
     ]
 
 
-def test_each_part_of_a_job_has_its_own_count(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its first line comes at once, and its time left counts from its own start."""
-    now = 0.0
-    monkeypatch.setattr("mbtf_core.app.progress.time.monotonic", lambda: now)
-    with CONSOLE.progress(100, "training", "%") as bar:
-        for now in (1.0, 2.0):
-            bar.update(50 * now, "loss 1")
-        now = 3.0
-        bar.update(20, "m", label="calibrating")
-        now = 12.0
-        bar.update(50, label="calibrating")
-        now = 13.0
-        bar.update(80, label="calibrating")
-        bar.update(10, label="predicting")
-    assert capsys.readouterr().err.splitlines() == [
-        "training: 100%, 0:02 elapsed, loss 1",
-        "calibrating: 20%, 0:03 elapsed, m",
-        "calibrating: 80%, 0:13 elapsed, 0:03 left, m",
-        "predicting: 10%, 0:13 elapsed, m",
-    ]
-
-
 def test_plain_progress_has_a_line_at_intervals(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -275,8 +235,3 @@ def test_progress_on_a_terminal_is_a_bar() -> None:
     assert note in lines
     assert any("━" in line and "100%" in line for line in lines)
     assert all(re.match(r"rendering ━+ |loss ", line) and len(line) <= 60 for line in lines), lines
-
-
-def test_the_version_is_said(app: App, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(app, ["--version"]) == 0
-    assert re.fullmatch(r"prog \d+\.\d+\.\d+\S*\n", capsys.readouterr().out)

@@ -158,16 +158,6 @@ def test_damaged_bytes(data: st.DataObject, folder: Path) -> None:
     loads_or_refuses(lambda: DOCUMENTS[kind][1](path))
 
 
-@given(
-    st.sampled_from(["seed", "queries", "queries.spp", "light.width", "a.b", "", "queries.train", "."]),
-    st.sampled_from(["=", "", "=="]),
-    st.one_of(st.sampled_from(ODD), st.text(max_size=8)),
-)
-@examples(150)
-def test_odd_assignments(key: str, sign: str, value: str) -> None:
-    loads_or_refuses(lambda: resolve(GeneratorConfig, assignments=["material=x", f"{key}{sign}{value}"]))
-
-
 BOMB = "a: &a [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"{name}: &{name} [{', '.join([f'*{before}'] * 10)}]\n"
     for before, name in zip("abcdefgh", "bcdefghi", strict=True)

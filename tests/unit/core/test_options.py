@@ -34,11 +34,6 @@ class All(Options[Config]):
     """All options."""
 
 
-@options_from(Config, "queries")
-class Some(Options[Config]):
-    """Those of one section."""
-
-
 def everything(
     material: str | None = None,
     /,
@@ -92,20 +87,6 @@ def test_a_command_takes_them_as_its_own(capsys: pytest.CaptureFixture[str]) -> 
         assert text in whole
     # The short page names them, after the others.
     assert short.index("--last") < short.index("--help-all") < short.index("--mesh, --config, --set")
-
-
-def test_values_go_over_presets_and_files(tmp_path: Path) -> None:
-    file = tmp_path / "c.yaml"
-    file.write_text("material: map.exr\nqueries: {spp: 2, mixture: 0.1}\nlayout: image\n")
-    given = {"spp": "8"}
-    assignments = ["queries.mixture=0.3", "queries.train=9x"]
-    options = Some(**given, config=file, assignments=assignments)  # type: ignore[call-arg]
-    presets = {"queries.mixture": 0.2, "layout": "shuffled", "queries.spp": 6}
-    resolved = options.resolve(presets, material=None)
-    assert resolved.queries == Query(train="9x", spp=8, mixture=0.3)
-    assert resolved.layout == "shuffled"
-    assert resolved.material == str(tmp_path / "map.exr")
-    assert options.resolve(material="here.exr").material == "here.exr"
 
 
 def test_a_command_line_can_be_given_to_a_shell() -> None:

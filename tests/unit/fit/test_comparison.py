@@ -18,7 +18,6 @@ from support.datasets import edit, read_checksummed, write_dataset
 from support.plugin_materials import write_material
 
 from mbtf_core.color import to_display
-from mbtf_fit.comparison import _rms_text
 from mbtf_fit.preview.grid import BAR_STRIP, CAPTION, GAP, MARGIN
 from mbtf_gen.pictures import reference
 
@@ -85,11 +84,6 @@ def test_errors_and_panels_are_those_of_reference_and_fit(work: Path) -> None:
     below = image[-BAR_STRIP:].min(axis=(0, 2))
     assert (below[: MARGIN + 2 * pitch - GAP] == 255).all()
     assert below[MARGIN + 2 * pitch : -MARGIN].max() < 255
-
-
-@pytest.mark.parametrize(("error", "text"), [(0.004, "RMS error 20.0%"), (0.006, "RMS error within noise")])
-def test_rms_errors_are_relative_to_the_mean_value(error: float, text: str) -> None:
-    assert _rms_text({"mean": 0.5, "mse": {"value": 0.01, "error": error}}) == text
 
 
 def test_data_of_another_material_are_announced(work: Path, tmp_path: Path) -> None:

@@ -49,28 +49,3 @@ def test_errors_above_1_are_worse_than_the_mean_value(value: float, remark: bool
     assert ("above 1: worse than the mean value" in report_errors(found, None)[-1]) == remark
     # The data of another material say nothing of the number of queries.
     assert "above 1" not in report_errors(found, None, foreign=True)[-1]
-
-
-def test_where_the_unexplained_variance_is_undefined_the_psnr_is_the_number() -> None:
-    """A material of one value, or few noisy queries."""
-    lines = report_errors({"test": split(1e-5, 1e-6, None), "training": split(1e-5, 1e-6, None)}, None)
-    assert lines[0].startswith("PSNR 50.0 dB of 4096 test queries at exposure +0.00 EV")
-    assert lines[-1].startswith("undefined unexplained variance: the noise exceeds")
-
-
-def test_the_table_holds_what_is_defined() -> None:
-    """Rows and columns without a number are left out; what remains undefined is explained once."""
-    known, unknown = split(2e-3, 1e-5), split(2e-3, 1e-5, None)
-    test = {**known, "levels": {"0": unknown, "1": known, "2": known}, "elevations": {"0-0.2": unknown}}
-    training = {**known, "levels": {"0": unknown, "1": unknown}}
-    found = {"test": test, "training": training, "held_out_directions": unknown}
-    table = report_errors(found, None, verbose=True)
-    head = next(k for k, line in enumerate(table) if line.startswith("unexplained variance  "))
-    assert "held-out directions" not in table[head]
-    assert [line.split("  ")[0] for line in table[head + 1 :]] == [
-        *("all", "level 1", "level 2", "queries"),
-        table[-1],
-    ]
-    assert table[-1].startswith("-: ")
-    del test["levels"]["1"], test["levels"]["2"]
-    assert report_errors(found, None, verbose=True)[-1].startswith("queries")

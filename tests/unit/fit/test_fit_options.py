@@ -9,7 +9,6 @@ import pytest
 
 from mbtf_core.app.console import run
 from mbtf_core.config.settings import build
-from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.units import format_duration, parse_duration
 from mbtf_fit import ops
@@ -54,12 +53,6 @@ def test_flags_override_assignments_presets_and_files(tmp_path: Path) -> None:
 def test_a_time_and_a_number_of_steps_exclude_each_other(words: tuple[str, ...]) -> None:
     with pytest.raises(UsageError, match=r"time.* and .*steps'? are mutually exclusive"):
         config_of(*words)
-
-
-def test_a_resolved_configuration_with_steps_reads_back(tmp_path: Path) -> None:
-    found = config_of("--steps", "3")
-    (tmp_path / "c.yaml").write_text(dump_yaml(found.model_dump(mode="json")))
-    assert config_of("--config", str(tmp_path / "c.yaml")) == found
 
 
 def test_presets_keep_what_sections_set() -> None:
@@ -147,10 +140,3 @@ def test_every_operation_has_a_line(capsys: pytest.CaptureFixture[str]) -> None:
         "1×1 convolution, Inception modules, 1×1 convolution over a Neighborhood ("
     )
     assert found.keys() == {name for name in ops.__all__ if name[0].isupper()} - {"Backend", "Operation"}
-
-
-def test_every_model_has_a_line(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(app, ["models"]) == 0
-    rows = capsys.readouterr().out.splitlines()[1:]
-    assert [row.split()[0] for row in rows] == sorted(NAMES)
-    assert all(len(row.split()) > 3 for row in rows)

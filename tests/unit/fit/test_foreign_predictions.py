@@ -49,23 +49,17 @@ def test_what_cannot_be_scored_is_refused(shards: Path, tmp_path: Path) -> None:
     file = tmp_path / "mine.npz"
     with pytest.raises(InputError, match="no such file"):
         score_predictions(file, shards)
-    for text in (b"", b"text", b"PK\x03\x04"):
-        file.write_bytes(text)
-        with pytest.raises(InputError, match="no npz file"):
-            score_predictions(file, shards)
-    for arrays in ({"values": np.zeros((1500, 3))}, {"value": np.array(["a"])}):
+    for arrays in ({"values": np.zeros((1500, 3))}, {"value": np.array(["a"])}, {"value": np.full(3, 1j)}):
         np.savez(file, **arrays)
         with pytest.raises(InputError, match="no npz file"):
             score_predictions(file, shards)
     np.savez_compressed(file, value=np.ones((1500, 3)))
     damaged = bytearray(file.read_bytes())
     damaged[60:90] = bytes(30)
-    file.write_bytes(damaged)
-    with pytest.raises(InputError, match="no npz file"):
-        score_predictions(file, shards)
-    np.savez(file, value=np.full((1500, 3), 1j))
-    with pytest.raises(InputError, match="no npz file"):
-        score_predictions(file, shards)
+    for content in (b"", b"text", damaged):
+        file.write_bytes(content)
+        with pytest.raises(InputError, match="no npz file"):
+            score_predictions(file, shards)
     for shape in ((), (4500,), (1499, 3), (3, 1500)):
         np.savez(file, value=np.zeros(shape))
         with pytest.raises(InputError, match=r"shape .* 1500 test queries"):

@@ -121,18 +121,6 @@ def test_a_target_error_is_a_share_or_per_cent(text: str | float, share: float) 
 
 
 @pytest.mark.parametrize(
-    ("given", "canonical"),
-    [
-        ("cc-by-4.0", "CC-BY-4.0"),
-        ("mit or apache-2.0", "MIT OR Apache-2.0"),
-        ("LicenseRef-Ours", "LicenseRef-Ours"),
-    ],
-)
-def test_licenses_get_their_canonical_spelling(given: str, canonical: str) -> None:
-    assert PublishConfig(license=given).license == canonical
-
-
-@pytest.mark.parametrize(
     "said",
     [
         {"license": "Creative Commons"},
@@ -152,13 +140,6 @@ def test_what_cannot_be_published_is_refused(said: dict[str, Any]) -> None:
     with pytest.raises(InputError) as fault:
         PublishConfig.model_validate({"license": "MIT", **said})
     assert fault.value.what.startswith(f"'{next(iter(said))}")
-
-
-def test_authors_are_separated_as_in_bibtex() -> None:
-    said = PublishConfig.model_validate(
-        {"license": "MIT", "author": "Lovelace, Ada and Mary  and  Ferdinand"}
-    )
-    assert list(said.author) == ["Lovelace, Ada", "Mary", "Ferdinand"]
 
 
 def test_addresses_cannot_end_a_link() -> None:

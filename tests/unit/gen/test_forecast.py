@@ -4,18 +4,13 @@ from __future__ import annotations
 
 import math
 import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from support.datasets import write_dataset
 
 from mbtf_core import forecast as core
-from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.schema import Queries
-from mbtf_core.data.shard_files import row_bytes
-from mbtf_core.units import size_text
 from mbtf_gen import forecast as module
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.forecast import forecast
@@ -135,18 +130,3 @@ def test_a_forecast_of_slow_paths_is_short(faked: None, monkeypatch: pytest.Monk
     found = forecast(job, RunPlan(plan_effects(job, pilots=False)), seconds=1.0)
     assert found.seconds == pytest.approx(found.paths / RATE, rel=1e-6)
     assert module.time.now < 6.0  # type: ignore[attr-defined]
-
-
-def test_bytes_are_those_of_the_arrays(tmp_path: Path) -> None:
-    data = write_dataset(tmp_path / "shards", queries={"train": "64", "test": "16", "spp": 4})
-    arrays = Dataset.open(data.folder).load("train")
-    assert row_bytes(False) * 64 == sum(a.nbytes for a in arrays.values())
-    assert row_bytes(True) == row_bytes(False) + 4
-
-
-def test_a_run_without_noise_has_a_forecast(faked: None) -> None:
-    job = job_of(train="1000", test="10")
-    quiet = forecast(job, RunPlan(plan_effects(job, pilots=False)), seconds=0.0)
-    assert quiet.bytes == 1010 * row_bytes(False)
-    assert str(size_text(quiet.bytes)) == "65 kB"
-    assert "of the mean value" in quiet.describe()

@@ -71,11 +71,6 @@ def test_the_limit_of_the_displacement_range_can_be_raised(tmp_path: Path) -> No
     assert raised.config_hash == Job.of(config(height_scale=1.0), raised.material).config_hash
 
 
-def test_too_many_shards_are_refused(heights: Path) -> None:
-    with pytest.raises(UsageError, match=r"shards of 40"):
-        _ = job_of(heights, train="1e12/texel").shards
-
-
 def test_most_paths_include_pilots_and_cap(heights: Path) -> None:
     job = job_of(heights)
     assert most_paths(job) == planned_paths(job, job.shards) == 320

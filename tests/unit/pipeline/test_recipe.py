@@ -13,9 +13,8 @@ import pytest
 from mbtf_core.app.console import Console, run
 from mbtf_core.errors import InputError
 from mbtf_pipeline.cli.app import app
-from mbtf_pipeline.cli.run import _report
 from mbtf_pipeline.recipe import load_recipe, read_resolved, write_recipe
-from mbtf_pipeline.run import RunResult, _material_inputs, _RecipeRun, survey
+from mbtf_pipeline.run import _material_inputs, _RecipeRun, survey
 from mbtf_pipeline.stages import run_stages
 
 HEAD = """\
@@ -90,23 +89,6 @@ def test_a_fit_is_out_of_date_when_the_file_of_its_model_has_changed(
     assert inputs() == before
     file.write_text(file.read_text().replace("pass", "calibrates = True"))
     assert inputs() != before
-
-
-def test_last_lines_say_which_errors_do_not_rank_models(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    recipe, folder = load_recipe(written(tmp_path, NAMED)), tmp_path / "out"
-    for name in recipe.fit:
-        (folder / "fits" / name).mkdir(parents=True)
-    write_recipe(recipe, folder)
-    error = {"unexplained": {"value": 0.5, "error": 0.01, "n": 9}, "mse": None}
-    steps = {"neumip": 400, "quick": 91}
-    tests = {fit: {"splits": {"test": error}, "training_steps": n} for fit, n in steps.items()}
-    _report(RunResult(folder / "report.html", None, {}, {"test": tests}), Console(), None)
-    assert capsys.readouterr().out.splitlines()[1:] == [
-        "  neumip: unexplained variance 0.500 ± 0.010",
-        "  quick (91 steps: not converged): unexplained variance 0.500 ± 0.010",
-    ]
 
 
 def test_an_assigned_material_is_relative_to_the_current_folder(
@@ -216,18 +198,3 @@ def test_a_stored_recipe_runs_no_code(tmp_path: Path) -> None:
     with pytest.raises(InputError):
         load_recipe(tmp_path / "recipe.yaml")
     assert ran.exists()
-
-
-def test_listing_shows_recipes_and_errors(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    written(tmp_path, SINGLE + "description: four by four\n")
-    (tmp_path / "broken.yaml").write_text("name: broken\nfti: {}\n")
-    monkeypatch.chdir(tmp_path)
-    assert run(app, ["list", "."]) == 0
-    broken, small = capsys.readouterr().out.splitlines()
-    assert broken.startswith("broken.yaml: line 2: unknown key 'fti'")
-    assert small == "recipe-under-test.yaml: four by four"
-    assert run(app, ["list", ".", "-v"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[2:] == [f"    {s}: has not run" for s in ("generate", "fit neumip", "compare", "report")]

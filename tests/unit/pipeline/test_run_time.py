@@ -15,7 +15,6 @@ from mbtf_core.app.console import run
 from mbtf_core.data.shard_files import row_bytes
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.files import folders
-from mbtf_fit.sections import TimeBudget
 from mbtf_pipeline import run as runs
 from mbtf_pipeline import run_time as module
 from mbtf_pipeline.cli.app import app
@@ -127,27 +126,6 @@ def test_training_is_shortened_when_generating_overran(fake: Machine, one: Path)
     assert "the run will be about" in notes[-1]
 
 
-def test_a_preset_that_does_not_fit_on_the_disk_is_not_chosen(fake: Machine, one: Path) -> None:
-    fake.path = 1e-12
-    fake.free = 1e9
-    assert timed(one, 1200.0).split.quality == "draft"
-    fake.free = 1e5
-    with pytest.raises(InputError, match="are free"):
-        timed(one, 1000.0, folder=one.parent / "full")
-    assert not (one.parent / "full").exists()
-
-
-def test_a_given_preset_is_kept_and_fits_share_the_training(fake: Machine, one: Path) -> None:
-    notes: list[str] = []
-    found = timed(FILE, 300.0, folder=one.parent / "run", quality="draft", progress=notes.append)
-    assert found.split.quality == "draft"
-    assert len(found.recipe.fit) == 3
-    assert all(fit.training.steps is None for fit in found.recipe.fit.values())
-    assert {fit.training.time for fit in found.recipe.fit.values()} == {TimeBudget(found.split.training)}
-    assert found.recipe.generate.light == preset_recipe(FILE, None).generate.light
-    assert [note.split(",")[0] for note in notes] == ["time: preset draft"]
-
-
 def test_the_same_command_resumes_with_the_same_split(fake: Machine, one: Path) -> None:
     first = timed(one, 200.0)
     fake.path *= 1.5
@@ -155,16 +133,6 @@ def test_the_same_command_resumes_with_the_same_split(fake: Machine, one: Path) 
     # A damaged record is split anew.
     (one.parent / "run" / module.SPLIT_NAME).write_text('{"key": 1}')
     assert timed(one, 200.0).split.training < first.split.training
-
-
-def test_what_cannot_be_split_is_refused(fake: Machine, one: Path) -> None:
-    with pytest.raises(UsageError, match="layout"):
-        timed(one, 100.0, "fit.model=hierarchical")
-    assert not (one.parent / "run").exists()
-    (one.parent / "run").mkdir()
-    (one.parent / "run" / "file").write_text("")
-    with pytest.raises(InputError, match="holds no run"):
-        timed(one, 100.0)
 
 
 def test_all_stages_count(fake: Machine) -> None:

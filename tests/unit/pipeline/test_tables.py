@@ -8,7 +8,7 @@ import pytest
 
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.compare.perceptual_metrics import PERCEPTUAL_METRICS, available_metrics
-from mbtf_pipeline.tables import data_errors, decibel, estimate_text, levels_text
+from mbtf_pipeline.tables import data_errors, decibel, estimate_text
 
 
 @pytest.mark.parametrize("value", [0.03, -0.03, 0.0])
@@ -55,8 +55,3 @@ def test_perceptual_differences_that_noise_explains() -> None:
     record = {"flip": {"hdr": 0.2}, "ssim": 0.8, "st_lpips": None}
     assert (hdr.of(record), learned.text(learned.of(record), None)) == (0.2, "–")
     assert [m.title for m in available_metrics([{"fits": {"a": record}}], ["a"])] == ["HDR-FLIP", "SSIM"]
-
-
-def test_levels_finer_than_the_data_are_marked() -> None:
-    assert levels_text([3.0, 3.0], 7) == "level 3.0"
-    assert levels_text([6.0, 8.5], 7) == "level 6.0–8.5 (finest level of the data: 7)"

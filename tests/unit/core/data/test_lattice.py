@@ -58,9 +58,3 @@ def test_texel_centers() -> None:
     assert centers[0, 0] == pytest.approx([0.5 / 8, 1 - 0.5 / 4])
     assert centers[3, 7] == pytest.approx([1 - 0.5 / 8, 0.5 / 4])
     assert centers.mean(axis=(0, 1)) == pytest.approx([0.5, 0.5])
-
-
-@pytest.mark.parametrize(("finest", "aspect"), [(-1, 1.0), (15, 1.0), (3, 0.0), (3, -1.0), (3, float("nan"))])
-def test_nonsense_is_refused(finest: int, aspect: float) -> None:
-    with pytest.raises(ValueError, match="must"):
-        Lattice(finest, aspect)

@@ -205,8 +205,3 @@ def test_refusals_are_not_tried_again(store: ObjectStore, error: Exception) -> N
 )
 def test_urls_are_recognized(text: object, expected: tuple[str, str] | None) -> None:
     assert split_url(text) == expected
-
-
-def test_an_unknown_protocol_is_refused() -> None:
-    with pytest.raises(InputError, match="cannot be opened"):
-        ObjectStore("nosuchprotocol://bucket/data")

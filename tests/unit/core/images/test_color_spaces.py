@@ -210,35 +210,6 @@ def test_curves_of_profiles_are_constant_below_their_start(tmp_path: Path) -> No
         assert linear_rgb(read_image(tmp_path / "g.png"))[0, :, 0] == pytest.approx(expected, abs=1e-4)
 
 
-def test_unsupported_declarations_are_named(tmp_path: Path) -> None:
-    codes = rng().integers(0, 256, (4, 4, 3))
-    for chunk, what in (
-        ((b"cICP", bytes([9, 16, 0, 1])), "cICP chunk"),
-        ((b"cICP", bytes([9])), "cICP chunk"),
-        ((b"cHRM", bytes(32)), "chromaticities"),
-        ((b"iCCP", b"x\0\0" + zlib.compress(icc("Odd", P3_COLUMNS, para(0, -2.0)))), "color profile 'Odd'"),
-        ((b"iCCP", b"x\0\0" + zlib.compress(icc("P3", P3_COLUMNS, table(2.0, 9)[:20]))), "color profile"),
-        # Of video, not of full range.
-        ((b"cICP", bytes([12, 13, 0, 0])), "cICP chunk"),
-        # Of Y'CbCr.
-        ((b"cICP", bytes([12, 13, 1, 1])), "cICP chunk"),
-    ):
-        assert what in (read_image(png(tmp_path / "x.png", codes, 2, 8, extra=(chunk,))).tags.foreign or "")
-
-
-def test_exif_declares_adobe_rgb(tmp_path: Path) -> None:
-    codes = rng().integers(100, 150, (1, 1, 3)).astype(np.uint8).repeat(16, 0).repeat(16, 1)
-    exif = Pillow.Exif()
-    exif.get_ifd(0x8769)[0xA001] = 65535
-    exif.get_ifd(0x8769)[0xA005] = {1: "R03"}
-    Pillow.fromarray(codes).save(tmp_path / "x.jpg", exif=exif, quality=100, subsampling=0)
-    image = read_image(tmp_path / "x.jpg")
-    # Published by colour-science; red and blue are those of Rec.709.
-    matrix = [[1.39836, -0.39836, 0.0], [0.0, 1.0, 0.0], [0.0, -0.04293, 1.04293]]
-    expected = image.pixels.astype(float) ** 2.19921875 @ np.array(matrix).T
-    assert linear_rgb(image) == pytest.approx(expected, abs=1e-4)
-
-
 def test_chromaticities_of_exr_and_radiance(tmp_path: Path) -> None:
     numbers = rng().random((4, 8, 3)).astype(np.float32)
     channels = {name: numbers[..., k].copy() for k, name in enumerate("RGB")}

@@ -12,13 +12,6 @@ from mbtf_core.errors import InputError
 from mbtf_core.images.environment import read_environment
 
 
-def test_a_profile_that_is_not_applied_is_mentioned(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    picture = Image.fromarray(np.full((2, 4, 3), 188, np.uint8))
-    picture.save(tmp_path / "sky.png", icc_profile=b"broken")
-    read_environment(tmp_path / "sky.png", 64)
-    assert "color profile 'unreadable'" in caplog.text
-
-
 def test_surroundings_are_linear_and_small(tmp_path: Path) -> None:
     sky = np.zeros((200, 400, 3), np.float32)
     sky[:100] = (0.25, 0.5, 4.0)
@@ -49,13 +42,3 @@ def test_surroundings_are_linear_and_small(tmp_path: Path) -> None:
     ):
         with pytest.raises(InputError, match=what):
             read_environment(tmp_path / name, 64)
-
-
-def test_other_formats_are_refused_with_those_that_are_read(tmp_path: Path) -> None:
-    (tmp_path / "README.md").write_text("text")
-    with pytest.raises(
-        InputError, match=r"'\.md' is not an image format .*\n  use one of \.hdr, \.exr, \.png"
-    ):
-        read_environment(tmp_path / "README.md", 64)
-    with pytest.raises(InputError, match="no such file"):
-        read_environment(tmp_path / "none.md", 64)

@@ -117,35 +117,3 @@ def test_single_channels_of_other_kinds(tmp_path: Path) -> None:
     assert "R, G, B, A" in caught.value.hint
     gray = png(tmp_path / "gray.png", codes[..., :1], 0, 16)
     assert np.array_equal(read_image(gray, "Y").pixels, read_image(gray).pixels)
-
-
-class TestClaims:
-    @pytest.mark.parametrize(
-        ("chunks", "space", "foreign"),
-        [
-            ((), None, None),
-            (((b"sRGB", b"\x00"),), "srgb", None),
-            (((b"gAMA", (45455).to_bytes(4, "big")),), "srgb", None),
-            (((b"gAMA", (100000).to_bytes(4, "big")),), "linear", None),
-            (((b"gAMA", (100000).to_bytes(4, "big")), (b"sRGB", b"\x00")), "srgb", None),
-        ],
-    )
-    @pytest.mark.parametrize("bits", [8, 16])
-    def test_png(
-        self, tmp_path: Path, chunks: tuple[Any, ...], space: str | None, foreign: str | None, bits: int
-    ) -> None:
-        path = png(tmp_path / "x.png", rng().integers(0, 256, (4, 4, 3)), 2, bits, extra=chunks)
-        tags = read_image(path).tags
-        assert (tags.space, tags.foreign) == (space, foreign)
-
-    def test_orientation_is_reported_but_not_applied(self, tmp_path: Path) -> None:
-        from PIL import Image as Pillow
-
-        codes = np.zeros((8, 16), np.uint8)
-        codes[0] = 255
-        exif = Pillow.Exif()
-        exif[0x0112] = 6
-        Pillow.fromarray(codes).save(tmp_path / "x.png", exif=exif)
-        image = read_image(tmp_path / "x.png")
-        assert image.tags.orientation == 6
-        assert np.array_equal(image.pixels[..., 0] * 255, codes)

@@ -133,28 +133,6 @@ def test_truncated_files_are_refused(tmp_path: Path, share: float, capfd: pytest
     assert capfd.readouterr() == ("", "")
 
 
-def test_files_that_are_no_images(tmp_path: Path) -> None:
-    cases = {
-        "missing.png": (None, "no such file"),
-        "empty.png": (b"", "is empty"),
-        "text.png": (b"hello, this is text", "is not a valid PNG image"),
-        "text.exr": (b"hello, this is text", "is not a valid EXR image"),
-        "notes.txt": (b"hello", "'.txt' is not an image format"),
-        "none": (b"hello", "'' is not an image format"),
-        "jpeg.png": (b"\xff\xd8\xff\xe0rest", "contains JPEG data"),
-    }
-    for name, (content, message) in cases.items():
-        if content is not None:
-            (tmp_path / name).write_bytes(content)
-        with pytest.raises(InputError) as caught:
-            read_image(tmp_path / name)
-        assert message in caught.value.what
-        assert caught.value.exit_code == 3
-    with pytest.raises(InputError, match="is a folder"):
-        read_image(tmp_path)
-    assert "rename it to jpeg.jpg" in caught.value.message
-
-
 def test_kinds_that_would_lose_something_are_refused(tmp_path: Path) -> None:
     from PIL import Image as Pillow
 

@@ -318,17 +318,3 @@ def test_more_instances_than_fit_are_refused_before_they_are_made(tmp_path: Path
     builder.node(mesh, extensions=extension)
     with pytest.raises(InputError, match="25,000,000 triangles"):
         content_of(builder, tmp_path)
-
-
-def test_what_is_not_used_is_named_once(tmp_path: Path) -> None:
-    builder = with_triangle(extensions={"KHR_lights_punctual": {"light": 0}})
-    for mode in (0, 1, 3):
-        builder.node(builder.mesh(SQUARE, None, mode=mode))
-    unused = {"normalTexture": {"index": 0}, "occlusionTexture": {"index": 0}, "emissiveFactor": [0, 0, 2]}
-    for name in "ab":
-        builder.plate(builder.material({}, name=name, **unused))
-    builder.document |= {"animations": [{}], "extensions": {"KHR_lights_punctual": {"lights": []}}}
-    found = content_of(builder, tmp_path)
-    assert len(found.shapes[0].vertices) == 3
-    for word in ("KHR_lights_punctual", "points and lines", "animations", "normal", "occlusion", "emission"):
-        assert sum(word in warning for warning in found.warnings) == 1, word

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from support.gltf_files import SQUARE, SQUARE_UV, GltfBuilder, png
+from support.gltf_files import SQUARE, SQUARE_UV, GltfBuilder
 
 from mbtf_core.errors import InputError
 from mbtf_core.meshes.content import MeshContent, MeshShape, Texture, numbers_of
@@ -295,55 +295,3 @@ def test_alpha_of_vertices_is_refused_where_it_counts(tmp_path: Path) -> None:
         else:
             with pytest.raises(InputError, match="alpha"):
                 content_of(builder, tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("metallicFactor", 1e9),
-        ("metallicFactor", -0.1),
-        ("roughnessFactor", "0.5"),
-        ("roughnessFactor", True),
-        ("baseColorFactor", [1, 1, 1]),
-        ("baseColorFactor", [-1, 1, 1, 1]),
-        ("baseColorFactor", [1, 1, 1, 2]),
-    ],
-)
-def test_factors_out_of_range_are_refused(tmp_path: Path, key: str, value: Any) -> None:
-    with pytest.raises(InputError, match=f"materials.0.pbrMetallicRoughness.{key}"):
-        content_of(plate_of({key: value}), tmp_path)
-    path = plate_of({"metallicFactor": 0.25}).write(tmp_path / "a.gltf")
-    path.write_text(path.read_text().replace("0.25", "NaN"))
-    with pytest.raises(InputError, match="NaN"):
-        read_mesh_content(path)
-
-
-def fault_of(texture: dict[str, Any], image: dict[str, Any] | None, folder: Path) -> InputError:
-    builder = GltfBuilder()
-    if image is not None:
-        builder.add("images", image)
-    builder.add("textures", texture)
-    (shape,) = content_of(plate_of({"baseColorTexture": {"index": 0}}, builder), folder).shapes
-    assert shape.faults.keys() == {"base_color"}
-    return shape.faults["base_color"]
-
-
-def test_images_that_cannot_be_read_are_named(tmp_path: Path) -> None:
-    fault = fault_of({"source": 0}, {"uri": "gone.png"}, tmp_path)
-    assert fault.where == str(tmp_path / "gone.png")
-    (tmp_path / "a.png").write_bytes(png(np.zeros((4, 4, 3), np.uint8))[:40])
-    assert fault_of({"source": 0}, {"uri": "a.png"}, tmp_path).where == str(tmp_path / "a.png")
-    (tmp_path / "b.png").write_bytes(b"\xabKTX 20\xbb\r\n\x1a\n" + bytes(99))
-    assert fault_of({"source": 0}, {"uri": "b.png"}, tmp_path).where == str(tmp_path / "b.png")
-    assert "KTX2" in fault_of({"extensions": {"KHR_texture_basisu": {"source": 0}}}, None, tmp_path).hint
-    assert "no image" in fault_of({}, None, tmp_path).what
-    assert "images.3" in fault_of({"source": 3}, None, tmp_path).what
-
-
-def test_specular_and_glossiness_alone_are_a_fault(tmp_path: Path) -> None:
-    extensions = {"KHR_materials_pbrSpecularGlossiness": {"diffuseFactor": [1, 0, 0, 1]}}
-    (shape,) = content_of(plate_of(None, extensions=extensions), tmp_path).shapes
-    assert shape.faults.keys() == {"base_color", "roughness", "metallic"}
-    found = content_of(plate_of({}, extensions=extensions), tmp_path)
-    assert found.shapes[0].faults == {}
-    assert any("SpecularGlossiness" in text for text in found.warnings)

@@ -16,7 +16,6 @@ from mbtf_core.errors import InputError
 from mbtf_core.meshes.content import MeshContent, MeshShape, Texture
 from mbtf_core.meshes.obj import read_obj
 from mbtf_core.meshes.polygons import triangulate
-from mbtf_core.meshes.read import seems_up
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nvn 0 0 1\n"
 FACES = "f 1/1 2/2 3/3\nf 1/1 3/3 4/4\n"
@@ -259,53 +258,6 @@ def test_values_that_cannot_be_read_are_faults(tmp_path: Path, text: str, role: 
     assert says in shape.faults[role].message
 
 
-@pytest.mark.parametrize(
-    ("use", "library", "says"),
-    [("ghost", "a.mtl", "'ghost'"), ("m", "gone.mtl", "gone.mtl"), ("mm", "a.mtl", "did you mean 'm'")],
-)
-def test_materials_that_are_not_there(tmp_path: Path, use: str, library: str, says: str) -> None:
-    text = f"mtllib {library}\n{SQUARE}usemtl {use}\n{FACES}"
-    (shape,) = read(tmp_path, text, a_mtl="newmtl m\nKd 1 1 1\n").shapes
-    assert says in shape.faults["base_color"].message
-    # Where no file is named, there is only a warning.
-    content = read(tmp_path, f"{SQUARE}usemtl {use}\n{FACES}")
-    assert not content.shapes[0].faults
-    assert f"'{use}'" in content.warnings[0]
-
-
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        (
-            "Ks 0.5 0.5 0.5\nNs 250\nKe 1 0 0\nmap_Bump n.png\nnorm n.png\naniso 0.5",
-            "Ke Ks aniso map_Bump norm",
-        ),
-        ("map_Kd -bm 2 -texres 4 a.png", "-bm -texres"),
-        ("Kd 0 0 0\nmap_Kd a.png", "Kd black"),
-        ("newmtl m\nKd 0 0 0", "twice"),
-        ("Tr 1", "Tr"),
-        ("d 0", "d hides"),
-    ],
-)
-def test_what_is_not_used_is_said(tmp_path: Path, text: str, says: str) -> None:
-    Image.fromarray(QUAD).save(tmp_path / "a.png")
-    text = text if "Kd" in text.split()[0] else f"Kd 1 1 1\n{text}"
-    (warning,) = with_material(tmp_path, text).warnings
-    for word in says.split():
-        assert word in warning
-
-
-def test_statements_of_no_effect_are_silent(tmp_path: Path) -> None:
-    blender = "Ns 250\nKa 1 1 1\nKd 0.8 0.8 0.8\nKs 0 0 0\nKe 0 0 0\nNi 1.45\nd 1\nillum 2\nPr 0.5\nPm 0\n"
-    blender += "Ps 0\nPc 0\nPcr 0.03\naniso 0\nanisor 0"
-    content = with_material(tmp_path, blender)
-    assert content.warnings == []
-    assert content.shapes[0].values.keys() == {"base_color", "roughness", "metallic"}
-    layers = with_material(tmp_path, "Kd 1 1 1\nPc 0.5\nPcr 0.2\nPs 0.3\nTr 0.25").shapes[0].values
-    assert (layers["clearcoat"], layers["clearcoat_roughness"], layers["sheen"]) == (0.5, 0.2, 0.3)
-    assert layers["opacity"] == 0.75
-
-
 def test_colors_of_vertices_are_srgb_factors(tmp_path: Path) -> None:
     colored = "v 0 0 0 1 0 0\nv 1 0 0 0.5 0.5 0.5\nv 0 1 0 0 0 1\nf 1 2 3\n"
     (shape,) = read(tmp_path, colored).shapes
@@ -321,28 +273,3 @@ def test_colors_of_vertices_are_srgb_factors(tmp_path: Path) -> None:
     assert "white" in content.warnings[0]
     content = read(tmp_path, f"mtllib a.mtl\nusemtl m\n{colored}", a_mtl="newmtl m\nKd 0.5 0.5 0.5\n")
     assert "multiplies" in content.warnings[0]
-
-
-def test_y_up_is_noticed() -> None:
-    rng = np.random.default_rng(0)
-    n = 8
-    x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, n)))
-    index = np.arange(n * n).reshape(n, n)
-    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
-    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
-    for height in (0.0, 0.1, 0.4):
-        sheet = np.stack([x, y, height * rng.random(n * n)], axis=-1)
-        assert not seems_up("y", sheet, faces)
-        assert seems_up("y", sheet[:, [0, 2, 1]], faces)
-        assert seems_up("z", sheet, faces)
-        assert not seems_up("z", sheet[:, [0, 2, 1]], faces)
-    # Upright blades on a strip that is narrow along y.
-    blades = np.array([[0, 0, 0], [0.1, 0, 0], [0.05, 0, 1], [3, 0.3, 0], [3, 0.31, 0], [3, 0.3, 1]])
-    floor = np.array([[0, 0, 0], [3, 0, 0], [3, 0.4, 0]])
-    assert not seems_up("y", np.concatenate([blades, floor]), np.arange(9).reshape(3, 3))
-
-
-def test_elements_that_are_not_used_are_said(tmp_path: Path) -> None:
-    (warning,) = read(tmp_path, SQUARE + "l 1 2\np 3\ncurv 0 1 1 2\n#MRGB ff808080\n" + FACES).warnings
-    for word in ("lines", "points", "curves", "ZBrush"):
-        assert word in warning

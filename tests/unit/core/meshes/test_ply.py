@@ -214,15 +214,3 @@ def test_altered_files_are_read_or_refused(
     with contextlib.suppress(InputError):
         for shape in read(tmp_path_factory.mktemp("fuzz"), altered).shapes:
             assert shape.faces.max() < len(shape.vertices)
-
-
-def test_what_is_not_used_is_said(tmp_path: Path) -> None:
-    elements = {
-        "vertex": ([*XYZ, "float quality", "uchar alpha"], [(*p, 0.5, 100) for p in SQUARE]),
-        "edge": (["int vertex1", "list uchar int more"], [(0, [1, 2]), (1, [])]),
-        "face": ([CORNERS], TRIANGLES),
-    }
-    content = read(tmp_path, ply(elements, "binary_little_endian") + b"more")
-    assert content.shapes[0].faces.tolist() == [[0, 1, 2], [0, 2, 3]]
-    for word, warning in zip(("quality, alpha", "edge", "after"), content.warnings, strict=True):
-        assert word in warning

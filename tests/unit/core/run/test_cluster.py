@@ -251,33 +251,6 @@ def test_what_a_site_configures_is_kept(
     assert {"#SBATCH --constraint=site", "#SBATCH -A mine"} <= set(job)
 
 
-def test_options_that_would_be_ignored_are_refused_or_named(
-    job_of: Callable[..., list[str]], tmp_path: Path
-) -> None:
-    with pytest.raises(ValueError, match=r"'env_extra' is the old name of 'job_script_prologue'"):
-        job_of(env_extra=["a"], job_script_prologue=["b"])
-    for key, ours in (("cores", "threads"), ("walltime", "walltime"), ("processes", "workers")):
-        with pytest.raises(ValueError, match=rf"'{key}' follows from '{ours}'"):
-            job_of(**{key: "02:00:00"})
-    site = "jobqueue: {slurm: {cores: 24, memory: 120GB, walltime: '00:30:00'}}"
-    (line,) = (x for x in job_of(site, log_directory=str(tmp_path / "logs")) if x.startswith("cluster:"))
-    assert "cores, memory of Dask's jobqueue.slurm" in line
-    assert "threads, memory" in line
-    assert "walltime" not in line
-
-
-def test_unknown_options_of_a_batch_system_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("dask_jobqueue")
-    monkeypatch.setattr("shutil.which", lambda command: f"/usr/bin/{command}")
-    file = tmp_path / "slurm.yaml"
-    file.write_text("engine: slurm\noptions: {qeue: short}\n")
-    with (
-        pytest.raises(InputError, match="has no option 'qeue'"),
-        open_runner(str(file), lambda line: None),
-    ):
-        pass
-
-
 def test_workers_of_this_machine_divide_its_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(task.GPUS_VARIABLE, "2")
     handlers: dict[Any, Any] = {}
@@ -291,16 +264,6 @@ def test_workers_of_this_machine_divide_its_gpus(monkeypatch: pytest.MonkeyPatch
         assert os.environ["CUDA_VISIBLE_DEVICES"] == expected
     # The signal of Ctrl-C is the command's.
     assert handlers == {signal.SIGINT: signal.SIG_IGN}
-
-
-def test_old_names_of_options_are_understood(job_of: Callable[..., list[str]], tmp_path: Path) -> None:
-    old = {"project": "graphics", "job_extra": "--qos=low", "env_extra": ["module load python"]}
-    more = {"header_skip": "--mem", "extra": ["--local-directory", "/scratch"]}
-    job = job_of(**old, **more, log_directory=str(tmp_path / "logs"))
-    assert job.index("module load python") < job.index(OURS)
-    assert {"#SBATCH -A graphics", "#SBATCH --qos=low", "#SBATCH -n 1"} <= set(job)
-    assert not any("--mem=" in line for line in job)
-    assert "--local-directory /scratch" in job[-1]
 
 
 def test_an_interruption_while_waiting_for_jobs_is_one(tmp_path: Path) -> None:

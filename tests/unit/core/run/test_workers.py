@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import pytest
 
-from mbtf_core.errors import InputError, UsageError
 from mbtf_core.run.workers import local_config, read_cluster
 
 
@@ -33,28 +31,3 @@ def test_files_and_addresses(tmp_path: Path) -> None:
     file.write_text("address: tcp://scheduler:8786\ntimeout: 2min\n")
     config = read_cluster(str(file))
     assert (config.address, config.timeout) == ("tcp://scheduler:8786", 120.0)
-
-
-@pytest.mark.parametrize(
-    ("text", "word"),
-    [
-        ("address: tcp://a:1\nworkers: 3", "workers cannot go with address"),
-        ("address: scheduler:8786", "tcp://scheduler:8786"),
-        ("memory: 16", "memory"),
-        ("timeout: 0s", "timeout"),
-        ("engine: [slurm", "site.yaml"),
-        ("\x00\x01\xff", "site.yaml"),
-        ("slurm", "site.yaml"),
-    ],
-)
-def test_files_that_are_at_fault(tmp_path: Path, text: str, word: str) -> None:
-    file = tmp_path / "site.yaml"
-    file.write_text(text, "latin-1")
-    with pytest.raises(InputError, match=re.escape(word)):
-        read_cluster(str(file))
-
-
-@pytest.mark.parametrize("where", ["lokal", "local:0", "local:", "local:-1", "http://x", ""])
-def test_other_words_are_refused(where: str) -> None:
-    with pytest.raises(UsageError, match="is no cluster"):
-        read_cluster(where)

@@ -15,7 +15,6 @@ import mbtf_fit.evaluation
 from mbtf_core.data.dataset import Dataset, Shard
 from mbtf_core.data.folder import DataFolder
 from mbtf_core.errors import InputError
-from mbtf_core.units import format_size, parse_size
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import Partition, load_training
 from mbtf_fit.data.streaming import Selection, StreamedQueries
@@ -80,12 +79,6 @@ def test_exr_shards_too_large_for_memory_are_refused(tmp_path: Path) -> None:
     data = Dataset.open(write_data(tmp_path / "d", parallax, train=1000, suffix=".exr"))
     with pytest.raises(InputError, match=r"more than data\.memory allows.*\n.*--format npz"):
         load_training(data, HELD_OUT, 0, memory=1e4)
-
-
-@pytest.mark.parametrize(("text", "size"), [("500MB", 5e8), ("4GB", 4e9), ("1.5 kB", 1500.0), (2e6, 2e6)])
-def test_amounts_of_memory_are_read_and_written(text: str | float, size: float) -> None:
-    assert parse_size(text) == size
-    assert parse_size(format_size(size)) == size
 
 
 def test_memory_does_not_grow_with_the_data(tmp_path: Path, run_python: RunPython) -> None:

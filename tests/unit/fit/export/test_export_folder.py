@@ -115,12 +115,3 @@ def test_a_target_names_all_files_that_it_writes(source: Path, tmp_path: Path, n
     written = set(os.listdir(tmp_path / "out")) - {"export.json"}
     assert written
     assert written <= set(targets()[name].files)
-
-
-def test_files_of_formats_may_lie_beside_the_material(source: Path, tmp_path: Path) -> None:
-    own = tmp_path / "own"
-    shutil.copytree(source, own)
-    before = set(os.listdir(own))
-    for words in ([], ["--half", "--overwrite"], ["--to", "slang"]):
-        assert run(app, ["export", str(own), "-q", *words]) == 0
-    assert set(os.listdir(own)) == before | {"textures.exr", "layers.json", "material.slang", "material.bin"}

@@ -180,12 +180,3 @@ def test_what_a_reader_evaluates_differently_is_refused(
     assert not (
         tmp_path / "out" / {"exr": "textures.exr", "json": "layers.json"}.get(name, "material.json")
     ).exists()
-
-
-def test_an_operation_needs_a_name_of_its_own() -> None:
-    with pytest.raises(TypeError, match="has an operation 'gate'"):
-
-        class Gate(Operation):
-            """Of the name of one of the project."""
-
-    assert _KINDS["gate"] is ops.Gate

@@ -6,7 +6,6 @@ import json
 import math
 import shutil
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -82,13 +81,6 @@ def test_damaged_weights(data: st.DataObject, whole: Path, folder: Path) -> None
     loads_or_refuses(lambda: use(folder))
 
 
-@given(content=st.binary(max_size=60))
-@examples(40)
-def test_a_damaged_history(content: bytes, whole: Path, folder: Path) -> None:
-    (folder / "metrics.jsonl").write_bytes((whole / "metrics.jsonl").read_bytes() + content)
-    assert len(read_history(folder)) >= len(read_history(whole))
-
-
 def odd_tensors(whole: Path) -> dict[str, tuple[dict[str, torch.Tensor], str]]:
     """Invalid contents of the weights and their messages."""
     good = load((whole / WEIGHTS).read_bytes())
@@ -155,15 +147,6 @@ def test_odd_operations(whole: Path, folder: Path) -> None:
         write(folder, whole, json.dumps({**description, "operations": operations}), None)
         with pytest.raises(InputError, match=message):
             Material.load(folder)
-
-
-@pytest.mark.parametrize("errors", [[], {"test": [1]}, {"test": {"n": 1}}])
-def test_odd_errors(errors: Any, whole: Path, folder: Path) -> None:
-    description = json.loads((whole / DESCRIPTION).read_text())
-    description["training"]["errors"] = errors
-    write(folder, whole, json.dumps(description), None)
-    with pytest.raises(InputError, match=r"training\.errors"):
-        Material.load(folder)
 
 
 @pytest.mark.parametrize("content", [b"", b"\xff" * 64, b"{}", (2**60).to_bytes(8, "little") + b"{}"])

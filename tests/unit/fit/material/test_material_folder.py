@@ -17,8 +17,8 @@ from support.fit_data import constant, parallax, random_queries, write_data
 import mbtf_fit.material.material
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.lattice import Lattice
-from mbtf_core.errors import EngineError, InputError
-from mbtf_fit import FitConfig, FitResult, Material, evaluate, fit, read_history
+from mbtf_core.errors import InputError
+from mbtf_fit import FitConfig, FitResult, Material, evaluate, fit
 from mbtf_fit.data.loader import load_split, load_training
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.evaluation import split_errors
@@ -216,14 +216,6 @@ def test_evaluation_refuses_a_tile_of_another_shape(fitted: FitResult, tmp_path:
         evaluate(fitted.material, other)
 
 
-def test_the_history_records_the_training(fitted: FitResult) -> None:
-    history = read_history(fitted.folder)
-    assert history == fitted.history
-    assert history[-1]["step"] == 30
-    assert history[-1]["fraction"] == 1.0
-    assert {"seconds", "loss", "unexplained", "unexplained_error", "queries_per_second"} <= set(history[-1])
-
-
 def test_another_configuration_is_refused_with_its_differences(data: Path, tmp_path: Path) -> None:
     out = tmp_path / "m"
     fit(config(3), data, out)
@@ -254,13 +246,6 @@ def test_a_folder_of_other_files_is_never_touched(data: Path, tmp_path: Path) ->
         with pytest.raises(InputError, match="holds no fit"):
             fit(config(3), data, tmp_path, overwrite=overwrite)
     assert [p.name for p in tmp_path.iterdir()] == ["precious"]
-
-
-def test_cuda_where_there_is_none_is_refused(data: Path, tmp_path: Path) -> None:
-    if torch.cuda.is_available():
-        pytest.skip("this machine has a CUDA device")
-    with pytest.raises(EngineError, match="no CUDA device"):
-        fit(config(3, device="cuda"), data, tmp_path / "m")
 
 
 def test_evaluation_broadcasts_as_numpy_does(fitted: FitResult) -> None:
@@ -306,9 +291,3 @@ def test_odd_inputs_are_refused_by_name(fitted: FitResult, name: str, value: Any
     with pytest.raises(InputError, match=what) as fault:
         fitted.material.evaluate(**given)
     assert name in str(fault.value.where)
-
-
-def test_representations_are_one_line(fitted: FitResult, data: Path) -> None:
-    assert repr(fitted.material) == "<Material: neumip, resolution 8>"
-    assert repr(fitted).startswith(f"<FitResult {fitted.folder}: neumip, ")
-    assert repr(Dataset.open(data)).startswith(f"<Dataset {data}: 8000 train, ")

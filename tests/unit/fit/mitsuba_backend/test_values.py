@@ -43,7 +43,7 @@ SHAPES: dict[str, dict[str, Any]] = {
     "one texel, concatenated": {"case": "concatenated, softplus", "finest": 0},
 }
 SHAPES |= {case: {"case": case} for case in ALL.keys() - HIERARCHICAL.keys() - {"black"}}
-UNROLLED = ("neumip", "half vector", "encoded with pi", "relief")
+UNROLLED = ("neumip", "relief")
 
 
 @pytest.mark.parametrize("name", sorted(SHAPES))

@@ -85,7 +85,7 @@ def seen(
     return through_pixel_centers(scene, camera, integrator, samples)[..., 0], at_pixels
 
 
-@pytest.mark.parametrize("tiles_across", [0.25, 1.0, 3.0, 10.0, 30.0, 300.0])
+@pytest.mark.parametrize("tiles_across", [0.25, 3.0, 30.0, 300.0])
 def test_pixels_are_filtered(material: Path, texture: NDArray[np.float64], tiles_across: float) -> None:
     camera = Camera(
         80.0, -70.0, tiles_across=tiles_across, target=(0.3, 0.6), rows=64, columns=64, field_of_view=6.0

@@ -14,7 +14,6 @@ from support.slice_data import spots, write_slices
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.lattice import Lattice
-from mbtf_core.errors import InputError, UsageError
 from mbtf_fit import fit
 from mbtf_fit.config import FitConfig, build_model
 from mbtf_fit.data.layouts import SharedSlices, TrainingSlices
@@ -210,16 +209,3 @@ def test_slices_of_cloth_have_a_transmittance(tmp_path: Path) -> None:
     omega = slice_directions("spiral", 2, 0.5)
     found = material.transmittance.evaluate(u, np.full(2, 1 / 16), omega)
     np.testing.assert_allclose(found, (0.8, 0.2), atol=0.1)
-
-
-def test_options_of_other_models_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="has no option init_from"):
-        FitConfig.model_validate({"model": "rainer2019", "init_from": "material"})
-    with pytest.raises(InputError, match=r"has no option training\.materials, which rainer2020"):
-        config("rainer2019", materials=["x"])
-    with pytest.raises(InputError, match=r"has no option network\.offset"):
-        FitConfig.model_validate({"model": "rainer2020", "network": {"offset": "depth"}})
-    with pytest.raises(InputError, match="nothing to learn from"):
-        fit(config("rainer2020", own_material=False), write_slices(tmp_path / "data"), tmp_path / "fit")
-    with pytest.raises((InputError, UsageError), match="no such folder"):
-        fit(config("rainer2020", materials=["missing"]), tmp_path / "data", tmp_path / "other")

@@ -4,23 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from support.datasets import read_checksummed
-from support.fit_data import parallax, random_queries, training_queries, write_data
+from support.fit_data import parallax, random_queries, training_queries
 from support.fuzzing import check_message
 from support.known_surfaces import rough_surface
 from torch import Tensor
 
 from mbtf_core.data.lattice import Lattice
-from mbtf_core.data.schema import MANIFEST_NAME
 from mbtf_core.errors import InputError
-from mbtf_core.files.atomic import checksummed
-from mbtf_fit import FitConfig, fit
+from mbtf_fit import FitConfig
 from mbtf_fit.backends.cpu.gradients import NativeGradients
 from mbtf_fit.backends.cpu.model import NativeModel, supports
 from mbtf_fit.config import build_model
@@ -188,13 +184,4 @@ def test_tensors_of_other_shapes_are_refused(name: str, change: Callable[[Tensor
     tensors = model_of("default").weights()
     with pytest.raises(InputError, match=f"do not fit the model relief: '{name}'") as caught:
         build_model("relief", LATTICE).load_weights({**tensors, name: change(tensors[name])})
-    check_message(caught.value)
-
-
-def test_data_without_geometry_are_refused(tmp_path: Path) -> None:
-    folder = write_data(tmp_path / "data", parallax, train=2000, test=100)
-    path = folder / MANIFEST_NAME
-    path.write_bytes(checksummed({**read_checksummed(path), "geometry": None}))
-    with pytest.raises(InputError, match=r"no geometry, which relief traces\n.*--model neumip\+") as caught:
-        fit(FitConfig.model_validate({"training": {"steps": 2}}), folder, tmp_path / "material")
     check_message(caught.value)

@@ -40,7 +40,7 @@ def test_a_plane_is_recovered(metallic: float, roughness: float, tmp_path: Path)
     shards = write_data(
         tmp_path / "shards", lambda *at: brdf(*at[2:], metallic, roughness), train=4000, test=1000, finest=1
     )
-    training = {"steps": 600, "batch": 1000, "texture_learning_rate": 0.2}
+    training = {"steps": 400, "batch": 1000, "texture_learning_rate": 0.2}
     config = FitConfig.model_validate({"model": "svbrdf", "training": training, "device": "cpu"})
     weights = fit(config, shards, tmp_path / "material").material.model.weights()
     # Engines have no calibration factors.

@@ -14,10 +14,9 @@ from support.scenes import mi
 
 import mbtf_fit.backends.mitsuba
 from mbtf_core.color import to_display
-from mbtf_core.config.settings import resolve
 from mbtf_core.directions import from_angles
 from mbtf_core.pictures import Camera
-from mbtf_fit.preview.config import MaterialPreviewConfig, SheetSection, TurntableSection
+from mbtf_fit.preview.config import SheetSection, TurntableSection
 from mbtf_gen.config.pictures import Direction
 
 mbtf_fit.backends.mitsuba.register()
@@ -140,26 +139,3 @@ def test_a_white_plate_and_a_white_sheet_have_one_exposure(tmp_path: Path) -> No
     (picture,) = turntable.frames(white(tmp_path), section)
     # The plate in front of the ball, which shadows none of the lights there and hides some of the sky.
     assert picture[19:21, 8:11].mean() == pytest.approx(0.25, rel=0.12)
-
-
-def test_view_and_light_replace_those_of_the_sheet() -> None:
-    """Spelled as in ``mbtf-gen reference``."""
-    config = resolve(
-        MaterialPreviewConfig, flags={"material": "m", "sheet.view": "60,-90", "sheet.light": "45,30"}
-    )
-    assert config.sheet.view == [Direction(elevation=60, azimuth=-90)]
-    assert config.sheet.light == [Direction(elevation=45, azimuth=30)]
-
-
-def test_bad_input_of_previews_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from mbtf_core.app.console import run
-    from mbtf_fit.cli.app import app
-
-    for code, what, *words in (
-        (3, "no material.json", str(tmp_path), "-o", str(tmp_path / "out")),
-        (2, "pixels; use smaller or fewer", "m", "--size", "2000"),
-        (2, "no material given"),
-    ):
-        assert run(app, ["preview", *words]) == code
-        assert what in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()

@@ -82,13 +82,6 @@ def test_twice_the_time_gains_half_of_what_the_second_half_did(power: float) -> 
     assert cost([r | {"change_error": 0.2} for r in records], {}).doubling is None
 
 
-def test_the_middle_record_counts_by_its_fraction() -> None:
-    records = history(0.3)
-    later = [r for r in records if r["fraction"] != 0.5]
-    later.insert(2, history(0.3)[0] | {"fraction": 0.62, "unexplained": 0.2 * 0.62**-0.3})
-    assert cost(later, {}).doubling == pytest.approx(cost(records, {}).doubling, rel=0.02)
-
-
 def test_only_a_flat_curve_says_that_longer_training_is_useless() -> None:
     for power, useless in ((0.02, True), (-0.2, True), (0.25, False)):
         found = cost(history(power), {})
@@ -157,19 +150,6 @@ def test_a_fit_to_other_training_queries_gets_no_advice(
     assert lines[0].startswith("expect" if advised else "the fit had other training data")
 
 
-def test_incomplete_histories_say_nothing() -> None:
-    for records in ([], history(0.5)[:-1]):
-        assert marginal_cost_of(records, {}) is None
-    unknown = [{**r, "unexplained": None, "unexplained_error": None} for r in history(0.5)]
-    assert cost(unknown, {}).as_dict() == {
-        "doubling": None,
-        "noise_share": None,
-        "steps": 4000,
-        "noise_share_error": 0.0,
-        "kept_step": None,
-    }
-
-
 @pytest.mark.parametrize(
     ("doubling", "share", "errors", "kind"),
     [
@@ -193,12 +173,6 @@ def test_the_next_step_is_what_pays_most(
     doubling: float | None, share: float | None, errors: dict[str, Any], kind: str
 ) -> None:
     assert next_step(MarginalCost(doubling, share, 4000), errors).kind == kind
-
-
-@pytest.mark.parametrize(("training", "overfits"), [(-0.24, True), (0.2, False)])
-def test_overfitting_is_named_beside_an_uncertain_error(training: float, overfits: bool) -> None:
-    found = next_step(MarginalCost(0.8, 0.9, 4000), fitted(0.28, 0.08, training))
-    assert (found.kind, "overfits" in found.reason) == ("test", overfits)
 
 
 @pytest.mark.parametrize(

@@ -358,31 +358,3 @@ def test_other_architectures_are_refused(data: dict[str, Path], tmp_path: Path) 
         with pytest.raises(InputError, match=message):
             fit(wanted, data["waves"], tmp_path / "n")
     assert not (tmp_path / "n").exists()
-
-
-@pytest.mark.parametrize("model", ["neumip-baseline", "neumip+", "hierarchical", "rainer2020"])
-@pytest.mark.parametrize("option", ["decoder", "shared_decoder"])
-def test_other_models_are_refused(model: str, option: str) -> None:
-    given: dict[str, Any] = {"decoder": "m"} if option == "decoder" else {"training": {option: True}}
-    with pytest.raises(InputError, match=r"has no option .*decoder, which neumip and relief have"):
-        FitConfig.model_validate({"model": model, **given})
-
-
-def test_options_of_shared_networks_leave_other_fits_as_they_are() -> None:
-    plain = FitConfig.model_validate({})
-    assert "decoder" not in plain.fields()
-    assert "shared_decoder" not in plain.fields()["training"]
-    joint = joint_config()
-    assert joint.fields()["training"]["shared_decoder"] is True
-    shared = FitConfig.model_validate({"training": {"shared_decoder": True}}).training
-    assert (shared.batch, shared.learning_rate) == (1 << 14, 0.01)
-    assert joint.hash("x") != single_config(steps=300).hash("x")
-
-
-def test_one_data_set_shares_no_network(data: dict[str, Path], tmp_path: Path) -> None:
-    """The command line's refusals are those of :func:`fit_jointly`; these two it cannot ask for."""
-    with pytest.raises(InputError, match="a shared network takes several data sets"):
-        fit(joint_config(), data["waves"], tmp_path / "m")
-    with pytest.raises(InputError, match=r"training\.shared_decoder: is not set"):
-        fit_jointly(single_config(), [data["waves"]] * 2, [tmp_path / "a", tmp_path / "b"], tmp_path / "d")
-    assert not any(tmp_path.iterdir())

@@ -4,12 +4,6 @@ from __future__ import annotations
 
 import http.client
 import json
-import signal
-import socket
-import struct
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -81,49 +75,6 @@ def test_only_this_machine_gets_the_page() -> None:
             PageServer("", port)
     finally:
         server.close()
-
-
-def test_a_browser_may_leave_in_the_middle_of_an_answer(
-    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    failed: list[object] = []
-    monkeypatch.setattr("mbtf_fit.viewer.server._log.debug", lambda *words: failed.append(words))
-    page = "x" * (1 << 24)
-    server = PageServer(page)
-    try:
-        address = ("127.0.0.1", int(server.url.rstrip("/").rpartition(":")[2]))
-        with socket.create_connection(address, timeout=10) as browser:
-            # Closing it resets the connection.
-            browser.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-            browser.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
-            assert browser.recv(100)
-        for _ in range(500):
-            if failed:
-                break
-            time.sleep(0.02)
-        assert failed
-        connection = http.client.HTTPConnection(*address, timeout=10)
-        # The name alone is what a browser sends at port 80.
-        connection.request("GET", "/", headers={"Host": "localhost"})
-        assert connection.getresponse().read() == page.encode()
-    finally:
-        server.close()
-    assert capfd.readouterr().err == ""
-
-
-def test_ctrl_c_ends_the_service(tmp_path: Path) -> None:
-    write_material(tmp_path / "material")
-    command = [sys.executable, "-m", "mbtf_fit", "view", str(tmp_path / "material"), "--quiet"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    try:
-        assert process.stdout is not None
-        url = process.stdout.readline()
-        assert url.startswith("http://127.0.0.1:")
-        process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=60)
-        assert (process.returncode, errors) == (0, "")
-    finally:
-        process.kill()
 
 
 def test_a_loss_that_is_not_finite_is_shown_as_undefined(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -251,11 +251,3 @@ def test_levels_without_data_are_averages(opened: Open, tmp_path: Path) -> None:
     grid = (np.stack(np.mgrid[:12, :12], -1).reshape(-1, 2) + 0.5) / 12
     mean = np.mean([known(np.repeat(u[None], 20, 0), light, view) for u in grid], axis=0)
     assert np.abs(found - mean).mean() < 0.1 * mean.mean()
-
-
-def test_rounded_footprints_add_no_level(opened: Open) -> None:
-    """Half precision rounds by up to a part in 2000."""
-    for sigma, finest in ((0.5 / 16 * (1 - 5e-4), 4), (0.028, 5)):
-        source = Listed()
-        source.arrays["sigma"][:] = sigma
-        assert opened(source).lattice.finest == finest

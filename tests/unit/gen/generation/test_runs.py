@@ -111,40 +111,6 @@ def test_half_the_difference_of_the_halves_is_the_error(
     assert summary.relative_error == pytest.approx(np.sqrt(np.mean((a - b) ** 2 / 4)) / np.mean((a + b) / 2))
 
 
-def test_progress_counts_traced_paths(config: GeneratorConfig, engine: Formula, out: Path) -> None:
-    """A target error changes the number of paths; the expected total follows the shards that are done."""
-    engine.more = 7
-    seen: list[tuple[float, float | None]] = []
-    summary = generate(config, out, progress=lambda done, note, total: seen.append((done, total)))
-    # The test split, of 120 planned paths, comes last: until then it counts as planned.
-    train, test = 7 * 200, 7 * 120
-    expected = [(560, train + 120), (1120, train + 120), (train, train + 120), (train + test,) * 2]
-    assert seen == [(0, None)] * 2 + expected
-    assert summary.paths == train + test
-
-
-def test_progress_names_the_phases_and_counts_launches(
-    config: GeneratorConfig, engine: Formula, monkeypatch: pytest.MonkeyPatch, out: Path
-) -> None:
-    """The first shard of slow paths takes minutes."""
-    estimate = engine.estimate
-
-    def launched(queries: Any, spp: int, stream: Any, lights: int) -> Any:
-        for _ in range(2):
-            engine.observe(len(queries.sigma) * spp // 2)  # type: ignore[attr-defined]
-        return estimate(queries, spp, stream, lights=lights)
-
-    monkeypatch.setattr(engine, "estimate", launched)
-    seen: list[tuple[float, str, float | None]] = []
-    generate(config, out, progress=lambda *now: seen.append(now))
-    assert [note.split(",")[0] for _, note, _ in seen[:2]] == ["pilot paths", "building the scene"]
-    done = [paths for paths, _, _ in seen]
-    assert done == sorted(done)
-    assert {40, 80, 120, 160, 180, 200, 260, 320} <= set(done)
-    assert all("paths/s" in note for _, note, _ in seen[2:])
-    assert {total for _, _, total in seen[2:]} == {320}
-
-
 def test_too_many_nonfinite_samples_fail_the_run(config: GeneratorConfig, engine: Formula, out: Path) -> None:
     """Two per shard: any run may have four, but not six, and not on a second try either."""
     engine.bad = (BadSample(7, "direct light"), BadSample(9, "interreflection"))

@@ -305,15 +305,6 @@ def _documents_only(self: ObjectStore, name: str, content: bytes, *, new: bool =
     return _write(self, name, content, new=new)
 
 
-@pytest.mark.parametrize("program", ["preview", "reference"])
-def test_only_data_sets_are_written_to_stores(
-    tmp_path: Path, url: str, program: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    line = command(tmp_path, tmp_path / "unused")
-    assert run(app, [program, line[0], "-o", url]) == 2
-    assert "only data sets are written to object stores" in capsys.readouterr().err
-
-
 def test_a_corrupt_shard_is_not_read(tmp_path: Path, url: str) -> None:
     assert generate(command_at(tmp_path, url)) == 0
     store = ObjectStore(url)
@@ -322,8 +313,3 @@ def test_a_corrupt_shard_is_not_read(tmp_path: Path, url: str) -> None:
     store.write("train-00001.npz", bytes(flipped))
     with pytest.raises(InputError, match=f"{url}/train-00001.npz: has changed since it was written"):
         Dataset.open(url).load("train")
-
-
-def test_a_url_names_a_bucket() -> None:
-    with pytest.raises(InputError, match="names no bucket"):
-        Dataset.open("s3://")

@@ -13,8 +13,7 @@ from support.datasets import write_dataset
 from support.measured_files import write_hdf5
 
 from mbtf_core.errors import InputError
-from mbtf_gen.generation.imported import open_measured
-from mbtf_gen.measured.exported import export_neumip, export_neural_btf
+from mbtf_gen.measured.exported import export_neumip
 from mbtf_gen.measured.hdf5 import NeumipQueries, NeuralBtf
 
 TEXELS = files.ROWS * files.COLUMNS
@@ -105,12 +104,6 @@ def changed(**new: Any) -> dict[str, Any]:
 def test_refused(arrays: dict[str, np.ndarray], message: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=message):
         NeumipQueries(write_hdf5(tmp_path / "a.hdf5", arrays))
-
-
-@pytest.mark.parametrize("radius", [-1.0, np.nan, "x", [1.0, 2.0]])
-def test_base_radius_is_a_positive_number(radius: Any, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="base_radius"):
-        NeumipQueries(write_hdf5(tmp_path / "a.hdf5", stored(), base_radius=radius))
 
 
 def test_numbers_that_are_not_in_the_file(tmp_path: Path) -> None:
@@ -211,21 +204,6 @@ def test_nan_values_are_refused_where_they_are_used(tmp_path: Path) -> None:
         btf.values(np.array([0, 0]), np.array([0, files.COLUMNS + 1]))
 
 
-def test_a_filter_that_is_not_installed_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "a.hdf5"
-    with h5py.File(path, "w") as file:
-        for name, array in images().items():
-            file.create_dataset(name, data=array, compression="gzip")
-    content = path.read_bytes()
-    assert NeuralBtf(path).rows == files.ROWS
-    # The number of a filter lies eight bytes before its name.
-    changed = content.replace(b"\1\0\x08\0\1\0\1\0deflate\0", b"\1\x7d\x08\0\1\0\1\0blosc\0\0\0")
-    assert changed != content
-    path.write_bytes(changed)
-    with pytest.raises(InputError, match=r"the HDF5 filter 32001 \(blosc\)"):
-        NeuralBtf(path)
-
-
 def test_numbers_that_a_file_cannot_have(tmp_path: Path) -> None:
     path = tmp_path / "a.hdf5"
     with h5py.File(path, "w") as file:
@@ -255,34 +233,3 @@ def test_an_export_for_neumip(tmp_path: Path) -> None:
         np.testing.assert_array_equal(queries[name][:, :2], whole[name][:256, :2])
     value = 0.5 * (whole["value_a"].astype(np.float64) + whole["value_b"])
     np.testing.assert_allclose(queries["value"], value[:256], rtol=1e-6)
-
-
-def test_what_cannot_be_exported(tmp_path: Path) -> None:
-    wide = write_dataset(tmp_path / "wide", queries={"train": "30", "test": "8"})
-    with pytest.raises(InputError, match="tiles are square"):
-        export_neumip(wide, tmp_path / "a.hdf5")
-    with pytest.raises(InputError, match="learns from images under fixed lights"):
-        export_neural_btf(wide, tmp_path / "a.hdf5")
-    slices = write_dataset(tmp_path / "s", queries={"train": "9/texel", "test": "8", "layout": "slices"})
-    with pytest.raises(InputError, match="learns from shuffled queries"):
-        export_neumip(slices, tmp_path / "a.hdf5")
-    assert not (tmp_path / "a.hdf5").exists()
-
-
-def test_files_of_no_known_kind(tmp_path: Path) -> None:
-    for content, message in (
-        (b"", "is empty"),
-        (b"hello", "known kind"),
-        (b"\xef\xbb\xbf\n <!DOCTYPE html><title>Quota exceeded", "web page"),
-        (b"Rar!\x1a\x07\x00", "unpack it"),
-        (b"!ABC", "DFMF08FCR"),
-        (b"PK", "zip"),
-    ):
-        (tmp_path / "a").write_bytes(content)
-        with pytest.raises(InputError) as caught:
-            open_measured(tmp_path / "a")
-        assert message in caught.value.message
-    with pytest.raises(InputError, match="without 'ground_color'"):
-        open_measured(write_hdf5(tmp_path / "a", {"other": np.zeros(3)}))
-    with pytest.raises(InputError, match="no such file"):
-        open_measured(tmp_path / "none")

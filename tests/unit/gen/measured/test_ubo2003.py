@@ -92,25 +92,6 @@ def test_photographs_of_floats_are_linear(suffix: str, zipped: bool, tmp_path: P
     assert (np.abs(values_of(path) - LINEAR) <= atol).all()
 
 
-def test_a_radiance_header(tmp_path: Path) -> None:
-    path = tmp_path / f"{NAME}.hdr"
-    path.write_bytes(radiance(LINEAR))
-    plain = values_of(tmp_path)
-    path.write_bytes(radiance(LINEAR, b"EXPOSURE=2\nFORMAT=32-bit_rle_rgbe\nEXPOSURE= 4.0\n"))
-    np.testing.assert_allclose(values_of(tmp_path), plain / 8)
-    for header, message in (
-        (b"FORMAT=32-bit_rle_xyze\n", "stores XYZ"),
-        (b"EXPOSURE=0\n", "exposure"),
-        (b"EXPOSURE=nan\n", "exposure"),
-    ):
-        path.write_bytes(radiance(LINEAR, header))
-        with pytest.raises(InputError, match=message):
-            Ubo2003(tmp_path)
-    path.write_bytes(radiance(LINEAR).replace(b"-Y 2 +X 2", b"-Y 60000 +X 60000"))
-    with pytest.raises(InputError, match="claims 60000 x 60000 pixels"):
-        Ubo2003(tmp_path)
-
-
 def test_png_of_16_bits(tmp_path: Path) -> None:
     import imagecodecs
 
@@ -178,13 +159,6 @@ def test_refused(content: dict[str, bytes], message: str, zipped: bool, tmp_path
         path = files.write_folder(tmp_path / "a", content)
     with pytest.raises(InputError, match=message):
         Ubo2003(path)
-
-
-def test_sizes_differ(tmp_path: Path) -> None:
-    other = {"tl010 pl000 tv000 pv000.jpg": files.encoded(UP, UP, rows=8)}
-    btf = Ubo2003(files.write_folder(tmp_path, good() | other))
-    with pytest.raises(InputError, match="24 x 8 texels, other images 24 x 16"):
-        btf.values(np.array([1]), np.array([0]))
 
 
 def test_archives_that_are_refused(tmp_path: Path) -> None:

@@ -16,10 +16,9 @@ from mbtf_core.errors import InputError
 from mbtf_core.pictures import Camera
 from mbtf_core.run.processes import run_child
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.config.pictures import PreviewSection
 from mbtf_gen.job import Job
 from mbtf_gen.pictures import mesh
-from mbtf_gen.pictures.mesh import MOST_CELLS, draw, tiled_mesh
+from mbtf_gen.pictures.mesh import draw, tiled_mesh
 from mbtf_gen.pictures.query_plots import QuerySample, level_histogram, sampled_queries, stored_queries
 from mbtf_gen.sampling.query_sampler import LevelMixture
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
@@ -64,15 +63,6 @@ def test_holes_are_cut_where_little_is_left() -> None:
     expected[1:2, 2:5] = True
     np.testing.assert_array_equal(block.hole, np.tile(expected, (2, 2)))
     assert tiled_mesh(material(opacity=0.2), 1, 0.0).hole.all()
-
-
-def test_a_large_mesh_is_coarsened() -> None:
-    m = material()
-    for tiles, wide in ((1, MOST_CELLS), (4, MOST_CELLS // 4)):
-        block = tiled_mesh(m.at(mesh=4000), tiles, 0.0)
-        assert block.cells == (wide // 2, wide)
-    tall = tiled_mesh(material(8, 4).at(mesh=2000), 2, 0.0)
-    assert tall.cells == (MOST_CELLS // 2, MOST_CELLS // 4)
 
 
 def sample_of(count: int, seed: int = 0, **options: Any) -> QuerySample:
@@ -131,14 +121,6 @@ def test_unfinished_shards_are_left_out(tmp_path: Path) -> None:
         (tmp_path / "set" / name).unlink()
     with pytest.raises(InputError, match="no finished train shard"):
         stored_queries(dataset)
-
-
-def test_cloth_gets_smaller_pictures_unless_asked_otherwise() -> None:
-    assert PreviewSection().sizes(fibers=False) == (640, 16)
-    size, spp = PreviewSection().sizes(fibers=True)
-    # A minute at the 15 000 paths per second of two busy cores.
-    assert size**2 * spp < 60 * 15_000
-    assert PreviewSection(size=512, spp=64).sizes(fibers=True) == (512, 64)
 
 
 def test_a_crash_while_drawing_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -214,7 +214,3 @@ def test_blocks_end_where_they_should(text: str) -> None:
     found, tags = shown(fenced(text) + "\n\nafter")
     assert tags == {"pre", "code", "p"}
     assert found == f"{text.strip()}\n\nafter" or found.split() == f"{text} after".split()
-
-
-def test_line_breaks_and_controls_become_blanks() -> None:
-    assert escaped("a\n# b\x1b[2J\u202ec") == "a # b \\[2J c"

@@ -12,7 +12,7 @@ from support.fit_data import write_data
 from support.published import LAYOUTS, small
 
 from mbtf_core.data.dataset import Dataset
-from mbtf_gen.publishing.picture import brdf_image, displayed, tile_images, visible_positions, write_picture
+from mbtf_gen.publishing.picture import brdf_image, tile_images, visible_positions, write_picture
 
 
 def test_images_have_v_and_the_light_where_they_belong(tmp_path: Path) -> None:
@@ -38,18 +38,6 @@ def test_images_have_v_and_the_light_where_they_belong(tmp_path: Path) -> None:
     assert np.corrcoef(brdf[..., 2][known], expected[known])[0, 1] > 0.95
 
 
-def test_lights_come_from_their_sides(tmp_path: Path) -> None:
-    def lit(u, sigma, omega_i, omega_o):  # type: ignore[no-untyped-def]
-        return omega_i + 1.0
-
-    write_data(tmp_path / "data", lit, train=20_000, test=10, finest=2)
-    images = tile_images(Dataset.open(tmp_path / "data").load("train"), 1.0, None)
-    mean = {title: np.nanmean(image - 1, axis=(0, 1)) for title, image in images.items()}
-    assert mean["grazing light from the left"][0] < -0.6
-    assert mean["grazing light from the top"][1] > 0.6
-    assert np.abs(mean["all lights"][:2]).max() < 0.05
-
-
 def test_parallax_is_removed_where_heights_are_known() -> None:
     """The tile is twice as wide as high; its half v > 1/2 is deeper."""
     heights = np.full((64, 128), -0.02, np.float32)
@@ -72,12 +60,3 @@ def test_every_layout_has_its_picture(layout: str, tmp_path: Path, draws: None) 
     first = write_picture(*shown, tmp_path / "a.png")
     assert write_picture(*shown, tmp_path / "b.png").sha256 == first.sha256
     assert np.asarray(Image.open(tmp_path / "a.png").convert("L"), np.float64).std() > 5
-
-
-def test_bright_is_bright_and_unknown_is_gray() -> None:
-    picture = np.full((1, 3, 3), 0.02)
-    picture[0, 1] = (0.04, 0.02, 0.01)
-    picture[0, 2] = np.nan
-    shown = displayed(picture).astype(int)[0]
-    assert shown[1, 0] > shown[0, 0] > shown[1, 2] > 20
-    assert shown[2].tolist() == [238, 238, 238]

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import shutil
-import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 from support.datasets import write_dataset
 from support.published import contents, publish, small
 
-from mbtf_core.errors import EngineError, InputError, PartialError, UsageError
-from mbtf_core.files.atomic import Stored
+from mbtf_core.errors import InputError, UsageError
 from mbtf_gen.config.exchange import PublishConfig
-from mbtf_gen.publishing import publication as module
 from mbtf_gen.publishing.publication import Publication
 
 CONFIG = PublishConfig(license="CC0-1.0", form="parquet")
@@ -51,22 +47,6 @@ def test_what_has_changed_is_replaced_on_request_only(shards: Path, tmp_path: Pa
     assert contents(card) == whole
 
 
-@pytest.mark.parametrize("below", ["", "data"])
-def test_a_folder_that_vanishes_is_one_line(
-    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, below: str
-) -> None:
-    add = module.OutputFolder.add
-
-    def vanishing(folder: Any, name: str, write: Any) -> Stored:
-        if name == "data/train-00000.parquet":
-            shutil.rmtree(folder.path / below)
-        return add(folder, name, write)
-
-    monkeypatch.setattr(module.OutputFolder, "add", vanishing)
-    with pytest.raises(PartialError, match="vanished"):
-        publish(shards, tmp_path / "card", form="parquet")
-
-
 def test_other_options_are_refused_and_replace(shards: Path, tmp_path: Path) -> None:
     card = publish(shards, tmp_path / "card", form="parquet")
     (card / "mine.txt").write_text("kept")
@@ -98,19 +78,6 @@ def test_a_full_disk_is_said_before(shards: Path, tmp_path: Path, monkeypatch: p
     with pytest.raises(InputError, match=r"needs .* MB; 1 kB are free"):
         publish(shards, tmp_path / "card", form="parquet")
     assert not (tmp_path / "card").exists()
-
-
-def test_the_announced_size_is_enough(shards: Path, tmp_path: Path) -> None:
-    publication = Publication.prepare(shards, CONFIG)
-    publication.write(tmp_path / "card")
-    assert sum(map(len, contents(tmp_path / "card").values())) < publication.size
-
-
-def test_without_a_library_one_line_says_so(shards: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(EngineError, match="pyarrow is not installed") as raised:
-        Publication.prepare(shards, PublishConfig(license="CC0-1.0"))
-    assert raised.value.hint == "pip install 'mbtf[publish]'"
 
 
 def test_shards_of_exr_are_not_npz(tmp_path: Path) -> None:

@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from support.datasets import edit
 from support.formula_runs import SMALL, Formula, cheap_plan
-from support.published import contents, small
+from support.published import contents
 
 from mbtf_core.config.settings import resolve
 from mbtf_core.data.dataset import Dataset
@@ -19,7 +18,6 @@ from mbtf_gen.config.exchange import PublishConfig
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation import run as generation
 from mbtf_gen.publishing.publication import Publication
-from mbtf_gen.tile.loading import load_material
 
 CONFIG = PublishConfig(license="CC0-1.0", form="npz")
 
@@ -88,15 +86,3 @@ def test_changed_and_lost_maps_are_refused(tmp_path: Path) -> None:
         Publication.prepare(tmp_path / "data", CONFIG, with_maps=True)
     with pytest.raises(UsageError, match="goes with --with-maps"):
         Publication.prepare(tmp_path / "data", CONFIG, material=tmp_path / "moved")
-
-
-def test_a_mesh_of_several_files_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "tile.mtl").write_text("newmtl a\nKd 1 0 0\n")
-    (tmp_path / "tile.obj").write_text(
-        "mtllib tile.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nusemtl a\nf 1 2 4\nf 1 4 3\n"
-    )
-    small(tmp_path / "data")
-    material = load_material(tmp_path / "tile.obj")
-    edit(tmp_path / "data/manifest.json", lambda m: m.update(inputs=dict(material.digests)))
-    with pytest.raises(InputError, match="names other files"):
-        Publication.prepare(tmp_path / "data", CONFIG, with_maps=True, material=tmp_path / "tile.obj")

@@ -71,9 +71,3 @@ def test_a_delta_light_is_divided_by_its_cosine() -> None:
     assert light.is_delta
     omega = from_angles([90.0, 30.0, 0.01], 10.0)
     np.testing.assert_array_equal(light.irradiance(omega), omega[:, 2])
-
-
-@pytest.mark.parametrize("width", [-1.0, 1e-3, 60.0, float("nan")])
-def test_widths_that_make_no_light_are_refused(width: float) -> None:
-    with pytest.raises(ValueError, match="degrees"):
-        LightKernel(width)

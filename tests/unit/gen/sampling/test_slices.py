@@ -7,7 +7,6 @@ import pytest
 from support.datasets import write_dataset
 
 from mbtf_core.data.lattice import Lattice
-from mbtf_core.errors import UsageError
 from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan, direction_pairs, slice_directions
 
 
@@ -79,16 +78,3 @@ def test_a_data_set_rounds_down_to_squares(tmp_path) -> None:  # type: ignore[no
     assert data.manifest["splits"]["train"]["queries"] == 9 * data.lattice.texels()
     assert arrays["value_a"].shape == (data.lattice.texels(), 9, 3)
     assert data.load("test")["sigma"].shape == (50, 1)
-
-
-@pytest.mark.parametrize(
-    ("queries", "words"),
-    [
-        ({"train": "3"}, "at least one query per texel"),
-        ({"train": "100/texel", "slice_directions": "ubo2003"}, "need 6561/texel"),
-        ({"train": "6561/texel", "slice_directions": "ubo2003", "min_cos": 0.3}, "are lower"),
-    ],
-)
-def test_too_few_queries_are_refused(tmp_path, queries, words: str) -> None:  # type: ignore[no-untyped-def]
-    with pytest.raises(UsageError, match=words):
-        write_dataset(tmp_path / "shards", queries={"layout": "slices", "resolution": 4, **queries})

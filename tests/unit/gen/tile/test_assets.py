@@ -25,7 +25,6 @@ MATERIALS = {
 }
 # A height map below a BSDF or a coat, and a mesh.
 FURTHER = ("coated_copper", "brushed_aluminum", "fish_scales")
-MAPS = ("height.exr", "base_color.png", "roughness.png")
 
 
 def pixels(path: Path) -> NDArray[Any]:

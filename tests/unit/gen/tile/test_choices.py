@@ -59,12 +59,6 @@ class TestWrite:
         assert "before make-tileable blend" in text
         assert "does not tile" not in text.partition("warnings")[2]
 
-    def test_what_was_given(self, maps: Path) -> None:
-        flags = ["--height-scale", "0.3", "--make-tileable", "mirror", "--resolution", "16"]
-        content = written(maps, *flags)
-        assert (content["height"]["scale"], content["make_tileable"]) == (0.3, "mirror")
-        assert content["resolution"] == 16
-
     def test_what_the_material_file_says(self, maps: Path) -> None:
         text = "height: {file: height.png, scale: 0.2}\nmake_tileable: none\nresolution: 8\nroughness: 0.4\n"
         (maps / "material.yaml").write_text(text)
@@ -107,29 +101,6 @@ class TestWrite:
         assert job_of(maps).config_hash != before
         # Recipes know the material by its digests.
         assert load_material(maps).digests["settings"] != digests["settings"]
-
-    def test_names_are_relative_to_the_file(self, maps: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        (maps.parent / "link").symlink_to(maps.parent)
-        monkeypatch.chdir(maps)
-        for place, name in (("../other/rock.yaml", "../maps"), ("../link/rock.yaml", "maps")):
-            assert run(app, ["inspect", ".", "--write", place]) == 0
-            assert read_yaml(Path(place))["height"]["file"] == f"{name}/height.png"
-            assert load_material(place).resolution is None
-
-    def test_a_bsdf_keeps_its_textures(self, maps: Path) -> None:
-        text = (
-            "height: height.png\n"
-            "bsdf: {type: diffuse, reflectance: {type: bitmap, filename: height.png, raw: true}}\n"
-        )
-        (maps / "material.yaml").write_text(text)
-        content = written(maps, file="../rock.yaml")
-        assert content["bsdf"]["reflectance"] == {
-            "type": "bitmap",
-            "filename": "maps/height.png",
-            "raw": True,
-        }
-        # The seams stay: the textures could not follow.
-        assert content["make_tileable"] == "none"
 
 
 class TestExport:

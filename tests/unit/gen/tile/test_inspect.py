@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 from support.height_maps import fractal, normals_of, save_heights, save_normals
 
-from mbtf_core.app.console import run
-from mbtf_gen.cli.app import app
 from mbtf_gen.config.generator import GeometrySection
 from mbtf_gen.tile.heights import HeightGrid, rms_slope, slope_angles, triangle_slopes
 from mbtf_gen.tile.inspection import inspection_text
@@ -79,12 +77,6 @@ class TestNumbers:
         for part in ("the mesh keeps", "--mesh 96 keeps all", "25.0% of the albedo lies above 0.95"):
             assert part in texts
 
-    def test_floats_that_were_integers(self, tmp_path: Path) -> None:
-        for name, height in (("a", fractal(96, 96)), ("b", np.rint(fractal(96, 96) * 200) / 200)):
-            np.save(tmp_path / f"{name}.npy", 0.1 * height)
-            oddities = load_material(tmp_path / f"{name}.npy").inspect(GeometrySection())["oddities"]
-            assert any("distinct values" in o for o in oddities) == (name == "b")
-
     @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (5, 1), (2, 3)])
     def test_tiny_maps(self, tmp_path: Path, shape: tuple[int, int]) -> None:
         save_heights(tmp_path / "height.png", np.random.default_rng(0).random(shape), 8)
@@ -93,72 +85,3 @@ class TestNumbers:
         assert found["maps"]["height"]["columns"] == shape[1]
         assert found["normal"] is not None
         assert "nothing to compare" in inspection_text(found, "tiny")
-
-    def test_a_flat_map_has_no_slopes(self, tmp_path: Path) -> None:
-        np.save(tmp_path / "h.npy", np.zeros((4, 4)))
-        found = load_material(tmp_path / "h.npy").inspect(GeometrySection())
-        assert "displacement range 0 tile widths" in inspection_text(found, "flat")
-        assert found["geometry"]["slope_max_deg"] == 0.0
-        assert found["geometry"]["slope_kept"] == 1.0
-        assert found["oddities"] == []
-        assert found["tiling"] == []
-        assert any("heights are constant" in w for w in found["warnings"])
-
-
-class TestText:
-    def test_a_height_scale_far_from_the_suggested_one(self, folder: Path) -> None:
-        save_normals(folder / "normal.png", normals_of(fractal(48, 96), 0.01))
-
-        def warned(height: float | None = None) -> bool:
-            found = load_material(folder).inspect(GeometrySection(height_scale=height))
-            shown = inspection_text(found, "wool").splitlines()
-            last = shown[-1].startswith("warning: normal.png: the heights are 5 times as steep as its slopes")
-            assert shown[-1].endswith("add --height-scale 0.00998 to agree") == last
-            assert sum("as steep as" in line for line in shown) == last
-            return last
-
-        assert warned()
-        assert warned(0.05)
-        assert not warned(0.012)
-        save_heights(folder / "height.png", fractal(48, 96) / 50)
-        (warning,) = (w for w in load_material(folder).warnings_in_use() if "as steep as" in w)
-        assert "are 0.1 times as steep" in warning
-        save_heights(folder / "height.png", fractal(48, 96))
-        (folder / "material.yaml").write_text("height: {file: height.png, scale: 0.05}\nnormal: normal.png\n")
-        assert warned()
-        (folder / "material.yaml").unlink()
-        save_normals(folder / "normal.png", normals_of(fractal(48, 96), 0.04))
-        assert not any("as steep as its slopes" in w for w in load_material(folder).warnings_in_use())
-
-
-class TestCommand:
-    @pytest.mark.parametrize(
-        ("options", "fault", "hint"),
-        [
-            (["s3://bucket/rock"], "is a URL", "mbtf-fit info s3://bucket/rock"),
-            (["{rock}", "--write", "{folder}/a.txt"], "must end in .yaml or .yml", ""),
-            (
-                ["{rock}", "--write", "{folder}/old.yaml"],
-                "old.yaml: exists already",
-                "--overwrite replaces it",
-            ),
-            (["{rock}", "--export", "{folder}/b.exr"], "b.exr: exists already", "name a file"),
-            (["{folder}/plain.curves", "--export", "{folder}/c.exr"], "--export: is for height maps", ""),
-            (["{folder}/felt.btf"], "is a measured BTF", "mbtf-gen import"),
-            (["{folder}/roc"], "no such file", "did you mean"),
-        ],
-    )
-    def test_refusals_say_what_to_do(
-        self, options: list[str], fault: str, hint: str, folder: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        work = folder.parent
-        (work / "old.yaml").write_text("kept")
-        (work / "b.exr").mkdir()
-        (work / "felt.btf").touch()
-        (work / "plain.curves").write_text("0 0 0 .1\n1 0 0 .1\n2 0 0 .1\n3 1 0 .1\n")
-        assert run(app, ["inspect", *(o.format(rock=folder, folder=work) for o in options)]) in (2, 3)
-        lines = capsys.readouterr().err.splitlines()
-        assert fault in lines[0]
-        assert hint in lines[-1]
-        assert len(lines) <= 2
-        assert (work / "old.yaml").read_text() == "kept"

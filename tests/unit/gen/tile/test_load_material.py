@@ -180,38 +180,6 @@ class TestYaml:
         assert not material.is_lambert
         assert "bsdf.0" in material.digests
 
-    @pytest.mark.parametrize(
-        ("text", "message"),
-        [
-            (
-                "height: rock_height.npy\nroughnes: 0.5\n",
-                r"material\.yaml:2: unknown key 'roughnes'.*\n.*'roughness'",
-            ),
-            (
-                "height:\n  file: rock_height.npy\n  scal: 2\n",
-                r"material\.yaml:3: unknown key 'height\.scal'.*\n.*'scale'",
-            ),
-            ("roughness: 0.5\n", "key 'height' is missing"),
-            (
-                "height: rock_height.npy\nroughness: 1.5\n",
-                r"material\.yaml:2: .*roughness.*equal to 1",
-            ),
-            ("height: rock_height.npy\nbase_color: [0.1, 0.2]\n", r"material\.yaml:2: .*base_color"),
-            ("height: rock_height.npy\nbase_color: [0.1, 0.2, 1.2]\n", r"less than or equal to 1"),
-            ("height: rock_height.npy\nmetallic: {}\n", "either 'file' or 'value'"),
-            ("height: rock_height.npy\nmetallic: {file: a.png, value: 1}\n", "either 'file' or 'value'"),
-            ("height: rock_height.npy\nroughness: gone.png\n", r"gone\.png: no such file"),
-            ("height: rock_height.npy\nbsdf: {alpha: 1}\n", "needs a 'type'"),
-            ("height: rock_height.npy\nmetallic: 1\nbsdf: {type: diffuse}\n", "replaces metallic"),
-            ("height: rock_height.npy\nbsdf: {type: diffuse, filename: no.png}\n", r"no\.png: no such file"),
-            ("height: [\n", "not valid YAML"),
-            ("", "key 'height' is missing"),
-        ],
-    )
-    def test_invalid_inputs_are_named(self, folder: Path, text: str, message: str) -> None:
-        with pytest.raises(InputError, match=message):
-            load_material(self.write(folder, text))
-
 
 class TestDigests:
     def test_they_cover_contents_and_not_names(self, folder: Path, tmp_path: Path) -> None:

@@ -84,16 +84,6 @@ def test_corners_are_placed_by_the_axis_the_bounds_and_the_width(tmp_path: Path)
     assert (shape.aspect, shape.thickness) == (2, 0.5)
 
 
-def test_a_period_that_does_not_fit_is_noted(tmp_path: Path) -> None:
-    bumps().export(tmp_path / "a.ply")
-    path = tmp_path / "m.yaml"
-    path.write_text("mesh: a.ply\nperiod: [1.1, 1]\n")
-    assert shape_of(path).open_edges()[0] > 0
-    path.write_text("mesh: a.ply\nperiod: [0.3, 1]\n")
-    with pytest.raises(InputError, match="periods"):
-        load_material(path)
-
-
 def test_corners_at_one_place_are_one(tmp_path: Path) -> None:
     bumps().export(tmp_path / "a.ply")
     shape = shape_of(tmp_path / "a.ply")

@@ -99,16 +99,6 @@ def record(*materials: dict[str, Any], training: str | None = None) -> dict[str,
     return {"recipe": recipe, "command": "run", "machine": machine, "runs": list(materials)}
 
 
-def test_order_and_sum_of_times_where_runs_are_finished(tmp_path: Path) -> None:
-    assert "largest errors" not in library_page(record(material("a", "pending")), tmp_path)
-    shown = library_page(record(material("a", "done", 0.1), material("b", "done", 0.3)), tmp_path)
-    assert "largest errors come first" in shown
-    assert shown.index('id="b"') < shown.index('id="a"')
-    assert f"took {clock(100.0)}: generate {clock(40.0)}, fit relief {clock(60.0)}." in shown
-    shown = library_page(record(material("a", "done"), training="30s"), tmp_path)
-    assert "Each material is trained for 30s." in shown
-
-
 def test_failures_come_after_errors_and_show_nothing_of_earlier_runs(tmp_path: Path) -> None:
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / "report.html").write_text("")

@@ -14,9 +14,9 @@ from support.paths import ROOT
 
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.collection.finished_run import FinishedRun, mean_of, ratio_of
-from mbtf_pipeline.collection.paper_tables import ablations, levels, methods, timing, zooms
+from mbtf_pipeline.collection.paper_tables import ablations, levels, methods
 from mbtf_pipeline.collection.recipes import PaperRecipe, first_known, load
-from mbtf_pipeline.tables import Column, Shown, Table
+from mbtf_pipeline.tables import Table
 
 PAPER = load(ROOT / "pipelines" / "paper_methods.yaml")
 assert isinstance(PAPER, PaperRecipe)
@@ -131,33 +131,6 @@ def test_ablations_compare_with_the_first_row(tmp_path: Path) -> None:
     assert float(rows[3][less]) == pytest.approx(-2e-4)
     assert float(rows[3][f"{less}_se"]) == pytest.approx(math.hypot(1e-6, 1e-6), rel=1e-3)
     assert rows[0]["queries_per_texel"] == "400"
-
-
-def test_times(tmp_path: Path) -> None:
-    times = {"device": "cpu", "queries": 7, "evaluate_ms": 9.0, "stage1_ms": 5.0, "stage2_ms": 2.0}
-    times |= {"lights_ms": {"1": 7.0, "16": 37.0}}
-    run = make(tmp_path, timing={"neumip": [times]})
-    (row,) = rows_of(timing([run], PUBLISHED)[0])
-    assert (row["material evaluation"], row["1 light"], row["16 lights"]) == ("9.0", "7.0", "37.0")
-
-
-def test_zooms_have_one_row_per_span_and_fit(tmp_path: Path) -> None:
-    run = make(tmp_path)
-    far = record(tmp_path, 8.0)["pictures"]
-    run.comparison["pictures"] = run.pictures + far
-    table = zooms([run], PUBLISHED)[0]
-    assert [(r["tiles_across"], r["method"]) for r in csv_of(table)] == [
-        (s, f) for s in ("1", "8") for f in MSE
-    ]
-    assert [len(row) for _, row in table.images] == [2, 2, 2]
-
-
-def test_cells_are_printed_and_exported() -> None:
-    columns = [Column("a", "a", factor=100.0), Column("b", "b"), Column("c", "c")]
-    seen = Shown("0.970, within noise", 0.97, 0.9, "noise")
-    table = Table("t", "", columns, [[Estimate(0.5, 0.01, 9), None, seen], ["x", 1200, None]])
-    assert table.for_page()["rows"] == [["50.0 ± 1.0", "–", "0.970, within noise"], ["x", "1,200", "–"]]
-    assert table.csv().splitlines() == ["a,a_se,b,c,c_noise", "0.5,0.01,,0.97,0.9", "x,,1200,,"]
 
 
 def test_means_and_ratios_have_error_bars() -> None:

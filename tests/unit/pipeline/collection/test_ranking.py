@@ -110,16 +110,6 @@ def test_foreign_predictions_are_ranked_and_faulty_ones_named(
     assert list(ranked) == [("good",), ("relief",), ("neumip",), ("svbrdf",), ("poor",)]
 
 
-def test_a_material_without_the_first_method_has_no_ratio(runs: list[FinishedRun]) -> None:
-    test = runs[1].comparison["test"]
-    names = [name for name in test if not name.startswith("neumip")]
-    runs[1].comparison.update(fits=names, test={name: test[name] for name in names})
-    ranked, by_material = map(cells, ranking(runs, []))
-    assert by_material["wool", "relief"]["ratio"] is None
-    assert ranked["relief",]["ratio"] is None
-    assert ranked["neumip",]["ratio"].value == 1
-
-
 def test_variants_are_compared_with_their_own_first_method(tmp_path: Path) -> None:
     runs = [make(tmp_path / variant, material) for variant, material in (("a", "rock"), ("b", "wool"))]
     both = [FinishedRun("stone", r.folder.parent.parent.name, r.folder, r.comparison, {}) for r in runs]

@@ -88,14 +88,6 @@ def test_own_options_and_further_materials(folder: Path) -> None:
     assert list(shell.fit) == ["relief"]
 
 
-def test_cloths_get_the_model_without_geometry(folder: Path) -> None:
-    cloth = folder / "assets" / "cloth"
-    cloth.mkdir()
-    (cloth / "material.yaml").write_text("weave: plain\n")
-    found, _ = load(folder, "library: [assets/cloth]\n" + BASE)
-    assert list(found["cloth"].fit) == ["neumip+"]
-
-
 def test_faults_of_the_recipe(folder: Path) -> None:
     with pytest.raises(InputError, match=r"materials\.shel\b.*no material of the library"):
         load(folder, "library: [assets]\nmaterials:\n  shel: {fit: {relief: {}}}\n" + BASE)
@@ -111,14 +103,6 @@ def test_faults_of_the_recipe(folder: Path) -> None:
     (folder / "empty").mkdir()
     with pytest.raises(InputError, match="names no material"):
         load(folder, "library: [empty]\n" + BASE)
-
-
-def test_equal_names_are_numbered(tmp_path: Path) -> None:
-    for name in ("木", "石", "oak dark", "oak_dark"):
-        material(tmp_path / "u" / name)
-    assert sorted(load(tmp_path, "library: [u]\n" + BASE)[0]) == [
-        *("u-material", "u-material-2", "u-oak_dark", "u-oak_dark-2")
-    ]
 
 
 def test_a_file_and_what_it_names_are_one_material(tmp_path: Path) -> None:
@@ -155,14 +139,6 @@ def test_a_fault_of_the_base_is_one_error(folder: Path) -> None:
         load(folder, "library: [assets]\nbase:\n  each_fit: {trainig: {batch: 5}}\n")
     with pytest.raises(InputError, match=r"materials\.steep: has no path"):
         planned(written(folder, TEXT.replace("material: maps/height.npy, ", "")))
-
-
-def test_one_training_time_of_all_or_of_each(folder: Path) -> None:
-    own = "training: 10s\nlibrary: [assets]\n"
-    with pytest.raises(InputError, match=r"materials\.shell: 'relief' has a training time"):
-        load(folder, f"{own}{BASE}materials: {{shell: {{fit: {{relief: {{training: {{steps: 9}}}}}}}}}}\n")
-    with pytest.raises(InputError, match=r"base: 'each_fit' has a training time"):
-        load(folder, f"{own}base: {{each_fit: {{training: {{time: 3s}}}}}}\n")
 
 
 def written(folder: Path, text: str = TEXT) -> Path:

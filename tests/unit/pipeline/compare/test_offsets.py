@@ -8,7 +8,7 @@ import pytest
 from mbtf_core.directions import from_angles
 from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.tile.heights import HeightGrid
-from mbtf_pipeline.compare.offsets import _regression, towards_view, traced_offset
+from mbtf_pipeline.compare.offsets import towards_view, traced_offset
 from mbtf_pipeline.recipe import SceneView
 
 DEPTH = 0.05
@@ -47,10 +47,3 @@ def test_a_peak_at_the_plane_is_not_displaced(plane_below: object) -> None:
     np.testing.assert_allclose(found, 0, atol=1e-6)
     slanted = traced_offset(plane_below, u, from_angles(30, 0))  # type: ignore[arg-type]
     assert np.abs(slanted).max() < 1e-4
-
-
-def test_correlation() -> None:
-    x = np.linspace(0, 1, 50, dtype=np.float32)
-    assert _regression(x, 3 * x - 2) == pytest.approx({"correlation": 1.0, "slope": 3.0})
-    assert _regression(x, -x) == pytest.approx({"correlation": -1.0, "slope": -1.0})
-    assert _regression(np.zeros_like(x), x) == {"correlation": None, "slope": None}

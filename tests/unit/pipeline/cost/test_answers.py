@@ -2,28 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
-from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
-import pytest
-from support.paths import ROOT
 
-from mbtf_core.app.console import run
 from mbtf_core.stats import Estimate
 from mbtf_core.units import clock
-from mbtf_pipeline.cli.app import app
-from mbtf_pipeline.cost import forecast as module
 from mbtf_pipeline.cost.answers import Evidence, answers
-from mbtf_pipeline.cost.forecast import forecast_errors, has_error
 from mbtf_pipeline.cost.measurement import Measurement, combined, seed_deviation
 from mbtf_pipeline.cost.runs import LEAST_SECONDS, SLOW_SERIES, planned_runs
 from mbtf_pipeline.cost.study import too_short
-from mbtf_pipeline.recipe import Recipe, load_recipe
-from mbtf_pipeline.run_time import RunForecaster
 
 SECONDS = (10.0, 20.0, 40.0, 80.0, 160.0, 320.0)
 
@@ -121,59 +109,3 @@ def test_the_least_time_has_room_for_three_lengths() -> None:
     assert lengths(0.99 * LEAST_SECONDS) == 2
     assert "--time 1min measures errors, but is too short" in too_short(60.0, 401.0)
     assert "3 lengths take about 7min" in too_short(60.0, 401.0)
-
-
-@pytest.fixture
-def recipe(monkeypatch: pytest.MonkeyPatch) -> Recipe:
-    monkeypatch.setattr(RunForecaster, "speed", property(lambda self: (4.0, 4e-7)))
-    network = {"width": 40, "channels": 8, "relief": {"places": 1}}
-    fits = {
-        "relief": {"training": {"time": "60s"}, "network": network},
-        "neumip": {"training": {"time": "60s"}},
-    }
-    return load_recipe(ROOT / "pipelines" / "quickstart.yaml", [f"fit={json.dumps(fits)}"])
-
-
-def test_a_dry_run_writes_nothing(
-    recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "run"
-    for time in ([], ["--time", "10min"]):
-        command = ["run", str(ROOT / "pipelines" / "quickstart.yaml"), "-o", str(out), "--dry-run", *time]
-        assert run(app, [*command, "--error", "0.05"]) == 0
-        assert "has no data of these options yet" in capsys.readouterr().out
-        assert not out.exists()
-    assert run(app, [*command, "--error", "2"]) == 2
-    assert "--error: must be above 0 and at most 1" in capsys.readouterr().err
-
-
-def test_a_dry_run_takes_the_training_times_of_pilots(
-    recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def seconds(found: dict[str, Any]) -> float:
-        monkeypatch.setattr(module, "forecast_errors", lambda *_: found)
-        file, out = ROOT / "pipelines" / "quickstart.yaml", tmp_path / "run"
-        assert run(app, ["run", str(file), "-o", str(out), "--dry-run", "--json"]) == 0
-        return float(json.loads(capsys.readouterr().out)["seconds"])
-
-    pilots = {"relief": {"source": "pilots", "text": "text", "forecast": {"seconds": 500.0}}}
-    without = {"relief": {"source": None, "text": "text"}}
-    # The recipe says 60 s.
-    assert seconds(pilots) - seconds(without) == pytest.approx(440.0)
-
-
-def test_pilots_answer_where_there_are_data(
-    recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[tuple[Any, Path]] = []
-
-    def forecast(config: Any, shards: Path) -> Any:
-        asked.append((config.training.error, shards))
-        return SimpleNamespace(error=SimpleNamespace(describe=lambda: "text", as_dict=dict))
-
-    monkeypatch.setattr("mbtf_fit.training.forecast.forecast_fit", forecast)
-    monkeypatch.setattr(module, "survey", lambda *_: {"generate": ""})
-    monkeypatch.setattr(module, "is_dataset", lambda folder: True)
-    found = forecast_errors(has_error(recipe, 0.1), tmp_path, lambda text: None)
-    assert {f["source"] for f in found.values()} == {"pilots"}
-    assert asked == [(0.1, tmp_path / "shards")] * 2

@@ -22,7 +22,6 @@ from mbtf_pipeline.cost.generator import (
     TARGETS,
     GeneratorBenchmark,
     generator_configurations,
-    path_seconds,
 )
 from mbtf_pipeline.cost.measurement import Measurement
 from mbtf_pipeline.cost.runs import planned_runs
@@ -112,15 +111,6 @@ def test_closed_forms_fit_into_memory(benchmark: GeneratorBenchmark, monkeypatch
     monkeypatch.setattr(FakeEstimator, "estimate", estimate)
     benchmark._noise(benchmark.job({"queries.spp": 2}), 0.0, 0.25)
     assert max(sizes) == 1 << 18
-
-
-def test_the_time_of_a_path_is_that_of_the_next_number_of_paths() -> None:
-    one = Estimate(1.0, 0.1, 4)
-    found = [
-        Measurement("paths", series, "", "", Estimate(seconds, 0.1, 4), one, details={"spp": spp})
-        for series, spp, seconds in (("uniform", 2.0, 3.0), ("uniform", 8.0, 4.0), ("by noise", 6.0, 9.0))
-    ]
-    assert path_seconds(found, 6) == pytest.approx(4.0 / 8e6)
 
 
 @pytest.mark.parametrize(

@@ -7,13 +7,10 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-from PIL import Image
-
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.cost.measurement import Measurement
 from mbtf_pipeline.cost.page import write_page
 from mbtf_pipeline.cost.study import Study
-from mbtf_pipeline.report.plots import Series, plot
 
 DESCRIPTION = {
     "name": "a study", "machine": {"system": "a machine"}, "date": "today", "time": 600.0, "taken": 273.0,
@@ -34,50 +31,11 @@ def measured(study: str, seconds: float, error: float, series: str = "neumip") -
     return Measurement(study, series, f"{seconds:g} s", command, *estimates, details=details)
 
 
-def test_plots_are_also_opaque_pngs_with_labels_and_the_front(tmp_path: Path) -> None:
-    cloud = Series("a", [1.0, 10.0], [0.5, 0.1], [0.02, 0.5], [0.1, math.inf], ["first", "second"], "points")
-    svg = plot([cloud], "seconds", "error", "a plot", front=[(1.0, 0.5)], png=tmp_path / "a.png")
-    assert all(text in svg for text in ("first", "second", "Pareto front"))
-    with Image.open(tmp_path / "a.png") as picture:
-        assert picture.convert("RGBA").getpixel((1, 1)) == (255, 255, 255, 255)
-
-
 def test_an_undefined_error_is_shown_as_such(tmp_path: Path) -> None:
     """Test values whose variance is not significant leave no unexplained variance."""
     page = write_page(Study(tmp_path, DESCRIPTION, [measured("run", 10.0, math.nan)])).read_text()
     assert not re.search(r"\b(nan|inf)\b", page)
     assert "No unexplained variance of test queries could be measured" in page
-
-
-def test_one_run_is_an_answer_without_a_front(tmp_path: Path) -> None:
-    """Neither has a comparison of one configuration a plot."""
-    run, paths = measured("run", 10.0, 0.3), measured("paths", 1.0, 0.3)
-    study = Study(tmp_path, DESCRIPTION, [paths, run], skipped=["paths, 8 paths"], least=131.0)
-    page = write_page(study).read_text()
-    assert list(tmp_path.glob("*.png")) == []
-    assert "planned for 10:00 and took 4:33" in page
-    assert "One complete run was measured" in page
-    assert page.count("Pareto front") == 1
-    assert "<td>700</td>" in page
-    assert 'id="paths"' not in page
-    assert '<td>0:10</td><td class="text">0.300 ± 0.010</td>' in page
-    assert "Too few complete runs for a forecast: repeat the same command; it keeps" in page
-    assert "Not measured: 1 configuration, for" in page
-    study.measurements[1] = replace(run, curve=((6.0, 0.5), (8.0, 0.4)))
-    study.description = {**DESCRIPTION, "time": 60.0}
-    page = write_page(study).read_text()
-    assert list(tmp_path.glob("*.png")) == []
-    assert "repeat the command with --time 140s;" in page
-
-
-def test_forecasts_are_marked_as_such(tmp_path: Path) -> None:
-    found = [measured("run", seconds, 2.0 * seconds**-0.7) for seconds in (10.0, 20.0, 40.0)]
-    page = write_page(Study(tmp_path, DESCRIPTION, found, skipped=["a", "b"])).read_text()
-    rows = page.split('id="answers"')[1].split("</section>")[0].split("<tr")[2:]
-    for mark in ("class=forecast", "forecast, "):
-        assert [mark in row for row in rows] == [False] * 3 + [True] * 2
-    assert "forecast, 95% interval" in page
-    assert "Not measured: 2 configurations, for" in page
 
 
 def test_the_page_shows_the_front_with_commands_and_what_is_biased(tmp_path: Path) -> None:

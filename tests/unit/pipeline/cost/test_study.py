@@ -3,11 +3,7 @@ and what follows from them."""
 
 from __future__ import annotations
 
-import csv
-import io
-import json
 import math
-import re
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -18,15 +14,10 @@ import pytest
 from support.fake_runs import FakeRuns, MemoryStore, conditions, run
 from support.paths import ROOT
 
-from mbtf_core.app.console import run as main
-from mbtf_core.errors import InputError, PartialError
-from mbtf_core.files import folders
+from mbtf_core.errors import InputError
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item, Result, packed, run_task
 from mbtf_core.stats import Estimate
-from mbtf_core.units import parse_duration
-from mbtf_pipeline.cli.app import app
-from mbtf_pipeline.cost import plan as plan_module
 from mbtf_pipeline.cost import study as module
 from mbtf_pipeline.cost.generator import GeneratorBenchmark, GeneratorConfiguration
 from mbtf_pipeline.cost.measurement import (
@@ -35,8 +26,7 @@ from mbtf_pipeline.cost.measurement import (
     MeasurementFolder,
     pareto_front,
 )
-from mbtf_pipeline.cost.page import to_csv
-from mbtf_pipeline.cost.runs import MOST_SEEDS, TEST, Run, disk_bytes
+from mbtf_pipeline.cost.runs import MOST_SEEDS, TEST, Run
 from mbtf_pipeline.cost.study import Measurements
 from mbtf_pipeline.recipe import load_recipe
 from mbtf_pipeline.stages import machine
@@ -71,12 +61,6 @@ def test_measurements_come_back_and_damaged_ones_are_repeated(tmp_path: Path) ->
     (path,) = store.folder.glob("mesh-*")
     path.write_text(path.read_text()[:-20])
     assert store.get(mesh) is None
-
-
-def test_the_csv_holds_every_number_with_its_error() -> None:
-    rows = list(csv.DictReader(io.StringIO(to_csv([point(10, 0.5, bytes=3e5), point(20, math.nan)]))))
-    assert (rows[0]["seconds"], rows[0]["error"], rows[0]["error_se"]) == ("10", "0.5", "0.01")
-    assert (rows[0]["bytes"], rows[0]["bias"], rows[1]["error"]) == ("300000", "", "")
 
 
 def test_studies_of_other_machines_are_refused(tmp_path: Path) -> None:
@@ -148,21 +132,6 @@ def test_workers_begin_what_fits_into_the_time_of_all(measured: list[tuple[str, 
     assert quick.expected_seconds(runs[1]) == pytest.approx(5.0 + 3.0, abs=1e-4)
 
 
-def test_a_full_disk_ends_the_study(monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(self: Run, conditions: Conditions) -> Measurement:
-        raise PartialError("no space left on device", hint="free some")
-
-    monkeypatch.setattr(Run, "measure", full)
-    found = Measurements(conditions(), MemoryStore(), Runner())  # type: ignore[arg-type]
-    with pytest.raises(PartialError, match="no space left"):
-        found.measure_runs([run()], lambda run: True)
-
-
-def test_a_study_is_of_the_machine_of_its_workers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("MBTF_WORKER_THREADS", "1")
-    assert module.measuring_machine()["system"].endswith("workers of 1 thread")
-
-
 RUNS = [run(3000, "long", 7200.0), run(2000, "short", 60.0), run(1000, "m", 40.0)]
 
 
@@ -226,67 +195,6 @@ def test_a_study_keeps_its_time_and_resumes(fake: FakeRuns, tmp_path: Path) -> N
     assert sum(r.planned_seconds(0.0) for r in runs) <= 3790.0
 
 
-def test_a_dry_run_plans_what_a_study_measures(
-    fake: FakeRuns, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """By a pilot of the generator; it writes nothing, and what is measured costs no time."""
-    pilot = SimpleNamespace(start=2.0, query_seconds=4e-9)
-    monkeypatch.setattr(plan_module, "forecast", lambda *_, **__: pilot)
-    folder = tmp_path / "study"
-    command = ["cost", str(RECIPE), "-o", str(folder), "--dry-run"]
-    assert main(app, [*command, "--time", "230s"]) == 0
-    text = capsys.readouterr().out
-    assert not folder.exists()
-    # Two runs of 60 s and one of 40 s, each with 12 s besides; 4 s to start, and 14 s of the generator.
-    assert text.splitlines()[0].startswith("expected: about 3:34, ")
-    assert re.findall(r"neumip, (.*?):", text) == ["short", "short, seed + 1", "m"]
-    assert "up to about 1:12, measured" in text
-    assert "cannot forecast errors of longer times: that takes --time 275min" in text
-    assert "cannot tell what effects, mesh and number of paths cost" in text
-    study = module.run_study(load_recipe(RECIPE, []), folder, seconds=190.0)
-    # Both name the same time.
-    assert main(app, [*command, "--time", "190s", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["least"] == pytest.approx(study.least, rel=1e-8)
-    assert main(app, [*command, "--time", "5h", "--json"]) == 0
-    plan = json.loads(capsys.readouterr().out)
-    assert (plan["measured"], len(plan["runs"])) == (3, 3)
-    # The runs that are measured took 1 s more than planned.
-    assert plan["longest"] == pytest.approx(7201.0, abs=1.0)
-    assert plan["seconds"] > 2 * 7200.0 + 40.0
-    # Nothing fits; the longest run is a measured one, and the rate that of the study, not of the pilot.
-    pilot.query_seconds = 1.0
-    assert main(app, [*command, "--time", "30s", "--json"]) == 0
-    plan = json.loads(capsys.readouterr().out)
-    assert (plan["measured"], plan["runs"]) == (3, [])
-    assert plan["longest"] == pytest.approx(61.0, abs=0.1)
-    assert plan["seconds"] < 30.0
-
-
-@pytest.mark.parametrize("path_seconds", [2e-7, 1e-5])
-def test_the_times_that_a_dry_run_names_suffice(
-    path_seconds: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """On a fast and on a busy machine."""
-    pilot = SimpleNamespace(start=4.0, query_seconds=4 * path_seconds)
-    monkeypatch.setattr(plan_module, "forecast", lambda *_, **__: pilot)
-
-    def planned(seconds: float) -> plan_module.StudyPlan:
-        return plan_module.plan_study(load_recipe(RECIPE, []), tmp_path / "study", seconds=seconds)
-
-    none = planned(10.0)
-    assert none.runs == []
-    assert none.least_run is not None
-    named = (
-        r"runs to measure: none\nno complete run fits into the time: one takes --time (\w+), and .* (\w+)$"
-    )
-    found = re.search(named, none.describe(10.0))
-    assert found
-    one, three = (planned(parse_duration(time)) for time in found.groups())
-    assert one.runs
-    assert len({label.split(":")[0] for label in three.runs if "seed" not in label}) >= 3
-    assert "a forecast for up to 4 times as long" in three.describe(parse_duration(found[2]))
-
-
 def test_a_slow_first_run_makes_the_others_fewer_and_longer(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its fewest steps took longer than planned, so that it does not count among them."""
     found = Measurements(conditions(), MemoryStore(), Runner(), path_seconds=1e-7)  # type: ignore[arg-type]
@@ -305,18 +213,6 @@ def test_a_slow_first_run_makes_the_others_fewer_and_longer(monkeypatch: pytest.
     assert found.overhead == pytest.approx(40.0 - 20.0 - 2.1, abs=0.1)
 
 
-def test_runs_that_do_not_fit_on_the_disk_are_refused(
-    fake: FakeRuns, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    recipe, said = load_recipe(RECIPE, []), list[str]()
-    monkeypatch.setattr(folders.shutil, "disk_usage", lambda path: SimpleNamespace(free=1e6))
-    with pytest.raises(InputError, match=r"needs 18 MB; 1.0 MB are free\n.*--time"):
-        module.run_study(recipe, tmp_path / "study", seconds=150.0, announce=said.append)
-    assert not said
-    assert not fake.measured
-    assert disk_bytes(RUNS) == (TEST[0] + 3000) * 68
-
-
 def test_other_seeds_and_materials_are_not_mixed(fake: FakeRuns, tmp_path: Path) -> None:
     recipe = load_recipe(RECIPE, [])
     wool = load_recipe(RECIPE, ["generate.material=assets/twisted_wool"])
@@ -325,23 +221,3 @@ def test_other_seeds_and_materials_are_not_mixed(fake: FakeRuns, tmp_path: Path)
         study = module.run_study(one, tmp_path / "study", seconds=600.0, seed=seed)
         assert len(fake.measured) == count
         assert study.description["seed"] == (seed or 0)
-
-
-def test_a_refused_study_leaves_the_folder_as_it_was(
-    fake: FakeRuns, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    recipe, folder = load_recipe(RECIPE, []), tmp_path / "study"
-    module.run_study(recipe, folder, seconds=600.0)
-
-    def content() -> dict[Path, bytes]:
-        return {p: p.read_bytes() for p in folder.rglob("*") if p.is_file() and "lock" not in p.name}
-
-    before = content()
-
-    def refuse(benchmark: Any) -> None:
-        raise InputError("reflects nothing")
-
-    monkeypatch.setattr(GeneratorBenchmark, "check_variation", refuse)
-    with pytest.raises(InputError, match="reflects nothing"):
-        module.run_study(recipe, folder, seconds=60.0, seed=5)
-    assert content() == before

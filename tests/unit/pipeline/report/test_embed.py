@@ -9,18 +9,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mbtf_core.color import Palette, common_scale, indices, palette, robust_scale, to_display
-from mbtf_pipeline.report.images import REDUCTIONS, color_bar, linear_uri, map_uri, scaled_maps, shrink
+from mbtf_core.color import common_scale, palette, robust_scale, to_display
+from mbtf_pipeline.report.images import REDUCTIONS, color_bar, linear_uri, map_uri, scaled_maps
 
 
 def decoded(uri: str) -> np.ndarray:
     head, _, data = uri.partition(",")
     assert head in ("data:image/png;base64", "data:image/jpeg;base64")
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))
-
-
-def luma(colors: np.ndarray) -> np.ndarray:
-    return np.asarray(colors, float) @ [0.2126, 0.7152, 0.0722]
 
 
 def test_images_match_their_sources_and_shrink() -> None:
@@ -32,32 +28,6 @@ def test_images_match_their_sources_and_shrink() -> None:
     assert decoded(map_uri(2 * values - 1, "signed"))[0, 64].max() < 40
     sizes = [len(linear_uri(picture, 1.0, n)) + len(map_uri(values, "flip", n)) for n in REDUCTIONS]
     assert sizes == sorted(sizes, reverse=True)
-
-
-def test_averaging_preserves_the_mean() -> None:
-    x = np.arange(6 * 9, dtype=float).reshape(6, 9)
-    assert shrink(x, 3).mean() == pytest.approx(x.mean())
-    assert shrink(x, 4).tolist() == [[x[:4, :4].mean(), x[:4, 4:8].mean()]]
-    assert shrink(np.ones((5, 3, 3)), 16).shape == (1, 1, 3)
-
-
-@pytest.mark.parametrize("name", ["local", "flip"])
-def test_lightness_encodes_magnitude(name: Palette) -> None:
-    lightness = luma(palette(name))
-    assert np.diff(lightness).min() > -0.6
-    assert lightness[-1] - lightness[0] > 150
-
-
-def test_signed_colors_encode_sign_and_magnitude() -> None:
-    colors = palette("signed")[indices([-1.0, -0.5, 0.0, 0.5, 1.0, 7.0, np.nan], "signed")].astype(int)
-    shades = luma(colors)
-    assert shades[2] < 20
-    assert shades[1] < shades[0]
-    assert shades[3] < shades[4]
-    assert colors[0, 2] > colors[0, 0]
-    assert colors[4, 0] > colors[4, 2]
-    assert (colors[5] == colors[4]).all()
-    assert (colors[6] == colors[2]).all()
 
 
 def test_scales_and_color_bars_are_round() -> None:

@@ -53,13 +53,3 @@ def test_ids_are_unique_and_plots_are_reproducible() -> None:
     ids = [set(re.findall(r'\bid="([^"]+)"', svg)) for svg in (first, other)]
     assert ids[0]
     assert not ids[0] & ids[1]
-
-
-def test_error_bars_and_bands_that_reach_zero_are_clipped() -> None:
-    wide = points(["0"], {"a": [(0.2, 0.19999)], "b": [(0.3, 0.01)]}, "x", "y", "wide")
-    assert "0.001" not in texts(wide)
-    lines = [Series("a", [10.0, 20.0, 30.0], [0.3, 0.2, -0.01], [0.31, 5.0, 0.1])]
-    svg = plot(lines, "x", "y", "band", log="y")
-    numbers = {float(t) for t in texts(svg) if re.fullmatch(r"[\d.e-]+", t)}
-    below = {n for n in numbers if n < 10}
-    assert (min(below), max(below)) == (0.1, 0.5)

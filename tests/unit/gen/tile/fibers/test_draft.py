@@ -76,23 +76,3 @@ def test_the_period_is_the_least_common_multiple() -> None:
 def test_sequences_are_thread_counts() -> None:
     assert parse_sequence("red2 white", "warp") == ["red", "red", "white"]
     assert parse_sequence("K/2, R1 Y/3", "warp") == list("KKRYYYR")
-
-
-@pytest.mark.parametrize(
-    "text", ["", "4", "red 4", "red-4", "red0", "red/4 white2", "red4 white/2 red4", "red2000", "red*4"]
-)
-def test_other_sequences_are_refused_in_one_line(text: str) -> None:
-    with pytest.raises(InputError) as error:
-        parse_sequence(text, "warp")
-    assert "\n" not in error.value.what
-
-
-@pytest.mark.parametrize(
-    "text",
-    ["", "basket", "basket 0", "twill 3", "twill 1/1/1", "satin 5/1", "satin 6/2", "X.\nX", "X#",
-     "basket 5000", "plain 3", "herringbone 2/2 4 4", "gingham 0", "tweed"],
-)  # fmt: skip
-def test_other_weaves_are_refused_in_one_line(text: str) -> None:
-    with pytest.raises(InputError) as error:
-        parse_draft(text)
-    assert "\n" not in error.value.what

@@ -11,9 +11,7 @@ import pytest
 import tifffile
 from support.image_files import rng
 
-from mbtf_core.app.console import run
 from mbtf_core.errors import InputError
-from mbtf_gen.cli.app import app
 from mbtf_gen.config.generator import GeometrySection
 from mbtf_gen.tile.loading import load_material
 
@@ -70,15 +68,6 @@ def test_low_heights_and_unused_declarations_are_data(tmp_path: Path) -> None:
     assert found.facts["height"].bits == 8
 
 
-def test_missing_data_of_other_maps_are_mentioned(tmp_path: Path) -> None:
-    np.save(tmp_path / "height.npy", 0.1 * rng().random((32, 48)))
-    codes = np.full((32, 48), 100, np.uint8)
-    codes[2, 4] = 0
-    terrain(tmp_path / "albedo.tif", codes, (42113, 2, "0"))
-    (warning,) = load_material(tmp_path).warnings
-    assert "1 pixel, at column 4, row 2, is without data" in warning
-
-
 def test_heights_in_meters_need_a_scale(tmp_path: Path) -> None:
     np.save(tmp_path / "dem.npy", hills())
     material = load_material(tmp_path / "dem.npy")
@@ -92,14 +81,6 @@ def test_heights_in_meters_need_a_scale(tmp_path: Path) -> None:
         assert given.grid.displacement_range == pytest.approx(40 * scale, rel=1e-3)
     (tmp_path / "m.yaml").write_text(f"height: {{file: dem.npy, scale: {1 / 48}}}\n")
     assert load_material(tmp_path / "m.yaml").configured(DEFAULT).grid is not None
-
-
-def test_written_choices_leave_the_scale_open(tmp_path: Path) -> None:
-
-    np.save(tmp_path / "dem.npy", hills())
-    assert run(app, ["inspect", str(tmp_path / "dem.npy"), "--write", str(tmp_path / "m.yaml")]) == 0
-    with pytest.raises(InputError, match="need a height scale"):
-        _ = load_material(tmp_path / "m.yaml").configured(DEFAULT).grid
 
 
 SCALE, TIE, MATRIX, KEYS = 33550, 33922, 34264, 34735
@@ -145,25 +126,3 @@ def test_fractions_that_are_cliffs_need_a_scale(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="steeper than 8") as caught:
         _ = load_material(tmp_path / "noise.npy").configured(DEFAULT).grid
     assert "--height-scale 0.05" in caught.value.hint
-
-
-def test_a_scale_beyond_the_largest_is_not_suggested(tmp_path: Path) -> None:
-    path = terrain(tmp_path / "dem.tif", hills().astype("u2"), (SCALE, 12, (1.0, 1.0, 0.0)))
-    with pytest.raises(InputError, match="need a height scale") as caught:
-        _ = load_material(path).configured(DEFAULT).grid
-    assert "as floats" in caught.value.hint
-
-
-@pytest.mark.parametrize(("kind", "word"), [(4, "mask"), (2, "first"), (1, None)])
-def test_further_pages_are_mentioned(tmp_path: Path, kind: int, word: str | None) -> None:
-    heights = (0.001 * (hills() - 600)).astype("f4")
-    with tifffile.TiffWriter(tmp_path / "h.tif") as file:
-        file.write(heights)
-        # Masks have one bit.
-        second = np.ones((16, 24), bool if kind == 4 else np.uint8)
-        file.write(second, subfiletype=kind, photometric="minisblack")
-    material = load_material(tmp_path / "h.tif")
-    assert material.height == pytest.approx(heights)
-    (*found,) = (w for w in material.warnings if "not used" in w or "is used" in w)
-    assert len(found) == (word is not None)
-    assert all(str(word) in w for w in found)

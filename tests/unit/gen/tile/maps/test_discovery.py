@@ -34,13 +34,6 @@ class TestSharedWords:
         metal = "PaintedMetal004_1K_Metalness.png"
         assert found(tmp_path / "b", *names, metal) == {**expected, "metallic": metal}
 
-    def test_letters_behind_a_telling_asset(self, tmp_path: Path) -> None:
-        names = [f"T_MetalPlate_{letter}.png" for letter in "DHN"]
-        with pytest.raises(InputError, match="no height map among") as caught:
-            find_maps(fill(tmp_path, *names))
-        assert f"(their names match no map: {', '.join(names)})" in caught.value.hint
-        assert "name it in a material.yaml" in caught.value.hint
-
     @pytest.mark.parametrize(
         "expected",
         [
@@ -156,34 +149,6 @@ class TestSites:
         # Nothing that a surface shows is left out, but for normals of another kind.
         assert all("normal map" in warning for warning in maps.warnings)
 
-    def test_what_a_surface_may_lack_is_one_warning(self, tmp_path: Path) -> None:
-        names = ["Specular", "Fuzz", "Translucency", "AO", "Cavity", "coatColor"]
-        fill(tmp_path, "x_height.png", "x.png", "x_farbe.png", *(f"x_{name}.png" for name in names))
-        (warning,) = find_maps(tmp_path).warnings
-        for name in ("Specular", "Fuzz", "Translucency", "coatColor", "farbe"):
-            assert f"x_{name}.png" in warning
-        assert "x.png" in warning
-        assert "AO" not in warning
-        assert "Cavity" not in warning
-        # Beside a color, a file named like the asset is its picture.
-        assert "x.png" not in find_maps(fill(tmp_path, "x_albedo.png")).warnings[0]
-
-    def test_formats_that_are_not_read_are_one_warning(self, tmp_path: Path) -> None:
-        fill(
-            tmp_path,
-            "w_height.png",
-            "w_diffuse.dds",
-            "w_normal.psd",
-            "w_rough.png",
-            "w_rough.webp",
-            "w.blend",
-        )
-        (warning,) = find_maps(tmp_path).warnings
-        assert "not read: w_diffuse.dds, w_normal.psd;" in warning
-        with pytest.raises(InputError, match="no image") as caught:
-            find_maps(fill(tmp_path / "b", "w_height.dds"))
-        assert "w_height.dds" in caught.value.hint
-
     def test_all_that_is_ambiguous_is_refused_at_once(self, tmp_path: Path) -> None:
         names = ["r_disp.exr", "r_disp.png", "r_diff_1k.png", "r_diff_2k.png", "r_orm.png", "r_nor.png"]
         with pytest.raises(InputError, match="two maps or more of") as caught:
@@ -250,7 +215,3 @@ class TestPacked:
         maps = find_maps(fill(tmp_path, "x_height.png", "x_RoughnessMetallic.png"))
         assert maps.maps.keys() == {"height"}
         assert "channel" in maps.warnings[0]
-
-    def test_an_asset_named_by_maps(self, tmp_path: Path) -> None:
-        names = ["rough_metal_ao.png", "rough_metal_disp.png", "preview.png"]
-        assert found(tmp_path, *names) == {"height": "rough_metal_disp.png"}

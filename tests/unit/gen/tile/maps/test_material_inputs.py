@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -37,11 +36,6 @@ class TestHeights:
         text = "height: {file: height.png, channel: G, dequantize: false}\n"
         material = load_material(write(tmp_path, text))
         assert np.array_equal(np.rint(material.height * 255), codes[..., 1])
-
-    def test_a_normal_map_is_recognized(self, tmp_path: Path) -> None:
-        codes = np.clip(rng().normal((128, 128, 250), (40, 40, 5), (8, 8, 3)), 0, 255)
-        with pytest.raises(InputError, match="colored like a normal map"):
-            load_material(png(tmp_path / "height.png", codes, 2, 8))
 
     def test_srgb_when_asked_for(self, tmp_path: Path) -> None:
         codes = rng().integers(0, 65536, (8, 16, 1))
@@ -194,11 +188,6 @@ class TestNormals:
             normal = load_material(heights).maps["normal"]
             assert normal == pytest.approx(n, abs=1e-6)
 
-    def test_normals_that_point_down(self, heights: Path) -> None:
-        codes = np.full((8, 16, 3), 100)
-        png(heights / "normal.png", codes, 2, 8)
-        assert any("100.00% of its normals point into" in w for w in load_material(heights).warnings)
-
 
 class TestNamesOfFiles:
     """Names with the separators of Windows."""
@@ -212,19 +201,6 @@ class TestNamesOfFiles:
         expected = {"height": "height.npy", "roughness": "maps/rough.png"}
         files = load_material(path).files
         assert {role: file.relative_to(heights).as_posix() for role, file in files.items()} == expected
-
-
-def test_warnings_name_files_without_parent_folders(heights: Path) -> None:
-    """Behind a symbolic link ``..`` is another folder, and the path stays as it is."""
-    folder = heights.parent / "elsewhere/inside"
-    folder.mkdir(parents=True)
-    (heights / "link").symlink_to(folder)
-    os.link(heights / "height.npy", folder.parent / "height.npy")
-    (heights / "nested").mkdir()
-    for name, expected in (("nested", heights), ("link", heights / "link/..")):
-        path = heights / name / "material.yaml"
-        path.write_text("height: ../height.npy\n")
-        assert load_material(path).files["height"] == expected / "height.npy"
 
 
 def test_orientation_is_ignored_with_a_warning(heights: Path) -> None:

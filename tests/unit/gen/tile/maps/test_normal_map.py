@@ -141,14 +141,6 @@ class TestMaterial:
         wrong = "_" in name and convention not in name
         assert ["the name implies" in warning for warning in material.warnings] == [True] * wrong
 
-    def test_a_convention_that_is_asked_for_and_wrong(self, tmp_path: Path) -> None:
-        folder = self.folder(tmp_path, fractal(96, 96), "n.png", dx=True)
-        (folder / "material.yaml").write_text("height: height.png\nnormal: {file: n.png, convention: gl}\n")
-        material = load_material(folder)
-        assert "the material file implies OpenGL, the heights' slopes imply DirectX" in material.warnings[0]
-        assert "read as OpenGL" in material.warnings[0]
-        assert material.normal_convention == "gl"
-
     def test_turned_and_inverted_heights_warn(self, tmp_path: Path) -> None:
         folder = self.folder(tmp_path, np.rot90(fractal(96, 96), -1), "normal.png", dx=False)
         (warning,) = load_material(folder).warnings

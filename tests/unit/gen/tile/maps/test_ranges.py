@@ -6,12 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.image_files import P3_COLUMNS, SRGB_CURVE, exr, icc, rng
+from support.image_files import exr, rng
 
-from mbtf_core.app.console import run
-from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError
-from mbtf_gen.cli.app import app
 from mbtf_gen.tile.loading import load_material
 
 ACESCG = (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767)
@@ -91,14 +88,3 @@ def test_primaries_matter_for_colors_only(folder: Path) -> None:
     assert f"{int((red > 1.001).sum())} pixels" in warning
     assert "ACEScg" in warning
     assert "ACEScg" in material.facts["base_color"].colorspace
-
-
-def test_written_choices_keep_the_conversion(folder: Path) -> None:
-    from PIL import Image as Pillow
-
-    codes = rng().integers(60, 200, (32, 32, 3)).astype(np.uint8)
-    Pillow.fromarray(codes).save(folder / "diff.png", icc_profile=icc("P3", P3_COLUMNS, SRGB_CURVE))
-    assert run(app, ["inspect", str(folder), "--write", str(folder / "m.yaml")]) == 0
-    found, written = load_material(folder), load_material(folder / "m.yaml")
-    assert np.array_equal(found.maps["base_color"], written.maps["base_color"])
-    assert np.abs(found.maps["base_color"] - srgb_to_linear(codes / 255)).max() > 0.01
