@@ -1,50 +1,57 @@
-"""Error against training time: the models on eleven materials, and what each part of a model contributes.
+"""Error at equal training time: the models on eleven materials, and what each part of a model contributes.
 
-    python benchmarks/front.py --out FOLDER [MATERIAL ...] [--time 30s 2min] [--seed 0]
+    python benchmarks/front.py --out FOLDER [MATERIAL ...] [--time 30s] [--seeds 5]
     python benchmarks/front.py --out FOLDER --ablation relief|neumip+ [MATERIAL] [--time 30s]
     python benchmarks/front.py --out FOLDER --rock-cliff [--time 100s]
 
-For each material, all models are trained for the same times on the same data: those of the preset ``draft``
-at 128 texels across, of five assets and six texture sets. Test queries have 256 paths: with fewer, the noise
-of highlights hides the differences. All networks have the same width; ``relief`` also traces four view rays
-per footprint, and ``neumip+`` learns heights without the geometry. On the materials of Kuznetsov et al. 2021,
-``neumip-baseline`` is trained as well, for the ratios that they published. ``--ablation`` leaves out one part
-of a model at a time, on one material (``rock_cliff`` by default). ``--rock-cliff`` is the benchmark
-``rock_cliff-128``: models of their default sizes, a larger ``neumip`` and the baseline, on the data of
-``pipelines/rock_cliff.yaml``, with thresholds of their unexplained variance. FOLDER keeps data and figures,
-so the same command resumes. Nothing else should use the processors.
+For each material, all models are trained on the same data: those of the preset ``draft`` at 128 texels
+across, of five assets and six texture sets. Test queries have 256 paths, and three quarters of them are drawn
+by the highlights: otherwise the noise of highlights hides the differences. All networks have the same width;
+``relief`` traces one, two or four view rays per footprint, and ``neumip+`` learns heights without the
+geometry. On the materials of Kuznetsov et al. 2021, ``neumip-baseline`` is trained as well, for the ratios
+that they published. ``--ablation`` leaves out one part of a model at a time, on one material (``rock_cliff``
+by default). ``--rock-cliff`` is the benchmark ``rock_cliff-128``: models of their default sizes, a larger
+``neumip`` and the baseline, on the data of ``pipelines/rock_cliff.yaml``, with thresholds of their
+unexplained variance.
 
-The last line is one JSON object. Thresholds hold for the longest time: the unexplained variance of ``relief``
-over that of ``neumip`` is at most 0.6 on displaced materials and at most 1 elsewhere (two standard errors).
+Training rates are measured first, in turns; nothing else should use the processors then. Fits get the steps
+that the time allows at these rates, so other work does not change them. FOLDER keeps data, rates and errors,
+so the same command resumes. Errors of means are those of the seeds; of one seed, those of the test queries.
+
+The last line is one JSON object. Thresholds: the unexplained variance of ``relief`` over that of ``neumip``
+is at most 0.6 on displaced materials and at most 1 elsewhere (two standard errors).
 """
 
 from __future__ import annotations
 
-import argparse
 import math
 import re
 from pathlib import Path
+from statistics import mean, median, stdev
 from typing import Any
 
-from common import HEIGHT_SCALES, RELIEFS, ROOT, finish, is_available, kept, parser_of, start
+from common import HEIGHT_SCALES, RELIEFS, ROOT, finish, is_available, kept, parser_of, processor, start
 from quality import generator_config
 
 from mbtf_core.config.settings import deep_merge, resolve
 from mbtf_core.data.dataset import Dataset
+from mbtf_core.units import parse_duration
 from mbtf_fit import FitConfig, fit
 from mbtf_gen.generation.run import generate
 from mbtf_pipeline.collection.recipes import PaperRecipe, first_known
 from mbtf_pipeline.recipe import load_recipe
 
 RESOLUTION = 128
-# Paths per test query.
-TEST_SPP = 256
+# Paths per test query, and the share of these that highlights draw.
+TEST_SPP, HIGHLIGHTS = 256, 0.75
+# Training time in which a rate is measured, and how often.
+RATE_TIME, RATE_TURNS = "5s", 3
 NEUMIP: dict[str, Any] = {
     "model": "neumip",
     "network": {"width": 40, "channels": 12, "encoding": {"direction_xyz": True}},
     "training": {"texture_weight_decay": 1.0, "blur": {"min_sigma": 0.8}},
 }
-BASELINE: dict[str, Any] = {**NEUMIP, "model": "neumip-baseline"}
+BASELINE: dict[str, dict[str, Any]] = {"neumip-baseline": {**NEUMIP, "model": "neumip-baseline"}}
 RELIEF: dict[str, Any] = {"model": "relief", "network": {"width": 40, "channels": 8}}
 LEARNED: dict[str, Any] = {"model": "neumip+", "network": {"width": 40, "channels": 12}}
 # What an ablation changes in the network, by model.
@@ -73,7 +80,7 @@ MODELS: dict[str, dict[str, Any]] = {
     "neumip": NEUMIP,
     "neumip+": LEARNED,
     "relief": RELIEF,
-    "four rays": deep_merge(RELIEF, {"network": PARTS["relief"]["four rays"]}),
+    **{rays: deep_merge(RELIEF, {"network": PARTS["relief"][rays]}) for rays in ("two rays", "four rays")},
 }
 THRESHOLDS = {"displaced": 0.6, "any": 1.0}
 STANDARD_ERRORS = 2.0
@@ -98,34 +105,58 @@ def shards(name: str, folder: Path) -> Path:
     """Data of a material, generated where they are missing."""
     out = folder / name / "shards"
     config = generator_config(name, "draft", RESOLUTION)
-    queries = config.queries.model_copy(update={"test_spp": TEST_SPP})
+    queries = config.queries.model_copy(update={"test_spp": TEST_SPP, "test_highlights": HIGHLIGHTS})
     generate(config.model_copy(update={"queries": queries}), out)
     return out
 
 
+def steps_of(models: dict[str, dict[str, Any]], data: Path, folder: Path, time: str) -> dict[str, int]:
+    """Steps of each model in a training time, at the rates that are kept in a folder."""
+    batch, seconds = FitConfig().training.batch, parse_duration(time)
+
+    def rates() -> dict[str, Any]:
+        found: dict[str, list[float]] = {label: [] for label in models}
+        for _ in range(RATE_TURNS):
+            for label, options in models.items():
+                config = FitConfig.model_validate(deep_merge(options, {"training": {"time": RATE_TIME}}))
+                record = fit(config, data, folder / "rate", overwrite=True).history[-1]
+                found[label].append(record["queries_per_second"])
+        return {"processor": processor(), "rates": {label: median(each) for label, each in found.items()}}
+
+    measured = kept(folder / "rates.json", rates)
+    print(f"queries per second, {measured['processor']}: {measured['rates']}")
+    return {label: round(seconds * rate / batch) for label, rate in measured["rates"].items()}
+
+
 def train(
-    label: str, options: dict[str, Any], data: Path, folder: Path, time: str, seed: int
+    label: str, options: dict[str, Any], data: Path, folder: Path, steps: int, seeds: int
 ) -> dict[str, Any]:
-    """Error of one fit; kept in a folder."""
-    name = f"{re.sub('[^a-z+]+', '-', label)}-{time}-{seed}"
+    """Errors of the fits of each seed, and their mean; each is kept in a folder."""
+    fits = []
+    for seed in range(seeds):
+        name = f"{re.sub('[^a-z0-9+]+', '-', label)}-{steps}-{seed}"
 
-    def measure() -> dict[str, Any]:
-        config = FitConfig.model_validate(deep_merge(options, {"seed": seed, "training": {"time": time}}))
-        result = fit(config, data, folder / name, overwrite=True)
-        test = result.errors["test"]
-        return {
-            **test["unexplained"],
-            "levels": {level: errors["unexplained"]["value"] for level, errors in test["levels"].items()},
-            "steps": result.history[-1]["step"],
-            "queries_per_second": round(result.history[-1]["queries_per_second"]),
-        }
+        def measure(name: str = name, seed: int = seed) -> dict[str, Any]:
+            config = FitConfig.model_validate(
+                deep_merge(options, {"seed": seed, "training": {"steps": steps}})
+            )
+            result = fit(config, data, folder / name, overwrite=True)
+            test = result.errors["test"]
+            levels = {level: errors["unexplained"]["value"] for level, errors in test["levels"].items()}
+            return {**test["unexplained"], "levels": levels}
 
-    found = kept(folder / f"{name}.json", measure)
-    levels = " ".join("-" if value is None else f"{value:.3f}" for value in found["levels"].values())
+        fits.append(kept(folder / f"{name}.json", measure))
+    values = [each["value"] for each in fits]
+    error = stdev(values) / math.sqrt(seeds) if seeds > 1 else fits[0]["error"]
+    levels = {
+        level: None if value is None else mean(each["levels"][level] for each in fits)
+        for level, value in fits[0]["levels"].items()
+    }
+    found = {"value": mean(values), "error": error, "levels": levels, "steps": steps, "seeds": values}
+    texts = " ".join("-" if value is None else f"{value:.3f}" for value in levels.values())
     print(
-        f"{folder.name:16s} {label:30s} {time:>6s} {found['steps']:6d} steps  "
-        f"{found['value']:.3f} ± {found['error']:.3f}   "
-        f"by level {levels}",
+        f"{folder.name:16s} {label:30s} {steps:6d} steps  {found['value']:.3f} ± {error:.3f}   "
+        f"by level {texts}",
         flush=True,
     )
     return found
@@ -137,46 +168,52 @@ def ratio_of(a: dict[str, Any], b: dict[str, Any]) -> tuple[float, float]:
     return ratio, ratio * math.hypot(a["error"] / a["value"], b["error"] / b["value"])
 
 
-def compared(name: str, folder: Path, times: list[str], seed: int) -> dict[str, Any]:
-    """All models on one material, after each of the times."""
+def compared(name: str, folder: Path, steps: dict[str, int], seeds: int) -> dict[str, Any]:
+    """All models on one material."""
     data = shards(name, folder)
 
-    def fits_of(models: dict[str, dict[str, Any]], time: str) -> dict[str, dict[str, Any]]:
-        return {label: train(label, o, data, folder / name, time, seed) for label, o in models.items()}
+    def fits_of(models: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+        return {
+            label: train(label, o, data, folder / name, steps[label], seeds) for label, o in models.items()
+        }
 
-    front = {time: fits_of(MODELS, time) for time in times}
-    fits = front[times[-1]]
+    fits = fits_of(MODELS)
     ratio, error = ratio_of(fits["relief"], fits["neumip"])
     extent = Dataset.open(data).manifest["tile"]["displacement_range"]
     limit = THRESHOLDS["displaced" if extent >= DISPLACED else "any"]
-    found = {"material": name, "displacement_range": extent, "fits": front, "ratio": ratio, "error": error}
+    found = {"material": name, "displacement_range": extent, "fits": fits, "ratio": ratio, "error": error}
     sources = resolve(PaperRecipe, file=PAPER).published
     published, _ = first_known(sources, lambda p: p.mse_ratio(name, "neumip", "neumip-baseline"))
     if published is not None:
-        plain = fits_of({"neumip-baseline": BASELINE}, times[-1])["neumip-baseline"]
+        plain = fits_of(BASELINE)["neumip-baseline"]
         ratios = {label: ratio_of(one, plain) for label, one in fits.items()}
         found["over_baseline"] = {"published neumip": published, "ratios": ratios}
         texts = "   ".join(f"{label} {value:.2f} ± {bar:.2f}" for label, (value, bar) in ratios.items())
         print(f"{name:16s} over neumip-baseline: {texts}   published for neumip {published:.2f}")
-    print(f"{name:16s} relief over neumip {ratio:.2f} ± {error:.2f}", flush=True)
+    for label in list(MODELS)[1:]:
+        value, bar = ratio_of(fits[label], fits["neumip"])
+        print(f"{name:16s} {label} over neumip {value:.2f} ± {bar:.2f}", flush=True)
     return {**found, "met": ratio - STANDARD_ERRORS * error <= limit}
 
 
-def ablation(model: str, name: str, arguments: argparse.Namespace) -> int:
+def ablation(model: str, name: str, out: Path, time: str, seeds: int) -> int:
     """One model without one of its parts at a time."""
-    data, folder = shards(name, arguments.out), arguments.out / name
-    figures = {}
-    for label, change in PARTS[model].items():
-        options = deep_merge(MODELS[model], {"network": change})
-        figures[label] = train(label, options, data, folder, arguments.time[-1], arguments.seed)
-    return finish({"material": name, "fits": figures}, {}, None)
+    data, folder = shards(name, out), out / name / model
+    changed = {
+        label: deep_merge(MODELS[model], {"network": change}) for label, change in PARTS[model].items()
+    }
+    steps = steps_of(changed, data, folder, time)
+    fits = {label: train(label, o, data, folder, steps[label], seeds) for label, o in changed.items()}
+    return finish({"material": name, "fits": fits}, {}, None)
 
 
-def rock_cliff(out: Path, time: str, seed: int) -> int:
+def rock_cliff(out: Path, time: str, seeds: int) -> int:
     """The benchmark ``rock_cliff-128``."""
-    generate(load_recipe(ROCK_CLIFF).generate, out / "shards")
+    data = out / "shards"
+    generate(load_recipe(ROCK_CLIFF).generate, data)
+    steps = steps_of({label: options for label, (options, _) in BENCHMARK.items()}, data, out, time)
     found = {
-        label: train(label, options, out / "shards", out, time, seed)
+        label: train(label, options, data, out, steps[label], seeds)
         for label, (options, _) in BENCHMARK.items()
     }
     ratio = found["neumip-baseline"]["value"] / found["neumip"]["value"]
@@ -190,18 +227,20 @@ def main() -> int:
     parser = parser_of(__doc__)
     parser.add_argument("materials", nargs="*")
     parser.add_argument("--out", type=Path, required=True, help="folder of data and figures")
-    parser.add_argument("--time", nargs="+", help="training times, the longest last; 60s, of rock_cliff 100s")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--time", help="training time; 30s, of rock_cliff 100s")
+    parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--ablation", choices=PARTS, help="model whose parts are left out")
     parser.add_argument("--rock-cliff", action="store_true", help="the benchmark rock_cliff-128")
     arguments = parser.parse_args()
+    out, seeds = arguments.out, arguments.seeds
     if arguments.rock_cliff:
-        return rock_cliff(arguments.out / "rock_cliff-128", (arguments.time or ["100s"])[-1], arguments.seed)
-    arguments.time = arguments.time or ["60s"]
+        return rock_cliff(out / "rock_cliff-128", arguments.time or "100s", seeds)
+    time = arguments.time or "30s"
     if arguments.ablation:
-        return ablation(arguments.ablation, (arguments.materials or ["rock_cliff"])[0], arguments)
+        return ablation(arguments.ablation, (arguments.materials or ["rock_cliff"])[0], out, time, seeds)
     names = [n for n in arguments.materials or [*RELIEFS, *HEIGHT_SCALES] if is_available(n)]
-    found = [compared(name, arguments.out, arguments.time, arguments.seed) for name in names]
+    steps = steps_of({**MODELS, **BASELINE}, shards(names[0], out), out, time)
+    found = [compared(name, out, steps, seeds) for name in names]
     return finish(found, THRESHOLDS, bool(found) and all(one["met"] for one in found))
 
 
