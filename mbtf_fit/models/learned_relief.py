@@ -36,7 +36,7 @@ TRACED = 10
 # Steps after which normals and horizons are filtered again, for textures of so many texels and fewer; for
 # larger ones in proportion, so that the filter takes a fixed share of the time. In short fits they are
 # filtered so many times at least, in equal parts of the budget.
-FILTERED, FILTERED_TEXELS, FILTERED_LEAST = 40, 1 << 14, 8
+FILTERED, FILTERED_TEXELS, FILTERED_LEAST = 160, 1 << 14, 4
 
 
 class LearnedRelief(Relief):
