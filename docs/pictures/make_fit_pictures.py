@@ -18,7 +18,7 @@ import mbtf_fit.backends.mitsuba
 ROOT = Path(__file__).parents[2]
 WORK = Path("out/fit_pictures")
 TURTLE_SHELL = "out/quickstart/fits/relief"
-SIZE, SPP = 384, 32
+SIZE, SPP = 480, 64
 
 
 def run(program: str, arguments: str, output: str) -> Path:
