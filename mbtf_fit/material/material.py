@@ -72,7 +72,9 @@ def _numbers(values: ArrayLike, name: str) -> NDArray[np.float32]:
         raise InputError(f"is no array of real numbers ({reason(error)})", where=name) from None
     with np.errstate(over="ignore"):
         found = np.asarray(array, np.float32)
-    if bad := int((~np.isfinite(found)).sum()):
+    # An infinite footprint is that of the coarsest level.
+    wrong = np.isnan(found) if name == "sigma" else ~np.isfinite(found)
+    if bad := int(wrong.sum()):
         raise InputError(f"holds NaN or infinity ({bad} of {found.size} numbers)", where=name)
     return found
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import re
 import statistics
 import time
 from collections.abc import Iterable, Sequence
@@ -79,7 +78,7 @@ class Configuration:
     @property
     def folder(self) -> str:
         """Folder that its command writes to: no two configurations of a study share one."""
-        return re.sub(r"[^a-z0-9.]+", "-", self.label.lower()).strip("-.")
+        return f"{self.study.replace(' ', '-')}-{data_sha256(self.key)[:6]}"
 
     @property
     def key(self) -> dict[str, Any]:

