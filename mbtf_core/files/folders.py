@@ -248,7 +248,7 @@ class OutputKind:
 class OutputFolder:
     """A folder that :meth:`claim` has claimed for one configuration of a command; the caller owns it.
 
-    As a context manager it gives up the claim if an error comes before the first file.
+    As a context manager it gives up the claim of a new folder if an error comes before the first file.
 
     Attributes
     ----------
@@ -257,8 +257,8 @@ class OutputFolder:
 
     def __init__(self, path: Path, kind: OutputKind, record: _Record) -> None:
         self.path, self._kind, self._record = path, kind, record
-        # The files that tell whose the folder is.
-        self._claim = [kind.record]
+        # The files that tell whose a new folder is.
+        self._claim = [] if kind.check(path) else [kind.record]
 
     @classmethod
     def claim(
@@ -307,7 +307,8 @@ class OutputFolder:
         if folder._record is new:
             folder._save()
         if config is not None:
-            folder._claim.insert(0, CONFIG_NAME)
+            if folder._claim:
+                folder._claim.insert(0, CONFIG_NAME)
             write_document(path / CONFIG_NAME, dump_yaml(config), overwrite=overwrite)
         return folder
 

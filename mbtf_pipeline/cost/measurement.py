@@ -32,7 +32,7 @@ ESTIMATES = ("seconds", "error", "bias", "noise")
 # it counts for: studies of four materials found 1.5 to 6% (docs/results/cost.md).
 PRIOR, PRIOR_DEGREES = 0.05, 4
 # Share of the processors below which other work is worth a warning.
-_FREE = 0.9
+_FREE = 0.8
 # Wall time of a probe of the processors, seconds, and bytes of its steps, which run without Python's lock.
 _PROBE_SECONDS, _PROBE_BYTES = 0.05, 1 << 20
 

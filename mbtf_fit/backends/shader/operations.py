@@ -193,7 +193,7 @@ def _rotate(op: ops.Rotate, code: Code, axis: Value, omega: Value) -> str:
 @SHADER.implements(ops.ToFrame)
 def _to_frame(op: ops.ToFrame, code: Code, axes: Value, omega: Value) -> str:
     code.include("shading")
-    return f"in_frame({axes[:3]}, {axes[3:]}, {omega}, {op.shortest})"
+    return f"in_frame({axes[:3]}, {axes[3:]}, {omega}, {number(op.shortest)})"
 
 
 @SHADER.implements(ops.Stereographic)

@@ -115,6 +115,16 @@ def make(folder: OutputFolder, *names: str) -> None:
     folder.keep(names[0].partition(".")[0], paths, {"noise": 0.5})
 
 
+def test_failures_give_up_new_folders_only(tmp_path: Path) -> None:
+    """A configuration that stood in the folder before stays, changed by hand or not."""
+    for before in (False, True):
+        if before:
+            make(claim(tmp_path / "out"), *FILES)
+        with pytest.raises(InputError), claim(tmp_path / "out", overwrite=True):
+            raise InputError("fails", where=tmp_path)
+        assert (tmp_path / "out/config.yaml").exists() == before
+
+
 def listing(path: Path) -> dict[str, bytes]:
     return {p.name: p.read_bytes() for p in path.iterdir()}
 
