@@ -76,7 +76,7 @@ def report_errors(
         value = format_estimate(split["unexplained"])
         scale = "0: exact, 1: as good as the mean value"
         if few_decide(split):
-            scale = f"unreliable: ten of them make {min(1.0, split['ten_largest']):.0%} of it"
+            scale = few_decide_text(split)
         lines.append(f"unexplained variance {value} {of} ({scale})")
     text, word = visibility(split)
     if word is not None:
@@ -92,6 +92,11 @@ def report_errors(
         others.append(f"rms error of transmittance {max(0.0, through['mse']['value']) ** 0.5:.3f}")
     lines += [", ".join(others)] if others else []
     return [*lines, *_remarks(errors, foreign), *(_table_of(errors) if verbose else [])]
+
+
+def few_decide_text(split: Mapping[str, Any]) -> str:
+    """``unreliable: ten of them make 95% of it``"""
+    return f"unreliable: ten of them make {min(1.0, split['ten_largest']):.0%} of it"
 
 
 def few_decide(split: Mapping[str, Any]) -> bool:

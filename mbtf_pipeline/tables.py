@@ -24,14 +24,12 @@ def is_significant(e: Estimate) -> bool:
     return not math.isfinite(e.value) or abs(e.value) > SIGNIFICANT * e.error
 
 
-def estimate_text(
-    e: Estimate, factor: float = 1.0, unit: str = "", *, significant: bool | None = None
-) -> str:
-    """``0.123 ± 0.004``, or ``not significant (0.003 ± 0.004)``; `significant` overrides the value's test."""
+def estimate_text(e: Estimate, factor: float = 1.0, unit: str = "") -> str:
+    """``0.123 ± 0.004``, or ``not significant (0.003 ± 0.004)``."""
     if not math.isfinite(e.value):
         return "undefined"
     text = signed(f"{e.scaled(factor)}{unit}")
-    return text if (is_significant(e) if significant is None else significant) else not_significant(text)
+    return text if is_significant(e) else not_significant(text)
 
 
 def not_significant(text: str) -> str:
@@ -47,15 +45,15 @@ def signed(text: str) -> str:
 def data_errors(record: Mapping[str, Any]) -> tuple[str, str]:
     """(unexplained variance, MSE in 10⁻³/sr²) of the same queries.
 
-    The former is the latter divided by a variance, so both are marked as significant or neither is. An
-    unexplained variance that may be below 0 and above 1 has no number.
+    The former is the latter divided by the variance of the values: a highlight adds to both, so that the
+    quotient may be significant where the MSE is not. An unexplained variance that may be below 0 and above 1
+    has no number.
     """
     unexplained, mse = estimate(record["unexplained"]), estimate(record["mse"])
-    significant = is_significant(unexplained) and is_significant(mse)
-    text = estimate_text(unexplained, significant=significant)
-    if not significant and unexplained.value + SIGNIFICANT * unexplained.error > 1.0:
+    text = estimate_text(unexplained)
+    if not is_significant(unexplained) and unexplained.value + SIGNIFICANT * unexplained.error > 1.0:
         text = NOT_SIGNIFICANT
-    return text, estimate_text(mse, 1e3, significant=significant)
+    return text, estimate_text(mse, 1e3)
 
 
 def decibel(psnr: Estimate, mse: Estimate) -> str:

@@ -128,8 +128,7 @@ def _error_table(comparison: Mapping[str, Any]) -> dict[str, Any]:
 def _grouping(
     tests: Mapping[str, Any], key: str, title: str, axis: str, head: str
 ) -> tuple[dict[str, Any], dict[str, Any]] | None:
-    """Plot and table of the errors by level or by cosine; None where none is defined. The table begins with
-    the groups where a fit has a significant error."""
+    """Plot and table of the errors by level or by cosine; None where none is defined."""
     names = sorted({n for test in tests.values() for n in test[key]}, key=lambda n: float(n.split("-")[0]))
     known = [
         n
@@ -153,9 +152,6 @@ def _grouping(
             series[fit].append((found.value, found.error) if math.isfinite(found.value) else None)
             row += ("–", "–") if group is None else data_errors(group)
         rows.append(row)
-    rows.sort(
-        key=lambda row: all(NOT_SIGNIFICANT in text or text in ("–", "undefined") for text in row[2::2])
-    )
     svg = points([labels[name] for name in known], series, axis, UNEXPLAINED, f"{UNEXPLAINED} {title}")
     heads = [h for fit in tests for h in (f"{fit}: {UNEXPLAINED}", f"{fit}: MSE [10⁻³/sr²]")]
     table = {"title": f"{title}, test split", "head": [head, "queries", *heads], "rows": rows, "note": note}
