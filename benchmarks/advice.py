@@ -33,7 +33,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from common import ASSETS, finish, is_available, kept, parser_of, start
-from front import TEST_SPP
+from front import HIGHLIGHTS, TEST_SPP
 from quality import generator_config
 
 from mbtf_fit import FitConfig, fit
@@ -54,7 +54,6 @@ QUERIES_AT, OTHERS_TO = 800, 800
 QUERIES = 400
 # Stone bricks of this relief, with half of the queries.
 FEW, FEW_RELIEF, FEW_QUERIES = "few", 0.01, 200
-HIGHLIGHTS = 0.75
 RESOLUTION = 64
 WITHIN, FLAT, STANDARD_ERRORS = 1.5, 0.8, 2.0
 SHARE, DEVIATION, DEVIATION_FROM = 0.8, 0.1, 200

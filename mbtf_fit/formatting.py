@@ -74,9 +74,7 @@ def report_errors(
     lines = []
     if split["unexplained"]["value"] is not None:
         value = format_estimate(split["unexplained"])
-        scale = "0: exact, 1: as good as the mean value"
-        if few_decide(split):
-            scale = few_decide_text(split)
+        scale = unreliable(split) or "0: exact, 1: as good as the mean value"
         lines.append(f"unexplained variance {value} {of} ({scale})")
     text, word = visibility(split)
     if word is not None:
@@ -94,14 +92,13 @@ def report_errors(
     return [*lines, *_remarks(errors, foreign), *(_table_of(errors) if verbose else [])]
 
 
-def few_decide_text(split: Mapping[str, Any]) -> str:
-    """``unreliable: ten of them make 95% of it``"""
-    return f"unreliable: ten of them make {min(1.0, split['ten_largest']):.0%} of it"
-
-
-def few_decide(split: Mapping[str, Any]) -> bool:
-    """Whether so few of many queries decide an error that others like them may be missing."""
-    return split["n"] >= _MANY and (split.get("ten_largest") or 0.0) > _DECISIVE
+def unreliable(split: Mapping[str, Any]) -> str:
+    """``unreliable: ten of them make 95% of it``, where so few of many queries decide an error that others
+    like them may be missing; empty elsewhere."""
+    share = split.get("ten_largest") or 0.0
+    if split["n"] < _MANY or share <= _DECISIVE:
+        return ""
+    return f"unreliable: ten of them make {min(1.0, share):.0%} of it"
 
 
 def _remarks(errors: Mapping[str, Any], foreign: bool) -> list[str]:

@@ -14,7 +14,7 @@ from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.schema import CONFIG_NAME
 from mbtf_core.units import format_duration
 from mbtf_fit.config import FitConfig
-from mbtf_fit.formatting import few_decide, headline
+from mbtf_fit.formatting import headline, unreliable
 from mbtf_fit.training.validation import FEWEST_STEPS, FLAT, MarginalCost
 
 # Below so many steps, the error itself says little.
@@ -93,7 +93,7 @@ def next_step(cost: MarginalCost, errors: Mapping[str, Any]) -> NextStep:
     if cost.few and (value is None or value >= 1.0 or untrained):
         factor = 2 ** math.ceil(math.log2(FEWEST_STEPS / cost.steps))
         return NextStep("time", f"{cost.steps} steps are few: train {factor} times as long", factor)
-    if value is None or error is None or error > _UNCERTAIN * abs(value) or few_decide(split):
+    if value is None or error is None or error > _UNCERTAIN * abs(value) or unreliable(split):
         reason = "few test queries decide the error; four times as many, by highlights, measure it better"
         if (
             value is not None

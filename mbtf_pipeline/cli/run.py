@@ -189,7 +189,7 @@ def _report_collection(done: CollectionResult, folder: Path, console: Console) -
 
 
 def _report(result: RunResult, console: Console, quality: Quality | None) -> None:
-    from mbtf_fit.formatting import few_decide, few_decide_text
+    from mbtf_fit.formatting import unreliable
     from mbtf_fit.training.endings import describe_ending
     from mbtf_fit.training.fit_folder import read_history
     from mbtf_fit.training.validation import caveat
@@ -213,7 +213,7 @@ def _report(result: RunResult, console: Console, quality: Quality | None) -> Non
             "caveat": why or None,
         }
         name = f"{fit} ({why})" if why else fit
-        few = f" ({few_decide_text(errors)})" if few_decide(errors) else ""
+        few = f" ({remark})" if (remark := unreliable(errors)) else ""
         lines.append(f"  {name}: unexplained variance {estimate(errors['unexplained'])}{few}")
         lines += [] if ending is None else [f"    {ending}"]
     if result.viewer is not None:
