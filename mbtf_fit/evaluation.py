@@ -65,7 +65,8 @@ def split_errors(
     dict
         Plain data for JSON. ``mse`` E[(p-a)(p-b)] and ``variance`` of the values, in 1/sr², and their ratio
         ``unexplained`` (1 - R²: 0 is exact, 1 as good as the mean value), each an estimate with ``value``,
-        ``error`` and ``n``; ``ten_largest``: share of the ten largest squared errors in their sum; also by
+        ``error`` and ``n``; ``color``: what is unexplained of the values minus their mean over the channels,
+        a small part of all; ``ten_largest``: share of the ten largest squared errors in their sum; also by
         nearest level (``levels``) and by band of the smaller cosine of light and view (``elevations``).
         ``psnr``: its peak is the value that the exposure shows as white; ``visibility``: in words;
         ``includes_noise``: whether the data have one value per query.
@@ -75,8 +76,10 @@ def split_errors(
     exposure = exposure_of(queries) if exposure is None else exposure
     arrays = predict(queries), *queries.halves
     mse = noise_free_mse(*arrays)
+    colors = _color(arrays[0]), _color(queries.value_a), _color(queries.value_b)
     found = {
         **_errors(len(queries), mse, signal_variance(*arrays[1:]), unexplained_variance(*arrays)),
+        "color": unexplained_variance(*colors, queries.weight, queries.group).as_dict(),
         "exposure": exposure,
         "ten_largest": _ten_largest(*arrays[:4]),
     }
@@ -94,6 +97,10 @@ def split_errors(
             f"{ELEVATION_BANDS[k]:g}-{ELEVATION_BANDS[k + 1]:g}": errors for k, errors in bands.items()
         },
     }
+
+
+def _color(values: F32) -> F32:
+    return values - values.mean(axis=-1, keepdims=True)
 
 
 def _ten_largest(prediction: F32, a: F32, b: F32, weight: F32 | None) -> float | None:

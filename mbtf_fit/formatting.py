@@ -126,6 +126,7 @@ def _table_of(errors: Mapping[str, Any]) -> list[str]:
     shown = {name: split for name, split in errors.items() if split["unexplained"]["value"] is not None}
     rows = [["unexplained variance", *(SPLIT_NAMES.get(name, name) for name in shown)]]
     rows.append(["all", *cells([*shown.values()])])
+    rows.append(["color alone", *cells([{"unexplained": split["color"]} for split in shown.values()])])
     for grouping, label in (("levels", "level"), ("elevations", "cosine")):
         groups = {group for split in shown.values() for group in split[grouping]}
         for group in sorted(groups, key=lambda g: float(g.split("-")[0])):

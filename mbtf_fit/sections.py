@@ -14,7 +14,7 @@ from mbtf_core.config.settings import Settings
 from mbtf_core.units import Size, format_duration, parse_duration
 
 OutputTransform = Literal["expm1", "exp", "identity", "softplus", "fourth-root"]
-LossKind = Literal["relative", "squared", "linear", "log", "fourth-root", "gradient"]
+LossKind = Literal["relative", "squared", "chroma", "linear", "log", "fourth-root", "gradient"]
 Correction = Literal["none", "linear"]
 
 
@@ -176,7 +176,7 @@ class TrainingSection(Settings):
         "more lights and views, at a larger margin per texel",
     )
     losses: tuple[LossTerm, ...] = Field(
-        (LossTerm(kind="relative", weight=1.0),),
+        (LossTerm(kind="relative", weight=1.0), LossTerm(kind="chroma", weight=3.0)),
         min_length=1,
         description="terms of the loss, which are added: {kind, weight, start}",
     )

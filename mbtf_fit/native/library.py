@@ -19,7 +19,7 @@ MAX_CHANNELS, MAX_WIDTH, MAX_LAYERS, MAX_LEVELS, MAX_PLACES = 64, 128, 16, 16, 4
 
 _I32, _I64, _F32, _POINTER = ctypes.c_int32, ctypes.c_int64, ctypes.c_float, ctypes.c_void_p
 # Version of what the functions mean, where sizes of structures do not show it; as in src/kernel.h.
-INTERFACE = 6
+INTERFACE = 7
 
 
 class NetworkStruct(ctypes.Structure):
@@ -94,7 +94,7 @@ class QuadraticLoss(ctypes.Structure):
     """``mbtf_loss``"""
 
     _fields_ = (
-        *((name, _F32) for name in ("relative", "squared", "scale")),
+        *((name, _F32) for name in ("relative", "squared", "chroma", "scale")),
         ("bound", _F32 * 3),
         ("bounded", _I32),
     )

@@ -134,32 +134,42 @@ def relative(p: Tensor, detached: Tensor, t: Tensor, variance: Tensor | None) ->
     return ((p - t).square() / (detached.square() + 1)).mean()
 
 
+def chroma(p: Tensor, detached: Tensor, t: Tensor, variance: Tensor | None) -> Tensor:
+    """Mean square of how far the relative errors ``e = (p-t) / √(p² + s²)`` of the channels deviate from
+    their mean: what changes the color of a value, not its brightness."""
+    error = (p - t) / (detached.square() + 1).sqrt()
+    return (error - error.mean(-1, keepdim=True)).square().mean()
+
+
 # Of prediction, detached prediction, value, and its variance.
 Term = Callable[[Tensor, Tensor, Tensor, Tensor | None], Tensor]
 _TERMS: dict[LossKind, Term] = {
     "relative": relative,
     "squared": CurveTerm(LossCurve(), squared),
+    "chroma": chroma,
     "linear": CurveTerm(LossCurve(), absolute),
     "log": CurveTerm(Log(), squared),
     "fourth-root": CurveTerm(FourthRoot(), absolute),
     "gradient": CurveTerm(FourthRoot(), absolute_gradient),
 }
 # Terms whose gradient is linear in the value.
-_QUADRATIC: tuple[LossKind, ...] = ("relative", "squared")
+_QUADRATIC: tuple[LossKind, ...] = ("relative", "squared", "chroma")
 
 
 @dataclass(frozen=True)
 class Quadratic:
-    """The loss ``(relative / (p² + s²) + squared / s²)·d²`` with ``d = p - t`` clamped to
-    ``±√(b₀ + b₁|p| + b₂p²)``; all but d is detached.
+    """The loss ``relative·e² + squared·d² / s² + chroma·(e - ē)²`` with ``d = p - t``, which is clamped to
+    ``±√(b₀ + b₁|p| + b₂p²)``, and ``e = d / √(p² + s²)``; ē is the mean over the channels, and all but d is
+    detached.
 
     Attributes
     ----------
-    relative, squared : weights; scale : s in 1/sr; bound : b, or None for none
+    relative, squared, chroma : weights; scale : s in 1/sr; bound : b, or None for none
     """
 
     relative: float
     squared: float
+    chroma: float
     scale: float
     bound: tuple[float, float, float] | None
 
@@ -201,7 +211,9 @@ class Objective:
     def quadratic(self) -> Quadratic | None:
         """The same loss for the compiled kernel; None if it has another form."""
         weights = {term: sum(w for w, t in self._terms if t is term) for _, term in self._terms}
-        relative_weight, squared_weight = (weights.pop(_TERMS[kind], 0.0) for kind in _QUADRATIC)
+        relative_weight, squared_weight, chroma_weight = (
+            weights.pop(_TERMS[kind], 0.0) for kind in _QUADRATIC
+        )
         if weights:
             return None
         bound = None
@@ -209,7 +221,7 @@ class Objective:
             c0, c1, c2 = (self._huber_delta**2 * float(c) for c in self._noise.overall)
             scale = self._noise.scale
             bound = ((self._huber_delta**2 + c0) * scale**2, c1 * scale, c2)
-        return Quadratic(relative_weight, squared_weight, self._unit, bound)
+        return Quadratic(relative_weight, squared_weight, chroma_weight, self._unit, bound)
 
     def bound(self, prediction: Tensor) -> Tensor | None:
         """Huber bound (n, 3) of the errors of predictions (n, 3); None without one."""

@@ -56,7 +56,7 @@ _WARMUP_SHARE = 0.2
 _REFERENCE_NOISE = 0.5
 # Decay per noise-to-signal ratio over the number of queries: of weights that multiply what depends on the
 # position, and of others; and the largest one.
-_SPATIAL_WEIGHTS, _WEIGHTS, _MOST_DECAY = 2e5, 3e4, 1.0
+_SPATIAL_WEIGHTS, _WEIGHTS, _MOST_DECAY = 2e5, 9e3, 1.0
 # Decay of texels, and squared sigma of their blur, per noise-to-signal ratio over the number of queries per
 # texel; and the largest decay.
 _TEXELS, _BLUR, _MOST_TEXEL_DECAY = 150.0, 25.0, 50.0
@@ -82,7 +82,8 @@ class Regularization:
     they are blurred grow with the noise-to-signal ratio over the number of queries per texel. Decay alone has
     no effect where the weights that multiply the texels grow instead, so these decay too, and those that
     multiply hints, which are large at few highlights. Decay of the other weights flattens the dependence on
-    directions: it is much smaller. Decays are applied to the parameters themselves, not to the gradients
+    directions and removes colors, which are a small share of the loss: it is much smaller. Decays are
+    applied to the parameters themselves, not to the gradients
     (Loshchilov and Hutter, ICLR 2019).
 
     Attributes

@@ -58,7 +58,7 @@ class _Sums:
 def quadratic_form(loss: Quadratic) -> QuadraticLoss:
     """A quadratic loss, as the kernel takes it."""
     bound = (ctypes.c_float * 3)(*(loss.bound or (0.0, 0.0, 0.0)))
-    return QuadraticLoss(loss.relative, loss.squared, loss.scale, bound, loss.bound is not None)
+    return QuadraticLoss(loss.relative, loss.squared, loss.chroma, loss.scale, bound, loss.bound is not None)
 
 
 class NativeGradients:

@@ -10,7 +10,7 @@
 #include <stdint.h>
 
 /* Version of what the functions mean; raised where sizes of structures do not show a change. */
-#define INTERFACE 6
+#define INTERFACE 7
 #define BLOCK 128
 #define MAX_CHANNELS 64
 #define MAX_WIDTH 128
@@ -85,11 +85,11 @@ typedef struct {
 } mbtf_gradients;
 
 /* Loss of a prediction p on a value t that the kernel takes by itself, the mean over queries and colors of
- *     (relative / (p² + scale²) + squared / scale²) · d²,   d = p - t,
- * p held still in the weight and in the bound on d:
+ *     relative · e² + squared · d² / scale² + chroma · (e - ē)²,   e = d / √(p² + scale²),   d = p - t,
+ * ē the mean over the colors; p held still under the root and in the bound on d:
  *     |d| <= √(bound[0] + bound[1] |p| + bound[2] p²)   where `bounded`. */
 typedef struct {
-    float relative, squared, scale, bound[3];
+    float relative, squared, chroma, scale, bound[3];
     int32_t bounded;
 } mbtf_loss;
 

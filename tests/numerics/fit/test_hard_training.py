@@ -157,6 +157,33 @@ def test_noise_does_not_flatten_the_dependence_on_directions() -> None:
     assert ratio(bright > np.quantile(bright, 0.8)) > 0.93 * ratio(bright < np.quantile(bright, 0.3))
 
 
+def test_noise_does_not_fade_colors() -> None:
+    """Teal and gold across the tile, under stripes of black and white whose noise hides what color adds to
+    the loss. Over four seeds, 0.06 of the variance of color is unexplained; without the term
+    ``chroma``, or with three times the decay of all weights, decay removes color: 0.98."""
+    random, lattice = np.random.default_rng(0), Lattice(6)
+
+    def colored(u: F32, sigma: F32, omega_i: F32, omega_o: F32) -> NDArray[np.float64]:
+        gold = 0.5 + 0.5 * np.cos(2 * np.pi * u[:, :1]) * np.exp(-0.5 * (2 * np.pi * sigma[:, None]) ** 2)
+        hue = gold * np.array([1.4, 1.0, 0.6]) + (1 - gold) * np.array([0.6, 1.1, 1.3])
+        return stripes(u, sigma, omega_i, omega_o) * hue
+
+    at = random_queries(random, 200_000, lattice)
+    true = colored(*at.values())
+    a, b = (2 * true * (random.random((len(true), 1)) < 0.5) for _ in range(2))
+    noisy = ShardQueries(*at.values(), a.astype(np.float32), b.astype(np.float32))
+    queries = training_queries(at, (a + b) / 2)
+    noise = NoiseModel.of(noisy, lattice, typical_value(queries.value.numpy()))
+    trainer = train_fully(
+        make_trainer(queries, lattice, noise=noise, **{**SMALL, "steps": 300, "batch": 2000})
+    )
+    other = random_queries(random, 20_000, lattice)
+    expected = colored(*other.values())
+    found = trainer.predict(ShardQueries(*other.values(), *2 * [expected.astype(np.float32)]))
+    color = [x - x.mean(1, keepdims=True) for x in (found, expected)]
+    assert missed(*color) < 0.2
+
+
 def test_outliers_do_not_dominate() -> None:
     """Four values of 1e5 among 4000 around 0.1. The loss limits their gradients to that of an error of 10
     times the value. They increase the error elsewhere by at most 0.1 of the variance."""

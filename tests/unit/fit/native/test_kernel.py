@@ -127,7 +127,7 @@ def assert_gradients_alike(model: NeuralMaterial, found: dict[Tensor, Tensor], e
     width=st.integers(1, 40),
     layers=st.integers(2, 5),
     n=st.integers(1, 300),
-    kind=st.sampled_from(["relative", "squared"]),
+    kind=st.sampled_from(["relative", "squared", "chroma"]),
     huber_delta=st.sampled_from([None, 0.5]),
     direction_xyz=st.booleans(),
 )
@@ -222,7 +222,8 @@ def test_other_losses_go_through_pytorch_in_pieces(kind: str, monkeypatch: pytes
 
 
 def test_the_quadratic_form_is_the_same_loss() -> None:
-    terms = [{"kind": "relative", "weight": 0.7}, {"kind": "squared", "weight": 0.2}]
+    weights = {"relative": 0.7, "squared": 0.2, "chroma": 1.3}
+    terms = [{"kind": kind, "weight": weight} for kind, weight in weights.items()]
     noise = NoiseModel(0.1, np.array([0.3, 0.2, 0.1]), np.zeros((4, 3)), np.ones(3), 0.0)
     section = FitConfig.model_validate({"training": {"losses": terms, "huber_delta": 1.5}}).training
     loss = Objective(section, noise)
@@ -235,13 +236,14 @@ def test_the_quadratic_form_is_the_same_loss() -> None:
     bound = (b0 + b1 * p.abs() + b2 * p * p).sqrt().detach()
     d = (p - batch.value).clamp(-bound, bound)
     assert (d.abs() == bound).double().mean() > 0.1
-    weight = form.relative / (p * p + form.scale**2) + form.squared / form.scale**2
+    root = (p * p + form.scale**2).sqrt()
+    weight = form.relative / root**2 + form.squared / form.scale**2
+    color = d / root - (d / root).mean(1, keepdim=True)
     expected = loss(p, batch)
-    torch.testing.assert_close((weight * d * d).mean(), expected)
+    torch.testing.assert_close((weight * d * d + form.chroma * color * color).mean(), expected)
     # Within the bound and beyond: the same derivative.
-    torch.testing.assert_close(
-        2 * (weight * d / d.numel()).detach(), torch.autograd.grad(expected, p)[0], rtol=1e-6, atol=1e-12
-    )
+    slope = 2 * (weight * d + form.chroma * color / root) / d.numel()
+    torch.testing.assert_close(slope.detach(), torch.autograd.grad(expected, p)[0], rtol=1e-6, atol=1e-12)
 
 
 @needs_kernel
