@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from mbtf_core.files.folders import OutputFolder, OutputKind
 from mbtf_core.paths import refuse_special, suggest_path
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries
-from mbtf_fit.material.decoder import DECODER_NAME, Decoder
+from mbtf_fit.material.decoder import Decoder
 from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME, read_description
 from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME
 from mbtf_fit.models import code_of
@@ -30,7 +30,7 @@ HISTORY_NAME = "metrics.jsonl"
 FIT = OutputKind("fit.json", "mbtf-fit", 3, "a fit")
 # The description goes first: without it nothing counts as a finished material.
 _FILES = (
-    *(DESCRIPTION_NAME, DECODER_NAME, HISTORY_NAME, CHECKPOINT_NAME),
+    *(DESCRIPTION_NAME, HISTORY_NAME, CHECKPOINT_NAME),
     *(WEIGHTS_NAME, TRANSMITTANCE_NAME, "layers.json", "textures.exr"),
 )
 
@@ -74,14 +74,6 @@ def identity_of(config: FitConfig, data: Dataset, group: Sequence[Dataset] = ())
 def training_digest(data: Dataset) -> str:
     """SHA-256 over those of the shards of training queries."""
     return data_sha256([shard.sidecar["sha256"] for shard in data.shards("train")])
-
-
-def joint_identity(identities: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
-    """Identity of a shared network: that of the first material, with the hash of all; `identities`: name →
-    identity of each material."""
-    hashes = [identity["config_hash"] for identity in identities.values()]
-    data = {name: identity["data"] for name, identity in identities.items()}
-    return {**next(iter(identities.values())), "config_hash": data_sha256(hashes), "data": data}
 
 
 def claim(out: Path, identity: dict[str, Any], config: FitConfig, overwrite: bool) -> OutputFolder:
