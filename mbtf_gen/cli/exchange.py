@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import Literal
 
 from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.options import (
@@ -82,21 +83,24 @@ def export(
     file: Path,
     /,
     *,
+    program: Literal["neumip", "neuralbtf"] = "neumip",
     overwrite: Overwrite = False,
     console: Console = CONSOLE,
 ) -> None:
-    """Write training queries as HDF5 for the published training code of NeuMIP.
+    """Write training queries as HDF5 for other programs.
 
     Parameters
     ----------
     shards
-        Folder of shards of the shuffled layout, or its URL.
+        Folder of shards, or its URL.
     file
         HDF5 file to write.
+    program
+        The program that reads it: NeuMIP (shuffled layout) or NeuralBTF (slices layout).
     """
     from mbtf_core.data.dataset import Dataset
     from mbtf_core.data.folder import DataFolder
-    from mbtf_gen.measured.exported import export_neumip
+    from mbtf_gen.measured.exported import export_neumip, export_neural_btf
 
     folder = DataFolder.open(shards)
     inside = folder.local is not None and real_path(folder.local) in real_path(file).parents
@@ -107,10 +111,10 @@ def export(
     if file.exists() and not overwrite:
         raise UsageError("exists", where=file, hint="choose another name, or --overwrite")
     data = Dataset.open(folder)
-    count = export_neumip(data, file)
+    count = (export_neumip if program == "neumip" else export_neural_btf)(data, file)
     total = int(data.manifest["splits"]["train"]["queries"])
     left = f"; {total - count} that do not fill an image are left out" if count < total else ""
-    console.report({"file": file, "values": count}, f"{file}: {count} values{left}")
+    console.report({"file": file, "program": program, "values": count}, f"{file}: {count} values{left}")
 
 
 @options_from(PublishConfig)

@@ -1,8 +1,9 @@
-"""Data sets as HDF5 of NeuMIP's code, whose format :mod:`mbtf_gen.measured.hdf5` describes."""
+"""Data sets as HDF5 files of other programs, whose formats :mod:`mbtf_gen.measured.hdf5` describes."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,3 +95,43 @@ def _neumip_queries(arrays: Arrays) -> Arrays:
         LIGHT: -arrays["omega_i"][:, :2],
     }
     return {name: np.asarray(array, np.float32) for name, array in found.items()}
+
+
+def export_neural_btf(data: Dataset, path: Path) -> int:
+    """Write the images of all pairs of light and view for NeuralBTF's code.
+
+    Parameters
+    ----------
+    data : of the slices layout
+    path : it is replaced only once all images are written
+
+    Returns
+    -------
+    int
+        Values written.
+
+    Raises
+    ------
+    InputError : the data set has no such images, or a shard cannot be read
+    """
+    if data.layout != "slices":
+        raise InputError(
+            f"has the {data.layout} layout, but NeuralBTF learns from images under fixed lights and views",
+            where=data.folder,
+            hint="generate it with --layout slices",
+        )
+    rows, columns = data.lattice.shape()
+    whole = data.load("train")
+    values = mean_of(whole)[np.argsort(data.lattice.texel_of(whole["u"][:, 0]))].reshape(rows, columns, -1, 3)
+
+    h5py = import_extra("h5py", path)
+
+    def write(temporary: Path) -> None:
+        with h5py.File(temporary, "w") as file:
+            file[LIGHT], file[VIEW] = whole["omega_i"][0, :, :2], whole["omega_o"][0, :, :2]
+            color: Any = file.create_dataset(COLOR, (values.shape[2], rows, columns, 3), np.float32)
+            for pair in range(values.shape[2]):
+                color[pair] = values[:, :, pair]
+
+    write_through(path, write)
+    return int(values.size // 3)

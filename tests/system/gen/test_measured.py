@@ -26,7 +26,9 @@ LINES = {
     "slices": f"wool {SMALL} --queries 81/texel --layout slices -o slices",
     "to neumip": "export shuffled shuffled.hdf5",
     "from neumip": "import shuffled.hdf5 --test-queries 32 -o neumip",
-    "wrong layout": "export slices other.hdf5",
+    "to neuralbtf": "export slices slices.hdf5 --program neuralbtf",
+    "from neuralbtf": "import slices.hdf5 --cosine excluded --queries 60/texel -o neuralbtf",
+    "wrong layout": "export shuffled other.hdf5 --program neuralbtf",
     "exists": "export shuffled shuffled.hdf5",
 }
 
@@ -75,10 +77,11 @@ def rows(arrays: dict[str, Any], digits: int = 4) -> dict[tuple[Any, ...], Any]:
     return dict(zip(map(tuple, np.round(keys, digits).tolist()), values.reshape(-1, 3).tolist(), strict=True))
 
 
-def test_an_export_is_imported_exactly(work: Path, done: dict[str, Done]) -> None:
-    assert done["from neumip"].code == 0, done["from neumip"].err + done["to neumip"].err
-    before = rows(Dataset.open(work / "shuffled").load("train"))
-    data = Dataset.open(work / "neumip")
+@pytest.mark.parametrize(("source", "name"), [("shuffled", "neumip"), ("slices", "neuralbtf")])
+def test_an_export_is_imported_exactly(work: Path, done: dict[str, Done], source: str, name: str) -> None:
+    assert done[f"from {name}"].code == 0, done[f"from {name}"].err + done[f"to {name}"].err
+    before = rows(Dataset.open(work / source).load("train"))
+    data = Dataset.open(work / name)
     after = {key: value for split in data.splits for key, value in rows(data.load(split)).items()}
     assert len(after) > 500
     missing = [key for key in after if key not in before]
