@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Decoder:
-    """The network of a material; :meth:`tensors` reads it.
+    """The network of a material; :meth:`load` reads it.
 
     Attributes
     ----------
@@ -57,10 +57,6 @@ class Decoder:
         """Options that a fit with this network needs: dotted key → value."""
         return _architecture(self.config)
 
-    def tensors(self) -> dict[str, Tensor]:
-        """Tensors of the network, by their names in a material."""
-        return read_weights(self.folder / WEIGHTS_NAME)
-
     def check(self, config: FitConfig) -> None:
         """Refuse a fit of another model or architecture.
 
@@ -92,7 +88,7 @@ class Decoder:
         ------
         InputError : a tensor is missing
         """
-        given = self.tensors()
+        given = read_weights(self.folder / WEIGHTS_NAME)
         for name, tensor in network_tensors(model).items():
             if name not in given or given[name].shape != tensor.shape:
                 raise InputError(f"its network lacks '{name}'", where=self.folder, hint="fit it again")

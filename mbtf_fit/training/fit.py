@@ -128,14 +128,9 @@ class FitResult:
 
 def _check_folder(config: FitConfig, out: Path) -> None:
     """Refuse a network of another architecture, and to replace what the fit reads."""
-    read = []
     if config.decoder is not None:
-        network = Decoder.find(config.decoder)
-        network.check(config)
-        read.append(network.folder)
-    if config.init_from is not None:
-        read.append(Path(config.init_from))
-    if real_path(out) in map(real_path, read):
+        Decoder.find(config.decoder).check(config)
+    if real_path(out) in map(real_path, filter(None, (config.decoder, config.init_from))):
         raise InputError("holds what the fit starts from", where=out, hint=ELSEWHERE)
 
 

@@ -17,7 +17,6 @@ from mbtf_core.files.folders import OutputFolder, OutputKind
 from mbtf_core.paths import refuse_special, suggest_path
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries
-from mbtf_fit.material.decoder import Decoder
 from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME, read_description
 from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME
 from mbtf_fit.models import code_of
@@ -54,11 +53,10 @@ def identity_of(config: FitConfig, data: Dataset, group: Sequence[Dataset] = ())
     operations = operations_of(config.model, data.lattice, config.network)
     model = data_sha256([operation.as_json() for operation in operations])
     config_hash += "".join(f"-{digest}" for digest in (model, *code_of(config.model).values()))
-    if config.init_from is not None:
-        description, _ = read_description(Path(config.init_from))
+    # One of them at most.
+    for source in filter(None, (config.init_from, config.decoder)):
+        description, _ = read_description(Path(source))
         config_hash += f"-{description['weights']['sha256']}"
-    if config.decoder is not None:
-        config_hash += f"-{Decoder.find(config.decoder).sha256}"
     if group:
         config_hash += f"-{data_sha256([other.manifest['config_hash'] for other in group])}"
     queries = (data.manifest.get("config") or {}).get("queries") or {}
