@@ -18,7 +18,7 @@ from mbtf_core.errors import InputError
 from mbtf_core.paths import named_file
 from mbtf_fit.config import DEFAULT_MODEL, STORED, FitConfig, fitter_options
 from mbtf_gen.config.generator import RESOLUTION, GeneratorConfig, Paths, generator_options
-from mbtf_gen.config.pictures import EXPOSURE, Direction, Exposure
+from mbtf_gen.config.pictures import EXPOSURE, Direction, Exposure, TilesAcross
 
 RECIPE_NAME = "recipe.yaml"
 # Names become file and folder names.
@@ -58,10 +58,6 @@ Kinds = Annotated[
     AfterValidator(distinct),
     AfterValidator(partial(sorted, reverse=True)),
 ]
-TilesAcross = Annotated[float, Field(gt=0, le=1e4)]
-
-
-Widths = Annotated[list[TilesAcross], Field(min_length=1), AfterValidator(distinct)]
 # Texels of the finest level that a pixel covers at the target, in the pictures of a comparison.
 PIXEL_TEXELS = (1.0, 4.0)
 
@@ -77,7 +73,7 @@ class CompareSection(Settings):
         [Direction(elevation=45, azimuth=45), Direction(elevation=20, azimuth=160)],
         description="directions of the light",
     )
-    tiles_across: Widths | None = Field(
+    tiles_across: TilesAcross | None = Field(
         None,
         description="widths of the field of view at the target, in tile widths; default: pixels cover 1 "
         "and 4 texels of the data",
