@@ -77,8 +77,7 @@ class FitConfig(Settings):
     )
     decoder: Annotated[LocalName | None, Flag("--decoder", "FOLDER", rare=True)] = Field(
         None,
-        description="folder of a shared network or of a material, whose network is kept: only textures are "
-        "trained",
+        description="folder of a material whose network is kept: only textures are trained",
     )
     network: NetworkSection = NetworkSection()
     training: TrainingSection = TrainingSection()

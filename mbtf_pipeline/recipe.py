@@ -18,7 +18,7 @@ from mbtf_core.errors import InputError
 from mbtf_core.paths import named_file
 from mbtf_fit.config import DEFAULT_MODEL, STORED, FitConfig, fitter_options
 from mbtf_gen.config.generator import RESOLUTION, GeneratorConfig, Paths, generator_options
-from mbtf_gen.config.pictures import EXPOSURE, Exposure
+from mbtf_gen.config.pictures import EXPOSURE, Direction, Exposure, TilesAcross
 
 RECIPE_NAME = "recipe.yaml"
 # Names become file and folder names.
@@ -37,19 +37,10 @@ COMPARE: dict[Quality, dict[str, Any]] = {
 Name = Annotated[str, Field(pattern=_NAME, max_length=100)]
 
 
-class SceneDirection(Settings):
-    """A direction as seen from the tile."""
-
-    elevation: float = Field(gt=0, le=90, description="above the reference plane, in degrees")
-    azimuth: float = Field(0.0, ge=-360, le=360, description="from +u towards +v, in degrees")
-
-
-class SceneView(SceneDirection):
+class SceneView(Direction):
     """Direction of the camera; high enough that no horizon is visible."""
 
-    elevation: float = Field(
-        ge=FIELD_OF_VIEW * 0.7 + 2, le=90, description="above the reference plane, in degrees"
-    )
+    elevation: float = Field(ge=FIELD_OF_VIEW * 0.7 + 2, le=90, description="degrees above the plane")
 
 
 def distinct(values: Sequence[Any]) -> Sequence[Any]:
@@ -67,10 +58,6 @@ Kinds = Annotated[
     AfterValidator(distinct),
     AfterValidator(partial(sorted, reverse=True)),
 ]
-TilesAcross = Annotated[float, Field(gt=0, le=1e4)]
-
-
-Widths = Annotated[list[TilesAcross], Field(min_length=1), AfterValidator(distinct)]
 # Texels of the finest level that a pixel covers at the target, in the pictures of a comparison.
 PIXEL_TEXELS = (1.0, 4.0)
 
@@ -82,11 +69,11 @@ class CompareSection(Settings):
         [SceneView(elevation=90, azimuth=-90), SceneView(elevation=35, azimuth=-90)],
         description="directions of the cameras",
     )
-    lights: Annotated[list[SceneDirection], Field(min_length=1), AfterValidator(distinct)] = Field(
-        [SceneDirection(elevation=45, azimuth=45), SceneDirection(elevation=20, azimuth=160)],
+    lights: Annotated[list[Direction], Field(min_length=1), AfterValidator(distinct)] = Field(
+        [Direction(elevation=45, azimuth=45), Direction(elevation=20, azimuth=160)],
         description="directions of the light",
     )
-    tiles_across: Widths | None = Field(
+    tiles_across: TilesAcross | None = Field(
         None,
         description="widths of the field of view at the target, in tile widths; default: pixels cover 1 "
         "and 4 texels of the data",

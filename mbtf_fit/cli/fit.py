@@ -80,8 +80,7 @@ def fit(
     processes
         With --many, number of simultaneous fits.
     shared_decoder
-        With --many, fit all data sets together with one network, which is also written to the folder decoder/
-        of the output. --time is that of all of them.
+        With --many, fit all data sets together with one network. --time is that of all of them.
     tensorboard
         Write the curves of the fit as event files for TensorBoard to a folder.
     """
@@ -281,11 +280,9 @@ def _fit_many(
     if processes is not None or cluster is not None:
         flag = "--cluster" if processes is None else "--processes"
         raise UsageError(f"a shared network is one fit: leave out {flag}")
-    from mbtf_fit.material.decoder import DECODER_FOLDER, Decoder
     from mbtf_fit.training.endings import describe_kept
     from mbtf_fit.training.fit import fit_jointly
 
-    decoder = output / DECODER_FOLDER
     what = f"{len(shards)} data sets -> {output}: {config.model} with a shared network"
     _announce(config, shards, output, what, console)
     with console.progress(total=100, label="reading", unit="%") as bar:
@@ -293,21 +290,19 @@ def _fit_many(
             config,
             shards,
             folders,
-            decoder,
             overwrite=overwrite,
-            progress=_training_progress(bar, decoder),
+            progress=_training_progress(bar, output),
         )
     fits = [fitted.as_dict() for fitted in results]
     outcomes = [
         {"shards": str(data), "material": fitted["material"], "result": fitted, "error": None}
         for data, fitted in zip(shards, fits, strict=True)
     ]
-    shared = {"folder": decoder, "sha256": Decoder.find(decoder).sha256}
     lines = [fits_table({folder.name: fitted for folder, fitted in zip(folders, fits, strict=True)})]
     for folder, fitted in zip(folders, results, strict=True):
         if (kept := describe_kept(fitted.history, fitted.kept_step)) is not None:
             lines.append(f"{folder.name}: {kept}")
-    console.report({"decoder": shared, "fits": outcomes}, "\n".join(lines))
+    console.report({"fits": outcomes}, "\n".join(lines))
 
 
 def _fit_each(

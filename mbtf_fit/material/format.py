@@ -45,13 +45,6 @@ class _File(BaseModel):
     sha256: str
 
 
-class Described(BaseModel):
-    """Keys that ``material.json`` and ``decoder.json`` share, of those that readers require."""
-
-    weights: _File
-    config: dict[str, Any]
-
-
 class _Weights(_File):
     network_weights: int
     texels: int
@@ -94,10 +87,11 @@ class _Data(BaseModel):
     min_cos: Annotated[float, Field(strict=True, gt=0, lt=1)] = DEFAULT_MIN_COS
 
 
-class _Description(Described):
+class _Description(BaseModel):
     """Keys of ``material.json`` that readers require; it has more."""
 
     model: str
+    config: dict[str, Any]
     operations: list[dict[str, Any]]
     weights: _Weights
     levels: _Levels
@@ -124,38 +118,28 @@ def read_description(folder: Path) -> tuple[dict[str, Any], Path]:
             where=folder,
             hint="make a material with: mbtf-fit SHARDS -o FOLDER",
         )
-    return read_described(path, FORMAT_NAME, SCHEMA_VERSION, _Description)
-
-
-def read_described(
-    path: Path, format_name: str, version: int, model: type[Described]
-) -> tuple[dict[str, Any], Path]:
-    """Content of a description, validated, and the path of the weights beside it, with their digest verified.
-
-    Raises
-    ------
-    InputError : corrupt, or of another format or schema
-    """
     description = read_json(path, AGAIN)
-    if description.get("format") != format_name:
-        raise InputError(f"is not of the format {format_name}", where=path, hint=AGAIN)
-    check_schema(description, version, path, "fit it again with this version of mbtf-fit")
-    check_document(model, description, path, AGAIN)
-    return description, check_digest(path.with_name(WEIGHTS_NAME), description["weights"], path.name)
+    if description.get("format") != FORMAT_NAME:
+        raise InputError(f"is not of the format {FORMAT_NAME}", where=path, hint=AGAIN)
+    check_schema(description, SCHEMA_VERSION, path, "fit it again with this version of mbtf-fit")
+    check_document(_Description, description, path, AGAIN)
+    return description, check_digest(folder / WEIGHTS_NAME, description["weights"])
 
 
-def check_digest(path: Path, stated: Mapping[str, Any], by: str = DESCRIPTION_NAME) -> Path:
-    """The path of a file whose digest is the one that the file `by` states.
+def check_digest(path: Path, stated: Mapping[str, Any]) -> Path:
+    """The path of a file whose digest is the one that ``material.json`` states.
 
     Raises
     ------
     InputError : it is missing or corrupt
     """
     if not path.is_file():
-        raise InputError(f"no such file, but {by} names it", where=path, hint=AGAIN)
+        raise InputError(f"no such file, but {DESCRIPTION_NAME} names it", where=path, hint=AGAIN)
     if file_sha256(path) != stated["sha256"]:
         raise InputError(
-            f"is damaged, or of another material (its SHA-256 is not that in {by})", where=path, hint=AGAIN
+            f"is damaged, or of another material (its SHA-256 is not that in {DESCRIPTION_NAME})",
+            where=path,
+            hint=AGAIN,
         )
     return path
 

@@ -22,7 +22,7 @@ from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import Partition, load_training, open_data
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.formatting import format_estimate, headline
-from mbtf_fit.material.decoder import DECODER_NAME, Decoder
+from mbtf_fit.material.decoder import Decoder
 from mbtf_fit.material.format import DESCRIPTION_NAME
 from mbtf_fit.material.material import Material
 from mbtf_fit.models.registry import model_class
@@ -32,7 +32,6 @@ from mbtf_fit.training.fit_folder import (
     append_history,
     claim,
     identity_of,
-    joint_identity,
     read_history,
     truncate_history,
 )
@@ -129,14 +128,9 @@ class FitResult:
 
 def _check_folder(config: FitConfig, out: Path) -> None:
     """Refuse a network of another architecture, and to replace what the fit reads."""
-    read = []
     if config.decoder is not None:
-        network = Decoder.find(config.decoder)
-        network.check(config)
-        read.append(network.folder)
-    if config.init_from is not None:
-        read.append(Path(config.init_from))
-    if real_path(out) in map(real_path, read):
+        Decoder.find(config.decoder).check(config)
+    if real_path(out) in map(real_path, filter(None, (config.decoder, config.init_from))):
         raise InputError("holds what the fit starts from", where=out, hint=ELSEWHERE)
 
 
@@ -194,14 +188,13 @@ def fit(
         )
     out = Path(out)
     _check_folder(config, out)
-    return _fit(config, [shards], [out], out, overwrite, progress, observe)[0]
+    return _fit(config, [shards], [out], overwrite, progress, observe)[0]
 
 
 def fit_jointly(
     config: FitConfig,
     shards: Sequence[str | Path],
     folders: Sequence[str | Path],
-    decoder: str | Path,
     *,
     overwrite: bool = False,
     progress: ProgressCallback | None = None,
@@ -218,9 +211,7 @@ def fit_jointly(
     shards : sequence of str or Path
         Folders made by ``mbtf-gen``, two at least.
     folders : sequence of str or Path
-        Folder of each material.
-    decoder : str or Path
-        Folder of the shared network.
+        Folder of each material; the first one has the checkpoint.
     overwrite : bool
         Replace fits of another configuration.
     progress : callable, optional
@@ -239,7 +230,7 @@ def fit_jointly(
     check_type(config, FitConfig, "config", "such as FitConfig(training={'shared_decoder': True})")
     check_type(shards, (list, tuple), "shards", "give a list of folders")
     check_type(folders, (list, tuple), "folders", "give a list of folders")
-    decoder, outs = Path(decoder), [Path(folder) for folder in folders]
+    outs = [Path(folder) for folder in folders]
     if not config.training.shared_decoder:
         raise InputError("is not set", where="training.shared_decoder", hint="set it to true")
     if len(shards) < 2:
@@ -247,26 +238,21 @@ def fit_jointly(
             "a shared network takes two data sets at least",
             hint="mbtf-fit --many SHARDS SHARDS --shared-decoder -o materials/",
         )
-    if decoder in outs:
-        raise InputError(
-            "this folder is that of the shared network: rename the data set of this name", where=decoder
-        )
     for name, count in Counter(out.name for out in outs).items():
         if count > 1:
             raise InputError(f"{count} of the folders have this name", where=name, hint="rename them")
-    return _fit(config, shards, outs, decoder, overwrite, progress)
+    return _fit(config, shards, outs, overwrite, progress)
 
 
 def _fit(
     config: FitConfig,
     shards: Sequence[str | Path | DataFolder],
     folders: Sequence[Path],
-    home: Path,
     overwrite: bool,
     progress: ProgressCallback | None,
     observe: Observer | None = None,
 ) -> list[FitResult]:
-    """Fit materials to data sets; `home` has the checkpoint, and the network where they share one."""
+    """Fit materials to data sets; the first folder has the checkpoint."""
     begin = time.perf_counter()
     device = choose_device(config.device)
     layout, shared = model_class(config.model).layout, config.training.shared_decoder
@@ -275,21 +261,20 @@ def _fit(
     members = [
         Member(out, one, identity_of(config, one, group)) for out, one in zip(folders, data, strict=True)
     ]
-    identities = {member.folder.name: member.identity for member in members}
+    checkpoint = folders[0] / CHECKPOINT_NAME
     with ExitStack() as stack:
-        for folder in dict.fromkeys((home, *folders)):
+        for folder in folders:
             stack.enter_context(owned(folder))
-        claims = {home: joint_identity(identities)} if shared else {}
-        claims |= {member.folder: member.identity for member in members}
-        for folder, identity in claims.items():
+        for member in members:
             # A fit that fails before its first checkpoint leaves no folder.
-            stack.enter_context(claim(folder, identity, config, overwrite))
+            stack.enter_context(claim(member.folder, member.identity, config, overwrite))
         finished = all((folder / DESCRIPTION_NAME).exists() for folder in folders)
-        finished = finished and (not shared or (home / DECODER_NAME).exists())
+        # A joint fit that was killed may have exported a part of its materials anew.
+        finished = finished and not (shared and checkpoint.exists())
         resumed = finished or _train(
-            config, members, home, device, progress or (lambda phase, fraction, note: None), observe
+            config, members, checkpoint, device, progress or (lambda phase, fraction, note: None), observe
         )
-        (home / CHECKPOINT_NAME).unlink(missing_ok=True)
+        checkpoint.unlink(missing_ok=True)
         total = time.perf_counter() - begin
         return [result_of(folder, total, resumed=resumed) for folder in folders]
 
@@ -297,7 +282,7 @@ def _fit(
 def _train(
     config: FitConfig,
     members: Sequence[Member],
-    home: Path,
+    checkpoint: Path,
     device: torch.device,
     progress: ProgressCallback,
     observe: Observer | None,
@@ -323,7 +308,6 @@ def _train(
     names = [member.folder.name for member in members] if len(members) > 1 else [""]
     validation = [queries for _, queries in subsets]
     loop = TrainingLoop(trainers, names)
-    checkpoint = home / CHECKPOINT_NAME
     resumed = checkpoint.exists()
     if resumed:
         read_checkpoint(loop, checkpoint)
@@ -361,7 +345,6 @@ def _train(
         members,
         partitions,
         [name for name, _ in subsets],
-        home,
         progress,
     )
     return resumed

@@ -15,7 +15,7 @@ from mbtf_core.stats import pooled_variance
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import Partition
 from mbtf_fit.evaluation import evaluate_splits
-from mbtf_fit.material.decoder import Decoder, write_decoder
+from mbtf_fit.material.decoder import Decoder
 from mbtf_fit.material.material import export
 from mbtf_fit.material.transmittance import evaluate_transmittance, fit_transmittance
 from mbtf_fit.training.fit_folder import training_digest
@@ -39,12 +39,10 @@ def export_fits(
     members: Sequence[Member],
     partitions: Sequence[Partition],
     validated: Sequence[str],
-    home: Path,
     announce: Callable[[str, float, str], None],
 ) -> None:
-    """Write the materials, and the network that they share; `trained`: progress at the end of training, of
-    which the loop may have kept an earlier state; `announce` receives each phase, the fraction of it that is
-    done, and the material."""
+    """Write the materials; `trained`: progress at the end of training, of which the loop may have kept an
+    earlier state; `announce` receives each phase, the fraction of it that is done, and the material."""
     steps, seconds, kept = trained.step, round(trained.seconds, 3), loop.progress.step
     summary: dict[str, Any] = {"materials": list(loop.names), "steps": steps, "seconds": seconds}
     summary["kept_step"] = kept
@@ -58,10 +56,6 @@ def export_fits(
             share["decoder"] = {"sha256": Decoder.find(config.decoder).sha256}
         trainer = loop.trainers[k]
         export_fit(trainer, config, member, partition, announce, validated=validated[k], share=share)
-    if config.training.shared_decoder:
-        # It tells other fits that all materials are complete.
-        data = {member.folder.name: member.identity["data"] for member in members}
-        write_decoder(home, loop.trainers[0].model, config, materials=data, training=summary)
 
 
 def export_fit(

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,6 @@ from mbtf_core.files.folders import OutputFolder, OutputKind
 from mbtf_core.paths import refuse_special, suggest_path
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries
-from mbtf_fit.material.decoder import DECODER_NAME, Decoder
 from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME, read_description
 from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME
 from mbtf_fit.models import code_of
@@ -30,7 +29,7 @@ HISTORY_NAME = "metrics.jsonl"
 FIT = OutputKind("fit.json", "mbtf-fit", 3, "a fit")
 # The description goes first: without it nothing counts as a finished material.
 _FILES = (
-    *(DESCRIPTION_NAME, DECODER_NAME, HISTORY_NAME, CHECKPOINT_NAME),
+    *(DESCRIPTION_NAME, HISTORY_NAME, CHECKPOINT_NAME),
     *(WEIGHTS_NAME, TRANSMITTANCE_NAME, "layers.json", "textures.exr"),
 )
 
@@ -54,11 +53,10 @@ def identity_of(config: FitConfig, data: Dataset, group: Sequence[Dataset] = ())
     operations = operations_of(config.model, data.lattice, config.network)
     model = data_sha256([operation.as_json() for operation in operations])
     config_hash += "".join(f"-{digest}" for digest in (model, *code_of(config.model).values()))
-    if config.init_from is not None:
-        description, _ = read_description(Path(config.init_from))
+    # One of them at most.
+    for source in filter(None, (config.init_from, config.decoder)):
+        description, _ = read_description(Path(source))
         config_hash += f"-{description['weights']['sha256']}"
-    if config.decoder is not None:
-        config_hash += f"-{Decoder.find(config.decoder).sha256}"
     if group:
         config_hash += f"-{data_sha256([other.manifest['config_hash'] for other in group])}"
     queries = (data.manifest.get("config") or {}).get("queries") or {}
@@ -74,14 +72,6 @@ def identity_of(config: FitConfig, data: Dataset, group: Sequence[Dataset] = ())
 def training_digest(data: Dataset) -> str:
     """SHA-256 over those of the shards of training queries."""
     return data_sha256([shard.sidecar["sha256"] for shard in data.shards("train")])
-
-
-def joint_identity(identities: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
-    """Identity of a shared network: that of the first material, with the hash of all; `identities`: name →
-    identity of each material."""
-    hashes = [identity["config_hash"] for identity in identities.values()]
-    data = {name: identity["data"] for name, identity in identities.items()}
-    return {**next(iter(identities.values())), "config_hash": data_sha256(hashes), "data": data}
 
 
 def claim(out: Path, identity: dict[str, Any], config: FitConfig, overwrite: bool) -> OutputFolder:

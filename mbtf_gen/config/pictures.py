@@ -23,7 +23,7 @@ class Direction(Settings):
     """A direction above the plane."""
 
     elevation: float = Field(gt=0, le=90, description="degrees above the plane")
-    azimuth: float = Field(ge=-360, le=360, description="degrees from +u towards +v")
+    azimuth: float = Field(0.0, ge=-360, le=360, description="degrees from +u towards +v")
 
     @model_validator(mode="before")
     @classmethod

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
 from mbtf_core.pictures import Camera
-from mbtf_pipeline.recipe import FIELD_OF_VIEW, PIXEL_TEXELS, CompareSection, SceneDirection, SceneView
+from mbtf_gen.config.pictures import Direction
+from mbtf_pipeline.recipe import FIELD_OF_VIEW, PIXEL_TEXELS, CompareSection, SceneView
 
 F32 = NDArray[np.float32]
 PICTURES = "pictures"
@@ -34,7 +35,7 @@ class Scene:
     index: int
     name: str
     view: SceneView
-    light: SceneDirection
+    light: Direction
     tiles_across: float
 
     def camera(self, size: int) -> Camera:

@@ -35,7 +35,7 @@ MISTAKES: dict[str, tuple[Callable[[], object], str]] = {
     "missing data set": (lambda: verify("missing"), "no such folder"),
     "method of tiling": (lambda: load_material("rock", "mirro"), "mirror"),
     "arguments swapped": (lambda: fit("shards", FitConfig(), "out"), "FitConfig("),
-    "one folder of several": (lambda: fit_jointly(FitConfig(), "a", "b", "c"), "list of folders"),
+    "one folder of several": (lambda: fit_jointly(FitConfig(), "a", "b"), "list of folders"),
     "no material": (lambda: Material.load(None), "path"),
     "missing material": (lambda: evaluate("missing", "shards"), "no such folder"),
     "missing fit": (lambda: read_history("missing"), "no such folder"),

@@ -12,7 +12,7 @@ from support.datasets import edit
 from support.fit_data import constant, parallax, write_data
 
 from mbtf_fit import FitResult, Material
-from mbtf_fit.material.decoder import Decoder, network_tensors
+from mbtf_fit.material.decoder import network_tensors
 
 QUICK = ("--steps", "6", "--batch", "300", "--device", "cpu")
 
@@ -41,12 +41,9 @@ def materials(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_fit_takes_model_and_network_from_the_folder(materials: Path, data: Path, tmp_path: Path) -> None:
-    wanted = Decoder.find(materials).tensors()
-    for folder in (materials / "decoder", materials / "a"):
-        tensors = Decoder.find(folder).tensors()
-        assert all((tensors[name] == wanted[name]).all() for name in wanted)
+    wanted = network_tensors(Material.load(materials / "a").model)
     # A preset has another network.
-    words = ["--decoder", str(materials), "-o", str(tmp_path / "m"), "--quality", "draft", *QUICK]
+    words = ["--decoder", str(materials / "a"), "-o", str(tmp_path / "m"), "--quality", "draft", *QUICK]
     done = call(["mbtf-fit", str(data / "c"), *words])
     assert done.code == 0, done.err
     found = Material.load(tmp_path / "m")
@@ -62,10 +59,8 @@ def test_the_same_command_keeps_a_finished_fit(
     first = call(["mbtf-fit", *words, "--json"])
     assert first.code == 0, first.err
     found = json.loads(first.out)
-    assert Path(found["decoder"]["folder"]) == tmp_path / "m" / "decoder"
     assert [fit["result"]["resumed"] for fit in found["fits"]] == [False] * 3
     again = json.loads(call(["mbtf-fit", *words, "--json"]).out)
-    assert again["decoder"] == found["decoder"]
     assert [fit["result"]["resumed"] for fit in again["fits"]] == [True] * 3
     # As a single fit, each material says if it returned to an earlier state.
     monkeypatch.setattr(FitResult, "kept_step", 6)

@@ -124,7 +124,7 @@ def test_names_and_models_default_to_each_other(tmp_path: Path, fit: str, models
         (NAMED.replace("time: 5s", "tmie: 5s"), 10, "did you mean 'time'"),
         (HEAD + "fit:\n  other:\n", 6, "rainer2020"),
         (HEAD + "fit: {}\n", 5, "contains no fit"),
-        (SINGLE + "compare: {tiles_across: [2, 2.0]}\n", 6, "same entry twice"),
+        (SINGLE + "compare: {tiles_across: [2, 2.0]}\n", 6, "same width twice"),
     ],
 )
 def test_errors_name_the_line(tmp_path: Path, text: str, line: int, what: str) -> None:

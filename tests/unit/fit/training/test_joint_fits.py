@@ -22,6 +22,7 @@ from mbtf_fit import FitConfig, FitResult, Material, fit
 from mbtf_fit.evaluation import evaluate
 from mbtf_fit.material.decoder import Decoder, network_tensors
 from mbtf_fit.training.fit import fit_jointly
+from mbtf_fit.training.fit_export import Member
 from mbtf_fit.training.fit_folder import read_history
 from mbtf_fit.training.loop import TrainingLoop
 from mbtf_fit.training.trainer import Trainer
@@ -77,7 +78,7 @@ def single_config(model: str = "relief", steps: int = 100, **options: Any) -> Fi
 def fit_two(config: FitConfig, data: dict[str, Path], out: Path, **options: Any) -> list[FitResult]:
     names = NAMES[:2]
     folders = [out / name for name in names]
-    return fit_jointly(config, [data[name] for name in names], folders, out / "decoder", **options)
+    return fit_jointly(config, [data[name] for name in names], folders, **options)
 
 
 @pytest.fixture(scope="module", params=["relief", "neumip"])
@@ -102,11 +103,9 @@ def unexplained(folder: Path, shards: Path) -> float:
 
 def test_materials_share_the_bits_of_one_network(library_folder: Path) -> None:
     first, second = (Material.load(library_folder / name).model for name in NAMES[:2])
-    shared = Decoder.find(library_folder).tensors()
-    for model in (first, second):
-        own = network_tensors(model)
-        assert own.keys() == shared.keys()
-        assert all(torch.equal(own[name], shared[name]) for name in shared)
+    shared, own = network_tensors(first), network_tensors(second)
+    assert own.keys() == shared.keys()
+    assert all(torch.equal(own[name], shared[name]) for name in shared)
     assert ("offset_network.0.weight" in shared) == (first.name == "neumip")
     # All else is the material's own.
     assert first.unit != second.unit
@@ -159,11 +158,11 @@ def test_noisy_materials_do_not_decide_the_decay_alone(data: dict[str, Path], tm
 
 def test_a_kept_network_keeps_its_bits(library_folder: Path, data: dict[str, Path], tmp_path: Path) -> None:
     model = Material.load(library_folder / "waves").model.name
-    shared = Decoder.find(library_folder).tensors()
+    shared = networks_of(library_folder / "waves")
     errors = []
     for steps in (1, 150):
         out = tmp_path / str(steps)
-        fit(single_config(model, steps, decoder=str(library_folder)), data["third"], out)
+        fit(single_config(model, steps, decoder=str(library_folder / "waves")), data["third"], out)
         found = networks_of(out)
         assert all(torch.equal(found[name], shared[name]) for name in shared)
         errors.append(unexplained(out, data["third"]))
@@ -215,7 +214,8 @@ def test_a_killed_joint_fit_ends_with_the_same_bits(
     out, step, export = tmp_path / "killed", Trainer._step, mbtf_fit.training.fit_export.export_fit
     kills, exports = 0, 0
     save = mbtf_fit.training.fit.write_checkpoint
-    while not (out / "decoder" / "decoder.json").exists():
+    found: list[FitResult] = []
+    while not found:
         left = int(random.integers(2, 6))
 
         def dying(self: Trainer, *arguments: Any) -> torch.Tensor:
@@ -254,7 +254,7 @@ def test_a_killed_joint_fit_ends_with_the_same_bits(
         assert mine.errors == other.errors
         steps = [record["step"] for record in read_history(mine.folder)]
         assert steps == sorted(set(steps))
-    assert not (out / "decoder" / "checkpoint.safetensors").exists()
+    assert not list(out.glob("*/checkpoint.safetensors"))
     # A finished one is kept.
     monkeypatch.undo()
     assert all(again.resumed for again in fit_two(config, data, out))
@@ -310,26 +310,41 @@ def test_a_calibration_takes_a_share_of_the_steps_of_its_material(
     assert granted == [5 * 512 // 4, 4 * 512 // 4]
 
 
-def test_a_lost_material_is_fitted_again(data: dict[str, Path], tmp_path: Path) -> None:
+def test_a_lost_material_is_fitted_again(
+    data: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where it is killed once all folders hold a material, the last one that of the first fit."""
     fit_two(joint_config(steps=2), data, tmp_path)
-    shutil.rmtree(tmp_path / "stripes")
-    assert [found.resumed for found in fit_two(joint_config(steps=2), data, tmp_path)] == [False] * 2
+    shutil.rmtree(tmp_path / "waves")
+    export = mbtf_fit.training.fit_export.export_fit
+
+    def dying_export(
+        trainer: Trainer, config: FitConfig, member: Member, *arguments: Any, **more: Any
+    ) -> None:
+        if member.folder.name == "stripes":
+            raise Killed
+        export(trainer, config, member, *arguments, **more)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(mbtf_fit.training.fit_export, "export_fit", dying_export)
+        with pytest.raises(Killed):
+            fit_two(joint_config(steps=2), data, tmp_path)
+    before = (tmp_path / "stripes" / "material.json").stat().st_ino
+    assert [found.resumed for found in fit_two(joint_config(steps=2), data, tmp_path)] == [True] * 2
+    assert (tmp_path / "stripes" / "material.json").stat().st_ino != before
 
 
 def test_other_data_sets_are_another_fit(data: dict[str, Path], tmp_path: Path) -> None:
     fit_two(joint_config(steps=2), data, tmp_path)
     names = ("waves", "third")
-    arguments = [data[name] for name in names], [tmp_path / name for name in names], tmp_path / "decoder"
-    with pytest.raises(InputError, match=r"decoder: holds a fit of another configuration.*\n.*--overwrite"):
+    arguments = [data[name] for name in names], [tmp_path / name for name in names]
+    with pytest.raises(InputError, match=r"waves: holds a fit of another configuration.*\n.*--overwrite"):
         fit_jointly(joint_config(steps=2), *arguments)
     with pytest.raises(InputError, match=r"waves: holds a fit of another configuration: .*shared_decoder"):
         fit(single_config(steps=2), data["waves"], tmp_path / "waves")
-    # Also where the network lies elsewhere.
-    with pytest.raises(InputError, match="waves: holds a fit of another configuration"):
-        fit_jointly(joint_config(steps=2), *arguments[:2], tmp_path / "network")
     fit_jointly(joint_config(steps=2), *arguments, overwrite=True)
-    shared = Decoder.find(tmp_path).tensors()
-    assert all(torch.equal(networks_of(tmp_path / "third")[name], shared[name]) for name in shared)
+    first, second = (networks_of(tmp_path / name) for name in names)
+    assert all(torch.equal(first[name], second[name]) for name in first)
 
 
 def test_divergence_names_the_material(
