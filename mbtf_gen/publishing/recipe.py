@@ -52,14 +52,19 @@ def public_documents(manifest: Mapping[str, Any]) -> dict[str, Content]:
     }
 
 
+def is_yaml_alone(data: Dataset) -> bool:
+    """Whether the material of a data set has no other files than its YAML: a weave or a knit."""
+    return bool(data.manifest["inputs"].keys() == {"settings"})
+
+
 def recipe_files(data: Dataset, *, with_maps: bool, moved: Path | None) -> dict[str, Content]:
     """Configuration, digests and material of a recipe, by name in the published folder.
 
     Parameters
     ----------
     data : generated, not measured
-    with_maps : whether the input files of the material are published; the YAML of a weave or knit, which has
-        no other files, is in any case while it can be read
+    with_maps : whether the input files of the material are published; a weave or a knit is in any case, where
+        its YAML is unchanged
     moved : path of the material, if it is not where the data set was generated from
 
     Raises
@@ -74,7 +79,7 @@ def recipe_files(data: Dataset, *, with_maps: bool, moved: Path | None) -> dict[
     lines = "".join(f"{digest}  {name}\n" for name, digest in sums.items())
     documents: dict[str, Content] = {SUMS_NAME: lines.encode()}
     without = documents | {f"{RECIPE}/{CONFIG_NAME}": dump_yaml(config).encode()}
-    if not with_maps and data.manifest["inputs"].keys() != {"settings"}:
+    if not with_maps and not is_yaml_alone(data):
         return without
     path = Path(data.manifest["config"]["material"]) if moved is None else moved
     hint = "name it: --material PATH; or leave out --with-maps"
