@@ -127,7 +127,7 @@ class QueryDataset(IterableDataset[QueryBatch]):
         sizes = np.asarray(self._sizes, np.int64)[order]
         ends = np.cumsum(sizes)
         parts = [
-            (block, slice(max(0, first - start), last - start))
+            (int(block), slice(max(0, first - start), last - start))
             for block, start, end in zip(order, ends - sizes, ends, strict=True)
             if start < last and first < end
         ]
