@@ -32,8 +32,6 @@ PAGES = (
     DOCS / "how-to" / "add-a-model.md",
 )
 _TABLE = re.compile(r"(<!-- (configuration|schema|operations) ([^>]*) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
-# A role of Sphinx, such as :class:`~mbtf_fit.ops.lookup.Trace`, by the name that it shows.
-_ROLE = re.compile(r":\w+:`~?(?:\w+\.)*(\w+)`")
 
 
 def schema(name: str) -> str:
@@ -48,15 +46,13 @@ def schema(name: str) -> str:
 
 
 def operations(modules: list[str]) -> str:
-    """The operations of some modules of ``mbtf_fit.ops``, with the first paragraphs of their docstrings."""
+    """The operations of some modules of ``mbtf_fit.ops``, with their arguments."""
     rows = []
     for name in modules:
         module = importlib.import_module(f"mbtf_fit.ops.{name}")
         for found in filter(inspect.isclass, vars(module).values()):
             if issubclass(found, Operation) and found.__module__ == module.__name__:
-                text = " ".join((inspect.getdoc(found) or "").split("\n\n")[0].split())
-                text = _ROLE.sub(r"`\1`", text)
-                rows.append(f"- `{found.__name__}`: {cell(text)}")
+                rows.append(f"- `{found.signature()}`: {cell(found.summary())}")
     return "\n".join(rows)
 
 

@@ -255,10 +255,10 @@ class OutputFolder:
     path : Path
     """
 
-    def __init__(self, path: Path, kind: OutputKind, record: _Record) -> None:
+    def __init__(self, path: Path, kind: OutputKind, record: _Record, *, new: bool) -> None:
         self.path, self._kind, self._record = path, kind, record
         # The files that tell whose a new folder is.
-        self._claim = [] if kind.check(path) else [kind.record]
+        self._claim = [kind.record] if new else []
 
     @classmethod
     def claim(
@@ -288,8 +288,9 @@ class OutputFolder:
         PartialError : it cannot be written
         """
         new = _Record(hash=digest or data_sha256(depends), depends=dict(depends), listed=list(listed))
-        folder = cls(path, kind, new)
-        if kind.check(path):
+        present = kind.check(path)
+        folder = cls(path, kind, new, new=not present)
+        if present:
             old = check_document(_Record, kind.read(path) or {}, path / kind.record, ELSEWHERE)
             if not overwrite and old.hash != new.hash:
                 raise other_configuration(path, kind.what, old.depends, new.depends)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-
 from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.options import Switch
 
@@ -21,23 +19,19 @@ def models(*, operations: Switch = False, console: Console = CONSOLE) -> None:
     from mbtf_fit.models.registry import MODELS
 
     if operations:
-        kinds = [kind for name, kind in vars(ops).items() if isinstance(kind, type) and name in ops.__all__]
+        exported = (getattr(ops, name) for name in ops.__all__)
+        kinds = [k for k in exported if isinstance(k, type) and issubclass(k, ops.Operation)]
         found = [
-            {"name": kind.__name__, "description": _first_paragraph(kind.__doc__ or "")}
-            for kind in kinds
-            if kind is not ops.Operation and issubclass(kind, ops.Operation)
+            {"name": k.__name__, "call": k.signature(), "description": k.summary().replace("`", "")}
+            for k in kinds
+            if k is not ops.Operation
         ]
-    else:
-        found = [
-            {"name": name, "layout": model.layout, "description": model.description}
-            for name, model in sorted(MODELS.items())
-        ]
-    what = "operations" if operations else "models"
-    rows = [[what.removesuffix("s"), *list(found[0])[1:]], *(list(one.values()) for one in found)]
-    console.report({what: found}, format_table(rows))
-
-
-def _first_paragraph(docstring: str) -> str:
-    """The first paragraph on one line, without markup."""
-    text = " ".join(docstring.split("\n\n")[0].split())
-    return re.sub(r":\w+:`~?(?:[\w.]+\.)?(\w+)`", r"\1", text).replace("``", "")
+        lines = "\n".join(f"{one['call']}\n    {one['description']}" for one in found)
+        console.report({"operations": found}, lines)
+        return
+    found = [
+        {"name": name, "layout": model.layout, "description": model.description}
+        for name, model in sorted(MODELS.items())
+    ]
+    rows = [["model", *list(found[0])[1:]], *(list(one.values()) for one in found)]
+    console.report({"models": found}, format_table(rows))

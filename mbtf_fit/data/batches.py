@@ -53,8 +53,7 @@ class QueryDataset(IterableDataset[QueryBatch]):
     An epoch visits blocks of about 4096 queries of all shards in random order, and shuffles 32 of them at a
     time: memory does not grow with the data set. The order depends on seed, epoch and number of workers
     alone. A loader takes batches as they are: ``DataLoader(queries, batch_size=None, num_workers=2)``; each
-    worker reads blocks of its own. There is no ``len()``: each worker ends with a batch of its own size, so
-    that the number of batches depends on the loader; without workers it is ``ceil(count / batch_size)``.
+    worker makes batches of its own. ``len()`` is the number of batches of an epoch, of one worker or many.
 
     Parameters
     ----------
@@ -63,7 +62,7 @@ class QueryDataset(IterableDataset[QueryBatch]):
     split : str
         ``train`` or ``test``.
     batch_size : int
-        Queries per batch; the last batch of each worker has fewer.
+        Queries per batch; one batch may have fewer.
     seed : int
         Of the order.
     shuffle : bool, optional
@@ -100,12 +99,17 @@ class QueryDataset(IterableDataset[QueryBatch]):
         # Shared with workers, also with those that live for several epochs.
         self._epoch = zeros((), dtype=int64).share_memory_()
         self._blocks: list[tuple[Shard, int, int]] = []
-        self.count = 0
+        self._sizes: list[int] = []
         for shard in self.data.shards(split):
             each = int(np.prod(shard.image, dtype=int))
             step = max(1, _BLOCK // each)
-            self._blocks += [(shard, at, min(at + step, shard.rows)) for at in range(0, shard.rows, step)]
-            self.count += each * shard.rows
+            blocks = [(shard, at, min(at + step, shard.rows)) for at in range(0, shard.rows, step)]
+            self._blocks += blocks
+            self._sizes += [each * (stop - start) for _, start, stop in blocks]
+        self.count = sum(self._sizes)
+
+    def __len__(self) -> int:
+        return -(-self.count // self.batch_size)
 
     def set_epoch(self, epoch: int) -> None:
         """Select the order of an epoch; call it before each. Epochs of one number have one order."""
@@ -118,12 +122,21 @@ class QueryDataset(IterableDataset[QueryBatch]):
         order = np.arange(len(self._blocks))
         if self.shuffle:
             order = philox(self.seed, 2 * epoch).permutation(order)
-        order = order[number::workers]
+        # The worker's share of the queries in this order: whole batches, but for the last one of all.
+        first, last = (k * len(self) // workers * self.batch_size for k in (number, number + 1))
+        sizes = np.asarray(self._sizes, np.int64)[order]
+        ends = np.cumsum(sizes)
+        parts = [
+            (int(block), slice(max(0, first - start), last - start))
+            for block, start, end in zip(order, ends - sizes, ends, strict=True)
+            if start < last and first < end
+        ]
         # As in the loader's batches, even streams order an epoch, odd ones what is below.
         random = np.random.Generator(np.random.Philox(key=[self.seed, 2 * epoch + 1], counter=number))
         left: list[ShardQueries] = []
-        for start in range(0, len(order), _MIXED):
-            mixed = ShardQueries.join([*left, *map(self._read, order[start : start + _MIXED])])
+        for start in range(0, len(parts), _MIXED):
+            found = (self._read(block).take(part) for block, part in parts[start : start + _MIXED])
+            mixed = ShardQueries.join([*left, *found])
             if self.shuffle:
                 mixed = mixed.take(random.permutation(len(mixed)))
             whole = len(mixed) // self.batch_size * self.batch_size

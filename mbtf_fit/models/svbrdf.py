@@ -7,7 +7,8 @@ parallax nor shadows, and one lobe per texel: a baseline for all that does.
 
 Microgeometry shadows its highlights. Without the weight, the loss removes a lobe that is too bright by making
 it too narrow for the queries to sample, which leaves spikes between them. Roughness and slopes therefore
-train slower than colors: lobes start wide, and become narrow only where many queries agree.
+train slower than colors: lobes start wide, and become narrow only where many queries agree. On glossy
+bricks the error rises again in long fits, the more, the faster texels train.
 
 Towards grazing angles every lobe is bright, while parallax and shadows move and remove highlights. The
 relative loss of a highlight at the wrong place is bounded, and energy calibration scales it up: such fits can
@@ -37,7 +38,7 @@ class Svbrdf(Model):
     description = "a diffuse and a GGX lobe per texel, without a network"
     defaults: ClassVar[Mapping[str, Any]] = {
         "network": {"offset": "none"},
-        "training": {"texture_learning_rate": 0.1, "losses": [{"kind": "relative"}, {"kind": "squared"}]},
+        "training": {"texture_learning_rate": 0.05, "losses": [{"kind": "relative"}, {"kind": "squared"}]},
     }
     calibrates = False
     takes = ("init_from",)

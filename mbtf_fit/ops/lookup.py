@@ -40,8 +40,7 @@ class Lookup(Operation):
 
 @dataclass(frozen=True)
 class Neighborhood(Operation):
-    """Positions of a grid around the query, a texel of the nearest level apart (Xue et al. 2024, on the
-    material).
+    """Positions of a grid around the query, a texel of the nearest level apart (Xue et al. 2024).
 
     ``(u + i / columns(s), v - j / rows(s))`` for i, j = -margin..margin and ``s = ⌊l + ½⌋``. What follows is
     computed at each of these positions, up to an :class:`~mbtf_fit.ops.network.Inception` network.

@@ -43,12 +43,12 @@ class Network(Operation):
 @dataclass(frozen=True)
 class Inception(Operation):
     """1×1 convolution, Inception modules, 1×1 convolution over a :class:`~mbtf_fit.ops.lookup.Neighborhood`
-    (Xue et al. 2024; Szegedy et al., CVPR 2015), an activation after all convolutions but the last; the
-    output is that of the middle.
+    (Xue et al. 2024).
 
-    A module joins ``one(x)``, ``three(before3(x))``, ``five(before5(x))`` and ``pooled(3×3 maximum of x)``;
-    there is no padding. Tensors: ``weights.first.weight`` (outputs, inputs, 1, 1), ``weights.0.one.weight``,
-    …, ``weights.last.bias``.
+    An activation follows all convolutions but the last; the output is that of the middle. A module (Szegedy
+    et al., CVPR 2015) joins ``one(x)``, ``three(before3(x))``, ``five(before5(x))`` and ``pooled(3×3 maximum
+    of x)``; there is no padding. Tensors: ``weights.first.weight`` (outputs, inputs, 1, 1),
+    ``weights.0.one.weight``, …, ``weights.last.bias``.
 
     Attributes
     ----------
@@ -148,12 +148,12 @@ class Position(Operation):
 
 @dataclass(frozen=True)
 class Frequencies(Operation):
-    """Sines of doubling frequencies, then cosines (NeRF: Mildenhall et al., ECCV 2020; for materials: Xue et
-    al. 2024).
+    """Sines of doubling frequencies, then cosines.
 
-    ``sin(f_k x)`` with ``f_k = 2^k`` or ``2^k π``, k = 0..bands-1 of the first coordinate, then of the next;
-    then the cosines likewise. With a level, each is averaged over the footprint of a :class:`Position`, that
-    is multiplied by ``exp(-(f_k s)²/2)``, ``s = 2^-l / (1, aspect)`` (mip-NeRF: Barron et al., ICCV 2021).
+    From NeRF (Mildenhall et al., ECCV 2020), for materials by Xue et al. 2024: ``sin(f_k x)`` with ``f_k =
+    2^k`` or ``2^k π``, k = 0..bands-1 of the first coordinate, then of the next; then the cosines likewise.
+    With a level, each is averaged over the footprint of a :class:`Position`, that is multiplied by
+    ``exp(-(f_k s)²/2)``, ``s = 2^-l / (1, aspect)`` (mip-NeRF: Barron et al., ICCV 2021).
 
     Attributes
     ----------

@@ -16,11 +16,23 @@ name of an operation in files, and its keys there, are those of the dataclass.""
 
 from __future__ import annotations
 
+import inspect
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 from functools import cache
-from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Generic,
+    Literal,
+    TypeVar,
+    cast,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
@@ -47,8 +59,23 @@ _REFERENCE = re.compile(r"(\w+)(?:\[(\d+):(\d+)\])?")
 V = TypeVar("V")
 
 
+class _Checked(type):
+    """Refuses wrong arguments with the signature of the operation."""
+
+    def __call__(cls, *given: Any, **named: Any) -> Any:
+        operation = cast("type[Operation]", cls)
+        try:
+            found = inspect.signature(operation.__init__).bind(None, *given, **named).arguments
+            for name in _lists_of(operation.kind()):
+                if isinstance(found[name], str):
+                    raise TypeError(f"'{name}' is one name, not several: ('{found[name]}',)")
+        except TypeError as error:
+            raise TypeError(f"{error}; the arguments are {operation.signature()}") from None
+        return super().__call__(*given, **named)
+
+
 @dataclass(frozen=True)
-class Operation:
+class Operation(metaclass=_Checked):
     """One step of a model.
 
     Attributes
@@ -87,6 +114,22 @@ class Operation:
     def kind(cls) -> str:
         """Its name in files: ``half_vector`` of HalfVector."""
         return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", cls.__name__).lower()
+
+    @classmethod
+    def signature(cls) -> str:
+        """How it is called: ``Product(output, (x, …))``; several values stand in parentheses."""
+        several, out = _lists_of(cls.kind()), []
+        for f in fields(cls):
+            shown = "…" if isinstance(f.default, tuple) else repr(f.default)
+            name = f"({f.name}, …)" if f.name in several else f.name
+            out.append(name if f.default is MISSING else f"{name}={shown}")
+        return f"{cls.__name__}({', '.join(out)})"
+
+    @classmethod
+    def summary(cls) -> str:
+        """The first paragraph of its docstring on one line, with code between backquotes."""
+        text = " ".join((inspect.getdoc(cls) or "").split("\n\n")[0].split())
+        return re.sub(r":\w+:`~?(?:\w+\.)*(\w+)`", r"`\1`", text).replace("``", "`")
 
     def size(self, sizes: Sequence[int]) -> int:
         """Numbers of the output, from those of the inputs in the order of the fields."""
@@ -150,6 +193,13 @@ def _fields_of(operation: str, kind: str) -> list[str]:
     cls = _KINDS[operation]
     hints = get_type_hints(cls, include_extras=True)
     return [f.name for f in fields(cls) if kind in _marks(hints[f.name])]
+
+
+@cache
+def _lists_of(operation: str) -> list[str]:
+    """The fields that name several values."""
+    hints = get_type_hints(_KINDS[operation], include_extras=True)
+    return [name for name, hint in hints.items() if hint == Values]
 
 
 @cache

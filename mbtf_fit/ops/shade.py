@@ -114,11 +114,11 @@ def grazing_reflectance(f0: float) -> float:
 
 @dataclass(frozen=True)
 class Lobe(Operation):
-    """A diffuse and a GGX lobe (Walter et al. 2007; Fresnel: Schlick 1994) under a light whose irradiance on
-    the reference plane is 1, hence the division by ω_i,z.
+    """A diffuse and a GGX lobe (Walter et al. 2007; Fresnel: Schlick 1994).
 
-    ``M = max(0, n·ω_i) / ω_i,z · (b/π + w GGX(F0, α²))`` with the normal ``n = (-s_x, -s_y, 1) / ‖·‖``;
-    cosines of light and view in the lobe are at least `least_light` and `least_view`.
+    ``M = max(0, n·ω_i) / ω_i,z · (b/π + w GGX(F0, α²))`` with the normal ``n = (-s_x, -s_y, 1) / ‖·‖``: the
+    light has the irradiance 1 on the reference plane, hence the division by ω_i,z. Cosines of light and view
+    in the lobe are at least `least_light` and `least_view`.
 
     Attributes
     ----------

@@ -67,12 +67,13 @@ class NextStep:
         if self.kind == "queries":
             words += ["--queries", _times(made["queries"]["train"], 2)]
         else:
+            # The training queries need not be made again; those of other layouts come in large units.
+            words += ["--queries", "1"] if data.layout == "shuffled" else []
             words += ["--test-queries", _times(made["queries"]["test"], 4)]
             words += [] if made["queries"].get("test_highlights") else ["--test-highlights", "75%"]
         words += ["-o", shards]
         then = ["mbtf-fit", shards, *fitted, *out]
         if self.kind == "test":
-            # Training queries are the same.
             then = ["mbtf-fit", "evaluate", str(material), shards]
         return f"{shlex.join(words)} && {shlex.join(then)}"
 

@@ -160,10 +160,15 @@ def publish(
     if data.local is not None and real_path(data.local) in (real_path(output), *real_path(output).parents):
         raise UsageError("is the data set, or inside it", where=f"-o {output}", hint="choose another folder")
     from mbtf_gen.publishing.publication import Publication
+    from mbtf_gen.publishing.recipe import is_yaml_alone
 
     publication = Publication.prepare(
         data, config, with_maps=with_maps, material=None if material is None else Path(material)
     )
+    if is_yaml_alone(publication.data) and not publication.maps:
+        console.note(
+            "the YAML of the material has moved or changed and is left out; to add it: --with-maps --material"
+        )
     console.note(f"{data} -> {output}: {config.form}, at most {size_text(publication.size)}")
     keep_on_interruption(f"the finished files are kept in {output}")
     with console.progress(publication.count, "publishing", "shards") as bar:

@@ -27,6 +27,7 @@ from mbtf_gen.publishing.formats import copied, published_names, shard_writers
 from mbtf_gen.publishing.picture import PICTURE_NAME, write_picture
 from mbtf_gen.publishing.recipe import (
     MATERIAL,
+    MATERIAL_NAME,
     Content,
     check_inputs,
     public_documents,
@@ -105,7 +106,7 @@ class Publication:
             documents |= {f"data/{name}": content for name, content in public_documents(manifest).items()}
         if not measured:
             documents |= recipe_files(data, with_maps=with_maps, moved=material)
-        return cls(data, config, documents, with_maps)
+        return cls(data, config, documents, MATERIAL_NAME in documents)
 
     @cached_property
     def shards(self) -> dict[str, list[Shard]]:

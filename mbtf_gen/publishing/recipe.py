@@ -20,6 +20,7 @@ from mbtf_gen.tile.protocol import Tile
 # Folders of the recipe and of the material in the published folder.
 RECIPE, MATERIAL = "recipe", "recipe/material"
 _MATERIAL_FILE = "material.yaml"
+MATERIAL_NAME = f"{MATERIAL}/{_MATERIAL_FILE}"
 # Digests of the files that the recipe makes, as ``sha256sum --check`` reads them.
 SUMS_NAME = f"{RECIPE}/SHA256SUMS"
 # Keys of material files that name a file.
@@ -51,13 +52,19 @@ def public_documents(manifest: Mapping[str, Any]) -> dict[str, Content]:
     }
 
 
+def is_yaml_alone(data: Dataset) -> bool:
+    """Whether the material of a data set has no other files than its YAML: a weave or a knit."""
+    return bool(data.manifest["inputs"].keys() == {"settings"})
+
+
 def recipe_files(data: Dataset, *, with_maps: bool, moved: Path | None) -> dict[str, Content]:
     """Configuration, digests and material of a recipe, by name in the published folder.
 
     Parameters
     ----------
     data : generated, not measured
-    with_maps : whether the input files of the material are published
+    with_maps : whether the input files of the material are published; a weave or a knit is in any case, where
+        its YAML is unchanged
     moved : path of the material, if it is not where the data set was generated from
 
     Raises
@@ -70,13 +77,17 @@ def recipe_files(data: Dataset, *, with_maps: bool, moved: Path | None) -> dict[
     if (geometry := data.manifest["geometry"]) is not None:
         sums[GEOMETRY_NAME] = geometry["sha256"]
     lines = "".join(f"{digest}  {name}\n" for name, digest in sums.items())
-    if not with_maps:
-        return {f"{RECIPE}/{CONFIG_NAME}": dump_yaml(config).encode(), SUMS_NAME: lines.encode()}
+    documents: dict[str, Content] = {SUMS_NAME: lines.encode()}
+    without = documents | {f"{RECIPE}/{CONFIG_NAME}": dump_yaml(config).encode()}
+    if not with_maps and not is_yaml_alone(data):
+        return without
     path = Path(data.manifest["config"]["material"]) if moved is None else moved
     hint = "name it: --material PATH; or leave out --with-maps"
     try:
         tile = check_inputs(data, path, "has changed since the data set was made", hint)
     except InputError as error:
+        if not with_maps:
+            return without
         raise InputError(error.what, where=error.where, hint=error.hint or hint) from None
     if any(role.startswith(COMPANION) for role in tile.files):
         raise InputError(
@@ -89,9 +100,9 @@ def recipe_files(data: Dataset, *, with_maps: bool, moved: Path | None) -> dict[
     document = _copied(spec.model_dump(mode="json", exclude_unset=True), folder, "", files)
     config["material"] = f"{Path(MATERIAL).name}/{_MATERIAL_FILE}"
     return {
+        **documents,
         f"{RECIPE}/{CONFIG_NAME}": dump_yaml(config).encode(),
-        SUMS_NAME: lines.encode(),
-        f"{MATERIAL}/{_MATERIAL_FILE}": dump_yaml(document).encode(),
+        MATERIAL_NAME: dump_yaml(document).encode(),
         **{f"{MATERIAL}/{name}": source for name, source in files.items()},
     }
 

@@ -350,7 +350,8 @@ class HeightFieldTile(Tile):
         if extent == 0:
             return None
         if "normal" in self.files:
-            text = suggestion_warning(self.files["normal"], self.normal_fit, self.height_scale)
+            median = slope_angles(self._resampled)[0]
+            text = suggestion_warning(self.files["normal"], self.normal_fit, self.height_scale, median)
             if text is not None:
                 return text
         extent *= abs(self.height_scale)

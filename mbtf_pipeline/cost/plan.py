@@ -9,6 +9,7 @@ from mbtf_core.run.runner import Runner
 from mbtf_core.units import clock, expectation, rounded_duration
 from mbtf_gen.forecast import forecast
 from mbtf_gen.job import Job
+from mbtf_pipeline.cost import measurement
 from mbtf_pipeline.cost.answers import FARTHEST
 from mbtf_pipeline.cost.measurement import MeasurementFolder
 from mbtf_pipeline.cost.runs import LEAST_SECONDS, disk_bytes
@@ -41,6 +42,8 @@ class StudyPlan:
     least_run : seconds of a study that measures a run; None where any is measured
     least : seconds of a study that forecasts
     generator : whether it compares configurations of the generator
+    share : of the processors that other work leaves now
+    overhead : seconds of a run besides generating and training; assumed until a run is measured
     """
 
     runs: list[str]
@@ -51,6 +54,8 @@ class StudyPlan:
     least_run: float | None
     least: float
     generator: bool
+    share: float
+    overhead: float
 
     def describe(self, asked: float) -> str:
         """Lines: what it measures, and what it can and cannot answer in the time that is asked for."""
@@ -59,6 +64,12 @@ class StudyPlan:
         expected = expectation(self.seconds, self.bytes)
         lines = [f"{expected}; complete runs to measure: {len(self.runs) or 'none'}{known}{ends}"]
         lines += [f"  {label}" for label in self.runs]
+        if self.least_run is not None:
+            lines.append(
+                f"estimated from a pilot of the generator, while other work leaves {self.share:.0%} of the "
+                f"processors, and {self.overhead:.0f} s per run for loading and evaluation; the first run "
+                "measures training and the rest, so fewer runs may fit"
+            )
         if not self.runs and self.least_run is not None:
             return "\n".join([*lines, no_run(self.least_run, self.least)])
         lines.append(f"answers: the error after times of up to about {clock(self.longest)}, measured")
@@ -90,9 +101,11 @@ def plan_study(recipe: Recipe, folder: Path, *, seconds: float, seed: int | None
     """
     record = STUDY.read(folder) if STUDY.check(folder) else None
     job = Job.load(study_config(recipe.generate, seed))
+    # Alone, as each pilot takes all processors.
+    share = measurement.processor_share()
     spp, pilot = job.config.queries.spp, forecast(job, seconds=1.0)
     conditions = conditions_of(job, folder, seconds)
-    found = Measurements(conditions, MeasurementFolder(folder, conditions), Runner())
+    found = Measurements(conditions, MeasurementFolder(folder, conditions), Runner(), share=share)
     if not found.recall_rate(spp):
         found.path_seconds = pilot.query_seconds / spp
     setup = 2.0 * pilot.start + _SETUP_PATHS * found.path_seconds
@@ -115,4 +128,6 @@ def plan_study(recipe: Recipe, folder: Path, *, seconds: float, seed: int | None
         least_run,
         least or LEAST_SECONDS,
         generator,
+        share,
+        found.overhead,
     )

@@ -144,6 +144,7 @@ class Measurements:
     note : called when a configuration is taken, with its label and the time that it is expected to take
     failed : why runs failed
     path_seconds, step_seconds : seconds of generating a query over its number of paths; of a training step
+    share : share of the processors that other work leaves
     """
 
     conditions: Conditions
@@ -154,6 +155,7 @@ class Measurements:
     failed: dict[str, str] = field(default_factory=dict)
     path_seconds: float = 0.0
     step_seconds: float = 0.0
+    share: float = 1.0
     # Taken, but not measured yet.
     _pending: dict[str, Configuration] = field(default_factory=dict)
     # Whether a run has made the test set.
@@ -164,7 +166,7 @@ class Measurements:
     @property
     def overhead(self) -> float:
         """Seconds that a run takes besides the test set, generating and training, at most."""
-        return max(self._besides, default=OVERHEAD)
+        return max(self._besides, default=OVERHEAD / self.share)
 
     @cached_property
     def configurations(self) -> list[Configuration]:

@@ -134,7 +134,9 @@ def test_a_model_that_is_not_installed_is_named(tmp_path: Path, source: str) -> 
 
 def test_every_operation_has_a_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(app, ["models", "--operations", "--json"]) == 0
-    found = {one["name"]: one["description"] for one in json.loads(capsys.readouterr().out)["operations"]}
+    listed = json.loads(capsys.readouterr().out)["operations"]
+    assert {one["name"]: one["call"] for one in listed}["Matrix"] == "Matrix(output, x, rows=…)"
+    found = {one["name"]: one["description"] for one in listed}
     assert found["DivideByCosine"] == "x / max(ω_z, least)."
     assert found["Inception"].startswith(
         "1×1 convolution, Inception modules, 1×1 convolution over a Neighborhood ("

@@ -223,3 +223,17 @@ def test_chromaticities_of_exr_and_radiance(tmp_path: Path) -> None:
     assert read_environment(tmp_path / "x.hdr", 2)[0, 0] == pytest.approx(
         np.array(FROM_P3) @ (1, 0.5, 0.25), rel=0.01
     )
+
+
+@pytest.mark.parametrize(("index", "adobe"), [("R03", True), ("R98", False)])
+def test_cameras_declare_adobe_rgb_in_exif(tmp_path: Path, index: str, adobe: bool) -> None:
+    """By its interoperability index (DCF 2.0); the matrix is that of Adobe RGB (1998) to Rec.709."""
+    exif = Pillow.Exif()
+    exif[0x8769] = {0xA001: 65535, 0xA005: {1: index, 2: b"0100"}}
+    color = Pillow.new("RGB", (16, 16), (200, 150, 100))
+    color.save(tmp_path / "c.jpg", quality=100, subsampling=0, exif=exif)
+    with Pillow.open(tmp_path / "c.jpg") as stored:
+        code = np.array(stored)[0, 0] / 255.0
+    matrix = np.array([[1.39836, -0.39836, 0.0], [0.0, 1.0, 0.0], [0.0, -0.04293, 1.04293]])
+    expected = matrix @ code**2.19921875 if adobe else srgb_to_linear(code)
+    assert linear_rgb(read_image(tmp_path / "c.jpg"))[0, 0] == pytest.approx(expected, abs=1e-4)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 
@@ -52,6 +53,19 @@ def stored(folder: Path, split: str = "train") -> np.ndarray:
 
 def in_order(found: np.ndarray) -> np.ndarray:
     return found[np.lexsort(found.T)]
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize("size", [700, 9001, 10_000])
+def test_a_loader_has_the_stated_number_of_batches(shards: Path, size: int, workers: int) -> None:
+    """Of the whole size, but for one; PyTorch warns of more batches than stated."""
+    loader = DataLoader(QueryDataset(shards, batch_size=size), batch_size=None, num_workers=workers)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message="Length of IterableDataset")
+        sizes = sorted(len(batch.sigma) for batch in loader)
+    whole, rest = divmod(9001, size)
+    assert len(loader) == len(sizes)
+    assert sizes == [*[rest] * (rest > 0), *[size] * whole]
 
 
 @pytest.mark.parametrize("workers", [0, 2])

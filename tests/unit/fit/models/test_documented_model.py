@@ -81,6 +81,12 @@ def test_to_fit_again_needs_the_file(fitted: Path) -> None:
         ({}, "my_model.py:math", "my_model.py", "'math' is no subclass of Model"),
         ({"import math": "import mathematics"}, None, "my_model.py:1", "ModuleNotFoundError"),
         ({"1 / math.pi": "1 / math.tau0"}, None, "my_model.py:18", "AttributeError"),
+        (
+            {", channels=3": ""},
+            None,
+            "my_model.py:16",
+            "argument: 'channels'; the arguments are Lookup(",
+        ),
         ({'"albedo", "texel"': '"albedo", "text"'}, None, "my_model.py", "reads 'text'"),
         ({"_rate": "_rat"}, None, "defaults of my_model.py:TexelDiffuse", "'training.texture_learning_rat'"),
         ({'{"training": {"texture_learning_rate": 0.05}}': "[1]"}, None, "my_model.py", "TypeError"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any, get_args
 
 import pytest
@@ -303,3 +304,10 @@ def test_operations_refuse_unknown_names() -> None:
     ):
         with pytest.raises(ValueError, match=r"'a': \w+ must be one of .*, not 's\w+'"):
             wrong()
+
+
+@pytest.mark.parametrize("given", [("v", "a", "b"), ("v", "a"), ("v",)])
+def test_wrong_arguments_are_answered_by_the_signature(given: tuple[str, ...]) -> None:
+    with pytest.raises(TypeError, match=r"Product\(output, \(x, …\)\)"):
+        ops.Product(*given)  # type: ignore[call-arg, arg-type]
+    assert copy.copy(ops.Product("v", ("a", "b"))).x == ("a", "b")

@@ -193,7 +193,10 @@ def test_a_fit_that_kept_an_earlier_state_needs_more_queries(share: float | None
 def test_the_next_command_is_complete(tmp_path: Path) -> None:
     """Twice of what was given, four times the test queries, in new folders."""
     queries = {"train": "50/texel", "test": "8192"}
-    manifest: dict[str, Any] = {"config": {"material": "wool maps", "queries": queries}}
+    manifest: dict[str, Any] = {
+        "config": {"material": "wool maps", "queries": queries},
+        "layout": "shuffled",
+    }
     data = Dataset(DataFolder.open(tmp_path / "shards"), manifest)
     config = FitConfig.model_validate({"training": {"time": "30s"}})
 
@@ -215,7 +218,7 @@ def test_the_next_command_is_complete(tmp_path: Path) -> None:
         f"mbtf-fit shards-2 {fitted} -o material-2",
     )
     assert command("queries") == f"{made} --queries 100/texel -o shards-2 && {fit}"
-    more = "--test-queries 32768 --test-highlights 75%"
+    more = "--queries 1 --test-queries 32768 --test-highlights 75%"
     assert command("test") == f"{made} {more} -o shards-2 && mbtf-fit evaluate material shards-2"
     # The digits of a name count nothing; a second sequel does.
     for name, following in (("b2_500", "b2_500-2"), ("m-2/", "m-3"), ("m-10", "m-11"), ("m-64", "m-64-2")):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +55,16 @@ def folder(tmp_path: Path) -> Path:
     metallic[:, 50:] = 1.0
     np.save(out / "metallic.npy", metallic)
     return out
+
+
+def test_the_warning_about_the_scale_states_the_slopes_that_it_leads_to(folder: Path) -> None:
+    material = load_material(folder)
+    assert material.normal_fit is not None
+    agreed = slope_angles(material.at(material.normal_fit.scale).grid)[0]
+    for scale in (0.01, 0.6, -0.6):
+        other = material.at(scale)
+        now = slope_angles(other.grid)[0]
+        assert re.findall(r"[\d.]+°", other.scale_warning() or "") == [f"{agreed:.1f}°", f"{now:.1f}°"]
 
 
 class TestNumbers:

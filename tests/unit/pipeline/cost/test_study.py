@@ -3,7 +3,9 @@ and what follows from them."""
 
 from __future__ import annotations
 
+import errno
 import math
+import os
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +16,7 @@ import pytest
 from support.fake_runs import FakeRuns, MemoryStore, conditions, run
 from support.paths import ROOT
 
-from mbtf_core.errors import InputError
+from mbtf_core.errors import InputError, PartialError
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item, Result, packed, run_task
 from mbtf_core.stats import Estimate
@@ -193,6 +195,36 @@ def test_a_study_keeps_its_time_and_resumes(fake: FakeRuns, tmp_path: Path) -> N
     assert {r.seed for r in runs} >= {2}
     assert all(r.name != "long" for r in runs)
     assert sum(r.planned_seconds(0.0) for r in runs) <= 3790.0
+
+
+def test_a_full_disk_keeps_what_is_measured(
+    fake: FakeRuns, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe, folder = load_recipe(RECIPE, []), tmp_path / "study"
+    put = MeasurementFolder.put
+
+    def full(store: MeasurementFolder, of: Any, measurement: Measurement) -> None:
+        if (of.name, getattr(of, "seed", 0)) == ("short", 1):
+            with monkeypatch.context() as patch:
+                patch.setattr(os, "fsync", no_space)
+                put(store, of, measurement)
+        put(store, of, measurement)
+
+    def no_space(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(MeasurementFolder, "put", full)
+    with pytest.raises(PartialError, match="No space left on device"):
+        module.run_study(recipe, folder, seconds=190.0)
+    assert not (folder / ".work").exists()
+    kept = [(run.name, run.seed) for run in fake.measured]
+    monkeypatch.setattr(MeasurementFolder, "put", put)
+    fake.measured.clear()
+    module.run_study(recipe, folder, seconds=190.0)
+    again = [(run.name, run.seed) for run in fake.measured]
+    # The run whose result did not fit is repeated, no other.
+    assert kept[-1] == again[0] == ("short", 1)
+    assert not set(kept[:-1]) & set(again)
 
 
 def test_a_slow_first_run_makes_the_others_fewer_and_longer(monkeypatch: pytest.MonkeyPatch) -> None:
