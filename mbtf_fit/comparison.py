@@ -31,7 +31,7 @@ from mbtf_core.errors import InputError
 from mbtf_core.files.folders import OutputFolder, owned
 from mbtf_core.pictures import claim_pictures, write_png
 from mbtf_core.run.signals import keep_on_interruption
-from mbtf_core.stats import LOCAL_WINDOW, local_error, noise_free_mse, signal_variance, unexplained_variance
+from mbtf_core.stats import local_error, noise_free_mse, signal_variance, unexplained_variance
 from mbtf_fit.evaluation import check_aspect, foreign_inputs
 from mbtf_fit.formatting import format_estimate, visibility
 from mbtf_fit.material.material import Material
@@ -200,7 +200,7 @@ def _draw(
     captions = [
         f"path-traced reference\nexposure {exposure:+.2f} EV",
         f"fit, one query per pixel\n{pixels}",
-        f"local RMS error, without noise\n% of the mean value; Gaussian window of {LOCAL_WINDOW:g} pixels",
+        "local RMS error, without noise\n% of the mean value",
     ]
     path = folder.path / PICTURE_NAME
     shown = [[_enlarged(picture) for picture in column] for column in columns]

@@ -24,7 +24,7 @@ YARNS = {"light": "#e6dfd0", "sand": "#b59a6a", "rust": "#a4472c", "dark": "#232
 NEEDED = {"houndstooth": ("dark", "light"), "gingham": ("rust", "light"), "denim": ("blue", "light")}
 # Fewer, coarser fibers than those of the type.
 YARN = "yarn: {type: cotton2, fibers: 20, radius: 3, flyaways: 0.4, width: 1}"
-SIZE, SPP, ACROSS = 200, 32, 4
+SIZE, SPP, ACROSS = 200, 96, 4
 
 
 def material(title: str, start: str) -> str:
