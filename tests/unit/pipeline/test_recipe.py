@@ -74,10 +74,13 @@ def test_a_fit_is_out_of_date_when_the_file_of_its_model_has_changed(
     """The model is named by its class, and its path is relative to the current folder."""
     monkeypatch.chdir(tmp_path)
     file = tmp_path / "mine.py"
-    file.write_text("from mbtf_fit.models.svbrdf import Svbrdf\n\n\nclass Lobes(Svbrdf):\n    pass\n")
+    file.write_text(
+        "from mbtf_fit.models.svbrdf import Svbrdf\n\n\n"
+        "class Lobes(Svbrdf):\n    defaults = {'training': {'warmup': 7}}\n"
+    )
     recipe = load_recipe(written(tmp_path, HEAD + "fit: {model: mine.py:Lobes}\n"))
     assert list(recipe.fit) == ["Lobes"]
-    assert recipe.fit["Lobes"].training.texture_learning_rate == 0.1
+    assert recipe.fit["Lobes"].training.warmup == 7
 
     def inputs() -> Mapping[str, str]:
         (stage,) = (
@@ -87,7 +90,7 @@ def test_a_fit_is_out_of_date_when_the_file_of_its_model_has_changed(
 
     before = inputs()
     assert inputs() == before
-    file.write_text(file.read_text().replace("pass", "calibrates = True"))
+    file.write_text(file.read_text().replace("7", "8"))
     assert inputs() != before
 
 
