@@ -255,7 +255,9 @@ def measure_speed(arguments: argparse.Namespace) -> int:
     lattice, n = Lattice(arguments.finest), arguments.batch
     # The fitter does so for its own path; the plain way has it too.
     keep_freed_memory()
-    config = FitConfig.model_validate({"model": "neumip", "training": {"steps": STEPS, "batch": n}})
+    config = FitConfig.model_validate(
+        {"model": "neumip", "training": {"steps": STEPS, "batch": n, "losses": [{"kind": "relative"}]}}
+    )
     queries = random_batch(np.random.default_rng(0), n * len(MOMENTS), lattice)
     batches = [queries.slice(k * n, (k + 1) * n) for k in range(len(MOMENTS))]
     unit = float(queries.value.mean())

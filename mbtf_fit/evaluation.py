@@ -65,8 +65,8 @@ def split_errors(
     dict
         Plain data for JSON. ``mse`` E[(p-a)(p-b)] and ``variance`` of the values, in 1/sr², and their ratio
         ``unexplained`` (1 - R²: 0 is exact, 1 as good as the mean value), each an estimate with ``value``,
-        ``error`` and ``n``; ``color``: what is unexplained of the values minus their mean over the channels,
-        a small part of all; ``ten_largest``: share of the ten largest squared errors in their sum; also by
+        ``error`` and ``n``; ``color``: what is unexplained of the differences between channels, a small part
+        of all; ``ten_largest``: share of the ten largest squared errors in their sum; also by
         nearest level (``levels``) and by band of the smaller cosine of light and view (``elevations``).
         ``psnr``: its peak is the value that the exposure shows as white; ``visibility``: in words;
         ``includes_noise``: whether the data have one value per query.
@@ -100,7 +100,9 @@ def split_errors(
 
 
 def _color(values: F32) -> F32:
-    return values - values.mean(axis=-1, keepdims=True)
+    """Differences between channels: their mean square over that of other values is that of deviations from
+    the mean, and they are exactly 0 for gray."""
+    return values - np.roll(values, 1, axis=-1)
 
 
 def _ten_largest(prediction: F32, a: F32, b: F32, weight: F32 | None) -> float | None:

@@ -233,8 +233,10 @@ class TrainingSection(Settings):
 
     @model_validator(mode="after")
     def _some_loss(self) -> TrainingSection:
-        if all(term.start > 0 for term in self.losses):
-            raise ValueError("losses: no term counts from the start: set start of one of them to 0")
+        if all(term.start > 0 or term.kind == "chroma" for term in self.losses):
+            raise ValueError(
+                "losses: no term but chroma counts from the start: set start of one of them to 0"
+            )
         return self
 
 

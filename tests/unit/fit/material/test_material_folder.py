@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -178,9 +179,22 @@ def test_errors_of_a_perfect_prediction_are_zero(data: Path) -> None:
     assert flat is not None
     assert abs(perfect["mse"]["value"]) < 4 * perfect["mse"]["error"]
     assert flat["unexplained"]["value"] == pytest.approx(1.0, abs=0.02)
+    # Of color likewise, although its noise is as large as its variance.
+    assert abs(perfect["color"]["value"]) < 4 * perfect["color"]["error"]
+    assert flat["color"]["value"] == pytest.approx(1.0, abs=0.05)
     for groups in (flat["levels"], flat["elevations"]):
         assert sum(errors["n"] for errors in groups.values()) == len(queries)
     assert set(flat["elevations"]) == {"0-0.2", "0.2-0.4", "0.4-0.7", "0.7-1"}
+
+
+def test_gray_data_have_no_error_of_color(data: Path) -> None:
+    opened = Dataset.open(data)
+    stored = load_split(opened, "test")
+    gray = np.repeat(stored.value_a[:, :1], 3, axis=1)
+    found = split_errors(lambda q: 1.1 * gray, replace(stored, value_a=gray, value_b=gray), opened)
+    assert found is not None
+    assert found["unexplained"]["value"] is not None
+    assert found["color"]["value"] is None
 
 
 def test_few_queries_that_decide_an_error_are_said(data: Path) -> None:

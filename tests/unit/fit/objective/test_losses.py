@@ -19,6 +19,8 @@ from mbtf_fit.sections import TrainingSection
 
 KINDS = ("relative", "squared", "linear", "log", "fourth-root")
 SCALE = 0.5
+# A term that counts little.
+RELATIVE = ({"kind": "relative", "weight": 1e-6},)
 
 
 def objective(kind: str, variance: float = 0.0, **options: Any) -> Objective:
@@ -62,6 +64,20 @@ def skewed(relative: float) -> Tensor:
 def test_by_default_the_minimum_is_the_expectation_whatever_the_noise(kind: str) -> None:
     value = skewed(0.8)
     assert minimum(objective(kind, 0.64, huber_delta=None), value) == pytest.approx(1.0, abs=2e-3)
+
+
+def test_the_loss_of_color_has_its_minimum_at_the_expectation_and_takes_patches() -> None:
+    """Brightness is free; noise that differs between channels, and skewed."""
+    mean = torch.tensor([1.0, 0.5, 2.0])
+    value = mean * torch.cat([skewed(0.8), skewed(0.4).flip(0), skewed(1.2).roll(7, 0)], 1)
+    loss, slopes = objective("chroma", huber_delta=None, losses=[{"kind": "chroma"}, *RELATIVE]), []
+    for factor in (torch.ones(3), torch.tensor([1.01, 1.0, 1.0])):
+        p = (factor * mean).expand(value.shape).clone().requires_grad_()
+        (gradient,) = torch.autograd.grad(loss(p, queries(value)), p)
+        slopes.append(gradient.sum(0))
+    assert slopes[0].abs().max() < 0.01 * slopes[1].abs().max()
+    rows, p = value[:60].view(5, 3, 4, 3), mean * torch.linspace(0.5, 2, 60)[:, None]
+    torch.testing.assert_close(loss(p.view(5, 3, 4, 3), patches(rows)), loss(p, queries(value[:60])))
 
 
 @pytest.mark.parametrize(("kind", "least"), [("linear", 0.15), ("log", 0.08), ("fourth-root", 0.15)])
@@ -156,5 +172,5 @@ def test_a_term_counts_from_its_start_on() -> None:
     assert mixed.quadratic() is None
     mixed.fraction = 0.4
     assert mixed.quadratic() is not None
-    with pytest.raises(InputError, match="no term counts from the start"):
+    with pytest.raises(InputError, match="counts from the start"):
         TrainingSection.model_validate({"losses": terms[1:]})
