@@ -87,25 +87,20 @@ def next_step(cost: MarginalCost, errors: Mapping[str, Any]) -> NextStep:
     errors : by split
     """
     split = errors[headline(errors)]
-    training: Mapping[str, Any] = errors["training"]["unexplained"] if "training" in errors else {}
-    own = training.get("value")
+    own = errors["training"]["unexplained"]["value"] if "training" in errors else None
     value, error = split["unexplained"]["value"], split["unexplained"]["error"]
     untrained = cost.steps < _UNTRAINED and cost.doubling is None
+    data = 1.0 if cost.noise_share is None else 1.0 - 0.5 * cost.noise_share
     if cost.few and (value is None or value >= 1.0 or untrained):
         factor = 2 ** math.ceil(math.log2(FEWEST_STEPS / cost.steps))
         return NextStep("time", f"{cost.steps} steps are few: train {factor} times as long", factor)
     if value is None or error is None or error > _UNCERTAIN * abs(value) or unreliable(split):
         reason = "few test queries decide the error; four times as many, by highlights, measure it better"
-        if (
-            value is not None
-            and own is not None
-            and value - own > 2.0 * math.hypot(error or 0, training["error"] or 0)
-        ):
-            reason += f"; the fit overfits noise (error of training queries: {own:.2g})"
+        if data < FLAT:
+            reason += "; the fit overfits noise: then, more training queries help"
         return NextStep("test", reason)
     if value >= 1.0 and own is not None and own < 1.0:
         return NextStep("queries", "the training queries are too few or too noisy")
-    data = 1.0 if cost.noise_share is None else 1.0 - 0.5 * cost.noise_share
     if cost.kept_step is not None:
         reason = f"the fit overfits noise after {cost.kept_step} steps; "
         reason += (
