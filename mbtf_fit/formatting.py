@@ -101,6 +101,12 @@ def unreliable(split: Mapping[str, Any]) -> str:
     return f"unreliable: ten of them make {min(1.0, share):.0%} of it"
 
 
+def above_one(unexplained: Mapping[str, Any]) -> list[str]:
+    """The remark on an unexplained variance that is significantly above 1."""
+    value, error = unexplained["value"], unexplained["error"]
+    return [ABOVE_ONE] if value is not None and value - _SIGNIFICANT * (error or 0.0) >= 1.0 else []
+
+
 def _remarks(errors: Mapping[str, Any], foreign: bool) -> list[str]:
     """Notes on an undefined or large error."""
     found, split = [], errors[headline(errors)]
@@ -110,9 +116,7 @@ def _remarks(errors: Mapping[str, Any], foreign: bool) -> list[str]:
         found.append(f"undefined unexplained variance: {why}")
     if measured:
         found.append("these errors include the noise of the data, which have one value per query")
-    if value is None or value < 1 or foreign:
-        return found
-    return [*found, ABOVE_ONE]
+    return found if foreign else [*found, *above_one(split["unexplained"])]
 
 
 def _table_of(errors: Mapping[str, Any]) -> list[str]:

@@ -4,6 +4,7 @@ overfitting."""
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -18,7 +19,7 @@ from mbtf_core.stats import (
 )
 from mbtf_fit.data.loader import Partition, load_split
 from mbtf_fit.data.queries import ShardQueries
-from mbtf_fit.formatting import ABOVE_ONE
+from mbtf_fit.formatting import above_one
 from mbtf_fit.training.best_state import excess_error
 from mbtf_fit.training.trainer import Trainer
 
@@ -113,11 +114,11 @@ FLAT = 0.95
 _RESOLVED = 0.25
 
 
-def caveat(steps: int, error: float | None) -> str:
+def caveat(steps: int, unexplained: Mapping[str, Any]) -> str:
     """Why the error of a fit does not rank its model: few steps, or an unexplained variance above 1; empty
     where it does."""
     few = [f"{steps} steps: not converged"] if steps < FEWEST_STEPS else []
-    return ", ".join([*few, *([ABOVE_ONE] if error is not None and error >= 1.0 else [])])
+    return ", ".join([*few, *above_one(unexplained)])
 
 
 @dataclass(frozen=True)

@@ -205,7 +205,7 @@ def _report(result: RunResult, console: Console, quality: Quality | None) -> Non
     for fit, record in result.comparison["test"].items():
         errors = record["splits"]["test"]
         ending = describe_ending(recipe.fit[fit], read_history(folder / FITS / fit))
-        why = caveat(record["training_steps"], errors["unexplained"]["value"])
+        why = caveat(record["training_steps"], errors["unexplained"])
         fits[fit] = {
             "unexplained_variance": errors["unexplained"],
             "mse": errors["mse"],

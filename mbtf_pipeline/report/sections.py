@@ -71,7 +71,7 @@ def _with_caveat(fit: str, comparison: Mapping[str, Any]) -> str:
     from mbtf_fit.training.validation import caveat
 
     record = comparison["test"][fit]
-    text = caveat(record["training_steps"], record["splits"]["test"]["unexplained"]["value"])
+    text = caveat(record["training_steps"], record["splits"]["test"]["unexplained"])
     return f"{fit} ({text})" if text else fit
 
 

@@ -43,7 +43,7 @@ def test_psnr_has_a_word(mse: float, error: float, text: str, word: str | None) 
     assert [least for least, _ in VISIBILITY] == sorted((least for least, _ in VISIBILITY), reverse=True)
 
 
-@pytest.mark.parametrize(("value", "remark"), [(0.99, False), (1.0, True)])
+@pytest.mark.parametrize(("value", "remark"), [(0.99, False), (1.0, False), (1.2, True)])
 def test_errors_above_1_are_worse_than_the_mean_value(value: float, remark: bool) -> None:
     found = {"test": split(1e-3, 1e-5, value)}
     assert ("above 1: worse than the mean value" in report_errors(found, None)[-1]) == remark

@@ -61,7 +61,9 @@ def cost(records: list[dict[str, Any]], *arguments: Any, **options: Any) -> Marg
 def test_fits_of_few_steps_or_large_errors_do_not_rank_models(
     steps: int, error: float | None, text: str
 ) -> None:
-    assert caveat(steps, error) == text
+    assert caveat(steps, {"value": error, "error": 0.0}) == text
+    # Where the error may as well lie below 1, nothing is said.
+    assert "above" not in caveat(steps, {"value": error, "error": 0.3})
 
 
 @pytest.mark.parametrize("power", [0.2, 0.4, 0.8])
