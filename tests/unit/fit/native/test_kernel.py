@@ -155,7 +155,8 @@ def test_values_and_gradients_are_those_of_the_reference(
         patch.setattr("mbtf_fit.material.inference.kernel", lambda: kernel_of(variant))
         found = predict(model, *(t.numpy() for t in inputs_of(batch)))
     assert_alike(torch.from_numpy(found), exact.clamp_min(0), 1e-5)
-    loss = objective(lattice, losses=[{"kind": kind, "weight": 0.7}], huber_delta=huber_delta)
+    terms = [{"kind": kind, "weight": 0.7}, {"kind": "relative", "weight": 0.1}]
+    loss = objective(lattice, losses=terms, huber_delta=huber_delta)
     exact_loss, expected = exact_gradients(model, loss, batch)
     value, gradients = kernel_gradients(variant, model, loss, batch)
     torch.testing.assert_close(value.double(), exact_loss, rtol=1e-5, atol=1e-8)
