@@ -108,6 +108,8 @@ def forecast(job: Job, plan: RunPlan | None = None, seconds: float = 2.0) -> For
     count, test_paths = split_queries(job, "train"), split_queries(job, "test") * job.config.queries.test_spp
     lights = split_lights(job.config, "train")
     size = max(1, _FIRST_PATHS // (spp if target is None else target.max_spp))
+    # A piece is at most the work of the run, in training queries; a test set alone has one of these.
+    most = max(count // lights, test_paths // spp)
     found: list[Estimates] = []
 
     def stored(estimates: Estimates) -> int:
@@ -116,8 +118,7 @@ def forecast(job: Job, plan: RunPlan | None = None, seconds: float = 2.0) -> For
 
     def piece(number: int) -> int:
         """Estimate and write some queries as in the run; returns their paths."""
-        # Whole groups: `count` is a multiple of the lights.
-        queries = pilot_queries(job, lights * max(1, min(size, count // lights)), number, lights)
+        queries = pilot_queries(job, lights * max(1, min(size, most)), number, lights)
         stream = Stream(job.config.seed, "pilot", number)
         found.append(estimate_shard(estimator, queries, spp, target, stream, plan.allocation, lights))
         arrays = vars(queries) | {name: getattr(found[-1], name) for name in _HALVES}
@@ -198,6 +199,8 @@ def announce_shards(
     paths, queries = 0 if plan.effects.closed_form else share * most_paths(job), job.config.queries
     number, per_texel = parse_count(queries.train)
     faster = f"--queries {max(1, round(number / 4))}{'/texel' * per_texel}"
-    if queries.target_error is None and queries.spp > FEWEST_SPP:
+    if split_queries(job, "train") * queries.spp < split_queries(job, "test") * queries.test_spp:
+        faster = f"--test-queries {max(1, split_queries(job, 'test') // 4)}"
+    elif queries.target_error is None and queries.spp > FEWEST_SPP:
         faster += f", --spp {queries.spp // 4 * 2}"
     announce(console, paths, seconds, size, job.material.scatters, faster)

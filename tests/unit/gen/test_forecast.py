@@ -22,6 +22,8 @@ from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 
 RATE = 1e6
+# Seconds that each launch takes beside its paths.
+LAUNCH = 0.0
 
 
 class Clock:
@@ -48,7 +50,7 @@ class Fake:
         n = len(queries.sigma)
         counts = np.broadcast_to(np.asarray(spp, np.int64), (n,))
         paths = int(counts.sum()) // lights
-        self.clock.now += 0.5 * (1 + lights) * paths / RATE
+        self.clock.now += LAUNCH + 0.5 * (1 + lights) * paths / RATE
         noise = 0.8 * np.sqrt(2.0 / counts)[:, None]
         a, b = (np.tile(rng.normal(size=(n // lights, 3)), (lights, 1)) for _ in range(2))
         a, b = ((0.25 + noise * x).astype(np.float32) for x in (a, b))
@@ -130,3 +132,11 @@ def test_a_forecast_of_slow_paths_is_short(faked: None, monkeypatch: pytest.Monk
     found = forecast(job, RunPlan(plan_effects(job, pilots=False)), seconds=1.0)
     assert found.seconds == pytest.approx(found.paths / RATE, rel=1e-6)
     assert module.time.now < 6.0  # type: ignore[attr-defined]
+
+
+def test_a_test_set_alone_is_forecast_from_many_paths(faked: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Extrapolating from launches of its one training query multiplied their overhead."""
+    monkeypatch.setattr(sys.modules[__name__], "LAUNCH", 0.01)
+    job = job_of(train="1", spp=4, test="20000", test_spp=256)
+    found = forecast(job, RunPlan(plan_effects(job, pilots=False)), seconds=0.0)
+    assert found.seconds == pytest.approx(found.paths / RATE, rel=0.1)
