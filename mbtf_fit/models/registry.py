@@ -78,7 +78,7 @@ def model_class(name: str) -> type[Model]:
         try:
             text = path.read_text(encoding="utf-8")
         except FileNotFoundError:
-            hint = f"the path is relative to the current folder, {Path().absolute()}"
+            hint = f"searched for {path.absolute()}"
             raise InputError("no such file", where=file, hint=hint) from None
         found = vars(_run(path, text))
     model = found.get(wanted)

@@ -5,22 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from mbtf_core.forecast import processor_share
 from mbtf_core.run.runner import Runner
 from mbtf_core.units import clock, expectation, rounded_duration
 from mbtf_gen.forecast import forecast
 from mbtf_gen.job import Job
-from mbtf_pipeline.cost import measurement
 from mbtf_pipeline.cost.answers import FARTHEST
+from mbtf_pipeline.cost.conditions import conditions_of, generator_seconds, study_config
 from mbtf_pipeline.cost.measurement import MeasurementFolder
 from mbtf_pipeline.cost.runs import LEAST_SECONDS, disk_bytes
-from mbtf_pipeline.cost.study import (
-    STUDY,
-    Measurements,
-    conditions_of,
-    generator_seconds,
-    no_run,
-    study_config,
-)
+from mbtf_pipeline.cost.schedule import Measurements
+from mbtf_pipeline.cost.study import STUDY, no_run
 from mbtf_pipeline.recipe import Recipe
 
 # Paths of the reference and of the generator's rate, which come before runs.
@@ -42,7 +37,7 @@ class StudyPlan:
     least_run : seconds of a study that measures a run; None where any is measured
     least : seconds of a study that forecasts
     generator : whether it compares configurations of the generator
-    share : of the processors that other work leaves now
+    share : of the processors that other work leaves, as the generator's rate was measured
     overhead : seconds of a run besides generating and training; assumed until a run is measured
     """
 
@@ -102,7 +97,7 @@ def plan_study(recipe: Recipe, folder: Path, *, seconds: float, seed: int | None
     record = STUDY.read(folder) if STUDY.check(folder) else None
     job = Job.load(study_config(recipe.generate, seed))
     # Alone, as each pilot takes all processors.
-    share = measurement.processor_share()
+    share = processor_share()
     spp, pilot = job.config.queries.spp, forecast(job, seconds=1.0)
     conditions = conditions_of(job, folder, seconds)
     found = Measurements(conditions, MeasurementFolder(folder, conditions), Runner(), share=share)
@@ -128,6 +123,6 @@ def plan_study(recipe: Recipe, folder: Path, *, seconds: float, seed: int | None
         least_run,
         least or LEAST_SECONDS,
         generator,
-        share,
+        found.share,
         found.overhead,
     )

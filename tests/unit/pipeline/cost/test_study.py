@@ -20,6 +20,7 @@ from mbtf_core.errors import InputError, PartialError
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item, Result, packed, run_task
 from mbtf_core.stats import Estimate
+from mbtf_pipeline.cost import measurement, schedule
 from mbtf_pipeline.cost import study as module
 from mbtf_pipeline.cost.generator import GeneratorBenchmark, GeneratorConfiguration
 from mbtf_pipeline.cost.measurement import (
@@ -29,7 +30,7 @@ from mbtf_pipeline.cost.measurement import (
     pareto_front,
 )
 from mbtf_pipeline.cost.runs import MOST_SEEDS, TEST, Run
-from mbtf_pipeline.cost.study import Measurements
+from mbtf_pipeline.cost.schedule import Measurements
 from mbtf_pipeline.recipe import load_recipe
 from mbtf_pipeline.stages import machine
 
@@ -152,11 +153,11 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> FakeRuns:
     configuration = GeneratorConfiguration("paths", "uniform", "4", {"queries.spp": 4}, None)
     monkeypatch.setattr(module, "time", clock)
     monkeypatch.setattr(Run, "measure", measure)
-    monkeypatch.setattr(module, "generator_configurations", lambda benchmark: [configuration])
+    monkeypatch.setattr(schedule, "generator_configurations", lambda benchmark: [configuration])
     monkeypatch.setattr(GeneratorBenchmark, "check_variation", lambda benchmark: None)
     planned = [replace(run, seed=seed) for run in RUNS for seed in range(2)]
-    monkeypatch.setattr(module, "planned_runs", lambda *_: planned)
-    monkeypatch.setattr(module, "path_seconds", lambda *_: 1e-9)
+    monkeypatch.setattr(schedule, "planned_runs", lambda *_: planned)
+    monkeypatch.setattr(schedule, "path_seconds", lambda *_: 1e-9)
     return found
 
 
@@ -183,13 +184,13 @@ def test_a_study_keeps_its_time_and_resumes(fake: FakeRuns, tmp_path: Path) -> N
     assert "run, neumip, short, about 1:12" in [note for _, note in shown]
     assert shown[-1][0] == 1.0
     assert [share for share, _ in shown] == sorted(share for share, _ in shown)
-    assert [m.details.get("seeds") for m in first.measurements] == [None, 2, 1]
+    assert [m.details.get("seeds") for m in first.measurements] == [None, 1, 2]
     assert sum(r.planned_seconds(0.0) for r in runs) <= 190.0
     assert first.skipped == ["run, neumip, long"]
     # Only what is missing is measured: the second seed of the last run.
     second, runs = measured(seconds=190.0)
     assert [(r.name, r.seed) for r in runs] == [("m", 1)]
-    assert second.measurements[1].error.value == first.measurements[1].error.value
+    assert second.measurements[2].error.value == first.measurements[2].error.value
     # Refining takes its own time, for further seeds.
     _, runs = measured(seconds=190.0, refine=3600.0)
     assert {r.seed for r in runs} >= {2}
@@ -243,6 +244,21 @@ def test_a_slow_first_run_makes_the_others_fewer_and_longer(monkeypatch: pytest.
     assert len(slow) < len(fast)
     # The excess of training is none of the time besides: 6 s are planned, of which 2.1 s generate.
     assert found.overhead == pytest.approx(40.0 - 20.0 - 2.1, abs=0.1)
+
+
+def test_a_study_expects_slower_runs_where_other_work_left_less(
+    fake: FakeRuns, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As its dry run does, before a run is measured."""
+    recipe, said = load_recipe(RECIPE, []), list[str]()
+    for share in (1.0, 0.25):
+        monkeypatch.setattr(measurement, "processor_share", lambda share=share: share)
+        module.run_study(
+            recipe, tmp_path / f"{share}", seconds=190.0, progress=lambda spent, note: said.append(note)
+        )
+    first = [note for note in said if note.startswith("run, neumip, short, about")]
+    # 60 s, and 12 s or 48 s besides.
+    assert [note.rpartition(" ")[2] for note in first] == ["1:12", "1:48"]
 
 
 def test_other_seeds_and_materials_are_not_mixed(fake: FakeRuns, tmp_path: Path) -> None:
