@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import inspect
 import re
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
 from functools import cache
@@ -64,14 +65,29 @@ class _Checked(type):
 
     def __call__(cls, *given: Any, **named: Any) -> Any:
         operation = cast("type[Operation]", cls)
+        signature = inspect.signature(operation.__init__)
         try:
-            found = inspect.signature(operation.__init__).bind(None, *given, **named).arguments
+            found = signature.bind(None, *given, **named).arguments
             for name in _lists_of(operation.kind()):
                 if isinstance(found[name], str):
                     raise TypeError(f"'{name}' is one name, not several: ('{found[name]}',)")
         except TypeError as error:
-            raise TypeError(f"{error}; the arguments are {operation.signature()}") from None
-        return super().__call__(*given, **named)
+            known = list(signature.parameters)
+            hint = next((suggest_name(name, known) for name in named if name not in known), "")
+            text = f"{error}; {hint and f'{hint} '}the arguments are {operation.signature()}"
+            raise TypeError(text) from None
+        made = super().__call__(*given, **named)
+        caller = sys._getframe(1)
+        object.__setattr__(made, "made_at", (caller.f_code.co_filename, caller.f_lineno))
+        return made
+
+
+class OperationError(ValueError):
+    """An operation of a list does not fit those before it; `made_at` is that of the operation."""
+
+    def __init__(self, what: str, made_at: tuple[str, int]) -> None:
+        super().__init__(what)
+        self.made_at = made_at
 
 
 @dataclass(frozen=True)
@@ -84,6 +100,8 @@ class Operation(metaclass=_Checked):
         Name of the value that it computes.
     """
 
+    # File and line of the call that made it; empty for one that is read from a material.
+    made_at: ClassVar[tuple[str, int]] = ("", 0)
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid", allow_inf_nan=False)
 
     output: str
@@ -265,14 +283,18 @@ def sizes_of(operations: Sequence[Operation]) -> dict[str, int]:
 
     Raises
     ------
-    ValueError : an operation reads an unknown value, or one of a wrong size, or a value is computed twice
+    OperationError : one reads an unknown value, or one of a wrong size, or computes a value again
+    ValueError : the last one gives no color
     """
     sizes = dict(INPUTS)
     for operation in operations:
-        found = operation.results(input_sizes(operation, sizes))
-        again = next((name for name in found if name in sizes), None)
-        if again is not None:
-            raise ValueError(f"'{again}' is computed twice")
+        try:
+            found = operation.results(input_sizes(operation, sizes))
+            again = next((name for name in found if name in sizes), None)
+            if again is not None:
+                raise ValueError(f"'{again}' is computed twice")
+        except ValueError as error:
+            raise OperationError(str(error), operation.made_at) from None
         sizes |= found
     if not operations or sizes[operations[-1].output] != 3:
         raise ValueError("the last operation gives no color")
@@ -285,7 +307,9 @@ def input_sizes(operation: Operation, sizes: Mapping[str, int]) -> list[int]:
     for reference in operation.inputs():
         name, part = parse(reference)
         if name not in sizes:
-            raise ValueError(f"{operation.kind()} '{operation.output}' reads '{name}', which is not computed")
+            hint = suggest_name(name, list(sizes))
+            what = f"{operation.kind()} '{operation.output}' reads '{name}', which is not computed"
+            raise ValueError(what + (hint and f"; {hint}"))
         size = len(range(sizes[name])[part])
         if size == 0 or (part.stop or 0) > sizes[name]:
             raise ValueError(f"'{reference}' is beyond the {sizes[name]} numbers of '{name}'")

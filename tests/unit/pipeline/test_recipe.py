@@ -6,16 +6,20 @@ import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from mbtf_core.app.console import Console, run
 from mbtf_core.errors import InputError
+from mbtf_gen.generation import run as generation
+from mbtf_gen.job import Job
 from mbtf_pipeline.cli.app import app
 from mbtf_pipeline.recipe import load_recipe, read_resolved, write_recipe
 from mbtf_pipeline.run import _material_inputs, _RecipeRun, survey
-from mbtf_pipeline.stages import run_stages
+from mbtf_pipeline.stages import NOT_RUN, Decision, run_stages
 
 HEAD = """\
 name: small
@@ -118,6 +122,24 @@ def test_every_path_is_relative_to_the_recipe(tmp_path: Path, monkeypatch: pytes
         assert (fit["neumip"].model, fit["neumip"].init_from) == ("neumip", "s3://bucket/a")
         assert fit["relief"].decoder == str(tmp_path.parent / "b")
         assert fit["rainer2020"].training.materials == (f"{tmp_path}/c", f"{tmp_path}/d")
+
+
+def test_the_material_of_two_data_sets_is_announced_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its warnings, too."""
+    recipe = load_recipe(written(tmp_path, HEAD + "fit: {svbrdf: , hierarchical: }\n"))
+    announced, generated = list[Job](), list[Job]()
+
+    def generate(job: Job, *_: Any, **__: Any) -> Any:
+        generated.append(job)
+        return SimpleNamespace(shard_seconds=1.0)
+
+    monkeypatch.setattr(Job, "announce", lambda job: announced.append(job))
+    monkeypatch.setattr(generation, "generate", generate)
+    for stage in _RecipeRun(recipe, tmp_path / "run", Console(quiet=True)).stages({})[:2]:
+        stage.run(Decision(NOT_RUN))
+    assert (len(announced), len(generated)) == (1, 2)
 
 
 def test_an_assigned_material_is_relative_to_the_current_folder(
