@@ -121,11 +121,11 @@ def test_workers_begin_what_fits_into_the_time_of_all(measured: list[tuple[str, 
     found = Measurements(conditions(), MemoryStore(), Workers())  # type: ignore[arg-type]
     found.path_seconds = 1e-9
     test = 1e-9 * TEST[0] * TEST[1]
-    # Two workers for 24 s; a run takes 9 or 5 s of training and, until one is measured, 12 s besides.
+    # Two workers for 18 s; a run takes 9 or 5 s of training and, until one is measured, 7 s besides.
     runs = [run(3000, "long", 9.0), run(2000, "one"), run(2000, "two")]
-    assert found.expected_seconds(runs[0]) == pytest.approx(21.0 + test, abs=1e-4)
+    assert found.expected_seconds(runs[0]) == pytest.approx(16.0 + test, abs=1e-4)
     planned = [replace(run, seed=seed) for run in runs for seed in range(2)]
-    found.measure_runs(planned, lambda run: found.fits(run, 24.0))
+    found.measure_runs(planned, lambda run: found.fits(run, 18.0))
     assert sorted(measured) == [("long", 0), ("long", 1)]
     # The test set is there, and the runs took 15 s beyond their plan.
     assert found.expected_seconds(runs[1]) == pytest.approx(5.0 + 15.0, abs=1e-4)
@@ -178,10 +178,10 @@ def test_a_study_keeps_its_time_and_resumes(fake: FakeRuns, tmp_path: Path) -> N
     # The shortest study that forecasts, by the runs that it takes, of which the generator gets a share; the
     # time of the next run.
     assert "3 lengths take about 275min" in said[-1]
-    # Runs take 1 s besides, not the 12 s that were expected.
+    # Runs take 1 s besides, not the 7 s that were expected.
     assert "--time 273min" in first.more
     assert first.description["taken"] == sum(r.planned_seconds(0.0) for r in runs)
-    assert "run, neumip, short, about 1:12" in [note for _, note in shown]
+    assert "run, neumip, short, about 1:07" in [note for _, note in shown]
     assert shown[-1][0] == 1.0
     assert [share for share, _ in shown] == sorted(share for share, _ in shown)
     assert [m.details.get("seeds") for m in first.measurements] == [None, 1, 2]
@@ -257,8 +257,8 @@ def test_a_study_expects_slower_runs_where_other_work_left_less(
             recipe, tmp_path / f"{share}", seconds=190.0, progress=lambda spent, note: said.append(note)
         )
     first = [note for note in said if note.startswith("run, neumip, short, about")]
-    # 60 s, and 12 s or 48 s besides.
-    assert [note.rpartition(" ")[2] for note in first] == ["1:12", "1:48"]
+    # 60 s, and 7 s or 28 s besides.
+    assert [note.rpartition(" ")[2] for note in first] == ["1:07", "1:28"]
 
 
 def test_other_seeds_and_materials_are_not_mixed(fake: FakeRuns, tmp_path: Path) -> None:
