@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -52,6 +53,11 @@ Kinds = Annotated[
     AfterValidator(distinct),
     AfterValidator(partial(sorted, reverse=True)),
 ]
+# Where a recipe of any kind has paths: its own, those of its layers, and those of their fits.
+_PATH = re.compile(
+    r"output|library/\d+|materials/[^/]+|((base|quick|(materials|variants)/[^/]+)/)?(generate/material|(each_fit"
+    r"|fit(/(?!network/)[^/]+)?)/(model|init_from|decoder|training/materials/\d+))"
+)
 # Texels of the finest level that a pixel covers at the target, in the pictures of a comparison.
 PIXEL_TEXELS = (1.0, 4.0)
 
@@ -165,57 +171,31 @@ class Recipe(Settings):
         return self.report.title or self.name
 
 
-def _paths(data: Any) -> Iterator[tuple[Any, Any]]:
-    """(mapping or list, key) of every path in the data of a recipe of any kind."""
-
-    def of_fit(options: Any) -> Iterator[tuple[Any, Any]]:
-        if isinstance(options, Mapping):
-            yield from ((options, key) for key in ("model", "init_from", "decoder"))
-            training = options.get("training")
-            others = training.get("materials") if isinstance(training, Mapping) else None
-            if isinstance(others, list):
-                yield from ((others, number) for number in range(len(others)))
-
-    yield data, "output"
-    for name in ("library", "materials"):
-        listed = data.get(name)
-        if isinstance(listed, list | Mapping):
-            yield from (
-                (listed, key) for key in (listed if isinstance(listed, Mapping) else range(len(listed)))
-            )
-    several = (data.get(name) for name in ("materials", "variants"))
-    inner = (layer for layers in several if isinstance(layers, Mapping) for layer in layers.values())
-    for layer in (data, data.get("base"), data.get("quick"), *inner):
-        if not isinstance(layer, Mapping):
-            continue
-        if isinstance(layer.get("generate"), Mapping):
-            yield layer["generate"], "material"
-        yield from of_fit(layer.get("each_fit"))
-        fits = layer.get("fit")
-        if isinstance(fits, Mapping):
-            for options in [fits] if _is_single(fits) else fits.values():
-                yield from of_fit(options)
+def texts_of(data: Any, at: str = "") -> Iterator[tuple[Any, Any, str]]:
+    """(mapping or list, key, name with slashes) of every text in plain data."""
+    for key, value in data.items() if isinstance(data, Mapping) else enumerate(data):
+        if isinstance(value, Mapping | list):
+            yield from texts_of(value, f"{at}{key}/")
+        elif isinstance(value, str):
+            yield data, key, f"{at}{key}"
 
 
 def _move_paths(data: Any, moved: Callable[[str], object]) -> None:
-    """Replace every path in the data of a recipe; names of models and URLs are none."""
+    """Replace every path in the data of a recipe; URLs and names of installed models are none."""
     changes = []
-    for container, key in _paths(data):
-        # Aliases of YAML share their containers: nothing is replaced twice.
-        text = container.get(key) if isinstance(container, Mapping) else container[key]
-        if not isinstance(text, str) or split_url(text) is not None:
-            continue
-        if key != "model":
-            changes.append((container, key, str(moved(text))))
-        elif (given := file_and_class(text)) is not None:
-            changes.append((container, key, f"{moved(given[0])}:{given[1]}"))
+    for container, key, name in texts_of(data):
+        file, cls = container[key], ""
+        if name.endswith("/model"):
+            file, cls = file_and_class(file) or ("", "")
+        if _PATH.fullmatch(name) and file and split_url(file) is None:
+            changes.append((container, key, f"{moved(file)}{cls and f':{cls}'}"))
+    # Afterwards, as aliases of YAML are one container.
     for container, key, text in changes:
         container[key] = text
 
 
 def read_recipe(path: Path) -> Any:
-    """Data of a recipe of any kind. Its paths, which are relative to its file, become relative to the current
-    folder.
+    """Data of a recipe of any kind; its paths, relative to its file, are made relative to the current folder.
 
     Raises
     ------
@@ -261,10 +241,9 @@ def load_recipe(
     assigned = not keys.isdisjoint(("generate", "generate.material"))
     material = named_file(Path(), recipe.generate.material)
     if not material.exists():
-        data = {} if assigned else read_yaml(path)
-        line = line_of(data, ("generate", "material"))
+        line = None if assigned else line_of(read_yaml(path), ("generate", "material"))
         raise InputError(
-            f"material '{material if assigned else data['generate']['material']}' does not exist",
+            f"material '{material}' does not exist",
             where="--set generate.material" if assigned else f"{path}:{line}" if line else path,
             hint=f"searched for {os.path.abspath(material)}"
             + ("" if assigned else "; paths in a recipe are relative to its file"),

@@ -157,8 +157,7 @@ class _RecipeRun:
         from mbtf_gen.job import Job
 
         job = Job.load(data.config)
-        if data.stage == GENERATE_STAGE:
-            # Data of another layout are of the same material.
+        if data.stage == GENERATE_STAGE:  # that of another layout is of the same material
             job.announce()
         shards = self.folder / data.sub
         for path in decision.changed_files:

@@ -37,9 +37,6 @@ QUERY = tuple(CONFORMANCE)[:-1]
 _KEY = "mbtf"
 # Most tensors of a file, each of which takes a call.
 _MOST_TENSORS = 10_000
-# Depth to which a folder is searched for materials, and how many of them are named: a library has them in
-# NAME/fits/FIT.
-_DEPTH, _NAMED = 3, 5
 # Hint for a damaged material.
 AGAIN = "copy the folder again, or fit again"
 
@@ -116,9 +113,10 @@ def read_description(folder: Path) -> tuple[dict[str, Any], Path]:
         raise InputError("no such folder", where=folder, hint=suggest_path(folder, Path.is_dir))
     path = folder / DESCRIPTION_NAME
     if not path.exists():
-        hint = "make a material with: mbtf-fit SHARDS -o FOLDER"
-        if inside := _materials_in(folder):
-            hint = f"materials in it: {', '.join(inside[:_NAMED])}{', …' * (len(inside) > _NAMED)}"
+        # A library has them in NAME/fits/FIT.
+        inside = [str(p.parent) for k in (1, 2, 3) for p in sorted(folder.glob("*/" * k + DESCRIPTION_NAME))]
+        hint = f"materials in it: {', '.join(inside[:5])}{', …' * (len(inside) > 5)}"
+        hint = hint if inside else "make a material with: mbtf-fit SHARDS -o FOLDER"
         raise InputError(f"no {DESCRIPTION_NAME} in it", where=folder, hint=hint)
     description = read_json(path, AGAIN)
     if description.get("format") != FORMAT_NAME:
@@ -126,12 +124,6 @@ def read_description(folder: Path) -> tuple[dict[str, Any], Path]:
     check_schema(description, SCHEMA_VERSION, path, "fit it again with this version of mbtf-fit")
     check_document(_Description, description, path, AGAIN)
     return description, check_digest(folder / WEIGHTS_NAME, description["weights"])
-
-
-def _materials_in(folder: Path) -> list[str]:
-    """Materials in a folder, such as that of a run or of a library, and in its folders."""
-    found = (path for depth in range(1, _DEPTH + 1) for path in folder.glob("*/" * depth + DESCRIPTION_NAME))
-    return sorted(str(path.parent) for path in found)
 
 
 def check_digest(path: Path, stated: Mapping[str, Any]) -> Path:

@@ -23,7 +23,7 @@ from mbtf_core.errors import InputError, MbtfError, reason
 from mbtf_core.paths import refuse_special, suggest_name
 from mbtf_fit.models import FOREIGN, file_and_class
 from mbtf_fit.models.model import Model
-from mbtf_fit.ops import Operation, OperationError
+from mbtf_fit.ops import Operation
 from mbtf_fit.sections import NetworkSection
 
 if TYPE_CHECKING:
@@ -80,8 +80,7 @@ def model_class(name: str) -> type[Model]:
         try:
             text = path.read_text(encoding="utf-8")
         except FileNotFoundError:
-            hint = f"searched for {path.absolute()}"
-            raise InputError("no such file", where=file, hint=hint) from None
+            raise InputError("no such file", where=file, hint=f"searched for {path.absolute()}") from None
         found = vars(_run(path, text))
     model = found.get(wanted)
     if not (isinstance(model, type) and issubclass(model, Model) and model is not Model):
@@ -120,32 +119,26 @@ def _faults_of(name: str) -> Iterator[None]:
             raise
         path, _ = file_and_class(name) or ("", name)
         places = [(frame.filename, frame.lineno) for frame in extract_tb(error.__traceback__)]
+        what, hint = reason(error), _suggest(error) or "correct the file; --debug shows the traceback"
         if isinstance(error, SyntaxError):
+            what = reason(error.msg)
             places.append((error.filename or "", error.lineno))
-        elif isinstance(error, OperationError):
-            places.append(error.made_at)
         lines = [line for file, line in places if file == path]
         where = f"{path}:{lines[-1]}" if lines else path
-        what = reason(error.msg if isinstance(error, SyntaxError) else error)
-        hint = _suggest(error) or "correct the file; --debug shows the traceback"
         raise InputError(f"{type(error).__name__}: {what}", where=where, hint=hint) from error
 
 
 def _suggest(error: BaseException) -> str:
-    """``did you mean 'Lookup'?`` for a name that an import, an object or a file does not have."""
-    name: str | None = getattr(error, "name", None)
+    """``did you mean 'Lookup'?`` for a name that a module, an object or a file does not have."""
+    name, known = getattr(error, "name", None) or "", dir(getattr(error, "obj", None))
     if isinstance(error, ImportError):
         # Python 3.12 has it as `name_from`.
         found = re.search(r"cannot import name '(\w+)'", str(error))
-        name, known = found and found[1], dir(sys.modules.get(error.name or ""))
-    elif isinstance(error, AttributeError):
-        known = dir(error.obj)
-    elif isinstance(error, NameError) and (frames := list(walk_tb(error.__traceback__))):
-        frame = frames[-1][0]
+        name, known = found[1] if found else "", dir(sys.modules.get(name))
+    elif isinstance(error, NameError):
+        frame = list(walk_tb(error.__traceback__))[-1][0]
         known = [*frame.f_locals, *frame.f_globals, *dir(builtins)]
-    else:
-        return ""
-    return suggest_name(name, [each for each in known if not each.startswith("_")]) if name else ""
+    return suggest_name(name, known)
 
 
 def operations_of(name: str, lattice: Lattice, network: NetworkSection) -> list[Operation]:

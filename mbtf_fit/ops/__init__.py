@@ -13,14 +13,7 @@ from mbtf_fit.ops.network import (
     Stereographic,
     ToFrame,
 )
-from mbtf_fit.ops.operation import (
-    Backend,
-    Operation,
-    OperationError,
-    read_operations,
-    sizes_of,
-    stages,
-)
+from mbtf_fit.ops.operation import Backend, Operation, read_operations, sizes_of, stages
 from mbtf_fit.ops.shade import Lobe, Shade
 from mbtf_fit.ops.value import Calibrate, DivideByCosine, Gate, Matrix, Product, Standardize, Transform
 
@@ -40,7 +33,6 @@ __all__ = [
     "Network",
     "Offset",
     "Operation",
-    "OperationError",
     "Position",
     "Product",
     "Rotate",

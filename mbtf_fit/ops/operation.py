@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import inspect
 import re
-import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
 from functools import cache
@@ -76,18 +75,7 @@ class _Checked(type):
             hint = next((suggest_name(name, known) for name in named if name not in known), "")
             text = f"{error}; {hint and f'{hint} '}the arguments are {operation.signature()}"
             raise TypeError(text) from None
-        made = super().__call__(*given, **named)
-        caller = sys._getframe(1)
-        object.__setattr__(made, "made_at", (caller.f_code.co_filename, caller.f_lineno))
-        return made
-
-
-class OperationError(ValueError):
-    """An operation of a list does not fit those before it; `made_at` is that of the operation."""
-
-    def __init__(self, what: str, made_at: tuple[str, int]) -> None:
-        super().__init__(what)
-        self.made_at = made_at
+        return super().__call__(*given, **named)
 
 
 @dataclass(frozen=True)
@@ -100,8 +88,6 @@ class Operation(metaclass=_Checked):
         Name of the value that it computes.
     """
 
-    # File and line of the call that made it; empty for one that is read from a material.
-    made_at: ClassVar[tuple[str, int]] = ("", 0)
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid", allow_inf_nan=False)
 
     output: str
@@ -283,18 +269,14 @@ def sizes_of(operations: Sequence[Operation]) -> dict[str, int]:
 
     Raises
     ------
-    OperationError : one reads an unknown value, or one of a wrong size, or computes a value again
-    ValueError : the last one gives no color
+    ValueError : an operation reads an unknown value, or one of a wrong size, or a value is computed twice
     """
     sizes = dict(INPUTS)
     for operation in operations:
-        try:
-            found = operation.results(input_sizes(operation, sizes))
-            again = next((name for name in found if name in sizes), None)
-            if again is not None:
-                raise ValueError(f"'{again}' is computed twice")
-        except ValueError as error:
-            raise OperationError(str(error), operation.made_at) from None
+        found = operation.results(input_sizes(operation, sizes))
+        again = next((name for name in found if name in sizes), None)
+        if again is not None:
+            raise ValueError(f"'{again}' is computed twice")
         sizes |= found
     if not operations or sizes[operations[-1].output] != 3:
         raise ValueError("the last operation gives no color")

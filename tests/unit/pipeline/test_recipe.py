@@ -191,8 +191,8 @@ def test_a_missing_material_is_one_clear_line(tmp_path: Path, capsys: pytest.Cap
     assert run(app, ["run", str(path), "-o", str(tmp_path / "out")]) == 3
     out, err = capsys.readouterr()
     first, second = err.splitlines()
-    assert first == f"error: {path}:3: material '../nowhere/height.exr' does not exist"
     searched = os.path.abspath(tmp_path / "../nowhere/height.exr")
+    assert first == f"error: {path}:3: material '{searched}' does not exist"
     assert second.strip().startswith(f"searched for {searched}; ")
     assert out == ""
     assert not (tmp_path / "out").exists()
