@@ -245,8 +245,7 @@ def load_recipe(
         raise InputError(
             f"material '{material}' does not exist",
             where="--set generate.material" if assigned else f"{path}:{line}" if line else path,
-            hint=f"searched for {os.path.abspath(material)}"
-            + ("" if assigned else "; paths in a recipe are relative to its file"),
+            hint=f"searched for {os.path.abspath(material)}",
         )
     generate = recipe.generate.model_copy(update={"material": os.path.normpath(material)})
     return recipe.model_copy(update={"generate": generate})

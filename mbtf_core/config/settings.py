@@ -35,6 +35,7 @@ else:
     ModelMetaclass = type(BaseModel)
 
 _COMMAND_LINE = "command line"
+Read = Callable[[Path], Any]
 
 
 def parts_of(annotation: Any, *, containers: bool = True) -> list[Any]:
@@ -290,11 +291,8 @@ def _contradiction(model: type[Settings], data: Mapping[str, Any]) -> tuple[str,
     return next(((key, other) for key, other in found.items() if other in found), None)
 
 
-def explicit_options(
-    file: Path | None, assignments: Sequence[str], read: Callable[[Path], Any] = read_yaml
-) -> dict[str, Any]:
-    """Options of a configuration file, as it is read, and of ``a.b=c``, nested; single values of the latter
-    as text.
+def explicit_options(file: Path | None, assignments: Sequence[str], read: Read = read_yaml) -> dict[str, Any]:
+    """Options of a configuration file and of ``a.b=c``, nested; single values of the latter as text.
 
     Raises
     ------
@@ -317,7 +315,7 @@ def resolve(
     assignments: Sequence[str] = (),
     flags: Mapping[str, Any] | None = None,
     spelled: Mapping[str, str] | None = None,
-    read: Callable[[Path], Any] = read_yaml,
+    read: Read = read_yaml,
 ) -> S:
     """Resolved configuration: defaults, then the file, presets, ``a.b=c`` assignments, and flags.
 

@@ -107,22 +107,12 @@ def plan_study(recipe: Recipe, folder: Path, *, seconds: float, seed: int | None
     if record is not None:
         setup = record.get("setup_seconds", setup)
     planned = found.plan_runs(seconds, spp)
-    least, least_run = found.least_seconds(spp, setup), found.least_run_seconds(spp, setup)
+    least = found.least_run_seconds(spp, setup), found.least_seconds(spp, setup) or LEAST_SECONDS
     measured = [run for run in planned if found.recall(run)]
     runs, spent = found.fitting(planned, setup + generator_seconds(seconds), seconds)
     times = (run.planned_seconds(found.path_seconds, found.step_seconds) for run in (*measured, *runs))
     longest = max(times, default=0.0) + found.overhead
     labels = [f"{run.label}: {run.queries:,} queries × {spp} paths" for run in runs]
     generator = seconds >= _COMPARISONS * LEAST_SECONDS
-    return StudyPlan(
-        labels,
-        len(measured),
-        spent,
-        disk_bytes(runs),
-        longest,
-        least_run,
-        least or LEAST_SECONDS,
-        generator,
-        found.share,
-        found.overhead,
-    )
+    size, share = disk_bytes(runs), found.share
+    return StudyPlan(labels, len(measured), spent, size, longest, *least, generator, share, found.overhead)

@@ -187,9 +187,8 @@ class Measurements:
 
     def least_run_seconds(self, spp: int, setup: float) -> float | None:
         """Likewise of a study that measures one run; None where any is measured."""
-        return (
-            None if self._besides else self._study_seconds(planned_runs(0.0, spp, self.path_seconds), setup)
-        )
+        runs = planned_runs(0.0, spp, self.path_seconds)
+        return None if self._besides else self._study_seconds(runs, setup)
 
     def _study_seconds(self, runs: Sequence[Run], setup: float) -> float:
         """Seconds of a study that has time for some runs, and makes the test set anew."""
