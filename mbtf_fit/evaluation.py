@@ -65,11 +65,11 @@ def split_errors(
     dict
         Plain data for JSON. ``mse`` E[(p-a)(p-b)] and ``variance`` of the values, in 1/sr², and their ratio
         ``unexplained`` (1 - R²: 0 is exact, 1 as good as the mean value), each an estimate with ``value``,
-        ``error`` and ``n``; ``color``: what is unexplained of the differences between channels, a small part
-        of all; ``ten_largest``: share of the ten largest squared errors in their sum; also by
-        nearest level (``levels``) and by band of the smaller cosine of light and view (``elevations``).
-        ``psnr``: its peak is the value that the exposure shows as white; ``visibility``: in words;
-        ``includes_noise``: whether the data have one value per query.
+        ``error`` and ``n``, also by nearest level (``levels``) and by band of the smaller cosine of light and
+        view (``elevations``); ``color``: what is unexplained of the differences between channels, a small
+        part of all; ``ten_largest``: share of the ten largest squared errors in their sum; ``psnr``: its peak
+        is the value that the exposure shows as white; ``visibility``: in words; ``includes_noise``: whether
+        the data have one value per query.
     """
     if len(queries) == 0:
         return None

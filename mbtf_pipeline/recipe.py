@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -12,11 +13,12 @@ from pydantic import AfterValidator, BeforeValidator, Field
 
 from mbtf_core.app.options import Quality
 from mbtf_core.color import ALBEDO_EXPOSURE
-from mbtf_core.config.settings import Settings, build, explicit_options, resolve
+from mbtf_core.config.settings import Settings, build, distinct, explicit_options, resolve
 from mbtf_core.config.yaml_file import dump_yaml, line_of, read_yaml
 from mbtf_core.errors import InputError
-from mbtf_core.paths import named_file
+from mbtf_core.paths import named_file, split_url
 from mbtf_fit.config import DEFAULT_MODEL, STORED, FitConfig, fitter_options
+from mbtf_fit.models import file_and_class
 from mbtf_gen.config.generator import RESOLUTION, GeneratorConfig, Paths, generator_options
 from mbtf_gen.config.pictures import EXPOSURE, Direction, Exposure, TilesAcross
 
@@ -43,13 +45,6 @@ class SceneView(Direction):
     elevation: float = Field(ge=FIELD_OF_VIEW * 0.7 + 2, le=90, description="degrees above the plane")
 
 
-def distinct(values: Sequence[Any]) -> Sequence[Any]:
-    """The same values; a ValueError if two are equal."""
-    if any(value in values[:i] for i, value in enumerate(values)):
-        raise ValueError("contains the same entry twice")
-    return values
-
-
 Views = Annotated[list[SceneView], Field(min_length=1), AfterValidator(distinct)]
 # The main kind, "query", comes first.
 Kinds = Annotated[
@@ -58,6 +53,11 @@ Kinds = Annotated[
     AfterValidator(distinct),
     AfterValidator(partial(sorted, reverse=True)),
 ]
+# Where a recipe of any kind has paths: its own, those of its layers, and those of their fits.
+_PATH = re.compile(
+    r"output|library/\d+|materials/[^/]+|((base|quick|(materials|variants)/[^/]+)/)?(generate/material|(each_fit"
+    r"|fit(/(?!network/)[^/]+)?)/(model|init_from|decoder|training/materials/\d+))"
+)
 # Texels of the finest level that a pixel covers at the target, in the pictures of a comparison.
 PIXEL_TEXELS = (1.0, 4.0)
 
@@ -171,12 +171,47 @@ class Recipe(Settings):
         return self.report.title or self.name
 
 
+def texts_of(data: Any, at: str = "") -> Iterator[tuple[Any, Any, str]]:
+    """(mapping or list, key, name with slashes) of every text in plain data."""
+    for key, value in data.items() if isinstance(data, Mapping) else enumerate(data):
+        if isinstance(value, Mapping | list):
+            yield from texts_of(value, f"{at}{key}/")
+        elif isinstance(value, str):
+            yield data, key, f"{at}{key}"
+
+
+def _move_paths(data: Any, moved: Callable[[str], object]) -> None:
+    """Replace every path in the data of a recipe; URLs and names of installed models are none."""
+    changes = []
+    for container, key, name in texts_of(data):
+        file, cls = container[key], ""
+        if name.endswith("/model"):
+            file, cls = file_and_class(file) or ("", "")
+        if _PATH.fullmatch(name) and file and split_url(file) is None:
+            changes.append((container, key, f"{moved(file)}{cls and f':{cls}'}"))
+    # Afterwards, as aliases of YAML are one container.
+    for container, key, text in changes:
+        container[key] = text
+
+
+def read_recipe(path: Path) -> Any:
+    """Data of a recipe of any kind; its paths, relative to its file, are made relative to the current folder.
+
+    Raises
+    ------
+    InputError : the file cannot be read
+    """
+    data = read_yaml(path)
+    _move_paths(data, partial(named_file, path.parent))
+    return data
+
+
 def load_recipe(
     path: Path, assignments: Sequence[str] = (), presets: Mapping[str, Any] | None = None
 ) -> Recipe:
     """Read a recipe.
 
-    The path of a material in the file is relative to the file, that in an assignment to the current folder.
+    Paths in the file are relative to the file, those in an assignment to the current folder.
 
     Parameters
     ----------
@@ -190,7 +225,7 @@ def load_recipe(
     Returns
     -------
     Recipe
-        With the material's path relative to the current folder.
+        With paths relative to the current folder.
 
     Raises
     ------
@@ -201,19 +236,16 @@ def load_recipe(
     """
     if path.is_dir():
         raise InputError("is a folder, not a recipe", where=path, hint="give a YAML file in it")
-    recipe = resolve(Recipe, file=path, presets=presets, assignments=assignments)
-    assigned = any(a.partition("=")[0].strip() == "generate.material" for a in assignments)
-    written = recipe.generate.material
-    # By its words, as it is used below: folders of the path may be links.
-    material = named_file(Path() if assigned else path.parent, written)
-    material = material if assigned else Path(os.path.normpath(material))
+    recipe = resolve(Recipe, file=path, presets=presets, assignments=assignments, read=read_recipe)
+    keys = {assignment.partition("=")[0].strip() for assignment in assignments}
+    assigned = not keys.isdisjoint(("generate", "generate.material"))
+    material = named_file(Path(), recipe.generate.material)
     if not material.exists():
         line = None if assigned else line_of(read_yaml(path), ("generate", "material"))
         raise InputError(
-            f"material '{written}' does not exist",
+            f"material '{material}' does not exist",
             where="--set generate.material" if assigned else f"{path}:{line}" if line else path,
-            hint=f"searched for {os.path.abspath(material)}"
-            + ("" if assigned else f"; edit 'generate.material' in {path}"),
+            hint=f"searched for {os.path.abspath(material)}",
         )
     generate = recipe.generate.model_copy(update={"material": os.path.normpath(material)})
     return recipe.model_copy(update={"generate": generate})
@@ -235,7 +267,7 @@ def quality_options(
     """
     if quality is None:
         return {}
-    given = explicit_options(path, assignments)
+    given = explicit_options(path, assignments, read_recipe)
     generate, fits = given.get("generate"), given.get("fit")
     if isinstance(fits, Mapping) and not _is_single(fits):
         own = {f"fit.{name}": {"model": name, **(options or {})} for name, options in fits.items()}
@@ -282,7 +314,7 @@ def write_recipe(recipe: Recipe, folder: Path, *, overwrite: bool = False) -> No
     from mbtf_core.files.editable import write_document
 
     data = recipe.model_dump(mode="json")
-    data["generate"]["material"] = os.path.relpath(recipe.generate.material, folder)
+    _move_paths(data, partial(os.path.relpath, start=folder))
     write_document(folder / RECIPE_NAME, dump_yaml(data), overwrite=overwrite)
 
 
@@ -298,4 +330,4 @@ def read_resolved(folder: Path) -> Recipe:
     if not path.exists():
         hint = "create one: mbtf-pipeline run RECIPE -o FOLDER"
         raise InputError(f"contains no run (no {RECIPE_NAME})", where=folder, hint=hint)
-    return build(Recipe, read_yaml(path), source=str(path), context=STORED)
+    return build(Recipe, read_recipe(path), source=str(path), context=STORED)

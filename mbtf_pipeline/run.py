@@ -157,7 +157,8 @@ class _RecipeRun:
         from mbtf_gen.job import Job
 
         job = Job.load(data.config)
-        job.announce()
+        if data.stage == GENERATE_STAGE:  # that of another layout is of the same material
+            job.announce()
         shards = self.folder / data.sub
         for path in decision.changed_files:
             if path.name != MANIFEST_NAME:

@@ -10,7 +10,7 @@ import os
 import re
 import types
 import typing
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, TypeVar, Union
 
@@ -35,6 +35,7 @@ else:
     ModelMetaclass = type(BaseModel)
 
 _COMMAND_LINE = "command line"
+Read = Callable[[Path], Any]
 
 
 def parts_of(annotation: Any, *, containers: bool = True) -> list[Any]:
@@ -132,6 +133,13 @@ def _separated(name: str) -> str:
 
 # The same, relative to the current folder.
 LocalName = Annotated[FileName, AfterValidator(_separated)]
+
+
+def distinct(values: list[Any]) -> list[Any]:
+    """The same values; a ValueError if two are equal."""
+    if any(value in values[:i] for i, value in enumerate(values)):
+        raise ValueError("contains the same entry twice")
+    return values
 
 
 def _models_in(parts: Iterable[Any]) -> list[type[BaseModel]]:
@@ -283,7 +291,7 @@ def _contradiction(model: type[Settings], data: Mapping[str, Any]) -> tuple[str,
     return next(((key, other) for key, other in found.items() if other in found), None)
 
 
-def explicit_options(file: Path | None, assignments: Sequence[str]) -> dict[str, Any]:
+def explicit_options(file: Path | None, assignments: Sequence[str], read: Read = read_yaml) -> dict[str, Any]:
     """Options of a configuration file and of ``a.b=c``, nested; single values of the latter as text.
 
     Raises
@@ -291,7 +299,7 @@ def explicit_options(file: Path | None, assignments: Sequence[str]) -> dict[str,
     InputError : the file cannot be read
     UsageError : an assignment has another form
     """
-    given = {} if file is None else dict(read_yaml(file))
+    given = {} if file is None else dict(read(file))
     for text in assignments:
         key, parsed = parse_assignment(text)
         value = parsed if isinstance(parsed, Mapping) else text.partition("=")[2].strip()
@@ -307,6 +315,7 @@ def resolve(
     assignments: Sequence[str] = (),
     flags: Mapping[str, Any] | None = None,
     spelled: Mapping[str, str] | None = None,
+    read: Read = read_yaml,
 ) -> S:
     """Resolved configuration: defaults, then the file, presets, ``a.b=c`` assignments, and flags.
 
@@ -316,13 +325,14 @@ def resolve(
         gives a whole section
     flags : dotted key → value; None values are flags that were not given
     spelled : dotted key → its flag, for messages
+    read : reads the file
 
     Raises
     ------
     InputError : the file is at fault
     UsageError : an assignment or a flag is at fault
     """
-    data: Any = read_yaml(file) if file is not None else {}
+    data: Any = read(file) if file is not None else {}
     switches = [(key, value) for key, value in (flags or {}).items() if value is not None]
     names = {key: flag for key, flag in (spelled or {}).items() if (flags or {}).get(key) is not None}
     said = nested(dict(map(parse_assignment, assignments)) | dict(switches))

@@ -193,7 +193,7 @@ def _announce(
 ) -> None:
     """State budget and expected time of a fit, and refuse one that the disk cannot hold."""
     from mbtf_core.files.folders import check_space
-    from mbtf_core.forecast import is_long
+    from mbtf_core.forecast import is_long, processor_share
     from mbtf_fit.data.loader import open_data
     from mbtf_fit.models.registry import model_class
     from mbtf_fit.native import missing_reason
@@ -205,7 +205,7 @@ def _announce(
     training = config.training
     budget = training.time if training.steps is None else f"{training.steps} steps"
     queries = sum(int(one.manifest["splits"]["train"].get("queries", 0)) for one in data)
-    beside = preparing_seconds(queries) + closing_seconds(queries)
+    beside = (preparing_seconds(queries) + closing_seconds(queries)) / processor_share()
     console.note(
         f"{what}, training for {budget} (change it with --time or --steps); reading, calibration and errors "
         f"take about {beside:.0f} s beside it"

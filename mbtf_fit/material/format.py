@@ -113,11 +113,11 @@ def read_description(folder: Path) -> tuple[dict[str, Any], Path]:
         raise InputError("no such folder", where=folder, hint=suggest_path(folder, Path.is_dir))
     path = folder / DESCRIPTION_NAME
     if not path.exists():
-        raise InputError(
-            f"no {DESCRIPTION_NAME} in it",
-            where=folder,
-            hint="make a material with: mbtf-fit SHARDS -o FOLDER",
-        )
+        # A library has them in NAME/fits/FIT.
+        inside = [str(p.parent) for k in (1, 2, 3) for p in sorted(folder.glob("*/" * k + DESCRIPTION_NAME))]
+        hint = f"materials in it: {', '.join(inside[:5])}{', …' * (len(inside) > 5)}"
+        hint = hint if inside else "make a material with: mbtf-fit SHARDS -o FOLDER"
+        raise InputError(f"no {DESCRIPTION_NAME} in it", where=folder, hint=hint)
     description = read_json(path, AGAIN)
     if description.get("format") != FORMAT_NAME:
         raise InputError(f"is not of the format {FORMAT_NAME}", where=path, hint=AGAIN)

@@ -4,21 +4,23 @@ any file, by its path and their class."""
 
 from __future__ import annotations
 
+import builtins
 import importlib
 import pkgutil
+import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
-from traceback import extract_tb
+from traceback import extract_tb, walk_tb
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import mbtf_fit.models
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError, MbtfError, reason
-from mbtf_core.paths import refuse_special
+from mbtf_core.paths import refuse_special, suggest_name
 from mbtf_fit.models import FOREIGN, file_and_class
 from mbtf_fit.models.model import Model
 from mbtf_fit.ops import Operation
@@ -78,14 +80,16 @@ def model_class(name: str) -> type[Model]:
         try:
             text = path.read_text(encoding="utf-8")
         except FileNotFoundError:
-            hint = f"the path is relative to the current folder, {Path().absolute()}"
-            raise InputError("no such file", where=file, hint=hint) from None
+            raise InputError("no such file", where=file, hint=f"searched for {path.absolute()}") from None
         found = vars(_run(path, text))
     model = found.get(wanted)
     if not (isinstance(model, type) and issubclass(model, Model) and model is not Model):
         own = [n for n, c in found.items() if isinstance(c, type) and issubclass(c, Model) and c is not Model]
         what = f"'{wanted}' is no subclass of Model" if wanted in found else f"has no class '{wanted}'"
         raise InputError(what, where=file, hint=f"models in it: {', '.join(own) or 'none'}")
+    if all("operations" not in vars(base) for base in model.__mro__ if base is not Model):
+        hint = suggest_name("operations", list(vars(model)))
+        raise InputError(f"'{wanted}' has no method 'operations'", where=file, hint=hint)
     if "name" not in vars(model):
         model.name = wanted
     if model.name in MODELS:
@@ -114,10 +118,27 @@ def _faults_of(name: str) -> Iterator[None]:
         if name in MODELS or isinstance(error, MbtfError):
             raise
         path, _ = file_and_class(name) or ("", name)
-        lines = [frame.lineno for frame in extract_tb(error.__traceback__) if frame.filename == path]
+        places = [(frame.filename, frame.lineno) for frame in extract_tb(error.__traceback__)]
+        what, hint = reason(error), _suggest(error) or "correct the file; --debug shows the traceback"
+        if isinstance(error, SyntaxError):
+            what = reason(error.msg)
+            places.append((error.filename or "", error.lineno))
+        lines = [line for file, line in places if file == path]
         where = f"{path}:{lines[-1]}" if lines else path
-        hint = "correct the file; --debug shows the traceback"
-        raise InputError(f"{type(error).__name__}: {reason(error)}", where=where, hint=hint) from error
+        raise InputError(f"{type(error).__name__}: {what}", where=where, hint=hint) from error
+
+
+def _suggest(error: BaseException) -> str:
+    """``did you mean 'Lookup'?`` for a name that a module, an object or a file does not have."""
+    name, known = getattr(error, "name", None) or "", dir(getattr(error, "obj", None))
+    if isinstance(error, ImportError):
+        # Python 3.12 has it as `name_from`.
+        found = re.search(r"cannot import name '(\w+)'", str(error))
+        name, known = found[1] if found else "", dir(sys.modules.get(name))
+    elif isinstance(error, NameError):
+        frame = list(walk_tb(error.__traceback__))[-1][0]
+        known = [*frame.f_locals, *frame.f_globals, *dir(builtins)]
+    return suggest_name(name, known)
 
 
 def operations_of(name: str, lattice: Lattice, network: NetworkSection) -> list[Operation]:

@@ -64,13 +64,17 @@ class _Checked(type):
 
     def __call__(cls, *given: Any, **named: Any) -> Any:
         operation = cast("type[Operation]", cls)
+        signature = inspect.signature(operation.__init__)
         try:
-            found = inspect.signature(operation.__init__).bind(None, *given, **named).arguments
+            found = signature.bind(None, *given, **named).arguments
             for name in _lists_of(operation.kind()):
                 if isinstance(found[name], str):
                     raise TypeError(f"'{name}' is one name, not several: ('{found[name]}',)")
         except TypeError as error:
-            raise TypeError(f"{error}; the arguments are {operation.signature()}") from None
+            known = list(signature.parameters)
+            hint = next((suggest_name(name, known) for name in named if name not in known), "")
+            text = f"{error}; {hint and f'{hint} '}the arguments are {operation.signature()}"
+            raise TypeError(text) from None
         return super().__call__(*given, **named)
 
 
@@ -285,7 +289,9 @@ def input_sizes(operation: Operation, sizes: Mapping[str, int]) -> list[int]:
     for reference in operation.inputs():
         name, part = parse(reference)
         if name not in sizes:
-            raise ValueError(f"{operation.kind()} '{operation.output}' reads '{name}', which is not computed")
+            hint = suggest_name(name, list(sizes))
+            what = f"{operation.kind()} '{operation.output}' reads '{name}', which is not computed"
+            raise ValueError(what + (hint and f"; {hint}"))
         size = len(range(sizes[name])[part])
         if size == 0 or (part.stop or 0) > sizes[name]:
             raise ValueError(f"'{reference}' is beyond the {sizes[name]} numbers of '{name}'")

@@ -82,9 +82,8 @@ class Regularization:
     they are blurred grow with the noise-to-signal ratio over the number of queries per texel. Decay alone has
     no effect where the weights that multiply the texels grow instead, so these decay too, and those that
     multiply hints, which are large at few highlights. Decay of the other weights flattens the dependence on
-    directions and removes colors, which are a small share of the loss: it is much smaller. Decays are
-    applied to the parameters themselves, not to the gradients
-    (Loshchilov and Hutter, ICLR 2019).
+    directions and removes colors, which are a small share of the loss: it is much smaller. Decays are applied
+    to the parameters themselves, not to the gradients (Loshchilov and Hutter, ICLR 2019).
 
     Attributes
     ----------

@@ -8,15 +8,9 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from mbtf_core.app.options import Flag
 from mbtf_core.color import ALBEDO_EXPOSURE
-from mbtf_core.config.settings import Settings
+from mbtf_core.config.settings import Settings, distinct
 from mbtf_core.units import parse_numbers
 from mbtf_gen.config.generator import GeneratorConfig, Paths
-
-
-def _distinct(values: list[float]) -> list[float]:
-    if len(set(values)) < len(values):
-        raise ValueError("lists the same width twice")
-    return values
 
 
 class Direction(Settings):
@@ -43,7 +37,7 @@ TilesAcross = Annotated[
     list[Annotated[float, Field(gt=0, le=1e4)]],
     BeforeValidator(parse_numbers),
     Field(min_length=1),
-    AfterValidator(_distinct),
+    AfterValidator(distinct),
 ]
 PATHS_PER_PIXEL = "paths per pixel"
 Exposure = Annotated[Annotated[float, Field(ge=-40, le=40)] | Literal["auto"], Flag("--exposure", "EV|auto")]

@@ -23,10 +23,11 @@ F64 = NDArray[np.float64]
 PICTURE_NAME = "contact_sheet.png"
 # Panels of the tile: the side that grazing lights come from; (0, 0) takes all lights.
 _SIDES = {"all lights": (0, 0), "grazing light from the left": (-1, 0), "grazing light from the top": (0, 1)}
-# Elevations of grazing lights, and of the lights of the BRDF, in degrees.
-_GRAZING, _ELEVATIONS = (20.0, 45.0), (35.0, 65.0)
+# Highest elevation of grazing lights, and elevations of the lights of the BRDF, in degrees. The lowest
+# lights have the most contrast, and the more there are, the narrower is the smoothing.
+_GRAZING, _ELEVATIONS = 45.0, (35.0, 65.0)
 # Smallest cosine of views in panels of the tile; without heights, parallax blurs them.
-_WITH_HEIGHTS, _FROM_ABOVE = 0.5, 0.85
+_WITH_HEIGHTS, _FROM_ABOVE = 0.35, 0.85
 # Pixels across a panel, queries that its smoothing averages, its largest standard deviation in tile widths.
 _ACROSS, _PER_WINDOW, _WIDEST = 192, 32, 0.1
 # Share of the queries, those with the finest footprints, that is shown at least.
@@ -61,8 +62,7 @@ def tile_images(arrays: Arrays, aspect: float, geometry: Geometry | None) -> dic
     else:
         known = view[:, 2] > _WITH_HEIGHTS
         u[known] = visible_positions(u[known], view[known], geometry)
-    elevation = np.degrees(np.arcsin(np.clip(light[:, 2], 0.0, 1.0)))
-    grazing = (elevation >= _GRAZING[0]) & (elevation <= _GRAZING[1])
+    grazing = light[:, 2] <= np.sin(np.radians(_GRAZING))
     out = {}
     for title, side in _SIDES.items():
         from_side = light[:, :2] @ side >= 0.5 * np.hypot(*light[:, :2].T)

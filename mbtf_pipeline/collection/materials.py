@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import chain, count
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from typing import Any
 from mbtf_core.config.yaml_file import read_yaml
 from mbtf_core.errors import InputError, UsageError, reason
 from mbtf_core.paths import named_file, real_path
+from mbtf_pipeline.recipe import texts_of
 
 # Files in a folder of materials that are materials.
 _SUFFIXES = {".yaml", ".yml", ".pyp", ".bcc", ".curves", ".glb", ".gltf", ".ply", ".obj"}
@@ -63,8 +64,8 @@ def _in_folder(folder: Path) -> list[Path]:
     if files & {"material.yaml", "material.yml"} or any(role_of(name) == "height" for name in images):
         return [folder]
     documents = {path: _document(path) for path in inside if path.suffix.lower() in _YAML and path.is_file()}
-    texts = {text for document in documents.values() for text in _texts(document) if "\0" not in text}
-    parts = {os.path.normpath(named_file(folder, text)) for text in texts}
+    texts = {data[key] for document in documents.values() for data, key, _ in texts_of(document)}
+    parts = {os.path.normpath(named_file(folder, text)) for text in texts if "\0" not in text}
     out: list[Path] = []
     for path in inside:
         if path.is_dir():
@@ -86,15 +87,6 @@ def _document(path: Path) -> Mapping[str, Any]:
     except InputError:
         return {}
     return found
-
-
-def _texts(data: Any) -> Iterator[str]:
-    """All texts in plain data."""
-    if isinstance(data, str):
-        yield data
-    elif isinstance(data, Mapping | Sequence):
-        for value in data.values() if isinstance(data, Mapping) else data:
-            yield from _texts(value)
 
 
 def name_materials(paths: Sequence[Path], taken: Collection[str] = ()) -> list[str]:

@@ -10,15 +10,13 @@ from typing import Annotated, Any, Literal, NamedTuple, Self, TypeVar
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from mbtf_core.config.settings import FileName, Settings, build, deep_merge, resolve
-from mbtf_core.config.yaml_file import read_yaml
+from mbtf_core.config.settings import FileName, Settings, build, deep_merge, distinct, resolve
 from mbtf_core.errors import InputError, MbtfError
-from mbtf_core.paths import named_file
 from mbtf_core.units import Duration
 from mbtf_fit.config import DEFAULT_MODEL, FIBER_MODEL
 from mbtf_pipeline.collection.materials import find_materials, name_materials
 from mbtf_pipeline.compare.perceptual_metrics import weights_file
-from mbtf_pipeline.recipe import Name, Recipe, distinct, load_recipe
+from mbtf_pipeline.recipe import Name, Recipe, load_recipe, read_recipe
 
 TableName = Literal["methods", "levels", "ablations", "timing", "offsets", "zooms", "ranking"]
 # The name of a fit that is repeated: what is trained, and the seed.
@@ -158,17 +156,14 @@ class Collection(Settings):
             if "material" not in layer.generate:
                 where = f"{file}: materials.{name}"
                 raise InputError("has no path", where=where, hint="add generate.material")
-        return {
-            name: named_file(file.parent, str(layer.generate["material"]))
-            for name, layer in self.materials.items()
-        }
+        return {name: Path(str(layer.generate["material"])) for name, layer in self.materials.items()}
 
     def plan(self, file: Path, quick: bool = False) -> tuple[list[Planned], dict[str, Skipped]]:
         """The runs in their order, and materials that cannot be run, by name.
 
         Parameters
         ----------
-        file : the recipe; paths of materials are relative to it
+        file : the recipe, for messages
         quick : whether to apply the options of the quick size
 
         Returns
@@ -255,7 +250,7 @@ class LibraryRecipe(Collection):
 
     def paths(self, file: Path) -> dict[str, Path]:
         """Those in `library` in its order, of one folder by name, and further ones."""
-        listed = [path for text in self.library for path in find_materials(named_file(file.parent, text))]
+        listed = [path for text in self.library for path in find_materials(Path(text))]
         own = {name: layer for name, layer in self.materials.items() if "material" in layer.generate}
         found = dict(zip(name_materials(listed, own), listed, strict=True))
         for name in self.materials.keys() - own.keys() - found.keys():
@@ -290,11 +285,11 @@ def load(file: Path, assignments: Sequence[str] = ()) -> Recipe | LibraryRecipe 
     UsageError
         An assignment is invalid.
     """
-    keys = read_yaml(file) if file.is_file() else {}
+    keys = read_recipe(file) if file.is_file() else {}
     if "tables" in keys:
-        return resolve(PaperRecipe, file=file, assignments=assignments)
+        return resolve(PaperRecipe, file=file, assignments=assignments, read=read_recipe)
     if "library" in keys:
-        return resolve(LibraryRecipe, file=file, assignments=assignments)
+        return resolve(LibraryRecipe, file=file, assignments=assignments, read=read_recipe)
     return load_recipe(file, assignments)
 
 

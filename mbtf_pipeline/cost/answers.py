@@ -109,7 +109,7 @@ class Evidence:
 def answers(evidence: Evidence) -> list[dict[str, Any]]:
     """What each time gives, measured or forecast: texts for page and console, and numbers for JSON."""
     rows = []
-    for m in (*evidence.slow, *evidence.runs):
+    for m in sorted((*evidence.slow, *evidence.runs), key=lambda m: m.seconds.value):
         spent = [m.details[f"{part}_seconds"] for part in ("generation", "training", "overhead")]
         basis = "measured: {:.0f} s generating, {:.0f} s training, {:.0f} s start-up and calibration".format(
             *spent

@@ -3,12 +3,9 @@ follows: error bars of seeds, the Pareto front."""
 
 from __future__ import annotations
 
-import hashlib
 import math
 import statistics
-import time
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +13,7 @@ from typing import Any
 
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import data_sha256, read_json, write_json
-from mbtf_core.run.task import available_cores, worker_threads
+from mbtf_core.forecast import processor_share
 from mbtf_core.stats import Estimate, mean_estimate
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.tables import estimate
@@ -33,8 +30,6 @@ ESTIMATES = ("seconds", "error", "bias", "noise")
 PRIOR, PRIOR_DEGREES = 0.05, 4
 # Share of the processors below which other work is worth a warning.
 _FREE = 0.8
-# Wall time of a probe of the processors, seconds, and bytes of its steps, which run without Python's lock.
-_PROBE_SECONDS, _PROBE_BYTES = 0.05, 1 << 20
 
 
 @dataclass(frozen=True)
@@ -133,22 +128,6 @@ def measure(configuration: Configuration, conditions: Conditions) -> Measurement
     error = math.hypot(found.seconds.error, (1.0 - share) * found.seconds.value)
     details = {**found.details, "processor_share": share}
     return replace(found, seconds=replace(found.seconds, error=error), details=details)
-
-
-def processor_share() -> float:
-    """Share of the processors that this process gets while all its threads compute, in (0, 1]; other work
-    takes the rest."""
-    block = bytes(_PROBE_BYTES)
-
-    def share(_: int) -> float:
-        begin, own = time.perf_counter(), time.thread_time()
-        while time.perf_counter() - begin < _PROBE_SECONDS:
-            hashlib.sha256(block)
-        return (time.thread_time() - own) / (time.perf_counter() - begin)
-
-    threads = worker_threads() or available_cores()
-    with ThreadPoolExecutor(threads) as pool:
-        return min(1.0, statistics.fmean(pool.map(share, range(threads))))
 
 
 def other_work(found: Iterable[Measurement]) -> str:

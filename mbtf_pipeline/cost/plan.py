@@ -5,22 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from mbtf_core.forecast import processor_share
 from mbtf_core.run.runner import Runner
 from mbtf_core.units import clock, expectation, rounded_duration
 from mbtf_gen.forecast import forecast
 from mbtf_gen.job import Job
-from mbtf_pipeline.cost import measurement
 from mbtf_pipeline.cost.answers import FARTHEST
+from mbtf_pipeline.cost.conditions import conditions_of, generator_seconds, study_config
 from mbtf_pipeline.cost.measurement import MeasurementFolder
 from mbtf_pipeline.cost.runs import LEAST_SECONDS, disk_bytes
-from mbtf_pipeline.cost.study import (
-    STUDY,
-    Measurements,
-    conditions_of,
-    generator_seconds,
-    no_run,
-    study_config,
-)
+from mbtf_pipeline.cost.schedule import Measurements
+from mbtf_pipeline.cost.study import STUDY, no_run
 from mbtf_pipeline.recipe import Recipe
 
 # Paths of the reference and of the generator's rate, which come before runs.
@@ -42,7 +37,7 @@ class StudyPlan:
     least_run : seconds of a study that measures a run; None where any is measured
     least : seconds of a study that forecasts
     generator : whether it compares configurations of the generator
-    share : of the processors that other work leaves now
+    share : of the processors that other work leaves, as the generator's rate was measured
     overhead : seconds of a run besides generating and training; assumed until a run is measured
     """
 
@@ -102,7 +97,7 @@ def plan_study(recipe: Recipe, folder: Path, *, seconds: float, seed: int | None
     record = STUDY.read(folder) if STUDY.check(folder) else None
     job = Job.load(study_config(recipe.generate, seed))
     # Alone, as each pilot takes all processors.
-    share = measurement.processor_share()
+    share = processor_share()
     spp, pilot = job.config.queries.spp, forecast(job, seconds=1.0)
     conditions = conditions_of(job, folder, seconds)
     found = Measurements(conditions, MeasurementFolder(folder, conditions), Runner(), share=share)
@@ -112,22 +107,12 @@ def plan_study(recipe: Recipe, folder: Path, *, seconds: float, seed: int | None
     if record is not None:
         setup = record.get("setup_seconds", setup)
     planned = found.plan_runs(seconds, spp)
-    least, least_run = found.least_seconds(spp, setup), found.least_run_seconds(spp, setup)
+    least = found.least_run_seconds(spp, setup), found.least_seconds(spp, setup) or LEAST_SECONDS
     measured = [run for run in planned if found.recall(run)]
     runs, spent = found.fitting(planned, setup + generator_seconds(seconds), seconds)
     times = (run.planned_seconds(found.path_seconds, found.step_seconds) for run in (*measured, *runs))
     longest = max(times, default=0.0) + found.overhead
     labels = [f"{run.label}: {run.queries:,} queries × {spp} paths" for run in runs]
     generator = seconds >= _COMPARISONS * LEAST_SECONDS
-    return StudyPlan(
-        labels,
-        len(measured),
-        spent,
-        disk_bytes(runs),
-        longest,
-        least_run,
-        least or LEAST_SECONDS,
-        generator,
-        share,
-        found.overhead,
-    )
+    size, share = disk_bytes(runs), found.share
+    return StudyPlan(labels, len(measured), spent, size, longest, *least, generator, share, found.overhead)

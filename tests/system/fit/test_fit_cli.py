@@ -25,7 +25,8 @@ def material(shards: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = call(["mbtf-fit", str(shards), "-o", str(folder), *QUICK])
     assert done.code == 0, done.err
     assert "training for 5 steps (change it with --time or --steps); reading, calibration and" in done.err
-    assert " errors take about 5 s beside it" in done.err
+    # 5 s, or longer where other work leaves less of the processors.
+    assert re.search(r" errors take about \d+ s beside it", done.err)
     # One suggestion, and its command.
     *summary, reason, command = done.out.splitlines()
     assert len(summary) <= 5

@@ -190,15 +190,17 @@ def test_a_cost_study_measures_reports_and_resumes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two configurations of the generator, then a third one and a run."""
-    from mbtf_pipeline.cost import study
+    from mbtf_pipeline.cost import schedule
     from mbtf_pipeline.cost.generator import generator_configurations
     from mbtf_pipeline.cost.runs import planned_runs
 
     some, runs = 2, 0
     all_of = generator_configurations
-    monkeypatch.setattr(study, "generator_configurations", lambda benchmark: islice(all_of(benchmark), some))
-    monkeypatch.setattr(study, "planned_runs", lambda *arguments: planned_runs(30.0, *arguments[1:])[:1])
-    monkeypatch.setattr(study.Measurements, "fits", lambda *_: runs > 0)
+    monkeypatch.setattr(
+        schedule, "generator_configurations", lambda benchmark: islice(all_of(benchmark), some)
+    )
+    monkeypatch.setattr(schedule, "planned_runs", lambda *arguments: planned_runs(30.0, *arguments[1:])[:1])
+    monkeypatch.setattr(schedule.Measurements, "fits", lambda *_: runs > 0)
     monkeypatch.setattr("mbtf_pipeline.cost.conditions._CONFIGURATIONS", 1000)
     monkeypatch.setattr("mbtf_pipeline.cost.runs.SHORTEST", 4.0)
     monkeypatch.setattr("mbtf_pipeline.cost.runs.FEWEST_STEPS", 2)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from mbtf_core import forecast as module
-from mbtf_core.forecast import FEWEST_PIECES, pilot_seconds
+from mbtf_core.forecast import FEWEST_PIECES, pilot_seconds, processor_share
+from mbtf_core.run.task import THREADS_VARIABLE, available_cores
 
 
 class Clock:
@@ -30,3 +31,8 @@ def test_a_pilot_times_its_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     found = pilot_seconds(piece, 100.0)
     assert found.value == pytest.approx(0.5)
     assert found.error < 0.01
+
+
+def test_threads_that_share_a_processor_get_less_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(THREADS_VARIABLE, str(8 * available_cores()))
+    assert 0 < processor_share() < 0.5

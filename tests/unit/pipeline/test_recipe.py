@@ -6,16 +6,20 @@ import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from mbtf_core.app.console import Console, run
 from mbtf_core.errors import InputError
+from mbtf_gen.generation import run as generation
+from mbtf_gen.job import Job
 from mbtf_pipeline.cli.app import app
 from mbtf_pipeline.recipe import load_recipe, read_resolved, write_recipe
 from mbtf_pipeline.run import _material_inputs, _RecipeRun, survey
-from mbtf_pipeline.stages import run_stages
+from mbtf_pipeline.stages import NOT_RUN, Decision, run_stages
 
 HEAD = """\
 name: small
@@ -71,8 +75,8 @@ def test_data_are_out_of_date_when_a_map_has_changed(tmp_path: Path) -> None:
 def test_a_fit_is_out_of_date_when_the_file_of_its_model_has_changed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The model is named by its class, and its path is relative to the current folder."""
-    monkeypatch.chdir(tmp_path)
+    """The model is named by its class, and its path is relative to the recipe."""
+    monkeypatch.chdir("/")
     file = tmp_path / "mine.py"
     file.write_text(
         "from mbtf_fit.models.svbrdf import Svbrdf\n\n\n"
@@ -92,6 +96,50 @@ def test_a_fit_is_out_of_date_when_the_file_of_its_model_has_changed(
     assert inputs() == before
     file.write_text(file.read_text().replace("7", "8"))
     assert inputs() != before
+
+
+def test_every_path_is_relative_to_the_recipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also in the resolved recipe of a run's folder; names of models are no paths, nor are URLs."""
+    monkeypatch.chdir("/")
+    (tmp_path / "mine.py").write_text(
+        "from mbtf_fit.models.svbrdf import Svbrdf\n\n\nclass Mine(Svbrdf):\n    pass\n"
+    )
+    fits = (
+        "fit:\n  one: &one {model: mine.py:Mine, init_from: fits/a}\n  two: *one\n  neumip: {<<: *one, "
+        "model: neumip, init_from: 's3://bucket/a'}\n  relief: {decoder: ../b}\n"
+        "  rainer2020: {training: {materials: [c, d]}}\noutput: run\n"
+    )
+    recipe = load_recipe(written(tmp_path, HEAD + fits))
+    folder = tmp_path / "run"
+    folder.mkdir()
+    write_recipe(recipe, folder)
+    for found in (recipe, load_recipe(folder / "recipe.yaml"), read_resolved(folder)):
+        fit = found.fit
+        assert Path(found.generate.material) == tmp_path / "maps" / "height.npy"
+        assert found.folder == folder
+        assert fit["one"].model == fit["two"].model == f"{tmp_path}/mine.py:Mine"
+        assert fit["one"].init_from == fit["two"].init_from == f"{tmp_path}/fits/a"
+        assert (fit["neumip"].model, fit["neumip"].init_from) == ("neumip", "s3://bucket/a")
+        assert fit["relief"].decoder == str(tmp_path.parent / "b")
+        assert fit["rainer2020"].training.materials == (f"{tmp_path}/c", f"{tmp_path}/d")
+
+
+def test_the_material_of_two_data_sets_is_announced_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its warnings, too."""
+    recipe = load_recipe(written(tmp_path, HEAD + "fit: {svbrdf: , hierarchical: }\n"))
+    announced, generated = list[Job](), list[Job]()
+
+    def generate(job: Job, *_: Any, **__: Any) -> Any:
+        generated.append(job)
+        return SimpleNamespace(shard_seconds=1.0)
+
+    monkeypatch.setattr(Job, "announce", lambda job: announced.append(job))
+    monkeypatch.setattr(generation, "generate", generate)
+    for stage in _RecipeRun(recipe, tmp_path / "run", Console(quiet=True)).stages({})[:2]:
+        stage.run(Decision(NOT_RUN))
+    assert (len(announced), len(generated)) == (1, 2)
 
 
 def test_an_assigned_material_is_relative_to_the_current_folder(
@@ -127,7 +175,7 @@ def test_names_and_models_default_to_each_other(tmp_path: Path, fit: str, models
         (NAMED.replace("time: 5s", "tmie: 5s"), 10, "did you mean 'time'"),
         (HEAD + "fit:\n  other:\n", 6, "rainer2020"),
         (HEAD + "fit: {}\n", 5, "contains no fit"),
-        (SINGLE + "compare: {tiles_across: [2, 2.0]}\n", 6, "same width twice"),
+        (SINGLE + "compare: {tiles_across: [2, 2.0]}\n", 6, "same entry twice"),
     ],
 )
 def test_errors_name_the_line(tmp_path: Path, text: str, line: int, what: str) -> None:
@@ -143,9 +191,9 @@ def test_a_missing_material_is_one_clear_line(tmp_path: Path, capsys: pytest.Cap
     assert run(app, ["run", str(path), "-o", str(tmp_path / "out")]) == 3
     out, err = capsys.readouterr()
     first, second = err.splitlines()
-    assert first == f"error: {path}:3: material '../nowhere/height.exr' does not exist"
     searched = os.path.abspath(tmp_path / "../nowhere/height.exr")
-    assert second.strip() == f"searched for {searched}; edit 'generate.material' in {path}"
+    assert first == f"error: {path}:3: material '{searched}' does not exist"
+    assert second.strip() == f"searched for {searched}"
     assert out == ""
     assert not (tmp_path / "out").exists()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from mbtf_fit.data.loader import load_split, load_training
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.evaluation import split_errors
 from mbtf_fit.formatting import report_errors
+from mbtf_fit.material.decoder import Decoder
 from mbtf_fit.material.material import conformance_queries, export
 from mbtf_fit.models.registry import MODELS
 from mbtf_fit.training.trainer import prepare_trainer
@@ -42,6 +44,15 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def fitted(data: Path, tmp_path_factory: pytest.TempPathFactory) -> FitResult:
     return fit(config(), data, tmp_path_factory.mktemp("fit") / "material")
+
+
+def test_a_folder_of_materials_names_them(fitted: FitResult, tmp_path: Path) -> None:
+    """As those of a run and of a library."""
+    inside = tmp_path / "library" / "rock" / "fits" / "relief"
+    shutil.copytree(fitted.folder, inside)
+    with pytest.raises(InputError) as caught:
+        Decoder.find(tmp_path / "library")
+    assert str(inside) in caught.value.hint
 
 
 def test_a_fit_states_the_lowest_direction_of_its_data(tmp_path: Path) -> None:

@@ -87,7 +87,13 @@ def test_to_fit_again_needs_the_file(fitted: Path) -> None:
             "my_model.py:16",
             "argument: 'channels'; the arguments are Lookup(",
         ),
-        ({'"albedo", "texel"': '"albedo", "text"'}, None, "my_model.py", "reads 'text'"),
+        ({"takes = ()": "takes = )"}, None, "my_model.py:10", "unmatched"),
+        ({"import Lookup,": "import Lokup,"}, None, "my_model.py:4", "did you mean 'Lookup'?"),
+        ({"Lookup(": "Lokup("}, None, "my_model.py:16", "did you mean 'Lookup'?"),
+        ({"return [": "return [network.widht,"}, None, "my_model.py:15", "did you mean 'width'?"),
+        ({"channels=3": "chanels=3"}, None, "my_model.py:16", "did you mean 'channels'?"),
+        ({"def operations(": "def operation("}, None, "my_model.py", "did you mean 'operation'?"),
+        ({'"albedo", "texel"': '"albedo", "text"'}, None, "my_model.py", "did you mean 'texel'?"),
         ({"_rate": "_rat"}, None, "defaults of my_model.py:TexelDiffuse", "'training.texture_learning_rat'"),
         ({'{"training": {"texture_learning_rate": 0.05}}': "[1]"}, None, "my_model.py", "TypeError"),
         ({'"texel-diffuse"': '"svbrdf"'}, None, "my_model.py:TexelDiffuse", "that of an installed model"),
@@ -110,7 +116,7 @@ def test_a_file_at_fault_is_named_with_its_line(
     with pytest.raises(InputError) as caught:
         build_model(name or "my_model.py:TexelDiffuse", Lattice(2, 1.0))
     assert caught.value.where == where
-    assert what in caught.value.what
+    assert what in caught.value.message
 
 
 def test_an_edited_file_is_read_again(tmp_path: Path) -> None:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from mbtf_pipeline.cost import measurement
+from mbtf_pipeline.cost import measurement, plan
 
 
 @pytest.fixture(autouse=True)
 def free_machine(monkeypatch: pytest.MonkeyPatch) -> None:
     """No probe of the processors: this machine gets all of them."""
-    monkeypatch.setattr(measurement, "processor_share", lambda: 1.0)
+    for module in (measurement, plan):
+        monkeypatch.setattr(module, "processor_share", lambda: 1.0)

@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import pytest
 from support.paths import ROOT
 
-from mbtf_pipeline.cost import measurement, plan
-from mbtf_pipeline.cost.study import OVERHEAD
+from mbtf_pipeline.cost import plan
+from mbtf_pipeline.cost.schedule import OVERHEAD
 from mbtf_pipeline.recipe import load_recipe
 
 
@@ -18,7 +18,7 @@ def test_other_work_makes_runs_fewer(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     pilot = SimpleNamespace(query_seconds=4e-6, start=2.0)
     monkeypatch.setattr(plan, "forecast", lambda *_, **__: pilot)
     free = plan.plan_study(recipe, tmp_path / "study", seconds=200.0)
-    monkeypatch.setattr(measurement, "processor_share", lambda: 0.25)
+    monkeypatch.setattr(plan, "processor_share", lambda: 0.25)
     busy = plan.plan_study(recipe, tmp_path / "study", seconds=200.0)
     assert (free.overhead, busy.overhead) == (OVERHEAD, 4 * OVERHEAD)
     assert 0 < len(busy.runs) < len(free.runs)

@@ -20,6 +20,7 @@ from mbtf_core.errors import InputError, PartialError
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item, Result, packed, run_task
 from mbtf_core.stats import Estimate
+from mbtf_pipeline.cost import measurement, schedule
 from mbtf_pipeline.cost import study as module
 from mbtf_pipeline.cost.generator import GeneratorBenchmark, GeneratorConfiguration
 from mbtf_pipeline.cost.measurement import (
@@ -29,7 +30,7 @@ from mbtf_pipeline.cost.measurement import (
     pareto_front,
 )
 from mbtf_pipeline.cost.runs import MOST_SEEDS, TEST, Run
-from mbtf_pipeline.cost.study import Measurements
+from mbtf_pipeline.cost.schedule import Measurements
 from mbtf_pipeline.recipe import load_recipe
 from mbtf_pipeline.stages import machine
 
@@ -120,11 +121,11 @@ def test_workers_begin_what_fits_into_the_time_of_all(measured: list[tuple[str, 
     found = Measurements(conditions(), MemoryStore(), Workers())  # type: ignore[arg-type]
     found.path_seconds = 1e-9
     test = 1e-9 * TEST[0] * TEST[1]
-    # Two workers for 24 s; a run takes 9 or 5 s of training and, until one is measured, 12 s besides.
+    # Two workers for 18 s; a run takes 9 or 5 s of training and, until one is measured, 7 s besides.
     runs = [run(3000, "long", 9.0), run(2000, "one"), run(2000, "two")]
-    assert found.expected_seconds(runs[0]) == pytest.approx(21.0 + test, abs=1e-4)
+    assert found.expected_seconds(runs[0]) == pytest.approx(16.0 + test, abs=1e-4)
     planned = [replace(run, seed=seed) for run in runs for seed in range(2)]
-    found.measure_runs(planned, lambda run: found.fits(run, 24.0))
+    found.measure_runs(planned, lambda run: found.fits(run, 18.0))
     assert sorted(measured) == [("long", 0), ("long", 1)]
     # The test set is there, and the runs took 15 s beyond their plan.
     assert found.expected_seconds(runs[1]) == pytest.approx(5.0 + 15.0, abs=1e-4)
@@ -152,11 +153,11 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> FakeRuns:
     configuration = GeneratorConfiguration("paths", "uniform", "4", {"queries.spp": 4}, None)
     monkeypatch.setattr(module, "time", clock)
     monkeypatch.setattr(Run, "measure", measure)
-    monkeypatch.setattr(module, "generator_configurations", lambda benchmark: [configuration])
+    monkeypatch.setattr(schedule, "generator_configurations", lambda benchmark: [configuration])
     monkeypatch.setattr(GeneratorBenchmark, "check_variation", lambda benchmark: None)
     planned = [replace(run, seed=seed) for run in RUNS for seed in range(2)]
-    monkeypatch.setattr(module, "planned_runs", lambda *_: planned)
-    monkeypatch.setattr(module, "path_seconds", lambda *_: 1e-9)
+    monkeypatch.setattr(schedule, "planned_runs", lambda *_: planned)
+    monkeypatch.setattr(schedule, "path_seconds", lambda *_: 1e-9)
     return found
 
 
@@ -177,19 +178,19 @@ def test_a_study_keeps_its_time_and_resumes(fake: FakeRuns, tmp_path: Path) -> N
     # The shortest study that forecasts, by the runs that it takes, of which the generator gets a share; the
     # time of the next run.
     assert "3 lengths take about 275min" in said[-1]
-    # Runs take 1 s besides, not the 12 s that were expected.
+    # Runs take 1 s besides, not the 7 s that were expected.
     assert "--time 273min" in first.more
     assert first.description["taken"] == sum(r.planned_seconds(0.0) for r in runs)
-    assert "run, neumip, short, about 1:12" in [note for _, note in shown]
+    assert "run, neumip, short, about 1:07" in [note for _, note in shown]
     assert shown[-1][0] == 1.0
     assert [share for share, _ in shown] == sorted(share for share, _ in shown)
-    assert [m.details.get("seeds") for m in first.measurements] == [None, 2, 1]
+    assert [m.details.get("seeds") for m in first.measurements] == [None, 1, 2]
     assert sum(r.planned_seconds(0.0) for r in runs) <= 190.0
     assert first.skipped == ["run, neumip, long"]
     # Only what is missing is measured: the second seed of the last run.
     second, runs = measured(seconds=190.0)
     assert [(r.name, r.seed) for r in runs] == [("m", 1)]
-    assert second.measurements[1].error.value == first.measurements[1].error.value
+    assert second.measurements[2].error.value == first.measurements[2].error.value
     # Refining takes its own time, for further seeds.
     _, runs = measured(seconds=190.0, refine=3600.0)
     assert {r.seed for r in runs} >= {2}
@@ -243,6 +244,21 @@ def test_a_slow_first_run_makes_the_others_fewer_and_longer(monkeypatch: pytest.
     assert len(slow) < len(fast)
     # The excess of training is none of the time besides: 6 s are planned, of which 2.1 s generate.
     assert found.overhead == pytest.approx(40.0 - 20.0 - 2.1, abs=0.1)
+
+
+def test_a_study_expects_slower_runs_where_other_work_left_less(
+    fake: FakeRuns, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As its dry run does, before a run is measured."""
+    recipe, said = load_recipe(RECIPE, []), list[str]()
+    for share in (1.0, 0.25):
+        monkeypatch.setattr(measurement, "processor_share", lambda share=share: share)
+        module.run_study(
+            recipe, tmp_path / f"{share}", seconds=190.0, progress=lambda spent, note: said.append(note)
+        )
+    first = [note for note in said if note.startswith("run, neumip, short, about")]
+    # 60 s, and 7 s or 28 s besides.
+    assert [note.rpartition(" ")[2] for note in first] == ["1:07", "1:28"]
 
 
 def test_other_seeds_and_materials_are_not_mixed(fake: FakeRuns, tmp_path: Path) -> None:
