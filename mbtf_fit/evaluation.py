@@ -117,7 +117,7 @@ def _largest_errors(prediction: F32, queries: ShardQueries) -> dict[str, Any]:
         np.square(x, dtype=np.float64).reshape(len(x), -1).mean(axis=1) for x in (prediction - value, noise)
     )
     product = (squared - reference) * (1.0 if queries.weight is None else queries.weight)
-    if (total := float(product.sum())) <= 0:
+    if not (total := float(product.sum())) > 0:
         return {"ten_largest": None, "outliers": None}
     largest = np.argsort(product)[:-11:-1]
     share = product[largest] / total

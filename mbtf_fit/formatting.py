@@ -112,7 +112,7 @@ def outliers(split: Mapping[str, Any]) -> list[str]:
     values = f"{found['predicted']:.2g} predicted for {found['value']:.2g}"
     where = "level {:.1f}, elevations of light {:.0f}° and view {:.0f}°, u ({:.3f}, {:.3f})"
     place = where.format(found["level"], *found["elevations"], *found["u"])
-    return [f"{count} {found['share']:.0%} of it: {values}, at {place}"]
+    return [f"{count} {min(1.0, found['share']):.0%} of the error: {values}, at {place}"]
 
 
 def above_one(unexplained: Mapping[str, Any]) -> list[str]:

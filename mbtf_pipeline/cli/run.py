@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time as clocks
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -86,15 +87,13 @@ def run(
     }
     command = command_line("mbtf-pipeline", "run", recipe, **given)
     loaded, own = load(recipe, assignments or []), assignments or []
-    all_given = given | {"live": live, "dry_run": dry_run}
+    flags = given | {"live": live, "dry_run": dry_run}
     check_error(error)
     if isinstance(loaded, Collection):
         from mbtf_pipeline.collection.run import run_collection
 
         hint = "set times in the recipe; --quick is its small size"
-        _refuse(
-            all_given, ("quality", "time", "error", "dry_run", "live"), "a recipe of several materials", hint
-        )
+        _refuse(flags, ("quality", "time", "error", "dry_run", "live"), "a recipe of several materials", hint)
         folder = output or loaded.folder_of(quick)
         keep_on_interruption(f"the finished stages are kept in {folder}")
         # A crash ends one material of a library alone; the runs of a paper show their progress.
@@ -112,10 +111,14 @@ def run(
             )
         _report_collection(done, folder, console)
     else:
-        _refuse(all_given, ("quick",), "a recipe of one material", "use --quality draft")
+        _refuse(flags, ("quick",), "a recipe of one material", "use --quality draft")
         folder = output or loaded.folder
+        from mbtf_core.config.settings import explicit_options
         from mbtf_pipeline.cost.forecast import has_error
+        from mbtf_pipeline.recipe import is_single
 
+        # The file may be another one when the run has ended.
+        single = is_single(explicit_options(recipe, own)["fit"])
         if time is None:
             from mbtf_pipeline.recipe import preset_recipe
             from mbtf_pipeline.run_time import forecast_left
@@ -149,7 +152,7 @@ def run(
                 live=page,
                 runner=runner,
             )
-        _report(result, console, quality, recipe, given)
+        _report(result, console, quality, partial(_next_command, recipe, single, given))
 
 
 def _forecast(recipe: Recipe, folder: Path, console: Console) -> None:
@@ -190,14 +193,14 @@ def _report_collection(done: CollectionResult, folder: Path, console: Console) -
         )
 
 
-def _next_command(file: Path, given: Mapping[str, Any], options: Mapping[str, dict[str, str]]) -> str | None:
-    """The command of a run, `given` its own, with the options that its fits need; None where that is none."""
-    from mbtf_core.config.settings import explicit_options
+def _next_command(
+    file: Path, single: bool, given: Mapping[str, Any], options: Mapping[str, dict[str, str]]
+) -> str | None:
+    """The command of a run, `given` its own options, with those that its fits, by name, need; None where they
+    need none. `single`: the recipe has no name for its fit."""
     from mbtf_core.units import asked_duration, format_duration
-    from mbtf_pipeline.recipe import is_single
 
     own, more, changes = given["set"] or [], dict(given), dict[str, str]()
-    single = is_single(explicit_options(file, own)["fit"])
     for name, needed in options.items():
         changes |= {k.replace("fit", "fit" if single else f"fit.{name}", 1): v for k, v in needed.items()}
     if given["time"] and any(key.endswith(".training.time") for key in changes):
@@ -210,7 +213,10 @@ def _next_command(file: Path, given: Mapping[str, Any], options: Mapping[str, di
 
 
 def _report(
-    result: RunResult, console: Console, quality: Quality | None, file: Path, given: Mapping[str, Any]
+    result: RunResult,
+    console: Console,
+    quality: Quality | None,
+    again: Callable[[Mapping[str, Any]], str | None],
 ) -> None:
     from mbtf_fit import Material
     from mbtf_fit.cli.advice import suggest
@@ -247,7 +253,7 @@ def _report(
         lines += [f"    {line}" for line in more if line]
         if step is not None:
             options[fit] = step.options(recipe.fit[fit], record["training_seconds"], queries)
-    command = _next_command(file, given, options)
+    command = again(options)
     lines += [] if command is None else ["next:", f"  {command}"]
     if result.viewer is not None:
         lines.append(f"{result.viewer}: open it in a browser to turn the fits under lights")

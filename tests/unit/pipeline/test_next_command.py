@@ -9,38 +9,35 @@ import pytest
 
 from mbtf_pipeline.cli.run import _next_command
 
-NAMED = "fit: {relief: , quick: {model: neumip}}"
 TIME, QUERIES = {"fit.training.time": "2min"}, {"generate.queries.train": "800/texel"}
 
 
 @pytest.mark.parametrize(
-    ("fits", "options", "changes", "words"),
+    ("single", "options", "changes", "words"),
     [
         (
-            NAMED,
+            False,
             {},
             TIME | QUERIES,
             "--set fit.relief.training.time=2min --set generate.queries.train=800/texel",
         ),
-        ("fit: {model: relief}", {}, TIME, "--set fit.training.time=2min"),
+        (True, {}, TIME, "--set fit.training.time=2min"),
         # A value that was given already is replaced, others stay.
         (
-            NAMED,
+            False,
             {"quality": "draft", "set": ["fit.relief.training.time=1min", "compare.size=64"]},
             TIME,
             "--quality draft --set compare.size=64 --set fit.relief.training.time=2min",
         ),
         # A time of everything sets those of the fits.
-        (NAMED, {"time": "4min"}, TIME | QUERIES, "--time 8min --set generate.queries.train=800/texel"),
-        (NAMED, {"time": "4min"}, QUERIES, "--time 4min --set generate.queries.train=800/texel"),
-        (NAMED, {}, {}, None),
+        (False, {"time": "4min"}, TIME | QUERIES, "--time 8min --set generate.queries.train=800/texel"),
+        (False, {"time": "4min"}, QUERIES, "--time 4min --set generate.queries.train=800/texel"),
+        (False, {}, {}, None),
     ],
 )
 def test_the_next_command_sets_keys_of_the_recipe(
-    fits: str, options: dict[str, Any], changes: dict[str, str], words: str | None, tmp_path: Path
+    single: bool, options: dict[str, Any], changes: dict[str, str], words: str | None
 ) -> None:
-    file = tmp_path / "r.yaml"
-    file.write_text(f"name: r\ngenerate: {{material: maps}}\n{fits}\n")
     given = {"quality": None, "time": None, "set": None, **options}
-    found = _next_command(file, given, {"relief": changes, "quick": {}})
-    assert found == (None if words is None else f"mbtf-pipeline run {file} {words}")
+    found = _next_command(Path("r.yaml"), single, given, {"relief": changes, "quick": {}})
+    assert found == (None if words is None else f"mbtf-pipeline run r.yaml {words}")
