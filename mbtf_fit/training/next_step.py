@@ -110,10 +110,11 @@ def next_step(cost: MarginalCost, errors: Mapping[str, Any]) -> NextStep:
     elif None not in (value, error, own) and value - own > max(0.5 * value, _SIGNIFICANT * error):
         short = "the error of training queries is less than half as large"
     if value is None or error is None or error > _UNCERTAIN * abs(value) or unreliable(split):
-        reason = "few test queries decide the error; four times as many, by highlights, measure it better"
+        better = "four times as many, by highlights, measure it better"
         if not short:
-            return NextStep("test", reason)
-        return NextStep("queries", f"{short}: twice the queries reduce the error; {reason}", test=True)
+            return NextStep("test", f"few test queries decide the error; {better}")
+        reason = f"{short}; twice the queries reduce the error; few test queries decide it: {better}"
+        return NextStep("queries", reason, test=True)
     if value >= 1.0 and own is not None and own < 1.0:
         return NextStep("queries", "the training queries are too few or too noisy")
     if cost.kept_step is not None:

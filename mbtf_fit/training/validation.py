@@ -171,8 +171,10 @@ def marginal_cost_of(
     share, error = _noise_share(errors, training.get("noise_variance")) or (None, 0.0)
     last, doubling, limit = history[-1], _doubling(history), 0.0
     ratio, density = training.get("noise_ratio"), training.get("queries_per_texel")
-    if ratio and density and _number(last["unexplained"]) and last["unexplained"] > 0.0:
-        limit = min(1.0, _NOISE_ERROR * ratio / density / last["unexplained"])
+    if ratio and density:
+        # An unknown error is about that of the mean value.
+        reached = last["unexplained"] if _number(last["unexplained"]) and last["unexplained"] > 0.0 else 1.0
+        limit = min(1.0, _NOISE_ERROR * ratio / density / reached)
     # Longer training reduces the rest.
     doubling = None if doubling is None else doubling ** (1.0 - limit)
     kept = kept_step(training)

@@ -190,6 +190,11 @@ def test_noisy_training_queries_limit_longer_training(density: float | None, kin
         assert found.doubling == pytest.approx(free.doubling, abs=0.02)
     step = next_step(found, fitted(0.2, 0.002, training=0.19))
     assert step.kind == kind
+    # Of an unknown error, too.
+    lost = [r | {"unexplained": None, "unexplained_error": None} for r in history(0.3)]
+    found = cost(lost, {}, noise_ratio=4.0, queries_per_texel=density)
+    unknown = {"test": {"n": 8, "unexplained": {"value": None, "error": None}}}
+    assert next_step(found, unknown).kind == ("queries" if kind == "queries" else "test")
     assert ("140% of their variance at 50 per texel" in step.reason) == (kind == "queries")
 
 
