@@ -91,7 +91,7 @@ class NextStep:
 def next_step(cost: MarginalCost, errors: Mapping[str, Any]) -> NextStep:
     """What the evidence says pays most: the marginal cost of a fit, and its errors by split."""
     split = errors[headline(errors)]
-    own = errors["training"]["unexplained"]["value"] if "training" in errors else None
+    own, spread = (errors.get("training", split)["unexplained"][key] for key in ("value", "error"))
     value, error = split["unexplained"]["value"], split["unexplained"]["error"]
     untrained = cost.steps < _UNTRAINED and cost.doubling is None
     overfit, limit = 0.5 * (cost.noise_share or 0.0), _LIMITED * cost.noise_limit
@@ -107,8 +107,9 @@ def next_step(cost: MarginalCost, errors: Mapping[str, Any]) -> NextStep:
         short = f"noise of the training queries limits the fit ({known})"
     elif data < FLAT:
         short = "the fit overfits noise"
-    elif None not in (value, error, own) and value - own > max(0.5 * value, _SIGNIFICANT * error):
-        short = "the error of training queries is less than half as large"
+    elif None not in (value, error, own, spread):
+        is_less = value - own > max(0.5 * value, _SIGNIFICANT * math.hypot(error, spread))
+        short = "the error of training queries is less than half as large" if is_less else ""
     if value is None or error is None or error > _UNCERTAIN * abs(value) or unreliable(split):
         better = "four times as many, by highlights, measure it better"
         if not short:

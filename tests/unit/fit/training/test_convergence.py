@@ -208,6 +208,11 @@ def test_noisy_training_queries_limit_longer_training(density: float | None, kin
         (MarginalCost(0.8, None, 4000), fitted(0.22, 0.06, training=0.03), "queries"),
         (MarginalCost(0.8, None, 4000), fitted(0.22, 0.06, training=0.14), "test"),
         (MarginalCost(0.8, None, 4000), fitted(0.22, 0.12, training=0.03), "test"),
+        (
+            MarginalCost(0.8, None, 4000),
+            fitted(0.22, 0.06) | {"training": {"n": 9, "unexplained": {"value": -1.0, "error": 1.3}}},
+            "test",
+        ),
     ],
 )
 def test_an_uncertain_error_asks_for_training_queries_where_they_are_too_few(
