@@ -188,6 +188,8 @@ def main() -> int:
     print("\nsteps  sentences; right; twice the steps (mean); root mean square of log(came / said)")
     deviations: list[float] = []
     for steps, all_ in by_steps.items():
+        if not all_:
+            continue
         kinds = dict(Counter(s.kind for s in all_))
         spoken = [s for s in all_ if s.kind != "none"]
         right = sum(s.right for s in spoken) / max(1, len(spoken))
