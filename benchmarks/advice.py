@@ -104,7 +104,10 @@ def fitted(name: str, folder: Path, steps: int, seed: int, twice: bool = False) 
         cost = result.marginal_cost
         share = None if cost is None else cost.noise_share
         error = result.errors["test"]["unexplained"]
-        return {**error, "history": result.history, "noise_share": share, "kept": result.kept_step}
+        recorded = result.material.description["training"]
+        data = {key: recorded[key] for key in ("noise_ratio", "queries_per_texel")}
+        found = {"history": result.history, "noise_share": share, "kept": result.kept_step, "data": data}
+        return error | found
 
     return kept(home / f"{steps}-{seed}.json", measure)
 
@@ -168,7 +171,7 @@ def main() -> int:
             for steps, longer in pairwise(used):
                 if fits[steps]["kept"] is not None:
                     continue
-                cost = marginal_cost_of(fits[steps]["history"], {})
+                cost = marginal_cost_of(fits[steps]["history"], {}, fits[steps]["data"])
                 assert cost is not None
                 found.append(followed(fits[steps], fits[longer], sentence(cost), cost.doubling))
                 by_steps[steps].append(found[-1])
@@ -185,6 +188,8 @@ def main() -> int:
     print("\nsteps  sentences; right; twice the steps (mean); root mean square of log(came / said)")
     deviations: list[float] = []
     for steps, all_ in by_steps.items():
+        if not all_:
+            continue
         kinds = dict(Counter(s.kind for s in all_))
         spoken = [s for s in all_ if s.kind != "none"]
         right = sum(s.right for s in spoken) / max(1, len(spoken))

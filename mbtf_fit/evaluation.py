@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mbtf_core.color import auto_exposure, brightness, white_of
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.folder import DataFolder
+from mbtf_core.data.lattice import level_of_sigma
 from mbtf_core.directions import ELEVATION_BANDS
 from mbtf_core.errors import InputError
 from mbtf_core.paths import opened
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
     from mbtf_fit.material.material import Material
 
 F32 = NDArray[np.float32]
+# Outliers make up this share of an error each, and are off by so many standard errors of the reference.
+_OUTLYING, _OFF = 0.05, 4.0
 Predict = Callable[[ShardQueries], F32]
 
 
@@ -67,9 +70,10 @@ def split_errors(
         ``unexplained`` (1 - R²: 0 is exact, 1 as good as the mean value), each an estimate with ``value``,
         ``error`` and ``n``, also by nearest level (``levels``) and by band of the smaller cosine of light and
         view (``elevations``); ``color``: what is unexplained of the differences between channels, a small
-        part of all; ``ten_largest``: share of the ten largest squared errors in their sum; ``psnr``: its peak
-        is the value that the exposure shows as white; ``visibility``: in words; ``includes_noise``: whether
-        the data have one value per query.
+        part of all; ``ten_largest``: share of the ten largest squared errors in their sum; ``outliers``:
+        those that noise does not explain, and where the first is; ``psnr``: its peak is the value that the
+        exposure shows as white; ``visibility``: in words; ``includes_noise``: whether the data have one value
+        per query.
     """
     if len(queries) == 0:
         return None
@@ -81,7 +85,7 @@ def split_errors(
         **_errors(len(queries), mse, signal_variance(*arrays[1:]), unexplained_variance(*arrays)),
         "color": unexplained_variance(*colors, queries.weight, queries.group).as_dict(),
         "exposure": exposure,
-        "ten_largest": _ten_largest(*arrays[:4]),
+        **_largest_errors(arrays[0], queries),
     }
     bands = _grouped(elevation_groups(queries.omega_i, queries.omega_o), *arrays)
     return {
@@ -105,12 +109,33 @@ def _color(values: F32) -> F32:
     return values - np.roll(values, 1, axis=-1)
 
 
-def _ten_largest(prediction: F32, a: F32, b: F32, weight: F32 | None) -> float | None:
-    product = (prediction - a) * (prediction - b)
-    squared = product.reshape(len(product), -1).mean(axis=1, dtype=np.float64)
-    squared = squared if weight is None else squared * weight
-    total = float(squared.sum())
-    return float(np.sort(squared)[-10:].sum()) / total if total > 0 else None
+def _largest_errors(prediction: F32, queries: ShardQueries) -> dict[str, Any]:
+    """Share of the ten largest squared errors in their sum; and the outliers among them, or None: predictions
+    that noise does not explain. Values (1/sr) are means of the channels."""
+    value, noise = mean_value(queries.value_a, queries.value_b), 0.5 * (queries.value_a - queries.value_b)
+    squared, reference = (
+        np.square(x, dtype=np.float64).reshape(len(x), -1).mean(axis=1) for x in (prediction - value, noise)
+    )
+    product = (squared - reference) * (1.0 if queries.weight is None else queries.weight)
+    if not (total := float(product.sum())) > 0:
+        return {"ten_largest": None, "outliers": None}
+    largest = np.argsort(product)[:-11:-1]
+    share = product[largest] / total
+    off = (squared > _OFF**2 * reference)[largest] & (share > _OUTLYING)
+    if not off.any() or prediction.ndim > 2:
+        return {"ten_largest": float(share.sum()), "outliers": None}
+    first = largest[off][0]
+    z = queries.omega_i[first, 2], queries.omega_o[first, 2]
+    outliers = {
+        "n": int(off.sum()),
+        "share": float(share[off].sum()),
+        "predicted": float(prediction[first].mean()),
+        "value": float(value[first].mean()),
+        "level": float(level_of_sigma(queries.sigma[first])),
+        "elevations": np.degrees(np.arcsin(np.minimum(z, 1.0))).tolist(),
+        "u": queries.u[first].tolist(),
+    }
+    return {"ten_largest": float(share.sum()), "outliers": outliers}
 
 
 def _errors(n: int, mse: Estimate, variance: Estimate, unexplained: Estimate) -> dict[str, Any]:

@@ -25,6 +25,8 @@ VISIBILITY = (
 ABOVE_ONE = "above 1: worse than the mean value"
 # Share of an error that ten of so many queries at least make up.
 _DECISIVE, _MANY = 0.5, 1000
+# Share of an error from which its outliers are named.
+_OUTLYING = 0.25
 # Standard errors of a significant difference from zero.
 _SIGNIFICANT = 2.0
 
@@ -101,6 +103,18 @@ def unreliable(split: Mapping[str, Any]) -> str:
     return f"unreliable: ten of them make {min(1.0, share):.0%} of it"
 
 
+def outliers(split: Mapping[str, Any]) -> list[str]:
+    """A line on the few predictions that make up much of an error, though noise does not explain them."""
+    found = split.get("outliers")
+    if split["n"] < _MANY or split.get("includes_noise") or found is None or found["share"] < _OUTLYING:
+        return []
+    count = "one outlier makes" if found["n"] == 1 else f"{found['n']} outliers make"
+    values = f"{found['predicted']:.2g} predicted for {found['value']:.2g}"
+    where = "level {:.1f}, elevations of light {:.0f}° and view {:.0f}°, u ({:.3f}, {:.3f})"
+    place = where.format(found["level"], *found["elevations"], *found["u"])
+    return [f"{count} {min(1.0, found['share']):.0%} of the error: {values}, at {place}"]
+
+
 def above_one(unexplained: Mapping[str, Any]) -> list[str]:
     """The remark on an unexplained variance that is significantly above 1."""
     value, error = unexplained["value"], unexplained["error"]
@@ -116,6 +130,7 @@ def _remarks(errors: Mapping[str, Any], foreign: bool) -> list[str]:
         found.append(f"undefined unexplained variance: {why}")
     if measured:
         found.append("these errors include the noise of the data, which have one value per query")
+    found += outliers(split)
     return found if foreign else [*found, *above_one(split["unexplained"])]
 
 

@@ -107,7 +107,7 @@ class ReportSection(Settings):
     max_megabytes: float = Field(9.5, ge=1, le=100, description="size limit of the file")
 
 
-def _is_single(fits: Mapping[str, Any]) -> bool:
+def is_single(fits: Mapping[str, Any]) -> bool:
     """Whether the section holds the options of one fit, not fits by name."""
     known = FitConfig.model_fields
     return any(key in known or not isinstance(value, Mapping | None) for key, value in fits.items())
@@ -119,7 +119,7 @@ def _named(fits: Any) -> Any:
         return fits
     if not fits:
         raise ValueError("contains no fit")
-    if _is_single(fits):
+    if is_single(fits):
         # That of a file by its class.
         return {str(fits.get("model", DEFAULT_MODEL)).rpartition(":")[2]: fits}
     return {str(name): {"model": name, **(options or {})} for name, options in fits.items()}
@@ -269,7 +269,7 @@ def quality_options(
         return {}
     given = explicit_options(path, assignments, read_recipe)
     generate, fits = given.get("generate"), given.get("fit")
-    if isinstance(fits, Mapping) and not _is_single(fits):
+    if isinstance(fits, Mapping) and not is_single(fits):
         own = {f"fit.{name}": {"model": name, **(options or {})} for name, options in fits.items()}
     else:
         own = {"fit": {"model": DEFAULT_MODEL, **(fits if isinstance(fits, Mapping) else {})}}

@@ -37,7 +37,7 @@ def kept_step(training: Mapping[str, Any]) -> int | None:
     the fit overfitted. The history of materials that share a network counts the steps of all."""
     counted = training.get("shared_decoder") or training
     kept: int | None = counted.get("kept_step")
-    return None if kept == counted["steps"] else kept
+    return None if kept == counted.get("steps") else kept
 
 
 def describe_kept(history: Sequence[dict[str, Any]], kept: int | None) -> str | None:

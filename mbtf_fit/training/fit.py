@@ -117,8 +117,7 @@ class FitResult:
     @property
     def marginal_cost(self) -> MarginalCost | None:
         """Expected gain by longer training and by more data; None where the history is incomplete."""
-        noise = self.material.description["training"].get("noise_variance")
-        return marginal_cost_of(self.history, self.errors, noise, self.kept_step)
+        return marginal_cost_of(self.history, self.errors, self.material.description["training"])
 
     @property
     def kept_step(self) -> int | None:

@@ -81,9 +81,12 @@ def export_fit(
     variance = errors["training"]["variance"]["value"]
     sample = partition.sample
     noise = pooled_variance(sample.value_a, sample.value_b).value if data.estimates == 2 else None
+    # Other layouts count images, and slices of all texels.
+    density = len(partition.training) / data.lattice.texels() if data.layout == "shuffled" else None
     training = {
         "batch": trainer.batch,
         "queries": len(partition.training),
+        "queries_per_texel": density,
         "shards_sha256": training_digest(data),
         "loss": trainer.progress.loss,
         "validation_set": validated,

@@ -21,6 +21,18 @@ from mbtf_fit.training.validation import FEWEST_STEPS, FLAT, MarginalCost
 _UNTRAINED = 100
 # Relative standard error of the test error from which more test queries come first.
 _UNCERTAIN = 0.25
+# Standard errors of a significant difference.
+_SIGNIFICANT = 2.0
+# Of an error that is all due to noise, twice the queries remove this share.
+_LIMITED = 0.3
+# Flags of generator and fit, by the key that a recipe has.
+_FLAGS = {
+    "generate.queries.train": "--queries",
+    "generate.queries.test": "--test-queries",
+    "generate.queries.test_highlights": "--test-highlights",
+    "fit.training.time": "--time",
+    "fit.training.steps": "--steps",
+}
 
 
 @dataclass(frozen=True)
@@ -32,93 +44,97 @@ class NextStep:
     kind : what to take more of: test queries, training time, training queries; or nothing
     reason : one sentence
     factor : of the training time or its steps
+    test : whether more test queries are needed beside the training queries
     """
 
     kind: Literal["test", "time", "queries", "none"]
     reason: str
     factor: int = 2
+    test: bool = False
+
+    def options(self, config: FitConfig, seconds: float, queries: Mapping[str, Any]) -> dict[str, str]:
+        """Options to change, by dotted key as in a recipe: ``generate.queries.train``, ``fit.training.time``;
+        of a fit of so many seconds, and data with this section of the generator's configuration."""
+        training = config.training
+        if self.kind == "time" and training.steps is not None:
+            return {"fit.training.steps": str(self.factor * training.steps)}
+        if self.kind == "time":
+            return {"fit.training.time": _times_as_long(training.time.seconds, seconds, self.factor)}
+        more = {"generate.queries.train": _times(queries["train"], 2)} if self.kind == "queries" else {}
+        if self.kind == "test" or self.test:
+            more["generate.queries.test"] = _times(queries["test"], 4)
+            more |= {} if queries.get("test_highlights") else {"generate.queries.test_highlights": "75%"}
+        return more
 
     def command(self, config: FitConfig, seconds: float, data: Dataset, material: Path) -> str | None:
-        """The whole command, which writes to new folders; None where there is nothing to do, or where the
-        data are of an unknown source.
-
-        Parameters
-        ----------
-        config : of the fit
-        seconds : that it was trained for
-        data : its data set
-        material : its folder
-        """
+        """The whole command, which writes to new folders, for a fit of so many seconds in the folder
+        `material`; None where there is nothing to do, or where its data are of an unknown source."""
+        made = data.manifest.get("config") or {}
+        # Measured data have no path of their file, those of another program no configuration.
+        if self.kind == "none" or not (self.kind == "time" or {"material", "queries"} <= made.keys()):
+            return None
+        more = self.options(config, seconds, made.get("queries", {}))
         fitted = ["--config", str(material / "config.yaml")]
         out = ["-o", _numbered(str(material))]
-        if self.kind == "none":
-            return None
         if self.kind == "time":
-            training = config.training
-            more = ["--time", _times_as_long(training.time.seconds, seconds, self.factor)]
-            if training.steps is not None:
-                more = ["--steps", str(self.factor * training.steps)]
-            return shlex.join(["mbtf-fit", str(data.folder), *fitted, *more, *out])
-        made, shards = data.manifest.get("config") or {}, _numbered(str(data.folder))
-        if not {"material", "queries"} <= made.keys():
-            # Measured, which have no path of their file, or of another program.
-            return None
-        words = ["mbtf-gen", made["material"], "--config", str(data.folder.at(CONFIG_NAME))]
-        if self.kind == "queries":
-            words += ["--queries", _times(made["queries"]["train"], 2)]
-        else:
-            # The training queries need not be made again; those of other layouts come in large units.
-            words += ["--queries", "1"] if data.layout == "shuffled" else []
-            words += ["--test-queries", _times(made["queries"]["test"], 4)]
-            words += [] if made["queries"].get("test_highlights") else ["--test-highlights", "75%"]
-        words += ["-o", shards]
+            return shlex.join(["mbtf-fit", str(data.folder), *fitted, *_flags(more), *out])
+        shards = _numbered(str(data.folder))
         then = ["mbtf-fit", shards, *fitted, *out]
         if self.kind == "test":
+            # The training queries need not be made again; those of other layouts come in large units.
+            more = {"generate.queries.train": "1"} | more if data.layout == "shuffled" else more
             then = ["mbtf-fit", "evaluate", str(material), shards]
-        return f"{shlex.join(words)} && {shlex.join(then)}"
+        words = ["mbtf-gen", made["material"], "--config", str(data.folder.at(CONFIG_NAME))]
+        return f"{shlex.join([*words, *_flags(more), '-o', shards])} && {shlex.join(then)}"
 
 
 def next_step(cost: MarginalCost, errors: Mapping[str, Any]) -> NextStep:
-    """What the evidence says pays most.
-
-    Parameters
-    ----------
-    cost : of the fit
-    errors : by split
-    """
+    """What the evidence says pays most: the marginal cost of a fit, and its errors by split."""
     split = errors[headline(errors)]
-    own = errors["training"]["unexplained"]["value"] if "training" in errors else None
+    own, spread = (errors.get("training", split)["unexplained"][key] for key in ("value", "error"))
     value, error = split["unexplained"]["value"], split["unexplained"]["error"]
     untrained = cost.steps < _UNTRAINED and cost.doubling is None
-    data = 1.0 if cost.noise_share is None else 1.0 - 0.5 * cost.noise_share
+    overfit, limit = 0.5 * (cost.noise_share or 0.0), _LIMITED * cost.noise_limit
+    data = 1.0 - max(overfit, limit)
     if cost.few and (value is None or value >= 1.0 or untrained):
         factor = 2 ** math.ceil(math.log2(FEWEST_STEPS / cost.steps))
         return NextStep("time", f"{cost.steps} steps are few: train {factor} times as long", factor)
+    short = ""
+    if cost.kept_step is not None:
+        short = f"the fit overfits noise after {cost.kept_step} steps"
+    elif data < FLAT and limit > overfit:
+        known = f"{cost.noise:.0%} of their variance at {cost.density:.0f} per texel"
+        short = f"noise of the training queries limits the fit ({known})"
+    elif data < FLAT:
+        short = "the fit overfits noise"
+    elif None not in (value, error, own, spread):
+        is_less = value - own > max(0.5 * value, _SIGNIFICANT * math.hypot(error, spread))
+        short = "the error of training queries is less than half as large" if is_less else ""
     if value is None or error is None or error > _UNCERTAIN * abs(value) or unreliable(split):
-        reason = "few test queries decide the error; four times as many, by highlights, measure it better"
-        if data < FLAT:
-            reason += "; the fit overfits noise: then, more training queries help"
-        return NextStep("test", reason)
+        better = "four times as many, by highlights, measure it better"
+        if not short:
+            return NextStep("test", f"few test queries decide the error; {better}")
+        reason = f"{short}; twice the queries reduce the error; few test queries decide it: {better}"
+        return NextStep("queries", reason, test=True)
     if value >= 1.0 and own is not None and own < 1.0:
         return NextStep("queries", "the training queries are too few or too noisy")
     if cost.kept_step is not None:
-        reason = f"the fit overfits noise after {cost.kept_step} steps; "
-        reason += (
-            "twice the queries let it train longer"
-            if data >= FLAT
-            else (f"expect at most {data:.2g} of this error with twice the queries")
-        )
-        return NextStep("queries", reason)
+        most = f"expect at most {1.0 - overfit:.2g} of this error with twice the queries"
+        more = "twice the queries let it train longer" if 1.0 - overfit >= FLAT else most
+        return NextStep("queries", f"{short}; {more}")
     time = cost.doubling
     if data < min(FLAT, 1.0 if time is None else time):
-        reason = f"the fit overfits noise; expect about {data:.2g} of this error with twice the queries"
-        return NextStep("queries", reason)
+        return NextStep("queries", f"{short}; expect about {data:.2g} of this error with twice the queries")
     if time is None:
         reason = f"{cost.steps} steps are few" if cost.few else "it is unknown what longer training gains"
         return NextStep("time", f"{reason}; try twice the training")
     if time < FLAT or cost.few:
         return NextStep("time", f"expect about {time:.2g} of this error after twice the training")
     return NextStep("none", "neither twice the training nor twice the queries would reduce the error by 5%")
+
+
+def _flags(options: Mapping[str, str]) -> list[str]:
+    return [word for key, value in options.items() for word in (_FLAGS[key], value)]
 
 
 def _numbered(folder: str) -> str:

@@ -21,6 +21,7 @@ from mbtf_fit.data.loader import Partition, load_split
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.formatting import above_one
 from mbtf_fit.training.best_state import excess_error
+from mbtf_fit.training.endings import kept_step
 from mbtf_fit.training.trainer import Trainer
 
 # Queries of the validation subset, and the fewest queries of the test split that are preferred over others.
@@ -105,6 +106,8 @@ _EARLY_STEPS, _LAW_SCATTER = 50.0, 0.1
 # Of the reduction of the error's logarithm by the second half of training, twice the time gains half again:
 # the other half is due to the falling learning rate. Standard deviation of this rule.
 _LASTING, _LASTING_SCATTER = 0.5, 0.05
+# Unexplained variance that noise leaves, over the noise-to-signal ratio per query of a texel.
+_NOISE_ERROR = 6.0
 # Below so many steps, twice the steps reduce the error by a tenth or more: in the mean over seven materials
 # to 0.84 of it after 200 steps, to 0.92 after 400.
 FEWEST_STEPS = 400
@@ -134,6 +137,9 @@ class MarginalCost:
     steps : number of training steps
     noise_share_error : two standard errors of `noise_share`
     kept_step : step of the state that is kept, if it is not the last: later, the fit overfitted
+    noise : noise variance of the training queries over the variance of their values; None where unknown
+    density : training queries per texel; None where the data hold images or slices
+    noise_limit : share of the error that this noise leaves however long the training; 0 where unknown
     """
 
     doubling: float | None
@@ -141,6 +147,9 @@ class MarginalCost:
     steps: int
     noise_share_error: float = 0.0
     kept_step: int | None = None
+    noise: float | None = None
+    density: float | None = None
+    noise_limit: float = 0.0
 
     def as_dict(self) -> dict[str, float | int | None]:
         """Plain data for JSON."""
@@ -153,18 +162,23 @@ class MarginalCost:
 
 
 def marginal_cost_of(
-    history: list[dict[str, Any]],
-    errors: dict[str, Any],
-    noise: float | None = None,
-    kept: int | None = None,
+    history: list[dict[str, Any]], errors: dict[str, Any], training: Mapping[str, Any]
 ) -> MarginalCost | None:
-    """Marginal cost of a finished fit, from the records of its history, its errors by split, the variance
-    of the noise of training values in 1/sr² (None: unknown), and the step of the state that is kept (None:
-    the last); None where the history is incomplete."""
+    """Marginal cost of a finished fit, from the records of its history, its errors by split, and the record
+    of its training, empty where unknown; None where the history is incomplete."""
     if not history or history[-1].get("fraction", 0.0) < 1.0:
         return None
-    share, error = _noise_share(errors, noise) or (None, 0.0)
-    return MarginalCost(_doubling(history), share, int(history[-1]["step"]), error, kept)
+    share, error = _noise_share(errors, training.get("noise_variance")) or (None, 0.0)
+    last, doubling, limit = history[-1], _doubling(history), 0.0
+    ratio, density = training.get("noise_ratio"), training.get("queries_per_texel")
+    if ratio and density:
+        # An unknown error is about that of the mean value.
+        reached = last["unexplained"] if _number(last["unexplained"]) and last["unexplained"] > 0.0 else 1.0
+        limit = min(1.0, _NOISE_ERROR * ratio / density / reached)
+    # Longer training reduces the rest.
+    doubling = None if doubling is None else doubling ** (1.0 - limit)
+    kept = kept_step(training)
+    return MarginalCost(doubling, share, int(last["step"]), error, kept, ratio, density, limit)
 
 
 def _doubling(history: list[dict[str, Any]]) -> float | None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time as clocks
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -86,13 +87,13 @@ def run(
     }
     command = command_line("mbtf-pipeline", "run", recipe, **given)
     loaded, own = load(recipe, assignments or []), assignments or []
-    given |= {"live": live, "dry_run": dry_run}
+    flags = given | {"live": live, "dry_run": dry_run}
     check_error(error)
     if isinstance(loaded, Collection):
         from mbtf_pipeline.collection.run import run_collection
 
         hint = "set times in the recipe; --quick is its small size"
-        _refuse(given, ("quality", "time", "error", "dry_run", "live"), "a recipe of several materials", hint)
+        _refuse(flags, ("quality", "time", "error", "dry_run", "live"), "a recipe of several materials", hint)
         folder = output or loaded.folder_of(quick)
         keep_on_interruption(f"the finished stages are kept in {folder}")
         # A crash ends one material of a library alone; the runs of a paper show their progress.
@@ -110,10 +111,14 @@ def run(
             )
         _report_collection(done, folder, console)
     else:
-        _refuse(given, ("quick",), "a recipe of one material", "use --quality draft")
+        _refuse(flags, ("quick",), "a recipe of one material", "use --quality draft")
         folder = output or loaded.folder
+        from mbtf_core.config.settings import explicit_options
         from mbtf_pipeline.cost.forecast import has_error
+        from mbtf_pipeline.recipe import is_single
 
+        # The file may be another one when the run has ended.
+        single = is_single(explicit_options(recipe, own)["fit"])
         if time is None:
             from mbtf_pipeline.recipe import preset_recipe
             from mbtf_pipeline.run_time import forecast_left
@@ -147,7 +152,7 @@ def run(
                 live=page,
                 runner=runner,
             )
-        _report(result, console, quality)
+        _report(result, console, quality, partial(_next_command, recipe, single, given))
 
 
 def _forecast(recipe: Recipe, folder: Path, console: Console) -> None:
@@ -188,8 +193,34 @@ def _report_collection(done: CollectionResult, folder: Path, console: Console) -
         )
 
 
-def _report(result: RunResult, console: Console, quality: Quality | None) -> None:
-    from mbtf_fit.formatting import unreliable
+def _next_command(
+    file: Path, single: bool, given: Mapping[str, Any], options: Mapping[str, dict[str, str]]
+) -> str | None:
+    """The command of a run, `given` its own options, with those that its fits, by name, need; None where they
+    need none. `single`: the recipe has no name for its fit."""
+    from mbtf_core.units import asked_duration, format_duration
+
+    own, more, changes = given["set"] or [], dict(given), dict[str, str]()
+    for name, needed in options.items():
+        changes |= {k.replace("fit", "fit" if single else f"fit.{name}", 1): v for k, v in needed.items()}
+    if given["time"] and any(key.endswith(".training.time") for key in changes):
+        # The time of everything sets those of the fits.
+        more["time"] = format_duration(2 * asked_duration(given["time"], "--time"))
+        changes = {key: value for key, value in changes.items() if not key.endswith(".training.time")}
+    kept = [text for text in own if text.partition("=")[0].strip() not in changes]
+    more["set"] = [*kept, *(f"{key}={value}" for key, value in changes.items())]
+    return command_line("mbtf-pipeline", "run", file, **more) if more != {**given, "set": own} else None
+
+
+def _report(
+    result: RunResult,
+    console: Console,
+    quality: Quality | None,
+    again: Callable[[Mapping[str, Any]], str | None],
+) -> None:
+    from mbtf_fit import Material
+    from mbtf_fit.cli.advice import suggest
+    from mbtf_fit.formatting import outliers, unreliable
     from mbtf_fit.training.endings import describe_ending
     from mbtf_fit.training.fit_folder import read_history
     from mbtf_fit.training.validation import caveat
@@ -201,21 +232,29 @@ def _report(result: RunResult, console: Console, quality: Quality | None) -> Non
     ran = {name: stage.seconds for name, stage in result.stages.items() if stage.reason}
     times = ", ".join(f"{name} {clock(seconds)}" for name, seconds in ran.items())
     lines = [f"{result.report}: {times or 'everything up to date'}"]
-    fits, recipe = {}, read_resolved(folder)
+    fits, options, recipe = {}, {}, read_resolved(folder)
+    queries = recipe.generate.queries.model_dump(mode="json")
     for fit, record in result.comparison["test"].items():
-        errors = record["splits"]["test"]
-        ending = describe_ending(recipe.fit[fit], read_history(folder / FITS / fit))
+        errors, history = record["splits"]["test"], read_history(folder / FITS / fit)
+        ending = describe_ending(recipe.fit[fit], history)
+        step = suggest(Material.load(folder / FITS / fit), history, record["splits"])
         why = caveat(record["training_steps"], errors["unexplained"])
         fits[fit] = {
             "unexplained_variance": errors["unexplained"],
             "mse": errors["mse"],
             "ending": ending,
             "caveat": why or None,
+            "advice": None if step is None else step.reason,
         }
         name = f"{fit} ({why})" if why else fit
         few = f" ({remark})" if (remark := unreliable(errors)) else ""
         lines.append(f"  {name}: unexplained variance {estimate(errors['unexplained'])}{few}")
-        lines += [] if ending is None else [f"    {ending}"]
+        more = [*outliers(errors), ending, fits[fit]["advice"]]
+        lines += [f"    {line}" for line in more if line]
+        if step is not None:
+            options[fit] = step.options(recipe.fit[fit], record["training_seconds"], queries)
+    command = again(options)
+    lines += [] if command is None else ["next:", f"  {command}"]
     if result.viewer is not None:
         lines.append(f"{result.viewer}: open it in a browser to turn the fits under lights")
     data = {
@@ -229,6 +268,7 @@ def _report(result: RunResult, console: Console, quality: Quality | None) -> Non
             for name, stage in result.stages.items()
         },
         "test": fits,
+        "next_command": command,
     }
     console.report(data, "\n".join(lines))
 

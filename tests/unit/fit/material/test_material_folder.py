@@ -226,6 +226,27 @@ def test_few_queries_that_decide_an_error_are_said(data: Path) -> None:
     assert "unreliable" not in "".join(report_errors({"test": found | {"n": 500}}, None))
 
 
+def test_outliers_of_the_prediction_are_named(data: Path) -> None:
+    """One value of 5.4 for 0.6, at its place; not where the reference is as uncertain as that."""
+    opened = Dataset.open(data)
+    stored = load_split(opened, "test")
+    truth = np.full_like(stored.value_a, 0.6)
+    off = 0.02 * (-1.0) ** np.arange(len(truth), dtype=np.float32)[:, None] * np.ones_like(truth)
+    off[7] = 4.8
+    for spread, named in ((0.1, True), (4.0, False)):
+        a, b = truth.copy(), truth.copy()
+        a[7], b[7] = truth[7] + spread, truth[7] - spread
+        queries = ShardQueries(**(vars(stored) | {"value_a": a, "value_b": b}))
+        found = split_errors(lambda q: truth + off, queries, opened)
+        assert found is not None
+        found["n"] = 5000
+        line = "".join(report_errors({"test": found}, None))
+        assert ("one outlier makes" in line) == named
+        (u, v), level = stored.u[7], -np.log2(2.0 * stored.sigma[7])
+        for words in ("5.4 predicted for 0.6", f"level {level:.1f}", f"u ({u:.3f}, {v:.3f})"):
+            assert (words in line) == named
+
+
 def test_evaluation_repeats_the_errors_of_the_fit(fitted: FitResult, data: Path) -> None:
     again = evaluate(fitted.material, data)["errors"]
     assert set(again) == {"test", "held_out_queries", "held_out_directions", "training"}

@@ -43,8 +43,8 @@ def fitted(value: float, error: float, training: float = 0.1) -> dict[str, Any]:
     return {name: {"n": 8192, "unexplained": {"value": v, "error": e}} for name, (v, e) in both.items()}
 
 
-def cost(records: list[dict[str, Any]], *arguments: Any, **options: Any) -> MarginalCost:
-    found = marginal_cost_of(records, *arguments, **options)
+def cost(records: list[dict[str, Any]], errors: dict[str, Any], **training: Any) -> MarginalCost:
+    found = marginal_cost_of(records, errors, training)
     assert found is not None
     return found
 
@@ -119,12 +119,12 @@ def test_few_steps_ask_for_more_whatever_the_curve_shows() -> None:
 def test_half_of_the_distance_to_the_training_error_is_overfitting() -> None:
     # Least squares with k free numbers and noise s² in n queries misses others by s²k/n, and seems to miss
     # its own by -s²k/n.
-    found = cost(history(0.5), errors(0.2 + 0.05, 0.2 - 0.05), 0.3)
+    found = cost(history(0.5), errors(0.2 + 0.05, 0.2 - 0.05), noise_variance=0.3)
     assert found.noise_share == pytest.approx(0.05 / 0.25)
     # Two standard errors of 0.002, over 2 x 0.25.
     assert found.noise_share_error == pytest.approx(0.01, rel=0.1)
     for same in (errors(0.25, 0.248), errors(0.25, 0.3), {}, errors(math.nan, 0.1)):
-        assert cost(history(0.5), same, 0.3).noise_share is None
+        assert cost(history(0.5), same, noise_variance=0.3).noise_share is None
 
 
 @pytest.mark.parametrize(
@@ -132,7 +132,7 @@ def test_half_of_the_distance_to_the_training_error_is_overfitting() -> None:
 )
 def test_overfitting_is_bounded_by_the_noise(noise: float | None, share: float | None) -> None:
     """Few queries without noise leave the same distance: what lies between them was not learned."""
-    found = cost(history(0.5), errors(0.25, 0.15), noise).noise_share
+    found = cost(history(0.5), errors(0.25, 0.15), noise_variance=noise).noise_share
     assert found == (share if share is None else pytest.approx(share))
 
 
@@ -163,9 +163,9 @@ def test_a_fit_to_other_training_queries_gets_no_advice(
         (None, None, fitted(0.2, 0.04), "time"),
         (0.99, 0.05, fitted(0.2, 0.04), "none"),
         # Neither is known of an uncertain or an undefined error.
-        (0.8, 0.9, fitted(0.2, 0.06), "test"),
-        (0.8, 0.9, {"test": {"n": 8, "unexplained": {"value": None, "error": None}}}, "test"),
-        (0.8, 0.9, {"test": fitted(0.2, 0.04)["test"] | {"ten_largest": 0.69}}, "test"),
+        (0.8, None, fitted(0.2, 0.06), "test"),
+        (0.8, None, {"test": {"n": 8, "unexplained": {"value": None, "error": None}}}, "test"),
+        (0.8, None, {"test": fitted(0.2, 0.04)["test"] | {"ten_largest": 0.69}}, "test"),
         # Worse than the mean value: training queries that were learned, or not yet.
         (0.8, None, fitted(1.4, 0.1), "queries"),
         (0.8, None, fitted(1.4, 0.1, training=1.2), "time"),
@@ -175,6 +175,56 @@ def test_the_next_step_is_what_pays_most(
     doubling: float | None, share: float | None, errors: dict[str, Any], kind: str
 ) -> None:
     assert next_step(MarginalCost(doubling, share, 4000), errors).kind == kind
+
+
+@pytest.mark.parametrize(("density", "kind"), [(50, "queries"), (800, "time"), (None, "time")])
+def test_noisy_training_queries_limit_longer_training(density: float | None, kind: str) -> None:
+    """The basket weave at 50 queries per texel, 16 paths each: twice of 400 steps left 1.04 of the error,
+    twice the queries 0.69. The same noise in many queries per texel hardly matters."""
+    free, found = (cost(history(0.3), {}, noise_ratio=1.4, queries_per_texel=d) for d in (None, density))
+    assert free.doubling is not None
+    assert found.doubling is not None
+    if kind == "queries":
+        assert found.doubling > FLAT
+    else:
+        assert found.doubling == pytest.approx(free.doubling, abs=0.02)
+    step = next_step(found, fitted(0.2, 0.002, training=0.19))
+    assert step.kind == kind
+    # Of an unknown error, too.
+    lost = [r | {"unexplained": None, "unexplained_error": None} for r in history(0.3)]
+    found = cost(lost, {}, noise_ratio=4.0, queries_per_texel=density)
+    unknown = {"test": {"n": 8, "unexplained": {"value": None, "error": None}}}
+    assert next_step(found, unknown).kind == ("queries" if kind == "queries" else "test")
+    assert ("140% of their variance at 50 per texel" in step.reason) == (kind == "queries")
+
+
+@pytest.mark.parametrize(
+    ("found", "errors", "kind"),
+    [
+        # Overfitting; an earlier state; noise; errors of training queries that are much smaller, or not.
+        (MarginalCost(0.8, 0.3, 4000), fitted(0.22, 0.06, training=0.2), "queries"),
+        (MarginalCost(0.8, None, 4000, kept_step=480), fitted(0.22, 0.06, training=0.2), "queries"),
+        (MarginalCost(0.8, None, 4000, 0, None, 1.4, 50, 0.5), fitted(0.22, 0.06, training=0.2), "queries"),
+        (MarginalCost(0.8, None, 4000), fitted(0.22, 0.06, training=0.03), "queries"),
+        (MarginalCost(0.8, None, 4000), fitted(0.22, 0.06, training=0.14), "test"),
+        (MarginalCost(0.8, None, 4000), fitted(0.22, 0.12, training=0.03), "test"),
+        (
+            MarginalCost(0.8, None, 4000),
+            fitted(0.22, 0.06) | {"training": {"n": 9, "unexplained": {"value": -1.0, "error": 1.3}}},
+            "test",
+        ),
+    ],
+)
+def test_an_uncertain_error_asks_for_training_queries_where_they_are_too_few(
+    found: MarginalCost, errors: dict[str, Any], kind: str
+) -> None:
+    step = next_step(found, errors)
+    assert step.kind == kind
+    # One command makes both.
+    changed = step.options(FitConfig(), 1.0, {"train": "50/texel", "test": "8192"})
+    test = {"generate.queries.test": "32768", "generate.queries.test_highlights": "75%"}
+    more = {"generate.queries.train": "100/texel"} if kind == "queries" else {}
+    assert changed == more | test
 
 
 @pytest.mark.parametrize(
@@ -188,7 +238,9 @@ def test_a_fit_that_kept_an_earlier_state_needs_more_queries(share: float | None
     """Whatever the curve shows; with twice the queries the best state is a later one, so the factor of equal
     states is a bound."""
     for doubling in (0.6, None, 1.5):
-        found = next_step(MarginalCost(doubling, share, 4000, kept_step=480), fitted(0.2, 0.002))
+        # The noise's limit is no bound: the states differ.
+        noisy = MarginalCost(doubling, share, 4000, 0.0, 480, 1.4, 50.0, noise_limit=1.0)
+        found = next_step(noisy, fitted(0.2, 0.002))
         assert found == NextStep("queries", f"the fit overfits noise after 480 steps; {reason}")
 
 
