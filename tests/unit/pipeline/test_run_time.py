@@ -118,12 +118,10 @@ def test_training_is_shortened_when_generating_overran(fake: Machine, one: Path)
     again = timed(one, 120.0)
     assert again.generated(again.recipe).fit["neumip"].training.time.seconds == after
     fake.now = 0.0
-    notes: list[str] = []
-    late = timed(one, 120.0, folder=one.parent / "late", progress=notes.append)
+    late = timed(one, 120.0, folder=one.parent / "late")
     fake.now = 500.0
     # No less than the preset's: never worse.
     assert late.generated(late.recipe).fit["neumip"].training.time.seconds == 12.0
-    assert "the run will be about" in notes[-1]
 
 
 def test_the_same_command_resumes_with_the_same_split(fake: Machine, one: Path) -> None:
@@ -147,17 +145,8 @@ def test_all_stages_count(fake: Machine) -> None:
     assert data < found.bytes < data + 2e8
     parts = (found.start, found.generating, found.training, found.evaluating, found.comparing)
     assert found.seconds == sum(parts)
-    assert found.describe().startswith("expected: about 3:")
     by_steps = forecaster.of(load_recipe(FILE, ["fit.neumip.training.steps=100"]))
     assert by_steps.training == 80.0
-    assert by_steps.describe().endswith(", and the steps of neumip")
-    # Steps that pilots have timed, and others.
-    recipe = preset_recipe(FILE, "draft")
-    found = forecaster.of(recipe, training={"relief": 50.0})
-    assert found.training == 50.0 + 12.0 * (len(recipe.fit) - 1)
-    assert found.describe().endswith(", or longer for 800 steps of training")
-    timed = forecaster.of(recipe, training=dict.fromkeys(recipe.fit, 50.0))
-    assert (timed.training, timed.min_steps) == (50.0 * len(recipe.fit), 0)
     recipe = load_recipe(FILE)
     # What is finished costs nothing.
     left = forecaster.of(recipe, ["fit neumip", "compare", "report"])

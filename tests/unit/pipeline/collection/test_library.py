@@ -12,8 +12,6 @@ import pytest
 
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item, Result
-from mbtf_core.units import clock
-from mbtf_pipeline.collection.pages import library_page
 from mbtf_pipeline.collection.recipes import Collection, load
 from mbtf_pipeline.collection.run import CollectionResult, run_collection
 
@@ -83,28 +81,3 @@ def test_fits_of_a_material_share_its_time(runs: Runs) -> None:
     for name, expected in (("a", ["1.5s"] * 2), ("b", ["3s"])):
         fits = runs.items[name].arguments["recipe"].fit
         assert [str(fit.training.time) for fit in fits.values()] == expected
-
-
-def material(name: str, state: str, value: float = 0.1, **more: Any) -> dict[str, Any]:
-    unexplained = {"value": value, "error": 0.001, "n": 100}
-    fits = {"relief": {"unexplained": unexplained, "picture": "fit.png"}} if state == "done" else {}
-    seconds = {"generate": 20.0, "fit relief": 30.0} if state == "done" else {}
-    found = {"name": name, "path": f"../{name}", "state": state, "error": "", "fits": fits}
-    return found | {"seconds": seconds, "reference": "reference.png", **more}
-
-
-def record(*materials: dict[str, Any], training: str | None = None) -> dict[str, Any]:
-    recipe = {"title": "Test", "description": "", "training": training}
-    machine = {"system": "here"}
-    return {"recipe": recipe, "command": "run", "machine": machine, "runs": list(materials)}
-
-
-def test_failures_come_after_errors_and_show_nothing_of_earlier_runs(tmp_path: Path) -> None:
-    (tmp_path / "a").mkdir()
-    (tmp_path / "a" / "report.html").write_text("")
-    failed = material("a", "done", 0.9) | {"state": "failed", "error": "no memory"}
-    shown = library_page(record(failed, material("b", "done", 0.0, path="<b>&")), tmp_path)
-    assert shown.index('id="b"') < shown.index('id="a"')
-    assert "report.html" not in shown
-    assert f"took {clock(50.0)}" in shown
-    assert "&lt;b&gt;&amp;" in shown

@@ -98,13 +98,9 @@ def test_published_numbers_match_the_papers() -> None:
     found = mse_ratio("insulation_foam", "rainer2020", "neumip")
     assert found == (pytest.approx(21.75 / 3.90), "Kuznetsov et al. 2021")
     assert mse_ratio("insulation_foam", "hierarchical", "neumip") == (None, None)
-    assert mse_ratio("tree_bark", "neumip", "neumip-baseline") == (None, None)
     decibels, _ = mse_ratio("turtle_shell", "hierarchical", "neumip")
     assert decibels is not None
     assert -10 * math.log10(decibels) == pytest.approx(32.18 - 30.79)
-    zooms, _ = first_known(PUBLISHED, lambda p: p.level_ratios("twisted_wool", "neumip"))
-    assert zooms is not None
-    assert [round(3.98 * ratio, 2) for ratio in zooms] == [3.98, 2.1, 1.47, 1.07, 0.74, 1.16, 1.17, 1.08]
 
 
 def test_levels_start_at_the_coarsest_and_zooms_at_the_finest(tmp_path: Path) -> None:

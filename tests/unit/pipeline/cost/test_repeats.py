@@ -12,7 +12,6 @@ import pytest
 from support.fake_runs import TRUE, FakeRuns, MemoryStore, conditions, run
 
 from mbtf_core.run.runner import Runner
-from mbtf_core.run.task import THREADS_VARIABLE, available_cores
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.cost import measurement as module
 from mbtf_pipeline.cost.measurement import (
@@ -23,7 +22,6 @@ from mbtf_pipeline.cost.measurement import (
     Measurement,
     combined,
     measure,
-    processor_share,
     seed_deviation,
 )
 from mbtf_pipeline.cost.runs import MOST_SEEDS, Run
@@ -152,8 +150,3 @@ def test_a_time_has_the_error_of_other_work(monkeypatch: pytest.MonkeyPatch) -> 
     assert combined(group, Estimate(0.1, 0.02, 9)).seconds.error == pytest.approx(
         0.25 * group[0].seconds.value
     )
-
-
-def test_threads_that_share_a_processor_get_less_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(THREADS_VARIABLE, str(8 * available_cores()))
-    assert 0 < processor_share() < 0.5

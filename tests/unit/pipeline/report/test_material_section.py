@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import io
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -27,17 +26,11 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def section(folder: Path) -> dict[str, Any]:
-    config = GeneratorConfig(material=str(folder))
-    return material_section(config, load_material(folder).digests)
-
-
 def test_maps_and_warnings_are_shown(folder: Path) -> None:
-    found = section(folder)
+    found = material_section(GeneratorConfig(material=str(folder)), load_material(folder).digests)
     assert found["missing"] == ""
     maps = {m["label"]: m for m in found["maps"]}
     assert set(maps) == {"Height", "Base color"}
-    assert maps["Height"]["lines"][:2] == ["height.png", "256 × 300, displaces the mesh"]
     for shown, brightest in (maps["Height"], 255), (maps["Base color"], 200):
         data = base64.b64decode(shown["image"].partition("base64,")[2])
         pixels = np.asarray(Image.open(io.BytesIO(data)).convert("RGB")).astype(int)
@@ -47,8 +40,6 @@ def test_maps_and_warnings_are_shown(folder: Path) -> None:
     warnings = "\n".join(found["warnings"])
     assert "height.png: 8-bit heights" in warnings
     assert "height.png: does not tile along u" in warnings
-    assert str(folder) not in warnings
-    assert "does not tile along u" in str(found["inspection"])
 
 
 def test_a_material_that_changed_since_is_not_shown(folder: Path) -> None:
