@@ -1,4 +1,4 @@
-"""What a driver does to the process that loads it."""
+"""Ends of processes that no handler sees."""
 
 from __future__ import annotations
 
@@ -6,6 +6,10 @@ import os
 import signal
 from collections.abc import Iterator
 from typing import Any
+
+
+class Killed(BaseException):
+    """Nothing that runs after it may tidy up: stands for SIGKILL in this process."""
 
 
 def crash(*_: str) -> Iterator[dict[str, Any]]:

@@ -18,7 +18,7 @@ from support.datasets import edit, read_checksummed, write_dataset
 from support.plugin_materials import write_material
 
 from mbtf_core.color import to_display
-from mbtf_fit.preview.grid import BAR_STRIP, CAPTION, GAP, MARGIN
+from mbtf_fit.preview.grid import CAPTION, GAP, MARGIN
 from mbtf_gen.pictures import reference
 
 VALUE = (0.1, 0.12, 0.15)
@@ -49,7 +49,6 @@ def halves(path: Path) -> list[np.ndarray]:
 def test_errors_and_panels_are_those_of_reference_and_fit(work: Path) -> None:
     done = compare(work)
     report = done.result()
-    assert "texels of the resolution" not in done.err
     assert "another material" not in done.err
     exposure = report["exposure"]
     image = np.asarray(Image.open(work / "out/comparison.png")).astype(int)
@@ -80,10 +79,6 @@ def test_errors_and_panels_are_those_of_reference_and_fit(work: Path) -> None:
         inside = lightness < 200
         assert inside.mean() > 0.5
         assert spearmanr(lightness[inside], smooth[inside]).statistic > 0.98
-    # The numbers of the color bar lie below the errors alone.
-    below = image[-BAR_STRIP:].min(axis=(0, 2))
-    assert (below[: MARGIN + 2 * pitch - GAP] == 255).all()
-    assert below[MARGIN + 2 * pitch : -MARGIN].max() < 255
 
 
 def test_data_of_another_material_are_announced(work: Path, tmp_path: Path) -> None:

@@ -10,12 +10,9 @@ import pytest
 from support.fit_data import parallax, write_data
 
 from mbtf_core.app.console import run
-from mbtf_core.data.lattice import Lattice
 from mbtf_core.files import folders
 from mbtf_fit.cli.app import app
-from mbtf_fit.config import FitConfig
 from mbtf_fit.training import fit as fits
-from mbtf_fit.training.forecast import fit_bytes
 
 
 @pytest.fixture(scope="module")
@@ -41,15 +38,3 @@ def test_a_long_fit_states_time_and_size(
     assert run(app, [str(shards), "-o", str(out)]) == 3
     assert "10 kB are free" in capsys.readouterr().err
     assert not out.exists()
-
-
-def test_the_size_is_that_of_two_checkpoints(shards: Path, tmp_path: Path) -> None:
-    """Weights and two moments each, as one is written beside the one before."""
-    config = FitConfig.model_validate({"model": "neumip", "training": {"steps": 2, "batch": 500}})
-    fits.fit(config, shards, tmp_path / "material")
-    stored = (tmp_path / "material" / "weights.safetensors").stat().st_size
-    assert fit_bytes(config, Lattice(3)) == pytest.approx(8 * stored, rel=0.5)
-    assert fit_bytes(config, Lattice(10)) > 4e8
-    relief = FitConfig.model_validate({"training": {"steps": 2, "batch": 500}})
-    fits.fit(relief, shards, tmp_path / "relief")
-    assert fit_bytes(relief, Lattice(3)) > (tmp_path / "relief" / "weights.safetensors").stat().st_size

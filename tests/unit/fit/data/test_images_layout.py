@@ -88,16 +88,6 @@ def test_at_least_one_image_is_held_out(tmp_path: Path) -> None:
         partition(folder, HeldOutSection(radius=0.99, direction=(0.0, 0.0)))
 
 
-def test_values_belong_to_the_positions_within_the_margin() -> None:
-    lattice = Lattice(3)
-    data = images(lattice, [3.0, 2.0], regular=False)
-    patches = data.patches(np.array([1, 0]), np.array([[5, 7], [2, 2]]), 4, 3)
-    number = patches.value[..., 0].long()
-    torch.testing.assert_close(patches.u[:, 3:-3, 3:-3], data.u.view(-1, 2)[number])
-    assert number[0, 0, 0] == 64 + 5 * 8 + 7
-    assert number[0, 1, 1] == 64 + 7 * 8 + (7 + 2) % 8
-
-
 def test_batches_take_every_image_and_resume_anywhere() -> None:
     data = images(Lattice(3), [1.0, 2.0, 3.0, 2.5, 0.5], regular=False)
     batches = list(islice(data.batches(32, 7, 0, 4), 10))
@@ -147,21 +137,6 @@ def test_patches_lie_inside_small_images() -> None:
         assert (number == number[0, 0] + 6 * torch.arange(4)[:, None] + torch.arange(4)).all()
         seen.add(int(number[0, 0]))
     assert seen == {6 * j + i for j in range(3) for i in range(3)}
-
-
-@pytest.mark.parametrize("patch_size", [None, 6])
-def test_smaller_patches_give_more_lights_and_views(tmp_path: Path, patch_size: int | None) -> None:
-    folder = write_images(tmp_path / "d", constant(0.1), train=40, patch_size=patch_size)
-    for patch, shape in ((2, (16, 2, 2, 3)), (4, (4, 4, 4, 3))):
-        training = {"steps": 1, "batch": 64, "patch_size": patch}
-        config = FitConfig.model_validate({"model": "hierarchical", "training": training})
-        data = Dataset.open(folder)
-        part = load_training(data, config.held_out, 0)
-        trainer = prepare_trainer(config, data, part, torch.device("cpu"))
-        batch = next(trainer.queries.batches(trainer.batch, 0, 0, trainer.model.margin))
-        assert isinstance(batch, Patches)
-        assert batch.value.shape == shape
-        assert len(batch.omega_i.unique(dim=0)) == shape[0]
 
 
 @pytest.mark.parametrize("cut", ["whole", "patch_sizes"])

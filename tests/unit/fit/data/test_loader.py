@@ -13,7 +13,7 @@ from support.fit_data import constant, parallax, write_data
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.shard_files import read_shard
 from mbtf_core.errors import InputError
-from mbtf_fit.data.loader import Partition, in_region, label_queries, load_split, load_training
+from mbtf_fit.data.loader import Partition, in_region, load_split, load_training
 from mbtf_fit.data.queries import ShardQueries, batch_starts
 from mbtf_fit.evaluation import split_errors
 from mbtf_fit.sections import HeldOutSection
@@ -53,19 +53,6 @@ def test_every_query_is_used_in_some_epoch(total: int, size: int) -> None:
     """Where batches do not come out even, each epoch leaves out others."""
     starts = list(islice(batch_starts(total, size, 0, 0), 60 * (total // size)))
     assert {k for start in starts for k in range(start, start + size)} == set(range(total))
-
-
-def test_queries_that_share_paths_are_held_out_together(tmp_path: Path) -> None:
-    """The noise of a group is correlated: a fit to some of it knows that of the others."""
-    queries = load_split(Dataset.open(write_data(tmp_path / "d", parallax, train=3000)), "train")
-    held_out = HeldOutSection(queries=0.2, radius=0)
-    labels = label_queries(held_out, queries, 0, 0, 3).reshape(3, 1000)
-    assert (labels == labels[0]).all()
-    assert labels.mean() == pytest.approx(0.2, abs=0.05)
-    # Beside a query of the region, none is trained on.
-    labels = label_queries(HELD_OUT, queries, 0, 0, 3).reshape(3, 1000)
-    assert ((labels == 0).all(axis=0) | (labels != 0).all(axis=0)).all()
-    assert (labels[in_region(HELD_OUT, queries.omega_i).reshape(3, 1000)] == labels.max()).all()
 
 
 def test_queries_know_their_group(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

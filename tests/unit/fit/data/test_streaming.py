@@ -6,18 +6,16 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from conftest import RunPython
 from support.fit_data import parallax, write_data
 
 import mbtf_fit.evaluation
-from mbtf_core.data.dataset import Dataset, Shard
-from mbtf_core.data.folder import DataFolder
+from mbtf_core.data.dataset import Dataset
 from mbtf_core.errors import InputError
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import Partition, load_training
-from mbtf_fit.data.streaming import Selection, StreamedQueries
+from mbtf_fit.data.streaming import StreamedQueries
 from mbtf_fit.evaluation import Predict
 from mbtf_fit.sections import HeldOutSection
 from mbtf_fit.training.fit import fit
@@ -59,20 +57,6 @@ def test_evaluation_streams_its_queries(tmp_path: Path, monkeypatch: pytest.Monk
     for name, expected in result.errors.items():
         assert errors[name]["n"] == expected["n"]
         assert errors[name]["mse"]["value"] == pytest.approx(expected["mse"]["value"], rel=1e-3)
-
-
-def test_selected_rows_are_found_by_index() -> None:
-    random = np.random.default_rng(0)
-    selection, wanted = Selection(), []
-    for k, rows in enumerate((10_000, 1, 4096, 20_001)):
-        chosen = random.random(rows) < (0.9, 0.0, 1.0, 0.01)[k]
-        chosen[:5000] &= k != 3
-        selection.add(Shard(DataFolder.open("."), str(k), {}), chosen)
-        wanted += [(str(k), int(row)) for row in np.flatnonzero(chosen)]
-    assert len(selection) == len(wanted)
-    for start, stop in ((0, 1), (0, len(wanted)), (8990, 9100), (13_000, len(wanted)), (4096, 8192)):
-        found = [(p.file, int(r)) for p, rows in selection.pieces(start, stop) for r in rows]
-        assert found == wanted[start:stop]
 
 
 def test_exr_shards_too_large_for_memory_are_refused(tmp_path: Path) -> None:

@@ -23,7 +23,6 @@ from mbtf_fit import FitConfig, FitResult, Material, evaluate, fit
 from mbtf_fit.data.loader import load_split, load_training
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.evaluation import split_errors
-from mbtf_fit.formatting import report_errors
 from mbtf_fit.material.material import conformance_queries, export
 from mbtf_fit.models.registry import MODELS
 from mbtf_fit.training.trainer import prepare_trainer
@@ -73,8 +72,6 @@ def test_black_data_are_fitted(tmp_path: Path) -> None:
 def test_the_folder_states_what_it_holds(fitted: FitResult) -> None:
     description = json.loads((fitted.folder / "material.json").read_text())
     weights = load_file(fitted.folder / "weights.safetensors")
-    assert description["tile"] == {"aspect": 0.5}
-    assert description["levels"]["shapes"] == [[1, 1], [1, 2], [2, 4], [4, 8]]
     assert {k: list(weights[k].shape) for k in description["weights"]["shapes"]} == description["weights"][
         "shapes"
     ]
@@ -84,7 +81,6 @@ def test_the_folder_states_what_it_holds(fitted: FitResult) -> None:
     held_out = [fitted.errors[name]["n"] for name in ("held_out_queries", "held_out_directions")]
     assert description["training"]["queries"] == 8000 - sum(held_out)
     assert not (fitted.folder / "checkpoint.safetensors").exists()
-    assert fitted.errors["test"]["n"] == 2000
 
 
 @pytest.mark.parametrize("finest", [0, 4])
@@ -121,15 +117,6 @@ def test_conformance_is_pytorchs(fitted: FitResult, tmp_path: Path, monkeypatch:
     assert again.deviation() == pytest.approx(0.25, rel=1e-3)
 
 
-def test_directions_that_are_no_unit_vectors_are_refused(fitted: FitResult) -> None:
-    queries = random_queries(np.random.default_rng(3), 10, fitted.material.lattice)
-    for name in ("omega_i", "omega_o"):
-        with pytest.raises(InputError, match=f"{name}: 10 of 10 directions"):
-            fitted.material.evaluate(**{**queries, name: 5.0 * queries[name]})
-    with pytest.raises(InputError, match="omega_o: 10 of 10 directions"):
-        fitted.material.offset(queries["u"], 5.0 * queries["omega_o"])
-
-
 def test_evaluation_takes_any_number_of_queries(fitted: FitResult) -> None:
     material = fitted.material
     queries = random_queries(np.random.default_rng(3), 70_000, material.lattice)
@@ -144,8 +131,7 @@ def test_evaluation_takes_any_number_of_queries(fitted: FitResult) -> None:
 
 
 def test_damaged_materials_are_refused(fitted: FitResult, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such folder"):
-        Material.load(tmp_path / "none")
+    """Fuzzed files are those of test_fuzz_fits.py."""
     with pytest.raises(InputError, match=r"no material\.json"):
         Material.load(tmp_path)
     for name in ("material.json", "weights.safetensors"):
@@ -154,18 +140,14 @@ def test_damaged_materials_are_refused(fitted: FitResult, tmp_path: Path) -> Non
     content = bytearray(weights.read_bytes())
     content[-1] ^= 1
     weights.write_bytes(content)
-    again = "copy the folder again, or fit again"
-    with pytest.raises(InputError, match=rf"is damaged, .*SHA-256 is not .*\n  {again}"):
+    with pytest.raises(InputError, match=r"is damaged, .*SHA-256 is not "):
         Material.load(tmp_path)
     weights.unlink()
-    with pytest.raises(InputError, match=rf"weights\.safetensors: no such file, .*\n  {again}"):
+    with pytest.raises(InputError, match=r"weights\.safetensors: no such file"):
         Material.load(tmp_path)
-    description = json.loads((tmp_path / "material.json").read_text())
-    (tmp_path / "material.json").write_text(json.dumps({**description, "schema": 99}))
+    edited = json.loads((tmp_path / "material.json").read_text()) | {"schema": 99}
+    (tmp_path / "material.json").write_text(json.dumps(edited))
     with pytest.raises(InputError, match="schema version 99"):
-        Material.load(tmp_path)
-    (tmp_path / "material.json").write_text("{")
-    with pytest.raises(InputError, match=f"not readable as JSON .*\n  {again}"):
         Material.load(tmp_path)
 
 
@@ -211,8 +193,6 @@ def test_few_queries_that_decide_an_error_are_said(data: Path) -> None:
         assert found is not None
         ten = 10 * (heavy or 1.0)
         assert found["ten_largest"] == pytest.approx(ten / (ten + 0.01 * (n - 10)), rel=1e-3)
-    assert "unreliable: ten" in "".join(report_errors({"test": found | {"n": 5000}}, None))
-    assert "unreliable" not in "".join(report_errors({"test": found | {"n": 500}}, None))
 
 
 def test_evaluation_repeats_the_errors_of_the_fit(fitted: FitResult, data: Path) -> None:
@@ -278,24 +258,18 @@ def test_evaluation_broadcasts_as_numpy_does(fitted: FitResult) -> None:
 
 
 @pytest.mark.parametrize(
-    ("u", "sigma"), [(np.zeros((5, 2)), np.ones(4)), (np.zeros((5, 1)), 0.1), (0.5, 0.1), (np.zeros(3), 0.1)]
-)
-def test_shapes_that_do_not_broadcast_are_refused(fitted: FitResult, u: Any, sigma: Any) -> None:
-    with pytest.raises(InputError, match=r"u, sigma, omega_i, omega_o: have the shapes") as fault:
-        fitted.material.evaluate(u, sigma, [0, 0, 1], [0, 0, 1])
-    assert fault.value.hint == "they must broadcast to (..., 2), (...), (..., 3), (..., 3)"
-
-
-@pytest.mark.parametrize(
     ("name", "value", "what"),
     [
         ("u", "here", "no array of real numbers"),
         ("u", [["0.1", "0.2"]], "no array of real numbers"),
-        ("sigma", [0.1, None], "no array of real numbers"),
         ("sigma", [[0.1], [0.1, 0.2]], "no array of real numbers"),
         ("u", [0.5, np.nan], r"NaN or infinity \(1 of 2"),
         ("sigma", np.nan, r"NaN or infinity \(1 of 1"),
+        ("u", np.zeros((5, 1)), "have the shapes"),
+        ("u", 0.5, "have the shapes"),
+        ("u", np.zeros(3), "have the shapes"),
         ("omega_i", 1.0, "have the shapes"),
+        ("omega_i", [0.0, 0.0, 5.0], "1 of 1 directions"),
         ("omega_o", [0.0, 1.0], "have the shapes"),
         ("omega_o", [0.0, 0.0, np.nan], "NaN or infinity"),
     ],

@@ -158,7 +158,6 @@ def test_an_operation_of_pytorch_alone_is_refused(tmp_path: Path) -> None:
     [
         ("network", {"hidden": [24, 25, 25]}, "has the shape"),
         ("lookup", {"channels": 6}, "has the shape"),
-        ("network", {"activation": "gelu"}, "activation"),
         ("network", {"x": ["nothing"]}, "'nothing', which is not computed"),
         ("lookup", {"operation": "guess"}, "is unknown: 'guess'"),
     ],
@@ -183,11 +182,8 @@ def test_operations_without_their_tensors_are_refused(
         ("surface.heights", lambda a: a + 0.01, "has heights above the reference plane"),
         ("surface.heights", lambda a: np.where(a == a.min(), np.nan, a), "not finite"),
         ("surface.maps.4", None, "lacks the tensor 'surface.maps.4'"),
-        ("surface.maps.2", lambda a: a[:-1], "has the shape (3, 4, 10)"),
         ("surface.maps.0", lambda a: a[..., :9], "have 9 channels in place of 8, 10 or 12"),
-        ("surface.horizons.0", lambda a: a[..., :-1], "has the shape (1, 1, 31)"),
         ("surface.dielectric", lambda a: a[None], "has the shape (1,)"),
-        ("depth_weights", lambda a: a[1:], "has the shape (3,)"),
     ],
 )
 def test_corrupt_surfaces_are_refused(name: str, change: Any, fault: str, tmp_path: Path) -> None:

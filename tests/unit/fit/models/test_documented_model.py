@@ -113,22 +113,6 @@ def test_a_file_at_fault_is_named_with_its_line(
     assert what in caught.value.what
 
 
-def test_an_edited_file_is_read_again(tmp_path: Path) -> None:
-    """And a class without a name has that of the class."""
-    file = tmp_path / "my_model.py"
-    texels = []
-    for channels in (3, 4):
-        text = documented().replace("channels=3", f"channels={channels}").replace('"texel"', '"texel[0:3]"')
-        text = text.replace('Lookup("texel[0:3]"', 'Lookup("texel"').replace(
-            "name, description = ", "said = "
-        )
-        file.write_text(text)
-        material = build_model(f"{file}:TexelDiffuse", Lattice(2, 1.0))
-        assert material.name == "TexelDiffuse"
-        texels.append(sum(p.numel() for p in material.parameters()))
-    assert texels[1] * 3 == texels[0] * 4
-
-
 def install(folder: Path, point: str = "") -> str:
     """Install the documented package, or one with another entry point; returns the path to import from."""
     project = tomllib.loads(documented("toml"))

@@ -17,8 +17,7 @@ from mbtf_fit.backends.cpu.gradients import NativeGradients
 from mbtf_fit.backends.cpu.model import NativeModel, supports
 from mbtf_fit.config import build_model
 from mbtf_fit.data.queries import TrainingQueries
-from mbtf_fit.models import learned_relief
-from mbtf_fit.models.learned_relief import FILTERED, FILTERED_LEAST, TRACED, LearnedRelief
+from mbtf_fit.models.learned_relief import LearnedRelief
 from mbtf_fit.native import library
 from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.noise import NoiseModel
@@ -146,21 +145,6 @@ def test_a_flat_surface_is_displaced_by_its_depth() -> None:
     torch.testing.assert_close(batch.hints[high, 1], torch.ones(int(high.sum())), atol=1e-4, rtol=0)
 
 
-def test_rays_follow_the_heights_before_normals_and_horizons() -> None:
-    hooks = model_of()
-    model: Any = hooks.material
-    first = model.known
-    with torch.no_grad():
-        model.heights.texels -= 0.1
-    hooks.follow(TRACED + 1, 0.0)
-    assert model.known is first
-    hooks.follow(TRACED, 0.0)
-    assert float((model.known.heights - first.heights).max()) == pytest.approx(-0.1 * HEIGHT_SCALE, rel=1e-3)
-    assert model.known.maps is first.maps
-    hooks.follow(FILTERED, 0.0)
-    assert model.known.maps is not first.maps
-
-
 def test_heights_stay_below_the_reference_plane() -> None:
     hooks = model_of()
     model: Any = hooks.material
@@ -172,55 +156,3 @@ def test_heights_stay_below_the_reference_plane() -> None:
     hooks.follow(0, 0.0)
     assert float(model.known.heights.max()) == pytest.approx(0, abs=1e-8)
     assert float(model.known.heights.max()) <= 0
-
-
-def test_short_fits_filter_normals_and_horizons_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(learned_relief, "FILTERED", 10**6)
-    hooks = model_of()
-    model: Any = hooks.material
-    seen = []
-    for step in range(1, 100):
-        before = model.known.maps
-        hooks.follow(step, 0.0, step / 100)
-        seen += [step] if model.known.maps is not before else []
-    assert len(seen) == FILTERED_LEAST - 1
-    assert seen[-1] < 90
-
-
-def test_heights_start_from_those_of_another_material() -> None:
-    first, second = model_of(), model_of()
-    texels = first.material.texture("heights").texels
-    with torch.no_grad():
-        texels -= torch.rand(texels.shape)
-    first.follow(0, 0.0)
-    second.init_from(first.material)
-    mine, theirs = (hooks.material.known.heights for hooks in (second, first))
-    assert torch.equal(mine, theirs)
-    # The next step of training goes on from there.
-    second.follow(0, 0.0)
-    torch.testing.assert_close(second.material.known.heights, theirs, atol=1e-6, rtol=0)
-
-
-def test_the_surface_is_restored() -> None:
-    """Also where rays see newer heights than normals and horizons were filtered from."""
-    hooks = model_of()
-    model: Any = hooks.material
-    with torch.no_grad():
-        model.heights.texels -= 0.1 * torch.rand(model.heights.texels.shape)
-    hooks.follow(TRACED, 0.0)
-    again = hooks_of(LATTICE)
-    again.restore({name: tensor.clone() for name, tensor in hooks.state().items()})
-    for name, tensor in model.known.tensors().items():
-        assert torch.equal(again.material.known.tensors()[name], tensor), name
-
-
-def test_a_material_stores_the_surface_alone() -> None:
-    hooks = model_of()
-    model: Any = hooks.material
-    tensors = model.weights()
-    assert "surface.heights" in tensors
-    assert not [name for name in tensors if name.startswith("heights")]
-    again = build_model("neumip+", LATTICE)
-    again.load_weights(tensors)
-    arrays = queries_of(batch_of(hooks, 50))[:4]
-    torch.testing.assert_close(again(*arrays), model(*arrays), atol=0, rtol=0)

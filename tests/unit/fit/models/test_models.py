@@ -95,9 +95,6 @@ def test_weight_counts_are_the_papers() -> None:
 
 
 def test_unset_options_are_the_models_own() -> None:
-    assert FitConfig(model="neumip").network.offset == "depth"
-    assert FitConfig().network.encoding.half_vector
-    assert FitConfig(model="neumip-baseline").network.offset == "none"
     network = resolve(FitConfig, assignments=["model=hierarchical", "network.encoding.position=6"]).network
     assert (network.decoder, network.output_transform) == ("inception", "fourth-root")
     assert network.encoding.direction == 4

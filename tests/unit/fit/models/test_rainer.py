@@ -16,13 +16,10 @@ from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.lattice import Lattice
 from mbtf_fit import fit
 from mbtf_fit.config import FitConfig, build_model
-from mbtf_fit.data.layouts import SharedSlices, TrainingSlices
+from mbtf_fit.data.layouts import TrainingSlices
 from mbtf_fit.data.loader import load_training
-from mbtf_fit.data.queries import mean_value
 from mbtf_fit.material.material import Material
-from mbtf_fit.models.model import Preparation
-from mbtf_fit.models.rainer import Rainer2019, shared_slices
-from mbtf_fit.objective.noise import typical_value
+from mbtf_fit.models.rainer import Rainer2019
 from mbtf_fit.training.fit_folder import identity_of
 from mbtf_fit.training.loop import TrainingLoop, read_checkpoint, write_checkpoint
 from mbtf_fit.training.trainer import prepare_trainer
@@ -165,28 +162,6 @@ def test_a_fit_is_known_by_what_other_data_hold(tmp_path: Path) -> None:
     moved = first.rename(tmp_path / "elsewhere")
     assert hash_of(moved, second) == both
     assert len({both, one, order, hash_of(second), hash_of()}) == 5
-
-
-def test_the_network_learns_others_in_units_of_its_own_material(tmp_path: Path) -> None:
-    own, other = write_slices(tmp_path / "own", dark), write_slices(tmp_path / "other", lights=12)
-    found = load_training(Dataset.open(own), config("rainer2020").held_out, 0).training
-    assert isinstance(found, TrainingSlices)
-    for own_material, count in ((False, 1), (True, 2)):
-        options = config("rainer2020", materials=[str(other)], own_material=own_material)
-        found_other = load_training(Dataset.open(other), options.held_out, 0)
-        typical = typical_value(mean_value(found_other.sample.value_a, found_other.sample.value_b))
-        loaded = found_other.training, typical
-        given = Preparation(
-            Dataset.open(own), found, options.training, 0.02, 0, lambda _, loaded=loaded: loaded
-        )
-        shared = shared_slices(given)
-        assert isinstance(shared, SharedSlices)
-        assert shared.own is found
-        assert len(shared.learned) == count
-        assert (shared.learned[0] is found) == own_material
-        # Ten times as bright as `dark`, before it is scaled to the typical value 0.02.
-        level = shared.learned[-1].values.mean() / found.values.mean()
-        assert 0.5 < level < 2.0
 
 
 @pytest.mark.parametrize("name", NAMES)

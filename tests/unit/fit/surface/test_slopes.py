@@ -31,16 +31,6 @@ def test_a_t_distribution_is_recovered() -> None:
     np.testing.assert_allclose(scatter_of(found), [0.30, 0.10, 0.15], atol=0.03)
 
 
-def test_the_center_is_that_of_most_slopes() -> None:
-    """A quarter of the texels are as steep as mortar: mean 0.5, center near 0."""
-    slopes = 0.05 * np.random.default_rng(0).standard_normal((64, 64, 2)).astype(np.float32)
-    slopes[:, ::4, 0] += 2.0
-    found = slope_distributions(slopes, moments_of(slopes), 1.0, (2, 2), 0.25).numpy()
-    assert np.abs(found[..., :2]).max() < 0.1
-    # Far below the variance, 0.75.
-    assert scatter_of(found)[..., 0].max() < 0.2
-
-
 def test_the_likelihood_of_a_footprint_is_highest() -> None:
     """Of texels by their Gaussian weights, in a tile twice as wide as high; minimized by another program."""
     random = np.random.default_rng(1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +12,11 @@ from support.fit_data import parallax, write_data
 
 import mbtf_fit.training.fit as fits
 import mbtf_fit.training.forecast as module
-from mbtf_core.stats import Estimate, Interval, signal_variance
+from mbtf_core.stats import Estimate, signal_variance
 from mbtf_fit import fit
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries
-from mbtf_fit.training.endings import describe_ending, reached
-from mbtf_fit.training.error_forecast import ErrorForecast
+from mbtf_fit.training.endings import reached
 from mbtf_fit.training.forecast import forecast_fit
 from mbtf_fit.training.loop import TrainingLoop
 from mbtf_fit.training.trainer import Trainer
@@ -88,10 +86,9 @@ def test_the_law_of_the_pilots_predicts_the_fit(law: list[tuple[int, int]], shar
     assert found.asked[1].low < 0.01 * 100 ** (1 / 0.7) < found.asked[1].high
     # What overfitting may add is more than what is asked for.
     assert found.asked[1].high == math.inf
-    assert "overfitting decides" in found.describe()
     # Below the level at which the law ends.
     below = forecast_fit(config(steps=STEPS, error=0.01), shards).error.describe()
-    assert below.splitlines()[-1].startswith("error 0.01: not reachable with these queries")
+    assert "not reachable with these queries" in below
 
 
 def test_a_pilot_that_gains_by_repeated_queries_adds_no_error(
@@ -112,43 +109,10 @@ def test_a_time_takes_its_fewest_steps(
     assert (found.seconds, found.steps) == (seconds, 100 * seconds)
 
 
-def test_forecasts_answer_or_say_why_not() -> None:
-    known = ErrorForecast(300.0, Interval(0.081, 0.062, 0.113), limit=Interval(0.03, 0.025, 0.035))
-    assert known.describe() == "5:00: expect an unexplained variance of 0.081 (0.062 to 0.11)"
-    asked = replace(known, asked=(0.05, Interval(720.0, 480.0, 1200.0)))
-    assert asked.describe().splitlines()[1] == "error 0.05: about 12:00 (8:00 to 20:00)"
-    never = replace(known, asked=(0.02, Interval(math.inf, math.inf, math.inf)))
-    assert never.describe().splitlines()[1] == (
-        "error 0.02: not reachable with these queries and this network: they limit it at about "
-        "0.03 (0.025 to 0.035)"
-    )
-    assert never.as_dict()["asked"] == {"error": 0.02, "seconds": {"value": None, "low": None, "high": None}}
-    for error, lines in ((0.01, 2), (0.02, 1)):
-        overfit = replace(known, excess=Estimate(0.03, error, 40)).describe()
-        assert (len(overfit.splitlines()), "overfitting decides" in overfit) == (lines, lines == 2)
-    vague = replace(known, error=Interval(0.08, 0.01, 0.4), asked=(0.05, Interval(720.0, 60.0, math.inf)))
-    assert [line.split(": ")[1] for line in vague.describe().splitlines()] == [
-        "the evidence does not suffice",
-        "the evidence does not suffice, but it takes at least 1:00",
-    ]
-    assert ErrorForecast(1.0, reason="3 steps").describe() == "no forecast of the error: 3 steps"
-
-
 def test_too_few_steps_give_no_forecast(law: list[tuple[int, int]], shards: Path) -> None:
     found = forecast_fit(config(steps=30), shards).error
     assert found.error is None
     assert "30 steps are too few" in found.describe()
-
-
-def test_an_ending_names_the_limit_that_came_last() -> None:
-    for budget, seconds, step, limit in (
-        ("5s", 5.01, 900, "0:05"),
-        ("5s, at least 800 steps", 5.01, 900, "0:05"),
-        ("5s, at least 800 steps", 9.0, 800, "800 steps"),
-    ):
-        last = {"unexplained": 0.3, "unexplained_error": 0.01, "seconds": seconds, "step": step}
-        ending = str(describe_ending(config(time=budget, error=0.1), [last]))
-        assert ending.startswith(f"stopped after {limit}: ")
 
 
 def test_training_stops_once_the_error_is_reached(
@@ -167,16 +131,10 @@ def test_training_stops_once_the_error_is_reached(
     # What is exported is what was validated.
     assert found.errors["test"]["unexplained"]["value"] == pytest.approx(last["unexplained"], rel=0.1)
     assert found.as_dict()["reached"] is True
-    assert str(describe_ending(asked, found.history)).startswith("stopped at error 0.8 after ")
-
     never = config(steps=5, error=1e-6)
     found = fit(never, shards, tmp_path / "never")
     assert found.history[-1]["step"] == 5
     assert found.as_dict()["reached"] is False
-    ending = describe_ending(never, found.history)
-    assert ending is not None
-    assert ending.startswith("stopped after 5 steps: validation error ")
-    assert ending.endswith("has not reached 1e-06")
     # Without an error to reach, fits are what they were, and no other configuration.
     assert reached(config(), found.history) is None
     assert "error" not in config().fields()["training"]

