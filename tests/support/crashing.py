@@ -1,4 +1,4 @@
-"""Ends of processes that no handler sees."""
+"""What a driver does to the process that loads it."""
 
 from __future__ import annotations
 
@@ -6,10 +6,6 @@ import os
 import signal
 from collections.abc import Iterator
 from typing import Any
-
-
-class Killed(BaseException):
-    """Nothing that runs after it may tidy up: stands for SIGKILL in this process."""
 
 
 def crash(*_: str) -> Iterator[dict[str, Any]]:

@@ -66,14 +66,9 @@ def _blocks(picture: F64) -> F64:
 
 
 def render_both(
-    config: GeneratorConfig,
-    material: Tile,
-    camera: Camera,
-    omega_i: F64,
-    spp: int,
-    moved: Camera | None = None,
+    config: GeneratorConfig, material: Tile, camera: Camera, omega_i: F64, other: Camera | None = None
 ) -> tuple[Halves, Halves]:
-    """A reference as two independent halves, by mbtf and by Mitsuba, whose camera may be another."""
+    """A reference in two halves, by mbtf and by Mitsuba, whose camera may be another one."""
     from mbtf_gen.pictures.reference import render_reference
     from mbtf_gen.planning.run_plan import reference_plan
     from mbtf_gen.planning.simulation import build_estimator

@@ -141,25 +141,6 @@ def test_round_footprints_of_the_frames_add_up_to_the_ellipse_of_a_pixel(page: P
         assert np.median((covariance - variance)[middle] / expected[1][middle]) == pytest.approx(0, abs=0.15)
 
 
-def test_each_side_has_the_tile_of_its_material(page: Page, tmp_path: Path) -> None:
-    materials = [make("calibrated", tmp_path / "half"), square(tmp_path / "square")]
-    light = from_angles(40.0, 20.0)
-    page.set(
-        {
-            "camera": view(90, -90, 2, 0.5, 0.5),
-            "lights": [{**LIGHT, "direction": light.tolist()}],
-            "material": 1,
-            "against": "material 0",
-            "divide": 0.5,
-        }
-    )
-    for side, material in enumerate(materials[::-1]):
-        part = slice(16 * side, 16 * (side + 1))
-        found = page.picture(24, 32, side)[:, part, :3]
-        expected = evaluate(material, Camera(90, -90, 2, rows=24, columns=32), light)[:, part] * light[2]
-        assert np.abs(found - expected).mean() < 0.08 * expected.mean()
-
-
 @pytest.mark.parametrize("angle", [0, 90])
 def test_a_bright_pixel_of_a_sky_is_a_directional_light(page: Page, angle: int) -> None:
     """Of irradiance 1 on the plane: at the azimuth of an envmap of Mitsuba, plus the rotation."""
@@ -200,25 +181,6 @@ def test_samples_of_the_built_in_sky_follow_its_radiance(page: Page) -> None:
     # Below the horizon radiance is constant, and so is the density.
     below = directions[directions[:, 2] < 0]
     assert (below[:, 2] ** 2).mean() == pytest.approx(1 / 3, abs=4 * 0.3 / np.sqrt(len(below)))
-
-
-def test_values_on_a_sphere_are_where_its_texture_is(page: Page) -> None:
-    """Position and view of pixels, against the intersection of their rays with the sphere."""
-    page.set({"camera": view(20, -60, 2), "shape": "sphere", "tiles": 4})
-    camera, radius = Camera(20, -60, 2, (0, 0)), 4 / (2 * np.pi)
-    for x, y in ((0.45, 0.3), (0.6, 0.55), (0.35, 0.6)):
-        found = page.pick(x, y)
-        assert found is not None
-        d, o = ray(page, camera, x, y), camera.position
-        p = o + (-(o @ d) - np.sqrt((o @ d) ** 2 - o @ o + radius**2)) * d
-        n = p / radius
-        a, e = np.arctan2(n[1], n[0]), np.arcsin(n[2])
-        # As many tiles of half the height lie between the poles as around the equator.
-        u = np.array([4 * a / (2 * np.pi), 4 * (e / np.pi + 0.5)])
-        assert np.abs((np.array(found["u"]) - u + 0.5) % 1 - 0.5).max() < 0.02
-        east = np.array([-np.sin(a), np.cos(a), 0])
-        assert found["omega_o"] == pytest.approx([-d @ east, -d @ np.cross(n, east), -d @ n], abs=0.02)
-    assert page.pick(0.02, 0.5) is None
 
 
 @pytest.mark.parametrize("behind", [False, True])

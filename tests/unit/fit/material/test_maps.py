@@ -9,16 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.known_surfaces import geometry
-from support.material_cases import make
 from support.plugin_materials import write_material
 
 from mbtf_core.app.console import Console
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import UsageError
-from mbtf_fit import Material
+from mbtf_fit import Material, ops
 from mbtf_fit.material.maps import Maps, knows_surface, make_maps, scale_color, surface_maps
 from mbtf_fit.material.reference_values import direction_pairs, tile_means
+from mbtf_fit.ops.constants import HEIGHTS
+from mbtf_fit.pytorch.material import NeuralMaterial
 from mbtf_fit.surface.known import KnownSurface
 
 
@@ -95,9 +96,12 @@ def test_the_mean_reflectance_is_that_of_the_network(tmp_path: Path) -> None:
 
 def test_levels_that_are_missing_are_refused(tmp_path: Path) -> None:
     assert not knows_surface(write_material(tmp_path / "neumip"))
-    assert not knows_surface(make("tracing alone", tmp_path / "traced"))
     material = write_material(tmp_path / "relief", model="relief")
     assert knows_surface(material)
+    # A surface that a model traces and does not shade has colors that are not the model's.
+    traced = ops.Trace("z", "hit", "u", "level", "omega_o", HEIGHTS)
+    model = NeuralMaterial(Lattice(3, 1.0), [traced, ops.Lookup("value", "hit", "level", "texels", 3)])
+    assert not knows_surface(replace(material, model=model))
     assert make_maps(material, None, Console(quiet=True))[0].level == 3
     for level in (-1, 4):
         with pytest.raises(UsageError, match="has the levels 0 to 3"):

@@ -2,26 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from support.fit_data import parallax, random_queries, training_queries
+from support.traced_gradients import assert_gradients_agree, needs_kernel, traced_batch
 from torch import Tensor
 
 from mbtf_core.data.lattice import Lattice
-from mbtf_fit import FitConfig
-from mbtf_fit.backends.cpu.gradients import NativeGradients
-from mbtf_fit.backends.cpu.model import NativeModel, supports
 from mbtf_fit.config import build_model
-from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.models.learned_relief import LearnedRelief
-from mbtf_fit.native import library
-from mbtf_fit.objective.losses import Objective
-from mbtf_fit.objective.noise import NoiseModel
-from mbtf_fit.objective.parallel import Workers
 from mbtf_fit.ops.constants import HEIGHT_SCALE
 
 LATTICE, FINE = Lattice(4, 0.5), Lattice(7, 0.5)
@@ -53,49 +44,18 @@ def model_of(steepness: float = 0.4, *, smooth: bool = False) -> LearnedRelief:
     return hooks
 
 
-def batch_of(hooks: LearnedRelief, n: int = 700) -> TrainingQueries:
-    arrays = random_queries(np.random.default_rng(0), n, LATTICE)
-    arrays["u"] = (5 * arrays["u"] - 2).astype(np.float32)
-    batch = training_queries(arrays, parallax(*arrays.values()))
-    at = batch.u, batch.sigma, batch.omega_i, batch.omega_o
-    return replace(batch, hints=hooks.material.hints(*at))
-
-
-def queries_of(batch: TrainingQueries) -> list[Tensor]:
-    assert batch.hints is not None
-    return [batch.u, batch.sigma, batch.omega_i, batch.omega_o, batch.hints]
-
-
-@pytest.mark.skipif(library.kernel() is None, reason=library.missing_reason() or "kernel")
+@needs_kernel
 def test_kernel_and_pytorch_agree() -> None:
-    """Gradients by texels, heights, depth weights and layers; some denominators are at their bound."""
-    hooks, found = model_of(4.0), library.kernel()
-    model: Any = hooks.material
-    assert found is not None
-    assert supports(model)
-    batch = batch_of(hooks)
-    objective = Objective(FitConfig().training, NoiseModel.silent(0.1, LATTICE))
-    texels, weights = model.parameter_groups()
-    loss = objective(model(*queries_of(batch)), batch)
-    by_texels, by_heights, *by_weights = torch.autograd.grad(loss, [*texels, *weights])
-    gradients = NativeGradients(NativeModel(found, model))
-    with Workers(torch.device("cpu")) as workers:
-        native = gradients.compute(objective, batch, workers)
-    assert float(native) == pytest.approx(float(loss.detach()), rel=1e-5)
-    names = [name for name, _ in model.named_parameters() if not name.endswith("texels")]
-    layers = iter(gradients.networks[0])
-    mine = [gradients.depth_weights[:5] if name == "depth_weights" else next(layers) for name in names]
-    assert float(by_heights.abs().max()) > 0
-    pairs = zip([by_texels, by_heights, *by_weights], [*gradients.textures, *mine], strict=True)
-    for label, (a, b) in zip(["texels", "heights", *names], pairs, strict=True):
-        assert float((a - b).abs().max()) < 1e-4 * float(a.abs().max()), label
+    """Some denominators are at their bound."""
+    model = model_of(4.0).material
+    assert_gradients_agree(model, traced_batch(model))
 
 
 def test_the_gradient_by_heights_moves_lookups_as_tracing_does() -> None:
     """On a surface without occlusion, against rays that are traced again after a change of the heights."""
     hooks = model_of(0.2, smooth=True)
     model: Any = hooks.material
-    batch = batch_of(hooks, 10_000)
+    batch = traced_batch(model, 10_000)
     # Where the bounds of denominator and cosine do not matter, and the surface falls away from the viewer:
     # without its slope the gradient would be smaller by a tenth.
     x, y, z = batch.omega_o.unbind(1)
@@ -136,7 +96,7 @@ def test_a_flat_surface_is_displaced_by_its_depth() -> None:
         model.heights.texels.fill_(-0.24)
         model.depth_weights.fill_(1.0)
     hooks.follow(0, 0.0)
-    batch = batch_of(hooks, 100)
+    batch = traced_batch(model, 100)
     wanted = -(0.04 + 0.24 * HEIGHT_SCALE) * batch.omega_o[:, :2] / batch.omega_o[:, 2:]
     torch.testing.assert_close(model.offset(batch.u, batch.omega_o), wanted, atol=1e-5, rtol=1e-4)
     assert batch.hints is not None

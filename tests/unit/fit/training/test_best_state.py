@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from support.crashing import Killed
 from support.fit_data import parallax, random_queries, write_data
+from support.killed_fits import Killed, kill_in
 
 import mbtf_fit.training.fit as fits
 import mbtf_fit.training.loop as loop
@@ -91,15 +91,8 @@ def test_a_fit_that_overfits_returns_to_its_best_state(
     assert line.startswith("validation error rose from ")
     assert line.endswith(f"after {STEPS}: kept the state after {BEST} steps")
 
-    step = Trainer._step
-
-    def dying(self: Trainer, *arguments: Any) -> torch.Tensor:
-        if self.progress.step == STEPS - 2:
-            raise Killed
-        return step(self, *arguments)
-
     with monkeypatch.context() as patch:
-        patch.setattr(Trainer, "_step", dying)
+        kill_in(patch, {STEPS - 1})
         with pytest.raises(Killed):
             fit(config(), shards, tmp_path / "killed")
     resumed = fit(config(), shards, tmp_path / "killed")

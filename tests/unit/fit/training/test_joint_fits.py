@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from support.crashing import Killed
 from support.fit_data import F32, parallax, write_data
+from support.killed_fits import Killed, kill_in, run_killed
 from support.known_surfaces import geometry, rough_heights
 
 import mbtf_fit.training.fit
@@ -25,7 +25,6 @@ from mbtf_fit.material.decoder import Decoder, network_tensors
 from mbtf_fit.training.fit import fit_jointly
 from mbtf_fit.training.fit_export import Member
 from mbtf_fit.training.fit_folder import read_history
-from mbtf_fit.training.loop import TrainingLoop
 from mbtf_fit.training.trainer import Trainer
 from mbtf_fit.training.validation import history_record
 
@@ -183,42 +182,19 @@ def test_a_killed_joint_fit_ends_with_the_same_bits(
     monkeypatch.setattr(mbtf_fit.training.fit, "_CHECKPOINT_SECONDS", 0.0)
     config = joint_config(model, steps=9)
     whole = fit_two(config, data, tmp_path / "whole")
-    random = np.random.default_rng(0)
-    out, step, export = tmp_path / "killed", Trainer._step, mbtf_fit.training.fit_export.export_fit
-    kills, exports = 0, 0
-    save = mbtf_fit.training.fit.write_checkpoint
-    found: list[FitResult] = []
-    while not found:
-        left = int(random.integers(2, 6))
+    out, export, exports = tmp_path / "killed", mbtf_fit.training.fit_export.export_fit, 0
 
-        def dying(self: Trainer, *arguments: Any) -> torch.Tensor:
-            nonlocal left
-            left -= 1
-            if left == 0:
-                raise Killed
-            return step(self, *arguments)
+    def dying_export(*arguments: Any, **more: Any) -> None:
+        nonlocal exports
+        exports += 1
+        # Between the two materials, once.
+        if exports == 2:
+            raise Killed
+        export(*arguments, **more)
 
-        def dying_export(*arguments: Any, **more: Any) -> None:
-            nonlocal exports
-            exports += 1
-            # Between the two materials, once.
-            if exports == 2:
-                raise Killed
-            export(*arguments, **more)
-
-        def forgetful(loop: TrainingLoop, path: Path) -> None:
-            # Not every step is saved: some are done again.
-            if random.random() < 0.6:
-                save(loop, path)
-
-        monkeypatch.setattr(Trainer, "_step", dying)
-        monkeypatch.setattr(mbtf_fit.training.fit_export, "export_fit", dying_export)
-        monkeypatch.setattr(mbtf_fit.training.fit, "write_checkpoint", forgetful)
-        try:
-            found = fit_two(config, data, out)
-        except Killed:
-            kills += 1
-            assert kills < 100
+    monkeypatch.setattr(mbtf_fit.training.fit_export, "export_fit", dying_export)
+    found, kills = run_killed(monkeypatch, lambda: fit_two(config, data, out))
+    assert exports > 2
     assert kills >= 2
     for mine, other in zip(found, whole, strict=True):
         expected = other.material.model.weights()
@@ -238,12 +214,8 @@ def test_training_stops_once_all_materials_have_reached_the_error(
 ) -> None:
     """The first one has after step 2, the other after step 5; killed in step 4, and once more when all is
     done."""
-    step, killed = Trainer._step, {4}
-
-    def dying(self: Trainer, *arguments: Any) -> torch.Tensor:
-        if self.progress.step + 1 in killed:
-            raise Killed
-        return step(self, *arguments)
+    killed = {4}
+    kill_in(monkeypatch, killed)
 
     def record(trainer: Trainer, *validation: Any) -> dict[str, Any]:
         least = 2 if trainer.model.lattice.finest == 3 else 5
@@ -253,7 +225,6 @@ def test_training_stops_once_all_materials_have_reached_the_error(
     def dying_export(*arguments: Any, **more: Any) -> None:
         raise Killed
 
-    monkeypatch.setattr(Trainer, "_step", dying)
     for name, new in (("history_record", record), ("_REPORT_SECONDS", 0.0), ("_CHECKPOINT_SECONDS", 0.0)):
         monkeypatch.setattr(mbtf_fit.training.fit, name, new)
     training = {"steps": 9, "shared_decoder": True, "error": 0.5, **BATCH}

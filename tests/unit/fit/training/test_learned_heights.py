@@ -52,16 +52,6 @@ def test_a_resumed_fit_is_the_same(shards: Path, tmp_path: Path) -> None:
         assert torch.equal(tensor, wanted[name]), name
 
 
-def test_a_fit_starts_from_the_heights_of_another(shards: Path, tmp_path: Path) -> None:
-    first = fit(config(60), shards, tmp_path / "a").material.model
-    options = config(4, init_from=str(tmp_path / "a"))
-    data = open_data(shards, "shuffled", options.model)
-    partition = load_training(data, options.held_out, options.seed)
-    second = prepare_trainer(options, data, partition, torch.device("cpu")).model
-    assert float(first.known.heights.std()) > 1e-6
-    assert torch.equal(second.known.heights, first.known.heights)
-
-
 def test_a_depth_is_learned(tmp_path: Path) -> None:
     """A wave at a depth of 0.05, from values alone."""
     shards = write_data(tmp_path / "data", parallax, train=20_000, test=1000, finest=4)

@@ -90,23 +90,6 @@ def test_a_material_keeps_its_surface(shards: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.evaluate(*queries), result.material.evaluate(*queries))
 
 
-def test_another_material_gives_textures_and_depth_weights(shards: Path, tmp_path: Path) -> None:
-    """Decoder and surface are those of the fit."""
-    fit(config(20), shards, tmp_path / "first")
-    flat = write_data(tmp_path / "flat", parallax, train=1000, test=100, aspect=0.75)
-    # At rates this low what training starts from is what it ends with.
-    slow: dict[str, Any] = {"learning_rate": 1e-9, "texture_learning_rate": 1e-9}
-    slow |= {"blur": {"initial_sigma": 0, "min_sigma": 0}, "energy_calibration": False}
-    own = weights(fit(config(1, training=slow), flat, tmp_path / "own"))
-    options = config(1, training=slow, init_from=str(tmp_path / "first"))
-    found = weights(fit(options, flat, tmp_path / "m"))
-    given = Material.load(tmp_path / "first").model.weights()
-    assert float((given["depth_weights"] - own["depth_weights"]).abs().max()) > 1e-3
-    for name, tensor in found.items():
-        source = given if name.startswith(("pyramid.", "depth_weights")) else own
-        torch.testing.assert_close(tensor, source[name], atol=1e-6, rtol=0)
-
-
 def test_heights_learn_rendered_rock_sooner_than_neumip(tmp_path: Path) -> None:
     """After as many steps. Measured: unexplained variances of 0.17 and 0.29, ± 0.01 over seeds; of learned
     heights 0.19, and a correlation of 0.57 with those of the rock."""

@@ -6,11 +6,10 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
-from support.crashing import Killed
 from support.fit_data import parallax, write_data
+from support.killed_fits import Killed, run_killed
 from support.known_surfaces import geometry, rough_heights
 
 import mbtf_fit.training.fit
@@ -59,31 +58,8 @@ def test_a_fit_killed_at_random_steps_ends_with_the_same_bits(
     often: None,
     memory: str,
 ) -> None:
-    random = np.random.default_rng(0)
-    out, step, kills = tmp_path / "killed", Trainer._step, 0
-    saved = mbtf_fit.training.fit.write_checkpoint
-    while not (out / "material.json").exists():
-        left = int(random.integers(2, 7))
-
-        def dying(self: Trainer, *arguments: Any) -> torch.Tensor:
-            nonlocal left
-            left -= 1
-            if left == 0:
-                raise Killed
-            return step(self, *arguments)
-
-        def forgetful(*arguments: Any) -> None:
-            # Not every step is saved: some are done again.
-            if random.random() < 0.6:
-                saved(*arguments)
-
-        monkeypatch.setattr(Trainer, "_step", dying)
-        monkeypatch.setattr(mbtf_fit.training.fit, "write_checkpoint", forgetful)
-        try:
-            found = fit(config(memory), shards, out)
-        except Killed:
-            kills += 1
-            assert kills < 200
+    out = tmp_path / "killed"
+    found, kills = run_killed(monkeypatch, lambda: fit(config(memory), shards, out))
     assert kills >= 2
     mine, other = found.material.model.weights(), whole.material.model.weights()
     assert all(torch.equal(mine[name], other[name]) for name in other)
