@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -99,27 +98,6 @@ def test_surroundings_light_a_plane(driver: Any, tmp_path: Path) -> None:
     page.js("window.mbtf.viewer.state.lights.length = 0")
     assert page.picture(64, 96)[..., :3].mean() == pytest.approx(0.2, rel=0.03)
     assert page.faults() == []
-
-
-def test_damaged_pages_say_so(driver: Any, tmp_path: Path) -> None:
-    make("calibrated", tmp_path / "material")
-    content = material_content(tmp_path / "material")[0]
-    short = json.loads(json.dumps(content))
-    short["textures"]["pyramid"]["data"] = short["textures"]["pyramid"]["data"][:400]
-    shader = {**content, "source": content["source"].replace("float3 stage2", "float4 stage2", 1)}
-    for damaged, what in ((short, ""), (shader, "refused a shader"), ({**content, "weights": "?"}, "")):
-        page = Page(driver, write_page({"materials": [damaged]}, "damaged"), tmp_path)
-        page.until(lambda page=page: not page.message().startswith("Loading"))
-        assert page.js("return window.mbtf === undefined")
-        assert what in page.message()
-        assert len(page.message()) > 10
-    page = Page(
-        driver,
-        write_page({"materials": [content]}, "link"),
-        tmp_path,
-        {"camera": 3, "tiles": "x", "lights": [1]},
-    )
-    page.ready()
 
 
 def test_a_page_follows_a_fit(driver: Any, tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.material_cases import make
-from support.plugin_materials import write_material
 from support.viewer_page import Page
 
 from mbtf_core.directions import from_angles
@@ -34,16 +33,15 @@ LIGHT: dict[str, Any] = {"direction": [0, 0, 1], "color": [1, 1, 1], "intensity"
 
 @pytest.fixture(scope="module")
 def page(driver: Any, tmp_path_factory: pytest.TempPathFactory) -> Page:
-    """Materials of aspects ½ and 1, two squares and a sky; nothing is drawn unless a test asks for it."""
+    """Materials of aspect ½, two squares and a sky; nothing is drawn unless a test asks for it."""
     folder = tmp_path_factory.mktemp("scene")
     make("calibrated", folder / "half")
     make("relief", folder / "relief")
-    square(folder / "square")
     (folder / "squares.obj").write_text(SQUARES)
     sky = np.zeros((*SKY, 3), np.float32)
     sky[SPOT] = COLOR
     content = {
-        "materials": [material_content(folder / name)[0] for name in ("half", "square", "relief")],
+        "materials": [material_content(folder / name)[0] for name in ("half", "relief")],
         "mesh": mesh_content(folder / "squares.obj"),
         "environment": {"name": "spot", "shape": list(SKY), "data": encode(sky)},
     }
@@ -52,17 +50,9 @@ def page(driver: Any, tmp_path_factory: pytest.TempPathFactory) -> Page:
     return page
 
 
-def square(folder: Path) -> Material:
-    return write_material(folder, model="neumip-baseline", finest=4)
-
-
 def view(elevation: float, azimuth: float, across: float, *target: float) -> dict[str, Any]:
-    return {
-        "elevation": elevation,
-        "azimuth": azimuth,
-        "tiles_across": across,
-        "target": [*target, 0, 0, 0][:3],
-    }
+    at = [*target, 0, 0, 0][:3]
+    return {"elevation": elevation, "azimuth": azimuth, "tiles_across": across, "target": at}
 
 
 def evaluate(material: Material, camera: Camera, light: F64) -> F64:
@@ -93,13 +83,8 @@ def test_pictures_are_those_of_the_same_camera(
     """Pixel by pixel: positions, footprints, frames, orientation, and the light's cosine."""
     light, color = from_angles(40.0, 20.0), np.array([1, 0.5, 0.25])
     lights = [{"direction": light.tolist(), "color": color.tolist(), "intensity": 2}]
-    page.set(
-        {
-            "camera": view(elevation, azimuth, across, 0.5, 0.5),
-            "lights": lights,
-            "material": ["calibrated", "square", "relief"].index(case),
-        }
-    )
+    material = ["calibrated", "relief"].index(case)
+    page.set({"camera": view(elevation, azimuth, across, 0.5, 0.5), "lights": lights, "material": material})
     found = page.picture(24, 32)
     camera = Camera(elevation, azimuth, across, rows=24, columns=32)
     expected = evaluate(make(case, tmp_path / "material"), camera, light) * light[2] * 2.0 * color

@@ -81,14 +81,6 @@ def test_errors_and_panels_are_those_of_reference_and_fit(work: Path) -> None:
         assert spearmanr(lightness[inside], smooth[inside]).statistic > 0.98
 
 
-def test_data_of_another_material_are_announced(work: Path, tmp_path: Path) -> None:
-    write_material(tmp_path / "fit", finest=3, aspect=0.5, inputs={"height": "0" * 64})
-    paths = [str(tmp_path / "fit"), str(work / "shards")]
-    picture = ["--view", "90,0", "--tiles-across", "1", "--spp", "2", "--size", "8"]
-    for words in (["compare", *paths, "-o", str(tmp_path / "out"), *picture], ["evaluate", *paths]):
-        assert "another material" in call(["mbtf-fit", *words]).err
-
-
 def test_finished_references_are_kept(work: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     compare(work)
     before = {path.name: path.read_bytes() for path in (work / "out").glob("*.exr")}

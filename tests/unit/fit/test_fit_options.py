@@ -53,15 +53,6 @@ def test_presets_keep_what_sections_set() -> None:
         assert config_of("--quality", "draft", *words).training.time == TimeBudget(5.0)
 
 
-def test_shared_networks_have_a_smaller_batch(tmp_path: Path) -> None:
-    shared = ("--set", "training.shared_decoder=true")
-    assert config_of(*shared).training.batch == 1 << 14
-    assert config_of(*shared, "--batch", "500").training.batch == 500
-    assert config_of("--set", "training.shared_decoder=false").training.batch == 1 << 15
-    (tmp_path / "c.yaml").write_text("training: {shared_decoder: true}\n")
-    assert config_of("--config", str(tmp_path / "c.yaml")).training.batch == 1 << 14
-
-
 @pytest.mark.parametrize(
     ("text", "seconds"),
     [("90s", 90.0), ("2min", 120.0), ("2 m", 120.0), ("1.5h", 5400.0), (45, 45.0), ("0.5s", 0.5)],

@@ -13,7 +13,7 @@ from support.paths import ROOT
 
 from mbtf_core.app.console import run
 from mbtf_core.data.shard_files import row_bytes
-from mbtf_core.errors import InputError, UsageError
+from mbtf_core.errors import InputError
 from mbtf_core.files import folders
 from mbtf_pipeline import run as runs
 from mbtf_pipeline import run_time as module
@@ -93,18 +93,6 @@ def test_the_best_preset_that_fits_trains_for_the_rest(fake: Machine, one: Path,
     assert seconds_of(found) == pytest.approx(0.96 * seconds, rel=0.02)
 
 
-def test_less_than_a_draft_is_a_draft_of_less_training(fake: Machine, one: Path) -> None:
-    recipe = preset_recipe(one, "draft")
-    expected = RunForecaster(recipe).of(recipe)
-    seconds = (expected.seconds - 5.0) / 0.96
-    found = timed(one, seconds)
-    assert found.split.quality == "draft"
-    assert found.split.training == pytest.approx(7.0, abs=0.1)
-    assert seconds_of(found) == pytest.approx(0.96 * seconds, rel=0.02)
-    with pytest.raises(UsageError, match="too short: all but training"):
-        timed(one, seconds - 7.0, folder=one.parent / "short")
-
-
 def test_training_is_shortened_when_generating_overran(fake: Machine, one: Path) -> None:
     found = timed(one, 120.0)
     planned = found.recipe
@@ -152,11 +140,6 @@ def test_all_stages_count(fake: Machine) -> None:
     left = forecaster.of(recipe, ["fit neumip", "compare", "report"])
     assert (left.generating, left.training) == (0.0, 60.0)
     assert left.bytes < 2e8
-
-
-def test_short_runs_need_no_pilot(fake: Machine, tmp_path: Path) -> None:
-    assert forecast_left(load_recipe(ROOT / "pipelines" / "ci.yaml"), tmp_path / "out") is None
-    assert forecast_left(load_recipe(FILE), tmp_path / "out") is not None
 
 
 def test_a_run_states_its_cost_and_is_refused_if_the_disk_is_full(

@@ -77,17 +77,6 @@ def test_whole_images_are_held_out(tmp_path: Path) -> None:
     assert other != held[0]
 
 
-def test_at_least_one_image_is_held_out(tmp_path: Path) -> None:
-    folder = write_images(tmp_path / "d", parallax, train=6)
-    few = HeldOutSection(queries=0.01, radius=0)
-    assert len(partition(folder, few).held_out_queries) == 64
-    none = partition(folder, HeldOutSection(queries=0, radius=0))
-    assert len(none.held_out_queries) == len(none.held_out_directions) == 0
-    assert len(images_of(none)) == 6 * 64
-    with pytest.raises(InputError, match=r"all 6 images .* held out"):
-        partition(folder, HeldOutSection(radius=0.99, direction=(0.0, 0.0)))
-
-
 def test_batches_take_every_image_and_resume_anywhere() -> None:
     data = images(Lattice(3), [1.0, 2.0, 3.0, 2.5, 0.5], regular=False)
     batches = list(islice(data.batches(32, 7, 0, 4), 10))
@@ -124,19 +113,6 @@ def test_patches_extend_beyond_the_border_of_small_images() -> None:
         rows, columns = nearest_shapes(lattice, patches.sigma[item : item + 1].numpy())[0]
         step = patches.u[item, 1:, 1:] - patches.u[item, :-1, :-1] - torch.tensor([1 / columns, -1 / rows])
         torch.testing.assert_close(step, step.round().to(step.dtype), atol=1e-6, rtol=0)
-
-
-def test_patches_lie_inside_small_images() -> None:
-    data = small_images(Lattice(4), 6, 8)
-    for batch in islice(data.batches(2 * 16, 0, 0, 2), 20):
-        assert batch.value.shape == (1, 6, 6, 3)
-    seen = set()
-    for batch in islice(data.batches(16, 0, 0, 2), 40):
-        assert batch.value.shape == (1, 4, 4, 3)
-        number = batch.value[0, ..., 0].long() % 36
-        assert (number == number[0, 0] + 6 * torch.arange(4)[:, None] + torch.arange(4)).all()
-        seen.add(int(number[0, 0]))
-    assert seen == {6 * j + i for j in range(3) for i in range(3)}
 
 
 @pytest.mark.parametrize("cut", ["whole", "patch_sizes"])

@@ -74,11 +74,6 @@ def ripple(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     del _KINDS["ripple"], PYTORCH._functions[Ripple]
 
 
-@pytest.mark.parametrize("name", targets())
-def test_a_model_of_the_projects_operations_is_exported(supported: Path, tmp_path: Path, name: str) -> None:
-    assert command(supported, tmp_path / "out", name) == 0
-
-
 @pytest.mark.parametrize("name", sorted(targets().keys() - DOCUMENTS))
 def test_an_operation_that_readers_lack_is_refused(
     ripple: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]

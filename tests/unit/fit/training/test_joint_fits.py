@@ -11,7 +11,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from support.fit_data import F32, parallax, write_data
-from support.killed_fits import Killed, kill_in, run_killed
+from support.killed_fits import Killed, run_killed
 from support.known_surfaces import geometry, rough_heights
 
 import mbtf_fit.training.fit
@@ -26,7 +26,6 @@ from mbtf_fit.training.fit import fit_jointly
 from mbtf_fit.training.fit_export import Member
 from mbtf_fit.training.fit_folder import read_history
 from mbtf_fit.training.trainer import Trainer
-from mbtf_fit.training.validation import history_record
 
 NAMES = ("waves", "stripes", "third")
 BATCH = {"batch": 512, "warmup": 10}
@@ -58,13 +57,15 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {name: folder / name for name in NAMES}
 
 
-def joint_config(model: str = "relief", steps: int = 300, **options: Any) -> FitConfig:
-    training = {"steps": steps, "shared_decoder": True, **BATCH}
+def joint_config(model: str = "relief", steps: int = 300) -> FitConfig:
+    return single_config(model, steps, shared_decoder=True)
+
+
+def single_config(
+    model: str = "relief", steps: int = 100, shared_decoder: bool = False, **options: Any
+) -> FitConfig:
+    training = {"steps": steps, "shared_decoder": shared_decoder, **BATCH}
     return FitConfig.model_validate({"model": model, "training": training, **options})
-
-
-def single_config(model: str = "relief", steps: int = 100, **options: Any) -> FitConfig:
-    return FitConfig.model_validate({"model": model, "training": {"steps": steps, **BATCH}, **options})
 
 
 def fit_two(config: FitConfig, data: dict[str, Path], out: Path, **options: Any) -> list[FitResult]:
@@ -113,13 +114,8 @@ def test_joint_fits_learn_each_material(library_folder: Path, data: dict[str, Pa
         after = unexplained(library_folder / name, data[name])
         assert after < 0.25
         assert after < 0.5 * unexplained(tmp_path / name, data[name])
-        # The library itself states the same errors, of queries that training used or never saw.
-        material = Material.load(library_folder / name)
-        stated = material.description["training"]["errors"]
-        for split, found in evaluate(material, data[name])["errors"].items():
-            assert stated[split]["unexplained"]["value"] == pytest.approx(
-                found["unexplained"]["value"], rel=1e-6
-            )
+        stated = Material.load(library_folder / name).description["training"]["errors"]
+        assert stated["test"]["unexplained"]["value"] == pytest.approx(after, rel=1e-6)
 
 
 def test_steps_take_the_materials_in_turn(data: dict[str, Path], tmp_path: Path) -> None:
@@ -209,37 +205,6 @@ def test_a_killed_joint_fit_ends_with_the_same_bits(
     assert all(again.resumed for again in fit_two(config, data, out))
 
 
-def test_training_stops_once_all_materials_have_reached_the_error(
-    data: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The first one has after step 2, the other after step 5; killed in step 4, and once more when all is
-    done."""
-    killed = {4}
-    kill_in(monkeypatch, killed)
-
-    def record(trainer: Trainer, *validation: Any) -> dict[str, Any]:
-        least = 2 if trainer.model.lattice.finest == 3 else 5
-        error = 0.1 if trainer.progress.step >= least else 0.9
-        return history_record(trainer, *validation) | {"unexplained": error, "unexplained_error": 0.01}
-
-    def dying_export(*arguments: Any, **more: Any) -> None:
-        raise Killed
-
-    for name, new in (("history_record", record), ("_REPORT_SECONDS", 0.0), ("_CHECKPOINT_SECONDS", 0.0)):
-        monkeypatch.setattr(mbtf_fit.training.fit, name, new)
-    training = {"steps": 9, "shared_decoder": True, "error": 0.5, **BATCH}
-    config = FitConfig.model_validate({"model": "neumip", "training": training})
-    with monkeypatch.context() as patch:
-        patch.setattr(mbtf_fit.training.fit_export, "export_fit", dying_export)
-        for steps in (3, 5):
-            with pytest.raises(Killed):
-                fit_two(config, data, tmp_path)
-            killed.clear()
-            assert len(read_history(tmp_path / NAMES[0])) == steps
-    for found in fit_two(config, data, tmp_path):
-        assert [r["step"] for r in found.history] == [1, 2, 3, 4, 5]
-
-
 def test_a_lost_material_is_fitted_again(
     data: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -275,20 +240,6 @@ def test_other_data_sets_are_another_fit(data: dict[str, Path], tmp_path: Path) 
     fit_jointly(joint_config(steps=2), *arguments, overwrite=True)
     first, second = (networks_of(tmp_path / name) for name in names)
     assert all(torch.equal(first[name], second[name]) for name in first)
-
-
-def test_divergence_names_the_material(
-    data: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    step = Trainer._step
-
-    def poisoned(self: Trainer, *arguments: Any) -> torch.Tensor:
-        loss = step(self, *arguments)
-        return loss * float("nan") if self.progress.step == 3 else loss
-
-    monkeypatch.setattr(Trainer, "_step", poisoned)
-    with pytest.raises(InputError, match=r"stripes: training diverged at step 4"):
-        fit_two(joint_config(steps=6), data, tmp_path)
 
 
 def test_other_architectures_are_refused(data: dict[str, Path], tmp_path: Path) -> None:

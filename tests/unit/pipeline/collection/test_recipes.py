@@ -11,7 +11,6 @@ from support.paths import ROOT
 from mbtf_core.errors import InputError, UsageError
 from mbtf_pipeline.collection import recipes
 from mbtf_pipeline.collection.recipes import Collection
-from mbtf_pipeline.collection.run import run_collection
 from mbtf_pipeline.recipe import Recipe
 
 BASE = "base: {generate: {queries: {train: 10/texel}}}\n"
@@ -115,21 +114,6 @@ def test_a_file_and_what_it_names_are_one_material(tmp_path: Path) -> None:
     assert sorted({**found[0], **found[1]}) == ["other", "shirt"]
 
 
-def test_folders_of_folders_and_stray_pictures(tmp_path: Path) -> None:
-    material(tmp_path / "q" / "group" / "a")
-    material(tmp_path / "q" / "b")
-    np.save(material(tmp_path / "q" / "c") / "more.npy", np.zeros((4, 4), np.float32))
-    (tmp_path / "q" / "preview.png").write_bytes(b"")
-    (tmp_path / "q" / "unclear").mkdir()
-    (tmp_path / "q" / "unclear" / "wood.png").write_bytes(b"")
-    (tmp_path / "q" / "loop").symlink_to(tmp_path / "q", target_is_directory=True)
-    for hidden in (".cache", "_old"):
-        material(tmp_path / "q" / hidden / "d")
-    found, errors = load(tmp_path, "library: [q]\n" + BASE)
-    assert list(found) == ["b", "c", "a"]
-    assert "height" in errors["unclear"]
-
-
 def written(folder: Path, text: str = TEXT) -> Path:
     (folder / "maps").mkdir(exist_ok=True)
     np.save(folder / "maps" / "height.npy", np.zeros((4, 4), np.float32))
@@ -160,30 +144,6 @@ def test_every_variant_is_one_run(tmp_path: Path) -> None:
     assert list(runs) == ["here-few", "here-many", "steep-few", "steep-many"]
     counts = [runs[name].generate.queries.train for name in ("here-few", "here-many")]
     assert counts == ["2/texel", "4/texel"]
-
-
-def test_missing_materials_are_skipped_and_listed(tmp_path: Path) -> None:
-    path = written(tmp_path)
-    runs, missing = planned(path)
-    assert list(runs) == ["here", "steep"]
-    assert missing == {"elsewhere": f"{tmp_path}/maps/nowhere.npy does not exist"}
-    (tmp_path / "maps" / "height.npy").unlink()
-    with pytest.raises(InputError, match="no material can be run"):
-        planned(path)
-
-
-def test_a_fit_of_other_materials_needs_some(tmp_path: Path) -> None:
-    """Before anything is generated."""
-    text = (
-        "name: lonely\ntables: [methods]\nlearn_from_others: [rainer2020]\n"
-        "materials:\n  here: maps/height.npy\n"
-        "base:\n  generate: {queries: {train: 4/texel, resolution: 4}}\n"
-        "  fit:\n    rainer2020: {training: {own_material: false}}\n"
-    )
-    path = written(tmp_path, text)
-    with pytest.raises(InputError, match="learns from other materials alone, but there are none"):
-        run_collection(recipes.load(path), path, tmp_path / "out", command="")  # type: ignore[arg-type]
-    assert not (tmp_path / "out").exists()
 
 
 def test_fits_are_repeated_with_seeds_or_left_out(tmp_path: Path) -> None:

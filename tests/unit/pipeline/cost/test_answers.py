@@ -7,10 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from mbtf_core.stats import Estimate
-from mbtf_core.units import clock
-from mbtf_pipeline.cost.answers import Evidence, answers
+from mbtf_pipeline.cost.answers import Evidence
 from mbtf_pipeline.cost.measurement import Measurement, combined, seed_deviation
-from mbtf_pipeline.cost.runs import SLOW_SERIES
 
 SECONDS = (10.0, 20.0, 40.0, 80.0, 160.0, 320.0)
 
@@ -56,25 +54,6 @@ def test_a_study_forecasts_times_and_errors() -> None:
     # The work of the longest run takes 313 s.
     assert "takes more than 20:59, which is as far as" in found.time_of(law(1900.0))
     assert found.error_after(1300.0) is None
-
-
-def test_answers_are_measured_or_forecast_for_up_to_four_times_as_long() -> None:
-    rows = answers(evidence())
-    assert [row["time"] for row in rows if not row["forecast"]] == [clock(s) for s in SECONDS]
-    forecast = [(row["time"], row["basis"]) for row in rows if row["forecast"]]
-    assert forecast == [(f"{n}0min", f"forecast, {f} times the longest run") for n, f in ((1, 1.9), (2, 3.8))]
-    assert rows[-1]["unexplained"]["low"] < law(1200.0) < rows[-1]["unexplained"]["high"]
-    # Three lengths forecast, two do not; what is measured is an answer all the same.
-    assert [row["time"] for row in answers(evidence(SECONDS[:3]))] == ["0:10", "0:20", "0:40", "1min", "2min"]
-    few = evidence(SECONDS[:2])
-    assert [row["time"] for row in answers(few)] == ["0:10", "0:20"]
-    assert "runs of 3 lengths are needed" in few.time_of(0.1)
-    assert answers(Evidence.of([], few.deviation)) == []
-    # The run of the fewest steps is an answer, too, but no evidence.
-    slow = replace(evidence().runs[0], series=SLOW_SERIES)
-    with_slow = Evidence.of([slow, *few.runs], few.deviation)
-    assert [row["time"] for row in answers(with_slow)] == ["0:10", "0:10", "0:20"]
-    assert with_slow.curve is None
 
 
 def test_forecasts_of_short_studies_contain_the_truth() -> None:

@@ -31,7 +31,6 @@ from mbtf_pipeline.cost.measurement import (
 from mbtf_pipeline.cost.runs import MOST_SEEDS, Run
 from mbtf_pipeline.cost.study import Measurements
 from mbtf_pipeline.recipe import load_recipe
-from mbtf_pipeline.stages import machine
 
 RECIPE = ROOT / "pipelines" / "quickstart.yaml"
 ONE = Estimate(1.0, 0.1, 4)
@@ -57,13 +56,6 @@ def test_measurements_come_back_and_damaged_ones_are_repeated(tmp_path: Path) ->
     (path,) = store.folder.glob("mesh-*")
     path.write_text(path.read_text()[:-20])
     assert store.get(mesh) is None
-
-
-def test_studies_of_other_machines_are_refused(tmp_path: Path) -> None:
-    module.STUDY.write(tmp_path, {"machine": machine()})
-    module.claim(tmp_path, machine())
-    with pytest.raises(InputError, match=r"another kind of machine .*; this is Plan 9\)"):
-        module.claim(tmp_path, {"system": "Plan 9"})
 
 
 class Workers(Runner):

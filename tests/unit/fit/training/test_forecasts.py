@@ -1,9 +1,11 @@
-"""Forecasts of the error of a fit, and training that ends once an error is reached."""
+"""Forecasts of fits, which write nothing; validations; an error that ends training."""
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,14 +14,21 @@ from support.fit_data import parallax, write_data
 
 import mbtf_fit.training.fit as fits
 import mbtf_fit.training.forecast as module
+import mbtf_fit.training.validation as validation
+from mbtf_core.app.console import run
+from mbtf_core.files import folders
 from mbtf_core.stats import Estimate, signal_variance
 from mbtf_fit import fit
+from mbtf_fit.cli.app import app
 from mbtf_fit.config import FitConfig
+from mbtf_fit.data.loader import load_training, open_data
 from mbtf_fit.data.queries import ShardQueries
+from mbtf_fit.sections import HeldOutSection
 from mbtf_fit.training.endings import reached
 from mbtf_fit.training.forecast import forecast_fit
 from mbtf_fit.training.loop import TrainingLoop
 from mbtf_fit.training.trainer import Trainer
+from mbtf_fit.training.validation import validation_set
 
 STEPS = 4000
 # Error that repeated queries add.
@@ -91,24 +100,6 @@ def test_the_law_of_the_pilots_predicts_the_fit(law: list[tuple[int, int]], shar
     assert "not reachable with these queries" in below
 
 
-def test_a_pilot_that_gains_by_repeated_queries_adds_no_error(
-    law: list[tuple[int, int]], shards: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(globals(), "ADDED", -0.02)
-    found = forecast_fit(config(steps=STEPS), shards).error
-    assert found.excess.value == 0.0
-    assert found.excess.error > 0.0
-
-
-@pytest.mark.parametrize(("time", "seconds"), [("2s", 8.0), ("20s", 20.0)])
-def test_a_time_takes_its_fewest_steps(
-    law: list[tuple[int, int]], shards: Path, time: str, seconds: float
-) -> None:
-    """Steps of 0.01 s."""
-    found = forecast_fit(config(time=f"{time}, at least 800 steps"), shards)
-    assert (found.seconds, found.steps) == (seconds, 100 * seconds)
-
-
 def test_too_few_steps_give_no_forecast(law: list[tuple[int, int]], shards: Path) -> None:
     found = forecast_fit(config(steps=30), shards).error
     assert found.error is None
@@ -138,3 +129,68 @@ def test_training_stops_once_the_error_is_reached(
     # Without an error to reach, fits are what they were, and no other configuration.
     assert reached(config(), found.history) is None
     assert "error" not in config().fields()["training"]
+
+
+@pytest.mark.parametrize("options", [{"time": "3s"}, {"steps": 12}])
+def test_a_forecast_matches_the_fit_that_follows(
+    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: dict[str, object]
+) -> None:
+    monkeypatch.setattr(module, "_PILOT_SECONDS", 0.1)
+    monkeypatch.setattr(module, "_PIECE_SECONDS", 0.05)
+    config = FitConfig.model_validate({"training": {"batch": 500, "warmup": 3, **options}})
+    before = sorted(tmp_path.rglob("*")), sorted(shards.rglob("*"))
+    found = forecast_fit(config, shards)
+    assert (sorted(tmp_path.rglob("*")), sorted(shards.rglob("*"))) == before
+    assert found.steps == pytest.approx(found.seconds * found.queries_per_second / 500, abs=0.5)
+    assert found.seconds == 3.0 if "time" in options else found.steps == 12
+    if "steps" in options:
+        fit(config, shards, tmp_path / "material")
+        # Names and shapes stand before the numbers, conformance queries beside them.
+        size = (tmp_path / "material" / "weights.safetensors").stat().st_size
+        assert found.bytes < size < found.bytes + 20480
+
+
+def test_validation_uses_a_large_split(shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its queries have more paths, but few of them say less than what was held out."""
+
+    def looked_at(shards: Path) -> tuple[str, ShardQueries]:
+        data = open_data(shards, "shuffled", "neumip")
+        return validation_set(data, load_training(data, HeldOutSection(), 0))
+
+    name, queries = looked_at(shards)
+    assert (name, len(queries)) == ("test", 2000)
+    name, queries = looked_at(write_data(tmp_path / "few", parallax, train=6000, test=10))
+    assert name == "held_out_queries"
+    assert 10 < len(queries) < 200
+    # Some thousand will do, however many were held out.
+    monkeypatch.setattr(validation, "_FEWEST", 30)
+    assert looked_at(write_data(tmp_path / "enough", parallax, train=6000, test=30))[0] == "test"
+
+
+def test_the_last_validation_is_the_error_of_the_fit(shards: Path, tmp_path: Path) -> None:
+    """All test queries are looked at here, so the last look is the fit's error itself."""
+    config = FitConfig.model_validate({"training": {"batch": 500, "steps": 12, "energy_calibration": False}})
+    found = fit(config, shards, tmp_path / "material")
+    assert found.material.description["training"]["validation_set"] == "test"
+    reached = found.errors["test"]["unexplained"]["value"]
+    assert found.history[-1]["unexplained"] == pytest.approx(reached, rel=1e-5)
+    assert found.errors["held_out_queries"]["unexplained"]["value"] != pytest.approx(reached, rel=1e-3)
+
+
+def test_a_long_fit_states_time_and_size(
+    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stop(*_: Any, **__: Any) -> Any:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(fits, "fit", stop)
+    out = tmp_path / "material"
+    assert run(app, [str(shards), "--time", "2min", "-o", str(out)]) == 130
+    # Loading and evaluation are included.
+    assert "expected: about 2:05, " in capsys.readouterr().err
+    assert run(app, [str(shards), "--time", "20s", "-o", str(out)]) == 130
+    assert "expected" not in capsys.readouterr().err
+    monkeypatch.setattr(folders.shutil, "disk_usage", lambda path: SimpleNamespace(free=1e4))
+    assert run(app, [str(shards), "-o", str(out)]) == 3
+    assert "10 kB are free" in capsys.readouterr().err
+    assert not out.exists()
