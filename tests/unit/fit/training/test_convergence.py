@@ -77,6 +77,8 @@ def test_only_a_flat_curve_says_that_longer_training_is_useless() -> None:
         assert found.doubling is not None
         assert (found.doubling >= FLAT) == useless
         assert (next_step(found, fitted(0.2, 0.002)).kind == "none") == useless
+    # Few steps ask for more, whatever the curve shows.
+    assert next_step(cost(history(0.0, steps=146), {}), fitted(0.2, 0.002)).kind == "time"
     # An error as uncertain as that of a glossy metal tells neither.
     for records in (history(0.02, error=0.4), history(0.25, error=0.4)):
         assert cost(records, {}).doubling is None
