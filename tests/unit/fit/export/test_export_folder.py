@@ -99,3 +99,5 @@ def test_a_target_names_all_files_that_it_writes(source: Path, tmp_path: Path, n
     assert written
     # A model that knows no surface has no heights.
     assert written <= set(targets()[name].files) - {"height.png"}
+    documents = [path for path in (tmp_path / "out").iterdir() if path.suffix in (".gltf", ".usda", ".mtlx")]
+    assert not any(word in path.read_text() for path in documents for word in ("height", "displacement"))
