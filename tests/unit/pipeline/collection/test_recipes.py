@@ -78,17 +78,11 @@ def test_folders_lists_and_broken_materials(folder: Path) -> None:
 def test_faults_of_the_recipe(folder: Path) -> None:
     (folder / "more" / "empty").mkdir()
     for text, what in (
-        (
-            "library: [assets]\nmaterials:\n  shel: {fit: {relief: {}}}\n" + BASE,
-            r"materials\.shel\b.*no mat",
-        ),
+        ("library: [assets]\nmaterials:\n  shel: {fit: {relief: {}}}\n" + BASE, r"\.shel\b.*no material of"),
         (f"library: [{'x' * 300}]\n" + BASE, "is not a valid file name"),
         ("library: [more/empty]\n" + BASE, "names no material"),
         ("library: [assets]\nbase:\n  generate:\n    querys: {}\n", r"base: unknown key 'generate\.querys'"),
-        (
-            "library: [assets]\nbase:\n  each_fit: {trainig: {}}\n",
-            r"unknown key 'fit\.relief\.trainig'",
-        ),
+        ("library: [assets]\nbase:\n  each_fit: {trainig: {}}\n", r"base: .*'fit\.relief\.trainig'"),
     ):
         with pytest.raises(InputError, match=what):
             load(folder, text)
