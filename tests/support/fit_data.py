@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mbtf_core.data.geometry import Geometry, encode_geometry, geometry_record
 from mbtf_core.data.lattice import Lattice, sigma_of_level
-from mbtf_core.data.schema import GEOMETRY_NAME, SCHEMA_VERSION
+from mbtf_core.data.schema import GEOMETRY_NAME
 from mbtf_core.directions import from_projected_disk
 from mbtf_fit.config import FitConfig, build_model
 from mbtf_fit.data.queries import TrainingQueries
@@ -59,6 +59,16 @@ def parallax(u: F32, sigma: F32, omega_i: F32, omega_o: F32) -> NDArray[np.float
     return value[:, None] * np.array([1.0, 0.8, 0.6])
 
 
+def noisy_halves(
+    random: np.random.Generator, value: NDArray[np.float64], noise: float
+) -> dict[str, NDArray[np.float32]]:
+    """Two estimates of values with independent noise."""
+    return {
+        f"value_{half}": (value + noise * random.standard_normal(value.shape)).astype(np.float32)
+        for half in "ab"
+    }
+
+
 def write_data(
     folder: Path,
     function: Function,
@@ -70,8 +80,6 @@ def write_data(
     aspect: float = 1.0,
     noise: float = 0.0,
     suffix: str = ".npz",
-    layout: str = "shuffled",
-    schema: int = SCHEMA_VERSION,
     seed: int = 0,
     through: Callable[[F32, F32, F32], NDArray[np.float64]] | None = None,
     geometry: Geometry | None = None,
@@ -95,11 +103,7 @@ def write_data(
         for index in range(count):
             n = total * (index + 1) // count - total * index // count
             queries = random_queries(random, n, lattice)
-            value = function(*queries.values())
-            halves = {
-                f"value_{half}": (value + noise * random.standard_normal(value.shape)).astype(np.float32)
-                for half in "ab"
-            }
+            halves = noisy_halves(random, function(*queries.values()), noise)
             arrays = {**queries, **halves, "spp": np.full(n, 2, np.float32)}
             if through is not None:
                 seen = through(queries["u"], queries["sigma"], queries["omega_o"])
@@ -107,8 +111,8 @@ def write_data(
             entries.append(write_part(folder, split, index, arrays, config_hash, suffix))
         splits[split] = total, entries
     more: dict[str, Any] = {} if through is None else {"arrays": {"transmittance": {}}}
-    more |= {"config": {"light": {"width": 1.0}}, "geometry": geometry_record(geometry), "schema": schema}
-    return write_manifest(folder, layout, lattice, config_hash, splits, **more)
+    more |= {"config": {"light": {"width": 1.0}}, "geometry": geometry_record(geometry)}
+    return write_manifest(folder, "shuffled", lattice, config_hash, splits, **more)
 
 
 def flat_geometry(lattice: Lattice) -> Geometry:

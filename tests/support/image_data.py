@@ -12,7 +12,7 @@ from mbtf_core.data.lattice import Lattice, sigma_of_level, texel_centers
 from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan
 
 from .datasets import write_manifest, write_part
-from .fit_data import F32, Function, random_directions
+from .fit_data import F32, Function, noisy_halves, random_directions
 
 
 def random_images(
@@ -37,8 +37,6 @@ def write_images(
     *,
     train: int = 60,
     test: int = 3,
-    finest: int = 3,
-    aspect: float = 1.0,
     noise: float = 0.0,
     seed: int = 0,
     patch_size: int | None = None,
@@ -52,7 +50,7 @@ def write_images(
     through : transmittance at u, σ and view, of a material with holes
     """
     folder.mkdir(parents=True, exist_ok=True)
-    lattice, random = Lattice(finest, aspect), np.random.default_rng(seed)
+    lattice, random = Lattice(3), np.random.default_rng(seed)
     config_hash = f"images-{function.__name__}-{seed}-{noise}"
     splits: dict[str, Any] = {}
     for split, counts in (("train", (train // 2, train - train // 2)), ("test", (test,))):
@@ -64,11 +62,7 @@ def write_images(
                 queries = {name: getattr(plan.draw(split, index, items), name) for name in queries}
             shape = queries["sigma"].shape
             flat = {name: a.reshape(-1, *a.shape[3:]) for name, a in queries.items()}
-            value = function(*flat.values()).reshape(*shape, 3)
-            halves = {
-                f"value_{half}": (value + noise * random.standard_normal(value.shape)).astype(np.float32)
-                for half in "ab"
-            }
+            halves = noisy_halves(random, function(*flat.values()).reshape(*shape, 3), noise)
             if through is not None:
                 seen = through(flat["u"], flat["sigma"], flat["omega_o"])
                 halves["transmittance"] = seen.reshape(shape).astype(np.float32)

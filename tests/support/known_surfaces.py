@@ -56,13 +56,11 @@ def geometry(
     return Geometry(heights, lattice.aspect, slopes, moments, base_color=varied(np.asarray(color)), **maps)
 
 
-def rough_surface(
-    lattice: Lattice, *, glossy: bool = True, coated: bool = False, size: int = 16, seed: int = 0
-) -> KnownSurface:
+def rough_surface(lattice: Lattice, *, glossy: bool = True, coated: bool = False) -> KnownSurface:
     """A rough surface with random maps."""
-    heights = rough_heights(max(1, round(size * lattice.aspect)), size, seed=seed)
+    heights = rough_heights(max(1, round(16 * lattice.aspect)), 16)
     layers: dict[str, Any] = {"clearcoat": (1.0, 0.5)} if coated else {}
     if glossy:
         layers |= {"roughness": 0.4, "metallic": 0.7}
-    given = geometry(lattice, heights, **layers, seed=seed)
+    given = geometry(lattice, heights, **layers, seed=0)
     return KnownSurface.of(given, lattice, 5.0)

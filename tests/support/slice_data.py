@@ -16,7 +16,7 @@ from mbtf_fit.pytorch.networks import initialize_layers
 from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan, slice_directions
 
 from .datasets import write_manifest, write_part
-from .fit_data import F32, Function
+from .fit_data import F32, Function, noisy_halves
 
 
 def spots(u: F32, sigma: F32, omega_i: F32, omega_o: F32) -> Any:
@@ -58,11 +58,8 @@ def write_slices(
         for index, start in enumerate(range(0, total, rows)):
             queries = plan.draw(split, index, min(rows, total - start))
             flat, lead = queries.flat(), queries.lead
-            value = function(flat.u, flat.sigma, flat.omega_i, flat.omega_o)
-            arrays: dict[str, F32] = dict(vars(queries))
-            for half in "ab":
-                noisy = value + noise * random.standard_normal(value.shape)
-                arrays[f"value_{half}"] = noisy.reshape(*lead, 3).astype(np.float32)
+            value = function(flat.u, flat.sigma, flat.omega_i, flat.omega_o).reshape(*lead, 3)
+            arrays: dict[str, F32] = {**vars(queries), **noisy_halves(random, value, noise)}
             arrays["spp"] = np.full(lead, 2, np.float32)
             if through is not None:
                 arrays["transmittance"] = through(queries.u)

@@ -13,128 +13,76 @@ from __future__ import annotations
 
 import math
 import tempfile
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.directions import from_angles
 from mbtf_core.pictures import PIXEL_SIGMA, Camera
 from mbtf_core.stats import Estimate, mean_estimate
+from mbtf_gen.config.generator import GeneratorConfig, LightSection
+from mbtf_gen.job import Job
 from mbtf_gen.tile.maps.material_file import ROLES
-
-if TYPE_CHECKING:
-    from mbtf_gen.config.generator import GeneratorConfig
-    from mbtf_gen.job import Job
-    from mbtf_gen.tile.protocol import Tile
-    from mbtf_pipeline.recipe import CompareSection
+from mbtf_gen.tile.protocol import Tile
 
 F64 = NDArray[np.float64]
+Halves = tuple[F64, F64]
 # Lowest elevation of the light for which the finite block suffices.
 LOWEST_LIGHT = 30.0
 # Pixels along every edge that are ignored, and the side of the blocks taken as independent: neighboring
 # pixels share samples of the Gaussian filter. Correlation across borders makes error bars 5% too small.
 _MARGIN, _BLOCK = 4, 8
-# With fewer blocks the error bars are too uncertain to decide anything.
-MIN_BLOCKS = 9
-# Tolerated differences relative to the mean value: of the mean, and root mean square over pixels.
-MEAN_TOLERANCE, RMS_TOLERANCE = 0.005, 0.02
-# A larger difference is tolerated within so many standard errors: among dozens of comparisons, some exceed
-# two.
-MAX_STANDARD_ERRORS = 3.0
+_SPP = 32
+# Tolerated differences relative to the mean value: of the mean, and root mean square over pixels; larger ones
+# are tolerated within so many standard errors.
+MEAN_TOLERANCE, RMS_TOLERANCE, MAX_STANDARD_ERRORS = 0.005, 0.02, 3.0
 # Properties that a Lambertian surface does not have.
 _NOT_LAMBERTIAN = tuple(role for role in ROLES if role != "base_color")
 
 
-Verdict = Literal["agree", "differ", "inconclusive"]
-
-
-@dataclass(frozen=True)
-class MitsubaAgreement:
-    """Comparison of one scene rendered by mbtf and by unmodified Mitsuba.
-
-    Attributes
-    ----------
-    mean : difference of the means, mbtf minus Mitsuba, relative to the mean value
-    square : noise-free mean squared difference, relative to the squared mean value
-    mbtf, mitsuba : (rows, columns, 3) values in 1/sr
-    """
-
-    mean: Estimate
-    square: Estimate
-    mbtf: F64
-    mitsuba: F64
-
-    @property
-    def verdict(self) -> Verdict:
-        """:func:`verdict` of its two differences."""
-        return verdict(self.mean, self.square)
-
-
-def verdict(mean: Estimate, square: Estimate) -> Verdict:
-    """Whether both relative differences lie within their tolerance or within three standard errors."""
-    if min(mean.n, square.n) < MIN_BLOCKS:
-        return "inconclusive"
-    pixels_agree = square.value <= max(RMS_TOLERANCE**2, MAX_STANDARD_ERRORS * square.error)
-    means_agree = abs(mean.value) <= max(MEAN_TOLERANCE, MAX_STANDARD_ERRORS * mean.error)
-    return "agree" if pixels_agree and means_agree else "differ"
-
-
-def agreement(mbtf: tuple[F64, F64], mitsuba: tuple[F64, F64]) -> MitsubaAgreement:
-    """Compare two renderings (rows, columns, 3), each given as two independent halves."""
+def differences(mbtf: Halves, mitsuba: Halves) -> tuple[Estimate, Estimate]:
+    """Difference of the means of two renderings (rows, columns, 3), and its noise-free mean square, relative
+    to the mean value."""
     a1, b1, a2, b2 = (_blocks(x) for x in (*mbtf, *mitsuba))
-    scale = 4.0 / max(float((a1 + b1 + a2 + b2).mean()), 1e-30)
-    difference = mean_estimate((a1 + b1 - a2 - b2) / 2.0).scaled(scale)
-    square = mean_estimate((a1 - a2) * (b1 - b2)).scaled(scale**2)
-    return MitsubaAgreement(difference, square, (mbtf[0] + mbtf[1]) / 2, (mitsuba[0] + mitsuba[1]) / 2)
+    scale = 4.0 / float((a1 + b1 + a2 + b2).mean())
+    mean = mean_estimate((a1 + b1 - a2 - b2) / 2.0).scaled(scale)
+    return mean, mean_estimate((a1 - a2) * (b1 - b2)).scaled(scale**2)
+
+
+def agree(mean: Estimate, square: Estimate) -> bool:
+    """Whether both differences lie within their tolerance or within three standard errors."""
+    return square.value <= max(RMS_TOLERANCE**2, MAX_STANDARD_ERRORS * square.error) and abs(
+        mean.value
+    ) <= max(MEAN_TOLERANCE, MAX_STANDARD_ERRORS * mean.error)
 
 
 def _blocks(picture: F64) -> F64:
-    """(blocks, pixels, 3) within the margin; incomplete blocks are dropped. A small image is one block."""
+    """(blocks, pixels, 3) within the margin; incomplete blocks are dropped."""
     rows, columns = ((n - 2 * _MARGIN) // _BLOCK for n in picture.shape[:2])
-    if min(rows, columns) < 1:
-        return picture.reshape(1, -1, 3)
     inner = picture[_MARGIN : _MARGIN + rows * _BLOCK, _MARGIN : _MARGIN + columns * _BLOCK]
     cut = inner.reshape(rows, _BLOCK, columns, _BLOCK, 3)
     return cut.transpose(0, 2, 1, 3, 4).reshape(rows * columns, -1, 3)
 
 
-def compare_with_mitsuba(
-    section: CompareSection, generate: GeneratorConfig, material: Tile
-) -> dict[str, MitsubaAgreement]:
-    """Render one scene with mbtf and with Mitsuba: the ``base color`` alone, and the ``full`` surface."""
-    from mbtf_gen.config.generator import LightSection
-    from mbtf_gen.job import Job
+def render_both(
+    config: GeneratorConfig, material: Tile, camera: Camera, omega_i: F64, other: Camera | None = None
+) -> tuple[Halves, Halves]:
+    """A reference in two halves, by mbtf and by Mitsuba, whose camera may be another one."""
     from mbtf_gen.pictures.reference import render_reference
     from mbtf_gen.planning.run_plan import reference_plan
     from mbtf_gen.planning.simulation import build_estimator
 
-    view, light, tiles_across = section.views[0], section.lights[0], min(section.tiles_across or [1.0])
-    config = generate.model_copy(update={"light": LightSection(width=0.0)})
-    camera = Camera(view.elevation, view.azimuth, tiles_across, rows=section.size, columns=section.size)
-    omega_i = from_angles(light.elevation, light.azimuth)
-    out = {}
-    for surface, variant in _surfaces(material).items():
-        job = Job.of(config, variant)
-        estimator = build_estimator(job, reference_plan(job))
-        image = render_reference(
-            estimator, camera, omega_i, kind="pixel", spp=section.spp, seed=section.seed, index=0
-        )
-        mbtf = image.value_a.astype(np.float64), image.value_b.astype(np.float64)
-        mitsuba = render_with_mitsuba(job, camera, omega_i, section.spp, section.seed)
-        out[surface] = agreement(mbtf, mitsuba)
-    return out
+    job = Job.of(config.model_copy(update={"light": LightSection(width=0.0)}), material)
+    estimator = build_estimator(job, reference_plan(job))
+    image = render_reference(estimator, camera, omega_i, kind="pixel", spp=_SPP, seed=0, index=0)
+    mbtf = image.value_a.astype(np.float64), image.value_b.astype(np.float64)
+    return mbtf, render_with_mitsuba(job, other or camera, omega_i, _SPP, 0)
 
 
-def _surfaces(material: Tile) -> dict[str, Tile]:
-    """The material as a Lambertian surface of its base color, and as it is but without opacity."""
-    if material.bsdf_type is not None:
-        return {"full": material}
-    lambertian = material.with_maps(**dict.fromkeys(_NOT_LAMBERTIAN))
-    full = material.with_maps(opacity=None)
-    return {"base color": lambertian, **({} if _is_lambertian(full) else {"full": full})}
+def lambertian(material: Tile) -> Tile:
+    """The material as a Lambertian surface of its base color."""
+    return material.with_maps(**dict.fromkeys(_NOT_LAMBERTIAN))
 
 
 def _is_lambertian(material: Tile) -> bool:

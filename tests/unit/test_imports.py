@@ -17,76 +17,21 @@ from conftest import RunPython
 from support.paths import ROOT
 
 PACKAGES = ("mbtf_core", "mbtf_gen", "mbtf_fit", "mbtf_pipeline")
-# The rooms from the lowest to the highest: folders, or single files, of the packages. A room imports from its
-# own line and from those above it. A package's name stands for its files that no line names.
-ROOMS = """
-mbtf_core
-mbtf_core.config
-mbtf_core.files
-mbtf_core.run
-mbtf_core.app
-mbtf_core.images
-mbtf_core.meshes
-mbtf_core.data
-mbtf_core.stats
-mbtf_core.pictures
-mbtf_core.forecast
-mbtf_gen.sampling
-mbtf_gen.measured
-mbtf_gen.engine
-mbtf_gen.config
-mbtf_gen.tile.tracers
-mbtf_gen.tile.heights
-mbtf_gen.tile.fibers
-mbtf_gen.tile.maps
-mbtf_gen.tile
-mbtf_gen.render
-mbtf_gen.checks
-mbtf_gen.doctor mbtf_gen.selftest
-mbtf_gen.job
-mbtf_gen.planning
-mbtf_gen.forecast
-mbtf_gen.generation
-mbtf_gen.pictures
-mbtf_gen.publishing
-mbtf_gen.cli
-mbtf_gen
-mbtf_fit.sections
-mbtf_fit.formatting
-mbtf_fit.ops
-mbtf_fit.data
-mbtf_fit.native
-mbtf_fit.surface
-mbtf_fit.pytorch
-mbtf_fit.objective
-mbtf_fit.backends.cpu
-mbtf_fit.models
-mbtf_fit.config
-mbtf_fit.material
-mbtf_fit.evaluation
-mbtf_fit.training
-mbtf_fit.backends.mitsuba
-mbtf_fit.backends.shader
-mbtf_fit.preview
-mbtf_fit.comparison
-mbtf_fit.viewer
-mbtf_fit.export
-mbtf_fit.cli
-mbtf_fit
-mbtf_pipeline.recipe
-mbtf_pipeline.stages
-mbtf_pipeline.compare
-mbtf_pipeline.stages
-mbtf_pipeline.tables
-mbtf_pipeline.report
-mbtf_pipeline.run
-mbtf_pipeline.collection
-mbtf_pipeline.run_time
-mbtf_pipeline.cost
-mbtf_pipeline.cli
-mbtf_pipeline
-"""
-RANK = {name: rank for rank, line in enumerate(ROOMS.split("\n")) for name in line.split()}
+# The rooms of each package from the lowest to the highest: folders or single files. A room imports from those
+# before it; a comma joins two that stand side by side. A dot stands for the files that no room names.
+ROOMS = {
+    "mbtf_core": ". config files run app images meshes data stats pictures forecast",
+    "mbtf_gen": "sampling measured engine config tile.tracers tile.heights tile.fibers tile.maps tile render"
+    " checks doctor,selftest job planning forecast generation pictures publishing cli .",
+    "mbtf_fit": "sections formatting ops data native surface pytorch objective backends.cpu models config"
+    " material evaluation training backends.mitsuba backends.shader preview comparison viewer export cli .",
+    "mbtf_pipeline": "recipe compare stages tables report run collection run_time cost cli .",
+}
+RANK = {
+    f"{package}.{name}".removesuffix(".."): rank
+    for rank, (package, names) in enumerate((p, names) for p, line in ROOMS.items() for names in line.split())
+    for name in names.split(",")
+}
 # What a package, or one of its rooms, may not import anywhere, not even inside a function.
 FORBIDDEN = {
     "mbtf_core": {"torch", "mitsuba", "drjit", "trimesh"},

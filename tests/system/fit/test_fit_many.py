@@ -1,4 +1,4 @@
-"""``mbtf-fit --many``: several data sets, none stopped by another's failure."""
+"""``mbtf-fit --many``: several data sets, none stopped by another's failure, also with a shared network."""
 
 from __future__ import annotations
 
@@ -7,13 +7,16 @@ from pathlib import Path
 
 import pytest
 from support.command_lines import call
-from support.fit_data import parallax, write_data
+from support.datasets import edit
+from support.fit_data import constant, parallax, write_data
 
 from mbtf_core.data.shard_files import read_shard, write_shard
 from mbtf_core.errors import InputError
+from mbtf_fit import Material
+from mbtf_fit.material.decoder import network_tensors
 from mbtf_fit.training.fit_many import find_data
 
-QUICK = ("--steps", "3", "--batch", "300", "--device", "cpu")
+QUICK = ("--steps", "6", "--batch", "300", "--device", "cpu")
 
 
 def test_one_that_fails_does_not_stop_the_others(tmp_path: Path) -> None:
@@ -32,7 +35,7 @@ def test_one_that_fails_does_not_stop_the_others(tmp_path: Path) -> None:
     assert [Path(fit["material"]).name for fit in (broken, other)] == ["a", "b"]
     assert "train-00000.npz" in broken["error"]
     assert other["error"] is None
-    assert other["result"]["training"]["steps"] == 3
+    assert other["result"]["training"]["steps"] == 6
     # Of the failed one nothing is left, nor of a command of which all fail.
     assert not (tmp_path / "out" / "a").exists()
     alone = call(["mbtf-fit", "--many", str(shard.parent), "-o", str(tmp_path / "none"), *QUICK])
@@ -58,3 +61,53 @@ def test_data_sets_come_from_folders_and_folders_of_folders(tmp_path: Path) -> N
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="contains no data sets"):
         find_data([tmp_path / "empty"])
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("data")
+    for seed, name in enumerate(("a", "b", "c")):
+        write_data(folder / name, parallax, train=1000, test=100, seed=seed)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def materials(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("fits") / "materials"
+    narrow = ("--set", "network.width=16")
+    words = ["--many", str(data / "a"), str(data / "b"), "--shared-decoder", "-o", str(out)]
+    done = call(["mbtf-fit", *words, *QUICK, *narrow])
+    assert done.code == 0, done.err
+    assert [line.split()[0] for line in done.out.splitlines()] == ["material", "a", "b"]
+    return out
+
+
+def test_a_fit_takes_model_and_network_from_the_folder(materials: Path, data: Path, tmp_path: Path) -> None:
+    wanted = network_tensors(Material.load(materials / "a").model)
+    # A preset has another network.
+    words = ["--decoder", str(materials / "a"), "-o", str(tmp_path / "m"), "--quality", "draft", *QUICK]
+    done = call(["mbtf-fit", str(data / "c"), *words])
+    assert done.code == 0, done.err
+    found = Material.load(tmp_path / "m")
+    assert found.config.network.width == 16
+    own = network_tensors(found.model)
+    assert all((own[name] == wanted[name]).all() for name in wanted)
+
+
+def test_the_same_command_keeps_a_finished_fit(data: Path, tmp_path: Path) -> None:
+    words = ["--many", str(data), "--shared-decoder", "-o", str(tmp_path / "m"), *QUICK]
+    first = call(["mbtf-fit", *words, "--json"])
+    assert first.code == 0, first.err
+    found = json.loads(first.out)
+    assert [fit["result"]["resumed"] for fit in found["fits"]] == [False] * 3
+    again = json.loads(call(["mbtf-fit", *words, "--json"]).out)
+    assert [fit["result"]["resumed"] for fit in again["fits"]] == [True] * 3
+
+
+def test_data_without_geometry_share_a_network_of_neumip(data: Path, tmp_path: Path) -> None:
+    flat = write_data(tmp_path / "flat", constant(0.3), train=500, test=50)
+    edit(flat / "manifest.json", lambda manifest: manifest.update(geometry=None))
+    words = ["--many", str(data / "a"), str(flat), "--shared-decoder", "-o", str(tmp_path / "m"), *QUICK]
+    done = call(["mbtf-fit", *words])
+    assert done.code == 0, done.err
+    assert Material.load(tmp_path / "m" / "flat").config.model == "neumip"

@@ -95,9 +95,7 @@ def test_the_page_is_self_contained_and_names_the_size(made: Path) -> None:
     assert not found.external
     assert len(found.pictures) == 4 + 3 + 10
     assert all(p.startswith("data:image/") for p in found.pictures)
-    assert "This is the quick size" in html
     assert "Skipped because of missing files: elsewhere" in html
-    assert "--quick" in html
 
 
 def test_the_same_command_runs_nothing_again(made: Path, capsys: pytest.CaptureFixture[str]) -> None:

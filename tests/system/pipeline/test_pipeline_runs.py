@@ -111,15 +111,6 @@ def test_the_report_is_self_contained(first: dict[str, Any], folder: Path) -> No
         head, _, data = uri.partition(",")
         assert head in ("data:image/png;base64", "data:image/jpeg;base64")
         assert len(base64.b64decode(data, validate=True)) > 100
-    for text in (
-        "1/sr, albedo 1, is white",
-        "HDR-FLIP",
-        "% of white",
-        "flip-evaluator",
-        "mbtf-pipeline run",
-        "mitsuba",
-    ):
-        assert text in html
     assert html.count("<svg") >= 6
     ids = re.findall(r'\bid="([^"]+)"', html)
     assert len(ids) == len(set(ids))
@@ -168,9 +159,6 @@ def test_the_report_can_be_written_again(
     capsys.readouterr()
     assert run(app, ["report", str(folder), "--exposure", "-0.5", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["exposure"] == -0.5
-    assert "exposure -0.50 EV (1.41 1/sr, albedo 4.4, is white)" in (folder / "report.html").read_text(
-        encoding="utf-8"
-    )
     assert run(app, ["report", str(folder), "--exposure", "90"]) == 2
     # The recipe has its own exposure.
     assert list(again()) == ["report"]
@@ -227,6 +215,4 @@ def test_a_cost_study_measures_reports_and_resumes(
     assert " && mbtf-fit run-" in point["command"]
     html = (out / "cost.html").read_text()
     assert not loads(html).external
-    for text in ("Paths per query", "One complete run was measured", "--time 1h"):
-        assert text in html
     assert len((out / "cost.csv").read_text().splitlines()) == 1 + 4

@@ -1,23 +1,35 @@
-"""Recipes: reading, errors with lines and hints, and exit codes."""
+"""Recipes: reading, errors with lines and hints, quality presets, and exit codes."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
+from support.paths import ROOT
 
 from mbtf_core.app.console import Console, run
+from mbtf_core.app.options import Quality
+from mbtf_core.config.settings import resolve
 from mbtf_core.errors import InputError
+from mbtf_fit.config import FITTER, FitConfig
+from mbtf_fit.sections import TimeBudget
+from mbtf_gen.config.generator import GENERATOR, GeneratorConfig, count_queries
 from mbtf_gen.generation import run as generation
 from mbtf_gen.job import Job
 from mbtf_pipeline.cli.app import app
-from mbtf_pipeline.recipe import load_recipe, read_resolved, write_recipe
+from mbtf_pipeline.recipe import (
+    COMPARE,
+    load_recipe,
+    preset_recipe,
+    quality_options,
+    read_resolved,
+    write_recipe,
+)
 from mbtf_pipeline.run import _material_inputs, _RecipeRun, survey
 from mbtf_pipeline.stages import NOT_RUN, Decision, run_stages
 
@@ -49,15 +61,21 @@ def written(folder: Path, text: str) -> Path:
     return path
 
 
-def test_the_material_is_relative_to_the_recipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_paths_are_relative_to_the_recipe_or_the_current_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
+    np.save(elsewhere / "h.npy", np.zeros((2, 2), np.float32))
     monkeypatch.chdir(elsewhere)
     for text in (SINGLE, SINGLE.replace("maps/height.npy", "maps\\height.npy")):
-        path = written(tmp_path, text)
-        recipe = load_recipe(Path("..") / path.name)
+        path = Path("..") / written(tmp_path, text).name
+        recipe = load_recipe(path)
         assert Path(recipe.generate.material).samefile(tmp_path / "maps" / "height.npy")
     assert recipe.folder == Path("out") / "small"
+    recipe = load_recipe(path, ["generate.material=h.npy", "compare.spp=32"])
+    assert Path(recipe.generate.material).samefile(elsewhere / "h.npy")
+    assert recipe.compare.spp == 32
 
 
 def test_data_are_out_of_date_when_a_map_has_changed(tmp_path: Path) -> None:
@@ -142,37 +160,11 @@ def test_the_material_of_two_data_sets_is_announced_once(
     assert (len(announced), len(generated)) == (1, 2)
 
 
-def test_an_assigned_material_is_relative_to_the_current_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = written(tmp_path, SINGLE)
-    other = tmp_path / "other"
-    other.mkdir()
-    np.save(other / "h.npy", np.zeros((2, 2), np.float32))
-    monkeypatch.chdir(other)
-    recipe = load_recipe(path, ["generate.material=h.npy", "compare.spp=32"])
-    assert Path(recipe.generate.material).samefile(other / "h.npy")
-    assert recipe.compare.spp == 32
-
-
-@pytest.mark.parametrize(
-    ("fit", "models"),
-    [
-        ("fit: {training: {time: 9s}}\n", {"relief": "relief"}),
-        (NAMED.removeprefix(HEAD), {"neumip": "neumip", "quick": "neumip-baseline"}),
-        ("fit: {neumip+: }\n", {"neumip+": "neumip+"}),
-    ],
-)
-def test_names_and_models_default_to_each_other(tmp_path: Path, fit: str, models: dict[str, str]) -> None:
-    recipe = load_recipe(written(tmp_path, HEAD + fit))
-    assert {name: config.model for name, config in recipe.fit.items()} == models
-
-
 @pytest.mark.parametrize(
     ("text", "line", "what"),
     [
-        (SINGLE + "compare:\n  views:\n  - {elevation: 45, azimut: 3}\n", 8, "did you mean 'azimuth'"),
         (NAMED.replace("time: 5s", "tmie: 5s"), 10, "did you mean 'time'"),
+        (SINGLE.replace("maps/", "../nowhere/"), 3, "nowhere/height.npy' does not exist"),
         (HEAD + "fit:\n  other:\n", 6, "rainer2020"),
         (HEAD + "fit: {}\n", 5, "contains no fit"),
         (SINGLE + "compare: {tiles_across: [2, 2.0]}\n", 6, "same entry twice"),
@@ -186,23 +178,11 @@ def test_errors_name_the_line(tmp_path: Path, text: str, line: int, what: str) -
     assert what in caught.value.message
 
 
-def test_a_missing_material_is_one_clear_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = written(tmp_path, SINGLE.replace("maps/height.npy", "../nowhere/height.exr"))
-    assert run(app, ["run", str(path), "-o", str(tmp_path / "out")]) == 3
-    out, err = capsys.readouterr()
-    first, second = err.splitlines()
-    searched = os.path.abspath(tmp_path / "../nowhere/height.exr")
-    assert first == f"error: {path}:3: material '{searched}' does not exist"
-    assert second.strip() == f"searched for {searched}"
-    assert out == ""
-    assert not (tmp_path / "out").exists()
-
-
 @pytest.mark.parametrize(
     ("arguments", "code", "what"),
     [
         (["run", "recipe-under-tset.yaml"], 3, "did you mean 'recipe-under-test.yaml'?"),
-        (["run", "recipe-under-test.yaml", "--set", "compare.sp=2"], 2, "did you mean 'spp'"),
+        (["run", "recipe-under-test.yaml", "--set", "generate.material=no.exr"], 3, "does not exist"),
         (["run", "recipe-under-test.yaml", "--quality", "draft", "--set", "fit={}"], 2, "contains no fit"),
         (["run", "recipe-under-test.yaml", "-o", "maps"], 3, "not empty"),
         (["report", "maps"], 3, "contains no run"),
@@ -249,3 +229,67 @@ def test_a_stored_recipe_runs_no_code(tmp_path: Path) -> None:
     with pytest.raises(InputError):
         load_recipe(tmp_path / "recipe.yaml")
     assert ran.exists()
+
+
+QUALITIES: tuple[Quality, ...] = get_args(Quality)
+
+
+def test_each_preset_takes_more_paths_than_the_one_before() -> None:
+    paths = []
+    for quality in QUALITIES:
+        config = resolve(GeneratorConfig, presets={"material": "m", **GENERATOR[quality]})
+        paths.append(count_queries(config.queries.train, 128**2) * config.queries.spp)
+    assert paths == sorted(set(paths))
+
+
+@pytest.mark.parametrize("quality", QUALITIES)
+def test_recipes_take_a_preset(quality: Quality) -> None:
+    path = ROOT / "pipelines" / "quickstart.yaml"
+    recipe = preset_recipe(path, quality)
+    assert recipe.generate.queries.train == GENERATOR[quality]["queries.train"]
+    plain = load_recipe(path)
+    assert recipe.generate.light == plain.generate.light
+    assert list(recipe.fit) == list(plain.fit)
+    for fit in recipe.fit.values():
+        expected = resolve(FitConfig, presets=FITTER[quality])
+        assert fit.training.steps == expected.training.steps
+        if expected.training.steps is None:
+            assert fit.training.time.seconds == expected.training.time.seconds
+    assert recipe.compare.size == COMPARE[quality]["compare.size"]
+
+
+@pytest.mark.parametrize("name", ["models", "hierarchical"])
+@pytest.mark.parametrize("quality", QUALITIES)
+def test_recipes_that_compare_networks_keep_them(quality: Quality, name: str) -> None:
+    path = ROOT / "pipelines" / f"{name}.yaml"
+    plain, raised = load_recipe(path), load_recipe(path, presets=quality_options(path, quality))
+    assert {n: f.network for n, f in raised.fit.items()} == {n: f.network for n, f in plain.fit.items()}
+    for one, fit in raised.fit.items():
+        if plain.fit[one].training.blur.initial_sigma == 0 or fit.model == "hierarchical":
+            assert fit.training.blur == plain.fit[one].training.blur
+
+
+def test_a_section_overrides_the_preset_value_by_value(tmp_path: Path) -> None:
+    np.save(tmp_path / "height.npy", np.zeros((8, 8)))
+    path = tmp_path / "recipe.yaml"
+    path.write_text("name: r\ngenerate: {material: height.npy}\nfit: {neumip: {}}\n")
+    for section, single in (
+        ("fit.neumip={network: {width: 7}}", "fit.neumip.network.width=7"),
+        ("fit={neumip: {training: {blur: {fraction: 0.4}}}}", "fit.neumip.training.blur.fraction=0.4"),
+    ):
+        found, expected = (preset_recipe(path, "draft", [text]) for text in (section, single))
+        assert found == expected
+        assert found.fit["neumip"].training.time == TimeBudget(12.0, 800)
+
+
+def test_a_preset_sets_the_resolution_unless_told(tmp_path: Path) -> None:
+    """A draft of large maps is a draft; explicit resolutions of recipes and assignments are kept."""
+    np.save(tmp_path / "height.npy", np.zeros((256, 256)))
+    path = tmp_path / "recipe.yaml"
+    text = "name: r\ngenerate: {material: height.npy, geometry: {height_scale: 1}}\nfit: {model: neumip}\n"
+    path.write_text(text)
+    found = [preset_recipe(path, quality).generate.queries.resolution for quality in QUALITIES]
+    # No finer than the map, whose own is the paper's.
+    assert found == [128, 256, 256, None]
+    told = preset_recipe(path, "draft", ["generate.queries.resolution=512"])
+    assert told.generate.queries.resolution == 512

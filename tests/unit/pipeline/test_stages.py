@@ -74,12 +74,6 @@ def pipeline(tmp_path: Path) -> Pipeline:
     return pipeline
 
 
-def test_nothing_runs_twice(pipeline: Pipeline) -> None:
-    results = pipeline.run()
-    assert pipeline.ran == []
-    assert not any(r.reason for r in results.values())
-
-
 @pytest.mark.parametrize(
     ("stage", "expected"),
     [

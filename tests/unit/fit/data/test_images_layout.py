@@ -77,27 +77,6 @@ def test_whole_images_are_held_out(tmp_path: Path) -> None:
     assert other != held[0]
 
 
-def test_at_least_one_image_is_held_out(tmp_path: Path) -> None:
-    folder = write_images(tmp_path / "d", parallax, train=6)
-    few = HeldOutSection(queries=0.01, radius=0)
-    assert len(partition(folder, few).held_out_queries) == 64
-    none = partition(folder, HeldOutSection(queries=0, radius=0))
-    assert len(none.held_out_queries) == len(none.held_out_directions) == 0
-    assert len(images_of(none)) == 6 * 64
-    with pytest.raises(InputError, match=r"all 6 images .* held out"):
-        partition(folder, HeldOutSection(radius=0.99, direction=(0.0, 0.0)))
-
-
-def test_values_belong_to_the_positions_within_the_margin() -> None:
-    lattice = Lattice(3)
-    data = images(lattice, [3.0, 2.0], regular=False)
-    patches = data.patches(np.array([1, 0]), np.array([[5, 7], [2, 2]]), 4, 3)
-    number = patches.value[..., 0].long()
-    torch.testing.assert_close(patches.u[:, 3:-3, 3:-3], data.u.view(-1, 2)[number])
-    assert number[0, 0, 0] == 64 + 5 * 8 + 7
-    assert number[0, 1, 1] == 64 + 7 * 8 + (7 + 2) % 8
-
-
 def test_batches_take_every_image_and_resume_anywhere() -> None:
     data = images(Lattice(3), [1.0, 2.0, 3.0, 2.5, 0.5], regular=False)
     batches = list(islice(data.batches(32, 7, 0, 4), 10))
@@ -134,34 +113,6 @@ def test_patches_extend_beyond_the_border_of_small_images() -> None:
         rows, columns = nearest_shapes(lattice, patches.sigma[item : item + 1].numpy())[0]
         step = patches.u[item, 1:, 1:] - patches.u[item, :-1, :-1] - torch.tensor([1 / columns, -1 / rows])
         torch.testing.assert_close(step, step.round().to(step.dtype), atol=1e-6, rtol=0)
-
-
-def test_patches_lie_inside_small_images() -> None:
-    data = small_images(Lattice(4), 6, 8)
-    for batch in islice(data.batches(2 * 16, 0, 0, 2), 20):
-        assert batch.value.shape == (1, 6, 6, 3)
-    seen = set()
-    for batch in islice(data.batches(16, 0, 0, 2), 40):
-        assert batch.value.shape == (1, 4, 4, 3)
-        number = batch.value[0, ..., 0].long() % 36
-        assert (number == number[0, 0] + 6 * torch.arange(4)[:, None] + torch.arange(4)).all()
-        seen.add(int(number[0, 0]))
-    assert seen == {6 * j + i for j in range(3) for i in range(3)}
-
-
-@pytest.mark.parametrize("patch_size", [None, 6])
-def test_smaller_patches_give_more_lights_and_views(tmp_path: Path, patch_size: int | None) -> None:
-    folder = write_images(tmp_path / "d", constant(0.1), train=40, patch_size=patch_size)
-    for patch, shape in ((2, (16, 2, 2, 3)), (4, (4, 4, 4, 3))):
-        training = {"steps": 1, "batch": 64, "patch_size": patch}
-        config = FitConfig.model_validate({"model": "hierarchical", "training": training})
-        data = Dataset.open(folder)
-        part = load_training(data, config.held_out, 0)
-        trainer = prepare_trainer(config, data, part, torch.device("cpu"))
-        batch = next(trainer.queries.batches(trainer.batch, 0, 0, trainer.model.margin))
-        assert isinstance(batch, Patches)
-        assert batch.value.shape == shape
-        assert len(batch.omega_i.unique(dim=0)) == shape[0]
 
 
 @pytest.mark.parametrize("cut", ["whole", "patch_sizes"])

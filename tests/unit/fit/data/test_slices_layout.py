@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -71,21 +72,18 @@ def test_a_batch_decodes_pairs_of_whole_slices(tmp_path: Path) -> None:
     assert torch.equal(next(shared.batches(640, 1, 4)).values, 2 * next(slices.batches(640, 1, 4)).values)
 
 
-def test_slices_with_other_directions_are_refused(tmp_path: Path) -> None:
-    def turn(arrays) -> None:  # type: ignore[no-untyped-def]
-        arrays["omega_i"] = arrays["omega_i"].copy()
-        arrays["omega_i"][1] = arrays["omega_i"][1][::-1]
+@pytest.mark.parametrize(
+    ("name", "changed", "message"),
+    [
+        ("omega_i", lambda a: a[1][::-1], "do not share their directions"),
+        ("u", lambda a: a[0], "lacks slices of some texels"),
+    ],
+)
+def test_damaged_slices_are_refused(tmp_path: Path, name: str, changed: Any, message: str) -> None:
+    def change(arrays: Any) -> None:
+        arrays[name] = arrays[name].copy()
+        arrays[name][1] = changed(arrays[name])
 
-    data = Dataset.open(write_slices(tmp_path / "data", change=turn))
-    with pytest.raises(InputError, match="do not share their directions"):
-        load_training(data, HeldOutSection(), 0)
-
-
-def test_a_texel_without_a_slice_is_named(tmp_path: Path) -> None:
-    def repeat(arrays) -> None:  # type: ignore[no-untyped-def]
-        arrays["u"] = arrays["u"].copy()
-        arrays["u"][1] = arrays["u"][0]
-
-    data = Dataset.open(write_slices(tmp_path / "data", change=repeat))
-    with pytest.raises(InputError, match="lacks slices of some texels"):
+    data = Dataset.open(write_slices(tmp_path / "data", change=change))
+    with pytest.raises(InputError, match=message):
         load_training(data, HeldOutSection(), 0)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +11,8 @@ import pytest
 from support.plugin_materials import write_material
 
 from mbtf_core.app.console import run
-from mbtf_core.errors import InputError
 from mbtf_fit.cli.app import app
 from mbtf_fit.export import targets
-from mbtf_fit.export.checks import check_values
 from mbtf_fit.material.material import Material
 
 
@@ -53,18 +50,6 @@ def test_an_unfinished_export_is_resumed(source: Path, tmp_path: Path, lost: tup
         (out / name).unlink()
     assert export(source, out) == 0
     assert Material.load(out).deviation() < 1e-4
-
-
-@pytest.mark.parametrize(("wrong", "refused"), [(5, False), (6, True)])
-def test_rays_that_pass_an_edge_may_differ(source: Path, tmp_path: Path, wrong: int, refused: bool) -> None:
-    """2% of the 256 conformance values."""
-    material, file = Material.load(source), tmp_path / "file"
-    file.touch()
-    found = material.conformance["rgb"].copy()
-    found[:wrong] += 0.01 * found.mean()
-    with pytest.raises(InputError, match=f"{wrong} of 256") if refused else nullcontext():
-        check_values(found, material, file)
-    assert file.exists() is not refused
 
 
 def test_a_file_beside_the_material_is_replaced_on_request_only(
@@ -109,9 +94,10 @@ def test_one_export_does_not_mix_with_another(
 def test_a_target_names_all_files_that_it_writes(source: Path, tmp_path: Path, name: str) -> None:
     if name in (libraries := {"gltf": "pygltflib", "usd": "pxr", "materialx": "MaterialX"}):
         pytest.importorskip(libraries[name])
-        source = tmp_path / "relief"
-        write_material(source, finest=1, model="relief")
     assert run(app, ["export", str(source), "--to", name, "-o", str(tmp_path / "out"), "-q"]) == 0
     written = set(os.listdir(tmp_path / "out")) - {"export.json"}
     assert written
-    assert written <= set(targets()[name].files)
+    # A model that knows no surface has no heights.
+    assert written <= set(targets()[name].files) - {"height.png"}
+    documents = [path for path in (tmp_path / "out").iterdir() if path.suffix in (".gltf", ".usda", ".mtlx")]
+    assert not any(word in path.read_text() for path in documents for word in ("height", "displacement"))

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from numpy.typing import NDArray
 from support.material_cases import make
 from support.plugin_materials import write_material
@@ -89,20 +88,6 @@ def test_an_export_is_sufficient_for_evaluation(case: str, half: bool, tmp_path:
         queries = (material.conformance[k] for k in ("u", "sigma", "omega_o"))
         assert material.transmittance is not None
         assert (material.transmittance.evaluate(*queries) == through.astype(np.float32)).all() != half
-
-
-def test_half_precision_states_its_error(tmp_path: Path) -> None:
-    material = make("neumip", tmp_path)
-    rounded, error = to_half(material)
-    difference = rounded.conformance["rgb"] - material.conformance["rgb"]
-    assert error.largest == pytest.approx(np.abs(difference).max(), rel=1e-5)
-    assert error.rms == pytest.approx(np.sqrt((difference**2).mean()), rel=1e-4)
-    assert error.relative is not None
-    assert 1e-5 < error.relative < 1e-2
-    assert rounded.deviation() < 1e-6
-    for tensor in rounded.model.weights().values():
-        assert tensor.ndim == 0 or torch.equal(tensor, tensor.half().float())
-    assert f"{error.rms:.2g} 1/sr" in str(error)
 
 
 def test_a_material_in_half_precision_loads_like_any_other(tmp_path: Path) -> None:

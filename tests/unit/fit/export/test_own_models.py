@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +9,6 @@ from typing import Any
 
 import pytest
 import torch
-from support.known_surfaces import geometry, rough_heights
 from support.plugin_materials import TRAINING
 from torch import Tensor
 
@@ -23,11 +21,9 @@ from mbtf_fit.config import FitConfig
 from mbtf_fit.export import targets
 from mbtf_fit.material import numpy_reader
 from mbtf_fit.material.material import export
-from mbtf_fit.ops.constants import HEIGHTS
 from mbtf_fit.ops.operation import _KINDS, Operation, Value
 from mbtf_fit.pytorch.material import NeuralMaterial
 from mbtf_fit.pytorch.operations import PYTORCH, Execution
-from mbtf_fit.surface.known import KnownSurface
 
 DOCUMENTS = {"gltf", "usd", "materialx"}
 
@@ -43,29 +39,6 @@ def write(folder: Path, *last: Operation) -> Path:
     generator = torch.Generator().manual_seed(0)
     for textures in model.textures():
         torch.nn.init.normal_(textures.texels, generator=generator)
-    folder.mkdir()
-    export(model, FitConfig(), folder, data={"hash": "0" * 64}, training=TRAINING)
-    return folder
-
-
-def write_traced(folder: Path) -> Path:
-    """A material that reads colors of its own where view rays meet the known heights."""
-    hit = ops.Trace("z", "hit", "u", "level", "omega_o", HEIGHTS)
-    lattice = Lattice(3, 1.0)
-    texel = ops.Lookup("texel", "hit", "level", "texels", 3)
-    # Albedos of at most 0.8.
-    color = ops.Transform("color", "texel", "sigmoid")
-    value = ops.Matrix("value", "color", ((0.25, 0.0, 0.0), (0.0, 0.25, 0.0), (0.0, 0.0, 0.25)))
-    model = NeuralMaterial(lattice, [hit, texel, color, value], "own")
-    generator = torch.Generator().manual_seed(0)
-    for textures in model.textures():
-        torch.nn.init.normal_(textures.texels, generator=generator)
-    model.know(KnownSurface.of(geometry(lattice, rough_heights(16, 16, depth=0.02)), lattice, 5.0))
-    # Coarser levels have the mean of the finest.
-    weights = model.weights()
-    mean = torch.logit(torch.sigmoid(weights["texels.3"]).mean((0, 1)))
-    weights |= {f"texels.{s}": mean.expand(weights[f"texels.{s}"].shape) for s in range(3)}
-    model.load_weights(weights)
     folder.mkdir()
     export(model, FitConfig(), folder, data={"hash": "0" * 64}, training=TRAINING)
     return folder
@@ -99,29 +72,6 @@ def ripple(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
     yield write(tmp_path_factory.mktemp("ripple") / "material", Ripple("value", "color", "omega_i"))
     del _KINDS["ripple"], PYTORCH._functions[Ripple]
-
-
-@pytest.mark.parametrize("name", targets())
-def test_a_model_of_the_projects_operations_is_exported(supported: Path, tmp_path: Path, name: str) -> None:
-    assert command(supported, tmp_path / "out", name) == 0
-
-
-def test_maps_are_those_of_the_values(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A surface that a model traces and does not shade has colors that are not the model's."""
-    material = write_traced(tmp_path / "material")
-    for name in ("exr", "json", "slang"):
-        assert command(material, tmp_path / name, name) == 0
-    capsys.readouterr()
-    assert run(app, ["export", str(material), "--to", "gltf", "-o", str(tmp_path / "gltf"), "--json"]) == 0
-    maps = json.loads(capsys.readouterr().out)["maps"]
-    assert maps["source"] == "fit"
-    assert maps["unexplained"]["value"] < 0.1
-
-
-def test_a_material_has_one_surface() -> None:
-    hit = ops.Trace("z", "hit", "u", "level", "omega_o", "heights")
-    with pytest.raises(ValueError, match="reads 'heights', which is not of the surface"):
-        NeuralMaterial(Lattice(3, 1.0), [hit, ops.Lookup("value", "hit", "level", "texels", 3)])
 
 
 @pytest.mark.parametrize("name", sorted(targets().keys() - DOCUMENTS))

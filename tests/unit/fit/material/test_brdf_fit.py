@@ -184,15 +184,6 @@ def test_values_are_divided_by_what_the_view_meets(tmp_path: Path) -> None:
     np.testing.assert_allclose(maps.evaluate(*direction_pairs(8, 0.5))[0], 0.25 * value, rtol=0.01)
 
 
-@pytest.mark.parametrize("model", ["neumip", "hierarchical", "rainer2020", "neumip+"])
-def test_every_model_has_maps(tmp_path: Path, model: str) -> None:
-    material = write_material(tmp_path, model=model, finest=2, brightness=0.1)
-    maps = scale_color(material, fitted(material, 2))
-    for values in (maps.base_color, maps.roughness, maps.metallic, maps.opacity):
-        assert ((values >= 0) & (values <= 1)).all()
-    assert np.isfinite(maps.slopes).all()
-
-
 def test_views_follow_the_offset(tmp_path: Path) -> None:
     """They see the point that the normal view sees: position plus offset is the same."""
     material = write_material(tmp_path, aspect=0.5, contrast=0.05, brightness=0.0)

@@ -18,7 +18,6 @@ from support.fuzzing import altered, damaged, examples, loads_or_refuses
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import file_sha256
 from mbtf_fit import FitConfig, Material, fit, read_history
-from mbtf_fit.material.format import read_tensors
 
 CONFIG = FitConfig.model_validate(
     {"training": {"steps": 2, "batch": 50, "warmup": 1}, "network": {"channels": 2, "width": 4, "layers": 2}}
@@ -101,20 +100,13 @@ def odd_tensors(whole: Path) -> dict[str, tuple[dict[str, torch.Tensor], str]]:
     }
 
 
-@pytest.mark.parametrize(
-    "case",
-    [
-        *("none", "no weights", "one too many", "another shape", "few queries", "flat queries"),
-        *("integers", "bfloat16", "NaN", "infinite", "many"),
-    ],
-)
-def test_odd_tensors(case: str, whole: Path, folder: Path) -> None:
-    tensors, message = odd_tensors(whole)[case]
-    padding = {} if tensors else {"padding": torch.zeros(1000)}
-    write(folder, whole, None, save({**tensors, **padding}))
-    with pytest.raises(InputError) as caught:
-        Material.load(folder)
-    assert message in caught.value.what
+def test_odd_tensors(whole: Path, folder: Path) -> None:
+    for case, (tensors, message) in odd_tensors(whole).items():
+        padding = {} if tensors else {"padding": torch.zeros(1000)}
+        write(folder, whole, None, save({**tensors, **padding}))
+        with pytest.raises(InputError) as caught:
+            Material.load(folder)
+        assert message in caught.value.what, case
 
 
 @pytest.mark.parametrize(
@@ -147,14 +139,6 @@ def test_odd_operations(whole: Path, folder: Path) -> None:
         write(folder, whole, json.dumps({**description, "operations": operations}), None)
         with pytest.raises(InputError, match=message):
             Material.load(folder)
-
-
-@pytest.mark.parametrize("content", [b"", b"\xff" * 64, b"{}", (2**60).to_bytes(8, "little") + b"{}"])
-def test_files_that_hold_no_tensors(content: bytes, tmp_path: Path) -> None:
-    path = tmp_path / "t.safetensors"
-    path.write_bytes(content)
-    with pytest.raises(InputError, match="cannot be read as tensors"):
-        read_tensors(path)
 
 
 @pytest.mark.parametrize(

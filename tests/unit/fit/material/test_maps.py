@@ -15,9 +15,11 @@ from mbtf_core.app.console import Console
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import UsageError
-from mbtf_fit import Material
+from mbtf_fit import Material, ops
 from mbtf_fit.material.maps import Maps, knows_surface, make_maps, scale_color, surface_maps
 from mbtf_fit.material.reference_values import direction_pairs, tile_means
+from mbtf_fit.ops.constants import HEIGHTS
+from mbtf_fit.pytorch.material import NeuralMaterial
 from mbtf_fit.surface.known import KnownSurface
 
 
@@ -71,38 +73,14 @@ def test_rows_and_opacity(tmp_path: Path) -> None:
     np.testing.assert_allclose(half.evaluate(omega_i, omega_o), 0.5 * maps.evaluate(omega_i, omega_o))
 
 
-def one_texel(**changes: object) -> Maps:
-    flat = Maps(
-        0,
-        1.0,
-        np.full((1, 1, 3), 0.5),
-        np.zeros((1, 1, 2)),
-        np.full((1, 1), 0.5),
-        np.zeros((1, 1)),
-        np.ones((1, 1)),
-        0.04,
-        np.zeros((2, 2)),
-    )
-    return replace(flat, **changes)  # type: ignore[arg-type]
-
-
 def test_surfaces_that_face_away_are_black() -> None:
-    maps = one_texel(slopes=np.array([[[3.0, 0.0]]]))
+    half, one = np.full((1, 1, 3), 0.5), np.ones((1, 1))
+    maps = Maps(0, 1.0, half, np.array([[[3.0, 0.0]]]), 0.5 * one, 0 * one, one, 0.04, np.zeros((2, 2)))
     away, towards, up = from_angles(10.0, 0.0), from_angles(30.0, 180.0), np.array([0.0, 0.0, 1.0])
     lights, views = np.stack([away, up, towards]), np.stack([up, away, up])
     values = maps.evaluate(lights, views)[0]
     assert (values[:2] == 0).all()
     assert (values[2] > 0).all()
-
-
-def test_directions_are_cosine_weighted() -> None:
-    """The mean of the cosine is 2/3 where all of the hemisphere counts."""
-    light, view = direction_pairs(1024, 1e-6)
-    for omega in (light, view):
-        np.testing.assert_allclose(np.linalg.norm(omega, axis=1), 1)
-        assert omega[:, 2].mean() == pytest.approx(2 / 3, abs=0.01)
-        np.testing.assert_allclose(omega[:, :2].mean(0), 0, atol=0.02)
-    assert min(direction_pairs(1024, 0.3)[0][:, 2]) >= 0.3
 
 
 def test_the_mean_reflectance_is_that_of_the_network(tmp_path: Path) -> None:
@@ -120,6 +98,10 @@ def test_levels_that_are_missing_are_refused(tmp_path: Path) -> None:
     assert not knows_surface(write_material(tmp_path / "neumip"))
     material = write_material(tmp_path / "relief", model="relief")
     assert knows_surface(material)
+    # A surface that a model traces and does not shade has colors that are not the model's.
+    traced = ops.Trace("z", "hit", "u", "level", "omega_o", HEIGHTS)
+    model = NeuralMaterial(Lattice(3, 1.0), [traced, ops.Lookup("value", "hit", "level", "texels", 3)])
+    assert not knows_surface(replace(material, model=model))
     assert make_maps(material, None, Console(quiet=True))[0].level == 3
     for level in (-1, 4):
         with pytest.raises(UsageError, match="has the levels 0 to 3"):

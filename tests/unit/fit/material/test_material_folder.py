@@ -14,7 +14,7 @@ import pytest
 import torch
 from safetensors.numpy import load_file
 from support.datasets import edit
-from support.fit_data import constant, parallax, random_queries, write_data
+from support.fit_data import constant, parallax, write_data
 
 import mbtf_fit.material.material
 from mbtf_core.data.dataset import Dataset
@@ -73,19 +73,9 @@ def test_the_first_parameters_follow_the_seed(data: Path) -> None:
         assert not torch.equal(first[name], other[name]), name
 
 
-def test_black_data_are_fitted(tmp_path: Path) -> None:
-    folder = write_data(tmp_path / "d", constant(0.0), train=3000)
-    result = fit(config(100), folder, tmp_path / "m")
-    queries = random_queries(np.random.default_rng(5), 500, Lattice(3))
-    assert result.material.evaluate(*queries.values()).mean() < 0.01
-    assert result.errors["test"]["unexplained"]["value"] is None
-
-
 def test_the_folder_states_what_it_holds(fitted: FitResult) -> None:
     description = json.loads((fitted.folder / "material.json").read_text())
     weights = load_file(fitted.folder / "weights.safetensors")
-    assert description["tile"] == {"aspect": 0.5}
-    assert description["levels"]["shapes"] == [[1, 1], [1, 2], [2, 4], [4, 8]]
     assert {k: list(weights[k].shape) for k in description["weights"]["shapes"]} == description["weights"][
         "shapes"
     ]
@@ -95,7 +85,6 @@ def test_the_folder_states_what_it_holds(fitted: FitResult) -> None:
     held_out = [fitted.errors[name]["n"] for name in ("held_out_queries", "held_out_directions")]
     assert description["training"]["queries"] == 8000 - sum(held_out)
     assert not (fitted.folder / "checkpoint.safetensors").exists()
-    assert fitted.errors["test"]["n"] == 2000
 
 
 @pytest.mark.parametrize("finest", [0, 4])
@@ -103,10 +92,8 @@ def test_conformance_queries_include_seams_and_end_levels(finest: int) -> None:
     """Seams of the tile, footprints at both ends and beyond, light and view from straight above."""
     lattice = Lattice(finest)
     queries = conformance_queries(lattice)
-    assert ((queries["u"] >= 0) & (queries["u"] <= 1)).all()
-    for axis in (0, 1):
-        assert (queries["u"][:, axis] == 0).any()
-        assert (queries["u"][:, axis] > 0.998).any()
+    assert (queries["u"] == 0).any(0).all()
+    assert (queries["u"] > 0.998).any(0).all()
     level = -np.log2(2 * queries["sigma"])
     assert level.min() == -1
     assert level.max() == finest + 1
@@ -114,7 +101,6 @@ def test_conformance_queries_include_seams_and_end_levels(finest: int) -> None:
     for name in ("omega_i", "omega_o"):
         assert (queries[name][:, 2] == 1).any()
         assert queries[name][:, 2].min() < 0.3
-        np.testing.assert_allclose(np.linalg.norm(queries[name], axis=1), 1, atol=1e-6)
 
 
 def test_conformance_is_pytorchs(fitted: FitResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -132,31 +118,8 @@ def test_conformance_is_pytorchs(fitted: FitResult, tmp_path: Path, monkeypatch:
     assert again.deviation() == pytest.approx(0.25, rel=1e-3)
 
 
-def test_directions_that_are_no_unit_vectors_are_refused(fitted: FitResult) -> None:
-    queries = random_queries(np.random.default_rng(3), 10, fitted.material.lattice)
-    for name in ("omega_i", "omega_o"):
-        with pytest.raises(InputError, match=f"{name}: 10 of 10 directions"):
-            fitted.material.evaluate(**{**queries, name: 5.0 * queries[name]})
-    with pytest.raises(InputError, match="omega_o: 10 of 10 directions"):
-        fitted.material.offset(queries["u"], 5.0 * queries["omega_o"])
-
-
-def test_evaluation_takes_any_number_of_queries(fitted: FitResult) -> None:
-    material = fitted.material
-    queries = random_queries(np.random.default_rng(3), 70_000, material.lattice)
-    found = material.evaluate(*queries.values())
-    assert found.shape == (70_000, 3)
-    assert found.min() >= 0
-    part = material.evaluate(*(a[40_000:40_010] for a in queries.values()))
-    np.testing.assert_allclose(found[40_000:40_010], part, atol=1e-6)
-    assert material.evaluate(*(a[:0] for a in queries.values())).shape == (0, 3)
-    shifted = material.evaluate(queries["u"] + np.array([2.0, -1.0]), *list(queries.values())[1:])
-    np.testing.assert_allclose(shifted, found, atol=1e-4)
-
-
 def test_damaged_materials_are_refused(fitted: FitResult, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such folder"):
-        Material.load(tmp_path / "none")
+    """Fuzzed files are those of test_fuzz_fits.py."""
     with pytest.raises(InputError, match=r"no material\.json"):
         Material.load(tmp_path)
     for name in ("material.json", "weights.safetensors"):
@@ -165,18 +128,14 @@ def test_damaged_materials_are_refused(fitted: FitResult, tmp_path: Path) -> Non
     content = bytearray(weights.read_bytes())
     content[-1] ^= 1
     weights.write_bytes(content)
-    again = "copy the folder again, or fit again"
-    with pytest.raises(InputError, match=rf"is damaged, .*SHA-256 is not .*\n  {again}"):
+    with pytest.raises(InputError, match=r"is damaged, .*SHA-256 is not "):
         Material.load(tmp_path)
     weights.unlink()
-    with pytest.raises(InputError, match=rf"weights\.safetensors: no such file, .*\n  {again}"):
+    with pytest.raises(InputError, match=r"weights\.safetensors: no such file"):
         Material.load(tmp_path)
-    description = json.loads((tmp_path / "material.json").read_text())
-    (tmp_path / "material.json").write_text(json.dumps({**description, "schema": 99}))
+    edited = json.loads((tmp_path / "material.json").read_text()) | {"schema": 99}
+    (tmp_path / "material.json").write_text(json.dumps(edited))
     with pytest.raises(InputError, match="schema version 99"):
-        Material.load(tmp_path)
-    (tmp_path / "material.json").write_text("{")
-    with pytest.raises(InputError, match=f"not readable as JSON .*\n  {again}"):
         Material.load(tmp_path)
 
 
@@ -222,8 +181,6 @@ def test_few_queries_that_decide_an_error_are_said(data: Path) -> None:
         assert found is not None
         ten = 10 * (heavy or 1.0)
         assert found["ten_largest"] == pytest.approx(ten / (ten + 0.01 * (n - 10)), rel=1e-3)
-    assert "unreliable: ten" in "".join(report_errors({"test": found | {"n": 5000}}, None))
-    assert "unreliable" not in "".join(report_errors({"test": found | {"n": 500}}, None))
 
 
 def test_outliers_of_the_prediction_are_named(data: Path) -> None:
@@ -233,27 +190,15 @@ def test_outliers_of_the_prediction_are_named(data: Path) -> None:
     truth = np.full_like(stored.value_a, 0.6)
     off = 0.02 * (-1.0) ** np.arange(len(truth), dtype=np.float32)[:, None] * np.ones_like(truth)
     off[7] = 4.8
+    (u, v), level = stored.u[7], -np.log2(2.0 * stored.sigma[7])
     for spread, named in ((0.1, True), (4.0, False)):
         a, b = truth.copy(), truth.copy()
         a[7], b[7] = truth[7] + spread, truth[7] - spread
-        queries = ShardQueries(**(vars(stored) | {"value_a": a, "value_b": b}))
-        found = split_errors(lambda q: truth + off, queries, opened)
+        found = split_errors(lambda q: truth + off, replace(stored, value_a=a, value_b=b), opened)
         assert found is not None
-        found["n"] = 5000
-        line = "".join(report_errors({"test": found}, None))
-        assert ("one outlier makes" in line) == named
-        (u, v), level = stored.u[7], -np.log2(2.0 * stored.sigma[7])
+        line = "".join(report_errors({"test": found | {"n": 5000}}, None))
         for words in ("5.4 predicted for 0.6", f"level {level:.1f}", f"u ({u:.3f}, {v:.3f})"):
             assert (words in line) == named
-
-
-def test_evaluation_repeats_the_errors_of_the_fit(fitted: FitResult, data: Path) -> None:
-    again = evaluate(fitted.material, data)["errors"]
-    assert set(again) == {"test", "held_out_queries", "held_out_directions", "training"}
-    for name, errors in again.items():
-        stored = fitted.errors[name]
-        assert errors["n"] == stored["n"]
-        assert errors["mse"]["value"] == pytest.approx(stored["mse"]["value"], rel=1e-3)
 
 
 def test_evaluation_refuses_a_tile_of_another_shape(fitted: FitResult, tmp_path: Path) -> None:
@@ -300,22 +245,11 @@ def test_evaluation_broadcasts_as_numpy_does(fitted: FitResult) -> None:
     u = np.random.default_rng(3).random((4, 1, 2))
     sigma, light, views = 0.05, [0.6, 0.0, 0.8], np.array([[0.0, 0.0, 1.0], [0.0, 0.6, 0.8], [0.8, 0.0, 0.6]])
     picture, offsets = material.evaluate(u, sigma, light, views), material.offset(u, views)
-    assert picture.shape == (4, 3, 3)
-    assert offsets.shape == (4, 3, 2)
     for i, j in ((0, 0), (3, 1), (1, 2)):
-        single = material.evaluate(u[i], [sigma], [light], views[j : j + 1])
-        np.testing.assert_allclose(picture[i, j], single[0], atol=1e-6)
-        np.testing.assert_allclose(offsets[i, j], material.offset(u[i], views[j : j + 1])[0], atol=1e-6)
-    assert material.evaluate(u[0, 0], sigma, light, views[0]).shape == (3,)
-
-
-@pytest.mark.parametrize(
-    ("u", "sigma"), [(np.zeros((5, 2)), np.ones(4)), (np.zeros((5, 1)), 0.1), (0.5, 0.1), (np.zeros(3), 0.1)]
-)
-def test_shapes_that_do_not_broadcast_are_refused(fitted: FitResult, u: Any, sigma: Any) -> None:
-    with pytest.raises(InputError, match=r"u, sigma, omega_i, omega_o: have the shapes") as fault:
-        fitted.material.evaluate(u, sigma, [0, 0, 1], [0, 0, 1])
-    assert fault.value.hint == "they must broadcast to (..., 2), (...), (..., 3), (..., 3)"
+        np.testing.assert_allclose(
+            picture[i, j], material.evaluate(u[i, 0], sigma, light, views[j]), atol=1e-6
+        )
+        np.testing.assert_allclose(offsets[i, j], material.offset(u[i, 0], views[j]), atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -323,11 +257,14 @@ def test_shapes_that_do_not_broadcast_are_refused(fitted: FitResult, u: Any, sig
     [
         ("u", "here", "no array of real numbers"),
         ("u", [["0.1", "0.2"]], "no array of real numbers"),
-        ("sigma", [0.1, None], "no array of real numbers"),
         ("sigma", [[0.1], [0.1, 0.2]], "no array of real numbers"),
         ("u", [0.5, np.nan], r"NaN or infinity \(1 of 2"),
         ("sigma", np.nan, r"NaN or infinity \(1 of 1"),
+        ("u", np.zeros((5, 1)), "have the shapes"),
+        ("u", 0.5, "have the shapes"),
+        ("u", np.zeros(3), "have the shapes"),
         ("omega_i", 1.0, "have the shapes"),
+        ("omega_i", [0.0, 0.0, 5.0], "1 of 1 directions"),
         ("omega_o", [0.0, 1.0], "have the shapes"),
         ("omega_o", [0.0, 0.0, np.nan], "NaN or infinity"),
     ],

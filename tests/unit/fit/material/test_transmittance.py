@@ -58,17 +58,6 @@ def test_a_known_transmittance_is_found(tmp_path: Path) -> None:
     assert np.sqrt(np.mean((found - wanted)[fine] ** 2)) < 0.02
 
 
-@pytest.mark.parametrize("patch_size", [None, 4])
-def test_images_give_the_same_transmittance(tmp_path: Path, patch_size: int | None) -> None:
-    folder = write_images(tmp_path, constant(0.2), train=1500, through=lace, patch_size=patch_size)
-    data = Dataset.open(folder)
-    model = fit_transmittance(data, chosen(data))
-    assert model is not None
-    q = random_queries(np.random.default_rng(9), 4000, data.lattice)
-    found = model.evaluate(q["u"], q["sigma"], q["omega_o"])
-    assert np.sqrt(np.mean((found - lace(q["u"], q["sigma"], q["omega_o"])) ** 2)) < 0.05
-
-
 def test_few_queries_fall_back_on_coarser_levels(tmp_path: Path) -> None:
     """No texel of an empty neighborhood is left without a value."""
     data = Dataset.open(

@@ -42,7 +42,7 @@ SHAPES: dict[str, dict[str, Any]] = {
     **{f"one texel, {case}": {"case": case, "finest": 0} for case in ("neumip", "relief", "calibrated")},
     "one texel, concatenated": {"case": "concatenated, softplus", "finest": 0},
 }
-SHAPES |= {case: {"case": case} for case in ALL.keys() - HIERARCHICAL.keys() - {"black"}}
+SHAPES |= {case: {"case": case} for case in ALL.keys() - HIERARCHICAL.keys()}
 UNROLLED = ("neumip", "relief")
 
 
@@ -54,7 +54,10 @@ def test_conformance_and_random_queries(name: str, tmp_path: Path) -> None:
     plugin = Evaluator(read_material(tmp_path / "material"), networks)
     stored = material.conformance
     known = [stored[k] for k in ("u", "sigma", "omega_i", "omega_o")]
-    assert stored["rgb"].std() > 0.005
+    assert (stored["rgb"].std() > 0.005) == (name != "black")
+    if name == "black":
+        assert not plugin.evaluate(*known).any()
+        return
     assert deviation(plugin.evaluate(*known), stored["rgb"]) < 1e-4
     queries = random_queries(np.random.default_rng(3), 4000, Lattice(material.lattice.finest))
     queries["u"] = 5 * queries["u"] - 2
@@ -78,14 +81,6 @@ def test_half_precision_errs_by_less_than_one_percent(options: dict[str, Any], t
     half = Evaluator(read_material(tmp_path), "half")
     queries = random_queries(np.random.default_rng(4), 20_000, material.lattice)
     assert 1e-5 < deviation(half.evaluate(*queries.values()), material.evaluate(*queries.values())) < 1e-2
-
-
-def test_black_data_are_black(tmp_path: Path) -> None:
-    """Their unit is 0, whatever is known of the surface."""
-    material = write_material(tmp_path, model="relief", weights={"unit": torch.zeros(())})
-    queries = random_queries(np.random.default_rng(5), 100, material.lattice)
-    plugin = Evaluator(read_material(tmp_path), "cooperative")
-    assert not plugin.evaluate(*queries.values()).any()
 
 
 @pytest.mark.parametrize("cosine", [0.3, 1e-2, 1e-4])
@@ -158,7 +153,6 @@ def test_an_operation_of_pytorch_alone_is_refused(tmp_path: Path) -> None:
     [
         ("network", {"hidden": [24, 25, 25]}, "has the shape"),
         ("lookup", {"channels": 6}, "has the shape"),
-        ("network", {"activation": "gelu"}, "activation"),
         ("network", {"x": ["nothing"]}, "'nothing', which is not computed"),
         ("lookup", {"operation": "guess"}, "is unknown: 'guess'"),
     ],
@@ -183,11 +177,8 @@ def test_operations_without_their_tensors_are_refused(
         ("surface.heights", lambda a: a + 0.01, "has heights above the reference plane"),
         ("surface.heights", lambda a: np.where(a == a.min(), np.nan, a), "not finite"),
         ("surface.maps.4", None, "lacks the tensor 'surface.maps.4'"),
-        ("surface.maps.2", lambda a: a[:-1], "has the shape (3, 4, 10)"),
         ("surface.maps.0", lambda a: a[..., :9], "have 9 channels in place of 8, 10 or 12"),
-        ("surface.horizons.0", lambda a: a[..., :-1], "has the shape (1, 1, 31)"),
         ("surface.dielectric", lambda a: a[None], "has the shape (1,)"),
-        ("depth_weights", lambda a: a[1:], "has the shape (3,)"),
     ],
 )
 def test_corrupt_surfaces_are_refused(name: str, change: Any, fault: str, tmp_path: Path) -> None:

@@ -13,7 +13,6 @@ from support.documented import code_block
 from support.fit_data import constant, write_data
 from support.paths import ROOT
 
-from mbtf_core.config.settings import explicit_options
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
 from mbtf_fit import Material, evaluate, fit
@@ -51,13 +50,12 @@ def test_a_model_of_a_file_is_fitted_and_read_without_the_file(fitted: Path) -> 
     assert evaluate(fitted / "out", fitted / "shards")["errors"]["test"]["psnr"]["value"] > 25
 
 
-def test_the_network_of_the_page_is_fitted(tmp_path: Path) -> None:
+def test_the_network_of_the_page_is_fitted(fitted: Path, tmp_path: Path) -> None:
     """To a constant, at the width that the user sets."""
-    write_data(tmp_path / "shards", constant(0.2), train=4000, test=200, finest=2)
     file = tmp_path / "my_network.py"
     file.write_text(code_block("how-to/add-a-model.md", "python", 1))
     options = {"model": f"{file}:HalfVectorDecoder", "network": {"width": 8}, "training": {"steps": 100}}
-    material = fit(FitConfig.model_validate(options), tmp_path / "shards", tmp_path / "out").material
+    material = fit(FitConfig.model_validate(options), fitted / "shards", tmp_path / "out").material
     up = np.tile(np.float32([0.0, 0.0, 1.0]), (50, 1))
     value = material.evaluate(np.random.default_rng(0).random((50, 2)), np.full(50, 0.1), up, up)
     assert np.abs(value - 0.2).max() < 0.02
@@ -65,28 +63,14 @@ def test_the_network_of_the_page_is_fitted(tmp_path: Path) -> None:
     assert weights["decoder.0.weight"] == (8, 7 + 4 * 3)
 
 
-def test_to_fit_again_needs_the_file(fitted: Path) -> None:
-    """Its stored options name it; the material alone never runs it."""
-    options = explicit_options(fitted / "out" / "config.yaml", [])
-    with pytest.raises(InputError, match="no such file") as caught:
-        FitConfig.model_validate(options)
-    assert caught.value.where == str(fitted / "my_model.py")
-
-
 @pytest.mark.parametrize(
     ("changes", "name", "where", "what"),
     [
         ({}, "missing.py:TexelDiffuse", "missing.py", "no such file"),
         ({}, "my_model.py:Missing", "my_model.py", "has no class 'Missing'"),
-        ({}, "my_model.py:math", "my_model.py", "'math' is no subclass of Model"),
         ({"import math": "import mathematics"}, None, "my_model.py:1", "ModuleNotFoundError"),
         ({"1 / math.pi": "1 / math.tau0"}, None, "my_model.py:18", "AttributeError"),
-        (
-            {", channels=3": ""},
-            None,
-            "my_model.py:16",
-            "argument: 'channels'; the arguments are Lookup(",
-        ),
+        ({", channels=3": ""}, None, "my_model.py:16", "argument: 'channels'"),
         ({"takes = ()": "takes = )"}, None, "my_model.py:10", "unmatched"),
         ({"import Lookup,": "import Lokup,"}, None, "my_model.py:4", "did you mean 'Lookup'?"),
         ({"Lookup(": "Lokup("}, None, "my_model.py:16", "did you mean 'Lookup'?"),
@@ -95,7 +79,6 @@ def test_to_fit_again_needs_the_file(fitted: Path) -> None:
         ({"def operations(": "def operation("}, None, "my_model.py", "did you mean 'operation'?"),
         ({'"albedo", "texel"': '"albedo", "text"'}, None, "my_model.py", "did you mean 'texel'?"),
         ({"_rate": "_rat"}, None, "defaults of my_model.py:TexelDiffuse", "'training.texture_learning_rat'"),
-        ({'{"training": {"texture_learning_rate": 0.05}}': "[1]"}, None, "my_model.py", "TypeError"),
         ({'"texel-diffuse"': '"svbrdf"'}, None, "my_model.py:TexelDiffuse", "that of an installed model"),
     ],
 )
@@ -117,22 +100,6 @@ def test_a_file_at_fault_is_named_with_its_line(
         build_model(name or "my_model.py:TexelDiffuse", Lattice(2, 1.0))
     assert caught.value.where == where
     assert what in caught.value.message
-
-
-def test_an_edited_file_is_read_again(tmp_path: Path) -> None:
-    """And a class without a name has that of the class."""
-    file = tmp_path / "my_model.py"
-    texels = []
-    for channels in (3, 4):
-        text = documented().replace("channels=3", f"channels={channels}").replace('"texel"', '"texel[0:3]"')
-        text = text.replace('Lookup("texel[0:3]"', 'Lookup("texel"').replace(
-            "name, description = ", "said = "
-        )
-        file.write_text(text)
-        material = build_model(f"{file}:TexelDiffuse", Lattice(2, 1.0))
-        assert material.name == "TexelDiffuse"
-        texels.append(sum(p.numel() for p in material.parameters()))
-    assert texels[1] * 3 == texels[0] * 4
 
 
 def install(folder: Path, point: str = "") -> str:
@@ -171,7 +138,6 @@ def test_another_package_brings_a_model(tmp_path: Path, run_python: RunPython) -
     ("point", "fault"),
     [
         ("texel-diffuse = my_model:Missing", "has no attribute 'Missing'"),
-        ("other = my_model:TexelDiffuse", "no model of this name"),
         ("neumip = my_model:Named", "has the same name"),
     ],
 )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from typing import Any, get_args
 
 import pytest
@@ -10,12 +9,10 @@ import torch
 
 from mbtf_core.config.settings import resolve
 from mbtf_core.data.lattice import Lattice
-from mbtf_core.errors import InputError, UsageError
-from mbtf_fit import ops
+from mbtf_core.errors import UsageError
 from mbtf_fit.config import FitConfig, build_model
 from mbtf_fit.ops import read_operations
 from mbtf_fit.pytorch.material import NeuralMaterial
-from mbtf_fit.pytorch.operations import FUNCTIONS
 from mbtf_fit.sections import OutputTransform
 
 F64, LATTICE = torch.float64, Lattice(3)
@@ -95,9 +92,6 @@ def test_weight_counts_are_the_papers() -> None:
 
 
 def test_unset_options_are_the_models_own() -> None:
-    assert FitConfig(model="neumip").network.offset == "depth"
-    assert FitConfig().network.encoding.half_vector
-    assert FitConfig(model="neumip-baseline").network.offset == "none"
     network = resolve(FitConfig, assignments=["model=hierarchical", "network.encoding.position=6"]).network
     assert (network.decoder, network.output_transform) == ("inception", "fourth-root")
     assert network.encoding.direction == 4
@@ -190,11 +184,6 @@ def test_exported_weights_make_the_same_model(variant: str) -> None:
     other.load_weights(model.weights())
     at = arguments(20)
     torch.testing.assert_close(other(*at), model(*at), rtol=0, atol=0)
-    weights = model.weights()
-    lost = next(name for name in weights if name.startswith("decoder."))
-    weights.pop(lost)
-    with pytest.raises(InputError, match=lost.replace(".", r"\.")):
-        other.load_weights(weights)
 
 
 @pytest.mark.parametrize("output", get_args(OutputTransform))
@@ -252,7 +241,7 @@ def test_filtered_encodings_are_means_over_the_footprint() -> None:
 
 @variants
 def test_initial_parameters_have_the_stated_distributions(variant: str) -> None:
-    """Features of 0.1·N(0,1), no offset texture; variance-preserving weights, biases 0 but the answer's."""
+    """Features of 0.1·N(0,1), no offset texture; variance-preserving weights."""
     name, options = VARIANTS[variant]
     model = build_model(name, Lattice(5), **{**options, "width": 128}).requires_grad_(False)
     model.initialize(torch.Generator().manual_seed(0), 0.2)
@@ -264,12 +253,7 @@ def test_initial_parameters_have_the_stated_distributions(variant: str) -> None:
         mine = [key for key in weights if key.startswith(network)]
         for key in mine:
             tensor, last = weights[key], key in mine[-2:]
-            if key.endswith(".bias"):
-                transform = FitConfig.model_validate({"model": name, "network": options}).network
-                start = FUNCTIONS[transform.output_transform][1] if last and network == "decoder" else 0.0
-                assert float(tensor[0]) == pytest.approx(start)
-                assert not tensor[3 if last else 0 :].any()
-            else:
+            if not key.endswith(".bias"):
                 variance = float(tensor.double().square().mean()) * tensor[0].numel()
                 # Of so many numbers, to four standard errors.
                 assert variance == pytest.approx(1 if last else 2, rel=4 * (2 / tensor.numel()) ** 0.5), key
@@ -295,19 +279,3 @@ def test_hierarchical_sees_nine_by_nine_texels_of_the_nearest_level() -> None:
         torch.testing.assert_close(places[4, 4], u[0])
         torch.testing.assert_close(places[4, 5] - places[4, 4], torch.tensor([1 / columns, 0.0], dtype=F64))
         torch.testing.assert_close(places[5, 4] - places[4, 4], torch.tensor([0.0, -1 / rows], dtype=F64))
-
-
-def test_operations_refuse_unknown_names() -> None:
-    for wrong in (
-        lambda: ops.Transform("a", "b", "sgmoid"),  # type: ignore[arg-type]
-        lambda: ops.Network("a", ("b",), "n", (), 3, "sigmoid"),  # type: ignore[arg-type]
-    ):
-        with pytest.raises(ValueError, match=r"'a': \w+ must be one of .*, not 's\w+'"):
-            wrong()
-
-
-@pytest.mark.parametrize("given", [("v", "a", "b"), ("v", "a"), ("v",)])
-def test_wrong_arguments_are_answered_by_the_signature(given: tuple[str, ...]) -> None:
-    with pytest.raises(TypeError, match=r"Product\(output, \(x, …\)\)"):
-        ops.Product(*given)  # type: ignore[call-arg, arg-type]
-    assert copy.copy(ops.Product("v", ("a", "b"))).x == ("a", "b")

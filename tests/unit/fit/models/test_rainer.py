@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from support.fit_data import constant
 from support.slice_data import prepared as prepared_model
 from support.slice_data import spots, write_slices
 
@@ -16,7 +15,7 @@ from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.lattice import Lattice
 from mbtf_fit import fit
 from mbtf_fit.config import FitConfig, build_model
-from mbtf_fit.data.layouts import SharedSlices, TrainingSlices
+from mbtf_fit.data.layouts import TrainingSlices
 from mbtf_fit.data.loader import load_training
 from mbtf_fit.data.queries import mean_value
 from mbtf_fit.material.material import Material
@@ -24,8 +23,6 @@ from mbtf_fit.models.model import Preparation
 from mbtf_fit.models.rainer import Rainer2019, shared_slices
 from mbtf_fit.objective.noise import typical_value
 from mbtf_fit.training.fit_folder import identity_of
-from mbtf_fit.training.loop import TrainingLoop, read_checkpoint, write_checkpoint
-from mbtf_fit.training.trainer import prepare_trainer
 from mbtf_gen.sampling.query_sampler import direction_pairs, slice_directions
 
 NAMES = ("rainer2019", "rainer2020")
@@ -122,21 +119,6 @@ def test_a_smooth_material_is_learned_and_loads_again(name: str, tmp_path: Path)
     assert not any("encoder" in key for key in material.description["weights"]["shapes"])
 
 
-def test_a_fit_resumes_where_it_stopped(tmp_path: Path) -> None:
-    data = Dataset.open(write_slices(tmp_path / "data"))
-    options = config("rainer2019", steps=8)
-    partition = load_training(data, options.held_out, 0)
-    whole, first, second = (prepare_trainer(options, data, partition, torch.device("cpu")) for _ in range(3))
-    assert TrainingLoop([whole]).train(1e3)
-    while first.progress.step < 5:
-        TrainingLoop([first]).train(0.0)
-    write_checkpoint(TrainingLoop([first]), tmp_path / "state")
-    read_checkpoint(TrainingLoop([second]), tmp_path / "state")
-    assert TrainingLoop([second]).train(1e3)
-    for a, b in zip(whole.hooks.trained()[1], second.hooks.trained()[1], strict=True):
-        assert torch.equal(a, b)
-
-
 def dark(u: Any, sigma: Any, omega_i: Any, omega_o: Any) -> Any:
     """Another material, a tenth as bright."""
     return 0.1 * spots(1.0 - u, sigma, omega_i, omega_o)
@@ -152,6 +134,22 @@ def test_a_network_of_other_materials_encodes_a_new_one(tmp_path: Path) -> None:
     assert result.errors["test"]["unexplained"]["value"] < 0.3
 
 
+def test_the_network_learns_others_in_units_of_its_own_material(tmp_path: Path) -> None:
+    """Ten times as bright as `dark`, before they are scaled to the typical value 0.02."""
+    held_out = config("rainer2020").held_out
+    own, other = (
+        load_training(Dataset.open(write_slices(tmp_path / name, function)), held_out, 0)
+        for name, function in (("own", dark), ("other", spots))
+    )
+    typical = typical_value(mean_value(other.sample.value_a, other.sample.value_b))
+    training = config("rainer2020", materials=["other"]).training
+    data = Dataset.open(tmp_path / "own")
+    given = Preparation(data, own.training, training, 0.02, 0, lambda _: (other.training, typical))
+    first, second = shared_slices(given).learned
+    assert first is own.training
+    assert 0.5 < second.values.mean() / first.values.mean() < 2.0
+
+
 def test_a_fit_is_known_by_what_other_data_hold(tmp_path: Path) -> None:
     """Moved data are the same; any other set of them changes the fit."""
 
@@ -165,36 +163,6 @@ def test_a_fit_is_known_by_what_other_data_hold(tmp_path: Path) -> None:
     moved = first.rename(tmp_path / "elsewhere")
     assert hash_of(moved, second) == both
     assert len({both, one, order, hash_of(second), hash_of()}) == 5
-
-
-def test_the_network_learns_others_in_units_of_its_own_material(tmp_path: Path) -> None:
-    own, other = write_slices(tmp_path / "own", dark), write_slices(tmp_path / "other", lights=12)
-    found = load_training(Dataset.open(own), config("rainer2020").held_out, 0).training
-    assert isinstance(found, TrainingSlices)
-    for own_material, count in ((False, 1), (True, 2)):
-        options = config("rainer2020", materials=[str(other)], own_material=own_material)
-        found_other = load_training(Dataset.open(other), options.held_out, 0)
-        typical = typical_value(mean_value(found_other.sample.value_a, found_other.sample.value_b))
-        loaded = found_other.training, typical
-        given = Preparation(
-            Dataset.open(own), found, options.training, 0.02, 0, lambda _, loaded=loaded: loaded
-        )
-        shared = shared_slices(given)
-        assert isinstance(shared, SharedSlices)
-        assert shared.own is found
-        assert len(shared.learned) == count
-        assert (shared.learned[0] is found) == own_material
-        # Ten times as bright as `dark`, before it is scaled to the typical value 0.02.
-        level = shared.learned[-1].values.mean() / found.values.mean()
-        assert 0.5 < level < 2.0
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_black_data_stay_black(name: str, tmp_path: Path) -> None:
-    shards = write_slices(tmp_path / "data", constant(0.0))
-    material = fit(config(name, steps=3), shards, tmp_path / "fit").material
-    omega = slice_directions("spiral", 9, 0.2)
-    assert (material.evaluate(np.zeros((9, 2)), np.full(9, 0.1), omega, omega) == 0.0).all()
 
 
 def test_slices_of_cloth_have_a_transmittance(tmp_path: Path) -> None:

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 from support.plugin_materials import write_material
 from support.scenes import mi
 
@@ -105,13 +104,6 @@ def test_rotation_changes_patterned_materials_only(tmp_path: Path) -> None:
     assert np.abs(turned[1] - turned[0]).mean() > 0.12 * turned[0].mean()
 
 
-@pytest.mark.parametrize(("resolution", "tiles"), [(8, 8), (64, 5), (128, 3), (1024, 3)])
-def test_fine_materials_have_few_tiles_around(resolution: int, tiles: int) -> None:
-    """A texel covers two pixels, within limits: 64 texels and 400 pixels leave 4.5 tiles."""
-    assert TurntableSection().tiles_around(resolution) == tiles
-    assert TurntableSection(tiles=7).tiles_around(resolution) == 7
-
-
 def test_a_signal_after_a_frame_interrupts(tmp_path: Path) -> None:
     """Mitsuba's own handler, which ignores the signal, may stay behind after an integrator in Python."""
     section = TurntableSection(frames=3, size=16, spp=1, tiles=1)
@@ -119,18 +111,6 @@ def test_a_signal_after_a_frame_interrupts(tmp_path: Path) -> None:
     next(pictures)
     with pytest.raises(KeyboardInterrupt):
         signal.raise_signal(signal.SIGINT)
-
-
-def test_the_animation_repeats_and_keeps_its_frames(tmp_path: Path) -> None:
-    pictures = [np.full((8, 8, 3), (40 * k, 90, 250 - 40 * k), np.uint8) for k in range(5)]
-    turntable.write_gif(tmp_path / "turn.gif", pictures)
-    with Image.open(tmp_path / "turn.gif") as file:
-        assert file.info["loop"] == 0
-        for k, picture in enumerate(pictures):
-            file.seek(k)
-            assert np.abs(np.asarray(file.convert("RGB")).astype(int) - picture).max() <= 8
-            assert file.info["duration"] == turntable.TURN // 5
-        assert file.n_frames == 5
 
 
 def test_a_white_plate_and_a_white_sheet_have_one_exposure(tmp_path: Path) -> None:

@@ -12,23 +12,20 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from support.fit_data import parallax, random_queries, write_data
+from support.killed_fits import Killed, kill_in
 
 import mbtf_fit.training.fit as fits
 import mbtf_fit.training.loop as loop
 from mbtf_core.data.lattice import Lattice
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries
-from mbtf_fit.training.best_state import excess_error, is_candidate, overfits
+from mbtf_fit.training.best_state import excess_error, overfits
 from mbtf_fit.training.endings import describe_kept
 from mbtf_fit.training.fit import FitResult, fit
 from mbtf_fit.training.trainer import Trainer
 
 STEPS, BEST = 8, 3
 NOISE = 0.05
-
-
-class Killed(BaseException):
-    """Nothing that runs after it may tidy up: stands for SIGKILL."""
 
 
 @pytest.fixture(scope="module")
@@ -94,15 +91,8 @@ def test_a_fit_that_overfits_returns_to_its_best_state(
     assert line.startswith("validation error rose from ")
     assert line.endswith(f"after {STEPS}: kept the state after {BEST} steps")
 
-    step = Trainer._step
-
-    def dying(self: Trainer, *arguments: Any) -> torch.Tensor:
-        if self.progress.step == STEPS - 2:
-            raise Killed
-        return step(self, *arguments)
-
     with monkeypatch.context() as patch:
-        patch.setattr(Trainer, "_step", dying)
+        kill_in(patch, {STEPS - 1})
         with pytest.raises(Killed):
             fit(config(), shards, tmp_path / "killed")
     resumed = fit(config(), shards, tmp_path / "killed")
@@ -120,11 +110,6 @@ def test_the_choice_does_not_depend_on_the_speed_of_the_machine(
     monkeypatch.setattr(loop, "is_candidate", lambda step: step % 2 == 0)
     monkeypatch.setattr(fits, "_REPORT_SECONDS", seconds)
     assert fit(config(), shards, tmp_path / "m").kept_step == BEST + 1
-
-
-def test_candidates_are_half_octaves() -> None:
-    found = [step for step in range(400) if is_candidate(step)]
-    assert found == [32, 45, 64, 91, 128, 181, 256, 362]
 
 
 def test_a_fit_keeps_its_last_state_unless_another_is_better_beyond_noise(

@@ -6,26 +6,26 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from support.fit_data import parallax, write_data
+from support.killed_fits import Killed, run_killed
 from support.known_surfaces import geometry, rough_heights
+from support.slice_data import write_slices
 
 import mbtf_fit.training.fit
+from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
 from mbtf_core.files import folders
 from mbtf_fit.config import FitConfig
+from mbtf_fit.data.loader import load_training
 from mbtf_fit.training.fit import FitResult, fit
 from mbtf_fit.training.fit_folder import read_history
-from mbtf_fit.training.trainer import Trainer
+from mbtf_fit.training.loop import TrainingLoop, read_checkpoint, state_tensors, write_checkpoint
+from mbtf_fit.training.trainer import Trainer, prepare_trainer
 
 STEPS = 10
-
-
-class Killed(BaseException):
-    """Nothing that runs after it may tidy up: stands for SIGKILL."""
 
 
 @pytest.fixture(scope="module")
@@ -62,31 +62,8 @@ def test_a_fit_killed_at_random_steps_ends_with_the_same_bits(
     often: None,
     memory: str,
 ) -> None:
-    random = np.random.default_rng(0)
-    out, step, kills = tmp_path / "killed", Trainer._step, 0
-    saved = mbtf_fit.training.fit.write_checkpoint
-    while not (out / "material.json").exists():
-        left = int(random.integers(2, 7))
-
-        def dying(self: Trainer, *arguments: Any) -> torch.Tensor:
-            nonlocal left
-            left -= 1
-            if left == 0:
-                raise Killed
-            return step(self, *arguments)
-
-        def forgetful(*arguments: Any) -> None:
-            # Not every step is saved: some are done again.
-            if random.random() < 0.6:
-                saved(*arguments)
-
-        monkeypatch.setattr(Trainer, "_step", dying)
-        monkeypatch.setattr(mbtf_fit.training.fit, "write_checkpoint", forgetful)
-        try:
-            found = fit(config(memory), shards, out)
-        except Killed:
-            kills += 1
-            assert kills < 200
+    out = tmp_path / "killed"
+    found, kills = run_killed(monkeypatch, lambda: fit(config(memory), shards, out))
     assert kills >= 2
     mine, other = found.material.model.weights(), whole.material.model.weights()
     assert all(torch.equal(mine[name], other[name]) for name in other)
@@ -160,3 +137,28 @@ def test_ctrl_c_loses_no_step(shards: Path, tmp_path: Path, monkeypatch: pytest.
     _, data = read_tensors(tmp_path / "m" / "checkpoint.safetensors")
     assert data["step"] == 7
     assert data["seconds"] > 0
+
+
+@pytest.mark.parametrize(("model", "at", "steps"), [("neumip+", 65, 70), ("rainer2019", 5, 8)])
+def test_a_checkpoint_holds_what_a_model_learns_beside_its_weights(
+    model: str, at: int, steps: int, shards: Path, tmp_path: Path
+) -> None:
+    """Of learned heights at a step at which rays see newer ones than normals and horizons; of an encoder."""
+    data = Dataset.open(write_slices(tmp_path / "data") if model == "rainer2019" else shards)
+    training = {"steps": steps, "batch": 1024, "warmup": 3}
+    options = FitConfig.model_validate({"model": model, "training": training})
+    partition = load_training(data, options.held_out, 0)
+    loops = [TrainingLoop([prepare_trainer(options, data, partition, torch.device("cpu"))]) for _ in range(3)]
+    whole, first, second = loops
+    for loop, step in ((whole, steps), (first, at), (second, steps)):
+        if loop is second:
+            write_checkpoint(first, tmp_path / "state")
+            read_checkpoint(second, tmp_path / "state")
+        while loop.trainers[0].progress.step < step:
+            loop.train(0.0)
+    expected, found = state_tensors(whole), state_tensors(second)
+    assert all(torch.equal(found[name], tensor) for name, tensor in expected.items())
+    weights = second.trainers[0].model.weights()
+    # Normals that are filtered again are equal up to rounding.
+    for name, tensor in whole.trainers[0].model.weights().items():
+        torch.testing.assert_close(weights[name], tensor, rtol=0, atol=1e-8)

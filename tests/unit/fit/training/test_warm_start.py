@@ -1,4 +1,4 @@
-"""Fits that start from another material's textures and offset."""
+"""Fits that start from another material's textures, offsets and heights."""
 
 from __future__ import annotations
 
@@ -9,51 +9,59 @@ import pytest
 import torch
 from support.fit_data import parallax, write_data
 from support.image_data import write_images
+from support.known_surfaces import geometry, rough_heights
 
+from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
 from mbtf_fit import FitConfig, Material, fit
 
-
-def config(model: str, start: Path | None, steps: int = 3, **network: Any) -> FitConfig:
-    training = {"steps": steps, "batch": 256, "blur": {"initial_sigma": 0, "offset_sigma": 0}}
-    options = {"init_from": None if start is None else str(start), "network": network, "training": training}
-    return FitConfig.model_validate({"model": model, **options})
+# At rates this low what training starts from is what it ends with.
+SLOW = {"steps": 1, "batch": 64, "learning_rate": 1e-9, "texture_learning_rate": 1e-9}
+SLOW |= {"energy_calibration": False, "blur": {"initial_sigma": 0, "min_sigma": 0, "offset_sigma": 0}}
 
 
-@pytest.fixture(scope="module")
-def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """(images, material of a neumip that was fitted to queries of the same function)"""
-    folder = tmp_path_factory.mktemp("start")
-    shuffled = write_data(folder / "s", parallax, train=4000)
-    fit(config("neumip", None, 200), shuffled, folder / "m")
-    return write_images(folder / "d", parallax, train=40), folder / "m"
-
-
-def test_textures_and_offset_are_copied(folders: tuple[Path, Path], tmp_path: Path) -> None:
-    images, start = folders
-    # At rates this low what training started from is what it ends with.
-    rates = {"learning_rate": 1e-9, "texture_learning_rate": 1e-9}
-    slow = {"steps": 1, "batch": 64, "blur": {"initial_sigma": 0, "offset_sigma": 0}, **rates}
-    options = {"model": "hierarchical", "training": slow}
-    weights = {}
-    for name, more in (("own", {}), ("taken", {"init_from": str(start)})):
-        fit(FitConfig.model_validate({**options, **more}), images, tmp_path / name)
-        weights[name] = Material.load(tmp_path / name).model.weights()
-    given = Material.load(start).model.weights()
-    for key, tensor in weights["taken"].items():
-        shared = key.startswith(("pyramid.", "offset_"))
-        source = given if shared else weights["own"]
-        torch.testing.assert_close(tensor, source[key], atol=1e-6, rtol=0)
-    assert given["offset_texture.0"].std() > 0.01
-    assert not torch.allclose(weights["own"]["pyramid.3"], weights["taken"]["pyramid.3"], atol=0.01)
+def config(model: str, training: dict[str, Any], **options: Any) -> FitConfig:
+    return FitConfig.model_validate({"model": model, "training": training, **options})
 
 
 @pytest.mark.parametrize(
-    ("network", "lost"), [({"channels": 5}, "pyramid.0"), ({"offset": "direct"}, "offset_network")]
+    ("model", "first", "shared"),
+    [
+        ("hierarchical", "neumip", ("pyramid.", "offset_")),
+        ("relief", "relief", ("pyramid.", "depth_weights")),
+        ("neumip+", "neumip+", ("pyramid.", "depth_weights", "surface.heights")),
+    ],
 )
-def test_other_textures_are_refused_with_a_hint(
-    folders: tuple[Path, Path], tmp_path: Path, network: dict[str, Any], lost: str
+def test_what_the_models_share_is_copied(
+    model: str, first: str, shared: tuple[str, ...], tmp_path: Path
 ) -> None:
-    images, start = folders
-    with pytest.raises(InputError, match=rf"'{lost}.*does not have the shape.*\n.*same levels"):
-        fit(config("hierarchical", start, **network), images, tmp_path / "m")
+    """All else, the decoder and a known surface included, is that of the fit."""
+    rough = geometry(Lattice(3), rough_heights(16, 16), roughness=0.4, metallic=0.7, seed=0)
+    data = write_data(tmp_path / "rough", parallax, train=4000, geometry=rough)
+    fit(config(first, {"steps": 100, "batch": 256}), data, tmp_path / "first")
+    given = Material.load(tmp_path / "first").model.weights()
+    if model == "hierarchical":
+        data = write_images(tmp_path / "data", parallax, train=40)
+    else:
+        data = write_data(tmp_path / "data", parallax, train=1000, test=100)
+    own, taken = (
+        fit(config(model, SLOW, init_from=start), data, tmp_path / name).material.model.weights()
+        for name, start in (("own", None), ("taken", str(tmp_path / "first")))
+    )
+    for key, tensor in taken.items():
+        source = given if key.startswith(shared) else own
+        # Normals and horizons follow learned heights.
+        if model != "neumip+" or not key.startswith(("surface.maps", "surface.horizons")):
+            torch.testing.assert_close(tensor, source[key], atol=1e-6, rtol=0)
+    for start in shared:
+        changes = [float((given[key] - own[key]).abs().max()) for key in given if key.startswith(start)]
+        assert max(changes) > 1e-4, start
+
+
+def test_other_textures_are_refused_with_a_hint(tmp_path: Path) -> None:
+    shuffled = write_data(tmp_path / "s", parallax, train=1000)
+    fit(config("neumip", {"steps": 1, "batch": 256}), shuffled, tmp_path / "first")
+    images = write_images(tmp_path / "d", parallax, train=4)
+    other = config("hierarchical", SLOW, init_from=str(tmp_path / "first"), network={"channels": 5})
+    with pytest.raises(InputError, match=r"'pyramid.0.*does not have the shape.*\n.*same levels"):
+        fit(other, images, tmp_path / "m")

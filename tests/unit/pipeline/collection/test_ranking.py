@@ -108,11 +108,3 @@ def test_foreign_predictions_are_ranked_and_faulty_ones_named(
     # Its run has no data set here: the row says so.
     assert "shards" in by_material["wool", "poor"]["unexplained"]
     assert list(ranked) == [("good",), ("relief",), ("neumip",), ("svbrdf",), ("poor",)]
-
-
-def test_variants_are_compared_with_their_own_first_method(tmp_path: Path) -> None:
-    runs = [make(tmp_path / variant, material) for variant, material in (("a", "rock"), ("b", "wool"))]
-    both = [FinishedRun("stone", r.folder.parent.parent.name, r.folder, r.comparison, {}) for r in runs]
-    by_material = cells(ranking(both, [])[1])
-    assert by_material["stone a", "relief"]["ratio"].value == pytest.approx(0.5)
-    assert by_material["stone b", "relief"]["ratio"].value == pytest.approx(0.25)

@@ -7,11 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from mbtf_core.stats import Estimate
-from mbtf_core.units import clock
-from mbtf_pipeline.cost.answers import Evidence, answers
+from mbtf_pipeline.cost.answers import Evidence
 from mbtf_pipeline.cost.measurement import Measurement, combined, seed_deviation
-from mbtf_pipeline.cost.runs import LEAST_SECONDS, SLOW_SERIES, planned_runs
-from mbtf_pipeline.cost.study import too_short
 
 SECONDS = (10.0, 20.0, 40.0, 80.0, 160.0, 320.0)
 
@@ -59,30 +56,6 @@ def test_a_study_forecasts_times_and_errors() -> None:
     assert found.error_after(1300.0) is None
 
 
-def test_answers_are_measured_or_forecast_for_up_to_four_times_as_long() -> None:
-    rows = answers(evidence())
-    assert [row["time"] for row in rows if not row["forecast"]] == [clock(s) for s in SECONDS]
-    assert rows[0]["line"] == (
-        f"0:10: unexplained variance {law(10.0):.4f} ± 0.0010   "
-        "measured: 1 s generating, 2 s training, 7 s start-up and calibration"
-    )
-    assert [(row["time"], row["basis"]) for row in rows if row["forecast"]] == [
-        ("10min", "forecast, 1.9 times the longest run"), ("20min", "forecast, 3.8 times the longest run")
-    ]  # fmt: skip
-    assert rows[-1]["unexplained"]["low"] < law(1200.0) < rows[-1]["unexplained"]["high"]
-    # Three lengths forecast, two do not; what is measured is an answer all the same.
-    assert [row["time"] for row in answers(evidence(SECONDS[:3]))] == ["0:10", "0:20", "0:40", "1min", "2min"]
-    few = evidence(SECONDS[:2])
-    assert [row["time"] for row in answers(few)] == ["0:10", "0:20"]
-    assert "runs of 3 lengths are needed" in few.time_of(0.1)
-    assert answers(Evidence.of([], few.deviation)) == []
-    # The run of the fewest steps is an answer, too, but no evidence.
-    slow = replace(evidence().runs[0], series=SLOW_SERIES)
-    with_slow = Evidence.of([slow, *few.runs], few.deviation)
-    assert [row["time"] for row in answers(with_slow)] == ["0:10", "0:10", "0:20"]
-    assert with_slow.curve is None
-
-
 def test_forecasts_of_short_studies_contain_the_truth() -> None:
     """Studies of two minutes, whose runs deviate as much as those of measured materials."""
     random, inside, times = np.random.default_rng(0), [], SECONDS[:3]
@@ -98,14 +71,3 @@ def test_forecasts_of_short_studies_contain_the_truth() -> None:
         assert error.suffices
         inside.append(error.low < law(120.0) < error.high)
     assert np.mean(inside) > 0.9
-
-
-def test_the_least_time_has_room_for_three_lengths() -> None:
-    def lengths(seconds: float) -> int:
-        return len({r.name for r in planned_runs(seconds, 4, 1e-7) if r.series.startswith("35")})
-
-    assert LEAST_SECONDS <= 120.0
-    assert lengths(LEAST_SECONDS) == 3
-    assert lengths(0.99 * LEAST_SECONDS) == 2
-    assert "--time 1min measures errors, but is too short" in too_short(60.0, 401.0)
-    assert "3 lengths take about 7min" in too_short(60.0, 401.0)

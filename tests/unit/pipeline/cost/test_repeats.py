@@ -46,16 +46,6 @@ def repeat(monkeypatch: pytest.MonkeyPatch) -> Repeat:
     return measured
 
 
-def test_runs_are_measured_in_their_order(repeat: Repeat) -> None:
-    fake = FakeRuns()
-    # A failed run leaves the others, and is not tried with another seed.
-    fake.failing = {"one", "3"}
-    assert [len(group) for group in repeat(MemoryStore(), fake)] == [2, 2, 0, 2, 2, 2, 2, 0, 2, 2, 2, 2]
-    assert [(r.name, r.seed) for r in fake.measured[:2]] == [("long", 0), ("short", 0)]
-    assert [r.seed for r in fake.measured] == [0] * 12 + [1] * 10
-    assert sum(r.name in fake.failing for r in fake.measured) == 2
-
-
 def test_nothing_is_measured_twice(repeat: Repeat) -> None:
     store = MemoryStore()
     first, second, third = FakeRuns(0.2), FakeRuns(0.2, study_seed=1), FakeRuns()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import shlex
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,10 +19,9 @@ from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.files.atomic import write_text
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries
-from mbtf_fit.sections import TimeBudget
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.cost import runs as module
-from mbtf_pipeline.cost.runs import FEWEST_STEPS, GENERATOR, RUNS, SHORTEST, Run, planned_runs
+from mbtf_pipeline.cost.runs import GENERATOR, RUNS, Run, planned_runs
 
 FIT = {"model": "neumip", "training.time": "5s"}
 
@@ -38,22 +36,8 @@ def test_planned_runs_fit_into_the_time(seconds: float) -> None:
     # Total times double, so that a longer study keeps the runs of a shorter one.
     longer = planned_runs(2 * seconds, 4, 7.5e-7)
     doubling = [run for run in found if "35%" in run.series and run.seed == 0]
-    # They come first, then their second seeds.
     assert found[: len(doubling)] == doubling
-    assert [replace(run, seed=0) for run in found[len(doubling) :]][: len(doubling) - 1] == doubling[:-1]
     assert all(run in longer for run in doubling)
-    assert [run.name for run in doubling] == [
-        f"planned for {SHORTEST * 2**n:g} s" for n in range(len(doubling))
-    ]
-
-
-def test_no_run_is_planned_with_too_few_steps() -> None:
-    for step_seconds in (0.0, 0.03, 0.5):
-        found = planned_runs(3600.0, 4, 7.5e-7, step_seconds)
-        budgets = [TimeBudget.parse(run.fit["training.time"]) for run in found]
-        assert min(budget.seconds for budget in budgets) > 0.99 * FEWEST_STEPS * step_seconds
-        assert {budget.min_steps for budget in budgets} == {FEWEST_STEPS}
-        assert len(found) > 3
 
 
 @pytest.fixture

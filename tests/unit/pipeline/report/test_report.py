@@ -1,82 +1,21 @@
-"""Tables of the report: errors by group, errors over training time, and rates of evaluation."""
+"""Images, error maps, times and materials of the report."""
 
 from __future__ import annotations
 
-from typing import Any
+import base64
+import io
+from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
+from mbtf_core.color import palette, robust_scale, to_display
+from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.tile.loading import load_material
 from mbtf_pipeline.compare import timing
-from mbtf_pipeline.report.sections import _ranking, error_context
-
-
-def number(value: float, error: float) -> dict[str, Any]:
-    return {"value": value, "error": error, "n": 50}
-
-
-def test_errors_of_groups_are_marked_one_by_one() -> None:
-    close = {"n": 50, "unexplained": number(0.11, 0.06), "mse": number(2e-4, 0.9e-4)}
-    clear = {"n": 50, "unexplained": number(0.2, 0.01), "mse": number(4e-4, 1e-5)}
-    unknown = {"n": 50, "unexplained": {"value": None, "error": None, "n": 50}, "mse": number(4e-4, 1e-5)}
-    split = {**clear, "levels": {"0": close, "1": clear, "2": unknown}, "elevations": {"0.2-0.4": clear}}
-    error = {"psnr": number(30, 1), "mse": number(1e-4, 1e-6), "relative_mse": number(0.1, 0.01)}
-    flip = {"ldr": 0.1, "hdr": 0.2}
-    direction = {"elevation": 45, "azimuth": 0}
-    picture: dict[str, Any] = {"view": direction, "light": direction, "tiles_across": 1}
-    picture["references"] = {"query": {"flip": flip}}
-    picture["fits"] = {"a": {"errors": {"query": error}, "flip": flip}}
-    test = {
-        "a": {
-            "splits": {"test": split},
-            "network_weights": 9,
-            "texels": 9,
-            "training_steps": 9,
-            "training_seconds": 3.0,
-        }
-    }
-    record: dict[str, Any] = {
-        "fits": ["a"],
-        "kinds": ["query"],
-        "exposure": 0.0,
-        "white": 1.0,
-        "definitions": {},
-    }
-    record |= {"pictures": [picture], "test": test}
-    context = error_context(record)
-    levels, cosines = (table["rows"] for table in context["group_tables"])
-    # What tells nothing is left out.
-    assert levels == [
-        ["0", "50", "not significant (0.11 ± 0.06)", "0.20 ± 0.09"],
-        ["1", "50", "0.200 ± 0.010", "0.400 ± 0.010"],
-    ]
-    assert cosines[0][0] == "0.2–0.4"
-    assert context["facts"][0]["value"] == "0.200 ± 0.010"
-    assert context["facts"][0]["what"].endswith(" of a (9 steps: not converged)")
-    assert context["error_table"]["rows"][0][0] == "a (9 steps: not converged)"
-    assert [table["note"][:9] for table in context["group_tables"]] == ["Without 2", ""]
-    split["elevations"] = {"0.2-0.4": unknown}
-    assert len(error_context(record)["group_tables"]) == len(error_context(record)["error_plots"]) == 1
-
-
-@pytest.mark.parametrize(
-    ("images", "difference"), [((1e-4, 2e-4), 9e-5), ((2e-4, 1e-4), 9e-5), ((2e-4, 1e-4), 1e-5)]
-)
-def test_other_ranks_in_images_are_explained(images: tuple[float, float], difference: float) -> None:
-    """The test queries rank a before b."""
-    fits = dict(zip("ab", images, strict=True))
-    record: dict[str, Any] = {
-        "fits": list(fits),
-        "kinds": ["query"],
-        "pictures": [{"fits": {k: {"errors": {"query": {"mse": number(v, 1e-6)}}} for k, v in fits.items()}}],
-        "test": {
-            k: {"splits": {"test": {"mse": number(v, 1e-6)}}}
-            for k, v in (("a", 3e-4), ("b", 3e-4 + difference))
-        },
-    }
-    record["test"]["b"]["mse_minus_first"] = number(difference, 2e-5)
-    text = _ranking(record)
-    assert ("rank a, b, but the mean MSE of the images ranks b, a" in text) == (images[0] > images[1])
-    assert ("a and b do not differ significantly" in text) == (difference < 2e-5)
+from mbtf_pipeline.report.images import REDUCTIONS, linear_uri, map_uri, scaled_maps
+from mbtf_pipeline.report.sections import material_section
 
 
 def test_the_warm_up_and_an_outlier_do_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -90,3 +29,71 @@ def test_the_warm_up_and_an_outlier_do_not_count(monkeypatch: pytest.MonkeyPatch
     value, seconds = timing.timed(work)
     assert value == "value"
     assert seconds == pytest.approx(0.2)
+
+
+def decoded(uri: str) -> np.ndarray:
+    head, _, data = uri.partition(",")
+    assert head in ("data:image/png;base64", "data:image/jpeg;base64")
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))
+
+
+def test_images_match_their_sources_and_shrink() -> None:
+    picture = np.random.default_rng(1).random((96, 128, 3)).astype(np.float32)
+    assert (decoded(linear_uri(picture, 1.0)) == to_display(picture, 1.0)).all()
+    assert decoded(linear_uri(picture, 1.0, 8)).shape == (96 // 8, 128 // 8, 3)
+    values = np.tile(np.linspace(0, 1, 128), (96, 1))
+    assert (decoded(map_uri(values, "local"))[0, [0, -1]] == palette("local")[[0, -1]]).all()
+    assert decoded(map_uri(2 * values - 1, "signed"))[0, 64].max() < 40
+    sizes = [len(linear_uri(picture, 1.0, n)) + len(map_uri(values, "flip", n)) for n in REDUCTIONS]
+    assert sizes == sorted(sizes, reverse=True)
+
+
+def test_a_diverged_fit_is_clipped_and_marked() -> None:
+    """It does not widen the scale of the others; fits that differ by less keep one scale."""
+    ramp = np.linspace(0, 0.1, 400).reshape(20, 20)
+    assert robust_scale([[ramp], [2 * ramp]]) == robust_scale([[2 * ramp]])
+    fits = {"good": {"g": ramp}, "fair": {"f": 2 * ramp}, "diverged": {"d": 1e4 * ramp}}
+    bars, images, beyond = scaled_maps({"local": fits, "signed": {"good": {"g": ramp}}})
+    assert bars["local"]["ticks"] == ["0", "5", "10", "15", "≥ 20"]
+    assert not any("≥" in tick for tick in bars["signed"]["ticks"])
+    assert list(beyond) == ["d-local"]
+    assert beyond["d-local"] == pytest.approx(1, abs=0.01)
+    assert (decoded(images["f-local"](1))[-1, -1] == palette("local")[-1]).all()
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Maps whose right half is the brighter or redder one; the heights do not tile and have 8 bits."""
+    ramp = np.tile(np.arange(256, dtype=np.uint8), (300, 1))
+    Image.fromarray(ramp).save(tmp_path / "height.png")
+    red = np.zeros((300, 256, 3), np.uint8)
+    red[:, 128:, 0] = 200
+    Image.fromarray(red).save(tmp_path / "base_color.png")
+    return tmp_path
+
+
+def test_maps_and_warnings_are_shown(folder: Path) -> None:
+    found = material_section(GeneratorConfig(material=str(folder)), load_material(folder).digests)
+    assert found["missing"] == ""
+    maps = {m["label"]: m for m in found["maps"]}
+    assert set(maps) == {"Height", "Base color"}
+    for shown, brightest in (maps["Height"], 255), (maps["Base color"], 200):
+        pixels = decoded(shown["image"]).astype(int)
+        assert pixels.shape == (150, 128, 3)
+        assert pixels[:, :10, 0].max() < 24
+        assert abs(pixels[:, -10:, 0].max() - brightest) < 8
+    warnings = "\n".join(found["warnings"])
+    assert "height.png: 8-bit heights" in warnings
+    assert "height.png: does not tile along u" in warnings
+
+
+def test_a_material_that_changed_since_is_not_shown(folder: Path) -> None:
+    digests = load_material(folder).digests
+    config = GeneratorConfig(material=str(folder))
+    Image.new("L", (256, 300), 7).save(folder / "height.png")
+    changed = material_section(config, digests)
+    (folder / "height.png").unlink()
+    gone = material_section(config, digests)
+    assert "has changed" in changed["missing"]
+    assert "cannot be read any more" in gone["missing"]
+    assert changed["maps"] == gone["maps"] == []

@@ -1,4 +1,4 @@
-"""Errors of predictions that foreign code made for the test queries."""
+"""Errors of predictions that foreign code made for the test queries, and the word for an error."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from mbtf_core.app.console import run
 from mbtf_core.errors import InputError
 from mbtf_fit.cli.app import app
 from mbtf_fit.evaluation import score_predictions
+from mbtf_fit.formatting import visibility
 
 NOISE, OFFSET = 0.02, 0.01
 
@@ -32,32 +33,24 @@ def test_the_error_is_that_of_the_prediction_alone(shards: Path, tmp_path: Path)
     value = exact(shards)
     np.savez(tmp_path / "mine.npz", value=value + OFFSET)
     errors = score_predictions(tmp_path / "mine.npz", shards)["errors"]["test"]
+    assert run(app, ["evaluate", str(tmp_path / "mine.npz"), str(shards)]) == 0
     assert errors["n"] == 1500
     assert abs(errors["mse"]["value"] - OFFSET**2) < 4 * errors["mse"]["error"] < OFFSET**2
     assert math.isclose(errors["unexplained"]["value"], OFFSET**2 / value.var(0).mean(), rel_tol=0.3)
-
-
-def test_the_command_takes_predictions_for_a_material(
-    shards: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    np.savez(tmp_path / "mine.npz", value=exact(shards) + OFFSET)
-    assert run(app, ["evaluate", str(tmp_path / "mine.npz"), str(shards)]) == 0
-    assert "1500 test queries" in capsys.readouterr().out
 
 
 def test_what_cannot_be_scored_is_refused(shards: Path, tmp_path: Path) -> None:
     file = tmp_path / "mine.npz"
     with pytest.raises(InputError, match="no such file"):
         score_predictions(file, shards)
-    for arrays in ({"values": np.zeros((1500, 3))}, {"value": np.array(["a"])}, {"value": np.full(3, 1j)}):
-        np.savez(file, **arrays)
-        with pytest.raises(InputError, match="no npz file"):
-            score_predictions(file, shards)
     np.savez_compressed(file, value=np.ones((1500, 3)))
     damaged = bytearray(file.read_bytes())
     damaged[60:90] = bytes(30)
-    for content in (b"", b"text", damaged):
-        file.write_bytes(content)
+    for content in (b"text", damaged, {"values": np.zeros((1500, 3))}, {"value": np.full(3, 1j)}):
+        if isinstance(content, dict):
+            np.savez(file, **content)
+        else:
+            file.write_bytes(content)
         with pytest.raises(InputError, match="no npz file"):
             score_predictions(file, shards)
     for shape in ((), (4500,), (1499, 3), (3, 1500)):
@@ -69,3 +62,23 @@ def test_what_cannot_be_scored_is_refused(shards: Path, tmp_path: Path) -> None:
     np.savez(file, value=value)
     with pytest.raises(InputError, match="at 2 queries, first at query 7"):
         score_predictions(file, shards)
+
+
+@pytest.mark.parametrize(
+    ("mse", "error", "text", "word"),
+    [
+        (1e-5, 1e-7, "PSNR 50.0 dB", "not visible"),
+        (1e-3, 1e-5, "PSNR 30.0 dB", "visible"),
+        # An error below its own uncertainty, which may be negative.
+        (-1e-5, 2e-5, "PSNR above 45.2 dB", "not visible"),
+        (0.0, 5e-4, "PSNR above 30.0 dB", "visible at most"),
+        # A bound that excludes nothing.
+        (0.0, 250.0, "PSNR unknown", None),
+        (0.0, 0.0, "PSNR infinite", "not visible"),
+    ],
+)
+def test_psnr_has_a_word(mse: float, error: float, text: str, word: str | None) -> None:
+    # Four times the value is two stops less exposure, and the same picture.
+    for factor, exposure in ((1, 0.0), (16, -2.0)):
+        errors = {"value": factor * mse, "error": factor * error}
+        assert visibility({"mse": errors, "exposure": exposure}) == (text, word)
