@@ -57,7 +57,16 @@ class LearnedRelief(Relief):
             # Without the reflectance of the surface there is no single scattering to scale.
             "relief": {"gate": False},
         },
-        "training": {"texture_weight_decay": 1.0, "blur": {"min_sigma": 0.8, "offset_sigma": 2.0}},
+        "training": {
+            "texture_weight_decay": 1.0,
+            "blur": {"min_sigma": 0.8, "offset_sigma": 2.0},
+            # The relative loss alone leaves the grazing highlights of fibers at half their value.
+            "losses": [
+                {"kind": "relative"},
+                {"kind": "chroma", "weight": 3.0},
+                {"kind": "squared", "weight": 0.1},
+            ],
+        },
     }
     takes = (*PYRAMID, *(f"network.relief.{name}" for name in ("hints", "frame", "gate")))
     learned = "heights"
