@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated, Literal
 
 import pytest
 from pydantic import Field
 
 from mbtf_core.app.console import new_app, run
-from mbtf_core.app.options import Flag, Options, command_line, config_options, options_from
+from mbtf_core.app.options import Flag, Options, options_from
 from mbtf_core.config.settings import Settings
 
 
@@ -51,20 +50,6 @@ def everything(
     return options
 
 
-def test_options_are_listed_in_the_configuration_s_order() -> None:
-    found = {o.flag: o for o in config_options(Config)}
-    assert list(found) == ["--queries", "--spp", "--mesh", "--layout", "--widths"]
-    assert [(o.key, o.default, o.help) for o in found.values()] == [
-        ("queries.train", "100/texel", "Number of queries."),
-        ("queries.spp", "4", "Paths per query."),
-        ("queries.mesh", "the map's width", "Cells."),
-        ("layout", "shuffled", "Order."),
-        ("widths", "1,2.5", "Widths."),
-    ]
-    assert [o.metavar for o in found.values()] == ["N", "INT", "INT", None, "TEXT"]
-    assert [o.flag for o in config_options(Config, "queries.spp", "layout")] == ["--spp", "--layout"]
-
-
 def test_a_command_takes_them_as_its_own(capsys: pytest.CaptureFixture[str]) -> None:
     app = new_app("mbtf-test", "A test.")
     app.default(everything)
@@ -87,9 +72,3 @@ def test_a_command_takes_them_as_its_own(capsys: pytest.CaptureFixture[str]) -> 
         assert text in whole
     # The short page names them, after the others.
     assert short.index("--last") < short.index("--help-all") < short.index("--mesh, --config, --set")
-
-
-def test_a_command_line_can_be_given_to_a_shell() -> None:
-    options = {"quick": True, "force": False, "time": None, "output": Path("o"), "set": ["a=1"]}
-    line = command_line("mbtf-pipeline", "run", Path("a b.yaml"), **options)
-    assert line == "mbtf-pipeline run 'a b.yaml' --quick -o o --set a=1"

@@ -44,14 +44,6 @@ def test_the_least_recently_used_files_make_room(tmp_path: Path) -> None:
     assert fetch(cache, 1)
 
 
-def test_the_files_fetched_last_stay(tmp_path: Path) -> None:
-    cache = FileCache(tmp_path, limit=0)
-    for number in range(9):
-        fetch(cache, number)
-    assert len(list(tmp_path.iterdir())) == 4
-    assert not fetch(cache, 8)
-
-
 def test_a_damaged_copy_is_downloaded_again(tmp_path: Path) -> None:
     fetch(FileCache(tmp_path), 1)
     (path,) = tmp_path.iterdir()

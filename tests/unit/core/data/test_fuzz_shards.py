@@ -96,9 +96,9 @@ def test_an_altered_manifest_or_sidecar(data: st.DataObject, whole: Path) -> Non
         (whole / MANIFEST_NAME).write_text(manifest)
 
 
-def archive(members: dict[str, bytes], compression: int = zipfile.ZIP_STORED) -> bytes:
+def archive(members: dict[str, bytes]) -> bytes:
     stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w", compression) as out:
+    with zipfile.ZipFile(stream, "w") as out:
         for name, content in members.items():
             out.writestr(f"{name}.npy", content)
     return stream.getvalue()
@@ -116,18 +116,8 @@ def header(dtype: str, shape: str) -> str:
 
 CLAIMS = {
     "more than there is": (archive({"sigma": npy(header("<f4", "(9,)"), b"\0" * 32)}), "not as long as"),
-    "less than nothing": (archive({"sigma": npy(header("<f4", "(-4,)"))}), "not as long as"),
     "an overflow": (archive({"u": npy(header("<f4", f"({2**63}, 2)"))}), "not as long as"),
     "objects": (archive({"sigma": npy(header("|O", "(4,)"), b"\0" * 32)}), "not C-ordered float32"),
-    "no array": (archive({"sigma": b"not an array"}), "cannot be read"),
-    "four axes": (
-        archive({"sigma": npy(header("<f4", "(2, 1, 1, 2)"), b"\0" * 16)}),
-        "has the shape (2, 1, 1, 2)",
-    ),
-    "a bomb": (
-        archive({"sigma": npy(header("<f4", "(2500000,)"), bytes(10_000_000))}, zipfile.ZIP_DEFLATED),
-        "shard is compressed",
-    ),
 }
 
 

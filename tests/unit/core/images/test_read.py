@@ -78,30 +78,19 @@ def test_npy(tmp_path: Path) -> None:
         image = read_image(tmp_path / "i.npy")
         assert image.bits == bits
         assert np.array_equal(np.rint(image.pixels.astype(np.float64) * (2**bits - 1)), codes)
-    np.save(tmp_path / "w.npy", np.zeros((5, 6), np.int64))
-    with pytest.raises(InputError, match="int64 numbers"):
-        read_image(tmp_path / "w.npy")
-    np.save(tmp_path / "s.npy", np.zeros((5, 6, 7)))
-    with pytest.raises(InputError, match=r"shape \(5, 6, 7\)"):
-        read_image(tmp_path / "s.npy")
-    np.save(tmp_path / "o.npy", np.array([[None]]), allow_pickle=True)
-    with pytest.raises(InputError, match="npy"):
-        read_image(tmp_path / "o.npy")
+    refused = {"int64 numbers": np.zeros((5, 6), np.int64), r"shape \(5, 6, 7\)": np.zeros((5, 6, 7))}
+    for message, array in {**refused, "npy": np.array([[None]])}.items():
+        np.save(tmp_path / "w.npy", array, allow_pickle=True)
+        with pytest.raises(InputError, match=message):
+            read_image(tmp_path / "w.npy")
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_pixels_that_are_not_finite_are_counted_and_placed(tmp_path: Path, value: float) -> None:
     numbers = np.zeros((4, 6), np.float32)
     numbers[2, 5] = numbers[3, 0] = value
-    with pytest.raises(
-        InputError, match=r"x\.exr: 2 pixels, the first at column 5, row 2, are NaN or infinite"
-    ):
+    with pytest.raises(InputError, match=r"x\.exr: 2 pixels, the first at column 5, row 2, are NaN or inf"):
         read_image(exr(tmp_path / "x.exr", {"Y": numbers}))
-    color = np.zeros((4, 6, 3))
-    color[1, 2] = value
-    np.save(tmp_path / "x.npy", color)
-    with pytest.raises(InputError, match=r"x\.npy: 1 pixel, at column 2, row 1, is NaN or infinite"):
-        read_image(tmp_path / "x.npy")
 
 
 def good_files(folder: Path) -> list[Path]:
@@ -148,31 +137,19 @@ def test_kinds_that_would_lose_something_are_refused(tmp_path: Path) -> None:
         read_image(whole)
 
 
-class TestGray:
-    def test_exact_for_equal_channels(self) -> None:
-        codes = rng().integers(0, 256, (4, 5, 1))
-        image = Image(np.repeat(codes, 3, axis=2).astype(np.uint8), Path("x.png"))
-        numbers, warnings = gray(image)
-        assert np.array_equal(numbers, codes[..., 0] / 255)
-        assert warnings == []
-        # Rounding of JPG is no color.
-        rounded = np.full((4, 5, 3), 100, np.uint8)
-        rounded[0, 0, 1] = 102
-        assert gray(Image(rounded, Path("x.jpg")))[1] == []
-
-    def test_color_becomes_luminance_with_a_warning(self) -> None:
-        codes = np.zeros((4, 5, 3), np.uint8)
-        codes[..., 1] = 51
-        numbers, warnings = gray(Image(codes, Path("x.png")))
-        assert numbers == pytest.approx(0.7152 * 0.2)
-        assert len(warnings) == 1
-        assert "luminance" in warnings[0]
-
-    def test_alpha_that_means_something_is_mentioned(self) -> None:
-        codes = np.full((4, 5, 2), 255, np.uint8)
-        assert gray(Image(codes, Path("x.png")))[1] == []
-        codes[0, 0, 1] = 128
-        assert "alpha" in gray(Image(codes, Path("x.png")))[1][0]
+def test_gray_is_exact_for_equal_channels_and_else_the_luminance_with_a_warning() -> None:
+    codes = rng().integers(0, 256, (4, 5, 1))
+    numbers, warnings = gray(Image(np.repeat(codes, 3, axis=2).astype(np.uint8), Path("x.png")))
+    assert np.array_equal(numbers, codes[..., 0] / 255)
+    assert warnings == []
+    # Rounding of JPG is no color.
+    rounded = np.full((4, 5, 3), 100, np.uint8)
+    rounded[0, 0, 1] = 102
+    assert gray(Image(rounded, Path("x.jpg")))[1] == []
+    numbers, (warning,) = gray(Image(np.uint8([[[0, 51, 0]]]), Path("x.png")))
+    assert numbers == pytest.approx(0.7152 * 0.2)
+    assert "luminance" in warning
+    assert "alpha" in gray(Image(np.uint8([[[255, 128]]]), Path("x.png")))[1][0]
 
 
 def test_srgb() -> None:
