@@ -241,7 +241,6 @@ def test_heights_of_the_mesh(folder: Path, columns: int, scale: float) -> None:
 def test_slopes_that_shading_adds(folder: Path, columns: int) -> None:
     job = job_of(folder / "matte.yaml", columns)
     found = job.material.normal_slopes(job.config.effects.normal)
-    assert found is not None
     assert found[1] > 0.1
     np.testing.assert_allclose(found[0], residual(normals(folder), job.material.grid.z), atol=1e-5)
 

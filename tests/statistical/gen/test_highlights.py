@@ -58,7 +58,6 @@ def plane() -> Highlights:
     """Highlights of the plane, from a pilot of its values."""
     pilot = PLAN.draw("pilot", 0, 8192)
     found = fit_highlights(pilot, value_of(pilot))
-    assert found is not None
     return found
 
 

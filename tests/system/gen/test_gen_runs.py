@@ -160,7 +160,6 @@ def test_reference_writes_pictures_for_people_and_programs(batch: dict[str, Done
         *(f"{s}.{x}" for s in stems for x in ("exr", "png")),
     }
     pictures = report["pictures"]
-    assert isinstance(pictures, list)
     assert {Path(p["file"]).stem for p in pictures} == stems
     for p in pictures:
         arrays = read_exr(work / p["file"])

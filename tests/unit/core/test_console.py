@@ -119,7 +119,7 @@ def test_the_time_left_counts_neither_set_up_nor_earlier_runs(
     with CONSOLE.progress(100, "fitting", "%") as bar:
         # Reading takes 30 s, the first step of a resumed fit compiles, then each percent takes a second.
         notes = "reading", "training", "loss 3", "loss 2"
-        for now, done, note in zip((0.0, 30.0, 45.0, 60.0), (0, 0, 50, 65), notes, strict=True):
+        for now, done, note in zip((0.0, 30.0, 45.0, 60.0), (0, 0, 50, 65), notes, strict=True):  # noqa: B007
             bar.update(done, note)
         # Within an interval there is no line but the last.
         bar.update(66, "loss 1")

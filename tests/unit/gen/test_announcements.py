@@ -12,11 +12,9 @@ import pytest
 from mbtf_core.app.console import run
 from mbtf_core.data.shard_files import row_bytes
 from mbtf_core.files import folders
-from mbtf_core.pictures import Camera
 from mbtf_gen import forecast
 from mbtf_gen.cli.app import app
 from mbtf_gen.generation import run as generation
-from mbtf_gen.pictures import reference
 
 DRAFT = 400 * 128**2 + 65536
 
@@ -29,11 +27,7 @@ def heights(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize(
     "words",
-    [
-        (),
-        ("reference", "--size", "512"),
-        ("preview", "--size", "1024"),
-    ],
+    [(), ("reference", "--size", "512"), ("preview", "--size", "1024")],
 )
 def test_what_does_not_fit_is_refused_before_anything_is_written(
     heights: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], words: tuple[str, ...]
@@ -80,22 +74,3 @@ def test_a_long_run_states_time_and_size(
     assert f"resolution {options[1] if options else 128}, {size}" in err
     assert f"expected: about 10:05, {size} on disk; faster: --queries 100/texel" in err
     assert seen == [False]
-
-
-@pytest.mark.parametrize(("rate", "most"), [(3e4, 1e5), (5e5, 8e5), (5e6, 2e6)])
-def test_the_pilot_of_a_picture_is_short_and_exact(
-    monkeypatch: pytest.MonkeyPatch, rate: float, most: float
-) -> None:
-    """At a rate of paths per second, after a compilation of 3 s."""
-    clock, traced = [0.0], [0]
-
-    def render(_: Any, camera: Camera, omega_i: Any, *, spp: int) -> None:
-        paths = camera.rows * camera.columns * spp
-        clock[0] += paths / rate + 3.0 * (not traced[0])
-        traced[0] += paths
-
-    monkeypatch.setattr(reference, "render_reference", render)
-    monkeypatch.setattr(reference, "time", SimpleNamespace(perf_counter=lambda: clock[0]))
-    found = reference.picture_seconds(None, Camera(rows=500), None, 10_000_000)  # type: ignore[arg-type]
-    assert found == pytest.approx(1e7 / rate)
-    assert traced[0] < most

@@ -15,7 +15,7 @@ from PIL import ImageCms
 from support.image_files import P3_COLUMNS, SRGB_COLUMNS, SRGB_CURVE, exr, icc, png, rng
 
 from mbtf_core.color import linear_to_srgb, srgb_to_linear
-from mbtf_core.images.color_spaces import adaptation, from_chromaticities, from_cicp
+from mbtf_core.images.color_spaces import from_chromaticities
 from mbtf_core.images.environment import read_environment
 from mbtf_core.images.read import linear_rgb, read_image
 
@@ -26,9 +26,6 @@ FROM_P3 = [[1.2249, -0.2249, 0.0], [-0.0421, 1.0421, 0.0], [-0.0196, -0.0786, 1.
 REC2020 = (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290)
 # ITU-R BT.2087.
 FROM_REC2020 = [[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]]
-# IEC 61966-2-1.
-TO_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
-D65 = TO_XYZ.sum(axis=1)
 P3_CHRM = (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290)
 
 
@@ -43,10 +40,6 @@ def para(kind: int, *numbers: float) -> bytes:
         + struct.pack(">HH", kind, 0)
         + struct.pack(f">{len(numbers)}i", *(round(65536 * n) for n in numbers))
     )
-
-
-def white_xyz(xy: tuple[float, float]) -> np.ndarray:
-    return np.array([xy[0], xy[1], 1.0 - xy[0] - xy[1]]) / xy[1]
 
 
 def chrm(values: tuple[float, ...]) -> tuple[bytes, bytes]:
@@ -168,22 +161,6 @@ def test_curves_of_cicp(tmp_path: Path, primaries: int, transfer: int, code: flo
     chunk = (b"cICP", bytes([primaries, transfer, 0, 1]))
     found = linear_rgb(read_image(png(tmp_path / "x.png", codes, 2, 16, extra=(chunk,))))
     assert found == pytest.approx(expected, abs=2e-5)
-
-
-@pytest.mark.parametrize(
-    ("code", "xy"),
-    [
-        # Green of ITU-T H.273.
-        *((5, (0.29, 0.60)), (6, (0.310, 0.595)), (9, (0.170, 0.797)), (11, (0.265, 0.690))),
-    ],
-)
-def test_primaries_of_cicp(code: int, xy: tuple[float, float]) -> None:
-    matrix = from_cicp(bytes([code, 8, 0, 1])).matrix
-    white = (0.314, 0.351) if code == 11 else (0.3127, 0.3290)
-    # Columns in XYZ, from the white of Rec.709 to the own one.
-    x, y, z = (adaptation(D65, white_xyz(white)) @ TO_XYZ @ matrix)[:, 1]
-    assert (x / (x + y + z), y / (x + y + z)) == pytest.approx(xy, abs=2e-3)
-    assert matrix.sum(axis=1) == pytest.approx(np.ones(3), abs=1e-4)
 
 
 def test_chromaticities_of_exr_and_radiance(tmp_path: Path) -> None:

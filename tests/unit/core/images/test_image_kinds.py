@@ -11,7 +11,6 @@ import tifffile
 from support.image_files import png, rng
 
 from mbtf_core.errors import InputError
-from mbtf_core.images.exr import choose_channels
 from mbtf_core.images.read import read_image
 
 
@@ -58,20 +57,6 @@ class TestTiff:
 
 
 class TestLayers:
-    def test_choice_by_name(self, tmp_path: Path) -> None:
-        names = ["R", "G", "B", "displacement.Y", "roughness.Y"]
-        path = tmp_path / "x.exr"
-        assert choose_channels(names, path, None, lambda label: label == "displacement") == ["displacement.Y"]
-        assert choose_channels(names, path, None) == ["R", "G", "B"]
-        assert choose_channels(names, path, "roughness") == ["roughness.Y"]
-        assert choose_channels(names, path, "G") == ["G"]
-        with pytest.raises(InputError, match=r"no channel or layer 'roughnes'") as caught:
-            choose_channels(names, path, "roughnes")
-        assert "'roughness'" in caught.value.hint
-        with pytest.raises(InputError, match="unclear") as caught:
-            choose_channels(["a.Y", "b.Y"], path, None)
-        assert "channel: a" in caught.value.hint
-
     def test_several_parts(self, tmp_path: Path) -> None:
         import OpenEXR
 

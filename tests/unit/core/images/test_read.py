@@ -160,12 +160,3 @@ def test_srgb() -> None:
     assert linear_to_srgb(srgb_to_linear(x)) == pytest.approx(x, abs=1e-6)
     assert srgb_to_linear(np.float32([0.5])).dtype == np.float32
     assert np.all(np.diff(srgb_to_linear(x)) > 0)
-
-
-@pytest.mark.parametrize("bits", [8, 16])
-def test_channels_of_many_rows_become_linear(bits: int) -> None:
-    codes = rng().integers(0, 2**bits, (1000, 3, 3)).astype(f"u{bits // 8}")
-    image = Image(codes, Path("x.png"))
-    shares = codes[..., [2, 0]] / (2**bits - 1)
-    assert np.allclose(image.linear((2, 0)), shares, atol=1e-7)
-    assert np.allclose(image.linear((2, 0), encoded=True), srgb_to_linear(shares), atol=1e-6)

@@ -168,20 +168,6 @@ def test_a_chain_of_many_nodes_is_no_recursion(tmp_path: Path) -> None:
     assert shape_of(builder, tmp_path).vertices[:, 0].tolist() == [3000, 3002, 3000]
 
 
-def test_primitives_of_one_material_are_one_shape(tmp_path: Path) -> None:
-    builder = GltfBuilder()
-    red, green = (builder.material({"baseColorFactor": [*c, 1]}, name=n) for n, c in COLORS.items())
-    for k, material in enumerate((red, green, red, None)):
-        builder.node(builder.mesh(SQUARE, material=material), translation=[k, 0, 0])
-    shapes = content_of(builder, tmp_path).shapes
-    assert [(shape.name, len(shape.faces)) for shape in shapes] == [("red", 4), ("green", 2), ("part", 2)]
-    assert shapes[0].vertices[:, 0].max() == 3
-    assert shapes[0].faces.max() == 7
-
-
-COLORS = {"red": (1, 0, 0), "green": (0, 1, 0)}
-
-
 def test_other_readers_agree_on_positions(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     builder = GltfBuilder()

@@ -7,10 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 from support.gltf_files import SQUARE_UV, GltfBuilder
 
-from mbtf_core.errors import InputError
 from mbtf_core.meshes.content import MeshContent, MeshShape, Texture, numbers_of
 from mbtf_core.meshes.read import read_mesh_content
 
@@ -128,18 +126,6 @@ def test_values_of_materials(tmp_path: Path, name: str) -> None:
             assert numbers_of(values[role]) == pytest.approx(np.array(wanted), abs=1e-6), role
 
 
-def test_jpeg_files_beside_it_are_read_whatever_their_name(tmp_path: Path) -> None:
-    pixels = np.full((8, 8, 3), (200, 10, 128), np.uint8)
-    Image.fromarray(pixels).save(tmp_path / "wood a.png", "JPEG", quality=100, subsampling=0)
-    builder = GltfBuilder()
-    builder.add("images", {"uri": "wood%20a.png"})
-    base = {"baseColorTexture": {"index": builder.add("textures", {"source": 0})}}
-    found = content_of(plate_of(base, builder), tmp_path)
-    assert found.files == {"wood%20a.png": tmp_path / "wood a.png"}
-    expected = [CODES[200], CODES[10], CODES[128]]
-    assert numbers_of(found.shapes[0].values["base_color"])[0, 0] == pytest.approx(expected, abs=0.01)
-
-
 @pytest.mark.parametrize(
     ("codes", "wrap"), [(10497, "repeat"), (33648, "mirror"), (33071, "clamp"), (None, "repeat")]
 )
@@ -243,14 +229,3 @@ def test_vertex_colors_are_clamped_and_linear(tmp_path: Path) -> None:
     found = content_of(builder, tmp_path)
     assert found.shapes[0].colors[0].tolist() == [1, 0, 0.5]
     assert any("clamped" in text for text in found.warnings)
-
-
-def test_alpha_of_vertices_is_refused_where_it_counts(tmp_path: Path) -> None:
-    for mode in ("OPAQUE", "BLEND"):
-        builder = GltfBuilder()
-        builder.plate(builder.material(alphaMode=mode), COLOR_0=np.full((4, 4), 0.5, np.float32))
-        if mode == "OPAQUE":
-            assert "opacity" not in shape_of(builder, tmp_path).values
-        else:
-            with pytest.raises(InputError, match="alpha"):
-                content_of(builder, tmp_path)

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from PIL import Image
 
 from mbtf_core.errors import InputError
@@ -93,23 +90,6 @@ def test_texture_coordinates_and_colors_of_faces(tmp_path: Path, kind: str) -> N
     np.testing.assert_allclose(colors[True], np.tile([0.5, 0.5, 0], (3, 1)))
 
 
-@pytest.mark.parametrize("names", ["u v", "texture_u texture_v"])
-def test_images_of_several_numbers(tmp_path: Path, names: str) -> None:
-    for name, code in (("a.png", 0), ("b.png", 255)):
-        Image.fromarray(np.full((1, 1), code, np.uint8)).save(tmp_path / name)
-    vertices = [(*p, *p[:2]) for p in SQUARE]
-    faces = [(*triangle, number) for number, triangle in zip((1, 0), TRIANGLES, strict=True)]
-    elements = {
-        "vertex": ([*XYZ, *(f"float {name}" for name in names.split())], vertices),
-        "face": ([CORNERS, "int texnumber"], faces),
-    }
-    first, second = read(tmp_path, ply(elements, comments=("TextureFile a.png", "TextureFile b.png"))).shapes
-    assert [s.values["base_color"][0].pixels.max() for s in (first, second)] == [0, 1]
-    assert second.vertices[second.faces][0].tolist() == [[0, 0, 0], [1, 0, 0], [1, 1, 0]]
-    first, second = read(tmp_path, ply(elements, comments=("TextureFile a.png",))).shapes
-    assert second.faults.keys() == {"base_color"}
-
-
 def test_colors_of_sixteen_bits_and_beside_images(tmp_path: Path) -> None:
     properties = [*XYZ, *(f"ushort {c}" for c in ("red", "green", "blue")), "float s", "float t"]
     # 0.5 as sRGB is 0.2140 (IEC 61966-2-1).
@@ -170,16 +150,3 @@ def test_trimesh_and_mitsuba_read_the_same(tmp_path: Path, encoding: str) -> Non
     np.testing.assert_array_equal(
         positions[np.array(params["faces"]).reshape(-1, 3)], shape.vertices[shape.faces].astype(np.float32)
     )
-
-
-@settings(max_examples=150, deadline=None)
-@given(data=st.data(), whole=st.sampled_from([WHOLE, TEXT]))
-def test_altered_files_are_read_or_refused(
-    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject, whole: bytes
-) -> None:
-    start = data.draw(st.integers(0, len(whole) - 1))
-    length = data.draw(st.integers(0, 8))
-    altered = whole[:start] + data.draw(st.binary(max_size=8)) + whole[start + length :]
-    with contextlib.suppress(InputError):
-        for shape in read(tmp_path_factory.mktemp("fuzz"), altered).shapes:
-            assert shape.faces.max() < len(shape.vertices)

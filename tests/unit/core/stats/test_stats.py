@@ -40,14 +40,6 @@ def test_estimates_print_with_as_many_digits_as_they_know(value: float, error: f
     assert str(Estimate(value, error, 10)) == text
 
 
-def test_mean_estimate_by_hand() -> None:
-    estimate = mean_estimate([[1.0, 3.0], [3.0, 5.0], [5.0, 7.0]])
-    assert estimate.value == 4.0
-    assert estimate.error == pytest.approx(2.0 / math.sqrt(3.0))
-    assert estimate.n == 3
-    assert mean_estimate([1.0]).error == math.inf
-
-
 @pytest.mark.parametrize("weighted", [False, True])
 def test_queries_of_a_group_count_as_one(weighted: bool) -> None:
     """Four copies of every query know no more than one."""

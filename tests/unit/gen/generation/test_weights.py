@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.datasets import rewrite, write_dataset
+from support.datasets import write_dataset
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.verify import verify
-from mbtf_core.errors import InputError
 from mbtf_core.stats import unexplained_variance
 from mbtf_fit import QueryDataset
 from mbtf_fit.data.loader import load_split
@@ -64,13 +63,6 @@ def test_without_highlights_nothing_changes(tmp_path: Path) -> None:
         assert first.sidecar["sha256"] == second.sidecar["sha256"]
 
 
-def test_weights_that_are_not_positive_are_refused(tmp_path: Path) -> None:
-    data = write(tmp_path / "shards", highlights=HIGHLIGHTS)
-    rewrite(tmp_path / "shards" / "test-00000.npz", weight=np.zeros(64, np.float32))
-    with pytest.raises(InputError, match="'weight' holds numbers that are not positive: 64"):
-        load_split(data, "test")
-
-
 def test_errors_of_a_fit_use_the_weights(tmp_path: Path) -> None:
     """A query of the weight 2 counts as two queries."""
     data = write(tmp_path / "shards", highlights=HIGHLIGHTS)
@@ -85,8 +77,6 @@ def test_errors_of_a_fit_use_the_weights(tmp_path: Path) -> None:
         return 0.3 * queries.omega_i[:, 2:] + np.zeros(3, np.float32)
 
     found, expected = (split_errors(predict, queries, data) for queries in (weighted, repeated))
-    assert found is not None
-    assert expected is not None
     assert found["mse"]["value"] == pytest.approx(expected["mse"]["value"])
     assert found["exposure"] == pytest.approx(expected["exposure"], abs=0.02)
     for group in ("levels", "elevations"):

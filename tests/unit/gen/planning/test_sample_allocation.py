@@ -65,16 +65,6 @@ def test_a_group_of_lights_has_the_paths_that_its_noise_takes() -> None:
     assert 1.0 < found.gain < alone.gain
 
 
-def test_a_log_linear_mean_is_recovered() -> None:
-    rng = np.random.default_rng(0)
-    x = rng.normal(size=20_000)
-    weights = fit_log_linear([np.ones_like(x), x], np.exp(0.5 * x - 3.0) * rng.exponential(size=len(x)))
-    assert weights == pytest.approx([-3.0, 0.5], abs=0.05)
-    nothing = fit_log_linear([np.ones_like(x), x], np.zeros_like(x))
-    assert nothing is not None
-    assert not nothing.any()
-
-
 def glossy_pilot(q: Queries, seed: int) -> Estimates:
     """Noise of a sharp lobe, large where the half vector is the normal and seen by few paths."""
     half = q.omega_i.astype(np.float64) + q.omega_o
@@ -91,7 +81,6 @@ def test_a_sharp_lobe_is_fitted_to_the_end() -> None:
     found = glossy_pilot(q, 1)
     noise = np.sqrt(np.mean((found.value_a.astype(np.float64) - found.value_b) ** 2, axis=-1))
     weights = fit_log_linear(direction_terms(q), noise)
-    assert weights is not None
     fit = np.exp(np.stack(direction_terms(q), axis=1) @ weights)
     # The constant has no ridge, so this holds at the optimum and nowhere else along it.
     assert fit.mean() == pytest.approx(noise.mean(), rel=1e-3)
@@ -103,20 +92,12 @@ def test_a_sharp_lobe_is_fitted_to_the_end() -> None:
     assert np.mean(s**2) == pytest.approx(0.25 * SPP * np.mean(noise**2), rel=1e-3)
 
 
-def test_a_failed_fit_gives_even_counts(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_failed_fit_gives_even_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     q = some_queries(2000)
     found = glossy_pilot(q, 1)
     monkeypatch.setattr("mbtf_gen.planning.sample_allocation._STEPS", 2)
     allocation = fit_allocation(q, found, SPP, 12)
-    assert caplog.messages == [
-        "the fit of the tile mean over directions did not converge; a constant is used",
-        "the fit of the noise over queries did not converge; a constant is used",
-    ]
     assert (allocation.counts(q, 12) == 12).all()
-    difference = found.value_a.astype(np.float64) - found.value_b
-    assert allocation.deviation(q) ** 2 == pytest.approx(np.full(2000, 0.25 * SPP * np.mean(difference**2)))
     mean = 0.5 * np.mean(found.value_a.astype(np.float64) + found.value_b)
     assert allocation.tile_mean(q) == pytest.approx(np.full(2000, mean))
 
@@ -200,19 +181,11 @@ def test_an_expectation_below_the_pilots_is_raised() -> None:
         assert correction(variance, deviation, mean) == pytest.approx(expected, rel=0.05)
         variance[7] = 1e6
         assert correction(variance, deviation, mean) == pytest.approx(expected, rel=0.08)
-    # Where the dark ones are the noisy ones, they count.
-    dark = mean < np.median(mean)
-    assert correction(np.where(dark, 2.0, 0.7) * deviation**2, deviation, mean) == pytest.approx(
-        1.16, rel=0.02
-    )
     # Too few say nothing; nor does black.
     assert correction(9.0 * deviation[:100] ** 2, deviation[:100], mean[:100]) == 1.0
     assert correction(np.zeros(n), np.zeros(n), np.zeros(n)) == 1.0
-    found = Estimates(
-        *np.zeros((2, n, 3), np.float32), None, 0, 0, 0, 0, path_variance=np.zeros(n, np.float32)
-    )
-    assert found.path_variance is not None
-    found.path_variance[:] = (1.5 * deviation) ** 2
+    variance = ((1.5 * deviation) ** 2).astype(np.float32)
+    found = Estimates(*np.zeros((2, n, 3), np.float32), None, 0, 0, 0, 0, path_variance=variance)
     needed, _ = needed_paths(found, 16, deviation, mean, 0.05)
     assert needed == pytest.approx(np.full(n, (1.5 * 0.3 / 0.05) ** 2), rel=1e-5)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from support.fit_data import write_data
 from support.published import LAYOUTS, small
 
 from mbtf_core.data.dataset import Dataset
-from mbtf_gen.publishing.picture import brdf_image, tile_images, visible_positions, write_picture
+from mbtf_gen.publishing.picture import brdf_image, tile_images, write_picture
 
 
 def test_images_have_v_and_the_light_where_they_belong(tmp_path: Path) -> None:
@@ -36,21 +35,6 @@ def test_images_have_v_and_the_light_where_they_belong(tmp_path: Path) -> None:
     height = np.sqrt(np.maximum(0.0, 1 - x**2 - y**2))
     expected = 1 + np.cos(np.radians(50)) * x + np.sin(np.radians(50)) * height
     assert np.corrcoef(brdf[..., 2][known], expected[known])[0, 1] > 0.95
-
-
-def test_parallax_is_removed_where_heights_are_known() -> None:
-    """The tile is twice as wide as high; its half v > 1/2 is deeper."""
-    heights = np.full((64, 128), -0.02, np.float32)
-    heights[:32] = -0.1
-    heights[0, 0] = 0.0
-    geometry = SimpleNamespace(heights=heights, aspect=0.5)
-    u = np.array([[0.5, 0.75], [0.5, 0.25], [0.98, 0.2]])
-    view = np.array([[0.6, 0.0, 0.8], [0.0, 0.6, 0.8], [-0.6, 0.0, 0.8]])
-    # At slopes of 3/4.
-    expected = [[0.5 - 0.075, 0.75], [0.5, 0.25 - 2 * 0.015], [0.995, 0.2]]
-    seen = visible_positions(u, view, geometry)  # type: ignore[arg-type]
-    np.testing.assert_allclose(seen, expected, atol=2 * 0.1 / 48)
-    assert visible_positions(np.array([[0.99, 0.7]]), view[2:], geometry)[0, 0] < 0.07  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)

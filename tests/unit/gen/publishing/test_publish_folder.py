@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import pytest
-from support.datasets import write_dataset
 from support.published import contents, publish, small
 
-from mbtf_core.errors import InputError, UsageError
+from mbtf_core.errors import InputError
 from mbtf_gen.config.exchange import PublishConfig
 from mbtf_gen.publishing.publication import Publication
 
@@ -69,20 +67,3 @@ def test_damage_is_found_before_anything_is_written(shards: Path, tmp_path: Path
     with pytest.raises(InputError, match=r"train-00001\.npz: has changed since it was written"):
         publish(shards, tmp_path / "card", form="parquet")
     assert not (tmp_path / "card").exists()
-
-
-def test_a_full_disk_is_said_before(shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "mbtf_core.files.folders.shutil.disk_usage", lambda _: shutil._ntuple_diskusage(1, 1, 1000)
-    )
-    with pytest.raises(InputError, match=r"needs .* MB; 1 kB are free"):
-        publish(shards, tmp_path / "card", form="parquet")
-    assert not (tmp_path / "card").exists()
-
-
-def test_shards_of_exr_are_not_npz(tmp_path: Path) -> None:
-    write_dataset(tmp_path / "data", queries={"train": "40", "test": "8"}, output={"format": "exr"})
-    with pytest.raises(UsageError, match="holds shards of another format"):
-        publish(tmp_path / "data", tmp_path / "card", form="npz")
-    card = publish(tmp_path / "data", tmp_path / "card", form="parquet")
-    assert (card / "data/train-00000.parquet").exists()

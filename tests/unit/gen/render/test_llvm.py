@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from pathlib import Path
 
@@ -10,7 +9,6 @@ import pytest
 from conftest import RunPython
 
 from mbtf_core.errors import EngineError
-from mbtf_core.run.processes import run_child
 from mbtf_gen.engine import runtime as engine
 
 LOAD = """
@@ -50,14 +48,6 @@ def test_it_is_found_and_works_with_nothing_set(run_python: RunPython, tmp_path:
     assert any(p.name.startswith("llvm-proof-") for p in (tmp_path / "mbtf").iterdir())
 
 
-def test_a_path_the_user_set_wins(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(engine.VARIABLE, "/somewhere/libLLVM.so.99")
-    monkeypatch.delenv(engine.CACHE_VARIABLE, raising=False)
-    engine.use_shipped_llvm()
-    assert os.environ[engine.VARIABLE] == "/somewhere/libLLVM.so.99"
-    assert os.environ[engine.CACHE_VARIABLE].endswith("kernels-libLLVM.so.99")
-
-
 def test_an_old_llvm_is_refused(run_python: RunPython) -> None:
     done = run_python("-c", LOAD, DRJIT_LIBLLVM_PATH=old_llvm(15))
     assert done.returncode == 0
@@ -68,7 +58,6 @@ def test_an_old_llvm_is_refused(run_python: RunPython) -> None:
 def test_an_installation_never_started_by_its_owner_works(run_python: RunPython, tmp_path: Path) -> None:
     # Links of the C++ runtime appear at the first start that may write; here they never did.
     shipped = engine.shipped_llvm()
-    assert shipped is not None
     runtime = sorted({p.resolve() for p in shipped.parent.glob("*-linux-gnu/lib*.so.*")})
     if not runtime:
         pytest.skip("the library brings no C++ runtime on this platform")
@@ -123,17 +112,3 @@ def test_a_failed_proof_is_not_cached(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 # What a child of the test below runs.
-
-
-def prove_whatever_the_version():  # type: ignore[no-untyped-def]
-    engine.OLDEST_LLVM = 0
-    engine.has_version = lambda library: True
-    yield from engine._proof(engine.CPU_VARIANT)
-
-
-def test_the_proof_catches_the_abort_of_llvm_15(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Without the version check, the test kernels end the child in the way they would end a render."""
-    monkeypatch.setenv(engine.VARIABLE, old_llvm(15))
-    environment = {engine.CACHE_VARIABLE: str(tmp_path)}
-    outcome = run_child(__name__, "prove_whatever_the_version", timeout=60, environment=environment)
-    assert "ended by SIGABRT" in outcome.fault

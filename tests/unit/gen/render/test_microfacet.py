@@ -12,7 +12,6 @@ from mbtf_gen.render.bsdf.microfacet import (
     MIRROR_ALPHA,
     EnergyTables,
     distribution,
-    grazing_reflectance,
     half_tangent2,
     missing_energy_pdf,
     sample_missing_energy,
@@ -133,8 +132,3 @@ def test_samples_of_missing_energy_have_its_density() -> None:
         for q in (0.1, 0.5, 0.9):
             at = np.interp(q, cumulative, log)
             assert np.mean(np.log(w[2]) < at) == pytest.approx(q, abs=3e-3)
-
-
-def test_no_reflectance_means_none_at_grazing_either() -> None:
-    f90 = np.array(grazing_reflectance(mi.Float([0.0, 0.01, 0.02, 0.04, 1.0])))
-    np.testing.assert_allclose(f90, [0.0, 0.5, 1.0, 1.0, 1.0], rtol=1e-6)

@@ -51,11 +51,6 @@ def test_the_table_is_as_good_as_the_integral(width: float) -> None:
     np.testing.assert_allclose(light.irradiance(from_angles(elevation, 30.0)), direct, rtol=1e-6)
 
 
-def test_narrow_lobes_have_the_concentration_of_a_gaussian() -> None:
-    for width in (0.01, 0.05, 0.3):
-        assert concentration(width) * np.radians(width) ** 2 == pytest.approx(1.0, rel=1e-4)
-
-
 def test_radiance_is_cut_below_the_horizon_and_normalized() -> None:
     light = LightKernel(5.0)
     axis = from_angles(1.0, 0.0)

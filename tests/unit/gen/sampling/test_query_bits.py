@@ -80,14 +80,7 @@ def test_bits_do_not_depend_on_the_processors_features(run_python: RunPython) ->
         assert again == digests
 
 
-LATTICES = [
-    Lattice(3, 1.0),
-    Lattice(3, 0.75),
-    Lattice(4, 5 / 16),
-    Lattice(2, 2.5),
-    Lattice(0, 1.0),
-    Lattice(0, 3.0),
-]
+LATTICES = [Lattice(*k) for k in ((3, 1.0), (3, 0.75), (4, 5 / 16), (2, 2.5), (0, 1.0), (0, 3.0))]
 
 
 def texels(lattice: Lattice, u: NDArray[np.float32]) -> NDArray[np.int64]:
@@ -153,8 +146,6 @@ def test_patches_are_grids_of_the_level_nearest_to_their_footprint(lattice: Latt
     # They begin anywhere.
     assert len(np.unique(q.u[:, 0, 0])) == 80
     assert np.ptp(q.u[:, 0, 0], axis=0).min() > 0.7
-    other = QueryPlan(lattice, LevelMixture(1, 0), 0.2, "image", 5, 40, patch_size=5).draw("train", 2, 40)
-    assert not equal(q, other)
 
 
 def equal(a: Queries, b: Queries) -> bool:
@@ -216,9 +207,3 @@ def test_every_number_is_within_its_range(layout: str) -> None:
             length = np.linalg.norm(omega.astype(np.float64), axis=-1)
             np.testing.assert_allclose(length, 1.0, rtol=0, atol=1e-6)
             assert (omega[:, 2] >= np.float32(0.2)).all()
-
-
-def test_mixture_weights_are_normalized_and_not_all_zero() -> None:
-    assert (LevelMixture(3.0, 1.0).log_uniform, LevelMixture(3.0, 1.0).finest) == (0.75, 0.25)
-    with pytest.raises(ValueError, match="zero"):
-        LevelMixture(0.0, 0.0)

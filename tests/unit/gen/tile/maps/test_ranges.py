@@ -48,14 +48,11 @@ def test_lossy_exr_is_clamped_with_one_warning(folder: Path, compression: str) -
     [
         ("ZIP", np.float16, 1 + 2**-10, True),
         ("ZIP", np.float16, 1 + 2**-9, False),
-        ("PIZ", np.float32, 1.0005, False),
         ("NO", np.float32, -0.01, False),
         ("PXR24", np.float32, 1 + 2**-15, True),
-        ("PXR24", np.float32, 1.001, False),
         ("B44", np.float16, -1e-5, True),
         ("B44", np.float16, 1.01, False),
         ("DWAA", np.float16, 1.5, False),
-        ("DWAA", np.float16, -0.5, False),
     ],
 )
 def test_the_tolerance_depends_on_the_compression(
