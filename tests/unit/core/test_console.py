@@ -77,15 +77,12 @@ def test_a_failure_is_one_or_two_lines_and_one_object_of_json(
 
 
 def test_json_takes_arrays_paths_and_missing_numbers(capsys: pytest.CaptureFixture[str]) -> None:
-    array, number, count = np.array([[1.5, math.nan]], np.float32), np.float32(0.25), np.int64(3)
-    data = {"array": array, "number": number, "count": count, "infinite": math.inf}
-    data |= {"path": Path("a/b"), "rows": (1, 2), "flag": True}
-    Console(json=True).report(data, "text")
-    found = json.loads(capsys.readouterr().out)
-    assert found == {
-        **{"array": [[1.5, None]], "number": 0.25, "count": 3, "infinite": None},
-        **{"path": "a/b", "rows": [1, 2], "flag": True},
-    }
+    array = np.array([[1.5, math.nan]], np.float32)
+    Console(json=True).report(
+        {"array": array, "count": np.int64(3), "infinite": math.inf, "path": Path("a")}, ""
+    )
+    expected = {"array": [[1.5, None]], "count": 3, "infinite": None, "path": "a"}
+    assert json.loads(capsys.readouterr().out) == expected
 
 
 @pytest.mark.parametrize("line", ["doctr", "--json doctor", "doctr --code 3", "--json doctor more"])

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import pytest
 from pydantic import Field
 
-from mbtf_core.config.settings import LocalName, Settings, resolve
+from mbtf_core.config.settings import Settings, resolve
 from mbtf_core.config.yaml_file import dump_yaml
 from mbtf_core.errors import InputError, UsageError
 
@@ -30,11 +30,6 @@ class Whole(Settings):
     light: Light = Light()
     levels: int | None = None
     stages: tuple[Stage, ...] = ()
-
-
-class Needy(Settings):
-    source: str
-    spp: int = 1
 
 
 @pytest.fixture
@@ -100,14 +95,6 @@ def test_faults_name_line_and_hint(write: Any, text: str, where: int, what: str,
     assert caught.value.hint == hint
 
 
-def test_required_keys_may_come_from_flags(write: Any) -> None:
-    assert resolve(Needy, file=write("spp: 2\n"), flags={"source": "map.exr"}) == Needy(
-        source="map.exr", spp=2
-    )
-    with pytest.raises(UsageError, match="'source' is missing"):
-        resolve(Needy)
-
-
 def test_what_is_dumped_reads_back(tmp_path: Path) -> None:
     whole = Whole(height=1e-6, light=Light(kind="delta"), stages=(Stage(name="ä: #"),))
     path = tmp_path / "resolved.yaml"
@@ -128,17 +115,3 @@ def test_a_value_that_a_flag_gave_is_blamed_on_the_flag(write: Any) -> None:
     with pytest.raises(InputError) as read:
         resolve(Whole, file=write("light: {width_deg: 31}\n"), spelled=spelled)
     assert str(read.value.where).endswith("config.yaml:1")
-
-
-def test_backslashes_separate_where_no_such_file_exists(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Reader(Settings):
-        folder: LocalName
-
-    (tmp_path / "fits" / "a").mkdir(parents=True)
-    monkeypatch.chdir(tmp_path)
-    for name in ("fits\\a", "fits/a"):
-        assert Path(Reader(folder=name).folder) == Path("fits/a")
-    for name in ("s3://bucket/a", "fits\\b"):
-        assert Reader(folder=name).folder == name

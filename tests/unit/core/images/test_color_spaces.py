@@ -15,7 +15,6 @@ from PIL import ImageCms
 from support.image_files import P3_COLUMNS, SRGB_COLUMNS, SRGB_CURVE, exr, icc, png, rng
 
 from mbtf_core.color import linear_to_srgb, srgb_to_linear
-from mbtf_core.images.color_spaces import from_chromaticities
 from mbtf_core.images.environment import read_environment
 from mbtf_core.images.read import linear_rgb, read_image
 
@@ -23,9 +22,6 @@ ACESCG = (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767)
 # Published by colour-science for Bradford's adaptation.
 FROM_ACESCG = [[1.70505, -0.62179, -0.08326], [-0.13026, 1.14080, -0.01055], [-0.02400, -0.12897, 1.15297]]
 FROM_P3 = [[1.2249, -0.2249, 0.0], [-0.0421, 1.0421, 0.0], [-0.0196, -0.0786, 1.0983]]
-REC2020 = (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290)
-# ITU-R BT.2087.
-FROM_REC2020 = [[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]]
 P3_CHRM = (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290)
 
 
@@ -46,13 +42,6 @@ def chrm(values: tuple[float, ...]) -> tuple[bytes, bytes]:
     red, green, blue, white = zip(values[::2], values[1::2], strict=True)
     numbers = (*white, *red, *green, *blue)
     return b"cHRM", struct.pack(">8I", *(round(100_000 * n) for n in numbers))
-
-
-@pytest.mark.parametrize(
-    ("chromaticities", "matrix"), [(ACESCG, FROM_ACESCG), (P3_CHRM, FROM_P3), (REC2020, FROM_REC2020)]
-)
-def test_matrices_are_the_published_ones(chromaticities: tuple[float, ...], matrix: list[float]) -> None:
-    assert from_chromaticities(chromaticities).matrix == pytest.approx(np.array(matrix), abs=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -143,24 +132,6 @@ def test_precedence_of_png(
     expected = linear @ np.array(FROM_P3).T if wide else linear
     found = linear_rgb(read_image(png(tmp_path / "x.png", codes, 2, bits, extra=chunks)))
     assert found == pytest.approx(expected, abs=2e-3)
-
-
-@pytest.mark.parametrize(
-    ("primaries", "transfer", "code", "expected"),
-    [
-        # ITU-R BT.709-6 encodes 0.5 as 0.705515 and 0.01 as 0.045.
-        (1, 1, 0.705515, 0.5),
-        (1, 14, 0.045, 0.01),
-        (1, 5, 0.5, 0.143587),
-        (1, 8, 0.5, 0.5),
-        (1, 13, 0.5, 0.214041),
-    ],
-)
-def test_curves_of_cicp(tmp_path: Path, primaries: int, transfer: int, code: float, expected: float) -> None:
-    codes = np.full((2, 2, 3), round(65535 * code))
-    chunk = (b"cICP", bytes([primaries, transfer, 0, 1]))
-    found = linear_rgb(read_image(png(tmp_path / "x.png", codes, 2, 16, extra=(chunk,))))
-    assert found == pytest.approx(expected, abs=2e-5)
 
 
 def test_chromaticities_of_exr_and_radiance(tmp_path: Path) -> None:

@@ -39,15 +39,6 @@ class TestTiff:
         for name in ("tiled.tif", "planes.tif"):
             assert np.array_equal(np.rint(read_image(tmp_path / name).pixels.astype(float) * 65535), codes)
 
-    @pytest.mark.parametrize("dtype", ["i1", "i2", "i4", "u4", "i8"])
-    def test_other_integers_are_numbers(self, tmp_path: Path, dtype: str) -> None:
-        span = np.iinfo(dtype)
-        stored = np.array([[span.min, 0, 1, span.max >> 1]], dtype)
-        tifffile.imwrite(tmp_path / "x.tif", stored)
-        image = read_image(tmp_path / "x.tif")
-        assert image.bits is None
-        assert np.array_equal(image.pixels[..., 0], stored.astype(np.float64))
-
     @pytest.mark.parametrize("dtype", ["u1", "u2"])
     def test_white_may_be_zero(self, tmp_path: Path, dtype: str) -> None:
         stored = rng().integers(0, np.iinfo(dtype).max, (6, 8)).astype(dtype)
@@ -78,8 +69,5 @@ def test_single_channels_of_other_kinds(tmp_path: Path) -> None:
         image = read_image(path, name.lower())
         assert np.array_equal(image.pixels, codes[..., index : index + 1] / 65535)
         assert image.channels == (name,)
-    with pytest.raises(InputError, match="no channel 'Y'") as caught:
+    with pytest.raises(InputError, match="no channel 'Y'"):
         read_image(path, "Y")
-    assert "R, G, B, A" in caught.value.hint
-    gray = png(tmp_path / "gray.png", codes[..., :1], 0, 16)
-    assert np.array_equal(read_image(gray, "Y").pixels, read_image(gray).pixels)

@@ -122,21 +122,6 @@ def test_truncated_files_are_refused(tmp_path: Path, share: float, capfd: pytest
     assert capfd.readouterr() == ("", "")
 
 
-def test_kinds_that_would_lose_something_are_refused(tmp_path: Path) -> None:
-    from PIL import Image as Pillow
-
-    Pillow.new("CMYK", (4, 4)).save(tmp_path / "cmyk.jpg")
-    with pytest.raises(InputError, match="CMYK"):
-        read_image(tmp_path / "cmyk.jpg")
-    window = (np.array([1, 0], np.int32), np.array([6, 4], np.int32))
-    cropped = exr(tmp_path / "crop.exr", {"Y": np.zeros((5, 6), np.float32)}, dataWindow=window)
-    with pytest.raises(InputError, match="cropped tile"):
-        read_image(cropped)
-    whole = exr(tmp_path / "int.exr", {"Y": np.zeros((5, 6), np.uint32)})
-    with pytest.raises(InputError, match="stores integers"):
-        read_image(whole)
-
-
 def test_gray_is_exact_for_equal_channels_and_else_the_luminance_with_a_warning() -> None:
     codes = rng().integers(0, 256, (4, 5, 1))
     numbers, warnings = gray(Image(np.repeat(codes, 3, axis=2).astype(np.uint8), Path("x.png")))

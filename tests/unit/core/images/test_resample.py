@@ -55,17 +55,6 @@ def test_nothing_shifts(rows: int, columns: int, enlarge: str, tolerance: float)
     assert np.abs(out - shifted).max() > 2 * tolerance
 
 
-def test_one_texel_and_channels_and_dtype() -> None:
-    color = noise(4, 6, 3).astype(np.float32)
-    one = resample(color, 1, 1)
-    assert one.shape == (1, 1, 3)
-    assert one.dtype == np.float32
-    assert one[0, 0] == pytest.approx(color.mean(axis=(0, 1)), abs=1e-6)
-    assert np.array_equal(resample(one, 5, 3, "cubic"), np.broadcast_to(one, (5, 3, 3)))
-    with pytest.raises(ValueError, match="at least one"):
-        resample(color, 0, 4)
-
-
 STEP = 1.0 / 255.0
 
 

@@ -67,11 +67,3 @@ def test_a_palette(tmp_path: Path) -> None:
     codes = rng().integers(0, 4, (5, 6, 1)).astype(np.uint8)
     image = read_image(write(tmp_path / "x.TGA", codes, 0, runs=True, palette=palette))
     assert np.array_equal(np.rint(255 * image.pixels), palette[codes[..., 0]])
-
-
-def test_bmp(tmp_path: Path) -> None:
-    from PIL import Image as Pillow
-
-    codes = rng().integers(0, 256, (5, 6, 3)).astype(np.uint8)
-    Pillow.fromarray(codes).save(tmp_path / "x.bmp")
-    assert np.array_equal(np.rint(255 * read_image(tmp_path / "x.bmp").pixels), codes)

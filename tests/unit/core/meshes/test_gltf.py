@@ -150,16 +150,6 @@ def test_instances_are_placed_within_their_node(tmp_path: Path) -> None:
     assert ["_ID" in text for text in found.warnings] == [True]
 
 
-def test_the_default_scene_alone_is_used(tmp_path: Path) -> None:
-    builder = with_triangle()
-    builder.node(builder.mesh(SQUARE), translation=[9, 9, 9])
-    builder.document["scenes"] = [{"nodes": [0]}, {"nodes": [1]}]
-    builder.document["scene"] = 1
-    found = content_of(builder, tmp_path)
-    assert found.shapes[0].vertices.min() == 8
-    assert any("not in the scene" in text for text in found.warnings)
-
-
 def test_a_chain_of_many_nodes_is_no_recursion(tmp_path: Path) -> None:
     builder = GltfBuilder()
     mesh = builder.mesh(TRIANGLE, None)
@@ -202,16 +192,13 @@ def changed(change: Callable[[dict[str, Any]], object]) -> GltfBuilder:
 
 REFUSED: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "index": (lambda d: d["nodes"][0].update(mesh=7), "meshes.7"),
-    "negative index": (lambda d: d["nodes"][0].update(mesh=-1), "nodes.0.mesh"),
     "cycle": (lambda d: (d["nodes"][0].update(children=[0]), d.update(scenes=[{"nodes": [0]}])), "node 0"),
     "two parents": (lambda d: d["nodes"].extend([{"children": [0]}, {"children": [0]}]), "node 0"),
     "count": (lambda d: d["accessors"][0].update(count=300_000_000), "300,000,000"),
     "range of the view": (lambda d: d["bufferViews"][0].update(byteLength=10**12), "bufferViews.0"),
     "component type": (lambda d: d["accessors"][0].update(componentType=5130), "5130"),
-    "element type": (lambda d: d["accessors"][0].update(type="VEC2"), "VEC2"),
     "text for a number": (lambda d: d["nodes"][0].update(scale=["1", 1, 1]), "nodes.0.scale"),
     "projection": (lambda d: d["nodes"][0].update(matrix=[*range(1, 17)]), "matrix"),
-    "skin": (lambda d: d["nodes"][0].update(skin=0), "skeleton"),
     "weights": (lambda d: d["meshes"][0].update(weights=[0.0, 0.5]), "morph"),
     "glTF 1": (lambda d: d["asset"].update(version="1.0"), "1.0"),
     "required": (lambda d: d.update(extensionsRequired=["EXT_unheard_of"]), "EXT_unheard_of"),
@@ -227,14 +214,6 @@ def test_what_cannot_be_read_is_refused_in_one_line(tmp_path: Path, name: str) -
     assert says in error.value.message
     assert "\n" not in error.value.what
     assert str(tmp_path / "a.glb") in error.value.message
-
-
-def test_damaged_containers_are_refused(tmp_path: Path) -> None:
-    whole, path = with_triangle().glb(), tmp_path / "a.glb"
-    for content in (whole[:-5], whole[:16], b"glTF", b"", b"{}", b"[]", b'{"asset": NaN}', b"[" * 200_000):
-        path.write_bytes(content)
-        with pytest.raises(InputError):
-            read_mesh_content(path)
 
 
 def test_missing_and_short_buffers_are_named(tmp_path: Path) -> None:

@@ -90,20 +90,6 @@ def test_texture_coordinates_and_colors_of_faces(tmp_path: Path, kind: str) -> N
     np.testing.assert_allclose(colors[True], np.tile([0.5, 0.5, 0], (3, 1)))
 
 
-def test_colors_of_sixteen_bits_and_beside_images(tmp_path: Path) -> None:
-    properties = [*XYZ, *(f"ushort {c}" for c in ("red", "green", "blue")), "float s", "float t"]
-    # 0.5 as sRGB is 0.2140 (IEC 61966-2-1).
-    vertices = [(*p, 65535, 32768, 0, *p[:2]) for p in SQUARE]
-    elements = {"vertex": (properties, vertices), "face": ([CORNERS], TRIANGLES)}
-    (shape,) = read(tmp_path, ply(elements)).shapes
-    assert shape.colors[0] == pytest.approx([1, 0.2140, 0], abs=1e-4)
-    Image.fromarray(np.full((2, 2, 3), 255, np.uint8)).save(tmp_path / "a.png")
-    content = read(tmp_path, ply(elements, comments=("TextureFile a.png",)))
-    assert content.shapes[0].colors is None
-    assert isinstance(content.shapes[0].values["base_color"], tuple)
-    assert any("colors of its vertices are not used" in text for text in content.warnings)
-
-
 def test_a_missing_image_and_colors_out_of_range_are_faults(tmp_path: Path) -> None:
     elements = {"vertex": (XYZ, SQUARE), "face": ([CORNERS], TRIANGLES)}
     (shape,) = read(tmp_path, ply(elements, comments=("TextureFile gone away.png",))).shapes

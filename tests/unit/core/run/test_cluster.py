@@ -24,7 +24,7 @@ from mbtf_core.run import cluster as module
 from mbtf_core.run import task
 from mbtf_core.run.cluster import open_runner
 from mbtf_core.run.runner import Runner
-from mbtf_core.run.task import Item, packed, run_task
+from mbtf_core.run.task import Item
 from mbtf_core.run.workers import ClusterConfig
 
 
@@ -98,14 +98,6 @@ def test_workers_that_dask_cannot_close_are_killed(monkeypatch: pytest.MonkeyPat
     assert worker.exitcode == -signal.SIGKILL
     assert other.is_alive()
     other.kill()
-
-
-def test_other_versions_are_refused() -> None:
-    call, _, folder = packed(run_tasks.double, Item("x", {"x": 1}))
-    found = run_task(call, "0.0.0", folder)
-    assert found["fatal"]
-    assert "version" in found["error"]
-    assert "version" in found["hint"]
 
 
 def scheduler_file(folder: Path, address: str) -> str:

@@ -30,14 +30,12 @@ def check(btf: Ubo2003) -> None:
     np.testing.assert_allclose(values, files.value(2 * row, 2 * column, light, view), atol=0.012)
 
 
-def test_a_folder(tmp_path: Path) -> None:
-    check(Ubo2003(files.write_folder(tmp_path, files.photographs())))
-
-
-@pytest.mark.parametrize("method", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
-def test_an_archive(method: int, tmp_path: Path) -> None:
-    (tmp_path / "a.zip").write_bytes(files.zipped(files.photographs() | {"read me.txt": b"hello"}, method))
-    check(Ubo2003(tmp_path / "a.zip"))
+def test_a_folder_and_archives(tmp_path: Path) -> None:
+    check(Ubo2003(files.write_folder(tmp_path / "a", files.photographs())))
+    for method in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        content = files.zipped(files.photographs() | {"read me.txt": b"hello"}, method)
+        (tmp_path / "a.zip").write_bytes(content)
+        check(Ubo2003(tmp_path / "a.zip"))
 
 
 def test_png_is_exact(tmp_path: Path) -> None:
@@ -101,7 +99,6 @@ def good(name: str = "tl000 pl000 tv000 pv000.jpg") -> dict[str, bytes]:
     [
         ({"a.jpg": b"x"}, "named by their directions"),
         ({"tl000 pl000 tv000 pv000.jpg": b"not an image"}, "cannot be decoded"),
-        ({"tl200 pl000 tv000 pv000.jpg": b""}, "angles out of range"),
         ({"tl095 pl000 tv000 pv000.jpg": b""}, "above the horizon"),
         (good() | good("b/tl000 pl000 tv000 pv000.jpg"), "the same directions"),
         ({f"{NAME}.bmp": b""}, ".jpg, .jpeg, .png, .exr, .hdr are read"),
