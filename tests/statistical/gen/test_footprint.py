@@ -84,8 +84,7 @@ def test_camera_rays_fill_the_pixel_that_its_query_states(aspect: float) -> None
 
 @pytest.mark.parametrize("azimuth", [0, 90, 200])
 def test_positions_in_the_footprint_do_not_follow_light_directions(azimuth: float) -> None:
-    """Under a wide light each direction has its own irradiance. If it depended on the position, the mean over
-    a color ramp would be biased."""
+    """Under a wide light each direction has its own irradiance."""
     ramp = np.linspace(0.0, 1.0, 64, dtype=np.float32)
     pixels = np.zeros((64, 64, 3), np.float32)
     pixels[..., 0], pixels[..., 1] = ramp[None, :], ramp[::-1, None]

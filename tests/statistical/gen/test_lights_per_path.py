@@ -143,10 +143,3 @@ def test_values_do_not_depend_on_launches_and_numbers_of_paths_differ_by_group(g
         assert np.array_equal(one, other)
     assert found[0].paths == counts.sum() / LIGHTS
     assert np.array_equal(found[0].spp, counts)
-
-
-def test_queries_of_a_group_have_equal_numbers_of_paths(groups: Queries) -> None:
-    estimator = Estimator(scene("heights"), LightKernel(3.0), Transport())
-    counts = np.repeat([2, 4], LIGHTS * GROUPS // 2)
-    with pytest.raises(ValueError, match="groups of 4 with equal numbers"):
-        estimator.estimate(groups, counts, Stream(1, "train", 0), lights=LIGHTS)

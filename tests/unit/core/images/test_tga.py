@@ -16,10 +16,7 @@ Codes = NDArray[np.uint8]
 
 
 def write(path: Path, codes: Codes, origin: int, *, runs: bool, palette: Codes | None = None) -> Path:
-    """Codes (H, W, C), gray, gray and alpha, RGB or RGBA, or indices of a palette (n, 3).
-
-    Bits 5 and 4 of the origin say that the first row is the top, and the first pixel of a row the right one.
-    """
+    """Codes (H, W, C), gray, gray and alpha, RGB or RGBA, or indices of a palette (n, 3)."""
     rows, columns, channels = codes.shape
     kind = 1 if palette is not None else 3 if channels < 3 else 2
     order = [2, 1, 0, 3][:channels] if channels > 2 else list(range(channels))

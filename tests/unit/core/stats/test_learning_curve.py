@@ -21,8 +21,7 @@ def truth(power: float, level: float, time: float | NDArray[np.float64]) -> NDAr
 @pytest.mark.parametrize("deviation", [0.02, 0.05])
 @pytest.mark.parametrize(("power", "level"), [(0.25, 0.0), (0.5, 0.0), (0.3, 0.3), (1.0, 0.6), (0.5, 1.0)])
 def test_intervals_contain_the_truth(power: float, level: float, deviation: float) -> None:
-    """Of curves with noise: the error at twenty times the time, the time of an error, the limit. Nominally
-    95% contain it; at the end of the allowed shapes, level 0, it is 89%."""
+    """Of curves with noise: the error at twenty times the time, the time of an error, the limit."""
     random, inside = np.random.default_rng(1), np.zeros(3)
     repeats = 80
     for _ in range(repeats):

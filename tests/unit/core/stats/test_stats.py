@@ -16,9 +16,7 @@ from mbtf_core.stats import (
     level_groups,
     local_error,
     mean_estimate,
-    mean_of_halves,
     noise_free_mse,
-    pooled_relative_error,
     pooled_variance,
     signal_variance,
     t_test,
@@ -55,25 +53,6 @@ def test_queries_of_a_group_count_as_one(weighted: bool) -> None:
         four = statistic(*copies, groups)  # type: ignore[operator]
         assert four.error == pytest.approx(one.error, rel=0.01)
         assert four.n == one.n == 200
-
-
-def test_halves_by_hand() -> None:
-    a, b = np.array([[1.0], [3.0]]), np.array([[3.0], [3.0]])
-    assert pooled_variance(a, b).value == 0.5
-    assert mean_of_halves(a, b) == Estimate(2.5, 0.5, 2, 1.0)
-    assert noise_free_mse(np.array([[2.0], [5.0]]), a, b).value == pytest.approx((-1.0 + 4.0) / 2.0)
-    a, b = np.tile(a, (10, 1)), np.tile(b, (10, 1))
-    assert pooled_relative_error(a, b).value == pytest.approx(math.sqrt(0.5) / 2.5)
-
-
-def test_effective_degrees_of_freedom() -> None:
-    """One query: 1. Many alike: about n. One noisy query among silent ones: 1 again."""
-    rng = np.random.default_rng(1)
-    a, b = rng.normal(size=(2, 10_000))
-    assert mean_of_halves(a[:1], b[:1]).degrees == 1.0
-    assert mean_of_halves(a, b).degrees == pytest.approx(10_000, rel=0.1)
-    a[1:] = b[1:]
-    assert mean_of_halves(a, b).degrees == 1.0
 
 
 def test_one_query_and_constant_data_have_no_unexplained_share() -> None:

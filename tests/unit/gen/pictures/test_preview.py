@@ -70,12 +70,3 @@ def test_stored_queries_are_those_that_the_configuration_samples(layout: str, tm
         assert sample.total == sample.level.size
         assert (sample.mixture, sample.finest) == (LevelMixture(0.6, 0.4), 3)
         assert (sample.min_cos, sample.aspect) == (0.1, 0.5)
-
-
-def test_unfinished_shards_are_left_out(tmp_path: Path) -> None:
-    dataset = write_dataset(
-        tmp_path / "set", queries={"train": "100", "test": "8"}, output={"shard_queries": 40}
-    )
-    (tmp_path / "set/train-00001.json").unlink()
-    sample = stored_queries(dataset)
-    assert (sample.level.size, sample.total) == (60, 100)
