@@ -107,21 +107,6 @@ def test_bias_bounds_equal_the_rendered_change(shape: tuple[int, int]) -> None:
     assert bounds.normal == pytest.approx(measured, rel=0.3)
 
 
-def test_the_change_is_relative_to_the_mean_and_free_of_noise() -> None:
-    rng = np.random.default_rng(0)
-    n = 20_000
-
-    def values(shift: float, noise: float) -> Estimates:
-        a, b = (0.5 + shift + noise * rng.normal(size=(n, 3)).astype(np.float32) for _ in range(2))
-        return Estimates(a.astype(np.float32), b.astype(np.float32), None, n, 0, 0, 0)
-
-    found = Change.of(values(0.0, 0.1), values(0.05, 0.1))
-    assert found.rms == pytest.approx(0.1, rel=0.05)
-    assert found.rms < found.upper < 0.12
-    none = Change.of(values(0.0, 0.1), values(0.0, 0.1))
-    assert none.rms < min(0.03, none.upper)
-
-
 def test_the_tolerance_is_shared_not_spent_twice() -> None:
     """If two effects fit the tolerance only one at a time, one of them stays on."""
     normal = tilted(32, 32)

@@ -23,7 +23,6 @@ from support.scenes import (
     rocks,
 )
 
-from mbtf_core.errors import InputError
 from mbtf_gen.render.estimates import MOST_LOCATED
 
 
@@ -40,12 +39,6 @@ def test_one_path_in_each_half_has_the_variance_of_two_numbers() -> None:
     expected = 0.5 * np.mean((e.value_a.astype(np.float64) - e.value_b) ** 2, axis=1)
     assert expected.max() > 1e-3
     np.testing.assert_allclose(e.path_variance, expected, rtol=1e-3, atol=1e-6)
-
-
-def test_directions_that_are_no_unit_vectors_are_refused() -> None:
-    long = queries([0.3, 0.7], 0.1, 5.0 * direction(40, 60), direction(55, 200), 2)
-    with pytest.raises(InputError, match="omega_i: 2 of 2 directions are not unit vectors"):
-        estimator().estimate(long, 2, Stream(0, "train", 0))
 
 
 def test_values_differ_between_streams_and_are_uncorrelated() -> None:

@@ -168,23 +168,6 @@ def test_hostile_yaml(case: str, write: Callable[[str], Path]) -> None:
     assert message in caught.value.what
 
 
-@pytest.mark.parametrize(
-    ("content", "line"),
-    [
-        (b"a: 1\nb: [0, [1, !mine 5]]\n", 2),
-        (b"a: 1\nb: x\0y\n", 2),
-        (b"a: 1\nb: " + 101 * b"[", 2),
-        (b"a: {b: 1,\n  b: 2}\n", 2),
-    ],
-)
-def test_the_line_is_named(content: bytes, line: int, tmp_path: Path) -> None:
-    path = tmp_path / "a.yaml"
-    path.write_bytes(content)
-    with pytest.raises(InputError) as caught:
-        read_yaml(path)
-    assert caught.value.where == f"{path}:{line}", caught.value.message
-
-
 @pytest.mark.parametrize("text", ["a: &a [*a]\n", "a: &a\n  b: *a\n", "&a a: {b: *a}\n"])
 def test_a_value_that_holds_itself(text: str, write: Callable[[str], Path]) -> None:
     path = write(text)

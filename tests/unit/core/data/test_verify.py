@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import time
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.documents import finished_record
 from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.schema import ShardEntry
-from mbtf_core.data.shard_files import Arrays, read_shard, write_shard
+from mbtf_core.data.shard_files import read_shard, write_shard
 from mbtf_core.data.verify import foreign_files, verify
 from mbtf_core.files.atomic import file_sha256
 
@@ -189,19 +188,3 @@ def test_a_broken_sidecar_is_a_fault_not_an_abort(copy: Path, text: str) -> None
     sidecar_of(shard(copy)).write_text(text)
     assert list(faults(copy)) == [shard(copy).name]
     assert not finished_record(DataFolder.open(copy), entry(copy, 40), "any")
-
-
-def test_headers_are_parsed_in_one_thread(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In several threads an intact header may seem corrupt (CPython issue 106905)."""
-    inside = 0
-
-    def read(path: Path) -> Arrays:
-        nonlocal inside
-        inside += 1
-        time.sleep(0.01)
-        assert inside == 1
-        inside -= 1
-        return read_shard(path)
-
-    monkeypatch.setattr("mbtf_core.data.verify.read_shard", read)
-    assert verify(copy) == []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import os
@@ -229,12 +228,3 @@ def test_a_record_cannot_remove_what_lies_elsewhere(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"is damaged .*must lie in the folder"):
         claim(tmp_path / "out", overwrite=True)
     assert (tmp_path / "mine.txt").exists()
-
-
-def test_a_command_that_fails_before_its_first_file_claims_nothing(tmp_path: Path) -> None:
-    for written in ([], ["a.png"]):
-        with contextlib.suppress(InputError), owned(tmp_path / "out"), claim(tmp_path / "out") as folder:
-            for name in written:
-                (folder.path / name).write_text("")
-            raise InputError("cannot be used")
-        assert (tmp_path / "out").exists() is bool(written)

@@ -12,7 +12,7 @@ import pytest
 import tifffile
 from PIL import Image as Pillow
 from PIL import ImageCms
-from support.image_files import P3_COLUMNS, SRGB_COLUMNS, SRGB_CURVE, exr, icc, png, rng
+from support.image_files import P3_COLUMNS, SRGB_CURVE, exr, icc, png, rng
 
 from mbtf_core.color import linear_to_srgb, srgb_to_linear
 from mbtf_core.images.environment import read_environment
@@ -69,22 +69,6 @@ def test_profiles_agree_with_littlecms(tmp_path: Path, curve: bytes) -> None:
     for name in ("x.png", "x.tif", "deep.png"):
         found = linear_rgb(read_image(tmp_path / name))
         assert np.abs(255 * linear_to_srgb(np.clip(found, 0, 1)) - expected).max() < 1.6, name
-
-
-def test_what_a_profile_contains_decides_not_its_name(tmp_path: Path) -> None:
-    picture = Pillow.fromarray(rng().integers(0, 256, (8, 8, 3)).astype(np.uint8))
-    linear = b"curv\0\0\0\0" + struct.pack(">I", 0)
-    for name, columns, curve, space, says in (
-        ("Display P3 Gamut with sRGB Transfer", P3_COLUMNS, SRGB_CURVE, None, False),
-        ("sRGB IEC61966-2.1", SRGB_COLUMNS, SRGB_CURVE, "srgb", False),
-        ("sRGB-elle-V4-g10", SRGB_COLUMNS, linear, "linear", False),
-        ("Display P3", SRGB_COLUMNS, SRGB_CURVE, "srgb", True),
-    ):
-        picture.save(tmp_path / "x.jpg", icc_profile=icc(name, columns, curve))
-        tags = read_image(tmp_path / "x.jpg").tags
-        assert tags.space == space, name
-        assert (tags.declared is not None) == (space is None)
-        assert (tags.foreign is not None) == says
 
 
 def test_profiles_of_gray_and_of_floats(tmp_path: Path) -> None:

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import trimesh
 from support.gltf_files import SQUARE, SQUARE_UV, GltfBuilder
 
 from mbtf_core.errors import InputError
@@ -148,40 +147,6 @@ def test_instances_are_placed_within_their_node(tmp_path: Path) -> None:
     assert shape.vertices == pytest.approx(expected, abs=1e-5)
     assert shape.faces.tolist() == [[0, 1, 2], [3, 4, 5]]
     assert ["_ID" in text for text in found.warnings] == [True]
-
-
-def test_a_chain_of_many_nodes_is_no_recursion(tmp_path: Path) -> None:
-    builder = GltfBuilder()
-    mesh = builder.mesh(TRIANGLE, None)
-    chain = [{"children": [k + 1], "translation": [1, 0, 0]} for k in range(3000)]
-    builder.document["nodes"] = [*chain, {"mesh": mesh}]
-    assert shape_of(builder, tmp_path).vertices[:, 0].tolist() == [3000, 3002, 3000]
-
-
-def test_other_readers_agree_on_positions(tmp_path: Path) -> None:
-    rng = np.random.default_rng(1)
-    builder = GltfBuilder()
-    parent = None
-    for _ in range(4):
-        mesh = builder.mesh(rng.random((9, 3)).astype(np.float32), np.arange(9, dtype=np.uint32))
-        quaternion = rng.normal(size=4)
-        quaternion /= np.linalg.norm(quaternion)
-        parent = builder.node(
-            mesh,
-            translation=rng.random(3).tolist(),
-            rotation=quaternion.tolist(),
-            scale=(rng.random(3) + 0.5).tolist(),
-            **({} if parent is None else {"children": [parent]}),
-        )
-    path = builder.write(tmp_path / "a.glb")
-    ours = read_mesh_content(path).shapes[0]
-    theirs = trimesh.load_scene(path, process=False).to_geometry()
-
-    def corners(triangles: np.ndarray) -> np.ndarray:
-        flat = triangles.reshape(-1, 9)
-        return flat[np.lexsort(np.round(flat, 6).T)]
-
-    assert corners(ours.vertices[ours.faces]) == pytest.approx(corners(theirs.triangles), abs=1e-6)
 
 
 def changed(change: Callable[[dict[str, Any]], object]) -> GltfBuilder:

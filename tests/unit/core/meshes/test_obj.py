@@ -10,7 +10,6 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 from PIL import Image
-from support.image_files import P3_COLUMNS, SRGB_CURVE, icc
 
 from mbtf_core.errors import InputError
 from mbtf_core.meshes.content import MeshContent, MeshShape, Texture
@@ -198,34 +197,6 @@ def test_colors_of_images_are_srgb_and_numbers_are_linear(tmp_path: Path) -> Non
         assert texture_of(content, role)[0].pixels == pytest.approx(188 / 255)
         assert texture_of(content, role)[1] == factor
     assert texture_of(content, "opacity")[0].pixels.tolist() == [[0, 1]]
-
-
-def test_colors_of_images_are_converted_from_the_space_that_they_declare(tmp_path: Path) -> None:
-    picture = Image.fromarray(QUAD)
-    picture.save(tmp_path / "a.png", icc_profile=icc("P3", P3_COLUMNS, SRGB_CURVE))
-    content = with_material(tmp_path, "map_Kd a.png\nPr 0.5\nmap_Pm -imfchan g a.png")
-    # Of Display P3; its red and its green are beyond Rec.709.
-    expected = [[[1, 0, 0], [0, 1, 0]], [[0, 0, 1], [1, 1, 1]]]
-    assert texture_of(content)[0].pixels == pytest.approx(np.array(expected), abs=1e-3)
-    assert any("Rec.709" in text for text in content.warnings)
-    assert texture_of(content, "metallic")[0].pixels.tolist() == [[0, 1], [0, 1]]
-
-
-@pytest.mark.parametrize(
-    ("text", "role", "says"),
-    [
-        ("map_Kd gone.png", "base_color", "gone.png"),
-        ("map_Kd a.mtl", "base_color", "image"),
-        ("map_Kd -s x a.png", "base_color", "-s"),
-        ("Kd nan 0 0", "base_color", "nan"),
-        ("Kd 0 -0.5 0", "base_color", "-0.5"),
-        ("Kd 1 1 1\nPm 2", "metallic", "2"),
-    ],
-)
-def test_values_that_cannot_be_read_are_faults(tmp_path: Path, text: str, role: str, says: str) -> None:
-    (shape,) = with_material(tmp_path, text).shapes
-    assert shape.faults.keys() == {role}
-    assert says in shape.faults[role].message
 
 
 def test_colors_of_vertices_are_srgb_factors(tmp_path: Path) -> None:

@@ -90,15 +90,6 @@ def test_texture_coordinates_and_colors_of_faces(tmp_path: Path, kind: str) -> N
     np.testing.assert_allclose(colors[True], np.tile([0.5, 0.5, 0], (3, 1)))
 
 
-def test_a_missing_image_and_colors_out_of_range_are_faults(tmp_path: Path) -> None:
-    elements = {"vertex": (XYZ, SQUARE), "face": ([CORNERS], TRIANGLES)}
-    (shape,) = read(tmp_path, ply(elements, comments=("TextureFile gone away.png",))).shapes
-    assert "gone away.png" in shape.faults["base_color"].message
-    colored = [*XYZ, "float red", "float green", "float blue"]
-    elements["vertex"] = (colored, [(*p, 255, 0, 0) for p in SQUARE])
-    assert "base_color" in read(tmp_path, ply(elements)).shapes[0].faults
-
-
 WHOLE = ply({"vertex": (XYZ, SQUARE), "face": ([CORNERS], TRIANGLES)}, "binary_little_endian")
 TEXT = ply({"vertex": (XYZ, SQUARE), "face": ([CORNERS], TRIANGLES)})
 

@@ -25,7 +25,7 @@ from mbtf_core.run import task
 from mbtf_core.run.cluster import open_runner
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item
-from mbtf_core.run.workers import ClusterConfig
+from mbtf_core.run.workers import ClusterConfig, local_config, read_cluster
 
 
 @pytest.fixture(scope="module")
@@ -33,22 +33,6 @@ def cluster() -> Iterator[Runner]:
     pytest.importorskip("distributed", reason="no Dask; to enable: pip install 'mbtf[cluster]'")
     with open_runner("local:2", lambda line: None) as opened:
         yield opened
-
-
-def test_a_batch_system_that_refuses_the_jobs_is_no_wait(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    pytest.importorskip("dask_jobqueue", reason="no dask-jobqueue; to enable: pip install 'mbtf[cluster]'")
-    command = tmp_path / "sbatch"
-    command.write_text("#!/bin/sh\necho 'sbatch: error: invalid partition' >&2\nexit 1\n")
-    command.chmod(0o755)
-    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
-    file = tmp_path / "site.yaml"
-    file.write_text("engine: slurm\nworkers: 1\nstart_timeout: 30s\noptions: {interface: lo}\n")
-    refused = r"refuses the jobs \(sbatch: error: invalid partition\)"
-    with pytest.raises(InputError, match=refused), open_runner(str(file), lambda line: None):
-        pass
-    assert "Traceback" not in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("task", [run_tasks.die_at_first, run_tasks.fail_at_first])
@@ -235,3 +219,12 @@ def test_a_cluster_without_workers_is_not_waited_for_for_ever(
         one_worker.scale(0)
         with pytest.raises(PartialError, match=r"the cluster is lost .no worker within 1s"):
             list(results)
+
+
+def test_local_workers_share_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.sched_getaffinity", lambda pid: set(range(16)), raising=False)
+    assert (local_config().workers, local_config().threads) == (4, 4)
+    config = read_cluster("local:8")
+    assert (config.engine, config.workers, config.threads) == ("local", 8, 2)
+    many = read_cluster("local:64")
+    assert many.threads == 1

@@ -1,12 +1,17 @@
-"""Estimates, their printing, groups and refusals."""
+"""Estimates, their printing, groups and refusals, and the example of ``examples/dataset_statistics.py``."""
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from support.datasets import write_dataset
+from support.paths import ROOT
 
+from mbtf_core import stats
 from mbtf_core.data.lattice import sigma_of_level
 from mbtf_core.errors import InputError
 from mbtf_core.stats import (
@@ -108,3 +113,19 @@ def test_local_error_is_not_biased_by_noise() -> None:
     assert np.median(found[:, :40]) < 0.05
     assert 0.3 < np.mean(found[:, :40] == 0) < 0.7
     assert (found >= 0).all()
+
+
+EXAMPLE = (ROOT / "examples/dataset_statistics.py").read_text(encoding="utf-8")
+
+
+def test_the_worked_example(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_dataset(tmp_path / "shards", queries={"train": "2000", "test": "4000"})
+    monkeypatch.chdir(tmp_path)
+    found: dict[str, Any] = {}
+    exec(EXAMPLE, found)
+    assert abs(stats.unexplained_variance(found["constant"], found["a"], found["b"]).value - 1.0) < 0.1
+    assert found["better"].p_value < 1e-6
+    # Two digits: the noise that the data were made with.
+    assert "noise of one query: 0.03" in capsys.readouterr().out

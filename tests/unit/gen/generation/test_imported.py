@@ -22,7 +22,6 @@ from mbtf_gen.config.exchange import ImportConfig
 from mbtf_gen.generation import imported
 from mbtf_gen.generation.imported import Import, import_measured
 from mbtf_gen.generation.repair import repair
-from mbtf_gen.sampling.query_sampler import slice_directions
 from mbtf_pipeline.compare.metrics import dataset_errors
 
 Open = Callable[..., Import]
@@ -76,18 +75,6 @@ def test_test_queries_have_pairs_of_their_own(opened: Open, tmp_path: Path) -> N
     assert len(test) == 3
     assert not train & test
     assert len(train | test) > 55
-
-
-def test_options_of_values(opened: Open, tmp_path: Path) -> None:
-    plain = opened(Images(), queries={"train": "300", "test": "1"}, seed=3)
-    import_measured(plain, tmp_path / "plain")
-    kept = opened(Images(), queries={"train": "300", "test": "1"}, seed=3, cosine="excluded", scale=2.0)
-    import_measured(kept, tmp_path / "kept")
-    a, b = (Dataset.open(tmp_path / name).load("train") for name in ("plain", "kept"))
-    assert (a["u"] == b["u"]).all()
-    np.testing.assert_allclose(b["value_a"], 2.0 * a["value_a"] * a["omega_i"][:, 2:], rtol=1e-5)
-    with pytest.raises(InputError, match="no pair of light and view"):
-        opened(Images(), queries={"min_cos": 0.9999})
 
 
 def test_an_interrupted_import_resumes_with_the_same_bytes(opened: Open, tmp_path: Path) -> None:
@@ -181,20 +168,3 @@ def test_errors_of_a_fit_include_the_noise(opened: Open, tmp_path: Path) -> None
     streamed = load_training(Dataset.open(tmp_path / "shards"), config.held_out, 0, memory=None).training
     kept = load_training(Dataset.open(tmp_path / "shards"), config.held_out, 0).training
     assert (streamed.slice(5, 50).value == kept.slice(5, 50).value).all()  # type: ignore[union-attr]
-
-
-def test_levels_without_data_are_averages(opened: Open, tmp_path: Path) -> None:
-    queries = {"train": "400/texel", "test": "500", "min_cos": 0.2}
-    import_measured(opened(Images(lights=16), queries=queries), tmp_path / "shards")
-    config = FitConfig.model_validate({"model": "neumip-baseline", "training": {"steps": 400, "batch": 4096}})
-    material = fit(config, tmp_path / "shards", tmp_path / "fit").material
-    coverage = material.description["training"]["coverage"]
-    assert [level for level, share in coverage.items() if share == 0] == ["0", "1", "2"]
-    pyramid = material.model.pyramid.export()
-    np.testing.assert_allclose(pyramid["0"][0, 0], pyramid["3"].mean((0, 1)), atol=1e-5)
-    omega = slice_directions("spiral", 40, 0.3)
-    light, view = omega[:20], omega[20:]
-    found = material.evaluate(np.full((20, 2), 0.5), np.full(20, 0.5), light, view)
-    grid = (np.stack(np.mgrid[:12, :12], -1).reshape(-1, 2) + 0.5) / 12
-    mean = np.mean([known(np.repeat(u[None], 20, 0), light, view) for u in grid], axis=0)
-    assert np.abs(found - mean).mean() < 0.1 * mean.mean()

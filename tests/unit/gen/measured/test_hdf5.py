@@ -9,11 +9,9 @@ import h5py
 import numpy as np
 import pytest
 from support import measured_files as files
-from support.datasets import write_dataset
 from support.measured_files import write_hdf5
 
 from mbtf_core.errors import InputError
-from mbtf_gen.measured.exported import export_neumip
 from mbtf_gen.measured.hdf5 import NeumipQueries, NeuralBtf
 
 TEXELS = files.ROWS * files.COLUMNS
@@ -152,22 +150,6 @@ def test_images_of_the_known_function(tmp_path: Path) -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("name", "array", "message"),
-    [
-        ("ground_light", None, "no data set 'ground_light'"),
-        ("ground_light", np.zeros((8, 2)), "the shape"),
-        ("ground_camera_dir", np.zeros((9, files.ROWS, files.COLUMNS, 2)), "direction for each pixel"),
-        ("ground_camera_dir", np.full((9, 2), 0.8), "unit vectors"),
-        ("ground_color", np.zeros((9, 5, 4, 4)), "the shape"),
-    ],
-)
-def test_images_that_are_refused(name: str, array: Any, message: str, tmp_path: Path) -> None:
-    arrays = {key: a for key, a in (images() | {name: array}).items() if a is not None}
-    with pytest.raises(InputError, match=message):
-        NeuralBtf(write_hdf5(tmp_path / "a.hdf5", arrays))
-
-
 def test_numbers_that_a_file_cannot_have(tmp_path: Path) -> None:
     path = tmp_path / "a.hdf5"
     with h5py.File(path, "w") as file:
@@ -177,23 +159,3 @@ def test_numbers_that_a_file_cannot_have(tmp_path: Path) -> None:
         file["ground_light"] = file["ground_camera_dir"] = np.zeros((30, 2), np.float32)
     with pytest.raises(InputError, match="claims 94,371,840 bytes"):
         NeuralBtf(path)
-
-
-def test_an_export_for_neumip(tmp_path: Path) -> None:
-    """All that fills whole images, in the order of the shards; the program reads single precision too."""
-    data = write_dataset(
-        tmp_path / "data", queries={"train": "300", "test": "8"}, output={"shard_queries": 90}, rows=8
-    )
-    assert export_neumip(data, tmp_path / "a.hdf5") == 256
-    with h5py.File(tmp_path / "a.hdf5") as file:
-        assert {file[name].shape[:-1] for name in file} == {(1, 16, 16)}
-    found = NeumipQueries(tmp_path / "a.hdf5")
-    assert (found.count, found.base_radius) == (256, 0.5 / (1 << data.lattice.finest))
-    queries, whole = found.read(0, 256), data.load("train")
-    np.testing.assert_array_equal(queries["sigma"], whole["sigma"][:256])
-    distance = np.abs(queries["u"] - whole["u"][:256])
-    assert np.minimum(distance, 1 - distance).max() < 1e-7
-    for name in ("omega_i", "omega_o"):
-        np.testing.assert_array_equal(queries[name][:, :2], whole[name][:256, :2])
-    value = 0.5 * (whole["value_a"].astype(np.float64) + whole["value_b"])
-    np.testing.assert_allclose(queries["value"], value[:256], rtol=1e-6)

@@ -1,14 +1,18 @@
-"""The LLVM library: found without the user, and never the cause of an abort."""
+"""The LLVM library: found without the user, never the cause of an abort; its threads and memory."""
 
 from __future__ import annotations
 
+import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 from conftest import RunPython
 
 from mbtf_core.errors import EngineError
+from mbtf_core.run.task import THREADS_VARIABLE
 from mbtf_gen.engine import runtime as engine
 
 LOAD = """
@@ -112,3 +116,44 @@ def test_a_failed_proof_is_not_cached(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 # What a child of the test below runs.
+
+
+SHOWN = """
+from mbtf_gen.engine.runtime import load_mitsuba
+load_mitsuba()
+import drjit
+print(drjit.thread_count())
+"""
+
+
+def test_a_worker_renders_with_its_threads() -> None:
+    environment = {**os.environ, THREADS_VARIABLE: "3"}
+    shown = subprocess.run([sys.executable, "-c", SHOWN], env=environment, capture_output=True, text=True)
+    assert shown.stdout.split() == ["3"], shown.stderr
+
+
+# Numbers at the end of readable memory.
+CODE = """
+import ctypes, mmap, sys
+import numpy as np
+from mbtf_gen.engine.types import padded
+from mbtf_gen.engine.runtime import load_mitsuba
+mi = load_mitsuba()
+import drjit as dr
+half, n = 1 << 19, 1601
+memory = mmap.mmap(-1, 2 * half)
+start = ctypes.addressof(ctypes.c_char.from_buffer(memory))
+assert ctypes.CDLL(None).mprotect(ctypes.c_void_p(start + half), half, 0) == 0
+numbers = np.frombuffer(memory, np.uint32, count=n, offset=half - 4 * n)
+if sys.argv[1] == "padded":
+    numbers = padded(numbers)
+copied = mi.UInt32(numbers) + dr.opaque(mi.UInt32, 1)
+dr.eval(copied)
+assert (np.array(copied) == 1).all()
+"""
+
+
+def test_kernels_stay_within_the_memory_of_the_process(run_python: RunPython) -> None:
+    assert run_python("-c", CODE, "padded").returncode == 0
+    # Where this passes, Dr.Jit reads no further any more, and nothing needs to be padded.
+    assert run_python("-c", CODE, "plain").returncode != 0

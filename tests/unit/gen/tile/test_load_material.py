@@ -1,17 +1,19 @@
-"""Materials from bare files, folders and YAML: what is found, what is assumed, what is refused."""
+"""Materials from bare files, folders and YAML: what is found, assumed, refused, and kept between calls."""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from PIL import Image
 
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError
-from mbtf_gen.tile.loading import load_material
+from mbtf_gen.tile.loading import latest_material, load_material
 
 
 def rng() -> np.random.Generator:
@@ -147,3 +149,41 @@ class TestDigests:
         path = folder / "material.yaml"
         path.write_text("height: rock_height.npy\n")
         assert load_material(path).digests == load_material(folder / "rock_height.npy").digests
+
+
+def write_png(path: Path, codes: NDArray[np.uint8]) -> None:
+    Image.fromarray(codes).save(path)
+
+
+@pytest.fixture
+def changing(tmp_path: Path) -> Path:
+    write_png(tmp_path / "height.png", np.arange(64, dtype=np.uint8).reshape(8, 8))
+    write_png(tmp_path / "roughness.png", np.full((8, 8), 90, np.uint8))
+    return tmp_path
+
+
+def test_an_unchanged_material_is_not_decoded_again(changing: Path) -> None:
+    first = latest_material(changing)
+    assert latest_material(changing) is first
+    # A job states the method that it found.
+    assert latest_material(changing, "none") is first
+    assert latest_material(changing, "mirror") is not first
+
+
+def test_a_changed_folder_is_loaded_again(changing: Path) -> None:
+    first = latest_material(changing)
+    # As many bytes, and the same times, as before.
+    path = changing / "roughness.png"
+    stat = path.stat()
+    write_png(path, np.full((8, 8), 200, np.uint8))
+    os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+    second = latest_material(changing)
+    before, after = (np.asarray(m.maps["roughness"], np.float64).mean() for m in (first, second))
+    assert after > before
+    write_png(changing / "metallic.png", np.full((8, 8), 255, np.uint8))
+    assert np.mean(latest_material(changing).maps["metallic"]) == 1.0 != np.mean(second.maps["metallic"])
+    (changing / "material.yaml").write_text("height: {file: height.png, scale: 0.3}\n", encoding="utf-8")
+    assert latest_material(changing).height_scale == 0.3
+    (changing / "height.png").unlink()
+    with pytest.raises(InputError):
+        latest_material(changing)

@@ -30,16 +30,6 @@ class TestSharedWords:
         expected = {"base_color": plain[0], "height": plain[1]}
         assert found(tmp_path, *plain, "PaintedMetal004.png") == expected
 
-    @pytest.mark.parametrize(
-        "expected",
-        [
-            {"height": "rock_height.png", "opacity": "rock_height_mask.png"},
-            {"height": "metal_disp.png", "roughness": "metal_rough.png", "metallic": "metal_metal.png"},
-        ],
-    )
-    def test_words_decide_roles(self, expected: dict[str, str], tmp_path: Path) -> None:
-        assert found(tmp_path, *expected.values()) == expected
-
 
 # Folders as sites and programs name them → entries of a material file, in words: role=file[channel], with a
 # "1-" where the map is inverted. A star stands for the common start.
