@@ -217,17 +217,3 @@ def test_counts_ignore_launches_and_threads(kind: str, config: GeneratorConfig, 
         assert (other.value_a == one.value_a).all()
         assert (other.value_b == one.value_b).all()
         assert other.target == one.target
-
-
-def test_images_and_transmittance_keep_their_shape(tmp_path: Path) -> None:
-    rng = np.random.default_rng(4)
-    np.save(tmp_path / "height.npy", rng.random((8, 8)))
-    np.save(tmp_path / "opacity.npy", (rng.random((8, 8)) > 0.3).astype(np.float32))
-    queries = {"train": "256", "test": "64", "test_spp": 4, "layout": "image", "target_error": "10%"}
-    sections = {"geometry": {"height_scale": 0.02}, "queries": queries}
-    config = GeneratorConfig.model_validate({"material": str(tmp_path), **sections})
-    generate(config, tmp_path / "out")
-    data = Dataset.open(tmp_path / "out").load("train")
-    assert data["spp"].shape == data["transmittance"].shape == data["value_a"].shape[:-1] == (4, 8, 8)
-    assert 0.1 < data["transmittance"].mean() < 0.5
-    assert data["spp"].min() >= 2

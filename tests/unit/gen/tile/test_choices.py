@@ -75,13 +75,6 @@ class TestWrite:
         assert plain.config.geometry == flagged.config.geometry
         assert plain.config.queries == flagged.config.queries
 
-    def test_flags_override_the_file(self, maps: Path) -> None:
-        written(maps, "--resolution", "16")
-        sections = {"geometry": {"height_scale": 0.5, "make_tileable": "none"}, "queries": {"resolution": 32}}
-        job = job_of(maps, **sections)
-        assert (job.material.tiling, job.lattice.finest) == ("none", 5)
-        assert job.material.grid.displacement_range == pytest.approx(0.5 * np.ptp(job.material.height))
-
 
 class TestExport:
     @pytest.mark.parametrize("flags", [(), ("--mesh", "40"), ("--height-scale", "-0.2")])

@@ -10,10 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.fuzzing import damaged, examples, loads_or_refuses
-from support.paths import ROOT
 
 from mbtf_core.errors import InputError
-from mbtf_gen.config.generator import GeometrySection
 from mbtf_gen.tile.fibers import curve_file, weave
 from mbtf_gen.tile.fibers.cloth_file import CURVE_FILES
 from mbtf_gen.tile.fibers.curve_file import read_curves
@@ -63,25 +61,6 @@ def test_a_pattern_has_the_yarns_of_its_edges(tmp_path: Path) -> None:
     (yarn,) = pattern.yarns
     assert yarn.shift.tolist() == [1, 0]
     assert yarn.points[:, 0] == pytest.approx([0.125, 0.375, 0.625, 0.875])
-
-
-@pytest.mark.parametrize("name", ["stock_9", "basket_9", "satin_9"])
-def test_published_patterns(name: str) -> None:
-    """Of Sperl et al. 2021: all vertices are used, and no yarn jumps, also from its end to its start."""
-    path = ROOT.parent / f"shared/data/yarn/{name}.pyp"
-    if not path.exists():
-        pytest.skip(f"{path.name} is not beside the project")
-    width, height, radius, vertices = map(float, path.read_text().splitlines()[1].split())
-    pattern = read_pattern(path)
-    assert (pattern.aspect, pattern.radius) == pytest.approx((height / width, radius / width))
-    assert sum(len(yarn.points) for yarn in pattern.yarns) == vertices
-    for yarn in pattern.yarns:
-        end = yarn.points[0] + [*yarn.shift * (1.0, pattern.aspect), 0.0]
-        steps = np.linalg.norm(np.diff([*yarn.points, end], axis=0), axis=1)
-        assert steps.max() < 3 * np.median(steps)
-    tile = load_material(path).configured(GeometrySection())
-    assert tile.aspect == pytest.approx(pattern.aspect)
-    assert 2 * pattern.radius < tile.thickness < 1
 
 
 @pytest.mark.parametrize(

@@ -86,19 +86,6 @@ def test_named_drafts_are_those_of_textbooks() -> None:
     assert rows("X.X\n.X.") == ["X.X", ".X."]
 
 
-@pytest.mark.parametrize("width", [4, 5, 8])
-def test_herringbone_reverses_every_so_many_warps_and_breaks_there(width: int) -> None:
-    draft = parse_draft(f"herringbone 2/2 {width}")
-    assert draft.shape == (4, 2 * width)
-    columns = draft.T.tolist()
-    for k, (a, b) in enumerate(pairwise([*columns, columns[0]])):
-        if k in (width - 1, 2 * width - 1):
-            assert a == [not up for up in b]
-        else:
-            # One pick further: up to the right, then down to the right.
-            assert np.roll(a, -1 if k < width else 1).tolist() == b
-
-
 @pytest.mark.parametrize(("n", "step"), [(5, 2), (7, 3), (8, 3)])
 def test_a_satin_has_scattered_crossings_and_floats_of_all_others(n: int, step: int) -> None:
     weave = named(f"satin {n}/{step}", "a", "b")

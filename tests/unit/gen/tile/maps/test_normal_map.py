@@ -64,23 +64,6 @@ def test_turned_heights(kind: str, turn: str, green: int) -> None:
     assert found.best - found.as_is > 0.1
 
 
-@pytest.mark.parametrize("turn", [t for t in SYMMETRIES if "mirrored top" not in t])
-def test_turned_pixels_of_the_normal_map(turn: str) -> None:
-    """Turned as an image, vectors and all left as they were."""
-    height = fractal(96, 96)
-    found = fit(height, np.ascontiguousarray(SYMMETRIES[turn](normals_of(height, 0.05))))
-    assert found.misfit
-    assert (found.image, found.turn) == ("normal", UNDO[turn])
-
-
-def test_other_resolutions() -> None:
-    height = fractal(128, 128, 3.0)
-    found = fit(height, normals_of(fractal(128, 128, 3.0), 0.05).reshape(64, 2, 64, 2, 3).mean(axis=(1, 3)))
-    assert found.fits
-    assert found.convention == "gl"
-    assert found.scale == pytest.approx(0.05, rel=0.05)
-
-
 class TestNoFinding:
     def test_flat(self) -> None:
         up = np.zeros((32, 32, 3))
