@@ -26,7 +26,7 @@ def test_a_preview_named_like_the_asset_is_no_map(tmp_path: Path) -> None:
     assert {path.name for path in find_maps(fill(tmp_path, *names)).maps.values()} == {*names[:2]}
 
 
-# Folders as sites and programs name them: the common start of all names, then their rests. Those that are maps
+# Folders as sites name them: the common start of all names, then their rests. Those that are maps
 # have the entry of a material file, in words: role=file[channel], with a "1-" where the map is inverted.
 SITES = {
     "ambientCG": "Metal032_1K-JPG_ base_color=Color.jpg height=Displacement.jpg NormalDX.jpg "
