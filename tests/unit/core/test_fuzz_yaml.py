@@ -26,17 +26,14 @@ base_color: [0.5, 0.4, 0.3]
 roughness: 0.4
 metallic: heights.npy
 normal: {file: normal.npy, convention: gl}
-bsdf: {type: principled, roughness: {type: bitmap, filename: normal.npy}}
 """
+BSDF = "height: heights.npy\nbsdf: {type: principled, roughness: {type: bitmap, filename: normal.npy}}\n"
 CONFIG = """\
 material: heights.npy
 geometry: {height_scale: 0.1, mesh: 64}
 queries:
   train: 400/texel
-  test: 1000
-  spp: 4
   mixture: {log_uniform: 1, finest: 0}
-light: {width: 1.0}
 seed: 7
 """
 FIT = """\
@@ -61,6 +58,7 @@ report: {title: "Small: a test"}
 """
 DOCUMENTS: dict[str, tuple[str, Callable[[Path], Any]]] = {
     "material": (MATERIAL, load_material),
+    "bsdf": (BSDF, load_material),
     "config": (CONFIG, lambda path: resolve(GeneratorConfig, file=path)),
     "fit": (FIT, lambda path: resolve(FitConfig, file=path)),
     "recipe": (RECIPE, load_recipe),

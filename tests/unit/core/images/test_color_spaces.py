@@ -1,4 +1,4 @@
-"""Color spaces that files declare: matrices against published ones, profiles against LittleCMS."""
+"""Color spaces that files declare, against published matrices and LittleCMS; pictures of the whole sphere."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
+from PIL import Image, ImageCms
 from PIL import Image as Pillow
-from PIL import ImageCms
 from support.image_files import P3_COLUMNS, SRGB_CURVE, exr, icc, png, rng
 
 from mbtf_core.color import linear_to_srgb, srgb_to_linear
+from mbtf_core.errors import InputError
 from mbtf_core.images.environment import read_environment
 from mbtf_core.images.read import linear_rgb, read_image
 
@@ -145,3 +146,30 @@ def test_cameras_declare_adobe_rgb_in_exif(tmp_path: Path, index: str, adobe: bo
     matrix = np.array([[1.39836, -0.39836, 0.0], [0.0, 1.0, 0.0], [0.0, -0.04293, 1.04293]])
     expected = matrix @ code**2.19921875 if adobe else srgb_to_linear(code)
     assert linear_rgb(read_image(tmp_path / "c.jpg"))[0, 0] == pytest.approx(expected, abs=1e-4)
+
+
+def test_surroundings_are_linear_and_small(tmp_path: Path) -> None:
+    sky = np.zeros((200, 400, 3), np.float32)
+    sky[:100] = (0.25, 0.5, 4.0)
+    np.save(tmp_path / "sky.npy", sky)
+    values = read_environment(tmp_path / "sky.npy", 64)
+    assert values.shape == (64, 128, 3)
+    np.testing.assert_allclose(values[:31], np.broadcast_to(sky[0, 0], (31, 128, 3)), rtol=1e-5)
+    assert values[34:].max() == 0
+    Image.fromarray(np.full((2, 4, 3), 188, np.uint8)).save(tmp_path / "gray.png")
+    np.testing.assert_allclose(read_environment(tmp_path / "gray.png", 64), 0.5029, rtol=1e-3)
+    # Radiance's RGBE: a mantissa of 128 and an exponent of 129 are 1.
+    pixels = bytes([128, 64, 32, 129]) * 8
+    (tmp_path / "one.hdr").write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 4\n" + pixels)
+    one = read_environment(tmp_path / "one.hdr", 64)
+    np.testing.assert_allclose(one[0, 0], (1, 0.5, 0.25), rtol=0.01)
+    head = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n"
+    for content, what in (
+        (head + b"-Y 60000 +X 60000\n" + pixels, "claims 60000 x 60000"),
+        (head + b"+X 4 +Y 2\n" + pixels, "turned"),
+        (head.replace(b"rgbe", b"xyze") + b"-Y 2 +X 4\n" + pixels, "XYZ"),
+        (b"#?RADIANCE\n", "Radiance picture"),
+    ):
+        (tmp_path / "bad.hdr").write_bytes(content)
+        with pytest.raises(InputError, match=what):
+            read_environment(tmp_path / "bad.hdr", 64)

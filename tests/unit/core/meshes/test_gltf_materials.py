@@ -62,14 +62,15 @@ SHEEN = {"sheenColorFactor": [1, 0.5, 0], "sheenColorTexture": SHEEN_COLOR}
 SHEEN |= {"sheenRoughnessFactor": 0.5, "sheenRoughnessTexture": FOUR}
 ALPHA = {alpha: codes((255, 255, 255, alpha), (255, 255, 255, 255)) for alpha in (0, 51, 204, 255)}
 HALF = {"baseColorFactor": [1, 1, 1, 0.5]}
+BLEND, MASK = {"alphaMode": "BLEND"}, {"alphaMode": "MASK"}
 # Material (its metallic and roughness, and the rest), and values by role; None: there are none.
 VALUES: dict[str, tuple[dict[str, Any] | None, dict[str, Any], dict[str, Any]]] = {
     # An index of refraction of 1.5 reflects 4%, half of what `specular` 1 does.
     "nothing": (None, {}, {"base_color": [1, 1, 1], "roughness": 1, "metallic": 1, "specular": 0.5}),
     "factors": (
-        {"baseColorFactor": [0.0018, 0.0055, 0.0137, 1], "metallicFactor": 0, "roughnessFactor": 0.9},
+        {"baseColorFactor": [0.1, 0.2, 0.3, 1], "metallicFactor": 0, "roughnessFactor": 0.9},
         {},
-        {"base_color": [0.0018, 0.0055, 0.0137], "roughness": 0.9, "metallic": 0},
+        {"base_color": [0.1, 0.2, 0.3], "roughness": 0.9, "metallic": 0},
     ),
     "colors are sRGB": (
         {"baseColorTexture": codes((0, 10, 128), (200, 255, 255)), "baseColorFactor": [1, 1, 0.5, 1]},
@@ -88,28 +89,12 @@ VALUES: dict[str, tuple[dict[str, Any] | None, dict[str, Any], dict[str, Any]]] 
         {"sheen": 1, "sheen_color": [[[CODES[128], CODES[128] / 2, 0]]], "sheen_roughness": [[0.4]]},
     ),
     "bare coat": ({}, extension("clearcoat", clearcoatFactor=1), {"clearcoat": 1, "clearcoat_roughness": 0}),
-    "specular weight": (
-        {"metallicFactor": 0},
-        extension("specular", specularTexture=FOUR),
-        {"specular": [[0.5 * 0.8]]},
-    ),
+    "specular weight": ({}, extension("specular", specularTexture=FOUR), {"specular": [[0.4]]}),
     "opaque": ({"baseColorTexture": ALPHA[0], **HALF}, {}, {"opacity": None}),
-    "blended": (
-        {"baseColorTexture": ALPHA[51], **HALF},
-        {"alphaMode": "BLEND"},
-        {"opacity": [[0.1, 0.5]], "opacity_cutoff": None},
-    ),
-    "blended, without holes": ({"baseColorTexture": ALPHA[255]}, {"alphaMode": "BLEND"}, {"opacity": None}),
-    "masked": (
-        {"baseColorTexture": ALPHA[0]},
-        {"alphaMode": "MASK"},
-        {"opacity": [[0, 1]], "opacity_cutoff": 0.5},
-    ),
-    "masked, all above the cutoff": (
-        {"baseColorTexture": ALPHA[204]},
-        {"alphaMode": "MASK"},
-        {"opacity": None, "opacity_cutoff": None},
-    ),
+    "blended": ({"baseColorTexture": ALPHA[51], **HALF}, BLEND, {"opacity": [[0.1, 0.5]]}),
+    "blended, without holes": ({"baseColorTexture": ALPHA[255]}, BLEND, {"opacity": None}),
+    "masked": ({"baseColorTexture": ALPHA[0]}, MASK, {"opacity": [[0, 1]], "opacity_cutoff": 0.5}),
+    "masked, all above the cutoff": ({"baseColorTexture": ALPHA[204]}, MASK, {"opacity": None}),
 }
 
 

@@ -25,18 +25,7 @@ except MbtfError as error:
 """
 
 
-def old_llvm(major: int) -> str:
-    """Path of a system library of that version, or skip."""
-    places = [
-        f"/usr/lib/x86_64-linux-gnu/libLLVM-{major}.so.1",
-        f"/usr/lib/aarch64-linux-gnu/libLLVM-{major}.so.1",
-        f"/usr/lib/llvm-{major}/lib/libLLVM-{major}.so.1",
-        f"/usr/lib64/libLLVM-{major}.so",
-    ]
-    for place in places:
-        if Path(place).exists():
-            return place
-    pytest.skip(f"no LLVM {major} on this machine")
+OLD = sorted(Path("/usr/lib").glob("*/libLLVM-1[0-5].so.1"))
 
 
 def test_it_is_found_and_works_with_nothing_set(run_python: RunPython, tmp_path: Path) -> None:
@@ -52,8 +41,9 @@ def test_it_is_found_and_works_with_nothing_set(run_python: RunPython, tmp_path:
     assert any(p.name.startswith("llvm-proof-") for p in (tmp_path / "mbtf").iterdir())
 
 
+@pytest.mark.skipif(not OLD, reason="no LLVM older than 16 on this machine")
 def test_an_old_llvm_is_refused(run_python: RunPython) -> None:
-    done = run_python("-c", LOAD, DRJIT_LIBLLVM_PATH=old_llvm(15))
+    done = run_python("-c", LOAD, DRJIT_LIBLLVM_PATH=str(OLD[-1]))
     assert done.returncode == 0
     assert "is older than LLVM 16" in done.stdout
     assert done.stderr == ""

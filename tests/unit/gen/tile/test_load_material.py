@@ -1,4 +1,4 @@
-"""Materials from bare files, folders and YAML: what is found, assumed, refused, and kept between calls."""
+"""Materials from bare files, folders and YAML: what is found, assumed, refused, documented, and kept."""
 
 from __future__ import annotations
 
@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
+from support import image_files
+from support.paths import ROOT
 
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError
 from mbtf_gen.tile.loading import latest_material, load_material
+from mbtf_gen.tile.maps.file_names import GLOSS_WORDS, LETTERS, SMOOTHNESS_IN_ALPHA, WEAK_WORDS, WORDS
 
 
 def rng() -> np.random.Generator:
@@ -187,3 +190,25 @@ def test_a_changed_folder_is_loaded_again(changing: Path) -> None:
     (changing / "height.png").unlink()
     with pytest.raises(InputError):
         latest_material(changing)
+
+
+DOCUMENT = (ROOT / "docs/reference/material-yaml.md").read_text()
+
+
+def test_the_example_is_valid(tmp_path: Path) -> None:
+    """The document's material file, with maps of those names beside it."""
+    text = DOCUMENT.split("```yaml\n", 1)[1].split("```", 1)[0]
+    (tmp_path / "material.yaml").write_text(text)
+    for name in ("diff", "arm", "nor"):
+        image_files.png(tmp_path / f"cliff_{name}.png", rng().integers(100, 200, (8, 8, 3)), 2, 8)
+    layers = {n: rng().random((8, 8)).astype(np.float32) for n in ("R", "G", "B", "displacement.Y")}
+    image_files.exr(tmp_path / "cliff.exr", layers)
+    material = load_material(tmp_path)
+    assert np.array_equal(material.height, layers["displacement.Y"])
+    assert material.height_scale == 0.12
+
+
+def test_every_word_is_listed() -> None:
+    words = [word for table in (WORDS, WEAK_WORDS) for words in table.values() for word in words]
+    for word in (*words, *GLOSS_WORDS, *LETTERS, *SMOOTHNESS_IN_ALPHA):
+        assert f"`{word}`" in DOCUMENT.lower(), word
