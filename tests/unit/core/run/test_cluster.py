@@ -150,6 +150,7 @@ def test_what_a_job_needs_comes_beside_what_tasks_need_and_what_a_site_configure
 
     job: list[str] = []
     own: dict[str, Any] = {"worker_extra_args": ["--local-directory", "/scratch"], "queue": "short"}
+    own["log_directory"] = str(tmp_path / "logs")
     monkeypatch.setattr("shutil.which", lambda command: f"/usr/bin/{command}")
     adapt = lambda self, **numbers: job.extend(self.job_script().splitlines())  # noqa: E731
     monkeypatch.setattr(dask_jobqueue.SLURMCluster, "adapt", adapt)
