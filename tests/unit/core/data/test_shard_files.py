@@ -120,6 +120,14 @@ def test_unreadable_files_are_refused(tmp_path: Path, suffix: str, capfd: pytest
     assert capfd.readouterr() == ("", "")
 
 
+def test_an_npz_array_that_claims_more_than_it_holds_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "x.npz"
+    write_shard(path, arrays(SHUFFLED))
+    path.write_bytes(path.read_bytes().replace(b"(2500,", b"(9500,"))
+    with pytest.raises(InputError, match="not as long as its header says"):
+        read_shard(path)
+
+
 def test_an_exr_image_that_is_no_shard(tmp_path: Path) -> None:
     import OpenEXR
 
